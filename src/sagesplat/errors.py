@@ -1,0 +1,25 @@
+"""Errors a user can cause. Each message is one line: the path, what is wrong, the cure."""
+
+
+class SageError(Exception):
+    """Base of every error that the command line prints as one line with exit code 2."""
+
+
+class SceneError(SageError):
+    """A capture (photos, poses, points) that cannot be read."""
+
+
+class LabelError(SageError):
+    """Label images or a taxonomy that cannot be used."""
+
+
+class RunError(SageError):
+    """A run folder that does not fit what is asked of it."""
+
+
+class DataError(SageError):
+    """A file of Gaussians or a table with content that cannot be used."""
+
+
+class BackendUnavailable(SageError):
+    """A named backend or optional dependency that this machine does not have."""

@@ -1,0 +1,69 @@
+"""The Gaussians type: a labelled splat scene as plain tensors."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+BYTES_PER_GAUSSIAN = 248  # 62 float32, the INRIA PLY: what the paper counts as occupancy
+
+PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussians:
+    """N Gaussians with a category each. `label_ids` are category ids, -1 = unlabelled."""
+
+    means: Float[Tensor, "N 3"]  # world
+    quats: Float[Tensor, "N 4"]  # wxyz, any length but zero
+    log_scales: Float[Tensor, "N 3"]  # natural log of the standard deviations, world units
+    logit_opacities: Float[Tensor, " N"]
+    sh0: Float[Tensor, "N 1 3"]
+    shN: Float[Tensor, "N K 3"]  # K = 0, 3, 8 or 15: degree 0 to 3
+    label_ids: Int[Tensor, " N"]  # int16
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def sh_degree(self) -> int:
+        """The degree that shN has room for."""
+        return {0: 0, 3: 1, 8: 2, 15: 3}[self.shN.shape[1]]
+
+    @property
+    def nbytes(self) -> int:
+        """Occupancy as the paper counts it: 248 bytes a Gaussian."""
+        return len(self) * BYTES_PER_GAUSSIAN
+
+    def parameters(self) -> dict[str, Tensor]:
+        """The trainable tensors by name."""
+        return {name: getattr(self, name) for name in PARAMETERS}
+
+    def select(self, index: Tensor) -> "Gaussians":
+        """The rows that a boolean mask or an index tensor names."""
+        return Gaussians(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+
+    def of_labels(self, label_ids: Sequence[int]) -> "Gaussians":
+        """The rows of some categories."""
+        wanted = torch.tensor(list(label_ids), dtype=self.label_ids.dtype, device=self.label_ids.device)
+        return self.select(torch.isin(self.label_ids, wanted))
+
+    def counts(self) -> dict[int, int]:
+        """Number of Gaussians by label id."""
+        ids, counts = torch.unique(self.label_ids, return_counts=True)
+        return dict(zip(ids.tolist(), counts.tolist(), strict=True))
+
+    def detach(self) -> "Gaussians":
+        """The same tensors outside any graph."""
+        return replace(self, **{name: p.detach() for name, p in self.parameters().items()})
+
+
+def concat(parts: Sequence[Gaussians]) -> Gaussians:
+    """All Gaussians of several sets in order; shN is padded with zeros to the largest degree."""
+    bases = max(p.shN.shape[1] for p in parts)
+    padded = [
+        replace(p, shN=torch.nn.functional.pad(p.shN, (0, 0, 0, bases - p.shN.shape[1]))) for p in parts
+    ]
+    return Gaussians(**{f.name: torch.cat([getattr(p, f.name) for p in padded]) for f in fields(Gaussians)})
