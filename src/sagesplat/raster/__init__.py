@@ -1,0 +1,55 @@
+"""Rasterising Gaussians: one function, several backends."""
+
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sagesplat.errors import BackendUnavailable
+from sagesplat.gaussians import Gaussians
+from sagesplat.raster.render import Render
+from sagesplat.scene.scene import Camera
+
+__all__ = ["Backend", "Render", "rasterize", "resolve_backend"]
+
+Backend = Literal["auto", "cpu", "reference"]
+
+
+def resolve_backend(backend: Backend) -> Backend:
+    """The backend that `auto` stands for on this machine; a named one must be there."""
+    if backend not in ("auto", "cpu", "reference"):
+        raise BackendUnavailable(f"backend {backend!r} is not known; use --backend cpu or reference")
+    return "cpu" if backend == "auto" else backend
+
+
+def rasterize(
+    gaussians: Gaussians,
+    camera: Camera,
+    *,
+    sh_degree: int | None = None,
+    background: Tensor | None = None,
+    features: Tensor | None = None,
+    antialiased: bool = False,
+    tile_mask: np.ndarray | None = None,
+    backend: Backend = "auto",
+) -> Render:
+    """Render Gaussians into a camera, with gradients for all their parameters and for `features`.
+
+    `sh_degree`: harmonics up to this degree (default: all there are). `background` [3] lies behind everything
+    (default black). `features` [N, C] are blended like colours, over zero. `antialiased` scales opacities by
+    the area that the low-pass adds (Mip-Splatting's 2D filter as gsplat has it). `tile_mask` bool
+    [ceil(H/16), ceil(W/16)]: tiles that are false show the background and take no gradient (`cpu` only).
+    The 2D means of the result carry a `.grad` after `backward()`. Raises `DataError` for NaN or Inf.
+    """
+    degree = gaussians.sh_degree if sh_degree is None else min(sh_degree, gaussians.sh_degree)
+    if background is None:
+        background = torch.zeros(3)
+    shared = {"degree": degree, "background": background, "features": features, "antialiased": antialiased}
+    if resolve_backend(backend) == "reference":
+        from sagesplat.raster import reference
+
+        return reference.render(gaussians, camera, **shared)
+    from sagesplat.raster import cpu
+
+    return cpu.render(gaussians, camera, tile_mask=tile_mask, **shared)

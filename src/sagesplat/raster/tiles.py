@@ -1,0 +1,136 @@
+"""Which Gaussian meets which tile, in depth order: one radix sort and counting placement."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit, prange
+
+from sagesplat.raster.blend import TILE
+from sagesplat.raster.render import ALPHA_MIN
+
+_CHUNKS = 16  # fixed, so that the result does not depend on the number of threads
+
+
+@dataclass(frozen=True, eq=False)
+class Intersections:
+    """Gaussians by tile and depth. An intersection's slot is its row when listed by Gaussian."""
+
+    tiles_x: int
+    starts: np.ndarray  # int64 [tiles + 1]
+    ids: np.ndarray  # int32 [I], Gaussian of each intersection
+    slots: np.ndarray  # int32 [I]
+    offsets: np.ndarray  # int64 [N + 1], first slot of each Gaussian
+
+
+@njit(cache=True)
+def depth_order(depths, radii):
+    """Indices of the drawn Gaussians (radius > 0), front to back; stable (LSD radix on the float's bits)."""
+    n = 0
+    for i in range(len(depths)):
+        n += radii[i] > 0
+    order, other = np.empty(n, np.int32), np.empty(n, np.int32)
+    bits = depths.view(np.uint32)  # positive floats sort as their bits do
+    n = 0
+    for i in range(len(depths)):
+        if radii[i] > 0:
+            order[n] = i
+            n += 1
+    for shift in (0, 11, 22):
+        starts = np.zeros(2049, np.int64)
+        for i in order:
+            starts[((bits[i] >> np.uint32(shift)) & np.uint32(2047)) + 1] += 1
+        starts = np.cumsum(starts)
+        for i in order:
+            digit = (bits[i] >> np.uint32(shift)) & np.uint32(2047)
+            other[starts[digit]] = i
+            starts[digit] += 1
+        order, other = other, order
+    return order
+
+
+@njit(cache=True)
+def _tile_box(records, i, tiles_x, tiles_y):
+    """First and last + 1 tile column and row of the bounding box."""
+    x0 = max(0, int(np.floor((records[i, 0] - records[i, 9]) / TILE)))
+    x1 = min(tiles_x, int(np.floor((records[i, 0] + records[i, 9]) / TILE)) + 1)
+    y0 = max(0, int(np.floor((records[i, 1] - records[i, 10]) / TILE)))
+    y1 = min(tiles_y, int(np.floor((records[i, 1] + records[i, 10]) / TILE)) + 1)
+    return x0, x1, y0, y1
+
+
+@njit(cache=True)
+def _edge_maximum(along, across, cross, fixed, lo, hi):
+    """Maximum over t in [lo, hi] of along t^2 + cross t fixed + across fixed^2 (along < 0)."""
+    t = min(max(-0.5 * cross * fixed / along, lo), hi)
+    return along * t * t + cross * t * fixed + across * fixed * fixed
+
+
+@njit(cache=True)
+def _touches(records, i, tile_x, tile_y, threshold):
+    """Whether alpha reaches its minimum anywhere in the tile's square (exact)."""
+    x0, y0 = tile_x * TILE - records[i, 0], tile_y * TILE - records[i, 1]
+    x1, y1 = x0 + TILE, y0 + TILE
+    if x0 <= 0 <= x1 and y0 <= 0 <= y1:
+        return True
+    a, b, c = records[i, 2], records[i, 3], records[i, 4]
+    best = -np.inf
+    # the maximum lies on an edge that faces the centre
+    if x0 > 0:
+        best = max(best, _edge_maximum(c, a, b, x0, y0, y1))
+    if x1 < 0:
+        best = max(best, _edge_maximum(c, a, b, x1, y0, y1))
+    if y0 > 0:
+        best = max(best, _edge_maximum(a, c, b, y0, x0, x1))
+    if y1 < 0:
+        best = max(best, _edge_maximum(a, c, b, y1, x0, x1))
+    return best + records[i, 5] >= threshold
+
+
+@njit(parallel=True, cache=True)
+def _count(records, order, tiles_x, tiles_y, tile_mask, threshold, per_tile, per_gaussian):
+    for chunk in prange(_CHUNKS):
+        for k in range(chunk * len(order) // _CHUNKS, (chunk + 1) * len(order) // _CHUNKS):
+            i = order[k]
+            x0, x1, y0, y1 = _tile_box(records, i, tiles_x, tiles_y)
+            for y in range(y0, y1):
+                for x in range(x0, x1):
+                    if tile_mask[y * tiles_x + x] and _touches(records, i, x, y, threshold):
+                        per_tile[chunk, y * tiles_x + x] += 1
+                        per_gaussian[i] += 1
+
+
+@njit(parallel=True, cache=True)
+def _place(records, order, tiles_x, tiles_y, tile_mask, threshold, cursor, offsets, ids, slots):
+    for chunk in prange(_CHUNKS):
+        for k in range(chunk * len(order) // _CHUNKS, (chunk + 1) * len(order) // _CHUNKS):
+            i = order[k]
+            slot = offsets[i]
+            x0, x1, y0, y1 = _tile_box(records, i, tiles_x, tiles_y)
+            for y in range(y0, y1):
+                for x in range(x0, x1):
+                    if tile_mask[y * tiles_x + x] and _touches(records, i, x, y, threshold):
+                        at = cursor[chunk, y * tiles_x + x]
+                        cursor[chunk, y * tiles_x + x] += 1
+                        ids[at] = i
+                        slots[at] = slot
+                        slot += 1
+
+
+def intersect(
+    records: np.ndarray, depths: np.ndarray, radii: np.ndarray, width: int, height: int, tile_mask: np.ndarray
+) -> Intersections:
+    """List every (tile, Gaussian) pair in which the Gaussian is visible, by tile, front to back."""
+    tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
+    order = depth_order(depths, radii)
+    # a hair below the blending threshold, so that rounding never loses a pixel
+    threshold = np.float32(np.log2(ALPHA_MIN) - 1e-3)
+    per_tile = np.zeros((_CHUNKS, tiles_x * tiles_y), np.int64)
+    per_gaussian = np.zeros(len(depths), np.int64)
+    _count(records, order, tiles_x, tiles_y, tile_mask, threshold, per_tile, per_gaussian)
+    offsets = np.concatenate([[0], np.cumsum(per_gaussian)])
+    ends = np.cumsum(per_tile.T.ravel())  # by tile, then by chunk
+    cursor = np.ascontiguousarray((ends - per_tile.T.ravel()).reshape(-1, _CHUNKS).T)
+    starts = np.append(cursor[0], ends[-1:])
+    ids, slots = np.empty(offsets[-1], np.int32), np.empty(offsets[-1], np.int32)
+    _place(records, order, tiles_x, tiles_y, tile_mask, threshold, cursor, offsets, ids, slots)
+    return Intersections(tiles_x, starts, ids, slots, offsets)
