@@ -1,0 +1,1 @@
+"""From measured quality to plans: levels, observations, quality models, plans, composed scenes."""

@@ -1,0 +1,1 @@
+"""What a run gives away: splat files, tables, figures and the report."""

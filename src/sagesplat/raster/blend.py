@@ -17,6 +17,7 @@ from sagesplat.raster.render import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 TILE = 16
 HALF = 8
 PIXELS = TILE * TILE
+PLANE = PIXELS + 16  # keeps a tile's planes off each other's cache sets
 RECORD = 11
 SUMS = 9  # per intersection: colour r, g, b, then gq times 1, dx, dy, dx^2, dx dy, dy^2
 
@@ -32,7 +33,7 @@ _BIAS, _MANTISSA = np.int32(127), np.int32(23)
 
 # Planes of a tile's buffer (unsigned: no check for negative indices stands in the way of vectorising)
 _U = np.uint64
-_Y, _S0, _S1, _S2, _S3, _S4, _S5 = (_U(PIXELS * k) for k in range(1, 8))
+_Y, _S0, _S1, _S2, _S3, _S4, _S5 = (_U(PLANE * k) for k in range(1, 8))
 
 # No NaN or Inf assumptions: sums may be reordered (that is what vectorises them), nothing else.
 FAST = {"contract", "reassoc", "nsz", "arcp"}
@@ -92,7 +93,7 @@ def _pixel_centres(buffer, x0, y0):
         half, rest = divmod(p, TILE * HALF)
         row, column = divmod(rest, HALF)
         buffer[p] = x0 + _F(half * HALF + column) + _F(0.5)
-        buffer[PIXELS + p] = y0 + _F(row) + _F(0.5)
+        buffer[PLANE + p] = y0 + _F(row) + _F(0.5)
 
 
 @njit(parallel=True, cache=True)
@@ -105,9 +106,9 @@ def forward(records, starts, ids, tiles_x, width, height, background, image, lef
     for tile in prange(len(starts) - 1):
         column0, row0 = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
         x0, y0 = _F(column0), _F(row0)
-        buffer = np.zeros(6 * PIXELS, np.float32)
+        buffer = np.zeros(6 * PLANE, np.float32)
         _pixel_centres(buffer, x0, y0)
-        state = buffer[2 * PIXELS :].reshape(4, PIXELS)
+        state = buffer[2 * PLANE :].reshape(4, PLANE)
         state[0] = _ONE
         end = starts[tile + 1]
         for k in range(starts[tile], starts[tile + 1]):
@@ -121,7 +122,7 @@ def forward(records, starts, ids, tiles_x, width, height, background, image, lef
                         records[i, 0], records[i, 1], records[i, 2], records[i, 3], records[i, 4],
                         records[i, 5], records[i, 6], records[i, 7], records[i, 8],
                     )  # fmt: skip
-            if k % 16 == 15 and state[0].max() < _T_MIN:
+            if k % 16 == 15 and state[0, :PIXELS].max() < _T_MIN:
                 end = k + 1
                 break
         ends[tile] = end
@@ -197,9 +198,9 @@ def backward(
             continue
         column0, row0 = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
         x0, y0 = _F(column0), _F(row0)
-        buffer = np.zeros(8 * PIXELS, np.float32)
+        buffer = np.zeros(8 * PLANE, np.float32)
         _pixel_centres(buffer, x0, y0)
-        state = buffer[2 * PIXELS :].reshape(6, PIXELS)
+        state = buffer[2 * PLANE :].reshape(6, PLANE)
         for row in range(min(TILE, height - row0)):
             for column in range(min(TILE, width - column0)):
                 half, inner = divmod(column, HALF)

@@ -40,7 +40,9 @@ def _project(options: _Options, parameters: list[np.ndarray]):
     )  # fmt: skip
     if n and radii.min() < 0:
         bad = np.flatnonzero(radii < 0)
-        raise DataError(f"{len(bad)} of {n} Gaussians hold NaN or Inf (first row {bad[0]}); drop them before rendering")
+        raise DataError(
+            f"{len(bad)} of {n} Gaussians hold NaN or Inf (first row {bad[0]}); drop them before rendering"
+        )
     return records, depths, radii
 
 
@@ -48,7 +50,14 @@ class _Rasterize(torch.autograd.Function):
     """(parameters, features, background, means2d leaf) -> rgb, alpha, features; radii and means2d aside."""
 
     @staticmethod
-    def forward(ctx: Any, options: _Options, means2d: Tensor, background: Tensor, features: Tensor, *parameters: Tensor):
+    def forward(
+        ctx: Any,
+        options: _Options,
+        means2d: Tensor,
+        background: Tensor,
+        features: Tensor,
+        *parameters: Tensor,
+    ):
         camera = options.camera
         arrays = [_array(p) for p in parameters]
         records, depths, radii = _project(options, arrays)
@@ -59,13 +68,23 @@ class _Rasterize(torch.autograd.Function):
         left = np.empty((camera.height, camera.width), np.float32)
         ends = np.empty(len(found.starts) - 1, np.int64)
         passes = [(records, _array(background))] + [
-            (_with_colors(records, chunk), np.zeros(_CHUNK, np.float32)) for chunk in _chunks(_array(features))
+            (_with_colors(records, chunk), np.zeros(_CHUNK, np.float32))
+            for chunk in _chunks(_array(features))
         ]
         images = []
         for painted, behind in passes:
             image = np.empty((camera.height, camera.width, 3), np.float32)
             blend.forward(
-                painted, found.starts, found.ids, found.tiles_x, camera.width, camera.height, behind, image, left, ends
+                painted,
+                found.starts,
+                found.ids,
+                found.tiles_x,
+                camera.width,
+                camera.height,
+                behind,
+                image,
+                left,
+                ends,
             )
             images.append(image)
         ctx.save_for_backward(*parameters)

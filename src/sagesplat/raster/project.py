@@ -14,6 +14,7 @@ from sagesplat.scene.scene import Camera
 from sagesplat.sh import direction_gradient, fill_bases
 
 _LOG2E = math.log2(math.e)
+_CHUNK = 256  # Gaussians that share a thread's scratch arrays
 
 
 def camera_vector(camera: Camera) -> np.ndarray:
@@ -53,145 +54,70 @@ def _half_covariance(cam, mean, quat, log_scale, rot, scale, jac, half):
         jac[1, k] = fy / z * (cam[3 + k] - v * cam[6 + k])
     for i in range(2):
         for k in range(3):
-            half[i, k] = (
-                jac[i, 0] * rot[0, k] + jac[i, 1] * rot[1, k] + jac[i, 2] * rot[2, k]
-            ) * scale[k]
+            half[i, k] = (jac[i, 0] * rot[0, k] + jac[i, 1] * rot[1, k] + jac[i, 2] * rot[2, k]) * scale[k]
     return x, y, z, u, v, inverse
+
+
+@njit(error_model="numpy", cache=True)
+def _forward_one(
+    i, cam, means, quats, log_scales, logits, sh0, shN, num_bases, antialiased, records, depths, radii,
+    rot, scale, jac, half, basis,
+):  # fmt: skip
+    radii[i] = 0.0
+    depths[i] = np.inf
+    z = cam[6] * means[i, 0] + cam[7] * means[i, 1] + cam[8] * means[i, 2] + cam[11]
+    check = means[i, 0] + means[i, 1] + means[i, 2] + logits[i] + sh0[i, 0, 0] + sh0[i, 0, 1] + sh0[i, 0, 2]
+    for k in range(3):
+        check += log_scales[i, k] + quats[i, k]
+    if not np.isfinite(check + quats[i, 3]):
+        radii[i] = -1.0
+        return
+    if z <= NEAR:
+        return
+    x, y, z, u, v, _ = _half_covariance(cam, means[i], quats[i], log_scales[i], rot, scale, jac, half)
+    sxx = half[0, 0] * half[0, 0] + half[0, 1] * half[0, 1] + half[0, 2] * half[0, 2]
+    sxy = half[0, 0] * half[1, 0] + half[0, 1] * half[1, 1] + half[0, 2] * half[1, 2]
+    syy = half[1, 0] * half[1, 0] + half[1, 1] * half[1, 1] + half[1, 2] * half[1, 2]
+    cxx, cyy = sxx + BLUR, syy + BLUR
+    det = cxx * cyy - sxy * sxy
+    opacity = 1.0 / (1.0 + math.exp(-logits[i]))
+    if antialiased:
+        opacity *= math.sqrt(max((sxx * syy - sxy * sxy) / det, 1e-10))
+    if not (opacity > ALPHA_MIN and det > 0.0 and np.isfinite(det)):
+        return
+    mx, my = cam[12] * x / z + cam[14], cam[13] * y / z + cam[15]
+    reach = 2.0 * math.log(opacity / ALPHA_MIN)
+    hx, hy = math.sqrt(reach * cxx), math.sqrt(reach * cyy)
+    if mx + hx <= 0 or mx - hx >= cam[16] or my + hy <= 0 or my - hy >= cam[17]:
+        return
+    depths[i] = z
+    radii[i] = max(hx, hy)
+    r = records[i]
+    r[0], r[1] = mx, my
+    r[2], r[3], r[4] = -0.5 * _LOG2E * cyy / det, _LOG2E * sxy / det, -0.5 * _LOG2E * cxx / det
+    r[5] = math.log2(opacity)
+    dx, dy, dz = means[i, 0] - cam[18], means[i, 1] - cam[19], means[i, 2] - cam[20]
+    length = math.sqrt(dx * dx + dy * dy + dz * dz)
+    fill_bases(dx / length, dy / length, dz / length, num_bases, basis)
+    for channel in range(3):
+        value = 0.5 + basis[0] * sh0[i, 0, channel]
+        for k in range(1, num_bases):
+            value += basis[k] * shN[i, k - 1, channel]
+        r[6 + channel] = max(value, 0.0)
+    r[9], r[10] = hx, hy
 
 
 @njit(parallel=True, error_model="numpy", cache=True)
 def forward(cam, means, quats, log_scales, logits, sh0, shN, num_bases, antialiased, records, depths, radii):
     """Fill records [N, 11] (see `blend`), depths [N] and radii [N] (0 = not drawn, -1 = not finite)."""
-    for i in prange(len(means)):
+    for chunk in prange((len(means) + _CHUNK - 1) // _CHUNK):
         rot, scale = np.empty((3, 3)), np.empty(3)
         jac, half, basis = np.empty((2, 3)), np.empty((2, 3)), np.empty(16)
-        radii[i] = 0.0
-        depths[i] = np.inf
-        z = cam[6] * means[i, 0] + cam[7] * means[i, 1] + cam[8] * means[i, 2] + cam[11]
-        check = means[i, 0] + means[i, 1] + means[i, 2] + logits[i] + sh0[i, 0, 0] + sh0[i, 0, 1] + sh0[i, 0, 2]
-        for k in range(3):
-            check += log_scales[i, k] + quats[i, k]
-        if not np.isfinite(check + quats[i, 3]):
-            radii[i] = -1.0
-            continue
-        if z <= NEAR:
-            continue
-        x, y, z, u, v, _ = _half_covariance(
-            cam, means[i], quats[i], log_scales[i], rot, scale, jac, half
-        )
-        sxx = half[0, 0] * half[0, 0] + half[0, 1] * half[0, 1] + half[0, 2] * half[0, 2]
-        sxy = half[0, 0] * half[1, 0] + half[0, 1] * half[1, 1] + half[0, 2] * half[1, 2]
-        syy = half[1, 0] * half[1, 0] + half[1, 1] * half[1, 1] + half[1, 2] * half[1, 2]
-        cxx, cyy = sxx + BLUR, syy + BLUR
-        det = cxx * cyy - sxy * sxy
-        opacity = 1.0 / (1.0 + math.exp(-logits[i]))
-        if antialiased:
-            opacity *= math.sqrt(max((sxx * syy - sxy * sxy) / det, 1e-10))
-        if not (opacity > ALPHA_MIN and det > 0.0 and np.isfinite(det)):
-            continue
-        mx, my = cam[12] * x / z + cam[14], cam[13] * y / z + cam[15]
-        reach = 2.0 * math.log(opacity / ALPHA_MIN)
-        hx, hy = math.sqrt(reach * cxx), math.sqrt(reach * cyy)
-        if mx + hx <= 0 or mx - hx >= cam[16] or my + hy <= 0 or my - hy >= cam[17]:
-            continue
-        depths[i] = z
-        radii[i] = max(hx, hy)
-        r = records[i]
-        r[0], r[1] = mx, my
-        r[2], r[3], r[4] = -0.5 * _LOG2E * cyy / det, _LOG2E * sxy / det, -0.5 * _LOG2E * cxx / det
-        r[5] = math.log2(opacity)
-        dx, dy, dz = means[i, 0] - cam[18], means[i, 1] - cam[19], means[i, 2] - cam[20]
-        length = math.sqrt(dx * dx + dy * dy + dz * dz)
-        fill_bases(dx / length, dy / length, dz / length, num_bases, basis)
-        for channel in range(3):
-            value = 0.5 + basis[0] * sh0[i, 0, channel]
-            for k in range(1, num_bases):
-                value += basis[k] * shN[i, k - 1, channel]
-            r[6 + channel] = max(value, 0.0)
-        r[9], r[10] = hx, hy
-
-
-@njit(parallel=True, error_model="numpy", cache=True)
-def backward(
-    cam, means, quats, log_scales, logits, sh0, shN, num_bases, antialiased, records, radii,
-    g_mean2d, g_conic, g_opacity, g_color, d_means, d_quats, d_log_scales, d_logits, d_sh0, d_shN,
-):  # fmt: skip
-    """Gradients of all parameters from those of the 2D Gaussians.
-
-    g_mean2d [N, 2]; g_conic [N, 3] for the inverse covariance's xx, xy (counted once), yy;
-    g_opacity [N] of the opacity that blending saw; g_color [N, 3]. Outputs must come in as zeros.
-    """
-    for i in prange(len(means)):
-        if radii[i] <= 0:
-            continue
-        rot, scale, d_rot = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
-        jac, half, d_half, d_jac = np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3))
-        x, y, z, u, v, inverse = _half_covariance(
-            cam, means[i], quats[i], log_scales[i], rot, scale, jac, half
-        )
-        fx, fy = cam[12], cam[13]
-        sxx = half[0, 0] * half[0, 0] + half[0, 1] * half[0, 1] + half[0, 2] * half[0, 2]
-        sxy = half[0, 0] * half[1, 0] + half[0, 1] * half[1, 1] + half[0, 2] * half[1, 2]
-        syy = half[1, 0] * half[1, 0] + half[1, 1] * half[1, 1] + half[1, 2] * half[1, 2]
-        cxx, cyy = sxx + BLUR, syy + BLUR
-        det = cxx * cyy - sxy * sxy
-        a, b, c = cyy / det, -sxy / det, cxx / det
-        # covariance = conic^-1, so d_cov = -conic g conic, with half of g_conic's xy on either side
-        gxx, gxy, gyy = g_conic[i, 0], 0.5 * g_conic[i, 1], g_conic[i, 2]
-        pxx, pxy, pyx, pyy = a * gxx + b * gxy, a * gxy + b * gyy, b * gxx + c * gxy, b * gxy + c * gyy
-        dxx, dxy, dyy = -(pxx * a + pxy * b), -(pxx * b + pxy * c), -(pyx * b + pyy * c)
-
-        opacity = 1.0 / (1.0 + math.exp(-logits[i]))
-        d_opacity = g_opacity[i]
-        sharp = sxx * syy - sxy * sxy
-        if antialiased and sharp / det > 1e-10:
-            compensation = math.sqrt(sharp / det)
-            factor = 0.5 * d_opacity * opacity * compensation
-            dxx += factor * (syy / sharp - cyy / det)
-            dyy += factor * (sxx / sharp - cxx / det)
-            dxy += factor * (sxy / det - sxy / sharp)
-            d_opacity *= compensation
-        elif antialiased:
-            d_opacity *= 1e-5
-        d_logits[i] = d_opacity * opacity * (1.0 - opacity)
-
-        for k in range(3):
-            d_half[0, k] = 2 * (dxx * half[0, k] + dxy * half[1, k])
-            d_half[1, k] = 2 * (dxy * half[0, k] + dyy * half[1, k])
-        for k in range(3):
-            along = 0.0
-            for j in range(3):
-                d_axis = jac[0, j] * d_half[0, k] + jac[1, j] * d_half[1, k]
-                along += d_axis * rot[j, k]
-                d_rot[j, k] = d_axis * scale[k]
-            d_log_scales[i, k] = along * scale[k]
-        for m in range(2):
-            for j in range(3):
-                d_jac[m, j] = (
-                    d_half[m, 0] * rot[j, 0] * scale[0]
-                    + d_half[m, 1] * rot[j, 1] * scale[1]
-                    + d_half[m, 2] * rot[j, 2] * scale[2]
-                )
-
-        # jac[0] = fx/z (W0 - u W2), jac[1] = fy/z (W1 - v W2); u = x/z unless clamped
-        d_fx_z = d_fy_z = d_u = d_v = 0.0
-        for j in range(3):
-            d_fx_z += d_jac[0, j] * (cam[j] - u * cam[6 + j])
-            d_fy_z += d_jac[1, j] * (cam[3 + j] - v * cam[6 + j])
-            d_u -= d_jac[0, j] * fx / z * cam[6 + j]
-            d_v -= d_jac[1, j] * fy / z * cam[6 + j]
-        if u != x / z:
-            d_u = 0.0
-        if v != y / z:
-            d_v = 0.0
-        d_u += g_mean2d[i, 0] * fx
-        d_v += g_mean2d[i, 1] * fy
-        dz = -(d_fx_z * fx + d_fy_z * fy) / (z * z) - (d_u * x + d_v * y) / (z * z)
-        dx, dy = d_u / z, d_v / z
-        for k in range(3):
-            d_means[i, k] = cam[k] * dx + cam[3 + k] * dy + cam[6 + k] * dz
-        _quaternion_gradient(quats[i], inverse, d_rot, d_quats[i])
-        _color_gradient(i, cam, means, shN, num_bases, records, g_color, d_means, d_sh0, d_shN)
+        for i in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(means))):
+            _forward_one(
+                i, cam, means, quats, log_scales, logits, sh0, shN, num_bases, antialiased, records, depths, radii,
+                rot, scale, jac, half, basis,
+            )  # fmt: skip
 
 
 @njit(cache=True)
@@ -200,13 +126,22 @@ def _quaternion_gradient(quat, inverse, d, out):
     w, x, y, z = quat[0] * inverse, quat[1] * inverse, quat[2] * inverse, quat[3] * inverse
     dw = 2 * (x * (d[2, 1] - d[1, 2]) + y * (d[0, 2] - d[2, 0]) + z * (d[1, 0] - d[0, 1]))
     dx = 2 * (
-        y * (d[0, 1] + d[1, 0]) + z * (d[0, 2] + d[2, 0]) + w * (d[2, 1] - d[1, 2]) - 2 * x * (d[1, 1] + d[2, 2])
+        y * (d[0, 1] + d[1, 0])
+        + z * (d[0, 2] + d[2, 0])
+        + w * (d[2, 1] - d[1, 2])
+        - 2 * x * (d[1, 1] + d[2, 2])
     )
     dy = 2 * (
-        x * (d[0, 1] + d[1, 0]) + z * (d[1, 2] + d[2, 1]) + w * (d[0, 2] - d[2, 0]) - 2 * y * (d[0, 0] + d[2, 2])
+        x * (d[0, 1] + d[1, 0])
+        + z * (d[1, 2] + d[2, 1])
+        + w * (d[0, 2] - d[2, 0])
+        - 2 * y * (d[0, 0] + d[2, 2])
     )
     dz = 2 * (
-        x * (d[0, 2] + d[2, 0]) + y * (d[1, 2] + d[2, 1]) + w * (d[1, 0] - d[0, 1]) - 2 * z * (d[0, 0] + d[1, 1])
+        x * (d[0, 2] + d[2, 0])
+        + y * (d[1, 2] + d[2, 1])
+        + w * (d[1, 0] - d[0, 1])
+        - 2 * z * (d[0, 0] + d[1, 1])
     )
     radial = dw * w + dx * x + dy * y + dz * z
     out[0], out[1] = (dw - radial * w) * inverse, (dx - radial * x) * inverse
@@ -214,9 +149,10 @@ def _quaternion_gradient(quat, inverse, d, out):
 
 
 @njit(cache=True)
-def _color_gradient(i, cam, means, shN, num_bases, records, g_color, d_means, d_sh0, d_shN):
+def _color_gradient(i, cam, means, shN, num_bases, records, g_color, d_means, d_sh0, d_shN, basis):
     """Gradients of the coefficients, and of the mean through the viewing direction."""
-    basis, weights = np.empty(16), np.zeros(16)
+    weights = basis[16:]
+    weights[:] = 0.0
     dx, dy, dz = means[i, 0] - cam[18], means[i, 1] - cam[19], means[i, 2] - cam[20]
     inverse = 1.0 / math.sqrt(dx * dx + dy * dy + dz * dz)
     dx, dy, dz = dx * inverse, dy * inverse, dz * inverse
@@ -232,3 +168,98 @@ def _color_gradient(i, cam, means, shN, num_bases, records, g_color, d_means, d_
     d_means[i, 0] += (gx - radial * dx) * inverse
     d_means[i, 1] += (gy - radial * dy) * inverse
     d_means[i, 2] += (gz - radial * dz) * inverse
+
+
+@njit(error_model="numpy", cache=True)
+def _backward_one(
+    i, cam, means, quats, log_scales, logits, shN, num_bases, antialiased, records,
+    g_mean2d, g_conic, g_opacity, g_color, d_means, d_quats, d_log_scales, d_logits, d_sh0, d_shN,
+    rot, scale, d_rot, jac, half, d_half, d_jac, basis,
+):  # fmt: skip
+    x, y, z, u, v, inverse = _half_covariance(cam, means[i], quats[i], log_scales[i], rot, scale, jac, half)
+    fx, fy = cam[12], cam[13]
+    sxx = half[0, 0] * half[0, 0] + half[0, 1] * half[0, 1] + half[0, 2] * half[0, 2]
+    sxy = half[0, 0] * half[1, 0] + half[0, 1] * half[1, 1] + half[0, 2] * half[1, 2]
+    syy = half[1, 0] * half[1, 0] + half[1, 1] * half[1, 1] + half[1, 2] * half[1, 2]
+    cxx, cyy = sxx + BLUR, syy + BLUR
+    det = cxx * cyy - sxy * sxy
+    a, b, c = cyy / det, -sxy / det, cxx / det
+    # covariance = conic^-1, so d_cov = -conic g conic, with half of g_conic's xy on either side
+    gxx, gxy, gyy = g_conic[i, 0], 0.5 * g_conic[i, 1], g_conic[i, 2]
+    pxx, pxy, pyx, pyy = a * gxx + b * gxy, a * gxy + b * gyy, b * gxx + c * gxy, b * gxy + c * gyy
+    dxx, dxy, dyy = -(pxx * a + pxy * b), -(pxx * b + pxy * c), -(pyx * b + pyy * c)
+
+    opacity = 1.0 / (1.0 + math.exp(-logits[i]))
+    d_opacity = g_opacity[i]
+    sharp = sxx * syy - sxy * sxy
+    if antialiased and sharp / det > 1e-10:
+        compensation = math.sqrt(sharp / det)
+        factor = 0.5 * d_opacity * opacity * compensation
+        dxx += factor * (syy / sharp - cyy / det)
+        dyy += factor * (sxx / sharp - cxx / det)
+        dxy += factor * (sxy / det - sxy / sharp)
+        d_opacity *= compensation
+    elif antialiased:
+        d_opacity *= 1e-5
+    d_logits[i] = d_opacity * opacity * (1.0 - opacity)
+
+    for k in range(3):
+        d_half[0, k] = 2 * (dxx * half[0, k] + dxy * half[1, k])
+        d_half[1, k] = 2 * (dxy * half[0, k] + dyy * half[1, k])
+    for k in range(3):
+        along = 0.0
+        for j in range(3):
+            d_axis = jac[0, j] * d_half[0, k] + jac[1, j] * d_half[1, k]
+            along += d_axis * rot[j, k]
+            d_rot[j, k] = d_axis * scale[k]
+        d_log_scales[i, k] = along * scale[k]
+    for m in range(2):
+        for j in range(3):
+            d_jac[m, j] = (
+                d_half[m, 0] * rot[j, 0] * scale[0]
+                + d_half[m, 1] * rot[j, 1] * scale[1]
+                + d_half[m, 2] * rot[j, 2] * scale[2]
+            )
+
+    # jac[0] = fx/z (W0 - u W2), jac[1] = fy/z (W1 - v W2); u = x/z unless clamped
+    d_fx_z = d_fy_z = d_u = d_v = 0.0
+    for j in range(3):
+        d_fx_z += d_jac[0, j] * (cam[j] - u * cam[6 + j])
+        d_fy_z += d_jac[1, j] * (cam[3 + j] - v * cam[6 + j])
+        d_u -= d_jac[0, j] * fx / z * cam[6 + j]
+        d_v -= d_jac[1, j] * fy / z * cam[6 + j]
+    if u != x / z:
+        d_u = 0.0
+    if v != y / z:
+        d_v = 0.0
+    d_u += g_mean2d[i, 0] * fx
+    d_v += g_mean2d[i, 1] * fy
+    dz = -(d_fx_z * fx + d_fy_z * fy) / (z * z) - (d_u * x + d_v * y) / (z * z)
+    dx, dy = d_u / z, d_v / z
+    for k in range(3):
+        d_means[i, k] = cam[k] * dx + cam[3 + k] * dy + cam[6 + k] * dz
+    _quaternion_gradient(quats[i], inverse, d_rot, d_quats[i])
+    _color_gradient(i, cam, means, shN, num_bases, records, g_color, d_means, d_sh0, d_shN, basis)
+
+
+@njit(parallel=True, error_model="numpy", cache=True)
+def backward(
+    cam, means, quats, log_scales, logits, sh0, shN, num_bases, antialiased, records, radii,
+    g_mean2d, g_conic, g_opacity, g_color, d_means, d_quats, d_log_scales, d_logits, d_sh0, d_shN,
+):  # fmt: skip
+    """Gradients of all parameters from those of the 2D Gaussians.
+
+    g_mean2d [N, 2]; g_conic [N, 3] for the inverse covariance's xx, xy (counted once), yy;
+    g_opacity [N] of the opacity that blending saw; g_color [N, 3]. Outputs must come in as zeros.
+    """
+    for chunk in prange((len(means) + _CHUNK - 1) // _CHUNK):
+        rot, scale, d_rot = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
+        jac, half, d_half, d_jac = np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3))
+        basis = np.empty(32)
+        for i in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(means))):
+            if radii[i] > 0:
+                _backward_one(
+                    i, cam, means, quats, log_scales, logits, shN, num_bases, antialiased, records,
+                    g_mean2d, g_conic, g_opacity, g_color, d_means, d_quats, d_log_scales, d_logits, d_sh0, d_shN,
+                    rot, scale, d_rot, jac, half, d_half, d_jac, basis,
+                )  # fmt: skip

@@ -56,14 +56,22 @@ def _project(g: Gaussians, camera: Camera, antialiased: bool):
 
 def shade(g: Gaussians, camera: Camera, degree: int) -> Tensor:
     """Colours [N, 3] seen from the camera, by spherical harmonics up to `degree`."""
-    directions = torch.nn.functional.normalize(g.means.double() - torch.tensor(camera.position).double(), dim=-1)
+    directions = torch.nn.functional.normalize(
+        g.means.double() - torch.tensor(camera.position).double(), dim=-1
+    )
     basis = torch.stack([torch.as_tensor(b).expand(len(g)) for b in sh.bases(*directions.unbind(-1))], -1)
     coefficients = torch.cat([g.sh0, g.shN], 1).double()[:, : sh.num_bases(degree)]
     return ((basis[:, : coefficients.shape[1], None] * coefficients).sum(1) + 0.5).clamp_min(0)
 
 
 def render(
-    g: Gaussians, camera: Camera, *, degree: int, background: Tensor, features: Tensor | None, antialiased: bool
+    g: Gaussians,
+    camera: Camera,
+    *,
+    degree: int,
+    background: Tensor,
+    features: Tensor | None,
+    antialiased: bool,
 ) -> Render:
     """Render in float64; see `sagesplat.raster.rasterize` for the arguments."""
     z, means2d, cov, opacity = _project(g, camera, antialiased)
@@ -91,4 +99,3 @@ def render(
     reach = 2 * torch.log((opacity / ALPHA_MIN).clamp_min(1.0))
     radii = (reach * torch.maximum(cov[:, 0, 0], cov[:, 1, 1])).sqrt() * (z > NEAR)
     return Render(rgb, 1 - left, image[..., 3:] if features is not None else None, means2d, radii.detach())
-

@@ -1,0 +1,68 @@
+"""Captures: posed photos and structure-from-motion points."""
+
+from pathlib import Path
+
+import numpy as np
+
+from sagesplat.scene.colmap import load_colmap
+from sagesplat.scene.scene import Scene
+
+__all__ = ["describe", "load_scene"]
+
+
+def load_scene(path: Path, *, downscale: int = 1, test_every: int = 8) -> Scene:
+    """The capture in a folder, as `colmap.load_colmap` reads it. Raises SceneError.
+
+    Photos are `downscale` times smaller than the files in images/. Every `test_every`-th view by name is
+    kept for tests, none with 0.
+    """
+    return load_colmap(path, downscale=downscale, test_every=test_every)
+
+
+def describe(scene: Scene) -> list[tuple[str, str]]:
+    """What `sagesplat info` prints of a scene: pairs of a name and its value."""
+    views, points = scene.views, scene.points
+    sizes = sorted({(v.camera.width, v.camera.height) for v in views})
+    Ks = {v.camera.K.tobytes() for v in views}
+    lenses = sorted({v.lens.model for v in views if v.lens})
+    offsets = np.array([v.camera.K[:2, 2] - [v.camera.width / 2, v.camera.height / 2] for v in views])
+    low, high = offsets.min(axis=0), offsets.max(axis=0)
+    rows = [
+        ("name", scene.name),
+        ("path", str(scene.path)),
+        ("views", f"{len(views)} ({len(scene.train_ids)} train, {len(scene.test_ids)} test)"),
+        ("image size", ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (", ..." if len(sizes) > 3 else "")),
+        ("cameras", f"{len(Ks)} distinct intrinsics"),
+        (
+            "principal point",
+            f"x {low[0]:+.1f} to {high[0]:+.1f}, y {low[1]:+.1f} to {high[1]:+.1f} px off centre",
+        ),
+        ("distortion", f"{', '.join(lenses)}: undistorted when loaded" if lenses else "none"),
+        ("points", f"{len(points.xyz):,}"),
+        ("extent", f"{scene.extent:.3g} world units"),
+    ]
+    if len(points.track_points):
+        depth, error = _depth_and_error(scene)
+        length = len(depth) / len(np.unique(points.track_points))
+        near, middle, far = np.quantile(depth, [0, 0.5, 1])
+        rows += [
+            ("mean track length", f"{length:.2f} views"),
+            ("reprojection error", f"{np.median(error):.2f} px median"),
+            ("depth of points", f"{near:.3g} nearest, {middle:.3g} median, {far:.3g} farthest"),
+        ]
+    masks = scene.path / "masks"
+    num_masks = len(list(masks.glob("**/*.png")))
+    rows.append(("masks", f"{num_masks} label images in {masks.name}/" if num_masks else "no masks/ folder"))
+    return rows
+
+
+def _depth_and_error(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Per observation: depth of its point in its view, world units, and reprojection error, pixels."""
+    points = scene.points
+    w2c = np.stack([v.camera.w2c for v in scene.views])[points.track_views]
+    K = np.stack([v.camera.K for v in scene.views])[points.track_views]
+    xyz = np.einsum("tij,tj->ti", w2c[:, :3, :3], points.xyz[points.track_points]) + w2c[:, :3, 3]
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        uvw = np.einsum("tij,tj->ti", K, xyz)
+        error = np.linalg.norm(uvw[:, :2] / uvw[:, 2:] - points.track_uv, axis=1)
+    return xyz[:, 2], error

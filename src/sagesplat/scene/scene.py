@@ -37,7 +37,7 @@ class Lens:
     """A COLMAP camera that is not a pinhole: what `images.load_photo` undistorts from."""
 
     model: str  # COLMAP's name, e.g. "OPENCV"
-    params: tuple[float, ...]  # in COLMAP's order, pixels of the file
+    params: tuple[float, ...]  # in COLMAP's order, pixels of width x height (the file may be smaller)
     width: int
     height: int
 

@@ -1,7 +1,307 @@
 """Label images and the taxonomy that names their ids."""
 
+import colorsys
+import zlib
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from jaxtyping import Int16, Int32
+from PIL import Image
+
+from sagesplat.errors import LabelError, RunError
+from sagesplat.files import atomic_path, read_json, write_json
+from sagesplat.scene.scene import Scene, View
+from sagesplat.scene.undistort import undistort
+from sagesplat.segment import coco
 
 UNLABELLED = -1  # pixels, points and Gaussians without a category
 UNLABELLED_NAME = "unlabelled"
+UNLABELLED_COLOR = (128, 128, 128)
+MAX_LABEL_ID = np.iinfo(np.int16).max
+_UNKNOWN = -2  # never leaves this file
+VOID_8, VOID_16 = 255, 65535  # what unlabelled pixels hold in 8- and 16-bit files, unless stated otherwise
+
+
+@dataclass(frozen=True)
+class Taxonomy:
+    """The categories of a scene."""
+
+    names: dict[int, str]  # category id -> name, ids in rising order
+
+    def name(self, label_id: int) -> str:
+        """A category's name; 'unlabelled' for -1."""
+        return UNLABELLED_NAME if label_id == UNLABELLED else self.names[label_id]
+
+    def color(self, label_id: int) -> tuple[int, int, int]:
+        """A category's RGB colour: COCO's own where id and name are COCO's, else one made from the name."""
+        name = self.name(label_id)
+        if label_id == UNLABELLED:
+            return UNLABELLED_COLOR
+        if coco.NAMES.get(label_id) == name:
+            return coco.COLORS[label_id]
+        seed = zlib.crc32(name.encode())
+        hue, saturation, value = seed % 997 / 997, 0.45 + seed % 5 * 0.1, 0.7 + seed % 3 * 0.1
+        r, g, b = (round(255 * c) for c in colorsys.hsv_to_rgb(hue, saturation, value))
+        return r, g, b
+
+    def write(self, path: Path) -> None:
+        """Write labels.json."""
+        write_json(path, {"labels": {str(label_id): name for label_id, name in self.names.items()}})
+
+    @classmethod
+    def read(cls, path: Path) -> "Taxonomy":
+        """Read labels.json; LabelError where it is missing or its content cannot be used."""
+        return _read_labels(path)[0]
+
+
+class Masks:
+    """The label images of a normalised folder (what `import_masks` or `segment_onnx` wrote), read lazily.
+
+    Images are kept until `cache_bytes` are full; the rest is read anew each time, since the stages visit all
+    views in turn.
+    """
+
+    def __init__(self, folder: Path, taxonomy: Taxonomy, cache_bytes: int = 2**28):
+        self.folder, self.taxonomy, self.cache_bytes = folder, taxonomy, cache_bytes
+        self._cache: dict[str, Int16[np.ndarray, "H W"]] = {}
+        self._used = 0
+
+    def __getitem__(self, view: View) -> Int16[np.ndarray, "H W"]:
+        """A view's category ids at the size of its camera, -1 = unlabelled; shared, so not to be changed."""
+        label_ids = self._cache.get(view.name)
+        if label_ids is None:
+            label_ids = read_mask(mask_path(self.folder, view), self.taxonomy)
+            if self._used + label_ids.nbytes <= self.cache_bytes:
+                self._cache[view.name] = label_ids
+                self._used += label_ids.nbytes
+        (h, w), camera = label_ids.shape, view.camera
+        if (h, w) != (camera.height, camera.width):
+            raise LabelError(
+                f"{mask_path(self.folder, view)}: {w} x {h} pixels where the scene has {camera.width} x "
+                f"{camera.height}; make the masks again at this size"
+            )
+        return label_ids
+
+
+def mask_path(folder: Path, view: View) -> Path:
+    """Where a normalised folder keeps the label image of a view."""
+    name = PurePosixPath(view.name)
+    if name.is_absolute() or ".." in name.parts:
+        raise LabelError(f"{view.name}: a photo outside the image folder; move it there and rename it")
+    return folder / name.with_suffix(".png")
+
+
+def prepare_folder(folder: Path, views: Sequence[View]) -> list[Path]:
+    """The paths of the views' label images in a folder that is about to be filled.
+
+    Removes its labels.json, which is written last and says that the folder is complete.
+    """
+    taken: dict[Path, str] = {}
+    for view in views:
+        path = mask_path(folder, view)
+        if path in taken:
+            raise LabelError(f"{view.name}: {taken[path]} has the same name but for the suffix; rename one")
+        taken[path] = view.name
+    (folder / "labels.json").unlink(missing_ok=True)
+    return list(taken)
+
+
+def read_mask(path: Path, taxonomy: Taxonomy) -> Int16[np.ndarray, "H W"]:
+    """A normalised label image; LabelError where it is missing, damaged or holds ids without a name."""
+    ids = {VOID_8: UNLABELLED, VOID_16: UNLABELLED} | {i: i for i in taxonomy.names}
+    return _translate(_read_png(path), ids, path, "make the masks again")
+
+
+def write_mask(path: Path, label_ids: Int16[np.ndarray, "H W"], taxonomy: Taxonomy) -> None:
+    """Write a label image: 8 bits with 255 = unlabelled if all ids allow it, else 16 bits with 65535.
+
+    The taxonomy decides and not the image, so that a folder is of one kind and 255 has one meaning.
+    """
+    small = max(taxonomy.names, default=0) < VOID_8
+    dtype, void = (np.uint8, VOID_8) if small else (np.uint16, VOID_16)
+    pixels = np.where(label_ids == UNLABELLED, void, label_ids).astype(dtype)
+    with atomic_path(path) as temporary:
+        Image.fromarray(pixels).save(temporary, format="PNG")
+
+
+def import_masks(scene: Scene, source: Path, target: Path) -> list[str]:
+    """Normalise label images: one per view at the size of its camera, ids checked, and a labels.json.
+
+    `source` holds PNGs named like the photos (x.png or x.jpg.png for x.jpg): 8- or 16-bit ids with a
+    labels.json {"unlabelled": 255, "labels": {"184": "tree-merged"}}, where "unlabelled" may be absent (then
+    255, in 16 bits 65535); or COCO panoptic PNGs with their JSON. Images are undistorted like the photos and
+    resampled to the nearest pixel. Views without an image become unlabelled everywhere; their names are
+    returned. LabelError where the images cannot be used.
+    """
+    if source.resolve() == target.resolve():
+        raise LabelError(f"{source}: these are the masks of the run itself; name the folder they came from")
+    if not source.is_dir():
+        raise LabelError(f"{source}: no such folder; name the one with the label images")
+    taxonomy, find = _id_source(source) if (source / "labels.json").exists() else _panoptic_source(source)
+    found = {view.name: find(view) for view in scene.views}
+    missing = [name for name, file in found.items() if file is None]
+    if len(missing) == len(scene.views):
+        raise LabelError(
+            f"{source}: no label image for any view; name them like the photos "
+            f"({PurePosixPath(missing[0]).with_suffix('.png')}, ...)"
+        )
+    occurring: set[int] = set()
+    for view, path in zip(scene.views, prepare_folder(target, scene.views), strict=True):
+        label_ids = np.full((view.camera.height, view.camera.width), UNLABELLED, np.int16)
+        if (file := found[view.name]) is not None:
+            label_ids = _fit(file.read(), view, file.path)
+        write_mask(path, label_ids, taxonomy)
+        occurring.update(np.unique(label_ids).tolist())
+    write_labels(target, taxonomy, occurring)
+    return missing
+
+
+def write_labels(folder: Path, taxonomy: Taxonomy, occurring: set[int]) -> None:
+    """Write the labels.json of a finished folder of masks, with only the categories that occur in it."""
+    names = {label_id: name for label_id, name in taxonomy.names.items() if label_id in occurring}
+    if not names:
+        raise LabelError(f"{folder}: every pixel is unlabelled; there is no category to work with")
+    Taxonomy(names).write(folder / "labels.json")
+
+
+@dataclass(frozen=True, eq=False)
+class _File:
+    """A label image of the user's."""
+
+    path: Path
+    ids: dict[int, int]  # value in the file -> category id or UNLABELLED
+    segments: bool  # RGB-coded segment ids instead of category ids
+    cure: str  # what helps where the file holds other values
+
+    def read(self) -> Int16[np.ndarray, "h w"]:
+        """Category ids at the file's own size."""
+        return _translate(_read_png(self.path, self.segments), self.ids, self.path, self.cure)
+
+
+_Find = Callable[[View], _File | None]
+
+
+def _id_source(folder: Path) -> tuple[Taxonomy, _Find]:
+    """Images of ids with a labels.json."""
+    taxonomy, unlabelled = _read_labels(folder / "labels.json")
+    voids = (VOID_8, VOID_16) if unlabelled is None else (unlabelled,)
+    ids = dict.fromkeys(voids, UNLABELLED) | {i: i for i in taxonomy.names}
+    cure = 'name them in labels.json (or say there which value is "unlabelled")'
+
+    def find(view: View) -> _File | None:
+        paths = (folder / f"{view.name}.png", mask_path(folder, view))
+        path = next((p for p in paths if p.exists()), None)
+        return None if path is None else _File(path, ids, False, cure)
+
+    return taxonomy, find
+
+
+def _panoptic_source(folder: Path) -> tuple[Taxonomy, _Find]:
+    """COCO panoptic PNGs with the JSON of their segments."""
+    panoptic = coco.read_panoptic(folder)
+    if panoptic is None:
+        raise LabelError(
+            f"{folder}: no labels.json; write one like "
+            '{"unlabelled": 255, "labels": {"184": "tree-merged"}}'
+        )
+    taxonomy = taxonomy_of(panoptic.names, folder)
+
+    def find(view: View) -> _File | None:
+        key = str(PurePosixPath(view.name).with_suffix(""))
+        path = panoptic.pngs.get(key)
+        if path is None or not path.exists():
+            return None
+        ids = {0: UNLABELLED} | panoptic.segments[key]
+        return _File(path, ids, True, "they are no segments in the JSON; export image and JSON together")
+
+    return taxonomy, find
+
+
+def _read_labels(path: Path) -> tuple[Taxonomy, int | None]:
+    """The taxonomy of a labels.json, and the value of unlabelled pixels if it is stated."""
+    try:
+        content = read_json(path)
+    except RunError as error:
+        raise LabelError(f"{error}; it names the ids of the label images") from None
+    try:
+        unlabelled = content.get("unlabelled")
+        unlabelled = None if unlabelled is None else int(unlabelled)
+        names: dict[int, Any] = {int(label_id): name for label_id, name in content["labels"].items()}
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
+        raise LabelError(
+            f'{path}: not of the form {{"unlabelled": 255, "labels": {{"184": "tree-merged"}}}} ({error!r}); '
+            "rewrite it so"
+        ) from None
+    if unlabelled is not None and not 0 <= unlabelled <= VOID_16:
+        raise LabelError(f'{path}: "unlabelled" is {unlabelled}; give a pixel value, 0 ... {VOID_16}')
+    if unlabelled in names:
+        raise LabelError(f'{path}: {unlabelled} is "unlabelled" and has a name too; remove one of them')
+    return taxonomy_of(names, path), unlabelled
+
+
+def taxonomy_of(names: dict[int, Any], path: Path) -> Taxonomy:
+    """A taxonomy whose ids fit and whose names are distinct: results are listed by name."""
+    wrong = [label_id for label_id in names if not 0 <= label_id <= MAX_LABEL_ID]
+    if wrong:
+        raise LabelError(f"{path}: label ids {wrong[:5]} are outside 0 ... {MAX_LABEL_ID}; renumber them")
+    if not names:
+        raise LabelError(f"{path}: names no label; list the ids of the label images")
+    seen = {UNLABELLED_NAME}
+    for label_id, name in names.items():
+        if not isinstance(name, str) or not name.strip() or name in seen:
+            raise LabelError(
+                f"{path}: label {label_id} is named {name!r}; give each id a name of its own "
+                f'(unlabelled pixels: "{UNLABELLED_NAME}": {label_id} beside "labels")'
+            )
+        seen.add(name)
+    return Taxonomy(dict(sorted(names.items())))
+
+
+def _read_png(path: Path, segments: bool = False) -> Int32[np.ndarray, "h w"]:
+    """The ids in a PNG: grey values or palette indices, or R + 256 G + 65536 B with `segments`."""
+    try:
+        with Image.open(path, formats=["PNG"]) as image:
+            mode, pixels = image.mode, np.asarray(image).astype(np.int32)
+    except FileNotFoundError:
+        raise LabelError(f"{path}: no such file; make the masks again") from None
+    except Exception as error:  # Pillow raises errors of many kinds for damaged files
+        raise LabelError(f"{path}: not a readable PNG ({error}); export it again") from None
+    if segments and mode in ("RGB", "RGBA"):
+        return pixels[..., 0] + 256 * pixels[..., 1] + 65536 * pixels[..., 2]
+    if segments or mode not in ("1", "L", "P", "I;16", "I"):
+        wanted = "an RGB image of segments" if segments else "one channel of 8- or 16-bit ids"
+        raise LabelError(f"{path}: a PNG of mode {mode} where {wanted} is needed; convert it")
+    return pixels
+
+
+def _translate(
+    raw: Int32[np.ndarray, "h w"], ids: dict[int, int], path: Path, cure: str
+) -> Int16[np.ndarray, "h w"]:
+    """Replace each value by what `ids` says; LabelError for values that it does not know."""
+    table = np.full(max(ids) + 2, _UNKNOWN, np.int16)  # its last entry is for all larger values
+    table[list(ids)] = list(ids.values())
+    label_ids = table[np.minimum(raw, len(table) - 1)]
+    unknown = np.unique(raw[label_ids == _UNKNOWN])
+    if len(unknown):
+        listed = ", ".join(map(str, unknown[:5])) + (", ..." if len(unknown) > 5 else "")
+        raise LabelError(f"{path}: unknown ids {listed}; {cure}")
+    return label_ids
+
+
+def _fit(label_ids: Int16[np.ndarray, "h w"], view: View, path: Path) -> Int16[np.ndarray, "H W"]:
+    """A label image as the view's camera sees it: undistorted, resampled to the nearest pixel."""
+    (h, w), full = label_ids.shape, view.lens or view.camera
+    # The smaller of the two may have been rounded to whole pixels: by up to one, in either direction.
+    if abs(w * full.height - h * full.width) > max(w, h, full.width, full.height):
+        raise LabelError(
+            f"{path}: {w} x {h} pixels, but its photo has {full.width} x {full.height}; "
+            "label images show the whole photo, at any resolution"
+        )
+    label_ids = undistort(label_ids, view.lens, view.camera, order=0)
+    h, w = label_ids.shape
+    rows = (np.arange(view.camera.height) + 0.5) * h / view.camera.height
+    columns = (np.arange(view.camera.width) + 0.5) * w / view.camera.width
+    return label_ids[rows.astype(int)[:, None], columns.astype(int)]

@@ -1,0 +1,221 @@
+"""Which level of each category meets a target SSIM at the least Gaussians (Eq. 1 of the paper)."""
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sagesplat.adapt.model import SsimModel
+from sagesplat.errors import DataError, RunError
+from sagesplat.files import read_json, write_json
+from sagesplat.gaussians import BYTES_PER_GAUSSIAN
+
+Models = Mapping[tuple[int, int], SsimModel]  # by (label id, level)
+Counts = Mapping[tuple[int, int], int]  # Gaussians of each (label id, level)
+
+STATUSES = ("ok", "infeasible", "no model")
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The level of one category."""
+
+    label_id: int
+    level: int  # training step of the level
+    predicted_ssim: float  # in a scene: what at least `share` of the views reach; NaN without a model
+    distance: float  # of the view, world units; NaN in a scene and where unknown
+    count: int  # Gaussians
+    status: str  # one of STATUSES; "infeasible" is the best attainable, "no model" the highest level
+
+    @property
+    def nbytes(self) -> int:
+        """Occupancy as the paper counts it."""
+        return self.count * BYTES_PER_GAUSSIAN
+
+
+@dataclass(frozen=True)
+class Plan:
+    """One level per category, for one view or for a whole scene."""
+
+    target: float  # SSIM that every category is to reach
+    view: int | None  # row in Scene.views; None = the scene
+    choices: tuple[Choice, ...]  # ordered by label id
+    share: float | None = None  # of the views that must reach the target; None for one view
+
+    @property
+    def levels(self) -> dict[int, int]:
+        """Level by label id."""
+        return {choice.label_id: choice.level for choice in self.choices}
+
+    @property
+    def count(self) -> int:
+        """Gaussians of the composition."""
+        return sum(choice.count for choice in self.choices)
+
+    @property
+    def nbytes(self) -> int:
+        """Occupancy of the composition as the paper counts it."""
+        return sum(choice.nbytes for choice in self.choices)
+
+    @property
+    def status(self) -> str:
+        """Whether every category with a model meets the target: "ok" or "infeasible"."""
+        return "infeasible" if any(c.status == "infeasible" for c in self.choices) else "ok"
+
+    @property
+    def binding(self) -> int | None:
+        """The category whose prediction is lowest against the target; None without any model."""
+        predicted = [c for c in self.choices if not math.isnan(c.predicted_ssim)]
+        return min(predicted, key=lambda c: c.predicted_ssim).label_id if predicted else None
+
+
+def plan_view(
+    models: Models,
+    counts: Counts,
+    distances: Mapping[int, float],
+    target: float,
+    view: int | None,
+    *,
+    recovering: Collection[int] = (),
+) -> Plan:
+    """Eq. 1 for one view: per category of `counts` the cheapest level predicted to reach `target`.
+
+    Where no level does, the one with the best prediction, "infeasible". `distances` maps label ids to world
+    units; a category that is missing there, or NaN, is predicted by its median. Levels in `recovering` (just
+    after an opacity reset) are taken only where a category has no other. RunError for an impossible target.
+    """
+    _check("target SSIM", target)
+    choices = []
+    for label_id, levels in _eligible(models, counts, recovering).items():
+        distance = float(distances.get(label_id, math.nan))
+        choices.append(_choose(models, label_id, levels, np.array([distance]), target, 1.0, distance))
+    return Plan(float(target), view, tuple(choices))
+
+
+def plan_scene(
+    models: Models,
+    counts: Counts,
+    distances: Mapping[int, np.ndarray],
+    target: float,
+    share: float = 0.95,
+    *,
+    recovering: Collection[int] = (),
+) -> Plan:
+    """Eq. 1 for a scene: per category the cheapest level that reaches `target` in `share` of its views.
+
+    Where no level does, the one that reaches it in most views, then the best on average, "infeasible".
+    `distances` maps label ids to one distance per view, world units; see `plan_view` for the rest.
+    """
+    _check("target SSIM", target)
+    _check("share of views", share)
+    choices = []
+    for label_id, levels in _eligible(models, counts, recovering).items():
+        known = np.asarray(distances.get(label_id, ()), np.float64)
+        views = known if len(known) else np.array([math.nan])
+        choices.append(_choose(models, label_id, levels, views, target, share, math.nan))
+    return Plan(float(target), None, tuple(choices), float(share))
+
+
+def _eligible(models: Models, counts: Counts, recovering: Collection[int]) -> dict[int, dict[int, int]]:
+    """Per label id, ascending, the counts of the levels to choose from."""
+    eligible: dict[int, dict[int, int]] = {}
+    for label_id in sorted({label_id for label_id, _ in counts}):
+        levels = {level: count for (label, level), count in counts.items() if label == label_id}
+        modelled = {level: count for level, count in levels.items() if (label_id, level) in models} or levels
+        settled = {level: count for level, count in modelled.items() if level not in recovering}
+        eligible[label_id] = settled or modelled
+    return eligible
+
+
+def _choose(
+    models: Models,
+    label_id: int,
+    levels: dict[int, int],
+    distances: np.ndarray,  # [V], NaN = unknown
+    target: float,
+    share: float,
+    distance: float,  # for the record
+) -> Choice:
+    """The level of one category; `levels` maps each candidate to its count."""
+    last = max(levels)
+    if (label_id, last) not in models:  # never seen: no promise to make, nothing to leave out
+        return Choice(label_id, last, math.nan, distance, levels[last], "no model")
+    needed = max(1, math.ceil(share * len(distances) - 1e-9))
+    feasible, all_levels = [], []
+    for level, count in levels.items():
+        ssim = models[label_id, level](distances)
+        promised = float(np.sort(ssim)[-needed])  # the lowest among the best `needed` views
+        reached = int((ssim >= target).sum())
+        choice = Choice(
+            label_id, level, promised, distance, count, "ok" if reached >= needed else "infeasible"
+        )
+        all_levels.append(((-reached, -float(ssim.mean()), count, -level), choice))
+        if reached >= needed:
+            feasible.append(((count, -promised, -level), choice))
+    return min(feasible or all_levels)[1]
+
+
+def _check(name: str, value: float) -> None:
+    if not (math.isfinite(value) and 0 < value <= 1):
+        raise RunError(f"{name} {value} is impossible; choose a number above 0 and at most 1, such as 0.9")
+
+
+def write_plans(path: Path, scene_plans: Sequence[Plan], view_plans: Sequence[Plan] = ()) -> None:
+    """plan.json: the targets, the plans of the scene (one or more targets) and those of single views."""
+    document = {
+        "targets": sorted({plan.target for plan in (*scene_plans, *view_plans)}),
+        "scene": [_to_json(plan) for plan in scene_plans],
+        "views": [_to_json(plan) for plan in view_plans],
+    }
+    write_json(path, document)
+
+
+def read_plans(path: Path) -> tuple[tuple[Plan, ...], tuple[Plan, ...]]:
+    """The scene's plans and the single views' that `write_plans` wrote; DataError for unusable content."""
+    document = read_json(path)
+    try:
+        scene_plans = tuple(_from_json(entry) for entry in document["scene"])
+        view_plans = tuple(_from_json(entry) for entry in document["views"])
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise DataError(f"{path}: not a file of plans ({error!r}); plan again") from None
+    return scene_plans, view_plans
+
+
+def _to_json(plan: Plan) -> dict[str, Any]:
+    """A plan with its totals; NaN becomes null, which JSON has."""
+    choices = [
+        {name: None if value != value else value for name, value in vars(choice).items()}
+        | {"nbytes": choice.nbytes}
+        for choice in plan.choices
+    ]
+    totals = {"count": plan.count, "nbytes": plan.nbytes, "status": plan.status, "binding": plan.binding}
+    return {"target": plan.target, "view": plan.view, "share": plan.share, **totals, "choices": choices}
+
+
+def _from_json(entry: dict[str, Any]) -> Plan:
+    def number(value: float | None) -> float:
+        return math.nan if value is None else float(value)
+
+    choices = tuple(
+        Choice(
+            label_id=int(choice["label_id"]),
+            level=int(choice["level"]),
+            predicted_ssim=number(choice["predicted_ssim"]),
+            distance=number(choice["distance"]),
+            count=int(choice["count"]),
+            status=str(choice["status"]),
+        )
+        for choice in entry["choices"]
+    )
+    if unknown := {choice.status for choice in choices} - set(STATUSES):
+        raise ValueError(f"unknown status {unknown.pop()!r}")
+    view, share = entry["view"], entry["share"]
+    return Plan(
+        target=float(entry["target"]),
+        view=None if view is None else int(view),
+        choices=choices,
+        share=None if share is None else float(share),
+    )

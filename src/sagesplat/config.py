@@ -1,0 +1,104 @@
+"""Settings of every stage. Standard library only, so that the command line answers at once."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class SceneConfig:
+    """How a capture is read."""
+
+    downscale: int = 1
+    """Train on photos made this many times smaller (images_N is used where it is shipped)."""
+    test_every: int = 8
+    """Every n-th view by name is a test view, seen by nothing but the evaluation; 0 = none."""
+
+
+@dataclass(frozen=True)
+class MasksConfig:
+    """Where label images come from."""
+
+    segmenter: Literal["masks", "onnx"] = "masks"
+    """masks: ready label images; onnx: a segmentation network (pip install 'sagesplat[onnx]')."""
+    masks: Path | None = None
+    """Folder of label images (default: SCENE/masks)."""
+    model: Path | None = None
+    """The network's .onnx file."""
+    classes: Path | None = None
+    """JSON with the network's class names and their category ids."""
+
+
+@dataclass(frozen=True)
+class LiftConfig:
+    """How label images become labels of points."""
+
+    votes: Literal["track", "projection"] = "track"
+    """Which pixels vote on a point: those of its track, or all views it projects into."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """3D Gaussian splatting as published. Step numbers are for a 30 000-step run and scale with max_steps."""
+
+    max_steps: int = 7000
+    level_every: int = 0
+    """Record a level every so many steps (0: a thirtieth of max_steps)."""
+    sh_degree: int = 3
+    ssim_weight: float = 0.2
+    antialiased: bool = False
+    """Scale opacities by the area that the screen-space low-pass adds."""
+    means_lr: float = 1.6e-4
+    """Times the scene's extent; falls exponentially to a hundredth."""
+    quats_lr: float = 1e-3
+    log_scales_lr: float = 5e-3
+    logit_opacities_lr: float = 5e-2
+    sh0_lr: float = 2.5e-3
+    shN_lr: float = 1.25e-4
+    refine_every: int = 100
+    """Densify every so many steps (not scaled: its statistics need the views)."""
+    refine_start: int = 500
+    refine_stop: int = 15_000
+    reset_every: int = 3000
+    """Opacities are reset every so many steps while densification runs."""
+    raise_sh_every: int = 1000
+    grow_grad: float = 2e-4
+    """Mean screen-space gradient (half images) above which a Gaussian is cloned or split."""
+    grow_scale: float = 0.01
+    """Split rather than clone above this share of the extent."""
+    prune_opacity: float = 5e-3
+    prune_scale: float = 0.1
+    """After the first reset, Gaussians larger than this share of the extent go."""
+    max_gaussians: int = 1_000_000
+    """No densification beyond this count."""
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """How the quality models are fitted."""
+
+    distance: Literal["percentile", "minimum"] = "percentile"
+    """d_min of a category in a view: 5th percentile over its points in sight, or the paper's minimum."""
+
+
+@dataclass(frozen=True)
+class PlanConfig:
+    """What is promised."""
+
+    target_ssim: float = 0.8
+    share: float = 0.95
+    """Share of the training views in which a category's level must reach the target."""
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Everything that a run needs to be done again."""
+
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    masks: MasksConfig = field(default_factory=MasksConfig)
+    lift: LiftConfig = field(default_factory=LiftConfig)
+    train: TrainConfig = field(default_factory=TrainConfig)
+    fit: FitConfig = field(default_factory=FitConfig)
+    plan: PlanConfig = field(default_factory=PlanConfig)
+    seed: int = 0
+    backend: Literal["auto", "cpu", "reference"] = "auto"

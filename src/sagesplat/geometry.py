@@ -1,0 +1,30 @@
+"""Geometry on plain arrays: projection and nearest neighbours."""
+
+import numpy as np
+from jaxtyping import Float32
+from scipy.spatial import KDTree
+
+
+def mean_neighbour_distance(xyz: Float32[np.ndarray, "P 3"], k: int = 3) -> Float32[np.ndarray, " P"]:
+    """Root mean square distance to the k nearest other points (fewer where there are fewer), at least 1e-7."""
+    k = min(k, len(xyz) - 1)
+    if k < 1:
+        return np.full(len(xyz), 1e-2, np.float32)
+    distances = KDTree(xyz).query(xyz, k=k + 1)[0][:, 1:]
+    return np.sqrt(np.maximum(np.square(distances).mean(1), 1e-14)).astype(np.float32)
+
+
+def to_camera(xyz: Float32[np.ndarray, "P 3"], w2c: Float32[np.ndarray, "4 4"]) -> Float32[np.ndarray, "P 3"]:
+    """World points in a camera's frame."""
+    return xyz @ w2c[:3, :3].T + w2c[:3, 3]
+
+
+def project(
+    xyz: Float32[np.ndarray, "P 3"], w2c: Float32[np.ndarray, "4 4"], K: Float32[np.ndarray, "3 3"]
+) -> tuple[Float32[np.ndarray, "P 2"], Float32[np.ndarray, " P"]]:
+    """Pixels and depths of world points; pixels of points behind the camera are NaN."""
+    points = to_camera(xyz, w2c)
+    depths = points[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pixels = points[:, :2] / np.where(depths > 0, depths, np.nan)[:, None]
+    return pixels * [K[0, 0], K[1, 1]] + [K[0, 2], K[1, 2]], depths

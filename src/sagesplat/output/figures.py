@@ -1,0 +1,297 @@
+"""The figures of a run, after the paper's Figs. 2 to 5; each is a matplotlib Figure, saved as PNG and SVG."""
+
+import io
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Int, UInt8
+from matplotlib import colormaps, rc_context
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from sagesplat.adapt.evaluate import Evaluation
+from sagesplat.adapt.model import SsimModel
+from sagesplat.adapt.observe import TOTAL, Observations
+from sagesplat.adapt.plan import Counts, Plan
+from sagesplat.files import atomic_path
+from sagesplat.gaussians import BYTES_PER_GAUSSIAN
+from sagesplat.output.tables import MB, last_counts, name_of, view_mean
+
+Colours = Mapping[int, tuple[int, int, int]]  # label id -> RGB, 0..255
+
+INK, FAINT, ACCENT = "#1d2530", "#8a94a3", "#c2410c"
+PAIR = (5.4, 4.9)  # inches, of two figures side by side
+STYLE: dict[Any, Any] = {
+    "font.size": 9,
+    "axes.titlesize": 10,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": "#c3cad4",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e8ebf0",
+    "text.color": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "legend.frameon": False,
+    "legend.fontsize": 8,
+    "text.parse_math": False,  # a category may have a dollar sign in its name
+    "svg.hashsalt": "sagesplat",  # the same data give the same file
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """One view in pictures: the photo, 3DGS at its last level, the composed scene, the label map."""
+
+    name: str
+    photo: UInt8[np.ndarray, "H W 3"]
+    full: UInt8[np.ndarray, "H W 3"]
+    composed: UInt8[np.ndarray, "H W 3"]
+    label_ids: Int[np.ndarray, "H W"]
+    ssim: float  # of the composed image
+    psnr: float  # dB
+    full_ssim: float
+    full_psnr: float
+
+
+def ink(label_id: int, colours: Colours) -> tuple[float, float, float]:
+    """A label's colour, 0..1, darkened where lines of it would be pale on white."""
+    rgb = np.array(colours.get(label_id, (128, 128, 128)), np.float64) / 255
+    luminance = float(rgb**2.2 @ [0.2126, 0.7152, 0.0722])
+    r, g, b = rgb * min(1.0, (0.32 / max(luminance, 1e-6)) ** (1 / 2.2))
+    return r, g, b
+
+
+def label_image(label_ids: Int[np.ndarray, "H W"], colours: Colours) -> UInt8[np.ndarray, "H W 3"]:
+    """The label map in the taxonomy's colours; unlabelled in grey."""
+    image = np.full((*label_ids.shape, 3), 128, np.uint8)
+    for label_id in np.unique(label_ids).tolist():
+        image[label_ids == label_id] = colours.get(label_id, (128, 128, 128))
+    return image
+
+
+def error_image(image: UInt8[np.ndarray, "H W 3"], photo: UInt8[np.ndarray, "H W 3"]) -> np.ndarray:
+    """Mean absolute difference over RGB as uint8 [H, W, 3]: black = none, white = half the range or more."""
+    difference = np.abs(image.astype(np.float32) - photo).mean(axis=2) / 127.5
+    return colormaps["inferno"](np.clip(difference, 0, 1), bytes=True)[..., :3]
+
+
+@rc_context(STYLE)
+def ssim_over_levels(
+    observations: Observations,
+    train_views: np.ndarray,
+    test_views: np.ndarray,
+    labels: Sequence[int],
+    names: Mapping[int, str],
+    colours: Colours,
+    recovering: frozenset[int],
+) -> Figure:
+    """Fig. 2: mean SSIM of each label by level, training views solid, test views dashed."""
+    figure = Figure(figsize=(9, 4.6), layout="constrained")
+    axes = figure.subplots()
+    levels = np.unique(observations.level)
+    last = {}
+    for views, line in ((test_views, "--"), (train_views, "-")):
+        rows = observations.select(np.isin(observations.view, views))
+        for label_id in [*labels, TOTAL]:
+            ssim = [view_mean(rows, label_id, level) for level in levels.tolist()]
+            last[label_id] = np.nan_to_num(ssim[-1:], nan=-1.0).sum()
+            colour = INK if label_id == TOTAL else ink(label_id, colours)
+            width = 2.4 if label_id == TOTAL else 1.3
+            axes.plot(levels, ssim, line, color=colour, lw=width, marker=".", ms=5)
+    half = np.min(np.diff(levels)) / 2 if len(levels) > 1 else 0.5
+    for level in sorted(recovering & set(levels.tolist())):
+        axes.axvspan(level - half, level + half, color="#f1e4d3", lw=0, zorder=0)
+    axes.set(xlabel="level (training step)", ylabel="SSIM")
+    ordered = sorted(
+        labels, key=lambda i: -last[i]
+    )  # the legend from top to bottom, like the ends of the lines
+    handles = [Line2D([], [], color=INK, lw=2.4, label=name_of(TOTAL, names))]
+    handles += [Line2D([], [], color=ink(i, colours), label=name_of(i, names)) for i in ordered]
+    handles += [Line2D([], [], color=FAINT, label="training views")]
+    handles += [Line2D([], [], color=FAINT, ls="--", label="test views (unseen)")]
+    if recovering & set(levels.tolist()):
+        handles += [Patch(color="#f1e4d3", label="recovering from a reset")]
+    figure.legend(handles=handles, loc="outside right upper")
+    return figure
+
+
+@rc_context(STYLE)
+def ssim_over_distance(
+    observations: Observations,
+    train_views: np.ndarray,
+    labels: Sequence[int],
+    names: Mapping[int, str],
+    colours: Colours,
+    models: Mapping[tuple[int, int], SsimModel],
+    levels: Sequence[int],
+) -> Figure:
+    """Fig. 3: SSIM of the training views (dots) and Eq. 3 (lines) over distance, a panel per label."""
+    shown = [i for i in labels if any((i, level) in models for level in levels)]
+    columns = max(1, min(3, len(shown)))
+    lines = max(1, math.ceil(len(shown) / columns))
+    figure = Figure(figsize=(3.3 * columns, 2.3 * lines + 0.5), layout="constrained")
+    grid = figure.subplots(lines, columns, squeeze=False).ravel()
+    shades = colormaps["viridis"](np.linspace(0.85, 0.05, len(levels)))
+    seen = np.isin(observations.view, train_views) & np.isfinite(observations.distance)
+    for axes, label_id in zip(grid, shown, strict=False):
+        for level, shade in zip(levels, shades, strict=True):
+            rows = observations.select(
+                seen & (observations.label_id == label_id) & (observations.level == level)
+            )
+            axes.plot(rows.distance, rows.ssim, ".", color=shade, ms=3.5, alpha=0.55, mew=0)
+            if model := models.get((label_id, level)):
+                distance = np.linspace(*model.d_range, 200)
+                axes.plot(distance, model(distance), color=shade, lw=1.6)
+        axes.set_title(name_of(label_id, names), color=ink(label_id, colours), loc="left", fontweight="bold")
+    for axes in grid[len(shown) :]:
+        axes.set_axis_off()
+    figure.supxlabel("distance to the category (world units)", fontsize=9)
+    figure.supylabel("SSIM", fontsize=9)
+    handles = [Line2D([], [], color=c, label=f"level {i:,}") for i, c in zip(levels, shades, strict=True)]
+    figure.legend(handles=handles, loc="outside upper center", ncols=max(1, len(levels)))
+    return figure
+
+
+@rc_context(STYLE)
+def size_by_target(
+    plans: Sequence[Plan], counts: Counts, labels: Sequence[int], names: Mapping[int, str], colours: Colours
+) -> Figure:
+    """Occupancy of 3DGS and of the plan for each target, stacked by label; hatched = target out of reach."""
+    figure = Figure(figsize=(9, 0.52 * (len(plans) + 1) + 1.6), layout="constrained")
+    axes = figure.subplots()
+    full = {i: n * BYTES_PER_GAUSSIAN for i, n in last_counts(counts).items()}
+    bars = [("3DGS, last level", full, set())]
+    for plan in plans:
+        infeasible = {c.label_id for c in plan.choices if c.status == "infeasible"}
+        bars.append((f"SSIM ≥ {plan.target:g}", {c.label_id: c.nbytes for c in plan.choices}, infeasible))
+    whole = max(sum(full.values()), 1)
+    for row, (_, nbytes, infeasible) in enumerate(bars):
+        left = 0.0
+        for label_id in labels:
+            width = nbytes.get(label_id, 0) / MB
+            hatch = "////" if label_id in infeasible else None
+            colour = ink(label_id, colours)
+            axes.barh(row, width, 0.72, left=left, color=colour, hatch=hatch, edgecolor="white", lw=0.6)
+            left += width
+        note = f" {left:,.1f} MB" + (f" · {sum(nbytes.values()) / whole:.0%}" if row else "")
+        axes.text(left, row, note, va="center", fontsize=9, fontweight="bold")
+    axes.set_yticks(range(len(bars)), [bar[0] for bar in bars])
+    axes.invert_yaxis()
+    axes.grid(axis="y", visible=False)
+    axes.set(xlabel="occupancy (MB, 248 bytes a Gaussian)", xlim=(0, 1.16 * whole / MB))
+    handles = [Patch(color=ink(i, colours), label=name_of(i, names)) for i in labels]
+    if any(bar[2] for bar in bars):
+        handles.append(
+            Patch(facecolor="#cccccc", hatch="////", edgecolor="white", label="target out of reach")
+        )
+    figure.legend(handles=handles, loc="outside lower center", ncols=6)
+    return figure
+
+
+@rc_context(STYLE)
+def promised_and_measured(
+    evaluation: Evaluation, labels: Sequence[int], names: Mapping[int, str], colours: Colours
+) -> Figure:
+    """Measured against promised SSIM on unseen views, a dot per (label, view, target)."""
+    figure = Figure(figsize=PAIR, layout="constrained")
+    axes = figure.subplots()
+    rows = evaluation.select(
+        (evaluation.label_id != TOTAL) & np.isfinite(evaluation.ssim + evaluation.predicted)
+    )
+    handles = []
+    for label_id in labels:
+        mine = rows.select(rows.label_id == label_id)
+        reached = mine.ssim >= mine.target
+        colour = ink(label_id, colours)
+        axes.plot(mine.predicted[reached], mine.ssim[reached], "o", color=colour, ms=5, alpha=0.75, mew=0)
+        axes.plot(mine.predicted[~reached], mine.ssim[~reached], "o", mfc="none", mec=colour, ms=5)
+        if len(mine):
+            handles.append(Line2D([], [], marker="o", ls="", color=colour, label=name_of(label_id, names)))
+    values = np.concatenate([rows.ssim, rows.predicted, np.array([0.5])])
+    ends = np.array([values.min() - 0.03, min(1.0, values.max() + 0.03)])
+    axes.plot(ends, ends, color=FAINT, lw=1)
+    axes.fill_between(ends, ends, ends[0], color="#f7ecec", lw=0, zorder=0)
+    axes.text(ends[1], ends[0], "measured below the prediction ", ha="right", va="bottom", color=FAINT)
+    axes.set(xlabel="promised SSIM", ylabel="measured SSIM", xlim=ends, ylim=ends)
+    handles += [Line2D([], [], marker="o", ls="", color=FAINT, label="target reached")]
+    handles += [Line2D([], [], marker="o", ls="", mfc="none", mec=FAINT, label="target missed")]
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=7.5)
+    return figure
+
+
+@rc_context(STYLE)
+def quality_over_size(
+    observations: Observations,
+    test_views: np.ndarray,
+    counts: Counts,
+    plans: Sequence[Plan],
+    evaluation: Evaluation,
+    recovering: frozenset[int],
+) -> Figure:
+    """Whole-image SSIM on unseen views over occupancy: 3DGS at each level, and the plan for each target."""
+    figure = Figure(figsize=PAIR, layout="constrained")
+    axes = figure.subplots()
+    rows = observations.select(np.isin(observations.view, test_views))
+    levels = np.array([i for i in np.unique(rows.level).tolist() if i not in recovering], np.int64)
+    size = [
+        sum(n for (_, i), n in counts.items() if i == level) * BYTES_PER_GAUSSIAN / MB
+        for level in levels.tolist()
+    ]
+    ssim = [view_mean(rows, TOTAL, level) for level in levels.tolist()]
+    axes.plot(size, ssim, "o-", color=FAINT, ms=4, label="3DGS, its own levels")
+    composed = []
+    for plan in plans:
+        at = (evaluation.target == np.float32(plan.target)) & (evaluation.label_id == TOTAL)
+        if at.any():
+            composed.append((plan.nbytes / MB, float(np.nanmean(evaluation.ssim[at])), plan.target))
+    axes.plot(*np.array(composed).reshape(-1, 3).T[:2], "o-", color=ACCENT, ms=6, label="composed by plan")
+    for x, y, target in composed:
+        axes.annotate(f"t = {target:g}", (x, y), (7, -11), textcoords="offset points", color=ACCENT)
+    axes.set(xlabel="occupancy (MB, 248 bytes a Gaussian)", ylabel="SSIM of the whole image")
+    axes.margins(0.08, 0.12)
+    axes.legend(loc="lower right")
+    return figure
+
+
+@rc_context(STYLE)
+def panel_strip(panel: Panel, colours: Colours) -> Figure:
+    """Figs. 4 and 5: photo, 3DGS, composed scene, label map and error of the composed scene side by side."""
+    pictures = [
+        ("photo", panel.photo),
+        (f"3DGS  {panel.full_psnr:.2f} dB / {panel.full_ssim:.3f}", panel.full),
+        (f"composed  {panel.psnr:.2f} dB / {panel.ssim:.3f}", panel.composed),
+        ("categories", label_image(panel.label_ids, colours)),
+        ("error of composed", error_image(panel.composed, panel.photo)),
+    ]
+    height, width = panel.photo.shape[:2]
+    figure = Figure(figsize=(15, 2.96 * height / width + 0.3))
+    share = (
+        2.96 * height / width / figure.get_figheight()
+    )  # of the figure's height, the rest holds the titles
+    for column, (title, picture) in enumerate(pictures):
+        axes = figure.add_axes((column / 5 + 0.001, 0, 0.198, share))
+        axes.imshow(picture, aspect="auto")
+        axes.set_title(title, loc="left", pad=4)
+        axes.set_axis_off()
+    return figure
+
+
+def save_figure(figure: Figure, path: Path) -> bytes:
+    """Write `path` with the suffixes .png and .svg; the SVG is also returned."""
+    buffer = io.BytesIO()
+    with rc_context(STYLE):
+        with atomic_path(path.with_suffix(".png")) as temporary:
+            figure.savefig(temporary, format="png", dpi=160)
+        figure.set_layout_engine("none")  # the layout just found also holds for the SVG
+        figure.savefig(buffer, format="svg", metadata={"Date": None})
+    with atomic_path(path.with_suffix(".svg")) as temporary:
+        temporary.write_bytes(buffer.getvalue())
+    return buffer.getvalue()

@@ -1,0 +1,203 @@
+"""The tables of a run: what the paper prints as Tables I to III, the plan, the models and the promise."""
+
+import csv
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sagesplat.adapt.evaluate import Evaluation
+from sagesplat.adapt.model import SsimModel
+from sagesplat.adapt.observe import TOTAL, Observations
+from sagesplat.adapt.plan import Counts, Plan
+from sagesplat.files import atomic_path
+from sagesplat.gaussians import BYTES_PER_GAUSSIAN
+from sagesplat.segment.masks import UNLABELLED, UNLABELLED_NAME
+
+MB = 1e6  # bytes
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows under a header; `formats` holds a format spec per column for people, the CSV keeps every digit."""
+
+    title: str
+    header: tuple[str, ...]
+    formats: tuple[str, ...]
+    rows: list[tuple[str | int | float, ...]]
+
+    def cells(self) -> list[list[str]]:
+        """The rows as text; NaN reads as a dash."""
+        return [[_text(v, spec) for v, spec in zip(row, self.formats, strict=True)] for row in self.rows]
+
+    def write_csv(self, path: Path) -> None:
+        """A header, then one line per row; NaN is an empty cell."""
+        with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(self.header)
+            writer.writerows([["" if _is_nan(value) else value for value in row] for row in self.rows])
+
+
+@dataclass(frozen=True)
+class Kept:
+    """How a promise fared: rows in which the model promised the target, and those that reached it."""
+
+    promised: int
+    kept: int
+    overshoot: float  # mean of measured SSIM minus target where promised; NaN if nothing was
+
+    @property
+    def share(self) -> float:
+        """Kept over promised, NaN if nothing was promised."""
+        return self.kept / self.promised if self.promised else math.nan
+
+
+def name_of(label_id: int, names: Mapping[int, str]) -> str:
+    """A category as people call it."""
+    special = {TOTAL: "whole image", UNLABELLED: UNLABELLED_NAME}
+    return special.get(label_id) or names.get(label_id, f"category {label_id}")
+
+
+def by_size(counts: Counts) -> list[int]:
+    """Label ids, the one with the most Gaussians at its last level first."""
+    last = last_counts(counts)
+    return sorted(last, key=lambda label_id: (-last[label_id], label_id))
+
+
+def last_counts(counts: Counts) -> dict[int, int]:
+    """Number of Gaussians of each label at the last level: the whole 3DGS model."""
+    last: dict[int, int] = {}
+    for (label_id, _), count in sorted(counts.items(), key=lambda item: item[0][1]):
+        last[label_id] = count
+    return last
+
+
+def view_mean(rows: Observations, label_id: int, level: int) -> float:
+    """Mean SSIM of a label at a level over the views it is seen in, NaN if none."""
+    return mean(rows.ssim[(rows.label_id == label_id) & (rows.level == level)])
+
+
+def quality_table(
+    observations: Observations, views: np.ndarray, labels: Sequence[int], names: Mapping[int, str], which: str
+) -> Table:
+    """Table I: mean SSIM over some views (rows of Scene.views), a line per level, a column per label."""
+    rows = observations.select(np.isin(observations.view, views))
+    columns = [TOTAL, *labels]
+    body = [
+        (level, *(view_mean(rows, label_id, level) for label_id in columns))
+        for level in np.unique(rows.level).tolist()
+    ]
+    header = ("level", *(name_of(label_id, names) for label_id in columns))
+    return Table(f"SSIM by level, {which} views", header, (",d", *[".3f"] * len(columns)), body)
+
+
+def counts_table(counts: Counts, labels: Sequence[int], names: Mapping[int, str]) -> Table:
+    """Table II: Gaussians by level and label."""
+    levels = sorted({level for _, level in counts})
+    body = []
+    for level in levels:
+        row = [counts.get((label_id, level), 0) for label_id in labels]
+        body.append((level, sum(row), *row))
+    header = ("level", "all", *(name_of(label_id, names) for label_id in labels))
+    return Table("Gaussians by level", header, (",d",) * len(header), body)
+
+
+def plan_table(plan: Plan, counts: Counts, names: Mapping[int, str]) -> Table:
+    """What one plan chose for each label, the largest first."""
+    full = last_counts(counts)
+    body = []
+    for choice in sorted(plan.choices, key=lambda c: -full.get(c.label_id, 0)):
+        share = choice.count / full[choice.label_id] if full.get(choice.label_id) else math.nan
+        cells = (choice.level, choice.count, share, choice.nbytes / MB)
+        name = name_of(choice.label_id, names)
+        body.append((name, *cells, choice.distance, choice.predicted_ssim, choice.status))
+    header = ("category", "level", "Gaussians", "of 3DGS", "MB", "distance", "promised SSIM", "status")
+    formats = ("", ",d", ",d", ".1%", ".2f", ".3f", ".3f", "")
+    return Table(f"Plan for SSIM {plan.target:g}", header, formats, body)
+
+
+def targets_table(
+    plans: Sequence[Plan], counts: Counts, labels: Sequence[int], names: Mapping[int, str]
+) -> Table:
+    """Table III: Gaussians, bytes and status of every label for 3DGS and for each target."""
+    full = last_counts(counts)
+    header = ["category", "3DGS Gaussians", "3DGS MB"]
+    for plan in plans:
+        header += [f"t={plan.target:g} {column}" for column in ("level", "Gaussians", "MB", "status")]
+    chosen = [{choice.label_id: choice for choice in plan.choices} for plan in plans]
+    body = []
+    for label_id in labels:
+        row = [
+            name_of(label_id, names),
+            full.get(label_id, 0),
+            full.get(label_id, 0) * BYTES_PER_GAUSSIAN / MB,
+        ]
+        for choices in chosen:
+            if choice := choices.get(label_id):
+                row += [choice.level, choice.count, choice.nbytes / MB, choice.status]
+            else:
+                row += [math.nan, 0, 0.0, ""]
+        body.append(tuple(row))
+    total = ["all", sum(full.values()), sum(full.values()) * BYTES_PER_GAUSSIAN / MB]
+    for plan in plans:
+        total += [math.nan, plan.count, plan.nbytes / MB, plan.status]
+    formats = ("", ",d", ".2f", *(",d", ",d", ".2f", "") * len(plans))
+    return Table("Size by target", tuple(header), formats, [*body, tuple(total)])
+
+
+def promise_kept(rows: Evaluation) -> Kept:
+    """Of the (label, view, target) rows whose predicted SSIM reaches the target, those measured there too."""
+    measured = np.isfinite(rows.ssim) & (rows.label_id != TOTAL)
+    promised = measured & (rows.predicted >= rows.target)
+    excess = (rows.ssim - rows.target)[promised]
+    return Kept(int(promised.sum()), int((excess >= 0).sum()), mean(excess))
+
+
+def evaluation_table(evaluation: Evaluation, labels: Sequence[int], names: Mapping[int, str]) -> Table:
+    """Promise against measurement for every target and label, and for the whole image."""
+    body = []
+    for target in np.unique(evaluation.target):
+        for label_id in [*labels, TOTAL]:
+            rows = evaluation.select((evaluation.target == target) & (evaluation.label_id == label_id))
+            rows = rows.select(np.isfinite(rows.ssim))
+            if not len(rows):
+                continue
+            kept = promise_kept(rows)
+            share = (math.nan,) * 3 if label_id == TOTAL else (kept.promised, kept.kept, kept.share)
+            promise = (mean(rows.predicted), mean(rows.ssim), mean(np.abs(rows.predicted - rows.ssim)))
+            others = (mean(rows.full_ssim), mean(rows.psnr), mean(rows.full_psnr))
+            body.append(
+                (float(f"{target:g}"), name_of(label_id, names), len(rows), *share, *promise, *others)
+            )
+    header = ("target", "category", "views", "promised", "kept", "share kept", "promised SSIM", "SSIM")
+    header += ("error of promise", "3DGS SSIM", "PSNR", "3DGS PSNR")
+    formats = ("g", "", ",d", ",d", ",d", ".0%", ".3f", ".3f", ".3f", ".3f", ".2f", ".2f")
+    return Table("Promise against measurement, unseen views", header, formats, body)
+
+
+def models_table(models: Mapping[tuple[int, int], SsimModel], names: Mapping[int, str]) -> Table:
+    """Eq. 3 for every label and level: parameters, fitted distances, error."""
+    parameters = next(iter(models.values())).params._fields if models else ()
+    body = [
+        (name_of(m.label_id, names), m.level, *m.params, *m.d_range, m.rmse, m.num_observations, m.status)
+        for _, m in sorted(models.items())
+    ]
+    header = ("category", "level", *parameters, "d min", "d max", "rmse", "observations", "status")
+    formats = ("", ",d", *[".4g"] * (len(parameters) + 2), ".4f", ",d", "")
+    return Table("Models of SSIM over distance (Eq. 3)", header, formats, body)
+
+
+def mean(values: np.ndarray) -> float:
+    """Mean of the finite values, NaN if there are none."""
+    finite = values[np.isfinite(values)]
+    return float(finite.mean(dtype=np.float64)) if len(finite) else math.nan
+
+
+def _is_nan(value: str | int | float) -> bool:
+    return isinstance(value, float) and math.isnan(value)
+
+
+def _text(value: str | int | float, spec: str) -> str:
+    return "–" if _is_nan(value) else format(value, spec)

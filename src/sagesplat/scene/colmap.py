@@ -1,0 +1,147 @@
+"""COLMAP workspaces: photos beside a sparse model, made into a scene."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from sagesplat.errors import SceneError
+from sagesplat.scene.colmap_read import ModelPoints, read_model
+from sagesplat.scene.colmap_write import ModelCamera, ModelImage
+from sagesplat.scene.images import photo_size
+from sagesplat.scene.scene import Camera, Lens, Points, Scene, View
+from sagesplat.scene.undistort import distort, intrinsics, is_pinhole, pinhole
+
+MIN_VIEWS = 3
+
+
+def load_colmap(path: Path, *, downscale: int = 1, test_every: int = 8, images: str | None = None) -> Scene:
+    """The scene of a COLMAP workspace: `images/` and `sparse/0` (or `sparse`) below `path`.
+
+    With `downscale` N the photos come from `images_N/` if that folder exists, otherwise from `images/`
+    with area resampling when they are loaded; `images` names another folder below `path`. Distorted
+    cameras become pinholes (`undistort.pinhole`), and their tracks move along. Observations that fall
+    outside their view are left out. Raises SceneError.
+    """
+    if downscale < 1 or test_every < 0 or test_every == 1:
+        raise SceneError(
+            f"{path}: downscale {downscale} and test_every {test_every} do not go together with training; "
+            "take downscale >= 1 and test_every 0 or >= 2"
+        )
+    model = _find_model(path)
+    with np.errstate(all="ignore"):  # damaged numbers overflow; what counts is checked to be finite
+        cameras, listed, points = read_model(model)
+        if len(listed) < MIN_VIEWS:
+            raise SceneError(
+                f"{model}: {len(listed)} posed photos, but it takes {MIN_VIEWS}; add some, run COLMAP"
+            )
+        if not len(points.xyz):
+            raise SceneError(f"{model}: no 3D points; run COLMAP's mapper or point_triangulator again")
+        listed = sorted(listed, key=lambda image: image.name)
+        folder, divisor = _find_photos(path, images, downscale)
+        _check_photos(folder, listed)
+        views = _views(model, folder, cameras, listed, divisor)
+        tracked = _scene_points(cameras, listed, views, points)
+    return Scene(path.resolve().name, path, views, tracked, test_every)
+
+
+def _find_model(path: Path) -> Path:
+    if not path.is_dir():
+        raise SceneError(f"{path}: no such folder; give the folder that holds images/ and sparse/")
+    for folder in (path / "sparse" / "0", path / "sparse"):
+        if any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
+            return folder
+    raise SceneError(
+        f"{path}: no COLMAP model (looked for cameras.bin and cameras.txt in sparse/0 and sparse); "
+        "run COLMAP on the photos first, or give the folder that holds images/ and sparse/"
+    )
+
+
+def _find_photos(path: Path, images: str | None, downscale: int) -> tuple[Path, int]:
+    """The folder of the photos and what is left to downscale at load."""
+    if images is None and downscale > 1 and (path / f"images_{downscale}").is_dir():
+        return path / f"images_{downscale}", 1
+    folder = path / (images or "images")
+    if not folder.is_dir():
+        raise SceneError(f"{folder}: no such folder; put the photos that COLMAP was run on there")
+    return folder, downscale
+
+
+def _check_photos(folder: Path, listed: Sequence[ModelImage]) -> None:
+    missing = [i.name for i in listed if not _is_file(folder / i.name)]
+    if missing:
+        raise SceneError(
+            f"{folder}: {len(missing)} of the model's {len(listed)} photos are missing, "
+            f"first {missing[0]!r}; add the files, or remove them from the model with COLMAP's image_deleter"
+        )
+    names = {i.name for i in listed}
+    if len(names) < len(listed):
+        raise SceneError(f"{folder}: the model lists a photo twice; run COLMAP's mapper again")
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a damaged name, e.g. too long
+        return False
+
+
+def _views(
+    model: Path, folder: Path, cameras: dict[int, ModelCamera], listed: Sequence[ModelImage], divisor: int
+) -> tuple[View, ...]:
+    lenses, Ks = {}, {}
+    for id in sorted({i.camera_id for i in listed}):
+        if id not in cameras:
+            raise SceneError(
+                f"{model}: a photo names camera {id}, which the model does not have; export it again"
+            )
+        c = cameras[id]
+        lenses[id] = Lens(c.model, c.params, c.width, c.height)
+        try:
+            Ks[id] = intrinsics(lenses[id]) if is_pinhole(lenses[id]) else pinhole(lenses[id])
+        except ValueError as error:
+            raise SceneError(f"{model}: camera {id}: {error}; calibrate it again with COLMAP") from None
+    views = []
+    for image in listed:
+        lens = lenses[image.camera_id]
+        width, height = photo_size(folder / image.name)
+        # images_N are rounded to whole pixels: both sides may be off by one, but not the aspect.
+        if abs(width / lens.width - height / lens.height) > 1 / lens.width + 1 / lens.height:
+            raise SceneError(
+                f"{folder / image.name}: {width} x {height} pixels, but its camera has another aspect, "
+                f"{lens.width} x {lens.height}; use the photos that COLMAP was run on, not rotated or cropped"
+            )
+        width, height = (max(1, round(side / divisor)) for side in (width, height))
+        scale = np.array([[width / lens.width], [height / lens.height], [1.0]])
+        K = (Ks[image.camera_id] * scale).astype(np.float32)
+        camera = Camera(image.w2c.astype(np.float32), K, width, height)
+        distorted = None if is_pinhole(lens) else lens
+        views.append(View(image.name, camera, folder / image.name, distorted))
+    return tuple(views)
+
+
+def _scene_points(
+    cameras: dict[int, ModelCamera], listed: Sequence[ModelImage], views: Sequence[View], points: ModelPoints
+) -> Points:
+    """Points with their tracks, which are read from the images: each observation there names its point."""
+    track_points, track_views, track_uv = [], [], []
+    for row, (image, view) in enumerate(zip(listed, views, strict=True)):
+        camera, model = view.camera, cameras[image.camera_id]
+        seen = image.point_rows >= 0
+        at = image.point_rows[seen]
+        size = np.array([camera.width, camera.height])
+        scale = size / [model.width, model.height]
+        uv = image.uv[seen] * scale
+        if view.lens is not None:
+            xyz = points.xyz[at] @ image.w2c[:3, :3].T + image.w2c[:3, 3]
+            rays = xyz[:, :2] / np.where(xyz[:, 2:] > 0, xyz[:, 2:], np.nan)
+            # The pinhole's projection, and beside it what the keypoint was off by in the distorted photo.
+            ideal = rays * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
+            uv = ideal + (uv - distort(view.lens, rays) * scale)
+        uv = uv.astype(np.float32)
+        inside = ((uv >= 0) & (uv < size)).all(axis=1)
+        track_points.append(at[inside])
+        track_views.append(np.full(inside.sum(), row, np.int32))
+        track_uv.append(uv[inside])
+    tracks = (np.concatenate(track_points).astype(np.int64), np.concatenate(track_views))
+    return Points(points.xyz.astype(np.float32), points.rgb, *tracks, np.concatenate(track_uv))

@@ -1,0 +1,200 @@
+"""Reads COLMAP models, text and binary, of any COLMAP version.
+
+Format: https://colmap.github.io/format.html. Since 3.12 a model has rigs and frames too; the images still
+carry their poses, so both are left alone.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, Int64, UInt8
+from scipy.spatial.transform import Rotation
+
+from sagesplat.errors import SceneError
+from sagesplat.scene.colmap_write import ModelCamera, ModelImage
+from sagesplat.scene.undistort import CAMERA_MODELS
+
+MODEL_NAMES = {model.id: name for name, model in CAMERA_MODELS.items()}
+MAX_SIDE = 10**6  # pixels
+# One record of each binary file, up to its part of variable length.
+CAMERA = np.dtype([("id", "<u4"), ("model", "<i4"), ("width", "<u8"), ("height", "<u8")])
+IMAGE = np.dtype([("id", "<u4"), ("pose", "<f8", 7), ("camera", "<u4")])
+OBSERVATION = np.dtype([("uv", "<f8", 2), ("point", "<i8")])
+POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8")])
+
+
+class ModelPoints(NamedTuple):
+    """points3D without its tracks, which the images repeat."""
+
+    ids: Int64[np.ndarray, " P"]  # sorted
+    xyz: Float64[np.ndarray, "P 3"]
+    rgb: UInt8[np.ndarray, "P 3"]
+
+
+def read_model(folder: Path) -> tuple[dict[int, ModelCamera], list[ModelImage], ModelPoints]:
+    """Cameras by id, posed images and points of the model in `folder`, which binary files have priority in.
+
+    Raises SceneError for content that is damaged; numbers are finite then, but otherwise as they are.
+    """
+    suffix = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
+    cameras = _read(folder / f"cameras{suffix}", _binary_cameras, _text_cameras)
+    listed = _read(folder / f"images{suffix}", _binary_images, _text_images)
+    points = _read(folder / f"points3D{suffix}", _binary_points, _text_points)
+    if not len(points.ids):
+        return cameras, listed, points
+
+    def rows(ids: np.ndarray) -> np.ndarray:
+        at = np.minimum(np.searchsorted(points.ids, ids), len(points.ids) - 1)
+        return np.where(points.ids[at] == ids, at, -1)
+
+    return cameras, [replace(i, point_rows=rows(i.point_rows)) for i in listed], points
+
+
+def _read(path: Path, binary: Callable, text: Callable) -> Any:
+    try:
+        if path.suffix == ".bin":
+            data = _Bytes(path.read_bytes())
+            value = binary(path, data)
+            if data.at != len(data.data):
+                raise ValueError(f"{len(data.data) - data.at} bytes too many")
+            return value
+        return text(path, [line.strip() for line in path.read_text(encoding="utf-8").split("\n")])
+    except FileNotFoundError:
+        raise SceneError(f"{path}: no such file; copy the whole model (cameras, images, points3D)") from None
+    except (OSError, ValueError, IndexError, OverflowError) as error:
+        raise SceneError(f"{path}: damaged or incomplete ({error}); copy or export the model again") from None
+
+
+class _Bytes:
+    """A binary file and how far it has been read; never allocates more than the file holds."""
+
+    def __init__(self, data: bytes):
+        self.data, self.at = data, 0
+
+    def take(self, dtype: Any, count: int = 1) -> np.ndarray:
+        size = np.dtype(dtype).itemsize * count
+        self.skip(size)
+        return np.frombuffer(self.data, dtype, count, self.at - size)
+
+    def skip(self, size: int) -> None:
+        if size > len(self.data) - self.at:
+            raise ValueError(f"it ends within a record, byte {self.at}")
+        self.at += size
+
+    def count(self) -> int:
+        self.skip(8)
+        return int.from_bytes(self.data[self.at - 8 : self.at], "little")
+
+    def name(self) -> str:
+        start, end = self.at, self.data.index(b"\0", self.at)
+        self.at = end + 1
+        return self.data[start:end].decode()
+
+
+def _binary_cameras(path: Path, data: _Bytes) -> dict[int, ModelCamera]:
+    cameras = {}
+    for _ in range(data.count()):
+        id, model, width, height = data.take(CAMERA)[0].tolist()
+        name = MODEL_NAMES.get(model) or _unknown_model(path, f"number {model}")
+        params = data.take("<f8", CAMERA_MODELS[name].num_params)
+        cameras[id] = _camera(id, name, width, height, params.tolist())
+    return cameras
+
+
+def _text_cameras(path: Path, lines: list[str]) -> dict[int, ModelCamera]:
+    cameras = {}
+    for line in _records(lines):
+        id, model, width, height, *params = line.split()
+        name = model if model in CAMERA_MODELS else _unknown_model(path, model)
+        cameras[int(id)] = _camera(int(id), name, int(width), int(height), [float(p) for p in params])
+    return cameras
+
+
+def _unknown_model(path: Path, model: str) -> str:
+    raise SceneError(
+        f"{path}: camera model {model} is unknown (known: {', '.join(CAMERA_MODELS)}); "
+        "undistort the photos with COLMAP's image_undistorter"
+    )
+
+
+def _camera(id: int, name: str, width: int, height: int, params: list[float]) -> ModelCamera:
+    model = CAMERA_MODELS[name]
+    if len(params) != model.num_params or not np.isfinite(params).all():
+        raise ValueError(f"camera {id}: {name} has {model.num_params} finite parameters, not {params}")
+    if min(params[: model.num_focal]) <= 0 or not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
+        raise ValueError(f"camera {id}: focal length {params[0]} or size {width} x {height} out of range")
+    return ModelCamera(id, name, width, height, tuple(params))
+
+
+def _binary_images(path: Path, data: _Bytes) -> list[ModelImage]:
+    rows, poses = [], []
+    for _ in range(data.count()):
+        id, pose, camera_id = data.take(IMAGE)[0]
+        name = data.name()
+        observed = data.take(OBSERVATION, data.count())
+        rows.append((int(id), name, int(camera_id), observed["uv"], observed["point"]))
+        poses.append(pose)
+    return _images(rows, poses)
+
+
+def _text_images(path: Path, lines: list[str]) -> list[ModelImage]:
+    rows, poses = [], []
+    remaining = iter(lines)
+    for line in remaining:
+        if not line or line.startswith("#"):
+            continue
+        id, *pose, camera_id, name = line.split(maxsplit=9)
+        observed = np.array(next(remaining, "").split(), float).reshape(-1, 3)  # the second line may be empty
+        rows.append((int(id), name, int(camera_id), observed[:, :2], observed[:, 2].astype(np.int64)))
+        poses.append(np.array(pose, float))
+    return _images(rows, poses)
+
+
+def _images(rows: list[tuple], poses: list[np.ndarray]) -> list[ModelImage]:
+    """Images with `point_rows` still holding point ids; poses are qw qx qy qz tx ty tz."""
+    if not rows:
+        return []
+    pose = np.stack(poses)
+    bad = ~np.isfinite(pose.astype(np.float32)).all(axis=1) | ~(np.linalg.norm(pose[:, :4], axis=1) > 1e-6)
+    if bad.any():
+        raise ValueError(f"photo {rows[int(np.argmax(bad))][1]!r} has a pose that is not finite")
+    w2c = np.tile(np.eye(4), (len(rows), 1, 1))
+    w2c[:, :3, :3] = Rotation.from_quat(pose[:, :4], scalar_first=True).as_matrix()
+    w2c[:, :3, 3] = pose[:, 4:]
+    return [
+        ModelImage(id, name, camera, m, uv, ids)
+        for (id, name, camera, uv, ids), m in zip(rows, w2c, strict=True)
+    ]
+
+
+def _binary_points(path: Path, data: _Bytes) -> ModelPoints:
+    number, starts = data.count(), []
+    for _ in range(number):  # the tracks, which the images repeat, are skipped
+        starts.append(data.at)
+        data.skip(POINT.itemsize)
+        data.skip(8 * data.count())
+    if not number:
+        return _points(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)))
+    windows = np.lib.stride_tricks.sliding_window_view(np.frombuffer(data.data, np.uint8), POINT.itemsize)
+    records = windows[starts].view(POINT)[:, 0]
+    return _points(records["id"].astype(np.int64), records["xyz"], records["rgb"])
+
+
+def _text_points(path: Path, lines: list[str]) -> ModelPoints:
+    rows = [line.split(maxsplit=8)[:8] for line in _records(lines)]
+    table = np.array(rows, float).reshape(-1, 8)
+    return _points(table[:, 0].astype(np.int64), table[:, 1:4], table[:, 4:7])
+
+
+def _points(ids: np.ndarray, xyz: np.ndarray, rgb: np.ndarray) -> ModelPoints:
+    if not np.isfinite(xyz.astype(np.float32)).all():
+        raise ValueError("points with coordinates that are not finite")
+    order = np.argsort(ids)
+    return ModelPoints(ids[order], xyz[order], rgb[order].astype(np.uint8))
+
+
+def _records(lines: list[str]) -> list[str]:
+    return [line for line in lines if line and not line.startswith("#")]

@@ -1,0 +1,121 @@
+"""Writes COLMAP models, text and binary: what the demo capture and the tests are made of.
+
+Format: https://colmap.github.io/format.html (the part that COLMAP before 3.12 reads too: no rigs, no frames).
+"""
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from scipy.spatial.transform import Rotation
+
+from sagesplat.files import atomic_path
+from sagesplat.scene.undistort import CAMERA_MODELS
+
+
+@dataclass(frozen=True, eq=False)
+class ModelCamera:
+    """A line of cameras.txt."""
+
+    id: int
+    model: str  # COLMAP's name, e.g. "PINHOLE"
+    width: int
+    height: int
+    params: tuple[float, ...]  # in COLMAP's order, pixels
+
+
+@dataclass(frozen=True, eq=False)
+class ModelImage:
+    """Two lines of images.txt; an observation that belongs to no point has row -1."""
+
+    id: int
+    name: str  # path below the image folder
+    camera_id: int
+    w2c: Float[np.ndarray, "4 4"]  # world to camera
+    uv: Float[np.ndarray, "M 2"]  # pixels, the first pixel's centre is at (0.5, 0.5)
+    point_rows: Int[np.ndarray, " M"]  # rows of the model's xyz, -1 = none
+
+
+def write_model(
+    folder: Path,
+    cameras: Sequence[ModelCamera],
+    images: Sequence[ModelImage],
+    xyz: Float[np.ndarray, "P 3"],
+    rgb: UInt8[np.ndarray, "P 3"],
+    error: Float[np.ndarray, " P"],
+    *,
+    text: bool = False,
+) -> None:
+    """Write cameras, images and points3D (.bin, or .txt with `text`) into `folder`, usually sparse/0.
+
+    `error` is each point's mean reprojection error in pixels. Row r of `xyz` gets the point id r + 1;
+    the tracks of points3D are those of the images' `point_rows`.
+    """
+    write = _write_text if text else _write_binary
+    write(folder, cameras, images, np.asarray(xyz, float), rgb, error, _tracks(images, len(xyz)))
+
+
+def _tracks(images: Sequence[ModelImage], num_points: int) -> list[np.ndarray]:
+    """Per point its observations [L, 2]: image id and index into the image's uv."""
+    rows = np.concatenate([i.point_rows for i in images])
+    ids = np.concatenate([np.full(len(i.point_rows), i.id) for i in images])
+    index = np.concatenate([np.arange(len(i.point_rows)) for i in images])
+    seen = np.flatnonzero(rows >= 0)
+    seen = seen[np.argsort(rows[seen], kind="stable")]
+    pairs = np.stack([ids[seen], index[seen]], axis=1)
+    return np.split(pairs, np.searchsorted(rows[seen], np.arange(1, num_points)))[:num_points]
+
+
+def _pose(image: ModelImage) -> list[float]:
+    """qw qx qy qz tx ty tz."""
+    quat = Rotation.from_matrix(image.w2c[:3, :3]).as_quat(canonical=True, scalar_first=True)
+    return [*quat.tolist(), *np.asarray(image.w2c[:3, 3], float).tolist()]
+
+
+def _write_binary(folder, cameras, images, xyz, rgb, error, tracks) -> None:
+    with atomic_path(folder / "cameras.bin") as path, path.open("wb") as file:
+        file.write(struct.pack("<Q", len(cameras)))
+        for c in cameras:
+            file.write(struct.pack("<IiQQ", c.id, CAMERA_MODELS[c.model].id, c.width, c.height))
+            file.write(np.array(c.params, "<f8").tobytes())
+    with atomic_path(folder / "images.bin") as path, path.open("wb") as file:
+        file.write(struct.pack("<Q", len(images)))
+        for i in images:
+            file.write(struct.pack("<I7dI", i.id, *_pose(i), i.camera_id) + i.name.encode() + b"\0")
+            observed = np.empty(len(i.uv), [("uv", "<f8", 2), ("point", "<i8")])
+            observed["uv"] = i.uv
+            observed["point"] = np.where(i.point_rows >= 0, i.point_rows + 1, -1)
+            file.write(struct.pack("<Q", len(observed)) + observed.tobytes())
+    with atomic_path(folder / "points3D.bin") as path, path.open("wb") as file:
+        file.write(struct.pack("<Q", len(xyz)))
+        for row, track in enumerate(tracks):
+            file.write(struct.pack("<Q3d3Bd", row + 1, *xyz[row], *rgb[row], error[row]))
+            file.write(struct.pack("<Q", len(track)) + track.astype("<u4").tobytes())
+
+
+def _write_text(folder, cameras, images, xyz, rgb, error, tracks) -> None:
+    with atomic_path(folder / "cameras.txt") as path, path.open("w", encoding="utf-8") as file:
+        file.write("# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n")
+        for c in cameras:
+            file.write(f"{c.id} {c.model} {c.width} {c.height} {_numbers(c.params)}\n")
+    with atomic_path(folder / "images.txt") as path, path.open("w", encoding="utf-8") as file:
+        file.write(
+            "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n"
+        )
+        for i in images:
+            file.write(f"{i.id} {_numbers(_pose(i))} {i.camera_id} {i.name}\n")
+            ids = np.where(i.point_rows >= 0, i.point_rows + 1, -1)
+            file.write(" ".join(f"{_numbers(uv)} {p}" for uv, p in zip(i.uv, ids, strict=True)) + "\n")
+    with atomic_path(folder / "points3D.txt") as path, path.open("w", encoding="utf-8") as file:
+        file.write("# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n")
+        for row, track in enumerate(tracks):
+            colour = " ".join(str(int(v)) for v in rgb[row])
+            pairs = " ".join(map(str, track.ravel().tolist()))
+            file.write(f"{row + 1} {_numbers(xyz[row])} {colour} {_numbers([error[row]])} {pairs}\n")
+
+
+def _numbers(values) -> str:
+    return " ".join(repr(float(v)) for v in values)  # repr reads back identical

@@ -1,0 +1,87 @@
+"""Photos from disk: 8-bit RGB at the size of their view."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+from sagesplat.errors import SceneError
+from sagesplat.scene.scene import View
+from sagesplat.scene.undistort import undistort
+
+# What Pillow raises for files that are damaged, no image, or too large to be one.
+_UNREADABLE = (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError)
+
+
+def photo_size(path: Path) -> tuple[int, int]:
+    """Width and height in stored pixels, from the file's header alone. Raises SceneError."""
+    try:
+        with Image.open(path) as image:
+            return image.size
+    except _UNREADABLE as error:
+        raise _unreadable(path, error) from None
+
+
+def load_photo(view: View) -> UInt8[np.ndarray, "H W 3"]:
+    """The photo as `view.camera` sees it: area-resampled to the camera's size, then undistorted.
+
+    EXIF orientation is not applied, because COLMAP's poses are those of the stored pixels. Grey photos
+    become RGB, 16 bits become 8, and alpha goes over black, the background of training. Raises SceneError.
+    """
+    try:
+        with Image.open(view.image_path) as file:
+            image = _rgb(file)
+    except _UNREADABLE as error:
+        raise _unreadable(view.image_path, error) from None
+    size = (view.camera.width, view.camera.height)
+    if image.size != size:
+        image = image.resize(size, Image.Resampling.BOX)  # before undistortion, which costs more
+    return undistort(np.array(image), view.lens, view.camera, order=1)
+
+
+class Photos:
+    """`photos[i]` is the photo of `views[i]`, uint8 [H, W, 3], loaded when it is asked for.
+
+    Photos are kept until `cache_bytes` are full; the rest is read anew each time. Nothing is evicted:
+    training visits all views in turn, where a least-recently-used cache never hits.
+    """
+
+    def __init__(self, views: Sequence[View], cache_bytes: int = 2**30):
+        self.views, self.cache_bytes = views, cache_bytes
+        self._cache: dict[int, np.ndarray] = {}
+        self._used = 0
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def __getitem__(self, index: int) -> UInt8[np.ndarray, "H W 3"]:
+        index = range(len(self.views))[index]
+        if index in self._cache:
+            return self._cache[index]
+        photo = load_photo(self.views[index])
+        if self._used + photo.nbytes <= self.cache_bytes:
+            self._cache[index] = photo
+            self._used += photo.nbytes
+        return photo
+
+
+def _rgb(image: Image.Image) -> Image.Image:
+    """8-bit RGB of any mode of Pillow."""
+    if image.mode.startswith("I") or image.mode == "F":
+        values = np.asarray(image, np.float64)
+        # Pillow clips 16-bit greys where they should be scaled.
+        scale = 257 if image.mode.startswith("I") and values.max() > 255 else 1
+        return Image.fromarray((values / scale).round().clip(0, 255).astype(np.uint8)).convert("RGB")
+    if image.has_transparency_data:
+        image = image.convert("RGBA")
+        return Image.alpha_composite(Image.new("RGBA", image.size, "black"), image).convert("RGB")
+    return image.convert("RGB")
+
+
+def _unreadable(path: Path, error: BaseException) -> SceneError:
+    reason = " ".join(str(error).split())
+    return SceneError(
+        f"{path}: not readable as a photo ({reason}); replace the file or take it out of the model"
+    )

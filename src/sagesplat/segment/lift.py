@@ -1,0 +1,124 @@
+"""Labels of the structure-from-motion points, by vote over the label images."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from itertools import pairwise
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float32, Int16, Int32, Int64
+
+from sagesplat.errors import LabelError
+from sagesplat.files import atomic_path
+from sagesplat.scene.scene import Camera, Scene
+from sagesplat.segment.masks import UNLABELLED, Masks
+
+
+@dataclass(frozen=True, eq=False)
+class LiftedLabels:
+    """The label of each point, and how clear the vote for it was."""
+
+    label_ids: Int16[np.ndarray, " P"]  # category id, -1 where nothing voted
+    num_votes: Int32[np.ndarray, " P"]  # labelled pixels that the point was seen on
+    num_agreeing: Int32[np.ndarray, " P"]  # those among them with the point's label
+
+    @property
+    def agreement(self) -> float:
+        """Share of all votes that agree with the label of their point; NaN without a vote."""
+        return _share(self.num_agreeing, self.num_votes)
+
+    def agreement_by_label(self) -> dict[int, float]:
+        """The same share among the points of each label."""
+        return {
+            int(label_id): _share(self.num_agreeing[of_label], self.num_votes[of_label])
+            for label_id in np.unique(self.label_ids[self.label_ids != UNLABELLED])
+            for of_label in [self.label_ids == label_id]
+        }
+
+    def write(self, path: Path) -> None:
+        """Write labels.npz."""
+        with atomic_path(path) as temporary:
+            np.savez(temporary, **{f.name: getattr(self, f.name) for f in fields(self)})
+
+    @classmethod
+    def read(cls, path: Path, num_points: int) -> "LiftedLabels":
+        """Read labels.npz; LabelError where it is missing, damaged or not of `num_points` points."""
+        types = {"label_ids": np.int16, "num_votes": np.int32, "num_agreeing": np.int32}
+        try:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+                columns = {name: stored[name].astype(dtype, casting="safe") for name, dtype in types.items()}
+        except FileNotFoundError:
+            raise LabelError(f"{path}: no such file; lift the labels first") from None
+        except Exception as error:  # zipfile and numpy raise errors of many kinds for damaged files
+            raise LabelError(f"{path}: not the labels of points ({error}); lift them again") from None
+        shapes = {column.shape for column in columns.values()}
+        if shapes != {(num_points,)}:
+            raise LabelError(
+                f"{path}: arrays of shape {shapes} where the scene has {num_points} points; lift them again"
+            )
+        return cls(**columns)
+
+
+def lift(scene: Scene, masks: Masks, *, votes: Literal["track", "projection"] = "track") -> LiftedLabels:
+    """Give each point the label that most of its pixels have.
+
+    A point votes once per observation of its track, or with `votes="projection"` once per view whose frustum
+    it lies in (occluded or not). Unlabelled pixels do not vote; ties go to the label with more pixels in all
+    label images together.
+    """
+    ids = np.array(sorted(masks.taxonomy.names))
+    column_of = np.zeros(ids[-1] + 1, np.int64)
+    column_of[ids] = np.arange(len(ids))
+    counts = np.zeros((len(scene.points.xyz), len(ids)), np.int32)
+    flat_counts = counts.reshape(-1)  # np.add.at is several times faster on one axis
+    num_pixels = np.zeros(len(ids), np.int64)
+    pixels = _track_pixels(scene) if votes == "track" else _projected_pixels(scene)
+    for view, (points, uv) in zip(scene.views, pixels, strict=True):
+        label_ids = masks[view]
+        # unsigned, unlabelled pixels are 65535: out of the way
+        num_pixels += np.bincount(label_ids.view(np.uint16).ravel(), minlength=ids[-1] + 1)[ids]
+        # uv on the image's far edge or, after undistortion, outside it shows no pixel
+        inside = (uv >= 0).all(1) & (uv < (view.camera.width, view.camera.height)).all(1)
+        x, y = uv[inside].astype(np.int64).T
+        seen = label_ids[y, x]
+        voted = seen != UNLABELLED
+        np.add.at(flat_counts, points[inside][voted] * len(ids) + column_of[seen[voted]], 1)
+    order = np.argsort(-num_pixels, kind="stable")  # arg max takes the first of several
+    winner = order[counts[:, order].argmax(1)]
+    num_votes = counts.sum(1, dtype=np.int32)
+    return LiftedLabels(
+        label_ids=np.where(num_votes > 0, ids[winner], UNLABELLED).astype(np.int16),
+        num_votes=num_votes,
+        num_agreeing=np.take_along_axis(counts, winner[:, None], 1)[:, 0],
+    )
+
+
+def _track_pixels(scene: Scene) -> Iterator[tuple[Int64[np.ndarray, " M"], Float32[np.ndarray, "M 2"]]]:
+    """View by view: the points that have an observation in it, and where."""
+    points = scene.points
+    order = np.argsort(points.track_views, kind="stable")
+    starts = np.searchsorted(points.track_views[order], np.arange(len(scene.views) + 1))
+    for start, end in pairwise(starts):
+        rows = order[start:end]
+        yield points.track_points[rows], points.track_uv[rows]
+
+
+def _projected_pixels(scene: Scene) -> Iterator[tuple[Int64[np.ndarray, " M"], Float32[np.ndarray, "M 2"]]]:
+    """View by view: the points in front of the camera, and where it sees them."""
+    for view in scene.views:
+        yield _project(view.camera, scene.points.xyz)
+
+
+def _project(
+    camera: Camera, xyz: Float32[np.ndarray, "P 3"]
+) -> tuple[Int64[np.ndarray, " M"], Float32[np.ndarray, "M 2"]]:
+    """Rows of the points in front of a camera, and their pixels."""
+    seen = xyz @ camera.w2c[:3, :3].T + camera.w2c[:3, 3]
+    rows = np.flatnonzero(seen[:, 2] > 1e-6)
+    homogeneous = seen[rows] @ camera.K.T
+    return rows, homogeneous[:, :2] / homogeneous[:, 2:]
+
+
+def _share(part: np.ndarray, whole: np.ndarray) -> float:
+    return float(part.sum() / whole.sum()) if whole.sum() else float("nan")

@@ -1,0 +1,95 @@
+"""Adaptive density control of 3DGS (Kerbl et al. 2023, section 5): clone, split, prune, reset."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sagesplat.config import TrainConfig
+from sagesplat.gaussians import PARAMETERS, Gaussians, concat
+from sagesplat.raster.reference import rotation_matrices
+from sagesplat.raster.render import Render
+from sagesplat.train.state import TrainState
+
+_SPLIT_SHRINK = 1.6
+_REFERENCE_STEPS = 30_000
+_RESET_FLOOR = 1000  # steps that a model needs between two resets, however short the run
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """When what happens, for one length of run."""
+
+    level_every: int
+    refine_start: int
+    refine_stop: int
+    reset_every: int
+    raise_sh_every: int
+    recovery: int  # steps after a reset in which a level counts as recovering
+
+
+def schedule(config: TrainConfig) -> Schedule:
+    """The published step numbers scaled to `max_steps`."""
+    share = config.max_steps / _REFERENCE_STEPS
+
+    def scaled(step: int) -> int:
+        return max(1, round(step * share))
+
+    reset_every = max(scaled(config.reset_every), min(config.reset_every, _RESET_FLOOR))
+    return Schedule(
+        level_every=config.level_every or scaled(1000),
+        refine_start=scaled(config.refine_start),
+        refine_stop=scaled(config.refine_stop),
+        reset_every=reset_every,
+        raise_sh_every=scaled(config.raise_sh_every),
+        recovery=min(1000, reset_every // 2),
+    )
+
+
+def observe_gradients(state: TrainState, render: Render, width: int, height: int, trainable: Tensor) -> None:
+    """Add a view's screen-space gradients, in half images as 3DGS measures them."""
+    grad = render.means2d.grad
+    assert grad is not None
+    seen = (render.radii > 0) & trainable
+    norm = (grad * grad.new_tensor([width / 2, height / 2])).norm(dim=-1)
+    state.grad_sum += torch.where(seen, norm, 0)
+    state.grad_count += seen
+
+
+def refine(state: TrainState, config: TrainConfig, extent: float, trainable: Tensor) -> None:
+    """Clone small and split large Gaussians with high gradients, prune faint and (after a reset) huge ones."""
+    g = state.gaussians
+    size = g.log_scales.exp().amax(-1)
+    grows = (state.grad_sum / state.grad_count.clamp_min(1) > config.grow_grad) & trainable
+    room = config.max_gaussians - len(g)
+    if int(grows.sum()) > room:
+        strength = torch.where(grows, state.grad_sum / state.grad_count.clamp_min(1), -1.0)
+        grows = torch.zeros_like(grows)
+        grows[torch.topk(strength, max(room, 0)).indices] = True
+    small = size <= config.grow_scale * extent
+    clones = g.select(grows & small)
+    halves = _split(g.select(grows & ~small), state.rng)
+    faint = g.logit_opacities.sigmoid() < config.prune_opacity
+    if state.last_reset >= 0:
+        faint |= size > config.prune_scale * extent
+    state.replace_rows(~(grows & ~small) & ~(faint & trainable), concat([clones, halves]))
+
+
+def _split(g: Gaussians, rng: np.random.Generator) -> Gaussians:
+    """Two smaller Gaussians drawn from each."""
+    both = concat([g, g])
+    noise = torch.from_numpy(rng.standard_normal((len(both), 3), np.float32)) * both.log_scales.exp()
+    shift = (rotation_matrices(both.quats) @ noise[..., None]).squeeze(-1)
+    return replace(both, means=both.means + shift, log_scales=both.log_scales - float(np.log(_SPLIT_SHRINK)))
+
+
+def reset_opacities(state: TrainState, config: TrainConfig, trainable: Tensor) -> None:
+    """Lower opacities to twice the pruning threshold; their moments start again."""
+    ceiling = float(np.log(2 * config.prune_opacity / (1 - 2 * config.prune_opacity)))
+    name = PARAMETERS[3]
+    logits = getattr(state.gaussians, name)
+    logits[trainable] = logits[trainable].clamp_max(ceiling)
+    for moments in (state.first[name], state.second[name]):
+        moments[trainable] = 0
+    state.last_reset = state.step

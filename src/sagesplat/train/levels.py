@@ -1,0 +1,118 @@
+"""Levels on disk: one .npz per level, its arrays by category, at most 79 bytes a Gaussian.
+
+means float32, quats int16, log_scales, logit_opacities and sh0 float16, shN int8 with a square-root scale per
+coefficient. Categories are read one by one, so that a composition touches only what it takes.
+"""
+
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from sagesplat.errors import DataError
+from sagesplat.files import atomic_path
+from sagesplat.gaussians import Gaussians, concat
+from sagesplat.sh import num_bases
+
+_HALVES = ("log_scales", "logit_opacities", "sh0")
+
+
+@dataclass(frozen=True)
+class LevelFile:
+    """One recorded level: what it holds, without its Gaussians."""
+
+    path: Path
+    step: int
+    recovering: bool  # taken soon after an opacity reset
+    sh_degree: int
+    counts: dict[int, int]  # Gaussians by label id
+
+
+def write_level(folder: Path, step: int, g: Gaussians, *, recovering: bool, sh_degree: int) -> Path:
+    """Record Gaussians as a level; harmonics above `sh_degree` (not yet in use) are left out."""
+    arrays: dict[str, np.ndarray] = {"meta": np.array([step, recovering, sh_degree], np.int64)}
+    for label in g.counts():
+        part = g.of_labels([label])
+        values = {name: p.detach().numpy() for name, p in part.parameters().items()}
+        quats = values["quats"] / np.linalg.norm(values["quats"], axis=1, keepdims=True)
+        coefficients = values["shN"][:, : num_bases(sh_degree) - 1]
+        scale = np.abs(coefficients).max(axis=0, initial=0)
+        share = coefficients / np.where(scale > 0, scale, 1)
+        columns = {
+            "means": values["means"],
+            "quats": np.round(quats * 32767).astype(np.int16),
+            **{name: values[name].astype(np.float16) for name in _HALVES},
+            "shN": np.round(np.sign(share) * np.sqrt(np.abs(share)) * 127).astype(np.int8),
+            "shN_scale": scale.astype(np.float32),
+        }
+        arrays |= {f"{label}/{name}": column for name, column in columns.items()}
+    path = folder / f"{step:06d}.npz"
+    with atomic_path(path) as temporary:
+        np.savez(temporary, allow_pickle=False, **arrays)
+    return path
+
+
+def _open(path: Path) -> np.lib.npyio.NpzFile:
+    try:
+        return np.load(path, allow_pickle=False)
+    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
+        raise DataError(f"{path}: not a readable level ({error}); run `sagesplat train` again") from None
+
+
+def read_header(path: Path) -> LevelFile:
+    """What a level holds, without reading its Gaussians."""
+    with _open(path) as file:
+        try:
+            step, recovering, degree = file["meta"].tolist()
+            labels = sorted({int(name.split("/")[0]) for name in file.files if "/" in name})
+            counts = {label: len(file[f"{label}/logit_opacities"]) for label in labels}
+        except (KeyError, ValueError, zipfile.BadZipFile) as error:
+            raise DataError(f"{path}: not a level ({error}); run `sagesplat train` again") from None
+    return LevelFile(path, step, bool(recovering), degree, counts)
+
+
+def read_level(path: Path, label_ids: Sequence[int] | None = None) -> Gaussians:
+    """The Gaussians of a level, or only those of some categories; raises `DataError` for NaN or a broken file."""
+    header = read_header(path)
+    wanted = sorted(header.counts) if label_ids is None else [i for i in label_ids if i in header.counts]
+    parts = []
+    with _open(path) as file:
+        try:
+            parts = [_decode(file, label) for label in wanted]
+        except (KeyError, ValueError, zipfile.BadZipFile) as error:
+            raise DataError(f"{path}: a broken level ({error}); run `sagesplat train` again") from None
+    if not parts:
+        return _empty(header.sh_degree)
+    g = concat(parts)
+    for name, parameter in g.parameters().items():
+        if not torch.isfinite(parameter).all():
+            raise DataError(f"{path}: {name} holds NaN or Inf; run `sagesplat train` again")
+    return g
+
+
+def _decode(file: np.lib.npyio.NpzFile, label: int) -> Gaussians:
+    def column(name: str) -> np.ndarray:
+        return file[f"{label}/{name}"].astype(np.float32)
+
+    share = column("shN") / 127
+    values = {name: column(name) for name in ("means", *_HALVES)}
+    values["quats"] = column("quats") / 32767
+    values["shN"] = np.sign(share) * share**2 * column("shN_scale")
+    labels = torch.full((len(values["means"]),), label, dtype=torch.int16)
+    return Gaussians(**{name: torch.from_numpy(v) for name, v in values.items()}, label_ids=labels)
+
+
+def _empty(sh_degree: int) -> Gaussians:
+    shapes = {
+        "means": (0, 3),
+        "quats": (0, 4),
+        "log_scales": (0, 3),
+        "logit_opacities": (0,),
+        "sh0": (0, 1, 3),
+    }
+    values = {name: torch.zeros(shape) for name, shape in shapes.items()}
+    shN = torch.zeros(0, num_bases(sh_degree) - 1, 3)
+    return Gaussians(**values, shN=shN, label_ids=torch.zeros(0, dtype=torch.int16))

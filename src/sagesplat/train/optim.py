@@ -1,0 +1,54 @@
+"""Adam over rows: one fused, parallel pass; rows outside the mask keep parameter and moments untouched."""
+
+import numpy as np
+from numba import njit, prange
+
+_BETA1, _BETA2, _EPS = 0.9, 0.999, 1e-15
+_CHUNK = 4096
+
+
+@njit(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", cache=True)
+def _update(parameter, grad, first, second, rate, correction):
+    b1, b2, eps, one = np.float32(_BETA1), np.float32(_BETA2), np.float32(_EPS), np.float32(1)
+    for i in range(np.uint64(len(parameter))):
+        g = grad[i]
+        m = b1 * first[i] + (one - b1) * g
+        v = b2 * second[i] + (one - b2) * g * g
+        first[i] = m
+        second[i] = v
+        parameter[i] -= rate * m / (np.sqrt(v) * correction + eps)
+
+
+@njit(parallel=True, cache=True)
+def _update_rows(parameter, grad, first, second, rate, correction, trainable):
+    """Flat arrays of N * width values; runs of trainable rows are updated together."""
+    n = len(trainable)
+    width = len(parameter) // n
+    for chunk in prange((n + _CHUNK - 1) // _CHUNK):
+        row, end = chunk * _CHUNK, min((chunk + 1) * _CHUNK, n)
+        while row < end:
+            stop = row
+            while stop < end and trainable[stop]:
+                stop += 1
+            if stop > row:
+                a, b = row * width, stop * width
+                _update(parameter[a:b], grad[a:b], first[a:b], second[a:b], rate, correction)
+            row = stop + 1
+
+
+def adam_step(
+    parameter: np.ndarray,  # [N, ...] float32, changed in place
+    grad: np.ndarray,
+    first: np.ndarray,  # moments, changed in place
+    second: np.ndarray,
+    *,
+    lr: float,
+    step: int,  # 1 for the first
+    trainable: np.ndarray,  # bool [N]
+) -> None:
+    """One Adam step (Kingma and Ba, betas 0.9 and 0.999, eps 1e-15 as 3DGS)."""
+    if parameter.size:
+        rate = np.float32(lr / (1 - _BETA1**step))
+        correction = np.float32((1 - _BETA2**step) ** -0.5)
+        flat = (a.reshape(-1) for a in (parameter, np.ascontiguousarray(grad), first, second))
+        _update_rows(*flat, rate, correction, trainable)

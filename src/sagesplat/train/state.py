@@ -1,0 +1,71 @@
+"""Everything that training changes, in one place."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sagesplat import geometry
+from sagesplat.gaussians import PARAMETERS, Gaussians
+from sagesplat.scene.scene import Points
+from sagesplat.sh import num_bases, rgb_to_sh0
+
+INITIAL_OPACITY = 0.1
+
+
+@dataclass(eq=False)
+class TrainState:
+    """Gaussians, Adam's moments, densification statistics and the order of the views."""
+
+    gaussians: Gaussians
+    first: dict[str, Tensor]  # Adam's moments by parameter name
+    second: dict[str, Tensor]
+    grad_sum: Tensor  # [N] summed screen-space gradient norms, half images
+    grad_count: Tensor  # [N] times seen
+    rng: np.random.Generator
+    queue: list[int]  # views still to come in this round
+    step: int = 0
+    last_reset: int = -1  # step of the last opacity reset, -1 = none yet
+
+    def replace_rows(self, keep: Tensor, new: Gaussians) -> None:
+        """Keep some rows (bool [N]) and append new Gaussians with fresh moments and statistics."""
+        from sagesplat.gaussians import concat
+
+        kept = self.gaussians.select(keep)
+        self.gaussians = concat([kept, new])
+        for name in PARAMETERS:
+            fresh = torch.zeros_like(getattr(new, name))
+            self.first[name] = torch.cat([self.first[name][keep], fresh])
+            self.second[name] = torch.cat([self.second[name][keep], fresh])
+        self.clear_statistics()
+
+    def clear_statistics(self) -> None:
+        """Start the densification statistics again."""
+        self.grad_sum = torch.zeros(len(self.gaussians))
+        self.grad_count = torch.zeros(len(self.gaussians))
+
+
+def from_points(points: Points, label_ids: np.ndarray, sh_degree: int) -> Gaussians:
+    """Gaussians at the SfM points: isotropic, as wide as the three nearest neighbours are far."""
+    n = len(points.xyz)
+    scales = geometry.mean_neighbour_distance(points.xyz)
+    quats = torch.zeros(n, 4)
+    quats[:, 0] = 1
+    rgb = torch.from_numpy(points.rgb.astype(np.float32) / 255)
+    return Gaussians(
+        means=torch.from_numpy(points.xyz.copy()),
+        quats=quats,
+        log_scales=torch.from_numpy(np.log(scales))[:, None].repeat(1, 3),
+        logit_opacities=torch.full((n,), float(np.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY)))),
+        sh0=rgb_to_sh0(rgb)[:, None, :].contiguous(),
+        shN=torch.zeros(n, num_bases(sh_degree) - 1, 3),
+        label_ids=torch.from_numpy(label_ids.astype(np.int16)),
+    )
+
+
+def initial_state(gaussians: Gaussians, seed: int) -> TrainState:
+    """A state before the first step."""
+    moments = [{n: torch.zeros_like(p) for n, p in gaussians.parameters().items()} for _ in range(2)]
+    zeros = torch.zeros(len(gaussians))
+    return TrainState(gaussians, *moments, zeros, zeros.clone(), np.random.default_rng(seed), [])

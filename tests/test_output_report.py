@@ -1,0 +1,202 @@
+import csv
+import dataclasses
+import re
+from dataclasses import dataclass
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sagesplat.adapt.evaluate import Evaluation, read_evaluation
+from sagesplat.adapt.model import fit_models
+from sagesplat.adapt.observe import TOTAL, Observations, read_observations
+from sagesplat.adapt.plan import plan_scene
+from sagesplat.output import figures
+from sagesplat.output.report import Panel, ReportData, write_report
+
+NAMES = {3: "vase", 7: "dining table", 9: "$x^2$ <b>&amp; _odd"}
+COLOURS = {3: (250, 250, 10), 7: (0, 160, 180), 9: (90, 10, 200), -1: (128, 128, 128)}
+LABELS: tuple[int, ...] = (-1, 3, 7, 9)
+LEVELS = (1000, 2000, 3000)
+VIEWS = 10
+TEST = np.array([0, 5])
+
+
+def quality(label: int, level: int, view: int) -> float:
+    return 0.5 + 0.03 * label + 0.05 * LEVELS.index(level) - 0.01 * view
+
+
+def columns(kind, rows: list[tuple]):
+    types = [np.dtype(f.type.dtypes[0]) for f in dataclasses.fields(kind)]  # pyright: ignore
+    return kind(*(np.array([row[i] for row in rows], t) for i, t in enumerate(types)))
+
+
+def make(panels: int = 2) -> ReportData:
+    train = np.setdiff1d(np.arange(VIEWS), TEST)
+    seen = [
+        (label, level, view, 1 + view / 3, quality(label, level, view), 0.5, 25.0, 100)
+        for label in (*LABELS, TOTAL)
+        for level in LEVELS
+        for view in range(VIEWS)
+    ]
+    observations = columns(Observations, seen)
+    counts = {(i, level): (i + 2) * 100 * (k + 1) for i in LABELS for k, level in enumerate(LEVELS)}
+    models = fit_models(observations, train)
+    distances = dict.fromkeys(LABELS, 1 + train / 3)
+    plans = [plan_scene(models, counts, distances, target) for target in (0.5, 0.6)]
+    measured = []
+    for plan in plans:
+        for view in (*TEST, 1):  # view 1 is a training view and must not count
+            for c in plan.choices:
+                ssim = quality(c.label_id, c.level, view) - (0.3 if view == 1 else 0.0)
+                promised = models[c.label_id, c.level](1 + view / 3)
+                measured.append((plan.target, view, c.label_id, c.level, promised, ssim, 24, 0.8, 26, 99))
+            measured.append((plan.target, view, TOTAL, -1, np.nan, 0.6 - 0.1 * (view == 1), 24, 0.8, 26, 400))
+    draw = np.random.default_rng(0)
+    photo, full, composed = draw.integers(0, 255, (3, 24, 40, 3)).astype(np.uint8)
+    ids = draw.choice(np.array(LABELS, np.int16), (24, 40))
+    return ReportData(
+        title="a <scene>",
+        target=0.6,
+        names=NAMES,
+        colours=COLOURS,
+        observations=observations,
+        train_views=train,
+        test_views=TEST,
+        view_names=[f"view_{i}.jpg" for i in range(VIEWS)],
+        counts=counts,
+        recovering=frozenset({2000}),
+        models=models,
+        plans=plans,
+        evaluation=columns(Evaluation, measured),
+        panels=[
+            Panel(f"view_{i}.jpg", photo, full, composed, ids, 0.6, 24.0, 0.8, 26.0) for i in range(panels)
+        ],
+        scene_facts=[("photos", "10")],
+        timings=[("train", 12.5)],
+    )
+
+
+@dataclass
+class Page(HTMLParser):
+    links: list[str]
+    text: str = ""
+
+    def __init__(self, path: Path):
+        super().__init__()
+        self.links = []
+        self.feed(path.read_text("utf-8"))
+
+    def handle_starttag(self, tag, attrs):
+        self.links += [value or "" for name, value in attrs if name in ("src", "href", "data", "action")]
+
+    def handle_data(self, data):
+        self.text += data
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory) -> tuple[Path, ReportData, Page]:
+    folder = tmp_path_factory.mktemp("run") / "report"
+    data = make()
+    path = write_report(folder, data)
+    return path, data, Page(path)
+
+
+def test_page_stands_alone(written):
+    path, _, page = written
+    assert path.name == "index.html"
+    without_pictures = re.sub(r"base64,[A-Za-z0-9+/=]*", "", path.read_text("utf-8"))
+    assert not re.search("//|@import|url\\(", without_pictures)
+    for link in page.links:
+        assert link.startswith("data:") or (path.parent / link).is_file(), link[:80]
+
+
+def test_every_category_is_on_it(written):
+    path, _, page = written
+    for name in (*NAMES.values(), "unlabelled", "whole image"):
+        assert name in page.text
+    assert "<b>&amp;amp; _odd" not in path.read_text("utf-8")  # escaped, not markup
+    assert "a <scene>" in page.text
+    assert "nan" not in page.text.lower().split()
+
+
+def test_headline_is_computed_from_unseen_views(written):
+    _, data, page = written
+    plan = data.plans[1]
+    full = sum(count for (_, level), count in data.counts.items() if level == LEVELS[-1])
+    words = " ".join(page.text.split())
+    assert f"{plan.count:,} of {full:,} Gaussians" in words
+    assert f"{int(100 * (1 - plan.count / full))}% fewer Gaussians" in words
+    assert "On 2 photos" in words
+    assert "SSIM 0.600 and 24.00 dB" in words  # view 1 would have lowered the mean
+
+
+def test_files_beside_the_page(written):
+    path, data, _ = written
+    figure_names = {"panel_0", "panel_1", "size_by_target", "quality_over_size", "promised_and_measured"}
+    figure_names |= {"ssim_over_levels", "ssim_over_distance"}
+    assert {f.stem for f in (path.parent / "figures").glob("*.svg")} == figure_names
+    for name in figure_names:
+        with Image.open(path.parent / "figures" / f"{name}.png") as image:
+            assert np.ptp(np.asarray(image.convert("L"))) > 100
+    for file in (path.parent / "tables").glob("*.csv"):
+        with file.open(newline="", encoding="utf-8") as handle:
+            rows = list(csv.reader(handle))
+        assert len(rows) > 1
+        assert len({len(row) for row in rows}) == 1
+    raw = read_observations(path.parent / "tables" / "observations.csv")
+    np.testing.assert_array_equal(raw.ssim, data.observations.ssim)
+    assert set(read_evaluation(path.parent / "tables" / "evaluation_rows.csv").view) == set(TEST)
+
+
+def test_without_test_views_and_pictures(tmp_path):
+    data = make(panels=0)
+    data = dataclasses.replace(data, test_views=TEST[:0], models={}, timings=())
+    text = write_report(tmp_path, data).read_text("utf-8")
+    assert "See the difference" not in text
+    assert "unseen it measures" not in text
+    assert "dining table" in text
+    assert not (tmp_path / "figures" / "quality_over_size.svg").exists()
+
+
+def test_categories_out_of_reach_are_named(tmp_path):
+    data = make(panels=0)
+    distances = {i: np.array([2.0]) for i in LABELS}
+    plan = plan_scene(data.models, data.counts, distances, 0.75)
+    out = [c.label_id for c in plan.choices if c.status == "infeasible"]
+    assert 0 < len(out) < len(LABELS)
+    data = dataclasses.replace(
+        data, plans=[plan], target=0.75, observations=data.observations.select(TEST[:0])
+    )
+    text = " ".join(Page(write_report(tmp_path, data)).text.split())
+    assert f"{len(out)} of {len(LABELS)} categories cannot reach 0.75" in text
+    assert text.count("infeasible") > len(out)
+
+
+def test_same_data_same_figure(tmp_path):
+    data = make(panels=0)
+    for name in ("a", "b"):
+        figure = figures.size_by_target(data.plans, data.counts, LABELS, NAMES, COLOURS)
+        figures.save_figure(figure, tmp_path / name)
+    assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
+
+
+def test_pictures():
+    ids = np.array([[3, -1], [7, 55]], np.int16)
+    image = figures.label_image(ids, COLOURS)
+    assert image.tolist() == [[[250, 250, 10], [128, 128, 128]], [[0, 160, 180], [128, 128, 128]]]
+    photo = np.zeros((2, 2, 3), np.uint8)
+    other = photo.copy()
+    other[0, 0] = 255
+    error = figures.error_image(other, photo)
+    assert error.shape == (2, 2, 3)
+    assert error[0, 0].sum() > 600
+    assert error[1, 1].sum() < 10
+
+
+def test_line_colours_are_dark_enough():
+    red, green, blue = figures.ink(3, COLOURS)
+    assert 0.2126 * red**2.2 + 0.7152 * green**2.2 + 0.0722 * blue**2.2 < 0.33
+    assert figures.ink(9, COLOURS) == pytest.approx((90 / 255, 10 / 255, 200 / 255))

@@ -1,0 +1,124 @@
+import csv
+import math
+
+import numpy as np
+import pytest
+
+from sagesplat.adapt.evaluate import Evaluation
+from sagesplat.adapt.model import fit_model
+from sagesplat.adapt.observe import TOTAL, Observations
+from sagesplat.adapt.plan import Choice, Plan
+from sagesplat.output import tables
+
+NAMES = {3: "vase", 7: "dining, table"}
+COUNTS = {(3, 1000): 10, (3, 2000): 40, (7, 1000): 50, (7, 2000): 60, (-1, 1000): 5, (-1, 2000): 5}
+LABELS = [7, 3, -1]
+
+
+def observe() -> Observations:
+    rows = [
+        (label, level, view, 2.0, ssim + view / 100, np.nan, 20.0, 9)
+        for label, ssim in ((3, 0.5), (7, 0.7), (TOTAL, 0.6))
+        for level in (1000, 2000)
+        for view in range(3)
+    ]
+    rows.append((-1, 1000, 0, np.nan, np.nan, np.nan, np.nan, 0))
+    kinds = ["i4", "i4", "i4", "f4", "f4", "f4", "f4", "i4"]
+    return Observations(*(np.array(c, k) for c, k in zip(zip(*rows, strict=True), kinds, strict=True)))
+
+
+def evaluate(rows: list[tuple[float, int, float, float]]) -> Evaluation:
+    """Rows of (target, label, predicted, measured), one view."""
+    target, label, predicted, ssim = (np.array(c) for c in zip(*rows, strict=True))
+    zero, one = np.zeros(len(rows), np.int32), np.full(len(rows), 0.9, np.float32)
+    f = np.float32
+    measured = (predicted.astype(f), ssim.astype(f), 30 * one, one, 33 * one)
+    return Evaluation(target.astype(f), zero, label.astype(np.int32), zero, *measured, zero)
+
+
+def as_text(table: tables.Table, path) -> list[dict[str, str]]:
+    table.write_csv(path)
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_last_level_is_3dgs():
+    assert tables.last_counts(COUNTS) == {3: 40, 7: 60, -1: 5}
+    assert tables.by_size(COUNTS) == LABELS
+    assert [tables.name_of(i, NAMES) for i in (7, -1, TOTAL, 9)] == [
+        "dining, table", "unlabelled", "whole image", "category 9",
+    ]  # fmt: skip
+
+
+def test_quality_averages_the_views_asked_for(tmp_path):
+    table = tables.quality_table(observe(), np.array([0, 2]), LABELS, NAMES, "training")
+    rows = as_text(table, tmp_path / "t.csv")
+    assert [row["level"] for row in rows] == ["1000", "2000"]
+    assert float(rows[0]["dining, table"]) == pytest.approx(0.71)
+    assert float(rows[1]["whole image"]) == pytest.approx(0.61)
+    assert rows[0]["unlabelled"] == ""
+    assert table.cells()[0] == ["1,000", "0.610", "0.710", "0.510", "–"]
+
+
+def test_counts_add_up(tmp_path):
+    rows = as_text(tables.counts_table(COUNTS, LABELS, NAMES), tmp_path / "t.csv")
+    assert [int(row["all"]) for row in rows] == [65, 105]
+    assert [int(row["vase"]) for row in rows] == [10, 40]
+
+
+def test_plan_and_targets(tmp_path):
+    choices = (
+        Choice(-1, 2000, math.nan, math.nan, 5, "no model"),
+        Choice(3, 1000, 0.61, 2.0, 10, "ok"),
+        Choice(7, 2000, 0.55, 2.5, 60, "infeasible"),
+    )
+    plan = Plan(0.6, None, choices, 0.95)
+    rows = as_text(tables.plan_table(plan, COUNTS, NAMES), tmp_path / "t.csv")
+    assert [row["category"] for row in rows] == ["dining, table", "vase", "unlabelled"]
+    assert [row["status"] for row in rows] == ["infeasible", "ok", "no model"]
+    assert float(rows[1]["of 3DGS"]) == 0.25
+    assert float(rows[1]["MB"]) == 10 * 248 / 1e6
+    assert rows[2]["promised SSIM"] == ""
+    rows = as_text(tables.targets_table([plan, plan], COUNTS, LABELS, NAMES), tmp_path / "t.csv")
+    assert rows[-1]["3DGS Gaussians"] == "105"
+    assert rows[-1]["t=0.6 Gaussians"] == "75"
+    assert rows[-1]["t=0.6 status"] == "infeasible"
+
+
+def test_promise_counts_only_what_was_promised():
+    rows = evaluate(
+        [
+            (0.6, 3, 0.62, 0.61),  # kept
+            (0.6, 3, 0.60, 0.58),  # broken
+            (0.6, 7, 0.59, 0.70),  # nothing promised
+            (0.6, 7, 0.65, np.nan),  # nothing measured
+            (0.6, 7, np.nan, 0.7),  # no model
+            (0.6, TOTAL, np.nan, 0.7),
+        ]
+    )
+    kept = tables.promise_kept(rows)
+    assert (kept.promised, kept.kept, kept.share) == (2, 1, 0.5)
+    assert kept.overshoot == pytest.approx(-0.005, abs=1e-6)
+    assert math.isnan(tables.promise_kept(rows.select(rows.label_id == TOTAL)).share)
+
+
+def test_evaluation_table(tmp_path):
+    rows = evaluate([(0.5, 3, 0.6, 0.5), (0.5, 3, 0.6, 0.4), (0.7, 3, 0.6, 0.5), (0.5, TOTAL, np.nan, 0.8)])
+    lines = as_text(tables.evaluation_table(rows, LABELS, NAMES), tmp_path / "t.csv")
+    assert [(line["target"], line["category"]) for line in lines] == [
+        ("0.5", "vase"), ("0.5", "whole image"), ("0.7", "vase"),
+    ]  # fmt: skip
+    assert (lines[0]["promised"], lines[0]["kept"], lines[0]["share kept"]) == ("2", "1", "0.5")
+    assert float(lines[0]["error of promise"]) == pytest.approx(0.15)
+    assert lines[1]["promised"] == lines[1]["promised SSIM"] == ""
+    assert lines[2]["promised"] == "0"
+
+
+def test_models_table(tmp_path):
+    distance = np.linspace(1, 5, 30, dtype=np.float32)
+    model = fit_model(3, 1000, distance, 0.8 * np.exp(-0.1 * distance))
+    row = as_text(tables.models_table({(3, 1000): model}, NAMES), tmp_path / "t.csv")[0]
+    assert row["category"] == "vase"
+    assert float(row["K1"]) == model.params.K1
+    assert (float(row["d min"]), float(row["d max"])) == (1, 5)
+    assert tables.models_table({}, NAMES).rows == []

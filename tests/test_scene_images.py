@@ -1,0 +1,105 @@
+"""Photos of every kind become 8-bit RGB at the size of their view."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sagesplat.errors import SceneError
+from sagesplat.scene import images
+from sagesplat.scene.images import Photos, load_photo, photo_size
+from sagesplat.scene.scene import Camera, View
+
+
+def view_of(path, width: int = 6, height: int = 4) -> View:
+    K = np.array([[5, 0, width / 2], [0, 5, height / 2], [0, 0, 1]], np.float32)
+    return View(path.name, Camera(np.eye(4, dtype=np.float32), K, width, height), path)
+
+
+GREY = np.arange(24, dtype=np.uint8).reshape(4, 6) * 10
+RGB = np.random.default_rng(1).integers(0, 256, (4, 6, 3)).astype(np.uint8)
+
+
+def saved(path, array, **options):
+    Image.fromarray(array).save(path, **options)
+    return view_of(path)
+
+
+def test_rgb_is_kept(tmp_path):
+    np.testing.assert_array_equal(load_photo(saved(tmp_path / "a.png", RGB)), RGB)
+
+
+def test_grey_of_any_depth(tmp_path):
+    expected = np.repeat(GREY[..., None], 3, axis=2)
+    sixteen = GREY.astype(np.uint16) * 257
+    for name, array in (
+        ("8.png", GREY),
+        ("16.png", sixteen),
+        ("16.tiff", sixteen),
+        ("32.tiff", sixteen.astype(np.int32)),
+    ):
+        np.testing.assert_array_equal(load_photo(saved(tmp_path / name, array)), expected)
+    Image.fromarray(GREY).convert("P").save(tmp_path / "p.png")
+    np.testing.assert_array_equal(load_photo(view_of(tmp_path / "p.png")), expected)
+
+
+def test_alpha_goes_over_black(tmp_path):
+    alpha = np.zeros((4, 6, 1), np.uint8)
+    alpha[1] = 255
+    photo = load_photo(saved(tmp_path / "a.png", np.concatenate([RGB, alpha], axis=2)))
+    np.testing.assert_array_equal(photo[1], RGB[1])
+    assert (photo[[0, 2, 3]] == 0).all()
+
+
+def test_cmyk(tmp_path):
+    Image.new("CMYK", (6, 4), (0, 255, 255, 0)).save(tmp_path / "a.tiff")
+    assert (load_photo(view_of(tmp_path / "a.tiff")) == [255, 0, 0]).all()
+
+
+def test_exif_orientation_is_not_applied(tmp_path):
+    exif = Image.Exif()
+    exif[0x0112] = 6  # turn by 90 degrees
+    view = saved(tmp_path / "a.png", RGB, exif=exif)
+    assert photo_size(view.image_path) == (6, 4)
+    np.testing.assert_array_equal(load_photo(view), RGB)
+
+
+def test_shrinking_averages_areas(tmp_path):
+    path = saved(tmp_path / "a.png", RGB).image_path
+    means = RGB.reshape(2, 2, 3, 2, 3).mean(axis=(1, 3))
+    assert np.abs(load_photo(view_of(path, 3, 2)) - means).max() <= 1  # Pillow rounds rows, then columns
+
+
+@pytest.mark.parametrize("content", [b"", b"no image", None])
+def test_unreadable_photo_is_one_line(tmp_path, content):
+    path = saved(
+        tmp_path / "a.png", np.random.default_rng(0).integers(0, 256, (90, 90, 3)).astype(np.uint8)
+    ).image_path
+    path.write_bytes(path.read_bytes()[:9000] if content is None else content)
+    with pytest.raises(SceneError, match=r"a\.png: not readable as a photo") as raised:
+        load_photo(view_of(path, 90, 90))
+    assert "\n" not in str(raised.value)
+
+
+def test_missing_photo(tmp_path):
+    with pytest.raises(SceneError, match=r"gone\.png: not readable as a photo"):
+        photo_size(tmp_path / "gone.png")
+
+
+def test_photos_cache_within_the_limit(tmp_path, monkeypatch):
+    views = [saved(tmp_path / f"{i}.png", np.full((4, 6, 3), i, np.uint8)) for i in range(3)]
+    loaded = []
+
+    def load(view):
+        loaded.append(view.name)
+        return load_photo(view)
+
+    monkeypatch.setattr(images, "load_photo", load)
+    photos = Photos(views, cache_bytes=2 * RGB.nbytes)
+    assert len(photos) == 3
+    assert loaded == []
+    for _ in range(2):
+        assert [int(photo.mean()) for photo in photos] == [0, 1, 2]
+    assert loaded == ["0.png", "1.png", "2.png", "2.png"]
+    assert int(photos[-1].mean()) == 2
+    with pytest.raises(IndexError):
+        photos[3]

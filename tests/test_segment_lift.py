@@ -1,0 +1,157 @@
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sagesplat.errors import LabelError
+from sagesplat.scene import load_scene
+from sagesplat.scene.scene import Camera, Points, Scene, View
+from sagesplat.segment.lift import LiftedLabels, lift
+from sagesplat.segment.masks import Masks, Taxonomy, mask_path, write_mask
+
+SCENES = Path(__file__).resolve().parents[2] / "shared" / "scenes"
+CAR, TREE, WALL = 3, 184, 199
+TAXONOMY = Taxonomy({CAR: "car", TREE: "tree-merged", WALL: "wall"})
+
+
+def scene_of(xyz, cameras, observations):
+    views = tuple(View(f"{i}.jpg", camera, Path(f"{i}.jpg")) for i, camera in enumerate(cameras))
+    rows, in_views, uv = zip(*observations, strict=True) if observations else ((), (), np.zeros((0, 2)))
+    points = Points(
+        np.array(xyz, np.float32),
+        np.zeros((len(xyz), 3), np.uint8),
+        np.array(rows, np.int64),
+        np.array(in_views, np.int32),
+        np.array(uv, np.float32).reshape(-1, 2),
+    )
+    return Scene("s", Path(), views, points)
+
+
+def camera_at(x=0.0, width=4, height=2):
+    w2c = np.eye(4, dtype=np.float32)
+    w2c[0, 3] = -x
+    K = np.array([[2, 0, width / 2], [0, 2, height / 2], [0, 0, 1]], np.float32)
+    return Camera(w2c, K, width, height)
+
+
+def masks_of(folder, scene, images):
+    for view, image in zip(scene.views, images, strict=True):
+        write_mask(mask_path(folder, view), np.array(image, np.int16), TAXONOMY)
+    return Masks(folder, TAXONOMY)
+
+
+def test_majority_of_the_track(tmp_path):
+    images = [[[CAR, CAR, CAR, TREE], [-1, TREE, TREE, TREE]], [[CAR, TREE, TREE, TREE], [CAR] * 4]]
+    observations = [
+        (0, 0, (0.99, 0.0)),  # car
+        (0, 0, (2.5, 0.99)),  # car, the same view again
+        (0, 1, (1.0, 0.0)),  # tree
+        (1, 0, (0.5, 1.5)),  # unlabelled: no vote
+        (1, 1, (3.5, 1.999)),  # car
+        (2, 0, (0.5, 1.5)),  # unlabelled only
+        (3, 0, (4.0, 0.5)),  # beyond the right edge
+        (3, 1, (-0.01, 0.5)),
+    ]
+    scene = scene_of(np.zeros((5, 3)), [camera_at(), camera_at()], observations)
+    lifted = lift(scene, masks_of(tmp_path, scene, images))
+    assert lifted.label_ids.dtype == np.int16
+    assert lifted.label_ids.tolist() == [CAR, CAR, -1, -1, -1]
+    assert lifted.num_votes.tolist() == [3, 1, 0, 0, 0]
+    assert lifted.num_agreeing.tolist() == [2, 1, 0, 0, 0]
+    assert lifted.agreement == 0.75
+    assert lifted.agreement_by_label() == {CAR: 0.75}
+
+
+@pytest.mark.parametrize(("rest", "winner"), [(CAR, CAR), (TREE, TREE), (WALL, CAR)])
+def test_ties_go_to_the_larger_share_of_the_images(tmp_path, rest, winner):
+    """With shares equal, the smaller id wins."""
+    observations = [(0, 0, (0.5, 0.5)), (0, 0, (1.5, 0.5))]
+    scene = scene_of([[0, 0, 1]], [camera_at()], observations)
+    lifted = lift(scene, masks_of(tmp_path, scene, [[[TREE, CAR, rest, rest], [rest] * 4]]))
+    assert lifted.label_ids.tolist() == [winner]
+    assert lifted.agreement == 0.5
+
+
+def test_projection_asks_every_view_that_the_point_lies_in(tmp_path):
+    xyz = [[0.0, 0, 1], [0, 0, -1], [9, 0, 1], [0.9, 0, 1]]  # seen, behind, outside, right edge
+    scene = scene_of(xyz, [camera_at(), camera_at(0.5), camera_at(-0.5)], [])
+    images = [[[TREE] * 4] * 2, [[CAR] * 4] * 2, [[CAR] * 4] * 2]
+    masks = masks_of(tmp_path, scene, images)
+    lifted = lift(scene, masks, votes="projection")
+    assert lifted.label_ids.tolist() == [CAR, -1, -1, CAR]  # the last by its tie
+    assert lifted.num_votes.tolist() == [3, 0, 0, 2]
+    assert lift(scene, masks).label_ids.tolist() == [-1] * 4  # no tracks
+    assert np.isnan(lift(scene, masks).agreement)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_against_a_loop(tmp_path_factory, seed):
+    rng = np.random.default_rng(seed)
+    images = rng.choice([-1, CAR, TREE, WALL], (3, 2, 4), p=[0.1, 0.4, 0.3, 0.2])
+    observations = [(rng.integers(6), rng.integers(3), rng.uniform(0, (4, 2))) for _ in range(30)]
+    scene = scene_of(np.zeros((6, 3)), [camera_at()] * 3, observations)
+    lifted = lift(scene, masks_of(tmp_path_factory.mktemp("masks"), scene, images))
+    share = {label: (images == label).sum() for label in (CAR, TREE, WALL)}
+    points = scene.points
+    for p in range(6):
+        seen = [
+            images[v, int(y), int(x)]
+            for q, v, (x, y) in zip(points.track_points, points.track_views, points.track_uv, strict=True)
+            if p == q
+        ]
+        votes = {label: seen.count(label) for label in (CAR, TREE, WALL)}
+        best = max(votes, key=lambda label: (votes[label], share[label], -label))
+        assert lifted.label_ids[p] == (best if sum(votes.values()) else -1)
+        assert (lifted.num_votes[p], lifted.num_agreeing[p]) == (sum(votes.values()), votes[best])
+
+
+def test_labels_npz(tmp_path):
+    path = tmp_path / "labels.npz"
+    labels = LiftedLabels(np.array([3, -1], np.int16), np.array([4, 0], np.int32), np.array([3, 0], np.int32))
+    labels.write(path)
+    again = LiftedLabels.read(path, 2)
+    for name, column in vars(labels).items():
+        np.testing.assert_array_equal(getattr(again, name), column)
+        assert getattr(again, name).dtype == column.dtype
+    with pytest.raises(LabelError, match=r"\(2,\)\} where the scene has 3 points"):
+        LiftedLabels.read(path, 3)
+    with pytest.raises(LabelError, match="no such file"):
+        LiftedLabels.read(tmp_path / "other.npz", 2)
+    np.savez(path, label_ids=np.array([3, 4], np.int16))
+    with pytest.raises(LabelError, match="not the labels of points"):
+        LiftedLabels.read(path, 2)
+    np.savez(path, label_ids=np.array([0.5, 1]), num_votes=labels.num_votes, num_agreeing=labels.num_agreeing)
+    with pytest.raises(LabelError, match="not the labels of points"):
+        LiftedLabels.read(path, 2)
+
+
+def test_damaged_npz(tmp_path):
+    path = tmp_path / "labels.npz"
+    LiftedLabels(*(np.arange(4).astype(t) for t in (np.int16, np.int32, np.int32))).write(path)
+    whole = path.read_bytes()
+    messages = []
+    for at in range(0, len(whole), 3):
+        for damaged in (whole[:at], whole[:at] + bytes([whole[at] ^ 0xFF]) + whole[at + 1 :]):
+            path.write_bytes(damaged)
+            try:
+                LiftedLabels.read(path, 4)
+            except LabelError as error:
+                messages.append(str(error))
+    assert len(messages) > len(whole) // 3
+    assert all(m.startswith(str(path)) and "\n" not in m for m in messages)
+
+
+@pytest.mark.parametrize(("name", "agreement"), [("garden", 0.978), ("dinosaur", 0.981)])
+def test_real_scenes_agree_as_their_notes_say(name, agreement):
+    if not (SCENES / name).exists():
+        pytest.skip("needs the real scenes beside the checkout")
+    scene, folder = load_scene(SCENES / name), SCENES / name / "masks"
+    start = time.process_time()
+    lifted = lift(scene, Masks(folder, Taxonomy.read(folder / "labels.json")))
+    assert time.process_time() - start < 5  # about 1.5 s
+    assert lifted.agreement == pytest.approx(agreement, abs=1e-3)
+    assert (lifted.label_ids >= 0).mean() > 0.95

@@ -1,0 +1,206 @@
+import json
+import struct
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sagesplat.errors import BackendUnavailable, LabelError
+from sagesplat.scene import load_scene
+from sagesplat.scene.images import Photos
+from sagesplat.scene.scene import Camera, Points, Scene, View
+from sagesplat.segment.masks import Masks, Taxonomy, read_mask
+from sagesplat.segment.onnx import OnnxSegmenter, arg_max_resized, read_classes, segment_onnx, to_input
+
+SHARED = Path(__file__).resolve().parents[2] / "shared"
+CLASSES = {"classes": ["red", "sky", "other"], "coco_panoptic": {"red": 500, "sky": 187, "other": None}}
+FLOAT, FLOAT_ATTRIBUTE, INTS_ATTRIBUTE = 1, 1, 7
+
+
+def field(number, value):
+    """One field of a protobuf message: a varint, a length-delimited one for bytes and text."""
+    if isinstance(value, int):
+        return varint(number << 3) + varint(value)
+    value = value.encode() if isinstance(value, str) else value
+    return varint(number << 3 | 2) + varint(len(value)) + value
+
+
+def varint(value):
+    low, rest = value & 0x7F, value >> 7
+    return bytes([low | 0x80]) + varint(rest) if rest else bytes([low])
+
+
+def value_info(name, shape):
+    dims = b"".join(field(1, field(1 if isinstance(d, int) else 2, d)) for d in shape)
+    return field(1, name) + field(2, field(1, field(1, FLOAT) + field(2, dims)))
+
+
+def node(kind, inputs, output, **ints):
+    attributes = b"".join(
+        field(5, field(1, name) + b"".join(field(8, i) for i in values) + field(20, INTS_ATTRIBUTE))
+        for name, values in ints.items()
+    )
+    return field(1, b"".join(field(1, i) for i in inputs) + field(2, output) + field(4, kind) + attributes)
+
+
+def write_model(path, weights, size=(16, 32), channels_first=True):
+    """A real ONNX model: the mean of each 4 x 4 block, then one linear map of the channels per class."""
+    weights = np.array(weights, np.float32)
+    x, classes = "photo", len(weights)
+    nodes = b""
+    if not channels_first:
+        nodes, x = node("Transpose", ["photo"], "planes", perm=(0, 3, 1, 2)), "planes"
+    nodes += node("AveragePool", [x], "pooled", kernel_shape=(4, 4), strides=(4, 4))
+    nodes += node("Conv", ["pooled", "weights"], "logits", kernel_shape=(1, 1))
+    tensor = b"".join(field(1, d) for d in (classes, 3, 1, 1)) + field(2, FLOAT) + field(8, "weights")
+    tensor += field(9, struct.pack(f"<{weights.size}f", *weights.ravel()))
+    shape = (1, 3, *size) if channels_first else (1, *size, 3)
+    out = (1, classes, *(s // 4 if isinstance(s, int) else s for s in size))
+    graph = nodes + field(2, "blocks") + field(5, tensor)
+    graph += field(11, value_info("photo", shape)) + field(12, value_info("logits", out))
+    path.write_bytes(field(1, 8) + field(7, graph) + field(8, field(2, 13)))
+    return path
+
+
+def scene_of(*names, width=64, height=32):
+    camera = Camera(np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32), width, height)
+    none = np.zeros(0, np.int64)
+    points = Points(
+        np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), none, none.astype(np.int32), none[:, None]
+    )
+    return Scene("s", Path(), tuple(View(n, camera, Path(n)) for n in names), points)
+
+
+@pytest.fixture
+def files(tmp_path):
+    pytest.importorskip("onnxruntime", reason="needs sagesplat[onnx]")
+    (tmp_path / "classes.json").write_text(json.dumps(CLASSES))
+    return write_model(tmp_path / "model.onnx", np.eye(3)[[0, 2, 1]]), tmp_path / "classes.json"
+
+
+def red_and_blue(height=32, width=64):
+    photo = np.zeros((height, width, 3), np.uint8)
+    photo[:, : width // 2, 0] = 255
+    photo[:, width // 2 :, 2] = 255
+    return photo
+
+
+@pytest.mark.parametrize("channels_first", [True, False])
+def test_a_model_segments_photos(tmp_path, files, channels_first):
+    model = write_model(tmp_path / "model.onnx", np.eye(3)[[0, 2, 1]], channels_first=channels_first)
+    photo = red_and_blue()
+    photo[16:, 32:] = (0, 255, 0)
+    label_ids = OnnxSegmenter(model, files[1]).segment(photo)
+    assert label_ids.shape == (32, 64)
+    assert label_ids.dtype == np.int16
+    expected = np.full((32, 64), 500)
+    expected[:16, 32:], expected[16:, 32:] = 187, -1
+    sure = np.ones((32, 64), bool)
+    sure[13:19, 29:35] = False  # where three regions meet, bilinear logits round the corners
+    np.testing.assert_array_equal(label_ids[sure], expected[sure])
+
+
+def test_a_killed_run_goes_on(tmp_path, files):
+    (model, classes), target = files, tmp_path / "out"
+    scene = scene_of("a.jpg", "sub/b.jpg")
+    photos = [red_and_blue(), red_and_blue()]
+    calls = []
+
+    def killed(done, total):
+        calls.append((done, total))
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        segment_onnx(scene, photos, model, classes, target, threads=1, on_view=killed)
+    assert not (target / "labels.json").exists()
+    photos[0] = np.zeros((32, 64, 3), np.uint8)  # would give another label image, were it looked at again
+    segment_onnx(scene, photos, model, classes, target, threads=1, on_view=lambda *call: calls.append(call))
+    assert calls == [(1, 2), (1, 2), (2, 2)]
+    taxonomy = Taxonomy.read(target / "labels.json")
+    assert taxonomy.names == {187: "sky-other-merged", 500: "red"}
+    for view in scene.views:
+        np.testing.assert_array_equal(Masks(target, taxonomy)[view][:, [0, -1]], [[500, 187]] * 32)
+    smaller = scene_of("a.jpg", "sub/b.jpg", width=32, height=16)
+    segment_onnx(
+        smaller, [red_and_blue(16, 32)] * 2, model, classes, target, threads=1
+    )  # of another size: made anew
+    assert read_mask(target / "a.png", taxonomy).shape == (16, 32)
+
+
+def test_input_and_output_are_resampled_bilinearly(tmp_path):
+    (tmp_path / "c.json").write_text(json.dumps(CLASSES))
+    photo = np.arange(2 * 4 * 3, dtype=np.uint8).reshape(2, 4, 3) * 10
+    x = to_input(photo, 2, 4, read_classes(tmp_path / "c.json"))
+    np.testing.assert_allclose(x, photo / 127.5 - 1, atol=1e-6)
+    (tmp_path / "c.json").write_text(json.dumps(CLASSES | {"mean": [0.4, 0.5, 0.6], "std": 0.2}))
+    x = to_input(photo, 2, 4, read_classes(tmp_path / "c.json"))
+    np.testing.assert_allclose(x, (photo / 255 - [0.4, 0.5, 0.6]) / 0.2, atol=1e-5)
+    assert to_input(photo, 5, 3, read_classes(tmp_path / "c.json")).shape == (5, 3, 3)
+    # class 1 overtakes class 0 where 3 t = 1 between the centres of two coarse pixels
+    logits = np.array([[[1.0, 1.0]], [[0.0, 3.0]]], np.float32)
+    classes = arg_max_resized(logits, 2, 200)
+    assert classes.tolist() == [[0] * 83 + [1] * 117] * 2  # 50 + 100 / 3 = 83.3
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        (None, "no such file"),
+        ([], "not of the form"),
+        ({"classes": ["sky"]}, "not of the form"),
+        ({"classes": ["sky"], "coco_panoptic": {}}, "not of the form .*KeyError"),
+        ({"classes": ["sky"], "coco_panoptic": {"sky": "blue"}}, "not of the form"),
+        ({"classes": ["sky"], "coco_panoptic": {"sky": None}}, "names no label"),
+        ({"classes": ["sky"], "coco_panoptic": {"sky": 70000}}, "outside 0"),
+        (CLASSES | {"std": 0}, "std above 0"),
+        (CLASSES | {"mean": [1, 2]}, "not of the form"),
+    ],
+)
+def test_unusable_classes(tmp_path, content, complaint):
+    if content is not None:
+        (tmp_path / "c.json").write_text(json.dumps(content))
+    with pytest.raises(LabelError, match=complaint) as caught:
+        read_classes(tmp_path / "c.json")
+    assert "\n" not in str(caught.value)
+
+
+def test_unusable_models(tmp_path, files):
+    model, classes = files
+    cases = [
+        (tmp_path / "none.onnx", "no such file"),
+        (classes, "no model that onnxruntime can load"),
+        (write_model(tmp_path / "open.onnx", np.eye(3), size=("height", "width")), "in fixed size is needed"),
+        (write_model(tmp_path / "two.onnx", np.eye(3)[:2]), "3 classes are listed"),
+    ]
+    for path, complaint in cases:
+        with pytest.raises(LabelError, match=complaint) as caught:
+            OnnxSegmenter(path, classes).segment(red_and_blue())
+        assert "\n" not in str(caught.value)
+        assert str(path) in str(caught.value)
+    scene = scene_of("a.jpg")
+    write_model(model, [[0, 0, 0], [0, 0, 0], [9, 9, 9]])
+    with pytest.raises(LabelError, match="every pixel is unlabelled"):
+        segment_onnx(scene, [np.full((32, 64, 3), 255, np.uint8)], model, classes, tmp_path / "out")
+
+
+def test_without_onnxruntime(tmp_path, monkeypatch):
+    (tmp_path / "c.json").write_text(json.dumps(CLASSES))
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(BackendUnavailable, match=r"pip install 'sagesplat\[onnx\]'"):
+        OnnxSegmenter(tmp_path / "m.onnx", tmp_path / "c.json")
+
+
+@pytest.mark.parametrize("name", ["deeplabv3plus_mnv2_ade32", "mosaic_r4_ade32"])
+def test_real_networks_on_a_real_photo(name):
+    pytest.importorskip("onnxruntime", reason="needs sagesplat[onnx]")
+    if not (SHARED / "models" / f"{name}.onnx").exists():
+        pytest.skip("needs the real scenes beside the checkout")
+    full = load_scene(SHARED / "scenes" / "dinosaur")
+    scene = Scene(full.name, full.path, full.views[60:61], full.points)
+    folder = full.path / "masks"
+    given = Masks(folder, Taxonomy.read(folder / "labels.json"))[scene.views[0]]
+    segmenter = OnnxSegmenter(SHARED / "models" / f"{name}.onnx", SHARED / "models" / "ade32.json")
+    found = segmenter.segment(Photos(scene.views)[0])
+    for label_id, least in ((184, 0.8), (197, 0.8), (187, 0.9)):
+        assert (found[given == label_id] == label_id).mean() > least
