@@ -79,6 +79,8 @@ class FitConfig:
 
     distance: Literal["percentile", "minimum"] = "percentile"
     """d_min of a category in a view: 5th percentile over its points in sight, or the paper's minimum."""
+    min_share: float = 5e-4
+    """A view counts for a category if this share of its pixels, at least, is of the category."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +90,15 @@ class PlanConfig:
     target_ssim: float = 0.8
     share: float = 0.95
     """Share of the training views in which a category's level must reach the target."""
+    other_targets: tuple[float, ...] | None = None
+    """Targets planned and measured beside the main one (default: 0.1 below and above)."""
+
+    @property
+    def targets(self) -> list[float]:
+        """All targets, ascending."""
+        near = (self.target_ssim - 0.1, self.target_ssim + 0.1)
+        others = [t for t in near if 0 < t < 1] if self.other_targets is None else self.other_targets
+        return sorted({round(t, 6) for t in (self.target_ssim, *others)})
 
 
 @dataclass(frozen=True)
@@ -101,4 +112,3 @@ class RunConfig:
     fit: FitConfig = field(default_factory=FitConfig)
     plan: PlanConfig = field(default_factory=PlanConfig)
     seed: int = 0
-    backend: Literal["auto", "cpu", "reference"] = "auto"

@@ -54,7 +54,7 @@ def bases(x, y, z):
     )
 
 
-@njit(cache=True, inline="never")
+@njit(error_model="numpy", forceinline=True, cache=True)
 def fill_bases(x, y, z, num, out):
     """`bases` into a row `out` [16], only the first `num`, for kernels."""
     out[0] = C0
@@ -78,7 +78,7 @@ def fill_bases(x, y, z, num, out):
         out[15] = -_C33 * x * (x * x - 3 * y * y)
 
 
-@njit(cache=True, inline="never")
+@njit(error_model="numpy", forceinline=True, cache=True)
 def direction_gradient(x, y, z, num, g):
     """d(sum_k g[k] * basis_k) / d(x, y, z) for weights `g` [16]."""
     dx = 0.0

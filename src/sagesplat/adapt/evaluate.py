@@ -1,5 +1,6 @@
 """Evaluation: composed scenes measured on views that nothing was fitted to, beside the promise."""
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -7,6 +8,13 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from sagesplat.adapt.columns import read_columns, write_columns
+from sagesplat.adapt.ladder import Ladder
+from sagesplat.adapt.observe import as_unit, measure, render_rgb
+from sagesplat.adapt.plan import Models, Plan
+from sagesplat.raster import Backend
+from sagesplat.scene.images import Photos
+from sagesplat.scene.scene import Scene
+from sagesplat.segment.masks import Masks
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,3 +47,53 @@ class Evaluation:
 def read_evaluation(path: Path) -> Evaluation:
     """The table that `write_csv` wrote. DataError where it is not one."""
     return read_columns(path, Evaluation, "run `sagesplat evaluate` again")
+
+
+def evaluate(
+    scene: Scene,
+    photos: Photos,
+    masks: Masks,
+    ladder: Ladder,
+    models: Models,
+    plans: Sequence[Plan],
+    distances: Mapping[int, Float32[np.ndarray, " V"]],
+    *,
+    backend: Backend = "auto",
+    antialiased: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Evaluation:
+    """Measure each plan's composition and full 3DGS on the test views, beside what the models promise there.
+
+    `progress` hears (images measured, images in all).
+    """
+    columns: dict[str, list[float]] = {f.name: [] for f in fields(Evaluation)}
+    views = scene.test_ids.tolist()
+    done, total = 0, len(views) * (1 + len(plans))
+
+    def measure_all(g):  # type: ignore[no-untyped-def]
+        nonlocal done
+        for row in views:
+            view = scene.views[row]
+            image = render_rgb(g, view.camera, backend=backend, antialiased=antialiased)
+            yield row, measure(image, as_unit(photos[row]), masks[view])
+            done += 1
+            if progress:
+                progress(done, total)
+
+    full = dict(measure_all(ladder.load(ladder.levels[-1])))
+    for plan in plans:
+        for row, measured in measure_all(ladder.compose(plan.levels)):
+            for label, values in measured.items():
+                level = plan.levels.get(label, -1)
+                predicted = np.nan
+                if (label, level) in models:
+                    predicted = float(models[label, level](float(distances[label][row])))
+                entry = {
+                    "target": plan.target, "view": row, "label_id": label, "level": level, "predicted": predicted,
+                    "ssim": values["ssim"], "psnr": values["psnr"], "num_pixels": values["num_pixels"],
+                    "full_ssim": full[row][label]["ssim"], "full_psnr": full[row][label]["psnr"],
+                }  # fmt: skip
+                for name, value in entry.items():
+                    columns[name].append(value)
+    whole = {"label_id", "level", "view", "num_pixels"}
+    return Evaluation(**{n: np.array(c, np.int32 if n in whole else np.float32) for n, c in columns.items()})

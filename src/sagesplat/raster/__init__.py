@@ -2,6 +2,7 @@
 
 from typing import Literal
 
+import numba
 import numpy as np
 import torch
 from torch import Tensor
@@ -11,16 +12,27 @@ from sagesplat.gaussians import Gaussians
 from sagesplat.raster.render import Render
 from sagesplat.scene.scene import Camera
 
-__all__ = ["Backend", "Render", "rasterize", "resolve_backend"]
+__all__ = ["Backend", "Render", "rasterize", "resolve_backend", "set_threads"]
 
 Backend = Literal["auto", "cpu", "reference"]
 
 
-def resolve_backend(backend: Backend) -> Backend:
+def resolve_backend(backend: Backend, device: str = "auto") -> Backend:
     """The backend that `auto` stands for on this machine; a named one must be there."""
     if backend not in ("auto", "cpu", "reference"):
         raise BackendUnavailable(f"backend {backend!r} is not known; use --backend cpu or reference")
+    if device not in ("auto", "cpu"):
+        raise BackendUnavailable(f"device {device!r} has no rasteriser in this version; use --device cpu")
     return "cpu" if backend == "auto" else backend
+
+
+def set_threads(threads: int = 0) -> int:
+    """Let kernels and torch use so many threads (0: one per core); the number comes back."""
+    most = numba.config.NUMBA_NUM_THREADS  # pyright: ignore[reportAttributeAccessIssue]
+    threads = min(threads, most) if threads > 0 else most
+    numba.set_num_threads(threads)
+    torch.set_num_threads(threads)
+    return threads
 
 
 def rasterize(

@@ -26,39 +26,40 @@ def camera_vector(camera: Camera) -> np.ndarray:
     )
 
 
-@njit(cache=True)
-def _rotation(q, r):
+@njit(error_model="numpy", forceinline=True, cache=True)
+def _rotation(i, quats, r):
     """Rotation matrix of a wxyz quaternion into r [3, 3]; returns 1 / |q|."""
-    inverse = 1.0 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-    w, x, y, z = q[0] * inverse, q[1] * inverse, q[2] * inverse, q[3] * inverse
+    w, x, y, z = float(quats[i, 0]), float(quats[i, 1]), float(quats[i, 2]), float(quats[i, 3])
+    inverse = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
+    w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
     r[0, 0], r[0, 1], r[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
     r[1, 0], r[1, 1], r[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
     r[2, 0], r[2, 1], r[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
     return inverse
 
 
-@njit(cache=True)
-def _half_covariance(cam, mean, quat, log_scale, rot, scale, jac, half):
+@njit(error_model="numpy", forceinline=True, cache=True)
+def _half_covariance(i, cam, means, quats, log_scales, rot, scale, jac, half):
     """Camera point, clamped slopes, J W into jac [2, 3] and J W R S into half [2, 3]."""
-    x = cam[0] * mean[0] + cam[1] * mean[1] + cam[2] * mean[2] + cam[9]
-    y = cam[3] * mean[0] + cam[4] * mean[1] + cam[5] * mean[2] + cam[10]
-    z = cam[6] * mean[0] + cam[7] * mean[1] + cam[8] * mean[2] + cam[11]
+    x = cam[0] * means[i, 0] + cam[1] * means[i, 1] + cam[2] * means[i, 2] + cam[9]
+    y = cam[3] * means[i, 0] + cam[4] * means[i, 1] + cam[5] * means[i, 2] + cam[10]
+    z = cam[6] * means[i, 0] + cam[7] * means[i, 1] + cam[8] * means[i, 2] + cam[11]
     fx, fy, cx, cy, width, height = cam[12], cam[13], cam[14], cam[15], cam[16], cam[17]
     margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * width, FRUSTUM_MARGIN * 0.5 * height
     u = min(max(x / z, (-cx - margin_x) / fx), (width - cx + margin_x) / fx)
     v = min(max(y / z, (-cy - margin_y) / fy), (height - cy + margin_y) / fy)
-    inverse = _rotation(quat, rot)
+    inverse = _rotation(i, quats, rot)
     for k in range(3):
-        scale[k] = math.exp(log_scale[k])
+        scale[k] = math.exp(log_scales[i, k])
         jac[0, k] = fx / z * (cam[k] - u * cam[6 + k])
         jac[1, k] = fy / z * (cam[3 + k] - v * cam[6 + k])
-    for i in range(2):
+    for m in range(2):
         for k in range(3):
-            half[i, k] = (jac[i, 0] * rot[0, k] + jac[i, 1] * rot[1, k] + jac[i, 2] * rot[2, k]) * scale[k]
+            half[m, k] = (jac[m, 0] * rot[0, k] + jac[m, 1] * rot[1, k] + jac[m, 2] * rot[2, k]) * scale[k]
     return x, y, z, u, v, inverse
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", forceinline=True, cache=True)
 def _forward_one(
     i, cam, means, quats, log_scales, logits, sh0, shN, num_bases, antialiased, records, depths, radii,
     rot, scale, jac, half, basis,
@@ -74,7 +75,7 @@ def _forward_one(
         return
     if z <= NEAR:
         return
-    x, y, z, u, v, _ = _half_covariance(cam, means[i], quats[i], log_scales[i], rot, scale, jac, half)
+    x, y, z, _, _, _ = _half_covariance(i, cam, means, quats, log_scales, rot, scale, jac, half)
     sxx = half[0, 0] * half[0, 0] + half[0, 1] * half[0, 1] + half[0, 2] * half[0, 2]
     sxy = half[0, 0] * half[1, 0] + half[0, 1] * half[1, 1] + half[0, 2] * half[1, 2]
     syy = half[1, 0] * half[1, 0] + half[1, 1] * half[1, 1] + half[1, 2] * half[1, 2]
@@ -92,19 +93,28 @@ def _forward_one(
         return
     depths[i] = z
     radii[i] = max(hx, hy)
-    r = records[i]
-    r[0], r[1] = mx, my
-    r[2], r[3], r[4] = -0.5 * _LOG2E * cyy / det, _LOG2E * sxy / det, -0.5 * _LOG2E * cxx / det
-    r[5] = math.log2(opacity)
+    records[i, 0], records[i, 1] = mx, my
+    records[i, 2], records[i, 3], records[i, 4] = (
+        -0.5 * _LOG2E * cyy / det,
+        _LOG2E * sxy / det,
+        -0.5 * _LOG2E * cxx / det,
+    )
+    records[i, 5] = math.log2(opacity)
     dx, dy, dz = means[i, 0] - cam[18], means[i, 1] - cam[19], means[i, 2] - cam[20]
     length = math.sqrt(dx * dx + dy * dy + dz * dz)
     fill_bases(dx / length, dy / length, dz / length, num_bases, basis)
-    for channel in range(3):
-        value = 0.5 + basis[0] * sh0[i, 0, channel]
-        for k in range(1, num_bases):
-            value += basis[k] * shN[i, k - 1, channel]
-        r[6 + channel] = max(value, 0.0)
-    r[9], r[10] = hx, hy
+    red = 0.5 + basis[0] * sh0[i, 0, 0]
+    green = 0.5 + basis[0] * sh0[i, 0, 1]
+    blue = 0.5 + basis[0] * sh0[i, 0, 2]
+    for k in range(1, num_bases):
+        red += basis[k] * shN[i, k - 1, 0]
+        green += basis[k] * shN[i, k - 1, 1]
+        blue += basis[k] * shN[i, k - 1, 2]
+    if not np.isfinite(red + green + blue):
+        radii[i] = -1.0
+        return
+    records[i, 6], records[i, 7], records[i, 8] = max(red, 0.0), max(green, 0.0), max(blue, 0.0)
+    records[i, 9], records[i, 10] = hx, hy
 
 
 @njit(parallel=True, error_model="numpy", cache=True)
@@ -120,10 +130,12 @@ def forward(cam, means, quats, log_scales, logits, sh0, shN, num_bases, antialia
             )  # fmt: skip
 
 
-@njit(cache=True)
-def _quaternion_gradient(quat, inverse, d, out):
+@njit(error_model="numpy", forceinline=True, cache=True)
+def _quaternion_gradient(i, quats, inverse, d, out):
     """d [3, 3] of the rotation matrix to the raw quaternion's gradient."""
-    w, x, y, z = quat[0] * inverse, quat[1] * inverse, quat[2] * inverse, quat[3] * inverse
+    w, x, y, z = (
+        quats[i, 0] * inverse, quats[i, 1] * inverse, quats[i, 2] * inverse, quats[i, 3] * inverse,
+    )  # fmt: skip
     dw = 2 * (x * (d[2, 1] - d[1, 2]) + y * (d[0, 2] - d[2, 0]) + z * (d[1, 0] - d[0, 1]))
     dx = 2 * (
         y * (d[0, 1] + d[1, 0])
@@ -144,25 +156,26 @@ def _quaternion_gradient(quat, inverse, d, out):
         - 2 * z * (d[0, 0] + d[1, 1])
     )
     radial = dw * w + dx * x + dy * y + dz * z
-    out[0], out[1] = (dw - radial * w) * inverse, (dx - radial * x) * inverse
-    out[2], out[3] = (dy - radial * y) * inverse, (dz - radial * z) * inverse
+    out[i, 0], out[i, 1] = (dw - radial * w) * inverse, (dx - radial * x) * inverse
+    out[i, 2], out[i, 3] = (dy - radial * y) * inverse, (dz - radial * z) * inverse
 
 
-@njit(cache=True)
-def _color_gradient(i, cam, means, shN, num_bases, records, g_color, d_means, d_sh0, d_shN, basis):
+@njit(error_model="numpy", forceinline=True, cache=True)
+def _color_gradient(i, cam, means, shN, num_bases, records, g_color, d_means, d_sh0, d_shN, basis, weights):
     """Gradients of the coefficients, and of the mean through the viewing direction."""
-    weights = basis[16:]
-    weights[:] = 0.0
     dx, dy, dz = means[i, 0] - cam[18], means[i, 1] - cam[19], means[i, 2] - cam[20]
     inverse = 1.0 / math.sqrt(dx * dx + dy * dy + dz * dz)
     dx, dy, dz = dx * inverse, dy * inverse, dz * inverse
     fill_bases(dx, dy, dz, num_bases, basis)
-    for channel in range(3):
-        g = g_color[i, channel] if records[i, 6 + channel] > 0 else 0.0
-        d_sh0[i, 0, channel] = basis[0] * g
-        for k in range(1, num_bases):
-            d_shN[i, k - 1, channel] = basis[k] * g
-            weights[k] += g * shN[i, k - 1, channel]
+    red = g_color[i, 0] if records[i, 6] > 0 else 0.0
+    green = g_color[i, 1] if records[i, 7] > 0 else 0.0
+    blue = g_color[i, 2] if records[i, 8] > 0 else 0.0
+    d_sh0[i, 0, 0], d_sh0[i, 0, 1], d_sh0[i, 0, 2] = basis[0] * red, basis[0] * green, basis[0] * blue
+    for k in range(1, num_bases):
+        d_shN[i, k - 1, 0] = basis[k] * red
+        d_shN[i, k - 1, 1] = basis[k] * green
+        d_shN[i, k - 1, 2] = basis[k] * blue
+        weights[k] = red * shN[i, k - 1, 0] + green * shN[i, k - 1, 1] + blue * shN[i, k - 1, 2]
     gx, gy, gz = direction_gradient(dx, dy, dz, num_bases, weights)
     radial = gx * dx + gy * dy + gz * dz
     d_means[i, 0] += (gx - radial * dx) * inverse
@@ -170,13 +183,13 @@ def _color_gradient(i, cam, means, shN, num_bases, records, g_color, d_means, d_
     d_means[i, 2] += (gz - radial * dz) * inverse
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", forceinline=True, cache=True)
 def _backward_one(
     i, cam, means, quats, log_scales, logits, shN, num_bases, antialiased, records,
     g_mean2d, g_conic, g_opacity, g_color, d_means, d_quats, d_log_scales, d_logits, d_sh0, d_shN,
-    rot, scale, d_rot, jac, half, d_half, d_jac, basis,
+    rot, scale, d_rot, jac, half, d_half, d_jac, basis, weights,
 ):  # fmt: skip
-    x, y, z, u, v, inverse = _half_covariance(cam, means[i], quats[i], log_scales[i], rot, scale, jac, half)
+    x, y, z, u, v, inverse = _half_covariance(i, cam, means, quats, log_scales, rot, scale, jac, half)
     fx, fy = cam[12], cam[13]
     sxx = half[0, 0] * half[0, 0] + half[0, 1] * half[0, 1] + half[0, 2] * half[0, 2]
     sxy = half[0, 0] * half[1, 0] + half[0, 1] * half[1, 1] + half[0, 2] * half[1, 2]
@@ -238,8 +251,8 @@ def _backward_one(
     dx, dy = d_u / z, d_v / z
     for k in range(3):
         d_means[i, k] = cam[k] * dx + cam[3 + k] * dy + cam[6 + k] * dz
-    _quaternion_gradient(quats[i], inverse, d_rot, d_quats[i])
-    _color_gradient(i, cam, means, shN, num_bases, records, g_color, d_means, d_sh0, d_shN, basis)
+    _quaternion_gradient(i, quats, inverse, d_rot, d_quats)
+    _color_gradient(i, cam, means, shN, num_bases, records, g_color, d_means, d_sh0, d_shN, basis, weights)
 
 
 @njit(parallel=True, error_model="numpy", cache=True)
@@ -255,11 +268,11 @@ def backward(
     for chunk in prange((len(means) + _CHUNK - 1) // _CHUNK):
         rot, scale, d_rot = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
         jac, half, d_half, d_jac = np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3))
-        basis = np.empty(32)
+        basis, weights = np.empty(16), np.zeros(16)
         for i in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(means))):
             if radii[i] > 0:
                 _backward_one(
                     i, cam, means, quats, log_scales, logits, shN, num_bases, antialiased, records,
                     g_mean2d, g_conic, g_opacity, g_color, d_means, d_quats, d_log_scales, d_logits, d_sh0, d_shN,
-                    rot, scale, d_rot, jac, half, d_half, d_jac, basis,
+                    rot, scale, d_rot, jac, half, d_half, d_jac, basis, weights,
                 )  # fmt: skip

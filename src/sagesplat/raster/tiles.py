@@ -48,7 +48,7 @@ def depth_order(depths, radii):
     return order
 
 
-@njit(cache=True)
+@njit(error_model="numpy", forceinline=True, cache=True)
 def _tile_box(records, i, tiles_x, tiles_y):
     """First and last + 1 tile column and row of the bounding box."""
     x0 = max(0, int(np.floor((records[i, 0] - records[i, 9]) / TILE)))
@@ -58,14 +58,14 @@ def _tile_box(records, i, tiles_x, tiles_y):
     return x0, x1, y0, y1
 
 
-@njit(cache=True)
+@njit(error_model="numpy", forceinline=True, cache=True)
 def _edge_maximum(along, across, cross, fixed, lo, hi):
     """Maximum over t in [lo, hi] of along t^2 + cross t fixed + across fixed^2 (along < 0)."""
     t = min(max(-0.5 * cross * fixed / along, lo), hi)
     return along * t * t + cross * t * fixed + across * fixed * fixed
 
 
-@njit(cache=True)
+@njit(error_model="numpy", forceinline=True, cache=True)
 def _touches(records, i, tile_x, tile_y, threshold):
     """Whether alpha reaches its minimum anywhere in the tile's square (exact)."""
     x0, y0 = tile_x * TILE - records[i, 0], tile_y * TILE - records[i, 1]

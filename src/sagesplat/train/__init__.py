@@ -1,0 +1,1 @@
+"""Training 3D Gaussians from photos, level by level."""

@@ -1,0 +1,242 @@
+"""The command line: one short function per command, each loads, calls and saves."""
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+from tyro.conf import Positional, arg
+
+from sagesplat.config import (
+    FitConfig,
+    LiftConfig,
+    MasksConfig,
+    PlanConfig,
+    RunConfig,
+    SceneConfig,
+    TrainConfig,
+)
+from sagesplat.errors import SageError
+
+if TYPE_CHECKING:
+    from sagesplat.pipeline import Job
+
+app = tyro.extras.SubcommandApp()
+
+
+@dataclass(frozen=True)
+class Machine:
+    """Where and how a command computes."""
+
+    threads: int = 0
+    """CPU threads (0: all cores)."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    backend: Literal["auto", "cpu", "reference"] = "auto"
+    """Rasteriser; reference is float64 and slow."""
+    force: bool = False
+    """Make results again that were made with other settings."""
+
+
+Scene = Positional[Annotated[Path, arg(metavar="SCENE", help="capture: a COLMAP workspace")]]
+Run = Positional[Annotated[Path, arg(metavar="RUN", help="run folder")]]
+Flat = arg(name="")
+
+
+@contextmanager
+def _job(run: Path, machine: Machine) -> Iterator["Job"]:
+    """A job on a run folder, shown on the console."""
+    from sagesplat.console import Console
+    from sagesplat.pipeline import Job
+    from sagesplat.raster import resolve_backend, set_threads
+    from sagesplat.run_dir import RunDir
+
+    backend = resolve_backend(machine.backend, machine.device)
+    threads = set_threads(machine.threads)
+    with Console() as console:
+        yield Job(RunDir(run), console, backend, threads, machine.force)
+
+
+@app.command
+def info(scene: Scene, scene_config: Annotated[SceneConfig, Flat] = SceneConfig()) -> None:
+    """Print what a capture holds."""
+    from sagesplat.scene import describe, load_scene
+
+    rows = describe(load_scene(scene, downscale=scene_config.downscale, test_every=scene_config.test_every))
+    width = max(len(name) for name, _ in rows)
+    for name, value in rows:
+        print(f"{name:{width}}  {value}")
+
+
+@app.command
+def run(
+    scene: Scene,
+    run: Run,
+    scene_config: Annotated[SceneConfig, Flat] = SceneConfig(),
+    masks: Annotated[MasksConfig, Flat] = MasksConfig(),
+    lift: LiftConfig = LiftConfig(),
+    train: TrainConfig = TrainConfig(),
+    fit: FitConfig = FitConfig(),
+    plan: Annotated[PlanConfig, Flat] = PlanConfig(),
+    machine: Annotated[Machine, Flat] = Machine(),
+    seed: int = 0,
+) -> None:
+    """Everything: photos and label images in, levels, models, a plan and a report out."""
+    from sagesplat import pipeline
+
+    with _job(run, machine) as job:
+        pipeline.run_all(job, scene, RunConfig(scene_config, masks, lift, train, fit, plan, seed))
+
+
+@app.command
+def demo(run: Path = Path("runs/demo"), machine: Annotated[Machine, Flat] = Machine()) -> None:
+    """Make the built-in capture, run the main job on it and say where to look."""
+    from sagesplat import pipeline
+    from sagesplat.demo.capture import cached_capture
+
+    with _job(run, machine) as job:
+        pipeline.run_all(job, cached_capture(), pipeline.DEMO)
+
+
+@app.command
+def masks(
+    scene: Scene,
+    run: Run,
+    scene_config: Annotated[SceneConfig, Flat] = SceneConfig(),
+    masks: Annotated[MasksConfig, Flat] = MasksConfig(),
+    machine: Annotated[Machine, Flat] = Machine(),
+) -> None:
+    """Begin a run: read the capture and bring its label images in."""
+    from sagesplat import pipeline
+
+    with _job(run, machine) as job:
+        pipeline.open_scene(job, scene, scene_config)
+        pipeline.make_masks(job, masks)
+
+
+@app.command
+def lift(run: Run, lift: LiftConfig = LiftConfig(), machine: Annotated[Machine, Flat] = Machine()) -> None:
+    """Vote the label images onto the points."""
+    from sagesplat import pipeline
+
+    with _job(run, machine) as job:
+        pipeline.lift_labels(job, lift)
+
+
+@app.command
+def train(
+    run: Run, train: TrainConfig = TrainConfig(), machine: Annotated[Machine, Flat] = Machine(), seed: int = 0
+) -> None:
+    """Train 3DGS and record the levels; a killed training goes on."""
+    from sagesplat import pipeline
+
+    with _job(run, machine) as job:
+        pipeline.train_levels(job, train, seed)
+
+
+@app.command
+def observe(run: Run, fit: FitConfig = FitConfig(), machine: Annotated[Machine, Flat] = Machine()) -> None:
+    """Measure every category at every level in every view."""
+    from sagesplat import pipeline
+
+    with _job(run, machine) as job:
+        pipeline.observe_levels(job, fit)
+
+
+@app.command
+def fit(run: Run, fit: FitConfig = FitConfig(), machine: Annotated[Machine, Flat] = Machine()) -> None:
+    """Fit SSIM over distance for every category and level."""
+    from sagesplat import pipeline
+
+    with _job(run, machine) as job:
+        pipeline.fit_ladder(job, fit)
+
+
+@app.command
+def plan(
+    run: Run,
+    plan: Annotated[PlanConfig, Flat] = PlanConfig(),
+    fit: FitConfig = FitConfig(),
+    machine: Annotated[Machine, Flat] = Machine(),
+) -> None:
+    """Choose the cheapest levels that keep a target SSIM."""
+    from sagesplat import pipeline
+
+    with _job(run, machine) as job:
+        pipeline.make_plan(job, plan, fit)
+
+
+@app.command
+def compose(run: Run, machine: Annotated[Machine, Flat] = Machine()) -> None:
+    """Write the planned scene as composed.ply."""
+    from sagesplat import pipeline
+
+    with _job(run, machine) as job:
+        pipeline.compose_plan(job)
+
+
+@app.command
+def evaluate(run: Run, fit: FitConfig = FitConfig(), machine: Annotated[Machine, Flat] = Machine()) -> None:
+    """Measure the plans on the test views, beside what was promised."""
+    from sagesplat import pipeline
+
+    with _job(run, machine) as job:
+        pipeline.evaluate_plans(job, fit)
+
+
+@app.command
+def report(run: Run, machine: Annotated[Machine, Flat] = Machine()) -> None:
+    """Write the report."""
+    from sagesplat import pipeline
+
+    with _job(run, machine) as job:
+        pipeline.make_report(job)
+
+
+@app.command
+def export(
+    run: Run,
+    ply: Positional[Annotated[Path, arg(metavar="OUT.ply")]],
+    level: int | None = None,
+    labels: tuple[str, ...] = (),
+    target_ssim: float | None = None,
+    machine: Annotated[Machine, Flat] = Machine(),
+) -> None:
+    """Write Gaussians as a PLY: the plan's composition, or one level; all categories or some.
+
+    Args:
+        run: run folder.
+        ply: file to write.
+        level: a level by its training step, instead of the composition.
+        labels: names of the categories to take.
+        target_ssim: the composition for this planned target (default: the main one).
+    """
+    from sagesplat import pipeline
+
+    with _job(run, machine) as job:
+        count = pipeline.export_ply(job, ply, level=level, labels=labels, target=target_ssim)
+    print(f"{ply}: {count:,} Gaussians")
+
+
+def main() -> None:
+    """Run a command; errors that a user can cause are one line and exit code 2."""
+    try:
+        app.cli(prog="sagesplat", description="Semantic-driven adaptive Gaussian splatting.")
+    except SageError as error:
+        _fail(str(error))
+    except KeyboardInterrupt:
+        _fail("interrupted; what is finished is kept: run the same command again to go on")
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as error:
+        _fail(
+            f"{error.filename or 'input/output'}: {error.strerror or error}; check the path, its rights and the disk"
+        )
+
+
+def _fail(message: str) -> None:
+    print(f"sagesplat: {' '.join(message.split())}", file=sys.stderr)
+    raise SystemExit(2)

@@ -1,0 +1,132 @@
+"""Points and tracks of the garden, as structure from motion would find them."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from sagesplat.demo.paint import dome_distance
+from sagesplat.demo.render import FAR, camera_rays, cast_rays, lit_world
+from sagesplat.scene.colmap_write import ModelCamera, ModelImage, write_model
+from sagesplat.scene.scene import Camera
+
+CANDIDATES = 12500  # features looked for over all views
+UV_NOISE = 0.4  # standard deviation of a feature's position, pixels
+SKY_ID = 187
+
+
+def write_points(
+    folder: Path, names: list[str], cameras: list[Camera], photos: np.ndarray, labels: np.ndarray, seed: int
+) -> None:
+    """A model as structure from motion would give it: points of textured places, seen in 3 or more views."""
+    rng = np.random.default_rng([seed, 2])
+    xyz, home, distance = _candidates(cameras, photos, labels, seed, rng)
+    projected = [project(camera, xyz) for camera in cameras]
+    uv, depth = np.stack([p[0] for p in projected], 1), np.stack([p[1] for p in projected], 1)
+    seen = _matched(cameras, xyz, uv, home, distance, seed, rng)
+    keep = seen.sum(1) >= 3
+    xyz, uv, depth, seen = xyz[keep], uv[keep], depth[keep], seen[keep]
+    point, view = np.nonzero(seen)
+    noisy = uv[point, view] + rng.normal(0, UV_NOISE, (len(point), 2))
+    inside = ((noisy >= 0) & (noisy < [cameras[0].width, cameras[0].height])).all(1)
+    noisy = np.where(inside[:, None], noisy, uv[point, view])
+    xyz = _triangulate(cameras, xyz, point, view, noisy, uv[point, view], depth[point, view])
+    again = np.stack([project(camera, xyz)[0] for camera in cameras], 1)[point, view]
+    error = np.linalg.norm(again - noisy, axis=1)
+    column, row = noisy.astype(int).T
+    rgb = np.zeros((len(xyz), 3))
+    np.add.at(rgb, point, photos[view, row, column])
+    count = np.bincount(point, minlength=len(xyz))
+    K = cameras[0].K
+    model = ModelCamera(
+        1,
+        "PINHOLE",
+        cameras[0].width,
+        cameras[0].height,
+        tuple(map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))),
+    )
+    images = [
+        ModelImage(i + 1, names[i], 1, cameras[i].w2c, noisy[view == i], point[view == i])
+        for i in range(len(cameras))
+    ]
+    colour = (rgb / count[:, None]).round().astype(np.uint8)
+    write_model(folder, [model], images, xyz, colour, np.bincount(point, error) / count)
+
+
+def project(camera: Camera, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels [n, 2] and camera z [n] of world points."""
+    inside = xyz @ camera.w2c[:3, :3].T.astype(float) + camera.w2c[:3, 3]
+    z = np.where(np.abs(inside[:, 2]) < 1e-6, 1e-6, inside[:, 2])
+    return inside[:, :2] / z[:, None] * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2], inside[:, 2]
+
+
+def _candidates(
+    cameras: list[Camera], photos: np.ndarray, labels: np.ndarray, seed: int, rng: np.random.Generator
+) -> Iterator[np.ndarray]:
+    """Surface points [n, 3] under textured pixels, the view each was found in, its distance from there."""
+    per_view = min(CANDIDATES // len(cameras), labels[0].size // 2)
+    world, found = lit_world(seed), []
+    for i, camera in enumerate(cameras):
+        grey = photos[i].mean(2)
+        slope = np.hypot(*np.gradient(grey))
+        slope[[0, -1]] = slope[:, [0, -1]] = 0
+        weight = np.minimum(slope, 30.0).ravel() + 0.3
+        weight[labels[i].ravel() == SKY_ID] *= 4  # clouds are faint
+        pick = rng.choice(weight.size, per_view, replace=False, p=weight / weight.sum())
+        uv = np.stack([pick % camera.width, pick // camera.width], 1) + 0.5
+        origins, directions, _ = camera_rays(camera, uv)
+        t = cast_rays(world, origins, directions, FAR, float(1 / camera.K[0, 0]))[0]
+        t = np.where(labels[i].ravel()[pick] == SKY_ID, dome_distance(origins, directions), t)
+        found.append((origins + t[:, None] * directions, np.full(per_view, i), t))
+    return (np.concatenate(c) for c in zip(*found, strict=True))
+
+
+def _matched(
+    cameras: list[Camera],
+    xyz: np.ndarray,
+    uv: np.ndarray,
+    home: np.ndarray,
+    distance: np.ndarray,
+    seed: int,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Which view has matched which point [n, V]: in the picture, not hidden, similar in angle and scale."""
+    world, seen = lit_world(seed), np.zeros((len(xyz), len(cameras)), bool)
+    centres = np.stack([c.position for c in cameras]).astype(float)
+    first = (centres[home] - xyz) / distance[:, None]
+    for i, camera in enumerate(cameras):
+        offset = xyz - centres[i]
+        away = np.linalg.norm(offset, axis=1)
+        alike = -np.einsum("ij,ij->i", offset / away[:, None], first)
+        scale = np.abs(np.log(away / distance))
+        _, z = project(camera, xyz)
+        framed = (z > 0) & (np.abs(uv[:, i] / [camera.width, camera.height] - 0.5) < 0.495).all(1)
+        # Matchers lose a feature beyond about 40 degrees and a factor of 1.8, and some by chance.
+        likely = framed & (alike > 0.77) & (scale < 0.6) & (rng.random(len(xyz)) < 0.75)
+        rows = np.flatnonzero(likely & (home != i))
+        start = np.tile(centres[i], (len(rows), 1))
+        t = cast_rays(world, start, offset[rows] / away[rows, None], away[rows], float(1 / camera.K[0, 0]))[0]
+        seen[rows, i] = t > away[rows] - 0.01 - 0.004 * away[rows]
+        seen[home == i, i] = True
+    return seen
+
+
+def _triangulate(
+    cameras: list[Camera],
+    xyz: np.ndarray,
+    point: np.ndarray,
+    view: np.ndarray,
+    noisy: np.ndarray,
+    uv: np.ndarray,
+    z: np.ndarray,
+) -> np.ndarray:
+    """Least-squares points of noisy features: one Gauss-Newton step from the truth."""
+    w2c, focal = np.stack([c.w2c for c in cameras])[view].astype(float), float(cameras[0].K[0, 0])
+    centred = (uv - cameras[0].K[:2, 2]) / focal
+    J = focal / z[:, None, None] * (w2c[:, :2, :3] - centred[:, :, None] * w2c[:, 2:3, :3])
+    normal, right = np.zeros((len(xyz), 3, 3)), np.zeros((len(xyz), 3))
+    np.add.at(normal, point, J.transpose(0, 2, 1) @ J)
+    np.add.at(right, point, np.einsum("tij,ti->tj", J, noisy - uv))
+    # A weak pull to the truth keeps points of narrow tracks (the far sky) from running off along their ray.
+    prior = 1e-3 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    return xyz + np.linalg.solve(normal + prior, right[..., None])[..., 0]

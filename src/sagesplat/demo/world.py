@@ -1,0 +1,267 @@
+"""The modelled garden as arrays: leaves in a tree of boxes, solids of revolution, convex bodies.
+
+World units are metres, z points up, the table stands at the origin, the house to the north (+y).
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int16, Int64
+
+# Materials. A leaf's material is LEAF and its label its own; every other material has one label.
+SKY, GRASS, PAVING, WOOD, GLAZE, CLAY, BARK, BRICK, ROOF, CORE, LEAF = range(11)
+POTTED_PLANT, TREE = 64, 184
+LABELS = {
+    64: "potted plant",
+    67: "dining table",
+    86: "vase",
+    184: "tree-merged",
+    187: "sky-other-merged",
+    191: "pavement-merged",
+    193: "grass-merged",
+    197: "building-other-merged",
+}
+LABEL_OF = np.array([187, 193, 191, 67, 86, 64, 184, 197, 197, 184, -1], np.int16)  # by material
+
+UP = np.array([0.0, 0.0, 1.0])
+BIN = 4  # leaves per box at the bottom of the tree
+PLOT = 8.0  # the ground's light is baked on [-PLOT, PLOT] squared
+SUN = np.array([-0.48, -0.52, 0.71]) / np.linalg.norm([-0.48, -0.52, 0.71])  # towards it
+
+
+class World(NamedTuple):
+    """Everything that a ray can meet; a NamedTuple because numba takes it as it is."""
+
+    boxes: Float64[np.ndarray, "2*bins 6"]  # heap order, root at 1: lowest and highest corner
+    axes: Int64[np.ndarray, " bins"]  # axis along which the children of a box differ
+    leaves: Float64[np.ndarray, "L 12"]  # centre, unit normal, and two axes divided by their squared length
+    leaf_rgb: Float32[np.ndarray, "L 3"]  # linear albedo
+    leaf_light: Float32[np.ndarray, "L 2"]  # baked: visible share of the sun and of the sky
+    leaf_label: Int16[np.ndarray, " L"]
+    solids: Float64[np.ndarray, "S 9"]  # x, y, bottom, height, r0, r1, belly, waist; largest radius
+    solid_material: Int64[np.ndarray, " S"]
+    bodies: Float64[np.ndarray, "B 7 4"]  # planes: outward normal n and c; inside is n.p <= c
+    body_material: Int64[np.ndarray, " B"]
+    ground_light: Float32[np.ndarray, "G G 2"]  # baked likewise; rows run along y, columns along x
+
+
+class Foliage:
+    """Collects leaves: pointed discs, each with a pose, a colour and a label."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.rng = rng
+        self.parts: list[tuple[np.ndarray, ...]] = []
+
+    def add(
+        self,
+        centre: np.ndarray,
+        facing: np.ndarray,
+        size: tuple[float, float],
+        rgb: np.ndarray,
+        label: int,
+        spread: float = 0.7,
+        along: np.ndarray | None = None,
+    ) -> None:
+        """Leaves at `centre` [n, 3], half length and width `size`, roughly `facing` [n, 3].
+
+        `along` [n, 3] is the direction of the midrib; random where it is not given.
+        """
+        rng, n = self.rng, len(centre)
+        normal = _unit(facing + spread * rng.normal(size=(n, 3)))
+        rib = rng.normal(size=(n, 3)) if along is None else along
+        u = _unit(rib - normal * (rib * normal).sum(1, keepdims=True))
+        v = np.cross(normal, u)
+        scale = rng.uniform(0.7, 1.25, (n, 1))
+        colour = rgb * rng.lognormal(0.0, 0.22, (n, 1)) * rng.lognormal(0.0, 0.06, (n, 3))
+        frame = np.concatenate([centre, normal, u / (size[0] * scale), v / (size[1] * scale)], 1)
+        reach = np.sqrt((size[0] * scale * u) ** 2 + (size[1] * scale * v) ** 2)
+        self.parts.append((frame, reach, colour, np.full(n, label)))
+
+    def crown(
+        self,
+        centre: Sequence[float],
+        radius: float,
+        count: int,
+        size: tuple[float, float],
+        rgb: Sequence[float],
+        label: int = TREE,
+    ) -> None:
+        """A crown of leaf clusters around `centre`."""
+        rng, clusters = self.rng, 26
+        at = _unit(rng.normal(size=(clusters, 3))) * rng.uniform(0.25, 0.85, (clusters, 1)) * radius
+        at[:, 2] *= 0.85
+        tint = np.array(rgb) * rng.lognormal(0, 0.18, (clusters, 1)) * rng.lognormal(0, 0.07, (clusters, 3))
+        which = rng.integers(0, clusters, count)
+        out = _unit(rng.normal(size=(count, 3)))
+        offset = out * rng.uniform(0.5, 1.0, (count, 1)) * 0.4 * radius
+        place = np.array(centre) + at[which] + offset
+        self.add(place, out + UP / 2, size, tint[which], label)
+
+    def hedge(self, low: Sequence[float], high: Sequence[float], per_metre2: float) -> None:
+        """Leaves over the faces of a box that stands on the lawn (its top and four sides)."""
+        rng, lo, hi = self.rng, np.array(low), np.array(high)
+        for axis, side in ((0, 0), (0, 1), (1, 0), (1, 1), (2, 1)):
+            extent = hi - lo
+            count = int(per_metre2 * np.prod(np.delete(extent, axis)))
+            place = lo + extent * rng.random((count, 3))
+            bumps = 0.07 * np.sin(place @ [3.1, 4.3, 5.2]) + rng.normal(0, 0.05, count)
+            place[:, axis] = (hi if side else lo)[axis] + (1 if side else -1) * bumps
+            facing = np.zeros((count, 3))
+            facing[:, axis] = 1 if side else -1
+            patch = 1 + 0.25 * np.sin(place @ [1.7, 2.3, 3.9])
+            rgb = patch[:, None] * [0.05, 0.12, 0.03]
+            self.add(place, facing + 0.4 * UP, (0.09, 0.05), rgb, TREE)
+
+    def bouquet(self, mouth: Sequence[float]) -> None:
+        """Leaves, stems and flowers that grow out of the vase's mouth."""
+        rng, base = self.rng, np.array(mouth)
+        out = _unit(rng.normal(size=(420, 3)) * [1, 1, 0.55] + [0, 0, 0.75])
+        reach = rng.uniform(0.05, 0.30, (420, 1))
+        droop = np.array([0, 0, -1.6]) * reach**2
+        rgb = np.array([0.07, 0.19, 0.04])
+        self.add(
+            base + out * reach + droop, [0, 0, 1] - 0.3 * out, (0.062, 0.02), rgb, POTTED_PLANT, 0.35, out
+        )
+        out = _unit(rng.normal(size=(34, 3)) * [1, 1, 0.5] + [0, 0, 1.1])
+        head = base + out * rng.uniform(0.24, 0.36, (34, 1))
+        self.add((base + head) / 2, rng.normal(size=(34, 3)), (0.17, 0.004), rgb, POTTED_PLANT, 0.0, out)
+        colours = np.array([[0.75, 0.10, 0.28], [0.85, 0.80, 0.75], [0.85, 0.45, 0.05]])
+        colour = colours[rng.integers(0, 3, 34)]
+        for angle in np.arange(8) * np.pi / 4:
+            side = _unit(np.cross(out, [0.3, 0.2, 1.0]))
+            petal = side * np.cos(angle) + np.cross(out, side) * np.sin(angle)
+            self.add(
+                head + 0.024 * petal, out + 0.3 * petal, (0.026, 0.013), colour, POTTED_PLANT, 0.1, petal
+            )
+        self.add(head + 0.008 * out, out, (0.012, 0.016), np.array([0.7, 0.5, 0.05]), POTTED_PLANT, 0.1)
+
+
+def build_world(seed: int) -> World:
+    """The garden of a seed, still without light (`render.light` bakes it)."""
+    foliage = Foliage(np.random.default_rng(seed))
+    solids, bodies = _furniture(), _buildings()
+    _plant(foliage, solids, bodies)
+    frame, reach, rgb, label = (np.concatenate(c) for c in zip(*foliage.parts, strict=True))
+    order, boxes, axes = _box_tree(frame[:, :3], reach)
+    return World(
+        boxes=boxes,
+        axes=axes,
+        leaves=frame[order],
+        leaf_rgb=rgb[order].astype(np.float32),
+        leaf_light=np.zeros((len(order), 2), np.float32),
+        leaf_label=label[order].astype(np.int16),
+        solids=np.array([row for row, _ in solids]),
+        solid_material=np.array([m for _, m in solids]),
+        bodies=np.array([planes for planes, _ in bodies]),
+        body_material=np.array([m for _, m in bodies]),
+        ground_light=np.zeros((321, 321, 2), np.float32),
+    )
+
+
+def _furniture() -> list[tuple[list[float], int]]:
+    """Solids of revolution: table, vase and pots (trunks come with the trees)."""
+    return [
+        (_solid(0, 0, 0.71, 0.04, 0.60, 0.60), WOOD),
+        (_solid(0, 0, 0.04, 0.67, 0.06, 0.05, 0.015, 0.01), WOOD),
+        (_solid(0, 0, 0.00, 0.05, 0.30, 0.22), WOOD),
+        (_solid(0.06, -0.03, 0.75, 0.38, 0.075, 0.075, 0.065, 0.05), GLAZE),
+        (_solid(1.75, 1.2, 0.0, 0.34, 0.15, 0.21), CLAY),
+        (_solid(-1.7, 1.45, 0.0, 0.28, 0.12, 0.18), CLAY),
+    ]
+
+
+def _solid(
+    x: float, y: float, z: float, height: float, r0: float, r1: float, belly: float = 0, waist: float = 0
+) -> list[float]:
+    return [x, y, z, height, r0, r1, belly, waist, max(r0, r1) + abs(belly) + abs(waist)]
+
+
+def _buildings() -> list[tuple[np.ndarray, int]]:
+    """Convex bodies: the house, its front roof, a chimney."""
+    house = _box([-4.6, 6.2, 0], [4.6, 8.6, 6])
+    slope = np.array([0, -0.66, 0.75])  # normal of the front roof; it passes through the eaves at z = 3
+    eaves = slope @ [0, 6.2, 3.0]
+    house[5] = [*slope, eaves]
+    roof = _box([-4.9, 5.85, 0], [4.9, 8.6, 9])
+    roof[5] = [*slope, eaves + 0.09]
+    roof[2] = [*-slope, -eaves - 0.001]
+    return [(house, BRICK), (roof, ROOF), (_box([2.2, 7.4, 3], [2.9, 8.1, 5.9]), BRICK)]
+
+
+def _box(low: Sequence[float], high: Sequence[float]) -> np.ndarray:
+    """Seven planes [7, 4]: -x, -y, -z, x, y, z and one that never cuts."""
+    planes = np.zeros((7, 4))
+    planes[:3, :3], planes[3:6, :3] = -np.eye(3), np.eye(3)
+    planes[:, 3] = [*(-np.array(low)), *high, 1]
+    return planes
+
+
+def _plant(foliage: Foliage, solids: list, bodies: list) -> None:
+    """Bouquet, shrubs, hedges and trees."""
+    rng = foliage.rng
+    foliage.bouquet([0.06, -0.03, 1.13])
+    foliage.crown([1.75, 1.2, 0.62], 0.34, 700, (0.05, 0.02), [0.05, 0.14, 0.04], POTTED_PLANT)
+    foliage.crown([-1.7, 1.45, 0.50], 0.28, 600, (0.04, 0.022), [0.13, 0.17, 0.03], POTTED_PLANT)
+    for x0, y0, x1, y1 in (
+        (-7.2, -7.2, -6.5, 6.4),
+        (6.5, -7.2, 7.2, 6.4),
+        (-6.5, -7.2, 6.5, -6.5),
+        (-7.2, 6.5, -4.6, 7.2),
+        (4.6, 6.5, 7.2, 7.2),
+    ):
+        top = rng.uniform(1.45, 1.6)
+        bodies.append((_box([x0 + 0.1, y0 + 0.1, 0], [x1 - 0.1, y1 - 0.1, top - 0.1]), CORE))
+        foliage.hedge([x0, y0, 0.05], [x1, y1, top], 150)
+    greens = ([0.07, 0.17, 0.03], [0.12, 0.18, 0.03], [0.05, 0.13, 0.04], [0.17, 0.15, 0.03])
+    for (x, y), rgb in zip(((-4.9, -4.7), (5.1, -4.3), (5.4, 3.7), (-5.3, 4.3)), greens, strict=True):
+        solids.append((_solid(x, y, 0, 2.4, 0.11, 0.06), BARK))
+        foliage.crown([x, y, 2.8], 1.35, 3400, (0.075, 0.04), rgb)
+    for i in range(11):  # behind the hedge, which hides their trunks
+        angle = -0.5 * np.pi + (i - 5) * 0.43
+        x, y = rng.uniform(10, 13) * np.array([np.cos(angle), np.sin(angle)])
+        foliage.crown([x, y, rng.uniform(2.8, 3.8)], 2.4, 1600, (0.17, 0.09), greens[rng.integers(3)])
+    for i in range(44):  # the far edge of the wood
+        angle = i * 2 * np.pi / 44
+        x, y = rng.uniform(28, 36) * np.array([np.cos(angle), np.sin(angle)])
+        foliage.crown([x, y, 2.2], rng.uniform(3.0, 4.5), 130, (0.8, 0.5), [0.07, 0.12, 0.05])
+
+
+def radius_at(solid, height):
+    """Radius of a solid of revolution at a share of its height: a cone with a belly and a waist.
+
+    `solid` is a row of `World.solids`, or the transposed table for an array of heights.
+    """
+    bow = 4 * height * (1 - height)
+    cone = solid[4] + (solid[5] - solid[4]) * height
+    return cone + bow * (solid[6] + solid[7] * 2.6 * (1 - 2 * height))
+
+
+def _box_tree(centre: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A complete binary tree of boxes over leaves with half extents `reach`.
+
+    Returns the leaves' order (BIN in a row share a bottom box; the last leaf repeats to fill the tree),
+    the boxes and the splitting axes in heap order. Level by level, each run of leaves is sorted along
+    its longest axis and cut in the middle.
+    """
+    depth = int(np.ceil(np.log2(len(centre) / BIN)))
+    order = np.minimum(np.arange(BIN << depth), len(centre) - 1)
+    axes = np.zeros(1 << depth, np.int64)
+    for level in range(depth):
+        runs = centre[order].reshape(1 << level, -1, 3)
+        axis = np.ptp(runs, axis=1).argmax(1)
+        axes[1 << level : 2 << level] = axis
+        key = np.take_along_axis(runs, axis[:, None, None], 2)[..., 0]
+        order = np.take_along_axis(order.reshape(1 << level, -1), key.argsort(1, kind="stable"), 1).ravel()
+    boxes = np.zeros((2 << depth, 6))
+    low = (centre - reach)[order].reshape(-1, BIN, 3).min(1)
+    high = (centre + reach)[order].reshape(-1, BIN, 3).max(1)
+    for level in range(depth, -1, -1):
+        boxes[1 << level : 2 << level] = np.concatenate([low, high], 1)
+        if level:
+            low, high = low.reshape(-1, 2, 3).min(1), high.reshape(-1, 2, 3).max(1)
+    return order, boxes, axes
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)

@@ -1,0 +1,126 @@
+"""Gathers what the report shows from a finished run."""
+
+import json
+import platform
+
+import numpy as np
+
+from sagesplat import __version__
+from sagesplat.adapt.evaluate import read_evaluation
+from sagesplat.adapt.ladder import Ladder
+from sagesplat.adapt.model import read_models
+from sagesplat.adapt.observe import TOTAL, as_unit, measure, read_observations, render_rgb
+from sagesplat.adapt.plan import Plan, read_plans
+from sagesplat.files import read_json
+from sagesplat.output.figures import Panel
+from sagesplat.output.report import ReportData
+from sagesplat.raster import Backend
+from sagesplat.run_dir import RunDir
+from sagesplat.scene import describe
+from sagesplat.scene.images import Photos
+from sagesplat.scene.scene import Scene
+from sagesplat.segment.masks import UNLABELLED, Masks
+
+PANELS = 3  # views shown in pictures
+STAGES = ("scene", "masks", "lift", "train", "observe", "fit", "plan", "compose", "evaluate")
+
+
+def report_data(
+    run: RunDir, scene: Scene, photos: Photos, masks: Masks, ladder: Ladder, target: float, backend: Backend
+) -> ReportData:
+    """Everything the report of a run shows; `target` is the SSIM that it leads with."""
+    names = {**masks.taxonomy.names, UNLABELLED: masks.taxonomy.name(UNLABELLED)}
+    plans = read_plans(run.plan)[0]
+    records = {stage: read_json(run.provenance(stage)) for stage in STAGES if run.provenance(stage).exists()}
+    antialiased = bool(records["train"]["settings"]["antialiased"])
+    plan = next(p for p in plans if p.target == target)
+    return ReportData(
+        title=scene.name,
+        target=target,
+        names=names,
+        colours={label: masks.taxonomy.color(label) for label in names},
+        observations=read_observations(run.observations),
+        train_views=scene.train_ids,
+        test_views=scene.test_ids,
+        view_names=[view.name for view in scene.views],
+        counts=ladder.counts,
+        recovering=ladder.recovering,
+        models=read_models(run.models),
+        plans=plans,
+        evaluation=read_evaluation(run.evaluation),
+        panels=_panels(scene, photos, masks, ladder, plan, backend, antialiased),
+        scene_facts=describe(scene),
+        settings=_settings(records),
+        timings=[(stage, float(made["seconds"])) for stage, made in records.items()],
+        provenance=_provenance(records),
+    )
+
+
+def _panels(
+    scene: Scene,
+    photos: Photos,
+    masks: Masks,
+    ladder: Ladder,
+    plan: Plan,
+    backend: Backend,
+    antialiased: bool,
+) -> list[Panel]:
+    """A few test views, spread over the capture, in pictures."""
+    if not len(scene.test_ids):
+        return []
+    rows = scene.test_ids[
+        np.unique(np.linspace(0, len(scene.test_ids) - 1, PANELS + 2).round().astype(int))[1:-1]
+    ]
+    if not len(rows):
+        rows = scene.test_ids[:1]
+    full, composed = ladder.load(ladder.levels[-1]), ladder.compose(plan.levels)
+    panels = []
+    for row in rows.tolist():
+        view = scene.views[row]
+        photo = photos[row]
+        images = [
+            render_rgb(g, view.camera, backend=backend, antialiased=antialiased) for g in (full, composed)
+        ]
+        of_full, of_composed = (measure(image, as_unit(photo), masks[view])[TOTAL] for image in images)
+        eight_bit = [np.round(image * 255).astype(np.uint8) for image in images]
+        panels.append(
+            Panel(
+                name=view.name,
+                photo=photo,
+                full=eight_bit[0],
+                composed=eight_bit[1],
+                label_ids=masks[view],
+                ssim=of_composed["ssim"],
+                psnr=of_composed["psnr"],
+                full_ssim=of_full["ssim"],
+                full_psnr=of_full["psnr"],
+            )  # fmt: skip
+        )
+    return panels
+
+
+def _settings(records: dict[str, dict]) -> list[tuple[str, str]]:
+    """Settings by stage, fingerprints left out."""
+    rows = []
+    for stage, made in records.items():
+        for name, value in made["settings"].items():
+            text = value if isinstance(value, str) else json.dumps(value)
+            if len(text) != 64:  # a hash
+                rows.append((f"{stage}.{name}", text))
+    return rows
+
+
+def _provenance(records: dict[str, dict]) -> list[tuple[str, str]]:
+    """Versions, and the hashes that tie the results to their inputs."""
+    import numba
+    import torch
+
+    versions = [
+        ("sagesplat", __version__),
+        ("Python", platform.python_version()),
+        ("machine", f"{platform.system()} {platform.machine()}"),
+        ("torch", torch.__version__),
+        ("numba", numba.__version__),
+    ]
+    hashes = {name: h for made in records.values() for name, h in made["inputs"].items()}
+    return versions + [(f"sha256 of {name}", h) for name, h in sorted(hashes.items())]

@@ -1,0 +1,148 @@
+"""A run folder: the names of everything in it, and what each result was made from."""
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sagesplat import __version__
+from sagesplat.errors import RunError
+from sagesplat.files import read_json, write_json
+
+FORMAT = 1  # of the run folder; raised when older folders can no longer be read
+
+
+@dataclass(frozen=True)
+class RunDir:
+    """Paths inside a run folder."""
+
+    path: Path
+
+    @property
+    def scene(self) -> Path:
+        """Where the capture is and how it is read."""
+        return self.path / "scene.json"
+
+    @property
+    def masks(self) -> Path:
+        """Label images at training size, with labels.json."""
+        return self.path / "masks"
+
+    @property
+    def labels(self) -> Path:
+        """Labels of the SfM points."""
+        return self.path / "labels.npz"
+
+    @property
+    def levels(self) -> Path:
+        """The recorded levels."""
+        return self.path / "levels"
+
+    @property
+    def checkpoint(self) -> Path:
+        """Where training goes on."""
+        return self.path / "checkpoint.npz"
+
+    @property
+    def observations(self) -> Path:
+        """Quality per category, level and view."""
+        return self.path / "observations.csv"
+
+    @property
+    def models(self) -> Path:
+        """Eq. 3 per category and level."""
+        return self.path / "models.json"
+
+    @property
+    def plan(self) -> Path:
+        """Levels chosen."""
+        return self.path / "plan.json"
+
+    @property
+    def composed(self) -> Path:
+        """The scene that the plan chose."""
+        return self.path / "composed.ply"
+
+    @property
+    def evaluation(self) -> Path:
+        """Composed scenes on test views."""
+        return self.path / "evaluation.csv"
+
+    @property
+    def report(self) -> Path:
+        """The report's folder."""
+        return self.path / "report"
+
+    def provenance(self, stage: str) -> Path:
+        """What a stage's result was made from."""
+        return self.path / "provenance" / f"{stage}.json"
+
+
+def file_hash(path: Path) -> str:
+    """SHA-256 of a file, or of all files of a folder with their names."""
+    digest = hashlib.sha256()
+    for file in sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]:
+        if path.is_dir():
+            digest.update(str(file.relative_to(path)).encode())
+        with file.open("rb") as stream:
+            digest.update(hashlib.file_digest(stream, "sha256").digest())
+    return digest.hexdigest()
+
+
+def is_done(
+    run: RunDir,
+    stage: str,
+    settings: Mapping[str, Any],
+    inputs: Sequence[Path],
+    outputs: Sequence[Path],
+    force: bool,
+) -> bool:
+    """Whether a stage's result is there, made with these settings from these inputs.
+
+    A result made otherwise is never overwritten without `force`: RunError says what differs.
+    """
+    record = run.provenance(stage)
+    if not record.exists() or not all(p.exists() for p in outputs):
+        return False
+    made = read_json(record)
+    if made.get("format") != FORMAT:
+        raise RunError(
+            f"{run.path}: a run folder of format {made.get('format')}, this sagesplat ({__version__}) reads "
+            f"{FORMAT}; choose another run folder"
+        )
+    differs = _differences(made, settings, {p.name: file_hash(p) for p in inputs})
+    if not differs:
+        return True
+    if not force:
+        raise RunError(
+            f"{outputs[0]}: made with other {differs}; choose another run folder, or add --force to make it again"
+        )
+    return False
+
+
+def _differences(made: dict[str, Any], settings: Mapping[str, Any], inputs: Mapping[str, str]) -> str:
+    """A few words on what changed since a result was made; empty = nothing."""
+    old = made.get("settings", {})
+    changed = [f"{k} ({old.get(k)} then, {v} now)" for k, v in settings.items() if old.get(k) != v]
+    changed += [
+        f"{name} (its content changed)" for name, h in inputs.items() if made.get("inputs", {}).get(name) != h
+    ]
+    return ", ".join(changed[:3])
+
+
+def record(
+    run: RunDir, stage: str, settings: Mapping[str, Any], inputs: Sequence[Path], seconds: float
+) -> None:
+    """Write down what a finished stage's result was made from."""
+    write_json(
+        run.provenance(stage),
+        {
+            "format": FORMAT,
+            "stage": stage,
+            "version": __version__,
+            "seconds": round(seconds, 2),
+            "settings": dict(settings),
+            "inputs": {p.name: file_hash(p) for p in inputs},
+        },
+    )
