@@ -23,7 +23,7 @@ from sagesplat.config import (
 from sagesplat.errors import SageError
 
 if TYPE_CHECKING:
-    from sagesplat.pipeline import Job
+    from sagesplat.job import Job
 
 app = tyro.extras.SubcommandApp()
 
@@ -50,7 +50,7 @@ Flat = arg(name="")
 def _job(run: Path, machine: Machine) -> Iterator["Job"]:
     """A job on a run folder, shown on the console."""
     from sagesplat.console import Console
-    from sagesplat.pipeline import Job
+    from sagesplat.job import Job
     from sagesplat.raster import resolve_backend, set_threads
     from sagesplat.run_dir import RunDir
 
@@ -95,10 +95,9 @@ def run(
 def demo(run: Path = Path("runs/demo"), machine: Annotated[Machine, Flat] = Machine()) -> None:
     """Make the built-in capture, run the main job on it and say where to look."""
     from sagesplat import pipeline
-    from sagesplat.demo.capture import cached_capture
 
     with _job(run, machine) as job:
-        pipeline.run_all(job, cached_capture(), pipeline.DEMO)
+        pipeline.run_demo(job)
 
 
 @app.command
@@ -110,20 +109,20 @@ def masks(
     machine: Annotated[Machine, Flat] = Machine(),
 ) -> None:
     """Begin a run: read the capture and bring its label images in."""
-    from sagesplat import pipeline
+    from sagesplat import stages
 
     with _job(run, machine) as job:
-        pipeline.open_scene(job, scene, scene_config)
-        pipeline.make_masks(job, masks)
+        stages.open_scene(job, scene, scene_config)
+        stages.make_masks(job, masks)
 
 
 @app.command
 def lift(run: Run, lift: LiftConfig = LiftConfig(), machine: Annotated[Machine, Flat] = Machine()) -> None:
     """Vote the label images onto the points."""
-    from sagesplat import pipeline
+    from sagesplat import stages
 
     with _job(run, machine) as job:
-        pipeline.lift_labels(job, lift)
+        stages.lift_labels(job, lift)
 
 
 @app.command
@@ -131,28 +130,28 @@ def train(
     run: Run, train: TrainConfig = TrainConfig(), machine: Annotated[Machine, Flat] = Machine(), seed: int = 0
 ) -> None:
     """Train 3DGS and record the levels; a killed training goes on."""
-    from sagesplat import pipeline
+    from sagesplat import stages
 
     with _job(run, machine) as job:
-        pipeline.train_levels(job, train, seed)
+        stages.train_levels(job, train, seed)
 
 
 @app.command
 def observe(run: Run, fit: FitConfig = FitConfig(), machine: Annotated[Machine, Flat] = Machine()) -> None:
     """Measure every category at every level in every view."""
-    from sagesplat import pipeline
+    from sagesplat import stages
 
     with _job(run, machine) as job:
-        pipeline.observe_levels(job, fit)
+        stages.observe_levels(job, fit)
 
 
 @app.command
 def fit(run: Run, fit: FitConfig = FitConfig(), machine: Annotated[Machine, Flat] = Machine()) -> None:
     """Fit SSIM over distance for every category and level."""
-    from sagesplat import pipeline
+    from sagesplat import stages
 
     with _job(run, machine) as job:
-        pipeline.fit_ladder(job, fit)
+        stages.fit_ladder(job, fit)
 
 
 @app.command
@@ -163,37 +162,37 @@ def plan(
     machine: Annotated[Machine, Flat] = Machine(),
 ) -> None:
     """Choose the cheapest levels that keep a target SSIM."""
-    from sagesplat import pipeline
+    from sagesplat import stages
 
     with _job(run, machine) as job:
-        pipeline.make_plan(job, plan, fit)
+        stages.make_plan(job, plan, fit)
 
 
 @app.command
 def compose(run: Run, machine: Annotated[Machine, Flat] = Machine()) -> None:
     """Write the planned scene as composed.ply."""
-    from sagesplat import pipeline
+    from sagesplat import stages
 
     with _job(run, machine) as job:
-        pipeline.compose_plan(job)
+        stages.compose_plan(job)
 
 
 @app.command
 def evaluate(run: Run, fit: FitConfig = FitConfig(), machine: Annotated[Machine, Flat] = Machine()) -> None:
     """Measure the plans on the test views, beside what was promised."""
-    from sagesplat import pipeline
+    from sagesplat import stages
 
     with _job(run, machine) as job:
-        pipeline.evaluate_plans(job, fit)
+        stages.evaluate_plans(job, fit)
 
 
 @app.command
 def report(run: Run, machine: Annotated[Machine, Flat] = Machine()) -> None:
     """Write the report."""
-    from sagesplat import pipeline
+    from sagesplat import stages
 
     with _job(run, machine) as job:
-        pipeline.make_report(job)
+        stages.make_report(job)
 
 
 @app.command
@@ -214,10 +213,10 @@ def export(
         labels: names of the categories to take.
         target_ssim: the composition for this planned target (default: the main one).
     """
-    from sagesplat import pipeline
+    from sagesplat import stages
 
     with _job(run, machine) as job:
-        count = pipeline.export_ply(job, ply, level=level, labels=labels, target=target_ssim)
+        count = stages.export_ply(job, ply, level=level, labels=labels, target=target_ssim)
     print(f"{ply}: {count:,} Gaussians")
 
 
@@ -232,9 +231,8 @@ def main() -> None:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except OSError as error:
-        _fail(
-            f"{error.filename or 'input/output'}: {error.strerror or error}; check the path, its rights and the disk"
-        )
+        where = error.filename or "input/output"
+        _fail(f"{where}: {error.strerror or error}; check the path, its rights and the disk")
 
 
 def _fail(message: str) -> None:

@@ -58,6 +58,7 @@ class TrainConfig:
     refine_every: int = 100
     """Densify every so many steps (not scaled: its statistics need the views)."""
     refine_start: int = 500
+    """Not scaled either (at most a fifth of the run): before, gradients say little."""
     refine_stop: int = 15_000
     reset_every: int = 3000
     """Opacities are reset every so many steps while densification runs."""
@@ -69,8 +70,8 @@ class TrainConfig:
     prune_opacity: float = 5e-3
     prune_scale: float = 0.1
     """After the first reset, Gaussians larger than this share of the extent go."""
-    max_gaussians: int = 1_000_000
-    """No densification beyond this count."""
+    max_gaussians: int = 0
+    """No densification beyond this count (0: 1.5 times the pixels of a photo, at least twice the points)."""
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from scipy.spatial import KDTree
 
 
 def mean_neighbour_distance(xyz: Float32[np.ndarray, "P 3"], k: int = 3) -> Float32[np.ndarray, " P"]:
-    """Root mean square distance to the k nearest other points (fewer where there are fewer), at least 1e-7."""
+    """Root mean square distance to the k nearest other points (or as many as there are), at least 1e-7."""
     k = min(k, len(xyz) - 1)
     if k < 1:
         return np.full(len(xyz), 1e-2, np.float32)

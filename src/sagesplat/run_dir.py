@@ -116,7 +116,7 @@ def is_done(
         return True
     if not force:
         raise RunError(
-            f"{outputs[0]}: made with other {differs}; choose another run folder, or add --force to make it again"
+            f"{outputs[0]}: made with other {differs}; choose another run folder, or add --force to redo it"
         )
     return False
 

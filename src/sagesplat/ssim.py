@@ -1,4 +1,4 @@
-"""SSIM fused with its gradient: 11x11 Gaussian window, sigma 1.5, zero padding, RGB in [0, 1] (method of 3DGS)."""
+"""SSIM fused with its gradient: 11x11 Gaussian window, sigma 1.5, zero padding, RGB in [0, 1], as in 3DGS."""
 
 import numpy as np
 from numba import njit, prange

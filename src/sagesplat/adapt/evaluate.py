@@ -89,7 +89,8 @@ def evaluate(
                 if (label, level) in models:
                     predicted = float(models[label, level](float(distances[label][row])))
                 entry = {
-                    "target": plan.target, "view": row, "label_id": label, "level": level, "predicted": predicted,
+                    "target": plan.target, "view": row, "label_id": label, "level": level,
+                    "predicted": predicted,
                     "ssim": values["ssim"], "psnr": values["psnr"], "num_pixels": values["num_pixels"],
                     "full_ssim": full[row][label]["ssim"], "full_psnr": full[row][label]["psnr"],
                 }  # fmt: skip

@@ -62,8 +62,8 @@ def distances_in_views(
 ) -> dict[int, Float32[np.ndarray, " V"]]:
     """d_min of each category in each view: how far its closest points in sight are from the camera.
 
-    The given percentile over the category's SfM points inside the view's frustum; 0 is the paper's minimum, which
-    one mislabelled point can spoil. World units; NaN where no point is in sight.
+    The given percentile over the category's SfM points inside the view's frustum; 0 is the paper's minimum,
+    which one mislabelled point can spoil. World units; NaN where no point is in sight.
     """
     labels = np.unique(point_labels)
     table = {int(label): np.full(len(scene.views), np.nan, np.float32) for label in labels}

@@ -9,12 +9,14 @@ from numba import njit
 jit = njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
 
 
-@jit
-def dice_at(i, j):
-    """A number in [0, 1) for a pair of integers."""
+def dice(i, j):
+    """A number in [0, 1) for a pair of integers, or for arrays of them."""
     h = (i * 374761393 + j * 668265263) & 0xFFFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
     return ((h ^ (h >> 16)) & 0xFFFFFF) / 16777216.0
+
+
+dice_at = jit(dice)
 
 
 @jit
@@ -60,10 +62,3 @@ def fbm(
     out = np.empty(len(footprint))
     _fill(np.ascontiguousarray(x), np.ascontiguousarray(y), scale, octaves, footprint, out)
     return out
-
-
-def dice(i: np.ndarray, j: np.ndarray | int) -> np.ndarray:
-    """`dice_at` over arrays: a number in [0, 1) for each pair of integers."""
-    h = (i * 374761393 + j * 668265263) & 0xFFFFFFFF
-    h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
-    return ((h ^ (h >> 16)) & 0xFFFFFF) / 16777216.0

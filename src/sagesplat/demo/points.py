@@ -28,8 +28,9 @@ def write_points(
     xyz, uv, depth, seen = xyz[keep], uv[keep], depth[keep], seen[keep]
     point, view = np.nonzero(seen)
     noisy = uv[point, view] + rng.normal(0, UV_NOISE, (len(point), 2))
-    inside = ((noisy >= 0) & (noisy < [cameras[0].width, cameras[0].height])).all(1)
-    noisy = np.where(inside[:, None], noisy, uv[point, view])
+    size = cameras[0].width, cameras[0].height
+    outside = (np.abs(noisy / size - 0.5) >= 0.5).any(1)
+    noisy[outside] = uv[point, view][outside]
     xyz = _triangulate(cameras, xyz, point, view, noisy, uv[point, view], depth[point, view])
     again = np.stack([project(camera, xyz)[0] for camera in cameras], 1)[point, view]
     error = np.linalg.norm(again - noisy, axis=1)

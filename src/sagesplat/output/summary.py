@@ -94,7 +94,7 @@ def _panels(
                 psnr=of_composed["psnr"],
                 full_ssim=of_full["ssim"],
                 full_psnr=of_full["psnr"],
-            )  # fmt: skip
+            )
         )
     return panels
 

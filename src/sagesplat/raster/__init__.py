@@ -5,6 +5,7 @@ from typing import Literal
 import numba
 import numpy as np
 import torch
+from numba.core import config as numba_config
 from torch import Tensor
 
 from sagesplat.errors import BackendUnavailable
@@ -28,7 +29,7 @@ def resolve_backend(backend: Backend, device: str = "auto") -> Backend:
 
 def set_threads(threads: int = 0) -> int:
     """Let kernels and torch use so many threads (0: one per core); the number comes back."""
-    most = numba.config.NUMBA_NUM_THREADS  # pyright: ignore[reportAttributeAccessIssue]
+    most = numba_config.NUMBA_NUM_THREADS  # pyright: ignore[reportAttributeAccessIssue]
     threads = min(threads, most) if threads > 0 else most
     numba.set_num_threads(threads)
     torch.set_num_threads(threads)

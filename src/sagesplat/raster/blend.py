@@ -57,7 +57,7 @@ def _exp2(q):
     p = _P2 + f * p
     p = _P1 + f * p
     p = _P0 + f * p
-    return p * _bits_to_float(np.int32((whole + _BIAS) << _MANTISSA))
+    return p * _bits_to_float(np.int32((whole + _BIAS) << _MANTISSA))  # pyright: ignore[reportCallIssue]
 
 
 @njit(fastmath=FAST, error_model="numpy", cache=True)

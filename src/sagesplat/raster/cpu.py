@@ -1,5 +1,6 @@
 """The `cpu` backend: numba kernels behind one autograd function."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +17,8 @@ from sagesplat.scene.scene import Camera
 
 _CHUNK = 3  # channels that one blending pass takes
 
+_Arrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # PARAMETERS
+
 
 @dataclass(frozen=True)
 class _Options:
@@ -30,7 +33,12 @@ def _array(tensor: Tensor) -> np.ndarray:
     return tensor.detach().contiguous().numpy()
 
 
-def _project(options: _Options, parameters: list[np.ndarray]):
+def _arrays(parameters: Sequence[Tensor]) -> _Arrays:
+    means, quats, log_scales, logits, sh0, shN = map(_array, parameters)
+    return means, quats, log_scales, logits, sh0, shN
+
+
+def _project(options: _Options, parameters: _Arrays):
     n = len(parameters[0])
     records = np.empty((n, blend.RECORD), np.float32)
     depths, radii = np.empty(n, np.float32), np.empty(n, np.float32)
@@ -59,7 +67,7 @@ class _Rasterize(torch.autograd.Function):
         *parameters: Tensor,
     ):
         camera = options.camera
-        arrays = [_array(p) for p in parameters]
+        arrays = _arrays(parameters)
         records, depths, radii = _project(options, arrays)
         means2d.detach().numpy()[:] = np.where(radii[:, None] > 0, records[:, :2], 0)
         tiles_y, tiles_x = -(-camera.height // blend.TILE), -(-camera.width // blend.TILE)
@@ -96,7 +104,7 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor):
         options, painted, radii, found, ends, images, left, num_features = ctx.kept
-        arrays = [_array(p) for p in ctx.saved_tensors]
+        arrays = _arrays(ctx.saved_tensors)
         g_rgb, g_alpha, g_extra = (_array(g) for g in grads[:3])
         n, camera = len(radii), options.camera
         g_mean2d, g_conic = np.zeros((n, 2), np.float32), np.zeros((n, 3), np.float32)
@@ -109,7 +117,8 @@ class _Rasterize(torch.autograd.Function):
             first = index == 0
             g_image = g_rgb if first else _padded(g_extra, _CHUNK * (index - 1))
             blend.backward(
-                records, found.starts, ends, found.ids, found.slots, found.tiles_x, camera.width, camera.height,
+                records, found.starts, ends, found.ids, found.slots, found.tiles_x, camera.width,
+                camera.height,
                 image, left, g_image, -g_alpha if first else no_alpha, sums,
             )  # fmt: skip
             g_channels = g_color if first else np.zeros((n, 3), np.float32)
@@ -117,17 +126,18 @@ class _Rasterize(torch.autograd.Function):
             if not first:
                 part = g_features[:, _CHUNK * (index - 1) : _CHUNK * index]
                 part[:] = g_channels[:, : part.shape[1]]
-        g_parameters = [np.zeros_like(a) for a in arrays]
+        means, quats, log_scales, logits, sh0, shN = map(np.zeros_like, arrays)
         project.backward(
-            project.camera_vector(camera), *arrays, sh.num_bases(options.degree), options.antialiased, painted[0],
-            radii, g_mean2d, g_conic, g_opacity, g_color, *g_parameters,
+            project.camera_vector(camera), *arrays, sh.num_bases(options.degree), options.antialiased,
+            painted[0],
+            radii, g_mean2d, g_conic, g_opacity, g_color, means, quats, log_scales, logits, sh0, shN,
         )  # fmt: skip
         return (
             None,
             torch.from_numpy(g_mean2d),
             None,
             torch.from_numpy(g_features),
-            *(torch.from_numpy(g) for g in g_parameters),
+            *(torch.from_numpy(g) for g in (means, quats, log_scales, logits, sh0, shN)),
         )
 
 
@@ -158,9 +168,10 @@ def render(
     tile_mask: np.ndarray | None,
 ) -> Render:
     """Render in float32 on the CPU; see `sagesplat.raster.rasterize` for the arguments."""
-    means2d = torch.zeros(len(g), 2, requires_grad=torch.is_grad_enabled())
     extra = g.means.new_zeros(len(g), 0) if features is None else features
     parameters = [getattr(g, name) for name in PARAMETERS]
+    tracked = torch.is_grad_enabled() and any(p.requires_grad for p in (*parameters, extra))
+    means2d = torch.zeros(len(g), 2, requires_grad=tracked)
     rgb, alpha, painted, radii = _Rasterize.apply(
         _Options(camera, degree, antialiased, tile_mask), means2d, background, extra, *parameters
     )  # type: ignore[misc]

@@ -61,7 +61,8 @@ def _half_covariance(i, cam, means, quats, log_scales, rot, scale, jac, half):
 
 @njit(error_model="numpy", forceinline=True, cache=True)
 def _forward_one(
-    i, cam, means, quats, log_scales, logits, sh0, shN, num_bases, antialiased, records, depths, radii,
+    i, cam, means, quats, log_scales, logits, sh0, shN, num_bases, antialiased, records, depths,
+                radii,
     rot, scale, jac, half, basis,
 ):  # fmt: skip
     radii[i] = 0.0
@@ -125,7 +126,8 @@ def forward(cam, means, quats, log_scales, logits, sh0, shN, num_bases, antialia
         jac, half, basis = np.empty((2, 3)), np.empty((2, 3)), np.empty(16)
         for i in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(means))):
             _forward_one(
-                i, cam, means, quats, log_scales, logits, sh0, shN, num_bases, antialiased, records, depths, radii,
+                i, cam, means, quats, log_scales, logits, sh0, shN, num_bases, antialiased, records, depths,
+                radii,
                 rot, scale, jac, half, basis,
             )  # fmt: skip
 
@@ -273,6 +275,6 @@ def backward(
             if radii[i] > 0:
                 _backward_one(
                     i, cam, means, quats, log_scales, logits, shN, num_bases, antialiased, records,
-                    g_mean2d, g_conic, g_opacity, g_color, d_means, d_quats, d_log_scales, d_logits, d_sh0, d_shN,
-                    rot, scale, d_rot, jac, half, d_half, d_jac, basis, weights,
+                    g_mean2d, g_conic, g_opacity, g_color, d_means, d_quats, d_log_scales, d_logits, d_sh0,
+                    d_shN, rot, scale, d_rot, jac, half, d_half, d_jac, basis, weights,
                 )  # fmt: skip

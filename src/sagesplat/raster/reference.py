@@ -33,8 +33,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:  # [N, 4] -> [N, 3, 3]
 
 def _project(g: Gaussians, camera: Camera, antialiased: bool):
     """Depths, 2D means, 2D covariances and opacities (EWA splatting as 3DGS uses it)."""
-    double = {"dtype": torch.float64}
-    w2c, K = torch.tensor(camera.w2c, **double), torch.tensor(camera.K, **double)
+    w2c, K = torch.tensor(camera.w2c).double(), torch.tensor(camera.K).double()
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     x, y, z = (g.means.double() @ w2c[:3, :3].T + w2c[:3, 3]).unbind(-1)
     safe = torch.where(z > NEAR, z, 1.0)
@@ -46,7 +45,7 @@ def _project(g: Gaussians, camera: Camera, antialiased: bool):
     scaled_axes = rotation_matrices(g.quats.double()) * g.log_scales.double().exp()[:, None, :]
     half = jacobian.reshape(-1, 2, 3) @ w2c[:3, :3] @ scaled_axes
     sharp = half @ half.transpose(-1, -2)
-    cov = sharp + BLUR * torch.eye(2, **double)
+    cov = sharp + BLUR * torch.eye(2, dtype=torch.float64)
     opacity = g.logit_opacities.double().sigmoid()
     if antialiased:
         opacity = opacity * (torch.linalg.det(sharp) / torch.linalg.det(cov)).clamp_min(1e-10).sqrt()

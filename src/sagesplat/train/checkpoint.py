@@ -48,7 +48,7 @@ def read_checkpoint(path: Path, settings: str) -> TrainState:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: torch.from_numpy(file[name]) for name in file.files if name != "meta"}
             meta = json.loads(str(file["meta"]))
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, ValueError, KeyError, RuntimeError, zipfile.BadZipFile) as error:
         raise RunError(f"{path}: not a readable checkpoint ({error}); {cure}") from None
     if meta.get("version") != _VERSION:
         raise RunError(

@@ -14,7 +14,7 @@ from sagesplat.train.state import TrainState
 
 _SPLIT_SHRINK = 1.6
 _REFERENCE_STEPS = 30_000
-_RESET_FLOOR = 1000  # steps that a model needs between two resets, however short the run
+_RESET_FLOOR = 1500  # steps that a model needs between two resets, however short the run
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ def schedule(config: TrainConfig) -> Schedule:
     reset_every = max(scaled(config.reset_every), min(config.reset_every, _RESET_FLOOR))
     return Schedule(
         level_every=config.level_every or scaled(1000),
-        refine_start=scaled(config.refine_start),
+        refine_start=min(config.refine_start, config.max_steps // 5),
         refine_stop=scaled(config.refine_stop),
         reset_every=reset_every,
         raise_sh_every=scaled(config.raise_sh_every),
@@ -57,12 +57,16 @@ def observe_gradients(state: TrainState, render: Render, width: int, height: int
     state.grad_count += seen
 
 
-def refine(state: TrainState, config: TrainConfig, extent: float, trainable: Tensor) -> None:
-    """Clone small and split large Gaussians with high gradients, prune faint and (after a reset) huge ones."""
+def cap(config: TrainConfig, num_pixels: int, num_points: int) -> int:
+    """The largest number of Gaussians: as set, or what photos of `num_pixels` can tell apart."""
+    return config.max_gaussians or max(int(1.5 * num_pixels), 2 * num_points)
+
+
+def refine(state: TrainState, config: TrainConfig, extent: float, room: int, trainable: Tensor) -> None:
+    """Clone small, split large Gaussians with high gradients; prune faint and, after a reset, huge ones."""
     g = state.gaussians
     size = g.log_scales.exp().amax(-1)
     grows = (state.grad_sum / state.grad_count.clamp_min(1) > config.grow_grad) & trainable
-    room = config.max_gaussians - len(g)
     if int(grows.sum()) > room:
         strength = torch.where(grows, state.grad_sum / state.grad_count.clamp_min(1), -1.0)
         grows = torch.zeros_like(grows)

@@ -17,6 +17,8 @@ from sagesplat.files import atomic_path
 from sagesplat.gaussians import Gaussians, concat
 from sagesplat.sh import num_bases
 
+# what numpy and zipfile raise for files that are cut off or changed
+_DAMAGED = (OSError, EOFError, ValueError, KeyError, RuntimeError, zipfile.BadZipFile)
 _HALVES = ("log_scales", "logit_opacities", "sh0")
 
 
@@ -58,7 +60,7 @@ def write_level(folder: Path, step: int, g: Gaussians, *, recovering: bool, sh_d
 def _open(path: Path) -> np.lib.npyio.NpzFile:
     try:
         return np.load(path, allow_pickle=False)
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
+    except _DAMAGED as error:
         raise DataError(f"{path}: not a readable level ({error}); run `sagesplat train` again") from None
 
 
@@ -69,20 +71,20 @@ def read_header(path: Path) -> LevelFile:
             step, recovering, degree = file["meta"].tolist()
             labels = sorted({int(name.split("/")[0]) for name in file.files if "/" in name})
             counts = {label: len(file[f"{label}/logit_opacities"]) for label in labels}
-        except (KeyError, ValueError, zipfile.BadZipFile) as error:
+        except _DAMAGED as error:
             raise DataError(f"{path}: not a level ({error}); run `sagesplat train` again") from None
     return LevelFile(path, step, bool(recovering), degree, counts)
 
 
 def read_level(path: Path, label_ids: Sequence[int] | None = None) -> Gaussians:
-    """The Gaussians of a level, or only those of some categories; raises `DataError` for NaN or a broken file."""
+    """The Gaussians of a level, or only those of some categories; `DataError` for NaN or a broken file."""
     header = read_header(path)
     wanted = sorted(header.counts) if label_ids is None else [i for i in label_ids if i in header.counts]
     parts = []
     with _open(path) as file:
         try:
             parts = [_decode(file, label) for label in wanted]
-        except (KeyError, ValueError, zipfile.BadZipFile) as error:
+        except _DAMAGED as error:
             raise DataError(f"{path}: a broken level ({error}); run `sagesplat train` again") from None
     if not parts:
         return _empty(header.sh_degree)

@@ -50,5 +50,8 @@ def adam_step(
     if parameter.size:
         rate = np.float32(lr / (1 - _BETA1**step))
         correction = np.float32((1 - _BETA2**step) ** -0.5)
-        flat = (a.reshape(-1) for a in (parameter, np.ascontiguousarray(grad), first, second))
-        _update_rows(*flat, rate, correction, trainable)
+        _update_rows(
+            parameter.reshape(-1), np.ascontiguousarray(grad).reshape(-1), first.reshape(-1),
+            second.reshape(-1),
+            rate, correction, trainable,
+        )  # fmt: skip

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from sagesplat import geometry
-from sagesplat.gaussians import PARAMETERS, Gaussians
+from sagesplat.gaussians import PARAMETERS, Gaussians, concat
 from sagesplat.scene.scene import Points
 from sagesplat.sh import num_bases, rgb_to_sh0
 
@@ -30,8 +30,6 @@ class TrainState:
 
     def replace_rows(self, keep: Tensor, new: Gaussians) -> None:
         """Keep some rows (bool [N]) and append new Gaussians with fresh moments and statistics."""
-        from sagesplat.gaussians import concat
-
         kept = self.gaussians.select(keep)
         self.gaussians = concat([kept, new])
         for name in PARAMETERS:
@@ -66,6 +64,8 @@ def from_points(points: Points, label_ids: np.ndarray, sh_degree: int) -> Gaussi
 
 def initial_state(gaussians: Gaussians, seed: int) -> TrainState:
     """A state before the first step."""
-    moments = [{n: torch.zeros_like(p) for n, p in gaussians.parameters().items()} for _ in range(2)]
+    first, second = (
+        {name: torch.zeros_like(p) for name, p in gaussians.parameters().items()} for _ in range(2)
+    )
     zeros = torch.zeros(len(gaussians))
-    return TrainState(gaussians, *moments, zeros, zeros.clone(), np.random.default_rng(seed), [])
+    return TrainState(gaussians, first, second, zeros, zeros.clone(), np.random.default_rng(seed), [])

@@ -75,6 +75,8 @@ def train(
     """
     plan = densify.schedule(config)
     extent = scene.extent
+    camera = scene.views[0].camera
+    most = densify.cap(config, camera.width * camera.height, len(scene.points.xyz))
     state = initial_state(from_points(scene.points, label_ids, config.sh_degree), seed)
     checkpoint = folder / "checkpoint.npz" if folder else None
     if checkpoint and checkpoint.exists():
@@ -89,7 +91,7 @@ def train(
         if plan.refine_start < step < plan.refine_stop:
             trainable = torch.ones(len(state.gaussians), dtype=torch.bool)
             if step % config.refine_every == 0:
-                densify.refine(state, config, extent, trainable)
+                densify.refine(state, config, extent, most - len(state.gaussians), trainable)
                 trainable = torch.ones(len(state.gaussians), dtype=torch.bool)
             if step % plan.reset_every == 0:
                 densify.reset_opacities(state, config, trainable)

@@ -1,0 +1,112 @@
+"""A run folder being worked on: what its stages share, and how a stage is done once."""
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sagesplat.adapt.ladder import Ladder, read_ladder
+from sagesplat.errors import RunError
+from sagesplat.events import Emit, StageDone, StageSkipped, StageStarted
+from sagesplat.files import read_json
+from sagesplat.raster import Backend
+from sagesplat.run_dir import RunDir, is_done, record
+from sagesplat.scene import load_scene
+from sagesplat.scene.images import Photos
+from sagesplat.scene.scene import Scene
+from sagesplat.segment.lift import LiftedLabels
+from sagesplat.segment.masks import Masks, Taxonomy
+
+NO_RUN = "not a run folder (no scene.json); begin with `sagesplat run SCENE RUN`"
+
+
+@dataclass(frozen=True)
+class Job:
+    """A run folder being worked on, and what its stages share."""
+
+    run: RunDir
+    emit: Emit
+    backend: Backend = "auto"
+    threads: int = 1
+    force: bool = False
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The capture that scene.json names, unchanged since."""
+        if not self.run.scene.exists():
+            raise RunError(f"{self.run.path}: {NO_RUN}")
+        made = read_json(self.run.scene)
+        scene = load_scene(Path(made["path"]), **made["settings"])
+        if fingerprint(scene) != made["fingerprint"]:
+            raise RunError(
+                f"{made['path']}: the capture changed since this run began; choose another run folder"
+            )
+        return scene
+
+    @cached_property
+    def photos(self) -> Photos:
+        """The photos, loaded when asked for."""
+        return Photos(self.scene.views)
+
+    @cached_property
+    def taxonomy(self) -> Taxonomy:
+        """The names of the run's categories."""
+        return Taxonomy.read(self.run.masks / "labels.json")
+
+    @cached_property
+    def masks(self) -> Masks:
+        """The label images, loaded when asked for."""
+        return Masks(self.run.masks, self.taxonomy)
+
+    @cached_property
+    def point_labels(self) -> np.ndarray:
+        """Category of each SfM point."""
+        return LiftedLabels.read(self.run.labels, len(self.scene.points.xyz)).label_ids
+
+    @cached_property
+    def ladder(self) -> Ladder:
+        """The levels that training recorded."""
+        return read_ladder(self.run.levels)
+
+    def names(self) -> dict[int, str]:
+        """Category names by id, the unlabelled one included."""
+        return {**self.taxonomy.names, -1: self.taxonomy.name(-1)}
+
+
+def run_stage(
+    job: Job, name: str, settings: dict[str, Any], inputs: Sequence[Path], outputs: Sequence[Path],
+    make: Callable[[], Sequence[str]],
+) -> None:  # fmt: skip
+    """Do a stage unless its result is there already."""
+    if name != "scene" and not job.run.scene.exists():
+        raise RunError(f"{job.run.path}: {NO_RUN}")
+    for path in inputs:
+        if not path.exists():
+            raise RunError(f"{path}: missing; run the stage before `sagesplat {name}`, or `sagesplat run`")
+    settings = json.loads(json.dumps(settings, default=str))  # as it will read back
+    if is_done(job.run, name, settings, inputs, outputs, job.force):
+        job.emit(StageSkipped(name))
+        return
+    job.emit(StageStarted(name))
+    begin = time.perf_counter()
+    lines = make()
+    seconds = time.perf_counter() - begin
+    record(job.run, name, settings, inputs, seconds)
+    job.emit(StageDone(name, seconds, tuple(lines)))
+
+
+def fingerprint(scene: Scene) -> str:
+    """Changes when the poses, the points or the set of photos do."""
+    digest = hashlib.sha256()
+    for view in scene.views:
+        size = view.image_path.stat().st_size
+        digest.update(f"{view.name} {size} {view.camera.width} {view.camera.height}".encode())
+        digest.update(view.camera.w2c.tobytes() + view.camera.K.tobytes())
+    digest.update(scene.points.xyz.tobytes())
+    return digest.hexdigest()

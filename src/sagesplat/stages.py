@@ -1,0 +1,378 @@
+"""The stages, one function each, in the order of the paper; each skips what is done and says what it did."""
+
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sagesplat.adapt.evaluate import evaluate
+from sagesplat.adapt.model import fit_models, read_models, write_models
+from sagesplat.adapt.observe import (
+    PERCENTILE,
+    TOTAL,
+    Observations,
+    distances_in_views,
+    observe,
+    read_observations,
+)
+from sagesplat.adapt.plan import plan_scene, plan_view, read_plans, write_plans
+from sagesplat.config import FitConfig, LiftConfig, MasksConfig, PlanConfig, SceneConfig, TrainConfig
+from sagesplat.errors import RunError
+from sagesplat.events import Progress, RunDone, TableMade, Training, Warned
+from sagesplat.files import read_json, write_json
+from sagesplat.job import Job, fingerprint, run_stage
+from sagesplat.output.ply import write_ply
+from sagesplat.output.report import write_report
+from sagesplat.output.summary import report_data
+from sagesplat.run_dir import RunDir, file_hash
+from sagesplat.scene import load_scene
+from sagesplat.segment.lift import lift
+from sagesplat.segment.masks import import_masks
+from sagesplat.train.checkpoint import read_checkpoint
+from sagesplat.train.trainer import LevelSaved, Resumed, Step, Trained, train
+
+LEVELS_SHOWN = 6  # columns of the table that a run prints of its ladder
+
+
+def open_scene(job: Job, path: Path, config: SceneConfig) -> None:
+    """Read a capture and write scene.json."""
+    run = job.run
+    if run.path.exists() and not run.scene.exists() and any(run.path.iterdir()):
+        raise RunError(f"{run.path}: not empty and not a run folder; choose a new folder")
+    scene = load_scene(path, downscale=config.downscale, test_every=config.test_every)
+    settings = {"path": str(path.resolve()), **asdict(config), "fingerprint": fingerprint(scene)}
+
+    def make() -> list[str]:
+        write_json(
+            run.scene,
+            {
+                "path": str(path.resolve()),
+                "settings": asdict(config),
+                "fingerprint": settings["fingerprint"],
+                "extent": scene.extent,
+                "points": len(scene.points.xyz),
+                "views": [
+                    {
+                        "name": view.name,
+                        "split": "test" if row in scene.test_ids else "train",
+                        "width": view.camera.width,
+                        "height": view.camera.height,
+                        "K": view.camera.K.tolist(),
+                        "w2c": view.camera.w2c.tolist(),
+                    }
+                    for row, view in enumerate(scene.views)
+                ],
+            },
+        )
+        size = scene.views[0].camera
+        return [
+            f"{len(scene.train_ids)} training, {len(scene.test_ids)} test views, {size.width}x{size.height}",
+            f"{len(scene.points.xyz):,} points",
+        ]
+
+    run_stage(job, "scene", settings, [], [run.scene], make)
+
+
+def make_masks(job: Job, config: MasksConfig) -> None:
+    """Bring the label images into the run: given ones, or a segmenter's."""
+    source = config.masks or job.scene.path / "masks"
+    settings: dict[str, Any] = {"segmenter": config.segmenter}
+    if config.segmenter == "onnx":
+        if config.model is None or config.classes is None:
+            raise RunError("--segmenter onnx needs --model NETWORK.onnx and --classes CLASSES.json")
+        for file in (config.model, config.classes):
+            if not file.is_file():
+                raise RunError(f"{file}: no such file; name the network and its classes")
+        settings |= {"model": file_hash(config.model), "classes": file_hash(config.classes)}
+    else:
+        settings["source"] = file_hash(source) if source.is_dir() else str(source)
+
+    def make() -> list[str]:
+        if config.segmenter == "onnx":
+            _segment(job, config, settings)
+        else:
+            shutil.rmtree(job.run.masks, ignore_errors=True)
+            missing = import_masks(job.scene, source, job.run.masks)
+            if missing:
+                names = ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
+                job.emit(
+                    Warned(f"{len(missing)} of {len(job.scene.views)} views have no label image: {names}")
+                )
+        return [f"{len(job.taxonomy.names)} categories: {', '.join(job.taxonomy.names.values())}"]
+
+    run_stage(job, "masks", settings, [job.run.scene], [job.run.masks / "labels.json"], make)
+
+
+def _segment(job: Job, config: MasksConfig, settings: dict[str, Any]) -> None:
+    """Segment the photos; images of an interrupted attempt with the same network are kept."""
+    from sagesplat.segment.onnx import segment_onnx
+
+    assert config.model
+    assert config.classes
+    marker = job.run.masks / ".network.json"
+    if not marker.exists() or read_json(marker) != settings:
+        shutil.rmtree(job.run.masks, ignore_errors=True)
+        write_json(marker, settings)
+    segment_onnx(
+        job.scene, job.photos, config.model, config.classes, job.run.masks, threads=job.threads,
+        on_view=lambda done, total: job.emit(Progress("masks", done, total)),
+    )  # fmt: skip
+
+
+def lift_labels(job: Job, config: LiftConfig) -> None:
+    """Vote the label images onto the SfM points."""
+    run = job.run
+
+    def make() -> list[str]:
+        lifted = lift(job.scene, job.masks, votes=config.votes)
+        lifted.write(run.labels)
+        return [f"{100 * lifted.agreement:.1f} % of the votes agree with the label of their point"]
+
+    labels = run.masks / "labels.json"
+    run_stage(job, "lift", asdict(config), [run.scene, run.provenance("masks"), labels], [run.labels], make)
+
+
+def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
+    """Train 3DGS from the labelled points and record the levels."""
+    run = job.run
+    settings = {**asdict(config), "seed": seed}
+
+    def make() -> list[str]:
+        belongs = json.dumps({**settings, "scene": file_hash(run.scene), "labels": file_hash(run.labels)})
+        if job.force and run.checkpoint.exists() and not _continues(run, belongs):
+            run.checkpoint.unlink()
+        if not run.checkpoint.exists():
+            shutil.rmtree(run.levels, ignore_errors=True)
+        counts: dict[str, int] = {}
+        events = train(
+            job.scene, job.photos, job.point_labels, config,
+            seed=seed, backend=job.backend, folder=run.path, settings=belongs,
+        )  # fmt: skip
+        for event in events:
+            match event:
+                case Resumed(step):
+                    job.emit(Warned(f"going on from step {step}"))
+                case Step(step, loss, num):
+                    job.emit(Training(step, config.max_steps, loss, counts, num))
+                case LevelSaved():
+                    counts = {job.taxonomy.name(i): n for i, n in event.counts.items()}
+                case Trained(gaussians):
+                    return [f"{len(gaussians):,} Gaussians after {config.max_steps} steps"]
+        return []
+
+    run_stage(job, "train", settings, [run.scene, run.labels], [run.levels, run.checkpoint], make)
+
+
+def _continues(run: RunDir, belongs: str) -> bool:
+    try:
+        read_checkpoint(run.checkpoint, belongs)
+    except RunError:
+        return False
+    return True
+
+
+def observe_levels(job: Job, config: FitConfig) -> None:
+    """Measure every category at every level in every view."""
+    run = job.run
+    antialiased = _antialiased(run)
+
+    def make() -> list[str]:
+        distances = _distances(job, config)
+        table = observe(
+            job.scene, job.photos, job.masks, job.ladder, distances, backend=job.backend,
+            antialiased=antialiased,
+            progress=lambda done, total: job.emit(Progress("observe", done, total)),
+        )  # fmt: skip
+        table.write_csv(run.observations)
+        job.emit(_ladder_table(job, table))
+        return [
+            f"{len(table):,} observations of {len(job.ladder.files)} levels in {len(job.scene.views)} views"
+        ]
+
+    settings = {"distance": config.distance, "antialiased": antialiased}
+    run_stage(job, "observe", settings, [run.scene, run.labels, run.levels], [run.observations], make)
+
+
+def _antialiased(run: RunDir) -> bool:
+    record = run.provenance("train")
+    return bool(read_json(record)["settings"]["antialiased"]) if record.exists() else False
+
+
+def _distances(job: Job, config: FitConfig) -> dict[int, np.ndarray]:
+    percentile = PERCENTILE if config.distance == "percentile" else 0.0
+    return distances_in_views(job.scene, job.point_labels, percentile)
+
+
+def _ladder_table(job: Job, table: Observations) -> TableMade:
+    """Mean SSIM and count per category at some levels, over training views (Tables I and II of the paper)."""
+    settled = [level for level in job.ladder.levels if level not in job.ladder.recovering]
+    picked = sorted({settled[i] for i in np.linspace(0, len(settled) - 1, LEVELS_SHOWN).round().astype(int)})
+    seen = table.select(np.isin(table.view, job.scene.train_ids))
+    counts = job.ladder.counts
+    last = {label: counts.get((label, settled[-1]), 0) for label in np.unique(seen.label_id).tolist()}
+    rows = []
+    for label in [*sorted((i for i in last if i != TOTAL), key=lambda i: -last[i]), TOTAL]:
+        name = "whole image" if label == TOTAL else job.taxonomy.name(label)
+        cells = [name]
+        for level in picked:
+            here = seen.ssim[(seen.label_id == label) & (seen.level == level)]
+            n = sum(c for (i, at), c in counts.items() if at == level and label in (TOTAL, i))
+            cells.append(f"{here.mean():.3f}  {_short(n)}" if len(here) else f"-  {_short(n)}")
+        rows.append(tuple(cells))
+    return TableMade(
+        "SSIM and Gaussians by level (training views)", ("category", *map(str, picked)), tuple(rows)
+    )
+
+
+def _short(count: int) -> str:
+    return f"{count / 1e6:.2f}M" if count >= 1e6 else f"{count / 1e3:.1f}k"
+
+
+def _large_enough(job: Job, config: FitConfig, table: Observations) -> Observations:
+    """Rows of views that show enough of the category."""
+    pixels = np.array([v.camera.width * v.camera.height for v in job.scene.views])
+    return table.select(table.num_pixels >= config.min_share * pixels[table.view])
+
+
+def fit_ladder(job: Job, config: FitConfig) -> None:
+    """Fit Eq. 3 to the observations of the training views."""
+    run = job.run
+
+    def make() -> list[str]:
+        table = _large_enough(job, config, read_observations(run.observations))
+        models = fit_models(table, job.scene.train_ids)
+        write_models(run.models, models)
+        statuses = [m.status for m in models.values()]
+        return [", ".join(f"{statuses.count(s)} {s}" for s in sorted(set(statuses)))]
+
+    run_stage(job, "fit", {"min_share": config.min_share}, [run.scene, run.observations], [run.models], make)
+
+
+def make_plan(job: Job, config: PlanConfig, fit: FitConfig) -> None:
+    """Choose the levels: for the scene at each target, for every view at the main one."""
+    run = job.run
+
+    def make() -> list[str]:
+        models, ladder = read_models(run.models), job.ladder
+        table = _large_enough(job, fit, read_observations(run.observations))
+        table = table.select(table.level == ladder.levels[-1])
+        seen = table.select(np.isin(table.view, job.scene.train_ids))
+        labels = {label for label, _ in ladder.counts}
+        by_label = {label: seen.distance[seen.label_id == label] for label in labels}
+        scene_plans = [
+            plan_scene(models, ladder.counts, by_label, target, config.share, recovering=ladder.recovering)
+            for target in config.targets
+        ]
+        view_plans = []
+        for row in range(len(job.scene.views)):
+            here = table.select(table.view == row)
+            distances = dict(zip(here.label_id.tolist(), here.distance.tolist(), strict=True))
+            view_plans.append(
+                plan_view(
+                    models, ladder.counts, distances, config.target_ssim, row, recovering=ladder.recovering
+                )
+            )
+        write_plans(run.plan, scene_plans, view_plans)
+        full = sum(ladder.files[-1].counts.values())
+        return [f"SSIM {p.target:g}: {p.count:,} of {full:,} Gaussians, {p.status}" for p in scene_plans]
+
+    inputs = [run.scene, run.models, run.observations, run.levels]
+    settings = {"targets": config.targets, "target_ssim": config.target_ssim, "share": config.share}
+    run_stage(job, "plan", settings | {"min_share": fit.min_share}, inputs, [run.plan], make)
+
+
+def main_target(run: RunDir) -> float:
+    """The target that the run's plan was made for."""
+    return float(read_json(run.provenance("plan"))["settings"]["target_ssim"])
+
+
+def compose_plan(job: Job) -> None:
+    """Write the scene that the plan chose."""
+    run = job.run
+
+    def make() -> list[str]:
+        target = main_target(run)
+        plan = next(p for p in read_plans(run.plan)[0] if p.target == target)
+        g = job.ladder.compose(plan.levels)
+        write_ply(run.composed, g, job.names())
+        return [f"{len(g):,} Gaussians, {plan.nbytes / 1e6:.1f} MB at 248 bytes each"]
+
+    run_stage(job, "compose", {}, [run.plan, run.levels], [run.composed], make)
+
+
+def evaluate_plans(job: Job, fit: FitConfig) -> None:
+    """Measure the compositions on the test views, beside the promise and full 3DGS."""
+    run = job.run
+
+    def make() -> list[str]:
+        table = evaluate(
+            job.scene, job.photos, job.masks, job.ladder, read_models(run.models), read_plans(run.plan)[0],
+            _distances(job, fit), backend=job.backend, antialiased=_antialiased(run),
+            progress=lambda done, total: job.emit(Progress("evaluate", done, total)),
+        )  # fmt: skip
+        table.write_csv(run.evaluation)
+        whole = table.select(table.label_id == TOTAL)
+        lines = []
+        for target in np.unique(whole.target):
+            at = whole.select(whole.target == target)
+            lines.append(
+                f"SSIM {target:g} asked: test views {at.ssim.mean():.3f} / {at.psnr.mean():.2f} dB "
+                f"(3DGS {at.full_ssim.mean():.3f} / {at.full_psnr.mean():.2f} dB)"
+            )
+        return lines
+
+    inputs = [run.scene, run.labels, run.levels, run.models, run.plan]
+    run_stage(job, "evaluate", {"distance": fit.distance}, inputs, [run.evaluation], make)
+
+
+def make_report(job: Job) -> None:
+    """Write the report."""
+    run = job.run
+
+    def make() -> list[str]:
+        target = main_target(run)
+        write_report(
+            run.report,
+            report_data(run, job.scene, job.photos, job.masks, job.ladder, target, job.backend),
+        )
+        return []
+
+    run_stage(
+        job,
+        "report",
+        {},
+        [run.observations, run.models, run.plan, run.evaluation],
+        [run.report / "index.html"],
+        make,
+    )
+    job.emit(RunDone(run.report / "index.html"))
+
+
+def export_ply(
+    job: Job, path: Path, *, level: int | None, labels: Sequence[str], target: float | None
+) -> int:
+    """Write a level or a composition, whole or some categories, as a PLY; returns the number of Gaussians."""
+    if path.exists() and not job.force:
+        raise RunError(f"{path}: exists; add --force to replace it")
+    ids = {name: label for label, name in job.names().items()}
+    if unknown := [name for name in labels if name not in ids]:
+        raise RunError(f"{job.run.path}: no category {unknown[0]!r}; there are {', '.join(ids)}")
+    wanted = [ids[name] for name in labels] or list(ids.values())
+    if level is not None:
+        g = job.ladder.load(level, wanted)
+    else:
+        asked = main_target(job.run) if target is None else target
+        plans = read_plans(job.run.plan)[0]
+        plan = next((p for p in plans if p.target == asked), None)
+        if plan is None:
+            known = ", ".join(f"{p.target:g}" for p in plans)
+            raise RunError(
+                f"{job.run.plan}: no plan for SSIM {asked:g}, only for {known}; run `sagesplat plan` for it"
+            )
+        g = job.ladder.compose({label: at for label, at in plan.levels.items() if label in wanted})
+    write_ply(path, g, job.names())
+    return len(g)

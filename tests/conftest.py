@@ -1,0 +1,127 @@
+"""Small labelled Gaussians, cameras and a capture on disk that several tests share."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import strategies as st
+from PIL import Image
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from sagesplat.gaussians import PARAMETERS, Gaussians
+from sagesplat.raster import Backend, Render, rasterize, set_threads
+from sagesplat.scene import load_scene
+from sagesplat.scene.colmap_write import ModelCamera, ModelImage, write_model
+from sagesplat.scene.scene import Camera, Scene
+from sagesplat.sh import num_bases, sh0_to_rgb
+
+LABELS = (-1, 3, 184)
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Scenes are tiny: threads that wait for each other cost more than they bring."""
+    set_threads(1)
+
+
+def random_gaussians(
+    count: int, *, seed: int = 0, degree: int = 3, log_scale: float = -2.2, logit: float = 0.0
+) -> Gaussians:
+    """A labelled cloud around (0, 0, 4) of mixed sizes, shapes, opacities and colours."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    return Gaussians(
+        means=normal(count, 3) * torch.tensor([1.0, 0.8, 0.8]) + torch.tensor([0.0, 0.0, 4.0]),
+        quats=normal(count, 4),
+        log_scales=normal(count, 3) * 0.5 + log_scale,
+        logit_opacities=normal(count) * 1.5 + logit,
+        sh0=normal(count, 1, 3) * 0.5,
+        shN=normal(count, num_bases(degree) - 1, 3) * 0.1,
+        label_ids=torch.tensor(LABELS, dtype=torch.int16)[torch.arange(count) % len(LABELS)],
+    )
+
+
+def pinhole(width: int = 70, height: int = 50, angle: float = 0.2) -> Camera:
+    """A camera near the origin that sees the cloud, its principal point off the centre."""
+    w2c = np.eye(4, dtype=np.float32)
+    w2c[:3, :3] = Rotation.from_euler("y", angle).as_matrix()
+    w2c[:3, 3] = [0.1, -0.2, 0.3]
+    K = np.array([[0.85 * width, 0, 0.47 * width], [0, 0.8 * width, 0.54 * height], [0, 0, 1]], np.float32)
+    return Camera(w2c, K, width, height)
+
+
+def render_with_gradients(
+    g: Gaussians,
+    camera: Camera,
+    backend: Backend = "cpu",
+    *,
+    features: Tensor | None = None,
+    pixels: Tensor | None = None,
+    **options: Any,
+) -> tuple[Render, dict[str, Tensor]]:
+    """A render and the gradients of a fixed random weighting of its outputs (of `pixels` [H, W] only)."""
+    leaves = {name: p.clone().requires_grad_() for name, p in g.parameters().items()}
+    if features is not None:
+        features = features.clone().requires_grad_()
+        leaves["features"] = features
+    moving = replace(g, **{name: leaves[name] for name in PARAMETERS})
+    render = rasterize(moving, camera, features=features, backend=backend, **options)
+    generator = torch.Generator().manual_seed(9)
+    loss = torch.zeros(())
+    for output in (render.rgb, render.alpha[..., None], render.features):
+        if output is not None:
+            weights = torch.randn(output.shape, generator=generator)
+            loss = loss + (output * (weights if pixels is None else weights * pixels[..., None])).sum()
+    loss.backward()
+    leaves["means2d"] = render.means2d
+    return render, {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
+
+
+def orbit(views: int, width: int = 48, height: int = 32) -> list[Camera]:
+    """Cameras on an arc around (0, 0, 4), all looking at it."""
+    cameras = []
+    for angle in np.linspace(-0.5, 0.5, views):
+        w2c = np.eye(4)
+        w2c[:3, :3] = Rotation.from_euler("xyz", [0.05, angle, 0.0]).as_matrix()
+        w2c[:3, 3] = np.array([0.0, 0.0, 4.0]) - w2c[:3, :3] @ [0.0, 0.0, 4.0]
+        K = np.array([[40, 0, width / 2 + 1], [0, 40, height / 2 - 2], [0, 0, 1]])
+        cameras.append(Camera(w2c.astype(np.float32), K.astype(np.float32), width, height))
+    return cameras
+
+
+def write_capture(folder: Path, truth: Gaussians, *, views: int = 8, noise: float = 0.05) -> Scene:
+    """A COLMAP workspace of photos of `truth`; its points are the means of `truth`, up to `noise`."""
+    rng = np.random.default_rng(0)
+    cameras = orbit(views)
+    xyz = truth.means.numpy() + rng.normal(0, noise, (len(truth), 3))
+    rgb = (sh0_to_rgb(truth.sh0[:, 0]).clamp(0, 1) * 255).to(torch.uint8).numpy()
+    width, height = cameras[0].width, cameras[0].height
+    K = cameras[0].K.astype(float)
+    model = ModelCamera(1, "PINHOLE", width, height, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+    images = []
+    (folder / "images").mkdir(parents=True)
+    for i, camera in enumerate(cameras):
+        pixels = rasterize(truth, camera).rgb.clamp(0, 1) * 255
+        Image.fromarray(pixels.round().to(torch.uint8).numpy()).save(folder / "images" / f"{i:02d}.png")
+        local = xyz @ camera.w2c[:3, :3].T + camera.w2c[:3, 3]
+        uv = local[:, :2] / local[:, 2:] * [K[0, 0], K[1, 1]] + K[:2, 2]
+        images.append(ModelImage(i + 1, f"{i:02d}.png", 1, camera.w2c.astype(float), uv, np.arange(len(xyz))))
+    write_model(folder / "sparse" / "0", [model], images, xyz, rgb, np.full(len(xyz), 0.5))
+    return load_scene(folder)
+
+
+def damage(content: bytes, data: st.DataObject) -> bytes:
+    """A file cut off somewhere, or with a few bytes changed, as hypothesis draws it."""
+    if data.draw(st.booleans()):
+        return content[: data.draw(st.integers(0, len(content) - 1))]
+    changed = bytearray(content)
+    for at in data.draw(st.lists(st.integers(0, len(content) - 1), min_size=1, max_size=4)):
+        changed[at] = data.draw(st.integers(0, 255))
+    return bytes(changed)

@@ -1,0 +1,153 @@
+"""The whole flow on a small procedural capture."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sagesplat import pipeline, stages
+from sagesplat.adapt.evaluate import read_evaluation
+from sagesplat.adapt.observe import TOTAL, read_observations
+from sagesplat.adapt.plan import read_plans
+from sagesplat.config import PlanConfig, RunConfig, TrainConfig
+from sagesplat.demo.capture import make_capture
+from sagesplat.errors import RunError
+from sagesplat.events import Event, RunDone, StageDone, StageSkipped, Training
+from sagesplat.job import Job
+from sagesplat.output.ply import read_ply
+from sagesplat.run_dir import RunDir
+from sagesplat.train.levels import read_level
+
+STAGES = ["scene", "masks", "lift", "train", "observe", "fit", "plan", "compose", "evaluate", "report"]
+CONFIG = RunConfig(train=TrainConfig(max_steps=90, level_every=30), plan=PlanConfig(target_ssim=0.4))
+
+
+def work(run: Path, capture: Path, config: RunConfig = CONFIG, *, force: bool = False) -> list[Event]:
+    events: list[Event] = []
+    pipeline.run_all(Job(RunDir(run), events.append, force=force), capture, config)
+    return events
+
+
+def named(events: list[Event], kind: type) -> list[str]:
+    return [e.name for e in events if isinstance(e, kind)]  # type: ignore[attr-defined]
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("demo") / "capture"
+    make_capture(folder, views=12, width=80, height=60)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def finished(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = tmp_path_factory.mktemp("run") / "run"
+    events = work(run, capture)
+    assert named(events, StageDone) == STAGES
+    assert isinstance(events[-1], RunDone)
+    return run
+
+
+def test_every_artefact_is_there_and_agrees_with_the_others(finished: Path, capture: Path) -> None:
+    run = RunDir(finished)
+    observations, evaluation = read_observations(run.observations), read_evaluation(run.evaluation)
+    assert set(observations.level) == {30, 60, 90}
+    assert set(observations.view) == set(range(12))
+    whole = observations.select(observations.label_id == TOTAL)
+    first, last = (whole.ssim[whole.level == level].mean() for level in (30, 90))
+    assert last > first + 0.02
+    scene_plans, view_plans = read_plans(run.plan)
+    assert [p.target for p in scene_plans] == [0.3, 0.4, 0.5]
+    assert len(view_plans) == 12
+    composed = read_ply(run.composed)
+    assert len(composed) == scene_plans[1].count
+    for choice in scene_plans[1].choices:
+        assert composed.counts()[choice.label_id] == choice.count
+    assert set(evaluation.view) == {0, 8}
+    page = (run.report / "index.html").read_text()
+    assert "grass-merged" in page
+    assert "http://" not in page.replace("http://www.w3.org", "")
+
+
+def test_whole_image_row_is_the_pixel_weighted_mean_of_the_categories(finished: Path) -> None:
+    table = read_observations(RunDir(finished).observations)
+    table = table.select((table.level == 90) & (table.view == 3))
+    parts = table.select(table.label_id != TOTAL)
+    whole = table.select(table.label_id == TOTAL)
+    assert parts.num_pixels.sum() == whole.num_pixels[0] == 80 * 60
+    assert np.average(parts.ssim, weights=parts.num_pixels) == pytest.approx(whole.ssim[0], abs=1e-5)
+
+
+def test_a_second_run_has_nothing_to_do(finished: Path, capture: Path) -> None:
+    assert named(work(finished, capture), StageSkipped) == STAGES
+
+
+def test_other_settings_need_force_and_redo_only_what_depends_on_them(finished: Path, capture: Path) -> None:
+    other = replace(CONFIG, plan=PlanConfig(target_ssim=0.5))
+    with pytest.raises(RunError, match=r"plan\.json: made with other .*--force"):
+        work(finished, capture, other)
+    try:
+        events = work(finished, capture, other, force=True)
+        assert named(events, StageDone) == ["plan", "compose", "evaluate", "report"]
+    finally:
+        work(finished, capture, force=True)
+
+
+def test_a_killed_run_goes_on_and_ends_with_the_same_levels(
+    finished: Path, capture: Path, tmp_path: Path
+) -> None:
+    class Killed(Exception):
+        pass
+
+    def emit(event: Event) -> None:
+        if isinstance(event, Training) and event.step == 71:
+            raise Killed
+
+    with pytest.raises(Killed):
+        pipeline.run_all(Job(RunDir(tmp_path / "run"), emit), capture, CONFIG)
+    events = work(tmp_path / "run", capture)
+    assert named(events, StageSkipped) == ["scene", "masks", "lift"]
+    assert min(e.step for e in events if isinstance(e, Training)) == 61
+    for level in (30, 60, 90):
+        a, b = (read_level(folder / "levels" / f"{level:06d}.npz") for folder in (finished, tmp_path / "run"))
+        for name, value in a.parameters().items():
+            np.testing.assert_array_equal(value, b.parameters()[name], err_msg=name)
+
+
+def test_a_run_folder_of_another_scene_is_refused(finished: Path, capture: Path, tmp_path: Path) -> None:
+    shutil.copytree(capture, tmp_path / "other")
+    with pytest.raises(RunError, match=r"scene\.json: made with other path"):
+        work(finished, tmp_path / "other")
+
+
+def test_a_folder_that_is_no_run_is_left_alone(capture: Path, tmp_path: Path) -> None:
+    (tmp_path / "letter.txt").write_text("dear")
+    with pytest.raises(RunError, match="not a run folder"):
+        work(tmp_path, capture)
+    assert [p.name for p in tmp_path.iterdir()] == ["letter.txt"]
+
+
+def test_export_takes_levels_and_categories(finished: Path, tmp_path: Path) -> None:
+    job = Job(RunDir(finished), print)
+    count = stages.export_ply(job, tmp_path / "a.ply", level=60, labels=["vase", "grass-merged"], target=None)
+    g = read_ply(tmp_path / "a.ply")
+    assert len(g) == count
+    assert set(g.counts()) == {86, 193}
+    expected = job.ladder.load(60, [86, 193])
+    np.testing.assert_array_equal(g.means, expected.means)
+    with pytest.raises(RunError, match=r"a\.ply: exists"):
+        stages.export_ply(job, tmp_path / "a.ply", level=None, labels=[], target=None)
+    with pytest.raises(RunError, match="no category 'cat'"):
+        stages.export_ply(job, tmp_path / "b.ply", level=None, labels=["cat"], target=None)
+    with pytest.raises(RunError, match=r"no plan for SSIM 0\.77"):
+        stages.export_ply(job, tmp_path / "b.ply", level=None, labels=[], target=0.77)
+
+
+def test_a_broken_level_is_one_clear_error(finished: Path, capture: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    (run / "levels" / "000060.npz").write_bytes(b"PK\x03\x04 broken")
+    with pytest.raises(RunError, match=r"made with other levels \(its content changed\)"):
+        work(run, capture)

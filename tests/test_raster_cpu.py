@@ -1,0 +1,117 @@
+"""The CPU backend against the float64 oracle: images, features, radii and all gradients."""
+
+import pytest
+import torch
+from conftest import pinhole, random_gaussians, render_with_gradients
+
+from sagesplat.gaussians import Gaussians
+from sagesplat.raster import set_threads
+from sagesplat.scene.scene import Camera
+
+IMAGE_TOLERANCE = 3e-6
+GRADIENT_TOLERANCE = 1e-5  # relative to a parameter's largest gradient
+
+
+def assert_agree(g: Gaussians, camera: Camera, image=IMAGE_TOLERANCE, gradient=GRADIENT_TOLERANCE, **options):
+    expected, expected_grads = render_with_gradients(g, camera, "reference", **options)
+    actual, actual_grads = render_with_gradients(g, camera, "cpu", **options)
+    assert actual.rgb.dtype == torch.float32
+    assert (actual.rgb - expected.rgb).abs().max() < image
+    assert (actual.alpha - expected.alpha).abs().max() < image
+    assert (actual.features is None) == (expected.features is None)
+    if actual.features is not None and expected.features is not None:
+        assert actual.features.shape == expected.features.shape
+        assert (actual.features - expected.features).abs().max() < image
+    drawn = actual.radii > 0
+    torch.testing.assert_close(actual.radii[drawn].double(), expected.radii[drawn], rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(actual.means2d[drawn].double(), expected.means2d[drawn], rtol=1e-5, atol=1e-4)
+    assert actual_grads.keys() == expected_grads.keys()
+    for name, wanted in expected_grads.items():
+        largest = wanted.abs().max() if wanted.numel() else torch.ones(())
+        error = (actual_grads[name].double() - wanted.double()).abs().max() if wanted.numel() else 0
+        assert error <= gradient * largest, name
+    return actual, actual_grads
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_agrees_with_the_oracle(degree, antialiased):
+    g = random_gaussians(80, seed=degree, degree=degree)
+    background = torch.tensor([0.2, 0.3, 0.4])
+    _, grads = assert_agree(g, pinhole(50, 38), background=background, antialiased=antialiased)
+    for name in ("means", "quats", "log_scales", "logit_opacities", "sh0", "means2d"):
+        assert grads[name].abs().max() > 1e-3, name  # something was compared
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4, 7])
+def test_features_blend_like_colours_over_zero(channels):
+    features = torch.randn(120, channels, generator=torch.Generator().manual_seed(channels))
+    render, grads = assert_agree(
+        random_gaussians(120, seed=5, degree=1),
+        pinhole(45, 33),
+        features=features,
+        background=torch.tensor([0.9, 0.1, 0.5]),
+    )
+    assert render.features is not None
+    assert render.features.shape == (33, 45, channels)
+    assert grads["features"].abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("size", [(16, 16), (33, 17), (5, 3), (1, 1), (1, 40)])
+def test_any_image_size(size):
+    assert_agree(random_gaussians(60, seed=1, degree=1), pinhole(*size))
+
+
+def test_harmonics_above_the_asked_degree_are_ignored():
+    g = random_gaussians(80, seed=2)
+    render, grads = assert_agree(g, pinhole(), sh_degree=1)
+    assert (grads["shN"][:, 3:] == 0).all()
+    assert (grads["shN"][:, :3] != 0).any()
+    full, _ = render_with_gradients(g, pinhole(), sh_degree=9)  # more than there are: all there are
+    default, _ = render_with_gradients(g, pinhole())
+    assert torch.equal(full.rgb, default.rgb)
+    assert not torch.equal(full.rgb, render.rgb)
+
+
+def test_a_jacobian_clamped_outside_the_image():
+    g = random_gaussians(80, seed=3, degree=1, log_scale=-1.0)
+    g.means[:, 0] *= 6  # most centres lie outside
+    g.means[:, 2] = g.means[:, 2].clamp_min(1.0)
+    render, _ = assert_agree(g, pinhole(60, 40))
+    clamped = ((render.means2d[:, 0] - 30).abs() > 1.3 * 30) & (render.radii > 0)
+    assert clamped.sum() > 3
+
+
+def test_an_opaque_pile_stops_early():
+    g = random_gaussians(300, seed=4, degree=0, log_scale=0.3, logit=4.0)
+    g.means[:, 2] = torch.linspace(2, 9, 300)
+    render, grads = assert_agree(g, pinhole(40, 40), gradient=1e-4)
+    assert render.alpha.min() > 1 - 1e-3
+    assert (render.radii[200:] > 0).all()  # they would be seen
+    assert (grads["sh0"][200:] == 0).all()  # and are hidden by those in front
+
+
+def test_same_bits_twice_and_with_any_number_of_threads():
+    g, camera = random_gaussians(3000, seed=6, degree=1), pinhole(200, 120)
+    features = torch.rand(3000, 4, generator=torch.Generator().manual_seed(1))
+    results = []
+    for threads in (1, 1, 0):
+        set_threads(threads)
+        results.append(render_with_gradients(g, camera, features=features))
+    first, first_grads = results[0]
+    for render, grads in results[1:]:
+        assert torch.equal(render.rgb, first.rgb)
+        assert torch.equal(render.alpha, first.alpha)
+        assert torch.equal(render.features, first.features)
+        assert all(torch.equal(grads[name], first_grads[name]) for name in first_grads)
+
+
+def test_the_order_of_the_rows_does_not_matter():
+    g, camera = random_gaussians(400, seed=7, degree=2), pinhole(90, 70)
+    order = torch.randperm(400, generator=torch.Generator().manual_seed(2))
+    render, grads = render_with_gradients(g, camera)
+    shuffled, shuffled_grads = render_with_gradients(g.select(order), camera)
+    assert (render.rgb - shuffled.rgb).abs().max() < 1e-6
+    assert torch.equal(render.radii[order], shuffled.radii)
+    for name, grad in grads.items():
+        assert (grad[order] - shuffled_grads[name]).abs().max() <= 1e-6 * grad.abs().max(), name

@@ -1,0 +1,116 @@
+"""Gaussians that no photograph asks for: the renderer stays finite, or says in one line what is wrong."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from conftest import pinhole, random_gaussians, render_with_gradients
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sagesplat.errors import BackendUnavailable, DataError
+from sagesplat.gaussians import PARAMETERS
+from sagesplat.raster import rasterize, resolve_backend
+
+BACKGROUND = torch.tensor([0.2, 0.3, 0.4])
+
+
+def assert_sound(g, camera, **options):
+    render, grads = render_with_gradients(g, camera, **options)
+    for tensor in (render.rgb, render.alpha, render.radii, *grads.values()):
+        assert torch.isfinite(tensor).all()
+    assert render.rgb.shape == (camera.height, camera.width, 3)
+    assert render.alpha.min() >= 0
+    assert render.alpha.max() <= 1
+    return render, grads
+
+
+def test_nothing_to_draw_shows_the_background():
+    g = random_gaussians(20)
+    behind = replace(g, means=g.means * torch.tensor([1.0, 1.0, -1.0]))
+    faint = replace(g, logit_opacities=torch.full((20,), -40.0))
+    for nothing in (g.select(torch.zeros(20, dtype=torch.bool)), behind, faint):
+        render, grads = render_with_gradients(nothing, pinhole(20, 10), background=BACKGROUND)
+        assert (render.rgb == BACKGROUND).all()
+        assert (render.alpha == 0).all()
+        assert (render.radii == 0).all()
+        assert all((grad == 0).all() for grad in grads.values())
+        oracle = rasterize(nothing, pinhole(20, 10), background=BACKGROUND, backend="reference")
+        assert (oracle.rgb == BACKGROUND).all()
+
+
+@pytest.mark.parametrize("log_scale", [-500.0, -20.0, 5.0, 20.0, 60.0, 400.0])
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_extreme_sizes(log_scale, antialiased):
+    g = random_gaussians(20, log_scale=log_scale)
+    render, _ = assert_sound(g, pinhole(20, 10), antialiased=antialiased)
+    if log_scale in (5.0, 20.0):
+        assert render.alpha.min() > 0.99  # everything is covered
+
+
+def test_points_are_as_wide_as_the_low_pass_unless_antialiased():
+    g = random_gaussians(20, log_scale=-20.0)
+    assert assert_sound(g, pinhole())[0].alpha.max() > 0.05
+    assert assert_sound(g, pinhole(), antialiased=True)[0].alpha.max() == 0
+
+
+@pytest.mark.parametrize("length", [3.0, 8.0, 15.0])
+def test_needles(length):
+    g = random_gaussians(20)
+    needles = replace(g, log_scales=torch.tensor([length, -length, -length]).repeat(20, 1))
+    assert_sound(needles, pinhole(40, 30))
+    if length == 3.0:
+        expected = rasterize(needles, pinhole(40, 30), backend="reference")
+        assert (rasterize(needles, pinhole(40, 30)).rgb - expected.rgb).abs().max() < 1e-4
+
+
+def test_full_opacity_is_capped():
+    g = random_gaussians(1, log_scale=0.0)
+    for logit in (40.0, 1000.0):
+        solid = replace(g, means=torch.tensor([[0.0, 0.0, 4.0]]), logit_opacities=torch.tensor([logit]))
+        render, grads = assert_sound(solid, pinhole())
+        assert float(render.alpha.detach().max()) == pytest.approx(0.999, abs=1e-6)
+        assert grads["logit_opacities"] == 0
+
+
+def test_a_quaternion_without_direction_is_not_drawn():
+    g = random_gaussians(5)
+    g.quats[2] = 0
+    render, _ = assert_sound(g, pinhole())
+    assert render.radii[2] == 0
+
+
+@pytest.mark.parametrize("name", PARAMETERS)
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_not_finite_is_refused_in_one_line(name, value):
+    g = random_gaussians(20)
+    parameter = getattr(g, name).clone()
+    parameter.view(20, -1)[3, 0] = value
+    parameter.view(20, -1)[11, -1] = value
+    with pytest.raises(DataError, match=r"^2 of 20 Gaussians hold NaN or Inf \(first row 3\); .*\w$"):
+        rasterize(replace(g, **{name: parameter}), pinhole())
+
+
+def test_unknown_backend():
+    with pytest.raises(BackendUnavailable, match=r"'cuda' is not known; use --backend cpu"):
+        resolve_backend("cuda")  # type: ignore[arg-type]
+    assert resolve_backend("auto") == "cpu"
+    assert resolve_backend("reference") == "reference"
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(
+    count=st.integers(0, 12),
+    degree=st.integers(0, 3),
+    seed=st.integers(0, 10_000),
+    spread=st.floats(-2, 6),
+    shape=st.floats(0, 14),
+    size=st.tuples(st.integers(1, 40), st.integers(1, 40)),
+    antialiased=st.booleans(),
+)
+def test_anything_finite_gives_something_finite(count, degree, seed, spread, shape, size, antialiased):
+    g = random_gaussians(count, seed=seed, degree=degree)
+    wild = replace(
+        g, means=g.means * 10**spread, log_scales=g.log_scales * shape, logit_opacities=g.logit_opacities * 10
+    )
+    assert_sound(wild, pinhole(*size), antialiased=antialiased)

@@ -1,0 +1,116 @@
+"""Checkpoints: identical when read back, one line for everything else."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import damage, random_gaussians
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from sagesplat.errors import RunError
+from sagesplat.gaussians import PARAMETERS
+from sagesplat.train.checkpoint import read_checkpoint, write_checkpoint
+from sagesplat.train.state import TrainState, initial_state
+
+
+def some_state() -> TrainState:
+    """A state in the middle of a run."""
+    state = initial_state(random_gaussians(9, degree=1), seed=3)
+    generator = torch.Generator().manual_seed(4)
+    for moments in (state.first, state.second):
+        for p in moments.values():
+            p += torch.rand(p.shape, generator=generator)
+    state.grad_sum += torch.rand(9, generator=generator)
+    state.grad_count += 3
+    state.rng.standard_normal(5)
+    state.queue, state.step, state.last_reset = [4, 1, 7], 1200, 1000
+    return state
+
+
+def change(path: Path, **arrays: np.ndarray) -> None:
+    """Replace arrays of a checkpoint."""
+    with np.load(path) as file:
+        content = {name: file[name] for name in file.files}
+    np.savez(path, **(content | arrays))  # type: ignore[arg-type]
+
+
+def test_round_trip_is_identical(tmp_path):
+    state, path = some_state(), tmp_path / "run" / "checkpoint.npz"
+    write_checkpoint(path, state, "these settings")
+    back = read_checkpoint(path, "these settings")
+    for name in (*PARAMETERS, "label_ids"):
+        expected = getattr(state.gaussians, name)
+        assert torch.equal(getattr(back.gaussians, name), expected)
+        assert getattr(back.gaussians, name).dtype == expected.dtype
+    for name in PARAMETERS:
+        assert torch.equal(back.first[name], state.first[name])
+        assert torch.equal(back.second[name], state.second[name])
+    assert torch.equal(back.grad_sum, state.grad_sum)
+    assert torch.equal(back.grad_count, state.grad_count)
+    assert (back.queue, back.step, back.last_reset) == ([4, 1, 7], 1200, 1000)
+    assert back.rng.integers(0, 2**60) == state.rng.integers(0, 2**60)  # the same random future
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
+
+
+def test_other_settings_are_refused(tmp_path):
+    path = tmp_path / "checkpoint.npz"
+    write_checkpoint(path, some_state(), "a")
+    with pytest.raises(
+        RunError, match=r"other settings or inputs; delete checkpoint\.npz \(or add --force\)"
+    ):
+        read_checkpoint(path, "b")
+
+
+def test_other_versions_are_refused(tmp_path):
+    path = tmp_path / "checkpoint.npz"
+    write_checkpoint(path, some_state(), "a")
+    with np.load(path) as file:
+        meta = json.loads(str(file["meta"]))
+    change(path, meta=np.array(json.dumps({**meta, "version": 99})))
+    with pytest.raises(
+        RunError, match=r"checkpoint\.npz: checkpoint version 99, this sagesplat reads \d+; delete"
+    ):
+        read_checkpoint(path, "a")
+
+
+@pytest.mark.parametrize("name", ["means", "shN", "first/quats", "second/sh0", "grad_sum"])
+def test_not_finite_is_refused(tmp_path, name):
+    path = tmp_path / "checkpoint.npz"
+    write_checkpoint(path, some_state(), "a")
+    with np.load(path) as file:
+        array = file[name]
+    array.flat[2] = np.nan
+    change(path, **{name: array})
+    with pytest.raises(RunError, match=rf"checkpoint\.npz: {name} holds NaN or Inf; delete"):
+        read_checkpoint(path, "a")
+
+
+@pytest.mark.filterwarnings(
+    "ignore::pytest.PytestUnraisableExceptionWarning"
+)  # np.load leaves such files open
+@settings(
+    max_examples=100,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(st.data())
+def test_damage_is_one_line_or_harmless(tmp_path, data):
+    path = tmp_path / "checkpoint.npz"
+    if not path.exists():
+        write_checkpoint(path, some_state(), "a")
+        (tmp_path / "good").write_bytes(path.read_bytes())
+    path.write_bytes(damage((tmp_path / "good").read_bytes(), data))
+    try:
+        state = read_checkpoint(path, "a")
+    except RunError as error:
+        message = str(error)
+    else:
+        message = f"{path} is harmless"
+        assert state.step == 1200
+        assert all(torch.isfinite(p).all() for p in state.gaussians.parameters().values())
+    assert str(path) in message
+    assert "\n" not in message

@@ -1,0 +1,63 @@
+"""The fused Adam against torch's, and rows that are left alone."""
+
+import numpy as np
+import pytest
+import torch
+
+from sagesplat.train.optim import adam_step
+
+
+def gradients(shape: tuple[int, ...], steps: int) -> list[np.ndarray]:
+    """Gradients whose entries differ by many orders of magnitude, some of them zero."""
+    rng = np.random.default_rng(1)
+    scale = 10.0 ** rng.uniform(-9, 2, shape)
+    grads = [rng.normal(size=shape) * scale for _ in range(steps)]
+    return [np.where(rng.random(shape) < 0.2, 0, g).astype(np.float32) for g in grads]
+
+
+# rows around the chunk of 4096 that a thread works on
+@pytest.mark.parametrize("shape", [(7,), (50, 3), (4097, 1, 3), (9000, 4), (5, 15, 3)])
+def test_steps_are_torchs(shape):
+    start = np.random.default_rng(0).normal(size=shape).astype(np.float32)
+    expected = torch.tensor(start, requires_grad=True)
+    adam = torch.optim.Adam([expected], lr=3e-3, betas=(0.9, 0.999), eps=1e-15)
+    actual, first, second = start.copy(), np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    everything = np.ones(shape[0], bool)
+    grads = gradients(shape, 6)
+    for step, grad in enumerate(grads, start=1):
+        expected.grad = torch.from_numpy(grad)
+        adam.step()
+        adam_step(actual, grad, first, second, lr=3e-3, step=step, trainable=everything)
+    state = adam.state[expected]
+    largest = np.abs(grads).max(0) + 1e-30
+    np.testing.assert_allclose(first / largest, state["exp_avg"].numpy() / largest, atol=1e-6)
+    np.testing.assert_allclose(second, state["exp_avg_sq"].numpy(), rtol=3e-5, atol=1e-30)
+    np.testing.assert_allclose(actual, expected.detach().numpy(), rtol=1e-6, atol=1e-6)
+    assert np.abs(actual - start).max() > 5e-3
+
+
+@pytest.mark.parametrize("pattern", ["random", "none", "ends", "alternating"])
+def test_frozen_rows_keep_every_bit_and_the_others_do_not_notice(pattern):
+    n = 5000
+    rng = np.random.default_rng(2)
+    trainable = {
+        "random": rng.random(n) < 0.5,
+        "none": np.zeros(n, bool),
+        "ends": (np.arange(n) == 0) | (np.arange(n) == n - 1) | (np.arange(n) == 4095),
+        "alternating": np.arange(n) % 2 == 0,
+    }[pattern]
+    start = [rng.random((n, 3)).astype(np.float32) for _ in range(3)]  # parameter and both moments
+    masked, free = [a.copy() for a in start], [a.copy() for a in start]
+    for step, grad in enumerate(gradients((n, 3), 3), start=10):
+        adam_step(masked[0], grad, *masked[1:], lr=0.01, step=step, trainable=trainable)
+        adam_step(free[0], grad, *free[1:], lr=0.01, step=step, trainable=np.ones(n, bool))
+    for before, after, unmasked in zip(start, masked, free, strict=True):
+        np.testing.assert_array_equal(after[~trainable], before[~trainable])
+        np.testing.assert_array_equal(after[trainable], unmasked[trainable])
+        assert (after[trainable] != before[trainable]).all(-1).all()
+
+
+def test_no_rows_and_no_columns():
+    for shape in ((0, 3), (5, 0, 3)):
+        empty = np.zeros(shape, np.float32)
+        adam_step(empty, empty, empty, empty, lr=1.0, step=1, trainable=np.ones(shape[0], bool))

@@ -1,0 +1,181 @@
+"""Training on photos of known Gaussians: it learns, it repeats itself, it survives being killed."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import random_gaussians, write_capture
+
+from sagesplat.config import TrainConfig
+from sagesplat.errors import RunError
+from sagesplat.gaussians import PARAMETERS, Gaussians
+from sagesplat.scene.images import Photos
+from sagesplat.scene.scene import Scene
+from sagesplat.train.levels import read_header, read_level
+from sagesplat.train.state import from_points, initial_state
+from sagesplat.train.trainer import Event, LevelSaved, Resumed, Step, Trained, settings_of, train
+
+LABEL_IDS = np.array([-1, 3, 184], np.int16)[np.arange(60) % 3]
+# 8 views, of which 7 train; densification from step 2 to 29, a reset after step 20, levels every 12 steps
+BUSY = TrainConfig(max_steps=60, level_every=12, refine_every=7, reset_every=20)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Scene:
+    truth = random_gaussians(60, seed=12, degree=0, log_scale=-1.6, logit=1.0)
+    return write_capture(tmp_path_factory.mktemp("capture") / "cloud", truth)
+
+
+def run(scene: Scene, config: TrainConfig, **options) -> Iterator[Event]:
+    return train(scene, Photos(scene.views), LABEL_IDS, config, **options)
+
+
+def final(events: list[Event]) -> Gaussians:
+    assert isinstance(events[-1], Trained)
+    return events[-1].gaussians
+
+
+def assert_identical(a: Gaussians, b: Gaussians) -> None:
+    for name in (*PARAMETERS, "label_ids"):
+        assert torch.equal(getattr(a, name), getattr(b, name)), name
+
+
+@pytest.fixture(scope="module")
+def undisturbed(scene, tmp_path_factory) -> tuple[list[Event], Path]:
+    folder = tmp_path_factory.mktemp("run")
+    return list(run(scene, BUSY, folder=folder, settings="s")), folder
+
+
+def test_the_loss_falls(scene):
+    events = list(run(scene, TrainConfig(max_steps=84, sh_degree=1)))
+    losses = [e.loss for e in events if isinstance(e, Step)]
+    assert np.mean(losses[-7:]) < 0.65 * np.mean(losses[:7])
+    assert not any(e.recovering for e in events if isinstance(e, LevelSaved))  # nothing was reset
+
+
+def test_events_come_in_order(undisturbed):
+    events, folder = undisturbed
+    steps = [e for e in events if isinstance(e, Step)]
+    assert [e.step for e in steps] == list(range(1, 61))
+    levels = [e for e in events if isinstance(e, LevelSaved)]
+    assert [e.step for e in levels] == [12, 24, 36, 48, 60]
+    for level in levels:
+        before = events[events.index(level) - 1]
+        assert isinstance(before, Step)
+        assert before.step == level.step
+        assert before.num_gaussians == sum(level.counts.values())
+    assert [e.step for e in levels if e.recovering] == [24]  # the reset came after step 20
+    assert len(events) == 60 + 5 + 1
+    assert sorted(p.name for p in folder.rglob("*.npz")) == [
+        *(f"{step:06d}.npz" for step in (12, 24, 36, 48, 60)),
+        "checkpoint.npz",
+    ]
+
+
+def test_levels_hold_what_was_announced(undisturbed):
+    events, folder = undisturbed
+    for event in (e for e in events if isinstance(e, LevelSaved)):
+        path = folder / "levels" / f"{event.step:06d}.npz"
+        assert event.path == path
+        header = read_header(path)
+        assert header.counts == event.counts
+        assert (header.step, header.recovering) == (event.step, event.recovering)
+        assert header.sh_degree == 3  # raised every second step of such a short run
+    last, expected = read_level(folder / "levels" / "000060.npz"), final(events)
+    assert last.counts() == expected.counts()
+    for label in expected.counts():
+        assert torch.equal(last.of_labels([label]).means, expected.of_labels([label]).means)
+
+
+def test_densification_grows_and_labels_stay(undisturbed):
+    events, _ = undisturbed
+    counts = [e.num_gaussians for e in events if isinstance(e, Step)]
+    assert len(set(counts[:1])) == 1
+    assert max(counts) > 65  # it grew
+    assert len(set(counts[30:])) == 1  # and only in the first half
+    g = final(events)
+    assert set(g.counts()) <= {-1, 3, 184}
+    assert g.label_ids.dtype == torch.int16
+    assert len(g.label_ids) == len(g) == counts[-1]
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_one_does_not(scene, undisturbed):
+    events, _ = undisturbed
+    again = list(run(scene, BUSY))
+    assert_identical(final(again), final(events))
+    assert [e for e in again if isinstance(e, Step)] == [e for e in events if isinstance(e, Step)]
+    assert all(e.path is None for e in again if isinstance(e, LevelSaved))  # nothing is written
+    other = list(run(scene, replace(BUSY, max_steps=10), seed=1))
+    first = [e.loss for e in events if isinstance(e, Step)][:10]
+    assert [e.loss for e in other if isinstance(e, Step)] != first
+
+
+@pytest.mark.parametrize("killed_after", [13, 26, 47])
+def test_a_killed_run_ends_where_it_would_have(scene, undisturbed, tmp_path, killed_after):
+    events, folder = undisturbed
+    killed = run(scene, BUSY, folder=tmp_path, settings="s")
+    for event in killed:
+        if isinstance(event, Step) and event.step == killed_after:
+            break
+    killed.close()  # type: ignore[attr-defined]
+    resumed = list(run(scene, BUSY, folder=tmp_path, settings="s"))
+    assert resumed[0] == Resumed(killed_after // 12 * 12)
+    assert_identical(final(resumed), final(events))
+    for path in sorted((folder / "levels").iterdir()):
+        assert_identical(read_level(tmp_path / "levels" / path.name), read_level(path))
+    finished = list(run(scene, BUSY, folder=tmp_path, settings="s"))
+    assert finished[0] == Resumed(60)
+    assert len(finished) == 2
+    assert_identical(final(finished), final(events))
+
+
+def test_a_checkpoint_of_other_settings_is_refused(scene, undisturbed):
+    _, folder = undisturbed
+    with pytest.raises(RunError, match=r"made with other settings"):
+        list(run(scene, BUSY, folder=folder, settings="others"))
+    assert settings_of(BUSY, 0) != settings_of(BUSY, 1)
+    assert settings_of(BUSY, 0) != settings_of(replace(BUSY, sh_degree=2), 0)
+
+
+def test_every_view_is_seen_once_a_round_and_test_views_never(scene):
+    class Recorded(Photos):
+        def __getitem__(self, index):
+            seen.append(index)
+            return super().__getitem__(index)
+
+    seen: list[int] = []
+    list(train(scene, Recorded(scene.views), LABEL_IDS, TrainConfig(max_steps=21, sh_degree=0)))
+    for start in (0, 7, 14):
+        assert sorted(seen[start : start + 7]) == [1, 2, 3, 4, 5, 6, 7]
+    assert seen[:7] != seen[7:14] or seen[:7] != seen[14:]
+
+
+def test_a_loss_that_is_not_finite_is_one_line(scene):
+    class Broken(Photos):
+        def __getitem__(self, index):
+            return super().__getitem__(index) + np.float32(np.nan)
+
+    with pytest.raises(RunError, match=r"^the loss became nan at step 1; lower the learning rates"):
+        list(train(scene, Broken(scene.views), LABEL_IDS, BUSY))
+
+
+def test_from_points(scene):
+    g = from_points(scene.points, LABEL_IDS, sh_degree=2)
+    np.testing.assert_array_equal(g.means.numpy(), scene.points.xyz)
+    np.testing.assert_array_equal(g.label_ids.numpy(), LABEL_IDS)
+    np.testing.assert_allclose(g.logit_opacities.sigmoid(), 0.1, rtol=1e-6)
+    assert g.sh_degree == 2
+    assert not g.shN.any()
+    shown = g.sh0[:, 0].numpy() * 0.28209479177387814 + 0.5
+    np.testing.assert_allclose(shown * 255, scene.points.rgb, atol=1e-3)
+    distances = np.linalg.norm(scene.points.xyz - scene.points.xyz[0], axis=1)
+    nearest = np.sort(distances)[1:4]
+    np.testing.assert_allclose(g.log_scales[0].exp(), np.sqrt(np.square(nearest).mean()), rtol=1e-5)
+    assert not np.shares_memory(g.means.numpy(), scene.points.xyz)
+    state = initial_state(g, seed=0)
+    assert state.step == 0
+    assert state.last_reset == -1
+    assert not any(p.any() for p in (*state.first.values(), *state.second.values()))
