@@ -73,7 +73,7 @@ def step(scene: Positional[Path], downscale: int = 1, threads: int = 0, repeats:
 
 @app.command
 def agreement(count: int = 400, width: int = 120, height: int = 90, seeds: int = 5) -> None:
-    """Largest differences of the cpu backend to the float64 reference; gradients relative to their largest."""
+    """Largest differences of the cpu backend to the float64 reference; gradients relative to the largest."""
     worst: dict[str, float] = {}
     for seed in range(seeds):
         images, grads = zip(

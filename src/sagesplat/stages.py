@@ -25,17 +25,17 @@ from sagesplat.errors import RunError
 from sagesplat.events import Progress, RunDone, TableMade, Training, Warned
 from sagesplat.files import read_json, write_json
 from sagesplat.job import Job, fingerprint, run_stage
+from sagesplat.output import tables
 from sagesplat.output.ply import write_ply
 from sagesplat.output.report import write_report
 from sagesplat.output.summary import report_data
+from sagesplat.output.tables import Table
 from sagesplat.run_dir import RunDir, file_hash
 from sagesplat.scene import load_scene
 from sagesplat.segment.lift import lift
 from sagesplat.segment.masks import import_masks
 from sagesplat.train.checkpoint import read_checkpoint
 from sagesplat.train.trainer import LevelSaved, Resumed, Step, Trained, train
-
-LEVELS_SHOWN = 6  # columns of the table that a run prints of its ladder
 
 
 def open_scene(job: Job, path: Path, config: SceneConfig) -> None:
@@ -188,7 +188,8 @@ def observe_levels(job: Job, config: FitConfig) -> None:
             progress=lambda done, total: job.emit(Progress("observe", done, total)),
         )  # fmt: skip
         table.write_csv(run.observations)
-        job.emit(_ladder_table(job, table))
+        seen = table.select(np.isin(table.view, job.scene.train_ids))
+        _show(job, tables.ladder_table(seen, job.ladder.counts, job.ladder.recovering, job.names()))
         return [
             f"{len(table):,} observations of {len(job.ladder.files)} levels in {len(job.scene.views)} views"
         ]
@@ -207,29 +208,8 @@ def _distances(job: Job, config: FitConfig) -> dict[int, np.ndarray]:
     return distances_in_views(job.scene, job.point_labels, percentile)
 
 
-def _ladder_table(job: Job, table: Observations) -> TableMade:
-    """Mean SSIM and count per category at some levels, over training views (Tables I and II of the paper)."""
-    settled = [level for level in job.ladder.levels if level not in job.ladder.recovering]
-    picked = sorted({settled[i] for i in np.linspace(0, len(settled) - 1, LEVELS_SHOWN).round().astype(int)})
-    seen = table.select(np.isin(table.view, job.scene.train_ids))
-    counts = job.ladder.counts
-    last = {label: counts.get((label, settled[-1]), 0) for label in np.unique(seen.label_id).tolist()}
-    rows = []
-    for label in [*sorted((i for i in last if i != TOTAL), key=lambda i: -last[i]), TOTAL]:
-        name = "whole image" if label == TOTAL else job.taxonomy.name(label)
-        cells = [name]
-        for level in picked:
-            here = seen.ssim[(seen.label_id == label) & (seen.level == level)]
-            n = sum(c for (i, at), c in counts.items() if at == level and label in (TOTAL, i))
-            cells.append(f"{here.mean():.3f}  {_short(n)}" if len(here) else f"-  {_short(n)}")
-        rows.append(tuple(cells))
-    return TableMade(
-        "SSIM and Gaussians by level (training views)", ("category", *map(str, picked)), tuple(rows)
-    )
-
-
-def _short(count: int) -> str:
-    return f"{count / 1e6:.2f}M" if count >= 1e6 else f"{count / 1e3:.1f}k"
+def _show(job: Job, table: Table) -> None:
+    job.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
 
 
 def _large_enough(job: Job, config: FitConfig, table: Observations) -> Observations:
@@ -315,6 +295,10 @@ def evaluate_plans(job: Job, fit: FitConfig) -> None:
             progress=lambda done, total: job.emit(Progress("evaluate", done, total)),
         )  # fmt: skip
         table.write_csv(run.evaluation)
+        target = main_target(run)
+        plan = next(p for p in read_plans(run.plan)[0] if p.target == target)
+        if len(table):
+            _show(job, tables.outcome_table(plan, job.ladder.counts, table, job.names()))
         whole = table.select(table.label_id == TOTAL)
         lines = []
         for target in np.unique(whole.target):

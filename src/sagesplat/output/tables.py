@@ -104,6 +104,45 @@ def counts_table(counts: Counts, labels: Sequence[int], names: Mapping[int, str]
     return Table("Gaussians by level", header, (",d",) * len(header), body)
 
 
+def ladder_table(
+    rows: Observations, counts: Counts, recovering: frozenset[int], names: Mapping[int, str], columns: int = 6
+) -> Table:
+    """Tables I and II in one, for a terminal: mean SSIM and thousands of Gaussians at some settled levels."""
+    levels = sorted({level for _, level in counts})
+    settled = [level for level in levels if level not in recovering] or levels
+    picked = sorted({settled[i] for i in np.linspace(0, len(settled) - 1, columns).round().astype(int)})
+    body = []
+    for label_id in [*by_size(counts), TOTAL]:
+        cells = []
+        for level in picked:
+            here = [n for (i, at), n in counts.items() if at == level and label_id in (TOTAL, i)]
+            cells.append(f"{view_mean(rows, label_id, level):.3f} {sum(here) / 1e3:6.1f}k")
+        body.append((name_of(label_id, names), *cells))
+    header = ("category", *(f"step {level}" for level in picked))
+    return Table("SSIM and Gaussians by level, training views", header, ("",) * len(header), body)
+
+
+def outcome_table(plan: Plan, counts: Counts, evaluation: Evaluation, names: Mapping[int, str]) -> Table:
+    """A plan in short: what each category takes, what was promised and what test views show."""
+    full = last_counts(counts)
+    rows = evaluation.select(evaluation.target == np.float32(plan.target))
+    body = []
+    for choice in sorted(plan.choices, key=lambda c: -full.get(c.label_id, 0)):
+        here = rows.select(rows.label_id == choice.label_id)
+        share = choice.count / full[choice.label_id] if full.get(choice.label_id) else math.nan
+        body.append(
+            (name_of(choice.label_id, names), choice.level, choice.count, share, choice.predicted_ssim,
+             mean(here.ssim), mean(here.full_ssim), choice.status)
+        )  # fmt: skip
+    whole = rows.select(rows.label_id == TOTAL)
+    share = plan.count / max(1, sum(full.values()))
+    measured = (mean(whole.ssim), mean(whole.full_ssim))
+    body.append((name_of(TOTAL, names), math.nan, plan.count, share, math.nan, *measured, plan.status))
+    header = ("category", "level", "Gaussians", "of 3DGS", "promised", "test SSIM", "3DGS", "status")
+    formats = ("", ",d", ",d", ".1%", ".3f", ".3f", ".3f", "")
+    return Table(f"Plan for SSIM {plan.target:g}, measured on test views", header, formats, body)
+
+
 def plan_table(plan: Plan, counts: Counts, names: Mapping[int, str]) -> Table:
     """What one plan chose for each label, the largest first."""
     full = last_counts(counts)
