@@ -9,7 +9,7 @@ from sagesplat.demo.capture import cached_capture
 from sagesplat.events import Progress, StageDone, StageStarted
 from sagesplat.job import Job
 
-DEMO = RunConfig(train=TrainConfig(max_steps=2000))  # the built-in capture, within minutes on two cores
+DEMO = RunConfig(train=TrainConfig(max_steps=2000, level_every=100))  # minutes on two cores
 
 
 def run_all(job: Job, scene: Path, config: RunConfig) -> None:

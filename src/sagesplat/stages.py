@@ -128,7 +128,7 @@ def lift_labels(job: Job, config: LiftConfig) -> None:
     run = job.run
 
     def make() -> list[str]:
-        lifted = lift(job.scene, job.masks, votes=config.votes)
+        lifted = lift(job.scene, job.masks, votes=config.votes, views=set(job.scene.train_ids.tolist()))
         lifted.write(run.labels)
         return [f"{100 * lifted.agreement:.1f} % of the votes agree with the label of their point"]
 

@@ -1,6 +1,6 @@
 """Labels of the structure-from-motion points, by vote over the label images."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, fields
 from itertools import pairwise
 from pathlib import Path
@@ -60,12 +60,18 @@ class LiftedLabels:
         return cls(**columns)
 
 
-def lift(scene: Scene, masks: Masks, *, votes: Literal["track", "projection"] = "track") -> LiftedLabels:
+def lift(
+    scene: Scene,
+    masks: Masks,
+    *,
+    votes: Literal["track", "projection"] = "track",
+    views: Collection[int] | None = None,
+) -> LiftedLabels:
     """Give each point the label that most of its pixels have.
 
     A point votes once per observation of its track, or with `votes="projection"` once per view whose frustum
     it lies in (occluded or not). Unlabelled pixels do not vote; ties go to the label with more pixels in all
-    label images together.
+    label images together. `views`: only these rows of `Scene.views` have a vote (default: all).
     """
     ids = np.array(sorted(masks.taxonomy.names))
     column_of = np.zeros(ids[-1] + 1, np.int64)
@@ -74,7 +80,9 @@ def lift(scene: Scene, masks: Masks, *, votes: Literal["track", "projection"] = 
     flat_counts = counts.reshape(-1)  # np.add.at is several times faster on one axis
     num_pixels = np.zeros(len(ids), np.int64)
     pixels = _track_pixels(scene) if votes == "track" else _projected_pixels(scene)
-    for view, (points, uv) in zip(scene.views, pixels, strict=True):
+    for row, (view, (points, uv)) in enumerate(zip(scene.views, pixels, strict=True)):
+        if views is not None and row not in views:
+            continue
         label_ids = masks[view]
         # unsigned, unlabelled pixels are 65535: out of the way
         num_pixels += np.bincount(label_ids.view(np.uint16).ravel(), minlength=ids[-1] + 1)[ids]

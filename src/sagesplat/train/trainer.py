@@ -1,7 +1,7 @@
 """Training: a generator of events over a state; it prints nothing and draws nothing."""
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -166,8 +166,3 @@ def _step(
             trainable=trainable.numpy(),
         )
     return value
-
-
-def settings_of(config: TrainConfig, seed: int) -> dict[str, object]:
-    """What a checkpoint must share with the run that continues it."""
-    return {**asdict(config), "seed": seed}

@@ -1,0 +1,56 @@
+"""Distances of categories, eroded masks and what is measured in a view."""
+
+import numpy as np
+import pytest
+from conftest import random_gaussians, write_capture
+
+from sagesplat.adapt.observe import TOTAL, as_unit, distances_in_views, erode, measure
+from sagesplat.metrics import ssim_map
+
+
+def test_distances_are_the_percentile_of_the_points_in_sight(tmp_path):
+    scene = write_capture(tmp_path, random_gaussians(200))
+    labels = np.arange(200, dtype=np.int16) % 2
+    nearest, default = distances_in_views(scene, labels, 0.0), distances_in_views(scene, labels)
+    for row, view in enumerate(scene.views):
+        for label in (0, 1):
+            expected = []
+            for x in scene.points.xyz[labels == label]:
+                u, v, depth = view.camera.K @ (view.camera.w2c[:3, :3] @ x + view.camera.w2c[:3, 3])
+                if depth > 0 and 0 <= u / depth < view.camera.width and 0 <= v / depth < view.camera.height:
+                    expected.append(np.linalg.norm(x - view.camera.position))
+            assert nearest[label][row] == pytest.approx(min(expected), rel=1e-5)
+            assert default[label][row] == pytest.approx(np.percentile(expected, 5), rel=1e-5)
+
+
+def test_a_category_out_of_sight_has_no_distance(tmp_path):
+    scene = write_capture(tmp_path, random_gaussians(50))
+    scene.points.xyz[7] = (0, 0, -50)  # behind every camera
+    labels = np.zeros(50, np.int16)
+    labels[7] = 9
+    assert np.isnan(distances_in_views(scene, labels)[9]).all()
+
+
+def test_erode_keeps_pixels_that_are_far_from_any_border():
+    label_ids = np.full((40, 50), 3, np.int16)
+    label_ids[:, 25:] = 4
+    inner = erode(label_ids)
+    assert set(np.unique(inner[:, :20])) == {3}
+    assert set(np.unique(inner[:, 30:])) == {4}
+    assert not np.isin(inner[:, 20:30], (3, 4)).any()
+
+
+def test_measure_takes_means_of_the_map_over_each_mask():
+    rng = np.random.default_rng(0)
+    photo = rng.integers(0, 256, (40, 50, 3), np.uint8)
+    image = np.clip(as_unit(photo) + rng.normal(0, 0.1, photo.shape), 0, 1).astype(np.float32)
+    label_ids = np.where(np.arange(50) < 25, -1, 7)[None].repeat(40, 0).astype(np.int16)
+    rows = measure(image, as_unit(photo), label_ids)
+    quality = ssim_map(image, as_unit(photo))
+    assert set(rows) == {-1, 7, TOTAL}
+    assert rows[7]["ssim"] == pytest.approx(quality[:, 25:].mean(), abs=1e-6)
+    assert rows[7]["ssim_eroded"] == pytest.approx(quality[:, 30:].mean(), abs=1e-6)
+    error = np.square(image - as_unit(photo))[:, :25].mean()
+    assert rows[-1]["psnr"] == pytest.approx(-10 * np.log10(error), abs=1e-3)
+    assert rows[TOTAL]["num_pixels"] == 2000
+    assert measure(as_unit(photo), as_unit(photo), label_ids)[TOTAL]["psnr"] == 100
