@@ -71,7 +71,7 @@ class TrainConfig:
     prune_scale: float = 0.1
     """After the first reset, Gaussians larger than this share of the extent go."""
     max_gaussians: int = 0
-    """No densification beyond this count (0: 1.5 times the pixels of a photo, at least twice the points)."""
+    """Cap of densification, reached in a straight line (0: by the size of the photos)."""
 
 
 @dataclass(frozen=True)

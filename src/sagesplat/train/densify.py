@@ -57,9 +57,15 @@ def observe_gradients(state: TrainState, render: Render, width: int, height: int
     state.grad_count += seen
 
 
-def cap(config: TrainConfig, num_pixels: int, num_points: int) -> int:
-    """The largest number of Gaussians: as set, or what photos of `num_pixels` can tell apart."""
-    return config.max_gaussians or max(int(1.5 * num_pixels), 2 * num_points)
+def budget(config: TrainConfig, plan: Schedule, step: int, num_pixels: int, num_points: int) -> int:
+    """How many Gaussians there may be after a step: from the points to the cap in a straight line.
+
+    Room that opens bit by bit goes to where the error is largest at the time, and gives levels of every size.
+    The cap is as set, or what photos of `num_pixels` can tell apart.
+    """
+    cap = config.max_gaussians or max(int(1.5 * num_pixels), 2 * num_points)
+    share = min(1.0, (step - plan.refine_start) / max(1, plan.refine_stop - plan.refine_start))
+    return num_points + int(share * (cap - num_points))
 
 
 def refine(state: TrainState, config: TrainConfig, extent: float, room: int, trainable: Tensor) -> None:

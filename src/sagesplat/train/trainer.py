@@ -76,7 +76,7 @@ def train(
     plan = densify.schedule(config)
     extent = scene.extent
     camera = scene.views[0].camera
-    most = densify.cap(config, camera.width * camera.height, len(scene.points.xyz))
+    num_pixels = camera.width * camera.height
     state = initial_state(from_points(scene.points, label_ids, config.sh_degree), seed)
     checkpoint = folder / "checkpoint.npz" if folder else None
     if checkpoint and checkpoint.exists():
@@ -91,6 +91,7 @@ def train(
         if plan.refine_start < step < plan.refine_stop:
             trainable = torch.ones(len(state.gaussians), dtype=torch.bool)
             if step % config.refine_every == 0:
+                most = densify.budget(config, plan, step, num_pixels, len(scene.points.xyz))
                 densify.refine(state, config, extent, most - len(state.gaussians), trainable)
                 trainable = torch.ones(len(state.gaussians), dtype=torch.bool)
             if step % plan.reset_every == 0:
