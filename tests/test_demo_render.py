@@ -118,3 +118,10 @@ def test_light_is_baked():
     assert 0.1 < world.leaf_light[:, 0].mean() < 0.9
     middle, lawn = world.ground_light[160, 160], world.ground_light[160, 260]
     assert middle[1] < 0.5 < lawn[1]  # the sky under the table, and on the lawn
+
+
+def test_no_leaf_fills_the_tree_alone():
+    # seed 3 has just more leaves than a power of two: thousands of copies of one leaf made rays crawl
+    for seed in (0, 3):
+        copies = np.unique(build_world(seed).leaves, axis=0, return_counts=True)[1]
+        assert copies.max() <= 2

@@ -2,6 +2,7 @@
 
 import time
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console as RichConsole
 from rich.progress import (
     BarColumn,
@@ -85,9 +86,11 @@ class Console:
                 for line in lines[1:]:
                     self.out.print(f"{'':21}{line}", soft_wrap=True)
             case TableMade(title, header, rows):
-                table = Table(title=title, title_justify="left", title_style="bold")
+                table = Table(
+                    title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1)
+                )
                 for index, column in enumerate(header):
-                    table.add_column(column, justify="left" if index == 0 else "right")
+                    table.add_column(column, justify="left" if index == 0 else "right", no_wrap=True)
                 for row in rows:
                     table.add_row(*row)
                 self.out.print(table)

@@ -41,10 +41,11 @@ def means_by_label(
     values: Float[np.ndarray, "H W"], label_ids: Int[np.ndarray, "H W"]
 ) -> dict[int, tuple[float, int]]:
     """Mean of a map over each label's pixels, and how many there are, by label id."""
-    present, inverse = np.unique(label_ids, return_inverse=True)
-    counts = np.bincount(inverse.ravel())
-    sums = np.bincount(inverse.ravel(), weights=values.ravel())
-    return {int(i): (float(s / n), int(n)) for i, s, n in zip(present, sums, counts, strict=True)}
+    lowest = int(label_ids.min(initial=0))
+    shifted = label_ids.ravel().astype(np.int64) - lowest
+    counts = np.bincount(shifted)
+    sums = np.bincount(shifted, weights=values.ravel())
+    return {int(i) + lowest: (float(sums[i] / counts[i]), int(counts[i])) for i in np.flatnonzero(counts)}
 
 
 class _PhotometricLoss(torch.autograd.Function):

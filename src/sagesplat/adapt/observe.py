@@ -102,10 +102,14 @@ def measure(
     image: Float32[np.ndarray, "H W 3"],
     photo: Float32[np.ndarray, "H W 3"],
     label_ids: Int16[np.ndarray, "H W"],
+    inner_ids: Int16[np.ndarray, "H W"] | None = None,
 ) -> dict[int, dict[str, float]]:
-    """SSIM, eroded SSIM, PSNR and pixels by label id, and under TOTAL those of the whole image."""
+    """SSIM, eroded SSIM, PSNR and pixels by label id, and under TOTAL those of the whole image.
+
+    `inner_ids`: the eroded label image, where it is at hand.
+    """
     quality, error = ssim_map(image, photo), squared_error_map(image, photo)
-    inner = means_by_label(quality, erode(label_ids))
+    inner = means_by_label(quality, erode(label_ids) if inner_ids is None else inner_ids)
     errors = means_by_label(error, label_ids)
     rows = {
         label: {
@@ -139,12 +143,13 @@ def observe(
     `progress` hears (images measured, images in all).
     """
     columns: dict[str, list[float]] = {f.name: [] for f in fields(Observations)}
+    inner = [erode(masks[view]) for view in scene.views]
     done, total = 0, len(ladder.files) * len(scene.views)
     for level in ladder.levels:
         g = ladder.load(level)
         for row, view in enumerate(scene.views):
             image = render_rgb(g, view.camera, backend=backend, antialiased=antialiased)
-            for label, values in measure(image, as_unit(photos[row]), masks[view]).items():
+            for label, values in measure(image, as_unit(photos[row]), masks[view], inner[row]).items():
                 distance = distances[label][row] if label in distances else np.nan
                 entry = {"label_id": label, "level": level, "view": row, "distance": distance, **values}
                 for name, value in entry.items():

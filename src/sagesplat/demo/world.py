@@ -240,12 +240,12 @@ def radius_at(solid, height):
 def _box_tree(centre: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A complete binary tree of boxes over leaves with half extents `reach`.
 
-    Returns the leaves' order (BIN in a row share a bottom box; the last leaf repeats to fill the tree),
+    Returns the leaves' order (BIN in a row share a bottom box; some leaves stand twice to fill the tree),
     the boxes and the splitting axes in heap order. Level by level, each run of leaves is sorted along
     its longest axis and cut in the middle.
     """
     depth = int(np.ceil(np.log2(len(centre) / BIN)))
-    order = np.minimum(np.arange(BIN << depth), len(centre) - 1)
+    order = np.arange(BIN << depth) * len(centre) // (BIN << depth)
     axes = np.zeros(1 << depth, np.int64)
     for level in range(depth):
         runs = centre[order].reshape(1 << level, -1, 3)

@@ -105,7 +105,7 @@ def counts_table(counts: Counts, labels: Sequence[int], names: Mapping[int, str]
 
 
 def ladder_table(
-    rows: Observations, counts: Counts, recovering: frozenset[int], names: Mapping[int, str], columns: int = 6
+    rows: Observations, counts: Counts, recovering: frozenset[int], names: Mapping[int, str], columns: int = 4
 ) -> Table:
     """Tables I and II in one, for a terminal: mean SSIM and thousands of Gaussians at some settled levels."""
     levels = sorted({level for _, level in counts})
@@ -116,10 +116,12 @@ def ladder_table(
         cells = []
         for level in picked:
             here = [n for (i, at), n in counts.items() if at == level and label_id in (TOTAL, i)]
-            cells.append(f"{view_mean(rows, label_id, level):.3f} {sum(here) / 1e3:6.1f}k")
+            cells.append(f"{view_mean(rows, label_id, level):.3f} {sum(here) / 1e3:5.1f}k")
         body.append((name_of(label_id, names), *cells))
-    header = ("category", *(f"step {level}" for level in picked))
-    return Table("SSIM and Gaussians by level, training views", header, ("",) * len(header), body)
+    header = ("category", *(f"{level}" for level in picked))
+    return Table(
+        "SSIM and Gaussians by level (training step), training views", header, ("",) * len(header), body
+    )
 
 
 def outcome_table(plan: Plan, counts: Counts, evaluation: Evaluation, names: Mapping[int, str]) -> Table:
