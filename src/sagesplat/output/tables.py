@@ -116,7 +116,9 @@ def ladder_table(
         cells = []
         for level in picked:
             here = [n for (i, at), n in counts.items() if at == level and label_id in (TOTAL, i)]
-            cells.append(f"{view_mean(rows, label_id, level):.3f} {sum(here) / 1e3:5.1f}k")
+            thousands = sum(here) / 1e3
+            count = f"{thousands:.1f}k" if thousands < 9.95 else f"{thousands:.0f}k"
+            cells.append(f"{view_mean(rows, label_id, level):.3f} {count:>5}")
         body.append((name_of(label_id, names), *cells))
     header = ("category", *(f"{level}" for level in picked))
     return Table(
