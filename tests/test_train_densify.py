@@ -178,7 +178,7 @@ def test_schedule_is_the_published_one_at_full_length():
 @pytest.mark.parametrize("steps", [1, 30, 300, 3000, 7000, 60_000])
 def test_schedule_scales_with_the_length(steps):
     plan = densify.schedule(TrainConfig(max_steps=steps))
-    assert plan.level_every == max(1, round(steps / 30))
+    assert plan.level_every == -(-steps // 30)
     assert plan.refine_stop == max(1, steps // 2)
     assert plan.reset_every == max(1500, steps // 10)  # a model needs time to come back
     assert plan.recovery <= plan.reset_every // 2

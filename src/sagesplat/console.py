@@ -87,7 +87,11 @@ class Console:
                     self.out.print(f"{'':21}{line}", soft_wrap=True)
             case TableMade(title, header, rows):
                 table = Table(
-                    title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1)
+                    title=title,
+                    title_justify="left",
+                    title_style="bold",
+                    box=SIMPLE_HEAD,
+                    padding=(0, 1, 0, 0),
                 )
                 for index, column in enumerate(header):
                     table.add_column(column, justify="left" if index == 0 else "right", no_wrap=True)

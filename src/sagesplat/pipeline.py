@@ -4,12 +4,13 @@ import time
 from pathlib import Path
 
 from sagesplat import stages
-from sagesplat.config import RunConfig, TrainConfig
+from sagesplat.config import PlanConfig, RunConfig, TrainConfig
 from sagesplat.demo.capture import cached_capture
 from sagesplat.events import Progress, StageDone, StageStarted
 from sagesplat.job import Job
 
-DEMO = RunConfig(train=TrainConfig(max_steps=2000, level_every=100))  # minutes on two cores
+# the built-in capture, within minutes on two cores
+DEMO = RunConfig(train=TrainConfig(max_steps=2000, level_every=100), plan=PlanConfig(target_ssim=0.7))
 
 
 def run_all(job: Job, scene: Path, config: RunConfig) -> None:

@@ -142,9 +142,14 @@ def outcome_table(plan: Plan, counts: Counts, evaluation: Evaluation, names: Map
     share = plan.count / max(1, sum(full.values()))
     measured = (mean(whole.ssim), mean(whole.full_ssim))
     body.append((name_of(TOTAL, names), math.nan, plan.count, share, math.nan, *measured, plan.status))
-    header = ("category", "level", "Gaussians", "of 3DGS", "promised", "test SSIM", "3DGS", "status")
-    formats = ("", ",d", ",d", ".1%", ".3f", ".3f", ".3f", "")
-    return Table(f"Plan for SSIM {plan.target:g}, measured on test views", header, formats, body)
+    header = ("category", "level", "Gaussians", "share", "promised", "test", "3DGS", "status")
+    formats = ("", "d", ",d", ".0%", ".3f", ".3f", ".3f", "")
+    return Table(
+        f"Plan for SSIM {plan.target:g}: promised, and measured on test views beside 3DGS",
+        header,
+        formats,
+        body,
+    )
 
 
 def plan_table(plan: Plan, counts: Counts, names: Mapping[int, str]) -> Table:

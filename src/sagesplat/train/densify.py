@@ -1,5 +1,6 @@
 """Adaptive density control of 3DGS (Kerbl et al. 2023, section 5): clone, split, prune, reset."""
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,7 +39,7 @@ def schedule(config: TrainConfig) -> Schedule:
 
     reset_every = max(scaled(config.reset_every), min(config.reset_every, _RESET_FLOOR))
     return Schedule(
-        level_every=config.level_every or scaled(1000),
+        level_every=config.level_every or math.ceil(config.max_steps / 30),
         refine_start=min(config.refine_start, config.max_steps // 5),
         refine_stop=scaled(config.refine_stop),
         reset_every=reset_every,
