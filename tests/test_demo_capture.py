@@ -132,7 +132,7 @@ def test_cache_is_made_once(tmp_path, monkeypatch):
     monkeypatch.setenv("SAGESPLAT_CACHE", str(tmp_path / "cache"))
     assert cached_capture() == cached_capture() == calls[0]
     assert len(calls) == 1
-    assert calls[0].parent == tmp_path / "cache"
+    assert calls[0].parents[1] == tmp_path / "cache"
     monkeypatch.delenv("SAGESPLAT_CACHE")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
-    assert cached_capture() == tmp_path / "xdg" / "sagesplat" / calls[0].name
+    assert cached_capture() == tmp_path / "xdg" / "sagesplat" / calls[0].parent.name / calls[0].name

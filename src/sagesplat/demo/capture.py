@@ -61,7 +61,7 @@ def cached_capture(on_view: Callable[[int, int], None] | None = None) -> Path:
     default = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sagesplat"
     cache = Path(os.environ.get("SAGESPLAT_CACHE") or default)
     code = b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
-    folder = cache / f"demo-{hashlib.sha256(__version__.encode() + code).hexdigest()[:12]}"
+    folder = cache / f"demo-{hashlib.sha256(__version__.encode() + code).hexdigest()[:12]}" / "courtyard"
     if not folder.exists():
         try:
             make_capture(folder, on_view=on_view)
