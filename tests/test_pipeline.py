@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sagesplat import pipeline, stages
+from sagesplat import pipeline
 from sagesplat.adapt.evaluate import read_evaluation
 from sagesplat.adapt.observe import TOTAL, read_observations
 from sagesplat.adapt.plan import read_plans
@@ -131,18 +131,20 @@ def test_a_folder_that_is_no_run_is_left_alone(capture: Path, tmp_path: Path) ->
 
 def test_export_takes_levels_and_categories(finished: Path, tmp_path: Path) -> None:
     job = Job(RunDir(finished), print)
-    count = stages.export_ply(job, tmp_path / "a.ply", level=60, labels=["vase", "grass-merged"], target=None)
+    count = pipeline.export_ply(
+        job, tmp_path / "a.ply", level=60, labels=["vase", "grass-merged"], target=None
+    )
     g = read_ply(tmp_path / "a.ply")
     assert len(g) == count
     assert set(g.counts()) == {86, 193}
     expected = job.ladder.load(60, [86, 193])
     np.testing.assert_array_equal(g.means, expected.means)
     with pytest.raises(RunError, match=r"a\.ply: exists"):
-        stages.export_ply(job, tmp_path / "a.ply", level=None, labels=[], target=None)
+        pipeline.export_ply(job, tmp_path / "a.ply", level=None, labels=[], target=None)
     with pytest.raises(RunError, match="no category 'cat'"):
-        stages.export_ply(job, tmp_path / "b.ply", level=None, labels=["cat"], target=None)
+        pipeline.export_ply(job, tmp_path / "b.ply", level=None, labels=["cat"], target=None)
     with pytest.raises(RunError, match=r"no plan for SSIM 0\.77"):
-        stages.export_ply(job, tmp_path / "b.ply", level=None, labels=[], target=0.77)
+        pipeline.export_ply(job, tmp_path / "b.ply", level=None, labels=[], target=0.77)
 
 
 def test_a_broken_level_is_one_clear_error(finished: Path, capture: Path, tmp_path: Path) -> None:

@@ -213,10 +213,10 @@ def export(
         labels: names of the categories to take.
         target_ssim: the composition for this planned target (default: the main one).
     """
-    from sagesplat import stages
+    from sagesplat import pipeline
 
     with _job(run, machine) as job:
-        count = stages.export_ply(job, ply, level=level, labels=labels, target=target_ssim)
+        count = pipeline.export_ply(job, ply, level=level, labels=labels, target=target_ssim)
     print(f"{ply}: {count:,} Gaussians")
 
 

@@ -1,13 +1,17 @@
 """The whole flow, from photos and label images to the report."""
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from sagesplat import stages
+from sagesplat.adapt.plan import read_plans
 from sagesplat.config import PlanConfig, RunConfig, TrainConfig
 from sagesplat.demo.capture import cached_capture
+from sagesplat.errors import RunError
 from sagesplat.events import Progress, StageDone, StageStarted
 from sagesplat.job import Job
+from sagesplat.output.ply import write_ply
 
 # the built-in capture, within minutes on two cores
 DEMO = RunConfig(train=TrainConfig(max_steps=2000, level_every=100), plan=PlanConfig(target_ssim=0.7))
@@ -34,3 +38,29 @@ def run_demo(job: Job) -> None:
     capture = cached_capture(lambda done, total: job.emit(Progress("capture", done, total)))
     job.emit(StageDone("capture", time.perf_counter() - begin, (f"the built-in scene, in {capture}",)))
     run_all(job, capture, DEMO)
+
+
+def export_ply(
+    job: Job, path: Path, *, level: int | None, labels: Sequence[str], target: float | None
+) -> int:
+    """Write a level or a composition, whole or some categories, as a PLY; returns the number of Gaussians."""
+    if path.exists() and not job.force:
+        raise RunError(f"{path}: exists; add --force to replace it")
+    ids = {name: label for label, name in job.names().items()}
+    if unknown := [name for name in labels if name not in ids]:
+        raise RunError(f"{job.run.path}: no category {unknown[0]!r}; there are {', '.join(ids)}")
+    wanted = [ids[name] for name in labels] or list(ids.values())
+    if level is not None:
+        g = job.ladder.load(level, wanted)
+    else:
+        asked = stages.main_target(job.run) if target is None else target
+        plans = read_plans(job.run.plan)[0]
+        plan = next((p for p in plans if p.target == asked), None)
+        if plan is None:
+            known = ", ".join(f"{p.target:g}" for p in plans)
+            raise RunError(
+                f"{job.run.plan}: no plan for SSIM {asked:g}, only for {known}; run `sagesplat plan` for it"
+            )
+        g = job.ladder.compose({label: at for label, at in plan.levels.items() if label in wanted})
+    write_ply(path, g, job.names())
+    return len(g)

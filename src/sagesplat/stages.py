@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -334,29 +333,3 @@ def make_report(job: Job) -> None:
         make,
     )
     job.emit(RunDone(run.report / "index.html"))
-
-
-def export_ply(
-    job: Job, path: Path, *, level: int | None, labels: Sequence[str], target: float | None
-) -> int:
-    """Write a level or a composition, whole or some categories, as a PLY; returns the number of Gaussians."""
-    if path.exists() and not job.force:
-        raise RunError(f"{path}: exists; add --force to replace it")
-    ids = {name: label for label, name in job.names().items()}
-    if unknown := [name for name in labels if name not in ids]:
-        raise RunError(f"{job.run.path}: no category {unknown[0]!r}; there are {', '.join(ids)}")
-    wanted = [ids[name] for name in labels] or list(ids.values())
-    if level is not None:
-        g = job.ladder.load(level, wanted)
-    else:
-        asked = main_target(job.run) if target is None else target
-        plans = read_plans(job.run.plan)[0]
-        plan = next((p for p in plans if p.target == asked), None)
-        if plan is None:
-            known = ", ".join(f"{p.target:g}" for p in plans)
-            raise RunError(
-                f"{job.run.plan}: no plan for SSIM {asked:g}, only for {known}; run `sagesplat plan` for it"
-            )
-        g = job.ladder.compose({label: at for label, at in plan.levels.items() if label in wanted})
-    write_ply(path, g, job.names())
-    return len(g)
