@@ -22,6 +22,7 @@ def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *w
 @pytest.mark.parametrize(
     ("words", "says"),
     [
+        (["fly"], "no command 'fly'; there are info, run"),
         (["info", "nowhere"], "nowhere: "),
         (["run", "nowhere", "out"], "nowhere: "),
         (["train", "nowhere"], "not a run folder"),
@@ -84,3 +85,18 @@ def test_flags_reach_their_settings(
 def test_help_imports_no_torch() -> None:
     code = "import sys, sagesplat.cli; sys.exit(any(m in sys.modules for m in ('torch', 'numba', 'numpy')))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_help_lists_every_command(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["sagesplat", "--help"])
+    cli.main()
+    text = capsys.readouterr().out
+    assert all(f"  {name} " in text for name in cli.COMMANDS)
+    for name in cli.COMMANDS:
+        monkeypatch.setattr(sys, "argv", ["sagesplat", name, "--help"])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        assert end.value.code == 0
+        assert f"sagesplat {name}" in capsys.readouterr().out

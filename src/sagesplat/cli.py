@@ -2,15 +2,16 @@
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
 import tyro
 from tyro.conf import Positional, arg
 
+from sagesplat import __version__
 from sagesplat.config import (
     FitConfig,
     LiftConfig,
@@ -25,7 +26,13 @@ from sagesplat.errors import SageError
 if TYPE_CHECKING:
     from sagesplat.job import Job
 
-app = tyro.extras.SubcommandApp()
+COMMANDS: dict[str, Callable[..., None]] = {}
+
+
+def command(function: Callable[..., None]) -> Callable[..., None]:
+    """Make a function a command of its name. Only the one that is called gets a parser: that takes time."""
+    COMMANDS[function.__name__] = function
+    return function
 
 
 @dataclass(frozen=True)
@@ -60,7 +67,7 @@ def _job(run: Path, machine: Machine) -> Iterator["Job"]:
         yield Job(RunDir(run), console, backend, threads, machine.force)
 
 
-@app.command
+@command
 def info(scene: Scene, scene_config: Annotated[SceneConfig, Flat] = SceneConfig()) -> None:
     """Print what a capture holds."""
     from sagesplat.scene import describe, load_scene
@@ -71,7 +78,7 @@ def info(scene: Scene, scene_config: Annotated[SceneConfig, Flat] = SceneConfig(
         print(f"{name:{width}}  {value}")
 
 
-@app.command
+@command
 def run(
     scene: Scene,
     run: Run,
@@ -91,7 +98,7 @@ def run(
         pipeline.run_all(job, scene, RunConfig(scene_config, masks, lift, train, fit, plan, seed))
 
 
-@app.command
+@command
 def demo(run: Path = Path("runs/demo"), machine: Annotated[Machine, Flat] = Machine()) -> None:
     """Make the built-in capture, run the main job on it and say where to look."""
     from sagesplat import pipeline
@@ -100,7 +107,7 @@ def demo(run: Path = Path("runs/demo"), machine: Annotated[Machine, Flat] = Mach
         pipeline.run_demo(job)
 
 
-@app.command
+@command
 def masks(
     scene: Scene,
     run: Run,
@@ -116,7 +123,7 @@ def masks(
         stages.make_masks(job, masks)
 
 
-@app.command
+@command
 def lift(run: Run, lift: LiftConfig = LiftConfig(), machine: Annotated[Machine, Flat] = Machine()) -> None:
     """Vote the label images onto the points."""
     from sagesplat import stages
@@ -125,7 +132,7 @@ def lift(run: Run, lift: LiftConfig = LiftConfig(), machine: Annotated[Machine, 
         stages.lift_labels(job, lift)
 
 
-@app.command
+@command
 def train(
     run: Run, train: TrainConfig = TrainConfig(), machine: Annotated[Machine, Flat] = Machine(), seed: int = 0
 ) -> None:
@@ -136,7 +143,7 @@ def train(
         stages.train_levels(job, train, seed)
 
 
-@app.command
+@command
 def observe(run: Run, fit: FitConfig = FitConfig(), machine: Annotated[Machine, Flat] = Machine()) -> None:
     """Measure every category at every level in every view."""
     from sagesplat import stages
@@ -145,7 +152,7 @@ def observe(run: Run, fit: FitConfig = FitConfig(), machine: Annotated[Machine, 
         stages.observe_levels(job, fit)
 
 
-@app.command
+@command
 def fit(run: Run, fit: FitConfig = FitConfig(), machine: Annotated[Machine, Flat] = Machine()) -> None:
     """Fit SSIM over distance for every category and level."""
     from sagesplat import stages
@@ -154,7 +161,7 @@ def fit(run: Run, fit: FitConfig = FitConfig(), machine: Annotated[Machine, Flat
         stages.fit_ladder(job, fit)
 
 
-@app.command
+@command
 def plan(
     run: Run,
     plan: Annotated[PlanConfig, Flat] = PlanConfig(),
@@ -168,7 +175,7 @@ def plan(
         stages.make_plan(job, plan, fit)
 
 
-@app.command
+@command
 def compose(run: Run, machine: Annotated[Machine, Flat] = Machine()) -> None:
     """Write the planned scene as composed.ply."""
     from sagesplat import stages
@@ -177,7 +184,7 @@ def compose(run: Run, machine: Annotated[Machine, Flat] = Machine()) -> None:
         stages.compose_plan(job)
 
 
-@app.command
+@command
 def evaluate(run: Run, fit: FitConfig = FitConfig(), machine: Annotated[Machine, Flat] = Machine()) -> None:
     """Measure the plans on the test views, beside what was promised."""
     from sagesplat import stages
@@ -186,7 +193,7 @@ def evaluate(run: Run, fit: FitConfig = FitConfig(), machine: Annotated[Machine,
         stages.evaluate_plans(job, fit)
 
 
-@app.command
+@command
 def report(run: Run, machine: Annotated[Machine, Flat] = Machine()) -> None:
     """Write the report."""
     from sagesplat import stages
@@ -195,7 +202,7 @@ def report(run: Run, machine: Annotated[Machine, Flat] = Machine()) -> None:
         stages.make_report(job)
 
 
-@app.command
+@command
 def export(
     run: Run,
     ply: Positional[Annotated[Path, arg(metavar="OUT.ply")]],
@@ -222,8 +229,14 @@ def export(
 
 def main() -> None:
     """Run a command; errors that a user can cause are one line and exit code 2."""
+    name, *words = sys.argv[1:] or ["--help"]
+    if name in ("-h", "--help", "--version"):
+        print(f"sagesplat {__version__}" if name == "--version" else _overview())
+        return
+    if name not in COMMANDS:
+        _fail(f"no command {name!r}; there are {', '.join(COMMANDS)}")
     try:
-        app.cli(prog="sagesplat", description="Semantic-driven adaptive Gaussian splatting.")
+        tyro.cli(COMMANDS[name], prog=f"sagesplat {name}", args=words)
     except SageError as error:
         _fail(str(error))
     except KeyboardInterrupt:
@@ -235,6 +248,14 @@ def main() -> None:
         _fail(f"{where}: {error.strerror or error}; check the path, its rights and the disk")
 
 
-def _fail(message: str) -> None:
+def _overview() -> str:
+    """What `sagesplat --help` prints."""
+    lines = ["usage: sagesplat COMMAND ...", "", "Semantic-driven adaptive Gaussian splatting.", ""]
+    for name, function in COMMANDS.items():
+        lines.append(f"  {name:10}{(function.__doc__ or '').splitlines()[0]}")
+    return "\n".join([*lines, "", "`sagesplat COMMAND --help` lists the settings of a command."])
+
+
+def _fail(message: str) -> NoReturn:
     print(f"sagesplat: {' '.join(message.split())}", file=sys.stderr)
     raise SystemExit(2)
