@@ -165,14 +165,13 @@ def fit(run: Run, fit: FitConfig = FitConfig(), machine: Annotated[Machine, Flat
 def plan(
     run: Run,
     plan: Annotated[PlanConfig, Flat] = PlanConfig(),
-    fit: FitConfig = FitConfig(),
     machine: Annotated[Machine, Flat] = Machine(),
 ) -> None:
     """Choose the cheapest levels that keep a target SSIM."""
     from sagesplat import stages
 
     with _job(run, machine) as job:
-        stages.make_plan(job, plan, fit)
+        stages.make_plan(job, plan)
 
 
 @command
@@ -185,12 +184,12 @@ def compose(run: Run, machine: Annotated[Machine, Flat] = Machine()) -> None:
 
 
 @command
-def evaluate(run: Run, fit: FitConfig = FitConfig(), machine: Annotated[Machine, Flat] = Machine()) -> None:
+def evaluate(run: Run, machine: Annotated[Machine, Flat] = Machine()) -> None:
     """Measure the plans on the test views, beside what was promised."""
     from sagesplat import stages
 
     with _job(run, machine) as job:
-        stages.evaluate_plans(job, fit)
+        stages.evaluate_plans(job)
 
 
 @command

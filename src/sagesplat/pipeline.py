@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sagesplat import stages
-from sagesplat.adapt.plan import read_plans
 from sagesplat.config import PlanConfig, RunConfig, TrainConfig
 from sagesplat.demo.capture import cached_capture
 from sagesplat.errors import RunError
@@ -25,9 +24,9 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
     stages.train_levels(job, config.train, config.seed)
     stages.observe_levels(job, config.fit)
     stages.fit_ladder(job, config.fit)
-    stages.make_plan(job, config.plan, config.fit)
+    stages.make_plan(job, config.plan)
     stages.compose_plan(job)
-    stages.evaluate_plans(job, config.fit)
+    stages.evaluate_plans(job)
     stages.make_report(job)
 
 
@@ -53,14 +52,7 @@ def export_ply(
     if level is not None:
         g = job.ladder.load(level, wanted)
     else:
-        asked = stages.main_target(job.run) if target is None else target
-        plans = read_plans(job.run.plan)[0]
-        plan = next((p for p in plans if p.target == asked), None)
-        if plan is None:
-            known = ", ".join(f"{p.target:g}" for p in plans)
-            raise RunError(
-                f"{job.run.plan}: no plan for SSIM {asked:g}, only for {known}; run `sagesplat plan` for it"
-            )
+        plan = stages.scene_plan(job.run, stages.main_target(job.run) if target is None else target)
         g = job.ladder.compose({label: at for label, at in plan.levels.items() if label in wanted})
     write_ply(path, g, job.names())
     return len(g)

@@ -121,6 +121,13 @@ def is_done(
     return False
 
 
+def settings_of(run: RunDir, stage: str) -> dict[str, Any]:
+    """The settings that a finished stage was made with."""
+    if not run.provenance(stage).exists():
+        raise RunError(f"{run.path}: stage {stage} is not done; run `sagesplat {stage}` or `sagesplat run`")
+    return read_json(run.provenance(stage))["settings"]
+
+
 def _differences(made: dict[str, Any], settings: Mapping[str, Any], inputs: Mapping[str, str]) -> str:
     """A few words on what changed since a result was made; empty = nothing."""
     old = made.get("settings", {})

@@ -18,7 +18,7 @@ from sagesplat.adapt.observe import (
     observe,
     read_observations,
 )
-from sagesplat.adapt.plan import plan_scene, plan_view, read_plans, write_plans
+from sagesplat.adapt.plan import Plan, plan_scene, plan_view, read_plans, write_plans
 from sagesplat.config import FitConfig, LiftConfig, MasksConfig, PlanConfig, SceneConfig, TrainConfig
 from sagesplat.errors import RunError
 from sagesplat.events import Progress, RunDone, TableMade, Training, Warned
@@ -29,7 +29,7 @@ from sagesplat.output.ply import write_ply
 from sagesplat.output.report import write_report
 from sagesplat.output.summary import report_data
 from sagesplat.output.tables import Table
-from sagesplat.run_dir import RunDir, file_hash
+from sagesplat.run_dir import RunDir, file_hash, settings_of
 from sagesplat.scene import load_scene
 from sagesplat.segment.lift import lift
 from sagesplat.segment.masks import import_masks
@@ -177,13 +177,12 @@ def _continues(run: RunDir, belongs: str) -> bool:
 def observe_levels(job: Job, config: FitConfig) -> None:
     """Measure every category at every level in every view."""
     run = job.run
-    antialiased = _antialiased(run)
 
     def make() -> list[str]:
-        distances = _distances(job, config)
+        distances = _distances(job, config.distance)
         table = observe(
             job.scene, job.photos, job.masks, job.ladder, distances, backend=job.backend,
-            antialiased=antialiased,
+            antialiased=settings_of(run, "train")["antialiased"],
             progress=lambda done, total: job.emit(Progress("observe", done, total)),
         )  # fmt: skip
         table.write_csv(run.observations)
@@ -193,17 +192,12 @@ def observe_levels(job: Job, config: FitConfig) -> None:
             f"{len(table):,} observations of {len(job.ladder.files)} levels in {len(job.scene.views)} views"
         ]
 
-    settings = {"distance": config.distance, "antialiased": antialiased}
-    run_stage(job, "observe", settings, [run.scene, run.labels, run.levels], [run.observations], make)
+    inputs = [run.scene, run.labels, run.levels]
+    run_stage(job, "observe", {"distance": config.distance}, inputs, [run.observations], make)
 
 
-def _antialiased(run: RunDir) -> bool:
-    record = run.provenance("train")
-    return bool(read_json(record)["settings"]["antialiased"]) if record.exists() else False
-
-
-def _distances(job: Job, config: FitConfig) -> dict[int, np.ndarray]:
-    percentile = PERCENTILE if config.distance == "percentile" else 0.0
+def _distances(job: Job, distance: str) -> dict[int, np.ndarray]:
+    percentile = PERCENTILE if distance == "percentile" else 0.0
     return distances_in_views(job.scene, job.point_labels, percentile)
 
 
@@ -211,10 +205,10 @@ def _show(job: Job, table: Table) -> None:
     job.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
 
 
-def _large_enough(job: Job, config: FitConfig, table: Observations) -> Observations:
+def _large_enough(job: Job, min_share: float, table: Observations) -> Observations:
     """Rows of views that show enough of the category."""
     pixels = np.array([v.camera.width * v.camera.height for v in job.scene.views])
-    return table.select(table.num_pixels >= config.min_share * pixels[table.view])
+    return table.select(table.num_pixels >= min_share * pixels[table.view])
 
 
 def fit_ladder(job: Job, config: FitConfig) -> None:
@@ -222,7 +216,7 @@ def fit_ladder(job: Job, config: FitConfig) -> None:
     run = job.run
 
     def make() -> list[str]:
-        table = _large_enough(job, config, read_observations(run.observations))
+        table = _large_enough(job, config.min_share, read_observations(run.observations))
         models = fit_models(table, job.scene.train_ids)
         write_models(run.models, models)
         statuses = [m.status for m in models.values()]
@@ -231,13 +225,14 @@ def fit_ladder(job: Job, config: FitConfig) -> None:
     run_stage(job, "fit", {"min_share": config.min_share}, [run.scene, run.observations], [run.models], make)
 
 
-def make_plan(job: Job, config: PlanConfig, fit: FitConfig) -> None:
+def make_plan(job: Job, config: PlanConfig) -> None:
     """Choose the levels: for the scene at each target, for every view at the main one."""
     run = job.run
 
     def make() -> list[str]:
         models, ladder = read_models(run.models), job.ladder
-        table = _large_enough(job, fit, read_observations(run.observations))
+        min_share = settings_of(run, "fit")["min_share"]
+        table = _large_enough(job, min_share, read_observations(run.observations))
         table = table.select(table.level == ladder.levels[-1])
         seen = table.select(np.isin(table.view, job.scene.train_ids))
         labels = {label for label, _ in ladder.counts}
@@ -261,12 +256,21 @@ def make_plan(job: Job, config: PlanConfig, fit: FitConfig) -> None:
 
     inputs = [run.scene, run.models, run.observations, run.levels]
     settings = {"targets": config.targets, "target_ssim": config.target_ssim, "share": config.share}
-    run_stage(job, "plan", settings | {"min_share": fit.min_share}, inputs, [run.plan], make)
+    run_stage(job, "plan", settings, inputs, [run.plan], make)
 
 
 def main_target(run: RunDir) -> float:
     """The target that the run's plan was made for."""
-    return float(read_json(run.provenance("plan"))["settings"]["target_ssim"])
+    return float(settings_of(run, "plan")["target_ssim"])
+
+
+def scene_plan(run: RunDir, target: float) -> Plan:
+    """The scene's plan for one of the run's targets."""
+    plans = {plan.target: plan for plan in read_plans(run.plan)[0]}
+    if target not in plans:
+        known = ", ".join(f"{t:g}" for t in plans)
+        raise RunError(f"{run.plan}: no plan for SSIM {target:g}, only for {known}; run `sagesplat plan`")
+    return plans[target]
 
 
 def compose_plan(job: Job) -> None:
@@ -274,8 +278,7 @@ def compose_plan(job: Job) -> None:
     run = job.run
 
     def make() -> list[str]:
-        target = main_target(run)
-        plan = next(p for p in read_plans(run.plan)[0] if p.target == target)
+        plan = scene_plan(run, main_target(run))
         g = job.ladder.compose(plan.levels)
         write_ply(run.composed, g, job.names())
         return [f"{len(g):,} Gaussians, {plan.nbytes / 1e6:.1f} MB at 248 bytes each"]
@@ -283,20 +286,20 @@ def compose_plan(job: Job) -> None:
     run_stage(job, "compose", {}, [run.plan, run.levels], [run.composed], make)
 
 
-def evaluate_plans(job: Job, fit: FitConfig) -> None:
+def evaluate_plans(job: Job) -> None:
     """Measure the compositions on the test views, beside the promise and full 3DGS."""
     run = job.run
 
     def make() -> list[str]:
         table = evaluate(
             job.scene, job.photos, job.masks, job.ladder, read_models(run.models), read_plans(run.plan)[0],
-            _distances(job, fit), backend=job.backend, antialiased=_antialiased(run),
+            _distances(job, settings_of(run, "observe")["distance"]), backend=job.backend,
+            antialiased=settings_of(run, "train")["antialiased"],
             progress=lambda done, total: job.emit(Progress("evaluate", done, total)),
         )  # fmt: skip
         table.write_csv(run.evaluation)
-        target = main_target(run)
-        plan = next(p for p in read_plans(run.plan)[0] if p.target == target)
         if len(table):
+            plan = scene_plan(run, main_target(run))
             _show(job, tables.outcome_table(plan, job.ladder.counts, table, job.names()))
         whole = table.select(table.label_id == TOTAL)
         lines = []
@@ -309,7 +312,7 @@ def evaluate_plans(job: Job, fit: FitConfig) -> None:
         return lines
 
     inputs = [run.scene, run.labels, run.levels, run.models, run.plan]
-    run_stage(job, "evaluate", {"distance": fit.distance}, inputs, [run.evaluation], make)
+    run_stage(job, "evaluate", {}, inputs, [run.evaluation], make)
 
 
 def make_report(job: Job) -> None:

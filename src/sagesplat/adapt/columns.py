@@ -1,6 +1,7 @@
 """Tables as frozen dataclasses of equal-length numpy columns, kept as CSV."""
 
 import csv
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -24,9 +25,20 @@ def write_columns(path: Path, table: Any) -> None:
         writer.writerows(zip(*columns, strict=True))
 
 
+def _types(table: type) -> dict[str, np.dtype]:
+    return {f.name: np.dtype(f.type.dtypes[0]) for f in fields(table)}  # pyright: ignore
+
+
+def from_rows(table: type[Columns], rows: Sequence[Mapping[str, float]]) -> Columns:
+    """A table from rows that name its columns."""
+    return table(
+        **{name: np.array([row[name] for row in rows], dtype) for name, dtype in _types(table).items()}
+    )
+
+
 def read_columns(path: Path, table: type[Columns], cure: str) -> Columns:
     """The table that `write_columns` wrote. DataError where it is not one; `cure` says what to run then."""
-    types = {f.name: np.dtype(f.type.dtypes[0]) for f in fields(table)}  # pyright: ignore
+    types = _types(table)
     try:
         with path.open(newline="", encoding="utf-8") as file:
             header, *rows = csv.reader(file)

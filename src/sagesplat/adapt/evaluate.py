@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Int32
 
-from sagesplat.adapt.columns import read_columns, write_columns
+from sagesplat.adapt.columns import from_rows, read_columns, write_columns
 from sagesplat.adapt.ladder import Ladder
-from sagesplat.adapt.observe import as_unit, measure, render_rgb
+from sagesplat.adapt.observe import as_unit, erode, measure, render_rgb
 from sagesplat.adapt.plan import Models, Plan
 from sagesplat.raster import Backend
 from sagesplat.scene.images import Photos
@@ -66,8 +66,9 @@ def evaluate(
 
     `progress` hears (images measured, images in all).
     """
-    columns: dict[str, list[float]] = {f.name: [] for f in fields(Evaluation)}
+    rows: list[dict[str, float]] = []
     views = scene.test_ids.tolist()
+    inner = {row: erode(masks[scene.views[row]]) for row in views}
     done, total = 0, len(views) * (1 + len(plans))
 
     def measure_all(g):  # type: ignore[no-untyped-def]
@@ -75,7 +76,7 @@ def evaluate(
         for row in views:
             view = scene.views[row]
             image = render_rgb(g, view.camera, backend=backend, antialiased=antialiased)
-            yield row, measure(image, as_unit(photos[row]), masks[view])
+            yield row, measure(image, as_unit(photos[row]), masks[view], inner[row])
             done += 1
             if progress:
                 progress(done, total)
@@ -88,13 +89,10 @@ def evaluate(
                 predicted = np.nan
                 if (label, level) in models:
                     predicted = float(models[label, level](float(distances[label][row])))
-                entry = {
+                rows.append({
                     "target": plan.target, "view": row, "label_id": label, "level": level,
                     "predicted": predicted,
                     "ssim": values["ssim"], "psnr": values["psnr"], "num_pixels": values["num_pixels"],
                     "full_ssim": full[row][label]["ssim"], "full_psnr": full[row][label]["psnr"],
-                }  # fmt: skip
-                for name, value in entry.items():
-                    columns[name].append(value)
-    whole = {"label_id", "level", "view", "num_pixels"}
-    return Evaluation(**{n: np.array(c, np.int32 if n in whole else np.float32) for n, c in columns.items()})
+                })  # fmt: skip
+    return from_rows(Evaluation, rows)

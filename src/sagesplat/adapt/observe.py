@@ -10,7 +10,7 @@ from jaxtyping import Float32, Int16, Int32, UInt8
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from sagesplat import geometry
-from sagesplat.adapt.columns import read_columns, write_columns
+from sagesplat.adapt.columns import from_rows, read_columns, write_columns
 from sagesplat.adapt.ladder import Ladder
 from sagesplat.gaussians import Gaussians
 from sagesplat.metrics import means_by_label, psnr, squared_error_map, ssim_map
@@ -142,7 +142,7 @@ def observe(
 
     `progress` hears (images measured, images in all).
     """
-    columns: dict[str, list[float]] = {f.name: [] for f in fields(Observations)}
+    rows: list[dict[str, float]] = []
     inner = [erode(masks[view]) for view in scene.views]
     done, total = 0, len(ladder.files) * len(scene.views)
     for level in ladder.levels:
@@ -151,13 +151,8 @@ def observe(
             image = render_rgb(g, view.camera, backend=backend, antialiased=antialiased)
             for label, values in measure(image, as_unit(photos[row]), masks[view], inner[row]).items():
                 distance = distances[label][row] if label in distances else np.nan
-                entry = {"label_id": label, "level": level, "view": row, "distance": distance, **values}
-                for name, value in entry.items():
-                    columns[name].append(value)
+                rows.append({"label_id": label, "level": level, "view": row, "distance": distance, **values})
             done += 1
             if progress:
                 progress(done, total)
-    whole = {"label_id", "level", "view", "num_pixels"}
-    return Observations(
-        **{n: np.array(c, np.int32 if n in whole else np.float32) for n, c in columns.items()}
-    )
+    return from_rows(Observations, rows)

@@ -107,11 +107,16 @@ def _save_level(
     recovering = state.last_reset >= 0 and state.step - state.last_reset < plan.recovery
     path = None
     if folder:
-        degree = min(config.sh_degree, state.step // plan.raise_sh_every)
+        degree = _sh_degree(state, config, plan)
         path = write_level(
             folder / "levels", state.step, state.gaussians, recovering=recovering, sh_degree=degree
         )
     return LevelSaved(state.step, path, state.gaussians.counts(), recovering)
+
+
+def _sh_degree(state: TrainState, config: TrainConfig, plan: densify.Schedule) -> int:
+    """The degree of the harmonics in use."""
+    return min(config.sh_degree, state.step // plan.raise_sh_every)
 
 
 def _next_view(state: TrainState, scene: Scene) -> int:
@@ -138,7 +143,7 @@ def _step(
     render = rasterize(
         replace(state.gaussians, **leaves),
         camera,
-        sh_degree=min(config.sh_degree, state.step // plan.raise_sh_every),
+        sh_degree=_sh_degree(state, config, plan),
         antialiased=config.antialiased,
         backend=backend,
     )
