@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from sagesplat.raster import rasterize, tiles
 from sagesplat.raster.cpu import _Options, _project
+from sagesplat.raster.workspace import Workspace
 
 BACKGROUND = torch.tensor([0.2, 0.3, 0.4])
 
@@ -36,10 +37,10 @@ def test_depth_order_of_many():
 def test_intersections_are_exact_sorted_and_consistent():
     g, camera = random_gaussians(200, seed=8, log_scale=-1.5), pinhole(75, 50)
     means, quats, log_scales, logits, sh0, shN = (p.numpy() for p in g.parameters().values())
-    options = _Options(camera, 3, False, None)
+    options = _Options(camera, 3, False, None, Workspace())
     records, depths, radii = _project(options, (means, quats, log_scales, logits, sh0, shN))
     mask = np.ones(5 * 4, bool)
-    found = tiles.intersect(records, depths, radii, camera.width, camera.height, mask)
+    found = tiles.intersect(records, depths, radii, camera.width, camera.height, mask, Workspace())
     assert found.tiles_x == 5
     assert found.starts[0] == 0
     assert found.starts[-1] == len(found.ids) == found.offsets[-1]

@@ -1,7 +1,6 @@
 """Spherical harmonics: orthonormal, in the published order, with the right slope."""
 
 import numpy as np
-import pytest
 import torch
 
 from sagesplat import sh
@@ -40,23 +39,13 @@ def test_order_and_sign_are_those_of_splat_files():
     np.testing.assert_allclose(values(-x, -y, -z), (-1.0) ** degrees[:, None] * b)
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_kernels_agree_with_the_formulas(degree):
-    num = sh.num_bases(degree)
-    assert num == (degree + 1) ** 2
+def test_direction_gradient_agrees_with_differences():
     rng = np.random.default_rng(1)
     h = 1e-5
     for d in directions(5):
-        x, y, z = d
-        row = np.full(16, np.nan)
-        sh.fill_bases(x, y, z, num, row)
-        np.testing.assert_allclose(row[:num], values(x, y, z)[:num], atol=1e-15)
-        assert np.isnan(row[num:]).all()
         g = rng.normal(size=16)
-        slope = sh.direction_gradient(x, y, z, num, g)
-        steps = np.eye(3) * h
-        expected = [g[:num] @ (values(*(d + s)) - values(*(d - s)))[:num] / (2 * h) for s in steps]
-        np.testing.assert_allclose(slope, expected, atol=1e-8)
+        expected = [g @ (values(*(d + s)) - values(*(d - s))) / (2 * h) for s in np.eye(3) * h]
+        np.testing.assert_allclose(sh.direction_gradient(d[0], d[1], d[2], g), expected, atol=1e-8)
 
 
 def test_rgb_is_shown_from_everywhere_and_comes_back():

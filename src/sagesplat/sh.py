@@ -2,7 +2,6 @@
 
 import math
 
-from numba import njit
 from torch import Tensor
 
 C0 = 0.5 / math.sqrt(math.pi)
@@ -33,7 +32,7 @@ def sh0_to_rgb(sh0: Tensor) -> Tensor:
 
 
 def bases(x, y, z):
-    """All 16 basis functions at unit direction (x, y, z): floats or tensors alike."""
+    """All 16 basis functions at unit direction (x, y, z): floats, tensors, vectors of kernels."""
     return (
         C0,
         -_C1 * y,
@@ -54,53 +53,19 @@ def bases(x, y, z):
     )
 
 
-@njit(error_model="numpy", forceinline=True, cache=True)
-def fill_bases(x, y, z, num, out):
-    """`bases` into a row `out` [16], only the first `num`, for kernels."""
-    out[0] = C0
-    if num > 1:
-        out[1] = -_C1 * y
-        out[2] = _C1 * z
-        out[3] = -_C1 * x
-    if num > 4:
-        out[4] = _C2 * x * y
-        out[5] = -_C2 * y * z
-        out[6] = _C20 * (2 * z * z - x * x - y * y)
-        out[7] = -_C2 * x * z
-        out[8] = _C22 * (x * x - y * y)
-    if num > 9:
-        out[9] = -_C33 * y * (3 * x * x - y * y)
-        out[10] = _C32 * x * y * z
-        out[11] = -_C31 * y * (4 * z * z - x * x - y * y)
-        out[12] = _C30 * z * (2 * z * z - 3 * x * x - 3 * y * y)
-        out[13] = -_C31 * x * (4 * z * z - x * x - y * y)
-        out[14] = _C322 * z * (x * x - y * y)
-        out[15] = -_C33 * x * (x * x - 3 * y * y)
-
-
-@njit(error_model="numpy", forceinline=True, cache=True)
-def direction_gradient(x, y, z, num, g):
-    """d(sum_k g[k] * basis_k) / d(x, y, z) for weights `g` [16]."""
-    dx = 0.0
-    dy = 0.0
-    dz = 0.0
-    if num > 1:
-        dy -= _C1 * g[1]
-        dz += _C1 * g[2]
-        dx -= _C1 * g[3]
-    if num > 4:
-        dx += _C2 * y * g[4] - 2 * _C20 * x * g[6] - _C2 * z * g[7] + 2 * _C22 * x * g[8]
-        dy += _C2 * x * g[4] - _C2 * z * g[5] - 2 * _C20 * y * g[6] - 2 * _C22 * y * g[8]
-        dz += -_C2 * y * g[5] + 4 * _C20 * z * g[6] - _C2 * x * g[7]
-    if num > 9:
-        xx, yy, zz = x * x, y * y, z * z
-        dx += -6 * _C33 * x * y * g[9] + _C32 * y * z * g[10] + 2 * _C31 * x * y * g[11]
-        dx += -6 * _C30 * x * z * g[12] - _C31 * (4 * zz - 3 * xx - yy) * g[13]
-        dx += 2 * _C322 * x * z * g[14] - _C33 * (3 * xx - 3 * yy) * g[15]
-        dy += -_C33 * (3 * xx - 3 * yy) * g[9] + _C32 * x * z * g[10]
-        dy += -_C31 * (4 * zz - xx - 3 * yy) * g[11] - 6 * _C30 * y * z * g[12]
-        dy += 2 * _C31 * x * y * g[13] - 2 * _C322 * y * z * g[14] + 6 * _C33 * x * y * g[15]
-        dz += _C32 * x * y * g[10] - 8 * _C31 * y * z * g[11]
-        dz += _C30 * (6 * zz - 3 * xx - 3 * yy) * g[12] - 8 * _C31 * x * z * g[13]
-        dz += _C322 * (xx - yy) * g[14]
+def direction_gradient(x, y, z, g):
+    """d(sum_k g[k] * basis_k) / d(x, y, z) for 16 weights `g`, of what type ever."""
+    xx, yy, zz = x * x, y * y, z * z
+    dx = -_C1 * g[3] + _C2 * y * g[4] - 2 * _C20 * x * g[6] - _C2 * z * g[7] + 2 * _C22 * x * g[8]
+    dx += -6 * _C33 * x * y * g[9] + _C32 * y * z * g[10] + 2 * _C31 * x * y * g[11]
+    dx += -6 * _C30 * x * z * g[12] - _C31 * (4 * zz - 3 * xx - yy) * g[13]
+    dx += 2 * _C322 * x * z * g[14] - _C33 * (3 * xx - 3 * yy) * g[15]
+    dy = -_C1 * g[1] + _C2 * x * g[4] - _C2 * z * g[5] - 2 * _C20 * y * g[6] - 2 * _C22 * y * g[8]
+    dy += -_C33 * (3 * xx - 3 * yy) * g[9] + _C32 * x * z * g[10]
+    dy += -_C31 * (4 * zz - xx - 3 * yy) * g[11] - 6 * _C30 * y * z * g[12]
+    dy += 2 * _C31 * x * y * g[13] - 2 * _C322 * y * z * g[14] + 6 * _C33 * x * y * g[15]
+    dz = _C1 * g[2] - _C2 * y * g[5] + 4 * _C20 * z * g[6] - _C2 * x * g[7]
+    dz += _C32 * x * y * g[10] - 8 * _C31 * y * z * g[11]
+    dz += _C30 * (6 * zz - 3 * xx - 3 * yy) * g[12] - 8 * _C31 * x * z * g[13]
+    dz += _C322 * (xx - yy) * g[14]
     return dx, dy, dz

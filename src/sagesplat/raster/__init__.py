@@ -11,9 +11,10 @@ from torch import Tensor
 from sagesplat.errors import BackendUnavailable
 from sagesplat.gaussians import Gaussians
 from sagesplat.raster.render import Render
+from sagesplat.raster.workspace import Workspace
 from sagesplat.scene.scene import Camera
 
-__all__ = ["Backend", "Render", "rasterize", "resolve_backend", "set_threads"]
+__all__ = ["Backend", "Render", "Workspace", "rasterize", "resolve_backend", "set_threads"]
 
 Backend = Literal["auto", "cpu", "reference"]
 
@@ -45,6 +46,7 @@ def rasterize(
     features: Tensor | None = None,
     antialiased: bool = False,
     tile_mask: np.ndarray | None = None,
+    workspace: Workspace | None = None,
     backend: Backend = "auto",
 ) -> Render:
     """Render Gaussians into a camera, with gradients for all their parameters and for `features`.
@@ -53,6 +55,7 @@ def rasterize(
     (default black). `features` [N, C] are blended like colours, over zero. `antialiased` scales opacities by
     the area that the low-pass adds (Mip-Splatting's 2D filter as gsplat has it). `tile_mask` bool
     [ceil(H/16), ceil(W/16)]: tiles that are false show the background and take no gradient (`cpu` only).
+    `workspace`: memory to use again; results and gradients hold until the next call with it (`cpu` only).
     The 2D means of the result carry a `.grad` after `backward()`. Raises `DataError` for NaN or Inf.
     """
     degree = gaussians.sh_degree if sh_degree is None else min(sh_degree, gaussians.sh_degree)
@@ -65,4 +68,4 @@ def rasterize(
         return reference.render(gaussians, camera, **shared)
     from sagesplat.raster import cpu
 
-    return cpu.render(gaussians, camera, tile_mask=tile_mask, **shared)
+    return cpu.render(gaussians, camera, tile_mask=tile_mask, workspace=workspace, **shared)

@@ -1,23 +1,33 @@
 """Blending kernels: Gaussians into pixels and gradients back, one thread per 16x16 tile.
 
-A tile's pixels lie in two halves of 8 columns (index = 128 * half + 8 * row + column), so that a Gaussian's
-rows in a half are one run of memory: the loops over a run are what LLVM vectorises. An intersection is one
-Gaussian in one tile; `records` holds what the loops need of each Gaussian:
+A tile's row of 16 pixels is one vector. An intersection is one Gaussian in one tile; `records` holds what
+the loops need of each Gaussian:
 mean x, y [px], exponent factors A, B, C (log2 alpha = L + A dx^2 + B dx dy + C dy^2), L = log2 opacity,
 colour r, g, b, and half width and height of the bounding box [px].
 """
 
 import numpy as np
-from llvmlite import ir
-from numba import njit, prange, types
-from numba.extending import intrinsic
+from numba import njit, prange
 
 from sagesplat.raster.render import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from sagesplat.raster.simd import (
+    exp2,
+    largest,
+    load16,
+    maximum,
+    minimum,
+    splat16,
+    spread16,
+    store,
+    store_totals,
+    total,
+    where,
+)
 
 TILE = 16
-HALF = 8
 PIXELS = TILE * TILE
-PLANE = PIXELS + 16  # keeps a tile's planes off each other's cache sets
+PLANE = PIXELS
+_BATCH = 16  # intersections between two looks whether a tile is opaque
 RECORD = 11
 SUMS = 9  # per intersection: colour r, g, b, then gq times 1, dx, dy, dx^2, dx dy, dy^2
 
@@ -25,75 +35,60 @@ _F = np.float32
 _LOG2_ALPHA_MIN = _F(np.log2(ALPHA_MIN))
 _ALPHA_MAX = _F(ALPHA_MAX)
 _T_MIN = _F(TRANSMITTANCE_MIN)
-_ONE, _ZERO, _FLOOR = _F(1), _F(0), _F(-24)
-# 2^f on [-1, 0]: minimax in relative error (7.5e-8)
-_P0, _P1, _P2 = _F(0.9999999250706731), _F(0.6931422526108741), _F(0.24017218887313774)
-_P3, _P4, _P5 = _F(0.05527972090328897), _F(0.009188609386239987), _F(0.0009387872768787113)
-_BIAS, _MANTISSA = np.int32(127), np.int32(23)
-
-# Planes of a tile's buffer (unsigned: no check for negative indices stands in the way of vectorising)
-_U = np.uint64
-_Y, _S0, _S1, _S2, _S3, _S4, _S5 = (_U(PLANE * k) for k in range(1, 8))
-
-# No NaN or Inf assumptions: sums may be reordered (that is what vectorises them), nothing else.
-FAST = {"contract", "reassoc", "nsz", "arcp"}
+_ONE, _ZERO, _HALF = _F(1), _F(0), _F(0.5)
+_CENTRES = np.arange(TILE, dtype=np.float32) + _HALF
+_SHARED = 6 * PLANE  # where a Gaussian's values that depend on the row alone lie
 
 
-@intrinsic
-def _bits_to_float(typing_context, bits):  # type: ignore[no-untyped-def]
-    def generate(context, builder, signature, arguments):
-        return builder.bitcast(arguments[0], ir.FloatType())
-
-    return types.float32(types.int32), generate
-
-
-@njit(inline="always")
-def _exp2(q):
-    """2^q for q in [-24, 1)."""
-    whole = np.int32(q)
-    f = q - np.float32(whole)
-    p = _P4 + f * _P5
-    p = _P3 + f * p
-    p = _P2 + f * p
-    p = _P1 + f * p
-    p = _P0 + f * p
-    return p * _bits_to_float(np.int32((whole + _BIAS) << _MANTISSA))  # pyright: ignore[reportCallIssue]
+@njit(error_model="numpy", forceinline=True, cache=True)
+def _gather(records, ids, first, last, y0, batch, rows):
+    """Copy the records of a batch to where they are near, with the rows of the tile that each one meets."""
+    for j in range(last - first):
+        i = ids[first + j]
+        for value in range(RECORD):
+            batch[j, value] = records[i, value]
+        rows[j, 0] = max(0, int(np.floor(batch[j, 1] - batch[j, 10] - y0)))
+        rows[j, 1] = min(TILE, int(np.ceil(batch[j, 1] + batch[j, 10] - y0)))
 
 
-@njit(fastmath=FAST, error_model="numpy", cache=True)
-def _blend_run(lo, hi, s, mx, my, a, b, c, log_opacity, red, green, blue):
-    """Blend one Gaussian into pixels lo..hi of a tile; state rows: T, r, g, b."""
-    for p in range(lo, hi):
-        dx = s[p] - mx
-        dy = s[p + _Y] - my
-        q = log_opacity + dx * (a * dx + b * dy) + c * dy * dy
-        alpha = min(_exp2(max(q, _FLOOR)), _ALPHA_MAX)
-        left = s[p + _S0]
-        weight = alpha * left if (q >= _LOG2_ALPHA_MIN) & (left >= _T_MIN) else _ZERO
-        s[p + _S0] = left - weight
-        s[p + _S1] += weight * red
-        s[p + _S2] += weight * green
-        s[p + _S3] += weight * blue
+@njit(cache=True)
+def _scratch(planes):
+    """Zeros for a tile's planes, on a boundary of 64 bytes."""
+    memory = np.zeros(planes * PLANE + 16, np.float32)
+    skip = (-memory.ctypes.data // 4) % 16
+    return memory[skip : skip + planes * PLANE]
 
 
-@njit(cache=True, inline="always")
-def _rows(records, i, half, x0, y0):
-    """Runs of a Gaussian's bounding box in one half of a tile: first row, last row + 1 (equal = none)."""
-    left = x0 + _F(half * HALF)
-    if records[i, 0] + records[i, 9] < left or records[i, 0] - records[i, 9] > left + _F(HALF):
-        return 0, 0
-    lo = max(0, int(np.floor(records[i, 1] - records[i, 10] - y0)))
-    hi = min(TILE, int(np.ceil(records[i, 1] + records[i, 10] - y0)))
-    return lo, max(lo, hi)
+@njit(cache=True)
+def _most(s):
+    """Largest transmittance of a tile."""
+    most = load16(s, 0)
+    for row in range(1, TILE):
+        most = maximum(most, load16(s, row * TILE))
+    return largest(most)
 
 
-@njit(cache=True, inline="always")
-def _pixel_centres(buffer, x0, y0):
-    for p in range(PIXELS):
-        half, rest = divmod(p, TILE * HALF)
-        row, column = divmod(rest, HALF)
-        buffer[p] = x0 + _F(half * HALF + column) + _F(0.5)
-        buffer[PLANE + p] = y0 + _F(row) + _F(0.5)
+@njit(error_model="numpy", cache=True)
+def _blend(s, lo, hi, columns, lines, mx, my, a, b, c, log_opacity, red, green, blue):
+    """Blend one Gaussian into rows lo..hi of a tile; planes of s: T, r, g, b, what rows share."""
+    dx = columns - mx
+    adx = dx * a
+    dy = lines - my
+    store(s, _SHARED, dy * b)
+    store(s, _SHARED + TILE, dy * dy * c + log_opacity)
+    q = dx * (adx + spread16(s, _SHARED + lo)) + spread16(s, _SHARED + TILE + lo)
+    raw = exp2(q)
+    for row in range(lo, hi):
+        p = row * TILE
+        left = load16(s, p)
+        seen = (q >= _LOG2_ALPHA_MIN) & (left >= _T_MIN)
+        weight = where(seen, minimum(raw, _ALPHA_MAX) * left, _ZERO)
+        q = dx * (adx + spread16(s, _SHARED + 1 + row)) + spread16(s, _SHARED + TILE + 1 + row)
+        raw = exp2(q)
+        store(s, p, left - weight)
+        store(s, p + PLANE, load16(s, p + PLANE) + weight * red)
+        store(s, p + 2 * PLANE, load16(s, p + 2 * PLANE) + weight * green)
+        store(s, p + 3 * PLANE, load16(s, p + 3 * PLANE) + weight * blue)
 
 
 @njit(parallel=True, cache=True)
@@ -106,80 +101,70 @@ def forward(records, starts, ids, tiles_x, width, height, background, image, lef
     for tile in prange(len(starts) - 1):
         column0, row0 = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
         x0, y0 = _F(column0), _F(row0)
-        buffer = np.zeros(6 * PLANE, np.float32)
-        _pixel_centres(buffer, x0, y0)
-        state = buffer[2 * PLANE :].reshape(4, PLANE)
-        state[0] = _ONE
-        end = starts[tile + 1]
-        for k in range(starts[tile], starts[tile + 1]):
-            i = ids[k]
-            for half in range(2):
-                lo, hi = _rows(records, i, half, x0, y0)
-                if lo < hi:
-                    base = half * TILE * HALF
-                    _blend_run(
-                        _U(base + lo * HALF), _U(base + hi * HALF), buffer,
-                        records[i, 0], records[i, 1], records[i, 2], records[i, 3], records[i, 4],
-                        records[i, 5], records[i, 6], records[i, 7], records[i, 8],
-                    )  # fmt: skip
-            if k % 16 == 15 and state[0, :PIXELS].max() < _T_MIN:
-                end = k + 1
-                break
+        columns, lines = load16(_CENTRES, 0) + x0, load16(_CENTRES, 0) + y0
+        state = _scratch(7)
+        state[:PIXELS] = _ONE
+        batch, rows = np.empty((_BATCH, RECORD), np.float32), np.empty((_BATCH, 2), np.int64)
+        end = starts[tile]
+        while end < starts[tile + 1] and _most(state) >= _T_MIN:
+            first, end = end, min(end + _BATCH, starts[tile + 1])
+            _gather(records, ids, first, end, y0, batch, rows)
+            for j in range(end - first):
+                _blend(
+                    state, rows[j, 0], rows[j, 1], columns, lines, batch[j, 0], batch[j, 1], batch[j, 2],
+                    batch[j, 3], batch[j, 4], batch[j, 5], batch[j, 6], batch[j, 7], batch[j, 8],
+                )  # fmt: skip
         ends[tile] = end
         for row in range(min(TILE, height - row0)):
             for column in range(min(TILE, width - column0)):
-                half, inner = divmod(column, HALF)
-                p = half * TILE * HALF + row * HALF + inner
-                left[row0 + row, column0 + column] = state[0, p]
+                p = row * TILE + column
+                left[row0 + row, column0 + column] = state[p]
                 for channel in range(3):
                     image[row0 + row, column0 + column, channel] = (
-                        state[1 + channel, p] + state[0, p] * background[channel]
+                        state[PLANE * (1 + channel) + p] + state[p] * background[channel]
                     )
 
 
-@njit(fastmath=FAST, error_model="numpy", cache=True)
-def _gradient_run(lo, hi, s, mx, my, a, b, c, log_opacity, red, green, blue, sums, slot):
-    """Add one Gaussian's gradient sums over pixels lo..hi; walks front to back.
+@njit(error_model="numpy", cache=True)
+def _gradient(s, lo, hi, columns, lines, mx, my, a, b, c, log_opacity, red, green, blue, sums, slot):
+    """One Gaussian's gradient sums over rows lo..hi; walks front to back.
 
-    state rows: T, what is still to come of (gradient . colour), dL/d(r, g, b), dL/dalpha.
+    Planes of s: T, what is still to come of (gradient . colour), dL/d(r, g, b), dL/dalpha.
     """
-    s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = _ZERO
-    for p in range(lo, hi):
-        dx = s[p] - mx
-        dy = s[p + _Y] - my
-        q = log_opacity + dx * (a * dx + b * dy) + c * dy * dy
-        raw = _exp2(max(q, _FLOOR))
-        alpha = min(raw, _ALPHA_MAX)
-        left = s[p + _S0]
-        seen = (q >= _LOG2_ALPHA_MIN) & (left >= _T_MIN)
-        weight = alpha * left if seen else _ZERO
-        g0, g1, g2 = s[p + _S2], s[p + _S3], s[p + _S4]
-        value = g0 * red + g1 * green + g2 * blue + s[p + _S5]
-        rest = s[p + _S1] - weight * value
-        s[p + _S1] = rest
-        s[p + _S0] = left - weight
-        slope = left * value - rest / (_ONE - alpha)
-        gq = slope * alpha if seen & (raw < _ALPHA_MAX) else _ZERO
-        s0 += weight * g0
-        s1 += weight * g1
-        s2 += weight * g2
-        gx = gq * dx
-        gy = gq * dy
-        s3 += gq
-        s4 += gx
-        s5 += gy
-        s6 += gx * dx
-        s7 += gx * dy
-        s8 += gy * dy
-    sums[slot, 0] += s0
-    sums[slot, 1] += s1
-    sums[slot, 2] += s2
-    sums[slot, 3] += s3
-    sums[slot, 4] += s4
-    sums[slot, 5] += s5
-    sums[slot, 6] += s6
-    sums[slot, 7] += s7
-    sums[slot, 8] += s8
+    dx = columns - mx
+    adx = dx * a
+    dy = lines - my
+    store(s, _SHARED, dy * b)
+    store(s, _SHARED + TILE, dy * dy * c + log_opacity)
+    store(s, _SHARED + 2 * TILE, dy)
+    s0 = s1 = s2 = r0 = r1 = r2 = splat16(_ZERO)
+    q = dx * (adx + spread16(s, _SHARED + lo)) + spread16(s, _SHARED + TILE + lo)
+    raw = exp2(q)
+    for row in range(lo, hi):
+        p = row * TILE
+        left = load16(s, p)
+        # lanes that are not seen may hold any value, also ones that are slow to compute with
+        alpha = where((q >= _LOG2_ALPHA_MIN) & (left >= _T_MIN), minimum(raw, _ALPHA_MAX), _ZERO)
+        weight = alpha * left
+        g0, g1, g2 = load16(s, p + 2 * PLANE), load16(s, p + 3 * PLANE), load16(s, p + 4 * PLANE)
+        value = g0 * red + g1 * green + g2 * blue + load16(s, p + 5 * PLANE)
+        rest = load16(s, p + PLANE) - weight * value
+        store(s, p + PLANE, rest)
+        store(s, p, left - weight)
+        gq = where(raw < _ALPHA_MAX, alpha * (left * value - rest / (_ONE - alpha)), _ZERO)
+        q = dx * (adx + spread16(s, _SHARED + 1 + row)) + spread16(s, _SHARED + TILE + 1 + row)
+        raw = exp2(q)
+        s0 = s0 + weight * g0
+        s1 = s1 + weight * g1
+        s2 = s2 + weight * g2
+        r0 = r0 + gq
+        down = spread16(s, _SHARED + 2 * TILE + row)
+        along = gq * down
+        r1 = r1 + along
+        r2 = r2 + along * down
+    rdx = r0 * dx
+    store_totals(sums, slot * SUMS, s0, s1, s2, r0, rdx, r1, rdx * dx, r1 * dx)
+    sums[slot, 8] = total(r2)
 
 
 @njit(parallel=True, cache=True)
@@ -191,41 +176,37 @@ def backward(
     image [H, W, 3] is what `forward` made; grad_left [H, W] is dL/d(remaining transmittance).
     """
     for tile in prange(len(starts) - 1):
-        for k in range(starts[tile], starts[tile + 1]):
+        for k in range(ends[tile], starts[tile + 1]):
             for column in range(SUMS):
                 sums[slots[k], column] = _ZERO
         if starts[tile] == ends[tile]:
             continue
         column0, row0 = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
         x0, y0 = _F(column0), _F(row0)
-        buffer = np.zeros(8 * PLANE, np.float32)
-        _pixel_centres(buffer, x0, y0)
-        state = buffer[2 * PLANE :].reshape(6, PLANE)
+        columns, lines = load16(_CENTRES, 0) + x0, load16(_CENTRES, 0) + y0
+        state = _scratch(7)
         for row in range(min(TILE, height - row0)):
             for column in range(min(TILE, width - column0)):
-                half, inner = divmod(column, HALF)
-                p = half * TILE * HALF + row * HALF + inner
+                p = row * TILE + column
                 y, x = row0 + row, column0 + column
-                state[0, p] = _ONE
-                total = _ZERO
+                state[p] = _ONE
+                rest = _ZERO
                 for channel in range(3):
-                    state[2 + channel, p] = grad_image[y, x, channel]
-                    total += grad_image[y, x, channel] * image[y, x, channel]
+                    state[PLANE * (2 + channel) + p] = grad_image[y, x, channel]
+                    rest += grad_image[y, x, channel] * image[y, x, channel]
                 # alpha = 1 - left is one more channel in which every Gaussian has the value 1
-                state[5, p] = -grad_left[y, x]
-                state[1, p] = total - grad_left[y, x] * (_ONE - left[y, x])
-        for k in range(starts[tile], ends[tile]):
-            i = ids[k]
-            slot = slots[k]
-            for half in range(2):
-                lo, hi = _rows(records, i, half, x0, y0)
-                if lo < hi:
-                    base = half * TILE * HALF
-                    _gradient_run(
-                        _U(base + lo * HALF), _U(base + hi * HALF), buffer,
-                        records[i, 0], records[i, 1], records[i, 2], records[i, 3], records[i, 4],
-                        records[i, 5], records[i, 6], records[i, 7], records[i, 8], sums, slot,
-                    )  # fmt: skip
+                state[5 * PLANE + p] = -grad_left[y, x]
+                state[PLANE + p] = rest - grad_left[y, x] * (_ONE - left[y, x])
+        batch, rows = np.empty((_BATCH, RECORD), np.float32), np.empty((_BATCH, 2), np.int64)
+        for first in range(starts[tile], ends[tile], _BATCH):
+            last = min(first + _BATCH, ends[tile])
+            _gather(records, ids, first, last, y0, batch, rows)
+            for j in range(last - first):
+                _gradient(
+                    state, rows[j, 0], rows[j, 1], columns, lines, batch[j, 0], batch[j, 1], batch[j, 2],
+                    batch[j, 3], batch[j, 4], batch[j, 5], batch[j, 6], batch[j, 7], batch[j, 8],
+                    sums, slots[first + j],
+                )  # fmt: skip
 
 
 @njit(parallel=True, cache=True)
@@ -235,16 +216,16 @@ def reduce(records, offsets, sums, g_mean2d, g_conic, g_opacity, g_color):
     for i in prange(len(records)):
         if offsets[i] == offsets[i + 1]:
             continue
-        total = np.zeros(SUMS, np.float64)
+        added = np.zeros(SUMS, np.float64)
         for slot in range(offsets[i], offsets[i + 1]):
             for column in range(SUMS):
-                total[column] += sums[slot, column]
+                added[column] += sums[slot, column]
         a, b, c = to_conic * records[i, 2], _F(0.5) * to_conic * records[i, 3], to_conic * records[i, 4]
-        g_mean2d[i, 0] += a * total[4] + b * total[5]
-        g_mean2d[i, 1] += b * total[4] + c * total[5]
-        g_conic[i, 0] -= 0.5 * total[6]
-        g_conic[i, 1] -= total[7]
-        g_conic[i, 2] -= 0.5 * total[8]
-        g_opacity[i] += total[3] / 2.0 ** records[i, 5]
+        g_mean2d[i, 0] += a * added[4] + b * added[5]
+        g_mean2d[i, 1] += b * added[4] + c * added[5]
+        g_conic[i, 0] -= 0.5 * added[6]
+        g_conic[i, 1] -= added[7]
+        g_conic[i, 2] -= 0.5 * added[8]
+        g_opacity[i] += added[3] / 2.0 ** records[i, 5]
         for channel in range(3):
-            g_color[i, channel] = total[channel]
+            g_color[i, channel] = added[channel]

@@ -13,6 +13,7 @@ from sagesplat.errors import DataError
 from sagesplat.gaussians import PARAMETERS, Gaussians
 from sagesplat.raster import blend, project, tiles
 from sagesplat.raster.render import Render
+from sagesplat.raster.workspace import Workspace
 from sagesplat.scene.scene import Camera
 
 _CHUNK = 3  # channels that one blending pass takes
@@ -26,6 +27,7 @@ class _Options:
     degree: int
     antialiased: bool
     tile_mask: np.ndarray | None
+    workspace: Workspace
 
 
 def _array(tensor: Tensor) -> np.ndarray:
@@ -38,14 +40,22 @@ def _arrays(parameters: Sequence[Tensor]) -> _Arrays:
     return means, quats, log_scales, logits, sh0, shN
 
 
+def _enough(*arrays: np.ndarray) -> Any:
+    """Arrays of as many rows as the projection kernels need at least: the last one again and again."""
+    missing = project.LANES - len(arrays[0])
+    if missing <= 0 or missing == project.LANES:
+        return arrays
+    return tuple(np.concatenate([a, a[-1:].repeat(missing, 0)]) for a in arrays)
+
+
 def _project(options: _Options, parameters: _Arrays):
     n = len(parameters[0])
-    records = np.empty((n, blend.RECORD), np.float32)
-    depths, radii = np.empty(n, np.float32), np.empty(n, np.float32)
-    project.forward(
-        project.camera_vector(options.camera), *parameters, sh.num_bases(options.degree), options.antialiased,
-        records, depths, radii,
-    )  # fmt: skip
+    parameters = _enough(*parameters)
+    rows, take = len(parameters[0]), options.workspace.take
+    records, depths, radii = take("records", rows, blend.RECORD), take("depths", rows), take("radii", rows)
+    fixed = project.camera_vector(options.camera), sh.num_bases(options.degree), options.antialiased
+    project.forward(*fixed, *parameters, records, depths, radii)
+    records, depths, radii = records[:n], depths[:n], radii[:n]
     if n and radii.min() < 0:
         bad = np.flatnonzero(radii < 0)
         raise DataError(
@@ -69,30 +79,22 @@ class _Rasterize(torch.autograd.Function):
         camera = options.camera
         arrays = _arrays(parameters)
         records, depths, radii = _project(options, arrays)
-        means2d.detach().numpy()[:] = np.where(radii[:, None] > 0, records[:, :2], 0)
-        tiles_y, tiles_x = -(-camera.height // blend.TILE), -(-camera.width // blend.TILE)
+        np.multiply(records[:, :2], radii[:, None] > 0, out=means2d.detach().numpy())
+        width, height, take = camera.width, camera.height, options.workspace.take
+        tiles_y, tiles_x = -(-height // blend.TILE), -(-width // blend.TILE)
         mask = np.ones(tiles_x * tiles_y, bool) if options.tile_mask is None else options.tile_mask.ravel()
-        found = tiles.intersect(records, depths, radii, camera.width, camera.height, mask)
-        left = np.empty((camera.height, camera.width), np.float32)
+        found = tiles.intersect(records, depths, radii, width, height, mask, options.workspace)
+        left = take("left", height, width)
         ends = np.empty(len(found.starts) - 1, np.int64)
         passes = [(records, _array(background))] + [
             (_with_colors(records, chunk), np.zeros(_CHUNK, np.float32))
             for chunk in _chunks(_array(features))
         ]
         images = []
-        for painted, behind in passes:
-            image = np.empty((camera.height, camera.width, 3), np.float32)
+        for index, (painted, behind) in enumerate(passes):
+            image = take(f"image {index}", height, width, 3)
             blend.forward(
-                painted,
-                found.starts,
-                found.ids,
-                found.tiles_x,
-                camera.width,
-                camera.height,
-                behind,
-                image,
-                left,
-                ends,
+                painted, found.starts, found.ids, found.tiles_x, width, height, behind, image, left, ends
             )
             images.append(image)
         ctx.save_for_backward(*parameters)
@@ -106,12 +108,11 @@ class _Rasterize(torch.autograd.Function):
         options, painted, radii, found, ends, images, left, num_features = ctx.kept
         arrays = _arrays(ctx.saved_tensors)
         g_rgb, g_alpha, g_extra = (_array(g) for g in grads[:3])
-        n, camera = len(radii), options.camera
-        g_mean2d, g_conic = np.zeros((n, 2), np.float32), np.zeros((n, 3), np.float32)
-        g_opacity = np.zeros(n, np.float32)
+        n, camera, space = len(radii), options.camera, options.workspace
+        g_mean2d, g_conic = space.zeros("g_mean2d", n, 2), space.zeros("g_conic", n, 3)
+        g_opacity, g_color = space.zeros("g_opacity", n), space.zeros("g_color", n, 3)
         g_features = np.zeros((n, num_features), np.float32)
-        g_color = np.zeros((n, 3), np.float32)
-        sums = np.empty((len(found.ids), blend.SUMS), np.float32)
+        sums = space.take("sums", len(found.ids), blend.SUMS)
         no_alpha = np.zeros_like(g_alpha)
         for index, (records, image) in enumerate(zip(painted, images, strict=True)):
             first = index == 0
@@ -126,19 +127,19 @@ class _Rasterize(torch.autograd.Function):
             if not first:
                 part = g_features[:, _CHUNK * (index - 1) : _CHUNK * index]
                 part[:] = g_channels[:, : part.shape[1]]
-        means, quats, log_scales, logits, sh0, shN = map(np.zeros_like, arrays)
-        project.backward(
-            project.camera_vector(camera), *arrays, sh.num_bases(options.degree), options.antialiased,
-            painted[0],
-            radii, g_mean2d, g_conic, g_opacity, g_color, means, quats, log_scales, logits, sh0, shN,
-        )  # fmt: skip
+        enough: Any = _enough(*arrays)
+        gradients = [space.take(name, *a.shape) for name, a in zip(PARAMETERS, enough, strict=True)]
+        num_bases = sh.num_bases(options.degree)
+        if space.gradients_of != (n, num_bases):  # harmonics that are not in use stay at zero
+            gradients[-1].fill(0)
+            space.gradients_of = n, num_bases
+        lists = _enough(painted[0], radii, g_mean2d, g_conic, g_opacity, g_color)
+        fixed = project.camera_vector(camera), num_bases, options.antialiased
+        project.backward(*fixed, *enough, *lists, *gradients)
         return (
-            None,
-            torch.from_numpy(g_mean2d),
-            None,
-            torch.from_numpy(g_features),
-            *(torch.from_numpy(g) for g in (means, quats, log_scales, logits, sh0, shN)),
-        )
+            None, torch.from_numpy(g_mean2d), None, torch.from_numpy(g_features),
+            *(torch.from_numpy(g[:n]) for g in gradients),
+        )  # fmt: skip
 
 
 def _chunks(features: np.ndarray) -> list[np.ndarray]:
@@ -166,6 +167,7 @@ def render(
     features: Tensor | None,
     antialiased: bool,
     tile_mask: np.ndarray | None,
+    workspace: Workspace | None,
 ) -> Render:
     """Render in float32 on the CPU; see `sagesplat.raster.rasterize` for the arguments."""
     extra = g.means.new_zeros(len(g), 0) if features is None else features
@@ -173,6 +175,10 @@ def render(
     tracked = torch.is_grad_enabled() and any(p.requires_grad for p in (*parameters, extra))
     means2d = torch.zeros(len(g), 2, requires_grad=tracked)
     rgb, alpha, painted, radii = _Rasterize.apply(
-        _Options(camera, degree, antialiased, tile_mask), means2d, background, extra, *parameters
+        _Options(camera, degree, antialiased, tile_mask, workspace or Workspace()),
+        means2d,
+        background,
+        extra,
+        *parameters,
     )  # type: ignore[misc]
     return Render(rgb, alpha, None if features is None else painted, means2d, radii)

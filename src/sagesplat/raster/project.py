@@ -1,20 +1,43 @@
 """Projection kernels: 3D Gaussians to 2D ones with colours, and the gradients back.
 
-The mathematics is that of `reference.py`, in float32, fused and parallel over Gaussians.
+The mathematics is that of `reference.py`, eight Gaussians at a time: geometry in float64, colours in float32.
 Camera vector: w2c rotation (9, row-major), translation (3), fx, fy, cx, cy, width, height, position (3).
 """
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit, prange
 
+from sagesplat import sh
 from sagesplat.raster.render import ALPHA_MIN, BLUR, FRUSTUM_MARGIN, NEAR
+from sagesplat.raster.simd import (
+    count,
+    double,
+    exp2,
+    gather,
+    load8,
+    log2,
+    maximum,
+    minimum,
+    scatter,
+    single,
+    sqrt,
+    store,
+    where,
+)
 from sagesplat.scene.scene import Camera
-from sagesplat.sh import direction_gradient, fill_bases
 
+LANES = 8  # the kernels need at least so many Gaussians
 _LOG2E = math.log2(math.e)
-_CHUNK = 256  # Gaussians that share a thread's scratch arrays
+_LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
+_CHUNK = 256  # Gaussians that a thread takes at a time
+_HUGE = 3e38  # float32's largest; what is beyond, or NaN, is not finite
+_RECORD = 11
+
+_bases: Any = njit(sh.bases, forceinline=True, cache=True)
+_direction_gradient: Any = njit(sh.direction_gradient, forceinline=True, cache=True)
 
 
 def camera_vector(camera: Camera) -> np.ndarray:
@@ -26,255 +49,373 @@ def camera_vector(camera: Camera) -> np.ndarray:
     )
 
 
-@njit(error_model="numpy", forceinline=True, cache=True)
-def _rotation(i, quats, r):
-    """Rotation matrix of a wxyz quaternion into r [3, 3]; returns 1 / |q|."""
-    w, x, y, z = float(quats[i, 0]), float(quats[i, 1]), float(quats[i, 2]), float(quats[i, 3])
-    inverse = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
-    w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
-    r[0, 0], r[0, 1], r[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-    r[1, 0], r[1, 1], r[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-    r[2, 0], r[2, 1], r[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
-    return inverse
+@njit(forceinline=True, cache=True)
+def _column(array, i, width, column):
+    """A column of eight rows in float64."""
+    return double(gather(array, i * width + column, width))
 
 
-@njit(error_model="numpy", forceinline=True, cache=True)
-def _half_covariance(i, cam, means, quats, log_scales, rot, scale, jac, half):
-    """Camera point, clamped slopes, J W into jac [2, 3] and J W R S into half [2, 3]."""
-    x = cam[0] * means[i, 0] + cam[1] * means[i, 1] + cam[2] * means[i, 2] + cam[9]
-    y = cam[3] * means[i, 0] + cam[4] * means[i, 1] + cam[5] * means[i, 2] + cam[10]
-    z = cam[6] * means[i, 0] + cam[7] * means[i, 1] + cam[8] * means[i, 2] + cam[11]
+@njit(forceinline=True, cache=True)
+def _three(array, i):
+    return _column(array, i, 3, 0), _column(array, i, 3, 1), _column(array, i, 3, 2)
+
+
+@njit(forceinline=True, cache=True)
+def _four(array, i):
+    return _column(array, i, 4, 0), _column(array, i, 4, 1), _column(array, i, 4, 2), _column(array, i, 4, 3)
+
+
+@njit(forceinline=True, cache=True)
+def _times_rotation(a, b, c, r):
+    """(a, b, c) R^T, R row-major."""
+    return a * r[0] + b * r[1] + c * r[2], a * r[3] + b * r[4] + c * r[5], a * r[6] + b * r[7] + c * r[8]
+
+
+@njit(forceinline=True, cache=True)
+def _finite(x):
+    return (x <= _HUGE) & (x >= -_HUGE)
+
+
+@njit(forceinline=True, cache=True)
+def _exp(x):
+    return exp2(minimum(maximum(x * _LOG2E, -1000.0), 1000.0))
+
+
+@njit(forceinline=True, cache=True)
+def _rotation(w, x, y, z):
+    """Rotation matrix, row-major, of a unit wxyz quaternion."""
+    return (
+        1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y),
+        2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x),
+        2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y),
+    )  # fmt: skip
+
+
+@njit(forceinline=True, cache=True)
+def _camera_point(cam, mx, my, mz):
+    return (
+        cam[0] * mx + cam[1] * my + cam[2] * mz + cam[9],
+        cam[3] * mx + cam[4] * my + cam[5] * mz + cam[10],
+        cam[6] * mx + cam[7] * my + cam[8] * mz + cam[11],
+    )
+
+
+@njit(forceinline=True, cache=True)
+def _jacobian(cam, x, y, z):
+    """Slopes x/z and y/z kept near the image, and J W [2 x 3]: that of the projection at the slopes."""
     fx, fy, cx, cy, width, height = cam[12], cam[13], cam[14], cam[15], cam[16], cam[17]
     margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * width, FRUSTUM_MARGIN * 0.5 * height
-    u = min(max(x / z, (-cx - margin_x) / fx), (width - cx + margin_x) / fx)
-    v = min(max(y / z, (-cy - margin_y) / fy), (height - cy + margin_y) / fy)
-    inverse = _rotation(i, quats, rot)
-    for k in range(3):
-        scale[k] = math.exp(log_scales[i, k])
-        jac[0, k] = fx / z * (cam[k] - u * cam[6 + k])
-        jac[1, k] = fy / z * (cam[3 + k] - v * cam[6 + k])
-    for m in range(2):
-        for k in range(3):
-            half[m, k] = (jac[m, 0] * rot[0, k] + jac[m, 1] * rot[1, k] + jac[m, 2] * rot[2, k]) * scale[k]
-    return x, y, z, u, v, inverse
+    u = minimum(maximum(x / z, (-cx - margin_x) / fx), (width - cx + margin_x) / fx)
+    v = minimum(maximum(y / z, (-cy - margin_y) / fy), (height - cy + margin_y) / fy)
+    sx, sy = fx / z, fy / z
+    return u, v, (
+        sx * (cam[0] - u * cam[6]), sx * (cam[1] - u * cam[7]), sx * (cam[2] - u * cam[8]),
+        sy * (cam[3] - v * cam[6]), sy * (cam[4] - v * cam[7]), sy * (cam[5] - v * cam[8]),
+    )  # fmt: skip
+
+
+@njit(forceinline=True, cache=True)
+def _half_covariance(j, r, s):
+    """J W R S [2 x 3]; times its transpose it is the 2D covariance."""
+    return (
+        (j[0] * r[0] + j[1] * r[3] + j[2] * r[6]) * s[0],
+        (j[0] * r[1] + j[1] * r[4] + j[2] * r[7]) * s[1],
+        (j[0] * r[2] + j[1] * r[5] + j[2] * r[8]) * s[2],
+        (j[3] * r[0] + j[4] * r[3] + j[5] * r[6]) * s[0],
+        (j[3] * r[1] + j[4] * r[4] + j[5] * r[7]) * s[1],
+        (j[3] * r[2] + j[4] * r[5] + j[5] * r[8]) * s[2],
+    )
+
+
+@njit(forceinline=True, cache=True)
+def _covariance(h):
+    return (
+        h[0] * h[0] + h[1] * h[1] + h[2] * h[2],
+        h[0] * h[3] + h[1] * h[4] + h[2] * h[5],
+        h[3] * h[3] + h[4] * h[4] + h[5] * h[5],
+    )
+
+
+@njit(forceinline=True, cache=True)
+def _direction(cam, mx, my, mz):
+    """Unit vector from the camera to the mean in float32, and one over their distance."""
+    dx, dy, dz = mx - cam[18], my - cam[19], mz - cam[20]
+    inverse = 1.0 / sqrt(dx * dx + dy * dy + dz * dz)
+    return single(dx * inverse), single(dy * inverse), single(dz * inverse), inverse
+
+
+@njit(forceinline=True, cache=True)
+def _store_bases(x, y, z, scratch):
+    for k, basis in enumerate(_bases(x, y, z)[1:]):
+        store(scratch, 8 * (k + 1), basis)
+
+
+@njit(forceinline=True, cache=True)
+def _shade(i, sh0, shN, num_bases, scratch):
+    """Colours of eight Gaussians; the values of the bases lie in `scratch`."""
+    width = 3 * shN.shape[1]
+    red = 0.5 + sh.C0 * gather(sh0, 3 * i, 3)
+    green = 0.5 + sh.C0 * gather(sh0, 3 * i + 1, 3)
+    blue = 0.5 + sh.C0 * gather(sh0, 3 * i + 2, 3)
+    for k in range(1, num_bases):
+        basis, at = load8(scratch, 8 * k), i * width + 3 * k - 3
+        red = red + basis * gather(shN, at, width)
+        green = green + basis * gather(shN, at + 1, width)
+        blue = blue + basis * gather(shN, at + 2, width)
+    return red, green, blue
 
 
 @njit(error_model="numpy", forceinline=True, cache=True)
-def _forward_one(
-    i, cam, means, quats, log_scales, logits, sh0, shN, num_bases, antialiased, records, depths,
-                radii,
-    rot, scale, jac, half, basis,
-):  # fmt: skip
-    radii[i] = 0.0
-    depths[i] = np.inf
-    z = cam[6] * means[i, 0] + cam[7] * means[i, 1] + cam[8] * means[i, 2] + cam[11]
-    check = means[i, 0] + means[i, 1] + means[i, 2] + logits[i] + sh0[i, 0, 0] + sh0[i, 0, 1] + sh0[i, 0, 2]
-    for k in range(3):
-        check += log_scales[i, k] + quats[i, k]
-    if not np.isfinite(check + quats[i, 3]):
-        radii[i] = -1.0
-        return
-    if z <= NEAR:
-        return
-    x, y, z, _, _, _ = _half_covariance(i, cam, means, quats, log_scales, rot, scale, jac, half)
-    sxx = half[0, 0] * half[0, 0] + half[0, 1] * half[0, 1] + half[0, 2] * half[0, 2]
-    sxy = half[0, 0] * half[1, 0] + half[0, 1] * half[1, 1] + half[0, 2] * half[1, 2]
-    syy = half[1, 0] * half[1, 0] + half[1, 1] * half[1, 1] + half[1, 2] * half[1, 2]
+def _forward_eight(
+    i,
+    cam,
+    means,
+    quats,
+    log_scales,
+    logits,
+    sh0,
+    shN,
+    num_bases,
+    antialiased,
+    records,
+    depths,
+    radii,
+    scratch,
+):
+    mx, my, mz = _three(means, i)
+    w, a, b, c = (
+        _column(quats, i, 4, 0),
+        _column(quats, i, 4, 1),
+        _column(quats, i, 4, 2),
+        _column(quats, i, 4, 3),
+    )
+    ls0, ls1, ls2 = _three(log_scales, i)
+    logit = _column(logits, i, 1, 0)
+    finite = _finite(mx + my + mz) & _finite(w + a + b + c) & _finite(ls0 + ls1 + ls2 + logit)
+    x, y, z = _camera_point(cam, mx, my, mz)
+    inverse = 1.0 / sqrt(w * w + a * a + b * b + c * c)
+    rotation = _rotation(w * inverse, a * inverse, b * inverse, c * inverse)
+    _, _, jacobian = _jacobian(cam, x, y, z)
+    sxx, sxy, syy = _covariance(_half_covariance(jacobian, rotation, (_exp(ls0), _exp(ls1), _exp(ls2))))
     cxx, cyy = sxx + BLUR, syy + BLUR
     det = cxx * cyy - sxy * sxy
-    opacity = 1.0 / (1.0 + math.exp(-logits[i]))
+    opacity = 1.0 / (1.0 + _exp(-logit))
     if antialiased:
-        opacity *= math.sqrt(max((sxx * syy - sxy * sxy) / det, 1e-10))
-    if not (opacity > ALPHA_MIN and det > 0.0 and np.isfinite(det)):
-        return
-    mx, my = cam[12] * x / z + cam[14], cam[13] * y / z + cam[15]
-    reach = 2.0 * math.log(opacity / ALPHA_MIN)
-    hx, hy = math.sqrt(reach * cxx), math.sqrt(reach * cyy)
-    if mx + hx <= 0 or mx - hx >= cam[16] or my + hy <= 0 or my - hy >= cam[17]:
-        return
-    depths[i] = z
-    radii[i] = max(hx, hy)
-    records[i, 0], records[i, 1] = mx, my
-    records[i, 2], records[i, 3], records[i, 4] = (
-        -0.5 * _LOG2E * cyy / det,
-        _LOG2E * sxy / det,
-        -0.5 * _LOG2E * cxx / det,
-    )
-    records[i, 5] = math.log2(opacity)
-    dx, dy, dz = means[i, 0] - cam[18], means[i, 1] - cam[19], means[i, 2] - cam[20]
-    length = math.sqrt(dx * dx + dy * dy + dz * dz)
-    fill_bases(dx / length, dy / length, dz / length, num_bases, basis)
-    red = 0.5 + basis[0] * sh0[i, 0, 0]
-    green = 0.5 + basis[0] * sh0[i, 0, 1]
-    blue = 0.5 + basis[0] * sh0[i, 0, 2]
-    for k in range(1, num_bases):
-        red += basis[k] * shN[i, k - 1, 0]
-        green += basis[k] * shN[i, k - 1, 1]
-        blue += basis[k] * shN[i, k - 1, 2]
-    if not np.isfinite(red + green + blue):
-        radii[i] = -1.0
-        return
-    records[i, 6], records[i, 7], records[i, 8] = max(red, 0.0), max(green, 0.0), max(blue, 0.0)
-    records[i, 9], records[i, 10] = hx, hy
+        opacity = opacity * sqrt(maximum((sxx * syy - sxy * sxy) / det, 1e-10))
+    level = log2(opacity)
+    reach = 2.0 / _LOG2E * (level - _LOG2_ALPHA_MIN)
+    hx, hy = sqrt(reach * cxx), sqrt(reach * cyy)
+    px, py = cam[12] * x / z + cam[14], cam[13] * y / z + cam[15]
+    drawn = (z > NEAR) & (opacity > ALPHA_MIN) & (det > 0.0) & _finite(det)
+    drawn = drawn & (px + hx > 0.0) & (px - hx < cam[16]) & (py + hy > 0.0) & (py - hy < cam[17])
+    if count(drawn) > 0:
+        dx, dy, dz, _ = _direction(cam, mx, my, mz)
+        _store_bases(dx, dy, dz, scratch)
+        red, green, blue = _shade(i, sh0, shN, num_bases, scratch)
+        shown = double(red + green + blue)
+        finite = finite & _finite(where(drawn, shown, 0.0))
+        scatter(records, i * _RECORD, _RECORD, single(px))
+        scatter(records, i * _RECORD + 1, _RECORD, single(py))
+        scatter(records, i * _RECORD + 2, _RECORD, single(-0.5 * _LOG2E * cyy / det))
+        scatter(records, i * _RECORD + 3, _RECORD, single(_LOG2E * sxy / det))
+        scatter(records, i * _RECORD + 4, _RECORD, single(-0.5 * _LOG2E * cxx / det))
+        scatter(records, i * _RECORD + 5, _RECORD, single(level))
+        scatter(records, i * _RECORD + 6, _RECORD, maximum(red, 0.0))
+        scatter(records, i * _RECORD + 7, _RECORD, maximum(green, 0.0))
+        scatter(records, i * _RECORD + 8, _RECORD, maximum(blue, 0.0))
+        scatter(records, i * _RECORD + 9, _RECORD, single(hx))
+        scatter(records, i * _RECORD + 10, _RECORD, single(hy))
+    radius = where(drawn, maximum(hx, hy), 0.0)
+    store(radii, i, single(where(finite, radius, -1.0)))
+    store(depths, i, single(where(drawn, z, np.inf)))
 
 
 @njit(parallel=True, error_model="numpy", cache=True)
-def forward(cam, means, quats, log_scales, logits, sh0, shN, num_bases, antialiased, records, depths, radii):
-    """Fill records [N, 11] (see `blend`), depths [N] and radii [N] (0 = not drawn, -1 = not finite)."""
-    for chunk in prange((len(means) + _CHUNK - 1) // _CHUNK):
-        rot, scale = np.empty((3, 3)), np.empty(3)
-        jac, half, basis = np.empty((2, 3)), np.empty((2, 3)), np.empty(16)
-        for i in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(means))):
-            _forward_one(
-                i, cam, means, quats, log_scales, logits, sh0, shN, num_bases, antialiased, records, depths,
-                radii,
-                rot, scale, jac, half, basis,
+def forward(cam, num_bases, antialiased, means, quats, log_scales, logits, sh0, shN, records, depths, radii):
+    """Fill records [N, 11] (see `blend`), depths [N], radii [N] (0 = not drawn, -1 = not finite); N >= 8."""
+    n = len(means)
+    for chunk in prange((n + _CHUNK - 1) // _CHUNK):
+        begin, end = chunk * _CHUNK, min((chunk + 1) * _CHUNK, n)
+        scratch = np.empty(16 * LANES, np.float32)
+        for start in range(begin, end, LANES):
+            # the last eight overlap those before: what is computed twice is the same
+            _forward_eight(
+                min(start, n - LANES), cam, means, quats, log_scales, logits, sh0, shN, num_bases,
+                antialiased, records, depths, radii, scratch,
             )  # fmt: skip
 
 
-@njit(error_model="numpy", forceinline=True, cache=True)
-def _quaternion_gradient(i, quats, inverse, d, out):
-    """d [3, 3] of the rotation matrix to the raw quaternion's gradient."""
-    w, x, y, z = (
-        quats[i, 0] * inverse, quats[i, 1] * inverse, quats[i, 2] * inverse, quats[i, 3] * inverse,
-    )  # fmt: skip
-    dw = 2 * (x * (d[2, 1] - d[1, 2]) + y * (d[0, 2] - d[2, 0]) + z * (d[1, 0] - d[0, 1]))
-    dx = 2 * (
-        y * (d[0, 1] + d[1, 0])
-        + z * (d[0, 2] + d[2, 0])
-        + w * (d[2, 1] - d[1, 2])
-        - 2 * x * (d[1, 1] + d[2, 2])
-    )
-    dy = 2 * (
-        x * (d[0, 1] + d[1, 0])
-        + z * (d[1, 2] + d[2, 1])
-        + w * (d[0, 2] - d[2, 0])
-        - 2 * y * (d[0, 0] + d[2, 2])
-    )
-    dz = 2 * (
-        x * (d[0, 2] + d[2, 0])
-        + y * (d[1, 2] + d[2, 1])
-        + w * (d[1, 0] - d[0, 1])
-        - 2 * z * (d[0, 0] + d[1, 1])
-    )
+@njit(forceinline=True, cache=True)
+def _quaternion_gradient(w, x, y, z, inverse, d):
+    """Gradient of the raw quaternion from that of the rotation matrix; w, x, y, z of length 1."""
+    dw = 2.0 * (x * (d[7] - d[5]) + y * (d[2] - d[6]) + z * (d[3] - d[1]))
+    dx = 2.0 * (y * (d[1] + d[3]) + z * (d[2] + d[6]) + w * (d[7] - d[5]) - 2.0 * x * (d[4] + d[8]))
+    dy = 2.0 * (x * (d[1] + d[3]) + z * (d[5] + d[7]) + w * (d[2] - d[6]) - 2.0 * y * (d[0] + d[8]))
+    dz = 2.0 * (x * (d[2] + d[6]) + y * (d[5] + d[7]) + w * (d[3] - d[1]) - 2.0 * z * (d[0] + d[4]))
     radial = dw * w + dx * x + dy * y + dz * z
-    out[i, 0], out[i, 1] = (dw - radial * w) * inverse, (dx - radial * x) * inverse
-    out[i, 2], out[i, 3] = (dy - radial * y) * inverse, (dz - radial * z) * inverse
+    return (
+        (dw - radial * w) * inverse, (dx - radial * x) * inverse,
+        (dy - radial * y) * inverse, (dz - radial * z) * inverse,
+    )  # fmt: skip
 
 
-@njit(error_model="numpy", forceinline=True, cache=True)
-def _color_gradient(i, cam, means, shN, num_bases, records, g_color, d_means, d_sh0, d_shN, basis, weights):
-    """Gradients of the coefficients, and of the mean through the viewing direction."""
-    dx, dy, dz = means[i, 0] - cam[18], means[i, 1] - cam[19], means[i, 2] - cam[20]
-    inverse = 1.0 / math.sqrt(dx * dx + dy * dy + dz * dz)
-    dx, dy, dz = dx * inverse, dy * inverse, dz * inverse
-    fill_bases(dx, dy, dz, num_bases, basis)
-    red = g_color[i, 0] if records[i, 6] > 0 else 0.0
-    green = g_color[i, 1] if records[i, 7] > 0 else 0.0
-    blue = g_color[i, 2] if records[i, 8] > 0 else 0.0
-    d_sh0[i, 0, 0], d_sh0[i, 0, 1], d_sh0[i, 0, 2] = basis[0] * red, basis[0] * green, basis[0] * blue
+@njit(forceinline=True, cache=True)
+def _load_sixteen(a):
+    return (
+        load8(a, 0), load8(a, 8), load8(a, 16), load8(a, 24), load8(a, 32), load8(a, 40), load8(a, 48),
+        load8(a, 56), load8(a, 64), load8(a, 72), load8(a, 80), load8(a, 88), load8(a, 96), load8(a, 104),
+        load8(a, 112), load8(a, 120),
+    )  # fmt: skip
+
+
+@njit(forceinline=True, cache=True)
+def _color_gradient(i, drawn, dx, dy, dz, shN, num_bases, records, g_color, d_sh0, d_shN, scratch, weights):
+    """Gradients of the coefficients; returns that of the viewing direction."""
+    width = 3 * shN.shape[1]
+    shown = gather(records, i * _RECORD + 6, _RECORD) > 0.0  # colours below 0 were cut off
+    red = where(drawn & shown, gather(g_color, 3 * i, 3), 0.0)
+    shown = gather(records, i * _RECORD + 7, _RECORD) > 0.0
+    green = where(drawn & shown, gather(g_color, 3 * i + 1, 3), 0.0)
+    shown = gather(records, i * _RECORD + 8, _RECORD) > 0.0
+    blue = where(drawn & shown, gather(g_color, 3 * i + 2, 3), 0.0)
+    scatter(d_sh0, 3 * i, 3, red * sh.C0)
+    scatter(d_sh0, 3 * i + 1, 3, green * sh.C0)
+    scatter(d_sh0, 3 * i + 2, 3, blue * sh.C0)
+    _store_bases(dx, dy, dz, scratch)
     for k in range(1, num_bases):
-        d_shN[i, k - 1, 0] = basis[k] * red
-        d_shN[i, k - 1, 1] = basis[k] * green
-        d_shN[i, k - 1, 2] = basis[k] * blue
-        weights[k] = red * shN[i, k - 1, 0] + green * shN[i, k - 1, 1] + blue * shN[i, k - 1, 2]
-    gx, gy, gz = direction_gradient(dx, dy, dz, num_bases, weights)
-    radial = gx * dx + gy * dy + gz * dz
-    d_means[i, 0] += (gx - radial * dx) * inverse
-    d_means[i, 1] += (gy - radial * dy) * inverse
-    d_means[i, 2] += (gz - radial * dz) * inverse
+        basis, at = load8(scratch, 8 * k), i * width + 3 * k - 3
+        weight = red * gather(shN, at, width) + green * gather(shN, at + 1, width)
+        store(weights, 8 * k, weight + blue * gather(shN, at + 2, width))
+        scatter(d_shN, at, width, basis * red)
+        scatter(d_shN, at + 1, width, basis * green)
+        scatter(d_shN, at + 2, width, basis * blue)
+    return _direction_gradient(dx, dy, dz, _load_sixteen(weights))
 
 
 @njit(error_model="numpy", forceinline=True, cache=True)
-def _backward_one(
-    i, cam, means, quats, log_scales, logits, shN, num_bases, antialiased, records,
+def _backward_eight(
+    i, cam, means, quats, log_scales, logits, shN, num_bases, antialiased, records, radii,
     g_mean2d, g_conic, g_opacity, g_color, d_means, d_quats, d_log_scales, d_logits, d_sh0, d_shN,
-    rot, scale, d_rot, jac, half, d_half, d_jac, basis, weights,
+    scratch, weights,
 ):  # fmt: skip
-    x, y, z, u, v, inverse = _half_covariance(i, cam, means, quats, log_scales, rot, scale, jac, half)
-    fx, fy = cam[12], cam[13]
-    sxx = half[0, 0] * half[0, 0] + half[0, 1] * half[0, 1] + half[0, 2] * half[0, 2]
-    sxy = half[0, 0] * half[1, 0] + half[0, 1] * half[1, 1] + half[0, 2] * half[1, 2]
-    syy = half[1, 0] * half[1, 0] + half[1, 1] * half[1, 1] + half[1, 2] * half[1, 2]
+    drawn32 = load8(radii, i) > 0.0
+    if count(drawn32) == 0:
+        d_means[i : i + LANES] = 0.0
+        d_quats[i : i + LANES] = 0.0
+        d_log_scales[i : i + LANES] = 0.0
+        d_logits[i : i + LANES] = 0.0
+        d_sh0[i : i + LANES] = 0.0
+        d_shN[i : i + LANES, : num_bases - 1] = 0.0
+        return
+    mx, my, mz = _three(means, i)
+    qw, qx, qy, qz = (
+        _column(quats, i, 4, 0),
+        _column(quats, i, 4, 1),
+        _column(quats, i, 4, 2),
+        _column(quats, i, 4, 3),
+    )
+    inverse = 1.0 / sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
+    qw, qx, qy, qz = qw * inverse, qx * inverse, qy * inverse, qz * inverse
+    r = _rotation(qw, qx, qy, qz)
+    ls0, ls1, ls2 = _three(log_scales, i)
+    s = _exp(ls0), _exp(ls1), _exp(ls2)
+    x, y, z = _camera_point(cam, mx, my, mz)
+    u, v, j = _jacobian(cam, x, y, z)
+    h = _half_covariance(j, r, s)
+    sxx, sxy, syy = _covariance(h)
     cxx, cyy = sxx + BLUR, syy + BLUR
     det = cxx * cyy - sxy * sxy
     a, b, c = cyy / det, -sxy / det, cxx / det
     # covariance = conic^-1, so d_cov = -conic g conic, with half of g_conic's xy on either side
-    gxx, gxy, gyy = g_conic[i, 0], 0.5 * g_conic[i, 1], g_conic[i, 2]
+    gxx, gxy, gyy = _column(g_conic, i, 3, 0), 0.5 * _column(g_conic, i, 3, 1), _column(g_conic, i, 3, 2)
     pxx, pxy, pyx, pyy = a * gxx + b * gxy, a * gxy + b * gyy, b * gxx + c * gxy, b * gxy + c * gyy
     dxx, dxy, dyy = -(pxx * a + pxy * b), -(pxx * b + pxy * c), -(pyx * b + pyy * c)
 
-    opacity = 1.0 / (1.0 + math.exp(-logits[i]))
-    d_opacity = g_opacity[i]
-    sharp = sxx * syy - sxy * sxy
-    if antialiased and sharp / det > 1e-10:
-        compensation = math.sqrt(sharp / det)
-        factor = 0.5 * d_opacity * opacity * compensation
-        dxx += factor * (syy / sharp - cyy / det)
-        dyy += factor * (sxx / sharp - cxx / det)
-        dxy += factor * (sxy / det - sxy / sharp)
-        d_opacity *= compensation
-    elif antialiased:
-        d_opacity *= 1e-5
-    d_logits[i] = d_opacity * opacity * (1.0 - opacity)
+    opacity = 1.0 / (1.0 + _exp(-_column(logits, i, 1, 0)))
+    d_opacity = _column(g_opacity, i, 1, 0)
+    if antialiased:
+        sharp = sxx * syy - sxy * sxy
+        smooth = sharp / det > 1e-10
+        compensation = where(smooth, sqrt(sharp / det), 1e-5)
+        factor = where(smooth, 0.5 * d_opacity * opacity * compensation, 0.0)
+        over = where(smooth, 1.0 / sharp, 0.0)
+        dxx = dxx + factor * (syy * over - cyy / det)
+        dyy = dyy + factor * (sxx * over - cxx / det)
+        dxy = dxy + factor * (sxy / det - sxy * over)
+        d_opacity = d_opacity * compensation
+    scatter(d_logits, i, 1, where(drawn32, single(d_opacity * opacity * (1.0 - opacity)), 0.0))
 
-    for k in range(3):
-        d_half[0, k] = 2 * (dxx * half[0, k] + dxy * half[1, k])
-        d_half[1, k] = 2 * (dxy * half[0, k] + dyy * half[1, k])
-    for k in range(3):
-        along = 0.0
-        for j in range(3):
-            d_axis = jac[0, j] * d_half[0, k] + jac[1, j] * d_half[1, k]
-            along += d_axis * rot[j, k]
-            d_rot[j, k] = d_axis * scale[k]
-        d_log_scales[i, k] = along * scale[k]
-    for m in range(2):
-        for j in range(3):
-            d_jac[m, j] = (
-                d_half[m, 0] * rot[j, 0] * scale[0]
-                + d_half[m, 1] * rot[j, 1] * scale[1]
-                + d_half[m, 2] * rot[j, 2] * scale[2]
-            )
+    # d_half = 2 d_cov half, then through half = J W R S
+    e = (
+        2.0 * (dxx * h[0] + dxy * h[3]), 2.0 * (dxx * h[1] + dxy * h[4]), 2.0 * (dxx * h[2] + dxy * h[5]),
+        2.0 * (dxy * h[0] + dyy * h[3]), 2.0 * (dxy * h[1] + dyy * h[4]), 2.0 * (dxy * h[2] + dyy * h[5]),
+    )  # fmt: skip
+    axes = (
+        j[0] * e[0] + j[3] * e[3], j[0] * e[1] + j[3] * e[4], j[0] * e[2] + j[3] * e[5],
+        j[1] * e[0] + j[4] * e[3], j[1] * e[1] + j[4] * e[4], j[1] * e[2] + j[4] * e[5],
+        j[2] * e[0] + j[5] * e[3], j[2] * e[1] + j[5] * e[4], j[2] * e[2] + j[5] * e[5],
+    )  # fmt: skip
+    d_scale = (
+        (axes[0] * r[0] + axes[3] * r[3] + axes[6] * r[6]) * s[0],
+        (axes[1] * r[1] + axes[4] * r[4] + axes[7] * r[7]) * s[1],
+        (axes[2] * r[2] + axes[5] * r[5] + axes[8] * r[8]) * s[2],
+    )
+    for k, value in enumerate(d_scale):
+        scatter(d_log_scales, 3 * i + k, 3, where(drawn32, single(value), 0.0))
+    d_rotation = (
+        axes[0] * s[0], axes[1] * s[1], axes[2] * s[2], axes[3] * s[0], axes[4] * s[1], axes[5] * s[2],
+        axes[6] * s[0], axes[7] * s[1], axes[8] * s[2],
+    )  # fmt: skip
+    for k, value in enumerate(_quaternion_gradient(qw, qx, qy, qz, inverse, d_rotation)):
+        scatter(d_quats, 4 * i + k, 4, where(drawn32, single(value), 0.0))
 
-    # jac[0] = fx/z (W0 - u W2), jac[1] = fy/z (W1 - v W2); u = x/z unless clamped
-    d_fx_z = d_fy_z = d_u = d_v = 0.0
-    for j in range(3):
-        d_fx_z += d_jac[0, j] * (cam[j] - u * cam[6 + j])
-        d_fy_z += d_jac[1, j] * (cam[3 + j] - v * cam[6 + j])
-        d_u -= d_jac[0, j] * fx / z * cam[6 + j]
-        d_v -= d_jac[1, j] * fy / z * cam[6 + j]
-    if u != x / z:
-        d_u = 0.0
-    if v != y / z:
-        d_v = 0.0
-    d_u += g_mean2d[i, 0] * fx
-    d_v += g_mean2d[i, 1] * fy
-    dz = -(d_fx_z * fx + d_fy_z * fy) / (z * z) - (d_u * x + d_v * y) / (z * z)
-    dx, dy = d_u / z, d_v / z
-    for k in range(3):
-        d_means[i, k] = cam[k] * dx + cam[3 + k] * dy + cam[6 + k] * dz
-    _quaternion_gradient(i, quats, inverse, d_rot, d_quats)
-    _color_gradient(i, cam, means, shN, num_bases, records, g_color, d_means, d_sh0, d_shN, basis, weights)
+    # J W = fx/z (W0 - u W2), fy/z (W1 - v W2); u = x/z unless it was kept near the image
+    jx0, jx1, jx2 = _times_rotation(e[0] * s[0], e[1] * s[1], e[2] * s[2], r)
+    jy0, jy1, jy2 = _times_rotation(e[3] * s[0], e[4] * s[1], e[5] * s[2], r)
+    fx, fy = cam[12], cam[13]
+    over_z = 1.0 / z
+    along_x = jx0 * cam[6] + jx1 * cam[7] + jx2 * cam[8]
+    along_y = jy0 * cam[6] + jy1 * cam[7] + jy2 * cam[8]
+    d_sx = jx0 * cam[0] + jx1 * cam[1] + jx2 * cam[2] - u * along_x
+    d_sy = jy0 * cam[3] + jy1 * cam[4] + jy2 * cam[5] - v * along_y
+    kept_u, kept_v = (u >= x / z) & (u <= x / z), (v >= y / z) & (v <= y / z)
+    d_u = where(kept_u, -fx * over_z * along_x, 0.0) + _column(g_mean2d, i, 2, 0) * fx
+    d_v = where(kept_v, -fy * over_z * along_y, 0.0) + _column(g_mean2d, i, 2, 1) * fy
+    d_z = -over_z * over_z * (d_sx * fx + d_sy * fy + d_u * x + d_v * y)
+    d_x, d_y = d_u * over_z, d_v * over_z
+
+    dx, dy, dz, over_distance = _direction(cam, mx, my, mz)
+    gx, gy, gz = _color_gradient(
+        i, drawn32, dx, dy, dz, shN, num_bases, records, g_color, d_sh0, d_shN, scratch, weights
+    )
+    radial = gx * dx + gy * dy + gz * dz
+    d_mean = (
+        cam[0] * d_x + cam[3] * d_y + cam[6] * d_z + double(gx - radial * dx) * over_distance,
+        cam[1] * d_x + cam[4] * d_y + cam[7] * d_z + double(gy - radial * dy) * over_distance,
+        cam[2] * d_x + cam[5] * d_y + cam[8] * d_z + double(gz - radial * dz) * over_distance,
+    )
+    for k, value in enumerate(d_mean):
+        scatter(d_means, 3 * i + k, 3, where(drawn32, single(value), 0.0))
 
 
 @njit(parallel=True, error_model="numpy", cache=True)
 def backward(
-    cam, means, quats, log_scales, logits, sh0, shN, num_bases, antialiased, records, radii,
+    cam, num_bases, antialiased, means, quats, log_scales, logits, sh0, shN, records, radii,
     g_mean2d, g_conic, g_opacity, g_color, d_means, d_quats, d_log_scales, d_logits, d_sh0, d_shN,
 ):  # fmt: skip
-    """Gradients of all parameters from those of the 2D Gaussians.
+    """Gradients of all parameters from those of the 2D Gaussians; N >= 8.
 
     g_mean2d [N, 2]; g_conic [N, 3] for the inverse covariance's xx, xy (counted once), yy;
-    g_opacity [N] of the opacity that blending saw; g_color [N, 3]. Outputs must come in as zeros.
+    g_opacity [N] of the opacity that blending saw; g_color [N, 3]. All rows are written, of d_shN
+    [N, bases - 1, 3] only the first num_bases - 1.
     """
-    for chunk in prange((len(means) + _CHUNK - 1) // _CHUNK):
-        rot, scale, d_rot = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
-        jac, half, d_half, d_jac = np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3))
-        basis, weights = np.empty(16), np.zeros(16)
-        for i in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(means))):
-            if radii[i] > 0:
-                _backward_one(
-                    i, cam, means, quats, log_scales, logits, shN, num_bases, antialiased, records,
-                    g_mean2d, g_conic, g_opacity, g_color, d_means, d_quats, d_log_scales, d_logits, d_sh0,
-                    d_shN, rot, scale, d_rot, jac, half, d_half, d_jac, basis, weights,
-                )  # fmt: skip
+    n = len(means)
+    for chunk in prange((n + _CHUNK - 1) // _CHUNK):
+        begin, end = chunk * _CHUNK, min((chunk + 1) * _CHUNK, n)
+        scratch, weights = np.empty(16 * LANES, np.float32), np.zeros(16 * LANES, np.float32)
+        for start in range(begin, end, LANES):
+            _backward_eight(
+                min(start, n - LANES), cam, means, quats, log_scales, logits, shN, num_bases, antialiased,
+                records, radii, g_mean2d, g_conic, g_opacity, g_color, d_means, d_quats, d_log_scales,
+                d_logits, d_sh0, d_shN, scratch, weights,
+            )  # fmt: skip

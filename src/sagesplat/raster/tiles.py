@@ -7,6 +7,7 @@ from numba import njit, prange
 
 from sagesplat.raster.blend import TILE
 from sagesplat.raster.render import ALPHA_MIN
+from sagesplat.raster.workspace import Workspace
 
 _CHUNKS = 16  # fixed, so that the result does not depend on the number of threads
 
@@ -117,7 +118,13 @@ def _place(records, order, tiles_x, tiles_y, tile_mask, threshold, cursor, offse
 
 
 def intersect(
-    records: np.ndarray, depths: np.ndarray, radii: np.ndarray, width: int, height: int, tile_mask: np.ndarray
+    records: np.ndarray,
+    depths: np.ndarray,
+    radii: np.ndarray,
+    width: int,
+    height: int,
+    tile_mask: np.ndarray,
+    workspace: Workspace,
 ) -> Intersections:
     """List every (tile, Gaussian) pair in which the Gaussian is visible, by tile, front to back."""
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
@@ -131,6 +138,6 @@ def intersect(
     ends = np.cumsum(per_tile.T.ravel())  # by tile, then by chunk
     cursor = np.ascontiguousarray((ends - per_tile.T.ravel()).reshape(-1, _CHUNKS).T)
     starts = np.append(cursor[0], ends[-1:])
-    ids, slots = np.empty(offsets[-1], np.int32), np.empty(offsets[-1], np.int32)
+    ids, slots = (workspace.take(name, offsets[-1], dtype=np.int32) for name in ("ids", "slots"))
     _place(records, order, tiles_x, tiles_y, tile_mask, threshold, cursor, offsets, ids, slots)
     return Intersections(tiles_x, starts, ids, slots, offsets)

@@ -11,7 +11,7 @@ from sagesplat.config import TrainConfig
 from sagesplat.errors import RunError
 from sagesplat.gaussians import PARAMETERS, Gaussians
 from sagesplat.metrics import photometric_loss
-from sagesplat.raster import Backend, rasterize
+from sagesplat.raster import Backend, Workspace, rasterize
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.train import densify
@@ -82,8 +82,9 @@ def train(
     if checkpoint and checkpoint.exists():
         state = read_checkpoint(checkpoint, settings)
         yield Resumed(state.step)
+    workspace = Workspace()
     while state.step < config.max_steps:
-        loss = _step(state, scene, photos, config, plan, extent, backend)
+        loss = _step(state, scene, photos, config, plan, extent, backend, workspace)
         yield Step(state.step, loss, len(state.gaussians))
         step, last = state.step, state.step == config.max_steps
         if step % plan.level_every == 0 or last:
@@ -134,6 +135,7 @@ def _step(
     plan: densify.Schedule,
     extent: float,
     backend: Backend,
+    workspace: Workspace,
 ) -> float:
     """Render one view, compare it with its photo, move the Gaussians."""
     view = _next_view(state, scene)
@@ -145,6 +147,7 @@ def _step(
         camera,
         sh_degree=_sh_degree(state, config, plan),
         antialiased=config.antialiased,
+        workspace=workspace,
         backend=backend,
     )
     loss = photometric_loss(render.rgb, photo, config.ssim_weight)
