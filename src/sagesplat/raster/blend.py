@@ -1,4 +1,4 @@
-"""Blending kernels: Gaussians into pixels and gradients back, one thread per 16x16 tile.
+"""Blending kernels: Gaussians into pixels and gradients back, a row of 16x16 tiles per thread.
 
 A tile's row of 16 pixels is one vector. An intersection is one Gaussian in one tile; `records` holds what
 the loops need of each Gaussian:
@@ -11,13 +11,17 @@ from numba import njit, prange
 
 from sagesplat.raster.render import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from sagesplat.raster.simd import (
+    ceil,
     exp2,
+    floor,
+    gather,
     largest,
     load16,
     maximum,
     minimum,
     splat16,
     spread16,
+    sqrt,
     store,
     store_totals,
     total,
@@ -41,14 +45,31 @@ _SHARED = 6 * PLANE  # where a Gaussian's values that depend on the row alone li
 
 
 @njit(error_model="numpy", forceinline=True, cache=True)
-def _gather(records, ids, first, last, y0, batch, rows):
-    """Copy the records of a batch to where they are near, with the rows of the tile that each one meets."""
+def _gather(records, ids, first, last, x0, y0, batch, rows):
+    """Copy the records of a batch to where they are near; rows [2, 16]: the tile's first and last + 1 in reach.
+
+    The highest point of an ellipse between two columns is its top, or lies on the column next to the top.
+    """
     for j in range(last - first):
-        i = ids[first + j]
         for value in range(RECORD):
-            batch[j, value] = records[i, value]
-        rows[j, 0] = max(0, int(np.floor(batch[j, 1] - batch[j, 10] - y0)))
-        rows[j, 1] = min(TILE, int(np.ceil(batch[j, 1] + batch[j, 10] - y0)))
+            batch[j, value] = records[ids[first + j], value]
+    for j in range(0, _BATCH, 8):
+        at = j * RECORD
+        mx, my = gather(batch, at, RECORD), gather(batch, at + 1, RECORD)
+        a, b, c = gather(batch, at + 2, RECORD), gather(batch, at + 3, RECORD), gather(batch, at + 4, RECORD)
+        width, height = gather(batch, at + 9, RECORD), gather(batch, at + 10, RECORD)
+        left = x0 + _HALF - mx
+        right = left + (TILE - 1)
+        top = -b * height / (a + a)
+        high, low = minimum(maximum(top, left), right), minimum(maximum(-top, left), right)
+        steep = (gather(batch, at + 5, RECORD) - _LOG2_ALPHA_MIN + 1e-3) / -c
+        slack = 0.01 + 1e-3 * sqrt(steep)  # rounding, several times over
+        high_part, low_part = high / width, low / width
+        up = sqrt(maximum(steep * (_ONE - high_part * high_part), _ZERO)) + slack
+        down = sqrt(maximum(steep * (_ONE - low_part * low_part), _ZERO)) + slack
+        slope, centre = -b / (c + c), my - (y0 + _HALF)
+        store(rows, j, maximum(ceil(centre + slope * low - down), _ZERO))
+        store(rows, j + _BATCH, minimum(floor(centre + slope * high + up) + _ONE, _F(TILE)))
 
 
 @njit(cache=True)
@@ -92,37 +113,41 @@ def _blend(s, lo, hi, columns, lines, mx, my, a, b, c, log_opacity, red, green, 
 
 
 @njit(parallel=True, cache=True)
-def forward(records, starts, ids, tiles_x, width, height, background, image, left, ends):
+def forward(records, starts, ids, row_order, width, height, background, image, left, ends):
     """Blend all tiles into image [H, W, 3] and left [H, W] (what remains of the transmittance).
 
     starts [tiles + 1] and ids [I] list the intersections by tile and depth; ends [tiles] receives where
     each tile stopped, for the backward pass. Tiles without intersections show the background.
     """
-    for tile in prange(len(starts) - 1):
-        column0, row0 = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-        x0, y0 = _F(column0), _F(row0)
-        columns, lines = load16(_CENTRES, 0) + x0, load16(_CENTRES, 0) + y0
+    tiles_x = (width + TILE - 1) // TILE
+    for r in prange(len(row_order)):
         state = _scratch(7)
-        state[:PIXELS] = _ONE
-        batch, rows = np.empty((_BATCH, RECORD), np.float32), np.empty((_BATCH, 2), np.int64)
-        end = starts[tile]
-        while end < starts[tile + 1] and _most(state) >= _T_MIN:
-            first, end = end, min(end + _BATCH, starts[tile + 1])
-            _gather(records, ids, first, end, y0, batch, rows)
-            for j in range(end - first):
-                _blend(
-                    state, rows[j, 0], rows[j, 1], columns, lines, batch[j, 0], batch[j, 1], batch[j, 2],
-                    batch[j, 3], batch[j, 4], batch[j, 5], batch[j, 6], batch[j, 7], batch[j, 8],
-                )  # fmt: skip
-        ends[tile] = end
-        for row in range(min(TILE, height - row0)):
-            for column in range(min(TILE, width - column0)):
-                p = row * TILE + column
-                left[row0 + row, column0 + column] = state[p]
-                for channel in range(3):
-                    image[row0 + row, column0 + column, channel] = (
-                        state[PLANE * (1 + channel) + p] + state[p] * background[channel]
-                    )
+        batch, rows = np.zeros((_BATCH, RECORD), np.float32), np.empty((2, _BATCH), np.float32)
+        for column in range(tiles_x):
+            tile, row0, column0 = row_order[r] * tiles_x + column, row_order[r] * TILE, column * TILE
+            x0, y0 = _F(column0), _F(row0)
+            columns, lines = load16(_CENTRES, 0) + x0, load16(_CENTRES, 0) + y0
+            state[:PIXELS] = _ONE
+            state[PIXELS : 4 * PLANE] = _ZERO
+            end = starts[tile]
+            while end < starts[tile + 1] and _most(state) >= _T_MIN:
+                first, end = end, min(end + _BATCH, starts[tile + 1])
+                _gather(records, ids, first, end, x0, y0, batch, rows)
+                for j in range(end - first):
+                    lo, hi = int(rows[0, j]), int(rows[1, j])
+                    if lo < hi:
+                        _blend(
+                            state, lo, hi, columns, lines, batch[j, 0], batch[j, 1], batch[j, 2],
+                            batch[j, 3], batch[j, 4], batch[j, 5], batch[j, 6], batch[j, 7], batch[j, 8],
+                        )  # fmt: skip
+            ends[tile] = end
+            for y in range(row0, min(row0 + TILE, height)):
+                for x in range(column0, min(column0 + TILE, width)):
+                    p = (y - row0) * TILE + x - column0
+                    left[y, x] = state[p]
+                    for channel in range(3):
+                        painted = state[PLANE * (1 + channel) + p]
+                        image[y, x, channel] = painted + state[p] * background[channel]
 
 
 @njit(error_model="numpy", cache=True)
@@ -169,44 +194,49 @@ def _gradient(s, lo, hi, columns, lines, mx, my, a, b, c, log_opacity, red, gree
 
 @njit(parallel=True, cache=True)
 def backward(
-    records, starts, ends, ids, slots, tiles_x, width, height, image, left, grad_image, grad_left, sums
+    records, starts, ends, ids, slots, row_order, width, height, image, left, grad_image, grad_left, sums
 ):
     """Gradient sums of every intersection into sums [I, 9], at the row that `slots` gives it.
 
     image [H, W, 3] is what `forward` made; grad_left [H, W] is dL/d(remaining transmittance).
     """
-    for tile in prange(len(starts) - 1):
-        for k in range(ends[tile], starts[tile + 1]):
-            for column in range(SUMS):
-                sums[slots[k], column] = _ZERO
-        if starts[tile] == ends[tile]:
-            continue
-        column0, row0 = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-        x0, y0 = _F(column0), _F(row0)
-        columns, lines = load16(_CENTRES, 0) + x0, load16(_CENTRES, 0) + y0
+    tiles_x = (width + TILE - 1) // TILE
+    for r in prange(len(row_order)):
         state = _scratch(7)
-        for row in range(min(TILE, height - row0)):
-            for column in range(min(TILE, width - column0)):
-                p = row * TILE + column
-                y, x = row0 + row, column0 + column
-                state[p] = _ONE
-                rest = _ZERO
-                for channel in range(3):
-                    state[PLANE * (2 + channel) + p] = grad_image[y, x, channel]
-                    rest += grad_image[y, x, channel] * image[y, x, channel]
-                # alpha = 1 - left is one more channel in which every Gaussian has the value 1
-                state[5 * PLANE + p] = -grad_left[y, x]
-                state[PLANE + p] = rest - grad_left[y, x] * (_ONE - left[y, x])
-        batch, rows = np.empty((_BATCH, RECORD), np.float32), np.empty((_BATCH, 2), np.int64)
-        for first in range(starts[tile], ends[tile], _BATCH):
-            last = min(first + _BATCH, ends[tile])
-            _gather(records, ids, first, last, y0, batch, rows)
-            for j in range(last - first):
-                _gradient(
-                    state, rows[j, 0], rows[j, 1], columns, lines, batch[j, 0], batch[j, 1], batch[j, 2],
-                    batch[j, 3], batch[j, 4], batch[j, 5], batch[j, 6], batch[j, 7], batch[j, 8],
-                    sums, slots[first + j],
-                )  # fmt: skip
+        batch, rows = np.zeros((_BATCH, RECORD), np.float32), np.empty((2, _BATCH), np.float32)
+        for column in range(tiles_x):
+            tile, row0, column0 = row_order[r] * tiles_x + column, row_order[r] * TILE, column * TILE
+            for k in range(ends[tile], starts[tile + 1]):
+                sums[slots[k]] = _ZERO
+            if starts[tile] == ends[tile]:
+                continue
+            x0, y0 = _F(column0), _F(row0)
+            columns, lines = load16(_CENTRES, 0) + x0, load16(_CENTRES, 0) + y0
+            state[: 6 * PLANE] = _ZERO
+            for y in range(row0, min(row0 + TILE, height)):
+                for x in range(column0, min(column0 + TILE, width)):
+                    p = (y - row0) * TILE + x - column0
+                    rest = grad_left[y, x] * (left[y, x] - _ONE)
+                    for channel in range(3):
+                        state[PLANE * (2 + channel) + p] = grad_image[y, x, channel]
+                        rest += grad_image[y, x, channel] * image[y, x, channel]
+                    state[p] = _ONE
+                    state[PLANE + p] = rest
+                    # alpha = 1 - left is one more channel in which every Gaussian has the value 1
+                    state[5 * PLANE + p] = -grad_left[y, x]
+            for first in range(starts[tile], ends[tile], _BATCH):
+                last = min(first + _BATCH, ends[tile])
+                _gather(records, ids, first, last, x0, y0, batch, rows)
+                for j in range(last - first):
+                    lo, hi, slot = int(rows[0, j]), int(rows[1, j]), slots[first + j]
+                    if lo < hi:
+                        _gradient(
+                            state, lo, hi, columns, lines, batch[j, 0], batch[j, 1], batch[j, 2],
+                            batch[j, 3], batch[j, 4], batch[j, 5], batch[j, 6], batch[j, 7], batch[j, 8],
+                            sums, slot,
+                        )  # fmt: skip
+                    else:
+                        sums[slot] = _ZERO
 
 
 @njit(parallel=True, cache=True)

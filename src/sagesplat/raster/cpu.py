@@ -94,7 +94,7 @@ class _Rasterize(torch.autograd.Function):
         for index, (painted, behind) in enumerate(passes):
             image = take(f"image {index}", height, width, 3)
             blend.forward(
-                painted, found.starts, found.ids, found.tiles_x, width, height, behind, image, left, ends
+                painted, found.starts, found.ids, found.row_order, width, height, behind, image, left, ends
             )
             images.append(image)
         ctx.save_for_backward(*parameters)
@@ -118,7 +118,7 @@ class _Rasterize(torch.autograd.Function):
             first = index == 0
             g_image = g_rgb if first else _padded(g_extra, _CHUNK * (index - 1))
             blend.backward(
-                records, found.starts, ends, found.ids, found.slots, found.tiles_x, camera.width,
+                records, found.starts, ends, found.ids, found.slots, found.row_order, camera.width,
                 camera.height,
                 image, left, g_image, -g_alpha if first else no_alpha, sums,
             )  # fmt: skip

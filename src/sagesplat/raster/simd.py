@@ -257,6 +257,8 @@ _EXP2_DOUBLE = (
 exp2 = _function(_exp2)  # for |q| < 126, d8: 1000; beyond, any value
 log2 = _function(_log2)  # of a positive d8, to 1e-10
 sqrt = _function(lambda builder, kind, a: _call(builder, f"llvm.sqrt.{kind.code}", kind.llvm, a))
+floor = _function(lambda builder, kind, a: _call(builder, f"llvm.floor.{kind.code}", kind.llvm, a))
+ceil = _function(lambda builder, kind, a: _call(builder, f"llvm.ceil.{kind.code}", kind.llvm, a))
 total = _function(
     lambda builder, kind, a: _call(
         builder, f"llvm.vector.reduce.fadd.{kind.code}", kind.llvm.element,

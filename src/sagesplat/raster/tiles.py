@@ -16,7 +16,7 @@ _CHUNKS = 16  # fixed, so that the result does not depend on the number of threa
 class Intersections:
     """Gaussians by tile and depth. An intersection's slot is its row when listed by Gaussian."""
 
-    tiles_x: int
+    row_order: np.ndarray  # int64 [tile rows]
     starts: np.ndarray  # int64 [tiles + 1]
     ids: np.ndarray  # int32 [I], Gaussian of each intersection
     slots: np.ndarray  # int32 [I]
@@ -68,9 +68,9 @@ def _edge_maximum(along, across, cross, fixed, lo, hi):
 
 @njit(error_model="numpy", forceinline=True, cache=True)
 def _touches(records, i, tile_x, tile_y, threshold):
-    """Whether alpha reaches its minimum anywhere in the tile's square (exact)."""
-    x0, y0 = tile_x * TILE - records[i, 0], tile_y * TILE - records[i, 1]
-    x1, y1 = x0 + TILE, y0 + TILE
+    """Whether alpha reaches its minimum anywhere between the centres of the tile's outer pixels (exact)."""
+    x0, y0 = tile_x * TILE + 0.5 - records[i, 0], tile_y * TILE + 0.5 - records[i, 1]
+    x1, y1 = x0 + TILE - 1, y0 + TILE - 1
     if x0 <= 0 <= x1 and y0 <= 0 <= y1:
         return True
     a, b, c = records[i, 2], records[i, 3], records[i, 4]
@@ -117,6 +117,12 @@ def _place(records, order, tiles_x, tiles_y, tile_mask, threshold, cursor, offse
                         slot += 1
 
 
+def row_order(tiles_y: int) -> np.ndarray:
+    """Rows of tiles by their reversed bits: threads that take a stretch each have rows from all over the image."""
+    bits = max(1, (tiles_y - 1).bit_length())
+    return np.argsort([int(f"{row:0{bits}b}"[::-1], 2) for row in range(tiles_y)])
+
+
 def intersect(
     records: np.ndarray,
     depths: np.ndarray,
@@ -140,4 +146,4 @@ def intersect(
     starts = np.append(cursor[0], ends[-1:])
     ids, slots = (workspace.take(name, offsets[-1], dtype=np.int32) for name in ("ids", "slots"))
     _place(records, order, tiles_x, tiles_y, tile_mask, threshold, cursor, offsets, ids, slots)
-    return Intersections(tiles_x, starts, ids, slots, offsets)
+    return Intersections(row_order(tiles_y), starts, ids, slots, offsets)
