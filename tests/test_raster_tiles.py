@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from sagesplat.raster import rasterize, tiles
 from sagesplat.raster.cpu import _Options, _project
-from sagesplat.raster.workspace import Workspace
+from sagesplat.workspace import Workspace
 
 BACKGROUND = torch.tensor([0.2, 0.3, 0.4])
 

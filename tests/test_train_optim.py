@@ -57,6 +57,23 @@ def test_frozen_rows_keep_every_bit_and_the_others_do_not_notice(pattern):
         assert (after[trainable] != before[trainable]).all(-1).all()
 
 
+def test_columns_without_gradient_can_be_left_out():
+    """As the harmonics that are not in use yet."""
+    n, in_use = 5000, 9
+    start = np.random.default_rng(3).normal(size=(n, 15, 3)).astype(np.float32)
+    whole, part = ([start.copy(), np.zeros_like(start), np.zeros_like(start)] for _ in range(2))
+    trainable = np.random.default_rng(4).random(n) < 0.9
+    for step, grad in enumerate(gradients(start.shape, 3), start=1):
+        grad.reshape(n, -1)[:, in_use:] = 0
+        adam_step(whole[0], grad, *whole[1:], lr=0.01, step=step, trainable=trainable)
+        grad.reshape(n, -1)[:, in_use:] = np.nan
+        adam_step(part[0], grad, *part[1:], lr=0.01, step=step, trainable=trainable, columns=in_use)
+    for a, b in zip(whole, part, strict=True):
+        np.testing.assert_array_equal(a, b)
+    adam_step(part[0], part[1], *part[1:], lr=0.01, step=4, trainable=trainable, columns=0)
+    np.testing.assert_array_equal(whole[0], part[0])
+
+
 def test_no_rows_and_no_columns():
     for shape in ((0, 3), (5, 0, 3)):
         empty = np.zeros(shape, np.float32)

@@ -5,24 +5,32 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, Int
+from numba import get_num_threads
 from torch import Tensor
 
 from sagesplat import ssim
+from sagesplat.workspace import Workspace
 
 SSIM_WEIGHT = 0.2  # of the published 3DGS loss: 0.8 L1 + 0.2 (1 - SSIM)
 
 
-def _maps(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _scratch(width: int, space: Workspace) -> np.ndarray:
+    return space.take("ssim scratch", get_num_threads(), ssim.scratch_size(width))
+
+
+def _maps(x: np.ndarray, y: np.ndarray, space: Workspace) -> tuple[np.ndarray, np.ndarray, float]:
+    """SSIM [C, H, W], its derivatives, and its mean."""
     height, width, channels = x.shape
-    values = np.empty((channels, height, width), np.float32)
-    derivatives = np.empty((3, channels, height, width), np.float32)
-    ssim.compare(x, y, values, derivatives)
-    return values, derivatives
+    wide, sums = ssim.padded(width), np.empty((channels, ssim.strips(height)))
+    values = space.take("ssim", channels, height, wide)
+    derivatives = space.take("ssim derivatives", 3, channels, height, wide)
+    ssim.compare(x, y, _scratch(width, space), values, derivatives, sums)
+    return values[..., :width], derivatives, float(sums.sum()) / x.size
 
 
 def ssim_map(x: Float32[np.ndarray, "H W 3"], y: Float32[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
     """SSIM at every pixel, averaged over the channels; images in [0, 1], 11x11 window, zero padding."""
-    return _maps(np.ascontiguousarray(x), np.ascontiguousarray(y))[0].mean(0)
+    return _maps(np.ascontiguousarray(x), np.ascontiguousarray(y), Workspace())[0].mean(0)
 
 
 def squared_error_map(
@@ -50,24 +58,29 @@ def means_by_label(
 
 class _PhotometricLoss(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, rgb: Tensor, photo: Tensor, ssim_weight: float) -> Tensor:
+    def forward(ctx: Any, rgb: Tensor, photo: Tensor, ssim_weight: float, space: Workspace) -> Tensor:
         x, y = rgb.detach().contiguous().numpy(), photo.contiguous().numpy()
-        values, derivatives = _maps(x, y)
-        grad = np.zeros_like(x)
-        ssim.gradient(
-            x, y, derivatives, np.float32(-ssim_weight / x.size), np.float32((1 - ssim_weight) / x.size), grad
-        )
+        _, derivatives, quality = _maps(x, y, space)
+        grad, errors = space.take("ssim gradient", *x.shape), np.empty((x.shape[2], ssim.strips(x.shape[0])))
+        scales = np.float32(-ssim_weight / x.size), np.float32((1 - ssim_weight) / x.size)
+        ssim.gradient(x, y, _scratch(x.shape[1], space), derivatives, *scales, grad, errors)
         ctx.grad = torch.from_numpy(grad)
-        l1 = float(np.abs(x - y).mean())
-        return torch.tensor((1 - ssim_weight) * l1 + ssim_weight * (1 - float(values.mean())))
+        l1 = float(errors.sum()) / x.size
+        return torch.tensor((1 - ssim_weight) * l1 + ssim_weight * (1 - quality))
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor):
-        return ctx.grad * grads[0], None, None
+        return ctx.grad * grads[0], None, None, None
 
 
 def photometric_loss(
-    rgb: Float[Tensor, "H W 3"], photo: Float[Tensor, "H W 3"], ssim_weight: float = SSIM_WEIGHT
+    rgb: Float[Tensor, "H W 3"],
+    photo: Float[Tensor, "H W 3"],
+    ssim_weight: float = SSIM_WEIGHT,
+    workspace: Workspace | None = None,
 ) -> Tensor:
-    """(1 - w) L1 + w (1 - SSIM), as 3DGS trains; differentiable by `rgb`."""
-    return _PhotometricLoss.apply(rgb, photo, ssim_weight)  # type: ignore[return-value]
+    """(1 - w) L1 + w (1 - SSIM), as 3DGS trains; differentiable by `rgb`.
+
+    With a `workspace`, go backward before the next call with it.
+    """
+    return _PhotometricLoss.apply(rgb, photo, ssim_weight, workspace or Workspace())  # type: ignore[return-value]

@@ -1,124 +1,151 @@
-"""SSIM fused with its gradient: 11x11 Gaussian window, sigma 1.5, zero padding, RGB in [0, 1], as in 3DGS."""
+"""SSIM fused with its gradient: 11x11 Gaussian window, sigma 1.5, zero padding, RGB in [0, 1], as in 3DGS.
 
+Maps are [3, H, W'] with W' = `padded(W)`, so that their rows are whole vectors.
+"""
+
+from typing import Any
+
+import numba
 import numpy as np
 from numba import njit, prange
 
+from sagesplat.simd import load16, load_blue, load_green, load_red, store, total, where
+
 WINDOW = 11
+LANES = 16
+get_thread_id: Any = getattr(numba, "get_thread_id")  # noqa: B009 - not in numba's stubs
 _RADIUS = WINDOW // 2
 _STRIP = 32  # rows a thread works on at a time
-_C1, _C2 = np.float32(0.01**2), np.float32(0.03**2)
+_F = np.float32
+_C1, _C2, _ONE, _TWO, _ZERO = _F(0.01**2), _F(0.03**2), _F(1), _F(2), _F(0)
 _taps = np.exp(-((np.arange(WINDOW) - _RADIUS) ** 2) / (2 * 1.5**2))
-_K0, _K1, _K2, _K3, _K4, _K5 = (np.float32(t) for t in (_taps / _taps.sum())[: _RADIUS + 1])
-_U = np.uint64
-_0, _1, _2, _3, _4, _5, _6, _7, _8, _9, _10 = (_U(i) for i in range(WINDOW))
-_TWO, _ONE = np.float32(2), np.float32(1)
-_FAST = {"contract", "nsz", "arcp", "reassoc"}
+_K0, _K1, _K2, _K3, _K4, _K5 = (_F(t) for t in (_taps / _taps.sum())[: _RADIUS + 1])
+_COLUMNS = np.arange(LANES, dtype=np.float32)
 
 
-@njit(fastmath=_FAST, cache=True)
-def _blur_row(row, out):
-    """Window along a row that is padded by 5 on either side."""
-    for w in range(_U(len(out))):
-        out[w] = (
-            _K0 * (row[w] + row[w + _10])
-            + _K1 * (row[w + _1] + row[w + _9])
-            + _K2 * (row[w + _2] + row[w + _8])
-            + _K3 * (row[w + _3] + row[w + _7])
-            + _K4 * (row[w + _4] + row[w + _6])
-            + _K5 * row[w + _5]
-        )
+def padded(width: int) -> int:
+    """A width as a number of whole vectors."""
+    return -(-width // LANES) * LANES
 
 
-@njit(fastmath=_FAST, cache=True)
-def _blur_column(rows, r, out):
-    """Window down the columns of rows r..r+10."""
-    for w in range(_U(len(out))):
-        out[w] = (
-            _K0 * (rows[r, w] + rows[r + _10, w])
-            + _K1 * (rows[r + _1, w] + rows[r + _9, w])
-            + _K2 * (rows[r + _2, w] + rows[r + _8, w])
-            + _K3 * (rows[r + _3, w] + rows[r + _7, w])
-            + _K4 * (rows[r + _4, w] + rows[r + _6, w])
-            + _K5 * rows[r + _5, w]
-        )
+def scratch_size(width: int) -> int:
+    """Floats that a thread works in."""
+    return 4 * (_STRIP + 2 * _RADIUS + 1) * (padded(width) + LANES)
 
 
-@njit(fastmath=_FAST, cache=True)
-def _products(x, y, xx, yy, xy):
-    for w in range(_U(len(x))):
-        xx[w] = x[w] * x[w]
-        yy[w] = y[w] * y[w]
-        xy[w] = x[w] * y[w]
+def strips(height: int) -> int:
+    """How many strips of rows an image has."""
+    return -(-height // _STRIP)
 
 
-@njit(fastmath=_FAST, error_model="numpy", cache=True)
-def _quality(mx, my, xx, yy, xy, ssim, d_mean, d_variance, d_covariance):
-    """A row of the SSIM map and its derivatives by the first image's mean, variance and the covariance."""
-    for w in range(_U(len(mx))):
-        a1, b1 = _TWO * mx[w] * my[w] + _C1, mx[w] * mx[w] + my[w] * my[w] + _C1
-        a2 = _TWO * (xy[w] - mx[w] * my[w]) + _C2
-        b2 = xx[w] - mx[w] * mx[w] + yy[w] - my[w] * my[w] + _C2
-        inverse = _ONE / (b1 * b2)
-        value = a1 * a2 * inverse
-        by_covariance = _TWO * a1 * inverse
-        by_variance = -value / b2
-        ssim[w] = value
-        d_covariance[w] = by_covariance
-        d_variance[w] = by_variance
-        d_mean[w] = (
-            _TWO * my[w] * a2 * inverse
-            - _TWO * mx[w] * value / b1
-            - my[w] * by_covariance
-            - _TWO * mx[w] * by_variance
-        )
+@njit(forceinline=True, cache=True)
+def _blur(values, at, step):
+    """Window over 16 neighbours at a time, from values[at] on; `step` from one tap to the next."""
+    return (
+        (load16(values, at) + load16(values, at + 10 * step)) * _K0
+        + (load16(values, at + step) + load16(values, at + 9 * step)) * _K1
+        + (load16(values, at + 2 * step) + load16(values, at + 8 * step)) * _K2
+        + (load16(values, at + 3 * step) + load16(values, at + 7 * step)) * _K3
+        + (load16(values, at + 4 * step) + load16(values, at + 6 * step)) * _K4
+        + load16(values, at + 5 * step) * _K5
+    )
+
+
+@njit(forceinline=True, cache=True)
+def _quality(mx, my, squares, product):
+    """SSIM and its derivatives by the first image's mean, by a variance and by the covariance."""
+    a1, b1 = mx * my * _TWO + _C1, mx * mx + my * my + _C1
+    a2, b2 = (product - mx * my) * _TWO + _C2, squares - mx * mx - my * my + _C2
+    inverse = _ONE / (b1 * b2)
+    value = a1 * a2 * inverse
+    by_covariance = a1 * inverse * _TWO
+    by_variance = -value * b1 * inverse
+    by_mean = (my * a2 * inverse - mx * value * b2 * inverse - mx * by_variance) * _TWO - my * by_covariance
+    return value, by_mean, by_variance, by_covariance
 
 
 @njit(parallel=True, cache=True)
-def compare(x, y, ssim, derivatives):
-    """SSIM maps of images x, y [H, W, C] into ssim [C, H, W], derivatives into [3, C, H, W]."""
+def compare(x, y, scratch, ssim, derivatives, sums):
+    """SSIM of x, y [H, W, 3] into ssim [3, H, W'], its derivatives [3, 3, H, W'], sums [3, strips]."""
     height, width, channels = x.shape
-    strips = -(-height // _STRIP)
+    wide = ssim.shape[2]
+    strips = sums.shape[1]
+    plane = channels * height * wide
+    line = wide + LANES  # rows a power of two apart would fall into the same few sets of the cache
+    area = (_STRIP + 2 * _RADIUS) * line
     for job in prange(strips * channels):
         channel, top = job // strips, (job % strips) * _STRIP
         bottom = min(top + _STRIP, height)
-        padded = np.zeros((5, width + 2 * _RADIUS), np.float32)
-        blurred = np.zeros((5, bottom - top + 2 * _RADIUS, width), np.float32)
+        rows, blurred = scratch[get_thread_id(), area * 4 :], scratch[get_thread_id()]
+        scratch[get_thread_id()] = _ZERO
         for r in range(max(top - _RADIUS, 0), min(bottom + _RADIUS, height)):
-            for w in range(width):
-                padded[0, w + _RADIUS] = x[r, w, channel]
-                padded[1, w + _RADIUS] = y[r, w, channel]
-            _products(padded[0], padded[1], padded[2], padded[3], padded[4])
-            for k in range(5):
-                _blur_row(padded[k], blurred[k, r - top + _RADIUS])
-        rows = np.empty((5, width), np.float32)
+            whole = width // LANES * LANES
+            for w in range(0, whole, LANES):
+                at = (r * width + w) * 3
+                if channel == 0:
+                    a, b = load_red(x, at), load_red(y, at)
+                elif channel == 1:
+                    a, b = load_green(x, at), load_green(y, at)
+                else:
+                    a, b = load_blue(x, at), load_blue(y, at)
+                store(rows, w + _RADIUS, a)
+                store(rows, line + w + _RADIUS, b)
+                store(rows, 2 * line + w + _RADIUS, a * a + b * b)
+                store(rows, 3 * line + w + _RADIUS, a * b)
+            for w in range(whole, width):
+                a, b = x[r, w, channel], y[r, w, channel]
+                rows[w + _RADIUS] = a
+                rows[line + w + _RADIUS] = b
+                rows[2 * line + w + _RADIUS] = a * a + b * b
+                rows[3 * line + w + _RADIUS] = a * b
+            for w in range(0, wide, LANES):
+                for k in range(4):
+                    store(blurred, k * area + (r - top + _RADIUS) * line + w, _blur(rows, k * line + w, 1))
+        added = 0.0
         for r in range(top, bottom):
-            for k in range(5):
-                _blur_column(blurred[k], _U(r - top), rows[k])
-            _quality(
-                rows[0], rows[1], rows[2], rows[3], rows[4], ssim[channel, r],
-                derivatives[0, channel, r], derivatives[1, channel, r], derivatives[2, channel, r],
-            )  # fmt: skip
+            for w in range(0, wide, LANES):
+                at = (r - top) * line + w
+                value, by_mean, by_variance, by_covariance = _quality(
+                    _blur(blurred, at, line), _blur(blurred, area + at, line),
+                    _blur(blurred, 2 * area + at, line), _blur(blurred, 3 * area + at, line),
+                )  # fmt: skip
+                at = (channel * height + r) * wide + w
+                store(ssim, at, value)
+                store(derivatives, at, by_mean)
+                store(derivatives, plane + at, by_variance)
+                store(derivatives, 2 * plane + at, by_covariance)
+                added += total(where(load16(_COLUMNS, 0) + _F(w) < _F(width), value, _ZERO))
+        sums[channel, job % strips] = added
 
 
 @njit(parallel=True, cache=True)
-def gradient(x, y, derivatives, scale, l1_scale, out):
-    """Add scale * d(sum of SSIM)/dx + l1_scale * sign(x - y) into out [H, W, C]."""
+def gradient(x, y, scratch, derivatives, scale, l1_scale, out, sums):
+    """scale * d(sum of SSIM)/dx + l1_scale * sign(x - y) into out [H, W, 3]; sums [3, strips] of |x - y|."""
     height, width, channels = x.shape
-    strips = -(-height // _STRIP)
+    wide = derivatives.shape[3]
+    strips = sums.shape[1]
+    line, area = wide + LANES, (_STRIP + 2 * _RADIUS) * (wide + LANES)
     for job in prange(strips * channels):
         channel, top = job // strips, (job % strips) * _STRIP
         bottom = min(top + _STRIP, height)
-        padded = np.zeros(width + 2 * _RADIUS, np.float32)
-        blurred = np.zeros((3, bottom - top + 2 * _RADIUS, width), np.float32)
+        row, blurred = scratch[get_thread_id(), area * 4 :], scratch[get_thread_id()]
+        smooth = row[line:]
+        scratch[get_thread_id()] = _ZERO
         for r in range(max(top - _RADIUS, 0), min(bottom + _RADIUS, height)):
             for k in range(3):
-                padded[_RADIUS : _RADIUS + width] = derivatives[k, channel, r]
-                _blur_row(padded, blurred[k, r - top + _RADIUS])
-        rows = np.empty((3, width), np.float32)
+                row[_RADIUS : _RADIUS + width] = derivatives[k, channel, r, :width]
+                for w in range(0, wide, LANES):
+                    store(blurred, k * area + (r - top + _RADIUS) * line + w, _blur(row, w, 1))
+        added = 0.0
         for r in range(top, bottom):
-            for k in range(3):
-                _blur_column(blurred[k], _U(r - top), rows[k])
+            for w in range(0, wide, LANES):
+                for k in range(3):
+                    store(smooth, k * wide + w, _blur(blurred, k * area + (r - top) * line + w, line))
+            error = _ZERO
             for w in range(width):
                 a, b = x[r, w, channel], y[r, w, channel]
-                by_ssim = rows[0, w] + _TWO * a * rows[1, w] + b * rows[2, w]
-                out[r, w, channel] += scale * by_ssim + l1_scale * np.sign(a - b)
+                error += abs(a - b)
+                by_ssim = smooth[w] + _TWO * a * smooth[wide + w] + b * smooth[2 * wide + w]
+                out[r, w, channel] = scale * by_ssim + l1_scale * (_F(a > b) - _F(a < b))
+            added += error
+        sums[channel, job % strips] = added

@@ -11,8 +11,8 @@ from torch import Tensor
 from sagesplat.errors import BackendUnavailable
 from sagesplat.gaussians import Gaussians
 from sagesplat.raster.render import Render
-from sagesplat.raster.workspace import Workspace
 from sagesplat.scene.scene import Camera
+from sagesplat.workspace import Workspace
 
 __all__ = ["Backend", "Render", "Workspace", "rasterize", "resolve_backend", "set_threads"]
 

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit, prange
 
 from sagesplat.raster.render import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
-from sagesplat.raster.simd import (
+from sagesplat.simd import (
     ceil,
     exp2,
     floor,
@@ -46,7 +46,7 @@ _SHARED = 6 * PLANE  # where a Gaussian's values that depend on the row alone li
 
 @njit(error_model="numpy", forceinline=True, cache=True)
 def _gather(records, ids, first, last, x0, y0, batch, rows):
-    """Copy the records of a batch to where they are near; rows [2, 16]: the tile's first and last + 1 in reach.
+    """Copy the records of a batch to where they are near; rows [2, 16]: first and last + 1 that each reaches.
 
     The highest point of an ellipse between two columns is its top, or lies on the column next to the top.
     """

@@ -13,8 +13,8 @@ from sagesplat.errors import DataError
 from sagesplat.gaussians import PARAMETERS, Gaussians
 from sagesplat.raster import blend, project, tiles
 from sagesplat.raster.render import Render
-from sagesplat.raster.workspace import Workspace
 from sagesplat.scene.scene import Camera
+from sagesplat.workspace import Workspace
 
 _CHUNK = 3  # channels that one blending pass takes
 

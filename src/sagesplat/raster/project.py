@@ -12,7 +12,8 @@ from numba import njit, prange
 
 from sagesplat import sh
 from sagesplat.raster.render import ALPHA_MIN, BLUR, FRUSTUM_MARGIN, NEAR
-from sagesplat.raster.simd import (
+from sagesplat.scene.scene import Camera
+from sagesplat.simd import (
     count,
     double,
     exp2,
@@ -27,7 +28,6 @@ from sagesplat.raster.simd import (
     store,
     where,
 )
-from sagesplat.scene.scene import Camera
 
 LANES = 8  # the kernels need at least so many Gaussians
 _LOG2E = math.log2(math.e)

@@ -7,7 +7,7 @@ from numba import njit, prange
 
 from sagesplat.raster.blend import TILE
 from sagesplat.raster.render import ALPHA_MIN
-from sagesplat.raster.workspace import Workspace
+from sagesplat.workspace import Workspace
 
 _CHUNKS = 16  # fixed, so that the result does not depend on the number of threads
 
@@ -88,37 +88,51 @@ def _touches(records, i, tile_x, tile_y, threshold):
 
 
 @njit(parallel=True, cache=True)
-def _count(records, order, tiles_x, tiles_y, tile_mask, threshold, per_tile, per_gaussian):
+def _count(records, order, tiles_x, tiles_y, tile_mask, threshold, per_tile, per_gaussian, boxes, met):
+    """Counts; for `_place` each Gaussian's box of tiles, and a bit for each of its first 64 that it meets."""
     for chunk in prange(_CHUNKS):
         for k in range(chunk * len(order) // _CHUNKS, (chunk + 1) * len(order) // _CHUNKS):
             i = order[k]
             x0, x1, y0, y1 = _tile_box(records, i, tiles_x, tiles_y)
+            boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3] = x0, x1, y0, y1
+            bits, bit, total = np.uint64(0), np.uint64(1), 0
             for y in range(y0, y1):
                 for x in range(x0, x1):
                     if tile_mask[y * tiles_x + x] and _touches(records, i, x, y, threshold):
                         per_tile[chunk, y * tiles_x + x] += 1
-                        per_gaussian[i] += 1
+                        bits |= bit
+                        total += 1
+                    bit <<= np.uint64(1)
+            met[k] = bits
+            per_gaussian[i] = total
 
 
 @njit(parallel=True, cache=True)
-def _place(records, order, tiles_x, tiles_y, tile_mask, threshold, cursor, offsets, ids, slots):
+def _place(records, order, tiles_x, tile_mask, threshold, boxes, met, cursor, offsets, ids, slots):
     for chunk in prange(_CHUNKS):
         for k in range(chunk * len(order) // _CHUNKS, (chunk + 1) * len(order) // _CHUNKS):
             i = order[k]
-            slot = offsets[i]
-            x0, x1, y0, y1 = _tile_box(records, i, tiles_x, tiles_y)
+            slot, bits = offsets[i], met[k]
+            x0, x1, y0, y1 = boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3]
+            small = (x1 - x0) * (y1 - y0) <= 64
             for y in range(y0, y1):
                 for x in range(x0, x1):
-                    if tile_mask[y * tiles_x + x] and _touches(records, i, x, y, threshold):
-                        at = cursor[chunk, y * tiles_x + x]
-                        cursor[chunk, y * tiles_x + x] += 1
+                    tile = y * tiles_x + x
+                    if small:
+                        meets = bits & np.uint64(1) != 0
+                        bits >>= np.uint64(1)
+                    else:
+                        meets = tile_mask[tile] and _touches(records, i, x, y, threshold)
+                    if meets:
+                        at = cursor[chunk, tile]
+                        cursor[chunk, tile] = at + 1
                         ids[at] = i
                         slots[at] = slot
                         slot += 1
 
 
 def row_order(tiles_y: int) -> np.ndarray:
-    """Rows of tiles by their reversed bits: threads that take a stretch each have rows from all over the image."""
+    """Rows of tiles by their reversed bits: each thread's stretch has rows from all over the image."""
     bits = max(1, (tiles_y - 1).bit_length())
     return np.argsort([int(f"{row:0{bits}b}"[::-1], 2) for row in range(tiles_y)])
 
@@ -139,11 +153,13 @@ def intersect(
     threshold = np.float32(np.log2(ALPHA_MIN) - 1e-3)
     per_tile = np.zeros((_CHUNKS, tiles_x * tiles_y), np.int64)
     per_gaussian = np.zeros(len(depths), np.int64)
-    _count(records, order, tiles_x, tiles_y, tile_mask, threshold, per_tile, per_gaussian)
+    boxes = workspace.take("boxes", len(order), 4, dtype=np.int32)
+    met = workspace.take("met", len(order), dtype=np.uint64)
+    _count(records, order, tiles_x, tiles_y, tile_mask, threshold, per_tile, per_gaussian, boxes, met)
     offsets = np.concatenate([[0], np.cumsum(per_gaussian)])
     ends = np.cumsum(per_tile.T.ravel())  # by tile, then by chunk
     cursor = np.ascontiguousarray((ends - per_tile.T.ravel()).reshape(-1, _CHUNKS).T)
     starts = np.append(cursor[0], ends[-1:])
     ids, slots = (workspace.take(name, offsets[-1], dtype=np.int32) for name in ("ids", "slots"))
-    _place(records, order, tiles_x, tiles_y, tile_mask, threshold, cursor, offsets, ids, slots)
+    _place(records, order, tiles_x, tile_mask, threshold, boxes, met, cursor, offsets, ids, slots)
     return Intersections(row_order(tiles_y), starts, ids, slots, offsets)

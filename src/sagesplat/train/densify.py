@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from numba import njit, prange
 from torch import Tensor
 
 from sagesplat.config import TrainConfig
@@ -50,12 +51,20 @@ def schedule(config: TrainConfig) -> Schedule:
 
 def observe_gradients(state: TrainState, render: Render, width: int, height: int, trainable: Tensor) -> None:
     """Add a view's screen-space gradients, in half images as 3DGS measures them."""
-    grad = render.means2d.grad
-    assert grad is not None
-    seen = (render.radii > 0) & trainable
-    norm = (grad * grad.new_tensor([width / 2, height / 2])).norm(dim=-1)
-    state.grad_sum += torch.where(seen, norm, 0)
-    state.grad_count += seen
+    assert render.means2d.grad is not None
+    _observe(
+        render.means2d.grad.numpy(), render.radii.numpy(), trainable.numpy(),
+        np.float32(width / 2), np.float32(height / 2), state.grad_sum.numpy(), state.grad_count.numpy(),
+    )  # fmt: skip
+
+
+@njit(parallel=True, cache=True)
+def _observe(grad, radii, trainable, half_width, half_height, grad_sum, grad_count):
+    for i in prange(len(radii)):
+        if radii[i] > 0 and trainable[i]:
+            x, y = grad[i, 0] * half_width, grad[i, 1] * half_height
+            grad_sum[i] += np.sqrt(x * x + y * y)
+            grad_count[i] += np.float32(1)
 
 
 def budget(config: TrainConfig, plan: Schedule, step: int, num_pixels: int, num_points: int) -> int:

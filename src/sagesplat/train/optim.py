@@ -20,7 +20,7 @@ def _update(parameter, grad, first, second, rate, correction):
 
 
 @njit(parallel=True, cache=True)
-def _update_rows(parameter, grad, first, second, rate, correction, trainable):
+def _update_rows(parameter, grad, first, second, rate, correction, trainable, columns):
     """Flat arrays of N * width values; runs of trainable rows are updated together."""
     n = len(trainable)
     width = len(parameter) // n
@@ -30,7 +30,11 @@ def _update_rows(parameter, grad, first, second, rate, correction, trainable):
             stop = row
             while stop < end and trainable[stop]:
                 stop += 1
-            if stop > row:
+            if columns < width:
+                for r in range(row, stop):
+                    a, b = r * width, r * width + columns
+                    _update(parameter[a:b], grad[a:b], first[a:b], second[a:b], rate, correction)
+            elif stop > row:
                 a, b = row * width, stop * width
                 _update(parameter[a:b], grad[a:b], first[a:b], second[a:b], rate, correction)
             row = stop + 1
@@ -45,13 +49,17 @@ def adam_step(
     lr: float,
     step: int,  # 1 for the first
     trainable: np.ndarray,  # bool [N]
+    columns: int | None = None,
 ) -> None:
-    """One Adam step (Kingma and Ba, betas 0.9 and 0.999, eps 1e-15 as 3DGS)."""
-    if parameter.size:
+    """One Adam step (Kingma and Ba, betas 0.9 and 0.999, eps 1e-15 as 3DGS).
+
+    `columns`: only so many values at the start of each row; what never had a gradient would not move anyway.
+    """
+    if parameter.size and columns != 0:
         rate = np.float32(lr / (1 - _BETA1**step))
         correction = np.float32((1 - _BETA2**step) ** -0.5)
         _update_rows(
             parameter.reshape(-1), np.ascontiguousarray(grad).reshape(-1), first.reshape(-1),
             second.reshape(-1),
-            rate, correction, trainable,
+            rate, correction, trainable, parameter.size if columns is None else columns,
         )  # fmt: skip

@@ -14,6 +14,7 @@ from sagesplat.metrics import photometric_loss
 from sagesplat.raster import Backend, Workspace, rasterize
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
+from sagesplat.sh import num_bases
 from sagesplat.train import densify
 from sagesplat.train.checkpoint import read_checkpoint, write_checkpoint
 from sagesplat.train.levels import write_level
@@ -141,16 +142,17 @@ def _step(
     view = _next_view(state, scene)
     camera = scene.views[view].camera
     photo = torch.from_numpy(photos[view]).float() / 255
+    degree = _sh_degree(state, config, plan)
     leaves = {name: p.detach().requires_grad_() for name, p in state.gaussians.parameters().items()}
     render = rasterize(
         replace(state.gaussians, **leaves),
         camera,
-        sh_degree=_sh_degree(state, config, plan),
+        sh_degree=degree,
         antialiased=config.antialiased,
         workspace=workspace,
         backend=backend,
     )
-    loss = photometric_loss(render.rgb, photo, config.ssim_weight)
+    loss = photometric_loss(render.rgb, photo, config.ssim_weight, workspace)
     value = float(loss.detach())
     if not np.isfinite(value):
         raise RunError(
@@ -163,6 +165,7 @@ def _step(
         densify.observe_gradients(state, render, camera.width, camera.height, trainable)
     rates = {name: getattr(config, f"{name}_lr") for name in PARAMETERS}
     rates["means"] *= extent * 0.01 ** (state.step / config.max_steps)
+    in_use = 3 * (num_bases(degree) - 1)
     for name, leaf in leaves.items():
         assert leaf.grad is not None
         adam_step(
@@ -173,5 +176,6 @@ def _step(
             lr=rates[name],
             step=state.step,
             trainable=trainable.numpy(),
+            columns=in_use if name == "shN" else None,
         )
     return value

@@ -331,6 +331,27 @@ load16, load8 = _reader(f16, _load), _reader(f8, _load)  # array[index : index +
 spread16 = _reader(f16, _spread)  # array[index] in all lanes
 
 
+def _channel_reader(channel: int) -> Any:
+    def read(context: Any, builder: Any, vector: Vector, array: Any, data: Any, index: Any) -> Any:
+        address = _address(context, builder, array, data, index)
+        blocks = []
+        for k in range(3):
+            part = builder.gep(address, [ir.Constant(ir.IntType(64), 16 * k)])
+            block = builder.bitcast(part, vector.llvm.as_pointer())
+            blocks.append(builder.load(block, align=4, typ=vector.llvm))
+        wanted = [3 * lane + channel for lane in range(16)]
+        kind = ir.VectorType(_INT, 16)
+        first = builder.shuffle_vector(*blocks[:2], ir.Constant(kind, [min(i, 31) for i in wanted]))
+        rest = [lane if i < 32 else i - 16 for lane, i in enumerate(wanted)]
+        return builder.shuffle_vector(first, blocks[2], ir.Constant(kind, rest))
+
+    return _reader(f16, read)
+
+
+# one channel of 16 pixels [16, 3] that begin at array[index]
+load_red, load_green, load_blue = _channel_reader(0), _channel_reader(1), _channel_reader(2)
+
+
 @intrinsic
 def store(typing_context, array, index, vector):  # type: ignore[no-untyped-def]
     """array[index : index + lanes] = vector."""
