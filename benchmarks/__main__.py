@@ -1,4 +1,4 @@
-"""`python -m benchmarks step SCENE` and `python -m benchmarks agreement`; each ends with one line of JSON."""
+"""`python -m benchmarks NAME`: each prints a table and ends with one line of JSON (docs/performance.md)."""
 
 import json
 import time
@@ -8,67 +8,238 @@ from pathlib import Path
 import numpy as np
 import torch
 import tyro
-from tyro.conf import Positional
 
-from sagesplat.config import TrainConfig
+from benchmarks import measure, plain, workloads
 from sagesplat.gaussians import PARAMETERS, Gaussians
-from sagesplat.metrics import photometric_loss
-from sagesplat.raster import Backend, rasterize, set_threads
+from sagesplat.raster import Backend, Workspace, add_weights, rasterize, set_threads
 from sagesplat.scene import load_scene
 from sagesplat.scene.images import Photos
-from sagesplat.scene.scene import Camera
-from sagesplat.train.state import from_points
-from sagesplat.train.trainer import Step, train
+from sagesplat.scene.scene import Camera, Scene
 
+RESULTS = Path(__file__).parent / "results" / "cpu"
 OPENSPLAT_STEP_MS = 1830  # its CPU path (1.1.5) on garden at 512 px from 42,599 points, on a two-core machine
 
 app = tyro.extras.SubcommandApp()
 
 
-def _milliseconds(call, repeats: int) -> float:  # type: ignore[no-untyped-def]
-    """Median time of a call, after three to warm up."""
-    times = []
-    for _ in range(3 + repeats):
-        begin = time.perf_counter()
-        call()
-        times.append(1e3 * (time.perf_counter() - begin))
-    return float(np.median(times[3:]))
+def _finish(name: str, result: dict, write: bool) -> None:  # type: ignore[type-arg]
+    """Print the last line; with --write, keep it."""
+
+    def short(value):  # type: ignore[no-untyped-def]
+        if isinstance(value, dict):
+            return {k: short(v) for k, v in value.items()}
+        if isinstance(value, list):
+            return [short(v) for v in value]
+        return float(f"{value:.4g}") if isinstance(value, float) else value
+
+    line = json.dumps(short(result))
+    if write:
+        RESULTS.mkdir(parents=True, exist_ok=True)
+        (RESULTS / f"{name}.json").write_text(line + "\n")
+    print(line)
+
+
+def _photo(scene: Scene, row: int) -> torch.Tensor:
+    return torch.from_numpy(Photos(scene.views)[row]).float() / 255
 
 
 @app.command
-def step(scene: Positional[Path], downscale: int = 1, threads: int = 0, repeats: int = 40) -> None:
-    """Training steps from the initial points of a capture: the whole step and its parts."""
+def garden(
+    scene: Path = workloads.GARDEN,
+    downscale: int = 1,
+    threads: int = 0,
+    steps: int = 0,
+    repeats: int = 20,
+    write: bool = False,
+) -> None:
+    """A training step on a capture, from its points or after some steps of training: its parts and rates."""
     used = set_threads(threads)
     capture = load_scene(scene, downscale=downscale)
-    photos = Photos(capture.views)
-    labels = np.full(len(capture.points.xyz), -1, np.int16)
-    events = train(capture, photos, labels, TrainConfig(max_steps=30_000, level_every=30_000))
-    whole = _milliseconds(lambda: next(e for e in events if isinstance(e, Step)), repeats)
+    g = workloads.trained(capture, steps) if steps else workloads.initial(capture)
+    camera, photo = capture.views[1].camera, _photo(capture, 1)
+    result = {"scene": capture.name, "size": [camera.width, camera.height], "gaussians": len(g)}
+    degree = min(3, steps // 1000)
+    result |= {"steps": steps, "threads": used, **measure.parts(g, camera, photo, degree, repeats)}
+    result |= measure.blending(g, camera, repeats) | {"peak_mib": measure.peak_mib()}
+    if (capture.name, camera.width, len(g)) == ("garden", 512, 42_599):
+        result["times_faster_than_opensplat_cpu"] = OPENSPLAT_STEP_MS / result["step_ms"]
+    for name, value in result.items():
+        print(f"{name:32} {value:,.4g}" if isinstance(value, float) else f"{name:32} {value}")
+    _finish(f"{capture.name}_{camera.width}_{steps}", result, write)
 
-    g = from_points(capture.points, labels, 3)
+
+@app.command
+def clouds(largest: int = 1_000_000, repeats: int = 5, write: bool = False) -> None:
+    """Steps on clouds of 10 k to 1 M Gaussians at 800 x 533, sparse and dense, with one thread and all."""
+    view, rows = workloads.camera(), []
+    photo = torch.rand(view.height, view.width, 3)
+    for overlap in workloads.OVERLAPS:
+        for count in (n for n in (10_000, 100_000, 1_000_000) if n <= largest):
+            g = workloads.cloud(count, overlap, view)
+            for threads in (1, 0):
+                used = set_threads(threads)
+                row = {"overlap": overlap, "gaussians": count, "threads": used}
+                row |= measure.parts(g, view, photo, 3, repeats) | measure.blending(g, view, repeats)
+                rows.append(row)
+                names = ("step_ms", "forward_ms", "backward_ms", "ssim_ms", "adam_ms")
+                rates = f"{row['pairs_per_s_forward']:.2e} {row['pairs_per_s_backward']:.2e} pairs/s"
+                times = " ".join(f"{name[:-3]} {row[name]:.1f}" for name in names)
+                print(f"{overlap} {count:>9,} threads {used}: {times} ms; {rates}", flush=True)
+    _finish("clouds", {"rows": rows}, write)
+
+
+@app.command
+def blending(count: int = 20_000, size: int = 512, repeats: int = 20, write: bool = False) -> None:
+    """Blending alone, of large faint Gaussians that overlap: pairs a second, share of the peak, threads."""
+    view = workloads.camera(size, size)
+    g = workloads.cloud(count, "dense", view)
+    result = {}
+    for threads in (1, 0):
+        used = set_threads(threads)
+        result[f"threads_{used}"] = measure.blending(g, view, repeats)
+        for name, value in result[f"threads_{used}"].items():
+            print(f"{used} threads {name:24} {value:.4g}")
+    one, most = result["threads_1"], result[f"threads_{used}"]
+    for part in ("forward", "backward"):
+        result[f"scaling_{part}"] = most[f"pairs_per_s_{part}"] / one[f"pairs_per_s_{part}"]
+    result["scaling_peak"] = most["peak_gflops"] / one["peak_gflops"]
+    _finish("blending", result, write)
+
+
+@app.command
+def growth(repeats: int = 5, write: bool = False) -> None:
+    """How a step grows with the number of Gaussians, of pixels, and with overlap: a plot of each."""
+    from matplotlib.figure import Figure
+
+    set_threads(0)
+    curves: dict[str, list[tuple[float, dict[str, float]]]] = {
+        "Gaussians": [],
+        "pixels": [],
+        "sigma [px]": [],
+    }
+    for count in (10_000, 20_000, 50_000, 100_000, 200_000, 400_000):
+        view = workloads.camera(512, 512)
+        curves["Gaussians"].append(
+            (count, _step_parts(workloads.cloud(count, "sparse", view), view, repeats))
+        )
+    g = workloads.cloud(50_000, "sparse", workloads.camera(512, 512))
+    for size in (128, 256, 512, 1024, 1536):
+        curves["pixels"].append((size * size, _step_parts(g, workloads.camera(size, size), repeats)))
+    for sigma in (1, 2, 4, 8, 16, 32):
+        view = workloads.camera(512, 512)
+        wide = replace(g, log_scales=g.log_scales + float(np.log(sigma / 2)))
+        curves["sigma [px]"].append((sigma, _step_parts(wide, view, repeats)))
+    figure = Figure(figsize=(12, 3.6), layout="constrained")
+    for axes, (name, points) in zip(figure.subplots(1, 3), curves.items(), strict=True):
+        for part in ("step_ms", "forward_ms", "backward_ms", "ssim_ms", "adam_ms"):
+            axes.loglog([x for x, _ in points], [row[part] for _, row in points], "o-", label=part[:-3])
+        axes.set_xlabel(name)
+        axes.set_ylabel("ms")
+        axes.grid(True, alpha=0.3)
+        axes.legend(fontsize=7)
+    if write:
+        RESULTS.mkdir(parents=True, exist_ok=True)
+        figure.savefig(RESULTS / "growth.png", dpi=110)
+    _finish("growth", {n: [{"x": x, **row} for x, row in points] for n, points in curves.items()}, write)
+
+
+def _step_parts(g: Gaussians, view: Camera, repeats: int) -> dict[str, float]:
+    return measure.parts(g, view, torch.rand(view.height, view.width, 3), 3, repeats)
+
+
+@app.command
+def against_torch(scene: Path = workloads.GARDEN, downscale: int = 2, write: bool = False) -> None:
+    """The same image and gradients by plain torch operations: time of both, in one run."""
+    set_threads(0)
+    capture = load_scene(scene, downscale=downscale)
+    g, camera = workloads.initial(capture), capture.views[1].camera
     leaves = {name: p.requires_grad_() for name, p in g.parameters().items()}
-    camera = capture.views[1].camera
-    photo = torch.from_numpy(photos[1]).float() / 255
+    g = replace(g, **leaves)
 
-    def forward():  # type: ignore[no-untyped-def]
-        return rasterize(replace(g, **leaves), camera, sh_degree=0)
+    def ours() -> torch.Tensor:
+        return rasterize(g, camera, sh_degree=0).rgb
 
-    def both() -> None:
-        forward().rgb.sum().backward()
+    def torchs() -> torch.Tensor:
+        return plain.render(g, camera)
 
     result = {
-        "scene": capture.name,
         "size": [camera.width, camera.height],
         "gaussians": len(g),
-        "threads": used,
-        "step_ms": whole,
-        "forward_ms": _milliseconds(forward, repeats),
-        "forward_backward_ms": _milliseconds(both, repeats),
-        "loss_ms": _milliseconds(lambda: photometric_loss(photo * 0.9, photo), repeats),
+        "largest_difference": float((ours() - torchs()).abs().max().detach()),
+        "torch_forward_ms": measure.milliseconds(lambda: torchs().detach(), 1),
+        "torch_both_ms": measure.milliseconds(lambda: torchs().sum().backward(), 1),
+        "forward_ms": measure.milliseconds(lambda: ours().detach(), 10),
+        "both_ms": measure.milliseconds(lambda: ours().sum().backward(), 10),
     }
-    if (capture.name, camera.width, len(g)) == ("garden", 512, 42_599):
-        result["times_faster_than_opensplat_cpu"] = OPENSPLAT_STEP_MS / whole
-    print(json.dumps({k: round(v, 2) if isinstance(v, float) else v for k, v in result.items()}))
+    result["times_faster"] = result["torch_both_ms"] / result["both_ms"]
+    _finish("against_torch", result, write)
+
+
+@app.command
+def votes(
+    scene: Path = workloads.GARDEN, count: int = 200_000, labels: int = 11, write: bool = False
+) -> None:
+    """Blending weights of every Gaussian and label over all views of a capture."""
+    used = set_threads(0)
+    capture = load_scene(scene)
+    g = workloads.initial(capture)
+    rng = np.random.default_rng(0)
+    rows = torch.from_numpy(rng.integers(0, len(g), count))
+    g = g.select(rows)
+    g = replace(g, means=g.means + 0.01 * torch.from_numpy(rng.normal(size=(count, 3)).astype(np.float32)))
+    camera, space, out = capture.views[0].camera, Workspace(), np.zeros((count, labels), np.float32)
+    blocks = rng.integers(
+        0, labels, (-(-camera.height // 64), -(-camera.width // 64))
+    )  # regions, as labels are
+    columns = np.kron(blocks, np.ones((64, 64), np.int64))[: camera.height, : camera.width]
+    columns = np.ascontiguousarray(columns)
+    add_weights(g, camera, columns, out, workspace=space)
+    begin = time.perf_counter()
+    for view in capture.views:
+        add_weights(g, view.camera, columns, out, workspace=space)
+    seconds = time.perf_counter() - begin
+    result = {"views": len(capture.views), "size": [camera.width, camera.height], "gaussians": count}
+    _finish("votes", result | {"labels": labels, "threads": used, "seconds": seconds}, write)
+
+
+@app.command
+def memory(count: int = 1_000_000, steps: int = 3, write: bool = False) -> None:
+    """Most memory that training so many Gaussians at 800 x 533 takes."""
+    set_threads(0)
+    view = workloads.camera()
+    before = measure.peak_mib()
+    g = workloads.cloud(count, "sparse", view)
+    parts = measure.parts(g, view, torch.rand(view.height, view.width, 3), 3, steps)
+    peak = measure.peak_mib()
+    per_gaussian = (peak - before) * 2**20 / count
+    result = {"gaussians": count, "peak_mib": peak, "bytes_per_gaussian": per_gaussian, **parts}
+    _finish("memory", result, write)
+
+
+# What the gate holds: rates over the machine's own multiply-add peak, measured in the same run
+GATE = {"share_of_peak_forward": 0.6, "share_of_peak_backward": 0.6, "steps_per_gflop": 0.6}
+
+
+@app.command
+def gate(write: bool = False) -> None:
+    """Fails where the kernels use much less of the machine than when `results/cpu/gate.json` was written."""
+    set_threads(0)
+    view = workloads.camera(512, 512)
+    rates = measure.blending(workloads.cloud(20_000, "dense", view), view, 10)
+    sparse = workloads.cloud(50_000, "sparse", view)
+    photo = torch.rand(view.height, view.width, 3)
+    step = measure.parts(sparse, view, photo, 3, 10)["step_ms"]
+    result = {name: rates[name] for name in list(GATE)[:2]}
+    result["steps_per_gflop"] = 1e3 / step / rates["peak_gflops"]
+    path = RESULTS / "gate.json"
+    if not write:
+        known = json.loads(path.read_text())
+        for name, least in GATE.items():
+            ratio = result[name] / known[name]
+            print(f"{name:28} {result[name]:.4g}, {ratio:.2f} of {known[name]:.4g} (at least {least})")
+            if ratio < least:
+                raise SystemExit(f"{name} fell to {ratio:.2f} of what it was; see docs/performance.md")
+    _finish("gate", result, write)
 
 
 @app.command

@@ -5,6 +5,7 @@ from typing import Literal
 import numba
 import numpy as np
 import torch
+from jaxtyping import Float32, Int64
 from numba.core import config as numba_config
 from torch import Tensor
 
@@ -14,7 +15,7 @@ from sagesplat.raster.render import Render
 from sagesplat.scene.scene import Camera
 from sagesplat.workspace import Workspace
 
-__all__ = ["Backend", "Render", "Workspace", "rasterize", "resolve_backend", "set_threads"]
+__all__ = ["Backend", "Render", "Workspace", "add_weights", "rasterize", "resolve_backend", "set_threads"]
 
 Backend = Literal["auto", "cpu", "reference"]
 
@@ -69,3 +70,22 @@ def rasterize(
     from sagesplat.raster import cpu
 
     return cpu.render(gaussians, camera, tile_mask=tile_mask, workspace=workspace, **shared)
+
+
+def add_weights(
+    gaussians: Gaussians,
+    camera: Camera,
+    columns_of: Int64[np.ndarray, "H W"],
+    out: Float32[np.ndarray, "N C"],
+    *,
+    antialiased: bool = False,
+    workspace: Workspace | None = None,
+) -> None:
+    """Add each Gaussian's blending weight (alpha times transmittance) over a view's pixels to `out`.
+
+    `columns_of` tells the column of `out` for each pixel, by its label for instance; -1: the pixel counts
+    nowhere. It is the gradient of a rendering of features that are 1 where a pixel's column is. `cpu` only.
+    """
+    from sagesplat.raster import cpu
+
+    cpu.add_weights(gaussians, camera, columns_of, out, antialiased=antialiased, workspace=workspace)

@@ -32,6 +32,7 @@ TILE = 16
 PIXELS = TILE * TILE
 PLANE = PIXELS
 _BATCH = 16  # intersections between two looks whether a tile is opaque
+_CHUNK = 256  # Gaussians that a thread takes at a time
 RECORD = 11
 SUMS = 9  # per intersection: colour r, g, b, then gq times 1, dx, dy, dx^2, dx dy, dy^2
 
@@ -240,22 +241,83 @@ def backward(
 
 
 @njit(parallel=True, cache=True)
+def weigh(records, starts, ids, slots, row_order, width, height, columns_of, sums):
+    """Sums of alpha T over each intersection's pixels, apart by column, into sums [I, columns].
+
+    columns_of [H, W] tells each pixel's column; pixels of column -1 count nowhere.
+    """
+    tiles_x, num_columns = (width + TILE - 1) // TILE, sums.shape[1]
+    for r in prange(len(row_order)):
+        state, masks = _scratch(7), np.zeros(num_columns * PLANE, np.float32)
+        batch, rows = np.zeros((_BATCH, RECORD), np.float32), np.empty((2, _BATCH), np.float32)
+        present = np.zeros(num_columns, np.bool_)
+        for column in range(tiles_x):
+            tile, row0, column0 = row_order[r] * tiles_x + column, row_order[r] * TILE, column * TILE
+            x0, y0 = _F(column0), _F(row0)
+            columns, lines = load16(_CENTRES, 0) + x0, load16(_CENTRES, 0) + y0
+            state[:PIXELS] = _ZERO
+            masks[:] = _ZERO
+            present[:] = False
+            for y in range(row0, min(row0 + TILE, height)):
+                for x in range(column0, min(column0 + TILE, width)):
+                    p, of = (y - row0) * TILE + x - column0, columns_of[y, x]
+                    state[p] = _ONE
+                    if of >= 0:
+                        masks[of * PLANE + p] = _ONE
+                        present[of] = True
+            end = starts[tile]
+            while end < starts[tile + 1] and _most(state) >= _T_MIN:
+                first, end = end, min(end + _BATCH, starts[tile + 1])
+                _gather(records, ids, first, end, x0, y0, batch, rows)
+                for j in range(end - first):
+                    lo, hi, slot = int(rows[0, j]), int(rows[1, j]), slots[first + j]
+                    # as a colour of 1 over a plane of zeros, each weight is left behind
+                    state[PLANE + lo * TILE : PLANE + max(lo, hi) * TILE] = _ZERO
+                    if lo < hi:
+                        _blend(
+                            state, lo, hi, columns, lines, batch[j, 0], batch[j, 1], batch[j, 2],
+                            batch[j, 3], batch[j, 4], batch[j, 5], _ONE, _ZERO, _ZERO,
+                        )  # fmt: skip
+                    for of in range(num_columns):
+                        added = splat16(_ZERO)
+                        if present[of]:
+                            for row in range(lo, hi):
+                                weight = load16(state, PLANE + row * TILE)
+                                added = added + weight * load16(masks, of * PLANE + row * TILE)
+                        sums[slot, of] = total(added)
+            for k in range(end, starts[tile + 1]):
+                sums[slots[k]] = _ZERO
+
+
+@njit(parallel=True, cache=True)
+def add_by_gaussian(offsets, sums, out):
+    """Add the sums [I, columns] of each Gaussian's intersections to its row of out [N, columns]."""
+    for i in prange(len(offsets) - 1):
+        for slot in range(offsets[i], offsets[i + 1]):
+            for column in range(sums.shape[1]):
+                out[i, column] += sums[slot, column]
+
+
+@njit(parallel=True, cache=True)
 def reduce(records, offsets, sums, g_mean2d, g_conic, g_opacity, g_color):
     """Add the sums of each Gaussian's intersections and turn them into gradients of its 2D parameters."""
     to_conic = _F(-2.0 / np.log2(np.e))
-    for i in prange(len(records)):
-        if offsets[i] == offsets[i + 1]:
-            continue
-        added = np.zeros(SUMS, np.float64)
-        for slot in range(offsets[i], offsets[i + 1]):
-            for column in range(SUMS):
-                added[column] += sums[slot, column]
-        a, b, c = to_conic * records[i, 2], _F(0.5) * to_conic * records[i, 3], to_conic * records[i, 4]
-        g_mean2d[i, 0] += a * added[4] + b * added[5]
-        g_mean2d[i, 1] += b * added[4] + c * added[5]
-        g_conic[i, 0] -= 0.5 * added[6]
-        g_conic[i, 1] -= added[7]
-        g_conic[i, 2] -= 0.5 * added[8]
-        g_opacity[i] += added[3] / 2.0 ** records[i, 5]
-        for channel in range(3):
-            g_color[i, channel] = added[channel]
+    n = len(records)
+    for chunk in prange((n + _CHUNK - 1) // _CHUNK):
+        added = np.empty(SUMS, np.float64)
+        for i in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, n)):
+            if offsets[i] == offsets[i + 1]:
+                continue
+            added[:] = 0.0
+            for slot in range(offsets[i], offsets[i + 1]):
+                for column in range(SUMS):
+                    added[column] += sums[slot, column]
+            a, b, c = to_conic * records[i, 2], _HALF * to_conic * records[i, 3], to_conic * records[i, 4]
+            g_mean2d[i, 0] += a * added[4] + b * added[5]
+            g_mean2d[i, 1] += b * added[4] + c * added[5]
+            g_conic[i, 0] -= 0.5 * added[6]
+            g_conic[i, 1] -= added[7]
+            g_conic[i, 2] -= 0.5 * added[8]
+            g_opacity[i] += added[3] / 2.0 ** records[i, 5]
+            for channel in range(3):
+                g_color[i, channel] = added[channel]

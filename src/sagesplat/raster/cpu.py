@@ -64,6 +64,13 @@ def _project(options: _Options, parameters: _Arrays):
     return records, depths, radii
 
 
+def _intersections(options: _Options, records: np.ndarray, depths: np.ndarray, radii: np.ndarray):
+    width, height = options.camera.width, options.camera.height
+    tiles_y, tiles_x = -(-height // blend.TILE), -(-width // blend.TILE)
+    mask = np.ones(tiles_x * tiles_y, bool) if options.tile_mask is None else options.tile_mask.ravel()
+    return tiles.intersect(records, depths, radii, width, height, mask, options.workspace)
+
+
 class _Rasterize(torch.autograd.Function):
     """(parameters, features, background, means2d leaf) -> rgb, alpha, features; radii and means2d aside."""
 
@@ -81,9 +88,7 @@ class _Rasterize(torch.autograd.Function):
         records, depths, radii = _project(options, arrays)
         np.multiply(records[:, :2], radii[:, None] > 0, out=means2d.detach().numpy())
         width, height, take = camera.width, camera.height, options.workspace.take
-        tiles_y, tiles_x = -(-height // blend.TILE), -(-width // blend.TILE)
-        mask = np.ones(tiles_x * tiles_y, bool) if options.tile_mask is None else options.tile_mask.ravel()
-        found = tiles.intersect(records, depths, radii, width, height, mask, options.workspace)
+        found = _intersections(options, records, depths, radii)
         left = take("left", height, width)
         ends = np.empty(len(found.starts) - 1, np.int64)
         passes = [(records, _array(background))] + [
@@ -182,3 +187,24 @@ def render(
         *parameters,
     )  # type: ignore[misc]
     return Render(rgb, alpha, None if features is None else painted, means2d, radii)
+
+
+def add_weights(
+    g: Gaussians,
+    camera: Camera,
+    columns_of: np.ndarray,  # int64 [H, W]
+    out: np.ndarray,  # float32 [N, columns]
+    *,
+    antialiased: bool,
+    workspace: Workspace | None,
+) -> None:
+    """See `sagesplat.raster.add_weights`."""
+    options = _Options(camera, 0, antialiased, None, workspace or Workspace())
+    projected = _project(options, _arrays([getattr(g, name) for name in PARAMETERS]))
+    found = _intersections(options, *projected)
+    sums = options.workspace.take("weights", len(found.ids), out.shape[1])
+    blend.weigh(
+        projected[0], found.starts, found.ids, found.slots, found.row_order, camera.width, camera.height,
+        columns_of, sums,
+    )  # fmt: skip
+    blend.add_by_gaussian(found.offsets, sums, out)

@@ -1,0 +1,149 @@
+"""Times, rates and memory of the training kernels."""
+
+import resource
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from numba import njit, prange
+
+from sagesplat.config import TrainConfig
+from sagesplat.gaussians import PARAMETERS, Gaussians
+from sagesplat.metrics import photometric_loss
+from sagesplat.raster import Workspace, blend, cpu, rasterize
+from sagesplat.scene.scene import Camera
+from sagesplat.sh import num_bases
+from sagesplat.simd import fma, splat16, total
+from sagesplat.train.optim import adam_step
+
+# operations that the blending loops cost per pixel and Gaussian (docs/performance.md)
+FORWARD_OPERATIONS, BACKWARD_OPERATIONS = 34, 75
+
+
+def milliseconds(call: Callable[[], Any], repeats: int, *, best: bool = False) -> float:
+    """Median (or best) time of a call, after three to warm up."""
+    times = []
+    for _ in range(3 + repeats):
+        begin = time.perf_counter()
+        call()
+        times.append(1e3 * (time.perf_counter() - begin))
+    return float(np.min(times[3:]) if best else np.median(times[3:]))
+
+
+@njit(parallel=True, cache=True)
+def _multiply_add(count, out):
+    for job in prange(len(out)):
+        x, y = splat16(np.float32(0.999999)), splat16(np.float32(1e-7))
+        a = b = c = d = e = f = g = h = i = j = splat16(np.float32(1))
+        for _ in range(count):
+            a, b, c, d, e = fma(a, x, y), fma(b, x, y), fma(c, x, y), fma(d, x, y), fma(e, x, y)
+            f, g, h, i, j = fma(f, x, y), fma(g, x, y), fma(h, x, y), fma(i, x, y), fma(j, x, y)
+        out[job] = total(a + b + c + d + e + f + g + h + i + j)
+
+
+def peak_gflops() -> float:
+    """What the machine's threads can multiply and add, right now: the calibration of everything else."""
+    out, count = np.zeros(numba.get_num_threads(), np.float32), 2_000_000
+    best = milliseconds(lambda: _multiply_add(count, out), 3, best=True)
+    return count * len(out) * 10 * 16 * 2 / best / 1e6
+
+
+@njit(cache=True)
+def _count_pairs(records, starts, ends, ids, tiles_x):
+    """Pairs of a pixel and a Gaussian that blending evaluates."""
+    batch, rows = np.zeros((16, blend.RECORD), np.float32), np.empty((2, 16), np.float32)
+    pairs = 0
+    for tile in range(len(ends)):
+        x0, y0 = np.float32(tile % tiles_x * blend.TILE), np.float32(tile // tiles_x * blend.TILE)
+        for first in range(starts[tile], ends[tile], 16):
+            last = min(first + 16, ends[tile])
+            blend._gather(records, ids, first, last, x0, y0, batch, rows)  # pyright: ignore[reportCallIssue]
+            for j in range(last - first):
+                pairs += max(0, int(rows[1, j]) - int(rows[0, j])) * blend.TILE
+    return pairs
+
+
+def blending(g: Gaussians, camera: Camera, repeats: int) -> dict[str, float]:
+    """The two blending loops alone: milliseconds, and pairs a second."""
+    options = cpu._Options(camera, 0, False, None, Workspace())
+    records, depths, radii = cpu._project(options, cpu._arrays([getattr(g, n) for n in PARAMETERS]))
+    found = cpu._intersections(options, records, depths, radii)
+    size, num = (camera.height, camera.width), len(found.starts) - 1
+    image, left, ends = np.zeros((*size, 3), np.float32), np.zeros(size, np.float32), np.zeros(num, np.int64)
+    black, sums = np.zeros(3, np.float32), np.zeros((len(found.ids), blend.SUMS), np.float32)
+    grad = np.random.default_rng(0).normal(size=image.shape).astype(np.float32)
+    none = np.zeros(size, np.float32)
+    forward = milliseconds(
+        lambda: blend.forward(
+            records, found.starts, found.ids, found.row_order, camera.width, camera.height, black, image,
+            left, ends,
+        ),
+        repeats, best=True,
+    )  # fmt: skip
+    backward = milliseconds(
+        lambda: blend.backward(
+            records, found.starts, ends, found.ids, found.slots, found.row_order, camera.width,
+            camera.height, image, left, grad, none, sums,
+        ),
+        repeats, best=True,
+    )  # fmt: skip
+    pairs = _count_pairs(records, found.starts, ends, found.ids, -(-camera.width // blend.TILE))
+    peak = peak_gflops()
+    return {
+        "pairs": pairs,
+        "intersections": len(found.ids),
+        "blend_forward_ms": forward,
+        "blend_backward_ms": backward,
+        "pairs_per_s_forward": pairs / forward * 1e3,
+        "pairs_per_s_backward": pairs / backward * 1e3,
+        "share_of_peak_forward": pairs / forward * FORWARD_OPERATIONS / 1e6 / peak,
+        "share_of_peak_backward": pairs / backward * BACKWARD_OPERATIONS / 1e6 / peak,
+        "peak_gflops": peak,
+    }
+
+
+def parts(g: Gaussians, camera: Camera, photo: torch.Tensor, degree: int, repeats: int) -> dict[str, float]:
+    """A training step in four parts, each timed alone, and as a whole."""
+    space, config = Workspace(), TrainConfig()
+    first, second = ({n: torch.zeros_like(p) for n, p in g.parameters().items()} for _ in range(2))
+    in_use = 3 * (num_bases(degree) - 1)
+    leaves: dict[str, torch.Tensor] = {}
+
+    def forward() -> torch.Tensor:
+        leaves.update({n: p.detach().requires_grad_() for n, p in g.parameters().items()})
+        return rasterize(replace(g, **leaves), camera, sh_degree=degree, workspace=space).rgb
+
+    slope = torch.rand(camera.height, camera.width, 3) * 1e-6
+    image = forward().detach().clone().requires_grad_()
+
+    def adam() -> None:
+        for name, leaf in leaves.items():
+            assert leaf.grad is not None
+            adam_step(
+                leaf.detach().numpy(), leaf.grad.numpy(), first[name].numpy(), second[name].numpy(),
+                lr=1e-9, step=100, trainable=np.ones(len(g), bool), columns=in_use if name == "shN" else None,
+            )  # fmt: skip
+
+    def step() -> None:
+        photometric_loss(forward(), photo, config.ssim_weight, space).backward()
+        adam()
+
+    forward_ms = milliseconds(forward, repeats)
+    return {
+        "step_ms": milliseconds(step, repeats),
+        "forward_ms": forward_ms,
+        "backward_ms": milliseconds(lambda: forward().backward(slope), repeats) - forward_ms,
+        "ssim_ms": milliseconds(
+            lambda: photometric_loss(image, photo, config.ssim_weight, space).backward(), repeats
+        ),
+        "adam_ms": milliseconds(adam, repeats),
+    }
+
+
+def peak_mib() -> float:
+    """Most memory that this process ever had."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

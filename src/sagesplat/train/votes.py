@@ -1,0 +1,46 @@
+"""Labels of trained Gaussians, by what each of them paints."""
+
+from collections.abc import Collection
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Int16
+
+from sagesplat.gaussians import Gaussians
+from sagesplat.raster import Workspace, add_weights
+from sagesplat.scene.scene import Scene
+from sagesplat.segment.masks import UNLABELLED, Masks
+
+
+def label_weights(
+    gaussians: Gaussians,
+    scene: Scene,
+    masks: Masks,
+    views: Collection[int],
+    *,
+    antialiased: bool = False,
+) -> tuple[Int16[np.ndarray, " L"], Float32[np.ndarray, "N L"]]:
+    """Category ids, ascending, and each Gaussian's blending weight on the pixels of each.
+
+    The weights (alpha times transmittance) are summed over the pixels of `views` (rows of `Scene.views`);
+    unlabelled pixels do not vote.
+    """
+    ids = np.array(sorted(masks.taxonomy.names), np.int16)
+    column_of = np.full(int(ids.max(initial=0)) + 2, -1, np.int64)  # the last one for unlabelled, -1
+    column_of[ids] = np.arange(len(ids))
+    weights, workspace = np.zeros((len(gaussians), len(ids)), np.float32), Workspace()
+    for row in views:
+        view = scene.views[row]
+        columns = column_of[masks[view]]
+        add_weights(gaussians, view.camera, columns, weights, antialiased=antialiased, workspace=workspace)
+    return ids, weights
+
+
+def vote(
+    gaussians: Gaussians, scene: Scene, masks: Masks, views: Collection[int], *, antialiased: bool = False
+) -> torch.Tensor:
+    """The category (int16 [N]) that each Gaussian paints most of; its old one where no view shows it."""
+    ids, weights = label_weights(gaussians, scene, masks, views, antialiased=antialiased)
+    winners = ids[weights.argmax(1)] if len(ids) else np.full(len(gaussians), UNLABELLED, np.int16)
+    seen = torch.from_numpy(weights.sum(1) > 0)
+    return torch.where(seen, torch.from_numpy(winners), gaussians.label_ids)
