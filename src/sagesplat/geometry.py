@@ -1,7 +1,7 @@
 """Geometry on plain arrays: projection and nearest neighbours."""
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Int64
 from scipy.spatial import KDTree
 
 
@@ -28,3 +28,16 @@ def project(
     with np.errstate(divide="ignore", invalid="ignore"):
         pixels = points[:, :2] / np.where(depths > 0, depths, np.nan)[:, None]
     return pixels * [K[0, 0], K[1, 1]] + [K[0, 2], K[1, 2]], depths
+
+
+def morton_order(points: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
+    """Rows of points along a curve that keeps neighbours together (Morton's, 10 bits an axis)."""
+    if not len(points):
+        return np.zeros(0, np.int64)
+    low, high = np.percentile(points, [1, 99], axis=0)  # floaters would leave a few cells for all others
+    cells = ((points - low) / np.maximum(high - low, 1e-12) * 1024).clip(0, 1023).astype(np.int64)
+    codes = np.zeros(len(points), np.int64)
+    for bit in range(10):
+        for axis in range(3):
+            codes |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return np.argsort(codes, kind="stable")

@@ -33,6 +33,7 @@ LANES = 8  # the kernels need at least so many Gaussians
 _LOG2E = math.log2(math.e)
 _LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
 _CHUNK = 256  # Gaussians that a thread takes at a time
+_REACH = 1.001 * math.sqrt(-2 * math.log(ALPHA_MIN))  # standard deviations that an opacity of 1 reaches
 _HUGE = 3e38  # float32's largest; what is beyond, or NaN, is not finite
 _RECORD = 11
 
@@ -183,29 +184,35 @@ def _forward_eight(
     scratch,
 ):
     mx, my, mz = _three(means, i)
-    w, a, b, c = (
-        _column(quats, i, 4, 0),
-        _column(quats, i, 4, 1),
-        _column(quats, i, 4, 2),
-        _column(quats, i, 4, 3),
-    )
+    w, a, b, c = _four(quats, i)
     ls0, ls1, ls2 = _three(log_scales, i)
     logit = _column(logits, i, 1, 0)
     finite = _finite(mx + my + mz) & _finite(w + a + b + c) & _finite(ls0 + ls1 + ls2 + logit)
     x, y, z = _camera_point(cam, mx, my, mz)
+    px, py = cam[12] * x / z + cam[14], cam[13] * y / z + cam[15]
+    opacity = 1.0 / (1.0 + _exp(-logit))
+    u, v, jacobian = _jacobian(cam, x, y, z)
+    s0, s1, s2 = _exp(ls0), _exp(ls1), _exp(ls2)
+    # no box is larger than that of an opaque ball of the largest scale
+    largest = maximum(maximum(s0, s1), s2) / z
+    wide = _REACH * sqrt((largest * cam[12]) * (largest * cam[12]) * (1.0 + u * u) + BLUR)
+    high = _REACH * sqrt((largest * cam[13]) * (largest * cam[13]) * (1.0 + v * v) + BLUR)
+    near = (z > NEAR) & (opacity > ALPHA_MIN)
+    near = near & (px + wide > 0.0) & (px - wide < cam[16]) & (py + high > 0.0) & (py - high < cam[17])
+    if count(near) == 0:
+        store(radii, i, single(where(finite, where(near, z, 0.0), -1.0)))
+        store(depths, i, single(where(near, z, np.inf)))
+        return
     inverse = 1.0 / sqrt(w * w + a * a + b * b + c * c)
     rotation = _rotation(w * inverse, a * inverse, b * inverse, c * inverse)
-    _, _, jacobian = _jacobian(cam, x, y, z)
-    sxx, sxy, syy = _covariance(_half_covariance(jacobian, rotation, (_exp(ls0), _exp(ls1), _exp(ls2))))
+    sxx, sxy, syy = _covariance(_half_covariance(jacobian, rotation, (s0, s1, s2)))
     cxx, cyy = sxx + BLUR, syy + BLUR
     det = cxx * cyy - sxy * sxy
-    opacity = 1.0 / (1.0 + _exp(-logit))
     if antialiased:
         opacity = opacity * sqrt(maximum((sxx * syy - sxy * sxy) / det, 1e-10))
     level = log2(opacity)
     reach = 2.0 / _LOG2E * (level - _LOG2_ALPHA_MIN)
     hx, hy = sqrt(reach * cxx), sqrt(reach * cyy)
-    px, py = cam[12] * x / z + cam[14], cam[13] * y / z + cam[15]
     drawn = (z > NEAR) & (opacity > ALPHA_MIN) & (det > 0.0) & _finite(det)
     drawn = drawn & (px + hx > 0.0) & (px - hx < cam[16]) & (py + hy > 0.0) & (py - hy < cam[17])
     if count(drawn) > 0:

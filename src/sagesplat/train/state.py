@@ -38,6 +38,15 @@ class TrainState:
             self.second[name] = torch.cat([self.second[name][keep], fresh])
         self.clear_statistics()
 
+    def sort(self) -> None:
+        """Put neighbours in space next to each other: then they are drawn, or not, together."""
+        order = torch.from_numpy(geometry.morton_order(self.gaussians.means.numpy()))
+        self.gaussians = self.gaussians.select(order)
+        for moments in (self.first, self.second):
+            for name in PARAMETERS:
+                moments[name] = moments[name][order]
+        self.grad_sum, self.grad_count = self.grad_sum[order], self.grad_count[order]
+
     def clear_statistics(self) -> None:
         """Start the densification statistics again."""
         self.grad_sum = torch.zeros(len(self.gaussians))

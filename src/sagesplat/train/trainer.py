@@ -79,6 +79,7 @@ def train(
     camera = scene.views[0].camera
     num_pixels = camera.width * camera.height
     state = initial_state(from_points(scene.points, label_ids, config.sh_degree), seed)
+    state.sort()
     checkpoint = folder / "checkpoint.npz" if folder else None
     if checkpoint and checkpoint.exists():
         state = read_checkpoint(checkpoint, settings)
@@ -95,6 +96,7 @@ def train(
             if step % config.refine_every == 0:
                 most = densify.budget(config, plan, step, num_pixels, len(scene.points.xyz))
                 densify.refine(state, config, extent, most - len(state.gaussians), trainable)
+                state.sort()
                 trainable = torch.ones(len(state.gaussians), dtype=torch.bool)
             if step % plan.reset_every == 0:
                 densify.reset_opacities(state, config, trainable)
