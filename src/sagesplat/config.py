@@ -42,6 +42,8 @@ class TrainConfig:
     """3D Gaussian splatting as published. Step numbers are for a 30 000-step run and scale with max_steps."""
 
     max_steps: int = 7000
+    pace: Literal["fast", "published"] = "fast"
+    """fast: larger steps at first, and smaller photos where they tell as much; published: 3DGS's rates."""
     level_every: int = 0
     """Record a level every so many steps (0: a thirtieth of max_steps)."""
     sh_degree: int = 3

@@ -67,15 +67,22 @@ def _observe(grad, radii, trainable, half_width, half_height, grad_sum, grad_cou
             grad_count[i] += np.float32(1)
 
 
-def budget(config: TrainConfig, plan: Schedule, step: int, num_pixels: int, num_points: int) -> int:
+def budget(
+    config: TrainConfig, plan: Schedule, step: int, num_pixels: int, pixels_now: int, num_points: int
+) -> int:
     """How many Gaussians there may be after a step: from the points to the cap in a straight line.
 
-    Room that opens bit by bit goes to where the error is largest at the time, and gives levels of every size.
-    The cap is as set, or what photos of `num_pixels` can tell apart.
+    Room that opens bit by bit goes to where the error is largest at the time, and gives levels of every
+    size. The cap is as set, or what photos of `num_pixels` can tell apart; the photos of the moment, of
+    `pixels_now`, set one too.
     """
-    cap = config.max_gaussians or max(int(1.5 * num_pixels), 2 * num_points)
+
+    def distinct(pixels: int) -> int:
+        return max(int(1.5 * pixels), 2 * num_points)
+
+    cap = config.max_gaussians or distinct(num_pixels)
     share = min(1.0, (step - plan.refine_start) / max(1, plan.refine_stop - plan.refine_start))
-    return num_points + int(share * (cap - num_points))
+    return min(num_points + int(share * (cap - num_points)), distinct(pixels_now))
 
 
 def refine(state: TrainState, config: TrainConfig, extent: float, room: int, trainable: Tensor) -> None:

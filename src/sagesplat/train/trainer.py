@@ -9,7 +9,7 @@ import torch
 
 from sagesplat.config import TrainConfig
 from sagesplat.errors import RunError
-from sagesplat.gaussians import PARAMETERS, Gaussians
+from sagesplat.gaussians import Gaussians
 from sagesplat.metrics import photometric_loss
 from sagesplat.raster import Backend, Workspace, rasterize
 from sagesplat.scene.images import Photos
@@ -19,6 +19,7 @@ from sagesplat.train import densify
 from sagesplat.train.checkpoint import read_checkpoint, write_checkpoint
 from sagesplat.train.levels import write_level
 from sagesplat.train.optim import adam_step
+from sagesplat.train.pace import Pace, pace, smaller
 from sagesplat.train.state import TrainState, from_points, initial_state
 
 
@@ -75,9 +76,10 @@ def train(
     loss stops being finite.
     """
     plan = densify.schedule(config)
-    extent = scene.extent
-    camera = scene.views[0].camera
+    extent, camera = scene.extent, scene.views[0].camera
     num_pixels = camera.width * camera.height
+    some = scene.train_ids[:: max(1, len(scene.train_ids) // 8)]
+    run_pace = pace(config, extent, [photos[i] for i in some] if config.pace == "fast" else [])
     state = initial_state(from_points(scene.points, label_ids, config.sh_degree), seed)
     state.sort()
     checkpoint = folder / "checkpoint.npz" if folder else None
@@ -86,7 +88,7 @@ def train(
         yield Resumed(state.step)
     workspace = Workspace()
     while state.step < config.max_steps:
-        loss = _step(state, scene, photos, config, plan, extent, backend, workspace)
+        loss = _step(state, scene, photos, config, plan, run_pace, backend, workspace)
         yield Step(state.step, loss, len(state.gaussians))
         step, last = state.step, state.step == config.max_steps
         if step % plan.level_every == 0 or last:
@@ -94,7 +96,8 @@ def train(
         if plan.refine_start < step < plan.refine_stop:
             trainable = torch.ones(len(state.gaussians), dtype=torch.bool)
             if step % config.refine_every == 0:
-                most = densify.budget(config, plan, step, num_pixels, len(scene.points.xyz))
+                pixels = num_pixels // run_pace.factor(step) ** 2
+                most = densify.budget(config, plan, step, num_pixels, pixels, len(scene.points.xyz))
                 densify.refine(state, config, extent, most - len(state.gaussians), trainable)
                 state.sort()
                 trainable = torch.ones(len(state.gaussians), dtype=torch.bool)
@@ -136,14 +139,15 @@ def _step(
     photos: Photos,
     config: TrainConfig,
     plan: densify.Schedule,
-    extent: float,
+    run_pace: Pace,
     backend: Backend,
     workspace: Workspace,
 ) -> float:
     """Render one view, compare it with its photo, move the Gaussians."""
     view = _next_view(state, scene)
-    camera = scene.views[view].camera
-    photo = torch.from_numpy(photos[view]).float() / 255
+    factor = run_pace.factor(state.step + 1)
+    pixels, camera = smaller(photos[view], scene.views[view].camera, factor)
+    photo = torch.from_numpy(pixels).float() / 255
     degree = _sh_degree(state, config, plan)
     leaves = {name: p.detach().requires_grad_() for name, p in state.gaussians.parameters().items()}
     render = rasterize(
@@ -165,8 +169,7 @@ def _step(
     trainable = torch.ones(len(state.gaussians), dtype=torch.bool)
     if state.step < plan.refine_stop:
         densify.observe_gradients(state, render, camera.width, camera.height, trainable)
-    rates = {name: getattr(config, f"{name}_lr") for name in PARAMETERS}
-    rates["means"] *= extent * 0.01 ** (state.step / config.max_steps)
+    rates = run_pace.rates(state.step)
     in_use = 3 * (num_bases(degree) - 1)
     for name, leaf in leaves.items():
         assert leaf.grad is not None
