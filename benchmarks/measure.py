@@ -25,13 +25,13 @@ FORWARD_OPERATIONS, BACKWARD_OPERATIONS = 34, 75
 
 
 def milliseconds(call: Callable[[], Any], repeats: int, *, best: bool = False) -> float:
-    """Median (or best) time of a call, after three to warm up."""
-    times = []
-    for _ in range(3 + repeats):
+    """Median (or best) time of a call, after up to three to warm up."""
+    times, warm = [], min(3, repeats)
+    for _ in range(warm + repeats):
         begin = time.perf_counter()
         call()
         times.append(1e3 * (time.perf_counter() - begin))
-    return float(np.min(times[3:]) if best else np.median(times[3:]))
+    return float(np.min(times[warm:]) if best else np.median(times[warm:]))
 
 
 @njit(parallel=True, cache=True)

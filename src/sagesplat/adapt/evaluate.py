@@ -11,7 +11,7 @@ from sagesplat.adapt.columns import from_rows, read_columns, write_columns
 from sagesplat.adapt.ladder import Ladder
 from sagesplat.adapt.observe import as_unit, erode, measure, render_rgb
 from sagesplat.adapt.plan import Models, Plan
-from sagesplat.raster import Backend
+from sagesplat.raster import Backend, Workspace
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.segment.masks import Masks
@@ -70,12 +70,13 @@ def evaluate(
     views = scene.test_ids.tolist()
     inner = {row: erode(masks[scene.views[row]]) for row in views}
     done, total = 0, len(views) * (1 + len(plans))
+    workspace = Workspace()
 
     def measure_all(g):  # type: ignore[no-untyped-def]
         nonlocal done
         for row in views:
             view = scene.views[row]
-            image = render_rgb(g, view.camera, backend=backend, antialiased=antialiased)
+            image = render_rgb(g, view.camera, backend=backend, antialiased=antialiased, workspace=workspace)
             yield row, measure(image, as_unit(photos[row]), masks[view], inner[row])
             done += 1
             if progress:

@@ -14,7 +14,7 @@ from sagesplat.adapt.columns import from_rows, read_columns, write_columns
 from sagesplat.adapt.ladder import Ladder
 from sagesplat.gaussians import Gaussians
 from sagesplat.metrics import means_by_label, psnr, squared_error_map, ssim_map
-from sagesplat.raster import Backend, rasterize
+from sagesplat.raster import Backend, Workspace, rasterize
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene
 from sagesplat.segment.masks import Masks
@@ -79,11 +79,17 @@ def distances_in_views(
 
 
 def render_rgb(
-    g: Gaussians, camera: Camera, *, backend: Backend, antialiased: bool
+    g: Gaussians,
+    camera: Camera,
+    *,
+    backend: Backend,
+    antialiased: bool,
+    workspace: Workspace | None = None,
 ) -> Float32[np.ndarray, "H W 3"]:
-    """An image in [0, 1], as quality is measured on it."""
+    """An image in [0, 1], as quality is measured on it; calls may share a `workspace`, images do not."""
     with torch.no_grad():
-        return rasterize(g, camera, backend=backend, antialiased=antialiased).rgb.clamp(0, 1).float().numpy()
+        render = rasterize(g, camera, backend=backend, antialiased=antialiased, workspace=workspace)
+        return render.rgb.clamp(0, 1).float().numpy()
 
 
 def as_unit(photo: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W 3"]:
@@ -145,10 +151,11 @@ def observe(
     rows: list[dict[str, float]] = []
     inner = [erode(masks[view]) for view in scene.views]
     done, total = 0, len(ladder.files) * len(scene.views)
+    workspace = Workspace()
     for level in ladder.levels:
         g = ladder.load(level)
         for row, view in enumerate(scene.views):
-            image = render_rgb(g, view.camera, backend=backend, antialiased=antialiased)
+            image = render_rgb(g, view.camera, backend=backend, antialiased=antialiased, workspace=workspace)
             for label, values in measure(image, as_unit(photos[row]), masks[view], inner[row]).items():
                 distance = distances[label][row] if label in distances else np.nan
                 rows.append({"label_id": label, "level": level, "view": row, "distance": distance, **values})

@@ -1,0 +1,43 @@
+"""Benchmarks run, and the torch rasteriser that they compare with shows the same image."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import torch
+from conftest import pinhole, random_gaussians
+
+from sagesplat.raster import rasterize
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_the_plain_rasteriser_shows_the_same():
+    sys.path.insert(0, str(ROOT))
+    try:
+        from benchmarks import plain
+    finally:
+        sys.path.remove(str(ROOT))
+    g, camera = random_gaussians(80, seed=2, degree=1), pinhole(70, 50)
+    assert (plain.render(g, camera, degree=1) - rasterize(g, camera, sh_degree=1).rgb).abs().max() < 2e-3
+
+
+def test_blending_ends_with_one_line_of_json():
+    command = [
+        sys.executable,
+        "-m",
+        "benchmarks",
+        "blending",
+        "--count",
+        "200",
+        "--size",
+        "64",
+        "--repeats",
+        "1",
+    ]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    result = json.loads(done.stdout.splitlines()[-1])
+    assert result["threads_1"]["pairs"] > 10_000
+    assert 0 < result["threads_1"]["share_of_peak_forward"] < 1
+    assert torch.isfinite(torch.tensor(result["scaling_forward"]))
