@@ -13,7 +13,7 @@ from sagesplat.job import Job
 from sagesplat.output.ply import write_ply
 
 # the built-in capture, within minutes on two cores
-DEMO = RunConfig(train=TrainConfig(max_steps=2000, level_every=100), plan=PlanConfig(target_ssim=0.7))
+DEMO = RunConfig(train=TrainConfig(max_steps=1200, level_every=60), plan=PlanConfig(target_ssim=0.7))
 
 
 def run_all(job: Job, scene: Path, config: RunConfig) -> None:

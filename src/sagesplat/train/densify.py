@@ -16,6 +16,7 @@ from sagesplat.train.state import TrainState
 
 _SPLIT_SHRINK = 1.6
 _REFERENCE_STEPS = 30_000
+_ENOUGH_REFINEMENTS, _LATEST_STOP = 8, 0.7  # share of the run
 _RESET_FLOOR = 1500  # steps that a model needs between two resets, however short the run
 
 
@@ -39,10 +40,14 @@ def schedule(config: TrainConfig) -> Schedule:
         return max(1, round(step * share))
 
     reset_every = max(scaled(config.reset_every), min(config.reset_every, _RESET_FLOOR))
+    refine_start, refine_stop = min(config.refine_start, config.max_steps // 5), scaled(config.refine_stop)
+    if config.pace == "fast":  # short runs too must have the time to grow
+        enough = refine_start + _ENOUGH_REFINEMENTS * config.refine_every
+        refine_stop = max(refine_stop, min(enough, int(_LATEST_STOP * config.max_steps)))
     return Schedule(
         level_every=config.level_every or math.ceil(config.max_steps / 30),
-        refine_start=min(config.refine_start, config.max_steps // 5),
-        refine_stop=scaled(config.refine_stop),
+        refine_start=refine_start,
+        refine_stop=refine_stop,
         reset_every=reset_every,
         raise_sh_every=scaled(config.raise_sh_every),
         recovery=min(1000, reset_every // 2),
