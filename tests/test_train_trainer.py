@@ -20,7 +20,7 @@ from sagesplat.train.trainer import Event, LevelSaved, Resumed, Step, Trained, t
 
 LABEL_IDS = np.array([-1, 3, 184], np.int16)[np.arange(60) % 3]
 # 8 views, of which 7 train; densification from step 12 to 29, a reset after step 20, levels every 12 steps
-BUSY = TrainConfig(max_steps=60, level_every=12, refine_every=7, reset_every=20)
+BUSY = TrainConfig(max_steps=60, level_every=12, refine_every=7, reset_every=20, pace="published")
 
 
 @pytest.fixture(scope="module")
