@@ -21,7 +21,12 @@ def render(g: Gaussians, camera: Camera, degree: int = 0) -> Tensor:  # [H, W, 3
     x, y, z = points[visible].unbind(-1)
     fx, fy = K[0, 0], K[1, 1]
     zero = torch.zeros_like(z)
-    jacobian = torch.stack([fx / z, zero, -fx * x / z**2, zero, fy / z, -fy * y / z**2], -1).reshape(-1, 2, 3)
+    width, height = 1.3 * camera.width / 2, 1.3 * camera.height / 2  # slopes are kept near the image
+    u = (x / z).clamp(-(K[0, 2] - camera.width / 2 + width) / fx, (camera.width / 2 - K[0, 2] + width) / fx)
+    v = (y / z).clamp(
+        -(K[1, 2] - camera.height / 2 + height) / fy, (camera.height / 2 - K[1, 2] + height) / fy
+    )
+    jacobian = torch.stack([fx / z, zero, -fx * u / z, zero, fy / z, -fy * v / z], -1).reshape(-1, 2, 3)
     axes = rotation_matrices(g.quats[visible]) * g.log_scales[visible].exp()[:, None]
     half = jacobian @ w2c[:3, :3] @ axes
     cov = half @ half.transpose(-1, -2) + BLUR * torch.eye(2)
