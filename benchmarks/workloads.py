@@ -52,7 +52,7 @@ def initial(scene: Scene) -> Gaussians:
 
 
 def trained(scene: Scene, steps: int) -> Gaussians:
-    """The Gaussians after the first steps of a run of 30 000."""
+    """The Gaussians after a short run of the fast pace."""
     config = TrainConfig(max_steps=steps, level_every=steps)
     labels = np.full(len(scene.points.xyz), -1, np.int16)
     for event in train(scene, Photos(scene.views), labels, config):

@@ -25,7 +25,9 @@ infer_global: Any = templates.infer_global
 intrinsic: Any = numba.extending.intrinsic
 
 _INT = ir.IntType(32)
-_FLAGS = ("contract", "nsz", "arcp", "reassoc")  # no assumption that NaN or Inf do not occur
+# No assumption that NaN or Inf do not occur, and no other order of sums: numba optimises a kernel once more
+# when it caches it, and what may be reordered would then have other bits than where it was compiled.
+_FLAGS = ("contract", "nsz", "arcp")
 _ELEMENTS = {types.float32: ir.FloatType(), types.float64: ir.DoubleType()}
 
 
@@ -262,7 +264,7 @@ ceil = _function(lambda builder, kind, a: _call(builder, f"llvm.ceil.{kind.code}
 total = _function(
     lambda builder, kind, a: _call(
         builder, f"llvm.vector.reduce.fadd.{kind.code}", kind.llvm.element,
-        ir.Constant(kind.llvm.element, -0.0), a, fastmath=_FLAGS,
+        ir.Constant(kind.llvm.element, -0.0), a, fastmath=("reassoc",),
     ),
     lambda kind: kind.element,
 )  # fmt: skip

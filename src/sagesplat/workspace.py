@@ -16,11 +16,6 @@ class Workspace:
         self._arrays: dict[str, np.ndarray] = {}
         self.gradients_of = (0, 0)  # rows and bases of the last gradients
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes held."""
-        return sum(a.nbytes for a in self._arrays.values())
-
     def take(self, name: str, *shape: int, dtype: Any = np.float32) -> np.ndarray:
         """An array with whatever was in it last."""
         size = math.prod(shape)

@@ -30,7 +30,6 @@ from sagesplat.simd import (
 
 TILE = 16
 PIXELS = TILE * TILE
-PLANE = PIXELS
 _BATCH = 16  # intersections between two looks whether a tile is opaque
 _CHUNK = 256  # Gaussians that a thread takes at a time
 RECORD = 11
@@ -42,7 +41,7 @@ _ALPHA_MAX = _F(ALPHA_MAX)
 _T_MIN = _F(TRANSMITTANCE_MIN)
 _ONE, _ZERO, _HALF = _F(1), _F(0), _F(0.5)
 _CENTRES = np.arange(TILE, dtype=np.float32) + _HALF
-_SHARED = 6 * PLANE  # where a Gaussian's values that depend on the row alone lie
+_SHARED = 6 * PIXELS  # where a Gaussian's values that depend on the row alone lie
 
 
 @njit(error_model="numpy", forceinline=True, cache=True)
@@ -74,11 +73,11 @@ def _gather(records, ids, first, last, x0, y0, batch, rows):
 
 
 @njit(cache=True)
-def _scratch(planes):
-    """Zeros for a tile's planes, on a boundary of 64 bytes."""
-    memory = np.zeros(planes * PLANE + 16, np.float32)
+def _scratch():
+    """Zeros for a tile's six planes and what its rows share, on a boundary of 64 bytes."""
+    memory = np.zeros(7 * PIXELS + 16, np.float32)
     skip = (-memory.ctypes.data // 4) % 16
-    return memory[skip : skip + planes * PLANE]
+    return memory[skip : skip + 7 * PIXELS]
 
 
 @njit(cache=True)
@@ -108,9 +107,9 @@ def _blend(s, lo, hi, columns, lines, mx, my, a, b, c, log_opacity, red, green, 
         q = dx * (adx + spread16(s, _SHARED + 1 + row)) + spread16(s, _SHARED + TILE + 1 + row)
         raw = exp2(q)
         store(s, p, left - weight)
-        store(s, p + PLANE, load16(s, p + PLANE) + weight * red)
-        store(s, p + 2 * PLANE, load16(s, p + 2 * PLANE) + weight * green)
-        store(s, p + 3 * PLANE, load16(s, p + 3 * PLANE) + weight * blue)
+        store(s, p + PIXELS, load16(s, p + PIXELS) + weight * red)
+        store(s, p + 2 * PIXELS, load16(s, p + 2 * PIXELS) + weight * green)
+        store(s, p + 3 * PIXELS, load16(s, p + 3 * PIXELS) + weight * blue)
 
 
 @njit(parallel=True, cache=True)
@@ -122,14 +121,14 @@ def forward(records, starts, ids, row_order, width, height, background, image, l
     """
     tiles_x = (width + TILE - 1) // TILE
     for r in prange(len(row_order)):
-        state = _scratch(7)
+        state = _scratch()
         batch, rows = np.zeros((_BATCH, RECORD), np.float32), np.empty((2, _BATCH), np.float32)
         for column in range(tiles_x):
             tile, row0, column0 = row_order[r] * tiles_x + column, row_order[r] * TILE, column * TILE
             x0, y0 = _F(column0), _F(row0)
             columns, lines = load16(_CENTRES, 0) + x0, load16(_CENTRES, 0) + y0
             state[:PIXELS] = _ONE
-            state[PIXELS : 4 * PLANE] = _ZERO
+            state[PIXELS : 4 * PIXELS] = _ZERO
             end = starts[tile]
             while end < starts[tile + 1] and _most(state) >= _T_MIN:
                 first, end = end, min(end + _BATCH, starts[tile + 1])
@@ -147,7 +146,7 @@ def forward(records, starts, ids, row_order, width, height, background, image, l
                     p = (y - row0) * TILE + x - column0
                     left[y, x] = state[p]
                     for channel in range(3):
-                        painted = state[PLANE * (1 + channel) + p]
+                        painted = state[PIXELS * (1 + channel) + p]
                         image[y, x, channel] = painted + state[p] * background[channel]
 
 
@@ -172,10 +171,10 @@ def _gradient(s, lo, hi, columns, lines, mx, my, a, b, c, log_opacity, red, gree
         # lanes that are not seen may hold any value, also ones that are slow to compute with
         alpha = where((q >= _LOG2_ALPHA_MIN) & (left >= _T_MIN), minimum(raw, _ALPHA_MAX), _ZERO)
         weight = alpha * left
-        g0, g1, g2 = load16(s, p + 2 * PLANE), load16(s, p + 3 * PLANE), load16(s, p + 4 * PLANE)
-        value = g0 * red + g1 * green + g2 * blue + load16(s, p + 5 * PLANE)
-        rest = load16(s, p + PLANE) - weight * value
-        store(s, p + PLANE, rest)
+        g0, g1, g2 = load16(s, p + 2 * PIXELS), load16(s, p + 3 * PIXELS), load16(s, p + 4 * PIXELS)
+        value = g0 * red + g1 * green + g2 * blue + load16(s, p + 5 * PIXELS)
+        rest = load16(s, p + PIXELS) - weight * value
+        store(s, p + PIXELS, rest)
         store(s, p, left - weight)
         gq = where(raw < _ALPHA_MAX, alpha * (left * value - rest / (_ONE - alpha)), _ZERO)
         q = dx * (adx + spread16(s, _SHARED + 1 + row)) + spread16(s, _SHARED + TILE + 1 + row)
@@ -203,7 +202,7 @@ def backward(
     """
     tiles_x = (width + TILE - 1) // TILE
     for r in prange(len(row_order)):
-        state = _scratch(7)
+        state = _scratch()
         batch, rows = np.zeros((_BATCH, RECORD), np.float32), np.empty((2, _BATCH), np.float32)
         for column in range(tiles_x):
             tile, row0, column0 = row_order[r] * tiles_x + column, row_order[r] * TILE, column * TILE
@@ -213,18 +212,18 @@ def backward(
                 continue
             x0, y0 = _F(column0), _F(row0)
             columns, lines = load16(_CENTRES, 0) + x0, load16(_CENTRES, 0) + y0
-            state[: 6 * PLANE] = _ZERO
+            state[: 6 * PIXELS] = _ZERO
             for y in range(row0, min(row0 + TILE, height)):
                 for x in range(column0, min(column0 + TILE, width)):
                     p = (y - row0) * TILE + x - column0
                     rest = grad_left[y, x] * (left[y, x] - _ONE)
                     for channel in range(3):
-                        state[PLANE * (2 + channel) + p] = grad_image[y, x, channel]
+                        state[PIXELS * (2 + channel) + p] = grad_image[y, x, channel]
                         rest += grad_image[y, x, channel] * image[y, x, channel]
                     state[p] = _ONE
-                    state[PLANE + p] = rest
+                    state[PIXELS + p] = rest
                     # alpha = 1 - left is one more channel in which every Gaussian has the value 1
-                    state[5 * PLANE + p] = -grad_left[y, x]
+                    state[5 * PIXELS + p] = -grad_left[y, x]
             for first in range(starts[tile], ends[tile], _BATCH):
                 last = min(first + _BATCH, ends[tile])
                 _gather(records, ids, first, last, x0, y0, batch, rows)
@@ -248,7 +247,7 @@ def weigh(records, starts, ids, slots, row_order, width, height, columns_of, sum
     """
     tiles_x, num_columns = (width + TILE - 1) // TILE, sums.shape[1]
     for r in prange(len(row_order)):
-        state, masks = _scratch(7), np.zeros(num_columns * PLANE, np.float32)
+        state, masks = _scratch(), np.zeros(num_columns * PIXELS, np.float32)
         batch, rows = np.zeros((_BATCH, RECORD), np.float32), np.empty((2, _BATCH), np.float32)
         present = np.zeros(num_columns, np.bool_)
         for column in range(tiles_x):
@@ -263,7 +262,7 @@ def weigh(records, starts, ids, slots, row_order, width, height, columns_of, sum
                     p, of = (y - row0) * TILE + x - column0, columns_of[y, x]
                     state[p] = _ONE
                     if of >= 0:
-                        masks[of * PLANE + p] = _ONE
+                        masks[of * PIXELS + p] = _ONE
                         present[of] = True
             end = starts[tile]
             while end < starts[tile + 1] and _most(state) >= _T_MIN:
@@ -272,7 +271,7 @@ def weigh(records, starts, ids, slots, row_order, width, height, columns_of, sum
                 for j in range(end - first):
                     lo, hi, slot = int(rows[0, j]), int(rows[1, j]), slots[first + j]
                     # as a colour of 1 over a plane of zeros, each weight is left behind
-                    state[PLANE + lo * TILE : PLANE + max(lo, hi) * TILE] = _ZERO
+                    state[PIXELS + lo * TILE : PIXELS + max(lo, hi) * TILE] = _ZERO
                     if lo < hi:
                         _blend(
                             state, lo, hi, columns, lines, batch[j, 0], batch[j, 1], batch[j, 2],
@@ -282,8 +281,8 @@ def weigh(records, starts, ids, slots, row_order, width, height, columns_of, sum
                         added = splat16(_ZERO)
                         if present[of]:
                             for row in range(lo, hi):
-                                weight = load16(state, PLANE + row * TILE)
-                                added = added + weight * load16(masks, of * PLANE + row * TILE)
+                                weight = load16(state, PIXELS + row * TILE)
+                                added = added + weight * load16(masks, of * PIXELS + row * TILE)
                         sums[slot, of] = total(added)
             for k in range(end, starts[tile + 1]):
                 sums[slots[k]] = _ZERO

@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit, prange
 
 from sagesplat import sh
+from sagesplat.raster.blend import RECORD
 from sagesplat.raster.render import ALPHA_MIN, BLUR, FRUSTUM_MARGIN, NEAR
 from sagesplat.scene.scene import Camera
 from sagesplat.simd import (
@@ -35,7 +36,6 @@ _LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
 _CHUNK = 256  # Gaussians that a thread takes at a time
 _REACH = 1.001 * math.sqrt(-2 * math.log(ALPHA_MIN))  # standard deviations that an opacity of 1 reaches
 _HUGE = 3e38  # float32's largest; what is beyond, or NaN, is not finite
-_RECORD = 11
 
 _bases: Any = njit(sh.bases, forceinline=True, cache=True)
 _direction_gradient: Any = njit(sh.direction_gradient, forceinline=True, cache=True)
@@ -201,7 +201,6 @@ def _forward_eight(
     near = near & (px + wide > 0.0) & (px - wide < cam[16]) & (py + high > 0.0) & (py - high < cam[17])
     if count(near) == 0:
         store(radii, i, single(where(finite, where(near, z, 0.0), -1.0)))
-        store(depths, i, single(where(near, z, np.inf)))
         return
     inverse = 1.0 / sqrt(w * w + a * a + b * b + c * c)
     rotation = _rotation(w * inverse, a * inverse, b * inverse, c * inverse)
@@ -221,17 +220,17 @@ def _forward_eight(
         red, green, blue = _shade(i, sh0, shN, num_bases, scratch)
         shown = double(red + green + blue)
         finite = finite & _finite(where(drawn, shown, 0.0))
-        scatter(records, i * _RECORD, _RECORD, single(px))
-        scatter(records, i * _RECORD + 1, _RECORD, single(py))
-        scatter(records, i * _RECORD + 2, _RECORD, single(-0.5 * _LOG2E * cyy / det))
-        scatter(records, i * _RECORD + 3, _RECORD, single(_LOG2E * sxy / det))
-        scatter(records, i * _RECORD + 4, _RECORD, single(-0.5 * _LOG2E * cxx / det))
-        scatter(records, i * _RECORD + 5, _RECORD, single(level))
-        scatter(records, i * _RECORD + 6, _RECORD, maximum(red, 0.0))
-        scatter(records, i * _RECORD + 7, _RECORD, maximum(green, 0.0))
-        scatter(records, i * _RECORD + 8, _RECORD, maximum(blue, 0.0))
-        scatter(records, i * _RECORD + 9, _RECORD, single(hx))
-        scatter(records, i * _RECORD + 10, _RECORD, single(hy))
+        scatter(records, i * RECORD, RECORD, single(px))
+        scatter(records, i * RECORD + 1, RECORD, single(py))
+        scatter(records, i * RECORD + 2, RECORD, single(-0.5 * _LOG2E * cyy / det))
+        scatter(records, i * RECORD + 3, RECORD, single(_LOG2E * sxy / det))
+        scatter(records, i * RECORD + 4, RECORD, single(-0.5 * _LOG2E * cxx / det))
+        scatter(records, i * RECORD + 5, RECORD, single(level))
+        scatter(records, i * RECORD + 6, RECORD, maximum(red, 0.0))
+        scatter(records, i * RECORD + 7, RECORD, maximum(green, 0.0))
+        scatter(records, i * RECORD + 8, RECORD, maximum(blue, 0.0))
+        scatter(records, i * RECORD + 9, RECORD, single(hx))
+        scatter(records, i * RECORD + 10, RECORD, single(hy))
     radius = where(drawn, maximum(hx, hy), 0.0)
     store(radii, i, single(where(finite, radius, -1.0)))
     store(depths, i, single(where(drawn, z, np.inf)))
@@ -279,11 +278,11 @@ def _load_sixteen(a):
 def _color_gradient(i, drawn, dx, dy, dz, shN, num_bases, records, g_color, d_sh0, d_shN, scratch, weights):
     """Gradients of the coefficients; returns that of the viewing direction."""
     width = 3 * shN.shape[1]
-    shown = gather(records, i * _RECORD + 6, _RECORD) > 0.0  # colours below 0 were cut off
+    shown = gather(records, i * RECORD + 6, RECORD) > 0.0  # colours below 0 were cut off
     red = where(drawn & shown, gather(g_color, 3 * i, 3), 0.0)
-    shown = gather(records, i * _RECORD + 7, _RECORD) > 0.0
+    shown = gather(records, i * RECORD + 7, RECORD) > 0.0
     green = where(drawn & shown, gather(g_color, 3 * i + 1, 3), 0.0)
-    shown = gather(records, i * _RECORD + 8, _RECORD) > 0.0
+    shown = gather(records, i * RECORD + 8, RECORD) > 0.0
     blue = where(drawn & shown, gather(g_color, 3 * i + 2, 3), 0.0)
     scatter(d_sh0, 3 * i, 3, red * sh.C0)
     scatter(d_sh0, 3 * i + 1, 3, green * sh.C0)
@@ -315,12 +314,7 @@ def _backward_eight(
         d_shN[i : i + LANES, : num_bases - 1] = 0.0
         return
     mx, my, mz = _three(means, i)
-    qw, qx, qy, qz = (
-        _column(quats, i, 4, 0),
-        _column(quats, i, 4, 1),
-        _column(quats, i, 4, 2),
-        _column(quats, i, 4, 3),
-    )
+    qw, qx, qy, qz = _four(quats, i)
     inverse = 1.0 / sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
     qw, qx, qy, qz = qw * inverse, qx * inverse, qy * inverse, qz * inverse
     r = _rotation(qw, qx, qy, qz)

@@ -55,9 +55,10 @@ def pace(config: TrainConfig, extent: float, photos: list[UInt8[np.ndarray, "H W
     """
     coarse, last = [], 0
     if config.pace == "fast":
-        for factor in _FACTORS:
+        shortest = min(min(p.shape[:2]) for p in photos)
+        for factor in (f for f in _FACTORS if shortest >= f * _SMALLEST):
             until = round(_LEARNT_BY * config.max_steps * float(np.mean([detail(p, factor) for p in photos])))
-            if min(min(p.shape[:2]) for p in photos) >= factor * _SMALLEST and until > last:
+            if until > last:
                 coarse.append((until, factor))
                 last = until
     return Pace(config, extent, tuple(coarse))
