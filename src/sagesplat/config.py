@@ -74,6 +74,10 @@ class TrainConfig:
     """After the first reset, Gaussians larger than this share of the extent go."""
     max_gaussians: int = 0
     """Cap of densification, reached in a straight line (0: by the size of the photos)."""
+    levels_after_reset: bool = False
+    """Record a level that falls on an opacity reset right after it (as the paper may have), not before."""
+    freeze_at: float | None = None
+    """Stop each category when its mean SSIM on the training views reaches this (Fig. 1 of the paper)."""
 
 
 @dataclass(frozen=True)

@@ -45,6 +45,11 @@ class RunDir:
         return self.path / "checkpoint.npz"
 
     @property
+    def frozen(self) -> Path:
+        """Steps at which categories stopped during training."""
+        return self.path / "frozen.json"
+
+    @property
     def observations(self) -> Path:
         """Quality per category, level and view."""
         return self.path / "observations.csv"

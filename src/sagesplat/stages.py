@@ -34,7 +34,7 @@ from sagesplat.scene import load_scene
 from sagesplat.segment.lift import lift
 from sagesplat.segment.masks import import_masks
 from sagesplat.train.checkpoint import read_checkpoint
-from sagesplat.train.trainer import LevelSaved, Resumed, Step, Trained, train
+from sagesplat.train.trainer import LabelFrozen, LevelSaved, Resumed, Step, Trained, train
 
 
 def open_scene(job: Job, path: Path, config: SceneConfig) -> None:
@@ -149,6 +149,7 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
         counts: dict[str, int] = {}
         events = train(
             job.scene, job.photos, job.point_labels, config,
+            masks=job.masks if config.freeze_at is not None else None,
             seed=seed, backend=job.backend, folder=run.path, settings=belongs,
         )  # fmt: skip
         for event in events:
@@ -159,8 +160,14 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
                     job.emit(Training(step, config.max_steps, loss, counts, num))
                 case LevelSaved():
                     counts = {job.taxonomy.name(i): n for i, n in event.counts.items()}
-                case Trained(gaussians):
-                    return [f"{len(gaussians):,} Gaussians after {config.max_steps} steps"]
+                case LabelFrozen(step, label, ssim, count):
+                    name = job.taxonomy.name(label)
+                    job.emit(
+                        Warned(f"{name} stops at step {step} with SSIM {ssim:.3f} and {count:,} Gaussians")
+                    )
+                case Trained(gaussians, step, frozen):
+                    write_json(run.frozen, {str(label): at for label, at in frozen.items()})
+                    return [f"{len(gaussians):,} Gaussians after {step} steps"]
         return []
 
     run_stage(job, "train", settings, [run.scene, run.labels], [run.levels, run.checkpoint], make)

@@ -26,6 +26,7 @@ def write_checkpoint(path: Path, state: TrainState, settings: str) -> None:
         "settings": settings,
         "step": state.step,
         "last_reset": state.last_reset,
+        "frozen": list(state.frozen.items()),
         "queue": state.queue,
         "rng": state.rng.bit_generator.state,
     }
@@ -71,4 +72,5 @@ def read_checkpoint(path: Path, settings: str) -> TrainState:
         queue=meta["queue"],
         step=meta["step"],
         last_reset=meta["last_reset"],
+        frozen={int(label): int(step) for label, step in meta.get("frozen", ())},
     )

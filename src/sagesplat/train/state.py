@@ -1,6 +1,6 @@
 """Everything that training changes, in one place."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -27,6 +27,7 @@ class TrainState:
     queue: list[int]  # views still to come in this round
     step: int = 0
     last_reset: int = -1  # step of the last opacity reset, -1 = none yet
+    frozen: dict[int, int] = field(default_factory=dict)  # label id -> step from which on it stays as it is
 
     def replace_rows(self, keep: Tensor, new: Gaussians) -> None:
         """Keep some rows (bool [N]) and append new Gaussians with fresh moments and statistics."""
