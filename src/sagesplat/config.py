@@ -86,6 +86,10 @@ class FitConfig:
 
     distance: Literal["percentile", "minimum"] = "percentile"
     """d_min of a category in a view: 5th percentile over its points in sight, or the paper's minimum."""
+    masks: Literal["given", "rendered"] = "given"
+    """Pixels of a category: those of the label image, or those that its Gaussians paint most of."""
+    region: Literal["mask", "eroded"] = "mask"
+    """Where a category is measured: all its pixels, or those at least 5 px from another category."""
     min_share: float = 5e-4
     """A view counts for a category if this share of its pixels, at least, is of the category."""
 
@@ -97,6 +101,8 @@ class PlanConfig:
     target_ssim: float = 0.8
     share: float = 0.95
     """Share of the training views in which a category's level must reach the target."""
+    tune_steps: int = 0
+    """Train a composition as a whole for so many steps, so that its categories fit each other."""
     other_targets: tuple[float, ...] | None = None
     """Targets planned and measured beside the main one (default: 0.1 below and above)."""
 

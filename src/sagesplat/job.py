@@ -16,7 +16,7 @@ from sagesplat.errors import RunError
 from sagesplat.events import Emit, StageDone, StageSkipped, StageStarted
 from sagesplat.files import read_json
 from sagesplat.raster import Backend
-from sagesplat.run_dir import RunDir, is_done, record
+from sagesplat.run_dir import RunDir, is_done, record, settings_of
 from sagesplat.scene import load_scene
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
@@ -73,6 +73,11 @@ class Job:
     def ladder(self) -> Ladder:
         """The levels that training recorded."""
         return read_ladder(self.run.levels)
+
+    @cached_property
+    def antialiased(self) -> bool:
+        """Whether the run's Gaussians are drawn with the antialiasing filter."""
+        return bool(settings_of(self.run, "train")["antialiased"])
 
     def names(self) -> dict[int, str]:
         """Category names by id, the unlabelled one included."""

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sagesplat import stages
+from sagesplat.adapt.plan import check_target
 from sagesplat.config import PlanConfig, RunConfig, TrainConfig
 from sagesplat.demo.capture import cached_capture
 from sagesplat.errors import RunError
@@ -18,6 +19,8 @@ DEMO = RunConfig(train=TrainConfig(max_steps=1200, level_every=60), plan=PlanCon
 
 def run_all(job: Job, scene: Path, config: RunConfig) -> None:
     """Every stage on one capture; those whose result is there already are skipped."""
+    for target in config.plan.targets:  # before hours of training
+        check_target(target)
     stages.open_scene(job, scene, config.scene)
     stages.make_masks(job, config.masks)
     stages.lift_labels(job, config.lift)

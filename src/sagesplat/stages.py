@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from dataclasses import asdict
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,10 @@ from sagesplat.adapt.model import fit_models, read_models, write_models
 from sagesplat.adapt.observe import (
     PERCENTILE,
     TOTAL,
-    Observations,
+    LabelImages,
+    RenderedLabels,
     distances_in_views,
+    large_enough,
     observe,
     read_observations,
 )
@@ -23,6 +25,7 @@ from sagesplat.config import FitConfig, LiftConfig, MasksConfig, PlanConfig, Sce
 from sagesplat.errors import RunError
 from sagesplat.events import Progress, RunDone, TableMade, Training, Warned
 from sagesplat.files import read_json, write_json
+from sagesplat.gaussians import Gaussians
 from sagesplat.job import Job, fingerprint, run_stage
 from sagesplat.output import tables
 from sagesplat.output.ply import write_ply
@@ -34,6 +37,7 @@ from sagesplat.scene import load_scene
 from sagesplat.segment.lift import lift
 from sagesplat.segment.masks import import_masks
 from sagesplat.train.checkpoint import read_checkpoint
+from sagesplat.train.stepper import tune
 from sagesplat.train.trainer import LabelFrozen, LevelSaved, Resumed, Step, Trained, train
 
 
@@ -186,10 +190,9 @@ def observe_levels(job: Job, config: FitConfig) -> None:
     run = job.run
 
     def make() -> list[str]:
-        distances = _distances(job, config.distance)
         table = observe(
-            job.scene, job.photos, job.masks, job.ladder, distances, backend=job.backend,
-            antialiased=settings_of(run, "train")["antialiased"],
+            job.scene, job.photos, label_images(job, config.masks), job.ladder,
+            distances(job, config.distance), backend=job.backend, antialiased=job.antialiased,
             progress=lambda done, total: job.emit(Progress("observe", done, total)),
         )  # fmt: skip
         table.write_csv(run.observations)
@@ -200,10 +203,19 @@ def observe_levels(job: Job, config: FitConfig) -> None:
         ]
 
     inputs = [run.scene, run.labels, run.levels]
-    run_stage(job, "observe", {"distance": config.distance}, inputs, [run.observations], make)
+    settings = {"distance": config.distance, "masks": config.masks}
+    run_stage(job, "observe", settings, inputs, [run.observations], make)
 
 
-def _distances(job: Job, distance: str) -> dict[int, np.ndarray]:
+def label_images(job: Job, source: str) -> LabelImages:
+    """The label images that came with the photos ("given"), or those of the 3D labels ("rendered")."""
+    if source == "given":
+        return job.masks
+    return RenderedLabels(job.ladder.load(job.ladder.levels[-1]), job.backend, job.antialiased)
+
+
+def distances(job: Job, distance: str) -> dict[int, np.ndarray]:
+    """d_min of each category in each view, as `FitConfig.distance` says."""
     percentile = PERCENTILE if distance == "percentile" else 0.0
     return distances_in_views(job.scene, job.point_labels, percentile)
 
@@ -212,24 +224,21 @@ def _show(job: Job, table: Table) -> None:
     job.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
 
 
-def _large_enough(job: Job, min_share: float, table: Observations) -> Observations:
-    """Rows of views that show enough of the category."""
-    pixels = np.array([v.camera.width * v.camera.height for v in job.scene.views])
-    return table.select(table.num_pixels >= min_share * pixels[table.view])
-
-
 def fit_ladder(job: Job, config: FitConfig) -> None:
     """Fit Eq. 3 to the observations of the training views."""
     run = job.run
 
     def make() -> list[str]:
-        table = _large_enough(job, config.min_share, read_observations(run.observations))
+        table = large_enough(read_observations(run.observations), job.scene, config.min_share)
+        if config.region == "eroded":
+            table = replace(table, ssim=table.ssim_eroded)
         models = fit_models(table, job.scene.train_ids)
         write_models(run.models, models)
         statuses = [m.status for m in models.values()]
         return [", ".join(f"{statuses.count(s)} {s}" for s in sorted(set(statuses)))]
 
-    run_stage(job, "fit", {"min_share": config.min_share}, [run.scene, run.observations], [run.models], make)
+    settings = {"min_share": config.min_share, "region": config.region}
+    run_stage(job, "fit", settings, [run.scene, run.observations], [run.models], make)
 
 
 def make_plan(job: Job, config: PlanConfig) -> None:
@@ -239,7 +248,7 @@ def make_plan(job: Job, config: PlanConfig) -> None:
     def make() -> list[str]:
         models, ladder = read_models(run.models), job.ladder
         min_share = settings_of(run, "fit")["min_share"]
-        table = _large_enough(job, min_share, read_observations(run.observations))
+        table = large_enough(read_observations(run.observations), job.scene, min_share)
         table = table.select(table.level == ladder.levels[-1])
         seen = table.select(np.isin(table.view, job.scene.train_ids))
         labels = {label for label, _ in ladder.counts}
@@ -262,7 +271,7 @@ def make_plan(job: Job, config: PlanConfig) -> None:
         return [f"SSIM {p.target:g}: {p.count:,} of {full:,} Gaussians, {p.status}" for p in scene_plans]
 
     inputs = [run.scene, run.models, run.observations, run.levels]
-    settings = {"targets": config.targets, "target_ssim": config.target_ssim, "share": config.share}
+    settings = asdict(config) | {"targets": config.targets}
     run_stage(job, "plan", settings, inputs, [run.plan], make)
 
 
@@ -280,17 +289,27 @@ def scene_plan(run: RunDir, target: float) -> Plan:
     return plans[target]
 
 
+def tune_composition(job: Job, g: Gaussians, steps: int) -> Gaussians:
+    """A composition trained as a whole, with the settings of the run's training; as it is for 0 steps."""
+    if steps <= 0:
+        return g
+    made = settings_of(job.run, "train")
+    config = TrainConfig(**{f.name: made[f.name] for f in fields(TrainConfig) if f.name in made})
+    return tune(g, job.scene, job.photos, config, steps, seed=made["seed"], backend=job.backend)
+
+
 def compose_plan(job: Job) -> None:
     """Write the scene that the plan chose."""
     run = job.run
 
     def make() -> list[str]:
         plan = scene_plan(run, main_target(run))
-        g = job.ladder.compose(plan.levels)
+        g = tune_composition(job, job.ladder.compose(plan.levels), settings["tune_steps"])
         write_ply(run.composed, g, job.names())
         return [f"{len(g):,} Gaussians, {plan.nbytes / 1e6:.1f} MB at 248 bytes each"]
 
-    run_stage(job, "compose", {}, [run.plan, run.levels], [run.composed], make)
+    settings = {"tune_steps": settings_of(run, "plan")["tune_steps"]}
+    run_stage(job, "compose", settings, [run.plan, run.levels], [run.composed], make)
 
 
 def evaluate_plans(job: Job) -> None:
@@ -298,10 +317,13 @@ def evaluate_plans(job: Job) -> None:
     run = job.run
 
     def make() -> list[str]:
+        observed = settings_of(run, "observe")
         table = evaluate(
-            job.scene, job.photos, job.masks, job.ladder, read_models(run.models), read_plans(run.plan)[0],
-            _distances(job, settings_of(run, "observe")["distance"]), backend=job.backend,
-            antialiased=settings_of(run, "train")["antialiased"],
+            job.scene, job.photos, label_images(job, observed["masks"]), job.ladder, read_models(run.models),
+            read_plans(run.plan)[0], distances(job, observed["distance"]),
+            region=settings_of(run, "fit")["region"],
+            tuned=lambda g: tune_composition(job, g, settings["tune_steps"]),
+            backend=job.backend, antialiased=job.antialiased,
             progress=lambda done, total: job.emit(Progress("evaluate", done, total)),
         )  # fmt: skip
         table.write_csv(run.evaluation)
@@ -319,7 +341,8 @@ def evaluate_plans(job: Job) -> None:
         return lines
 
     inputs = [run.scene, run.labels, run.levels, run.models, run.plan]
-    run_stage(job, "evaluate", {}, inputs, [run.evaluation], make)
+    settings = {"tune_steps": settings_of(run, "plan")["tune_steps"]}
+    run_stage(job, "evaluate", settings, inputs, [run.evaluation], make)
 
 
 def make_report(job: Job) -> None:

@@ -3,18 +3,19 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float32, Int32
 
 from sagesplat.adapt.columns import from_rows, read_columns, write_columns
 from sagesplat.adapt.ladder import Ladder
-from sagesplat.adapt.observe import as_unit, erode, measure, render_rgb
+from sagesplat.adapt.observe import LabelImages, as_unit, erode, measure, render_rgb
 from sagesplat.adapt.plan import Models, Plan
+from sagesplat.gaussians import Gaussians
 from sagesplat.raster import Backend, Workspace
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
-from sagesplat.segment.masks import Masks
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,27 +53,31 @@ def read_evaluation(path: Path) -> Evaluation:
 def evaluate(
     scene: Scene,
     photos: Photos,
-    masks: Masks,
+    masks: LabelImages,
     ladder: Ladder,
     models: Models,
     plans: Sequence[Plan],
     distances: Mapping[int, Float32[np.ndarray, " V"]],
     *,
+    region: Literal["mask", "eroded"] = "mask",
+    tuned: Callable[[Gaussians], Gaussians] = lambda g: g,
     backend: Backend = "auto",
     antialiased: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Evaluation:
     """Measure each plan's composition and full 3DGS on the test views, beside what the models promise there.
 
-    `progress` hears (images measured, images in all).
+    `region`: where a category's SSIM is measured. `tuned`: what becomes of a composition before it is
+    measured. `progress` hears (images measured, images in all).
     """
+    ssim = "ssim_eroded" if region == "eroded" else "ssim"
     rows: list[dict[str, float]] = []
     views = scene.test_ids.tolist()
     inner = {row: erode(masks[scene.views[row]]) for row in views}
     done, total = 0, len(views) * (1 + len(plans))
     workspace = Workspace()
 
-    def measure_all(g):  # type: ignore[no-untyped-def]
+    def measure_all(g: Gaussians):
         nonlocal done
         for row in views:
             view = scene.views[row]
@@ -84,7 +89,7 @@ def evaluate(
 
     full = dict(measure_all(ladder.load(ladder.levels[-1])))
     for plan in plans:
-        for row, measured in measure_all(ladder.compose(plan.levels)):
+        for row, measured in measure_all(tuned(ladder.compose(plan.levels))):
             for label, values in measured.items():
                 level = plan.levels.get(label, -1)
                 predicted = np.nan
@@ -93,7 +98,7 @@ def evaluate(
                 rows.append({
                     "target": plan.target, "view": row, "label_id": label, "level": level,
                     "predicted": predicted,
-                    "ssim": values["ssim"], "psnr": values["psnr"], "num_pixels": values["num_pixels"],
-                    "full_ssim": full[row][label]["ssim"], "full_psnr": full[row][label]["psnr"],
+                    "ssim": values[ssim], "psnr": values["psnr"], "num_pixels": values["num_pixels"],
+                    "full_ssim": full[row][label][ssim], "full_psnr": full[row][label]["psnr"],
                 })  # fmt: skip
     return from_rows(Evaluation, rows)

@@ -1,8 +1,9 @@
 """Observations: the quality of each category at each level, view by view."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -16,8 +17,8 @@ from sagesplat.gaussians import Gaussians
 from sagesplat.metrics import means_by_label, psnr, squared_error_map, ssim_map
 from sagesplat.raster import Backend, Workspace, rasterize
 from sagesplat.scene.images import Photos
-from sagesplat.scene.scene import Camera, Scene
-from sagesplat.segment.masks import Masks
+from sagesplat.scene.scene import Camera, Scene, View
+from sagesplat.segment.masks import UNLABELLED
 
 TOTAL = -2  # label id of the rows that average over all pixels of the image
 
@@ -50,6 +51,12 @@ class Observations:
 def read_observations(path: Path) -> Observations:
     """The table that `write_csv` wrote. DataError where it is not one."""
     return read_columns(path, Observations, "run `sagesplat observe` again")
+
+
+def large_enough(observations: Observations, scene: Scene, min_share: float) -> Observations:
+    """The rows whose category has at least this share of the pixels of its view."""
+    pixels = np.array([view.camera.width * view.camera.height for view in scene.views])
+    return observations.select(observations.num_pixels >= min_share * pixels[observations.view])
 
 
 ERODE = 5  # px that the inner mask keeps away from the category's border
@@ -90,6 +97,42 @@ def render_rgb(
     with torch.no_grad():
         render = rasterize(g, camera, backend=backend, antialiased=antialiased, workspace=workspace)
         return render.rgb.clamp(0, 1).float().numpy()
+
+
+class LabelImages(Protocol):
+    """Where the pixels of each category are: `segment.masks.Masks`, or `RenderedLabels`."""
+
+    def __getitem__(self, view: View) -> Int16[np.ndarray, "H W"]:
+        """A view's category ids, -1 = unlabelled."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class RenderedLabels:
+    """Label images of any view from the labels of Gaussians (the paper's cross-view masks)."""
+
+    gaussians: Gaussians
+    backend: Backend = "auto"
+    antialiased: bool = False
+    _kept: dict[str, Int16[np.ndarray, "H W"]] = field(default_factory=dict)
+
+    def __getitem__(self, view: View) -> Int16[np.ndarray, "H W"]:
+        """Per pixel the category that paints most of it; -1 where more shines through than that."""
+        if view.name not in self._kept:
+            self._kept[view.name] = self._render(view.camera)
+        return self._kept[view.name]
+
+    def _render(self, camera: Camera) -> Int16[np.ndarray, "H W"]:
+        ids = sorted({UNLABELLED, *self.gaussians.counts()})
+        one_hot = (self.gaussians.label_ids[:, None] == torch.tensor(ids)).float()
+        with torch.no_grad():
+            render = rasterize(
+                self.gaussians, camera, features=one_hot, backend=self.backend, antialiased=self.antialiased
+            )
+        assert render.features is not None
+        painted = render.features.float().numpy().copy()
+        painted[..., 0] += 1 - render.alpha.float().numpy()
+        return np.array(ids, np.int16)[painted.argmax(-1)]
 
 
 def as_unit(photo: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W 3"]:
@@ -136,7 +179,7 @@ def measure(
 def observe(
     scene: Scene,
     photos: Photos,
-    masks: Masks,
+    masks: LabelImages,
     ladder: Ladder,
     distances: Mapping[int, Float32[np.ndarray, " V"]],
     *,

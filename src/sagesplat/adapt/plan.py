@@ -87,7 +87,7 @@ def plan_view(
     units; a category that is missing there, or NaN, is predicted by its median. Levels in `recovering` (just
     after an opacity reset) are taken only where a category has no other. RunError for an impossible target.
     """
-    _check("target SSIM", target)
+    check_target(target)
     choices = []
     for label_id, levels in _eligible(models, counts, recovering).items():
         distance = float(distances.get(label_id, math.nan))
@@ -109,7 +109,7 @@ def plan_scene(
     Where no level does, the one that reaches it in most views, then the best on average, "infeasible".
     `distances` maps label ids to one distance per view, world units; see `plan_view` for the rest.
     """
-    _check("target SSIM", target)
+    check_target(target)
     _check("share of views", share)
     choices = []
     for label_id, levels in _eligible(models, counts, recovering).items():
@@ -156,6 +156,11 @@ def _choose(
         if reached >= needed:
             feasible.append(((count, -promised, -level), choice))
     return min(feasible or all_levels)[1]
+
+
+def check_target(target: float) -> None:
+    """RunError for an SSIM that cannot be asked for."""
+    _check("target SSIM", target)
 
 
 def _check(name: str, value: float) -> None:

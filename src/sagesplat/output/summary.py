@@ -10,9 +10,11 @@ from sagesplat.adapt.evaluate import read_evaluation
 from sagesplat.adapt.ladder import Ladder
 from sagesplat.adapt.model import read_models
 from sagesplat.adapt.observe import TOTAL, as_unit, measure, read_observations, render_rgb
-from sagesplat.adapt.plan import Plan, read_plans
+from sagesplat.adapt.plan import read_plans
 from sagesplat.files import read_json
+from sagesplat.gaussians import Gaussians
 from sagesplat.output.figures import Panel
+from sagesplat.output.ply import read_ply
 from sagesplat.output.report import ReportData
 from sagesplat.raster import Backend
 from sagesplat.run_dir import RunDir
@@ -33,7 +35,6 @@ def report_data(
     plans = read_plans(run.plan)[0]
     records = {stage: read_json(run.provenance(stage)) for stage in STAGES if run.provenance(stage).exists()}
     antialiased = bool(records["train"]["settings"]["antialiased"])
-    plan = next(p for p in plans if p.target == target)
     return ReportData(
         title=scene.name,
         target=target,
@@ -48,7 +49,7 @@ def report_data(
         models=read_models(run.models),
         plans=plans,
         evaluation=read_evaluation(run.evaluation),
-        panels=_panels(scene, photos, masks, ladder, plan, backend, antialiased),
+        panels=_panels(scene, photos, masks, ladder, read_ply(run.composed), backend, antialiased),
         scene_facts=describe(scene),
         settings=_settings(records),
         timings=[(stage, float(made["seconds"])) for stage, made in records.items()],
@@ -61,7 +62,7 @@ def _panels(
     photos: Photos,
     masks: Masks,
     ladder: Ladder,
-    plan: Plan,
+    composed: Gaussians,
     backend: Backend,
     antialiased: bool,
 ) -> list[Panel]:
@@ -73,7 +74,7 @@ def _panels(
     ]
     if not len(rows):
         rows = scene.test_ids[:1]
-    full, composed = ladder.load(ladder.levels[-1]), ladder.compose(plan.levels)
+    full = ladder.load(ladder.levels[-1])
     panels = []
     for row in rows.tolist():
         view = scene.views[row]

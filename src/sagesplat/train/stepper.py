@@ -33,7 +33,7 @@ class Stepper:
     def __call__(
         self, state: TrainState, degree: int, rates: dict[str, float], trainable: Tensor, factor: int = 1
     ) -> tuple[float, Render]:
-        """One step on a photo `factor` times smaller: the loss, and the render (its 2D means have gradients)."""
+        """One step on a photo `factor` times smaller; the loss, and the render with its gradients."""
         view = self._next_view(state)
         pixels, camera = smaller(self.photos[view], self.scene.views[view].camera, factor)
         photo = torch.from_numpy(pixels).float() / 255
