@@ -1,4 +1,4 @@
-"""Files written whole or not at all."""
+"""Files written whole or not at all, and the cache's folder."""
 
 import errno
 import json
@@ -10,6 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from sagesplat.errors import RunError
+
+
+def cache_folder() -> Path:
+    """$SAGESPLAT_CACHE, or $XDG_CACHE_HOME/sagesplat, or ~/.cache/sagesplat: what every run may share."""
+    default = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sagesplat"
+    return Path(os.environ.get("SAGESPLAT_CACHE") or default)
 
 
 @contextmanager

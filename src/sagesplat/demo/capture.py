@@ -1,7 +1,6 @@
 """Writes the garden as a capture: a COLMAP workspace with photos, poses, points and label images."""
 
 import hashlib
-import os
 import shutil
 import tempfile
 from collections.abc import Callable
@@ -15,7 +14,7 @@ from sagesplat.demo.points import write_points
 from sagesplat.demo.render import lit_world, render_view, threads_map
 from sagesplat.demo.world import LABELS
 from sagesplat.errors import SceneError
-from sagesplat.files import write_json
+from sagesplat.files import cache_folder, write_json
 from sagesplat.scene.scene import Camera
 
 
@@ -55,13 +54,13 @@ def make_capture(
 def cached_capture(on_view: Callable[[int, int], None] | None = None) -> Path:
     """The demo capture's folder, made on the first call.
 
-    It lies in $SAGESPLAT_CACHE, or $XDG_CACHE_HOME/sagesplat, or ~/.cache/sagesplat, under a name that
-    changes with the version and with the code that draws it.
+    It lies in the cache (`files.cache_folder`), under a name that changes with the version and with the code
+    that draws it.
     """
-    default = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sagesplat"
-    cache = Path(os.environ.get("SAGESPLAT_CACHE") or default)
     code = b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
-    folder = cache / f"demo-{hashlib.sha256(__version__.encode() + code).hexdigest()[:12]}" / "courtyard"
+    folder = (
+        cache_folder() / f"demo-{hashlib.sha256(__version__.encode() + code).hexdigest()[:12]}" / "courtyard"
+    )
     if not folder.exists():
         try:
             make_capture(folder, on_view=on_view)

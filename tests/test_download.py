@@ -1,0 +1,183 @@
+"""Downloads, from a server on this machine, of files that look like the published ones."""
+
+import errno
+import hashlib
+import socket
+import threading
+from dataclasses import replace
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+
+import pytest
+import torch
+
+from sagesplat import download
+from sagesplat.download import SOURCES, Source, download_lpips
+from sagesplat.errors import DataError, RunError
+from sagesplat.lpips import Net, load_lpips, shapes
+
+
+class Handler(SimpleHTTPRequestHandler):
+    """Serves a folder; of files named cut..., half of what it announces."""
+
+    def log_message(self, format, *args):
+        pass
+
+    def copyfile(self, source, outputfile):
+        content = source.read()
+        outputfile.write(content[: len(content) // 2] if self.path.startswith("/cut") else content)
+
+
+def state_dicts(net, source):
+    """What torchvision and the authors publish: convolution k is full of k, and so is head k."""
+    backbone, heads = {"classifier.1.weight": torch.zeros(2, 2)}, {}
+    for name, shape in shapes(net).items():
+        k, _, part = name.removeprefix("conv").removeprefix("lin").partition(".")
+        value = torch.tensor(float(k))
+        if part:
+            backbone[f"features.{source.convolutions[int(k)]}.{part}"] = value.expand(shape)
+        else:
+            heads[f"lin{k}.model.1.weight"] = value.expand(1, *shape, 1, 1)
+    return backbone, heads
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory):
+    """A folder of small files and the address at which it is served."""
+    folder = tmp_path_factory.mktemp("served")
+    for net, source in SOURCES.items():
+        backbone, heads = state_dicts(net, source)
+        torch.save(backbone, folder / f"{net}_backbone.pth")
+        torch.save(heads, folder / f"{net}.pth", _use_new_zipfile_serialization=False)  # as in 2018
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, directory=str(folder)))
+    thread = threading.Thread(target=server.serve_forever, args=(0.01,))
+    thread.start()
+    yield folder, f"http://127.0.0.1:{server.server_port}"
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+@pytest.fixture
+def sources(served, monkeypatch) -> dict[Net, Source]:
+    monkeypatch.setenv("no_proxy", "*")
+    folder, base = served
+    return {
+        net: Source(
+            f"{base}/{net}_backbone.pth",
+            hashlib.sha256((folder / f"{net}_backbone.pth").read_bytes()).hexdigest()[:8],
+            source.convolutions,
+            f"{base}/{net}.pth",
+        )
+        for net, source in SOURCES.items()
+    }
+
+
+def changed(sources, **fields) -> dict[Net, Source]:
+    return {"alex": replace(sources["alex"], **fields)}
+
+
+def test_what_is_published_becomes_what_is_loaded(sources, served, tmp_path, monkeypatch):
+    monkeypatch.setenv("SAGESPLAT_CACHE", str(tmp_path))
+    calls = []
+    paths = download_lpips(on_progress=lambda *call: calls.append(call), sources=sources)
+    assert paths == [tmp_path / "lpips" / "lpips_alex.npz", tmp_path / "lpips" / "lpips_vgg.npz"]
+    assert sorted((tmp_path / "lpips").iterdir()) == paths
+    for net in SOURCES:
+        for name, values in load_lpips(net).weights.items():
+            k = int("".join(filter(str.isdigit, name)))
+            assert (values == k).all(), name
+    sizes = {name: (served[0] / name).stat().st_size for name, _, _ in calls}
+    assert list(sizes) == ["alex.pth", "alex_backbone.pth", "vgg.pth", "vgg_backbone.pth"]
+    assert [call for call in calls if call[1] == call[2]] == [
+        (name, size, size) for name, size in sizes.items()
+    ]
+
+
+def test_files_that_are_there_stay(sources, tmp_path):
+    (path,) = download_lpips(tmp_path, ["alex"], sources=sources)
+    before = path.stat()
+    gone = changed(sources, heads="file:///nowhere", backbone="file:///nowhere")
+    assert download_lpips(tmp_path, ["alex"], sources=gone) == [path]
+    assert path.stat() == before
+    path.write_bytes(path.read_bytes()[:1000])  # damaged: made again
+    download_lpips(tmp_path, ["alex"], sources=sources)
+    assert path.stat().st_size == before.st_size
+
+
+def test_the_published_layers_are_convolutions():
+    """torchvision numbers convolutions, activations and poolings in one row."""
+    rows = {"alex": "cr p cr p cr cr cr p", "vgg": "cr cr p cr cr p cr cr cr p cr cr cr p cr cr cr p"}
+    for net, source in SOURCES.items():
+        layers = enumerate(rows[net].replace(" ", ""))
+        assert source.convolutions == tuple(i for i, layer in layers if layer == "c")
+        assert source.backbone.endswith(f"-{source.sha256}.pth")
+
+
+def test_failures_are_one_line_and_leave_nothing(sources, served, tmp_path):
+    folder, base = served
+    heads = state_dicts("alex", sources["alex"])[1]
+    bad_files = {
+        "key": {k: v for k, v in heads.items() if k != "lin3.model.1.weight"},
+        "shape": heads | {"lin3.model.1.weight": torch.zeros(1, 2, 1, 1)},
+        "nan": heads | {"lin3.model.1.weight": torch.full((1, 384, 1, 1), torch.nan)},
+        "list": [1, 2],
+        "code": heads | {"lin3.model.1.weight": print},  # weights_only refuses it
+        "deep": heads | {"lin3.model.1.weight": "text"},
+    }
+    for name, content in bad_files.items():
+        torch.save(content, folder / f"bad_{name}.pth")
+    (folder / "bad_text.pth").write_text("<html>Please log in</html>")
+    (folder / "bad_empty.pth").write_bytes(b"")
+    (folder / "cut.pth").write_bytes((folder / "alex.pth").read_bytes())
+    cases = {
+        f"{base}/absent.pth": "HTTP Error 404",
+        f"{base}/cut.pth": "ends after",
+        "http://127.0.0.1:1/alex.pth": "refused",
+        (folder / "absent.pth").as_uri(): "No such file",
+        **{f"{base}/bad_{name}.pth": "not the weights" for name in (*bad_files, "text", "empty")},
+    }
+    for url, reason in cases.items():
+        with pytest.raises(DataError) as caught:
+            download_lpips(tmp_path / "cache", ["alex"], sources=changed(sources, heads=url))
+        assert_one_line(caught.value, url, reason)
+        assert list((tmp_path / "cache").iterdir()) == []
+    with pytest.raises(DataError) as caught:
+        download_lpips(tmp_path / "cache", ["alex"], sources=changed(sources, sha256="7be5be79"))
+    assert_one_line(caught.value, sources["alex"].backbone, "not 7be5be79")
+    assert list((tmp_path / "cache").iterdir()) == []
+
+
+def assert_one_line(error, url, reason):
+    line = str(error)
+    assert line.startswith(f"{url}: ")
+    assert reason in line
+    assert "lpips_alex.npz" in line
+    assert "--lpips FOLDER" in line
+    assert "\n" not in line
+    assert len(line) < 500
+
+
+def test_a_full_disk_or_a_closed_folder(sources, tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RunError, match="cannot be written"):
+        download_lpips(tmp_path / "file" / "below", ["alex"], sources=sources)
+
+    def full(*args, **kwargs):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    for where in ("_fetch", "np.savez"):
+        with monkeypatch.context() as patch:
+            patch.setattr(f"sagesplat.download.{where}", full)
+            with pytest.raises(RunError, match="disk is full"):
+                download_lpips(tmp_path / "cache", ["alex"], sources=sources)
+        assert list((tmp_path / "cache").iterdir()) == []
+
+
+def test_a_server_that_falls_silent(sources, served, tmp_path, monkeypatch):
+    monkeypatch.setattr(download, "TIMEOUT", 0.1)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        quiet = changed(sources, heads=f"http://127.0.0.1:{silent.getsockname()[1]}/alex.pth")
+        with pytest.raises(DataError, match="timed out"):
+            download_lpips(tmp_path, ["alex"], sources=quiet)
+    assert list(tmp_path.iterdir()) == []
