@@ -63,6 +63,8 @@ class Console:
         """Show one event."""
         match event:
             case StageStarted(name):
+                if self._task is not None:  # of a stage that failed
+                    self._bar.remove_task(self._task)
                 self._task = self._bar.add_task(name, total=None, text="")
                 self._began, self._shown, self._tenth = time.monotonic(), 0.0, 0
             case StageSkipped(name):

@@ -9,7 +9,7 @@ from sagesplat.adapt.plan import check_target
 from sagesplat.config import PlanConfig, RunConfig, TrainConfig
 from sagesplat.demo.capture import cached_capture
 from sagesplat.errors import RunError
-from sagesplat.events import Progress, StageDone, StageStarted
+from sagesplat.events import Emit, Progress, StageDone, StageStarted
 from sagesplat.job import Job
 from sagesplat.output.ply import write_ply
 
@@ -33,13 +33,18 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
     stages.make_report(job)
 
 
+def demo_capture(emit: Emit) -> Path:
+    """The built-in capture's folder, made on the first call."""
+    emit(StageStarted("capture"))
+    begin = time.perf_counter()
+    capture = cached_capture(lambda done, total: emit(Progress("capture", done, total)))
+    emit(StageDone("capture", time.perf_counter() - begin, (f"the built-in scene, in {capture}",)))
+    return capture
+
+
 def run_demo(job: Job) -> None:
     """Make the built-in capture (once) and run everything on it."""
-    job.emit(StageStarted("capture"))
-    begin = time.perf_counter()
-    capture = cached_capture(lambda done, total: job.emit(Progress("capture", done, total)))
-    job.emit(StageDone("capture", time.perf_counter() - begin, (f"the built-in scene, in {capture}",)))
-    run_all(job, capture, DEMO)
+    run_all(job, demo_capture(job.emit), DEMO)
 
 
 def export_ply(

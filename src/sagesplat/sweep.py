@@ -1,0 +1,261 @@
+"""A sweep: every scene, variant of the settings and seed of one small file, summed up as mean and spread."""
+
+import math
+import re
+import statistics
+import time
+import tomllib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, is_dataclass, replace
+from pathlib import Path
+from types import UnionType
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from sagesplat import pipeline
+from sagesplat.adapt.evaluate import read_evaluation
+from sagesplat.adapt.observe import TOTAL
+from sagesplat.adapt.plan import read_plans
+from sagesplat.config import RunConfig
+from sagesplat.errors import DataError, RunError, SageError
+from sagesplat.events import Emit, Event, Progress, StageDone, StageStarted, TableMade, Training, Warned
+from sagesplat.files import read_json, write_text
+from sagesplat.job import Job
+from sagesplat.output.tables import MB, Table, mean, promise_kept
+from sagesplat.raster import Backend
+from sagesplat.run_dir import RunDir
+
+BUILT_IN = "demo"  # as a scene's path: the built-in capture
+# columns of numbers, with their formats: SSIM and PSNR (dB) are of whole test views; a training that went on
+# after a kill tells the seconds since then
+MEASURES = {
+    "Gaussians": ",.0f", "of 3DGS": ".1%", "MB": ".2f", "SSIM": ".3f", "3DGS SSIM": ".3f",
+    "PSNR": ".2f", "3DGS PSNR": ".2f", "promised": ".1f", "kept": ".1f", "share kept": ".1%",
+    "training s": ".1f",
+}  # fmt: skip
+SHOWN = ("of 3DGS", "SSIM", "share kept")  # what 80 characters have room for
+_SET_BY = {"seed": "seeds", "target_ssim": "targets", "other_targets": "targets"}
+_NEEDED = {
+    bool: "true or false", int: "a whole number", float: "a finite number", str: "text in quotes",
+    Path: "a path in quotes", tuple: "a list", dict: "a table",
+}  # fmt: skip
+Config = TypeVar("Config")  # a frozen dataclass of settings
+Row = tuple[str | int | float, ...]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One training of a sweep, with all targets planned on it."""
+
+    scene: str
+    variant: str  # empty where the file names none
+    capture: Path | None  # None: the built-in one
+    config: RunConfig  # with seed and targets
+
+    @property
+    def name(self) -> str:
+        """Name of its run folder."""
+        return "-".join(part for part in (self.scene, self.variant, f"seed{self.config.seed}") if part)
+
+
+Sweep = tuple[Cell, ...]
+
+
+@dataclass(frozen=True)
+class _File:
+    """What a sweep file may hold."""
+
+    targets: tuple[float, ...] = ()
+    seeds: tuple[int, ...] = ()
+    settings: RunConfig = field(default_factory=RunConfig)
+    scenes: dict[str, str] = field(default_factory=dict)
+    variants: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+
+def read_sweep(path: Path) -> Sweep:
+    """The cells that a sweep file asks for, by scene, variant and seed. DataError where it is not one."""
+    try:
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path}: not readable as TOML ({error}); examples/sweep.toml shows one") from None
+    folder = path.parent
+    file = _set(_File(), document, f"{path}: ", folder)
+    targets = sorted(round(target, 6) for target in file.targets)
+    for key, values in (("scenes", list(file.scenes)), ("targets", targets), ("seeds", file.seeds)):
+        _need(values, f"{path}: {key}: missing or empty; give at least one")
+        _need(len(set(values)) == len(values), f"{path}: {key}: two are equal; leave one out")
+    _need(targets[0] > 0 and targets[-1] <= 1, f"{path}: targets: an SSIM is above 0 and at most 1")
+    _need(min(file.seeds) >= 0, f"{path}: seeds: {min(file.seeds)} is negative; take 0 or more")
+    for name in (*file.scenes, *file.variants):
+        fine = re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.+-]*", name)
+        _need(fine, f"{path}: the name {name!r} makes no folder; use letters, digits, _ . + and -")
+    main = targets.pop(len(targets) // 2)
+    cells = []
+    for scene, to in file.scenes.items():
+        capture = None if to == BUILT_IN else folder / to
+        _need(not capture or capture.is_dir(), f"{path}: scenes.{scene}: no folder {capture}; mend the path")
+        for variant, changes in (file.variants or {"": {}}).items():
+            config = _set(file.settings, changes, f"{path}: variants.{variant}.", folder)
+            plan = replace(config.plan, target_ssim=main, other_targets=tuple(targets))
+            cells += [Cell(scene, variant, capture, replace(config, plan=plan, seed=s)) for s in file.seeds]
+    names = [cell.name.lower() for cell in cells]  # some disks know no capitals
+    for name in names:
+        _need(names.count(name) == 1, f"{path}: two runs would be called {name}; rename a scene or a variant")
+    return tuple(cells)
+
+
+def _need(fine: object, message: str) -> None:
+    if not fine:
+        raise DataError(message)
+
+
+def _set(config: Config, table: Any, where: str, folder: Path) -> Config:
+    """Settings with those of a TOML table in place; `where` is the path and key for errors."""
+    _need(isinstance(table, dict), f"{where.rstrip('.')}: {table!r} given, a table is needed")
+    hints = get_type_hints(type(config))
+    values = {}
+    for name, value in table.items():
+        key = f"{where}{name}"
+        _need(name not in _SET_BY, f"{key}: set by the list `{_SET_BY.get(name)}`; leave it out here")
+        _need(name in hints, f"{where}{name!r}: no such key; there are {', '.join(hints)}")
+        inner = getattr(config, name)
+        if is_dataclass(inner):
+            values[name] = _set(inner, value, f"{key}.", folder)
+        else:
+            values[name] = _value(hints[name], value, key, folder)
+    return replace(config, **values)  # pyright: ignore[reportArgumentType]
+
+
+def _value(hint: Any, value: Any, key: str, folder: Path) -> Any:
+    """A value of a TOML file as the type that a setting has; paths are relative to `folder`."""
+    kind, of = get_origin(hint) or hint, get_args(hint)
+    if kind is UnionType:  # X | None, and TOML has no null
+        return _value(of[0], value, key, folder)
+    if kind is Any or (kind is Literal and value in of):
+        return value
+    if kind is tuple and isinstance(value, list):
+        return tuple(_value(of[0], v, f"{key}[{i}]", folder) for i, v in enumerate(value))
+    if kind is dict and isinstance(value, dict):
+        return {name: _value(of[1], v, f"{key}.{name}", folder) for name, v in value.items()}
+    if kind is Path and isinstance(value, str):
+        return folder / value
+    if kind is float and type(value) in (int, float) and abs(value) < 1e300:  # neither NaN nor infinite
+        return float(value)
+    if kind in (bool, int, str) and type(value) is kind:
+        return value
+    needed = " or ".join(map(repr, of)) if kind is Literal else _NEEDED[kind]
+    raise DataError(f"{key}: {value!r} given, {needed} is needed")
+
+
+def run_sweep(
+    sweep: Sweep, out: Path, emit: Emit, backend: Backend = "auto", threads: int = 1, force: bool = False
+) -> Table:
+    """Run the cells in `out`/runs, skip what is done, and return means and spreads for a terminal.
+
+    cells.csv, summary.csv and summary.md in `out` are written after each cell. A cell that fails is recorded
+    there and the next one begins; RunError at the end says which did.
+    """
+    runs = out / "runs"
+    if out.exists() and not runs.exists() and any(out.iterdir()):
+        raise RunError(f"{out}: not empty and not the folder of a sweep; choose a new folder")
+    rows: list[Row] = []
+    failed: list[str] = []
+    for number, cell in enumerate(sweep, 1):
+        begin = time.perf_counter()
+        job = Job(RunDir(runs / cell.name), _named(emit, cell.name), backend, threads, force)
+        try:
+            pipeline.run_all(job, cell.capture or pipeline.demo_capture(job.emit), cell.config)
+            rows += _measure(cell, job)
+        except SageError as error:
+            failed.append(cell.name)
+            job.emit(Warned(str(error)))
+            nothing = [math.nan] * len(MEASURES)
+            for target in cell.config.plan.targets:
+                key = (cell.scene, cell.variant, cell.config.seed, target)
+                rows.append((*key, *nothing, f"failed: {error}"))
+        else:
+            seconds = time.perf_counter() - begin
+            emit(StageDone(cell.name, seconds, (f"run {number} of {len(sweep)}",)))
+        _write(out, rows)
+    shown = readable(summarise(rows), SHOWN)
+    emit(TableMade(shown.title, shown.header, tuple(map(tuple, shown.cells()))))
+    if failed:
+        raise RunError(
+            f"{out}: {len(failed)} of {len(sweep)} runs failed ({', '.join(failed)}); mend what `status` in "
+            f"{out / 'cells.csv'} says and sweep again"
+        )
+    return shown
+
+
+def _named(emit: Emit, cell: str) -> Emit:
+    """Passes on what a cell does, under its name; not its tables, nor what is up to date."""
+
+    def tell(event: Event) -> None:
+        match event:
+            case StageStarted() | StageDone() | Progress():
+                emit(replace(event, name=f"{cell}/{event.name}"))
+            case Warned(text):
+                emit(Warned(f"{cell}: {text}"))
+            case Training():
+                emit(event)
+
+    return tell
+
+
+def _measure(cell: Cell, job: Job) -> Iterator[Row]:
+    """What a finished run says of each target, as a row of cells.csv."""
+    full = sum(job.ladder.files[-1].counts.values())
+    evaluation = read_evaluation(job.run.evaluation)
+    seconds = float(read_json(job.run.provenance("train"))["seconds"])
+    for plan in read_plans(job.run.plan)[0]:
+        here = evaluation.select(evaluation.target == np.float32(plan.target))
+        whole = here.select(here.label_id == TOTAL)
+        kept = promise_kept(here)
+        quality = map(mean, (whole.ssim, whole.full_ssim, whole.psnr, whole.full_psnr))
+        yield (
+            cell.scene, cell.variant, cell.config.seed, plan.target, plan.count, plan.count / max(1, full),
+            plan.nbytes / MB, *quality, kept.promised, kept.kept, kept.share, seconds, plan.status,
+        )  # fmt: skip
+
+
+def summarise(rows: Sequence[Row]) -> Table:
+    """Rows of cells.csv as mean and sample standard deviation over the seeds: NaN of nothing, and of one.
+
+    `n` counts the runs that did not fail, `ok` those whose plan met the target.
+    """
+    groups: dict[Row, list[Row]] = {}
+    for scene, variant, _, target, *measured in rows:
+        groups.setdefault((scene, variant, target), []).append(tuple(measured))
+    body = []
+    for key, runs in groups.items():
+        *columns, status = zip(*runs, strict=True)
+        known = [[value for value in column if not math.isnan(value)] for column in columns]
+        spreads = []
+        for values in known:
+            spreads.append(statistics.fmean(values) if values else math.nan)
+            spreads.append(statistics.stdev(values) if len(values) > 1 else math.nan)
+        body.append((*key, len(known[0]), status.count("ok"), *spreads))
+    header = ("scene", "variant", "target", "n", "ok", *(f"{m}{sd}" for m in MEASURES for sd in ("", " sd")))
+    formats = ("", "", "g", "d", "d", *(spec for spec in MEASURES.values() for _ in range(2)))
+    return Table("Mean ± sample standard deviation over n seeds", header, formats, body)
+
+
+def readable(summary: Table, measures: Sequence[str]) -> Table:
+    """Some measures of a summary, each mean and spread in one cell."""
+    first = summary.header.index("ok") + 1
+    body: list[Row] = []
+    for row in summary.cells():
+        cells = dict(zip(summary.header, row, strict=True))
+        spreads = ("±".join(v for v in (cells[m], cells[f"{m} sd"]) if v != "–") or "–" for m in measures)
+        body.append((*row[:first], *spreads))
+    header = (*summary.header[:first], *measures)
+    return Table(summary.title, header, ("",) * len(header), body)
+
+
+def _write(out: Path, rows: list[Row]) -> None:
+    header = ("scene", "variant", "seed", "target", *MEASURES, "status")
+    Table("Runs", header, ("", "", "d", "g", *MEASURES.values(), ""), rows).write_csv(out / "cells.csv")
+    summary = summarise(rows)
+    summary.write_csv(out / "summary.csv")
+    write_text(out / "summary.md", f"{summary.title}\n\n{readable(summary, tuple(MEASURES)).markdown()}")
