@@ -16,6 +16,7 @@ from sagesplat.config import (
     FitConfig,
     LiftConfig,
     MasksConfig,
+    PaperConfig,
     PlanConfig,
     RunConfig,
     SceneConfig,
@@ -193,12 +194,111 @@ def evaluate(run: Run, machine: Annotated[Machine, Flat] = Machine()) -> None:
 
 
 @command
-def report(run: Run, machine: Annotated[Machine, Flat] = Machine()) -> None:
-    """Write the report."""
+def report(
+    run: Run,
+    paper: bool = False,
+    settings: Annotated[PaperConfig, Flat] = PaperConfig(),
+    machine: Annotated[Machine, Flat] = Machine(),
+) -> None:
+    """Write the report; with --paper, every table and figure of the paper.
+
+    Args:
+        run: run folder.
+        paper: cross-view, equal occupancy, and the paper's tables and figures, in report/paper.
+        settings: what they look at.
+        machine: where and how to compute.
+    """
     from sagesplat import stages
+    from sagesplat.paper import paper_report
 
     with _job(run, machine) as job:
-        stages.make_report(job)
+        if paper:
+            paper_report(job, settings)
+        else:
+            stages.make_report(job)
+
+
+@command
+def crossview(run: Run, machine: Annotated[Machine, Flat] = Machine()) -> None:
+    """Plan every unseen view by itself, and measure promise, error and regret."""
+    from sagesplat.paper import cross_views
+
+    with _job(run, machine) as job:
+        cross_views(job)
+
+
+@command
+def transfer(
+    run_a: Positional[Annotated[Path, arg(metavar="RUN_A")]],
+    run_b: Positional[Annotated[Path, arg(metavar="RUN_B")]],
+    out: Path | None = None,
+    targets: tuple[float, ...] = (),
+    machine: Annotated[Machine, Flat] = Machine(),
+) -> None:
+    """Predict run B with the quality models of run A (cross-scene).
+
+    Args:
+        run_a: run folder whose models are used.
+        run_b: run folder that they are used on.
+        out: folder for tables and figures (default: RUN_B/transfer).
+        targets: SSIM targets (default: those that B was planned for).
+        machine: where and how to compute.
+    """
+    from sagesplat.events import TableMade
+    from sagesplat.transfer import transfer as evaluate_transfer
+
+    out = out or run_b / "transfer"
+    with _job(run_a, machine) as job_a, _job(run_b, machine) as job_b:
+        table, line = evaluate_transfer(job_a, job_b, out, targets)
+        job_b.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
+    print(f"{line}\n{out}")
+
+
+@command
+def sweep(
+    file: Positional[Annotated[Path, arg(metavar="FILE.toml")]],
+    out: Positional[Annotated[Path, arg(metavar="OUT")]],
+    machine: Annotated[Machine, Flat] = Machine(),
+) -> None:
+    """Run scenes, variants of settings, targets and seeds of one small file; mean and spread come out.
+
+    Args:
+        file: what to run; examples/sweep.toml shows one.
+        out: folder for the runs and the summary; what is finished there is kept.
+        machine: where and how to compute.
+    """
+    from sagesplat.console import Console
+    from sagesplat.raster import resolve_backend, set_threads
+    from sagesplat.sweep import read_sweep, run_sweep
+
+    cells = read_sweep(file)
+    backend, threads = resolve_backend(machine.backend, machine.device), set_threads(machine.threads)
+    with Console() as console:
+        run_sweep(cells, out, console, backend, threads, machine.force)
+    print(out / "summary.md")
+
+
+@command
+def download(what: Positional[Literal["lpips"]], folder: Path | None = None) -> None:
+    """Fetch weights that are not part of the package, once: lpips.
+
+    Args:
+        what: lpips, the perceptual metric (761 MB are fetched, 69 MB kept).
+        folder: where to put them (default: the cache, ~/.cache/sagesplat).
+    """
+    from sagesplat.console import Console
+    from sagesplat.download import download_lpips
+    from sagesplat.events import Progress, StageStarted
+
+    with Console() as console:
+        console(StageStarted("download"))
+        files = download_lpips(
+            folder,
+            on_progress=lambda name, done, total: console(
+                Progress("download", done, max(total, done, 1), name)
+            ),
+        )
+    print("\n".join(map(str, files)))
 
 
 @command

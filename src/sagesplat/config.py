@@ -115,6 +115,18 @@ class PlanConfig:
 
 
 @dataclass(frozen=True)
+class PaperConfig:
+    """What the paper's tables and figures look at."""
+
+    view: str | None = None
+    """Photo of Tables III and IV and of Fig. 4 (default: the middle one of the test views)."""
+    lpips: Path | None = None
+    """Folder with the weights of LPIPS (default: where `sagesplat download lpips` puts them)."""
+    tune_steps: int = 500
+    """Training steps of pruned 3DGS, and of tuned compositions, in Table IV."""
+
+
+@dataclass(frozen=True)
 class RunConfig:
     """Everything that a run needs to be done again."""
 

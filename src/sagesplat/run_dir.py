@@ -75,9 +75,24 @@ class RunDir:
         return self.path / "evaluation.csv"
 
     @property
+    def cross_view(self) -> Path:
+        """Unseen views, each with a plan of its own."""
+        return self.path / "cross_view.csv"
+
+    @property
+    def occupancy(self) -> Path:
+        """Compositions and 3DGS of the same size."""
+        return self.path / "occupancy.csv"
+
+    @property
     def report(self) -> Path:
         """The report's folder."""
         return self.path / "report"
+
+    @property
+    def paper(self) -> Path:
+        """The paper's tables and figures."""
+        return self.report / "paper"
 
     def provenance(self, stage: str) -> Path:
         """What a stage's result was made from."""

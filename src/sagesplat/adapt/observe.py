@@ -65,12 +65,12 @@ PERCENTILE = 5.0
 
 
 def distances_in_views(
-    scene: Scene, point_labels: Int16[np.ndarray, " P"], percentile: float = PERCENTILE
+    scene: Scene, point_labels: Int16[np.ndarray, " P"], percentile: float | None = PERCENTILE
 ) -> dict[int, Float32[np.ndarray, " V"]]:
     """d_min of each category in each view: how far its closest points in sight are from the camera.
 
     The given percentile over the category's SfM points inside the view's frustum; 0 is the paper's minimum,
-    which one mislabelled point can spoil. World units; NaN where no point is in sight.
+    which one mislabelled point can spoil, and None the mean. World units; NaN where no point is in sight.
     """
     labels = np.unique(point_labels)
     table = {int(label): np.full(len(scene.views), np.nan, np.float32) for label in labels}
@@ -81,7 +81,8 @@ def distances_in_views(
         seen_labels = point_labels[inside]
         distance = np.linalg.norm(scene.points.xyz[inside] - camera.position, axis=1)
         for label in np.unique(seen_labels):
-            table[int(label)][row] = np.percentile(distance[seen_labels == label], percentile)
+            mine = distance[seen_labels == label]
+            table[int(label)][row] = mine.mean() if percentile is None else np.percentile(mine, percentile)
     return table
 
 

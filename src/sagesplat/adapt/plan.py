@@ -63,7 +63,12 @@ class Plan:
     @property
     def status(self) -> str:
         """Whether every category with a model meets the target: "ok" or "infeasible"."""
-        return "infeasible" if any(c.status == "infeasible" for c in self.choices) else "ok"
+        return "infeasible" if self.infeasible else "ok"
+
+    @property
+    def infeasible(self) -> list[int]:
+        """The categories for which no level reaches the target."""
+        return [c.label_id for c in self.choices if c.status == "infeasible"]
 
     @property
     def binding(self) -> int | None:

@@ -3,7 +3,7 @@
 import csv
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ from sagesplat.adapt.evaluate import Evaluation
 from sagesplat.adapt.model import SsimModel
 from sagesplat.adapt.observe import TOTAL, Observations
 from sagesplat.adapt.plan import Counts, Plan
-from sagesplat.files import atomic_path
+from sagesplat.files import atomic_path, write_text
 from sagesplat.gaussians import BYTES_PER_GAUSSIAN
 from sagesplat.segment.masks import UNLABELLED, UNLABELLED_NAME
 
@@ -21,23 +21,84 @@ MB = 1e6  # bytes
 
 @dataclass(frozen=True)
 class Table:
-    """Rows under a header; `formats` holds a format spec per column for people, the CSV keeps every digit."""
+    """Rows under a header; `formats` holds a format spec per column for people, the CSV keeps every digit.
+
+    The spec "k" writes counts short (141k, 1.4M).
+    """
 
     title: str
     header: tuple[str, ...]
     formats: tuple[str, ...]
     rows: list[tuple[str | int | float, ...]]
+    groups: tuple[tuple[str, int], ...] = ()  # (title, columns) over the header, from its second column on
+    marks: Mapping[tuple[int, int], str] = field(default_factory=dict)  # (row, column): a note to the cell
+    notes: tuple[str, ...] = ()  # under the table
 
     def cells(self) -> list[list[str]]:
         """The rows as text; NaN reads as a dash."""
         return [[_text(v, spec) for v, spec in zip(row, self.formats, strict=True)] for row in self.rows]
 
+    def columns(self) -> list[str]:
+        """The header in one line, with the titles of groups before it."""
+        groups = [title for title, span in self.groups for _ in range(span)]
+        groups = ["", *groups, *[""] * (len(self.header) - 1 - len(groups))]
+        return [f"{group} {name}".strip() for group, name in zip(groups, self.header, strict=True)]
+
     def write_csv(self, path: Path) -> None:
-        """A header, then one line per row; NaN is an empty cell."""
+        """A header, then one line per row; NaN is an empty cell, marks are a last column."""
+        notes = [""] * len(self.rows)
+        for (row, column), mark in sorted(self.marks.items()):
+            notes[row] += f"{'; ' if notes[row] else ''}{self.columns()[column]}: {mark}"
         with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
-            writer.writerow(self.header)
-            writer.writerows([["" if _is_nan(value) else value for value in row] for row in self.rows])
+            writer.writerow([*self.columns(), "marks"] if self.marks else self.columns())
+            for row, note in zip(self.rows, notes, strict=True):
+                values = ["" if _is_nan(value) else value for value in row]
+                writer.writerow([*values, note] if self.marks else values)
+
+    def markdown(self) -> str:
+        """The table in Markdown; marked cells are bold and carry their mark."""
+        columns = [name.replace("|", "\\|") for name in self.columns()]
+        lines = [f"| {' | '.join(columns)} |", "|---" + "|---:" * (len(columns) - 1) + "|"]
+        for r, cells in enumerate(self.cells()):
+            shown = [
+                f"**{cell}** ({self.marks[r, c]})" if (r, c) in self.marks else cell.replace("|", "\\|")
+                for c, cell in enumerate(cells)
+            ]
+            lines.append(f"| {' | '.join(shown)} |")
+        return "\n".join([*lines, "", *self.notes]).rstrip() + "\n"
+
+    def latex(self) -> str:
+        """The table in LaTeX (packages booktabs and, where cells are marked, xcolor with option `table`)."""
+        alignment = "l" + "r" * (len(self.header) - 1)
+        lines = [r"\begin{table}", r"\centering", rf"\caption{{{_tex(self.title)}}}"]
+        lines += [rf"\begin{{tabular}}{{{alignment}}}", r"\toprule"]
+        if self.groups:
+            heads, rules, column = [""], [], 2
+            for title, span in self.groups:
+                heads.append(rf"\multicolumn{{{span}}}{{c}}{{{_tex(title)}}}")
+                rules.append(rf"\cmidrule(lr){{{column}-{column + span - 1}}}")
+                column += span
+            heads += [""] * (len(self.header) + 1 - column)
+            lines += [" & ".join(heads) + r" \\", " ".join(rules)]
+        lines += [" & ".join(map(_tex, self.header)) + r" \\", r"\midrule"]
+        for r, cells in enumerate(self.cells()):
+            shown = [
+                rf"\cellcolor{{black!10}}{_tex(cell)}\textsuperscript{{{_tex(self.marks[r, c])}}}"
+                if (r, c) in self.marks
+                else _tex(cell)
+                for c, cell in enumerate(cells)
+            ]
+            lines.append(" & ".join(shown) + r" \\")
+        lines += [r"\bottomrule", r"\end{tabular}"]
+        lines += [rf"\par\smallskip\footnotesize {_tex(note)}" for note in self.notes]
+        return "\n".join([*lines, r"\end{table}", ""])
+
+    def write(self, stem: Path) -> None:
+        """The table as `stem`.csv, .md and .tex."""
+        self.write_csv(stem.with_name(stem.name + ".csv"))
+        write_text(stem.with_name(stem.name + ".md"), f"**{self.title}**\n\n{self.markdown()}")
+        write_text(stem.with_name(stem.name + ".tex"), self.latex())
 
 
 @dataclass(frozen=True)
@@ -248,4 +309,20 @@ def _is_nan(value: str | int | float) -> bool:
 
 
 def _text(value: str | int | float, spec: str) -> str:
-    return "–" if _is_nan(value) else format(value, spec)
+    if _is_nan(value):
+        return "–"
+    if spec == "k":
+        thousands = float(value) / 1e3
+        return (
+            f"{thousands / 1e3:.1f}M" if thousands >= 1e3 else f"{thousands:.{0 if thousands >= 10 else 1}f}k"
+        )
+    return format(value, spec)
+
+
+_TEX = {c: "\\" + c for c in "&%$#_{}"} | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}"}
+_TEX |= {"^": r"\textasciicircum{}", "–": "--", "≥": r"$\geq$", "<": r"$<$", ">": r"$>$", "|": r"$|$"}
+
+
+def _tex(text: str) -> str:
+    """Text with LaTeX's own characters taken as they are."""
+    return "".join(_TEX.get(character, character) for character in text)

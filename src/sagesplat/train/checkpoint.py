@@ -3,6 +3,7 @@
 import json
 import zipfile
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 import torch
@@ -49,7 +50,9 @@ def read_checkpoint(path: Path, settings: str) -> TrainState:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: torch.from_numpy(file[name]) for name in file.files if name != "meta"}
             meta = json.loads(str(file["meta"]))
-    except (OSError, EOFError, ValueError, KeyError, RuntimeError, zipfile.BadZipFile) as error:
+    except (
+        OSError, EOFError, ValueError, KeyError, RuntimeError, TokenError, zipfile.BadZipFile
+    ) as error:  # fmt: skip
         raise RunError(f"{path}: not a readable checkpoint ({error}); {cure}") from None
     if meta.get("version") != _VERSION:
         raise RunError(

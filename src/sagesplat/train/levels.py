@@ -8,6 +8,7 @@ import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 import torch
@@ -18,7 +19,7 @@ from sagesplat.gaussians import Gaussians, concat
 from sagesplat.sh import num_bases
 
 # what numpy and zipfile raise for files that are cut off or changed
-_DAMAGED = (OSError, EOFError, ValueError, KeyError, RuntimeError, zipfile.BadZipFile)
+_DAMAGED = (OSError, EOFError, ValueError, KeyError, RuntimeError, TokenError, zipfile.BadZipFile)
 _HALVES = ("log_scales", "logit_opacities", "sh0")
 
 

@@ -140,6 +140,12 @@ def train(
 
 
 def _check(config: TrainConfig, masks: Masks | None) -> None:
+    for name, low, high in (("max_steps", 1, 10**9), ("level_every", 0, 10**9), ("sh_degree", 0, 3)):
+        value = getattr(config, name)
+        if not low <= value <= high:
+            raise RunError(
+                f"--train.{name.replace('_', '-')} {value} is impossible; choose {low} to {high:,}"
+            )
     target = config.freeze_at
     if target is not None and not 0 < target <= 1:
         raise RunError(f"--train.freeze-at {target} is no SSIM to reach; choose a number such as 0.8")

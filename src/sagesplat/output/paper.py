@@ -1,0 +1,284 @@
+"""The tables and figures of the paper, from a finished run: CSV, Markdown, LaTeX, PNG and SVG."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+
+from sagesplat.adapt.cross_view import NONE, CrossView
+from sagesplat.adapt.model import SsimModel
+from sagesplat.adapt.observe import TOTAL, Observations
+from sagesplat.adapt.occupancy import METHODS, WHOLE, Occupancy
+from sagesplat.adapt.plan import Counts, Plan
+from sagesplat.files import write_text
+from sagesplat.gaussians import BYTES_PER_GAUSSIAN
+from sagesplat.output import figures
+from sagesplat.output.figures import STYLE, Colours
+from sagesplat.output.tables import MB, Table, by_size, last_counts, mean, name_of, view_mean
+
+ITERATIONS = (1 / 6, 1 / 3, 1 / 2, 1.0)  # of the run: the paper's 5000, 10 000, 15 000 and 30 000
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """One image of a panel, with its quality."""
+
+    title: str
+    rgb: UInt8[np.ndarray, "H W 3"]
+    psnr: float  # dB; NaN for the photo
+    lpips: float  # Alex; NaN where not measured
+
+
+@dataclass(frozen=True, eq=False)
+class PaperData:
+    """Everything that the paper's tables and figures show. Views are rows of `view_names`."""
+
+    names: Mapping[int, str]  # label id -> name
+    colours: Colours
+    observations: Observations
+    train_views: np.ndarray
+    test_views: np.ndarray
+    view_names: Sequence[str]
+    counts: Counts
+    recovering: frozenset[int]
+    models: Mapping[tuple[int, int], SsimModel]
+    iterations: Sequence[int]  # the four levels that Tables I to III and Fig. 3 show
+    view: int  # the view of Table III and Fig. 4
+    distances: Mapping[str, Mapping[int, float]]  # "min", "5 %", "mean" -> label id -> world units, in `view`
+    view_plans: Sequence[Plan]  # for `view`, one per target, from `iterations` alone
+    cross_view: CrossView
+    occupancy: Occupancy
+    panels: Mapping[str, Sequence[Picture]]  # view name -> photo, 3DGS, one per target
+
+
+def four_levels(levels: Sequence[int]) -> list[int]:
+    """The levels nearest to the shares of a run at which the paper's tables look."""
+    return sorted({min(levels, key=lambda level: abs(level - share * levels[-1])) for share in ITERATIONS})
+
+
+def write_paper(folder: Path, data: PaperData) -> Path:
+    """Write every table and figure into `folder`, and paper.md that shows them all; its path comes back."""
+    labels = by_size(data.counts)
+    parts = ["# Tables and figures of the paper\n"]
+    for name, table in _tables(data, labels):
+        table.write(folder / name)
+        parts.append(f"## {table.title}\n\n{table.markdown()}")
+    for name, title, figure in _figures(data, labels):
+        figures.save_figure(figure, folder / name)
+        parts.append(f"## {title}\n\n![{title}]({name}.png)\n")
+    write_text(folder / "paper.md", "\n".join(parts))
+    return folder / "paper.md"
+
+
+def _tables(data: PaperData, labels: Sequence[int]):
+    for number, which, views in (("1", "training", data.train_views), ("1", "test", data.test_views)):
+        if len(views):
+            yield f"table_{number}_{which}", quality_and_counts(data, labels, views, which)
+    yield "table_3_view", one_view(data, labels)
+    if len(data.occupancy.view):
+        yield "table_4_view", equal_occupancy(data.occupancy, data.view, data.view_names[data.view])
+        yield "table_4_test", equal_occupancy(data.occupancy, NONE, "mean of the test views")
+    if len(data.cross_view):
+        yield "cross_view", cross_view_table(data.cross_view, labels, data.names, data.counts)
+
+
+def _figures(data: PaperData, labels: Sequence[int]):
+    views = data.train_views, data.test_views
+    yield (
+        "figure_2",
+        "Fig. 2: SSIM over iterations",
+        figures.ssim_over_levels(
+            data.observations, *views, labels, data.names, data.colours, data.recovering
+        ),
+    )
+    yield (
+        "figure_3",
+        "Fig. 3: SSIM over distance",
+        figures.ssim_over_distance(
+            data.observations,
+            data.train_views,
+            labels,
+            data.names,
+            data.colours,
+            data.models,
+            data.iterations,
+        ),
+    )
+    for number, (name, pictures) in enumerate(data.panels.items(), 4):
+        yield (
+            f"figure_{min(number, 5)}{'' if number < 6 else f'_{number - 4}'}",
+            f"Figs. 4, 5: {name}",
+            panel(pictures),
+        )
+
+
+def quality_and_counts(data: PaperData, labels: Sequence[int], views: np.ndarray, which: str) -> Table:
+    """Tables I and II: SSIM averaged over views, and Gaussians, per label at four iterations."""
+    rows = data.observations.select(np.isin(data.observations.view, views))
+    body = []
+    for label in [*labels, TOTAL]:
+        cells: list[str | int | float] = [name_of(label, data.names)]
+        for level in data.iterations:
+            here = [n for (i, at), n in data.counts.items() if at == level and label in (TOTAL, i)]
+            cells += [view_mean(rows, label, level), sum(here)]
+        body.append(tuple(cells))
+    return Table(
+        f"Tables I, II: SSIM and Gaussians over iterations, {len(views)} {which} views",
+        ("category", *("SSIM", "Gaussians") * len(data.iterations)),
+        ("", *(".3f", "k") * len(data.iterations)),
+        body,
+        groups=tuple((f"{level:,}", 2) for level in data.iterations),
+        notes=_recovering(data),
+    )
+
+
+def _recovering(data: PaperData) -> tuple[str, ...]:
+    late = [f"{level:,}" for level in data.iterations if level in data.recovering]
+    return (f"Recovering from an opacity reset: {', '.join(late)}.",) if late else ()
+
+
+def one_view(data: PaperData, labels: Sequence[int]) -> Table:
+    """Table III: distances, SSIM at each iteration, counts and occupancy for 3DGS and each target, in a view.
+
+    An SSIM carries the targets for which its iteration was selected.
+    """
+    rows = data.observations.select(data.observations.view == data.view)
+    full = last_counts(data.counts)
+    plans = [{c.label_id: c for c in plan.choices} for plan in data.view_plans]
+    targets = [f"t={plan.target:g}" for plan in data.view_plans]
+    columns = len(data.distances), len(data.iterations)
+    body, marks = [], {}
+    for label in labels:
+        counts = [full[label], *(plan[label].count for plan in plans)]
+        cells = [data.distances[name].get(label, np.nan) for name in data.distances]
+        cells += [view_mean(rows, label, level) for level in data.iterations]
+        cells += [*counts, *(n * BYTES_PER_GAUSSIAN / MB for n in counts)]
+        for i, level in enumerate(data.iterations):
+            chosen = [t for t, plan in zip(targets, plans, strict=True) if plan[label].level == level]
+            if chosen:
+                marks[len(body), 1 + columns[0] + i] = " ".join(chosen)
+        body.append((name_of(label, data.names), *cells))
+    totals = [sum(full.values()), *(plan.count for plan in data.view_plans)]
+    whole = [view_mean(rows, TOTAL, level) for level in data.iterations]
+    nbytes = [n * BYTES_PER_GAUSSIAN / MB for n in totals]
+    body.append((name_of(TOTAL, data.names), *[np.nan] * columns[0], *whole, *totals, *nbytes))
+    out = [
+        f"t={plan.target:g}: {', '.join(name_of(label, data.names) for label in plan.infeasible)}"
+        for plan in data.view_plans
+        if plan.infeasible
+    ]
+    notes = ("Selected by the models fitted on the training views; SSIM is measured.",)
+    notes += (f"Out of reach, best taken: {'; '.join(out)}.",) if out else ()
+    return Table(
+        f"Table III: view {data.view_names[data.view]}",
+        ("category", *data.distances, *(f"{i:,}" for i in data.iterations), *("3DGS", *targets) * 2),
+        ("", *[".3f"] * sum(columns), *[",d"] * (1 + len(plans)), *[".2f"] * (1 + len(plans))),
+        body,
+        groups=(
+            ("distance", columns[0]),
+            ("SSIM at", columns[1]),
+            ("Gaussians", 1 + len(plans)),
+            ("MB", 1 + len(plans)),
+        ),
+        marks=marks,
+        notes=notes + _recovering(data),
+    )
+
+
+def equal_occupancy(occupancy: Occupancy, of_view: int, where: str) -> Table:
+    """Table IV: compositions and 3DGS of the same size; `of_view` as in `Occupancy`."""
+    rows = occupancy.select(occupancy.of_view == of_view)
+    body, best = [], {}
+    quality = {"ssim": 1, "psnr": 1, "lpips_alex": -1, "lpips_vgg": -1}  # larger or smaller is better
+    for target in sorted(t for t in np.unique(rows.target) if not np.isnan(t)):
+        first = len(body)
+        for method in range(WHOLE):
+            here = rows.select((rows.target == target) & (rows.method == method))
+            values = [mean(getattr(here, name)) for name in quality]
+            occupied = mean(here.count.astype(float)) * BYTES_PER_GAUSSIAN / MB
+            body.append((f"t={target:g}", METHODS[method], occupied, *values))
+        for column, sign in enumerate(quality.values(), 3):
+            scores = [sign * float(row[column]) for row in body[first:]]
+            if not np.isnan(scores).all():
+                best[first + int(np.nanargmax(scores)), column] = "best"
+    here = rows.select(rows.method == WHOLE)
+    values = [mean(getattr(here, name)) for name in quality]
+    occupied = mean(here.count.astype(float)) * BYTES_PER_GAUSSIAN / MB
+    body.append(("", METHODS[WHOLE], occupied, *values))
+    notes = (
+        "LPIPS (VGG) is fed images in [0, 1], as the evaluation of 3DGS feeds it; Alex as its authors do.",
+    )
+    if np.isnan(rows.lpips_alex).all() or np.isnan(rows.lpips_vgg).all():
+        notes += ("LPIPS not measured: no weights; run `sagesplat download lpips` and report again.",)
+    return Table(
+        f"Table IV: quality at equal occupancy, {where}",
+        ("size of", "method", "MB", "SSIM", "PSNR", "LPIPS (Alex)", "LPIPS (VGG)"),
+        ("", "", ".2f", ".3f", ".2f", ".3f", ".3f"),
+        body,
+        marks=best,
+        notes=notes,
+    )
+
+
+def cross_view_table(
+    table: CrossView, labels: Sequence[int], names: Mapping[int, str], counts: Counts
+) -> Table:
+    """Cross-view: promise, measurement, error of the prediction and regret per target and category."""
+    full, body = last_counts(counts), []
+    for target in np.unique(table.target):
+        for label in [*labels, TOTAL]:
+            rows = table.select((table.target == target) & (table.label_id == label))
+            if not len(rows):
+                continue
+            promised = rows.predicted >= target
+            kept = promised & (rows.ssim >= target)
+            met = rows.ssim >= target
+            regret = mean(rows.regret)
+            body.append((
+                f"{target:g}", name_of(label, names), len(rows), int(promised.sum()), int(kept.sum()),
+                int(met.sum()), mean(rows.predicted), mean(rows.level_ssim), mean(rows.ssim),
+                mean(rows.full_ssim), mean(np.abs(rows.predicted - rows.level_ssim)),
+                mean(np.abs(rows.predicted - rows.ssim)), regret, regret / max(1, full.get(label, 0)),
+            ))  # fmt: skip
+    header = (
+        "target",
+        "category",
+        "views",
+        "promised",
+        "kept",
+        "met",
+        "predicted",
+        "at its level",
+        "composed",
+    )
+    header += ("3DGS", "error at level", "error composed", "regret", "of category")
+    formats = ("", "", "d", "d", "d", "d", *[".3f"] * 6, ",.0f", ".1%")
+    notes = (
+        "Masks are the 3D labels rendered into each unseen view; each view has a plan of its own.",
+        "promised: predicted to reach the target; kept: measured there too, in the composition; met: "
+        "measured, promised or not. regret: Gaussians above the cheapest level that measures the target in "
+        "that view, where the chosen one does.",
+    )
+    return Table("Cross-view: plans for unseen views", header, formats, body, notes=notes)
+
+
+@rc_context(STYLE)
+def panel(pictures: Sequence[Picture]) -> Figure:
+    """Figs. 4 and 5: the photo, 3DGS and the composition for each target, with PSNR and LPIPS."""
+    height, width = pictures[0].rgb.shape[:2]
+    inches = 15 / len(pictures) * height / width
+    figure = Figure(figsize=(15, inches + 0.5))
+    for column, picture in enumerate(pictures):
+        axes = figure.add_axes(
+            (column / len(pictures) + 0.001, 0, 1 / len(pictures) - 0.002, inches / (inches + 0.5))
+        )
+        axes.imshow(picture.rgb, aspect="auto")
+        quality = "" if np.isnan(picture.psnr) else f"\n{picture.psnr:.2f} dB"
+        quality += "" if np.isnan(picture.lpips) else f" / LPIPS {picture.lpips:.3f}"
+        axes.set_title(picture.title + quality, loc="left", pad=4)
+        axes.set_axis_off()
+    return figure

@@ -1,0 +1,185 @@
+"""The paper's evaluation of a finished run, in three stages: crossview, occupancy, tables and figures."""
+
+from typing import cast
+
+import numpy as np
+
+from sagesplat.adapt.columns import from_rows, write_columns
+from sagesplat.adapt.cross_view import NONE, cross_view, read_cross_view
+from sagesplat.adapt.model import read_models
+from sagesplat.adapt.observe import TOTAL, as_unit, distances_in_views, read_observations, render_rgb
+from sagesplat.adapt.occupancy import Occupancy, compare, contenders, read_occupancy
+from sagesplat.adapt.plan import Plan, plan_view, read_plans
+from sagesplat.config import PaperConfig
+from sagesplat.errors import RunError, SageError
+from sagesplat.events import Progress, Warned
+from sagesplat.job import Job, run_stage
+from sagesplat.lpips import Lpips, Net, load_lpips, weights_path
+from sagesplat.metrics import psnr, squared_error_map
+from sagesplat.output.paper import PaperData, Picture, four_levels, write_paper
+from sagesplat.run_dir import file_hash, settings_of
+from sagesplat.stages import distances, tune_composition
+
+
+def paper_report(job: Job, config: PaperConfig) -> None:
+    """Everything of the paper that one run can show."""
+    cross_views(job)
+    equal_occupancy(job, config)
+    tables_and_figures(job, config)
+
+
+def cross_views(job: Job) -> None:
+    """Plan each unseen view by itself and measure what comes of it."""
+    run = job.run
+    targets = _targets(job)
+
+    def make() -> list[str]:
+        table = cross_view(
+            job.scene, job.photos, job.ladder, read_models(run.models), targets,
+            distances(job, settings_of(run, "observe")["distance"]),
+            min_share=settings_of(run, "fit")["min_share"],
+            backend=job.backend, antialiased=job.antialiased,
+            progress=lambda done, total: job.emit(Progress("crossview", done, total)),
+        )  # fmt: skip
+        table.write_csv(run.cross_view)
+        lines = []
+        for target in np.unique(table.target):
+            rows = table.select((table.target == target) & (table.label_id != TOTAL))
+            promised = rows.predicted >= target
+            kept = int((promised & (rows.ssim >= target)).sum())
+            lines.append(f"SSIM {target:g}: {kept} of {promised.sum()} promises kept on unseen views")
+        return lines
+
+    inputs = [run.scene, run.labels, run.levels, run.models, run.plan]
+    run_stage(job, "crossview", {"targets": targets}, inputs, [run.cross_view], make)
+
+
+def equal_occupancy(job: Job, config: PaperConfig) -> None:
+    """Compare compositions with 3DGS of the same size, on the test views and in one view."""
+    run = job.run
+    view = _view(job, config)
+    settings = {"view": view, "tune_steps": config.tune_steps, "lpips": _weights(config)}
+
+    def make() -> list[str]:
+        metrics = _metrics(job, config)
+        rows: list[dict[str, float]] = []
+        tests = job.scene.test_ids.tolist()
+        comparisons = [(NONE, read_plans(run.plan)[0], tests), (view, _view_plans(job, view), [view])]
+        for of_view, plans, views in comparisons:
+            if not views:
+                continue
+            sets = contenders(
+                job.scene, job.ladder, plans, lambda g: tune_composition(job, g, config.tune_steps),
+                antialiased=job.antialiased,
+            )  # fmt: skip
+            rows += compare(
+                job.scene, job.photos, views, sets, metrics, of_view=of_view,
+                backend=job.backend, antialiased=job.antialiased,
+                progress=lambda done, total: job.emit(Progress("occupancy", done, total)),
+            )  # fmt: skip
+        write_columns(run.occupancy, from_rows(Occupancy, rows))
+        return [f"{len(rows)} images measured"]
+
+    inputs = [run.scene, run.levels, run.models, run.observations, run.plan]
+    run_stage(job, "occupancy", settings, inputs, [run.occupancy], make)
+
+
+def tables_and_figures(job: Job, config: PaperConfig) -> None:
+    """Write report/paper."""
+    run = job.run
+    view = _view(job, config)
+
+    def make() -> list[str]:
+        ladder, taxonomy = job.ladder, job.taxonomy
+        view_plans = _view_plans(job, view)
+        reduced = {"min": 0.0, "5 %": 5.0, "mean": None}
+        by_statistic = {
+            name: distances_in_views(job.scene, job.point_labels, percentile)
+            for name, percentile in reduced.items()
+        }
+        data = PaperData(
+            names=job.names(),
+            colours={label: taxonomy.color(label) for label in job.names()},
+            observations=read_observations(run.observations),
+            train_views=job.scene.train_ids,
+            test_views=job.scene.test_ids,
+            view_names=[v.name for v in job.scene.views],
+            counts=ladder.counts,
+            recovering=ladder.recovering,
+            models=read_models(run.models),
+            iterations=four_levels(ladder.levels),
+            view=view,
+            distances={n: {i: float(d[view]) for i, d in table.items()} for n, table in by_statistic.items()},
+            view_plans=view_plans,
+            cross_view=read_cross_view(run.cross_view),
+            occupancy=read_occupancy(run.occupancy),
+            panels=_panels(job, config, view),
+        )
+        return [f"{write_paper(run.paper, data)}"]
+
+    inputs = [run.observations, run.models, run.plan, run.cross_view, run.occupancy]
+    run_stage(job, "paper", {"view": view}, inputs, [run.paper / "paper.md"], make)
+
+
+def _targets(job: Job) -> list[float]:
+    return list(settings_of(job.run, "plan")["targets"])
+
+
+def _view_plans(job: Job, view: int) -> list[Plan]:
+    """Plans for one view at every target, as the paper's Table III makes them: from its four iterations."""
+    levels = four_levels(job.ladder.levels)
+    counts = {key: n for key, n in job.ladder.counts.items() if key[1] in levels}
+    seen = distances(job, settings_of(job.run, "observe")["distance"])
+    here = {label: float(d[view]) for label, d in seen.items()}
+    models = read_models(job.run.models)
+    return [plan_view(models, counts, here, target, view) for target in _targets(job)]
+
+
+def _view(job: Job, config: PaperConfig) -> int:
+    """The view to look at: the one named, or the middle one of the test views (or of all)."""
+    names = [view.name for view in job.scene.views]
+    if config.view is None:
+        views = job.scene.test_ids if len(job.scene.test_ids) else np.arange(len(names))
+        return int(views[len(views) // 2])
+    matching = [row for row, name in enumerate(names) if config.view in (name, name.rpartition(".")[0])]
+    if not matching:
+        raise RunError(f"{job.scene.path}: no photo {config.view!r}; there are {names[0]} to {names[-1]}")
+    return matching[0]
+
+
+def _weights(config: PaperConfig) -> dict[str, str | None]:
+    """What tells one set of LPIPS weights from another."""
+    paths = {net: weights_path(cast(Net, net), config.lpips) for net in ("alex", "vgg")}
+    return {net: file_hash(path) if path.is_file() else None for net, path in paths.items()}
+
+
+def _metrics(job: Job, config: PaperConfig) -> dict[str, Lpips]:
+    """LPIPS as the field feeds it, by column; what cannot be loaded is left out with a warning."""
+    found = {}
+    for net, as_3dgs in (("alex", False), ("vgg", True)):
+        try:
+            found[f"lpips_{net}"] = load_lpips(cast(Net, net), config.lpips, as_3dgs=as_3dgs)
+        except SageError as error:
+            job.emit(Warned(f"no LPIPS ({net}): {error}"))
+    return found
+
+
+def _panels(job: Job, config: PaperConfig, view: int) -> dict[str, list[Picture]]:
+    """The view of Table III, and for cross-view two test views, in pictures."""
+    tests = job.scene.test_ids
+    rows = [view, *(int(tests[len(tests) * i // 4]) for i in (1, 3) if len(tests))]
+    metric = _metrics(job, config).get("lpips_alex")
+    full = job.ladder.load(job.ladder.levels[-1])
+    panels = {}
+    for row in dict.fromkeys(rows):
+        camera, photo = job.scene.views[row].camera, as_unit(job.photos[row])
+        sets = {f"3DGS, {len(full):,}": full}
+        sets |= {f"t={p.target:g}, {p.count:,}": job.ladder.compose(p.levels) for p in _view_plans(job, row)}
+        pictures = [Picture("photo", job.photos[row], np.nan, np.nan)]
+        for title, g in sets.items():
+            image = render_rgb(g, camera, backend=job.backend, antialiased=job.antialiased)
+            decibels = float(psnr(squared_error_map(image, photo).mean()))
+            lpips = metric(photo, image) if metric else np.nan
+            pictures.append(Picture(title, np.round(image * 255).astype(np.uint8), decibels, lpips))
+        panels[job.scene.views[row].name] = pictures
+    return panels
