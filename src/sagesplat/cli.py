@@ -255,6 +255,29 @@ def transfer(
 
 
 @command
+def compare(
+    online: Positional[Annotated[Path, arg(metavar="RUN_ONLINE")]],
+    full: Positional[Annotated[Path, arg(metavar="RUN_FULL")]],
+    out: Path | None = None,
+    machine: Annotated[Machine, Flat] = Machine(),
+) -> None:
+    """A run with --train.freeze-at beside snapshots of the same run without, composed for that target.
+
+    Args:
+        online: run folder trained with --train.freeze-at.
+        full: run folder trained alike, but without.
+        out: folder for the tables (default: RUN_ONLINE/online).
+        machine: where and how to compute.
+    """
+    from sagesplat.events import TableMade
+    from sagesplat.online import compare_online
+
+    with _job(online, machine) as job_online, _job(full, machine) as job_full:
+        for table in compare_online(job_online, job_full, out or online / "online"):
+            job_online.emit(TableMade(table.title, tuple(table.columns()), tuple(map(tuple, table.cells()))))
+
+
+@command
 def sweep(
     file: Positional[Annotated[Path, arg(metavar="FILE.toml")]],
     out: Positional[Annotated[Path, arg(metavar="OUT")]],

@@ -61,6 +61,6 @@ def export_ply(
         g = job.ladder.load(level, wanted)
     else:
         plan = stages.scene_plan(job.run, stages.main_target(job.run) if target is None else target)
-        g = job.ladder.compose({label: at for label, at in plan.levels.items() if label in wanted})
+        g = stages.compose(job, plan).of_labels(wanted)
     write_ply(path, g, job.names())
     return len(g)

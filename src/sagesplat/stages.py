@@ -298,17 +298,23 @@ def tune_composition(job: Job, g: Gaussians, steps: int) -> Gaussians:
     return tune(g, job.scene, job.photos, config, steps, seed=made["seed"], backend=job.backend)
 
 
+def compose(job: Job, plan: Plan) -> Gaussians:
+    """The composition of a plan, tuned if the run's plans are (`PlanConfig.tune_steps`)."""
+    steps = settings_of(job.run, "plan").get("tune_steps", 0)
+    return tune_composition(job, job.ladder.compose(plan.levels), steps)
+
+
 def compose_plan(job: Job) -> None:
     """Write the scene that the plan chose."""
     run = job.run
 
     def make() -> list[str]:
         plan = scene_plan(run, main_target(run))
-        g = tune_composition(job, job.ladder.compose(plan.levels), settings["tune_steps"])
+        g = compose(job, plan)
         write_ply(run.composed, g, job.names())
         return [f"{len(g):,} Gaussians, {plan.nbytes / 1e6:.1f} MB at 248 bytes each"]
 
-    settings = {"tune_steps": settings_of(run, "plan")["tune_steps"]}
+    settings = {"tune_steps": settings_of(run, "plan").get("tune_steps", 0)}
     run_stage(job, "compose", settings, [run.plan, run.levels], [run.composed], make)
 
 
@@ -322,7 +328,7 @@ def evaluate_plans(job: Job) -> None:
             job.scene, job.photos, label_images(job, observed["masks"]), job.ladder, read_models(run.models),
             read_plans(run.plan)[0], distances(job, observed["distance"]),
             region=settings_of(run, "fit")["region"],
-            tuned=lambda g: tune_composition(job, g, settings["tune_steps"]),
+            compose=lambda plan: compose(job, plan),
             backend=job.backend, antialiased=job.antialiased,
             progress=lambda done, total: job.emit(Progress("evaluate", done, total)),
         )  # fmt: skip
@@ -341,7 +347,7 @@ def evaluate_plans(job: Job) -> None:
         return lines
 
     inputs = [run.scene, run.labels, run.levels, run.models, run.plan]
-    settings = {"tune_steps": settings_of(run, "plan")["tune_steps"]}
+    settings = {"tune_steps": settings_of(run, "plan").get("tune_steps", 0)}
     run_stage(job, "evaluate", settings, inputs, [run.evaluation], make)
 
 

@@ -60,15 +60,15 @@ def evaluate(
     distances: Mapping[int, Float32[np.ndarray, " V"]],
     *,
     region: Literal["mask", "eroded"] = "mask",
-    tuned: Callable[[Gaussians], Gaussians] = lambda g: g,
+    compose: Callable[[Plan], Gaussians] | None = None,
     backend: Backend = "auto",
     antialiased: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Evaluation:
     """Measure each plan's composition and full 3DGS on the test views, beside what the models promise there.
 
-    `region`: where a category's SSIM is measured. `tuned`: what becomes of a composition before it is
-    measured. `progress` hears (images measured, images in all).
+    `region`: where a category's SSIM is measured. `compose`: the Gaussians of a plan (default: its
+    levels as they are). `progress` hears (images measured, images in all).
     """
     ssim = "ssim_eroded" if region == "eroded" else "ssim"
     rows: list[dict[str, float]] = []
@@ -89,7 +89,7 @@ def evaluate(
 
     full = dict(measure_all(ladder.load(ladder.levels[-1])))
     for plan in plans:
-        for row, measured in measure_all(tuned(ladder.compose(plan.levels))):
+        for row, measured in measure_all(compose(plan) if compose else ladder.compose(plan.levels)):
             for label, values in measured.items():
                 level = plan.levels.get(label, -1)
                 predicted = np.nan

@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Int16, Int32, UInt8
+from jaxtyping import Bool, Float32, Int16, Int32, UInt8
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from sagesplat import geometry
@@ -141,11 +141,15 @@ def as_unit(photo: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W 3"]:
     return photo.astype(np.float32) / 255
 
 
+def near_border(label_ids: Int16[np.ndarray, "H W"], width: int) -> Bool[np.ndarray, "H W"]:
+    """Pixels that have another category within `width` px (in either axis)."""
+    size = 2 * width + 1
+    return minimum_filter(label_ids, size) != maximum_filter(label_ids, size)
+
+
 def erode(label_ids: Int16[np.ndarray, "H W"]) -> Int16[np.ndarray, "H W"]:
     """The label image without pixels that have another category within 5 px (in either axis)."""
-    size = 2 * ERODE + 1
-    inner = minimum_filter(label_ids, size) == maximum_filter(label_ids, size)
-    return np.where(inner, label_ids, np.int16(_BORDER))
+    return np.where(near_border(label_ids, ERODE), np.int16(_BORDER), label_ids)
 
 
 def measure(

@@ -16,6 +16,13 @@ from sagesplat.segment.masks import Masks
 MOST_VIEWS = 32  # training views that a measurement takes at most, evenly spread: it must stay cheap
 
 
+def measured_views(scene: Scene) -> list[int]:
+    """Rows of the training views that quality is measured on."""
+    rows = scene.train_ids
+    picked = np.linspace(0, len(rows) - 1, min(MOST_VIEWS, len(rows))).round().astype(int)
+    return rows[np.unique(picked)].tolist()
+
+
 def label_quality(
     gaussians: Gaussians,
     scene: Scene,
@@ -26,11 +33,9 @@ def label_quality(
     backend: Backend,
     workspace: Workspace,
 ) -> dict[int, float]:
-    """Mean SSIM of each category over the training views that show it (at most MOST_VIEWS of all)."""
-    rows = scene.train_ids
-    rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(MOST_VIEWS, len(rows))).round().astype(int))]
+    """Mean SSIM of each category over those of `measured_views` that show it."""
     found: dict[int, list[float]] = {}
-    for row in rows.tolist():
+    for row in measured_views(scene):
         view = scene.views[row]
         with torch.no_grad():
             render = rasterize(
