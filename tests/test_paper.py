@@ -333,7 +333,7 @@ def test_tables_in_markdown_and_latex(tmp_path):
         "| category | t=5 SSIM | t=5 count | rest |",
         "|---|---:|---:|---:|",
         "| a_b\\|c | **0.50** (t=0.5) | 1.4M | 50 % |",
-        "| d | – | 9.4k |  |",
+        "| d | – | 9,400 |  |",
         "",
         "A note.",
     ]

@@ -1,7 +1,9 @@
 """A sweep: every scene, variant of the settings and seed of one small file, summed up as mean and spread."""
 
 import math
+import os
 import re
+import shutil
 import statistics
 import time
 import tomllib
@@ -27,12 +29,12 @@ from sagesplat.raster import Backend
 from sagesplat.run_dir import RunDir
 
 BUILT_IN = "demo"  # as a scene's path: the built-in capture
-# columns of numbers, with their formats: SSIM and PSNR (dB) are of whole test views; a training that went on
-# after a kill tells the seconds since then
+# columns of numbers, with their formats: SSIM and PSNR (dB) are of whole test views, `error` is the mean
+# error of a category's promise there; a training that went on after a kill tells the seconds since then
 MEASURES = {
     "Gaussians": ",.0f", "of 3DGS": ".1%", "MB": ".2f", "SSIM": ".3f", "3DGS SSIM": ".3f",
     "PSNR": ".2f", "3DGS PSNR": ".2f", "promised": ".1f", "kept": ".1f", "share kept": ".1%",
-    "training s": ".1f",
+    "error": ".3f", "training s": ".1f",
 }  # fmt: skip
 SHOWN = ("of 3DGS", "SSIM", "share kept")  # what 80 characters have room for
 _SET_BY = {"seed": "seeds", "target_ssim": "targets", "other_targets": "targets"}
@@ -165,6 +167,7 @@ def run_sweep(
         begin = time.perf_counter()
         job = Job(RunDir(runs / cell.name), _named(emit, cell.name), backend, threads, force)
         try:
+            _share_training(runs, sweep[: number - 1], cell)
             pipeline.run_all(job, cell.capture or pipeline.demo_capture(job.emit), cell.config)
             rows += _measure(cell, job)
         except SageError as error:
@@ -186,6 +189,27 @@ def run_sweep(
             f"{out / 'cells.csv'} says and sweep again"
         )
     return shown
+
+
+def _share_training(runs: Path, earlier: Sequence[Cell], cell: Cell) -> None:
+    """Begin with what an earlier cell has trained, if the settings up to there are the same."""
+
+    def trained(of: Cell) -> tuple:
+        c = of.config
+        return of.scene, c.scene, c.masks, c.lift, c.train, c.seed
+
+    like = next((c for c in earlier if trained(c) == trained(cell)), None)
+    new = RunDir(runs / cell.name)
+    if like is None or new.path.exists() or not RunDir(runs / like.name).provenance("train").exists():
+        return
+    old = RunDir(runs / like.name)
+    for path in (old.masks, old.levels):  # links take no room; nothing in a run is changed in place
+        shutil.copytree(path, new.path / path.name, copy_function=os.link)
+    stages = [old.provenance(stage) for stage in ("scene", "masks", "lift", "train")]
+    for path in (old.scene, old.labels, old.checkpoint, old.frozen, *stages):
+        target = new.path / path.relative_to(old.path)
+        target.parent.mkdir(exist_ok=True)
+        os.link(path, target)
 
 
 def _named(emit: Emit, cell: str) -> Emit:
@@ -215,7 +239,8 @@ def _measure(cell: Cell, job: Job) -> Iterator[Row]:
         quality = map(mean, (whole.ssim, whole.full_ssim, whole.psnr, whole.full_psnr))
         yield (
             cell.scene, cell.variant, cell.config.seed, plan.target, plan.count, plan.count / max(1, full),
-            plan.nbytes / MB, *quality, kept.promised, kept.kept, kept.share, seconds, plan.status,
+            plan.nbytes / MB, *quality, kept.promised, kept.kept, kept.share,
+            mean(np.abs(here.predicted - here.ssim)), seconds, plan.status,
         )  # fmt: skip
 
 

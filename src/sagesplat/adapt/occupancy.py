@@ -75,9 +75,9 @@ def prune_to(g: Gaussians, count: int, weights: np.ndarray) -> Gaussians:
 
 
 def nearest_snapshot(ladder: Ladder, count: int) -> int:
-    """The level (not soon after a reset, if there is another) whose size is nearest to `count`."""
+    """The level nearest in size to `count`, the latest of several; one soon after a reset only if all are."""
     settled = [f for f in ladder.files if not f.recovering] or list(ladder.files)
-    return min(settled, key=lambda f: abs(sum(f.counts.values()) - count)).step
+    return min(settled, key=lambda f: (abs(sum(f.counts.values()) - count), -f.step)).step
 
 
 def contenders(

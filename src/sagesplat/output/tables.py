@@ -23,7 +23,7 @@ MB = 1e6  # bytes
 class Table:
     """Rows under a header; `formats` holds a format spec per column for people, the CSV keeps every digit.
 
-    The spec "k" writes counts short (141k, 1.4M).
+    The spec "k" writes large counts short (141k, 1.4M).
     """
 
     title: str
@@ -312,10 +312,10 @@ def _text(value: str | int | float, spec: str) -> str:
     if _is_nan(value):
         return "–"
     if spec == "k":
-        thousands = float(value) / 1e3
-        return (
-            f"{thousands / 1e3:.1f}M" if thousands >= 1e3 else f"{thousands:.{0 if thousands >= 10 else 1}f}k"
-        )
+        number = float(value)
+        if number >= 1e4:
+            return f"{number / 1e6:.1f}M" if number >= 1e6 else f"{number / 1e3:.0f}k"
+        return f"{number:,.0f}"
     return format(value, spec)
 
 

@@ -29,7 +29,7 @@ class Schedule:
     refine_stop: int
     reset_every: int
     raise_sh_every: int
-    recovery: int  # steps after a reset in which a level counts as recovering
+    recovery: int  # steps after a reset up to which a level counts as recovering
 
 
 def schedule(config: TrainConfig) -> Schedule:

@@ -165,7 +165,7 @@ def _freeze(state: TrainState, quality: dict[int, float], target: float) -> Iter
 def _save_level(
     state: TrainState, config: TrainConfig, plan: densify.Schedule, folder: Path | None
 ) -> LevelSaved:
-    recovering = state.last_reset >= 0 and state.step - state.last_reset < plan.recovery
+    recovering = state.last_reset >= 0 and state.step - state.last_reset <= plan.recovery
     path = None
     if folder:
         degree = _sh_degree(state.step, config, plan)
