@@ -9,6 +9,7 @@ import numpy as np
 import torch
 import tyro
 
+from benchmarks import audit as table_iii
 from benchmarks import measure, plain, workloads
 from sagesplat.config import TrainConfig
 from sagesplat.gaussians import PARAMETERS, Gaussians
@@ -73,6 +74,13 @@ def garden(
     for name, value in result.items():
         print(f"{name:32} {value:,.4g}" if isinstance(value, float) else f"{name:32} {value}")
     _finish(f"{capture.name}_{camera.width}_{steps}", result, write)
+
+
+@app.command
+def audit() -> None:
+    """The paper's Table III: its sums, and what Eq. 1 chooses from its numbers."""
+    for table in (table_iii.choices_table(), table_iii.sums_table()):
+        print(f"{table.title}\n\n{table.markdown()}")
 
 
 @app.command

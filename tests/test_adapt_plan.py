@@ -8,8 +8,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.audit import (
+    BENCH,
+    GRASS,
+    NAMES,
+    PAVEMENT,
+    STEPS,
+    TABLE_III,
+    TREE,
+    choices_table,
+    paper_plan,
+    sums_table,
+)
 from sagesplat.adapt.model import Eq3, SsimModel
-from sagesplat.adapt.plan import Plan, plan_scene, plan_view, read_plans, write_plans
+from sagesplat.adapt.plan import plan_scene, plan_view, read_plans, write_plans
 from sagesplat.errors import DataError, RunError
 
 
@@ -22,35 +34,6 @@ def fading(label_id: int, level: int, peak: float, rate: float) -> SsimModel:
     """SSIM = peak exp(-rate d) on distances 0 to 10."""
     params = Eq3(peak, rate, 0.0, 1.0, peak, rate, 0.0, 1.0, 10.0)
     return SsimModel(label_id, level, params, (0.0, 10.0), peak, 0.0, 9, "one regime")
-
-
-# SAGE, Table III (bicycle, view DSC8719): minimum distance and SSIM at 5000, 10 000, 15 000 and 30 000 steps.
-# Gaussians: exact where Table III prints them, else Table I (rounded there to thousands or 0.1 million).
-STEPS = (5000, 10000, 15000, 30000)
-BENCH, BICYCLE, GRASS, PAVEMENT, SKY, TREE = range(6)
-TABLE_III = {
-    BENCH: (2.615, (0.587, 0.697, 0.742, 0.750), (141804, 234000, 334433, 336632)),
-    BICYCLE: (3.046, (0.632, 0.713, 0.759, 0.758), (50965, 111799, 144000, 146103)),
-    GRASS: (1.609, (0.341, 0.393, 0.434, 0.419), (287000, 703000, 972000, 985863)),
-    PAVEMENT: (2.671, (0.586, 0.662, 0.688, 0.693), (163298, 337966, 422000, 424146)),
-    SKY: (8.980, (0.805, 0.794, 0.795, 0.803), (278139, 456000, 587000, 578378)),
-    TREE: (0.753, (0.595, 0.612, 0.642, 0.634), (1428984, 2500000, 3200000, 3343641)),
-}
-PAPER_MODELS = {
-    (label, step): constant(label, step, ssim)
-    for label, (_, ssims, _) in TABLE_III.items()
-    for step, ssim in zip(STEPS, ssims, strict=True)
-}
-PAPER_COUNTS = {
-    (label, step): count
-    for label, (_, _, counts) in TABLE_III.items()
-    for step, count in zip(STEPS, counts, strict=True)
-}
-PAPER_DISTANCES = {label: distance for label, (distance, _, _) in TABLE_III.items()}
-
-
-def paper_plan(target: float, **options) -> Plan:
-    return plan_view(PAPER_MODELS, PAPER_COUNTS, PAPER_DISTANCES, target, 0, **options)
 
 
 @pytest.mark.parametrize(
@@ -67,7 +50,7 @@ def test_table_iii_of_the_paper(target, levels, infeasible):
     assert list(plan.levels.values()) == levels
     assert {c.label_id for c in plan.choices if c.status == "infeasible"} == infeasible
     assert (plan.status, plan.binding) == ("infeasible", GRASS)
-    assert [c.distance for c in plan.choices] == list(PAPER_DISTANCES.values())
+    assert [c.distance for c in plan.choices] == [row.distance for row in TABLE_III.values()]
     assert plan.nbytes == 248 * plan.count
 
 
@@ -77,6 +60,14 @@ def test_table_iii_totals():
     assert plan.count == 3049053 - 985863 + 972000
     assert plan.nbytes / 1e6 == pytest.approx(756.2 - 248 * (985863 - 972000) / 1e6, abs=0.05)
     assert paper_plan(0.6).count < 5138872  # and every category that can reach 0.6 does, unlike the paper's
+
+
+def test_the_audit_says_what_differs():
+    rows = {row[0]: row for row in choices_table().rows}
+    differ = {name for name in NAMES for t in range(3) if rows[name][1 + 3 * t] != rows[name][2 + 3 * t]}
+    assert differ == {"bench", "grass-merged", "tree-merged", "pavement-merged"}
+    assert [row[3] for row in sums_table().rows] == [-18_231, 0, -500, 0]
+    assert all("grass-merged: 224.5 printed, 244.5" in str(row[4]) for row in sums_table().rows)
 
 
 def test_levels_after_a_reset_are_taken_only_where_there_is_no_other():
@@ -231,9 +222,11 @@ def test_one_view_is_a_scene_of_one(ladder, target, distance):
 
 def test_plans_read_back_identical(tmp_path):
     path = tmp_path / "plan.json"
-    counts = PAPER_COUNTS | {(-1, 30000): 12}  # a category without a model: NaN in the plan, null in the file
-    views = [plan_view(PAPER_MODELS, counts, PAPER_DISTANCES, target, 4) for target in (0.5, 0.7)]
-    scene = [plan_scene(PAPER_MODELS, counts, {}, 0.6)]
+    models = {(label, step): fading(label, step, 0.9, 0.1) for label in (2, 5) for step in (10, 20)}
+    counts = {key: 7 * key[1] for key in models}
+    counts |= {(-1, 20): 12}  # a category without a model: NaN in the plan, null in the file
+    views = [plan_view(models, counts, {2: 1.5, 5: 2.5}, target, 4) for target in (0.5, 0.7)]
+    scene = [plan_scene(models, counts, {}, 0.6)]
     write_plans(path, scene, views)
     document = json.loads(path.read_text(), parse_constant=pytest.fail)
     assert document["targets"] == [0.5, 0.6, 0.7]

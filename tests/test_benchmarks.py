@@ -8,17 +8,13 @@ from pathlib import Path
 import torch
 from conftest import pinhole, random_gaussians
 
+from benchmarks import plain
 from sagesplat.raster import rasterize
 
 ROOT = Path(__file__).parents[1]
 
 
 def test_the_plain_rasteriser_shows_the_same():
-    sys.path.insert(0, str(ROOT))
-    try:
-        from benchmarks import plain
-    finally:
-        sys.path.remove(str(ROOT))
     g, camera = random_gaussians(80, seed=2, degree=1), pinhole(70, 50)
     assert (plain.render(g, camera, degree=1) - rasterize(g, camera, sh_degree=1).rgb).abs().max() < 2e-3
 

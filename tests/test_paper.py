@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import pinhole, random_gaussians
+from PIL import Image
 
 from sagesplat import pipeline, stages
 from sagesplat.adapt.cross_view import CrossView, read_cross_view
@@ -18,7 +19,7 @@ from sagesplat.config import FitConfig, PaperConfig, PlanConfig, RunConfig, Scen
 from sagesplat.demo.capture import make_capture
 from sagesplat.errors import RunError
 from sagesplat.events import Event, StageSkipped, Warned
-from sagesplat.files import read_json
+from sagesplat.files import read_json, write_json
 from sagesplat.job import Job
 from sagesplat.online import compare_online
 from sagesplat.output.paper import four_levels
@@ -196,6 +197,53 @@ def test_a_capture_without_test_views(capture, tmp_path):
     assert not (job.run.paper / "table_1_test.csv").exists()
     assert not (job.run.paper / "cross_view.csv").exists()
     assert set(read_occupancy(job.run.occupancy).of_view) == {6}
+
+
+def test_categories_that_hardly_occur(capture, tmp_path):
+    """One in two training views only, one of a single pixel, one in test views only."""
+    folder = tmp_path / "capture"
+    shutil.copytree(capture, folder)
+    names = read_json(folder / "masks" / "labels.json")
+    names["labels"] |= {"150": "ghost", "151": "speck", "152": "stranger"}
+    write_json(folder / "masks" / "labels.json", names)
+    where = {150: ((1, 3), np.s_[20:50, 20:60]), 151: ((2,), np.s_[30:31, 30:31]), 152: ((0, 8), np.s_[:30])}
+    for value, (views, pixels) in where.items():
+        for view in views:
+            path = folder / "masks" / f"view_{view:03d}.png"
+            mask = np.array(Image.open(path))
+            mask[pixels] = value
+            Image.fromarray(mask).save(path)
+    config = replace(CONFIG, train=TrainConfig(max_steps=30, level_every=10, freeze_at=0.9))
+    events: list[Event] = []
+    job = Job(RunDir(tmp_path / "run"), events.append)
+    pipeline.run_all(job, folder, config)
+    paper_report(job, replace(PAPER, lpips=tmp_path))
+    seen = read_observations(job.run.observations)
+    assert {150, 151, 152} <= set(seen.label_id)
+    assert set(seen.view[seen.label_id == 152]) == {0, 8}
+    assert (seen.num_pixels[seen.label_id == 151] == 1).all()
+    models = read_json(job.run.models)["models"]
+    assert {m["status"] for m in models if m["label_id"] == 150} == {"constant"}
+    assert not [m for m in models if m["label_id"] == 152]  # nothing to fit
+    assert (job.run.paper / "paper.md").exists()
+
+
+@pytest.mark.parametrize("target", [0.0, 1.5, float("nan"), -0.2])
+def test_impossible_targets_are_refused_before_training(capture, tmp_path, target):
+    job = Job(RunDir(tmp_path / "run"), lambda event: None)
+    with pytest.raises(RunError, match=r"target SSIM .* is impossible"):
+        pipeline.run_all(job, capture, replace(CONFIG, plan=PlanConfig(target_ssim=target)))
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_target_of_one_is_a_plan_out_of_reach(finished, tmp_path):
+    job, _ = finished
+    folder = tmp_path / "run"
+    shutil.copytree(job.run.path, folder)
+    other = Job(RunDir(folder), lambda event: None, force=True)
+    stages.make_plan(other, PlanConfig(target_ssim=1.0))
+    paper_report(other, replace(PAPER, lpips=tmp_path, tune_steps=0))
+    assert "; t=1: " in (folder / "report" / "paper" / "table_3_view.md").read_text()
 
 
 def test_masks_from_labels_and_eroded_regions_change_what_is_measured(finished, tmp_path):

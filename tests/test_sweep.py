@@ -121,6 +121,18 @@ def test_a_second_sweep_has_nothing_to_do_and_says_the_same(finished: Path) -> N
     assert [(finished / "out" / name).read_bytes() for name in TABLES] == before
 
 
+def test_what_is_trained_alike_is_trained_once(copy: Path) -> None:
+    text = TEXT + "variants.minimum.fit.distance = 'minimum'\n"
+    events = sweep_in(copy, text)
+    stages_of = [name.split("/")[1] for name in done(events) if name.startswith("plot-minimum-seed5/")]
+    assert stages_of == ["observe", "fit", "plan", "compose", "evaluate", "report"]
+    rows = {(r["variant"], r["seed"], r["target"]): r for r in rows_of(copy / "out" / "cells.csv")}
+    for target in ("0.3", "0.4"):
+        like, minimum = (rows[variant, "5", target] for variant in ("track", "minimum"))
+        assert like["3DGS PSNR"] == minimum["3DGS PSNR"]
+    assert done(sweep_in(copy, text)) == [*CELLS, "plot-minimum-seed0", "plot-minimum-seed5"]
+
+
 def test_a_cell_that_fails_is_recorded_and_the_others_go_on(copy: Path) -> None:
     (copy / "empty").mkdir()
     sweep = read_sweep(write(copy, TEXT.replace("scenes", 'scenes.bad = "empty"\nscenes')))
