@@ -4,7 +4,7 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from sagesplat.adapt.ladder import Ladder, read_ladder
+from sagesplat.config import FitConfig
 from sagesplat.errors import RunError
 from sagesplat.events import Emit, StageDone, StageSkipped, StageStarted
 from sagesplat.files import read_json
@@ -78,6 +79,12 @@ class Job:
     def antialiased(self) -> bool:
         """Whether the run's Gaussians are drawn with the antialiasing filter."""
         return bool(settings_of(self.run, "train")["antialiased"])
+
+    @property
+    def fit_config(self) -> FitConfig:
+        """How the run's levels were observed and its models fitted."""
+        made = settings_of(self.run, "observe") | settings_of(self.run, "fit")
+        return FitConfig(**{f.name: made[f.name] for f in fields(FitConfig) if f.name in made})
 
     def names(self) -> dict[int, str]:
         """Category names by id, the unlabelled one included."""

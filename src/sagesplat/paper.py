@@ -13,12 +13,15 @@ from sagesplat.adapt.plan import Plan, plan_view, read_plans
 from sagesplat.config import PaperConfig
 from sagesplat.errors import RunError, SageError
 from sagesplat.events import Progress, Warned
+from sagesplat.gaussians import Gaussians
 from sagesplat.job import Job, run_stage
 from sagesplat.lpips import Lpips, Net, load_lpips, weights_path
 from sagesplat.metrics import psnr, squared_error_map
 from sagesplat.output.paper import PaperData, Picture, four_levels, write_paper
 from sagesplat.run_dir import file_hash, settings_of
 from sagesplat.stages import distances, tune_composition
+
+_IMAGES_A_TRAINING = 50  # a short training takes about as long as measuring so many images
 
 
 def paper_report(job: Job, config: PaperConfig) -> None:
@@ -34,10 +37,10 @@ def cross_views(job: Job) -> None:
     targets = _targets(job)
 
     def make() -> list[str]:
+        fitted = job.fit_config
         table = cross_view(
             job.scene, job.photos, job.ladder, read_models(run.models), targets,
-            distances(job, settings_of(run, "observe")["distance"]),
-            min_share=settings_of(run, "fit")["min_share"],
+            distances(job, fitted.distance), min_share=fitted.min_share, region=fitted.region,
             backend=job.backend, antialiased=job.antialiased,
             progress=lambda done, total: job.emit(Progress("crossview", done, total)),
         )  # fmt: skip
@@ -61,21 +64,30 @@ def equal_occupancy(job: Job, config: PaperConfig) -> None:
     settings = {"view": view, "tune_steps": config.tune_steps, "lpips": _weights(config)}
 
     def make() -> list[str]:
-        metrics = _metrics(job, config)
-        rows: list[dict[str, float]] = []
         tests = job.scene.test_ids.tolist()
         comparisons = [(NONE, read_plans(run.plan)[0], tests), (view, _view_plans(job, view), [view])]
+        comparisons = [c for c in comparisons if c[2]]
+        images = sum(len(views) * (4 * len(plans) + 1) for _, plans, views in comparisons)
+        trainings = sum(2 * len(plans) for _, plans, _ in comparisons)
+        done, total = 0, trainings * _IMAGES_A_TRAINING + images
+
+        def advance(by: int) -> None:
+            nonlocal done
+            done += by
+            job.emit(Progress("occupancy", done, total))
+
+        def tuned(g: Gaussians) -> Gaussians:
+            result = tune_composition(job, g, config.tune_steps)
+            advance(_IMAGES_A_TRAINING)
+            return result
+
+        metrics = _metrics(job, config)
+        rows: list[dict[str, float]] = []
         for of_view, plans, views in comparisons:
-            if not views:
-                continue
-            sets = contenders(
-                job.scene, job.ladder, plans, lambda g: tune_composition(job, g, config.tune_steps),
-                antialiased=job.antialiased,
-            )  # fmt: skip
+            sets = contenders(job.scene, job.ladder, plans, tuned, antialiased=job.antialiased)
             rows += compare(
                 job.scene, job.photos, views, sets, metrics, of_view=of_view,
-                backend=job.backend, antialiased=job.antialiased,
-                progress=lambda done, total: job.emit(Progress("occupancy", done, total)),
+                backend=job.backend, antialiased=job.antialiased, progress=lambda *_: advance(1),
             )  # fmt: skip
         write_columns(run.occupancy, from_rows(Occupancy, rows))
         return [f"{len(rows)} images measured"]
@@ -129,7 +141,7 @@ def _view_plans(job: Job, view: int) -> list[Plan]:
     """Plans for one view at every target, as the paper's Table III makes them: from its four iterations."""
     levels = four_levels(job.ladder.levels)
     counts = {key: n for key, n in job.ladder.counts.items() if key[1] in levels}
-    seen = distances(job, settings_of(job.run, "observe")["distance"])
+    seen = distances(job, job.fit_config.distance)
     here = {label: float(d[view]) for label, d in seen.items()}
     models = read_models(job.run.models)
     return [plan_view(models, counts, here, target, view) for target in _targets(job)]

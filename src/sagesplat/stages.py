@@ -247,8 +247,7 @@ def make_plan(job: Job, config: PlanConfig) -> None:
 
     def make() -> list[str]:
         models, ladder = read_models(run.models), job.ladder
-        min_share = settings_of(run, "fit")["min_share"]
-        table = large_enough(read_observations(run.observations), job.scene, min_share)
+        table = large_enough(read_observations(run.observations), job.scene, job.fit_config.min_share)
         table = table.select(table.level == ladder.levels[-1])
         seen = table.select(np.isin(table.view, job.scene.train_ids))
         labels = {label for label, _ in ladder.counts}
@@ -323,11 +322,10 @@ def evaluate_plans(job: Job) -> None:
     run = job.run
 
     def make() -> list[str]:
-        observed = settings_of(run, "observe")
+        fitted = job.fit_config
         table = evaluate(
-            job.scene, job.photos, label_images(job, observed["masks"]), job.ladder, read_models(run.models),
-            read_plans(run.plan)[0], distances(job, observed["distance"]),
-            region=settings_of(run, "fit")["region"],
+            job.scene, job.photos, label_images(job, fitted.masks), job.ladder, read_models(run.models),
+            read_plans(run.plan)[0], distances(job, fitted.distance), region=fitted.region,
             compose=lambda plan: compose(job, plan),
             backend=job.backend, antialiased=job.antialiased,
             progress=lambda done, total: job.emit(Progress("evaluate", done, total)),

@@ -31,12 +31,13 @@ def transfer(job_a: Job, job_b: Job, out: Path, targets: Sequence[float] | None 
     targets = targets or list[float](settings_of(job_b.run, "plan")["targets"])
     for target in targets:
         check_target(target)
-    there, here = how_measured(job_a), how_measured(job_b)
-    for name in (name for name in there if there[name] != here[name]):
-        raise RunError(
-            f"{b.name}: measured with --fit.{name} {here[name]}, {a.name} with {there[name]}; run one of "
-            "them again like the other"
-        )
+    for name in ("distance", "masks", "region"):
+        there, here = (getattr(job.fit_config, name) for job in (job_a, job_b))
+        if there != here:
+            raise RunError(
+                f"{b.name}: measured with --fit.{name} {here}, {a.name} with {there}; run one of them again "
+                "like the other"
+            )
     scores = compare.transfer(a, b, targets)
     summary = transfer_report.summary_table(scores)
     transfer_report.transfer_table(scores).write(out / "transfer")
@@ -45,21 +46,14 @@ def transfer(job_a: Job, job_b: Job, out: Path, targets: Sequence[float] | None 
     return summary, transfer_report.headline(summary)
 
 
-def how_measured(job: Job) -> dict[str, str]:
-    """The settings that have to agree between runs (some are younger than some runs)."""
-    defaults = {"distance": "percentile", "masks": "given", "region": "mask"}
-    made = settings_of(job.run, "observe") | settings_of(job.run, "fit")
-    return {name: made.get(name, default) for name, default in defaults.items()}
-
-
 def load_fitted(job: Job) -> FittedRun:
     """What transfer needs of a run; RunError where its models are not fitted yet."""
     run, scene = job.run, job.scene
     for path in (run.labels, run.observations, run.models):
         if not path.exists():
             raise RunError(f"{path}: missing; finish this run with `sagesplat run`")
-    rows = large_enough(read_observations(run.observations), scene, settings_of(run, "fit")["min_share"])
-    if how_measured(job)["region"] == "eroded":
+    rows = large_enough(read_observations(run.observations), scene, job.fit_config.min_share)
+    if job.fit_config.region == "eroded":
         rows = replace(rows, ssim=rows.ssim_eroded)
     return FittedRun(
         name=str(run.path),

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float32, Int32
@@ -70,6 +71,7 @@ def cross_view(
     distances: Mapping[int, Float32[np.ndarray, " V"]],
     *,
     min_share: float = 0.0,
+    region: Literal["mask", "eroded"] = "mask",
     backend: Backend = "auto",
     antialiased: bool = False,
     progress: Callable[[int, int], None] | None = None,
@@ -77,7 +79,8 @@ def cross_view(
     """Plan each test view from its distances, compose, and measure per rendered mask, beside an oracle.
 
     The oracle knows what every settled level measures in that view. Categories with less than `min_share` of
-    the rendered pixels are planned but make no row. `progress` hears (images measured, images in all).
+    the rendered pixels are planned but make no row. `region`: where SSIM is measured. `progress` hears
+    (images measured, images in all).
     """
     rows: list[dict[str, float]] = []
     labels = RenderedLabels(ladder.load(ladder.levels[-1]), backend, antialiased)
@@ -92,7 +95,10 @@ def cross_view(
         done += 1
         if progress:
             progress(done, total)
-        return measure(image, as_unit(photos[row]), labels[view])
+        rows = measure(image, as_unit(photos[row]), labels[view])
+        if region == "eroded":
+            rows = {label: {**values, "ssim": values["ssim_eroded"]} for label, values in rows.items()}
+        return rows
 
     at_level: dict[int, dict[int, dict[int, dict[str, float]]]] = {}
     for level in ladder.levels:  # one level in memory at a time
