@@ -12,7 +12,7 @@ from sagesplat.adapt.occupancy import Occupancy, compare, contenders, read_occup
 from sagesplat.adapt.plan import Plan, plan_view, read_plans
 from sagesplat.config import PaperConfig
 from sagesplat.errors import RunError, SageError
-from sagesplat.events import Progress, Warned
+from sagesplat.events import Progress, RunDone, Warned
 from sagesplat.gaussians import Gaussians
 from sagesplat.job import Job, run_stage
 from sagesplat.lpips import Lpips, Net, load_lpips, weights_path
@@ -110,6 +110,7 @@ def tables_and_figures(job: Job, config: PaperConfig) -> None:
             for name, percentile in reduced.items()
         }
         data = PaperData(
+            title=job.scene.name,
             names=job.names(),
             colours={label: taxonomy.color(label) for label in job.names()},
             observations=read_observations(run.observations),
@@ -127,10 +128,12 @@ def tables_and_figures(job: Job, config: PaperConfig) -> None:
             occupancy=read_occupancy(run.occupancy),
             panels=_panels(job, config, view),
         )
-        return [f"{write_paper(run.paper, data)}"]
+        write_paper(run.paper, data)
+        return []
 
     inputs = [run.observations, run.models, run.plan, run.cross_view, run.occupancy]
-    run_stage(job, "paper", {"view": view}, inputs, [run.paper / "paper.md"], make)
+    run_stage(job, "paper", {"view": view}, inputs, [run.paper / "index.html"], make)
+    job.emit(RunDone(run.paper / "index.html"))
 
 
 def _targets(job: Job) -> list[float]:

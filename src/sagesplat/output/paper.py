@@ -18,6 +18,7 @@ from sagesplat.files import write_text
 from sagesplat.gaussians import BYTES_PER_GAUSSIAN
 from sagesplat.output import figures
 from sagesplat.output.figures import STYLE, Colours
+from sagesplat.output.report import template
 from sagesplat.output.tables import MB, Table, by_size, last_counts, mean, name_of, view_mean
 
 ITERATIONS = (1 / 6, 1 / 3, 1 / 2, 1.0)  # of the run: the paper's 5000, 10 000, 15 000 and 30 000
@@ -37,6 +38,7 @@ class Picture:
 class PaperData:
     """Everything that the paper's tables and figures show. Views are rows of `view_names`."""
 
+    title: str
     names: Mapping[int, str]  # label id -> name
     colours: Colours
     observations: Observations
@@ -61,17 +63,22 @@ def four_levels(levels: Sequence[int]) -> list[int]:
 
 
 def write_paper(folder: Path, data: PaperData) -> Path:
-    """Write every table and figure into `folder`, and paper.md that shows them all; its path comes back."""
+    """Write every table and figure into `folder`, with index.html (its path comes back) and paper.md."""
     labels = by_size(data.counts)
-    parts = ["# Tables and figures of the paper\n"]
-    for name, table in _tables(data, labels):
+    tables = list(_tables(data, labels))
+    for name, table in tables:
         table.write(folder / name)
-        parts.append(f"## {table.title}\n\n{table.markdown()}")
+    pictures = []
     for name, title, figure in _figures(data, labels):
         figures.save_figure(figure, folder / name)
-        parts.append(f"## {title}\n\n![{title}]({name}.png)\n")
+        pictures.append((name, title))
+    title = f"{data.title}: tables and figures of the paper"
+    parts = [f"# {title}\n", *(f"## {table.title}\n\n{table.markdown()}" for _, table in tables)]
+    parts += [f"## {caption}\n\n![{caption}]({name}.png)\n" for name, caption in pictures]
     write_text(folder / "paper.md", "\n".join(parts))
-    return folder / "paper.md"
+    page = template("paper.html.j2").render(title=title, tables=tables, pictures=pictures)
+    write_text(folder / "index.html", page)
+    return folder / "index.html"
 
 
 def _tables(data: PaperData, labels: Sequence[int]):
@@ -158,9 +165,11 @@ def one_view(data: PaperData, labels: Sequence[int]) -> Table:
         cells += [view_mean(rows, label, level) for level in data.iterations]
         cells += [*counts, *(n * BYTES_PER_GAUSSIAN / MB for n in counts)]
         for i, level in enumerate(data.iterations):
-            chosen = [t for t, plan in zip(targets, plans, strict=True) if plan[label].level == level]
+            chosen = [
+                p.target for p, plan in zip(data.view_plans, plans, strict=True) if plan[label].level == level
+            ]
             if chosen:
-                marks[len(body), 1 + columns[0] + i] = " ".join(chosen)
+                marks[len(body), 1 + columns[0] + i] = ", ".join(f"{target:g}" for target in chosen)
         body.append((name_of(label, data.names), *cells))
     totals = [sum(full.values()), *(plan.count for plan in data.view_plans)]
     whole = [view_mean(rows, TOTAL, level) for level in data.iterations]
@@ -171,7 +180,10 @@ def one_view(data: PaperData, labels: Sequence[int]) -> Table:
         for plan in data.view_plans
         if plan.infeasible
     ]
-    notes = ("Selected by the models fitted on the training views; SSIM is measured.",)
+    notes = (
+        "A marked SSIM is of the level selected for the targets named; selected by the models fitted on the "
+        "training views, measured in this view.",
+    )
     notes += (f"Out of reach, best taken: {'; '.join(out)}.",) if out else ()
     return Table(
         f"Table III: view {data.view_names[data.view]}",

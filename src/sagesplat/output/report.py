@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jinja2 import Environment, StrictUndefined
+from jinja2 import Environment, StrictUndefined, Template
 from PIL import Image
 
 from sagesplat import __version__
@@ -70,11 +70,7 @@ def write_report(folder: Path, data: ReportData) -> Path:
     for number, panel in enumerate(data.panels):
         strip = figures.panel_strip(panel, data.colours)
         figures.save_figure(strip, folder / "figures" / f"panel_{number}")
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    template = environment.from_string(Path(__file__).with_name("report.html.j2").read_text("utf-8"))
-    page = template.render(
+    page = template("report.html.j2").render(
         data=data,
         version=__version__,
         headline=_headline(data),
@@ -86,6 +82,14 @@ def write_report(folder: Path, data: ReportData) -> Path:
     )
     write_text(folder / "index.html", page)
     return folder / "index.html"
+
+
+def template(name: str) -> Template:
+    """A page's template, of the files beside this one."""
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    return environment.from_string(Path(__file__).with_name(name).read_text("utf-8"))
 
 
 def main_plan(data: ReportData) -> Plan:

@@ -59,7 +59,8 @@ class Table:
     def markdown(self) -> str:
         """The table in Markdown; marked cells are bold and carry their mark."""
         columns = [name.replace("|", "\\|") for name in self.columns()]
-        lines = [f"| {' | '.join(columns)} |", "|---" + "|---:" * (len(columns) - 1) + "|"]
+        rules = ["---:" if spec else "---" for spec in self.formats]
+        lines = [f"| {' | '.join(columns)} |", f"|{'|'.join(rules)}|"]
         for r, cells in enumerate(self.cells()):
             shown = [
                 f"**{cell}** ({self.marks[r, c]})" if (r, c) in self.marks else cell.replace("|", "\\|")
@@ -70,7 +71,7 @@ class Table:
 
     def latex(self) -> str:
         """The table in LaTeX (packages booktabs and, where cells are marked, xcolor with option `table`)."""
-        alignment = "l" + "r" * (len(self.header) - 1)
+        alignment = "".join("r" if spec else "l" for spec in self.formats)
         lines = [r"\begin{table}", r"\centering", rf"\caption{{{_tex(self.title)}}}"]
         lines += [rf"\begin{{tabular}}{{{alignment}}}", r"\toprule"]
         if self.groups:
