@@ -13,6 +13,7 @@ from PIL import Image
 
 from sagesplat import pipeline, stages
 from sagesplat.adapt.cross_view import CrossView, read_cross_view
+from sagesplat.adapt.ladder import read_ladder
 from sagesplat.adapt.observe import TOTAL, RenderedLabels, near_border, read_observations
 from sagesplat.adapt.occupancy import METHODS, WHOLE, importance, nearest_snapshot, prune_to, read_occupancy
 from sagesplat.config import FitConfig, PaperConfig, PlanConfig, RunConfig, SceneConfig, TrainConfig
@@ -22,12 +23,14 @@ from sagesplat.events import Event, StageSkipped, Warned
 from sagesplat.files import read_json, write_json
 from sagesplat.job import Job
 from sagesplat.online import compare_online
+from sagesplat.output import tables
 from sagesplat.output.paper import four_levels
 from sagesplat.output.ply import read_ply
 from sagesplat.output.tables import Table
 from sagesplat.paper import paper_report
 from sagesplat.run_dir import RunDir
 from sagesplat.scene.scene import View
+from sagesplat.train.levels import write_level
 
 CONFIG = RunConfig(train=TrainConfig(max_steps=90, level_every=15), plan=PlanConfig(target_ssim=0.4))
 PAPER = PaperConfig(tune_steps=5)
@@ -364,6 +367,18 @@ def pipeline_alpha(g, job, row):
     from sagesplat.raster import rasterize
 
     return rasterize(g, job.scene.views[row].camera).alpha.sum()
+
+
+def test_a_category_that_was_pruned_away_counts_nothing(tmp_path):
+    g = random_gaussians(30)
+    write_level(tmp_path, 100, g, recovering=False, sh_degree=3)
+    write_level(tmp_path, 200, g.of_labels([-1, 3]), recovering=False, sh_degree=3)
+    ladder = read_ladder(tmp_path)
+    assert ladder.counts == {(-1, 100): 10, (3, 100): 10, (184, 100): 10} | {
+        (-1, 200): 10, (3, 200): 10, (184, 200): 0
+    }  # fmt: skip
+    assert len(ladder.compose({-1: 100, 3: 200, 184: 200})) == 20
+    assert tables.last_counts(ladder.counts) == {-1: 10, 3: 10, 184: 0}
 
 
 def test_four_levels_are_the_papers():

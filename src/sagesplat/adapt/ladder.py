@@ -22,8 +22,9 @@ class Ladder:
 
     @property
     def counts(self) -> dict[tuple[int, int], int]:
-        """Gaussians of each (label id, level)."""
-        return {(label, f.step): count for f in self.files for label, count in f.counts.items()}
+        """Gaussians of each (label id, level); 0 where a category has none (left) at a level."""
+        labels = sorted({label for f in self.files for label in f.counts})
+        return {(label, f.step): f.counts.get(label, 0) for f in self.files for label in labels}
 
     @property
     def recovering(self) -> frozenset[int]:

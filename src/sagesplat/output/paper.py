@@ -165,11 +165,9 @@ def one_view(data: PaperData, labels: Sequence[int]) -> Table:
         cells += [view_mean(rows, label, level) for level in data.iterations]
         cells += [*counts, *(n * BYTES_PER_GAUSSIAN / MB for n in counts)]
         for i, level in enumerate(data.iterations):
-            chosen = [
-                p.target for p, plan in zip(data.view_plans, plans, strict=True) if plan[label].level == level
-            ]
+            chosen = [f"{p.target:g}" for p in data.view_plans if p.levels[label] == level]
             if chosen:
-                marks[len(body), 1 + columns[0] + i] = ", ".join(f"{target:g}" for target in chosen)
+                marks[len(body), 1 + columns[0] + i] = ", ".join(chosen)
         body.append((name_of(label, data.names), *cells))
     totals = [sum(full.values()), *(plan.count for plan in data.view_plans)]
     whole = [view_mean(rows, TOTAL, level) for level in data.iterations]
