@@ -25,6 +25,7 @@ from sagesplat.adapt.transfer import (
     score,
     shared_categories,
     transfer,
+    transferred_levels,
 )
 from sagesplat.config import SceneConfig
 from sagesplat.errors import RunError
@@ -168,6 +169,17 @@ def test_a_category_without_test_views_and_one_in_two_views():
     transfer_figure(A, b)
 
 
+def test_levels_that_another_runs_models_choose_for_a_view():
+    b = synthetic("b", {7: "apple", 9: "else"}, unit=3.0)  # all of B's distances are three times A's
+    view = int(b.test_views[0])
+    seen = b.observations.select(b.observations.view == view)
+    here = dict(zip(seen.label_id.tolist(), seen.distance.tolist(), strict=True))
+    for target in (0.5, 0.7, 0.8):
+        own = plan_view(b.models, b.counts, here, target, view).levels
+        levels = transferred_levels(A, b, view, here, target, "extent")
+        assert levels == {7: own[7]}  # `else` is not shared
+
+
 def test_what_is_not_known_is_predicted_by_the_median():
     b = replace(A, extent=math.nan, spacings={1: 0.01})
     scores = transfer(A, b, [0.7])
@@ -266,7 +278,8 @@ def job(tmp_path_factory: pytest.TempPathFactory) -> Job:
     made.observations.write_csv(run.observations)
     write_models(run.models, dict(made.models))
     for stage, values in (
-        ("observe", {"distance": "percentile"}), ("fit", {"min_share": 0.0}), ("plan", {"targets": TARGETS})
+        ("train", {"antialiased": False}), ("observe", {"distance": "percentile"}),
+        ("fit", {"min_share": 0.0}), ("plan", {"targets": TARGETS})
     ):  # fmt: skip
         record(run, stage, values, [], 0.0)
     return job
@@ -282,7 +295,7 @@ def test_a_run_predicts_itself_like_its_own_models(job, tmp_path):
         rows = list(csv.DictReader(file))
     assert {row["target"] for row in rows} == {str(target) for target in TARGETS}
     assert {row["missed"] for row in rows} == {"0"}
-    files = {"transfer.png", "transfer.svg"}
+    files = {"transfer.png", "transfer.svg", "panel.png", "panel.svg"}
     files |= {f"{name}.{kind}" for name in ("transfer", "summary") for kind in ("csv", "md", "tex")}
     assert {p.name for p in tmp_path.rglob("*.*")} == files
     fitted = load_fitted(job)

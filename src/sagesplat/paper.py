@@ -7,7 +7,7 @@ import numpy as np
 from sagesplat.adapt.columns import from_rows, write_columns
 from sagesplat.adapt.cross_view import NONE, cross_view, read_cross_view
 from sagesplat.adapt.model import read_models
-from sagesplat.adapt.observe import TOTAL, as_unit, distances_in_views, read_observations, render_rgb
+from sagesplat.adapt.observe import TOTAL, distances_in_views, read_observations
 from sagesplat.adapt.occupancy import Occupancy, compare, contenders, read_occupancy
 from sagesplat.adapt.plan import Plan, plan_view, read_plans
 from sagesplat.config import PaperConfig
@@ -16,8 +16,7 @@ from sagesplat.events import Progress, RunDone, Warned
 from sagesplat.gaussians import Gaussians
 from sagesplat.job import Job, run_stage
 from sagesplat.lpips import Lpips, Net, load_lpips, weights_path
-from sagesplat.metrics import psnr, squared_error_map
-from sagesplat.output.paper import PaperData, Picture, four_levels, write_paper
+from sagesplat.output.paper import PaperData, Picture, four_levels, take_pictures, write_paper
 from sagesplat.run_dir import file_hash, settings_of
 from sagesplat.stages import distances, tune_composition
 
@@ -187,14 +186,10 @@ def _panels(job: Job, config: PaperConfig, view: int) -> dict[str, list[Picture]
     full = job.ladder.load(job.ladder.levels[-1])
     panels = {}
     for row in dict.fromkeys(rows):
-        camera, photo = job.scene.views[row].camera, as_unit(job.photos[row])
         sets = {f"3DGS, {len(full):,}": full}
         sets |= {f"t={p.target:g}, {p.count:,}": job.ladder.compose(p.levels) for p in _view_plans(job, row)}
-        pictures = [Picture("photo", job.photos[row], np.nan, np.nan)]
-        for title, g in sets.items():
-            image = render_rgb(g, camera, backend=job.backend, antialiased=job.antialiased)
-            decibels = float(psnr(squared_error_map(image, photo).mean()))
-            lpips = metric(photo, image) if metric else np.nan
-            pictures.append(Picture(title, np.round(image * 255).astype(np.uint8), decibels, lpips))
-        panels[job.scene.views[row].name] = pictures
+        panels[job.scene.views[row].name] = take_pictures(
+            job.photos[row], job.scene.views[row].camera, sets, metric,
+            backend=job.backend, antialiased=job.antialiased,
+        )  # fmt: skip
     return panels

@@ -10,14 +10,17 @@ import numpy as np
 from sagesplat.adapt import transfer as compare
 from sagesplat.adapt.model import read_models
 from sagesplat.adapt.observe import large_enough, read_observations
-from sagesplat.adapt.plan import check_target
+from sagesplat.adapt.plan import check_target, plan_view
 from sagesplat.adapt.transfer import FittedRun
-from sagesplat.errors import RunError
+from sagesplat.errors import RunError, SageError
 from sagesplat.job import Job
+from sagesplat.lpips import load_lpips
 from sagesplat.output import transfer_report
 from sagesplat.output.figures import save_figure
+from sagesplat.output.paper import Picture, panel, take_pictures
 from sagesplat.output.tables import Table
 from sagesplat.run_dir import settings_of
+from sagesplat.stages import distances
 
 
 def transfer(job_a: Job, job_b: Job, out: Path, targets: Sequence[float] | None = None) -> tuple[Table, str]:
@@ -43,7 +46,30 @@ def transfer(job_a: Job, job_b: Job, out: Path, targets: Sequence[float] | None 
     transfer_report.transfer_table(scores).write(out / "transfer")
     summary.write(out / "summary")
     save_figure(transfer_report.transfer_figure(a, b), out / "figures" / "transfer")
+    save_figure(panel(_pictures(job_b, a, b, targets)), out / "figures" / "panel")
     return summary, transfer_report.headline(summary)
+
+
+def _pictures(job: Job, a: FittedRun, b: FittedRun, targets: Sequence[float]) -> list[Picture]:
+    """Fig. 5: a view of B composed as A's models say (distances over the extent), B's own for the rest."""
+    rows = b.test_views if len(b.test_views) else b.train_views
+    row = int(rows[len(rows) // 2])
+    seen = distances(job, job.fit_config.distance)
+    here = {label: float(d[row]) for label, d in seen.items()}
+    try:
+        metric = load_lpips("alex")
+    except SageError:
+        metric = None
+    full = job.ladder.load(job.ladder.levels[-1])
+    sets = {f"3DGS, {len(full):,}": full}
+    for target in sorted(targets):
+        own = plan_view(b.models, b.counts, here, target, row, recovering=b.recovering).levels
+        g = job.ladder.compose(own | compare.transferred_levels(a, b, row, here, target, "extent"))
+        sets[f"t={target:g}, {len(g):,}"] = g
+    return take_pictures(
+        job.photos[row], job.scene.views[row].camera, sets, metric,
+        backend=job.backend, antialiased=job.antialiased,
+    )  # fmt: skip
 
 
 def load_fitted(job: Job) -> FittedRun:

@@ -161,6 +161,23 @@ def transfer(a: FittedRun, b: FittedRun, targets: Sequence[float]) -> Transfer:
     return Transfer(**{f.name: np.array([row[f.name] for row in rows]) for f in fields(Transfer)})
 
 
+def transferred_levels(
+    a: FittedRun, b: FittedRun, view: int, distances: Mapping[int, float], target: float, predictor: str
+) -> dict[int, int]:
+    """Level of each shared category, by B's label id, that A's models choose for a view of B.
+
+    `distances`: by label id of B, world units; NaN or absent where nothing is in sight.
+    """
+    levels = {}
+    for shared in shared_categories(a, b):
+        models, scale = predictors(a, b, shared, b.focals[[view]])[predictor]
+        d = np.array([distances.get(shared.label_b, np.nan)]) * scale
+        counts = np.array([b.counts[shared.label_b, level] for level in shared.levels])
+        ssim = np.stack([model(d) for model in models])
+        levels[shared.label_b] = shared.levels[int(choose(ssim, np.array(shared.levels), counts, target)[0])]
+    return levels
+
+
 def score(
     predicted: Float[np.ndarray, "L V"],
     measured: Float[np.ndarray, "L V"],

@@ -11,15 +11,19 @@ from matplotlib.figure import Figure
 
 from sagesplat.adapt.cross_view import NONE, CrossView
 from sagesplat.adapt.model import SsimModel
-from sagesplat.adapt.observe import TOTAL, Observations
+from sagesplat.adapt.observe import TOTAL, Observations, as_unit, render_rgb
 from sagesplat.adapt.occupancy import METHODS, WHOLE, Occupancy
 from sagesplat.adapt.plan import Counts, Plan
 from sagesplat.files import write_text
-from sagesplat.gaussians import BYTES_PER_GAUSSIAN
+from sagesplat.gaussians import BYTES_PER_GAUSSIAN, Gaussians
+from sagesplat.lpips import Lpips
+from sagesplat.metrics import psnr, squared_error_map
 from sagesplat.output import figures
 from sagesplat.output.figures import STYLE, Colours
 from sagesplat.output.report import template
 from sagesplat.output.tables import MB, Table, by_size, last_counts, mean, name_of, view_mean
+from sagesplat.raster import Backend
+from sagesplat.scene.scene import Camera
 
 ITERATIONS = (1 / 6, 1 / 3, 1 / 2, 1.0)  # of the run: the paper's 5000, 10 000, 15 000 and 30 000
 
@@ -274,6 +278,26 @@ def cross_view_table(
         "that view, where the chosen one does.",
     )
     return Table("Cross-view: plans for unseen views", header, formats, body, notes=notes)
+
+
+def take_pictures(
+    photo: UInt8[np.ndarray, "H W 3"],
+    camera: Camera,
+    sets: Mapping[str, Gaussians],
+    metric: Lpips | None,
+    *,
+    backend: Backend = "auto",
+    antialiased: bool = False,
+) -> list[Picture]:
+    """The photo, and each set of Gaussians (by title) as the camera sees it."""
+    pictures = [Picture("photo", photo, np.nan, np.nan)]
+    unit = as_unit(photo)
+    for title, g in sets.items():
+        image = render_rgb(g, camera, backend=backend, antialiased=antialiased)
+        decibels = float(psnr(squared_error_map(image, unit).mean()))
+        lpips = metric(unit, image) if metric else np.nan
+        pictures.append(Picture(title, np.round(image * 255).astype(np.uint8), decibels, lpips))
+    return pictures
 
 
 @rc_context(STYLE)
