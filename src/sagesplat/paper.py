@@ -1,5 +1,6 @@
 """The paper's evaluation of a finished run, in three stages: crossview, occupancy, tables and figures."""
 
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -7,7 +8,7 @@ import numpy as np
 from sagesplat.adapt.columns import from_rows, write_columns
 from sagesplat.adapt.cross_view import NONE, cross_view, read_cross_view
 from sagesplat.adapt.model import read_models
-from sagesplat.adapt.observe import TOTAL, distances_in_views, read_observations
+from sagesplat.adapt.observe import TOTAL, distances_in_views, large_enough, read_observations
 from sagesplat.adapt.occupancy import Occupancy, compare, contenders, read_occupancy
 from sagesplat.adapt.plan import Plan, plan_view, read_plans
 from sagesplat.config import PaperConfig
@@ -108,11 +109,14 @@ def tables_and_figures(job: Job, config: PaperConfig) -> None:
             name: distances_in_views(job.scene, job.point_labels, percentile)
             for name, percentile in reduced.items()
         }
+        observations, fitted = read_observations(run.observations), job.fit_config
+        rows = large_enough(observations, job.scene, fitted.min_share)
         data = PaperData(
             title=job.scene.name,
             names=job.names(),
             colours={label: taxonomy.color(label) for label in job.names()},
-            observations=read_observations(run.observations),
+            observations=observations,
+            fitted=replace(rows, ssim=rows.ssim_eroded) if fitted.region == "eroded" else rows,
             train_views=job.scene.train_ids,
             test_views=job.scene.test_ids,
             view_names=[v.name for v in job.scene.views],

@@ -46,6 +46,7 @@ class PaperData:
     names: Mapping[int, str]  # label id -> name
     colours: Colours
     observations: Observations
+    fitted: Observations  # those of views that show enough of a category, as models are fitted to
     train_views: np.ndarray
     test_views: np.ndarray
     view_names: Sequence[str]
@@ -86,45 +87,26 @@ def write_paper(folder: Path, data: PaperData) -> Path:
 
 
 def _tables(data: PaperData, labels: Sequence[int]):
-    for number, which, views in (("1", "training", data.train_views), ("1", "test", data.test_views)):
+    for which, views in (("training", data.train_views), ("test", data.test_views)):
         if len(views):
-            yield f"table_{number}_{which}", quality_and_counts(data, labels, views, which)
+            yield f"table_1_{which}", quality_and_counts(data, labels, views, which)
     yield "table_3_view", one_view(data, labels)
-    if len(data.occupancy.view):
-        yield "table_4_view", equal_occupancy(data.occupancy, data.view, data.view_names[data.view])
+    yield "table_4_view", equal_occupancy(data.occupancy, data.view, data.view_names[data.view])
+    if len(data.test_views):
         yield "table_4_test", equal_occupancy(data.occupancy, NONE, "mean of the test views")
-    if len(data.cross_view):
         yield "cross_view", cross_view_table(data.cross_view, labels, data.names, data.counts)
+    if data.models:
+        yield "equation_3", curves_and_constants(data, labels)
 
 
 def _figures(data: PaperData, labels: Sequence[int]):
-    views = data.train_views, data.test_views
-    yield (
-        "figure_2",
-        "Fig. 2: SSIM over iterations",
-        figures.ssim_over_levels(
-            data.observations, *views, labels, data.names, data.colours, data.recovering
-        ),
-    )
-    yield (
-        "figure_3",
-        "Fig. 3: SSIM over distance",
-        figures.ssim_over_distance(
-            data.observations,
-            data.train_views,
-            labels,
-            data.names,
-            data.colours,
-            data.models,
-            data.iterations,
-        ),
-    )
+    named, seen = (labels, data.names, data.colours), data.observations
+    over_levels = figures.ssim_over_levels(seen, data.train_views, data.test_views, *named, data.recovering)
+    over_distance = figures.ssim_over_distance(seen, data.train_views, *named, data.models, data.iterations)
+    yield "figure_2", "Fig. 2: SSIM over iterations", over_levels
+    yield "figure_3", "Fig. 3: SSIM over distance", over_distance
     for number, (name, pictures) in enumerate(data.panels.items(), 4):
-        yield (
-            f"figure_{min(number, 5)}{'' if number < 6 else f'_{number - 4}'}",
-            f"Figs. 4, 5: {name}",
-            panel(pictures),
-        )
+        yield f"figure_{number}", f"Figs. 4, 5: view {name}", panel(pictures)
 
 
 def quality_and_counts(data: PaperData, labels: Sequence[int], views: np.ndarray, which: str) -> Table:
@@ -150,6 +132,39 @@ def quality_and_counts(data: PaperData, labels: Sequence[int], views: np.ndarray
 def _recovering(data: PaperData) -> tuple[str, ...]:
     late = [f"{level:,}" for level in data.iterations if level in data.recovering]
     return (f"Recovering from an opacity reset: {', '.join(late)}.",) if late else ()
+
+
+def curves_and_constants(data: PaperData, labels: Sequence[int]) -> Table:
+    """What distance explains: the error of Eq. 3 beside that of the median of the training views."""
+    rows = data.fitted.select(~np.isin(data.fitted.level, list(data.recovering)))
+    body = []
+    for label in labels:
+        errors: dict[tuple[str, str], list[np.ndarray]] = {}
+        models = [m for (i, level), m in data.models.items() if i == label and level not in data.recovering]
+        for model in models:
+            here = rows.select((rows.label_id == label) & (rows.level == model.level))
+            for split, views in (("train", data.train_views), ("test", data.test_views)):
+                at = here.select(np.isin(here.view, views) & np.isfinite(here.ssim))
+                errors.setdefault((split, "constant"), []).append(np.abs(at.ssim - model.median))
+                errors.setdefault((split, "Eq. 3"), []).append(np.abs(at.ssim - model(at.distance)))
+        if not models:
+            continue
+        means = [
+            mean(np.concatenate(errors[split, name]))
+            for split in ("train", "test")
+            for name in ("constant", "Eq. 3")
+        ]
+        kinds = [
+            sum(m.status == status for m in models) for status in ("constant", "one regime", "two regimes")
+        ]
+        body.append((name_of(label, data.names), *means, *kinds))
+    return Table(
+        "Eq. 3 beside a constant: mean error of SSIM over all settled levels",
+        ("category", *("constant", "Eq. 3") * 2, "constant", "one regime", "two regimes"),
+        ("", *[".3f"] * 4, *["d"] * 3),
+        body,
+        groups=(("training views", 2), ("test views", 2), ("models by kind", 3)),
+    )
 
 
 def one_view(data: PaperData, labels: Sequence[int]) -> Table:
