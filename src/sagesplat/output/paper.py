@@ -27,6 +27,8 @@ from sagesplat.scene.scene import Camera
 
 ITERATIONS = (1 / 6, 1 / 3, 1 / 2, 1.0)  # of the run: the paper's 5000, 10 000, 15 000 and 30 000
 
+_KINDS = ("constant", "one regime", "two regimes")  # of models
+
 
 @dataclass(frozen=True, eq=False)
 class Picture:
@@ -154,13 +156,11 @@ def curves_and_constants(data: PaperData, labels: Sequence[int]) -> Table:
             for split in ("train", "test")
             for name in ("constant", "Eq. 3")
         ]
-        kinds = [
-            sum(m.status == status for m in models) for status in ("constant", "one regime", "two regimes")
-        ]
-        body.append((name_of(label, data.names), *means, *kinds))
+        statuses = [model.status for model in models]
+        body.append((name_of(label, data.names), *means, *map(statuses.count, _KINDS)))
     return Table(
         "Eq. 3 beside a constant: mean error of SSIM over all settled levels",
-        ("category", *("constant", "Eq. 3") * 2, "constant", "one regime", "two regimes"),
+        ("category", *("constant", "Eq. 3") * 2, *_KINDS),
         ("", *[".3f"] * 4, *["d"] * 3),
         body,
         groups=(("training views", 2), ("test views", 2), ("models by kind", 3)),
