@@ -233,6 +233,7 @@ def transfer(
     run_b: Positional[Annotated[Path, arg(metavar="RUN_B")]],
     out: Path | None = None,
     targets: tuple[float, ...] = (),
+    lpips: Path | None = None,
     machine: Annotated[Machine, Flat] = Machine(),
 ) -> None:
     """Predict run B with the quality models of run A (cross-scene).
@@ -242,6 +243,7 @@ def transfer(
         run_b: run folder that they are used on.
         out: folder for tables and figures (default: RUN_B/transfer).
         targets: SSIM targets (default: those that B was planned for).
+        lpips: folder with the weights of LPIPS (default: where `sagesplat download lpips` puts them).
         machine: where and how to compute.
     """
     from sagesplat.events import TableMade
@@ -249,7 +251,7 @@ def transfer(
 
     out = out or run_b / "transfer"
     with _job(run_a, machine) as job_a, _job(run_b, machine) as job_b:
-        table, line = evaluate_transfer(job_a, job_b, out, targets)
+        table, line = evaluate_transfer(job_a, job_b, out, targets, lpips)
         job_b.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
     print(f"{line}\n{out}")
 

@@ -13,6 +13,7 @@ from sagesplat.adapt.observe import large_enough, read_observations
 from sagesplat.adapt.plan import check_target, plan_view
 from sagesplat.adapt.transfer import FittedRun
 from sagesplat.errors import RunError, SageError
+from sagesplat.events import Warned
 from sagesplat.job import Job
 from sagesplat.lpips import load_lpips
 from sagesplat.output import transfer_report
@@ -23,7 +24,13 @@ from sagesplat.run_dir import settings_of
 from sagesplat.stages import distances
 
 
-def transfer(job_a: Job, job_b: Job, out: Path, targets: Sequence[float] | None = None) -> tuple[Table, str]:
+def transfer(
+    job_a: Job,
+    job_b: Job,
+    out: Path,
+    targets: Sequence[float] | None = None,
+    lpips: Path | None = None,
+) -> tuple[Table, str]:
     """Predict run B with the models of run A; the summary comes back, and a line on its SSIM errors.
 
     Writes `out`/transfer.* and summary.* (csv, md, tex) and figures/transfer.*; the runs are only read.
@@ -46,20 +53,23 @@ def transfer(job_a: Job, job_b: Job, out: Path, targets: Sequence[float] | None 
     transfer_report.transfer_table(scores).write(out / "transfer")
     summary.write(out / "summary")
     save_figure(transfer_report.transfer_figure(a, b), out / "figures" / "transfer")
-    save_figure(panel(_pictures(job_b, a, b, targets)), out / "figures" / "panel")
+    save_figure(panel(_pictures(job_b, a, b, targets, lpips)), out / "figures" / "panel")
     return summary, transfer_report.headline(summary)
 
 
-def _pictures(job: Job, a: FittedRun, b: FittedRun, targets: Sequence[float]) -> list[Picture]:
+def _pictures(
+    job: Job, a: FittedRun, b: FittedRun, targets: Sequence[float], lpips: Path | None
+) -> list[Picture]:
     """Fig. 5: a view of B composed as A's models say (distances over the extent), B's own for the rest."""
     rows = b.test_views if len(b.test_views) else b.train_views
     row = int(rows[len(rows) // 2])
     seen = distances(job, job.fit_config.distance)
     here = {label: float(d[row]) for label, d in seen.items()}
     try:
-        metric = load_lpips("alex")
-    except SageError:
+        metric = load_lpips("alex", lpips)
+    except SageError as error:
         metric = None
+        job.emit(Warned(f"no LPIPS: {error}"))
     full = job.ladder.load(job.ladder.levels[-1])
     sets = {f"3DGS, {len(full):,}": full}
     for target in sorted(targets):
