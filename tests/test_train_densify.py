@@ -192,3 +192,14 @@ def test_short_runs_of_the_fast_pace_grow_for_longer(steps, stop):
     )
     assert fast.refine_stop == stop
     assert replace(fast, refine_stop=published.refine_stop) == published
+
+
+def test_room_of_stopped_categories_is_not_given_away():
+    state = initial_state(random_gaussians(100), seed=0)
+    everything, half = torch.ones(100, dtype=torch.bool), torch.arange(100) % 2 == 0
+    assert densify.room(state, 180, everything) == 80
+    assert densify.room(state, 180, half) == 40
+    assert state.withheld == 40
+    assert densify.room(state, 180, everything) == 40  # what was withheld stays so
+    assert densify.room(state, 90, everything) == 0
+    assert state.withheld == 40

@@ -28,6 +28,7 @@ def write_checkpoint(path: Path, state: TrainState, settings: str) -> None:
         "step": state.step,
         "last_reset": state.last_reset,
         "frozen": list(state.frozen.items()),
+        "withheld": state.withheld,
         "queue": state.queue,
         "rng": state.rng.bit_generator.state,
     }
@@ -76,4 +77,5 @@ def read_checkpoint(path: Path, settings: str) -> TrainState:
         step=meta["step"],
         last_reset=meta["last_reset"],
         frozen={int(label): int(step) for label, step in meta.get("frozen", ())},
+        withheld=int(meta.get("withheld", 0)),
     )

@@ -90,6 +90,14 @@ def budget(
     return min(num_points + int(share * (cap - num_points)), distinct(pixels_now))
 
 
+def room(state: TrainState, most: int, trainable: Tensor) -> int:
+    """How many Gaussians may come now; what stopped categories would have got goes to nobody."""
+    free = max(0, most - len(state.gaussians) - state.withheld)
+    given = round(free * float(trainable.float().mean()))
+    state.withheld += free - given
+    return given
+
+
 def refine(state: TrainState, config: TrainConfig, extent: float, room: int, trainable: Tensor) -> None:
     """Clone small, split large Gaussians with high gradients; prune faint and, after a reset, huge ones."""
     g = state.gaussians

@@ -28,6 +28,7 @@ class TrainState:
     step: int = 0
     last_reset: int = -1  # step of the last opacity reset, -1 = none yet
     frozen: dict[int, int] = field(default_factory=dict)  # label id -> step from which on it stays as it is
+    withheld: int = 0  # Gaussians that categories would have got, had they not stopped
 
     def replace_rows(self, keep: Tensor, new: Gaussians) -> None:
         """Keep some rows (bool [N]) and append new Gaussians with fresh moments and statistics."""

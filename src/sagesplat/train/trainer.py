@@ -127,7 +127,8 @@ def train(
         if refining and step % config.refine_every == 0:
             pixels = num_pixels // run_pace.factor(step) ** 2
             most = densify.budget(config, plan, step, num_pixels, pixels, len(scene.points.xyz))
-            densify.refine(state, config, extent, most - len(state.gaussians), trainable)
+            room = densify.room(state, most, trainable)
+            densify.refine(state, config, extent, room, trainable)
             state.sort()
             trainable = trainable_rows(state.gaussians, state.frozen)
         if resets:
