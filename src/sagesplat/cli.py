@@ -274,9 +274,11 @@ def compare(
     from sagesplat.events import TableMade
     from sagesplat.online import compare_online
 
+    out = out or online / "online"
     with _job(online, machine) as job_online, _job(full, machine) as job_full:
-        for table in compare_online(job_online, job_full, out or online / "online"):
-            job_online.emit(TableMade(table.title, tuple(table.columns()), tuple(map(tuple, table.cells()))))
+        table, _ = compare_online(job_online, job_full, out)
+        job_online.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
+    print(out)
 
 
 @command
