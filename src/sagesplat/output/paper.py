@@ -259,19 +259,21 @@ def cross_view_table(
     """Cross-view: promise, measurement, error of the prediction and regret per target and category."""
     full, body = last_counts(counts), []
     for target in np.unique(table.target):
-        for label in [*labels, TOTAL]:
-            rows = table.select((table.target == target) & (table.label_id == label))
+        here = table.select(table.target == target)
+        groups = [(name_of(i, names), here.select(here.label_id == i), full[i]) for i in labels]
+        groups += [("all categories", here.select(here.label_id != TOTAL), 0)]
+        groups += [(name_of(TOTAL, names), here.select(here.label_id == TOTAL), 0)]
+        for name, rows, size in groups:
             if not len(rows):
                 continue
-            promised = rows.predicted >= target
-            kept = promised & (rows.ssim >= target)
             met = rows.ssim >= target
-            regret = mean(rows.regret)
+            promised = rows.predicted >= target
+            regret = mean(rows.regret) if size else np.nan
             body.append((
-                f"{target:g}", name_of(label, names), len(rows), int(promised.sum()), int(kept.sum()),
-                int(met.sum()), mean(rows.predicted), mean(rows.level_ssim), mean(rows.ssim),
-                mean(rows.full_ssim), mean(np.abs(rows.predicted - rows.level_ssim)),
-                mean(np.abs(rows.predicted - rows.ssim)), regret, regret / max(1, full.get(label, 0)),
+                f"{target:g}", name, len(rows), int(promised.sum()), int((promised & met).sum()), int(met.sum()),
+                mean(rows.predicted), mean(rows.level_ssim), mean(rows.ssim), mean(rows.full_ssim),
+                mean(np.abs(rows.predicted - rows.level_ssim)), mean(np.abs(rows.predicted - rows.ssim)),
+                regret, regret / max(1, size),
             ))  # fmt: skip
     header = (
         "target",
