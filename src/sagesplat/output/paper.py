@@ -270,7 +270,8 @@ def cross_view_table(
             promised = rows.predicted >= target
             regret = mean(rows.regret) if size else np.nan
             body.append((
-                f"{target:g}", name, len(rows), int(promised.sum()), int((promised & met).sum()), int(met.sum()),
+                f"{target:g}", name, len(rows),
+                int(promised.sum()), int((promised & met).sum()), int(met.sum()),
                 mean(rows.predicted), mean(rows.level_ssim), mean(rows.ssim), mean(rows.full_ssim),
                 mean(np.abs(rows.predicted - rows.level_ssim)), mean(np.abs(rows.predicted - rows.ssim)),
                 regret, regret / max(1, size),
