@@ -1,5 +1,6 @@
 """The paper's evaluation of a finished run, in three stages: crossview, occupancy, tables and figures."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import cast
 
@@ -171,12 +172,12 @@ def _weights(config: PaperConfig) -> dict[str, str | None]:
     return {net: file_hash(path) if path.is_file() else None for net, path in paths.items()}
 
 
-def _metrics(job: Job, config: PaperConfig) -> dict[str, Lpips]:
+def _metrics(job: Job, config: PaperConfig, nets: Sequence[Net] = ("alex", "vgg")) -> dict[str, Lpips]:
     """LPIPS as the field feeds it, by column; what cannot be loaded is left out with a warning."""
     found = {}
-    for net, as_3dgs in (("alex", False), ("vgg", True)):
+    for net in nets:
         try:
-            found[f"lpips_{net}"] = load_lpips(cast(Net, net), config.lpips, as_3dgs=as_3dgs)
+            found[f"lpips_{net}"] = load_lpips(net, config.lpips, as_3dgs=net == "vgg")
         except SageError as error:
             job.emit(Warned(f"no LPIPS ({net}): {error}"))
     return found
@@ -186,7 +187,7 @@ def _panels(job: Job, config: PaperConfig, view: int) -> dict[str, list[Picture]
     """The view of Table III, and for cross-view two test views, in pictures."""
     tests = job.scene.test_ids
     rows = [view, *(int(tests[len(tests) * i // 4]) for i in (1, 3) if len(tests))]
-    metric = _metrics(job, config).get("lpips_alex")
+    metric = _metrics(job, config, ["alex"]).get("lpips_alex")
     full = job.ladder.load(job.ladder.levels[-1])
     panels = {}
     for row in dict.fromkeys(rows):
