@@ -400,6 +400,7 @@ def test_tables_in_markdown_and_latex(tmp_path):
     assert r"\cmidrule(lr){2-3}" in tex
     assert r"a\_b$|$c & \cellcolor{black!10}0.50\textsuperscript{t=0.5} & 1.4M & 50 \% \\" in tex
     assert tex.count(r"\\") == 4 + 0
+    assert table.only("count", "category").cells() == [["1.4M", "a_b|c"], ["9,400", "d"]]
     table.write(tmp_path / "t")
     assert (tmp_path / "t.csv").read_text().splitlines() == [
         "category,t=5 SSIM,t=5 count,rest,marks",

@@ -252,6 +252,7 @@ def transfer(
     out = out or run_b / "transfer"
     with _job(run_a, machine) as job_a, _job(run_b, machine) as job_b:
         table, line = evaluate_transfer(job_a, job_b, out, targets, lpips)
+        table = table.only("split", "predictor", "ssim error", "iteration error", "hit", "regret share")
         job_b.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
     print(f"{line}\n{out}")
 

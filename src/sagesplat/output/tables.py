@@ -34,6 +34,12 @@ class Table:
     marks: Mapping[tuple[int, int], str] = field(default_factory=dict)  # (row, column): a note to the cell
     notes: tuple[str, ...] = ()  # under the table
 
+    def only(self, *names: str) -> "Table":
+        """Some of its columns, without groups and marks."""
+        picked = [self.header.index(name) for name in names]
+        rows = [tuple(row[i] for i in picked) for row in self.rows]
+        return Table(self.title, names, tuple(self.formats[i] for i in picked), rows)
+
     def cells(self) -> list[list[str]]:
         """The rows as text; NaN reads as a dash."""
         return [[_text(v, spec) for v, spec in zip(row, self.formats, strict=True)] for row in self.rows]
