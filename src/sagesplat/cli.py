@@ -209,10 +209,11 @@ def report(
         machine: where and how to compute.
     """
     from sagesplat import stages
-    from sagesplat.paper import paper_report
 
     with _job(run, machine) as job:
         if paper:
+            from sagesplat.paper import paper_report
+
             paper_report(job, settings)
         else:
             stages.make_report(job)

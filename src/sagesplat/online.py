@@ -92,7 +92,7 @@ def first_levels(
         chosen[label] = ladder.levels[-1]
         for level in ladder.levels:
             here = (rows.label_id == label) & (rows.level == level)
-            if (label, level) in ladder.counts and mean(rows.ssim[here]) >= target:
+            if mean(rows.ssim[here]) >= target:
                 chosen[label] = level
                 break
     return chosen

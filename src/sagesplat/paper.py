@@ -9,7 +9,7 @@ import numpy as np
 from sagesplat.adapt.columns import from_rows, write_columns
 from sagesplat.adapt.cross_view import NONE, cross_view, read_cross_view
 from sagesplat.adapt.model import read_models
-from sagesplat.adapt.observe import TOTAL, distances_in_views, large_enough, read_observations
+from sagesplat.adapt.observe import distances_in_views, large_enough, read_observations
 from sagesplat.adapt.occupancy import Occupancy, compare, contenders, read_occupancy
 from sagesplat.adapt.plan import Plan, plan_view, read_plans
 from sagesplat.config import PaperConfig
@@ -19,6 +19,7 @@ from sagesplat.gaussians import Gaussians
 from sagesplat.job import Job, run_stage
 from sagesplat.lpips import Lpips, Net, load_lpips, weights_path
 from sagesplat.output.paper import PaperData, Picture, four_levels, take_pictures, write_paper
+from sagesplat.output.tables import promise_kept
 from sagesplat.run_dir import file_hash, settings_of
 from sagesplat.stages import distances, tune_composition
 
@@ -48,10 +49,8 @@ def cross_views(job: Job) -> None:
         table.write_csv(run.cross_view)
         lines = []
         for target in np.unique(table.target):
-            rows = table.select((table.target == target) & (table.label_id != TOTAL))
-            promised = rows.predicted >= target
-            kept = int((promised & (rows.ssim >= target)).sum())
-            lines.append(f"SSIM {target:g}: {kept} of {promised.sum()} promises kept on unseen views")
+            fared = promise_kept(table.select(table.target == target))
+            lines.append(f"SSIM {target:g}: {fared.kept} of {fared.promised} promises kept on unseen views")
         return lines
 
     inputs = [run.scene, run.labels, run.levels, run.models, run.plan]

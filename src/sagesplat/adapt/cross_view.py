@@ -143,9 +143,7 @@ def _rows(
             enough = [
                 (ladder.counts[label, level], -level)
                 for level, quality in levels.items()
-                if (label, level) in ladder.counts
-                and level not in ladder.recovering
-                and quality[label]["ssim"] >= plan.target
+                if level not in ladder.recovering and quality[label]["ssim"] >= plan.target
             ]
             if enough:
                 count, level = min(enough)

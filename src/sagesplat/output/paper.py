@@ -21,7 +21,7 @@ from sagesplat.metrics import psnr, squared_error_map
 from sagesplat.output import figures
 from sagesplat.output.figures import STYLE, Colours
 from sagesplat.output.report import template
-from sagesplat.output.tables import MB, Table, by_size, last_counts, mean, name_of, view_mean
+from sagesplat.output.tables import MB, Table, by_size, last_counts, mean, name_of, promise_kept, view_mean
 from sagesplat.raster import Backend
 from sagesplat.scene.scene import Camera
 
@@ -266,12 +266,11 @@ def cross_view_table(
         for name, rows, size in groups:
             if not len(rows):
                 continue
-            met = rows.ssim >= target
-            promised = rows.predicted >= target
+            fared = promise_kept(rows)
             regret = mean(rows.regret) if size else np.nan
             body.append((
                 f"{target:g}", name, len(rows),
-                int(promised.sum()), int((promised & met).sum()), int(met.sum()),
+                fared.promised, fared.kept, int((rows.ssim >= target).sum()),
                 mean(rows.predicted), mean(rows.level_ssim), mean(rows.ssim), mean(rows.full_ssim),
                 mean(np.abs(rows.predicted - rows.level_ssim)), mean(np.abs(rows.predicted - rows.ssim)),
                 regret, regret / max(1, size),
@@ -310,10 +309,11 @@ def take_pictures(
     """The photo, and each set of Gaussians (by title) as the camera sees it."""
     pictures = [Picture("photo", photo, np.nan, np.nan)]
     unit = as_unit(photo)
+    of_photo = metric.features(unit) if metric else None
     for title, g in sets.items():
         image = render_rgb(g, camera, backend=backend, antialiased=antialiased)
         decibels = float(psnr(squared_error_map(image, unit).mean()))
-        lpips = metric(unit, image) if metric else np.nan
+        lpips = metric.distance(of_photo, metric.features(image)) if metric and of_photo else np.nan
         pictures.append(Picture(title, np.round(image * 255).astype(np.uint8), decibels, lpips))
     return pictures
 

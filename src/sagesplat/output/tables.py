@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sagesplat.adapt.cross_view import CrossView
 from sagesplat.adapt.evaluate import Evaluation
 from sagesplat.adapt.model import SsimModel
 from sagesplat.adapt.observe import TOTAL, Observations
@@ -263,7 +264,7 @@ def targets_table(
     return Table("Size by target", tuple(header), formats, [*body, tuple(total)])
 
 
-def promise_kept(rows: Evaluation) -> Kept:
+def promise_kept(rows: Evaluation | CrossView) -> Kept:
     """Of the (label, view, target) rows whose predicted SSIM reaches the target, those measured there too."""
     measured = np.isfinite(rows.ssim) & (rows.label_id != TOTAL)
     promised = measured & (rows.predicted >= rows.target)
