@@ -86,8 +86,8 @@ def blending(g: Gaussians, camera: Camera, repeats: int) -> dict[str, float]:
     )  # fmt: skip
     backward = milliseconds(
         lambda: blend.backward(
-            records, found.starts, ends, found.ids, found.slots, found.row_order, camera.width,
-            camera.height, image, left, grad, none, sums,
+            records, radii, found.starts, ends, found.ids, found.slots, found.row_order, camera.width,
+            camera.height, image, left, grad, none, sums, None,
         ),
         repeats, best=True,
     )  # fmt: skip
@@ -129,7 +129,7 @@ def parts(g: Gaussians, camera: Camera, photo: torch.Tensor, degree: int, repeat
             )  # fmt: skip
 
     def step() -> None:
-        photometric_loss(forward(), photo, config.ssim_weight, space).backward()
+        photometric_loss(forward(), photo, config.ssim_weight, workspace=space).backward()
         adam()
 
     forward_ms = milliseconds(forward, repeats)
@@ -138,7 +138,7 @@ def parts(g: Gaussians, camera: Camera, photo: torch.Tensor, degree: int, repeat
         "forward_ms": forward_ms,
         "backward_ms": milliseconds(lambda: forward().backward(slope), repeats) - forward_ms,
         "ssim_ms": milliseconds(
-            lambda: photometric_loss(image, photo, config.ssim_weight, space).backward(), repeats
+            lambda: photometric_loss(image, photo, config.ssim_weight, workspace=space).backward(), repeats
         ),
         "adam_ms": milliseconds(adam, repeats),
     }

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from sagesplat.metrics import photometric_loss, ssim_map
+from sagesplat.raster import Workspace
 
 
 def plain_ssim(x: Tensor, y: Tensor) -> Tensor:
@@ -96,3 +97,35 @@ def test_symmetric_and_blind_to_strides():
     np.testing.assert_array_equal(ssim_map(wide, y.numpy()), forth)
     turned = torch.rot90(x, 1, (0, 1)).numpy(), torch.rot90(y, 1, (0, 1)).numpy()
     np.testing.assert_allclose(ssim_map(*turned), np.rot90(forth), atol=2e-6)
+
+
+@pytest.mark.parametrize("size", [*SIZES, (70, 90)])
+def test_tiles_that_leave_the_loss(size):
+    """The definition, in float64: the photo stands in for the render there, and they add nothing."""
+    height, width = size
+    x, y = pair(height, width, seed=2)
+    rng = np.random.default_rng(height)
+    for share in (0.0, 0.4, 0.7, 1.0):
+        tiles = rng.random((-(-height // 16), -(-width // 16))) < share
+        pixels = torch.from_numpy(tiles.repeat(16, 0).repeat(16, 1)[:height, :width])[..., None]
+        exact = x.double().requires_grad_()
+        seen = torch.where(pixels, exact, y.double())
+        quality = plain_ssim(seen, y.double())
+        expected = ((0.8 * (seen - y).abs() + 0.2 * (1 - quality)) * pixels).sum() / (3 * height * width)
+        expected.backward()
+        rgb = x.clone().requires_grad_()
+        loss = photometric_loss(rgb, y, 0.2, tiles, space := Workspace())
+        loss.backward()
+        assert float(loss.detach()) == pytest.approx(float(expected.detach()), abs=2e-6)
+        assert exact.grad is not None
+        assert rgb.grad is not None
+        scale = max(float(exact.grad.abs().max()), 1e-9)
+        np.testing.assert_allclose(rgb.grad.numpy() / scale, exact.grad.numpy() / scale, atol=2e-5)
+        assert not rgb.grad[~pixels[..., 0]].any()
+        masked = ssim_map(x.numpy(), y.numpy(), tiles)
+        np.testing.assert_allclose(masked, (quality.mean(-1) * pixels[..., 0]).detach().numpy(), atol=1e-5)
+        # what the workspace holds from a call before does not show
+        photometric_loss(x + 0.1, y, 0.2, None, space)
+        again = x.clone().requires_grad_()
+        photometric_loss(again, y, 0.2, tiles, space).backward()
+        assert torch.equal(again.grad, rgb.grad)  # type: ignore[arg-type]

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int
 from numba import get_num_threads
 from torch import Tensor
 
@@ -18,19 +18,30 @@ def _scratch(width: int, space: Workspace) -> np.ndarray:
     return space.take("ssim scratch", get_num_threads(), ssim.scratch_size(width))
 
 
-def _maps(x: np.ndarray, y: np.ndarray, space: Workspace) -> tuple[np.ndarray, np.ndarray, float]:
-    """SSIM [C, H, W], its derivatives, and its mean."""
+def _maps(
+    x: np.ndarray, y: np.ndarray, tile_mask: np.ndarray | None, space: Workspace
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """SSIM [C, H, W], its derivatives, the tiles that count, and the sum over those by the size of all."""
     height, width, channels = x.shape
     wide, sums = ssim.padded(width), np.empty((channels, ssim.strips(height)))
     values = space.take("ssim", channels, height, wide)
     derivatives = space.take("ssim derivatives", 3, channels, height, wide)
-    ssim.compare(x, y, _scratch(width, space), values, derivatives, sums)
-    return values[..., :width], derivatives, float(sums.sum()) / x.size
+    tiles = ssim.all_tiles(height, width) if tile_mask is None else tile_mask
+    ssim.compare(x, y, tiles, _scratch(width, space), values, derivatives, sums)
+    return values[..., :width], derivatives, tiles, float(sums.sum()) / x.size
 
 
-def ssim_map(x: Float32[np.ndarray, "H W 3"], y: Float32[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
-    """SSIM at every pixel, averaged over the channels; images in [0, 1], 11x11 window, zero padding."""
-    return _maps(np.ascontiguousarray(x), np.ascontiguousarray(y), Workspace())[0].mean(0)
+def ssim_map(
+    x: Float32[np.ndarray, "H W 3"],
+    y: Float32[np.ndarray, "H W 3"],
+    tile_mask: Bool[np.ndarray, "h w"] | None = None,
+) -> Float32[np.ndarray, "H W"]:
+    """SSIM at every pixel, averaged over the channels; images in [0, 1], 11x11 window, zero padding.
+
+    Outside a `tile_mask` (see `photometric_loss`) it is 0.
+    """
+    values, *_ = _maps(np.ascontiguousarray(x), np.ascontiguousarray(y), tile_mask, Workspace())
+    return values.mean(0)
 
 
 def squared_error_map(
@@ -58,29 +69,46 @@ def means_by_label(
 
 class _PhotometricLoss(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, rgb: Tensor, photo: Tensor, ssim_weight: float, space: Workspace) -> Tensor:
+    def forward(
+        ctx: Any,
+        rgb: Tensor,
+        photo: Tensor,
+        ssim_weight: float,
+        tile_mask: np.ndarray | None,
+        space: Workspace,
+    ) -> Tensor:
         x, y = rgb.detach().contiguous().numpy(), photo.contiguous().numpy()
-        _, derivatives, quality = _maps(x, y, space)
-        grad, errors = space.take("ssim gradient", *x.shape), np.empty((x.shape[2], ssim.strips(x.shape[0])))
+        height, width, channels = x.shape
+        _, derivatives, tiles, quality = _maps(x, y, tile_mask, space)
+        grad, errors = space.take("ssim gradient", *x.shape), np.empty((channels, ssim.strips(height)))
         scales = np.float32(-ssim_weight / x.size), np.float32((1 - ssim_weight) / x.size)
-        ssim.gradient(x, y, _scratch(x.shape[1], space), derivatives, *scales, grad, errors)
+        ssim.gradient(x, y, tiles, _scratch(width, space), derivatives, *scales, grad, errors)
         ctx.grad = torch.from_numpy(grad)
-        l1 = float(errors.sum()) / x.size
-        return torch.tensor((1 - ssim_weight) * l1 + ssim_weight * (1 - quality))
+        l1, share = float(errors.sum()) / x.size, ssim.covered(tiles, height, width)
+        return torch.tensor((1 - ssim_weight) * l1 + ssim_weight * (share - quality))
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor):
-        return ctx.grad * grads[0], None, None, None
+        return ctx.grad * grads[0], None, None, None, None
 
 
 def photometric_loss(
     rgb: Float[Tensor, "H W 3"],
     photo: Float[Tensor, "H W 3"],
     ssim_weight: float = SSIM_WEIGHT,
+    tile_mask: Bool[np.ndarray, "h w"] | Bool[Tensor, "h w"] | None = None,
     workspace: Workspace | None = None,
 ) -> Tensor:
     """(1 - w) L1 + w (1 - SSIM), as 3DGS trains; differentiable by `rgb`.
 
-    With a `workspace`, go backward before the next call with it.
+    `tile_mask` [ceil(H/16), ceil(W/16)]: tiles that are false leave the loss: they add nothing to the sum
+    (which is divided by the number of all pixels), and the windows of others see the photo there.
+    With a `workspace`, go backward before the next call with it. On a GPU the photo may be uint8, and the
+    mask is a tensor there.
     """
-    return _PhotometricLoss.apply(rgb, photo, ssim_weight, workspace or Workspace())  # type: ignore[return-value]
+    if rgb.is_cuda:
+        from sagesplat import ssim_triton
+
+        assert not isinstance(tile_mask, np.ndarray)
+        return ssim_triton.photometric_loss(rgb, photo, ssim_weight, tile_mask)
+    return _PhotometricLoss.apply(rgb, photo, ssim_weight, tile_mask, workspace or Workspace())  # type: ignore[return-value]

@@ -38,6 +38,18 @@ def strips(height: int) -> int:
     return -(-height // _STRIP)
 
 
+def all_tiles(height: int, width: int) -> np.ndarray:
+    """A mask of tiles in which every tile counts."""
+    return np.ones((-(-height // LANES), padded(width) // LANES), np.bool_)
+
+
+def covered(tiles: np.ndarray, height: int, width: int) -> float:
+    """Share of the pixels that lie in tiles that count."""
+    rows = np.minimum(height - LANES * np.arange(tiles.shape[0]), LANES)
+    columns = np.minimum(width - LANES * np.arange(tiles.shape[1]), LANES)
+    return float(rows @ tiles @ columns) / (height * width)
+
+
 @njit(forceinline=True, cache=True)
 def _blur(values, at, step):
     """Window over 16 neighbours at a time, from values[at] on; `step` from one tap to the next."""
@@ -64,9 +76,24 @@ def _quality(mx, my, squares, product):
     return value, by_mean, by_variance, by_covariance
 
 
+@njit(cache=True)
+def _blocks(tiles, top, bottom, needed, near):
+    """Which blocks of 16 columns hold a tile of the strip that counts, and which lie next to one."""
+    needed[:] = False
+    for row in range(top // LANES, (bottom + LANES - 1) // LANES):
+        needed |= tiles[row]
+    near[:] = needed
+    near[:-1] |= needed[1:]
+    near[1:] |= needed[:-1]
+
+
 @njit(parallel=True, cache=True)
-def compare(x, y, scratch, ssim, derivatives, sums):
-    """SSIM of x, y [H, W, 3] into ssim [3, H, W'], its derivatives [3, 3, H, W'], sums [3, strips]."""
+def compare(x, y, tiles, scratch, ssim, derivatives, sums):
+    """SSIM of x, y [H, W, 3] into ssim [3, H, W'], its derivatives [3, 3, H, W'], sums [3, strips].
+
+    tiles [ceil(H/16), W'/16]: those that are false count nowhere, and windows see y in x's place there;
+    what stands in ssim and derivatives there means nothing.
+    """
     height, width, channels = x.shape
     wide = ssim.shape[2]
     strips = sums.shape[1]
@@ -76,11 +103,18 @@ def compare(x, y, scratch, ssim, derivatives, sums):
     for job in prange(strips * channels):
         channel, top = job // strips, (job % strips) * _STRIP
         bottom = min(top + _STRIP, height)
+        needed, near = np.empty(wide // LANES, np.bool_), np.empty(wide // LANES, np.bool_)
+        _blocks(tiles, top, bottom, needed, near)
+        sums[channel, job % strips] = 0.0
+        if not needed.any():
+            continue
         rows, blurred = scratch[get_thread_id(), area * 4 :], scratch[get_thread_id()]
         scratch[get_thread_id()] = _ZERO
         for r in range(max(top - _RADIUS, 0), min(bottom + _RADIUS, height)):
             whole = width // LANES * LANES
             for w in range(0, whole, LANES):
+                if not near[w // LANES]:
+                    continue
                 at = (r * width + w) * 3
                 if channel == 0:
                     a, b = load_red(x, at), load_red(y, at)
@@ -88,22 +122,29 @@ def compare(x, y, scratch, ssim, derivatives, sums):
                     a, b = load_green(x, at), load_green(y, at)
                 else:
                     a, b = load_blue(x, at), load_blue(y, at)
+                if not tiles[r // LANES, w // LANES]:
+                    a = b
                 store(rows, w + _RADIUS, a)
                 store(rows, line + w + _RADIUS, b)
                 store(rows, 2 * line + w + _RADIUS, a * a + b * b)
                 store(rows, 3 * line + w + _RADIUS, a * b)
             for w in range(whole, width):
-                a, b = x[r, w, channel], y[r, w, channel]
+                b = y[r, w, channel]
+                a = x[r, w, channel] if tiles[r // LANES, w // LANES] else b
                 rows[w + _RADIUS] = a
                 rows[line + w + _RADIUS] = b
                 rows[2 * line + w + _RADIUS] = a * a + b * b
                 rows[3 * line + w + _RADIUS] = a * b
             for w in range(0, wide, LANES):
-                for k in range(4):
-                    store(blurred, k * area + (r - top + _RADIUS) * line + w, _blur(rows, k * line + w, 1))
+                if needed[w // LANES]:
+                    for k in range(4):
+                        at = k * area + (r - top + _RADIUS) * line + w
+                        store(blurred, at, _blur(rows, k * line + w, 1))
         added = 0.0
         for r in range(top, bottom):
             for w in range(0, wide, LANES):
+                if not tiles[r // LANES, w // LANES]:
+                    continue
                 at = (r - top) * line + w
                 value, by_mean, by_variance, by_covariance = _quality(
                     _blur(blurred, at, line), _blur(blurred, area + at, line),
@@ -118,9 +159,23 @@ def compare(x, y, scratch, ssim, derivatives, sums):
         sums[channel, job % strips] = added
 
 
+@njit(cache=True)
+def _run(tiles, w, width):
+    """The next columns from w on, as first and last + 1, whose tiles count (a row of `tiles`)."""
+    while w < width and not tiles[w // LANES]:
+        w += LANES
+    end = w
+    while end < width and tiles[end // LANES]:
+        end += LANES
+    return w, min(end, width)
+
+
 @njit(parallel=True, cache=True)
-def gradient(x, y, scratch, derivatives, scale, l1_scale, out, sums):
-    """scale * d(sum of SSIM)/dx + l1_scale * sign(x - y) into out [H, W, 3]; sums [3, strips] of |x - y|."""
+def gradient(x, y, tiles, scratch, derivatives, scale, l1_scale, out, sums):
+    """scale * d(sum of SSIM)/dx + l1_scale * sign(x - y) into out [H, W, 3]; sums [3, strips] of |x - y|.
+
+    `tiles` as in `compare`: nothing is added, and the gradient is zero, where they are false.
+    """
     height, width, channels = x.shape
     wide = derivatives.shape[3]
     strips = sums.shape[1]
@@ -128,24 +183,38 @@ def gradient(x, y, scratch, derivatives, scale, l1_scale, out, sums):
     for job in prange(strips * channels):
         channel, top = job // strips, (job % strips) * _STRIP
         bottom = min(top + _STRIP, height)
+        needed, near = np.empty(wide // LANES, np.bool_), np.empty(wide // LANES, np.bool_)
+        _blocks(tiles, top, bottom, needed, near)
         row, blurred = scratch[get_thread_id(), area * 4 :], scratch[get_thread_id()]
         smooth = row[line:]
         scratch[get_thread_id()] = _ZERO
-        for r in range(max(top - _RADIUS, 0), min(bottom + _RADIUS, height)):
-            for k in range(3):
-                row[_RADIUS : _RADIUS + width] = derivatives[k, channel, r, :width]
-                for w in range(0, wide, LANES):
-                    store(blurred, k * area + (r - top + _RADIUS) * line + w, _blur(row, w, 1))
+        if needed.any():
+            for r in range(max(top - _RADIUS, 0), min(bottom + _RADIUS, height)):
+                for k in range(3):
+                    row[_RADIUS : _RADIUS + width] = _ZERO
+                    first, last = _run(tiles[r // LANES], 0, width)
+                    while first < last:
+                        row[_RADIUS + first : _RADIUS + last] = derivatives[k, channel, r, first:last]
+                        first, last = _run(tiles[r // LANES], last, width)
+                    for w in range(0, wide, LANES):
+                        if needed[w // LANES]:
+                            store(blurred, k * area + (r - top + _RADIUS) * line + w, _blur(row, w, 1))
         added = 0.0
         for r in range(top, bottom):
-            for w in range(0, wide, LANES):
-                for k in range(3):
-                    store(smooth, k * wide + w, _blur(blurred, k * area + (r - top) * line + w, line))
+            first, last = _run(tiles[r // LANES], 0, width)
+            out[r, :first, channel] = _ZERO
             error = _ZERO
-            for w in range(width):
-                a, b = x[r, w, channel], y[r, w, channel]
-                error += abs(a - b)
-                by_ssim = smooth[w] + _TWO * a * smooth[wide + w] + b * smooth[2 * wide + w]
-                out[r, w, channel] = scale * by_ssim + l1_scale * (_F(a > b) - _F(a < b))
+            while first < last:
+                for w in range(first, last, LANES):
+                    for k in range(3):
+                        store(smooth, k * wide + w, _blur(blurred, k * area + (r - top) * line + w, line))
+                for w in range(first, last):
+                    a, b = x[r, w, channel], y[r, w, channel]
+                    error += abs(a - b)
+                    by_ssim = smooth[w] + _TWO * a * smooth[wide + w] + b * smooth[2 * wide + w]
+                    out[r, w, channel] = scale * by_ssim + l1_scale * (_F(a > b) - _F(a < b))
+                begin = last
+                first, last = _run(tiles[r // LANES], last, width)
+                out[r, begin:first, channel] = _ZERO
             added += error
         sums[channel, job % strips] = added
