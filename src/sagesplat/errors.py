@@ -23,3 +23,7 @@ class DataError(SageError):
 
 class BackendUnavailable(SageError):
     """A named backend or optional dependency that this machine does not have."""
+
+
+class OutOfMemory(SageError):
+    """The GPU has too little memory for what is asked of it."""

@@ -55,6 +55,10 @@ class Gaussians:
         ids, counts = torch.unique(self.label_ids, return_counts=True)
         return dict(zip(ids.tolist(), counts.tolist(), strict=True))
 
+    def to(self, device: torch.device | str) -> "Gaussians":
+        """The same on a device; tensors that are there already are shared."""
+        return Gaussians(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+
     def detach(self) -> "Gaussians":
         """The same tensors outside any graph."""
         return replace(self, **{name: p.detach() for name, p in self.parameters().items()})

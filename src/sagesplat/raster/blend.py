@@ -9,7 +9,7 @@ colour r, g, b, and half width and height of the bounding box [px].
 import numpy as np
 from numba import njit, prange
 
-from sagesplat.raster.render import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from sagesplat.raster.render import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN
 from sagesplat.simd import (
     ceil,
     exp2,
@@ -28,7 +28,6 @@ from sagesplat.simd import (
     where,
 )
 
-TILE = 16
 PIXELS = TILE * TILE
 _BATCH = 16  # intersections between two looks whether a tile is opaque
 _CHUNK = 256  # Gaussians that a thread takes at a time
@@ -40,6 +39,7 @@ _LOG2_ALPHA_MIN = _F(np.log2(ALPHA_MIN))
 _ALPHA_MAX = _F(ALPHA_MAX)
 _T_MIN = _F(TRANSMITTANCE_MIN)
 _ONE, _ZERO, _HALF = _F(1), _F(0), _F(0.5)
+_TO_CONIC = _F(-2.0 / np.log2(np.e))  # of the exponent factors A, C, B / 2
 _CENTRES = np.arange(TILE, dtype=np.float32) + _HALF
 _SHARED = 6 * PIXELS  # where a Gaussian's values that depend on the row alone lie
 
@@ -151,10 +151,35 @@ def forward(records, starts, ids, row_order, width, height, background, image, l
 
 
 @njit(error_model="numpy", cache=True)
-def _gradient(s, lo, hi, columns, lines, mx, my, a, b, c, log_opacity, red, green, blue, sums, slot):
+def _pass(s, lo, hi, columns, lines, mx, my, a, b, c, log_opacity, red, green, blue):
+    """What `_gradient` does to the planes, for a Gaussian whose own gradient nobody asks for."""
+    dx = columns - mx
+    adx = dx * a
+    dy = lines - my
+    store(s, _SHARED, dy * b)
+    store(s, _SHARED + TILE, dy * dy * c + log_opacity)
+    q = dx * (adx + spread16(s, _SHARED + lo)) + spread16(s, _SHARED + TILE + lo)
+    raw = exp2(q)
+    for row in range(lo, hi):
+        p = row * TILE
+        left = load16(s, p)
+        weight = where((q >= _LOG2_ALPHA_MIN) & (left >= _T_MIN), minimum(raw, _ALPHA_MAX) * left, _ZERO)
+        g0, g1, g2 = load16(s, p + 2 * PIXELS), load16(s, p + 3 * PIXELS), load16(s, p + 4 * PIXELS)
+        value = g0 * red + g1 * green + g2 * blue + load16(s, p + 5 * PIXELS)
+        store(s, p + PIXELS, load16(s, p + PIXELS) - weight * value)
+        store(s, p, left - weight)
+        q = dx * (adx + spread16(s, _SHARED + 1 + row)) + spread16(s, _SHARED + TILE + 1 + row)
+        raw = exp2(q)
+
+
+@njit(error_model="numpy", cache=True)
+def _gradient(
+    s, lo, hi, columns, lines, mx, my, a, b, c, log_opacity, red, green, blue, sums, absolute, slot
+):
     """One Gaussian's gradient sums over rows lo..hi; walks front to back.
 
-    Planes of s: T, what is still to come of (gradient . colour), dL/d(r, g, b), dL/dalpha.
+    Planes of s: T, what is still to come of (gradient . colour), dL/d(r, g, b), dL/dalpha. `absolute` [I, 2]
+    (or None) receives the sums of |dL/d mean|.
     """
     dx = columns - mx
     adx = dx * a
@@ -162,7 +187,7 @@ def _gradient(s, lo, hi, columns, lines, mx, my, a, b, c, log_opacity, red, gree
     store(s, _SHARED, dy * b)
     store(s, _SHARED + TILE, dy * dy * c + log_opacity)
     store(s, _SHARED + 2 * TILE, dy)
-    s0 = s1 = s2 = r0 = r1 = r2 = splat16(_ZERO)
+    s0 = s1 = s2 = r0 = r1 = r2 = across = up = splat16(_ZERO)
     q = dx * (adx + spread16(s, _SHARED + lo)) + spread16(s, _SHARED + TILE + lo)
     raw = exp2(q)
     for row in range(lo, hi):
@@ -187,6 +212,12 @@ def _gradient(s, lo, hi, columns, lines, mx, my, a, b, c, log_opacity, red, gree
         along = gq * down
         r1 = r1 + along
         r2 = r2 + along * down
+        if absolute is not None:
+            by_x, by_y = (dx * a + down * (b * _HALF)) * gq, (dx * (b * _HALF) + down * c) * gq
+            across = across + maximum(by_x, -by_x)
+            up = up + maximum(by_y, -by_y)
+    if absolute is not None:
+        absolute[slot, 0], absolute[slot, 1] = total(across) * -_TO_CONIC, total(up) * -_TO_CONIC
     rdx = r0 * dx
     store_totals(sums, slot * SUMS, s0, s1, s2, r0, rdx, r1, rdx * dx, r1 * dx)
     sums[slot, 8] = total(r2)
@@ -194,11 +225,13 @@ def _gradient(s, lo, hi, columns, lines, mx, my, a, b, c, log_opacity, red, gree
 
 @njit(parallel=True, cache=True)
 def backward(
-    records, starts, ends, ids, slots, row_order, width, height, image, left, grad_image, grad_left, sums
-):
+    records, radii, starts, ends, ids, slots, row_order, width, height, image, left, grad_image, grad_left,
+    sums, absolute,
+):  # fmt: skip
     """Gradient sums of every intersection into sums [I, 9], at the row that `slots` gives it.
 
-    image [H, W, 3] is what `forward` made; grad_left [H, W] is dL/d(remaining transmittance).
+    image [H, W, 3] is what `forward` made; grad_left [H, W] is dL/d(remaining transmittance). Gaussians of
+    radius 0 take no gradient: their sums are not written. `absolute` [I, 2] or None: see `_gradient`.
     """
     tiles_x = (width + TILE - 1) // TILE
     for r in prange(len(row_order)):
@@ -208,6 +241,8 @@ def backward(
             tile, row0, column0 = row_order[r] * tiles_x + column, row_order[r] * TILE, column * TILE
             for k in range(ends[tile], starts[tile + 1]):
                 sums[slots[k]] = _ZERO
+                if absolute is not None:
+                    absolute[slots[k]] = _ZERO
             if starts[tile] == ends[tile]:
                 continue
             x0, y0 = _F(column0), _F(row0)
@@ -229,14 +264,21 @@ def backward(
                 _gather(records, ids, first, last, x0, y0, batch, rows)
                 for j in range(last - first):
                     lo, hi, slot = int(rows[0, j]), int(rows[1, j]), slots[first + j]
-                    if lo < hi:
+                    if lo < hi and radii[ids[first + j]] > 0:
                         _gradient(
                             state, lo, hi, columns, lines, batch[j, 0], batch[j, 1], batch[j, 2],
                             batch[j, 3], batch[j, 4], batch[j, 5], batch[j, 6], batch[j, 7], batch[j, 8],
-                            sums, slot,
+                            sums, absolute, slot,
+                        )  # fmt: skip
+                    elif lo < hi:
+                        _pass(
+                            state, lo, hi, columns, lines, batch[j, 0], batch[j, 1], batch[j, 2],
+                            batch[j, 3], batch[j, 4], batch[j, 5], batch[j, 6], batch[j, 7], batch[j, 8],
                         )  # fmt: skip
                     else:
                         sums[slot] = _ZERO
+                        if absolute is not None:
+                            absolute[slot] = _ZERO
 
 
 @njit(parallel=True, cache=True)
@@ -298,20 +340,30 @@ def add_by_gaussian(offsets, sums, out):
 
 
 @njit(parallel=True, cache=True)
-def reduce(records, offsets, sums, g_mean2d, g_conic, g_opacity, g_color):
-    """Add the sums of each Gaussian's intersections and turn them into gradients of its 2D parameters."""
-    to_conic = _F(-2.0 / np.log2(np.e))
+def copy_means(records, radii, means2d):
+    """The 2D means [N, 2] of what is drawn; zeros for the rest."""
+    for i in prange(len(radii)):
+        for axis in range(2):
+            means2d[i, axis] = records[i, axis] if radii[i] > 0 else _ZERO
+
+
+@njit(parallel=True, cache=True)
+def reduce(records, radii, offsets, sums, g_mean2d, g_conic, g_opacity, g_color):
+    """Add the sums of each Gaussian's intersections and turn them into gradients of its 2D parameters.
+
+    Gaussians of radius 0 are left out.
+    """
     n = len(records)
     for chunk in prange((n + _CHUNK - 1) // _CHUNK):
         added = np.empty(SUMS, np.float64)
         for i in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, n)):
-            if offsets[i] == offsets[i + 1]:
+            if offsets[i] == offsets[i + 1] or radii[i] <= 0:
                 continue
             added[:] = 0.0
             for slot in range(offsets[i], offsets[i + 1]):
                 for column in range(SUMS):
                     added[column] += sums[slot, column]
-            a, b, c = to_conic * records[i, 2], _HALF * to_conic * records[i, 3], to_conic * records[i, 4]
+            a, b, c = _TO_CONIC * records[i, 2], _HALF * _TO_CONIC * records[i, 3], _TO_CONIC * records[i, 4]
             g_mean2d[i, 0] += a * added[4] + b * added[5]
             g_mean2d[i, 1] += b * added[4] + c * added[5]
             g_conic[i, 0] -= 0.5 * added[6]

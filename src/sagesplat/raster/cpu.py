@@ -28,6 +28,8 @@ class _Options:
     antialiased: bool
     tile_mask: np.ndarray | None
     workspace: Workspace
+    trainable: np.ndarray | None = None
+    absgrad: bool = False
 
 
 def _array(tensor: Tensor) -> np.ndarray:
@@ -54,7 +56,7 @@ def _project(options: _Options, parameters: _Arrays):
     rows, take = len(parameters[0]), options.workspace.take
     records, depths, radii = take("records", rows, blend.RECORD), take("depths", rows), take("radii", rows)
     fixed = project.camera_vector(options.camera), sh.num_bases(options.degree), options.antialiased
-    project.forward(*fixed, *parameters, records, depths, radii)
+    project.forward(*fixed, _active(options.tile_mask), *parameters, records, depths, radii)
     records, depths, radii = records[:n], depths[:n], radii[:n]
     if n and radii.min() < 0:
         bad = np.flatnonzero(radii < 0)
@@ -62,6 +64,13 @@ def _project(options: _Options, parameters: _Arrays):
             f"{len(bad)} of {n} Gaussians hold NaN or Inf (first row {bad[0]}); drop them before rendering"
         )
     return records, depths, radii
+
+
+def _active(tile_mask: np.ndarray | None) -> np.ndarray:
+    """How many tiles are true above and to the left of each corner; empty where all are."""
+    if tile_mask is None or tile_mask.all():
+        return np.zeros((0, 0), np.int64)
+    return np.pad(tile_mask.astype(np.int64).cumsum(0).cumsum(1), ((1, 0), (1, 0)))
 
 
 def _intersections(options: _Options, records: np.ndarray, depths: np.ndarray, radii: np.ndarray):
@@ -86,7 +95,7 @@ class _Rasterize(torch.autograd.Function):
         camera = options.camera
         arrays = _arrays(parameters)
         records, depths, radii = _project(options, arrays)
-        np.multiply(records[:, :2], radii[:, None] > 0, out=means2d.detach().numpy())
+        blend.copy_means(records, radii, means2d.detach().numpy())
         width, height, take = camera.width, camera.height, options.workspace.take
         found = _intersections(options, records, depths, radii)
         left = take("left", height, width)
@@ -118,31 +127,38 @@ class _Rasterize(torch.autograd.Function):
         g_opacity, g_color = space.zeros("g_opacity", n), space.zeros("g_color", n, 3)
         g_features = np.zeros((n, num_features), np.float32)
         sums = space.take("sums", len(found.ids), blend.SUMS)
+        absolute = space.take("absolute", len(found.ids), 2) if options.absgrad else None
+        g_absolute = np.zeros((n, 2), np.float32) if options.absgrad else g_mean2d
+        moved = radii if options.trainable is None else radii * options.trainable
         no_alpha = np.zeros_like(g_alpha)
         for index, (records, image) in enumerate(zip(painted, images, strict=True)):
             first = index == 0
             g_image = g_rgb if first else _padded(g_extra, _CHUNK * (index - 1))
             blend.backward(
-                records, found.starts, ends, found.ids, found.slots, found.row_order, camera.width,
+                records, moved, found.starts, ends, found.ids, found.slots, found.row_order, camera.width,
                 camera.height,
-                image, left, g_image, -g_alpha if first else no_alpha, sums,
+                image, left, g_image, -g_alpha if first else no_alpha, sums, absolute,
             )  # fmt: skip
             g_channels = g_color if first else np.zeros((n, 3), np.float32)
-            blend.reduce(records, found.offsets, sums, g_mean2d, g_conic, g_opacity, g_channels)
+            blend.reduce(records, moved, found.offsets, sums, g_mean2d, g_conic, g_opacity, g_channels)
+            if absolute is not None:
+                blend.add_by_gaussian(found.offsets, absolute, g_absolute)
             if not first:
                 part = g_features[:, _CHUNK * (index - 1) : _CHUNK * index]
                 part[:] = g_channels[:, : part.shape[1]]
+        if options.absgrad:
+            g_absolute[moved <= 0] = 0
         enough: Any = _enough(*arrays)
         gradients = [space.take(name, *a.shape) for name, a in zip(PARAMETERS, enough, strict=True)]
         num_bases = sh.num_bases(options.degree)
         if space.gradients_of != (n, num_bases):  # harmonics that are not in use stay at zero
             gradients[-1].fill(0)
             space.gradients_of = n, num_bases
-        lists = _enough(painted[0], radii, g_mean2d, g_conic, g_opacity, g_color)
+        lists = _enough(painted[0], moved, g_mean2d, g_conic, g_opacity, g_color)
         fixed = project.camera_vector(camera), num_bases, options.antialiased
         project.backward(*fixed, *enough, *lists, *gradients)
         return (
-            None, torch.from_numpy(g_mean2d), None, torch.from_numpy(g_features),
+            None, torch.from_numpy(g_absolute), None, torch.from_numpy(g_features),
             *(torch.from_numpy(g[:n]) for g in gradients),
         )  # fmt: skip
 
@@ -171,7 +187,9 @@ def render(
     background: Tensor,
     features: Tensor | None,
     antialiased: bool,
-    tile_mask: np.ndarray | None,
+    tile_mask: np.ndarray | Tensor | None,
+    trainable: Tensor | None,
+    absgrad: bool,
     workspace: Workspace | None,
 ) -> Render:
     """Render in float32 on the CPU; see `sagesplat.raster.rasterize` for the arguments."""
@@ -179,8 +197,12 @@ def render(
     parameters = [getattr(g, name) for name in PARAMETERS]
     tracked = torch.is_grad_enabled() and any(p.requires_grad for p in (*parameters, extra))
     means2d = torch.zeros(len(g), 2, requires_grad=tracked)
+    options = _Options(
+        camera, degree, antialiased, None if tile_mask is None else np.asarray(tile_mask),
+        workspace or Workspace(), None if trainable is None else trainable.numpy(), absgrad,
+    )  # fmt: skip
     rgb, alpha, painted, radii = _Rasterize.apply(
-        _Options(camera, degree, antialiased, tile_mask, workspace or Workspace()),
+        options,
         means2d,
         background,
         extra,

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit, prange
 
 from sagesplat import sh
-from sagesplat.raster.blend import RECORD
+from sagesplat.raster.blend import RECORD, TILE
 from sagesplat.raster.render import ALPHA_MIN, BLUR, FRUSTUM_MARGIN, NEAR
 from sagesplat.scene.scene import Camera
 from sagesplat.simd import (
@@ -167,22 +167,39 @@ def _shade(i, sh0, shN, num_bases, scratch):
 
 
 @njit(error_model="numpy", forceinline=True, cache=True)
+def tile_box(x, y, half_width, half_height, tiles_x, tiles_y):
+    """First and last + 1 tile column and row of a bounding box."""
+    x0 = max(0, int(np.floor((x - half_width) / TILE)))
+    x1 = min(tiles_x, int(np.floor((x + half_width) / TILE)) + 1)
+    y0 = max(0, int(np.floor((y - half_height) / TILE)))
+    y1 = min(tiles_y, int(np.floor((y + half_height) / TILE)) + 1)
+    return x0, x1, y0, y1
+
+
+@njit(error_model="numpy", cache=True)
+def _meets(active, x, y, half_width, half_height, scratch):
+    """1 in the lanes whose boxes hold an active tile, else 0, into the start of `scratch`."""
+    store(scratch, LANES, single(x))
+    store(scratch, 2 * LANES, single(y))
+    store(scratch, 3 * LANES, single(half_width))
+    store(scratch, 4 * LANES, single(half_height))
+    tiles_y, tiles_x = len(active) - 1, active.shape[1] - 1
+    for lane in range(LANES):
+        scratch[lane] = 0
+        if scratch[3 * LANES + lane] >= 0:  # not NaN
+            x0, x1, y0, y1 = tile_box(
+                scratch[LANES + lane], scratch[2 * LANES + lane], scratch[3 * LANES + lane],
+                scratch[4 * LANES + lane], tiles_x, tiles_y,
+            )  # fmt: skip
+            if x0 < x1 and y0 < y1:
+                scratch[lane] = active[y1, x1] - active[y0, x1] - active[y1, x0] + active[y0, x0] > 0
+
+
+@njit(error_model="numpy", forceinline=True, cache=True)
 def _forward_eight(
-    i,
-    cam,
-    means,
-    quats,
-    log_scales,
-    logits,
-    sh0,
-    shN,
-    num_bases,
-    antialiased,
-    records,
-    depths,
-    radii,
-    scratch,
-):
+    i, cam, means, quats, log_scales, logits, sh0, shN, num_bases, antialiased, active, records, depths,
+    radii, scratch,
+):  # fmt: skip
     mx, my, mz = _three(means, i)
     w, a, b, c = _four(quats, i)
     ls0, ls1, ls2 = _three(log_scales, i)
@@ -214,6 +231,9 @@ def _forward_eight(
     hx, hy = sqrt(reach * cxx), sqrt(reach * cyy)
     drawn = (z > NEAR) & (opacity > ALPHA_MIN) & (det > 0.0) & _finite(det)
     drawn = drawn & (px + hx > 0.0) & (px - hx < cam[16]) & (py + hy > 0.0) & (py - hy < cam[17])
+    if active.size > 0:
+        _meets(active, px, py, where(drawn, hx, -1.0), hy, scratch)
+        drawn = drawn & (double(load8(scratch, 0)) > 0.0)
     if count(drawn) > 0:
         dx, dy, dz, _ = _direction(cam, mx, my, mz)
         _store_bases(dx, dy, dz, scratch)
@@ -237,8 +257,14 @@ def _forward_eight(
 
 
 @njit(parallel=True, error_model="numpy", cache=True)
-def forward(cam, num_bases, antialiased, means, quats, log_scales, logits, sh0, shN, records, depths, radii):
-    """Fill records [N, 11] (see `blend`), depths [N], radii [N] (0 = not drawn, -1 = not finite); N >= 8."""
+def forward(
+    cam, num_bases, antialiased, active, means, quats, log_scales, logits, sh0, shN, records, depths, radii
+):
+    """Fill records [N, 11] (see `blend`), depths [N], radii [N] (0 = not drawn, -1 = not finite); N >= 8.
+
+    active [tiles_y + 1, tiles_x + 1] counts the active tiles above and to the left; without any in its box
+    a Gaussian is not drawn. Empty: all tiles are active.
+    """
     n = len(means)
     for chunk in prange((n + _CHUNK - 1) // _CHUNK):
         begin, end = chunk * _CHUNK, min((chunk + 1) * _CHUNK, n)
@@ -247,7 +273,7 @@ def forward(cam, num_bases, antialiased, means, quats, log_scales, logits, sh0, 
             # the last eight overlap those before: what is computed twice is the same
             _forward_eight(
                 min(start, n - LANES), cam, means, quats, log_scales, logits, sh0, shN, num_bases,
-                antialiased, records, depths, radii, scratch,
+                antialiased, active, records, depths, radii, scratch,
             )  # fmt: skip
 
 

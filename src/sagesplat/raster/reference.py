@@ -3,17 +3,22 @@
 Every pixel meets every Gaussian, so it serves small images only. The fast backends are tested against it.
 """
 
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
 import torch
 from torch import Tensor
 
 from sagesplat import sh
-from sagesplat.gaussians import Gaussians
+from sagesplat.gaussians import PARAMETERS, Gaussians
 from sagesplat.raster.render import (
     ALPHA_MAX,
     ALPHA_MIN,
     BLUR,
     FRUSTUM_MARGIN,
     NEAR,
+    TILE,
     TRANSMITTANCE_MIN,
     Render,
 )
@@ -29,6 +34,11 @@ def rotation_matrices(quats: Tensor) -> Tensor:  # [N, 4] -> [N, 3, 3]
         (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def _still(values: Tensor, trainable: Tensor) -> Tensor:
+    """The same values; rows that are not trainable pass no gradient."""
+    return torch.where(trainable.view(-1, *[1] * (values.ndim - 1)), values, values.detach())
 
 
 def _project(g: Gaussians, camera: Camera, antialiased: bool):
@@ -63,6 +73,18 @@ def shade(g: Gaussians, camera: Camera, degree: int) -> Tensor:
     return ((basis[:, : coefficients.shape[1], None] * coefficients).sum(1) + 0.5).clamp_min(0)
 
 
+class _AbsoluteSums(torch.autograd.Function):
+    """Zeros for every pixel, whose gradients go back as the sum of their absolute values."""
+
+    @staticmethod
+    def forward(ctx: Any, mean2d: Tensor, height: int, width: int) -> Tensor:
+        return mean2d.new_zeros(height, width, 2)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor):
+        return grads[0].abs().sum((0, 1)), None, None
+
+
 def render(
     g: Gaussians,
     camera: Camera,
@@ -71,11 +93,20 @@ def render(
     background: Tensor,
     features: Tensor | None,
     antialiased: bool,
+    tile_mask: np.ndarray | Tensor | None = None,
+    trainable: Tensor | None = None,
+    absgrad: bool = False,
 ) -> Render:
     """Render in float64; see `sagesplat.raster.rasterize` for the arguments."""
+    if trainable is not None:
+        parts = {name: _still(getattr(g, name), trainable) for name in PARAMETERS}
+        g, features = replace(g, **parts), None if features is None else _still(features, trainable)
     z, means2d, cov, opacity = _project(g, camera, antialiased)
-    if means2d.requires_grad:
-        means2d.retain_grad()
+    watched = means2d.detach().requires_grad_(means2d.requires_grad) if absgrad else means2d
+    if watched.requires_grad:
+        if trainable is not None:
+            watched.register_hook(lambda grad: torch.where(trainable[:, None], grad, 0.0))
+        watched.retain_grad()
     channels = shade(g, camera, degree)
     if features is not None:
         channels = torch.cat([channels, features.double()], -1)
@@ -87,14 +118,20 @@ def render(
     image = torch.zeros(camera.height, camera.width, channels.shape[1], dtype=torch.float64)
     left = torch.ones(camera.height, camera.width, dtype=torch.float64)
     conics = torch.linalg.inv(cov)
+    shown = torch.ones(camera.height, camera.width, dtype=torch.bool)
+    if tile_mask is not None:
+        tiles = torch.as_tensor(tile_mask)
+        shown = tiles.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[: camera.height, : camera.width]
     for i in order.tolist():
         d = pixels - means2d[i]
+        if absgrad:
+            d = d + _AbsoluteSums.apply(watched[i], camera.height, camera.width)
         power = 0.5 * torch.einsum("hwi,ij,hwj->hw", d, conics[i], d)
         alpha = (opacity[i] * torch.exp(-power)).clamp_max(ALPHA_MAX)
-        alpha = torch.where((alpha >= ALPHA_MIN) & (left >= TRANSMITTANCE_MIN), alpha, 0.0)
+        alpha = torch.where(shown & (alpha >= ALPHA_MIN) & (left >= TRANSMITTANCE_MIN), alpha, 0.0)
         image = image + (left * alpha)[..., None] * channels[i]
         left = left * (1 - alpha)
     rgb = image[..., :3] + left[..., None] * background.double()
     reach = 2 * torch.log((opacity / ALPHA_MIN).clamp_min(1.0))
     radii = (reach * torch.maximum(cov[:, 0, 0], cov[:, 1, 1])).sqrt() * (z > NEAR)
-    return Render(rgb, 1 - left, image[..., 3:] if features is not None else None, means2d, radii.detach())
+    return Render(rgb, 1 - left, image[..., 3:] if features is not None else None, watched, radii.detach())

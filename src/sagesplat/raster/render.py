@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
+TILE = 16  # px, side of the tiles of a tile mask, and of what is blended together
 NEAR = 0.01  # Gaussians closer than this along z are not drawn, world units
 BLUR = 0.3  # px^2 added to the 2D covariance (3DGS's low-pass)
 ALPHA_MIN = 1.0 / 255.0  # a contribution below is none

@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit, prange
 
 from sagesplat.raster.blend import TILE
+from sagesplat.raster.project import tile_box
 from sagesplat.raster.render import ALPHA_MIN
 from sagesplat.workspace import Workspace
 
@@ -50,16 +51,6 @@ def depth_order(depths, radii):
 
 
 @njit(error_model="numpy", forceinline=True, cache=True)
-def _tile_box(records, i, tiles_x, tiles_y):
-    """First and last + 1 tile column and row of the bounding box."""
-    x0 = max(0, int(np.floor((records[i, 0] - records[i, 9]) / TILE)))
-    x1 = min(tiles_x, int(np.floor((records[i, 0] + records[i, 9]) / TILE)) + 1)
-    y0 = max(0, int(np.floor((records[i, 1] - records[i, 10]) / TILE)))
-    y1 = min(tiles_y, int(np.floor((records[i, 1] + records[i, 10]) / TILE)) + 1)
-    return x0, x1, y0, y1
-
-
-@njit(error_model="numpy", forceinline=True, cache=True)
 def _edge_maximum(along, across, cross, fixed, lo, hi):
     """Maximum over t in [lo, hi] of along t^2 + cross t fixed + across fixed^2 (along < 0)."""
     t = min(max(-0.5 * cross * fixed / along, lo), hi)
@@ -93,7 +84,9 @@ def _count(records, order, tiles_x, tiles_y, tile_mask, threshold, per_tile, per
     for chunk in prange(_CHUNKS):
         for k in range(chunk * len(order) // _CHUNKS, (chunk + 1) * len(order) // _CHUNKS):
             i = order[k]
-            x0, x1, y0, y1 = _tile_box(records, i, tiles_x, tiles_y)
+            x0, x1, y0, y1 = tile_box(
+                records[i, 0], records[i, 1], records[i, 9], records[i, 10], tiles_x, tiles_y
+            )
             boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3] = x0, x1, y0, y1
             bits, bit, total = np.uint64(0), np.uint64(1), 0
             for y in range(y0, y1):

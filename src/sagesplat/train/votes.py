@@ -42,5 +42,5 @@ def vote(
     """The category (int16 [N]) that each Gaussian paints most of; its old one where no view shows it."""
     ids, weights = label_weights(gaussians, scene, masks, views, antialiased=antialiased)
     winners = ids[weights.argmax(1)] if len(ids) else np.full(len(gaussians), UNLABELLED, np.int16)
-    seen = torch.from_numpy(weights.sum(1) > 0)
-    return torch.where(seen, torch.from_numpy(winners), gaussians.label_ids)
+    seen, old = torch.from_numpy(weights.sum(1) > 0), gaussians.label_ids
+    return torch.where(seen.to(old.device), torch.from_numpy(winners).to(old.device), old)
