@@ -6,19 +6,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from conftest import pinhole
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from sagesplat.config import TrainConfig
 from sagesplat.demo.capture import make_capture
 from sagesplat.errors import RunError
 from sagesplat.gaussians import PARAMETERS, Gaussians
-from sagesplat.raster import Workspace
+from sagesplat.raster import Workspace, rasterize
 from sagesplat.scene import load_scene
 from sagesplat.scene.images import Photos
 from sagesplat.segment.lift import lift
 from sagesplat.segment.masks import Masks, Taxonomy, import_masks
-from sagesplat.train import trainer
-from sagesplat.train.freeze import label_quality, trainable_rows
-from sagesplat.train.stepper import tune
+from sagesplat.train import stepper, trainer
+from sagesplat.train.feed import Feed
+from sagesplat.train.freeze import Work, active_tiles, label_quality, trainable_rows
+from sagesplat.train.pace import smaller
+from sagesplat.train.state import initial_state
+from sagesplat.train.stepper import Stepper, tune
 from sagesplat.train.trainer import LabelFrozen, LevelSaved, Resumed, Step, Trained, train
 
 # densification from step 24 to 60 every 6, resets at 40, the SH degree rises every 4 steps
@@ -84,7 +90,7 @@ def test_a_category_stops_at_the_first_level_that_reaches_the_target(capture, le
     first = min(e.step for e in events if isinstance(e, LabelFrozen))
     for step in sorted(levels):
         degree = min(3, step // round(1000 * 40 / 30_000))
-        quality = label_quality(levels[step], scene, photos, masks, config, degree, "cpu", Workspace())
+        quality = label_quality(levels[step], Work(scene, masks), photos, config, degree, "cpu", Workspace())
         reached = {
             label for label, ssim in quality.items() if ssim >= 0.45 and label in levels[step].counts()
         }
@@ -169,6 +175,93 @@ def test_tuning_improves_and_keeps_the_set(capture):
     for name, p in before.parameters().items():  # the input is left alone
         assert torch.equal(p, getattr(end.gaussians, name))
     was, now = (
-        label_quality(g, scene, photos, masks, CONFIG, 3, "cpu", Workspace()) for g in (before, tuned)
+        label_quality(g, Work(scene, masks), photos, CONFIG, 3, "cpu", Workspace()) for g in (before, tuned)
     )
     assert np.mean(list(now.values())) > np.mean(list(was.values())) + 0.01
+
+
+def test_tiles_with_only_stopped_categories_are_done():
+    labels = np.zeros((40, 50), np.int16)
+    labels[:, 30:] = 3
+    labels[39, 49] = -1
+    left, both = [True, True, False, False], [True, True, False, True]
+    assert active_tiles(labels, {3}).tolist() == [left, left, both]
+    assert active_tiles(labels, {3, -1}).tolist() == [left] * 3
+    assert active_tiles(labels, {0, 3}).tolist() == [[False] * 4] * 2 + [[False, False, False, True]]
+    assert not active_tiles(labels, {-1, 0, 3}).any()
+    assert active_tiles(labels, ()).all()
+    # the image 20 x 25 has 2 x 2 tiles, the right ones from column 32 on
+    assert active_tiles(labels, {3}, 2).tolist() == [[True, False], [True, True]]
+    assert active_tiles(labels, {3}, 4).tolist() == [[True]]
+
+
+@settings(max_examples=50, deadline=None, derandomize=True)
+@given(st.integers(1, 70), st.integers(1, 70), st.sampled_from([1, 2, 4]), st.integers(0, 99))
+def test_masks_of_tiles_fit_photos_of_any_size(height, width, factor, seed):
+    labels = np.random.default_rng(seed).integers(-1, 2, (height, width)).astype(np.int16)
+    photo, camera = smaller(np.zeros((height, width, 3), np.uint8), pinhole(width, height), factor)
+    tiles = active_tiles(labels, {1}, factor)
+    assert tiles.shape == (-(-camera.height // 16), -(-camera.width // 16))
+    assert tiles.shape == (-(-photo.shape[0] // 16), -(-photo.shape[1] // 16))
+    if factor == 1:
+        for (row, column), active in np.ndenumerate(tiles):
+            part = labels[16 * row : 16 * row + 16, 16 * column : 16 * column + 16]
+            assert active == (part != 1).any()
+
+
+def test_stopped_categories_stop_costing(capture, monkeypatch):
+    """What is drawn shrinks with every category that stops, and frozen rows take no gradient."""
+    scene, photos, masks, labels = capture
+    drawn: list[tuple[int, float]] = []
+
+    def watched(*args, **options):
+        tiles = options["tile_mask"]
+        drawn.append((int(options["trainable"] is not None), 1.0 if tiles is None else float(tiles.mean())))
+        return rasterize(*args, **options)
+
+    monkeypatch.setattr(stepper, "rasterize", watched)
+    frozen_at: list[int] = []
+    config = replace(CONFIG, freeze_at=0.55)
+    for event in train(scene, photos, labels, config, masks=masks):
+        if isinstance(event, LabelFrozen):
+            frozen_at.append(event.step)
+    first, last = min(frozen_at), max(frozen_at)
+    assert set(drawn[:first]) == {(0, 1.0)}
+    before = np.mean([share for _, share in drawn[first:last]])
+    after = np.mean([share for _, share in drawn[last:]])
+    assert after < before < 1
+    assert all(asked for asked, _ in drawn[first:])  # for no gradients of frozen rows
+
+
+def test_finished_views_are_drawn_in_one_round_of_eight(capture):
+    scene, photos, masks, _ = capture
+    everything = frozenset({-1, *masks.taxonomy.names})
+    one = next(iter(sorted(masks.taxonomy.names)))
+    state = initial_state(three(one), 0)
+    device = torch.device("cpu")
+    shown = {row: set(np.unique(masks[scene.views[row]]).tolist()) for row in scene.train_ids.tolist()}
+    seen = {label: sum(label in labels for labels in shown.values()) for label in everything}
+    rare = min((label for label in seen if seen[label]), key=lambda label: seen[label])
+    assert seen[rare] < len(shown)
+    some = everything - {rare}
+    work = Work(scene, masks, some)
+    unfinished = {row for row in shown if shown[row] - some}
+    picked = Stepper(Feed(scene, photos, device), CONFIG, work)
+    views = [picked._next_view(state) for _ in range(2000)]
+    assert unfinished
+    assert {row for row in shown if not work.finished(row)} == unfinished
+    counts = {row: views.count(row) for row in shown}
+    busy = np.mean([counts[row] for row in unfinished])
+    for row in set(shown) - unfinished:
+        assert counts[row] < 0.4 * busy
+    done = Work(scene, masks, everything)
+    assert all(done.finished(row) for row in shown)
+    assert done.tiles(int(scene.train_ids[0])) is not None
+
+
+def three(label: int) -> Gaussians:
+    zeros = torch.zeros(3)
+    return Gaussians(
+        torch.rand(3, 3), torch.eye(4)[:1].repeat(3, 1), torch.zeros(3, 3), zeros, torch.zeros(3, 1, 3),
+        torch.zeros(3, 0, 3), torch.full((3,), label, dtype=torch.int16),
+    )  # fmt: skip

@@ -4,16 +4,19 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import gsplat_standin
 import numpy as np
 import pytest
 import torch
 from conftest import random_gaussians, write_capture
 
 from sagesplat.config import TrainConfig
-from sagesplat.errors import RunError
+from sagesplat.errors import OutOfMemory, RunError
 from sagesplat.gaussians import PARAMETERS, Gaussians
+from sagesplat.raster import rasterize
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
+from sagesplat.train import stepper, trainer
 from sagesplat.train.levels import read_header, read_level
 from sagesplat.train.state import from_points, initial_state
 from sagesplat.train.trainer import Event, LevelSaved, Resumed, Step, Trained, train
@@ -177,3 +180,102 @@ def test_from_points(scene):
     assert state.step == 0
     assert state.last_reset == -1
     assert not any(p.any() for p in (*state.first.values(), *state.second.values()))
+
+
+@pytest.mark.parametrize(
+    "config",
+    [replace(BUSY, strategy="mcmc"), replace(BUSY, absgrad=True, reset_every=1000), replace(BUSY, batch=3)],
+    ids=["mcmc", "absgrad", "batch"],
+)
+def test_other_strategies_learn_and_go_on_where_they_were(scene, tmp_path, config):
+    whole = list(run(scene, config))
+    losses = [e.loss for e in whole if isinstance(e, Step)]
+    assert np.mean(losses[-7:]) < 0.9 * np.mean(losses[:7])
+    assert len(final(whole)) > len(LABEL_IDS)
+    for event in run(scene, config, folder=tmp_path, settings="s"):
+        if isinstance(event, Step) and event.step == 41:
+            break
+    again = list(run(scene, config, folder=tmp_path, settings="s"))
+    assert again[0] == Resumed(36)
+    assert_identical(final(again), final(whole))
+
+
+def test_mcmc_grows_to_its_cap_and_loses_nobody(scene):
+    config = replace(BUSY, strategy="mcmc", max_steps=200, max_gaussians=90, level_every=20)
+    counts = [sum(e.counts.values()) for e in run(scene, config) if isinstance(e, LevelSaved)]
+    assert counts == sorted(counts)
+    assert counts[-1] == 90
+
+
+def test_gaussians_that_rest_stay_as_they_are(scene, monkeypatch):
+    awake: list[float] = []
+
+    def watched(*args, **options):
+        awake.append(1.0 if options["trainable"] is None else float(options["trainable"].float().mean()))
+        return rasterize(*args, **options)
+
+    monkeypatch.setattr(stepper, "rasterize", watched)
+    events = list(run(scene, replace(BUSY, rest_share=0.8)))
+    assert [share for share in awake if share < 1]
+    assert awake[-1] < 1 or awake[-8] < 1  # after densification every other stretch
+    assert final(events) is not None
+    with pytest.raises(RunError, match=r"--train.rest-share 1.0 is no share"):
+        list(run(scene, replace(BUSY, rest_share=1.0)))
+
+
+LESS = "out of memory; lower --train.max-gaussians"
+
+
+@pytest.mark.parametrize(
+    ("failure", "says"),
+    [
+        (
+            torch.OutOfMemoryError("CUDA out of memory. Tried ..."),
+            LESS,
+        ),
+        (OutOfMemory("the GPU is out of memory"), LESS),
+        (MemoryError(), LESS),
+        (
+            RuntimeError("CUDA error: unspecified launch failure\nmore"),
+            "the GPU failed .CUDA error: un",
+        ),
+    ],
+    ids=["torch", "raster", "memory", "device"],
+)
+def test_what_a_machine_cannot_do_is_one_line_and_costs_no_checkpoint(
+    scene, tmp_path, monkeypatch, failure, says
+):
+    calls = 0
+
+    def failing(*args, **options):
+        nonlocal calls
+        calls += 1
+        if calls == 30:
+            raise failure
+        return rasterize(*args, **options)
+
+    monkeypatch.setattr(stepper, "rasterize", failing)
+    with pytest.raises(RunError, match=says) as caught:
+        list(run(scene, BUSY, folder=tmp_path, settings="s"))
+    message = str(caught.value)
+    assert "\n" not in message
+    assert "training stopped at step 29" in message
+    assert str(tmp_path / "checkpoint.npz") in message
+    assert next(run(scene, BUSY, folder=tmp_path, settings="s")) == Resumed(24)
+
+
+def test_other_errors_keep_their_name(scene, monkeypatch):
+    monkeypatch.setattr(stepper, "rasterize", lambda *args, **options: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        list(run(scene, BUSY))
+
+
+def test_gsplats_translation_trains_like_the_cpu(scene, monkeypatch):
+    """gsplat's own torch code stands in for its kernels, on a CPU."""
+    config = replace(BUSY, max_steps=12, level_every=12)
+    expected = [e.loss for e in run(scene, config) if isinstance(e, Step)]
+    gsplat_standin.install(monkeypatch)
+    for module in (trainer, stepper):
+        monkeypatch.setattr(module, "device_of", lambda *_: torch.device("cpu"))
+    actual = [e.loss for e in run(scene, config, backend="cuda") if isinstance(e, Step)]
+    np.testing.assert_allclose(actual, expected, rtol=1e-3)

@@ -26,6 +26,7 @@ from sagesplat.errors import SageError
 
 if TYPE_CHECKING:
     from sagesplat.job import Job
+    from sagesplat.raster import Backend
 
 COMMANDS: dict[str, Callable[..., None]] = {}
 
@@ -43,8 +44,11 @@ class Machine:
     threads: int = 0
     """CPU threads (0: all cores)."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    backend: Literal["auto", "cpu", "reference"] = "auto"
+    """auto: a CUDA GPU where there is one that works (see `sagesplat doctor`), else the CPU."""
+    backend: Literal["auto", "cpu", "cuda", "reference"] = "auto"
     """Rasteriser; reference is float64 and slow."""
+    processes: int = 1
+    """Train in so many processes, one per GPU; a step then looks at a photo each."""
     force: bool = False
     """Make results again that were made with other settings."""
 
@@ -59,13 +63,23 @@ def _job(run: Path, machine: Machine) -> Iterator["Job"]:
     """A job on a run folder, shown on the console."""
     from sagesplat.console import Console
     from sagesplat.job import Job
-    from sagesplat.raster import resolve_backend, set_threads
     from sagesplat.run_dir import RunDir
 
-    backend = resolve_backend(machine.backend, machine.device)
-    threads = set_threads(machine.threads)
+    backend, threads = _prepare(machine)
     with Console() as console:
-        yield Job(RunDir(run), console, backend, threads, machine.force)
+        if backend == "cuda":
+            console.out.print("[dim]· computing on the GPU[/]")
+        yield Job(RunDir(run), console, backend, threads, machine.force, machine.processes)
+
+
+def _prepare(machine: Machine) -> "tuple[Backend, int]":
+    """The backend that this machine computes with, and its CPU threads."""
+    from sagesplat.raster import cuda, resolve_backend, set_threads
+
+    device, backend = machine.device, machine.backend
+    if (device, backend) == ("auto", "auto") and cuda.missing() is None:
+        device = "cuda"
+    return resolve_backend(backend, device), set_threads(machine.threads)
 
 
 @command
@@ -297,11 +311,10 @@ def sweep(
         machine: where and how to compute.
     """
     from sagesplat.console import Console
-    from sagesplat.raster import resolve_backend, set_threads
     from sagesplat.sweep import read_sweep, run_sweep
 
     cells = read_sweep(file)
-    backend, threads = resolve_backend(machine.backend, machine.device), set_threads(machine.threads)
+    backend, threads = _prepare(machine)
     with Console() as console:
         run_sweep(cells, out, console, backend, threads, machine.force)
     print(out / "summary.md")
@@ -328,6 +341,25 @@ def download(what: Positional[Literal["lpips"]], folder: Path | None = None) -> 
             ),
         )
     print("\n".join(map(str, files)))
+
+
+@command
+def doctor(build: bool = False, json: bool = False) -> None:
+    """Say what this machine can do, and what more needs.
+
+    Args:
+        build: compile gsplat's CUDA kernels now (about a minute), rather than at their first use.
+        json: print it for machines.
+    """
+    from sagesplat.doctor import as_json, examine, is_well, print_findings
+
+    findings = examine(build=build)
+    if json:
+        print(as_json(findings))
+    else:
+        print_findings(findings)
+    if not is_well(findings):
+        raise SystemExit(1)
 
 
 @command

@@ -50,6 +50,9 @@ class TrainConfig:
     ssim_weight: float = 0.2
     antialiased: bool = False
     """Scale opacities by the area that the screen-space low-pass adds."""
+    batch: int = 1
+    """Photos a step looks at (at least one per process); rates grow by its square root, max_steps does not
+    shrink."""
     means_lr: float = 1.6e-4
     """Times the scene's extent; falls exponentially to a hundredth."""
     quats_lr: float = 1e-3
@@ -57,6 +60,8 @@ class TrainConfig:
     logit_opacities_lr: float = 5e-2
     sh0_lr: float = 2.5e-3
     shN_lr: float = 1.25e-4
+    strategy: Literal["default", "mcmc"] = "default"
+    """How Gaussians come and go: clone, split, prune, reset as 3DGS, or relocation and noise as 3DGS-MCMC."""
     refine_every: int = 100
     """Densify every so many steps (not scaled: its statistics need the views)."""
     refine_start: int = 500
@@ -67,6 +72,9 @@ class TrainConfig:
     raise_sh_every: int = 1000
     grow_grad: float = 2e-4
     """Mean screen-space gradient (half images) above which a Gaussian is cloned or split."""
+    absgrad: bool = False
+    """Densify by sums of absolute gradients over pixels (AbsGS), above grow_absgrad."""
+    grow_absgrad: float = 8e-4
     grow_scale: float = 0.01
     """Split rather than clone above this share of the extent."""
     prune_opacity: float = 5e-3
@@ -74,10 +82,19 @@ class TrainConfig:
     """After the first reset, Gaussians larger than this share of the extent go."""
     max_gaussians: int = 0
     """Cap of densification, reached in a straight line (0: by the size of the photos)."""
+    mcmc_noise: float = 5e5
+    """Times the rate of the means: how far MCMC's Gaussians wander."""
+    mcmc_opacity: float = 0.01
+    """Weight of the mean opacity in MCMC's loss."""
+    mcmc_scale: float = 0.01
+    """Weight of the mean scale in MCMC's loss."""
     levels_after_reset: bool = False
     """Record a level that falls on an opacity reset right after it (as the paper may have), not before."""
     freeze_at: float | None = None
     """Stop each category when its mean SSIM on the training views reaches this (Fig. 1 of the paper)."""
+    rest_share: float = 0.0
+    """To compare with: after densification, the Gaussians whose gradients are within this smallest share rest
+    every other hundred steps (GSta). A run that is interrupted then goes on a little differently."""
 
 
 @dataclass(frozen=True)

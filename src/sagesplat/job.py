@@ -36,6 +36,7 @@ class Job:
     backend: Backend = "auto"
     threads: int = 1
     force: bool = False
+    processes: int = 1  # that train together
 
     @cached_property
     def scene(self) -> Scene:

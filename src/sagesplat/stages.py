@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import asdict, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,7 @@ from sagesplat.scene import load_scene
 from sagesplat.segment.lift import lift
 from sagesplat.segment.masks import import_masks
 from sagesplat.train.checkpoint import read_checkpoint
+from sagesplat.train.parallel import train_together
 from sagesplat.train.stepper import tune
 from sagesplat.train.trainer import LabelFrozen, LevelSaved, Resumed, Step, Trained, train
 
@@ -142,7 +144,8 @@ def lift_labels(job: Job, config: LiftConfig) -> None:
 def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
     """Train 3DGS from the labelled points and record the levels."""
     run = job.run
-    settings = {**asdict(config), "seed": seed}
+    # what a step looks at decides the result, not who does the work
+    settings = {**asdict(config), "batch": max(config.batch, job.processes), "seed": seed}
 
     def make() -> list[str]:
         belongs = json.dumps({**settings, "scene": file_hash(run.scene), "labels": file_hash(run.labels)})
@@ -151,7 +154,8 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
         if not run.checkpoint.exists():
             shutil.rmtree(run.levels, ignore_errors=True)
         counts: dict[str, int] = {}
-        events = train(
+        start = partial(train_together, job.processes, job.threads) if job.processes > 1 else train
+        events = start(
             job.scene, job.photos, job.point_labels, config,
             masks=job.masks if config.freeze_at is not None else None,
             seed=seed, backend=job.backend, folder=run.path, settings=belongs,
@@ -160,7 +164,7 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
             match event:
                 case Resumed(step):
                     job.emit(Warned(f"going on from step {step}"))
-                case Step(step, loss, num):
+                case Step(step, loss, num, _):
                     job.emit(Training(step, config.max_steps, loss, counts, num))
                 case LevelSaved():
                     counts = {job.taxonomy.name(i): n for i, n in event.counts.items()}

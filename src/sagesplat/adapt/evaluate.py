@@ -13,7 +13,7 @@ from sagesplat.adapt.ladder import Ladder
 from sagesplat.adapt.observe import LabelImages, as_unit, erode, measure, render_rgb
 from sagesplat.adapt.plan import Models, Plan
 from sagesplat.gaussians import Gaussians
-from sagesplat.raster import Backend, Workspace
+from sagesplat.raster import Backend, Workspace, device_of
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 
@@ -79,6 +79,7 @@ def evaluate(
 
     def measure_all(g: Gaussians):
         nonlocal done
+        g = g.to(device_of(backend))
         for row in views:
             view = scene.views[row]
             image = render_rgb(g, view.camera, backend=backend, antialiased=antialiased, workspace=workspace)

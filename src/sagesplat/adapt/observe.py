@@ -15,7 +15,7 @@ from sagesplat.adapt.columns import from_rows, read_columns, write_columns
 from sagesplat.adapt.ladder import Ladder
 from sagesplat.gaussians import Gaussians
 from sagesplat.metrics import means_by_label, psnr, squared_error_map, ssim_map
-from sagesplat.raster import Backend, Workspace, rasterize
+from sagesplat.raster import Backend, Workspace, device_of, rasterize
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene, View
 from sagesplat.segment.masks import UNLABELLED
@@ -96,8 +96,9 @@ def render_rgb(
 ) -> Float32[np.ndarray, "H W 3"]:
     """An image in [0, 1], as quality is measured on it; calls may share a `workspace`, images do not."""
     with torch.no_grad():
+        g = g.to(device_of(backend))
         render = rasterize(g, camera, backend=backend, antialiased=antialiased, workspace=workspace)
-        return render.rgb.clamp(0, 1).float().numpy()
+        return render.rgb.clamp(0, 1).float().cpu().numpy()
 
 
 class LabelImages(Protocol):
@@ -125,14 +126,15 @@ class RenderedLabels:
 
     def _render(self, camera: Camera) -> Int16[np.ndarray, "H W"]:
         ids = sorted({UNLABELLED, *self.gaussians.counts()})
-        one_hot = (self.gaussians.label_ids[:, None] == torch.tensor(ids)).float()
+        g = self.gaussians.to(device_of(self.backend))
+        one_hot = (g.label_ids[:, None] == torch.tensor(ids, device=g.label_ids.device)).float()
         with torch.no_grad():
             render = rasterize(
-                self.gaussians, camera, features=one_hot, backend=self.backend, antialiased=self.antialiased
+                g, camera, features=one_hot, backend=self.backend, antialiased=self.antialiased
             )
         assert render.features is not None
-        painted = render.features.float().numpy().copy()
-        painted[..., 0] += 1 - render.alpha.float().numpy()
+        painted = render.features.float().cpu().numpy().copy()
+        painted[..., 0] += 1 - render.alpha.float().cpu().numpy()
         return np.array(ids, np.int16)[painted.argmax(-1)]
 
 
@@ -201,7 +203,7 @@ def observe(
     done, total = 0, len(ladder.files) * len(scene.views)
     workspace = Workspace()
     for level in ladder.levels:
-        g = ladder.load(level)
+        g = ladder.load(level).to(device_of(backend))
         for row, view in enumerate(scene.views):
             image = render_rgb(g, view.camera, backend=backend, antialiased=antialiased, workspace=workspace)
             for label, values in measure(image, as_unit(photos[row]), masks[view], inner[row]).items():

@@ -1,6 +1,7 @@
 """Cameras, views, points and the scene they make (OpenCV axes: x right, y down, z forward)."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -73,7 +74,7 @@ class Scene:
     points: Points
     test_every: int = 8  # every n-th view by name is a test view; 0 = none
 
-    @property
+    @cached_property
     def extent(self) -> float:
         """1.1 times the largest distance of a training camera from their mean (3DGS's scene extent)."""
         centres = np.stack([self.views[i].camera.position for i in self.train_ids])

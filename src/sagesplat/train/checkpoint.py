@@ -18,6 +18,7 @@ _VERSION = 1
 
 def write_checkpoint(path: Path, state: TrainState, settings: str) -> None:
     """Save a state; `settings` says what run it belongs to and is checked on reading."""
+    state = state.to(torch.device("cpu"))
     g = state.gaussians
     arrays = {name: p.numpy() for name, p in g.parameters().items()}
     arrays |= {f"first/{name}": state.first[name].numpy() for name in PARAMETERS}

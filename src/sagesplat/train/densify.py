@@ -17,6 +17,7 @@ from sagesplat.train.state import TrainState
 _SPLIT_SHRINK = 1.6
 _REFERENCE_STEPS = 30_000
 _ENOUGH_REFINEMENTS, _LATEST_STOP = 8, 0.7  # share of the run
+_MCMC_STOP = 25_000  # step at which MCMC ends its refinement, as published
 _RESET_FLOOR = 1500  # steps that a model needs between two resets, however short the run
 
 
@@ -40,7 +41,8 @@ def schedule(config: TrainConfig) -> Schedule:
         return max(1, round(step * share))
 
     reset_every = max(scaled(config.reset_every), min(config.reset_every, _RESET_FLOOR))
-    refine_start, refine_stop = min(config.refine_start, config.max_steps // 5), scaled(config.refine_stop)
+    stop = config.refine_stop if config.strategy == "default" else max(config.refine_stop, _MCMC_STOP)
+    refine_start, refine_stop = min(config.refine_start, config.max_steps // 5), scaled(stop)
     if config.pace == "fast":  # short runs too must have the time to grow
         enough = refine_start + _ENOUGH_REFINEMENTS * config.refine_every
         refine_stop = max(refine_stop, min(enough, int(_LATEST_STOP * config.max_steps)))
@@ -56,10 +58,16 @@ def schedule(config: TrainConfig) -> Schedule:
 
 def observe_gradients(state: TrainState, render: Render, width: int, height: int, trainable: Tensor) -> None:
     """Add a view's screen-space gradients, in half images as 3DGS measures them."""
-    assert render.means2d.grad is not None
+    grad, radii = render.means2d.grad, render.radii
+    assert grad is not None
+    if grad.is_cuda:
+        seen = (radii > 0) & trainable
+        state.grad_sum += torch.hypot(grad[:, 0] * (width / 2), grad[:, 1] * (height / 2)) * seen
+        state.grad_count += seen
+        return
     _observe(
-        render.means2d.grad.numpy(), render.radii.numpy(), trainable.numpy(),
-        np.float32(width / 2), np.float32(height / 2), state.grad_sum.numpy(), state.grad_count.numpy(),
+        grad.numpy(), radii.numpy(), trainable.numpy(), np.float32(width / 2), np.float32(height / 2),
+        state.grad_sum.numpy(), state.grad_count.numpy(),
     )  # fmt: skip
 
 
@@ -82,12 +90,18 @@ def budget(
     `pixels_now`, set one too.
     """
 
-    def distinct(pixels: int) -> int:
-        return max(int(1.5 * pixels), 2 * num_points)
-
-    cap = config.max_gaussians or distinct(num_pixels)
+    most = cap(config, num_pixels, num_points)
     share = min(1.0, (step - plan.refine_start) / max(1, plan.refine_stop - plan.refine_start))
-    return min(num_points + int(share * (cap - num_points)), distinct(pixels_now))
+    return min(num_points + int(share * (most - num_points)), _distinct(pixels_now, num_points))
+
+
+def cap(config: TrainConfig, num_pixels: int, num_points: int) -> int:
+    """How many Gaussians there may be at most: as set, or what photos of `num_pixels` can tell apart."""
+    return config.max_gaussians or _distinct(num_pixels, num_points)
+
+
+def _distinct(pixels: int, num_points: int) -> int:
+    return max(int(1.5 * pixels), 2 * num_points)
 
 
 def room(state: TrainState, most: int, trainable: Tensor) -> int:
@@ -102,7 +116,8 @@ def refine(state: TrainState, config: TrainConfig, extent: float, room: int, tra
     """Clone small, split large Gaussians with high gradients; prune faint and, after a reset, huge ones."""
     g = state.gaussians
     size = g.log_scales.exp().amax(-1)
-    grows = (state.grad_sum / state.grad_count.clamp_min(1) > config.grow_grad) & trainable
+    threshold = config.grow_absgrad if config.absgrad else config.grow_grad
+    grows = (state.grad_sum / state.grad_count.clamp_min(1) > threshold) & trainable
     if int(grows.sum()) > room:
         strength = torch.where(grows, state.grad_sum / state.grad_count.clamp_min(1), -1.0)
         grows = torch.zeros_like(grows)
@@ -119,7 +134,8 @@ def refine(state: TrainState, config: TrainConfig, extent: float, room: int, tra
 def _split(g: Gaussians, rng: np.random.Generator) -> Gaussians:
     """Two smaller Gaussians drawn from each."""
     both = concat([g, g])
-    noise = torch.from_numpy(rng.standard_normal((len(both), 3), np.float32)) * both.log_scales.exp()
+    normal = torch.from_numpy(rng.standard_normal((len(both), 3), np.float32)).to(both.means.device)
+    noise = normal * both.log_scales.exp()
     shift = (rotation_matrices(both.quats) @ noise[..., None]).squeeze(-1)
     return replace(both, means=both.means + shift, log_scales=both.log_scales - float(np.log(_SPLIT_SHRINK)))
 

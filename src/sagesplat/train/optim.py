@@ -1,7 +1,14 @@
 """Adam over rows: one fused, parallel pass; rows outside the mask keep parameter and moments untouched."""
 
+from collections.abc import Mapping
+
 import numpy as np
 from numba import njit, prange
+from torch import Tensor
+
+from sagesplat.gaussians import PARAMETERS
+from sagesplat.sh import num_bases
+from sagesplat.train.state import TrainState
 
 _BETA1, _BETA2, _EPS = 0.9, 0.999, 1e-15
 _CHUNK = 4096
@@ -9,11 +16,12 @@ _CHUNK = 4096
 
 @njit(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", cache=True)
 def _update(parameter, grad, first, second, rate, correction):
-    b1, b2, eps, one = np.float32(_BETA1), np.float32(_BETA2), np.float32(_EPS), np.float32(1)
+    b1, b2, eps = np.float32(_BETA1), np.float32(_BETA2), np.float32(_EPS)
+    new1, new2 = np.float32(1 - _BETA1), np.float32(1 - _BETA2)
     for i in range(np.uint64(len(parameter))):
         g = grad[i]
-        m = b1 * first[i] + (one - b1) * g
-        v = b2 * second[i] + (one - b2) * g * g
+        m = b1 * first[i] + new1 * g
+        v = b2 * second[i] + new2 * g * g
         first[i] = m
         second[i] = v
         parameter[i] -= rate * m / (np.sqrt(v) * correction + eps)
@@ -63,3 +71,27 @@ def adam_step(
             second.reshape(-1),
             rate, correction, trainable, parameter.size if columns is None else columns,
         )  # fmt: skip
+
+
+def update(
+    state: TrainState,
+    grads: Mapping[str, Tensor],
+    rates: Mapping[str, float],
+    degree: int,
+    trainable: Tensor,
+) -> None:
+    """Adam's step number `state.step` on all parameters, on the device that they are on."""
+    for name in PARAMETERS:
+        tensors = getattr(state.gaussians, name), grads[name], state.first[name], state.second[name]
+        how = {
+            "lr": rates[name],
+            "step": state.step,
+            "columns": 3 * (num_bases(degree) - 1) if name == "shN" else None,
+        }
+        if trainable.is_cuda:
+            from sagesplat.train import adam_triton
+
+            adam_triton.adam_step(*tensors, trainable=trainable, **how)
+        else:
+            parameter, grad, first, second = (t.detach().numpy() for t in tensors)
+            adam_step(parameter, grad, first, second, trainable=trainable.numpy(), **how)

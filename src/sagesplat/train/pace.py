@@ -42,6 +42,17 @@ class Pace:
             rates = {n: rate * (_MEANS_GAIN if n == "means" else gain) for n, rate in rates.items()}
         return rates
 
+    def wander(self, step: int) -> float:
+        """MCMC's noise at a step, in 1 / world units: the published rate of the means times `mcmc_noise`, as
+        if the scene were scaled to an extent of 1.
+        """
+        return (
+            self.config.mcmc_noise
+            * self.config.means_lr
+            * _MEANS_SHRINK_TO ** (step / self.config.max_steps)
+            / self.extent
+        )
+
     def factor(self, step: int) -> int:
         """How many times smaller the photo of a step is."""
         return next((factor for last, factor in self.coarse if step <= last), 1)

@@ -1,6 +1,6 @@
 """Everything that training changes, in one place."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -42,7 +42,8 @@ class TrainState:
 
     def sort(self) -> None:
         """Put neighbours in space next to each other: then they are drawn, or not, together."""
-        order = torch.from_numpy(geometry.morton_order(self.gaussians.means.numpy()))
+        means = self.gaussians.means
+        order = torch.from_numpy(geometry.morton_order(means.cpu().numpy())).to(means.device)
         self.gaussians = self.gaussians.select(order)
         for moments in (self.first, self.second):
             for name in PARAMETERS:
@@ -51,8 +52,18 @@ class TrainState:
 
     def clear_statistics(self) -> None:
         """Start the densification statistics again."""
-        self.grad_sum = torch.zeros(len(self.gaussians))
-        self.grad_count = torch.zeros(len(self.gaussians))
+        self.grad_sum = self.gaussians.means.new_zeros(len(self.gaussians))
+        self.grad_count = self.grad_sum.clone()
+
+    def to(self, device: torch.device) -> "TrainState":
+        """The same on a device; tensors that are there already are shared."""
+        first, second = (
+            {name: m.to(device) for name, m in moments.items()} for moments in (self.first, self.second)
+        )
+        return replace(
+            self, gaussians=self.gaussians.to(device), first=first, second=second,
+            grad_sum=self.grad_sum.to(device), grad_count=self.grad_count.to(device),
+        )  # fmt: skip
 
 
 def from_points(points: Points, label_ids: np.ndarray, sh_degree: int) -> Gaussians:

@@ -1,78 +1,126 @@
 """Single training steps, and short trainings of a fixed set of Gaussians."""
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from sagesplat.config import TrainConfig
-from sagesplat.errors import RunError
 from sagesplat.gaussians import Gaussians
 from sagesplat.metrics import photometric_loss
-from sagesplat.raster import Backend, Render, Workspace, rasterize
+from sagesplat.raster import Backend, Render, Workspace, device_of, rasterize
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
-from sagesplat.sh import num_bases
-from sagesplat.train.freeze import trainable_rows
-from sagesplat.train.optim import adam_step
-from sagesplat.train.pace import Pace, smaller
+from sagesplat.train import densify, mcmc, optim
+from sagesplat.train.feed import Feed
+from sagesplat.train.freeze import Work, trainable_rows
+from sagesplat.train.group import ALONE, Group
+from sagesplat.train.pace import Pace
+from sagesplat.train.rest import Rest
 from sagesplat.train.state import TrainState, initial_state
 
+FINISHED_SHARE = 1 / 8  # of the rounds have a view in which nothing is left to learn: it is drawn whole then
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(eq=False)
 class Stepper:
-    """Takes training steps on a state: render one view, compare it with its photo, move the Gaussians."""
+    """Takes training steps on a state: render views, compare them with their photos, move the Gaussians."""
 
-    scene: Scene
-    photos: Photos
+    feed: Feed
     config: TrainConfig
+    work: Work
     backend: Backend = "auto"
+    group: Group = ALONE
+    rest: Rest | None = None
+    drawn: float = 1.0  # share of the tiles that the last step drew
     workspace: Workspace = field(default_factory=Workspace)
 
     def __call__(
-        self, state: TrainState, degree: int, rates: dict[str, float], trainable: Tensor, factor: int = 1
-    ) -> tuple[float, Render]:
-        """One step on a photo `factor` times smaller; the loss, and the render with its gradients."""
-        view = self._next_view(state)
-        pixels, camera = smaller(self.photos[view], self.scene.views[view].camera, factor)
-        photo = torch.from_numpy(pixels).float() / 255
+        self,
+        state: TrainState,
+        degree: int,
+        rates: Mapping[str, float],
+        trainable: Tensor,
+        factor: int = 1,
+        observing: bool = False,
+        wander: float = 0.0,
+    ) -> Tensor:
+        """One step on photos `factor` times smaller; the loss, on the device.
+
+        `observing`: add to the statistics that densification asks for. `wander`: MCMC's noise (see `Pace`).
+        """
+        batch = max(self.config.batch, self.group.size)
+        views = self.group.share([self._next_view(state) for _ in range(batch)])
+        if state.queue:
+            self.feed.expect(state.queue[-1 - self.group.rank % len(state.queue)], factor)
         leaves = {name: p.detach().requires_grad_() for name, p in state.gaussians.parameters().items()}
+        moving = replace(state.gaussians, **leaves)
+        losses: list[Tensor] = []
+        self.drawn = 0.0
+        grads: dict[str, Tensor] = {}
+        for view in views:
+            loss, render = self._draw(moving, view, degree, trainable, factor)
+            loss.backward()
+            losses.append(loss.detach())
+            if observing:
+                height, width, _ = render.rgb.shape
+                densify.observe_gradients(state, render, width, height, trainable)
+            for name, leaf in leaves.items():
+                assert leaf.grad is not None
+                if name in grads:
+                    grads[name] += leaf.grad
+                else:  # the workspace lends its memory until the next view comes
+                    grads[name] = leaf.grad.clone() if len(views) > 1 else leaf.grad
+                leaf.grad = None
+        self.drawn /= len(views)
+        total = torch.stack(losses).sum()
+        if batch > 1:
+            self.group.add(total, *grads.values())
+            grads = {name: grad / batch for name, grad in grads.items()}
+        if self.rest:
+            self.rest.watch(grads)
+        state.step += 1
+        if self.config.strategy == "mcmc":
+            weights = self.config.mcmc_opacity, self.config.mcmc_scale / self.feed.scene.extent
+            mcmc.add_regularisation_gradients(state, grads, *weights, trainable)
+        scaled = {name: rate * math.sqrt(batch) for name, rate in rates.items()}
+        optim.update(state, grads, scaled, degree, trainable)
+        if wander:
+            mcmc.perturb(state, wander, trainable)
+        return total / batch
+
+    def _draw(
+        self, moving: Gaussians, view: int, degree: int, trainable: Tensor, factor: int
+    ) -> tuple[Tensor, Render]:
+        photo, camera = self.feed(view, factor)
+        # nobody may paint over what is finished, so it is looked at now and then
+        tiles = None if self.work.finished(view) else self.work.tiles(view, factor)
+        self.drawn += 1.0 if tiles is None else float(tiles.mean())
+        if tiles is not None and self.feed.device.type != "cpu":
+            tiles = torch.from_numpy(tiles).to(self.feed.device, non_blocking=True)
         render = rasterize(
-            replace(state.gaussians, **leaves),
+            moving,
             camera,
             sh_degree=degree,
             antialiased=self.config.antialiased,
+            tile_mask=tiles,
+            trainable=trainable if self.work.frozen or self.rest else None,
+            absgrad=self.config.absgrad,
             workspace=self.workspace,
             backend=self.backend,
         )
-        loss = photometric_loss(render.rgb, photo, self.config.ssim_weight, self.workspace)
-        value = float(loss.detach())
-        if not np.isfinite(value):
-            raise RunError(
-                f"the loss became {value} at step {state.step + 1}; lower the learning rates and train again"
-            )
-        loss.backward()
-        state.step += 1
-        in_use = 3 * (num_bases(degree) - 1)
-        for name, leaf in leaves.items():
-            assert leaf.grad is not None
-            adam_step(
-                leaf.detach().numpy(),
-                leaf.grad.numpy(),
-                state.first[name].numpy(),
-                state.second[name].numpy(),
-                lr=rates[name],
-                step=state.step,
-                trainable=trainable.numpy(),
-                columns=in_use if name == "shN" else None,
-            )
-        return value, render
+        return photometric_loss(render.rgb, photo, self.config.ssim_weight, tiles, self.workspace), render
 
     def _next_view(self, state: TrainState) -> int:
-        """Views in random order, each once a round."""
-        if not state.queue:
-            state.queue = state.rng.permutation(self.scene.train_ids).tolist()
+        """Views in random order, each once a round; finished ones in a round out of eight."""
+        while not state.queue:
+            state.queue = [
+                view
+                for view in state.rng.permutation(self.feed.scene.train_ids).tolist()
+                if not self.work.finished(view) or state.rng.random() < FINISHED_SHARE
+            ]
         return state.queue.pop()
 
 
@@ -90,11 +138,14 @@ def tune(
 
     The rates are those of the last third of a published run of three times `steps`.
     """
+    config = replace(config, strategy="default", batch=1)
     rates = Pace(replace(config, max_steps=3 * steps, pace="published"), scene.extent).rates
+    device = device_of(backend)
     copies = {name: p.detach().clone() for name, p in gaussians.parameters().items()}
-    state = initial_state(replace(gaussians, **copies), seed)
+    state = initial_state(replace(gaussians, **copies).to(device), seed)
     state.sort()
-    stepper, everything = Stepper(scene, photos, config, backend), trainable_rows(gaussians, {})
+    stepper = Stepper(Feed(scene, photos, device), config, Work(scene, None), backend)
+    everything = trainable_rows(state.gaussians, {})
     for step in range(1, steps + 1):
         stepper(state, gaussians.sh_degree, rates(2 * steps + step), everything)
-    return state.gaussians
+    return state.gaussians.to("cpu")

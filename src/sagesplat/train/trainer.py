@@ -1,25 +1,35 @@
 """Training: a generator of events over a state; it prints nothing and draws nothing."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from sagesplat.config import TrainConfig
-from sagesplat.errors import RunError
+from sagesplat.errors import OutOfMemory, RunError
 from sagesplat.gaussians import Gaussians
-from sagesplat.raster import Backend
+from sagesplat.raster import Backend, device_of
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.segment.masks import Masks
-from sagesplat.train import densify
+from sagesplat.train import densify, mcmc
 from sagesplat.train.checkpoint import read_checkpoint, write_checkpoint
-from sagesplat.train.freeze import label_quality, trainable_rows
+from sagesplat.train.feed import Feed
+from sagesplat.train.freeze import Work, label_quality, trainable_rows
+from sagesplat.train.group import ALONE, Group
 from sagesplat.train.levels import write_level
 from sagesplat.train.pace import pace
+from sagesplat.train.rest import Rest
 from sagesplat.train.state import TrainState, from_points, initial_state
 from sagesplat.train.stepper import Stepper
+
+CHECKPOINT = "checkpoint.npz"
+_LESS = "lower --train.max-gaussians, or begin a run with --downscale 2"
+_LOOK_EVERY = 100  # steps between two looks at the loss on a GPU
 
 
 @dataclass(frozen=True)
@@ -36,6 +46,7 @@ class Step:
     step: int
     loss: float
     num_gaussians: int
+    drawn: float = 1.0  # share of the tiles that this process drew
 
 
 @dataclass(frozen=True)
@@ -81,67 +92,144 @@ def train(
     backend: Backend = "auto",
     folder: Path | None = None,
     settings: str = "",
+    group: Group = ALONE,
 ) -> Iterator[Event]:
     """Train on the training views; levels and the checkpoint go into `folder` (levels/, checkpoint.npz).
 
     With `config.freeze_at`, categories are measured on `masks` whenever a level is recorded; one that has
     reached it stays bit for bit as it is, and training ends when all have. A checkpoint found in `folder`
-    that belongs to the same `settings` is continued. Raises `RunError` where the loss stops being finite,
-    and for a `freeze_at` that is no SSIM.
+    that belongs to the same `settings` is continued. The processes of a `group` train one model together:
+    all call this with the same arguments, the first one writes. Raises `RunError` where the loss stops being
+    finite, memory runs out or a GPU fails, and for settings that cannot be.
     """
     _check(config, masks)
+    state: TrainState | None = None
+    try:
+        for event, state in _train(  # noqa: B007 - the last state is asked for where training fails
+            scene, photos, label_ids, config, masks, seed, backend, folder, settings, group
+        ):
+            yield event
+    except (torch.OutOfMemoryError, OutOfMemory, MemoryError) as error:
+        raise RunError(f"{_where(state, folder)}: out of memory; {_LESS}") from error
+    except RuntimeError as error:
+        if "CUDA error" not in str(error):
+            raise
+        reason = str(error).splitlines()[0]
+        raise RunError(
+            f"{_where(state, folder)}: the GPU failed ({reason}); look at nvidia-smi, then run again"
+        ) from error
+
+
+def _where(state: TrainState | None, folder: Path | None) -> str:
+    """How far training came, and where the next one begins."""
+    if state is None:
+        return "training did not begin"
+    kept = f", {folder / CHECKPOINT} is kept" if folder and (folder / CHECKPOINT).exists() else ""
+    return f"training stopped at step {state.step} with {len(state.gaussians):,} Gaussians{kept}"
+
+
+def _train(
+    scene: Scene,
+    photos: Photos,
+    label_ids: np.ndarray,
+    config: TrainConfig,
+    masks: Masks | None,
+    seed: int,
+    backend: Backend,
+    folder: Path | None,
+    settings: str,
+    group: Group,
+) -> Iterator[tuple[Event, TrainState]]:
+    """The events of `train`, each with the state that it comes from."""
     plan = densify.schedule(config)
-    extent, camera = scene.extent, scene.views[0].camera
-    num_pixels = camera.width * camera.height
     some = scene.train_ids[:: max(1, len(scene.train_ids) // 8)]
-    run_pace = pace(config, extent, [photos[i] for i in some] if config.pace == "fast" else [])
-    state = initial_state(from_points(scene.points, label_ids, config.sh_degree), seed)
+    run_pace = pace(config, scene.extent, [photos[i] for i in some] if config.pace == "fast" else [])
+    device = device_of(backend, group.rank)
+    state = initial_state(from_points(scene.points, label_ids, config.sh_degree), seed).to(device)
     state.sort()
-    checkpoint = folder / "checkpoint.npz" if folder else None
+    checkpoint = folder / CHECKPOINT if folder else None
     if checkpoint and checkpoint.exists():
-        state = read_checkpoint(checkpoint, settings)
-        yield Resumed(state.step)
-    stepper = Stepper(scene, photos, config, backend)
+        state = read_checkpoint(checkpoint, settings).to(device)
+        if not group.leads:  # the first has what all had seen
+            state.clear_statistics()
+        yield Resumed(state.step), state
+    folder = folder if group.leads else None
+    work = Work(scene, masks, frozenset(state.frozen))
+    rest = Rest(config.rest_share) if config.rest_share else None
+    stepper = Stepper(Feed(scene, photos, device), config, work, backend, group, rest)
     trainable = trainable_rows(state.gaussians, state.frozen)
-    while state.step < config.max_steps and bool(trainable.any()):
+    awake, learning, value = trainable, bool(trainable.any()), 0.0
+    while state.step < config.max_steps and learning:
         step = state.step + 1
-        degree, factor = _sh_degree(step - 1, config, plan), run_pace.factor(step)
-        loss, render = stepper(state, degree, run_pace.rates(step), trainable, factor)
-        yield Step(step, loss, len(state.gaussians))
-        if step < plan.refine_stop:
-            height, width, _ = render.rgb.shape
-            densify.observe_gradients(state, render, width, height, trainable)
         last = step == config.max_steps
+        records = step % plan.level_every == 0 or last
         refining = plan.refine_start < step < plan.refine_stop
-        records, resets = step % plan.level_every == 0 or last, refining and step % plan.reset_every == 0
+        degree, factor = _sh_degree(step - 1, config, plan), run_pace.factor(step)
+        observing = config.strategy == "default" and step < plan.refine_stop
+        wander = run_pace.wander(step) if config.strategy == "mcmc" else 0.0
+        loss = stepper(state, degree, run_pace.rates(step), awake, factor, observing, wander)
+        if device.type == "cpu" or records or step % _LOOK_EVERY == 0:  # looking waits for a GPU
+            value = _finite(loss, step)
+        yield Step(step, value, len(state.gaussians), stepper.drawn), state
+        resets = refining and config.strategy == "default" and step % plan.reset_every == 0
         late = resets and config.levels_after_reset
         if records and not late:
-            yield _save_level(state, config, plan, folder)
+            yield _save_level(state, config, plan, folder), state
         if records and config.freeze_at is not None and masks is not None:
             degree = _sh_degree(step, config, plan)
             quality = label_quality(
-                state.gaussians, scene, photos, masks, config, degree, backend, stepper.workspace
+                state.gaussians, stepper.work, photos, config, degree, backend, stepper.workspace, group
             )
-            yield from _freeze(state, quality, config.freeze_at)
-            trainable = trainable_rows(state.gaussians, state.frozen)
+            for event in _freeze(state, quality, config.freeze_at):
+                yield event, state
+            if len(state.frozen) > len(stepper.work.frozen):
+                stepper.work = Work(scene, masks, frozenset(state.frozen))
+            awake = trainable = trainable_rows(state.gaussians, state.frozen)
+            learning = bool(trainable.any())
         if refining and step % config.refine_every == 0:
-            pixels = num_pixels // run_pace.factor(step) ** 2
-            most = densify.budget(config, plan, step, num_pixels, pixels, len(scene.points.xyz))
-            room = densify.room(state, most, trainable)
-            densify.refine(state, config, extent, room, trainable)
-            state.sort()
-            trainable = trainable_rows(state.gaussians, state.frozen)
+            _refine(state, config, scene, trainable, group, run_pace.factor(step))
+            awake = trainable = trainable_rows(state.gaussians, state.frozen)
+        if rest and step % config.refine_every == 0:
+            awake = rest.turn(trainable)
         if resets:
             densify.reset_opacities(state, config, trainable)
         if records and late:
-            yield _save_level(state, config, plan, folder)
-        if checkpoint and records:
-            write_checkpoint(checkpoint, state, settings)
-    yield Trained(state.gaussians, state.step, state.frozen)
+            yield _save_level(state, config, plan, folder), state
+        if records:
+            group.collect(state.grad_sum, state.grad_count)
+        if folder and records:
+            write_checkpoint(folder / CHECKPOINT, state, settings)
+    yield Trained(state.gaussians.to("cpu"), state.step, state.frozen), state
+
+
+def _refine(
+    state: TrainState, config: TrainConfig, scene: Scene, trainable: Tensor, group: Group, factor: int
+) -> None:
+    """Let Gaussians come and go, as the strategy has it; photos of the moment are `factor` times smaller."""
+    plan, camera, num_points = densify.schedule(config), scene.views[0].camera, len(scene.points.xyz)
+    num_pixels = camera.width * camera.height
+    if config.strategy == "mcmc":
+        most = densify.cap(config, num_pixels, num_points)
+        refinements = (plan.refine_stop - plan.refine_start) // config.refine_every
+        mcmc.relocate(state, config, trainable)
+        mcmc.add(state, config, most, trainable, mcmc.growth(most, num_points, refinements))
+    else:
+        most = densify.budget(config, plan, state.step, num_pixels, num_pixels // factor**2, num_points)
+        group.add(state.grad_sum, state.grad_count)
+        densify.refine(state, config, scene.extent, densify.room(state, most, trainable), trainable)
+    state.sort()
+
+
+def _finite(loss: Tensor, step: int) -> float:
+    value = float(loss)
+    if not math.isfinite(value):
+        raise RunError(f"the loss became {value} at step {step}; lower the learning rates and train again")
+    return value
 
 
 def _check(config: TrainConfig, masks: Masks | None) -> None:
-    for name, low, high in (("max_steps", 1, 10**9), ("level_every", 0, 10**9), ("sh_degree", 0, 3)):
+    counts = (("max_steps", 1, 10**9), ("level_every", 0, 10**9), ("sh_degree", 0, 3), ("batch", 1, 10**6))
+    for name, low, high in counts:
         value = getattr(config, name)
         if not low <= value <= high:
             raise RunError(
@@ -150,6 +238,8 @@ def _check(config: TrainConfig, masks: Masks | None) -> None:
     target = config.freeze_at
     if target is not None and not 0 < target <= 1:
         raise RunError(f"--train.freeze-at {target} is no SSIM to reach; choose a number such as 0.8")
+    if not 0 <= config.rest_share < 1:
+        raise RunError(f"--train.rest-share {config.rest_share} is no share; choose a number such as 0.5")
     if target is not None and masks is None:
         raise RunError("--train.freeze-at needs label images to measure categories on; bring masks")
 
@@ -158,9 +248,9 @@ def _freeze(state: TrainState, quality: dict[int, float], target: float) -> Iter
     """Stop the categories that have reached the target."""
     counts = state.gaussians.counts()
     for label, ssim in quality.items():
-        if label in counts and label not in state.frozen and ssim >= target:
+        if label not in state.frozen and ssim >= target:
             state.frozen[label] = state.step
-            yield LabelFrozen(state.step, label, ssim, counts[label])
+            yield LabelFrozen(state.step, label, ssim, counts.get(label, 0))
 
 
 def _save_level(
@@ -171,7 +261,7 @@ def _save_level(
     if folder:
         degree = _sh_degree(state.step, config, plan)
         path = write_level(
-            folder / "levels", state.step, state.gaussians, recovering=recovering, sh_degree=degree
+            folder / "levels", state.step, state.gaussians.to("cpu"), recovering=recovering, sh_degree=degree
         )
     return LevelSaved(state.step, path, state.gaussians.counts(), recovering)
 
