@@ -1,16 +1,20 @@
 """`python -m benchmarks NAME`: each prints a table and ends with one line of JSON (docs/performance.md)."""
 
 import json
+import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
 import tyro
 
 from benchmarks import audit as table_iii
+from benchmarks import freeze as freezing
 from benchmarks import measure, plain, workloads
+from benchmarks.gpu import base, script
 from sagesplat.config import TrainConfig
 from sagesplat.gaussians import PARAMETERS, Gaussians
 from sagesplat.raster import Backend, Workspace, add_weights, rasterize, set_threads
@@ -274,6 +278,53 @@ def agreement(count: int = 400, width: int = 120, height: int = 90, seeds: int =
     for name, error in worst.items():
         print(f"{name:16} {error:.2e}")
     print(json.dumps(worst))
+
+
+@app.command
+def gpu(
+    scene: Path = workloads.GARDEN,
+    downscale: int = 1,
+    steps: int = 30_000,
+    minutes: float = 9.0,
+    device: Literal["cuda", "cpu"] = "cuda",
+    only: tuple[str, ...] = (),
+    masks: Path | None = None,
+    lpips: Path | None = None,
+    out: Path | None = None,
+    write: bool = False,
+) -> None:
+    """All checks that a machine with a GPU owes, in so many minutes; `--device cpu` tries the script."""
+    asked = base.Asked(scene, downscale, steps, minutes, device, only, masks, lpips, out, write)
+    raise SystemExit(script.main(asked))
+
+
+@app.command
+def freeze(
+    scene: Path = workloads.GARDEN,
+    downscale: int = 2,
+    steps: int = 3000,
+    targets: tuple[float, ...] = (0.8, 0.87),
+    rest_share: float = 0.0,
+    threads: int = 0,
+    write: bool = False,
+) -> None:
+    """Whole trainings with and without `--train.freeze-at`, in one run: time, tiles drawn, quality."""
+    set_threads(threads)
+    config = TrainConfig(max_steps=steps)
+    with tempfile.TemporaryDirectory() as folder:
+        capture = freezing.open_capture(scene, Path(folder), downscale)
+        freezing.timed(capture, replace(config, max_steps=20, freeze_at=0.01))  # kernels are compiled now
+        result = freezing.compare(capture, config, list(targets), rest_share)
+    for name, run in result.items():
+        if name != "pixel_shares":
+            times = " ".join(f"{ms:.0f}" for ms in run["ms_per_step"])
+            tiles = " ".join(f"{100 * share:.0f}" for share in run["tiles_drawn"])
+            test, share = run["test"], run.get("share_of_time", 1)
+            print(
+                f"{name:15} {run['seconds']:6.1f} s ({share:.2f}), {run['steps']} steps;"
+                f" test {test['psnr']:.2f} dB, {test['ssim']:.4f}; ms {times}; % of tiles {tiles}"
+            )
+    _finish("freeze", result, write)
 
 
 def _gradients(backend: Backend, count: int, width: int, height: int, seed: int):  # type: ignore[no-untyped-def]

@@ -82,6 +82,12 @@ def test_flags_reach_their_settings(
     assert (config.masks.segmenter, config.seed, seen["job"].threads) == ("onnx", 3, 1)
 
 
+def test_processes_are_counted(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    code, line = call(monkeypatch, capsys, *["run", "a", "b", "--processes", "0"])
+    assert code == 2
+    assert "--processes 0 is impossible; choose 1 or more" in line
+
+
 def test_help_imports_no_torch() -> None:
     code = "import sys, sagesplat.cli; sys.exit(any(m in sys.modules for m in ('torch', 'numba', 'numpy')))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

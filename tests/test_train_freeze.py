@@ -14,19 +14,20 @@ from sagesplat.config import TrainConfig
 from sagesplat.demo.capture import make_capture
 from sagesplat.errors import RunError
 from sagesplat.gaussians import PARAMETERS, Gaussians
-from sagesplat.raster import Workspace, rasterize
+from sagesplat.raster import rasterize
 from sagesplat.scene import load_scene
 from sagesplat.scene.images import Photos
 from sagesplat.segment.lift import lift
 from sagesplat.segment.masks import Masks, Taxonomy, import_masks
 from sagesplat.train import stepper, trainer
 from sagesplat.train.feed import Feed
-from sagesplat.train.freeze import Work, active_tiles, label_quality, trainable_rows
+from sagesplat.train.freeze import Work, active_tiles, label_quality, measured_views, trainable_rows
 from sagesplat.train.pace import smaller
 from sagesplat.train.state import initial_state
 from sagesplat.train.stepper import Stepper, tune
 from sagesplat.train.trainer import LabelFrozen, LevelSaved, Resumed, Step, Trained, train
 
+CPU = torch.device("cpu")
 # densification from step 24 to 60 every 6, resets at 40, the SH degree rises every 4 steps
 CONFIG = TrainConfig(
     max_steps=120, level_every=10, refine_start=24, refine_every=6, reset_every=40, pace="published"
@@ -54,6 +55,13 @@ def levels(monkeypatch) -> dict[int, Gaussians]:
 
     monkeypatch.setattr(trainer, "write_level", keep)
     return kept
+
+
+def measured(g: Gaussians, capture, degree: int) -> dict[int, float]:
+    """SSIM by label, as it decides who stops."""
+    scene, photos, masks, _ = capture
+    work, feed = Work(scene, masks), Feed(scene, photos, CPU)
+    return label_quality(g, work, feed, measured_views(scene, masks), CONFIG, degree, backend="cpu")
 
 
 def rows_of(g: Gaussians, label: int) -> np.ndarray:
@@ -90,7 +98,7 @@ def test_a_category_stops_at_the_first_level_that_reaches_the_target(capture, le
     first = min(e.step for e in events if isinstance(e, LabelFrozen))
     for step in sorted(levels):
         degree = min(3, step // round(1000 * 40 / 30_000))
-        quality = label_quality(levels[step], Work(scene, masks), photos, config, degree, "cpu", Workspace())
+        quality = measured(levels[step], capture, degree)
         reached = {
             label for label, ssim in quality.items() if ssim >= 0.45 and label in levels[step].counts()
         }
@@ -166,7 +174,7 @@ def test_rows_that_may_change(capture):
 
 
 def test_tuning_improves_and_keeps_the_set(capture):
-    scene, photos, masks, labels = capture
+    scene, photos, _, labels = capture
     *_, end = train(scene, photos, labels, replace(CONFIG, max_steps=60))
     assert isinstance(end, Trained)
     before = replace(end.gaussians, **{n: p.clone() for n, p in end.gaussians.parameters().items()})
@@ -174,9 +182,7 @@ def test_tuning_improves_and_keeps_the_set(capture):
     assert tuned.counts() == before.counts()
     for name, p in before.parameters().items():  # the input is left alone
         assert torch.equal(p, getattr(end.gaussians, name))
-    was, now = (
-        label_quality(g, Work(scene, masks), photos, CONFIG, 3, "cpu", Workspace()) for g in (before, tuned)
-    )
+    was, now = (measured(g, capture, 3) for g in (before, tuned))
     assert np.mean(list(now.values())) > np.mean(list(was.values())) + 0.01
 
 
@@ -238,7 +244,6 @@ def test_finished_views_are_drawn_in_one_round_of_eight(capture):
     everything = frozenset({-1, *masks.taxonomy.names})
     one = next(iter(sorted(masks.taxonomy.names)))
     state = initial_state(three(one), 0)
-    device = torch.device("cpu")
     shown = {row: set(np.unique(masks[scene.views[row]]).tolist()) for row in scene.train_ids.tolist()}
     seen = {label: sum(label in labels for labels in shown.values()) for label in everything}
     rare = min((label for label in seen if seen[label]), key=lambda label: seen[label])
@@ -246,7 +251,7 @@ def test_finished_views_are_drawn_in_one_round_of_eight(capture):
     some = everything - {rare}
     work = Work(scene, masks, some)
     unfinished = {row for row in shown if shown[row] - some}
-    picked = Stepper(Feed(scene, photos, device), CONFIG, work)
+    picked = Stepper(Feed(scene, photos, CPU), CONFIG, work)
     views = [picked._next_view(state) for _ in range(2000)]
     assert unfinished
     assert {row for row in shown if not work.finished(row)} == unfinished
@@ -265,3 +270,22 @@ def three(label: int) -> Gaussians:
         torch.rand(3, 3), torch.eye(4)[:1].repeat(3, 1), torch.zeros(3, 3), zeros, torch.zeros(3, 1, 3),
         torch.zeros(3, 0, 3), torch.full((3,), label, dtype=torch.int16),
     )  # fmt: skip
+
+
+def test_rare_categories_are_measured_where_they_show(capture):
+    scene = capture[0]
+    views = tuple(replace(scene.views[0], name=str(i)) for i in range(120))
+    many = replace(scene, views=views, test_every=8)
+
+    class Rare:
+        """7 everywhere but in three views, of which one is a test view, and 9 in most."""
+
+        def __getitem__(self, view):
+            label = 5 if view.name in ("8", "33", "77") else 7
+            return np.array([[label, 9 if int(view.name) > 30 else label]], np.int16)
+
+    rows = measured_views(many, Rare())  # type: ignore[arg-type]
+    assert rows == sorted(set(rows))
+    assert set(rows) <= set(many.train_ids.tolist())
+    assert {33, 77} <= set(rows)
+    assert 16 <= len(rows) <= 18

@@ -22,7 +22,7 @@ from sagesplat.config import (
     SceneConfig,
     TrainConfig,
 )
-from sagesplat.errors import SageError
+from sagesplat.errors import RunError, SageError
 
 if TYPE_CHECKING:
     from sagesplat.job import Job
@@ -76,6 +76,8 @@ def _prepare(machine: Machine) -> "tuple[Backend, int]":
     """The backend that this machine computes with, and its CPU threads."""
     from sagesplat.raster import cuda, resolve_backend, set_threads
 
+    if machine.processes < 1:
+        raise RunError(f"--processes {machine.processes} is impossible; choose 1 or more")
     device, backend = machine.device, machine.backend
     if (device, backend) == ("auto", "auto") and cuda.missing() is None:
         device = "cuda"

@@ -39,7 +39,7 @@ def compare_online(online: Job, full: Job, out: Path) -> tuple[Table, Table]:
     target = _check(online, full)
     stopped = {int(label): step for label, step in read_json(online.run.frozen).items()}
     ladder = full.ladder
-    views = measured_views(full.scene)
+    views = measured_views(full.scene, full.masks)
     reached = first_levels(ladder, read_observations(full.run.observations), views, target)
     sets = {
         "online": online.ladder.load(online.ladder.levels[-1]),

@@ -27,9 +27,12 @@ class Feed:
     _kept: dict[tuple[int, int], Seen] = field(default_factory=dict)
     _coming: dict[tuple[int, int], "Future[Seen]"] = field(default_factory=dict)
     _used: int = 0
-    _worker: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(1))
+    _worker: ThreadPoolExecutor = field(init=False)
 
     def __post_init__(self) -> None:
+        cuda = self.device.type == "cuda"  # which GPU is in use is every thread's own affair
+        chosen = {"initializer": torch.cuda.set_device, "initargs": (self.device,)} if cuda else {}
+        self._worker = ThreadPoolExecutor(1, **chosen)
         if self.limit < 0:
             free = torch.cuda.mem_get_info(self.device)[0] if self.device.type == "cuda" else 0
             self.limit = int(_MEMORY_SHARE * free)

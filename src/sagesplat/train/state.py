@@ -41,9 +41,10 @@ class TrainState:
         self.clear_statistics()
 
     def sort(self) -> None:
-        """Put neighbours in space next to each other: then they are drawn, or not, together."""
-        means = self.gaussians.means
-        order = torch.from_numpy(geometry.morton_order(means.cpu().numpy())).to(means.device)
+        """Put neighbours in space next to each other: then a CPU draws them, or not, together."""
+        if self.gaussians.means.is_cuda:
+            return
+        order = torch.from_numpy(geometry.morton_order(self.gaussians.means.numpy()))
         self.gaussians = self.gaussians.select(order)
         for moments in (self.first, self.second):
             for name in PARAMETERS:

@@ -96,10 +96,9 @@ class Stepper:
     ) -> tuple[Tensor, Render]:
         photo, camera = self.feed(view, factor)
         # nobody may paint over what is finished, so it is looked at now and then
-        tiles = None if self.work.finished(view) else self.work.tiles(view, factor)
-        self.drawn += 1.0 if tiles is None else float(tiles.mean())
-        if tiles is not None and self.feed.device.type != "cpu":
-            tiles = torch.from_numpy(tiles).to(self.feed.device, non_blocking=True)
+        finished, left = self.work.finished(view), self.work.tiles(view, factor)
+        self.drawn += 1.0 if finished or left is None else float(left.mean())
+        tiles = None if finished else self.work.mask(view, factor)
         render = rasterize(
             moving,
             camera,

@@ -19,7 +19,7 @@ from sagesplat.segment.masks import Masks
 from sagesplat.train import densify, mcmc
 from sagesplat.train.checkpoint import read_checkpoint, write_checkpoint
 from sagesplat.train.feed import Feed
-from sagesplat.train.freeze import Work, label_quality, trainable_rows
+from sagesplat.train.freeze import Work, label_quality, measured_views, trainable_rows
 from sagesplat.train.group import ALONE, Group
 from sagesplat.train.levels import write_level
 from sagesplat.train.pace import pace
@@ -154,10 +154,11 @@ def _train(
             state.clear_statistics()
         yield Resumed(state.step), state
     folder = folder if group.leads else None
-    work = Work(scene, masks, frozenset(state.frozen))
+    work = Work(scene, masks, frozenset(state.frozen), device)
     rest = Rest(config.rest_share) if config.rest_share else None
     stepper = Stepper(Feed(scene, photos, device), config, work, backend, group, rest)
     trainable = trainable_rows(state.gaussians, state.frozen)
+    looked_at = measured_views(scene, masks) if config.freeze_at is not None and masks is not None else []
     awake, learning, value = trainable, bool(trainable.any()), 0.0
     while state.step < config.max_steps and learning:
         step = state.step + 1
@@ -178,12 +179,13 @@ def _train(
         if records and config.freeze_at is not None and masks is not None:
             degree = _sh_degree(step, config, plan)
             quality = label_quality(
-                state.gaussians, stepper.work, photos, config, degree, backend, stepper.workspace, group
-            )
+                state.gaussians, stepper.work, stepper.feed, looked_at, config, degree,
+                backend=backend, workspace=stepper.workspace, group=group,
+            )  # fmt: skip
             for event in _freeze(state, quality, config.freeze_at):
                 yield event, state
             if len(state.frozen) > len(stepper.work.frozen):
-                stepper.work = Work(scene, masks, frozenset(state.frozen))
+                stepper.work = Work(scene, masks, frozenset(state.frozen), device)
             awake = trainable = trainable_rows(state.gaussians, state.frozen)
             learning = bool(trainable.any())
         if refining and step % config.refine_every == 0:

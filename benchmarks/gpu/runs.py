@@ -1,0 +1,354 @@
+"""Whole trainings on a GPU: ours, ours with the freeze of categories, and gsplat's."""
+
+import math
+import os
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from benchmarks import gsplat_trainer
+from benchmarks.gpu.base import Bench, Clock, Outcome, milliseconds, one_line, wait
+from benchmarks.gpu.split import grown, stages
+from sagesplat import metrics
+from sagesplat.adapt.observe import render_rgb
+from sagesplat.config import TrainConfig
+from sagesplat.errors import SageError
+from sagesplat.gaussians import Gaussians
+from sagesplat.lpips import Net, load_lpips
+from sagesplat.raster import (
+    rasterize,
+)
+from sagesplat.train import densify, trainer
+from sagesplat.train.feed import Feed
+from sagesplat.train.freeze import Work, label_quality, measured_views
+from sagesplat.train.group import ALONE
+from sagesplat.train.parallel import train_together
+
+KEPT_BACK = 0.1  # of the time, for what comes after the long runs
+WEIGHTS = {"ours": 1.0, "gsplat": 1.3, "third": 0.8, "two_thirds": 0.7, "all": 0.5}  # time of a run, guessed
+
+
+@dataclass(eq=False)
+class Run:
+    """A training, watched."""
+
+    name: str
+    steps: int  # taken
+    seconds: float
+    curve: list[dict[str, float]]  # at each level: step, seconds, ssim, psnr, gaussians, ...
+    gaussians: Gaussians  # on the CPU
+    peak_mib: float
+    stopped: str | None  # why it did not end by itself
+    label_ssim: dict[int, float]  # on training views, at a third of the run
+    settings: dict[str, Any]
+
+    def figures(self) -> dict[str, Any]:
+        """All but the Gaussians."""
+        return {name: value for name, value in vars(self).items() if name != "gaussians"}
+
+    def reaches(self, ssim: float) -> float | None:
+        """Seconds of training after which the test views are this similar."""
+        return time_to([(p["seconds"], p["ssim"]) for p in self.curve], ssim)
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A model in training, the clock stopped."""
+
+    step: int
+    gaussians: Gaussians
+    frozen: Mapping[int, int] = field(default_factory=dict)
+
+
+def full(bench: Bench) -> Outcome:
+    """The whole training at the published pace."""
+    run = run_of(bench, "ours")
+    last, views = run.curve[-1], len(bench.scene.train_ids)
+    figures = run.figures() | {"views": views, "steps_per_s": run.steps / run.seconds}
+    names = bench.masks.taxonomy.name if bench.masks else str
+    figures["counts"] = {names(label): count for label, count in run.gaussians.counts().items()}
+    for net in ("alex", "vgg"):
+        try:
+            figures[f"lpips_{net}"] = lpips(bench, run.gaussians, net)
+        except SageError as error:
+            figures[f"lpips_{net}"] = str(error)
+    perceived = (f"{net} {figures[f'lpips_{net}']:.4f}" for net in ("alex", "vgg")
+                 if isinstance(figures[f"lpips_{net}"], float))  # fmt: skip
+    line = (
+        f"{run.steps:,} steps on {views} views in {run.seconds:.1f} s ({figures['steps_per_s']:.0f}/s), "
+        f"{run.peak_mib:,.0f} MiB, SSIM {last['ssim']:.4f}, PSNR {last['psnr']:.2f}, "
+        f"LPIPS {', '.join(perceived) or 'no weights'}, {len(run.gaussians):,} Gaussians"
+    )
+    return Outcome("ok", f"{line}; {run.stopped}" if run.stopped else line, figures)
+
+
+def race(bench: Bench) -> Outcome:
+    """gsplat's recipe, ours, and ours with the freeze: time to the same SSIM on test views."""
+    runs: dict[str, Run] = {}
+    missed: dict[str, str] = {}
+    hopeless = {"gsplat": "it needs a GPU"} if bench.small else {}
+    if bench.masks is None:
+        hopeless |= dict.fromkeys(("third", "two_thirds", "all"), "no label images")
+    for name in ("gsplat", "ours", "third", "two_thirds", "all"):
+        if name in hopeless:
+            missed[name] = hopeless[name]
+            continue
+        try:
+            runs[name] = run_of(bench, name)
+        except Exception as error:
+            missed[name] = one_line(error)
+    if not runs:
+        raise RuntimeError(missed["ours"])
+    finals = {name: run.curve[-1]["ssim"] for name, run in runs.items()}
+    # when each was as good on the test views as each is at its end
+    times = {end: {name: run.reaches(ssim) for name, run in runs.items()} for end, ssim in finals.items()}
+    figures: dict[str, Any] = {"final_ssim": finals, "seconds_to_the_end_of": times, "missed": missed}
+    figures["runs"] = {name: run.figures() for name, run in runs.items()}
+    if not bench.small:
+        figures["loss_ms"] = loss_times(bench)
+    parts = []
+    for name, run in runs.items():
+        others = ((n, t) for n, t in times[name].items() if n != name and n in ("gsplat", "ours"))
+        same = ", ".join(f"{n} {'never' if t is None else f'{t:.1f} s'}" for n, t in others)
+        also = f"; {run.stopped}" if run.stopped else ""
+        parts.append(f"{name} {run.seconds:.1f} s to {finals[name]:.4f} ({same or 'alone'}{also})")
+    parts += [f"{name}: {why}" for name, why in missed.items()]
+    failed = any(name not in hopeless for name in missed)
+    return Outcome("FAILED" if failed else "ok", "; ".join(parts), figures)
+
+
+def freeze(bench: Bench) -> Outcome:
+    """What the freeze of categories saves: tiles, time per step, time in all."""
+    whole = run_of(bench, "ours")
+    figures: dict[str, Any] = {"without": {"seconds": whole.seconds, "steps": whole.steps}}
+    figures["label_ssim_at_a_third"], parts, failed = whole.label_ssim, [], False
+    for name in ("third", "two_thirds", "all"):
+        try:
+            run = run_of(bench, name)
+        except Exception as error:
+            parts, failed = [*parts, f"{name}: {one_line(error)}"], True
+            continue
+        figures[name] = run.figures()
+        last = run.curve[-1]
+        parts.append(
+            f"at {run.settings['freeze_at']}: "
+            f"{len(run.settings['frozen'])} of {len(whole.label_ssim)} labels, "
+            f"{100 * run.settings['skipped']:.0f} % of tiles, {last['step_ms']:.2f} ms a step at the end "
+            f"({whole.curve[-1]['step_ms']:.2f} without), {run.seconds:.1f} of {whole.seconds:.1f} s"
+        )
+    return Outcome("FAILED" if failed else "ok", "; ".join(parts), figures)
+
+
+def multi(bench: Bench) -> Outcome:
+    """Two GPUs that train one model."""
+    if bench.small or torch.cuda.device_count() < 2:
+        return Outcome("skipped", "no GPU" if bench.small else "one GPU")
+    steps = min(bench.asked.steps, 1000)
+    config, args = TrainConfig(max_steps=steps, pace="published"), (bench.scene, bench.photos, bench.labels)
+    seconds = {}
+    for name, events in {
+        "one": trainer.train(*args, config, backend="cuda"),
+        "two": train_together(2, os.cpu_count() or 2, *args, config, backend="cuda"),
+    }.items():
+        begin, first = time.perf_counter(), True
+        for event in events:
+            if first and isinstance(event, trainer.Step):  # processes start, kernels compile
+                begin, first = time.perf_counter(), False
+        wait(bench.device)
+        seconds[name] = time.perf_counter() - begin
+    ratio = 2 * seconds["one"] / seconds["two"]
+    times = f"{seconds['one']:.1f} s alone, {seconds['two']:.1f} s by two"
+    line = f"{steps} steps: {times}, {ratio:.2f} times the photos a second"
+    return Outcome("ok", line, {"steps": steps, "seconds": seconds, "photos_ratio": ratio})
+
+
+def run_of(bench: Bench, name: str) -> Run:
+    """A training that several checks look at, done once; `third`, ... are those that freeze."""
+    if name not in bench.runs:
+        try:
+            bench.runs[name] = _train(bench, name)
+        except Exception as error:
+            bench.runs[name] = error
+    found = bench.runs[name]
+    if isinstance(found, Exception):
+        raise found
+    return found
+
+
+def _train(bench: Bench, name: str) -> Run:
+    if bench.left() < KEPT_BACK * 60 * bench.asked.minutes:
+        raise RuntimeError("no time left")
+    if name in ("ours", "gsplat"):
+        config = TrainConfig(max_steps=steps_of(bench), pace="published")
+    elif bench.masks is None:
+        raise RuntimeError("no label images: nothing to freeze")
+    else:
+        target = targets(run_of(bench, "ours").label_ssim)[name]
+        config = TrainConfig(max_steps=steps_of(bench), pace="published", freeze_at=target)
+    run = watch(bench, name, config, (gsplats if name == "gsplat" else ours)(bench, config))
+    if name == "ours":
+        bench.trained = run.gaussians
+    last = run.curve[-1]
+    print(f"  {name}: {run.steps:,} steps, {run.seconds:.1f} s, SSIM {last['ssim']:.4f}", flush=True)
+    return run
+
+
+def steps_of(bench: Bench) -> int:
+    """Steps of each long run: as asked, or as many as there is time for when first asked."""
+    if bench.steps == 0:
+        names = list(WEIGHTS) if bench.chosen("race") or bench.chosen("freeze") else ["ours"]
+        if bench.masks is None:
+            names = [name for name in names if name in ("ours", "gsplat")]
+        if not bench.chosen("race") or bench.small:
+            names = [name for name in names if name != "gsplat"]
+        took = stages(bench, grown(bench), repeats=3 if bench.small else 60)["step"]
+        room = bench.left() - KEPT_BACK * 60 * bench.asked.minutes
+        room -= 0 if bench.small else 8 * len(names)  # looking at the models takes time too
+        bench.steps = affordable(bench.asked.steps, room, took, sum(WEIGHTS[name] for name in names))
+        if bench.steps < bench.asked.steps:
+            asked = bench.asked.steps
+            print(f"  {bench.steps:,} of {asked:,} steps: {took:.1f} ms each, {room:.0f} s left", flush=True)
+    return bench.steps
+
+
+def ours(bench: Bench, config: TrainConfig) -> Iterator[Moment]:
+    """Our trainer, at its levels and at its end."""
+    masks = bench.masks if config.freeze_at is not None else None
+    events = trainer._train(
+        bench.scene, bench.photos, bench.labels, config, masks, 0, bench.backend, None, "", ALONE
+    )
+    for event, state in events:
+        if isinstance(event, trainer.LevelSaved | trainer.Trained):
+            yield Moment(state.step, state.gaussians, dict(state.frozen))
+
+
+def gsplats(bench: Bench, config: TrainConfig) -> Iterator[Moment]:
+    """gsplat's recipe; its photos are on the device before the clock starts."""
+    rows = bench.scene.train_ids.tolist()
+    photos = [torch.from_numpy(bench.photos[row]).to(bench.device).float() / 255 for row in rows]
+    cameras, (_, loss) = [bench.scene.views[row].camera for row in rows], gsplat_trainer.losses()
+    moments = gsplat_trainer.train(bench.initial(), cameras, photos, bench.scene.extent, config, loss)
+    return (Moment(step, g) for step, g in moments)
+
+
+def watch(bench: Bench, name: str, config: TrainConfig, moments: Iterator[Moment]) -> Run:
+    """Train and, with the clock stopped, look at the model from time to time."""
+    plan, limit = densify.schedule(config), bench.end - KEPT_BACK * 60 * bench.asked.minutes
+    clock, curve, label_ssim, stopped, last = Clock(bench.device), [], {}, None, None
+    if bench.device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(bench.device)
+    clock.start()
+    for moment in moments:
+        clock.stop()
+        step, last = moment.step, moment
+        degree = min(config.sh_degree, step // plan.raise_sh_every)
+        before = curve[-1] if curve else {"step": 0, "seconds": 0.0}
+        if step > before["step"]:
+            point = {"step": step, "seconds": clock.seconds, "gaussians": len(moment.gaussians)}
+            point["step_ms"] = 1e3 * (clock.seconds - before["seconds"]) / (step - before["step"])
+            point |= view_quality(bench, moment.gaussians, degree)
+            point |= {"frozen": len(moment.frozen), "skipped": skipped(bench, moment.frozen)}
+            curve.append(point)
+        if name == "ours" and bench.masks and not label_ssim and step >= config.max_steps / 3:
+            work, feed = Work(bench.scene, bench.masks), Feed(bench.scene, bench.photos, bench.device)
+            label_ssim = label_quality(
+                moment.gaussians, work, feed, measured_views(bench.scene, bench.masks), config, degree,
+                backend=bench.backend,
+            )  # fmt: skip
+        if time.perf_counter() > limit:
+            stopped = f"out of time at step {step:,}"
+            break
+        clock.start()
+    else:
+        clock.stop()
+    assert last is not None
+    peak = torch.cuda.max_memory_allocated(bench.device) / 2**20 if bench.device.type == "cuda" else 0.0
+    settings: dict[str, Any] = {"max_steps": config.max_steps, "freeze_at": config.freeze_at}
+    settings |= {"frozen": dict(last.frozen), "skipped": skipped(bench, last.frozen)}
+    if name == "gsplat":
+        settings["loss"] = gsplat_trainer.losses()[0]
+    g = last.gaussians.to("cpu")
+    return Run(name, last.step, clock.seconds, curve, g, peak, stopped, label_ssim, settings)
+
+
+def skipped(bench: Bench, frozen: Mapping[int, int]) -> float:
+    """Share of the tiles of training views that show nothing but what is frozen."""
+    if not frozen or bench.masks is None:
+        return 0.0
+    work = Work(bench.scene, bench.masks, frozenset(frozen))
+    found = [work.tiles(row) for row in bench.scene.train_ids.tolist()[::8]]
+    return float(np.mean([1 - tiles.mean() for tiles in found if tiles is not None]))
+
+
+@torch.no_grad()
+def view_quality(bench: Bench, g: Gaussians, degree: int) -> dict[str, float]:
+    """Mean SSIM and PSNR over the test views, whoever trained."""
+    ssims, errors, g = [], [], g.to(bench.device)
+    for row in bench.scene.test_ids.tolist():
+        photo = torch.from_numpy(bench.photos[row])
+        rgb = rasterize(g, bench.scene.views[row].camera, sh_degree=degree, backend=bench.backend).rgb
+        rgb = rgb.clamp(0, 1)
+        if bench.device.type == "cuda":
+            from sagesplat import ssim_triton
+
+            photo = photo.to(bench.device)
+            ssims.append(ssim_triton.ssim_map(rgb, photo).mean())
+        else:
+            ssims.append(torch.tensor(metrics.ssim_map(rgb.numpy(), (photo.float() / 255).numpy()).mean()))
+        errors.append((rgb - photo.float() / 255).square().mean())
+    psnrs = metrics.psnr(torch.stack(errors).double().cpu().numpy())
+    return {"ssim": float(torch.stack(ssims).mean()), "psnr": float(np.mean(psnrs))}
+
+
+def lpips(bench: Bench, g: Gaussians, net: Net) -> float:
+    """Mean over the test views; vgg as 3DGS computes it."""
+    metric, there, values = load_lpips(net, bench.asked.lpips, as_3dgs=net == "vgg"), g.to(bench.device), []
+    for row in bench.scene.test_ids.tolist():
+        image = render_rgb(there, bench.scene.views[row].camera, backend=bench.backend, antialiased=False)
+        values.append(metric(image, bench.photos[row].astype(np.float32) / 255))
+    return float(np.mean(values))
+
+
+def loss_times(bench: Bench) -> dict[str, float]:
+    """Milliseconds of the race's losses and their gradients, so that its times can be put right."""
+    camera = bench.scene.views[0].camera
+    photo = torch.rand(camera.height, camera.width, 3, device=bench.device)
+    name, recipe = gsplat_trainer.losses()
+    found = {}
+    for of, loss in {
+        "ours": metrics.photometric_loss,
+        "torch": gsplat_trainer.torch_loss,
+        name: recipe,
+    }.items():
+        rgb = torch.rand_like(photo).requires_grad_()
+        found[of] = milliseconds(bench.device, lambda loss=loss, rgb=rgb: loss(rgb, photo, 0.2).backward())
+    return found
+
+
+def targets(label_ssim: Mapping[int, float]) -> dict[str, float]:
+    """Targets that a third, two thirds and all of the labels have reached, given the SSIM of each."""
+    best = sorted(label_ssim.values(), reverse=True)
+    places = {"third": math.ceil(len(best) / 3), "two_thirds": math.ceil(2 * len(best) / 3), "all": len(best)}
+    return {name: max(0.001, math.floor(best[place - 1] * 1e3) / 1e3) for name, place in places.items()}
+
+
+def time_to(curve: Sequence[tuple[float, float]], ssim: float) -> float | None:
+    """Seconds at which a curve of (seconds, SSIM) first reaches a value, on straight lines; None: never."""
+    before = None
+    for seconds, value in curve:
+        if value >= ssim:
+            if before is None or value == before[1]:
+                return seconds
+            return before[0] + (seconds - before[0]) * (ssim - before[1]) / (value - before[1])
+        before = seconds, value
+    return None
+
+
+def affordable(asked: int, seconds: float, step_ms: float, runs: float) -> int:
+    """Steps of each of so many runs that fit into some seconds: whole hundreds, at most as asked."""
+    fitting = int(1e3 * max(0.0, seconds) / (step_ms * max(runs, 1e-9)))
+    return min(asked, max(300, fitting // 100 * 100))

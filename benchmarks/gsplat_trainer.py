@@ -1,0 +1,130 @@
+"""gsplat's example trainer with its defaults, on gsplat's public API: what ours is raced against.
+
+Written anew after the documentation of gsplat 1.5.3 (Apache-2.0); the rates, the order of operations and the
+schedule are those of its `examples/simple_trainer.py`, which the wheel does not hold: DefaultStrategy, Adam
+`fused`, one for each parameter, rates of 3DGS, the means' falling to a hundredth, a degree of harmonics each
+1000 steps, `packed=False`, near 0.01, far 1e10, loss 0.8 L1 + 0.2 (1 - SSIM). What it does beside training is
+left out, in its favour: the data loader (photos lie on the GPU as floats), the progress bar, which waits for
+the loss at every step, and tensorboard.
+
+1.5.3's strategy never resets opacities: `step % reset_every == 0 & step > 0` is never true. It is raced as
+it is.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from sagesplat.config import TrainConfig
+from sagesplat.gaussians import Gaussians
+from sagesplat.metrics import photometric_loss
+from sagesplat.scene.scene import Camera
+from sagesplat.train import densify
+
+NAMES = {  # gsplat's name: ours
+    "means": "means", "scales": "log_scales", "quats": "quats", "opacities": "logit_opacities",
+    "sh0": "sh0", "shN": "shN",
+}  # fmt: skip
+Loss = Callable[[Tensor, Tensor, float], Tensor]  # of two images [H, W, 3] in [0, 1] and the weight of SSIM
+
+
+def losses() -> tuple[str, Loss]:
+    """The loss of the recipe and its name: fused_ssim's, or where that is missing ours on a GPU.
+
+    Ours is as fast as fused_ssim or faster, so the race stays one of trainers.
+    """
+    try:
+        from fused_ssim import fused_ssim  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        return ("ours", photometric_loss) if torch.cuda.is_available() else ("torch", torch_loss)
+
+    def fused(rgb: Tensor, photo: Tensor, weight: float) -> Tensor:
+        x, y = (image.permute(2, 0, 1)[None] for image in (rgb, photo))
+        return torch.lerp(F.l1_loss(rgb, photo), 1 - fused_ssim(x, y, padding="valid"), weight)
+
+    return "fused_ssim", fused
+
+
+def torch_loss(rgb: Tensor, photo: Tensor, weight: float) -> Tensor:
+    """The loss in plain torch operations, SSIM over whole windows of 11 x 11 (sigma 1.5) only."""
+    at = torch.arange(11, device=rgb.device) - 5.0
+    taps = torch.exp(-(at**2) / (2 * 1.5**2))
+    taps = taps / taps.sum()
+    x, y = rgb.permute(2, 0, 1)[None], photo.permute(2, 0, 1)[None]
+    maps = torch.cat([x, y, x * x, y * y, x * y], 1)
+    kernel = taps.expand(maps.shape[1], 1, 11)
+    maps = F.conv2d(F.conv2d(maps, kernel[..., None], groups=15), kernel[:, :, None], groups=15)
+    mx, my, xx, yy, xy = maps.split(3, 1)
+    c1, c2 = 0.01**2, 0.03**2
+    quality = (2 * mx * my + c1) * (2 * (xy - mx * my) + c2)
+    quality = quality / ((mx * mx + my * my + c1) * (xx - mx * mx + yy - my * my + c2))
+    return torch.lerp(F.l1_loss(rgb, photo), 1 - quality.mean(), weight)
+
+
+def train(
+    initial: Gaussians,  # on the device
+    cameras: Sequence[Camera],
+    photos: Sequence[Tensor],  # float32 [H, W, 3] in [0, 1], on the device
+    extent: float,
+    config: TrainConfig,  # of ours: its rates, steps and schedule are used
+    loss: Loss,
+    seed: int = 0,
+) -> Iterator[tuple[int, Gaussians]]:
+    """Train; steps taken and the Gaussians, each `level_every` steps of our schedule and at the end."""
+    import gsplat
+    from gsplat.strategy import DefaultStrategy
+
+    device, plan = initial.means.device, densify.schedule(config)
+    params: dict[str, Any] = {
+        name: torch.nn.Parameter(getattr(initial, ours).detach().clone()) for name, ours in NAMES.items()
+    }
+    rates = {name: getattr(config, f"{ours}_lr") for name, ours in NAMES.items()}
+    rates["means"] *= extent
+    optimizers: dict[str, torch.optim.Optimizer] = {
+        name: torch.optim.Adam([{"params": p, "lr": rates[name], "name": name}], eps=1e-15, fused=True)
+        for name, p in params.items()
+    }
+    slower = torch.optim.lr_scheduler.ExponentialLR(optimizers["means"], 0.01 ** (1 / config.max_steps))
+    strategy = DefaultStrategy(
+        prune_opa=config.prune_opacity, grow_grad2d=config.grow_grad, grow_scale3d=config.grow_scale,
+        prune_scale3d=config.prune_scale, refine_start_iter=plan.refine_start,
+        refine_stop_iter=plan.refine_stop, reset_every=plan.reset_every, refine_every=config.refine_every,
+    )  # fmt: skip
+    strategy.check_sanity(params, optimizers)
+    state = strategy.initialize_state(scene_scale=extent)
+    poses, Ks = (
+        torch.stack([torch.from_numpy(getattr(camera, name)) for camera in cameras]).to(device)
+        for name in ("w2c", "K")
+    )
+    generator, queue = torch.Generator().manual_seed(seed), []
+    for step in range(config.max_steps):
+        if not queue:
+            queue = torch.randperm(len(cameras), generator=generator).tolist()
+        view = queue.pop()
+        camera, photo = cameras[view], photos[view]
+        images, _, info = gsplat.rasterization(
+            params["means"], params["quats"], params["scales"].exp(), params["opacities"].sigmoid(),
+            torch.cat([params["sh0"], params["shN"]], 1), poses[view, None], Ks[view, None],
+            camera.width, camera.height, near_plane=0.01, far_plane=1e10, packed=False,
+            sh_degree=min(step // plan.raise_sh_every, config.sh_degree),
+        )  # fmt: skip
+        strategy.step_pre_backward(params, optimizers, state, step, info)
+        loss(images[0], photo, config.ssim_weight).backward()
+        for optimizer in optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+        slower.step()
+        strategy.step_post_backward(params, optimizers, state, step, info, packed=False)
+        done = step + 1
+        if done % plan.level_every == 0 or done == config.max_steps:
+            yield done, gaussians(params)
+
+
+def gaussians(params: dict[str, Tensor]) -> Gaussians:
+    """gsplat's parameters as Gaussians without categories."""
+    tensors: dict[str, Any] = {ours: params[name].detach() for name, ours in NAMES.items()}
+    labels = torch.full((len(params["means"]),), -1, dtype=torch.int16, device=params["means"].device)
+    return Gaussians(**tensors, label_ids=labels)

@@ -1,0 +1,223 @@
+"""The GPU script end to end on a CPU, its small functions, and gsplat's recipe over our rasteriser."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import gsplat
+import gsplat_standin
+import numpy as np
+import pytest
+import torch
+from conftest import random_gaussians, write_capture
+
+from benchmarks import gsplat_trainer
+from benchmarks.gpu import base, runs, script, split
+from sagesplat.config import TrainConfig
+from sagesplat.demo.capture import make_capture
+from sagesplat.metrics import photometric_loss, ssim_map
+from sagesplat.raster import cuda, rasterize
+from sagesplat.scene.images import Photos
+from sagesplat.scene.scene import Camera
+from sagesplat.train.state import from_points
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_a_trial_of_the_whole_script(tmp_path, capsys):
+    make_capture(tmp_path / "capture", views=9, width=64, height=48)
+    out = tmp_path / "out"
+    assert script.main(base.Asked(tmp_path / "capture", steps=60, device="cpu", out=out)) == 0
+    table = capsys.readouterr().out.splitlines()[-len(script.CHECKS) :]
+    assert [line.split()[:2] for line in table] == [
+        ["agreement", "ok"], ["full", "ok"], ["race", "ok"], ["freeze", "ok"], ["split", "ok"],
+        ["multi", "skipped"],
+    ]  # fmt: skip
+    figures = {name: json.loads((out / f"{name}.json").read_text()) for name in script.CHECKS}
+    assert figures["agreement"]["figures"]["frozen"]["kept"]
+    assert figures["agreement"]["figures"]["frozen"]["others_grew"] > 0
+    run = figures["full"]["figures"]
+    assert run["steps"] == run["curve"][-1]["step"] == 60
+    assert run["curve"][-1]["ssim"] > run["curve"][0]["ssim"]
+    race = figures["race"]["figures"]
+    assert set(race["runs"]) == {"ours", "third", "two_thirds", "all"}
+    assert set(race["missed"]) == {"gsplat"}
+    assert race["runs"]["third"]["settings"]["skipped"] > 0
+    assert set(figures["split"]["figures"]["kernels"]) == {*(name for name, _ in split.KERNELS), "rest"}
+
+
+def test_a_machine_without_a_gpu_says_so_in_one_line():
+    if cuda.missing() is None:
+        pytest.skip("there is one")
+    done = subprocess.run(
+        [sys.executable, "-m", "benchmarks", "gpu"], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    assert done.stdout == ""
+    (line,) = done.stderr.splitlines()
+    assert "; " in line or " or use --device cpu" in line
+
+
+def test_a_check_that_fails_does_not_keep_others_from_running(tmp_path, monkeypatch, capsys):
+    def broken(bench: base.Bench) -> base.Outcome:
+        raise RuntimeError("first line\nsecond line")
+
+    def fine(bench: base.Bench) -> base.Outcome:
+        return base.Outcome("ok", "well")
+
+    monkeypatch.setattr(script, "CHECKS", {"one": broken, "two": fine})
+    write_capture(tmp_path / "capture", random_gaussians(40))
+    assert script.main(base.Asked(tmp_path / "capture", device="cpu", out=tmp_path / "out")) == 1
+    printed = capsys.readouterr().out
+    assert printed.splitlines()[-2:] == [
+        "one        FAILED   RuntimeError: first line",
+        "two        ok       well",
+    ]
+    assert "no categories: " in printed
+    assert script.main(base.Asked(tmp_path / "capture", device="cpu", only=("three",))) == 2
+
+
+def test_a_lost_device_leaves_the_rest_to_a_new_process(tmp_path, monkeypatch):
+    commands = []
+
+    def run(command, **options):
+        commands.append(command)
+        (tmp_path / "two.json").write_text(json.dumps({"state": "ok", "line": "well"}))
+
+    monkeypatch.setattr(script.subprocess, "run", run)
+    asked = base.Asked(Path("scene"), minutes=5.0, out=tmp_path, write=True, masks=Path("labels"))
+    bench = SimpleNamespace(asked=asked, left=lambda: 120.0)
+    found = script.anew(bench, ["two", "three"])  # type: ignore[arg-type]
+    assert found["two"] == base.Outcome("ok", "well")
+    assert found["three"].state == "FAILED"
+    (command,) = commands
+    assert command[1:6] == ["-m", "benchmarks", "gpu", "--scene", "scene"]
+    assert command[command.index("--only") :] == ["--only", "two", "three"]
+    assert command[command.index("--minutes") + 1] == "1.5"
+    assert "--write" in command
+
+
+def test_names_of_folders():
+    assert script.slug("NVIDIA H200") == "nvidia-h200"
+    assert script.slug("NVIDIA RTX A6000 (2)") == "nvidia-rtx-a6000-2"
+
+
+def test_targets_are_what_so_many_labels_have_reached():
+    reached = {1: 0.9019, 2: 0.8, 3: 0.7, 4: 0.6, 5: 0.5, 6: 0.4007}
+    found = runs.targets(reached)
+    assert found == {"third": 0.8, "two_thirds": 0.6, "all": 0.4}
+    for name, share in (("third", 2), ("two_thirds", 4), ("all", 6)):
+        assert sum(ssim >= found[name] for ssim in reached.values()) == share
+    assert runs.targets({1: 0.75}) == {"third": 0.75, "two_thirds": 0.75, "all": 0.75}
+
+
+def test_time_to_an_ssim_is_on_straight_lines():
+    curve = [(10.0, 0.5), (20.0, 0.7), (30.0, 0.6), (40.0, 0.8)]
+    assert runs.time_to(curve, 0.4) == 10
+    assert runs.time_to(curve, 0.6) == pytest.approx(15)
+    assert runs.time_to(curve, 0.7) == 20
+    assert runs.time_to(curve, 0.75) == pytest.approx(37.5)
+    assert runs.time_to(curve, 0.81) is None
+    assert runs.time_to([], 0.5) is None
+
+
+def test_steps_that_there_is_time_for():
+    assert runs.affordable(30_000, 1000, 1.0, 2) == 30_000
+    assert runs.affordable(30_000, 100, 2.0, 4.3) == 11_600
+    assert runs.affordable(30_000, -5, 2.0, 4.3) == 300
+    assert runs.affordable(60, -5, 2.0, 4.3) == 60
+
+
+def test_kernels_belong_to_parts_of_a_step():
+    names = {
+        "void gsplat::projection_ewa_3dgs_fused_bwd_kernel<float>(...)": "projection",
+        "void gsplat::spherical_harmonics_fwd_kernel<float>": "projection",
+        "void gsplat::intersect_tile_kernel<float>": "tiles and sort",
+        "void cub::DeviceRadixSortOnesweepKernel<...>": "tiles and sort",
+        "void gsplat::rasterize_to_pixels_3dgs_fwd_kernel<3u, float>": "raster forward",
+        "void gsplat::rasterize_to_pixels_3dgs_bwd_kernel<3u, float>": "raster backward",
+        "_blur_images_across": "ssim",
+        "_compare": "ssim",
+        "_gradient": "ssim",
+        "_update": "adam",
+        "void at::native::vectorized_elementwise_kernel<4, ...>": "rest",
+    }
+    assert {name: split.group_of(name) for name in names} == names
+    assert set(split.traffic(10, 20, 30, 16)) == {name for name, _ in split.KERNELS}
+
+
+def test_binning_is_timed_over_the_cuda_backend(tmp_path, monkeypatch):
+    gsplat_standin.install(monkeypatch)
+    scene = write_capture(tmp_path / "capture", random_gaussians(20))
+    bench = SimpleNamespace(scene=scene, device=torch.device("cpu"))
+    found = split.binning(bench, random_gaussians(20))  # type: ignore[arg-type]
+    assert found["intersections"] > 20
+    assert found["host_ms"] > 0
+
+
+# --- gsplat's recipe -------------------------------------------------------------------------------------
+
+
+def test_the_losses_agree():
+    generator = torch.Generator().manual_seed(0)
+    x = torch.rand(40, 50, 3, generator=generator)
+    y = (x + 0.1 * torch.randn(40, 50, 3, generator=generator)).clamp(0, 1)
+    ours, plain = photometric_loss(x, y, 0.0), gsplat_trainer.torch_loss(x, y, 0.0)
+    torch.testing.assert_close(plain, ours)
+    inner = 1 - ssim_map(x.numpy(), y.numpy())[5:-5, 5:-5].mean()
+    torch.testing.assert_close(float(gsplat_trainer.torch_loss(x, y, 1.0)), float(inner), rtol=0, atol=1e-5)
+    name, loss = gsplat_trainer.losses()
+    assert name in ("fused_ssim", "ours", "torch")
+    assert torch.isfinite(loss(x, y, 0.2))
+
+
+def test_the_recipe_trains_and_densifies(tmp_path, monkeypatch):
+    """gsplat draws on a GPU only: here our rasteriser stands in, with what its strategy reads."""
+
+    def rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, height, **options):
+        assert options["packed"] is False
+        g = gsplat_trainer.gaussians(
+            {
+                "means": means, "quats": quats, "scales": scales, "opacities": opacities,
+                "sh0": colors[:, :1], "shN": colors[:, 1:],
+            }
+        )  # fmt: skip
+        leaves = {"means": means, "quats": quats, "log_scales": scales.log()}
+        leaves |= {"logit_opacities": opacities.logit(), "sh0": colors[:, :1], "shN": colors[:, 1:]}
+        camera = Camera(viewmats[0].numpy(), Ks[0].numpy(), width, height)
+        render = rasterize(type(g)(**leaves, label_ids=g.label_ids), camera, sh_degree=options["sh_degree"])
+
+        class Means2d:
+            def retain_grad(self) -> None:
+                pass
+
+            @property
+            def grad(self) -> torch.Tensor:
+                assert render.means2d.grad is not None
+                return render.means2d.grad[None]
+
+        radii = render.radii[None, :, None].expand(-1, -1, 2)
+        info = {"means2d": Means2d(), "radii": radii, "width": width, "height": height}
+        return render.rgb[None], render.alpha[None], info | {"n_cameras": 1, "gaussian_ids": None}
+
+    monkeypatch.setattr(gsplat, "rasterization", rasterization)
+    scene = write_capture(tmp_path / "capture", random_gaussians(60, degree=1))
+    photos = [torch.from_numpy(Photos(scene.views)[row]).float() / 255 for row in scene.train_ids]
+    cameras = [scene.views[row].camera for row in scene.train_ids]
+    initial = from_points(scene.points, np.full(len(scene.points.xyz), -1, np.int16), 3)
+    config = TrainConfig(
+        max_steps=120, level_every=40, refine_start=20, refine_stop=30_000, refine_every=20, grow_grad=1e-6
+    )  # fmt: skip
+
+    def error(g) -> float:
+        renders = [rasterize(g, camera).rgb for camera in cameras]
+        return float(torch.stack([(r - p).abs().mean() for r, p in zip(renders, photos, strict=True)]).mean())
+
+    found = list(
+        gsplat_trainer.train(initial, cameras, photos, scene.extent, config, gsplat_trainer.torch_loss)
+    )
+    assert [step for step, _ in found] == [40, 80, 120]
+    assert len(found[-1][1]) > len(initial)
+    assert error(found[-1][1]) < 0.7 * error(initial)
