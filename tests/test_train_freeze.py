@@ -284,8 +284,9 @@ def test_rare_categories_are_measured_where_they_show(capture):
             label = 5 if view.name in ("8", "33", "77") else 7
             return np.array([[label, 9 if int(view.name) > 30 else label]], np.int16)
 
-    rows = measured_views(many, Rare())  # type: ignore[arg-type]
-    assert rows == sorted(set(rows))
-    assert set(rows) <= set(many.train_ids.tolist())
-    assert {33, 77} <= set(rows)
-    assert 16 <= len(rows) <= 18
+    picked = measured_views(many, Rare())  # type: ignore[arg-type]
+    assert picked[5] == [33, 77]
+    assert len(picked[7]) in (14, 15, 16)
+    assert len(picked[9]) >= 8
+    assert min(picked[9]) > 30
+    assert all(set(rows) <= set(many.train_ids.tolist()) for rows in picked.values())

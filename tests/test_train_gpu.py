@@ -24,7 +24,7 @@ from sagesplat.raster import Workspace
 from sagesplat.scene.images import Photos
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.train import stepper, trainer
-from sagesplat.train.freeze import Work, label_quality
+from sagesplat.train.freeze import Work, label_quality, measured_views
 from sagesplat.train.stepper import Stepper
 from sagesplat.train.trainer import LabelFrozen, LevelSaved, Resumed, Step, Trained, train
 
@@ -152,7 +152,7 @@ def watched_states(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_quality_is_what_the_cpu_measures(scene, on_gpu, monkeypatch):  # noqa: F811
     g = final(run(scene, SHORT))
-    work, rows = Work(scene, Halves()), scene.train_ids.tolist()  # type: ignore[arg-type]
+    work, rows = Work(scene, Halves()), measured_views(scene, Halves())  # type: ignore[arg-type]
     feed = stepper.Feed(scene, Photos(scene.views), CPU)
     there = label_quality(g, work, feed, rows, SHORT, 3, backend="cuda")
     monkeypatch.undo()

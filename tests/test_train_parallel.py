@@ -84,6 +84,34 @@ class Broken:
         raise SystemExit(7)
 
 
+def test_a_process_that_cannot_go_on_says_why(capture, capfd):  # noqa: F811
+    scene, _, masks, labels = capture
+    config = TrainConfig(max_steps=20)
+    with pytest.raises(RunError, match="process 1 of 2 ended with code 1; look at its message above"):
+        list(train_together(2, 2, scene, Hungry(scene), labels, config, masks=masks))
+    assert (
+        "process 1: training did not begin: out of memory; lower --train.max-gaussians"
+        in capfd.readouterr().err
+    )
+
+
+class Hungry:
+    """Photos for which all processes but the first have no memory."""
+
+    def __init__(self, scene, first=True):
+        from sagesplat.scene.images import Photos
+
+        self.photos, self.first = Photos(scene.views), first
+
+    def __getitem__(self, row):
+        if not self.first:
+            raise MemoryError
+        return self.photos[row]
+
+    def __setstate__(self, state):
+        self.__dict__ |= state | {"first": False}
+
+
 def test_more_processes_than_gpus(capture, monkeypatch):  # noqa: F811
     monkeypatch.setattr(parallel.torch.cuda, "device_count", lambda: 1)
     with pytest.raises(RunError, match="--processes 2: this machine has 1 GPUs; lower it"):

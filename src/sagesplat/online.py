@@ -83,16 +83,15 @@ def compare_online(online: Job, full: Job, out: Path) -> tuple[Table, Table]:
 
 
 def first_levels(
-    ladder: Ladder, observations: Observations, views: list[int], target: float
+    ladder: Ladder, observations: Observations, views: Mapping[int, list[int]], target: float
 ) -> dict[int, int]:
-    """Per category the first level whose mean SSIM over `views` has reached the target, else the last."""
-    rows = observations.select(np.isin(observations.view, views))
+    """Per category the first level whose mean SSIM over its views has reached the target, else the last."""
     chosen = {}
     for label in sorted({label for label, _ in ladder.counts}):
         chosen[label] = ladder.levels[-1]
+        mine = (observations.label_id == label) & np.isin(observations.view, views.get(label, []))
         for level in ladder.levels:
-            here = (rows.label_id == label) & (rows.level == level)
-            if mean(rows.ssim[here]) >= target:
+            if mean(observations.ssim[mine & (observations.level == level)]) >= target:
                 chosen[label] = level
                 break
     return chosen

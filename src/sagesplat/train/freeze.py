@@ -18,19 +18,23 @@ from sagesplat.train.feed import Feed
 from sagesplat.train.group import ALONE, Group
 
 VIEWS = 16  # training views that a measurement takes, evenly spread: it must stay cheap
-_RARE_VIEWS = 8  # and so many of those that show a category, where fewer of the others do
+_RARE_VIEWS = 8  # that a category is measured on where fewer of those show it
 
 
-def measured_views(scene: Scene, masks: Masks) -> list[int]:
-    """Rows of the training views that quality is measured on."""
+def measured_views(scene: Scene, masks: Masks) -> dict[int, list[int]]:
+    """Rows of the training views that each category is measured on, by label id.
+
+    Those of 16 evenly spread ones that show it, or 8 of all that do: a few more for a rare category must not
+    change what the others are measured on.
+    """
     rows = scene.train_ids.tolist()
     shown = {row: np.unique(masks[scene.views[row]]).tolist() for row in rows}
-    picked = set(_spread(rows, VIEWS))
-    for label in {label for labels in shown.values() for label in labels}:
+    some, picked = set(_spread(rows, VIEWS)), {}
+    for label in sorted({label for labels in shown.values() for label in labels}):
         showing = [row for row in rows if label in shown[row]]
-        if len(picked.intersection(showing)) < _RARE_VIEWS:
-            picked.update(_spread(showing, _RARE_VIEWS))
-    return sorted(picked)
+        among = [row for row in showing if row in some]
+        picked[label] = among if len(among) >= _RARE_VIEWS else _spread(showing, _RARE_VIEWS)
+    return picked
 
 
 def _spread(rows: list[int], count: int) -> list[int]:
@@ -91,7 +95,7 @@ def label_quality(
     gaussians: Gaussians,
     work: Work,
     feed: Feed,
-    rows: Sequence[int],
+    views: Mapping[int, Sequence[int]],
     config: TrainConfig,
     sh_degree: int,
     *,
@@ -99,13 +103,14 @@ def label_quality(
     workspace: Workspace | None = None,
     group: Group = ALONE,
 ) -> dict[int, float]:
-    """Mean SSIM of each category that has not stopped, over those of some views (`rows`) that show it.
+    """Mean SSIM of each category that has not stopped, over the rows of views that `views` has for it.
 
     The processes of a `group` measure some views each.
     """
     assert work.masks is not None
     found: dict[int, dict[int, float]] = {}
-    for row in group.share(list(rows)):
+    left = {label: set(rows) for label, rows in views.items() if label not in work.frozen}
+    for row in group.share(sorted(set().union(*left.values()))):
         view, tiles = work.scene.views[row], work.tiles(row)
         if tiles is not None:  # windows reach into the tiles around
             tiles = binary_dilation(tiles, np.ones((3, 3)))
@@ -122,7 +127,7 @@ def label_quality(
         else:
             quality = ssim_map(image.numpy(), photo.numpy(), tiles)
         for label, (mean, _) in means_by_label(quality, work.masks[view]).items():
-            if label not in work.frozen:
+            if row in left.get(label, ()):
                 found.setdefault(label, {})[row] = mean
     values: dict[int, dict[int, float]] = {}  # by label and view, whoever measured it
     for part in group.gather(found):

@@ -49,7 +49,9 @@ def train_together(processes: int, threads: int, *args: Any, **options: Any) -> 
             with _joined(0, processes, meeting, cuda) as group:
                 yield from train(*args, **options, group=group)
         except RuntimeError as error:  # what torch.distributed raises when somebody is gone
-            raise RunError(f"{_lost(workers)}; look at its message above, then run again") from error
+            if (lost := _lost(workers)) is None:
+                raise
+            raise RunError(f"{lost}; look at its message above, then run again") from error
         finally:
             set_threads(before)
             for worker in workers:
@@ -57,12 +59,13 @@ def train_together(processes: int, threads: int, *args: Any, **options: Any) -> 
                 worker.join()
 
 
-def _lost(workers: Sequence[BaseProcess]) -> str:
+def _lost(workers: Sequence[BaseProcess]) -> str | None:
+    """Which process is gone, in words."""
     for rank, worker in enumerate(workers, 1):
         worker.join(5)
         if worker.exitcode:
             return f"process {rank} of {len(workers) + 1} ended with code {worker.exitcode}"
-    return "the training processes lost each other"
+    return None
 
 
 @contextmanager
@@ -94,5 +97,5 @@ def _work(
         with _joined(rank, size, meeting, cuda) as group:
             for _ in train(*args, **options, group=group):
                 pass
-    except SageError:
-        pass  # the first process meets the same and says so
+    except SageError as error:
+        raise SystemExit(f"process {rank}: {error}") from None

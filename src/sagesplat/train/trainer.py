@@ -158,7 +158,7 @@ def _train(
     rest = Rest(config.rest_share) if config.rest_share else None
     stepper = Stepper(Feed(scene, photos, device), config, work, backend, group, rest)
     trainable = trainable_rows(state.gaussians, state.frozen)
-    looked_at = measured_views(scene, masks) if config.freeze_at is not None and masks is not None else []
+    looked_at = measured_views(scene, masks) if config.freeze_at is not None and masks is not None else {}
     awake, learning, value = trainable, bool(trainable.any()), 0.0
     while state.step < config.max_steps and learning:
         step = state.step + 1
