@@ -9,8 +9,9 @@ INSTALLED := $(VENV)/.installed
 demo: $(INSTALLED)
 	$(BIN)/sagesplat demo
 
+# two processes of one thread each: the tests are small, and idle threads would spin in each other's way
 test: lint
-	$(BIN)/pytest -q
+	OMP_NUM_THREADS=1 $(BIN)/pytest -q -n 2
 
 test-slow: $(INSTALLED)
 	$(BIN)/pytest -q -m slow

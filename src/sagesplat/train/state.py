@@ -12,6 +12,7 @@ from sagesplat.scene.scene import Points
 from sagesplat.sh import num_bases, rgb_to_sh0
 
 INITIAL_OPACITY = 0.1
+MCMC_OPACITY, MCMC_SCALE = 0.5, 0.1  # what 3DGS-MCMC begins with; scales times those of 3DGS
 
 
 @dataclass(eq=False)
@@ -67,10 +68,16 @@ class TrainState:
         )  # fmt: skip
 
 
-def from_points(points: Points, label_ids: np.ndarray, sh_degree: int) -> Gaussians:
-    """Gaussians at the SfM points: isotropic, as wide as the three nearest neighbours are far."""
+def from_points(
+    points: Points,
+    label_ids: np.ndarray,
+    sh_degree: int,
+    opacity: float = INITIAL_OPACITY,
+    scale: float = 1.0,
+) -> Gaussians:
+    """Gaussians at the SfM points: isotropic, `scale` times as wide as their three neighbours are far."""
     n = len(points.xyz)
-    scales = geometry.mean_neighbour_distance(points.xyz)
+    scales = scale * geometry.mean_neighbour_distance(points.xyz)
     quats = torch.zeros(n, 4)
     quats[:, 0] = 1
     rgb = torch.from_numpy(points.rgb.astype(np.float32) / 255)
@@ -78,7 +85,7 @@ def from_points(points: Points, label_ids: np.ndarray, sh_degree: int) -> Gaussi
         means=torch.from_numpy(points.xyz.copy()),
         quats=quats,
         log_scales=torch.from_numpy(np.log(scales))[:, None].repeat(1, 3),
-        logit_opacities=torch.full((n,), float(np.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY)))),
+        logit_opacities=torch.full((n,), float(np.log(opacity / (1 - opacity)))),
         sh0=rgb_to_sh0(rgb)[:, None, :].contiguous(),
         shN=torch.zeros(n, num_bases(sh_degree) - 1, 3),
         label_ids=torch.from_numpy(label_ids.astype(np.int16)),

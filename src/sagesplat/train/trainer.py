@@ -24,7 +24,7 @@ from sagesplat.train.group import ALONE, Group
 from sagesplat.train.levels import write_level
 from sagesplat.train.pace import pace
 from sagesplat.train.rest import Rest
-from sagesplat.train.state import TrainState, from_points, initial_state
+from sagesplat.train.state import MCMC_OPACITY, MCMC_SCALE, TrainState, from_points, initial_state
 from sagesplat.train.stepper import Stepper
 
 CHECKPOINT = "checkpoint.npz"
@@ -145,7 +145,8 @@ def _train(
     some = scene.train_ids[:: max(1, len(scene.train_ids) // 8)]
     run_pace = pace(config, scene.extent, [photos[i] for i in some] if config.pace == "fast" else [])
     device = device_of(backend, group.rank)
-    state = initial_state(from_points(scene.points, label_ids, config.sh_degree), seed).to(device)
+    begin = (MCMC_OPACITY, MCMC_SCALE) if config.strategy == "mcmc" else ()
+    state = initial_state(from_points(scene.points, label_ids, config.sh_degree, *begin), seed).to(device)
     state.sort()
     checkpoint = folder / CHECKPOINT if folder else None
     if checkpoint and checkpoint.exists():
