@@ -5,11 +5,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
+from sagesplat.adapt.observe import TOTAL, as_unit, measure, render_rgb
 from sagesplat.config import TrainConfig
-from sagesplat.metrics import means_by_label, psnr, ssim_map
-from sagesplat.raster import Backend, device_of, rasterize
+from sagesplat.raster import Backend, device_of
 from sagesplat.scene import load_scene
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
@@ -79,21 +78,17 @@ def timed(capture: Capture, config: TrainConfig, backend: Backend = "auto") -> d
 
 def by_label(capture: Capture, trained: Trained, rows: list[int], backend: Backend) -> dict:  # type: ignore[type-arg]
     """Mean SSIM by label id over the views that show it, and SSIM and PSNR of whole images."""
-    found: dict[int, list[float]] = {}
-    whole, decibels = [], []
+    found: dict[int, dict[str, list[float]]] = {}
     gaussians = trained.gaussians.to(device_of(backend))
     for row in rows:
         view = capture.scene.views[row]
-        with torch.no_grad():
-            image = rasterize(gaussians, view.camera, backend=backend).rgb.clamp(0, 1).cpu().numpy()
-        photo = capture.photos[row].astype(np.float32) / 255
-        quality = ssim_map(image, photo)
-        whole.append(float(quality.mean()))
-        decibels.append(float(psnr(np.square(image - photo).mean())))
-        for label, (mean, _) in means_by_label(quality, capture.masks[view]).items():
-            found.setdefault(label, []).append(mean)
-    labels = {label: float(np.mean(values)) for label, values in sorted(found.items())}
-    return {"ssim": float(np.mean(whole)), "psnr": float(np.mean(decibels)), "labels": labels}
+        image = render_rgb(gaussians, view.camera, backend=backend, antialiased=False)
+        for label, values in measure(image, as_unit(capture.photos[row]), capture.masks[view]).items():
+            for name in ("ssim", "psnr"):
+                found.setdefault(label, {}).setdefault(name, []).append(values[name])
+    means = {label: {name: float(np.mean(v)) for name, v in of.items()} for label, of in found.items()}
+    whole = means.pop(TOTAL)
+    return {**whole, "labels": {label: of["ssim"] for label, of in sorted(means.items())}}
 
 
 def pixel_shares(capture: Capture) -> dict[int, float]:

@@ -34,7 +34,7 @@ Loss = Callable[[Tensor, Tensor, float], Tensor]  # of two images [H, W, 3] in [
 def losses() -> tuple[str, Loss]:
     """The loss of the recipe and its name: fused_ssim's, or where that is missing ours on a GPU.
 
-    Ours is as fast as fused_ssim or faster, so the race stays one of trainers.
+    A slow loss must not decide a race of trainers; the times of all are written beside it.
     """
     try:
         from fused_ssim import fused_ssim  # pyright: ignore[reportMissingImports]

@@ -144,7 +144,7 @@ def frozen_kept(bench: Bench, steps: int) -> dict[str, Any]:
         if step == 3 * every:
             densify.reset_opacities(state, config, trainable)
         if step % every == 0:
-            trainer._refine(state, config, scene, trainable, ALONE, 1)
+            trainer._refine(state, config, densify.schedule(config), scene, trainable, ALONE, 1)
             trainable = trainable_rows(state.gaussians, state.frozen)
     after = rows_of(state, label)
     kept = before.shape == after.shape and bool((before == after).all())

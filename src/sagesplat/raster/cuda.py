@@ -319,6 +319,7 @@ class _Tiles:
         return image, alpha
 
 
+@named_out_of_memory()
 def render(
     g: Gaussians,
     camera: Camera,
@@ -336,21 +337,6 @@ def render(
     `absgrad` sees what one pass draws: colours and at most 29 features. Raises `OutOfMemory`; a backward pass
     raises it where `named_out_of_memory` stands around it.
     """
-    with named_out_of_memory():
-        return _render(g, camera, degree, background, features, antialiased, tile_mask, trainable, absgrad)
-
-
-def _render(
-    g: Gaussians,
-    camera: Camera,
-    degree: int,
-    background: Tensor,
-    features: Tensor | None,
-    antialiased: bool,
-    tile_mask: np.ndarray | Tensor | None,
-    trainable: Tensor | None,
-    absgrad: bool,
-) -> Render:
     splats = _project(g, camera, degree, antialiased, trainable)
     drawn = (splats.radii > 0).all(-1)
     radii = splats.spread(torch.where(drawn, splats.radii.amax(-1), 0).float(), len(g))
@@ -392,6 +378,7 @@ def _render(
     return Render(image[..., :3], alpha, None if features is None else image[..., 3:], leaf, radii)
 
 
+@named_out_of_memory()
 def add_weights(
     g: Gaussians,
     camera: Camera,
@@ -401,18 +388,17 @@ def add_weights(
     antialiased: bool,
 ) -> None:
     """See `sagesplat.raster.add_weights`. Each 32 columns are a forward and a backward pass."""
-    with named_out_of_memory():
-        with torch.no_grad():
-            splats = _project(g, camera, 0, antialiased, None)
-            tiles = _Tiles(splats, camera, None)
-        columns = torch.as_tensor(columns_of, device=g.means.device)
-        for start in range(0, out.shape[1], _CHANNELS[-1]):
-            some = torch.arange(start, min(start + _CHANNELS[-1], out.shape[1]), device=columns.device)
-            with torch.enable_grad():
-                ones = torch.zeros(len(splats.radii), len(some), device=columns.device, requires_grad=True)
-                shapes = splats.means2d[None], splats.conics, splats.opacities
-                image, _ = tiles.blend(*shapes, ones, ones.new_zeros(len(some)))
-            (sums,) = torch.autograd.grad(image, ones, (columns[..., None] == some).float())
-            sums = splats.spread(sums, len(g))
-            part = out[:, start : start + len(some)]
-            part += sums.to(part.device) if isinstance(part, Tensor) else sums.cpu().numpy()
+    with torch.no_grad():
+        splats = _project(g, camera, 0, antialiased, None)
+        tiles = _Tiles(splats, camera, None)
+    columns = torch.as_tensor(columns_of, device=g.means.device)
+    for start in range(0, out.shape[1], _CHANNELS[-1]):
+        some = torch.arange(start, min(start + _CHANNELS[-1], out.shape[1]), device=columns.device)
+        with torch.enable_grad():
+            ones = torch.zeros(len(splats.radii), len(some), device=columns.device, requires_grad=True)
+            shapes = splats.means2d[None], splats.conics, splats.opacities
+            image, _ = tiles.blend(*shapes, ones, ones.new_zeros(len(some)))
+        (sums,) = torch.autograd.grad(image, ones, (columns[..., None] == some).float())
+        sums = splats.spread(sums, len(g))
+        part = out[:, start : start + len(some)]
+        part += sums.to(part.device) if isinstance(part, Tensor) else sums.cpu().numpy()

@@ -84,7 +84,7 @@ def active_tiles(
     side = TILE * factor
     rows, columns = (-(-max(1, round(n / factor)) // TILE) for n in (height, width))
     learns = np.zeros((rows * side, columns * side), bool)
-    moves = np.ones(2**16, bool)  # by the bits of an int16: a look-up is ten times faster than np.isin
+    moves = np.ones(2**16, bool)  # by the bits of an int16: a look-up takes a third of np.isin's time
     moves[np.array(list(frozen), np.int16).view(np.uint16)] = False
     shown = moves[label_ids.view(np.uint16)[: rows * side, : columns * side]]
     learns[: shown.shape[0], : shown.shape[1]] = shown

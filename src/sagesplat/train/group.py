@@ -38,10 +38,10 @@ class Group:
 
     def gather(self, thing: Any) -> list[Any]:
         """What all processes have, by rank."""
-        things: list[Any] = [None] * self.size
+        things = [thing] * self.size
         if self.size > 1:
             dist.all_gather_object(things, thing)
-        return things if self.size > 1 else [thing]
+        return things
 
 
 ALONE = Group()

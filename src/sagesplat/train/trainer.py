@@ -190,7 +190,7 @@ def _train(
             awake = trainable = trainable_rows(state.gaussians, state.frozen)
             learning = bool(trainable.any())
         if refining and step % config.refine_every == 0:
-            _refine(state, config, scene, trainable, group, run_pace.factor(step))
+            _refine(state, config, plan, scene, trainable, group, run_pace.factor(step))
             awake = trainable = trainable_rows(state.gaussians, state.frozen)
         if rest and step % config.refine_every == 0:
             awake = rest.turn(trainable)
@@ -206,10 +206,16 @@ def _train(
 
 
 def _refine(
-    state: TrainState, config: TrainConfig, scene: Scene, trainable: Tensor, group: Group, factor: int
+    state: TrainState,
+    config: TrainConfig,
+    plan: densify.Schedule,
+    scene: Scene,
+    trainable: Tensor,
+    group: Group,
+    factor: int,
 ) -> None:
     """Let Gaussians come and go, as the strategy has it; photos of the moment are `factor` times smaller."""
-    plan, camera, num_points = densify.schedule(config), scene.views[0].camera, len(scene.points.xyz)
+    camera, num_points = scene.views[0].camera, len(scene.points.xyz)
     num_pixels = camera.width * camera.height
     if config.strategy == "mcmc":
         most = densify.cap(config, num_pixels, num_points)
