@@ -14,6 +14,7 @@ import tyro
 from benchmarks import audit as table_iii
 from benchmarks import freeze as freezing
 from benchmarks import measure, plain, workloads
+from benchmarks import plans as planning
 from benchmarks.gpu import base, script
 from sagesplat.config import TrainConfig
 from sagesplat.gaussians import PARAMETERS, Gaussians
@@ -325,6 +326,20 @@ def freeze(
                 f" test {test['psnr']:.2f} dB, {test['ssim']:.4f}; ms {times}; % of tiles {tiles}"
             )
     _finish("freeze", result, write)
+
+
+@app.command
+def plans(positions: int = 1000, write: bool = False) -> None:
+    """Levels for a target and within a budget: time of one plan and of a path, by labels and levels."""
+    rows = [planning.measure(positions, *size) for size in planning.SIZES]
+    for row in rows:
+        print(
+            f"{row['labels']:4} x {row['levels']}: target {row['target_ms']:.2f} ms, budget"
+            f" {row['budget_ms']:.2f} ms (at most {row['budget_ms_most']:.2f}), {row['proven']:.0%} proven,"
+            f" gap {row['gap']:.1e}; path {row['path_target_s']:.2f} s and {row['path_budget_s']:.2f} s,"
+            f" changes {row['changes_target']:.2%} and {row['changes_budget']:.2%}"
+        )
+    _finish("plans", {"positions": positions, "rows": rows}, write)
 
 
 def _gradients(backend: Backend, count: int, width: int, height: int, seed: int):  # type: ignore[no-untyped-def]
