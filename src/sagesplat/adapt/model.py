@@ -243,13 +243,14 @@ def read_models(path: Path) -> dict[tuple[int, int], SsimModel]:
     """What `write_models` wrote; DataError where the content cannot be used."""
     document = read_json(path)
     try:
-        models = [_model_from(entry) for entry in document["models"]]
+        models = [model_from_json(entry) for entry in document["models"]]
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise DataError(f"{path}: not a file of quality models ({error!r}); fit the models again") from None
     return {(model.label_id, model.level): model for model in models}
 
 
-def _model_from(entry: dict) -> SsimModel:
+def model_from_json(entry: dict) -> SsimModel:
+    """The model of one entry; KeyError, TypeError or ValueError for unusable content."""
     low, high = map(float, entry["d_range"])
     model = SsimModel(
         label_id=int(entry["label_id"]),

@@ -1,22 +1,27 @@
 """Captures: posed photos and structure-from-motion points."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from sagesplat.errors import SceneError
 from sagesplat.scene.colmap import load_colmap
 from sagesplat.scene.scene import Scene
 
 __all__ = ["describe", "load_scene"]
 
 
-def load_scene(path: Path, *, downscale: int = 1, test_every: int = 8) -> Scene:
+def load_scene(path: Path, *, downscale: int = 1, test_every: int = 8, calibrate_every: int = 0) -> Scene:
     """The capture in a folder, as `colmap.load_colmap` reads it. Raises SceneError.
 
     Photos are `downscale` times smaller than the files in images/. Every `test_every`-th view by name is
-    kept for tests, none with 0.
+    kept for tests, none with 0; every `calibrate_every`-th of the others for calibration.
     """
-    return load_colmap(path, downscale=downscale, test_every=test_every)
+    if calibrate_every < 0 or calibrate_every == 1:
+        raise SceneError(f"{path}: calibrate_every {calibrate_every} leaves nothing; take 0 or 2 and more")
+    scene = load_colmap(path, downscale=downscale, test_every=test_every)
+    return replace(scene, calibrate_every=calibrate_every)
 
 
 def describe(scene: Scene) -> list[tuple[str, str]]:
@@ -26,11 +31,13 @@ def describe(scene: Scene) -> list[tuple[str, str]]:
     Ks = {v.camera.K.tobytes() for v in views}
     lenses = sorted({v.lens.model for v in views if v.lens})
     offsets = np.array([v.camera.K[:2, 2] - [v.camera.width / 2, v.camera.height / 2] for v in views])
+    kinds = (("train", scene.train_ids), ("calibration", scene.calibration_ids), ("test", scene.test_ids))
+    splits = ", ".join(f"{len(ids)} {kind}" for kind, ids in kinds if len(ids) or kind != "calibration")
     low, high = offsets.min(axis=0), offsets.max(axis=0)
     rows = [
         ("name", scene.name),
         ("path", str(scene.path)),
-        ("views", f"{len(views)} ({len(scene.train_ids)} train, {len(scene.test_ids)} test)"),
+        ("views", f"{len(views)} ({splits})"),
         ("image size", ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (", ..." if len(sizes) > 3 else "")),
         ("cameras", f"{len(Ks)} distinct intrinsics"),
         (

@@ -73,6 +73,7 @@ class Scene:
     views: tuple[View, ...]
     points: Points
     test_every: int = 8  # every n-th view by name is a test view; 0 = none
+    calibrate_every: int = 0  # every n-th of the others calibrates promises; 0 = none
 
     @cached_property
     def extent(self) -> float:
@@ -87,6 +88,18 @@ class Scene:
         return every[every % self.test_every == 0] if self.test_every else every[:0]
 
     @property
+    def calibration_ids(self) -> np.ndarray:
+        """Rows of `views` that tell what a promise is worth where no photo was trained on."""
+        rest = np.setdiff1d(np.arange(len(self.views)), self.test_ids)
+        return rest[self.calibrate_every // 2 :: self.calibrate_every] if self.calibrate_every else rest[:0]
+
+    def split(self, row: int) -> str:
+        """What a view is for: train, calibration or test."""
+        of_others = "calibration" if row in self.calibration_ids else "train"
+        return "test" if row in self.test_ids else of_others
+
+    @property
     def train_ids(self) -> np.ndarray:
         """Rows of `views` that training may use."""
-        return np.setdiff1d(np.arange(len(self.views)), self.test_ids)
+        kept = np.concatenate([self.test_ids, self.calibration_ids])
+        return np.setdiff1d(np.arange(len(self.views)), kept)
