@@ -267,7 +267,7 @@ def job(tmp_path_factory: pytest.TempPathFactory) -> Job:
     folder = tmp_path_factory.mktemp("transfer")
     g = random_gaussians(60, degree=0)
     write_capture(folder / "capture", g, views=VIEWS)
-    job = Job(RunDir(folder / "run"), lambda event: None)
+    job = Job(RunDir(folder / "run", "snapshots"), lambda event: None)
     run, made = job.run, synthetic("b", {3: "apple", 184: "bench"})
     stages.open_scene(job, folder / "capture", SceneConfig())
     Taxonomy(dict(made.names)).write(run.masks / "labels.json")
@@ -305,7 +305,7 @@ def test_a_run_predicts_itself_like_its_own_models(job, tmp_path):
 
 
 def test_runs_that_were_measured_differently(job, tmp_path):
-    other = Job(RunDir(tmp_path / "other"), print)
+    other = Job(RunDir(tmp_path / "other", "snapshots"), print)
     shutil.copytree(job.run.path, other.run.path)
     record(other.run, "observe", {"distance": "minimum"}, [], 0.0)
     with pytest.raises(
@@ -324,7 +324,7 @@ def test_impossible_targets_are_one_line(job, tmp_path, target):
 
 def test_runs_that_are_not_ready_are_one_line(job, tmp_path):
     with pytest.raises(RunError, match="nowhere: not a run folder"):
-        transfer_runs(Job(RunDir(tmp_path / "nowhere"), print), job, tmp_path / "out", [0.5])
+        transfer_runs(Job(RunDir(tmp_path / "nowhere", "snapshots"), print), job, tmp_path / "out", [0.5])
     hidden = job.run.models.rename(tmp_path / "models.json")
     try:
         with pytest.raises(RunError, match=r"models\.json: missing; finish"):

@@ -26,7 +26,7 @@ CONFIG = RunConfig(train=TrainConfig(max_steps=90, level_every=30), plan=PlanCon
 
 def work(run: Path, capture: Path, config: RunConfig = CONFIG, *, force: bool = False) -> list[Event]:
     events: list[Event] = []
-    pipeline.run_all(Job(RunDir(run), events.append, force=force), capture, config)
+    pipeline.run_all(Job(RunDir(run, "snapshots"), events.append, force=force), capture, config)
     return events
 
 
@@ -51,7 +51,7 @@ def finished(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_artefact_is_there_and_agrees_with_the_others(finished: Path, capture: Path) -> None:
-    run = RunDir(finished)
+    run = RunDir(finished, "snapshots")
     observations, evaluation = read_observations(run.observations), read_evaluation(run.evaluation)
     assert set(observations.level) == {30, 60, 90}
     assert set(observations.view) == set(range(12))
@@ -72,7 +72,7 @@ def test_every_artefact_is_there_and_agrees_with_the_others(finished: Path, capt
 
 
 def test_whole_image_row_is_the_pixel_weighted_mean_of_the_categories(finished: Path) -> None:
-    table = read_observations(RunDir(finished).observations)
+    table = read_observations(RunDir(finished, "snapshots").observations)
     table = table.select((table.level == 90) & (table.view == 3))
     parts = table.select(table.label_id != TOTAL)
     whole = table.select(table.label_id == TOTAL)
@@ -106,7 +106,7 @@ def test_a_killed_run_goes_on_and_ends_with_the_same_levels(
             raise Killed
 
     with pytest.raises(Killed):
-        pipeline.run_all(Job(RunDir(tmp_path / "run"), emit), capture, CONFIG)
+        pipeline.run_all(Job(RunDir(tmp_path / "run", "snapshots"), emit), capture, CONFIG)
     events = work(tmp_path / "run", capture)
     assert named(events, StageSkipped) == ["scene", "masks", "lift"]
     assert min(e.step for e in events if isinstance(e, Training)) == 61
@@ -130,7 +130,7 @@ def test_a_folder_that_is_no_run_is_left_alone(capture: Path, tmp_path: Path) ->
 
 
 def test_export_takes_levels_and_categories(finished: Path, tmp_path: Path) -> None:
-    job = Job(RunDir(finished), print)
+    job = Job(RunDir(finished, "snapshots"), print)
     count = pipeline.export_ply(
         job, tmp_path / "a.ply", level=60, labels=["vase", "grass-merged"], target=None
     )

@@ -20,8 +20,8 @@ def run(name: str, folder: Path, config: RunConfig) -> tuple[float, float]:
     """Mean SSIM and PSNR of full 3DGS over the test views."""
     if not (SCENES / name).is_dir():
         pytest.skip("needs the real scenes beside the checkout")
-    pipeline.run_all(Job(RunDir(folder), lambda event: None), SCENES / name, config)
-    table = read_evaluation(RunDir(folder).evaluation)
+    pipeline.run_all(Job(RunDir(folder, "snapshots"), lambda event: None), SCENES / name, config)
+    table = read_evaluation(RunDir(folder, "snapshots").evaluation)
     whole = table.select((table.label_id == TOTAL) & (table.target == np.float32(config.plan.target_ssim)))
     return float(whole.full_ssim.mean()), float(whole.full_psnr.mean())
 

@@ -25,6 +25,7 @@ ROOT = Path(__file__).parents[1]
 TEXT = """
 targets = [0.4, 0.3]
 seeds = [0, 5]
+settings.ladder = "snapshots"
 settings.train = { max_steps = 60, level_every = 20, refine_every = 5 }
 scenes.plot = "capture"
 variants.track = {}
@@ -92,7 +93,7 @@ def test_every_cell_and_target_is_a_row_that_agrees_with_its_run(finished: Path)
         for target in ("0.3", "0.4")
     ]
     for row in rows:
-        run = RunDir(finished / "out" / "runs" / f"plot-{row['variant']}-seed{row['seed']}")
+        run = RunDir(finished / "out" / "runs" / f"plot-{row['variant']}-seed{row['seed']}", "snapshots")
         plan = next(p for p in read_plans(run.plan)[0] if p.target == float(row["target"]))
         assert int(row["Gaussians"]) == plan.count
         assert row["status"] == plan.status
@@ -169,7 +170,7 @@ def test_changed_settings_fail_unless_forced(copy: Path) -> None:
 
 
 def test_without_test_views_quality_is_unknown(copy: Path) -> None:
-    text = TEXT.replace("60", "10").replace("settings", "settings.scene.test_every = 0\nsettings")
+    text = TEXT.replace("60", "10").replace("settings", "settings.scene.test_every = 0\nsettings", 1)
     sweep = read_sweep(write(copy, text))[:1]
     (row,) = run_sweep(sweep, copy / "new", lambda _: None).rows[:1]
     assert row[-2:] == ("–", "–")

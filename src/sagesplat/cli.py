@@ -4,7 +4,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
@@ -13,9 +13,11 @@ from tyro.conf import Positional, arg
 
 from sagesplat import __version__
 from sagesplat.config import (
+    CompareConfig,
     FitConfig,
     LiftConfig,
     MasksConfig,
+    NestConfig,
     PaperConfig,
     PlanConfig,
     RunConfig,
@@ -53,13 +55,14 @@ class Machine:
     """Make results again that were made with other settings."""
 
 
+LadderKind = Literal["nested", "snapshots"]
 Scene = Positional[Annotated[Path, arg(metavar="SCENE", help="capture: a COLMAP workspace")]]
 Run = Positional[Annotated[Path, arg(metavar="RUN", help="run folder")]]
 Flat = arg(name="")
 
 
 @contextmanager
-def _job(run: Path, machine: Machine) -> Iterator["Job"]:
+def _job(run: Path, machine: Machine, ladder: LadderKind = "nested") -> Iterator["Job"]:
     """A job on a run folder, shown on the console."""
     from sagesplat.console import Console
     from sagesplat.job import Job
@@ -69,7 +72,7 @@ def _job(run: Path, machine: Machine) -> Iterator["Job"]:
     with Console() as console:
         if backend == "cuda":
             console.out.print("[dim]· computing on the GPU[/]")
-        yield Job(RunDir(run), console, backend, threads, machine.force, machine.processes)
+        yield Job(RunDir(run, ladder), console, backend, threads, machine.force, machine.processes)
 
 
 def _prepare(machine: Machine) -> "tuple[Backend, int]":
@@ -89,7 +92,7 @@ def info(scene: Scene, scene_config: Annotated[SceneConfig, Flat] = SceneConfig(
     """Print what a capture holds."""
     from sagesplat.scene import describe, load_scene
 
-    rows = describe(load_scene(scene, downscale=scene_config.downscale, test_every=scene_config.test_every))
+    rows = describe(load_scene(scene, **asdict(scene_config)))
     width = max(len(name) for name, _ in rows)
     for name, value in rows:
         print(f"{name:{width}}  {value}")
@@ -103,16 +106,19 @@ def run(
     masks: Annotated[MasksConfig, Flat] = MasksConfig(),
     lift: LiftConfig = LiftConfig(),
     train: TrainConfig = TrainConfig(),
+    nest: NestConfig = NestConfig(),
     fit: FitConfig = FitConfig(),
     plan: Annotated[PlanConfig, Flat] = PlanConfig(),
+    ladder: LadderKind = "nested",
     machine: Annotated[Machine, Flat] = Machine(),
     seed: int = 0,
 ) -> None:
     """Everything: photos and label images in, levels, models, a plan and a report out."""
     from sagesplat import pipeline
 
-    with _job(run, machine) as job:
-        pipeline.run_all(job, scene, RunConfig(scene_config, masks, lift, train, fit, plan, seed))
+    config = RunConfig(scene_config, masks, lift, train, nest, fit, plan, ladder, seed)
+    with _job(run, machine, ladder) as job:
+        pipeline.run_all(job, scene, config)
 
 
 @command
@@ -161,20 +167,41 @@ def train(
 
 
 @command
-def observe(run: Run, fit: FitConfig = FitConfig(), machine: Annotated[Machine, Flat] = Machine()) -> None:
+def nest(
+    run: Run, nest: NestConfig = NestConfig(), machine: Annotated[Machine, Flat] = Machine(), seed: int = 0
+) -> None:
+    """Make the nested ladder: order the trained Gaussians, train their prefixes, write the chunks."""
+    from sagesplat import nesting
+
+    with _job(run, machine) as job:
+        nesting.nest_levels(job, nest, seed)
+
+
+@command
+def observe(
+    run: Run,
+    fit: FitConfig = FitConfig(),
+    ladder: LadderKind = "nested",
+    machine: Annotated[Machine, Flat] = Machine(),
+) -> None:
     """Measure every category at every level in every view."""
     from sagesplat import stages
 
-    with _job(run, machine) as job:
+    with _job(run, machine, ladder) as job:
         stages.observe_levels(job, fit)
 
 
 @command
-def fit(run: Run, fit: FitConfig = FitConfig(), machine: Annotated[Machine, Flat] = Machine()) -> None:
+def fit(
+    run: Run,
+    fit: FitConfig = FitConfig(),
+    ladder: LadderKind = "nested",
+    machine: Annotated[Machine, Flat] = Machine(),
+) -> None:
     """Fit SSIM over distance for every category and level."""
     from sagesplat import stages
 
-    with _job(run, machine) as job:
+    with _job(run, machine, ladder) as job:
         stages.fit_ladder(job, fit)
 
 
@@ -182,30 +209,31 @@ def fit(run: Run, fit: FitConfig = FitConfig(), machine: Annotated[Machine, Flat
 def plan(
     run: Run,
     plan: Annotated[PlanConfig, Flat] = PlanConfig(),
+    ladder: LadderKind = "nested",
     machine: Annotated[Machine, Flat] = Machine(),
 ) -> None:
     """Choose the cheapest levels that keep a target SSIM."""
     from sagesplat import stages
 
-    with _job(run, machine) as job:
+    with _job(run, machine, ladder) as job:
         stages.make_plan(job, plan)
 
 
 @command
-def compose(run: Run, machine: Annotated[Machine, Flat] = Machine()) -> None:
+def compose(run: Run, ladder: LadderKind = "nested", machine: Annotated[Machine, Flat] = Machine()) -> None:
     """Write the planned scene as composed.ply."""
     from sagesplat import stages
 
-    with _job(run, machine) as job:
+    with _job(run, machine, ladder) as job:
         stages.compose_plan(job)
 
 
 @command
-def evaluate(run: Run, machine: Annotated[Machine, Flat] = Machine()) -> None:
+def evaluate(run: Run, ladder: LadderKind = "nested", machine: Annotated[Machine, Flat] = Machine()) -> None:
     """Measure the plans on the test views, beside what was promised."""
     from sagesplat import stages
 
-    with _job(run, machine) as job:
+    with _job(run, machine, ladder) as job:
         stages.evaluate_plans(job)
 
 
@@ -214,19 +242,21 @@ def report(
     run: Run,
     paper: bool = False,
     settings: Annotated[PaperConfig, Flat] = PaperConfig(),
+    ladder: LadderKind = "nested",
     machine: Annotated[Machine, Flat] = Machine(),
 ) -> None:
     """Write the report; with --paper, every table and figure of the paper.
 
     Args:
         run: run folder.
-        paper: cross-view, equal occupancy, and the paper's tables and figures, in report/paper.
+        paper: cross-view, equal occupancy, and the paper's tables and figures, from its ladder of snapshots.
         settings: what they look at.
+        ladder: the ladder to report on.
         machine: where and how to compute.
     """
     from sagesplat import stages
 
-    with _job(run, machine) as job:
+    with _job(run, machine, "snapshots" if paper else ladder) as job:
         if paper:
             from sagesplat.paper import paper_report
 
@@ -236,11 +266,11 @@ def report(
 
 
 @command
-def crossview(run: Run, machine: Annotated[Machine, Flat] = Machine()) -> None:
+def crossview(run: Run, ladder: LadderKind = "nested", machine: Annotated[Machine, Flat] = Machine()) -> None:
     """Plan every unseen view by itself, and measure promise, error and regret."""
     from sagesplat.paper import cross_views
 
-    with _job(run, machine) as job:
+    with _job(run, machine, ladder) as job:
         cross_views(job)
 
 
@@ -267,7 +297,7 @@ def transfer(
     from sagesplat.transfer import transfer as evaluate_transfer
 
     out = out or run_b / "transfer"
-    with _job(run_a, machine) as job_a, _job(run_b, machine) as job_b:
+    with _job(run_a, machine, "snapshots") as job_a, _job(run_b, machine, "snapshots") as job_b:
         table, line = evaluate_transfer(job_a, job_b, out, targets, lpips)
         table = table.only("split", "predictor", "ssim error", "iteration error", "hit", "regret share")
         job_b.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
@@ -275,8 +305,8 @@ def transfer(
 
 
 @command
-def compare(
-    online: Positional[Annotated[Path, arg(metavar="RUN_ONLINE")]],
+def online(
+    stopped: Positional[Annotated[Path, arg(metavar="RUN_STOPPED")]],
     full: Positional[Annotated[Path, arg(metavar="RUN_FULL")]],
     out: Path | None = None,
     machine: Annotated[Machine, Flat] = Machine(),
@@ -284,19 +314,40 @@ def compare(
     """A run with --train.freeze-at beside snapshots of the same run without, composed for that target.
 
     Args:
-        online: run folder trained with --train.freeze-at.
+        stopped: run folder trained with --train.freeze-at.
         full: run folder trained alike, but without.
-        out: folder for the tables (default: RUN_ONLINE/online).
+        out: folder for the tables (default: RUN_STOPPED/online).
         machine: where and how to compute.
     """
     from sagesplat.events import TableMade
     from sagesplat.online import compare_online
 
-    out = out or online / "online"
-    with _job(online, machine) as job_online, _job(full, machine) as job_full:
+    out = out or stopped / "online"
+    with _job(stopped, machine, "snapshots") as job_online, _job(full, machine, "snapshots") as job_full:
         table, _ = compare_online(job_online, job_full, out)
         job_online.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
     print(out)
+
+
+@command
+def compare(
+    run: Run,
+    compare: Annotated[CompareConfig, Flat] = CompareConfig(),
+    json: Path | None = None,
+    machine: Annotated[Machine, Flat] = Machine(),
+) -> None:
+    """The nested ladder beside its baselines: 3DGS, SAGE, 3DGS pruned and tuned, 3DGS-MCMC.
+
+    Args:
+        run: run folder, finished with the nested ladder.
+        compare: which baselines; those that are trained are kept in RUN/compare.
+        json: write all that was measured here as well.
+        machine: where and how to compute.
+    """
+    from sagesplat.compare import compare as compare_methods
+
+    with _job(run, machine) as job:
+        compare_methods(job, compare, json)
 
 
 @command

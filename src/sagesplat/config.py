@@ -13,6 +13,8 @@ class SceneConfig:
     """Train on photos made this many times smaller (images_N is used where it is shipped)."""
     test_every: int = 8
     """Every n-th view by name is a test view, seen by nothing but the evaluation; 0 = none."""
+    calibrate_every: int = 8
+    """Every n-th of the others is kept from training too, to calibrate the promises on; 0 = none."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,28 @@ class TrainConfig:
 
 
 @dataclass(frozen=True)
+class NestConfig:
+    """How a trained model becomes a ladder whose levels contain each other."""
+
+    steps: int = 3000
+    """Training steps on random compositions."""
+    levels: int = 24
+    """Prefixes that are measured and planned with, in geometric steps of their size."""
+    smallest: float = 0.05
+    """Share of a category's Gaussians in its lowest level."""
+    full_share: float = 0.1
+    """Share of the steps that look at everything, to begin with."""
+    full_share_end: float = 0.9
+    """The same at the end: the whole model needs the last word."""
+    sh_bits: tuple[int, int] = (5, 4)
+    """Bits of harmonics in the chunks, of degree 1 and of those above; training gets used to them."""
+    criterion: Literal["weight", "weight-volume", "peak", "sensitivity", "opacity"] = "weight"
+    """What orders the Gaussians of a category; docs/nested.md compares them."""
+    gain: float = 4.0
+    """Rates to begin with, times those of a published run's last third; they fall to a twentieth."""
+
+
+@dataclass(frozen=True)
 class FitConfig:
     """How the quality models are fitted."""
 
@@ -109,6 +133,8 @@ class FitConfig:
     """Where a category is measured: all its pixels, or those at least 5 px from another category."""
     min_share: float = 5e-4
     """A view counts for a category if this share of its pixels, at least, is of the category."""
+    confidence: float = 0.95
+    """Share of the promises that are to be kept on views that nobody took a photo from."""
 
 
 @dataclass(frozen=True)
@@ -122,6 +148,12 @@ class PlanConfig:
     """Train a composition as a whole for so many steps, so that its categories fit each other."""
     other_targets: tuple[float, ...] | None = None
     """Targets planned and measured beside the main one (default: 0.1 below and above)."""
+    budget: float = 0.0
+    """Compose for a budget instead of the main target; 0: no budget."""
+    budget_unit: Literal["bytes", "gpu-bytes", "count"] = "bytes"
+    """Bytes to send, bytes on the viewer's GPU, or Gaussians."""
+    weights: dict[str, float] = field(default_factory=dict)
+    """How much a category counts within the budget, by name (1 unless named)."""
 
     @property
     def targets(self) -> list[float]:
@@ -144,6 +176,26 @@ class PaperConfig:
 
 
 @dataclass(frozen=True)
+class CompareConfig:
+    """Which baselines stand beside the nested ladder."""
+
+    targets: tuple[float, ...] = ()
+    """SSIM that SAGE composes for (default: 0.6 0.7 0.8, and what the run was planned for)."""
+    snapshots: int = 10
+    """At most so many of the training's snapshots, spread in size."""
+    shares: tuple[float, ...] = (0.05, 0.1, 0.2, 0.35, 0.5, 0.7)
+    """Shares of its Gaussians that the last snapshot is pruned to."""
+    tune_steps: int = 500
+    """Training steps of a pruned one; -1: as many as the nested ladder was trained on compositions."""
+    caps: tuple[float, ...] = (0.1, 0.2, 0.35, 0.5, 1.0)
+    """Caps of 3DGS-MCMC, each trained from the start, as shares of the last snapshot's Gaussians."""
+    budgets: int = 12
+    """Budgets of bytes that the nested ladder is planned for, in geometric steps."""
+    lpips: Path | None = None
+    """Folder with the weights of LPIPS (default: where `sagesplat download lpips` puts them)."""
+
+
+@dataclass(frozen=True)
 class RunConfig:
     """Everything that a run needs to be done again."""
 
@@ -151,6 +203,9 @@ class RunConfig:
     masks: MasksConfig = field(default_factory=MasksConfig)
     lift: LiftConfig = field(default_factory=LiftConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
+    nest: NestConfig = field(default_factory=NestConfig)
     fit: FitConfig = field(default_factory=FitConfig)
     plan: PlanConfig = field(default_factory=PlanConfig)
+    ladder: Literal["nested", "snapshots"] = "nested"
+    """Levels that contain each other, or the paper's: what training recorded on its way."""
     seed: int = 0

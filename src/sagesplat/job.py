@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from sagesplat.adapt.ladder import Ladder, read_ladder
+from sagesplat.adapt.ladder import Ladder, SnapshotLadder, read_ladder, read_prefixes
+from sagesplat.adapt.observe import PERCENTILE, LabelImages, RenderedLabels, distances_in_views
 from sagesplat.config import FitConfig
 from sagesplat.errors import RunError
 from sagesplat.events import Emit, StageDone, StageSkipped, StageStarted
@@ -72,9 +73,14 @@ class Job:
         return LiftedLabels.read(self.run.labels, len(self.scene.points.xyz)).label_ids
 
     @cached_property
-    def ladder(self) -> Ladder:
+    def snapshots(self) -> SnapshotLadder:
         """The levels that training recorded."""
         return read_ladder(self.run.levels)
+
+    @cached_property
+    def ladder(self) -> Ladder:
+        """The levels to choose from: prefixes of the nested model, or the snapshots."""
+        return read_prefixes(self.run.prefixes) if self.run.ladder == "nested" else self.snapshots
 
     @cached_property
     def antialiased(self) -> bool:
@@ -90,6 +96,19 @@ class Job:
     def names(self) -> dict[int, str]:
         """Category names by id, the unlabelled one included."""
         return {**self.taxonomy.names, -1: self.taxonomy.name(-1)}
+
+
+def label_images(job: Job, source: str) -> LabelImages:
+    """The label images that came with the photos ("given"), or those of the 3D labels ("rendered")."""
+    if source == "given":
+        return job.masks
+    return RenderedLabels(job.ladder.load(job.ladder.levels[-1]), job.backend, job.antialiased)
+
+
+def distances(job: Job, distance: str) -> dict[int, np.ndarray]:
+    """d_min of each category in each view, as `FitConfig.distance` says."""
+    percentile = PERCENTILE if distance == "percentile" else 0.0
+    return distances_in_views(job.scene, job.point_labels, percentile)
 
 
 def run_stage(

@@ -16,12 +16,12 @@ from sagesplat.config import PaperConfig
 from sagesplat.errors import RunError, SageError
 from sagesplat.events import Progress, RunDone, Warned
 from sagesplat.gaussians import Gaussians
-from sagesplat.job import Job, run_stage
+from sagesplat.job import Job, distances, label_images, run_stage
 from sagesplat.lpips import Lpips, Net, load_lpips, weights_path
 from sagesplat.output.paper import PaperData, Picture, four_levels, take_pictures, write_paper
 from sagesplat.output.tables import promise_kept
 from sagesplat.run_dir import file_hash, settings_of
-from sagesplat.stages import distances, tune_composition
+from sagesplat.stages import ladder_files, tune_composition, view_planner
 
 _IMAGES_A_TRAINING = 50  # a short training takes about as long as measuring so many images
 
@@ -40,9 +40,11 @@ def cross_views(job: Job) -> None:
 
     def make() -> list[str]:
         fitted = job.fit_config
+        # nobody has masks of unseen views, the paper says; a promise is measured on the photo's own
+        labels = label_images(job, fitted.masks) if run.ladder == "nested" else None
         table = cross_view(
-            job.scene, job.photos, job.ladder, read_models(run.models), targets,
-            distances(job, fitted.distance), min_share=fitted.min_share, region=fitted.region,
+            job.scene, job.photos, job.ladder, targets, view_planner(job), labels=labels,
+            min_share=fitted.min_share, region=fitted.region,
             backend=job.backend, antialiased=job.antialiased,
             progress=lambda done, total: job.emit(Progress("crossview", done, total)),
         )  # fmt: skip
@@ -53,7 +55,7 @@ def cross_views(job: Job) -> None:
             lines.append(f"SSIM {target:g}: {fared.kept} of {fared.promised} promises kept on unseen views")
         return lines
 
-    inputs = [run.scene, run.labels, run.levels, run.models, run.plan]
+    inputs = [run.scene, run.labels, *ladder_files(run), run.plan]
     run_stage(job, "crossview", {"targets": targets}, inputs, [run.cross_view], make)
 
 

@@ -4,27 +4,35 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from sagesplat import stages
+from sagesplat import nesting, stages
 from sagesplat.adapt.plan import check_target
-from sagesplat.config import PlanConfig, RunConfig, TrainConfig
+from sagesplat.config import NestConfig, PlanConfig, RunConfig, TrainConfig
 from sagesplat.demo.capture import cached_capture
 from sagesplat.errors import RunError
 from sagesplat.events import Emit, Progress, StageDone, StageStarted
 from sagesplat.job import Job
 from sagesplat.output.ply import write_ply
+from sagesplat.train import nested
 
 # the built-in capture, within minutes on two cores
-DEMO = RunConfig(train=TrainConfig(max_steps=1200, level_every=60), plan=PlanConfig(target_ssim=0.7))
+DEMO = RunConfig(
+    train=TrainConfig(max_steps=1200, level_every=60),
+    nest=NestConfig(steps=600, levels=12),
+    plan=PlanConfig(target_ssim=0.7),
+)
 
 
 def run_all(job: Job, scene: Path, config: RunConfig) -> None:
     """Every stage on one capture; those whose result is there already are skipped."""
     for target in config.plan.targets:  # before hours of training
         check_target(target)
+    nested.check(config.nest)
     stages.open_scene(job, scene, config.scene)
     stages.make_masks(job, config.masks)
     stages.lift_labels(job, config.lift)
     stages.train_levels(job, config.train, config.seed)
+    if job.run.ladder == "nested":
+        nesting.nest_levels(job, config.nest, config.seed)
     stages.observe_levels(job, config.fit)
     stages.fit_ladder(job, config.fit)
     stages.make_plan(job, config.plan)

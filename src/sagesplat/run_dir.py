@@ -4,20 +4,29 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from sagesplat import __version__
 from sagesplat.errors import RunError
 from sagesplat.files import read_json, write_json
 
-FORMAT = 1  # of the run folder; raised when older folders can no longer be read
+FORMAT = 2  # of the run folder; raised when older folders can no longer be read
+
+LadderKind = Literal["nested", "snapshots"]
+_BEFORE_LADDERS = ("scene", "masks", "lift", "train")  # stages that all ladders of a run share
 
 
 @dataclass(frozen=True)
 class RunDir:
-    """Paths inside a run folder."""
+    """Paths inside a run folder. What is made of a ladder lies in a folder of the ladder's name."""
 
     path: Path
+    ladder: LadderKind = "nested"
+
+    @property
+    def adapted(self) -> Path:
+        """What is made of the ladder."""
+        return self.path / self.ladder
 
     @property
     def scene(self) -> Path:
@@ -50,44 +59,64 @@ class RunDir:
         return self.path / "frozen.json"
 
     @property
+    def prefixes(self) -> Path:
+        """The nested ladder: one ordered set of Gaussians, its levels prefixes of it."""
+        return self.adapted / "ladder.npz"
+
+    @property
+    def chunks(self) -> Path:
+        """What each level of each category adds, as it is sent, with index.json."""
+        return self.adapted / "chunks"
+
+    @property
+    def nest_checkpoint(self) -> Path:
+        """Where training on compositions goes on."""
+        return self.adapted / "checkpoint.npz"
+
+    @property
     def observations(self) -> Path:
         """Quality per category, level and view."""
-        return self.path / "observations.csv"
+        return self.adapted / "observations.csv"
 
     @property
     def models(self) -> Path:
         """Eq. 3 per category and level."""
-        return self.path / "models.json"
+        return self.adapted / "models.json"
+
+    @property
+    def promises(self) -> Path:
+        """Quality per category and level at any viewpoint, with its lower bound."""
+        return self.adapted / "promises.json"
 
     @property
     def plan(self) -> Path:
         """Levels chosen."""
-        return self.path / "plan.json"
+        return self.adapted / "plan.json"
 
     @property
     def composed(self) -> Path:
         """The scene that the plan chose."""
-        return self.path / "composed.ply"
+        return self.adapted / "composed.ply"
 
     @property
     def evaluation(self) -> Path:
         """Composed scenes on test views."""
-        return self.path / "evaluation.csv"
+        return self.adapted / "evaluation.csv"
 
     @property
     def cross_view(self) -> Path:
         """Unseen views, each with a plan of its own."""
-        return self.path / "cross_view.csv"
+        return self.adapted / "cross_view.csv"
 
     @property
     def occupancy(self) -> Path:
         """Compositions and 3DGS of the same size."""
-        return self.path / "occupancy.csv"
+        return self.adapted / "occupancy.csv"
 
     @property
     def report(self) -> Path:
         """The report's folder."""
-        return self.path / "report"
+        return self.adapted / "report"
 
     @property
     def paper(self) -> Path:
@@ -96,7 +125,8 @@ class RunDir:
 
     def provenance(self, stage: str) -> Path:
         """What a stage's result was made from."""
-        return self.path / "provenance" / f"{stage}.json"
+        folder = self.path if stage in _BEFORE_LADDERS else self.adapted
+        return folder / "provenance" / f"{stage}.json"
 
 
 def file_hash(path: Path) -> str:

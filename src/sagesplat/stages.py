@@ -2,33 +2,34 @@
 
 import json
 import shutil
-from dataclasses import asdict, fields, replace
+from collections.abc import Callable
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sagesplat import nesting
 from sagesplat.adapt.evaluate import evaluate
 from sagesplat.adapt.model import fit_models, read_models, write_models
 from sagesplat.adapt.observe import (
-    PERCENTILE,
     TOTAL,
-    LabelImages,
-    RenderedLabels,
-    distances_in_views,
     large_enough,
     observe,
     read_observations,
 )
-from sagesplat.adapt.plan import Plan, plan_scene, plan_view, read_plans, write_plans
+from sagesplat.adapt.plan import Plan, plan_scene, plan_view, read_budget_plan, read_plans, write_plans
+from sagesplat.adapt.promise import read_promises, write_promises
+from sagesplat.adapt.promised import plan_for_scene, plan_for_view, plan_within
 from sagesplat.config import FitConfig, LiftConfig, MasksConfig, PlanConfig, SceneConfig, TrainConfig
 from sagesplat.errors import RunError
 from sagesplat.events import Progress, RunDone, TableMade, Training, Warned
 from sagesplat.files import read_json, write_json
 from sagesplat.gaussians import Gaussians
-from sagesplat.job import Job, fingerprint, run_stage
+from sagesplat.job import Job, distances, fingerprint, label_images, run_stage
 from sagesplat.output import tables
+from sagesplat.output.chunks import INDEX
 from sagesplat.output.ply import write_ply
 from sagesplat.output.report import write_report
 from sagesplat.output.summary import report_data
@@ -48,7 +49,7 @@ def open_scene(job: Job, path: Path, config: SceneConfig) -> None:
     run = job.run
     if run.path.exists() and not run.scene.exists() and any(run.path.iterdir()):
         raise RunError(f"{run.path}: not empty and not a run folder; choose a new folder")
-    scene = load_scene(path, downscale=config.downscale, test_every=config.test_every)
+    scene = load_scene(path, **asdict(config))
     settings = {"path": str(path.resolve()), **asdict(config), "fingerprint": fingerprint(scene)}
 
     def make() -> list[str]:
@@ -63,7 +64,7 @@ def open_scene(job: Job, path: Path, config: SceneConfig) -> None:
                 "views": [
                     {
                         "name": view.name,
-                        "split": "test" if row in scene.test_ids else "train",
+                        "split": scene.split(row),
                         "width": view.camera.width,
                         "height": view.camera.height,
                         "K": view.camera.K.tolist(),
@@ -203,25 +204,19 @@ def observe_levels(job: Job, config: FitConfig) -> None:
         seen = table.select(np.isin(table.view, job.scene.train_ids))
         _show(job, tables.ladder_table(seen, job.ladder.counts, job.ladder.recovering, job.names()))
         return [
-            f"{len(table):,} observations of {len(job.ladder.files)} levels in {len(job.scene.views)} views"
+            f"{len(table):,} observations of {len(job.ladder.levels)} levels in {len(job.scene.views)} views"
         ]
 
-    inputs = [run.scene, run.labels, run.levels]
+    inputs = [run.scene, run.labels, ladder_files(run)[0]]
     settings = {"distance": config.distance, "masks": config.masks}
     run_stage(job, "observe", settings, inputs, [run.observations], make)
 
 
-def label_images(job: Job, source: str) -> LabelImages:
-    """The label images that came with the photos ("given"), or those of the 3D labels ("rendered")."""
-    if source == "given":
-        return job.masks
-    return RenderedLabels(job.ladder.load(job.ladder.levels[-1]), job.backend, job.antialiased)
-
-
-def distances(job: Job, distance: str) -> dict[int, np.ndarray]:
-    """d_min of each category in each view, as `FitConfig.distance` says."""
-    percentile = PERCENTILE if distance == "percentile" else 0.0
-    return distances_in_views(job.scene, job.point_labels, percentile)
+def ladder_files(run: RunDir) -> list[Path]:
+    """What the run's levels, and the models of their quality, are read from."""
+    if run.ladder == "nested":
+        return [run.prefixes, run.chunks / INDEX, run.promises]
+    return [run.levels, run.models]
 
 
 def _show(job: Job, table: Table) -> None:
@@ -234,22 +229,60 @@ def fit_ladder(job: Job, config: FitConfig) -> None:
 
     def make() -> list[str]:
         table = large_enough(read_observations(run.observations), job.scene, config.min_share)
-        if config.region == "eroded":
-            table = replace(table, ssim=table.ssim_eroded)
+        table = nesting.eroded(table, config.region)
         models = fit_models(table, job.scene.train_ids)
         write_models(run.models, models)
         statuses = [m.status for m in models.values()]
-        return [", ".join(f"{statuses.count(s)} {s}" for s in sorted(set(statuses)))]
+        lines = [", ".join(f"{statuses.count(s)} {s}" for s in sorted(set(statuses)))]
+        if run.ladder == "nested":
+            promises = nesting.fit_viewpoints(job, table, config)
+            write_promises(run.promises, promises)
+            statuses = [m.status for m in promises.values()]
+            lines.append("promises: " + ", ".join(f"{statuses.count(s)} {s}" for s in sorted(set(statuses))))
+        return lines
 
-    settings = {"min_share": config.min_share, "region": config.region}
-    run_stage(job, "fit", settings, [run.scene, run.observations], [run.models], make)
+    settings = {name: getattr(config, name) for name in ("min_share", "region", "confidence")}
+    inputs, outputs = [run.scene, run.observations], [run.models]
+    if run.ladder == "nested":
+        inputs, outputs = [*inputs, run.prefixes, run.chunks / INDEX], [*outputs, run.promises]
+    run_stage(job, "fit", settings, inputs, outputs, make)
 
 
 def make_plan(job: Job, config: PlanConfig) -> None:
     """Choose the levels: for the scene at each target, for every view at the main one."""
     run = job.run
 
-    def make() -> list[str]:
+    def from_promises() -> list[str]:
+        costs = nesting.costs_of(job)
+        quality = nesting.quality_of(
+            job, read_promises(run.promises), distances(job, job.fit_config.distance)
+        )
+        shown = nesting.pixels_of(read_observations(run.observations), job, costs.labels, job.scene.train_ids)
+        scene_plans = [
+            plan_for_scene(quality, costs, target, config.share, shown) for target in config.targets
+        ]
+        view_plans = [
+            plan_for_view(quality, costs, config.target_ssim, row) for row in range(len(job.scene.views))
+        ]
+        within = None
+        if config.budget:
+            weights = {_label_named(job, name): weight for name, weight in config.weights.items()}
+            within = plan_within(quality, costs, config.budget, config.budget_unit, shown, weights)
+        write_plans(run.plan, scene_plans, view_plans, within)
+        full = int(costs.sent[:, -1].sum())
+        lines = [
+            f"SSIM {p.target:g}: {p.sent / 1e6:.2f} of {full / 1e6:.2f} MB, {p.count:,} Gaussians, {p.status}"
+            for p in scene_plans
+            if p.sent is not None
+        ]
+        if within and within.sent is not None:
+            lines.append(
+                f"budget {config.budget:,g} {config.budget_unit}: {within.sent / 1e6:.2f} MB, "
+                f"{within.count:,} Gaussians, {within.status}"
+            )
+        return lines
+
+    def from_models() -> list[str]:
         models, ladder = read_models(run.models), job.ladder
         table = large_enough(read_observations(run.observations), job.scene, job.fit_config.min_share)
         table = table.select(table.level == ladder.levels[-1])
@@ -270,12 +303,22 @@ def make_plan(job: Job, config: PlanConfig) -> None:
                 )
             )
         write_plans(run.plan, scene_plans, view_plans)
-        full = sum(ladder.files[-1].counts.values())
+        full = ladder.size(ladder.levels[-1])
         return [f"SSIM {p.target:g}: {p.count:,} of {full:,} Gaussians, {p.status}" for p in scene_plans]
 
-    inputs = [run.scene, run.models, run.observations, run.levels]
+    nested = run.ladder == "nested"
+    if config.budget and not nested:
+        raise RunError("--budget needs the nested ladder; leave out --ladder snapshots")
+    inputs = [run.scene, *ladder_files(run), run.observations]
     settings = asdict(config) | {"targets": config.targets}
-    run_stage(job, "plan", settings, inputs, [run.plan], make)
+    run_stage(job, "plan", settings, inputs, [run.plan], from_promises if nested else from_models)
+
+
+def _label_named(job: Job, name: str) -> int:
+    ids = {name: label for label, name in job.names().items()}
+    if name not in ids:
+        raise RunError(f"{job.run.path}: no category {name!r}; there are {', '.join(ids)}")
+    return ids[name]
 
 
 def main_target(run: RunDir) -> float:
@@ -296,9 +339,8 @@ def tune_composition(job: Job, g: Gaussians, steps: int) -> Gaussians:
     """A composition trained as a whole, with the settings of the run's training; as it is for 0 steps."""
     if steps <= 0:
         return g
-    made = settings_of(job.run, "train")
-    config = TrainConfig(**{f.name: made[f.name] for f in fields(TrainConfig) if f.name in made})
-    return tune(g, job.scene, job.photos, config, steps, seed=made["seed"], backend=job.backend)
+    seed = settings_of(job.run, "train")["seed"]
+    return tune(g, job.scene, job.photos, nesting.train_config(job), steps, seed=seed, backend=job.backend)
 
 
 def compose(job: Job, plan: Plan) -> Gaussians:
@@ -307,18 +349,55 @@ def compose(job: Job, plan: Plan) -> Gaussians:
     return tune_composition(job, job.ladder.compose(plan.levels), steps)
 
 
+def main_plan(run: RunDir) -> Plan:
+    """What the run composes: the plan for its budget, if it has one, else for its main target."""
+    return read_budget_plan(run.plan) or scene_plan(run, main_target(run))
+
+
 def compose_plan(job: Job) -> None:
     """Write the scene that the plan chose."""
     run = job.run
 
     def make() -> list[str]:
-        plan = scene_plan(run, main_target(run))
+        plan = main_plan(run)
         g = compose(job, plan)
         write_ply(run.composed, g, job.names())
-        return [f"{len(g):,} Gaussians, {plan.nbytes / 1e6:.1f} MB at 248 bytes each"]
+        sent = "" if plan.sent is None else f", {plan.sent / 1e6:.2f} MB to send"
+        return [f"{len(g):,} Gaussians, {plan.nbytes / 1e6:.1f} MB at 248 bytes each{sent}"]
 
     settings = {"tune_steps": settings_of(run, "plan").get("tune_steps", 0)}
-    run_stage(job, "compose", settings, [run.plan, run.levels], [run.composed], make)
+    run_stage(job, "compose", settings, [run.plan, ladder_files(run)[0]], [run.composed], make)
+
+
+def view_planner(job: Job) -> Callable[[int, float], Plan]:
+    """Plans single views (row of Scene.views, target SSIM), seen or not."""
+    far, ladder = distances(job, job.fit_config.distance), job.ladder
+    if job.run.ladder == "nested":
+        costs, quality = nesting.costs_of(job), nesting.quality_of(job, read_promises(job.run.promises), far)
+        return lambda row, target: plan_for_view(quality, costs, target, row)
+    models = read_models(job.run.models)
+
+    def plan(row: int, target: float) -> Plan:
+        here = {label: float(d[row]) for label, d in far.items()}
+        return plan_view(models, ladder.counts, here, target, row, recovering=ladder.recovering)
+
+    return plan
+
+
+def promised(job: Job) -> Callable[[int, int, int], float]:
+    """SSIM promised of a (label id, level) in a view (row of Scene.views); NaN where nothing is."""
+    far = distances(job, job.fit_config.distance)
+    if job.run.ladder == "nested":
+        quality = nesting.quality_of(job, read_promises(job.run.promises), far)
+        row_of = {label: i for i, label in enumerate(nesting.costs_of(job).labels)}
+        return lambda label, level, row: float(quality.bound[row, row_of[label], level - 1])
+    models = read_models(job.run.models)
+
+    def by_distance(label: int, level: int, row: int) -> float:
+        known = (label, level) in models and label in far
+        return float(models[label, level](float(far[label][row]))) if known else np.nan
+
+    return by_distance
 
 
 def evaluate_plans(job: Job) -> None:
@@ -326,11 +405,11 @@ def evaluate_plans(job: Job) -> None:
     run = job.run
 
     def make() -> list[str]:
-        fitted = job.fit_config
+        fitted, within = job.fit_config, read_budget_plan(run.plan)
+        plans = [*read_plans(run.plan)[0], *([within] if within else [])]
         table = evaluate(
-            job.scene, job.photos, label_images(job, fitted.masks), job.ladder, read_models(run.models),
-            read_plans(run.plan)[0], distances(job, fitted.distance), region=fitted.region,
-            compose=lambda plan: compose(job, plan),
+            job.scene, job.photos, label_images(job, fitted.masks), job.ladder, plans, promised(job),
+            region=fitted.region, compose=lambda plan: compose(job, plan),
             backend=job.backend, antialiased=job.antialiased,
             progress=lambda done, total: job.emit(Progress("evaluate", done, total)),
         )  # fmt: skip
@@ -341,14 +420,16 @@ def evaluate_plans(job: Job) -> None:
         whole = table.select(table.label_id == TOTAL)
         lines = []
         for target in np.unique(whole.target):
-            at = whole.select(whole.target == target)
+            within_budget = np.isnan(target)
+            at = whole.select(np.isnan(whole.target) if within_budget else whole.target == target)
+            asked = "within the budget" if within_budget else f"SSIM {target:g} asked"
             lines.append(
-                f"SSIM {target:g} asked: test views {at.ssim.mean():.3f} / {at.psnr.mean():.2f} dB "
+                f"{asked}: test views {at.ssim.mean():.3f} / {at.psnr.mean():.2f} dB "
                 f"(3DGS {at.full_ssim.mean():.3f} / {at.full_psnr.mean():.2f} dB)"
             )
         return lines
 
-    inputs = [run.scene, run.labels, run.levels, run.models, run.plan]
+    inputs = [run.scene, run.labels, *ladder_files(run), run.plan]
     settings = {"tune_steps": settings_of(run, "plan").get("tune_steps", 0)}
     run_stage(job, "evaluate", settings, inputs, [run.evaluation], make)
 

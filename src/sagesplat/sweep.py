@@ -165,7 +165,9 @@ def run_sweep(
     failed: list[str] = []
     for number, cell in enumerate(sweep, 1):
         begin = time.perf_counter()
-        job = Job(RunDir(runs / cell.name), _named(emit, cell.name), backend, threads, force)
+        job = Job(
+            RunDir(runs / cell.name, cell.config.ladder), _named(emit, cell.name), backend, threads, force
+        )
         try:
             _share_training(runs, sweep[: number - 1], cell)
             pipeline.run_all(job, cell.capture or pipeline.demo_capture(job.emit), cell.config)
@@ -229,7 +231,7 @@ def _named(emit: Emit, cell: str) -> Emit:
 
 def _measure(cell: Cell, job: Job) -> Iterator[Row]:
     """What a finished run says of each target, as a row of cells.csv."""
-    full = sum(job.ladder.files[-1].counts.values())
+    full = job.ladder.size(job.ladder.levels[-1])
     evaluation = read_evaluation(job.run.evaluation)
     seconds = float(read_json(job.run.provenance("train"))["seconds"])
     for plan in read_plans(job.run.plan)[0]:

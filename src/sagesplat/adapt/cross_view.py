@@ -10,8 +10,8 @@ from jaxtyping import Float32, Int32
 
 from sagesplat.adapt.columns import from_rows, read_columns, write_columns
 from sagesplat.adapt.ladder import Ladder
-from sagesplat.adapt.observe import TOTAL, RenderedLabels, as_unit, measure, render_rgb
-from sagesplat.adapt.plan import Models, Plan, plan_view
+from sagesplat.adapt.observe import TOTAL, LabelImages, RenderedLabels, as_unit, measure, render_rgb
+from sagesplat.adapt.plan import Plan
 from sagesplat.gaussians import Gaussians
 from sagesplat.raster import Backend, Workspace
 from sagesplat.scene.images import Photos
@@ -66,27 +66,30 @@ def cross_view(
     scene: Scene,
     photos: Photos,
     ladder: Ladder,
-    models: Models,
     targets: Sequence[float],
-    distances: Mapping[int, Float32[np.ndarray, " V"]],
+    plan_for: Callable[[int, float], Plan],
     *,
+    labels: LabelImages | None = None,
     min_share: float = 0.0,
     region: Literal["mask", "eroded"] = "mask",
     backend: Backend = "auto",
     antialiased: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> CrossView:
-    """Plan each test view from its distances, compose, and measure per rendered mask, beside an oracle.
+    """Plan each test view, compose, and measure per category, beside an oracle.
+
+    `plan_for` (row of Scene.views, target). `labels`: the pixels of each category (default: as the Gaussians
+    paint them, as nobody has masks of unseen views).
 
     The oracle knows what every settled level measures in that view. Categories with less than `min_share` of
     the rendered pixels are planned but make no row. `region`: where SSIM is measured. `progress` hears
     (images measured, images in all).
     """
     rows: list[dict[str, float]] = []
-    labels = RenderedLabels(ladder.load(ladder.levels[-1]), backend, antialiased)
+    labels = labels or RenderedLabels(ladder.load(ladder.levels[-1]), backend, antialiased)
     workspace = Workspace()
     views = scene.test_ids.tolist()
-    done, total = 0, len(views) * (len(ladder.files) + len(targets))
+    done, total = 0, len(views) * (len(ladder.levels) + len(targets))
 
     def measured(g: Gaussians, row: int) -> dict[int, dict[str, float]]:
         nonlocal done
@@ -105,9 +108,8 @@ def cross_view(
         g = ladder.load(level)
         at_level[level] = {row: measured(g, row) for row in views}
     for row in views:
-        here = {label: float(d[row]) for label, d in distances.items()}
         for target in targets:
-            plan = plan_view(models, ladder.counts, here, target, row, recovering=ladder.recovering)
+            plan = plan_for(row, target)
             composed = measured(ladder.compose(plan.levels), row)
             levels = {level: views_of[row] for level, views_of in at_level.items()}
             rows += _rows(plan, composed, levels, ladder, min_share)

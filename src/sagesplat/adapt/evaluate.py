@@ -1,6 +1,6 @@
 """Evaluation: composed scenes measured on views that nothing was fitted to, beside the promise."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
@@ -11,7 +11,7 @@ from jaxtyping import Float32, Int32
 from sagesplat.adapt.columns import from_rows, read_columns, write_columns
 from sagesplat.adapt.ladder import Ladder
 from sagesplat.adapt.observe import LabelImages, as_unit, erode, measure, render_rgb
-from sagesplat.adapt.plan import Models, Plan
+from sagesplat.adapt.plan import Plan
 from sagesplat.gaussians import Gaussians
 from sagesplat.raster import Backend, Workspace, device_of
 from sagesplat.scene.images import Photos
@@ -22,7 +22,7 @@ from sagesplat.scene.scene import Scene
 class Evaluation:
     """One row per (target, view, category) and one per (target, view) for the whole image; equal lengths."""
 
-    target: Float32[np.ndarray, " R"]  # SSIM asked for
+    target: Float32[np.ndarray, " R"]  # SSIM asked for; NaN for a plan within a budget
     view: Int32[np.ndarray, " R"]  # row in Scene.views
     label_id: Int32[np.ndarray, " R"]  # category id, -1 = unlabelled, -2 = the whole image
     level: Int32[np.ndarray, " R"]  # the level chosen, a training step; -1 for the whole image
@@ -55,9 +55,8 @@ def evaluate(
     photos: Photos,
     masks: LabelImages,
     ladder: Ladder,
-    models: Models,
     plans: Sequence[Plan],
-    distances: Mapping[int, Float32[np.ndarray, " V"]],
+    promised: Callable[[int, int, int], float],
     *,
     region: Literal["mask", "eroded"] = "mask",
     compose: Callable[[Plan], Gaussians] | None = None,
@@ -65,10 +64,11 @@ def evaluate(
     antialiased: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Evaluation:
-    """Measure each plan's composition and full 3DGS on the test views, beside what the models promise there.
+    """Measure each plan's composition and the whole model on the test views, beside what is promised there.
 
-    `region`: where a category's SSIM is measured. `compose`: the Gaussians of a plan (default: its
-    levels as they are). `progress` hears (images measured, images in all).
+    `promised` (label id, level, row of Scene.views): SSIM, NaN where nothing is. `region`: where a category's
+    SSIM is measured. `compose`: the Gaussians of a plan (default: its levels as they are). `progress` hears
+    (images measured, images in all).
     """
     ssim = "ssim_eroded" if region == "eroded" else "ssim"
     rows: list[dict[str, float]] = []
@@ -93,12 +93,9 @@ def evaluate(
         for row, measured in measure_all(compose(plan) if compose else ladder.compose(plan.levels)):
             for label, values in measured.items():
                 level = plan.levels.get(label, -1)
-                predicted = np.nan
-                if (label, level) in models:
-                    predicted = float(models[label, level](float(distances[label][row])))
                 rows.append({
                     "target": plan.target, "view": row, "label_id": label, "level": level,
-                    "predicted": predicted,
+                    "predicted": promised(label, level, row) if label in plan.levels else np.nan,
                     "ssim": values[ssim], "psnr": values["psnr"], "num_pixels": values["num_pixels"],
                     "full_ssim": full[row][label][ssim], "full_psnr": full[row][label]["psnr"],
                 })  # fmt: skip

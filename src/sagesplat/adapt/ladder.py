@@ -2,16 +2,52 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
 
 from sagesplat.errors import RunError
 from sagesplat.gaussians import Gaussians, concat
-from sagesplat.train.levels import LevelFile, read_header, read_level
+from sagesplat.train.levels import LevelFile, read_header, read_level, read_sizes
+
+
+class Ladder(Protocol):
+    """Levels of quality, each category by itself: snapshots of a training, or prefixes of one model."""
+
+    @property
+    def levels(self) -> list[int]:
+        """Their numbers, ascending: training steps of snapshots, 1 to K of prefixes."""
+        ...
+
+    @property
+    def counts(self) -> dict[tuple[int, int], int]:
+        """Gaussians of each (label id, level)."""
+        ...
+
+    @property
+    def recovering(self) -> frozenset[int]:
+        """Levels taken soon after an opacity reset."""
+        return frozenset()
+
+    def load(self, level: int, label_ids: Sequence[int] | None = None) -> Gaussians:
+        """The Gaussians of one level, or of some of its categories."""
+        ...
+
+    def size(self, level: int) -> int:
+        """Gaussians of a level, all categories together."""
+        return sum(n for (_, at), n in self.counts.items() if at == level)
+
+    def compose(self, levels: Mapping[int, int]) -> Gaussians:
+        """The union over categories of the Gaussians of each at its level (label id -> level)."""
+        ...
 
 
 @dataclass(frozen=True)
-class Ladder:
-    """Levels by training step, in ascending order."""
+class SnapshotLadder(Ladder):
+    """The paper's: what training recorded on its way."""
 
     files: tuple[LevelFile, ...]
 
@@ -32,14 +68,14 @@ class Ladder:
         return frozenset(f.step for f in self.files if f.recovering)
 
     def load(self, level: int, label_ids: Sequence[int] | None = None) -> Gaussians:
-        """The Gaussians of one level, or of some of its categories."""
+        """See `Ladder`."""
         for file in self.files:
             if file.step == level:
                 return read_level(file.path, label_ids)
-        raise RunError(f"level {level} is not in the ladder; it has {self.levels}")
+        raise _unknown(level, self.levels)
 
     def compose(self, levels: Mapping[int, int]) -> Gaussians:
-        """The union over categories of the Gaussians of each at its level (label id -> level)."""
+        """See `Ladder`."""
         return concat(
             [
                 self.load(level, [i for i, at in levels.items() if at == level])
@@ -48,9 +84,57 @@ class Ladder:
         )
 
 
-def read_ladder(folder: Path) -> Ladder:
-    """The ladder in a `levels` folder."""
+@dataclass(frozen=True)
+class PrefixLadder(Ladder):
+    """Ours: one ordered set of Gaussians per category; level k is its first `sizes[label][k - 1]`."""
+
+    path: Path
+    sizes: dict[int, tuple[int, ...]]
+
+    @property
+    def levels(self) -> list[int]:
+        """1 to K."""
+        return list(range(1, 1 + max(map(len, self.sizes.values()))))
+
+    @property
+    def counts(self) -> dict[tuple[int, int], int]:
+        """Gaussians of each (label id, level)."""
+        return {(label, k): n for label, sizes in self.sizes.items() for k, n in enumerate(sizes, 1)}
+
+    @cached_property
+    def gaussians(self) -> Gaussians:
+        """All of them, by category and in its order."""
+        return read_level(self.path)
+
+    def load(self, level: int, label_ids: Sequence[int] | None = None) -> Gaussians:
+        """See `Ladder`."""
+        return self.compose(dict.fromkeys(self.sizes if label_ids is None else label_ids, level))
+
+    def compose(self, levels: Mapping[int, int]) -> Gaussians:
+        """See `Ladder`."""
+        rows, labels = [], self.gaussians.label_ids.numpy()
+        for label, level in levels.items():
+            if not 1 <= level <= len(self.levels):
+                raise _unknown(level, self.levels)
+            if label in self.sizes:
+                rows.append(np.flatnonzero(labels == label)[: self.sizes[label][level - 1]])
+        return self.gaussians.select(torch.from_numpy(np.sort(np.concatenate([*rows, np.arange(0)]))))
+
+
+def _unknown(level: int, levels: list[int]) -> RunError:
+    return RunError(f"level {level} is not in the ladder; it has {levels}")
+
+
+def read_ladder(folder: Path) -> SnapshotLadder:
+    """The snapshots in a `levels` folder."""
     files = tuple(sorted((read_header(p) for p in folder.glob("*.npz")), key=lambda f: f.step))
     if not files:
         raise RunError(f"{folder}: no levels; run `sagesplat train` first")
-    return Ladder(files)
+    return SnapshotLadder(files)
+
+
+def read_prefixes(path: Path) -> PrefixLadder:
+    """The nested ladder in a file."""
+    if not path.exists():
+        raise RunError(f"{path}: no nested ladder; run `sagesplat nest` first")
+    return PrefixLadder(path, read_sizes(path))

@@ -200,7 +200,7 @@ def observe(
     """
     rows: list[dict[str, float]] = []
     inner = [erode(masks[view]) for view in scene.views]
-    done, total = 0, len(ladder.files) * len(scene.views)
+    done, total = 0, len(ladder.levels) * len(scene.views)
     workspace = Workspace()
     for level in ladder.levels:
         g = ladder.load(level).to(device_of(backend))

@@ -1,6 +1,6 @@
 """Quality at equal occupancy (Table IV of the paper): compositions against 3DGS of the same size."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import NamedTuple
@@ -16,9 +16,10 @@ from sagesplat.adapt.plan import Plan
 from sagesplat.gaussians import Gaussians
 from sagesplat.lpips import Lpips
 from sagesplat.metrics import psnr, squared_error_map, ssim_map
-from sagesplat.raster import Backend, Workspace, add_weights
+from sagesplat.raster import Backend, Workspace
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
+from sagesplat.train.importance import importance
 
 METHODS = ("SAGE", "SAGE, tuned", "3DGS, snapshot", "3DGS, pruned and tuned", "3DGS, whole")
 WHOLE = len(METHODS) - 1
@@ -56,18 +57,6 @@ def read_occupancy(path: Path) -> Occupancy:
     return read_columns(path, Occupancy, "run `sagesplat report --paper` again")
 
 
-def importance(
-    g: Gaussians, scene: Scene, views: Collection[int], *, antialiased: bool = False
-) -> np.ndarray:
-    """Each Gaussian's blending weight summed over all pixels of `views`: float32 [N]."""
-    weights, workspace = np.zeros((len(g), 1), np.float32), Workspace()
-    for row in views:
-        camera = scene.views[row].camera
-        columns = np.zeros((camera.height, camera.width), np.int64)
-        add_weights(g, camera, columns, weights, antialiased=antialiased, workspace=workspace)
-    return weights[:, 0]
-
-
 def prune_to(g: Gaussians, count: int, weights: np.ndarray) -> Gaussians:
     """The `count` Gaussians of the largest weight, in their order."""
     kept = np.sort(np.argsort(-weights, kind="stable")[:count])
@@ -76,8 +65,8 @@ def prune_to(g: Gaussians, count: int, weights: np.ndarray) -> Gaussians:
 
 def nearest_snapshot(ladder: Ladder, count: int) -> int:
     """The level nearest in size to `count`, the latest of several; one soon after a reset only if all are."""
-    settled = [f for f in ladder.files if not f.recovering] or list(ladder.files)
-    return min(settled, key=lambda f: (abs(sum(f.counts.values()) - count), -f.step)).step
+    settled = [level for level in ladder.levels if level not in ladder.recovering] or ladder.levels
+    return min(settled, key=lambda level: (abs(ladder.size(level) - count), -level))
 
 
 def contenders(

@@ -1,8 +1,9 @@
 """Which level of each category meets a target SSIM at the least Gaussians (Eq. 1 of the paper)."""
 
 import math
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ class Choice:
     distance: float  # of the view, world units; NaN in a scene and where unknown
     count: int  # Gaussians
     status: str  # one of STATUSES; "infeasible" is the best attainable, "no model" the highest level
+    sent: int | None = None  # bytes of its chunks; None where the ladder has none
 
     @property
     def nbytes(self) -> int:
@@ -40,10 +42,13 @@ class Choice:
 class Plan:
     """One level per category, for one view or for a whole scene."""
 
-    target: float  # SSIM that every category is to reach
+    target: float  # SSIM that every category is to reach; NaN for a plan within a budget
     view: int | None  # row in Scene.views; None = the scene
     choices: tuple[Choice, ...]  # ordered by label id
     share: float | None = None  # of the views that must reach the target; None for one view
+    budget: float | None = None  # what the composition may cost, in `unit`
+    unit: str | None = None  # bytes, gpu-bytes or count
+    fits: bool = True  # whether it keeps the budget
 
     @property
     def levels(self) -> dict[int, int]:
@@ -61,8 +66,16 @@ class Plan:
         return sum(choice.nbytes for choice in self.choices)
 
     @property
+    def sent(self) -> int | None:
+        """Bytes of the chunks to send; None where the ladder has none."""
+        sizes = [choice.sent for choice in self.choices]
+        return None if None in sizes else sum(size for size in sizes if size is not None)
+
+    @property
     def status(self) -> str:
-        """Whether every category with a model meets the target: "ok" or "infeasible"."""
+        """ "ok", or "infeasible" where a category with a model misses the target, or "over budget"."""
+        if not self.fits:
+            return "over budget"
         return "infeasible" if self.infeasible else "ok"
 
     @property
@@ -173,25 +186,42 @@ def _check(name: str, value: float) -> None:
         raise RunError(f"{name} {value} is impossible; choose a number above 0 and at most 1, such as 0.9")
 
 
-def write_plans(path: Path, scene_plans: Sequence[Plan], view_plans: Sequence[Plan] = ()) -> None:
-    """plan.json: the targets, the plans of the scene (one or more targets) and those of single views."""
+def write_plans(
+    path: Path, scene_plans: Sequence[Plan], view_plans: Sequence[Plan] = (), budget_plan: Plan | None = None
+) -> None:
+    """plan.json: the plans of the scene (one or more targets), those of single views, one for a budget."""
     document = {
         "targets": sorted({plan.target for plan in (*scene_plans, *view_plans)}),
         "scene": [_to_json(plan) for plan in scene_plans],
         "views": [_to_json(plan) for plan in view_plans],
     }
+    if budget_plan:
+        document["budget"] = _to_json(budget_plan)
     write_json(path, document)
 
 
 def read_plans(path: Path) -> tuple[tuple[Plan, ...], tuple[Plan, ...]]:
     """The scene's plans and the single views' that `write_plans` wrote; DataError for unusable content."""
     document = read_json(path)
-    try:
+    with _usable(path):
         scene_plans = tuple(_from_json(entry) for entry in document["scene"])
         view_plans = tuple(_from_json(entry) for entry in document["views"])
+        return scene_plans, view_plans
+
+
+def read_budget_plan(path: Path) -> Plan | None:
+    """The plan for a budget, if there is one; DataError for unusable content."""
+    document = read_json(path)
+    with _usable(path):
+        return _from_json(document["budget"]) if "budget" in document else None
+
+
+@contextmanager
+def _usable(path: Path) -> Iterator[None]:
+    try:
+        yield
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise DataError(f"{path}: not a file of plans ({error!r}); plan again") from None
-    return scene_plans, view_plans
 
 
 def _to_json(plan: Plan) -> dict[str, Any]:
@@ -201,13 +231,18 @@ def _to_json(plan: Plan) -> dict[str, Any]:
         | {"nbytes": choice.nbytes}
         for choice in plan.choices
     ]
-    totals = {"count": plan.count, "nbytes": plan.nbytes, "status": plan.status, "binding": plan.binding}
-    return {"target": plan.target, "view": plan.view, "share": plan.share, **totals, "choices": choices}
+    own = {f.name: getattr(plan, f.name) for f in fields(plan) if f.name != "choices"}
+    own["target"] = None if math.isnan(plan.target) else plan.target
+    totals = {n: getattr(plan, n) for n in ("count", "nbytes", "sent", "status", "binding")}
+    return {**own, **totals, "choices": choices}
 
 
 def _from_json(entry: dict[str, Any]) -> Plan:
     def number(value: float | None) -> float:
         return math.nan if value is None else float(value)
+
+    def maybe(kind: Callable[[Any], Any], value: Any) -> Any:
+        return None if value is None else kind(value)
 
     choices = tuple(
         Choice(
@@ -217,15 +252,18 @@ def _from_json(entry: dict[str, Any]) -> Plan:
             distance=number(choice["distance"]),
             count=int(choice["count"]),
             status=str(choice["status"]),
+            sent=maybe(int, choice.get("sent")),
         )
         for choice in entry["choices"]
     )
     if unknown := {choice.status for choice in choices} - set(STATUSES):
         raise ValueError(f"unknown status {unknown.pop()!r}")
-    view, share = entry["view"], entry["share"]
     return Plan(
-        target=float(entry["target"]),
-        view=None if view is None else int(view),
+        target=number(entry["target"]),
+        view=maybe(int, entry["view"]),
         choices=choices,
-        share=None if share is None else float(share),
+        share=maybe(float, entry["share"]),
+        budget=maybe(float, entry.get("budget")),
+        unit=maybe(str, entry.get("unit")),
+        fits=bool(entry.get("fits", True)),
     )

@@ -24,7 +24,7 @@ from sagesplat.scene.scene import Scene
 from sagesplat.segment.masks import UNLABELLED, Masks
 
 PANELS = 3  # views shown in pictures
-STAGES = ("scene", "masks", "lift", "train", "observe", "fit", "plan", "compose", "evaluate")
+STAGES = ("scene", "masks", "lift", "train", "nest", "observe", "fit", "plan", "compose", "evaluate")
 
 
 def report_data(

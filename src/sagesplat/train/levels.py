@@ -5,10 +5,11 @@ coefficient. Categories are read one by one, so that a composition touches only 
 """
 
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tokenize import TokenError
+from typing import Any
 
 import numpy as np
 import torch
@@ -36,7 +37,23 @@ class LevelFile:
 
 def write_level(folder: Path, step: int, g: Gaussians, *, recovering: bool, sh_degree: int) -> Path:
     """Record Gaussians as a level; harmonics above `sh_degree` (not yet in use) are left out."""
-    arrays: dict[str, np.ndarray] = {"meta": np.array([step, recovering, sh_degree], np.int64)}
+    path = folder / f"{step:06d}.npz"
+    _write(path, step, g, recovering, sh_degree, {})
+    return path
+
+
+def write_prefixes(
+    path: Path, g: Gaussians, step: int, sizes: Mapping[int, Sequence[int]], **more: Any
+) -> None:
+    """Record a nested ladder: Gaussians in their category's order, and its levels' sizes; `more` arrays."""
+    arrays = {f"{label}/sizes": np.array(n, np.int64) for label, n in sizes.items()}
+    _write(path, step, g, False, g.sh_degree, arrays | {f"more/{k}": np.asarray(v) for k, v in more.items()})
+
+
+def _write(
+    path: Path, step: int, g: Gaussians, recovering: bool, sh_degree: int, more: dict[str, Any]
+) -> None:
+    arrays: dict[str, np.ndarray] = {"meta": np.array([step, recovering, sh_degree], np.int64), **more}
     for label in g.counts():
         part = g.of_labels([label])
         values = {name: p.detach().numpy() for name, p in part.parameters().items()}
@@ -52,10 +69,26 @@ def write_level(folder: Path, step: int, g: Gaussians, *, recovering: bool, sh_d
             "shN_scale": scale.astype(np.float32),
         }
         arrays |= {f"{label}/{name}": column for name, column in columns.items()}
-    path = folder / f"{step:06d}.npz"
     with atomic_path(path) as temporary:
         np.savez(temporary, allow_pickle=False, **arrays)
-    return path
+
+
+def read_sizes(path: Path) -> dict[int, tuple[int, ...]]:
+    """Level sizes of a nested ladder by label id; `DataError` for anything else."""
+    counts = read_header(path).counts
+    with _open(path) as file:
+        try:
+            sizes = {label: tuple(file[f"{label}/sizes"].tolist()) for label in counts}
+        except _DAMAGED as error:
+            raise DataError(f"{path}: not a nested ladder ({error}); run `sagesplat nest` again") from None
+    lengths = {len(s) for s in sizes.values()}
+    if (
+        len(lengths) > 1
+        or any(s != tuple(sorted(s)) or s[0] < 0 or s[-1] != counts[i] for i, s in sizes.items() if s)
+        or 0 in lengths
+    ):
+        raise DataError(f"{path}: level sizes that do not fit its Gaussians; run `sagesplat nest` again")
+    return sizes
 
 
 def _open(path: Path) -> np.lib.npyio.NpzFile:
@@ -70,7 +103,7 @@ def read_header(path: Path) -> LevelFile:
     with _open(path) as file:
         try:
             step, recovering, degree = file["meta"].tolist()
-            labels = sorted({int(name.split("/")[0]) for name in file.files if "/" in name})
+            labels = sorted({int(n.split("/")[0]) for n in file.files if n.endswith("/logit_opacities")})
             counts = {label: len(file[f"{label}/logit_opacities"]) for label in labels}
         except _DAMAGED as error:
             raise DataError(f"{path}: not a level ({error}); run `sagesplat train` again") from None

@@ -13,6 +13,7 @@ from sagesplat.metrics import photometric_loss
 from sagesplat.raster import Backend, Render, Workspace, device_of, rasterize
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
+from sagesplat.sh import in_buckets
 from sagesplat.train import densify, mcmc, optim
 from sagesplat.train.feed import Feed
 from sagesplat.train.freeze import Work, trainable_rows
@@ -34,6 +35,7 @@ class Stepper:
     backend: Backend = "auto"
     group: Group = ALONE
     rest: Rest | None = None
+    sh_bits: tuple[int, int] | None = None  # draw harmonics in the buckets that SPZ will put them in
     drawn: float = 1.0  # share of the tiles that the last step drew
     workspace: Workspace = field(default_factory=Workspace)
 
@@ -46,17 +48,23 @@ class Stepper:
         factor: int = 1,
         observing: bool = False,
         wander: float = 0.0,
+        drawn_rows: Tensor | None = None,
     ) -> Tensor:
         """One step on photos `factor` times smaller; the loss, on the device.
 
         `observing`: add to the statistics that densification asks for. `wander`: MCMC's noise (see `Pace`).
+        `drawn_rows` (indices): only these Gaussians are there in this step, the others stay as they are.
         """
         batch = max(self.config.batch, self.group.size)
         views = self.group.share([self._next_view(state) for _ in range(batch)])
         if state.queue:
             self.feed.expect(state.queue[-1 - self.group.rank % len(state.queue)], factor)
-        leaves = {name: p.detach().requires_grad_() for name, p in state.gaussians.parameters().items()}
-        moving = replace(state.gaussians, **leaves)
+        shown = state.gaussians if drawn_rows is None else state.gaussians.select(drawn_rows)
+        leaves = {name: p.detach().requires_grad_() for name, p in shown.parameters().items()}
+        moving = replace(shown, **leaves)
+        if self.sh_bits:  # rounded, while gradients pass as if they were not
+            off = in_buckets(shown.shN, self.sh_bits) - shown.shN
+            moving = replace(moving, shN=leaves["shN"] + off)
         losses: list[Tensor] = []
         self.drawn = 0.0
         grads: dict[str, Tensor] = {}
@@ -79,6 +87,8 @@ class Stepper:
         if batch > 1:
             self.group.add(total, *grads.values())
             grads = {name: grad / batch for name, grad in grads.items()}
+        if drawn_rows is not None:
+            grads, trainable = _spread(grads, drawn_rows, trainable)
         if self.rest:
             self.rest.watch(grads)
         state.step += 1
@@ -121,6 +131,17 @@ class Stepper:
                 if not self.work.finished(view) or state.rng.random() < FINISHED_SHARE
             ]
         return state.queue.pop()
+
+
+def _spread(grads: Mapping[str, Tensor], rows: Tensor, trainable: Tensor) -> tuple[dict[str, Tensor], Tensor]:
+    """Gradients of some rows among zeros for all, and the trainable ones among these rows."""
+    spread = {}
+    for name, grad in grads.items():
+        spread[name] = grad.new_zeros(len(trainable), *grad.shape[1:])
+        spread[name][rows] = grad
+    there = torch.zeros_like(trainable)
+    there[rows] = trainable[rows]
+    return spread, there
 
 
 def tune(

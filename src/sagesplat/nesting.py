@@ -1,0 +1,177 @@
+"""The nested ladder of a run: its training, its costs, and what is promised of it."""
+
+import json
+from dataclasses import asdict, fields, replace
+
+import numpy as np
+import torch
+
+from sagesplat.adapt.observe import TOTAL, Observations, as_unit, large_enough, measure, render_rgb
+from sagesplat.adapt.promise import ViewModel, among_neighbours, fit_promises
+from sagesplat.adapt.promised import Costs, Quality, plan_for_view
+from sagesplat.config import FitConfig, NestConfig, TrainConfig
+from sagesplat.events import Progress
+from sagesplat.gaussians import Gaussians
+from sagesplat.job import Job, distances, label_images, run_stage
+from sagesplat.output.chunks import packed, read_chunks, read_index, totals, write_chunks
+from sagesplat.raster import Workspace
+from sagesplat.run_dir import file_hash, settings_of
+from sagesplat.scene.scene import Scene
+from sagesplat.segment.masks import UNLABELLED
+from sagesplat.train import nested
+from sagesplat.train.levels import write_prefixes
+from sagesplat.train.nested import Nested, NestStep
+
+_TARGETS = tuple(np.arange(0.5, 0.96, 0.05).round(2).tolist())  # SSIM of the compositions that are looked at
+
+
+def train_config(job: Job) -> TrainConfig:
+    """How the run was trained."""
+    made = settings_of(job.run, "train")
+    return TrainConfig(**{f.name: made[f.name] for f in fields(TrainConfig) if f.name in made})
+
+
+def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
+    """Order the trained Gaussians and train their prefixes; write the ladder and its chunks."""
+    run = job.run
+    nested.check(config)
+    settings = {**asdict(config), "seed": seed}
+
+    def make() -> list[str]:
+        full = job.snapshots.load(job.snapshots.levels[-1])
+        ordered = nested.order(full, job.scene, job.masks, config, antialiased=job.antialiased)
+        belongs = json.dumps({**settings, "scene": file_hash(run.scene), "levels": file_hash(run.levels)})
+        if job.force:
+            run.nest_checkpoint.unlink(missing_ok=True)
+        trained = ordered
+        for event in nested.nest(
+            ordered, job.scene, job.photos, train_config(job), config,
+            seed=seed, backend=job.backend, checkpoint=run.nest_checkpoint, settings=belongs,
+        ):  # fmt: skip
+            if isinstance(event, NestStep):
+                job.emit(Progress("nest", event.step, config.steps, f"loss {event.loss:.3f}"))
+            else:
+                trained = event
+        lines = _write_ladder(job, trained, config)
+        run.nest_checkpoint.unlink(missing_ok=True)
+        return lines
+
+    inputs = [run.scene, run.labels, run.levels]
+    run_stage(job, "nest", settings, inputs, [run.prefixes, run.chunks], make)
+
+
+def _write_ladder(job: Job, trained: Nested, config: NestConfig) -> list[str]:
+    counts = trained.gaussians.counts()
+    sizes = {
+        label: nested.level_sizes(n, config, trained.boundary.get(label, 0)) for label, n in counts.items()
+    }
+    rows = packed(trained.gaussians, sizes, sh_bits=config.sh_bits)
+    ordered = trained.gaussians.select(torch.from_numpy(rows))
+    chunks = write_chunks(
+        job.run.chunks, ordered, sizes, job.names(), sh_bits=config.sh_bits, antialiased=job.antialiased
+    )
+    # what is measured, planned and written from here on is what a viewer gets
+    sent = read_chunks(job.run.chunks, chunks)
+    write_prefixes(job.run.prefixes, sent, config.steps, sizes, clarity=trained.clarity[rows])
+    size, n = sum(chunk.nbytes for chunk in chunks), len(trained.gaussians)
+    across = sum(trained.boundary.values())
+    lost = _quality(job, ordered) - _quality(job, sent)
+    return [
+        f"{config.levels} levels, {n:,} Gaussians, {across:,} of them across borders and in every level",
+        f"{size / 1e6:.2f} MB in {len(chunks)} SPZ files, {size / n:.1f} bytes a Gaussian; "
+        f"encoding costs {lost:.4f} of SSIM",
+    ]
+
+
+def _quality(job: Job, g: Gaussians) -> float:
+    """Mean SSIM over some of the training views."""
+    found = []
+    for row in some_of(job.scene.train_ids):
+        view = job.scene.views[row]
+        image = render_rgb(g, view.camera, backend=job.backend, antialiased=job.antialiased)
+        found.append(measure(image, as_unit(job.photos[row]), job.masks[view])[TOTAL]["ssim"])
+    return float(np.mean(found))
+
+
+def some_of(rows: np.ndarray) -> list[int]:
+    """About 16 of the rows, evenly spread."""
+    return rows[:: max(1, len(rows) // 16)].tolist()
+
+
+def fit_viewpoints(job: Job, table: Observations, config: FitConfig) -> dict[int, ViewModel]:
+    """Promises for every category but the unlabelled pixels, which nobody asks for: they are shipped whole.
+
+    `table`: observations of views that show enough of a category. Levels are measured with everything at the
+    same one; what a category gains or loses among neighbours at others is measured on compositions planned
+    for the calibration views (some training views where there are none).
+    """
+    table = table.select(table.label_id != UNLABELLED)
+    promises = fit_promises(table, job.scene, config.confidence)
+    far, costs = distances(job, config.distance), costs_of(job)
+    quality, masks = quality_of(job, promises, far), label_images(job, config.masks)
+    keys = zip(table.label_id.tolist(), table.level.tolist(), table.view.tolist(), strict=True)
+    alone = dict(zip(keys, table.ssim.tolist(), strict=True))
+    changes: dict[int, list[float]] = {}
+    rows = job.scene.calibration_ids.tolist() or some_of(job.scene.train_ids)
+    workspace = Workspace()
+    for done, row in enumerate(rows, 1):
+        view = job.scene.views[row]
+        plans = [plan_for_view(quality, costs, target, row).levels for target in _TARGETS]
+        for levels in {tuple(plan.items()): plan for plan in plans}.values():
+            g = job.ladder.compose(levels)
+            image = render_rgb(
+                g, view.camera, backend=job.backend, antialiased=job.antialiased, workspace=workspace
+            )
+            for label, found in measure(image, as_unit(job.photos[row]), masks[view]).items():
+                key = label, levels.get(label, -1), row
+                if key in alone:
+                    ssim = found["ssim_eroded" if config.region == "eroded" else "ssim"]
+                    changes.setdefault(label, []).append(ssim - alone[key])
+        job.emit(Progress("fit", done, len(rows)))
+    return among_neighbours(promises, {label: np.array(change) for label, change in changes.items()})
+
+
+def costs_of(job: Job) -> Costs:
+    """What the levels of the run's nested ladder cost."""
+    labels = sorted({label for label, _ in job.ladder.counts})
+    levels = len(job.ladder.levels)
+    chunks = read_index(job.run.chunks)
+    count, sent, gpu = (totals(chunks, labels, levels, name) for name in ("count", "nbytes", "gpu_bytes"))
+    return Costs(tuple(labels), count, sent, gpu)
+
+
+def viewpoints(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Where each view looks from and to: positions [V, 3], world, and unit directions [V, 3]."""
+    cameras = [view.camera for view in scene.views]
+    return np.stack([c.position for c in cameras]), np.stack([c.w2c[2, :3] for c in cameras])
+
+
+def quality_of(job: Job, promises: dict[int, ViewModel], distances: dict[int, np.ndarray]) -> Quality:
+    """What the promises say of every view of the scene."""
+    costs = costs_of(job)
+    shape = len(job.scene.views), *costs.count.shape
+    position, direction = viewpoints(job.scene)
+    mean, bound, far = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape[:2], np.nan)
+    for i, label in enumerate(costs.labels):
+        far[:, i] = distances.get(label, far[:, i])
+        if label in promises:
+            told = promises[label].predict(far[:, i], position, direction)
+            known = np.array(promises[label].levels) - 1
+            mean[:, i, known], bound[:, i, known] = told.mean, told.bound
+    return Quality(mean, bound, far)
+
+
+def pixels_of(table: Observations, job: Job, labels: tuple[int, ...], views: np.ndarray) -> np.ndarray:
+    """Pixels of each category in each view, float64 [V, L]; 0 for other views and for small shares."""
+    table = large_enough(table, job.scene, job.fit_config.min_share)
+    table = table.select((table.level == table.level.max(initial=0)) & np.isin(table.view, views))
+    pixels = np.zeros((len(job.scene.views), len(labels)))
+    for i, label in enumerate(labels):
+        mine = table.select(table.label_id == label)
+        pixels[mine.view, i] = mine.num_pixels
+    return pixels
+
+
+def eroded(table: Observations, region: str) -> Observations:
+    """The table with SSIM as `FitConfig.region` measures it."""
+    return replace(table, ssim=table.ssim_eroded) if region == "eroded" else table

@@ -1,0 +1,122 @@
+"""Chunks of a nested ladder: one file per category and level, each only what the level adds."""
+
+import hashlib
+import re
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Int64
+
+from sagesplat.errors import DataError
+from sagesplat.files import read_json, write_json
+from sagesplat.gaussians import Gaussians, concat
+from sagesplat.output.ply import write_ply
+from sagesplat.output.spz import SH_BITS, encode_spz, packing_order, read_spz
+
+Format = Literal["spz", "ply"]
+INDEX = "index.json"
+_GPU_BYTES = (16, 24, 40, 56)  # of a splat in Spark 2.2, by degree of its harmonics
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """What a level adds to the one below it."""
+
+    label_id: int
+    level: int
+    uri: str  # below the chunks' folder; its hash makes it cacheable for ever
+    count: int  # Gaussians
+    nbytes: int
+    gpu_bytes: int
+    sha256: str
+
+
+def packed(
+    g: Gaussians, sizes: Mapping[int, Sequence[int]], *, sh_bits: tuple[int, int] = SH_BITS
+) -> Int64[np.ndarray, " N"]:
+    """Rows by category and level, and inside a level, where the order is free, as they compress best."""
+    rows = [
+        part[packing_order(g.select(torch.from_numpy(part)), sh_bits=sh_bits)]
+        for _, _, part in increments(g, sizes)
+    ]
+    return np.concatenate([*rows, np.arange(0)])
+
+
+def increments(g: Gaussians, sizes: Mapping[int, Sequence[int]]) -> list[tuple[int, int, np.ndarray]]:
+    """(label id, level, rows that it adds) of a ladder; levels that add nothing are left out."""
+    labels, parts = g.label_ids.numpy(), []
+    for label in sorted(sizes):
+        rows = np.flatnonzero(labels == label)
+        for level, (low, high) in enumerate(pairwise((0, *sizes[label])), 1):
+            if high > low:
+                parts.append((label, level, rows[low:high]))
+    return parts
+
+
+def write_chunks(
+    folder: Path,
+    g: Gaussians,
+    sizes: Mapping[int, Sequence[int]],
+    names: dict[int, str],
+    *,
+    kind: Format = "spz",
+    sh_bits: tuple[int, int] = SH_BITS,
+    antialiased: bool = False,
+) -> list[Chunk]:
+    """Write a ladder's increments and an index of them into a folder of their own, which is replaced."""
+    fresh = folder.with_name(f".{folder.name}-new")
+    shutil.rmtree(fresh, ignore_errors=True)
+    fresh.mkdir(parents=True)
+    chunks = []
+    for label, level, rows in increments(g, sizes):
+        part = g.select(torch.from_numpy(rows))
+        temporary = fresh / f"chunk.{kind}"
+        if kind == "spz":
+            temporary.write_bytes(encode_spz(part, sh_bits=sh_bits, antialiased=antialiased))
+        else:
+            write_ply(temporary, part, names)
+        content = temporary.read_bytes()
+        digest = hashlib.sha256(content).hexdigest()
+        slug = re.sub(r"[^a-z0-9]+", "-", names.get(label, str(label)).lower()).strip("-")
+        uri = f"{slug}-{level:02d}-{digest[:12]}.{kind}"
+        temporary.rename(fresh / uri)
+        gpu = len(part) * _GPU_BYTES[part.sh_degree]
+        chunks.append(Chunk(label, level, uri, len(part), len(content), gpu, digest))
+    write_json(fresh / INDEX, {"format": kind, "chunks": [asdict(chunk) for chunk in chunks]})
+    shutil.rmtree(folder, ignore_errors=True)
+    fresh.rename(folder)
+    return chunks
+
+
+def read_index(folder: Path) -> list[Chunk]:
+    """The index that `write_chunks` wrote; DataError for unusable content."""
+    document: Any = read_json(folder / INDEX)
+    try:
+        chunks = [Chunk(**entry) for entry in document["chunks"]]
+        if any(c.nbytes <= 0 or c.count <= 0 or c.gpu_bytes <= 0 or c.level < 1 for c in chunks):
+            raise ValueError("a chunk without content")
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(
+            f"{folder / INDEX}: not an index of chunks ({error!r}); run `sagesplat nest` again"
+        ) from None
+    return chunks
+
+
+def read_chunks(folder: Path, chunks: Sequence[Chunk]) -> Gaussians:
+    """What SPZ chunks hold, one after the other; DataError for a broken one."""
+    return concat([read_spz(folder / chunk.uri, chunk.label_id) for chunk in chunks])
+
+
+def totals(chunks: Sequence[Chunk], labels: Sequence[int], levels: int, what: str) -> np.ndarray:
+    """A column of the chunks summed up to each level: int64 [L, K] for rows `labels` and levels 1 to K."""
+    table = np.zeros((len(labels), levels), np.int64)
+    row = {label: i for i, label in enumerate(labels)}
+    for chunk in chunks:
+        table[row[chunk.label_id], chunk.level - 1] += getattr(chunk, what)
+    return table.cumsum(1)

@@ -1,0 +1,179 @@
+"""The nested ladder: one ordered set of Gaussians per category, trained so that its prefixes are levels."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+
+from sagesplat import geometry
+from sagesplat.config import NestConfig, TrainConfig
+from sagesplat.errors import RunError
+from sagesplat.gaussians import Gaussians
+from sagesplat.raster import Backend, device_of
+from sagesplat.scene.images import Photos
+from sagesplat.scene.scene import Scene
+from sagesplat.segment.masks import Masks
+from sagesplat.train.checkpoint import read_checkpoint, write_checkpoint
+from sagesplat.train.feed import Feed
+from sagesplat.train.freeze import Work, trainable_rows
+from sagesplat.train.importance import importance, ranks
+from sagesplat.train.pace import Pace
+from sagesplat.train.state import initial_state
+from sagesplat.train.stepper import Stepper
+from sagesplat.train.votes import label_weights, winners
+
+CLEAR = 0.8  # share of its blending weight that a Gaussian needs in one category, else it straddles a border
+_VISIBLE = 0.5  # pixels a view that it must paint of the others, on average, for that to matter
+_SHRINK_TO = 0.05  # of the rates, at the end
+_SAVE_EVERY = 500
+
+
+@dataclass(frozen=True, eq=False)
+class Nested:
+    """Gaussians in the order in which they are shipped: by category, the worthiest first."""
+
+    gaussians: Gaussians
+    clarity: Float32[np.ndarray, " N"]  # share of a Gaussian's blending weight in its own category; 1 unseen
+    boundary: dict[int, int]  # by label id, how many lie across two categories: they come first
+
+
+@dataclass(frozen=True)
+class NestStep:
+    """One step on a composition was taken."""
+
+    step: int
+    loss: float
+
+
+def level_sizes(count: int, config: NestConfig, boundary: int = 0) -> tuple[int, ...]:
+    """Gaussians of a category of `count` at each level, ascending and geometric; at least one of any.
+
+    The lowest level has all `boundary` ones. A category with few Gaussians has levels of the same size.
+    """
+    smallest = max(config.smallest, min(boundary, count) / max(count, 1))
+    shares = smallest ** np.linspace(0, 1, config.levels)[::-1]
+    return tuple(int(n) for n in np.ceil(shares * count - 1e-9))
+
+
+def order(
+    g: Gaussians,
+    scene: Scene,
+    masks: Masks,
+    config: NestConfig,
+    *,
+    antialiased: bool = False,
+) -> Nested:
+    """Vote on labels by what each Gaussian paints, and order each category.
+
+    Gaussians that straddle a border come first in theirs, so that every composition has them. Splitting them
+    in two does not help: nine in ten of the halves straddle as well.
+    """
+    views = scene.train_ids.tolist()
+    ids, weights = label_weights(g, scene, masks, views, antialiased=antialiased)
+    g = replace(g, label_ids=winners(g, ids, weights))
+    total = weights.sum(1)
+    column = np.searchsorted(ids, g.label_ids.numpy()).clip(0, max(len(ids) - 1, 0))
+    mine = weights[np.arange(len(g)), column] if len(ids) else total
+    clarity = np.where(total > 0, mine / np.maximum(total, 1e-12), 1).astype(np.float32)
+    worth = importance(g, scene, views, config.criterion, antialiased=antialiased)
+    boundary = straddling(weights, len(views))
+    worth = np.where(boundary, np.inf, worth).astype(np.float32)  # whichever side is there needs them
+    places = ranks(worth, g.label_ids.numpy())
+    rows = np.lexsort((places, g.label_ids.numpy()))
+    labels = g.label_ids.numpy()
+    across = {label: int((boundary & (labels == label)).sum()) for label in np.unique(labels).tolist()}
+    return Nested(g.select(torch.from_numpy(rows)), clarity[rows], across)
+
+
+def straddling(weights: Float32[np.ndarray, "N L"], num_views: int) -> np.ndarray:
+    """Gaussians (bool [N]) of which no category has 80 % of the weight, and which show on both sides."""
+    total, top = weights.sum(1), weights.max(1, initial=0)
+    return (top < CLEAR * total) & (total - top > _VISIBLE * num_views)
+
+
+def nest(
+    nested: Nested,
+    scene: Scene,
+    photos: Photos,
+    train_config: TrainConfig,
+    config: NestConfig,
+    *,
+    seed: int = 0,
+    backend: Backend = "auto",
+    checkpoint: Path | None = None,
+    settings: str = "",
+) -> Iterator[NestStep | Nested]:
+    """Train so that every composition of prefixes looks right; the last event is the result.
+
+    Each step draws a prefix per category, log-uniform between `config.smallest` and all, or everything (with
+    a probability that rises from `config.full_share`), and compares that composition with a photo, harmonics
+    rounded as the chunks will have them. Gaussians outside it, their moments included, stay as they are. A
+    `checkpoint` of the same `settings` is continued.
+    """
+    check(config)
+    device = device_of(backend)
+    labels, first = np.unique(nested.gaussians.label_ids.numpy(), return_index=True)
+    counts = np.diff(np.append(first, len(nested.gaussians)))
+    places = np.arange(len(nested.gaussians)) - np.repeat(first, counts)
+    near = geometry.morton_order(nested.gaussians.means.numpy())  # neighbours in space are drawn together
+    state = initial_state(nested.gaussians.select(torch.from_numpy(near)).to(device), seed)
+    if checkpoint and checkpoint.exists():
+        state = read_checkpoint(checkpoint, settings).to(device)
+    share = torch.from_numpy((places / np.repeat(counts, counts))[near]).float().to(device)
+    column = torch.from_numpy(np.repeat(np.arange(len(labels)), counts)[near]).to(device)
+    config_of_steps = replace(train_config, strategy="default", batch=1)
+    stepper = Stepper(Feed(scene, photos, device), config_of_steps, Work(scene, None), backend)
+    stepper.sh_bits = config.sh_bits
+    rates = _rates(train_config, config, scene)
+    everything = trainable_rows(state.gaussians, {})
+    while state.step < config.steps:
+        prefix = draw_shares(state.rng, len(labels), config, state.step / config.steps)
+        rows = None
+        if (prefix < 1).any():
+            rows = torch.nonzero(share < torch.from_numpy(prefix).float().to(device)[column])[:, 0]
+        loss = stepper(state, nested.gaussians.sh_degree, rates(state.step + 1), everything, drawn_rows=rows)
+        if checkpoint and state.step % _SAVE_EVERY == 0:
+            write_checkpoint(checkpoint, state, settings)
+        yield NestStep(state.step, float(loss))
+    back = torch.from_numpy(np.argsort(near))
+    yield replace(nested, gaussians=state.gaussians.to("cpu").select(back))
+
+
+def draw_shares(
+    rng: np.random.Generator, num_labels: int, config: NestConfig, done: float
+) -> Float32[np.ndarray, " L"]:
+    """Prefix of each category, as a share of it, that a step looks at when `done` of the steps are."""
+    everything = config.full_share + (config.full_share_end - config.full_share) * done
+    if rng.random() < everything:
+        return np.ones(num_labels, np.float32)
+    return np.exp(rng.uniform(np.log(config.smallest), 0, num_labels)).astype(np.float32)
+
+
+def _rates(train_config: TrainConfig, config: NestConfig, scene: Scene):
+    """Adam's rates by step."""
+    third = Pace(replace(train_config, max_steps=3, pace="published"), scene.extent).rates(2)
+
+    def rates(step: int) -> Mapping[str, float]:
+        gain = config.gain * _SHRINK_TO ** (step / config.steps)
+        return {name: gain * rate for name, rate in third.items()}
+
+    return rates
+
+
+def check(config: NestConfig) -> None:
+    """RunError for settings that cannot be."""
+    wrong = (
+        ("levels", config.levels, 1 <= config.levels <= 64, "1 to 64"),
+        ("steps", config.steps, config.steps >= 0, "0 or more"),
+        ("smallest", config.smallest, 0 < config.smallest <= 1, "a share such as 0.05"),
+        ("full-share", config.full_share, 0 <= config.full_share <= 1, "a share such as 0.1"),
+        ("full-share-end", config.full_share_end, 0 <= config.full_share_end <= 1, "a share such as 0.9"),
+        ("sh-bits", config.sh_bits, all(1 <= b <= 8 for b in config.sh_bits), "1 to 8, such as 5 4"),
+        ("gain", config.gain, config.gain > 0, "a number such as 4"),
+    )
+    for name, value, fine, cure in wrong:
+        if not fine:
+            raise RunError(f"--nest.{name} {value} is impossible; choose {cure}")
