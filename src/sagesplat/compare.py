@@ -1,0 +1,409 @@
+"""The nested ladder beside its baselines: same data, same training views, same evaluation."""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cache, partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import cast
+
+import numpy as np
+
+from sagesplat import nesting
+from sagesplat.adapt.allocate import along
+from sagesplat.adapt.model import read_models
+from sagesplat.adapt.observe import TOTAL, as_unit, large_enough, measure, read_observations, render_rgb
+from sagesplat.adapt.occupancy import nearest_snapshot, prune_to
+from sagesplat.adapt.plan import Plan, check_target, plan_scene
+from sagesplat.adapt.promise import read_promises
+from sagesplat.adapt.promised import Costs, Quality, plan_for_scene, plan_within
+from sagesplat.config import CompareConfig
+from sagesplat.errors import RunError, SageError
+from sagesplat.events import Progress, RunDone, TableMade, Warned
+from sagesplat.files import read_json, write_json
+from sagesplat.gaussians import Gaussians, concat
+from sagesplat.job import Job, run_stage
+from sagesplat.lpips import Lpips, Net, load_lpips, weights_path
+from sagesplat.metrics import ssim_map
+from sagesplat.output import compare_report as report
+from sagesplat.output.chunks import INDEX, read_index, write_chunks
+from sagesplat.output.compare_report import OfLabel, Point, Walk
+from sagesplat.output.spz import SH_BITS, read_spz
+from sagesplat.raster import Workspace
+from sagesplat.run_dir import RunDir, file_hash, is_done, settings_of
+from sagesplat.scene.scene import Points, Scene
+from sagesplat.stages import (
+    distances,
+    fit_ladder,
+    label_images,
+    ladder_files,
+    main_target,
+    observe_levels,
+    tune_composition,
+    view_planner,
+)
+from sagesplat.train.importance import importance
+from sagesplat.train.levels import read_level, write_prefixes
+from sagesplat.train.trainer import Step, Trained, train
+
+PAPER_TARGETS = (0.6, 0.7, 0.8)
+NETS: dict[str, Net] = {"lpips_alex": "alex", "lpips_vgg": "vgg"}
+_FEWEST = 10  # Gaussians that a training can begin with
+_TOGETHER = 8  # sets in memory at a time
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A set of Gaussians to be measured, made when it is its turn."""
+
+    method: str
+    name: str
+    steps: int  # training steps that it took, from the start
+    load: Callable[[], Gaussians]
+    encoded: dict[int, int] | None = None  # bytes by label id; None: a file per category
+    target: float = np.nan  # SSIM that it was planned for
+    budget: float = np.nan  # bytes that it was planned for
+
+
+def compare(job: Job, config: CompareConfig, copy: Path | None = None) -> list[Point]:
+    """Train what is missing of the baselines, measure all sets on the test views, write RUN/compare.
+
+    `job` is one on the nested ladder. compare.json has every point; `copy` becomes the same. RunError for a
+    run without a finished nested ladder or without test views, and for impossible settings.
+    """
+    _check(job, config)
+    folder, file = job.run.path / "compare", job.run.path / "compare" / report.FILE
+    lpips = {net: file_hash(path) if path.is_file() else None for net, path in _weights(config).items()}
+    targets = list(config.targets) or sorted({*PAPER_TARGETS, *settings_of(job.run, "plan")["targets"]})
+    settings = json.loads(json.dumps(asdict(config) | {"targets": targets, "lpips": lpips}))
+    is_done(job.run, "compare", settings, [], [file], job.force)  # refused before hours of training
+    snapshots = _snapshots(job)
+    trained = _pruned(job, config, folder) | _mcmc(job, config, folder)
+
+    def make() -> list[str]:
+        costs, quality = nesting.costs_of(job), _quality(job)
+        contenders = [
+            *_snapshot_points(snapshots, config),
+            *_sage(job, snapshots, targets),
+            *trained.values(),
+            *_nested(job, config, costs, quality),
+        ]
+        points = _measure(job, contenders, _metrics(job, config))
+        walks = _walks(job, snapshots, costs, quality)
+        (folder / report.PAGE).unlink(missing_ok=True)  # it shows what was measured before
+        report.write_comparison(file, points, walks, scene=job.scene.name, views=len(job.scene.test_ids))
+        return [f"{len(points)} sets in {len(job.scene.test_ids)} test views"]
+
+    run = job.run
+    inputs = [run.scene, *ladder_files(run), run.observations, run.plan, snapshots.run.models, *trained]
+    run_stage(job, "compare", settings, inputs, [file], make)
+    points, walks = report.read_comparison(file)
+    tables = report.make_tables(points, walks, main_target(run))
+
+    def show() -> list[str]:
+        report.write_report(folder, tables, points, job.names())
+        return list(tables["table_2_baselines"].notes[:-2])
+
+    run_stage(job, "compared", {}, [file], [folder / report.PAGE], show)
+    for stem, columns in report.CONSOLE.items():
+        table = tables[stem].only(*columns)
+        job.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
+    if copy:
+        write_json(copy, read_json(file))
+    job.emit(RunDone(folder / report.PAGE))
+    return points
+
+
+def _check(job: Job, config: CompareConfig) -> None:
+    run = job.run
+    if not len(job.scene.test_ids):
+        raise RunError(f"{run.path}: no test views to compare on; begin a run with --test-every 8")
+    for path in (run.prefixes, run.chunks / INDEX, run.observations, run.promises, run.plan):
+        if not path.exists():
+            raise RunError(f"{path}: missing, but all is compared with it; finish `sagesplat run` (nested)")
+    for name, shares in (("shares", config.shares), ("caps", config.caps)):
+        for share in shares:
+            if not 0 < share <= 1:
+                raise RunError(f"{run.path}: --{name} {share:g} is no share of Gaussians; choose 0.1, say")
+    wrong = (
+        ("snapshots", config.snapshots, config.snapshots >= 1, "1 or more"),
+        ("budgets", config.budgets, config.budgets >= 2, "2 or more"),
+        ("tune-steps", config.tune_steps, config.tune_steps >= -1, "0 or more, or -1"),
+    )
+    for name, value, fine, cure in wrong:
+        if not fine:
+            raise RunError(f"{run.path}: --{name} {value} is impossible; choose {cure}")
+    for target in config.targets:
+        check_target(target)
+    smallest = min(config.caps, default=1.0)
+    if round(smallest * job.snapshots.size(job.snapshots.levels[-1])) < _FEWEST:
+        raise RunError(f"{run.path}: --caps {smallest:g} leaves too few Gaussians to train; choose more")
+
+
+def _snapshots(job: Job) -> Job:
+    """The paper's job on the same run, its ladder measured and fitted as the nested one."""
+    other = replace(job, run=RunDir(job.run.path, "snapshots"))
+    vars(other).update(scene=job.scene, photos=job.photos)  # the same photos in memory, not twice
+    observe_levels(other, job.fit_config)
+    fit_ladder(other, job.fit_config)
+    return other
+
+
+def _pruned(job: Job, config: CompareConfig, folder: Path) -> dict[Path, Contender]:
+    """The last snapshot, pruned by LightGaussian's criterion (arXiv:2311.17245) and tuned."""
+    last = job.snapshots.files[-1]
+    steps = settings_of(job.run, "nest")["steps"] if config.tune_steps < 0 else config.tune_steps
+
+    @cache
+    def full() -> tuple[Gaussians, np.ndarray]:
+        g = read_level(last.path)
+        views = job.scene.train_ids.tolist()
+        return g, importance(g, job.scene, views, "weight-volume", antialiased=job.antialiased)
+
+    def make(share: float) -> Gaussians:
+        g, worth = full()
+        return tune_composition(job, prune_to(g, max(1, round(share * len(g))), worth), steps)
+
+    found = {}
+    for share in sorted(set(config.shares)):
+        settings = {"share": share, "tune_steps": steps}
+        path = folder / f"pruned-{share:g}-{steps}.npz"
+        _keep(job, path, settings, [job.run.scene, last.path], last.step + steps, partial(make, share))
+        name = f"{share:.0%}, {steps} steps"
+        found[path] = Contender(report.PRUNED, name, last.step + steps, partial(read_level, path))
+    return found
+
+
+def _mcmc(job: Job, config: CompareConfig, folder: Path) -> dict[Path, Contender]:
+    """3DGS-MCMC from the start, its Gaussians capped at shares of the last snapshot's."""
+    run, made, found = job.run, nesting.train_config(job), {}
+    full, seed = job.snapshots.size(job.snapshots.levels[-1]), settings_of(job.run, "train")["seed"]
+    for share in sorted(set(config.caps)):
+        cap = round(share * full)
+        mine = replace(made, strategy="mcmc", max_gaussians=cap, level_every=made.max_steps)
+        mine = replace(mine, freeze_at=None, rest_share=0.0)  # of the default strategy's
+        path = folder / f"mcmc-{share:g}.npz"
+
+        def make(cap: int = cap, mine=mine, stage: str = path.stem) -> Gaussians:
+            scene, labels = with_at_most(job.scene, job.point_labels, cap, seed)
+            for event in train(scene, job.photos, labels, mine, seed=seed, backend=job.backend):
+                if isinstance(event, Step):
+                    text = f"loss {event.loss:.3f}, {event.num_gaussians:,} Gaussians"
+                    job.emit(Progress(stage, event.step, mine.max_steps, text))
+                elif isinstance(event, Trained):
+                    return event.gaussians
+            raise AssertionError("a training ends with what it trained")
+
+        _keep(job, path, {**asdict(mine), "seed": seed}, [run.scene, run.labels], made.max_steps, make)
+        name = f"cap {share:.0%}"
+        found[path] = Contender(report.MCMC, name, made.max_steps, partial(read_level, path))
+    return found
+
+
+def _keep(
+    job: Job, path: Path, settings: dict, inputs: list[Path], step: int, make: Callable[[], Gaussians]
+) -> None:
+    """Train a set once: a stage of its own, so that a killed comparison goes on with the next one."""
+
+    def work() -> list[str]:
+        g = make()
+        write_prefixes(path, g, step, {})
+        return [f"{len(g):,} Gaussians"]
+
+    run_stage(job, path.stem, settings, inputs, [path], work)
+
+
+def with_at_most(scene: Scene, labels: np.ndarray, count: int, seed: int) -> tuple[Scene, np.ndarray]:
+    """The scene with at most `count` of its points, drawn at random, and their labels (int16 [P])."""
+    points = scene.points
+    if len(points.xyz) <= count:
+        return scene, labels
+    rows = np.sort(np.random.default_rng(seed).choice(len(points.xyz), count, replace=False))
+    place = np.full(len(points.xyz), -1)
+    place[rows] = np.arange(count)
+    kept = place[points.track_points] >= 0
+    tracks = place[points.track_points[kept]], points.track_views[kept], points.track_uv[kept]
+    return replace(scene, points=Points(points.xyz[rows], points.rgb[rows], *tracks)), labels[rows]
+
+
+def _snapshot_points(snapshots: Job, config: CompareConfig) -> list[Contender]:
+    """Settled snapshots, spread in size; of equal ones the latest."""
+    ladder = snapshots.snapshots
+    sizes = [ladder.size(level) for level in ladder.levels]
+    wanted = np.geomspace(max(1, min(sizes)), max(sizes), config.snapshots)[::-1]
+    picked = sorted({nearest_snapshot(ladder, round(size)) for size in wanted.tolist()})
+    return [Contender(report.SNAPSHOTS, f"step {i}", i, partial(ladder.load, i)) for i in picked]
+
+
+def _sage(job: Job, snapshots: Job, targets: Sequence[float]) -> list[Contender]:
+    """The paper's compositions for the scene (Eq. 1 with Eq. 3), from the snapshots."""
+    ladder, scene = snapshots.ladder, job.scene
+    models = read_models(snapshots.run.models)
+    table = large_enough(read_observations(snapshots.run.observations), scene, job.fit_config.min_share)
+    table = table.select((table.level == ladder.levels[-1]) & np.isin(table.view, scene.train_ids))
+    far = {label: table.distance[table.label_id == label] for label, _ in ladder.counts}
+    share = settings_of(job.run, "plan")["share"]
+    found = []
+    for target in targets:
+        plan = plan_scene(models, ladder.counts, far, target, share, recovering=ladder.recovering)
+        name = f"SSIM {target:g}, {plan.status}"
+        load = partial(ladder.compose, plan.levels)
+        found.append(Contender(report.SAGE, name, ladder.levels[-1], load, target=target))
+    return found
+
+
+def _quality(job: Job) -> Quality:
+    return nesting.quality_of(job, read_promises(job.run.promises), distances(job, job.fit_config.distance))
+
+
+def _nested(job: Job, config: CompareConfig, costs: Costs, quality: Quality) -> list[Contender]:
+    """Prefixes of the same share of every category, and plans: within budgets, and for the run's targets."""
+    made = settings_of(job.run, "plan")
+    shown = nesting.pixels_of(read_observations(job.run.observations), job, costs.labels, job.scene.train_ids)
+    steps = job.snapshots.levels[-1] + settings_of(job.run, "nest")["steps"]
+    sent = costs.sent.sum(0)
+    found = []
+    for k in range(costs.sent.shape[1]):
+        bytes_of = dict(zip(costs.labels, costs.sent[:, k].tolist(), strict=True))
+        load = partial(job.ladder.load, k + 1)
+        found.append(Contender(report.SAME_SHARE, f"level {k + 1}", steps, load, bytes_of))
+    budgets = np.ceil(np.geomspace(sent[0], sent[-1], config.budgets)).tolist()
+    plans: list[tuple[str, Plan]] = [
+        (f"{b / 1e6:.3g} MB", plan_within(quality, costs, b, "bytes", shown)) for b in budgets
+    ]
+    for target in made["targets"]:
+        plan = plan_for_scene(quality, costs, target, made["share"], shown)
+        plans.append((f"SSIM {target:g}, {plan.status}", plan))
+    seen = []
+    for name, plan in plans:
+        if plan.levels in seen and plan.budget is not None:
+            continue  # as a smaller budget's
+        seen.append(plan.levels)
+        found.append(
+            Contender(
+                report.PLANNED, name, steps, partial(job.ladder.compose, plan.levels),
+                {choice.label_id: choice.sent or 0 for choice in plan.choices}, plan.target,
+                np.nan if plan.budget is None else plan.budget,
+            )
+        )  # fmt: skip
+    return found
+
+
+def _weights(config: CompareConfig) -> dict[str, Path]:
+    return {net: weights_path(cast(Net, net), config.lpips) for net in NETS.values()}
+
+
+def _metrics(job: Job, config: CompareConfig) -> dict[str, Lpips]:
+    """LPIPS as the field feeds it, by column; what cannot be loaded is left out with a warning."""
+    found = {}
+    for column, net in NETS.items():
+        try:
+            found[column] = load_lpips(net, config.lpips, as_3dgs=net == "vgg")
+        except SageError as error:
+            job.emit(Warned(f"no LPIPS ({net}): {error}"))
+    return found
+
+
+def _measure(job: Job, contenders: Sequence[Contender], metrics: dict[str, Lpips]) -> list[Point]:
+    """All contenders on all test views, some at a time."""
+    labels = label_images(job, job.fit_config.masks)
+    tests, workspace, points = job.scene.test_ids.tolist(), Workspace(), []
+    done, total = 0, len(contenders) * len(tests)
+
+    def image_of(g: Gaussians, row: int) -> np.ndarray:
+        drawn = {"backend": job.backend, "antialiased": job.antialiased, "workspace": workspace}
+        return render_rgb(g, job.scene.views[row].camera, **drawn)
+
+    for begin in range(0, len(contenders), _TOGETHER):
+        some = contenders[begin : begin + _TOGETHER]
+        sets = [contender.load() for contender in some]
+        found: list[list[dict[str | int, float]]] = [[] for _ in some]
+        # the nested ladder is kept as it is sent
+        sent = [
+            _send(job, g) if c.encoded is None else (c.encoded, None) for c, g in zip(some, sets, strict=True)
+        ]
+        for row in tests:
+            photo, here = as_unit(job.photos[row]), labels[job.scene.views[row]]
+            of_photo = {column: metric.features(photo) for column, metric in metrics.items()}
+            for g, (_, arrived), values in zip(sets, sent, found, strict=True):
+                image = image_of(g, row)
+                values.append(_values(job, image, photo, here))
+                for column, metric in metrics.items():
+                    values[-1][column] = metric.distance(metric.features(image), of_photo[column])
+                if arrived is not None:
+                    values[-1]["ssim_sent"] = float(ssim_map(image_of(arrived, row), photo).mean())
+                done += 1
+                job.emit(Progress("compare", done, total))
+        parts = zip(some, sets, sent, found, strict=True)
+        points += [_point(c, g, encoded, values) for c, g, (encoded, _), values in parts]
+    return points
+
+
+def _values(job: Job, image: np.ndarray, photo: np.ndarray, labels: np.ndarray) -> dict[str | int, float]:
+    """What is measured of one image: of the whole by name, SSIM of its categories by label id."""
+    name = "ssim_eroded" if job.fit_config.region == "eroded" else "ssim"
+    rows, few = measure(image, photo, labels), job.fit_config.min_share * labels.size
+    whole = {"ssim": rows[TOTAL]["ssim"], "ssim_sent": rows[TOTAL]["ssim"], "psnr": rows[TOTAL]["psnr"]}
+    return whole | {i: of[name] for i, of in rows.items() if i != TOTAL and of["num_pixels"] >= few}
+
+
+def _point(
+    contender: Contender, g: Gaussians, encoded: dict[int, int], views: list[dict[str | int, float]]
+) -> Point:
+    def mean(key: str | int) -> float:
+        values = [values[key] for values in views if np.isfinite(values.get(key, np.nan))]
+        return float(np.mean(values)) if values else np.nan
+
+    counts = g.counts()
+    ids = sorted({*counts, *(key for values in views for key in values if isinstance(key, int))})
+    return Point(
+        method=contender.method,
+        name=contender.name,
+        target=contender.target,
+        budget=contender.budget,
+        count=len(g),
+        encoded=sum(encoded.values()),
+        steps=contender.steps,
+        **{name: mean(name) for name in ("ssim_sent", *report.MEASURES)},
+        labels={i: OfLabel(counts.get(i, 0), encoded.get(i, 0), mean(i)) for i in ids},
+    )
+
+
+def _send(job: Job, g: Gaussians) -> tuple[dict[int, int], Gaussians]:
+    """Bytes by label id, one file each made as the chunks of the nested ladder are, and what arrives."""
+    bits = tuple(settings_of(job.run, "nest").get("sh_bits", SH_BITS))
+    whole = {label: (count,) for label, count in g.counts().items()}
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "chunks"
+        chunks = write_chunks(path, g, whole, job.names(), sh_bits=bits, antialiased=job.antialiased)
+        arrived = [read_spz(path / chunk.uri, chunk.label_id) for chunk in chunks]
+    return {c.label_id: c.nbytes for c in chunks}, concat(arrived) if arrived else g
+
+
+def _walks(job: Job, snapshots: Job, costs: Costs, quality: Quality) -> list[Walk]:
+    """From view to view by name at the main target: ours with hysteresis, and the paper's plans."""
+    target, views = main_target(job.run), range(len(job.scene.views))
+    chosen = along(quality.bound, costs.sent, target=target) + 1
+    ours = [dict(zip(costs.labels, levels.tolist(), strict=True)) for levels in chosen]
+    chunks = read_index(job.run.chunks)
+    chunk_files = {
+        (label, k + 1): {c.uri: c.nbytes for c in chunks if c.label_id == label and c.level <= k + 1}
+        for label in costs.labels
+        for k in range(costs.sent.shape[1])
+    }
+    planned = view_planner(snapshots)
+    theirs = [planned(row, target).levels for row in views]
+    needed = sorted({choice for levels in theirs for choice in levels.items()})
+    level_files = {
+        (label, level): {
+            f"{label} at {level}": sum(_send(job, snapshots.ladder.load(level, [label]))[0].values())
+        }
+        for label, level in needed
+    }
+    walks = []
+    for keeps in (True, False):
+        mine = report.walk("nested", ours, chunk_files, keeps)
+        assert mine.replaced == 0, "a level must contain the ones below it"
+        walks += [mine, report.walk(report.SAGE, theirs, level_files, keeps)]
+    return walks
