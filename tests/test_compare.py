@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sagesplat import cli, nesting, stages
-from sagesplat.compare import compare, with_at_most
+from sagesplat.compare import compare
 from sagesplat.config import (
     CompareConfig,
     FitConfig,
@@ -47,6 +47,7 @@ from sagesplat.output.compare_report import (
 )
 from sagesplat.run_dir import RunDir
 from sagesplat.train.levels import read_level
+from sagesplat.train.nested import with_at_most
 
 NAN = math.nan
 CONFIG = CompareConfig(
@@ -165,7 +166,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Job:
     stages.make_masks(job, MasksConfig())
     stages.lift_labels(job, LiftConfig())
     stages.train_levels(job, TrainConfig(max_steps=60, level_every=20, refine_every=5), 0)
-    nesting.nest_levels(job, NestConfig(steps=20, levels=4), 0)
+    nesting.nest_levels(job, NestConfig(steps=20, levels=4, seed_steps=20), 0)
     stages.observe_levels(job, FitConfig())
     stages.fit_ladder(job, FitConfig())
     stages.make_plan(job, PlanConfig(target_ssim=0.4))

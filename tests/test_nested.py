@@ -28,10 +28,11 @@ from sagesplat.paper import cross_views
 from sagesplat.run_dir import RunDir
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Points, Scene, View
+from sagesplat.segment.masks import Taxonomy
 from sagesplat.sh import in_buckets
-from sagesplat.train.importance import importance, ranks
+from sagesplat.train.importance import importance
 from sagesplat.train.levels import write_prefixes
-from sagesplat.train.nested import Nested, NestStep, draw_shares, level_sizes, nest, straddling
+from sagesplat.train.nested import Nested, NestStep, draw_shares, level_sizes, nest, order, straddling
 
 QUICK = NestConfig(steps=12, levels=4, smallest=0.1)
 
@@ -102,11 +103,6 @@ def test_sensitivity_is_the_change_when_a_gaussian_fades(seen) -> None:
         energy = sum(float((rasterize(g, v.camera).rgb ** 2).sum()) for v in seen.views)
     found = np.mean([importance(g, seen, [0, 1], "sensitivity", seed=s)[0] for s in range(200)])
     assert found == pytest.approx(energy, rel=0.2)
-
-
-def test_ranks_count_from_the_worthiest_in_each_category() -> None:
-    worth = np.array([1, 5, 3, 2, 2], np.float32)
-    assert ranks(worth, np.array([7, 7, -1, -1, -1])).tolist() == [1, 0, 0, 1, 2]
 
 
 def ordered(count: int = 60) -> Nested:
@@ -258,7 +254,7 @@ def test_chunks_hold_what_each_level_adds(tmp_path: Path) -> None:
 CONFIG = RunConfig(
     scene=SceneConfig(calibrate_every=4),
     train=TrainConfig(max_steps=90, level_every=30),
-    nest=NestConfig(steps=40, levels=5, smallest=0.1),
+    nest=NestConfig(steps=40, levels=5, smallest=0.1, seed_steps=30),
     plan=PlanConfig(target_ssim=0.4),
 )
 STAGES = [
@@ -266,6 +262,7 @@ STAGES = [
     "masks",
     "lift",
     "train",
+    "seeds",
     "nest",
     "observe",
     "fit",
@@ -398,5 +395,25 @@ def test_each_view_is_planned_by_its_bound(finished: Path, tmp_path: Path) -> No
 def test_without_calibration_views_a_run_still_promises(capture: Path, tmp_path: Path) -> None:
     config = replace(CONFIG, scene=SceneConfig(calibrate_every=0), train=TrainConfig(max_steps=20))
     job = quiet(tmp_path / "run")
-    pipeline.run_all(job, capture, replace(config, nest=replace(QUICK, steps=2)))
+    pipeline.run_all(job, capture, replace(config, nest=replace(QUICK, steps=2, seed_share=0.0)))
     assert read_plans(job.run.plan)[0]
+
+
+def test_seeds_come_first_and_take_the_place_of_the_least_worthy(scene: Scene) -> None:
+    class OneLabel:
+        """Every pixel is of category 3."""
+
+        taxonomy = Taxonomy({3: "thing"})
+
+        def __getitem__(self, view: View) -> np.ndarray:
+            return np.full((view.camera.height, view.camera.width), 3, np.int16)
+
+    g = random_gaussians(50, seed=3)
+    seeds = random_gaussians(8, seed=4)
+    found = order(g, scene, OneLabel(), QUICK, seeds=seeds)  # type: ignore[arg-type]
+    assert len(found.gaussians) == 50
+    assert found.boundary == {3: 0}
+    assert sorted(found.gaussians.means[:8].tolist()) == sorted(seeds.means.tolist())
+    worth = importance(g, scene, scene.train_ids.tolist())
+    worthiest = g.means[torch.from_numpy(np.argsort(-worth, kind="stable")[:42].copy())]
+    assert torch.equal(found.gaussians.means[8:], worthiest)

@@ -32,7 +32,6 @@ from sagesplat.output.compare_report import OfLabel, Point, Walk
 from sagesplat.output.spz import SH_BITS, read_spz
 from sagesplat.raster import Workspace
 from sagesplat.run_dir import RunDir, file_hash, is_done, settings_of
-from sagesplat.scene.scene import Points, Scene
 from sagesplat.stages import (
     distances,
     fit_ladder,
@@ -45,7 +44,8 @@ from sagesplat.stages import (
 )
 from sagesplat.train.importance import importance
 from sagesplat.train.levels import read_level, write_prefixes
-from sagesplat.train.trainer import Step, Trained, train
+from sagesplat.train.nested import capped_config, train_capped
+from sagesplat.train.trainer import Step, Trained
 
 PAPER_TARGETS = (0.6, 0.7, 0.8)
 NETS: dict[str, Net] = {"lpips_alex": "alex", "lpips_vgg": "vgg"}
@@ -181,16 +181,18 @@ def _mcmc(job: Job, config: CompareConfig, folder: Path) -> dict[Path, Contender
     full, seed = job.snapshots.size(job.snapshots.levels[-1]), settings_of(job.run, "train")["seed"]
     for share in sorted(set(config.caps)):
         cap = round(share * full)
-        mine = replace(made, strategy="mcmc", max_gaussians=cap, level_every=made.max_steps)
-        mine = replace(mine, freeze_at=None, rest_share=0.0)  # of the default strategy's
+        mine = capped_config(made, cap, made.max_steps)
         path = folder / f"mcmc-{share:g}.npz"
 
-        def make(cap: int = cap, mine=mine, stage: str = path.stem) -> Gaussians:
-            scene, labels = with_at_most(job.scene, job.point_labels, cap, seed)
-            for event in train(scene, job.photos, labels, mine, seed=seed, backend=job.backend):
+        def make(cap: int = cap, stage: str = path.stem) -> Gaussians:
+            capped = train_capped(
+                job.scene, job.photos, job.point_labels, made, cap, made.max_steps,
+                seed=seed, backend=job.backend,
+            )  # fmt: skip
+            for event in capped:
                 if isinstance(event, Step):
                     text = f"loss {event.loss:.3f}, {event.num_gaussians:,} Gaussians"
-                    job.emit(Progress(stage, event.step, mine.max_steps, text))
+                    job.emit(Progress(stage, event.step, made.max_steps, text))
                 elif isinstance(event, Trained):
                     return event.gaussians
             raise AssertionError("a training ends with what it trained")
@@ -212,19 +214,6 @@ def _keep(
         return [f"{len(g):,} Gaussians"]
 
     run_stage(job, path.stem, settings, inputs, [path], work)
-
-
-def with_at_most(scene: Scene, labels: np.ndarray, count: int, seed: int) -> tuple[Scene, np.ndarray]:
-    """The scene with at most `count` of its points, drawn at random, and their labels (int16 [P])."""
-    points = scene.points
-    if len(points.xyz) <= count:
-        return scene, labels
-    rows = np.sort(np.random.default_rng(seed).choice(len(points.xyz), count, replace=False))
-    place = np.full(len(points.xyz), -1)
-    place[rows] = np.arange(count)
-    kept = place[points.track_points] >= 0
-    tracks = place[points.track_points[kept]], points.track_views[kept], points.track_uv[kept]
-    return replace(scene, points=Points(points.xyz[rows], points.rgb[rows], *tracks)), labels[rows]
 
 
 def _snapshot_points(snapshots: Job, config: CompareConfig) -> list[Contender]:

@@ -109,6 +109,10 @@ class NestConfig:
     """Prefixes that are measured and planned with, in geometric steps of their size."""
     smallest: float = 0.05
     """Share of a category's Gaussians in its lowest level."""
+    seed_share: float = 0.1
+    """Share of the Gaussians, the first of all, that a small 3DGS-MCMC training makes; 0: none."""
+    seed_steps: int = 3000
+    """Steps of that training."""
     full_share: float = 0.1
     """Share of the steps that look at everything, to begin with."""
     full_share_end: float = 0.9

@@ -19,8 +19,9 @@ from sagesplat.run_dir import file_hash, settings_of
 from sagesplat.scene.scene import Scene
 from sagesplat.segment.masks import UNLABELLED
 from sagesplat.train import nested
-from sagesplat.train.levels import write_prefixes
+from sagesplat.train.levels import read_header, read_level, write_prefixes
 from sagesplat.train.nested import Nested, NestStep
+from sagesplat.train.trainer import Step, Trained
 
 _TARGETS = tuple(np.arange(0.5, 0.96, 0.05).round(2).tolist())  # SSIM of the compositions that are looked at
 
@@ -39,7 +40,8 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
 
     def make() -> list[str]:
         full = job.snapshots.load(job.snapshots.levels[-1])
-        ordered = nested.order(full, job.scene, job.masks, config, antialiased=job.antialiased)
+        seeds = read_level(run.seeds) if config.seed_share else None
+        ordered = nested.order(full, job.scene, job.masks, config, seeds=seeds, antialiased=job.antialiased)
         belongs = json.dumps({**settings, "scene": file_hash(run.scene), "levels": file_hash(run.levels)})
         if job.force:
             run.nest_checkpoint.unlink(missing_ok=True)
@@ -57,7 +59,32 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
         return lines
 
     inputs = [run.scene, run.labels, run.levels]
+    if config.seed_share:
+        _make_seeds(job, config, seed)
+        inputs.append(run.seeds)
     run_stage(job, "nest", settings, inputs, [run.prefixes, run.chunks], make)
+
+
+def _make_seeds(job: Job, config: NestConfig, seed: int) -> None:
+    """Train the small model that the ladder begins with: a stage, so that a killed run has it already."""
+    run, made = job.run, train_config(job)
+    full = job.snapshots.size(job.snapshots.levels[-1])
+    cap = max(1, round(config.seed_share * full))
+    settings = {**asdict(nested.capped_config(made, cap, config.seed_steps)), "seed": seed}
+
+    def make() -> list[str]:
+        events = nested.train_capped(
+            job.scene, job.photos, job.point_labels, made, cap, config.seed_steps,
+            seed=seed, backend=job.backend,
+        )  # fmt: skip
+        for event in events:
+            if isinstance(event, Step):
+                job.emit(Progress("seeds", event.step, config.seed_steps, f"loss {event.loss:.3f}"))
+            elif isinstance(event, Trained):
+                write_prefixes(run.seeds, event.gaussians, event.step, {})
+        return [f"{sum(read_header(run.seeds).counts.values()):,} Gaussians"]
+
+    run_stage(job, "seeds", settings, [run.scene, run.labels], [run.seeds], make)
 
 
 def _write_ladder(job: Job, trained: Nested, config: NestConfig) -> list[str]:

@@ -17,7 +17,7 @@ from sagesplat.train import nested
 # the built-in capture, within minutes on two cores
 DEMO = RunConfig(
     train=TrainConfig(max_steps=1200, level_every=60),
-    nest=NestConfig(steps=600, levels=12),
+    nest=NestConfig(steps=600, levels=12, seed_steps=600),
     plan=PlanConfig(target_ssim=0.7),
 )
 

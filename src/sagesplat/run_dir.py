@@ -64,6 +64,11 @@ class RunDir:
         return self.adapted / "ladder.npz"
 
     @property
+    def seeds(self) -> Path:
+        """The small model that the nested ladder begins with."""
+        return self.adapted / "seeds.npz"
+
+    @property
     def chunks(self) -> Path:
         """What each level of each category adds, as it is sent, with index.json."""
         return self.adapted / "chunks"

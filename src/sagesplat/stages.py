@@ -401,7 +401,7 @@ def promised(job: Job) -> Callable[[int, int, int], float]:
 
 
 def evaluate_plans(job: Job) -> None:
-    """Measure the compositions on the test views, beside the promise and full 3DGS."""
+    """Measure the compositions on the test views, beside the promise and the whole model."""
     run = job.run
 
     def make() -> list[str]:
@@ -425,7 +425,7 @@ def evaluate_plans(job: Job) -> None:
             asked = "within the budget" if within_budget else f"SSIM {target:g} asked"
             lines.append(
                 f"{asked}: test views {at.ssim.mean():.3f} / {at.psnr.mean():.2f} dB "
-                f"(3DGS {at.full_ssim.mean():.3f} / {at.full_psnr.mean():.2f} dB)"
+                f"(everything {at.full_ssim.mean():.3f} / {at.full_psnr.mean():.2f} dB)"
             )
         return lines
 

@@ -109,7 +109,7 @@ def ssim_over_levels(
     half = np.min(np.diff(levels)) / 2 if len(levels) > 1 else 0.5
     for level in sorted(recovering & set(levels.tolist())):
         axes.axvspan(level - half, level + half, color="#f1e4d3", lw=0, zorder=0)
-    axes.set(xlabel="level (training step)", ylabel="SSIM")
+    axes.set(xlabel="level", ylabel="SSIM")
     ordered = sorted(
         labels, key=lambda i: -last[i]
     )  # the legend from top to bottom, like the ends of the lines
@@ -168,7 +168,7 @@ def size_by_target(
     figure = Figure(figsize=(9, 0.52 * (len(plans) + 1) + 1.6), layout="constrained")
     axes = figure.subplots()
     full = {i: n * BYTES_PER_GAUSSIAN for i, n in last_counts(counts).items()}
-    bars = [("3DGS, last level", full, set())]
+    bars = [("everything", full, set())]
     for plan in plans:
         infeasible = {c.label_id for c in plan.choices if c.status == "infeasible"}
         bars.append((f"SSIM ≥ {plan.target:g}", {c.label_id: c.nbytes for c in plan.choices}, infeasible))
@@ -246,7 +246,7 @@ def quality_over_size(
         for level in levels.tolist()
     ]
     ssim = [view_mean(rows, TOTAL, level) for level in levels.tolist()]
-    axes.plot(size, ssim, "o-", color=FAINT, ms=4, label="3DGS, its own levels")
+    axes.plot(size, ssim, "o-", color=FAINT, ms=4, label="all categories at one level")
     composed = []
     for plan in plans:
         at = (evaluation.target == np.float32(plan.target)) & (evaluation.label_id == TOTAL)
@@ -266,7 +266,7 @@ def panel_strip(panel: Panel, colours: Colours) -> Figure:
     """Figs. 4 and 5: photo, 3DGS, composed scene, label map and error of the composed scene side by side."""
     pictures = [
         ("photo", panel.photo),
-        (f"3DGS  {panel.full_psnr:.2f} dB / {panel.full_ssim:.3f}", panel.full),
+        (f"everything  {panel.full_psnr:.2f} dB / {panel.full_ssim:.3f}", panel.full),
         (f"composed  {panel.psnr:.2f} dB / {panel.ssim:.3f}", panel.composed),
         ("categories", label_image(panel.label_ids, colours)),
         ("error of composed", error_image(panel.composed, panel.photo)),

@@ -203,7 +203,7 @@ def _tables(data: ReportData, labels: Sequence[int]):
         yield "models", tables.models_table(data.models, names)
     if data.panels:
         rows = [(p.name, p.ssim, p.psnr, p.full_ssim, p.full_psnr) for p in data.panels]
-        header = ("view", "SSIM", "PSNR", "3DGS SSIM", "3DGS PSNR")
+        header = ("view", "SSIM", "PSNR", "everything SSIM", "everything PSNR")
         yield "panels", Table("Views shown above", header, ("", ".3f", ".2f", ".3f", ".2f"), rows)
     if data.timings:
         yield "timings", Table("Time by stage", ("stage", "seconds"), ("", ",.1f"), list(data.timings))
@@ -222,7 +222,7 @@ def _pictures(panel: Panel, colours: Colours) -> dict:
         "panel": panel,
         "ratio": f"{panel.photo.shape[1]} / {panel.photo.shape[0]}",
         "pictures": [
-            ("3DGS", _picture(panel.full, "JPEG")),
+            ("everything", _picture(panel.full, "JPEG")),
             ("photo", _picture(panel.photo, "JPEG")),
             ("categories", _picture(labels, "PNG")),
             ("error", _picture(error, "JPEG")),

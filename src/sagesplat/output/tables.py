@@ -190,9 +190,7 @@ def ladder_table(
             cells.append(f"{view_mean(rows, label_id, level):.3f} {count:>5}")
         body.append((name_of(label_id, names), *cells))
     header = ("category", *(f"{level}" for level in picked))
-    return Table(
-        "SSIM and Gaussians by level (training step), training views", header, ("",) * len(header), body
-    )
+    return Table("SSIM and Gaussians by level, training views", header, ("",) * len(header), body)
 
 
 def outcome_table(plan: Plan, counts: Counts, evaluation: Evaluation, names: Mapping[int, str]) -> Table:
@@ -211,10 +209,10 @@ def outcome_table(plan: Plan, counts: Counts, evaluation: Evaluation, names: Map
     share = plan.count / max(1, sum(full.values()))
     measured = (mean(whole.ssim), mean(whole.full_ssim))
     body.append((name_of(TOTAL, names), math.nan, plan.count, share, math.nan, *measured, plan.status))
-    header = ("category", "level", "Gaussians", "share", "promised", "test", "3DGS", "status")
+    header = ("category", "level", "Gaussians", "share", "promised", "test", "all", "status")
     formats = ("", "d", ",d", ".0%", ".3f", ".3f", ".3f", "")
     return Table(
-        f"Plan for SSIM {plan.target:g}: promised, and measured on test views beside 3DGS",
+        f"Plan for SSIM {plan.target:g}: promised, and measured on test views beside everything",
         header,
         formats,
         body,
@@ -230,7 +228,7 @@ def plan_table(plan: Plan, counts: Counts, names: Mapping[int, str]) -> Table:
         cells = (choice.level, choice.count, share, choice.nbytes / MB)
         name = name_of(choice.label_id, names)
         body.append((name, *cells, choice.distance, choice.predicted_ssim, choice.status))
-    header = ("category", "level", "Gaussians", "of 3DGS", "MB", "distance", "promised SSIM", "status")
+    header = ("category", "level", "Gaussians", "of all", "MB", "distance", "promised SSIM", "status")
     formats = ("", ",d", ",d", ".1%", ".2f", ".3f", ".3f", "")
     return Table(f"Plan for SSIM {plan.target:g}", header, formats, body)
 

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Int64
+from jaxtyping import Float32
 
 from sagesplat.gaussians import Gaussians
 from sagesplat.raster import Workspace, add_weights, rasterize
@@ -66,12 +66,3 @@ def _sensitivity(
         # by the logarithm of the opacity: what is left when all of it goes
         total += (grad / (1 - opacity).clamp_min(1e-6)) ** 2
     return total.cpu().numpy()
-
-
-def ranks(worth: Float32[np.ndarray, " N"], label_ids: np.ndarray) -> Int64[np.ndarray, " N"]:
-    """Place of each Gaussian in its category, 0 for the worthiest; equals keep their order."""
-    order = np.lexsort((-worth, label_ids))
-    places = np.empty(len(worth), np.int64)
-    _, starts, sizes = np.unique(label_ids[order], return_index=True, return_counts=True)
-    places[order] = np.arange(len(worth)) - np.repeat(starts, sizes)
-    return places

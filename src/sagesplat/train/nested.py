@@ -11,18 +11,19 @@ from jaxtyping import Float32
 from sagesplat import geometry
 from sagesplat.config import NestConfig, TrainConfig
 from sagesplat.errors import RunError
-from sagesplat.gaussians import Gaussians
+from sagesplat.gaussians import Gaussians, concat
 from sagesplat.raster import Backend, device_of
 from sagesplat.scene.images import Photos
-from sagesplat.scene.scene import Scene
+from sagesplat.scene.scene import Points, Scene
 from sagesplat.segment.masks import Masks
 from sagesplat.train.checkpoint import read_checkpoint, write_checkpoint
 from sagesplat.train.feed import Feed
 from sagesplat.train.freeze import Work, trainable_rows
-from sagesplat.train.importance import importance, ranks
+from sagesplat.train.importance import importance
 from sagesplat.train.pace import Pace
 from sagesplat.train.state import initial_state
 from sagesplat.train.stepper import Stepper
+from sagesplat.train.trainer import Event, train
 from sagesplat.train.votes import label_weights, winners
 
 CLEAR = 0.8  # share of its blending weight that a Gaussian needs in one category, else it straddles a border
@@ -64,28 +65,70 @@ def order(
     masks: Masks,
     config: NestConfig,
     *,
+    seeds: Gaussians | None = None,
     antialiased: bool = False,
 ) -> Nested:
-    """Vote on labels by what each Gaussian paints, and order each category.
+    """Vote on labels by what each Gaussian paints, and order each category by worth.
 
+    `seeds`, a small model of the same scene, take the place of as many Gaussians of the least worth and come
+    before all others: what is best placed alone makes better low levels than the worthiest of many.
     Gaussians that straddle a border come first in theirs, so that every composition has them. Splitting them
     in two does not help: nine in ten of the halves straddle as well.
     """
     views = scene.train_ids.tolist()
+    worth = importance(g, scene, views, config.criterion, antialiased=antialiased)
+    early = np.zeros(len(g), bool)
+    if seeds is not None and len(seeds):
+        kept = np.sort(np.argsort(-worth, kind="stable")[: max(len(g) - len(seeds), 0)])
+        of_seeds = importance(seeds, scene, views, config.criterion, antialiased=antialiased)
+        g = concat([seeds, g.select(torch.from_numpy(kept))])
+        worth, early = np.concatenate([of_seeds, worth[kept]]), np.arange(len(g)) < len(seeds)
     ids, weights = label_weights(g, scene, masks, views, antialiased=antialiased)
     g = replace(g, label_ids=winners(g, ids, weights))
     total = weights.sum(1)
     column = np.searchsorted(ids, g.label_ids.numpy()).clip(0, max(len(ids) - 1, 0))
     mine = weights[np.arange(len(g)), column] if len(ids) else total
     clarity = np.where(total > 0, mine / np.maximum(total, 1e-12), 1).astype(np.float32)
-    worth = importance(g, scene, views, config.criterion, antialiased=antialiased)
-    boundary = straddling(weights, len(views))
-    worth = np.where(boundary, np.inf, worth).astype(np.float32)  # whichever side is there needs them
-    places = ranks(worth, g.label_ids.numpy())
-    rows = np.lexsort((places, g.label_ids.numpy()))
+    boundary = straddling(weights, len(views))  # whichever side is there needs them
+    rows = np.lexsort((-worth, ~early, ~boundary, g.label_ids.numpy()))  # the last key decides first
     labels = g.label_ids.numpy()
     across = {label: int((boundary & (labels == label)).sum()) for label in np.unique(labels).tolist()}
     return Nested(g.select(torch.from_numpy(rows)), clarity[rows], across)
+
+
+def with_at_most(scene: Scene, labels: np.ndarray, count: int, seed: int) -> tuple[Scene, np.ndarray]:
+    """The scene with at most `count` of its points, drawn at random, and their labels (int16 [P])."""
+    points = scene.points
+    if len(points.xyz) <= count:
+        return scene, labels
+    rows = np.sort(np.random.default_rng(seed).choice(len(points.xyz), count, replace=False))
+    place = np.full(len(points.xyz), -1)
+    place[rows] = np.arange(count)
+    kept = place[points.track_points] >= 0
+    tracks = place[points.track_points[kept]], points.track_views[kept], points.track_uv[kept]
+    return replace(scene, points=Points(points.xyz[rows], points.rgb[rows], *tracks)), labels[rows]
+
+
+def capped_config(config: TrainConfig, cap: int, steps: int) -> TrainConfig:
+    """3DGS-MCMC with at most `cap` Gaussians, otherwise as `config`; nothing is recorded on the way."""
+    mcmc = replace(config, strategy="mcmc", max_gaussians=cap, max_steps=steps, level_every=steps)
+    return replace(mcmc, freeze_at=None, rest_share=0.0)
+
+
+def train_capped(
+    scene: Scene,
+    photos: Photos,
+    point_labels: np.ndarray,  # int16 [P]
+    config: TrainConfig,
+    cap: int,
+    steps: int,
+    *,
+    seed: int = 0,
+    backend: Backend = "auto",
+) -> Iterator[Event]:
+    """The events of a training of `capped_config`, from `cap` of the points where there are more."""
+    some, labels = with_at_most(scene, point_labels, cap, seed)
+    yield from train(some, photos, labels, capped_config(config, cap, steps), seed=seed, backend=backend)
 
 
 def straddling(weights: Float32[np.ndarray, "N L"], num_views: int) -> np.ndarray:
@@ -172,6 +215,8 @@ def check(config: NestConfig) -> None:
         ("full-share", config.full_share, 0 <= config.full_share <= 1, "a share such as 0.1"),
         ("full-share-end", config.full_share_end, 0 <= config.full_share_end <= 1, "a share such as 0.9"),
         ("sh-bits", config.sh_bits, all(1 <= b <= 8 for b in config.sh_bits), "1 to 8, such as 5 4"),
+        ("seed-share", config.seed_share, 0 <= config.seed_share < 1, "a share such as 0.1, or 0"),
+        ("seed-steps", config.seed_steps, config.seed_steps >= 1, "1 or more"),
         ("gain", config.gain, config.gain > 0, "a number such as 4"),
     )
     for name, value, fine, cure in wrong:
