@@ -8,11 +8,11 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from sagesplat.adapt.model import read_models
 from sagesplat.adapt.observe import PERCENTILE, distances_in_views
-from sagesplat.adapt.plan import plan_view
-from sagesplat.files import read_json
+from sagesplat.adapt.promise import read_promises
+from sagesplat.adapt.promised import plan_for_view, quality_at
 from sagesplat.job import Job
+from sagesplat.nesting import costs_of
 from sagesplat.output.ply import write_ply
 from sagesplat.run_dir import RunDir
 
@@ -29,7 +29,7 @@ def main() -> None:
     args = parser.parse_args()
 
     job = Job(RunDir(args.run), emit=lambda event: None)  # scene, labels and ladder, read when asked for
-    models, ladder = read_models(job.run.models), job.ladder
+    costs, promises = costs_of(job), read_promises(job.run.promises)
     views = {view.name: view for view in job.scene.views}
     if args.view not in views:
         parser.error(f"no view {args.view!r}; there are {', '.join(list(views)[:5])}, ...")
@@ -39,18 +39,16 @@ def main() -> None:
     w2c[2, 3] += args.back  # the world moves away along the camera's z
     viewer = replace(view, camera=replace(view.camera, w2c=w2c))
 
-    # The distances must be measured as those that the models were fitted to.
-    measured = read_json(job.run.provenance("observe"))["settings"]["distance"]
-    percentile = PERCENTILE if measured == "percentile" else 0.0
-    table = distances_in_views(replace(job.scene, views=(viewer,)), job.point_labels, percentile)
-    distances = {label: float(by_view[0]) for label, by_view in table.items()}
+    # The distances must be measured as those that the promises were fitted to.
+    percentile = PERCENTILE if job.fit_config.distance == "percentile" else 0.0
+    far = distances_in_views(replace(job.scene, views=(viewer,)), job.point_labels, percentile)
 
-    plan = plan_view(models, ladder.counts, distances, args.target_ssim, None, recovering=ladder.recovering)
+    plan = plan_for_view(quality_at(costs, promises, far, [viewer.camera]), costs, args.target_ssim, 0)
     for c in plan.choices:
-        name, promise = job.names()[c.label_id], f"distance {c.distance:6.2f}, SSIM {c.predicted_ssim:.3f}"
-        print(f"{name:24} level {c.level:6}  {c.count:9,} Gaussians  {promise}, {c.status}")
-    write_ply(args.ply, ladder.compose(plan.levels), job.names())
-    print(f"{args.ply}: {plan.count:,} Gaussians, {plan.nbytes / 1e6:.1f} MB at 248 bytes each")
+        name, kept = job.names()[c.label_id], f"SSIM at least {c.predicted_ssim:.3f}, {c.status}"
+        print(f"{name:24} level {c.level:3}  {c.count:9,} Gaussians  distance {c.distance:6.2f}  {kept}")
+    write_ply(args.ply, job.ladder.compose(plan.levels), job.names())
+    print(f"{args.ply}: {plan.count:,} Gaussians, {plan.sent or 0:,} bytes to send")
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import torch
 
 from sagesplat.adapt.observe import TOTAL, Observations, as_unit, large_enough, measure, render_rgb
 from sagesplat.adapt.promise import ViewModel, among_neighbours, fit_promises
-from sagesplat.adapt.promised import Costs, Quality, plan_for_view
+from sagesplat.adapt.promised import Costs, Quality, plan_for_view, quality_at
 from sagesplat.config import FitConfig, NestConfig, TrainConfig
 from sagesplat.events import Progress
 from sagesplat.gaussians import Gaussians
@@ -16,7 +16,6 @@ from sagesplat.job import Job, distances, label_images, run_stage
 from sagesplat.output.chunks import packed, read_chunks, read_index, totals, write_chunks
 from sagesplat.raster import Workspace
 from sagesplat.run_dir import file_hash, settings_of
-from sagesplat.scene.scene import Scene
 from sagesplat.segment.masks import UNLABELLED
 from sagesplat.train import nested
 from sagesplat.train.levels import read_header, read_level, write_prefixes
@@ -167,25 +166,9 @@ def costs_of(job: Job) -> Costs:
     return Costs(tuple(labels), count, sent, gpu)
 
 
-def viewpoints(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Where each view looks from and to: positions [V, 3], world, and unit directions [V, 3]."""
-    cameras = [view.camera for view in scene.views]
-    return np.stack([c.position for c in cameras]), np.stack([c.w2c[2, :3] for c in cameras])
-
-
 def quality_of(job: Job, promises: dict[int, ViewModel], distances: dict[int, np.ndarray]) -> Quality:
     """What the promises say of every view of the scene."""
-    costs = costs_of(job)
-    shape = len(job.scene.views), *costs.count.shape
-    position, direction = viewpoints(job.scene)
-    mean, bound, far = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape[:2], np.nan)
-    for i, label in enumerate(costs.labels):
-        far[:, i] = distances.get(label, far[:, i])
-        if label in promises:
-            told = promises[label].predict(far[:, i], position, direction)
-            known = np.array(promises[label].levels) - 1
-            mean[:, i, known], bound[:, i, known] = told.mean, told.bound
-    return Quality(mean, bound, far)
+    return quality_at(costs_of(job), promises, distances, [view.camera for view in job.scene.views])
 
 
 def pixels_of(table: Observations, job: Job, labels: tuple[int, ...], views: np.ndarray) -> np.ndarray:

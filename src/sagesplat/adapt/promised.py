@@ -1,7 +1,7 @@
 """Plans from promises: the cheapest levels that keep a target, or the best ones within a budget."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -10,7 +10,9 @@ from jaxtyping import Float, Int
 
 from sagesplat.adapt.allocate import Allocation, best_within, cheapest
 from sagesplat.adapt.plan import Choice, Plan, check_target
+from sagesplat.adapt.promise import ViewModel
 from sagesplat.errors import RunError
+from sagesplat.scene.scene import Camera
 
 Unit = Literal["bytes", "gpu-bytes", "count"]
 
@@ -36,6 +38,29 @@ class Quality:
     mean: Float[np.ndarray, "V L K"]  # expected SSIM
     bound: Float[np.ndarray, "V L K"]  # that it is not to fall below
     distance: Float[np.ndarray, "V L"]  # of the closest points in sight, world units; NaN: none
+
+
+def quality_at(
+    costs: Costs,
+    promises: Mapping[int, ViewModel],
+    distances: Mapping[int, Float[np.ndarray, " V"]],
+    cameras: Sequence[Camera],
+) -> Quality:
+    """What the promises say of any V viewpoints, whether a photo was taken there or not.
+
+    `distances`: by label id, of the closest points in sight (see `observe.distances_in_views`), NaN: none.
+    """
+    shape = len(cameras), *costs.count.shape
+    position = np.stack([camera.position for camera in cameras])
+    direction = np.stack([camera.w2c[2, :3] for camera in cameras])
+    mean, bound, far = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape[:2], np.nan)
+    for i, label in enumerate(costs.labels):
+        far[:, i] = distances.get(label, far[:, i])
+        if label in promises:
+            told = promises[label].predict(far[:, i], position, direction)
+            known = np.array(promises[label].levels) - 1
+            mean[:, i, known], bound[:, i, known] = told.mean, told.bound
+    return Quality(mean, bound, far)
 
 
 def plan_for_view(quality: Quality, costs: Costs, target: float, view: int) -> Plan:
