@@ -1,5 +1,6 @@
 """The nested ladder: order, training on compositions, prefixes, chunks, and a whole run with it."""
 
+import csv
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -390,6 +391,12 @@ def test_each_view_is_planned_by_its_bound(finished: Path, tmp_path: Path) -> No
     assert set(parts.level) <= {1, 2, 3, 4, 5}
     feasible = parts.select(parts.predicted >= parts.target)
     assert len(feasible)
+    by = {
+        row["by"]: row
+        for row in csv.DictReader((job.run.adapted / "promises_kept.csv").read_text().splitlines())
+    }
+    assert set(by) == {"eq3", "mean", "bound", "oracle"}
+    assert float(by["oracle"]["kept"]) == 1
 
 
 def test_without_calibration_views_a_run_still_promises(capture: Path, tmp_path: Path) -> None:
@@ -417,3 +424,27 @@ def test_seeds_come_first_and_take_the_place_of_the_least_worthy(scene: Scene) -
     worth = importance(g, scene, scene.train_ids.tolist())
     worthiest = g.means[torch.from_numpy(np.argsort(-worth, kind="stable")[:42].copy())]
     assert torch.equal(found.gaussians.means[8:], worthiest)
+
+
+def test_chunks_are_exported_as_files(finished: Path, tmp_path: Path) -> None:
+    job = quiet(finished)
+    for kind in ("spz", "ply"):
+        count = pipeline.export_chunks(job, tmp_path / kind, kind)
+        chunks = read_index(tmp_path / kind)
+        assert count == len(chunks) == len(list((tmp_path / kind).glob(f"*.{kind}")))
+        assert sum(c.count for c in chunks) == len(job.ladder.load(5))
+    counts = [[c.count for c in read_index(folder)] for folder in (tmp_path / "ply", job.run.chunks)]
+    assert counts[0] == counts[1]
+    with pytest.raises(RunError, match="exists"):
+        pipeline.export_chunks(job, tmp_path / "ply", "ply")
+    with pytest.raises(RunError, match="snapshots have no chunks"):
+        pipeline.export_chunks(Job(RunDir(finished, "snapshots"), print), tmp_path / "none", "ply")
+
+
+def test_one_gaussian_is_a_category_too(tmp_path: Path) -> None:
+    g = ordered().gaussians.select(torch.tensor([0, 20, 21]))
+    sizes = {label: level_sizes(n, QUICK) for label, n in g.counts().items()}
+    assert sizes[0] == (1, 1, 1, 1)
+    chunks = write_chunks(tmp_path / "chunks", g, sizes, {0: "a", 1: "b"})
+    assert [(c.label_id, c.level) for c in chunks] == [(0, 1), (1, 1), (1, 4)]
+    assert totals(chunks, [0, 1], 4, "count").tolist() == [[1, 1, 1, 1], [1, 1, 1, 2]]

@@ -418,26 +418,34 @@ def doctor(build: bool = False, json: bool = False) -> None:
 @command
 def export(
     run: Run,
-    ply: Positional[Annotated[Path, arg(metavar="OUT.ply")]],
+    out: Positional[Annotated[Path, arg(metavar="OUT")]],
     level: int | None = None,
     labels: tuple[str, ...] = (),
     target_ssim: float | None = None,
+    chunks: Literal["spz", "ply"] | None = None,
+    ladder: LadderKind = "nested",
     machine: Annotated[Machine, Flat] = Machine(),
 ) -> None:
-    """Write Gaussians as a PLY: the plan's composition, or one level; all categories or some.
+    """Write Gaussians as a PLY: the plan's composition, or one level; or all chunks of the nested ladder.
 
     Args:
         run: run folder.
-        ply: file to write.
-        level: a level by its training step, instead of the composition.
+        out: PLY to write, or a folder for chunks.
+        level: a level by its number (of snapshots: training step), instead of the composition.
         labels: names of the categories to take.
-        target_ssim: the composition for this planned target (default: the main one).
+        target_ssim: the composition for this planned target (default: the budget's or the main one).
+        chunks: a file for what each level of each category adds, in this format.
+        ladder: the ladder to take them from.
+        machine: where and how to compute.
     """
     from sagesplat import pipeline
 
-    with _job(run, machine) as job:
-        count = pipeline.export_ply(job, ply, level=level, labels=labels, target=target_ssim)
-    print(f"{ply}: {count:,} Gaussians")
+    with _job(run, machine, ladder) as job:
+        if chunks:
+            count = pipeline.export_chunks(job, out, chunks)
+        else:
+            count = pipeline.export_ply(job, out, level=level, labels=labels, target=target_ssim)
+    print(f"{out}: {count:,} {'chunks' if chunks else 'Gaussians'}")
 
 
 def main() -> None:

@@ -8,18 +8,21 @@ import numpy as np
 
 from sagesplat.adapt.columns import from_rows, write_columns
 from sagesplat.adapt.cross_view import NONE, cross_view, read_cross_view
+from sagesplat.adapt.kept import PREDICTORS, score
 from sagesplat.adapt.model import read_models
 from sagesplat.adapt.observe import distances_in_views, large_enough, read_observations
 from sagesplat.adapt.occupancy import Occupancy, compare, contenders, read_occupancy
 from sagesplat.adapt.plan import Plan, plan_view, read_plans
+from sagesplat.adapt.promise import read_promises
 from sagesplat.config import PaperConfig
 from sagesplat.errors import RunError, SageError
-from sagesplat.events import Progress, RunDone, Warned
+from sagesplat.events import Progress, RunDone, TableMade, Warned
 from sagesplat.gaussians import Gaussians
 from sagesplat.job import Job, distances, label_images, run_stage
 from sagesplat.lpips import Lpips, Net, load_lpips, weights_path
+from sagesplat.nesting import eroded
 from sagesplat.output.paper import PaperData, Picture, four_levels, take_pictures, write_paper
-from sagesplat.output.tables import promise_kept
+from sagesplat.output.tables import Table, promise_kept
 from sagesplat.run_dir import file_hash, settings_of
 from sagesplat.stages import ladder_files, tune_composition, view_planner
 
@@ -49,6 +52,10 @@ def cross_views(job: Job) -> None:
             progress=lambda done, total: job.emit(Progress("crossview", done, total)),
         )  # fmt: skip
         table.write_csv(run.cross_view)
+        if run.ladder == "nested":
+            kept = promises_table(job, targets)
+            kept.write(run.adapted / "promises_kept")
+            job.emit(TableMade(kept.title, kept.header, tuple(map(tuple, kept.cells()))))
         lines = []
         for target in np.unique(table.target):
             fared = promise_kept(table.select(table.target == target))
@@ -57,6 +64,31 @@ def cross_views(job: Job) -> None:
 
     inputs = [run.scene, run.labels, *ladder_files(run), run.plan]
     run_stage(job, "crossview", {"targets": targets}, inputs, [run.cross_view], make)
+
+
+def promises_table(job: Job, targets: Sequence[float]) -> Table:
+    """Decisions on test views by the paper's model, by ours and by its bound, everything at one level."""
+    run, fitted = job.run, job.fit_config
+    table = large_enough(read_observations(run.observations), job.scene, fitted.min_share)
+    table = eroded(table, fitted.region)
+    scores = score(table, job.scene, read_promises(run.promises), job.ladder.counts, targets)
+    body = []
+    for predictor in PREDICTORS:
+        totals = scores.select(scores.predictor == predictor).totals()
+        columns = ("feasible", "kept", "overshoot", "chosen_overshoot", "refused", "regret")
+        body.append((predictor, *(totals[name] for name in columns)))
+    return Table(
+        "Promises on unseen views, by what they are made from",
+        ("by", "feasible", "kept", "overshoot", "above the lowest", "refused", "regret"),
+        ("", ",d", ".1%", ".3f", ".3f", ",d", ",.0f"),
+        body,
+        notes=(
+            "(category, view, target) triples called feasible, and the share that measures the target; SSIM "
+            "above it, of all and where a level above the lowest was chosen; triples refused though a level "
+            "measures the target; Gaussians above the cheapest level that would have done. "
+            f"Targets: {', '.join(f'{t:g}' for t in targets)}. oracle: the measurement itself.",
+        ),
+    )
 
 
 def equal_occupancy(job: Job, config: PaperConfig) -> None:

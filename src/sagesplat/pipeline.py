@@ -5,13 +5,16 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sagesplat import nesting, stages
+from sagesplat.adapt.ladder import read_prefixes
 from sagesplat.adapt.plan import check_target
 from sagesplat.config import NestConfig, PlanConfig, RunConfig, TrainConfig
 from sagesplat.demo.capture import cached_capture
 from sagesplat.errors import RunError
 from sagesplat.events import Emit, Progress, StageDone, StageStarted
 from sagesplat.job import Job
+from sagesplat.output.chunks import INDEX, Format, write_chunks
 from sagesplat.output.ply import write_ply
+from sagesplat.run_dir import settings_of
 from sagesplat.train import nested
 
 # the built-in capture, within minutes on two cores
@@ -55,6 +58,20 @@ def run_demo(job: Job) -> None:
     run_all(job, demo_capture(job.emit), DEMO)
 
 
+def export_chunks(job: Job, folder: Path, kind: Format) -> int:
+    """Write what each level of each category adds as files of their own; returns how many."""
+    if job.run.ladder != "nested":
+        raise RunError(f"{job.run.path}: snapshots have no chunks; leave out --ladder snapshots")
+    if folder.exists() and not (job.force and (folder / INDEX).exists()):
+        raise RunError(f"{folder}: exists; choose a new folder (--force replaces one of chunks)")
+    ladder, made = read_prefixes(job.run.prefixes), settings_of(job.run, "nest")
+    chunks = write_chunks(
+        folder, ladder.gaussians, ladder.sizes, job.names(), kind=kind,
+        sh_bits=tuple(made["sh_bits"]), antialiased=job.antialiased,
+    )  # fmt: skip
+    return len(chunks)
+
+
 def export_ply(
     job: Job, path: Path, *, level: int | None, labels: Sequence[str], target: float | None
 ) -> int:
@@ -68,7 +85,7 @@ def export_ply(
     if level is not None:
         g = job.ladder.load(level, wanted)
     else:
-        plan = stages.scene_plan(job.run, stages.main_target(job.run) if target is None else target)
+        plan = stages.main_plan(job.run) if target is None else stages.scene_plan(job.run, target)
         g = stages.compose(job, plan).of_labels(wanted)
     write_ply(path, g, job.names())
     return len(g)

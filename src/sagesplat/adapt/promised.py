@@ -52,7 +52,7 @@ def quality_at(
     """
     shape = len(cameras), *costs.count.shape
     position = np.stack([camera.position for camera in cameras])
-    direction = np.stack([camera.w2c[2, :3] for camera in cameras])
+    direction = np.stack([camera.direction for camera in cameras])
     mean, bound, far = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape[:2], np.nan)
     for i, label in enumerate(costs.labels):
         far[:, i] = distances.get(label, far[:, i])
