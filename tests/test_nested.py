@@ -421,7 +421,7 @@ def test_seeds_come_first_and_take_the_place_of_the_least_worthy(scene: Scene) -
     assert len(found.gaussians) == 50
     assert found.boundary == {3: 0}
     assert sorted(found.gaussians.means[:8].tolist()) == sorted(seeds.means.tolist())
-    worth = importance(g, scene, scene.train_ids.tolist())
+    worth = importance(g, scene, scene.train_ids.tolist(), QUICK.criterion)
     worthiest = g.means[torch.from_numpy(np.argsort(-worth, kind="stable")[:42].copy())]
     assert torch.equal(found.gaussians.means[8:], worthiest)
 

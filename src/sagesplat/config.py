@@ -105,7 +105,7 @@ class NestConfig:
 
     steps: int = 3000
     """Training steps on random compositions."""
-    levels: int = 24
+    levels: int = 16
     """Prefixes that are measured and planned with, in geometric steps of their size."""
     smallest: float = 0.05
     """Share of a category's Gaussians in its lowest level."""
@@ -119,7 +119,7 @@ class NestConfig:
     """The same at the end: the whole model needs the last word."""
     sh_bits: tuple[int, int] = (5, 4)
     """Bits of harmonics in the chunks, of degree 1 and of those above; training gets used to them."""
-    criterion: Literal["weight", "weight-volume", "peak", "sensitivity", "opacity"] = "weight"
+    criterion: Literal["weight", "weight-volume", "peak", "sensitivity", "opacity"] = "sensitivity"
     """What orders the Gaussians of a category; docs/nested.md compares them."""
     gain: float = 4.0
     """Rates to begin with, times those of a published run's last third; they fall to a twentieth."""
