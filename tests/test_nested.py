@@ -352,7 +352,7 @@ def test_budgets_are_kept_and_more_bytes_promise_more(finished: Path, tmp_path: 
     stages.compose_plan(job)
     plan = read_budget_plan(job.run.plan)
     assert plan is not None
-    assert len(read_ply(job.run.composed)) == plan.count > 0.9 * full.count[:, -1].sum()
+    assert len(read_ply(job.run.composed)) == plan.count > 0.5 * full.count[:, -1].sum()
     stages.evaluate_plans(job)
     assert np.isnan(read_evaluation(job.run.evaluation).target).any()
     stages.make_plan(job, PlanConfig(target_ssim=0.4, budget=10.0))
