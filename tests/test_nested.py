@@ -32,7 +32,7 @@ from sagesplat.scene.scene import Points, Scene, View
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.sh import in_buckets
 from sagesplat.train.importance import importance
-from sagesplat.train.levels import write_prefixes
+from sagesplat.train.levels import write_set
 from sagesplat.train.nested import Nested, NestStep, draw_shares, level_sizes, nest, order, straddling
 
 QUICK = NestConfig(steps=12, levels=4, smallest=0.1)
@@ -197,7 +197,7 @@ def test_harmonics_in_buckets_are_multiples_and_zero_stays_zero() -> None:
 def ladder(tmp_path: Path) -> PrefixLadder:
     start = ordered()
     sizes = {0: (1, 5, 20), 1: (2, 2, 20), 2: (20, 20, 20)}
-    write_prefixes(tmp_path / "ladder.npz", start.gaussians, 12, sizes, clarity=start.clarity)
+    write_set(tmp_path / "ladder.npz", start.gaussians, 12, sizes, clarity=start.clarity)
     return read_prefixes(tmp_path / "ladder.npz")
 
 
@@ -219,7 +219,7 @@ def test_a_ladder_that_does_not_fit_its_gaussians_is_refused(tmp_path: Path) -> 
     g = ordered().gaussians
     for sizes in ({0: (5, 1, 20)}, {0: (1, 2, 19)}, {0: (1, 20)}):
         whole = {1: (1, 2, 20), 2: (1, 2, 20), **sizes}
-        write_prefixes(tmp_path / "ladder.npz", g, 1, whole)
+        write_set(tmp_path / "ladder.npz", g, 1, whole)
         with pytest.raises(DataError, match=r"ladder\.npz: level sizes"):
             read_prefixes(tmp_path / "ladder.npz")
     with pytest.raises(RunError, match="run `sagesplat nest`"):
@@ -352,7 +352,13 @@ def test_budgets_are_kept_and_more_bytes_promise_more(finished: Path, tmp_path: 
     stages.compose_plan(job)
     plan = read_budget_plan(job.run.plan)
     assert plan is not None
-    assert len(read_ply(job.run.composed)) == plan.count > 0.5 * full.count[:, -1].sum()
+    assert len(read_ply(job.run.composed)) == plan.count
+    costs, quality = nesting.promised_quality(job)
+    table = read_observations(job.run.observations)
+    shown = nesting.pixels_of(table, job, costs.labels, job.scene.train_ids)
+    best = (quality.mean * shown[..., None]).sum(0) / shown.sum(0)[:, None]
+    for row, choice in enumerate(plan.choices):  # all that money can buy
+        assert choice.status == "no model" or choice.predicted_ssim == pytest.approx(best[row].max())
     stages.evaluate_plans(job)
     assert np.isnan(read_evaluation(job.run.evaluation).target).any()
     stages.make_plan(job, PlanConfig(target_ssim=0.4, budget=10.0))

@@ -53,7 +53,7 @@ def on_gpu(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> N
         monkeypatch.setattr(module, "device_of", lambda *_: CPU)
     monkeypatch.setattr(Work, "mask", mask)
     monkeypatch.setattr(torch.Tensor, "is_cuda", property(lambda _: True), raising=False)
-    monkeypatch.setattr(trainer, "_LOOK_EVERY", 1)
+    monkeypatch.setattr(trainer, "LOOK_EVERY", 1)
 
 
 def mask(work: Work, row: int, factor: int = 1) -> torch.Tensor | None:

@@ -6,7 +6,6 @@ from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import cast
 
 import numpy as np
 
@@ -16,24 +15,22 @@ from sagesplat.adapt.model import read_models
 from sagesplat.adapt.observe import TOTAL, as_unit, large_enough, measure, read_observations, render_rgb
 from sagesplat.adapt.occupancy import nearest_snapshot, prune_to
 from sagesplat.adapt.plan import Plan, check_target, plan_scene
-from sagesplat.adapt.promise import read_promises
 from sagesplat.adapt.promised import Costs, Quality, plan_for_scene, plan_within
 from sagesplat.config import CompareConfig
-from sagesplat.errors import RunError, SageError
-from sagesplat.events import Progress, RunDone, TableMade, Warned
+from sagesplat.errors import RunError
+from sagesplat.events import Progress, RunDone, TableMade
 from sagesplat.files import read_json, write_json
-from sagesplat.gaussians import Gaussians, concat
-from sagesplat.job import Job, run_stage
-from sagesplat.lpips import Lpips, Net, load_lpips, weights_path
+from sagesplat.gaussians import Gaussians
+from sagesplat.job import Job, load_metrics, lpips_hashes, run_stage
+from sagesplat.lpips import Lpips
 from sagesplat.metrics import ssim_map
 from sagesplat.output import compare_report as report
-from sagesplat.output.chunks import INDEX, read_index, write_chunks
+from sagesplat.output.chunks import INDEX, read_chunks, read_index, write_chunks
 from sagesplat.output.compare_report import OfLabel, Point, Walk
-from sagesplat.output.spz import SH_BITS, read_spz
+from sagesplat.output.spz import SH_BITS
 from sagesplat.raster import Workspace
-from sagesplat.run_dir import RunDir, file_hash, is_done, settings_of
+from sagesplat.run_dir import RunDir, is_done, settings_of
 from sagesplat.stages import (
-    distances,
     fit_ladder,
     label_images,
     ladder_files,
@@ -43,12 +40,10 @@ from sagesplat.stages import (
     view_planner,
 )
 from sagesplat.train.importance import importance
-from sagesplat.train.levels import read_level, write_prefixes
-from sagesplat.train.nested import capped_config, train_capped
-from sagesplat.train.trainer import Step, Trained
+from sagesplat.train.levels import read_level, write_set
+from sagesplat.train.nested import capped_config
 
 PAPER_TARGETS = (0.6, 0.7, 0.8)
-NETS: dict[str, Net] = {"lpips_alex": "alex", "lpips_vgg": "vgg"}
 _FEWEST = 10  # Gaussians that a training can begin with
 _TOGETHER = 8  # sets in memory at a time
 
@@ -74,7 +69,7 @@ def compare(job: Job, config: CompareConfig, copy: Path | None = None) -> list[P
     """
     _check(job, config)
     folder, file = job.run.path / "compare", job.run.path / "compare" / report.FILE
-    lpips = {net: file_hash(path) if path.is_file() else None for net, path in _weights(config).items()}
+    lpips = lpips_hashes(config.lpips)
     targets = list(config.targets) or sorted({*PAPER_TARGETS, *settings_of(job.run, "plan")["targets"]})
     settings = json.loads(json.dumps(asdict(config) | {"targets": targets, "lpips": lpips}))
     is_done(job.run, "compare", settings, [], [file], job.force)  # refused before hours of training
@@ -82,14 +77,14 @@ def compare(job: Job, config: CompareConfig, copy: Path | None = None) -> list[P
     trained = _pruned(job, config, folder) | _mcmc(job, config, folder)
 
     def make() -> list[str]:
-        costs, quality = nesting.costs_of(job), _quality(job)
+        costs, quality = nesting.promised_quality(job)
         contenders = [
             *_snapshot_points(snapshots, config),
             *_sage(job, snapshots, targets),
             *trained.values(),
             *_nested(job, config, costs, quality),
         ]
-        points = _measure(job, contenders, _metrics(job, config))
+        points = _measure(job, contenders, load_metrics(job, config.lpips))
         walks = _walks(job, snapshots, costs, quality)
         (folder / report.PAGE).unlink(missing_ok=True)  # it shows what was measured before
         report.write_comparison(file, points, walks, scene=job.scene.name, views=len(job.scene.test_ids))
@@ -184,20 +179,10 @@ def _mcmc(job: Job, config: CompareConfig, folder: Path) -> dict[Path, Contender
         mine = capped_config(made, cap, made.max_steps)
         path = folder / f"mcmc-{share:g}.npz"
 
-        def make(cap: int = cap, stage: str = path.stem) -> Gaussians:
-            capped = train_capped(
-                job.scene, job.photos, job.point_labels, made, cap, made.max_steps,
-                seed=seed, backend=job.backend,
-            )  # fmt: skip
-            for event in capped:
-                if isinstance(event, Step):
-                    text = f"loss {event.loss:.3f}, {event.num_gaussians:,} Gaussians"
-                    job.emit(Progress(stage, event.step, made.max_steps, text))
-                elif isinstance(event, Trained):
-                    return event.gaussians
-            raise AssertionError("a training ends with what it trained")
-
-        _keep(job, path, {**asdict(mine), "seed": seed}, [run.scene, run.labels], made.max_steps, make)
+        _keep(
+            job, path, {**asdict(mine), "seed": seed}, [run.scene, run.labels], made.max_steps,
+            partial(nesting.train_capped, job, path.stem, cap, made.max_steps, seed),
+        )  # fmt: skip
         name = f"cap {share:.0%}"
         found[path] = Contender(report.MCMC, name, made.max_steps, partial(read_level, path))
     return found
@@ -210,7 +195,7 @@ def _keep(
 
     def work() -> list[str]:
         g = make()
-        write_prefixes(path, g, step, {})
+        write_set(path, g, step)
         return [f"{len(g):,} Gaussians"]
 
     run_stage(job, path.stem, settings, inputs, [path], work)
@@ -240,10 +225,6 @@ def _sage(job: Job, snapshots: Job, targets: Sequence[float]) -> list[Contender]
         load = partial(ladder.compose, plan.levels)
         found.append(Contender(report.SAGE, name, ladder.levels[-1], load, target=target))
     return found
-
-
-def _quality(job: Job) -> Quality:
-    return nesting.quality_of(job, read_promises(job.run.promises), distances(job, job.fit_config.distance))
 
 
 def _nested(job: Job, config: CompareConfig, costs: Costs, quality: Quality) -> list[Contender]:
@@ -276,21 +257,6 @@ def _nested(job: Job, config: CompareConfig, costs: Costs, quality: Quality) -> 
                 np.nan if plan.budget is None else plan.budget,
             )
         )  # fmt: skip
-    return found
-
-
-def _weights(config: CompareConfig) -> dict[str, Path]:
-    return {net: weights_path(cast(Net, net), config.lpips) for net in NETS.values()}
-
-
-def _metrics(job: Job, config: CompareConfig) -> dict[str, Lpips]:
-    """LPIPS as the field feeds it, by column; what cannot be loaded is left out with a warning."""
-    found = {}
-    for column, net in NETS.items():
-        try:
-            found[column] = load_lpips(net, config.lpips, as_3dgs=net == "vgg")
-        except SageError as error:
-            job.emit(Warned(f"no LPIPS ({net}): {error}"))
     return found
 
 
@@ -366,8 +332,8 @@ def _send(job: Job, g: Gaussians) -> tuple[dict[int, int], Gaussians]:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "chunks"
         chunks = write_chunks(path, g, whole, job.names(), sh_bits=bits, antialiased=job.antialiased)
-        arrived = [read_spz(path / chunk.uri, chunk.label_id) for chunk in chunks]
-    return {c.label_id: c.nbytes for c in chunks}, concat(arrived) if arrived else g
+        arrived = read_chunks(path, chunks) if chunks else g
+    return {c.label_id: c.nbytes for c in chunks}, arrived
 
 
 def _walks(job: Job, snapshots: Job, costs: Costs, quality: Quality) -> list[Walk]:

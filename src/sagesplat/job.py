@@ -14,17 +14,19 @@ import numpy as np
 from sagesplat.adapt.ladder import Ladder, SnapshotLadder, read_ladder, read_prefixes
 from sagesplat.adapt.observe import PERCENTILE, LabelImages, RenderedLabels, distances_in_views
 from sagesplat.config import FitConfig
-from sagesplat.errors import RunError
-from sagesplat.events import Emit, StageDone, StageSkipped, StageStarted
+from sagesplat.errors import RunError, SageError
+from sagesplat.events import Emit, StageDone, StageSkipped, StageStarted, Warned
 from sagesplat.files import read_json
+from sagesplat.lpips import Lpips, Net, load_lpips, weights_path
 from sagesplat.raster import Backend
-from sagesplat.run_dir import RunDir, is_done, record, settings_of
+from sagesplat.run_dir import RunDir, file_hash, is_done, record, settings_of
 from sagesplat.scene import load_scene
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.segment.lift import LiftedLabels
 from sagesplat.segment.masks import Masks, Taxonomy
 
+NETS: tuple[Net, ...] = ("alex", "vgg")
 NO_RUN = "not a run folder (no scene.json); begin with `sagesplat run SCENE RUN`"
 
 
@@ -109,6 +111,23 @@ def distances(job: Job, distance: str) -> dict[int, np.ndarray]:
     """d_min of each category in each view, as `FitConfig.distance` says."""
     percentile = PERCENTILE if distance == "percentile" else 0.0
     return distances_in_views(job.scene, job.point_labels, percentile)
+
+
+def lpips_hashes(folder: Path | None) -> dict[str, str | None]:
+    """What tells one set of LPIPS weights from another, by network."""
+    paths = {net: weights_path(net, folder) for net in NETS}
+    return {net: file_hash(path) if path.is_file() else None for net, path in paths.items()}
+
+
+def load_metrics(job: Job, folder: Path | None, nets: Sequence[Net] = NETS) -> dict[str, Lpips]:
+    """LPIPS as the field feeds it, by column; what cannot be loaded is left out with a warning."""
+    found = {}
+    for net in nets:
+        try:
+            found[f"lpips_{net}"] = load_lpips(net, folder, as_3dgs=net == "vgg")
+        except SageError as error:
+            job.emit(Warned(f"no LPIPS ({net}): {error}"))
+    return found
 
 
 def run_stage(

@@ -6,19 +6,21 @@ from dataclasses import asdict, fields, replace
 import numpy as np
 import torch
 
-from sagesplat.adapt.observe import TOTAL, Observations, as_unit, large_enough, measure, render_rgb
-from sagesplat.adapt.promise import ViewModel, among_neighbours, fit_promises
+from sagesplat.adapt.observe import Observations, as_unit, large_enough, measure, render_rgb
+from sagesplat.adapt.promise import ViewModel, among_neighbours, fit_promises, read_promises
 from sagesplat.adapt.promised import Costs, Quality, plan_for_view, quality_at
 from sagesplat.config import FitConfig, NestConfig, TrainConfig
 from sagesplat.events import Progress
 from sagesplat.gaussians import Gaussians
 from sagesplat.job import Job, distances, label_images, run_stage
+from sagesplat.metrics import ssim_map
 from sagesplat.output.chunks import packed, read_chunks, read_index, totals, write_chunks
 from sagesplat.raster import Workspace
 from sagesplat.run_dir import file_hash, settings_of
 from sagesplat.segment.masks import UNLABELLED
 from sagesplat.train import nested
-from sagesplat.train.levels import read_header, read_level, write_prefixes
+from sagesplat.train.freeze import VIEWS, spread
+from sagesplat.train.levels import read_level, write_set
 from sagesplat.train.nested import Nested, NestStep
 from sagesplat.train.trainer import Step, Trained
 
@@ -72,18 +74,24 @@ def _make_seeds(job: Job, config: NestConfig, seed: int) -> None:
     settings = {**asdict(nested.capped_config(made, cap, config.seed_steps)), "seed": seed}
 
     def make() -> list[str]:
-        events = nested.train_capped(
-            job.scene, job.photos, job.point_labels, made, cap, config.seed_steps,
-            seed=seed, backend=job.backend,
-        )  # fmt: skip
-        for event in events:
-            if isinstance(event, Step):
-                job.emit(Progress("seeds", event.step, config.seed_steps, f"loss {event.loss:.3f}"))
-            elif isinstance(event, Trained):
-                write_prefixes(run.seeds, event.gaussians, event.step, {})
-        return [f"{sum(read_header(run.seeds).counts.values()):,} Gaussians"]
+        g = train_capped(job, "seeds", cap, config.seed_steps, seed)
+        write_set(run.seeds, g, config.seed_steps)
+        return [f"{len(g):,} Gaussians"]
 
     run_stage(job, "seeds", settings, [run.scene, run.labels], [run.seeds], make)
+
+
+def train_capped(job: Job, stage: str, cap: int, steps: int, seed: int) -> Gaussians:
+    """3DGS-MCMC of at most `cap` Gaussians, otherwise trained as the run; progress goes to `stage`."""
+    for event in nested.train_capped(
+        job.scene, job.photos, job.point_labels, train_config(job), cap, steps, seed=seed, backend=job.backend
+    ):
+        if isinstance(event, Step):
+            text = f"loss {event.loss:.3f}, {event.num_gaussians:,} Gaussians"
+            job.emit(Progress(stage, event.step, steps, text))
+        elif isinstance(event, Trained):
+            return event.gaussians
+    raise AssertionError("a training ends with what it trained")
 
 
 def _write_ladder(job: Job, trained: Nested, config: NestConfig) -> list[str]:
@@ -98,7 +106,7 @@ def _write_ladder(job: Job, trained: Nested, config: NestConfig) -> list[str]:
     )
     # what is measured, planned and written from here on is what a viewer gets
     sent = read_chunks(job.run.chunks, chunks)
-    write_prefixes(job.run.prefixes, sent, config.steps, sizes, clarity=trained.clarity[rows])
+    write_set(job.run.prefixes, sent, config.steps, sizes, clarity=trained.clarity[rows])
     size, n = sum(chunk.nbytes for chunk in chunks), len(trained.gaussians)
     across = sum(trained.boundary.values())
     lost = _quality(job, ordered) - _quality(job, sent)
@@ -112,16 +120,11 @@ def _write_ladder(job: Job, trained: Nested, config: NestConfig) -> list[str]:
 def _quality(job: Job, g: Gaussians) -> float:
     """Mean SSIM over some of the training views."""
     found = []
-    for row in some_of(job.scene.train_ids):
-        view = job.scene.views[row]
-        image = render_rgb(g, view.camera, backend=job.backend, antialiased=job.antialiased)
-        found.append(measure(image, as_unit(job.photos[row]), job.masks[view])[TOTAL]["ssim"])
+    for row in spread(job.scene.train_ids.tolist(), VIEWS):
+        camera = job.scene.views[row].camera
+        image = render_rgb(g, camera, backend=job.backend, antialiased=job.antialiased)
+        found.append(ssim_map(image, as_unit(job.photos[row])).mean())
     return float(np.mean(found))
-
-
-def some_of(rows: np.ndarray) -> list[int]:
-    """About 16 of the rows, evenly spread."""
-    return rows[:: max(1, len(rows) // 16)].tolist()
 
 
 def fit_viewpoints(job: Job, table: Observations, config: FitConfig) -> dict[int, ViewModel]:
@@ -134,11 +137,12 @@ def fit_viewpoints(job: Job, table: Observations, config: FitConfig) -> dict[int
     table = table.select(table.label_id != UNLABELLED)
     promises = fit_promises(table, job.scene, config.confidence)
     far, costs = distances(job, config.distance), costs_of(job)
-    quality, masks = quality_of(job, promises, far), label_images(job, config.masks)
+    quality = quality_at(costs, promises, far, [view.camera for view in job.scene.views])
+    masks = label_images(job, config.masks)
     keys = zip(table.label_id.tolist(), table.level.tolist(), table.view.tolist(), strict=True)
     alone = dict(zip(keys, table.ssim.tolist(), strict=True))
     changes: dict[int, list[float]] = {}
-    rows = job.scene.calibration_ids.tolist() or some_of(job.scene.train_ids)
+    rows = job.scene.calibration_ids.tolist() or spread(job.scene.train_ids.tolist(), VIEWS)
     workspace = Workspace()
     for done, row in enumerate(rows, 1):
         view = job.scene.views[row]
@@ -166,9 +170,11 @@ def costs_of(job: Job) -> Costs:
     return Costs(tuple(labels), count, sent, gpu)
 
 
-def quality_of(job: Job, promises: dict[int, ViewModel], distances: dict[int, np.ndarray]) -> Quality:
-    """What the promises say of every view of the scene."""
-    return quality_at(costs_of(job), promises, distances, [view.camera for view in job.scene.views])
+def promised_quality(job: Job) -> tuple[Costs, Quality]:
+    """What the levels cost, and what the run's promises say of them in every view of the scene."""
+    costs, promises = costs_of(job), read_promises(job.run.promises)
+    cameras = [view.camera for view in job.scene.views]
+    return costs, quality_at(costs, promises, distances(job, job.fit_config.distance), cameras)
 
 
 def pixels_of(table: Observations, job: Job, labels: tuple[int, ...], views: np.ndarray) -> np.ndarray:

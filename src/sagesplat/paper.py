@@ -1,8 +1,6 @@
 """The paper's evaluation of a finished run, in three stages: crossview, occupancy, tables and figures."""
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import cast
 
 import numpy as np
 
@@ -15,15 +13,14 @@ from sagesplat.adapt.occupancy import Occupancy, compare, contenders, read_occup
 from sagesplat.adapt.plan import Plan, plan_view, read_plans
 from sagesplat.adapt.promise import read_promises
 from sagesplat.config import PaperConfig
-from sagesplat.errors import RunError, SageError
-from sagesplat.events import Progress, RunDone, TableMade, Warned
+from sagesplat.errors import RunError
+from sagesplat.events import Progress, RunDone, TableMade
 from sagesplat.gaussians import Gaussians
-from sagesplat.job import Job, distances, label_images, run_stage
-from sagesplat.lpips import Lpips, Net, load_lpips, weights_path
+from sagesplat.job import Job, distances, label_images, load_metrics, lpips_hashes, run_stage
 from sagesplat.nesting import eroded
 from sagesplat.output.paper import PaperData, Picture, four_levels, take_pictures, write_paper
 from sagesplat.output.tables import Table, promise_kept
-from sagesplat.run_dir import file_hash, settings_of
+from sagesplat.run_dir import settings_of
 from sagesplat.stages import ladder_files, tune_composition, view_planner
 
 _IMAGES_A_TRAINING = 50  # a short training takes about as long as measuring so many images
@@ -95,7 +92,7 @@ def equal_occupancy(job: Job, config: PaperConfig) -> None:
     """Compare compositions with 3DGS of the same size, on the test views and in one view."""
     run = job.run
     view = _view(job, config)
-    settings = {"view": view, "tune_steps": config.tune_steps, "lpips": _weights(config)}
+    settings = {"view": view, "tune_steps": config.tune_steps, "lpips": lpips_hashes(config.lpips)}
 
     def make() -> list[str]:
         tests = job.scene.test_ids.tolist()
@@ -115,7 +112,7 @@ def equal_occupancy(job: Job, config: PaperConfig) -> None:
             advance(_IMAGES_A_TRAINING)
             return result
 
-        metrics = _metrics(job, config)
+        metrics = load_metrics(job, config.lpips)
         rows: list[dict[str, float]] = []
         for of_view, plans, views in comparisons:
             sets = contenders(job.scene, job.ladder, plans, tuned, antialiased=job.antialiased)
@@ -150,7 +147,7 @@ def tables_and_figures(job: Job, config: PaperConfig) -> None:
             names=job.names(),
             colours={label: taxonomy.color(label) for label in job.names()},
             observations=observations,
-            fitted=replace(rows, ssim=rows.ssim_eroded) if fitted.region == "eroded" else rows,
+            fitted=eroded(rows, fitted.region),
             train_views=job.scene.train_ids,
             test_views=job.scene.test_ids,
             view_names=[v.name for v in job.scene.views],
@@ -199,28 +196,11 @@ def _view(job: Job, config: PaperConfig) -> int:
     return matching[0]
 
 
-def _weights(config: PaperConfig) -> dict[str, str | None]:
-    """What tells one set of LPIPS weights from another."""
-    paths = {net: weights_path(cast(Net, net), config.lpips) for net in ("alex", "vgg")}
-    return {net: file_hash(path) if path.is_file() else None for net, path in paths.items()}
-
-
-def _metrics(job: Job, config: PaperConfig, nets: Sequence[Net] = ("alex", "vgg")) -> dict[str, Lpips]:
-    """LPIPS as the field feeds it, by column; what cannot be loaded is left out with a warning."""
-    found = {}
-    for net in nets:
-        try:
-            found[f"lpips_{net}"] = load_lpips(net, config.lpips, as_3dgs=net == "vgg")
-        except SageError as error:
-            job.emit(Warned(f"no LPIPS ({net}): {error}"))
-    return found
-
-
 def _panels(job: Job, config: PaperConfig, view: int) -> dict[str, list[Picture]]:
     """The view of Table III, and for cross-view two test views, in pictures."""
     tests = job.scene.test_ids
     rows = [view, *(int(tests[len(tests) * i // 4]) for i in (1, 3) if len(tests))]
-    metric = _metrics(job, config, ["alex"]).get("lpips_alex")
+    metric = load_metrics(job, config.lpips, ["alex"]).get("lpips_alex")
     full = job.ladder.load(job.ladder.levels[-1])
     panels = {}
     for row in dict.fromkeys(rows):

@@ -78,10 +78,7 @@ def export_ply(
     """Write a level or a composition, whole or some categories, as a PLY; returns the number of Gaussians."""
     if path.exists() and not job.force:
         raise RunError(f"{path}: exists; add --force to replace it")
-    ids = {name: label for label, name in job.names().items()}
-    if unknown := [name for name in labels if name not in ids]:
-        raise RunError(f"{job.run.path}: no category {unknown[0]!r}; there are {', '.join(ids)}")
-    wanted = [ids[name] for name in labels] or list(ids.values())
+    wanted = [stages.label_named(job, name) for name in labels] or list(job.names())
     if level is not None:
         g = job.ladder.load(level, wanted)
     else:

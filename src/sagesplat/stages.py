@@ -20,7 +20,7 @@ from sagesplat.adapt.observe import (
     read_observations,
 )
 from sagesplat.adapt.plan import Plan, plan_scene, plan_view, read_budget_plan, read_plans, write_plans
-from sagesplat.adapt.promise import read_promises, write_promises
+from sagesplat.adapt.promise import write_promises
 from sagesplat.adapt.promised import plan_for_scene, plan_for_view, plan_within
 from sagesplat.config import FitConfig, LiftConfig, MasksConfig, PlanConfig, SceneConfig, TrainConfig
 from sagesplat.errors import RunError
@@ -30,7 +30,7 @@ from sagesplat.gaussians import Gaussians
 from sagesplat.job import Job, distances, fingerprint, label_images, run_stage
 from sagesplat.output import tables
 from sagesplat.output.chunks import INDEX
-from sagesplat.output.ply import write_ply
+from sagesplat.output.ply import read_ply, write_ply
 from sagesplat.output.report import write_report
 from sagesplat.output.summary import report_data
 from sagesplat.output.tables import Table
@@ -241,9 +241,10 @@ def fit_ladder(job: Job, config: FitConfig) -> None:
             lines.append("promises: " + ", ".join(f"{statuses.count(s)} {s}" for s in sorted(set(statuses))))
         return lines
 
-    settings = {name: getattr(config, name) for name in ("min_share", "region", "confidence")}
+    settings: dict[str, Any] = {"min_share": config.min_share, "region": config.region}
     inputs, outputs = [run.scene, run.observations], [run.models]
     if run.ladder == "nested":
+        settings["confidence"] = config.confidence
         inputs, outputs = [*inputs, run.prefixes, run.chunks / INDEX], [*outputs, run.promises]
     run_stage(job, "fit", settings, inputs, outputs, make)
 
@@ -253,10 +254,7 @@ def make_plan(job: Job, config: PlanConfig) -> None:
     run = job.run
 
     def from_promises() -> list[str]:
-        costs = nesting.costs_of(job)
-        quality = nesting.quality_of(
-            job, read_promises(run.promises), distances(job, job.fit_config.distance)
-        )
+        costs, quality = nesting.promised_quality(job)
         shown = nesting.pixels_of(read_observations(run.observations), job, costs.labels, job.scene.train_ids)
         scene_plans = [
             plan_for_scene(quality, costs, target, config.share, shown) for target in config.targets
@@ -266,7 +264,7 @@ def make_plan(job: Job, config: PlanConfig) -> None:
         ]
         within = None
         if config.budget:
-            weights = {_label_named(job, name): weight for name, weight in config.weights.items()}
+            weights = {label_named(job, name): weight for name, weight in config.weights.items()}
             within = plan_within(quality, costs, config.budget, config.budget_unit, shown, weights)
         write_plans(run.plan, scene_plans, view_plans, within)
         full = int(costs.sent[:, -1].sum())
@@ -314,7 +312,8 @@ def make_plan(job: Job, config: PlanConfig) -> None:
     run_stage(job, "plan", settings, inputs, [run.plan], from_promises if nested else from_models)
 
 
-def _label_named(job: Job, name: str) -> int:
+def label_named(job: Job, name: str) -> int:
+    """The id of a category of the run; RunError for a name that it does not have."""
     ids = {name: label for label, name in job.names().items()}
     if name not in ids:
         raise RunError(f"{job.run.path}: no category {name!r}; there are {', '.join(ids)}")
@@ -371,10 +370,10 @@ def compose_plan(job: Job) -> None:
 
 def view_planner(job: Job) -> Callable[[int, float], Plan]:
     """Plans single views (row of Scene.views, target SSIM), seen or not."""
-    far, ladder = distances(job, job.fit_config.distance), job.ladder
     if job.run.ladder == "nested":
-        costs, quality = nesting.costs_of(job), nesting.quality_of(job, read_promises(job.run.promises), far)
+        costs, quality = nesting.promised_quality(job)
         return lambda row, target: plan_for_view(quality, costs, target, row)
+    far, ladder = distances(job, job.fit_config.distance), job.ladder
     models = read_models(job.run.models)
 
     def plan(row: int, target: float) -> Plan:
@@ -386,12 +385,11 @@ def view_planner(job: Job) -> Callable[[int, float], Plan]:
 
 def promised(job: Job) -> Callable[[int, int, int], float]:
     """SSIM promised of a (label id, level) in a view (row of Scene.views); NaN where nothing is."""
-    far = distances(job, job.fit_config.distance)
     if job.run.ladder == "nested":
-        quality = nesting.quality_of(job, read_promises(job.run.promises), far)
-        row_of = {label: i for i, label in enumerate(nesting.costs_of(job).labels)}
+        costs, quality = nesting.promised_quality(job)
+        row_of = {label: i for i, label in enumerate(costs.labels)}
         return lambda label, level, row: float(quality.bound[row, row_of[label], level - 1])
-    models = read_models(job.run.models)
+    far, models = distances(job, job.fit_config.distance), read_models(job.run.models)
 
     def by_distance(label: int, level: int, row: int) -> float:
         known = (label, level) in models and label in far
@@ -440,9 +438,12 @@ def make_report(job: Job) -> None:
 
     def make() -> list[str]:
         target = main_target(run)
+        # the page leads with a target: what was composed for a budget is not what it is about
+        within_budget = read_budget_plan(run.plan) is not None
+        composed = compose(job, scene_plan(run, target)) if within_budget else read_ply(run.composed)
         write_report(
             run.report,
-            report_data(run, job.scene, job.photos, job.masks, job.ladder, target, job.backend),
+            report_data(run, job.scene, job.photos, job.masks, job.ladder, composed, target, job.backend),
         )
         return []
 

@@ -128,7 +128,7 @@ def plan_scene(
     `distances` maps label ids to one distance per view, world units; see `plan_view` for the rest.
     """
     check_target(target)
-    _check("share of views", share)
+    check_share(share)
     choices = []
     for label_id, levels in _eligible(models, counts, recovering).items():
         known = np.asarray(distances.get(label_id, ()), np.float64)
@@ -179,6 +179,11 @@ def _choose(
 def check_target(target: float) -> None:
     """RunError for an SSIM that cannot be asked for."""
     _check("target SSIM", target)
+
+
+def check_share(share: float) -> None:
+    """RunError for a share of views that cannot be asked for."""
+    _check("share of views", share)
 
 
 def _check(name: str, value: float) -> None:

@@ -9,9 +9,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sagesplat.adapt.allocate import Allocation, best_within, cheapest
-from sagesplat.adapt.plan import Choice, Plan, check_target
+from sagesplat.adapt.plan import Choice, Plan, check_share, check_target
 from sagesplat.adapt.promise import ViewModel
-from sagesplat.errors import RunError
 from sagesplat.scene.scene import Camera
 
 Unit = Literal["bytes", "gpu-bytes", "count"]
@@ -83,8 +82,7 @@ def plan_for_scene(
     `shown`: pixels of each category in each view to plan for, 0 where it does not count.
     """
     check_target(target)
-    if not (math.isfinite(share) and 0 < share <= 1):
-        raise RunError(f"share of views {share} is impossible; choose a number above 0 and at most 1")
+    check_share(share)
     bound = np.stack([_kept_in(quality.bound[shown[:, i] > 0, i], share) for i in range(len(costs.labels))])
     found = cheapest(bound, costs.sent, target)
     nowhere = np.full(len(costs.labels), np.nan)

@@ -25,7 +25,7 @@ from sagesplat.errors import DataError
 from sagesplat.files import atomic_path
 from sagesplat.gaussians import Gaussians
 from sagesplat.geometry import morton_order
-from sagesplat.sh import bases
+from sagesplat.sh import bases, in_buckets
 
 Frame = Literal["rub", "rdf"]  # axes in the file: right, up, back (SPZ's own); right, down, front (COLMAP's)
 
@@ -106,7 +106,7 @@ def encode_spz(
         _rounded(g.sh0.double().numpy() * _COLOUR + 127.5),
         _rounded((g.log_scales.double().numpy() + 10) * 16),
         _pack_rotations(quats),
-        _quantise(harmonics, sh_bits),
+        _rounded(128 + 128 * in_buckets(torch.from_numpy(harmonics), sh_bits).numpy()),
     ]
     header = _HEADER.pack(_MAGIC, 3, len(g), degree, bits, _ANTIALIASED if antialiased else 0, 0)
     packer = zlib.compressobj(
@@ -125,7 +125,7 @@ def packing_order(
     """
     g = g.detach().to("cpu")
     degree = g.sh_degree if sh_degree is None else min(sh_degree, g.sh_degree)
-    harmonics = _quantise(g.shN[:, : _BASES[degree]].numpy(), sh_bits)
+    harmonics = in_buckets(g.shN[:, : _BASES[degree]], sh_bits).numpy()
     colours = np.argsort(morton_order(g.sh0[:, 0].numpy()))  # ranks
     return np.lexsort((colours, *harmonics.reshape(len(g), 3 * _BASES[degree]).T[::-1]))
 
@@ -222,12 +222,6 @@ def _flip(means: np.ndarray, quats: np.ndarray, harmonics: np.ndarray) -> tuple[
 
 def _rounded(values: np.ndarray) -> np.ndarray:
     return np.rint(values).clip(0, 255).astype(np.uint8)
-
-
-def _quantise(harmonics: np.ndarray, sh_bits: tuple[int, int]) -> np.ndarray:
-    """Bytes [N, K, 3] of harmonics float32: the nearest multiple of 2^(8 - bits), 128 being zero."""
-    steps = np.repeat(2.0 ** (8 - np.array(sh_bits)), (3, 12)).astype(np.float32)[: harmonics.shape[1], None]
-    return _rounded(np.rint(harmonics.clip(-1, 1) * (128 / steps)) * steps + 128)
 
 
 def _pack_rotations(quats: np.ndarray) -> np.ndarray:

@@ -14,7 +14,6 @@ from sagesplat.adapt.plan import read_plans
 from sagesplat.files import read_json
 from sagesplat.gaussians import Gaussians
 from sagesplat.output.figures import Panel
-from sagesplat.output.ply import read_ply
 from sagesplat.output.report import ReportData
 from sagesplat.raster import Backend
 from sagesplat.run_dir import RunDir
@@ -28,9 +27,16 @@ STAGES = ("scene", "masks", "lift", "train", "nest", "observe", "fit", "plan", "
 
 
 def report_data(
-    run: RunDir, scene: Scene, photos: Photos, masks: Masks, ladder: Ladder, target: float, backend: Backend
+    run: RunDir,
+    scene: Scene,
+    photos: Photos,
+    masks: Masks,
+    ladder: Ladder,
+    composed: Gaussians,
+    target: float,
+    backend: Backend,
 ) -> ReportData:
-    """Everything the report of a run shows; `target` is the SSIM that it leads with."""
+    """Everything the report of a run shows; `target` is the SSIM that it leads with, `composed` its scene."""
     names = {**masks.taxonomy.names, UNLABELLED: masks.taxonomy.name(UNLABELLED)}
     plans = read_plans(run.plan)[0]
     records = {stage: read_json(run.provenance(stage)) for stage in STAGES if run.provenance(stage).exists()}
@@ -49,7 +55,7 @@ def report_data(
         models=read_models(run.models),
         plans=plans,
         evaluation=read_evaluation(run.evaluation),
-        panels=_panels(scene, photos, masks, ladder, read_ply(run.composed), backend, antialiased),
+        panels=_panels(scene, photos, masks, ladder, composed, backend, antialiased),
         scene_facts=describe(scene),
         settings=_settings(records),
         timings=[(stage, float(made["seconds"])) for stage, made in records.items()],

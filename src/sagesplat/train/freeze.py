@@ -29,15 +29,15 @@ def measured_views(scene: Scene, masks: Masks) -> dict[int, list[int]]:
     """
     rows = scene.train_ids.tolist()
     shown = {row: np.unique(masks[scene.views[row]]).tolist() for row in rows}
-    some, picked = set(_spread(rows, VIEWS)), {}
+    some, picked = set(spread(rows, VIEWS)), {}
     for label in sorted({label for labels in shown.values() for label in labels}):
         showing = [row for row in rows if label in shown[row]]
         among = [row for row in showing if row in some]
-        picked[label] = among if len(among) >= _RARE_VIEWS else _spread(showing, _RARE_VIEWS)
+        picked[label] = among if len(among) >= _RARE_VIEWS else spread(showing, _RARE_VIEWS)
     return picked
 
 
-def _spread(rows: list[int], count: int) -> list[int]:
+def spread(rows: list[int], count: int) -> list[int]:
     """So many of the rows, evenly spread; all, if there are not more."""
     return [rows[i] for i in np.linspace(0, len(rows) - 1, min(count, len(rows))).round().astype(int)]
 

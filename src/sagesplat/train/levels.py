@@ -42,11 +42,11 @@ def write_level(folder: Path, step: int, g: Gaussians, *, recovering: bool, sh_d
     return path
 
 
-def write_prefixes(
-    path: Path, g: Gaussians, step: int, sizes: Mapping[int, Sequence[int]], **more: Any
+def write_set(
+    path: Path, g: Gaussians, step: int, sizes: Mapping[int, Sequence[int]] | None = None, **more: Any
 ) -> None:
-    """Record a nested ladder: Gaussians in their category's order, and its levels' sizes; `more` arrays."""
-    arrays = {f"{label}/sizes": np.array(n, np.int64) for label, n in sizes.items()}
+    """Record Gaussians in order; of a nested ladder with its levels' sizes by label id. `more` arrays."""
+    arrays = {f"{label}/sizes": np.array(n, np.int64) for label, n in (sizes or {}).items()}
     _write(path, step, g, False, g.sh_degree, arrays | {f"more/{k}": np.asarray(v) for k, v in more.items()})
 
 

@@ -1,6 +1,6 @@
 """The nested ladder: one ordered set of Gaussians per category, trained so that its prefixes are levels."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,7 +23,7 @@ from sagesplat.train.importance import importance
 from sagesplat.train.pace import Pace
 from sagesplat.train.state import initial_state
 from sagesplat.train.stepper import Stepper
-from sagesplat.train.trainer import Event, train
+from sagesplat.train.trainer import LOOK_EVERY, Event, finite, named_failures, train
 from sagesplat.train.votes import label_weights, winners
 
 CLEAR = 0.8  # share of its blending weight that a Gaussian needs in one category, else it straddles a border
@@ -86,12 +86,12 @@ def order(
     ids, weights = label_weights(g, scene, masks, views, antialiased=antialiased)
     g = replace(g, label_ids=winners(g, ids, weights))
     total = weights.sum(1)
-    column = np.searchsorted(ids, g.label_ids.numpy()).clip(0, max(len(ids) - 1, 0))
+    labels = g.label_ids.numpy()
+    column = np.searchsorted(ids, labels).clip(0, max(len(ids) - 1, 0))
     mine = weights[np.arange(len(g)), column] if len(ids) else total
     clarity = np.where(total > 0, mine / np.maximum(total, 1e-12), 1).astype(np.float32)
     boundary = straddling(weights, len(views))  # whichever side is there needs them
-    rows = np.lexsort((-worth, ~early, ~boundary, g.label_ids.numpy()))  # the last key decides first
-    labels = g.label_ids.numpy()
+    rows = np.lexsort((-worth, ~early, ~boundary, labels))  # the last key decides first
     across = {label: int((boundary & (labels == label)).sum()) for label in np.unique(labels).tolist()}
     return Nested(g.select(torch.from_numpy(rows)), clarity[rows], across)
 
@@ -172,15 +172,22 @@ def nest(
     stepper.sh_bits = config.sh_bits
     rates = _rates(train_config, config, scene)
     everything = trainable_rows(state.gaussians, {})
-    while state.step < config.steps:
-        prefix = draw_shares(state.rng, len(labels), config, state.step / config.steps)
-        rows = None
-        if (prefix < 1).any():
-            rows = torch.nonzero(share < torch.from_numpy(prefix).float().to(device)[column])[:, 0]
-        loss = stepper(state, nested.gaussians.sh_degree, rates(state.step + 1), everything, drawn_rows=rows)
-        if checkpoint and state.step % _SAVE_EVERY == 0:
-            write_checkpoint(checkpoint, state, settings)
-        yield NestStep(state.step, float(loss))
+    value = 0.0
+    with named_failures(lambda: f"training on compositions stopped at step {state.step}"):
+        while state.step < config.steps:
+            prefix = draw_shares(state.rng, len(labels), config, state.step / config.steps)
+            rows = None
+            if (prefix < 1).any():
+                rows = torch.nonzero(share < torch.from_numpy(prefix).float().to(device)[column])[:, 0]
+            loss = stepper(
+                state, nested.gaussians.sh_degree, rates(state.step + 1), everything, drawn_rows=rows
+            )
+            saves = state.step % _SAVE_EVERY == 0
+            if device.type == "cpu" or saves or state.step % LOOK_EVERY == 0:  # looking waits for a GPU
+                value = finite(loss, state.step)
+            if checkpoint and saves:
+                write_checkpoint(checkpoint, state, settings)
+            yield NestStep(state.step, value)
     back = torch.from_numpy(np.argsort(near))
     yield replace(nested, gaussians=state.gaussians.to("cpu").select(back))
 
@@ -195,7 +202,9 @@ def draw_shares(
     return np.exp(rng.uniform(np.log(config.smallest), 0, num_labels)).astype(np.float32)
 
 
-def _rates(train_config: TrainConfig, config: NestConfig, scene: Scene):
+def _rates(
+    train_config: TrainConfig, config: NestConfig, scene: Scene
+) -> Callable[[int], Mapping[str, float]]:
     """Adam's rates by step."""
     third = Pace(replace(train_config, max_steps=3, pace="published"), scene.extent).rates(2)
 

@@ -1,7 +1,8 @@
 """Training: a generator of events over a state; it prints nothing and draws nothing."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,7 +30,7 @@ from sagesplat.train.stepper import Stepper
 
 CHECKPOINT = "checkpoint.npz"
 _LESS = "lower --train.max-gaussians, or begin a run with --downscale 2"
-_LOOK_EVERY = 100  # steps between two looks at the loss on a GPU
+LOOK_EVERY = 100  # steps between two looks at the loss on a GPU
 
 
 @dataclass(frozen=True)
@@ -104,20 +105,33 @@ def train(
     """
     _check(config, masks)
     state: TrainState | None = None
-    try:
+    with named_failures(lambda: _where(state, folder)):
         for event, state in _train(  # noqa: B007 - the last state is asked for where training fails
             scene, photos, label_ids, config, masks, seed, backend, folder, settings, group
         ):
             yield event
+
+
+@contextmanager
+def named_failures(where: Callable[[], str]) -> Iterator[None]:
+    """RunError where memory runs out or a GPU fails; `where` says how far training came."""
+    try:
+        yield
     except (torch.OutOfMemoryError, OutOfMemory, MemoryError) as error:
-        raise RunError(f"{_where(state, folder)}: out of memory; {_LESS}") from error
+        raise RunError(f"{where()}: out of memory; {_LESS}") from error
     except RuntimeError as error:
         if "CUDA error" not in str(error):
             raise
         reason = str(error).splitlines()[0]
-        raise RunError(
-            f"{_where(state, folder)}: the GPU failed ({reason}); look at nvidia-smi, then run again"
-        ) from error
+        raise RunError(f"{where()}: the GPU failed ({reason}); look at nvidia-smi, then run again") from error
+
+
+def finite(loss: Tensor, step: int) -> float:
+    """The loss as a number; RunError where it is none. A GPU is waited for."""
+    value = float(loss)
+    if not math.isfinite(value):
+        raise RunError(f"the loss became {value} at step {step}; lower the learning rates and train again")
+    return value
 
 
 def _where(state: TrainState | None, folder: Path | None) -> str:
@@ -170,8 +184,8 @@ def _train(
         observing = config.strategy == "default" and step < plan.refine_stop
         wander = run_pace.wander(step) if config.strategy == "mcmc" else 0.0
         loss = stepper(state, degree, run_pace.rates(step), awake, factor, observing, wander)
-        if device.type == "cpu" or records or step % _LOOK_EVERY == 0:  # looking waits for a GPU
-            value = _finite(loss, step)
+        if device.type == "cpu" or records or step % LOOK_EVERY == 0:  # looking waits for a GPU
+            value = finite(loss, step)
         yield Step(step, value, len(state.gaussians), stepper.drawn), state
         resets = refining and config.strategy == "default" and step % plan.reset_every == 0
         late = resets and config.levels_after_reset
@@ -227,13 +241,6 @@ def _refine(
         group.add(state.grad_sum, state.grad_count)
         densify.refine(state, config, scene.extent, densify.room(state, most, trainable), trainable)
     state.sort()
-
-
-def _finite(loss: Tensor, step: int) -> float:
-    value = float(loss)
-    if not math.isfinite(value):
-        raise RunError(f"the loss became {value} at step {step}; lower the learning rates and train again")
-    return value
 
 
 def _check(config: TrainConfig, masks: Masks | None) -> None:
