@@ -26,11 +26,11 @@ from sagesplat.job import Job
 from sagesplat.output.chunks import packed, read_chunks, read_index, totals, write_chunks
 from sagesplat.output.ply import read_ply
 from sagesplat.paper import cross_views
+from sagesplat.rounding import in_buckets
 from sagesplat.run_dir import RunDir
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Points, Scene, View
 from sagesplat.segment.masks import Taxonomy
-from sagesplat.sh import in_buckets
 from sagesplat.train.importance import importance
 from sagesplat.train.levels import write_set
 from sagesplat.train.nested import Nested, NestStep, draw_shares, level_sizes, nest, order, straddling

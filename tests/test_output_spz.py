@@ -16,6 +16,7 @@ from sagesplat.errors import DataError
 from sagesplat.gaussians import PARAMETERS, Gaussians
 from sagesplat.output.spz import MAX_COUNT, decode_spz, encode_spz, packing_order, read_spz, write_spz
 from sagesplat.raster import rasterize
+from sagesplat.rounding import rounded
 from sagesplat.scene.scene import Camera
 from tests.conftest import damage, pinhole, random_gaussians
 
@@ -169,6 +170,31 @@ def test_same_bytes_every_time(tmp_path):
     assert size == len(content)
     assert content[4:8] == bytes(4)  # no time in the gzip header
     assert len(read_spz(tmp_path / "a.spz", 3).of_labels([3])) == 50
+
+
+def test_coarse_files_hold_what_training_draws_and_are_smaller():
+    g = random_gaussians(2000, degree=3)
+    fine, coarse = encode_spz(g), encode_spz(g, coarse=True)
+    assert len(coarse) < 0.93 * len(fine)
+    back = decode_spz(coarse)
+    drawn = rounded(g, (5, 4))
+    for name in ("sh0", "log_scales", "shN"):
+        assert torch.allclose(getattr(back, name), getattr(drawn, name), atol=1e-6), name
+    assert (torch.sigmoid(back.logit_opacities) - torch.sigmoid(g.logit_opacities)).abs().max() < 2.01 / 255
+    alike = (rotations(back.quats) * rotations(g.quats)).sum(1).abs()
+    assert torch.rad2deg(2 * torch.arccos(alike.clamp(max=1))).max() < 2
+    half_a_step = torch.exp(g.log_scales).sort(1)[0][:, 1].quantile(0.1) / 4
+    assert (back.means - g.means).abs().max() <= half_a_step
+
+
+def test_gradients_pass_rounding_as_if_it_were_not_there():
+    g = random_gaussians(20, degree=3)
+    leaves = {name: p.requires_grad_() for name, p in g.parameters().items()}
+    drawn = rounded(g, (5, 4))
+    grads = torch.autograd.grad(
+        torch.cat([p.flatten() for p in drawn.parameters().values()]).sum(), [*leaves.values()]
+    )
+    assert all(torch.equal(grad, torch.ones_like(grad)) for grad in grads)
 
 
 @pytest.mark.parametrize("sh_bits", [(5, 4), (8, 8), (1, 1), (6, 5)])

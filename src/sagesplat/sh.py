@@ -2,7 +2,6 @@
 
 import math
 
-import torch
 from torch import Tensor
 
 C0 = 0.5 / math.sqrt(math.pi)
@@ -20,12 +19,6 @@ _C322 = math.sqrt(105 / (16 * math.pi))
 def num_bases(degree: int) -> int:
     """Number of basis functions up to `degree`, the constant one included."""
     return (degree + 1) ** 2
-
-
-def in_buckets(shN: Tensor, bits: tuple[int, int]) -> Tensor:
-    """Harmonics [N, K, 3] as SPZ stores them: multiples of 2^(1 - bits), of degree 1 and of those above."""
-    steps = shN.new_tensor([2.0 ** (1 - bits[0])] * 3 + [2.0 ** (1 - bits[1])] * 12)[: shN.shape[1], None]
-    return torch.round(shN.clamp(-1, 1) / steps) * steps
 
 
 def rgb_to_sh0(rgb: Tensor) -> Tensor:

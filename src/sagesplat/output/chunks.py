@@ -78,7 +78,7 @@ def write_chunks(
         part = g.select(torch.from_numpy(rows))
         temporary = fresh / f"chunk.{kind}"
         if kind == "spz":
-            temporary.write_bytes(encode_spz(part, sh_bits=sh_bits, antialiased=antialiased))
+            temporary.write_bytes(encode_spz(part, sh_bits=sh_bits, coarse=True, antialiased=antialiased))
         else:
             write_ply(temporary, part, names)
         content = temporary.read_bytes()

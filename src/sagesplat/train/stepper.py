@@ -11,9 +11,9 @@ from sagesplat.config import TrainConfig
 from sagesplat.gaussians import Gaussians
 from sagesplat.metrics import photometric_loss
 from sagesplat.raster import Backend, Render, Workspace, device_of, rasterize
+from sagesplat.rounding import rounded
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
-from sagesplat.sh import in_buckets
 from sagesplat.train import densify, mcmc, optim
 from sagesplat.train.feed import Feed
 from sagesplat.train.freeze import Work, trainable_rows
@@ -35,7 +35,7 @@ class Stepper:
     backend: Backend = "auto"
     group: Group = ALONE
     rest: Rest | None = None
-    sh_bits: tuple[int, int] | None = None  # draw harmonics in the buckets that SPZ will put them in
+    sh_bits: tuple[int, int] | None = None  # draw Gaussians rounded as SPZ files will hold them
     drawn: float = 1.0  # share of the tiles that the last step drew
     workspace: Workspace = field(default_factory=Workspace)
 
@@ -62,9 +62,8 @@ class Stepper:
         shown = state.gaussians if drawn_rows is None else state.gaussians.select(drawn_rows)
         leaves = {name: p.detach().requires_grad_() for name, p in shown.parameters().items()}
         moving = replace(shown, **leaves)
-        if self.sh_bits:  # rounded, while gradients pass as if they were not
-            off = in_buckets(shown.shN, self.sh_bits) - shown.shN
-            moving = replace(moving, shN=leaves["shN"] + off)
+        if self.sh_bits:
+            moving = rounded(moving, self.sh_bits)
         losses: list[Tensor] = []
         self.drawn = 0.0
         grads: dict[str, Tensor] = {}
