@@ -35,7 +35,7 @@ from sagesplat.train.importance import importance
 from sagesplat.train.levels import write_set
 from sagesplat.train.nested import Nested, NestStep, draw_shares, level_sizes, nest, order, straddling
 
-QUICK = NestConfig(steps=12, levels=4, smallest=0.1)
+QUICK = NestConfig(steps=12, levels=4, smallest=0.1, drawn_from=0.1)
 
 
 @given(st.integers(0, 5000), st.integers(1, 20), st.floats(0.01, 1), st.integers(0, 6000))
@@ -59,7 +59,7 @@ def test_a_gaussian_straddles_if_it_shows_on_both_sides() -> None:
 
 
 def test_everything_is_drawn_more_often_in_the_end() -> None:
-    config, rng = NestConfig(full_share=0.1, full_share_end=0.9, smallest=0.05), np.random.default_rng(0)
+    config, rng = NestConfig(full_share=0.1, full_share_end=0.9, drawn_from=0.05), np.random.default_rng(0)
     for done, share in ((0.0, 0.1), (0.5, 0.5), (1.0, 0.9)):
         drawn = np.stack([draw_shares(rng, 3, config, done) for _ in range(2000)])
         assert (drawn == 1).all(1).mean() == pytest.approx(share, abs=0.04)
@@ -126,7 +126,7 @@ def scene(tmp_path: Path) -> Scene:
 
 def test_training_lowers_the_loss_of_prefixes_and_keeps_the_order(scene: Scene) -> None:
     start = ordered()
-    config = NestConfig(steps=40, levels=3, smallest=0.2)
+    config = NestConfig(steps=40, levels=3, drawn_from=0.2)
     events = list(nest(start, scene, Photos(scene.views), TrainConfig(), config))
     result = events[-1]
     assert isinstance(result, Nested)
@@ -141,7 +141,7 @@ def test_training_lowers_the_loss_of_prefixes_and_keeps_the_order(scene: Scene) 
 def test_what_is_not_drawn_stays_as_it_is(scene: Scene) -> None:
     """With the smallest prefix drawn only (a share that rounds to one Gaussian), no other row moves."""
     start = ordered()
-    config = replace(QUICK, steps=3, smallest=1e-9, full_share=0.0, full_share_end=0.0)
+    config = replace(QUICK, steps=3, drawn_from=1e-9, full_share=0.0, full_share_end=0.0)
     result = trained(scene, start, config, seed=1)
     moved = (result.gaussians.means != start.gaussians.means).any(1).numpy()
     first = np.isin(np.arange(60), [0, 20, 40])
@@ -172,6 +172,7 @@ def test_a_killed_training_goes_on_bit_for_bit(scene: Scene, tmp_path: Path, mon
     [
         ({"levels": 0}, "--nest.levels 0"),
         ({"smallest": 0.0}, "--nest.smallest"),
+        ({"drawn_from": 0.0}, "--nest.drawn-from"),
         ({"full_share": 1.5}, "--nest.full-share"),
         ({"sh_bits": (9, 4)}, "--nest.sh-bits"),
         ({"steps": -1}, "--nest.steps"),

@@ -107,8 +107,10 @@ class NestConfig:
     """Training steps on random compositions."""
     levels: int = 16
     """Prefixes that are measured and planned with, in geometric steps of their size."""
-    smallest: float = 0.05
+    smallest: float = 0.01
     """Share of a category's Gaussians in its lowest level."""
+    drawn_from: float = 0.05
+    """Share of a category in the smallest prefix that training looks at: fewer serve easy categories only."""
     seed_share: float = 0.1
     """Share of the Gaussians, the first of all, that a small 3DGS-MCMC training makes; 0: none."""
     seed_steps: int = 3000

@@ -151,7 +151,7 @@ def nest(
 ) -> Iterator[NestStep | Nested]:
     """Train so that every composition of prefixes looks right; the last event is the result.
 
-    Each step draws a prefix per category, log-uniform between `config.smallest` and all, or everything (with
+    Each step draws a prefix per category, log-uniform between `config.drawn_from` and all, or everything (with
     a probability that rises from `config.full_share`), and compares that composition with a photo, harmonics
     rounded as the chunks will have them. Gaussians outside it, their moments included, stay as they are. A
     `checkpoint` of the same `settings` is continued.
@@ -199,7 +199,7 @@ def draw_shares(
     everything = config.full_share + (config.full_share_end - config.full_share) * done
     if rng.random() < everything:
         return np.ones(num_labels, np.float32)
-    return np.exp(rng.uniform(np.log(config.smallest), 0, num_labels)).astype(np.float32)
+    return np.exp(rng.uniform(np.log(config.drawn_from), 0, num_labels)).astype(np.float32)
 
 
 def _rates(
@@ -220,7 +220,8 @@ def check(config: NestConfig) -> None:
     wrong = (
         ("levels", config.levels, 1 <= config.levels <= 64, "1 to 64"),
         ("steps", config.steps, config.steps >= 0, "0 or more"),
-        ("smallest", config.smallest, 0 < config.smallest <= 1, "a share such as 0.05"),
+        ("smallest", config.smallest, 0 < config.smallest <= 1, "a share such as 0.01"),
+        ("drawn-from", config.drawn_from, 0 < config.drawn_from <= 1, "a share such as 0.05"),
         ("full-share", config.full_share, 0 <= config.full_share <= 1, "a share such as 0.1"),
         ("full-share-end", config.full_share_end, 0 <= config.full_share_end <= 1, "a share such as 0.9"),
         ("sh-bits", config.sh_bits, all(1 <= b <= 8 for b in config.sh_bits), "1 to 8, such as 5 4"),
