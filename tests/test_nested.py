@@ -31,6 +31,7 @@ from sagesplat.run_dir import RunDir
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Points, Scene, View
 from sagesplat.segment.masks import Taxonomy
+from sagesplat.train import nested
 from sagesplat.train.importance import importance
 from sagesplat.train.levels import write_set
 from sagesplat.train.nested import Nested, NestStep, draw_shares, level_sizes, nest, order, straddling
@@ -109,7 +110,9 @@ def test_sensitivity_is_the_change_when_a_gaussian_fades(seen) -> None:
 def ordered(count: int = 60) -> Nested:
     g = random_gaussians(count, degree=1)
     labels = torch.sort(torch.arange(count) % 3).values.to(torch.int16)
-    return Nested(replace(g, label_ids=labels), np.ones(count, np.float32), {0: 0, 1: 2, 2: 0})
+    ranks = np.full(count, 2, np.int8)
+    ranks[20:22] = 0  # the first two of category 1
+    return Nested(replace(g, label_ids=labels), np.ones(count, np.float32), ranks)
 
 
 def trained(scene: Scene, start: Nested, config: NestConfig, **options) -> Nested:
@@ -124,7 +127,8 @@ def scene(tmp_path: Path) -> Scene:
     return write_capture(tmp_path / "capture", random_gaussians(60, seed=3))
 
 
-def test_training_lowers_the_loss_of_prefixes_and_keeps_the_order(scene: Scene) -> None:
+def test_training_lowers_the_loss_of_prefixes_and_keeps_the_order(scene: Scene, monkeypatch) -> None:
+    monkeypatch.setattr(nested, "_SORT_AT", ())
     start = ordered()
     config = NestConfig(steps=40, levels=3, drawn_from=0.2)
     events = list(nest(start, scene, Photos(scene.views), TrainConfig(), config))
@@ -138,8 +142,20 @@ def test_training_lowers_the_loss_of_prefixes_and_keeps_the_order(scene: Scene) 
     assert np.mean(losses[-10:]) < np.mean(losses[:10])
 
 
-def test_what_is_not_drawn_stays_as_it_is(scene: Scene) -> None:
+def test_they_are_sorted_again_by_what_they_have_become_worth(scene: Scene, monkeypatch) -> None:
+    monkeypatch.setattr(nested, "_SORT_AT", (0,))
+    start, config = ordered(), replace(QUICK, steps=1)
+    result = trained(scene, start, config)
+    worth = importance(start.gaussians, scene, scene.train_ids.tolist(), config.criterion)
+    rows = np.lexsort((-worth, start.ranks, start.gaussians.label_ids.numpy()))
+    assert (rows != np.arange(60)).any()
+    assert (result.ranks == start.ranks[rows]).all()
+    assert torch.allclose(result.gaussians.means, start.gaussians.means[torch.from_numpy(rows)], atol=1e-2)
+
+
+def test_what_is_not_drawn_stays_as_it_is(scene: Scene, monkeypatch) -> None:
     """With the smallest prefix drawn only (a share that rounds to one Gaussian), no other row moves."""
+    monkeypatch.setattr(nested, "_SORT_AT", ())
     start = ordered()
     config = replace(QUICK, steps=3, drawn_from=1e-9, full_share=0.0, full_share_end=0.0)
     result = trained(scene, start, config, seed=1)
@@ -151,8 +167,6 @@ def test_what_is_not_drawn_stays_as_it_is(scene: Scene) -> None:
 
 
 def test_a_killed_training_goes_on_bit_for_bit(scene: Scene, tmp_path: Path, monkeypatch) -> None:
-    from sagesplat.train import nested
-
     monkeypatch.setattr(nested, "_SAVE_EVERY", 4)
     whole = trained(scene, ordered(), QUICK)
     file = tmp_path / "state.npz"

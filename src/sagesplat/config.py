@@ -111,7 +111,7 @@ class NestConfig:
     """Share of a category's Gaussians in its lowest level."""
     drawn_from: float = 0.05
     """Share of a category in the smallest prefix that training looks at: fewer serve easy categories only."""
-    seed_share: float = 0.1
+    seed_share: float = 0.2
     """Share of the Gaussians, the first of all, that a small 3DGS-MCMC training makes; 0: none."""
     seed_steps: int = 3000
     """Steps of that training."""

@@ -23,6 +23,8 @@ def write_checkpoint(path: Path, state: TrainState, settings: str) -> None:
     arrays = {name: p.numpy() for name, p in g.parameters().items()}
     arrays |= {f"first/{name}": state.first[name].numpy() for name in PARAMETERS}
     arrays |= {f"second/{name}": state.second[name].numpy() for name in PARAMETERS}
+    if state.place is not None:
+        arrays["place"] = state.place.numpy()
     meta = {
         "version": _VERSION,
         "settings": settings,
@@ -79,4 +81,5 @@ def read_checkpoint(path: Path, settings: str) -> TrainState:
         last_reset=meta["last_reset"],
         frozen={int(label): int(step) for label, step in meta.get("frozen", ())},
         withheld=int(meta.get("withheld", 0)),
+        place=arrays.get("place"),
     )

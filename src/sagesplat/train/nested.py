@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float32, Int8
+from torch import Tensor
 
 from sagesplat import geometry
 from sagesplat.config import NestConfig, TrainConfig
@@ -30,6 +31,7 @@ CLEAR = 0.8  # share of its blending weight that a Gaussian needs in one categor
 _VISIBLE = 0.5  # pixels a view that it must paint of the others, on average, for that to matter
 _SHRINK_TO = 0.05  # of the rates, at the end
 _SAVE_EVERY = 500
+_SORT_AT = 1 / 12, 1 / 6, 1 / 3, 1 / 2, 2 / 3  # of the steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +40,13 @@ class Nested:
 
     gaussians: Gaussians
     clarity: Float32[np.ndarray, " N"]  # share of a Gaussian's blending weight in its own category; 1 unseen
-    boundary: dict[int, int]  # by label id, how many lie across two categories: they come first
+    ranks: Int8[np.ndarray, " N"]  # in each category: 0 those across two categories, then 1 seeds, 2 the rest
+
+    @property
+    def boundary(self) -> dict[int, int]:
+        """By label id, how many lie across two categories."""
+        labels = self.gaussians.label_ids.numpy()
+        return {label: int((self.ranks[labels == label] == 0).sum()) for label in self.gaussians.counts()}
 
 
 @dataclass(frozen=True)
@@ -77,12 +85,13 @@ def order(
     """
     views = scene.train_ids.tolist()
     worth = importance(g, scene, views, config.criterion, antialiased=antialiased)
-    early = np.zeros(len(g), bool)
+    ranks = np.full(len(g), 2, np.int8)
     if seeds is not None and len(seeds):
         kept = np.sort(np.argsort(-worth, kind="stable")[: max(len(g) - len(seeds), 0)])
         of_seeds = importance(seeds, scene, views, config.criterion, antialiased=antialiased)
         g = concat([seeds, g.select(torch.from_numpy(kept))])
-        worth, early = np.concatenate([of_seeds, worth[kept]]), np.arange(len(g)) < len(seeds)
+        worth = np.concatenate([of_seeds, worth[kept]])
+        ranks = np.repeat(np.array([1, 2], np.int8), [len(seeds), len(kept)])
     ids, weights = label_weights(g, scene, masks, views, antialiased=antialiased)
     g = replace(g, label_ids=winners(g, ids, weights))
     total = weights.sum(1)
@@ -90,10 +99,9 @@ def order(
     column = np.searchsorted(ids, labels).clip(0, max(len(ids) - 1, 0))
     mine = weights[np.arange(len(g)), column] if len(ids) else total
     clarity = np.where(total > 0, mine / np.maximum(total, 1e-12), 1).astype(np.float32)
-    boundary = straddling(weights, len(views))  # whichever side is there needs them
-    rows = np.lexsort((-worth, ~early, ~boundary, labels))  # the last key decides first
-    across = {label: int((boundary & (labels == label)).sum()) for label in np.unique(labels).tolist()}
-    return Nested(g.select(torch.from_numpy(rows)), clarity[rows], across)
+    ranks[straddling(weights, len(views))] = 0  # whichever side is there needs them
+    rows = np.lexsort((-worth, ranks, labels))  # the last key decides first
+    return Nested(g.select(torch.from_numpy(rows)), clarity[rows], ranks[rows])
 
 
 def with_at_most(scene: Scene, labels: np.ndarray, count: int, seed: int) -> tuple[Scene, np.ndarray]:
@@ -151,22 +159,25 @@ def nest(
 ) -> Iterator[NestStep | Nested]:
     """Train so that every composition of prefixes looks right; the last event is the result.
 
-    Each step draws a prefix per category, log-uniform between `config.drawn_from` and all, or everything (with
-    a probability that rises from `config.full_share`), and compares that composition with a photo, harmonics
-    rounded as the chunks will have them. Gaussians outside it, their moments included, stay as they are. A
-    `checkpoint` of the same `settings` is continued.
+    Each step draws a prefix per category, log-uniform between `config.drawn_from` and all, or everything
+    (with a probability that rises from `config.full_share`), and compares that composition with a photo,
+    values rounded as the chunks will have them. Gaussians outside it, their moments included, stay as they
+    are. Now and then all are sorted again by what they have become worth beside each other: of a category,
+    still first those across borders, then the seeds, then the rest.
+    A `checkpoint` of the same `settings` is continued.
     """
     check(config)
     device = device_of(backend)
-    labels, first = np.unique(nested.gaussians.label_ids.numpy(), return_index=True)
-    counts = np.diff(np.append(first, len(nested.gaussians)))
-    places = np.arange(len(nested.gaussians)) - np.repeat(first, counts)
     near = geometry.morton_order(nested.gaussians.means.numpy())  # neighbours in space are drawn together
-    state = initial_state(nested.gaussians.select(torch.from_numpy(near)).to(device), seed)
+    labels, ranks = nested.gaussians.label_ids.numpy()[near], nested.ranks[near]
+    state = initial_state(nested.gaussians.select(torch.from_numpy(near)), seed)
+    state.place = places(labels, ranks, -near)
     if checkpoint and checkpoint.exists():
-        state = read_checkpoint(checkpoint, settings).to(device)
-    share = torch.from_numpy((places / np.repeat(counts, counts))[near]).float().to(device)
-    column = torch.from_numpy(np.repeat(np.arange(len(labels)), counts)[near]).to(device)
+        state = read_checkpoint(checkpoint, settings)
+    state = state.to(device)
+    categories, column = np.unique(labels, return_inverse=True)
+    column = torch.from_numpy(column).to(device)
+    views, sort_at = scene.train_ids.tolist(), {round(part * config.steps) for part in _SORT_AT}
     config_of_steps = replace(train_config, strategy="default", batch=1)
     stepper = Stepper(Feed(scene, photos, device), config_of_steps, Work(scene, None), backend)
     stepper.sh_bits = config.sh_bits
@@ -175,10 +186,16 @@ def nest(
     value = 0.0
     with named_failures(lambda: f"training on compositions stopped at step {state.step}"):
         while state.step < config.steps:
-            prefix = draw_shares(state.rng, len(labels), config, state.step / config.steps)
+            if state.step in sort_at:
+                worth = importance(
+                    state.gaussians, scene, views, config.criterion, antialiased=train_config.antialiased
+                )
+                state.place = places(labels, ranks, worth).to(device)
+            prefix = draw_shares(state.rng, len(categories), config, state.step / config.steps)
             rows = None
             if (prefix < 1).any():
-                rows = torch.nonzero(share < torch.from_numpy(prefix).float().to(device)[column])[:, 0]
+                assert state.place is not None
+                rows = torch.nonzero(state.place < torch.from_numpy(prefix).to(device)[column])[:, 0]
             loss = stepper(
                 state, nested.gaussians.sh_degree, rates(state.step + 1), everything, drawn_rows=rows
             )
@@ -188,8 +205,20 @@ def nest(
             if checkpoint and saves:
                 write_checkpoint(checkpoint, state, settings)
             yield NestStep(state.step, value)
-    back = torch.from_numpy(np.argsort(near))
-    yield replace(nested, gaussians=state.gaussians.to("cpu").select(back))
+    assert state.place is not None
+    rows = np.lexsort((state.place.cpu().numpy(), labels))
+    yield Nested(
+        state.gaussians.to("cpu").select(torch.from_numpy(rows)), nested.clarity[near][rows], ranks[rows]
+    )
+
+
+def places(labels: np.ndarray, ranks: np.ndarray, worth: np.ndarray) -> Tensor:
+    """Share of its category that comes before each Gaussian (float32 [N]): by rank, then by worth."""
+    rows = np.lexsort((-worth, ranks, labels))
+    _, first, counts = np.unique(labels[rows], return_index=True, return_counts=True)
+    found = np.empty(len(rows), np.float32)
+    found[rows] = (np.arange(len(rows)) - np.repeat(first, counts)) / np.repeat(counts, counts)
+    return torch.from_numpy(found)
 
 
 def draw_shares(

@@ -30,6 +30,7 @@ class TrainState:
     last_reset: int = -1  # step of the last opacity reset, -1 = none yet
     frozen: dict[int, int] = field(default_factory=dict)  # label id -> step from which on it stays as it is
     withheld: int = 0  # Gaussians that categories would have got, had they not stopped
+    place: Tensor | None = None  # [N] share of its category that comes before it: only of a nested ladder
 
     def replace_rows(self, keep: Tensor, new: Gaussians) -> None:
         """Keep some rows (bool [N]) and append new Gaussians with fresh moments and statistics."""
@@ -65,6 +66,7 @@ class TrainState:
         return replace(
             self, gaussians=self.gaussians.to(device), first=first, second=second,
             grad_sum=self.grad_sum.to(device), grad_count=self.grad_count.to(device),
+            place=None if self.place is None else self.place.to(device),
         )  # fmt: skip
 
 
