@@ -374,26 +374,51 @@ def sweep(
 
 
 @command
-def download(what: Positional[Literal["lpips"]], folder: Path | None = None) -> None:
-    """Fetch weights that are not part of the package, once: lpips.
+def download(
+    what: Positional[Annotated[str, arg(metavar="WHAT")]] = "",
+    folder: Positional[Annotated[Path | None, arg(metavar="FOLDER")]] = None,
+    scale: int | None = None,
+    show: Annotated[bool, arg(name="list")] = False,
+) -> None:
+    """Fetch a scene of the field, or weights that are not part of the package.
+
+    Of a scene only its own photos and model are transferred out of the official archive. What is there
+    already is kept, so a download that was cut goes on when the command is given again.
 
     Args:
-        what: lpips, the perceptual metric (761 MB are fetched, 69 MB kept).
-        folder: where to put them (default: the cache, ~/.cache/sagesplat).
+        what: a scene, such as mipnerf360/garden; or lpips, the weights of the perceptual metric (761 MB are
+            fetched, 69 MB kept).
+        folder: where to put it (default: the folder you are in; of weights the cache, ~/.cache/sagesplat).
+        scale: photos so many times smaller, as the archive has them (default: what papers evaluate on).
+        show: list the scenes.
     """
     from sagesplat.console import Console
     from sagesplat.download import download_lpips
+    from sagesplat.download_scenes import download_scene, find_scene, list_scenes
     from sagesplat.events import Progress, StageStarted
+
+    if show:
+        for scene in list_scenes():
+            size = f"of a {scene.archive_gb:g} GB archive" if scene.archive_gb else ""
+            print(f"{scene.name:24} {scene.photos:4} photos {size:24} {scene.page}")
+        return
+    if not what:
+        raise RunError("nothing to download; name a scene (see `sagesplat download --list`) or lpips")
 
     with Console() as console:
         console(StageStarted("download"))
-        files = download_lpips(
-            folder,
-            on_progress=lambda name, done, total: console(
-                Progress("download", done, max(total, done, 1), name)
-            ),
-        )
-    print("\n".join(map(str, files)))
+
+        def progress(name: str, done: int, total: int) -> None:
+            console(Progress("download", done, max(total, done, 1), name))
+
+        if what == "lpips":
+            found = download_lpips(folder, on_progress=progress)
+        else:
+            print(find_scene(what).licence, file=sys.stderr)
+            found = [download_scene(what, folder or Path(), scale=scale, on_progress=progress)]
+    print("\n".join(map(str, found)))
+    if what != "lpips" and (factor := scale or find_scene(what).scale) > 1:
+        print(f"train with --downscale {factor}", file=sys.stderr)
 
 
 @command

@@ -1,0 +1,674 @@
+"""Downloads of single scenes, from a server on this machine, out of archives with the published layout."""
+
+import errno
+import io
+import re
+import stat
+import struct
+import subprocess
+import sys
+import threading
+import time
+import zipfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from functools import cache
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from sagesplat import remote_zip
+from sagesplat.download_scenes import (
+    RemoteScene,
+    download_scene,
+    find_scene,
+    list_scenes,
+    read_registry,
+)
+from sagesplat.errors import DataError, RunError
+from sagesplat.remote_zip import RemoteZip
+from sagesplat.scene import load_scene
+from sagesplat.scene.colmap_write import ModelCamera, ModelImage, write_model
+
+NAME = "mipnerf360/garden"
+
+
+@dataclass
+class Site:
+    """What the server gives, how it misbehaves, and what was asked of it."""
+
+    archive: bytes = b""
+    base: str = ""
+    code: int = 0  # answer with this instead
+    failures: int = 1 << 30  # so many times, then properly
+    ranges: bool = True
+    cut: int | None = None  # bytes; the connection ends after so many of the archive have been sent
+    location: str = ""
+    content_range: str = "bytes {first}-{last}/{size}"
+    delay: float = 0.0
+    served: int = 0
+    asked: list[tuple[int, int]] = field(default_factory=list)
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+    @property
+    def url(self) -> str:
+        return f"{self.base}/360_v2.zip"
+
+    def answer(self, request: BaseHTTPRequestHandler) -> None:
+        time.sleep(self.delay)
+        size, match = len(self.archive), re.fullmatch(r"bytes=(\d+)-(\d+)", request.headers["Range"] or "")
+        with self.lock:
+            failing, self.failures = bool(self.code) and self.failures > 0, self.failures - 1
+        if self.location and not request.path.startswith("/moved"):
+            request.send_response(302)
+            request.send_header("Location", self.location)
+            request.end_headers()
+        elif failing:
+            request.send_error(self.code)
+        elif not self.ranges or match is None:
+            request.send_response(200)
+            request.send_header("Accept-Ranges", "none")
+            request.send_header("Content-Length", str(size))
+            request.end_headers()
+        else:
+            first, last = int(match[1]), min(int(match[2]), size - 1)
+            content = self.archive[first : last + 1]
+            request.send_response(206)
+            request.send_header("Content-Range", self.content_range.format(first=first, last=last, size=size))
+            request.send_header("Content-Length", str(len(content)))
+            request.end_headers()
+            with self.lock:
+                self.asked.append((first, last))
+                content = content if self.cut is None else content[: max(0, self.cut - self.served)]
+                self.served += len(content)
+            request.wfile.write(content)
+
+
+class Server(ThreadingHTTPServer):
+    def handle_error(self, request, client_address):
+        pass  # a client that hangs up is part of the tests
+
+
+@pytest.fixture
+def site(monkeypatch) -> Iterator[Site]:
+    monkeypatch.setenv("no_proxy", "*")
+    site = Site(ARCHIVE)
+
+    class Handler(BaseHTTPRequestHandler):
+        def log_message(self, format, *args):
+            pass
+
+        def do_GET(self):
+            site.answer(self)
+
+    with Server(("127.0.0.1", 0), Handler) as server:
+        site.base = f"http://127.0.0.1:{server.server_port}"
+        thread = threading.Thread(target=server.serve_forever, args=(0.01,))
+        thread.start()
+        yield site
+        server.shutdown()
+        thread.join()
+
+
+@cache
+def layout() -> dict[str, bytes]:
+    """Members as they are published: 12 photos in four sizes, beside scenes that nobody asks for."""
+    rng, files = np.random.default_rng(0), {}
+    for scene in "bicycle", "garden", "room":
+        for scale in 1, 2, 4, 8:
+            photos = "images" if scale == 1 else f"images_{scale}"
+            for i in range(12):
+                files[f"{scene}/{photos}/DSC{i:05d}.JPG"] = rng.bytes(90_000 // scale**2)
+        for model in "cameras", "images", "points3D":
+            files[f"{scene}/sparse/0/{model}.bin"] = rng.bytes(500) * 100  # deflates
+        files[f"{scene}/poses_bounds.npy"] = rng.bytes(2000)
+    return files
+
+
+def archive(files: dict[str, bytes] | None = None, change: Callable | None = None) -> bytes:
+    """A zip of `files`, after `change` of each member's ZipInfo; photos are stored, models deflated."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as file:
+        for folder in "garden/", "garden/images_4/":
+            file.writestr(zipfile.ZipInfo(folder), b"")
+        for name, content in (layout() if files is None else files).items():
+            info = zipfile.ZipInfo(name)
+            info.compress_type = zipfile.ZIP_STORED if name.endswith("JPG") else zipfile.ZIP_DEFLATED
+            file.writestr(info, content)
+        for info in file.filelist:
+            if change is not None and not info.is_dir():
+                change(info)
+    return buffer.getvalue()
+
+
+ARCHIVE = archive()
+
+
+def registry(site: Site, **fields) -> dict[str, RemoteScene]:
+    return {NAME: replace(find_scene(NAME), **({"url": site.url, "limit": 10**7} | fields))}
+
+
+def fetch(site: Site, folder: Path, **options) -> Path:
+    options = {"registry": registry(site), "sleep": lambda seconds: None} | options
+    return download_scene(NAME, folder, **options)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def expected(photos: str = "images_4") -> dict[str, bytes]:
+    keep = f"garden/{photos}/", "garden/sparse/"
+    return {name: content for name, content in layout().items() if name.startswith(keep)}
+
+
+def assert_one_line(error: BaseException, *parts: str) -> None:
+    line = str(error)
+    assert "\n" not in line
+    assert len(line) < 500
+    for part in parts:
+        assert part in line
+
+
+def test_one_size_of_one_scene_is_fetched(site, tmp_path):
+    assert fetch(site, tmp_path) == tmp_path / "garden"
+    assert contents(tmp_path) == expected()
+    assert oct((tmp_path / "garden/images_4/DSC00000.JPG").stat().st_mode & 0o777) == "0o644"
+
+
+@pytest.mark.parametrize(("scale", "photos"), [(1, "images"), (2, "images_2"), (8, "images_8")])
+def test_scales(site, tmp_path, scale, photos):
+    fetch(site, tmp_path, scale=scale)
+    assert contents(tmp_path) == expected(photos)
+
+
+def test_little_but_the_needed_members_is_transferred(site, tmp_path, monkeypatch):
+    monkeypatch.setattr(remote_zip, "TAIL", 20_000)  # of a 5 MB archive, as 1 MiB is of 12 GB
+    fetch(site, tmp_path)
+    with zipfile.ZipFile(io.BytesIO(site.archive)) as file:
+        needed = sum(file.getinfo(name).compress_size for name in expected())
+        headers = 100 * len(expected())
+    assert needed < site.served < needed + headers + 20_001
+    assert site.served < len(site.archive) / 20
+    assert len(site.asked) == 2 + len(expected())
+
+
+@pytest.mark.parametrize("tail", [1, 22, 100, 5000])
+def test_a_directory_that_is_larger_than_the_tail(site, tmp_path, monkeypatch, tail):
+    monkeypatch.setattr(remote_zip, "TAIL", tail)
+    fetch(site, tmp_path)
+    assert contents(tmp_path) == expected()
+
+
+def test_zip64_and_archives_behind_other_bytes(site, tmp_path, monkeypatch):
+    monkeypatch.setattr(zipfile, "ZIP64_LIMIT", 1000)  # as if the archive had more than 4 GB
+    site.archive = archive()
+    assert b"PK\6\6" in site.archive[-200:]
+    monkeypatch.undo()
+    monkeypatch.setenv("no_proxy", "*")
+    fetch(site, tmp_path / "zip64")
+    site.archive = b"#!/bin/sh\n" + ARCHIVE
+    fetch(site, tmp_path / "behind")
+    assert contents(tmp_path / "zip64") == contents(tmp_path / "behind") == expected()
+
+
+def test_progress_rises_to_all_bytes(site, tmp_path):
+    calls = []
+    fetch(site, tmp_path, on_progress=lambda *call: calls.append(call))
+    names, done, totals = zip(*calls, strict=True)
+    assert list(done) == sorted(set(done))
+    assert set(totals) == {sum(map(len, expected().values()))} == {done[-1]}
+    assert set(names) == {Path(name).name for name in expected()}
+
+
+def test_finished_files_are_kept(site, tmp_path):
+    fetch(site, tmp_path)
+    before = {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*.*")}
+    damaged = tmp_path / "garden/images_4/DSC00003.JPG"
+    damaged.write_bytes(bytes(damaged.stat().st_size))  # the right size
+    (tmp_path / "garden/sparse/0/images.bin").write_bytes(b"short")
+    (tmp_path / "garden/images_4/DSC00004.JPG").unlink()
+    (tmp_path / "garden/masks").mkdir()
+    (tmp_path / "garden/masks/own.png").write_bytes(b"own")
+    site.asked.clear()
+    fetch(site, tmp_path)
+    assert len(site.asked) == 2 + 3
+    assert contents(tmp_path) == expected() | {"garden/masks/own.png": b"own"}
+    changed = {p.name for p, mtime in before.items() if p.stat().st_mtime_ns != mtime}
+    assert changed == {"DSC00003.JPG", "DSC00004.JPG", "images.bin"}
+
+
+def test_a_cut_download_goes_on(site, tmp_path, monkeypatch):
+    monkeypatch.setattr(remote_zip, "TAIL", 20_000)
+    pauses = []
+    for cut in 100, 30_000, 60_000:
+        site.cut, site.served = cut, 0
+        with pytest.raises(DataError) as caught:
+            fetch(site, tmp_path, sleep=pauses.append)
+        assert_one_line(caught.value, site.url, "bytes early", "run it again: finished files are kept")
+        assert contents(tmp_path).items() <= expected().items()  # no halves, no temporary files
+    assert set(pauses) == {1.0, 5.0}
+    kept = len(contents(tmp_path))
+    assert kept > 0
+    site.cut = None
+    site.asked.clear()
+    fetch(site, tmp_path)
+    assert contents(tmp_path) == expected()
+    assert len(site.asked) == 2 + len(expected()) - kept
+
+
+def test_a_kill_between_members(site, tmp_path):
+    """The process ends without a word; what was finished stays."""
+    code = f"""if True:
+        import os
+        from dataclasses import replace
+        from pathlib import Path
+        from sagesplat.download_scenes import download_scene, find_scene
+
+        def stop(name, done, total):
+            if done > total / 2:
+                os._exit(7)
+
+        scene = replace(find_scene({NAME!r}), url={site.url!r})
+        download_scene({NAME!r}, Path({str(tmp_path)!r}), registry={{scene.name: scene}}, on_progress=stop)
+    """
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 7
+    left = {name: content for name, content in contents(tmp_path).items() if "/." not in name}
+    assert left.items() <= expected().items()
+    assert 2 < len(left) < len(expected())
+    site.asked.clear()
+    fetch(site, tmp_path)
+    assert len(site.asked) == 2 + len(expected()) - len(left)
+    assert contents(tmp_path).items() >= expected().items()
+
+
+def test_an_error_of_the_caller_stops_it(site, tmp_path):
+    def full(name: str, done: int, total: int) -> None:
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fetch(site, tmp_path, on_progress=full)
+    assert contents(tmp_path) == {}
+    assert threading.active_count() < 10
+
+
+@pytest.mark.parametrize("code", [408, 429, 500, 502, 503, 504])
+def test_passing_faults_are_tried_again(site, tmp_path, code):
+    site.code, site.failures = code, 2
+    pauses = []
+    fetch(site, tmp_path, sleep=pauses.append)
+    assert contents(tmp_path) == expected()
+    assert pauses == [1.0, 5.0]
+
+
+def test_a_broken_connection_goes_on_where_it_was(site, monkeypatch):
+    monkeypatch.setattr(remote_zip, "BLOCK", 1000)
+    remote = RemoteZip(site.url, lambda seconds: setattr(site, "cut", None))
+    member = next(m for m in remote.members() if m.info.filename == "garden/images/DSC00005.JPG")
+    site.asked.clear()
+    site.cut = site.served + 40_000
+    assert b"".join(remote.content(member)) == layout()["garden/images/DSC00005.JPG"]
+    (first, last), (second, end) = site.asked
+    assert first == member.info.header_offset
+    assert (second, end) == (first + 40_000, last)
+
+
+@pytest.mark.parametrize("code", [401, 403, 404, 410, 416])
+def test_final_faults(site, tmp_path, code):
+    site.code = code
+    with pytest.raises(DataError) as caught:
+        fetch(site, tmp_path, sleep=no_sleep)
+    assert_one_line(caught.value, site.url, f"HTTP Error {code}")
+    assert contents(tmp_path) == {}
+
+
+def no_sleep(seconds: float) -> None:
+    raise AssertionError("tried again")
+
+
+def test_a_fault_that_stays_is_one_line(site, tmp_path):
+    site.code = 503
+    with pytest.raises(DataError) as caught:
+        fetch(site, tmp_path)
+    assert_one_line(caught.value, site.url, "HTTP Error 503")
+    assert contents(tmp_path) == {}
+
+
+def test_servers_that_cannot_be_reached(tmp_path, site, monkeypatch):
+    monkeypatch.setattr(remote_zip, "TIMEOUT", 0.05)
+    site.delay = 0.3
+    cases = {
+        site.url: "timed out",
+        "http://127.0.0.1:1/360_v2.zip": "refused",
+        "http://no-such-host.invalid/360_v2.zip": "rror",
+        "ftp3://nowhere/360_v2.zip": "unknown url type",
+    }
+    for url, reason in cases.items():
+        pauses = []
+        with pytest.raises(DataError) as caught:
+            fetch(site, tmp_path, registry=registry(site, url=url), sleep=pauses.append)
+        assert_one_line(caught.value, url, "cannot be downloaded", reason)
+        assert pauses == [1.0, 5.0]
+
+
+def test_a_server_without_ranges(site, tmp_path):
+    site.ranges = False
+    with pytest.raises(DataError) as caught:
+        fetch(site, tmp_path, sleep=no_sleep)
+    assert_one_line(caught.value, site.url, "no range requests", "by hand")
+    assert contents(tmp_path) == {}
+    assert site.served == 0
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "bytes 0-0/*", "bytes 0-5/{size}", "bytes {first}-{last}/0", "bytes {first}-{last}/17", "chunks"],
+)
+def test_a_server_that_lies_about_sizes(site, tmp_path, text):
+    site.content_range = text
+    with pytest.raises(DataError) as caught:
+        fetch(site, tmp_path, sleep=no_sleep)
+    assert_one_line(caught.value, site.url)
+    assert contents(tmp_path) == {}
+
+
+def test_an_archive_that_changes_on_the_way(site, tmp_path):
+    def replaced(name: str, done: int, total: int) -> None:
+        site.archive = ARCHIVE + b"longer"
+
+    with pytest.raises(DataError) as caught:
+        fetch(site, tmp_path, on_progress=replaced)
+    assert_one_line(caught.value, site.url, "were asked for")
+    assert contents(tmp_path).items() <= expected().items()
+
+
+def test_redirects(site, tmp_path):
+    site.location = "/moved.zip"
+    fetch(site, tmp_path)
+    assert contents(tmp_path) == expected()
+    for location in "/360_v2.zip", "file:///etc/passwd":
+        site.location = location
+        with pytest.raises(DataError) as caught:
+            fetch(site, tmp_path / "other", sleep=no_sleep)
+        assert_one_line(caught.value, site.url, "302")
+
+
+def test_a_wrong_checksum_names_the_file(site, tmp_path):
+    at = site.archive.index(layout()["garden/images_4/DSC00007.JPG"])
+    site.archive = site.archive[: at + 50] + b"xxxx" + site.archive[at + 54 :]
+    with pytest.raises(DataError) as caught:
+        fetch(site, tmp_path)
+    assert_one_line(caught.value, site.url, "garden/images_4/DSC00007.JPG is damaged", "CRC")
+    assert contents(tmp_path).items() <= expected().items()
+    assert "garden/images_4/DSC00007.JPG" not in contents(tmp_path)
+
+
+def test_damaged_compression_names_the_file(site, tmp_path):
+    at = site.archive.index(b"garden/sparse/0/images.bin") + len("garden/sparse/0/images.bin")
+    site.archive = site.archive[:at] + b"\xff" * 20 + site.archive[at + 20 :]
+    with pytest.raises(DataError, match=r"garden/sparse/0/images.bin is damaged"):
+        fetch(site, tmp_path)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "garden/images_4/../../../evil.JPG",
+        "garden/images_4//evil.JPG",
+        "garden/images_4/./evil.JPG",
+        "garden/images_4/..\\evil.JPG",
+        "garden/images_4/C:evil.JPG",
+        "garden/images_4/a\nb.JPG",
+        "garden/sparse/0/../../../evil.bin",
+    ],
+)
+def test_hostile_names_are_refused(site, tmp_path, name):
+    site.archive = archive(layout() | {name: b"evil"})
+    with pytest.raises(DataError) as caught:
+        fetch(site, tmp_path / "below")
+    assert_one_line(caught.value, site.url, repr(name), "is refused", "leaves the folder")
+    assert contents(tmp_path) == {}
+
+
+def test_names_outside_the_scene_are_never_touched(site, tmp_path):
+    site.archive = archive(
+        layout() | {"/etc/evil": b"", "../evil": b"", "gardens/images_4/evil.JPG": b"", "garden": b""}
+    )
+    fetch(site, tmp_path)
+    assert contents(tmp_path) == expected()
+
+
+def lone(**fields: int) -> Callable[[zipfile.ZipInfo], None]:
+    """Changes one photo's entry in the directory."""
+
+    def change(info: zipfile.ZipInfo) -> None:
+        if info.filename == "garden/images_4/DSC00002.JPG":
+            for key, value in fields.items():
+                setattr(info, key, value)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lone(external_attr=(stat.S_IFLNK | 0o777) << 16), "a link or device"),
+        (lone(external_attr=(stat.S_IFCHR | 0o666) << 16), "a link or device"),
+        (lone(compress_type=zipfile.ZIP_LZMA), "compressed in an unusual way"),
+        (lone(flag_bits=1), "encrypted"),
+        (lone(compress_size=1), "5625 bytes from 1"),
+        (lone(file_size=2 * 10**9), "2000000000 bytes from 5625"),
+    ],
+)
+def test_hostile_members_are_refused(site, tmp_path, change, reason):
+    site.archive = archive(change=change)
+    with pytest.raises(DataError) as caught:
+        fetch(site, tmp_path)
+    assert_one_line(caught.value, site.url, "DSC00002.JPG' is refused", reason)
+    assert contents(tmp_path) == {}
+
+
+@pytest.mark.parametrize(
+    "fields", [{"file_size": 100}, {"file_size": 90_000}, {"header_offset": 5}, {"CRC": 1}]
+)
+def test_a_directory_that_lies_about_a_member(site, tmp_path, fields):
+    site.archive = archive(change=lone(**fields))
+    with pytest.raises(DataError, match="is damaged"):
+        fetch(site, tmp_path)
+    assert "garden/images_4/DSC00002.JPG" not in contents(tmp_path)
+
+
+def test_a_bomb_writes_no_more_than_it_lists(site, monkeypatch):
+    """A member that inflates to a thousand times what the directory says."""
+    files = layout() | {"garden/sparse/0/points3D.bin": bytes(10**7)}
+
+    def small(info: zipfile.ZipInfo) -> None:
+        if info.filename == "garden/sparse/0/points3D.bin":
+            info.file_size = 1000
+
+    site.archive = archive(files, small)
+    remote = RemoteZip(site.url)
+    member = next(m for m in remote.members() if m.info.filename == "garden/sparse/0/points3D.bin")
+    blocks = remote.content(member)
+    assert next(blocks) == bytes(1001)
+    with pytest.raises(DataError, match="1001 bytes"):
+        next(blocks)
+
+
+def test_what_an_archive_may_hold(site, tmp_path):
+    with pytest.raises(DataError, match=r"takes 0.00\d+ GB where 0.0001 GB is the most"):
+        fetch(site, tmp_path, registry=registry(site, limit=10**5))
+    with pytest.raises(DataError, match="holds no garden/images_16/"):
+        fetch(site, tmp_path, scale=16, registry=registry(site, scales=(16,)))
+    with pytest.raises(DataError, match="holds no garden2/images_4/"):
+        fetch(site, tmp_path, registry=registry(site, folder="garden2"))
+    site.archive = archive({k: v for k, v in layout().items() if "sparse" not in k})
+    with pytest.raises(DataError, match="holds no garden/sparse/0/"):
+        fetch(site, tmp_path)
+    with pytest.warns(UserWarning, match="Duplicate name"):
+        site.archive = twice()
+    with pytest.raises(DataError, match="twice"):
+        fetch(site, tmp_path)
+    assert contents(tmp_path) == {}
+
+
+def twice() -> bytes:
+    buffer = io.BytesIO()
+    buffer.write(ARCHIVE)
+    with zipfile.ZipFile(buffer, "a") as file:
+        file.writestr("garden/images_4/DSC00001.JPG", b"another")
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize("content", [b"x", b"<html>Please log in</html>", bytes(100), b"PK\5\6" + bytes(18)])
+def test_what_is_no_archive(site, tmp_path, content):
+    site.archive = content
+    with pytest.raises(DataError) as caught:
+        fetch(site, tmp_path)
+    assert_one_line(caught.value, site.url)
+
+
+def test_a_huge_directory_is_not_read(site, tmp_path, monkeypatch):
+    monkeypatch.setattr(remote_zip, "MAX_DIRECTORY", 1000)
+    monkeypatch.setattr(remote_zip, "TAIL", 100)
+    with pytest.raises(DataError, match=r"a directory of \d+ bytes"):
+        fetch(site, tmp_path)
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data())
+def test_damaged_directories_are_one_line(data):
+    """zipfile raises what it likes; what comes out is a DataError or a list of members in the archive."""
+    content = bytearray(SMALL)
+    start = content.index(b"PK\1\2")
+    for _ in range(data.draw(st.integers(1, 4))):
+        content[data.draw(st.integers(start, len(content) - 1))] = data.draw(st.integers(0, 255))
+    remote = object.__new__(RemoteZip)
+    remote.url, remote.size, remote._position = "http://here/a.zip", len(content), 0
+    remote._tail = bytes(content)
+    try:
+        members = remote.members()
+    except DataError as error:
+        assert_one_line(error, remote.url, "not readable as a zip archive")
+    else:
+        starts = [member.info.header_offset for member in members]
+        assert starts == sorted(starts)
+        assert not starts or starts[0] >= 0
+
+
+SMALL = archive({"garden/images_4/a.JPG": b"photo", "garden/sparse/0/images.bin": b"model" * 30})
+
+
+def test_names_and_scales_that_there_are_not(site, tmp_path):
+    with pytest.raises(DataError) as caught:
+        download_scene("mipnerf360/gardem", tmp_path)
+    assert_one_line(caught.value, "mipnerf360/gardem: no such scene", "mipnerf360/garden, ", "db/playroom")
+    for scale in 0, 3, -4:
+        with pytest.raises(DataError) as caught:
+            fetch(site, tmp_path, scale=scale)
+        assert_one_line(caught.value, f"{NAME}: no photos at scale {scale}; take one of 1, 2, 4, 8")
+    assert site.asked == []
+
+
+def test_a_full_disk_or_a_closed_folder(site, tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RunError) as caught:
+        fetch(site, tmp_path / "file")
+    assert_one_line(caught.value, "cannot be written")
+    opened = Path.open
+
+    class Full(io.BytesIO):
+        def write(self, content):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    def full(path: Path, mode: str = "r", *args, **kwargs):
+        space = mode != "wb" or "DSC00009" not in path.name
+        return opened(path, mode, *args, **kwargs) if space else Full()
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "open", full)
+        with pytest.raises(RunError) as caught:
+            fetch(site, tmp_path / "full")
+    assert_one_line(caught.value, "DSC00009.JPG", "the disk is full", "nothing was lost")
+    left = contents(tmp_path / "full")
+    assert left.items() <= expected().items()
+    assert len(left) > 2
+    fetch(site, tmp_path / "full")
+    assert contents(tmp_path / "full") == expected()
+
+
+def test_a_fetched_scene_loads_without_the_large_photos(site, tmp_path):
+    """images_4/ and sparse/0 are enough for downscale 4."""
+    source, files = tmp_path / "source", {}
+    camera = ModelCamera(1, "PINHOLE", 163, 122, (140.0, 140.0, 81.5, 61.0))
+    rng, images = np.random.default_rng(0), []
+    for i in range(4):
+        w2c, uv = np.eye(4), rng.uniform(0, 120, (10, 2))
+        w2c[:3, 3] = [0.1 * i, 0, 4]
+        images.append(ModelImage(i + 1, f"DSC{i}.JPG", 1, w2c, uv, np.arange(10)))
+        photo = io.BytesIO()
+        Image.fromarray(rng.integers(0, 256, (31, 41, 3), np.uint8)).save(photo, "JPEG")
+        files[f"garden/images_4/DSC{i}.JPG"] = photo.getvalue()
+    xyz, rgb = rng.uniform(-1, 1, (10, 3)), rng.integers(0, 256, (10, 3), np.uint8)
+    write_model(source, [camera], images, xyz, rgb, np.full(10, 0.5))
+    files |= {f"garden/sparse/0/{path.name}": path.read_bytes() for path in source.iterdir()}
+    site.archive = archive(files)
+    scene = load_scene(fetch(site, tmp_path), downscale=4, test_every=2)
+    assert scene.name == "garden"
+    assert [(v.name, v.camera.width, v.camera.height) for v in scene.views] == [
+        (f"DSC{i}.JPG", 41, 31) for i in range(4)
+    ]
+
+
+def test_the_registry():
+    scenes = list_scenes()
+    assert [scene.name for scene in scenes] == list(read_registry())
+    assert len(scenes) == 13
+    for scene in scenes:
+        assert re.fullmatch(r"https://[\w./-]+\.zip", scene.url)
+        assert scene.page.startswith("https://")
+        assert scene.scale in scene.scales
+        assert 10**9 <= scene.limit <= 12 * 10**9
+        assert scene.photos > 100
+        assert "https://" in scene.licence
+        assert "\n" not in scene.licence
+    outdoor = {scene.name.rpartition("/")[2] for scene in scenes if scene.scale == 4}
+    assert outdoor == {"bicycle", "garden", "stump", "flowers", "treehill"}
+    assert find_scene("tandt/truck").folder == "tandt/truck"
+    assert find_scene("db/playroom").scale == 1
+    assert list_scenes({}) == []
+
+
+def test_the_header_in_the_archive_may_be_longer_than_in_the_directory(site, tmp_path):
+    """Info-ZIP writes larger extra fields there."""
+    content, extra = layout()["garden/images_4/DSC00000.JPG"], b"UT\x09\0" + bytes(9)
+    name = b"garden/images_4/DSC00000.JPG"
+    at = site.archive.index(b"PK\3\4", site.archive.index(name) - 40)
+    longer = bytearray(site.archive[:at])
+    header = bytearray(site.archive[at : at + 30])
+    header[28:30] = struct.pack("<H", len(extra))
+    longer += header + name + extra + content + b"a data descriptor"
+    shift = len(longer) - (at + 30 + len(name) + len(content))
+    directory = site.archive[at + 30 + len(name) + len(content) :]
+    site.archive = bytes(longer + moved(directory, at, shift))
+    fetch(site, tmp_path)
+    assert contents(tmp_path) == expected()
+
+
+def moved(rest: bytes, after: int, shift: int) -> bytes:
+    """The rest of an archive with all offsets beyond `after` shifted."""
+    content = bytearray(rest)
+    entry = content.index(b"PK\1\2")
+    while content[entry : entry + 4] == b"PK\1\2":
+        (offset,) = struct.unpack_from("<I", content, entry + 42)
+        if offset > after:
+            struct.pack_into("<I", content, entry + 42, offset + shift)
+        entry += 46 + sum(struct.unpack_from("<HHH", content, entry + 28))
+    (offset,) = struct.unpack_from("<I", content, entry + 16)
+    struct.pack_into("<I", content, entry + 16, offset + shift)
+    return bytes(content)
