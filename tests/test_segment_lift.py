@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from sagesplat.errors import LabelError
 from sagesplat.scene import load_scene
 from sagesplat.scene.scene import Camera, Points, Scene, View
-from sagesplat.segment.lift import LiftedLabels, lift
+from sagesplat.segment.lift import LiftedLabels, agreement_in, lift
 from sagesplat.segment.masks import Masks, Taxonomy, mask_path, write_mask
 
 SCENES = Path(__file__).resolve().parents[2] / "shared" / "scenes"
@@ -83,8 +83,11 @@ def test_projection_asks_every_view_that_the_point_lies_in(tmp_path):
     lifted = lift(scene, masks, votes="projection")
     assert lifted.label_ids.tolist() == [CAR, -1, -1, CAR]  # the last by its tie
     assert lifted.num_votes.tolist() == [3, 0, 0, 2]
-    assert lift(scene, masks).label_ids.tolist() == [-1] * 4  # no tracks
-    assert np.isnan(lift(scene, masks).agreement)
+    assert lift(scene, masks).label_ids.tolist() == [CAR, -1, -1, CAR]  # no tracks: the same
+    assert np.isnan(lift(scene, masks, views=[]).agreement)
+    assert agreement_in(scene, masks, lifted.label_ids, {1, 2}) == 1
+    assert agreement_in(scene, masks, lifted.label_ids, {0}) == 0
+    assert np.isnan(agreement_in(scene, masks, lifted.label_ids, set()))
 
 
 @settings(max_examples=25, deadline=None)

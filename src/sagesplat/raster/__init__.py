@@ -77,9 +77,9 @@ def rasterize(
     """Render Gaussians into a camera, with gradients for all their parameters and for `features`.
 
     `sh_degree`: harmonics up to this degree (default: all there are). `background` [3] lies behind everything
-    (default black). `features` [N, C] are blended like colours, over zero. `antialiased` scales opacities by
-    the area that the low-pass adds (Mip-Splatting's 2D filter as gsplat has it). `tile_mask` bool
-    [ceil(H/16), ceil(W/16)]: tiles that are false show the background and take no gradient.
+    (default: the camera's). `features` [N, C] are blended like colours, over zero. `antialiased` scales
+    opacities by the area that the low-pass adds (Mip-Splatting's 2D filter as gsplat has it). `tile_mask`
+    bool [ceil(H/16), ceil(W/16)]: tiles that are false show the background and take no gradient.
     `trainable` bool [N]: rows that are false are drawn, but get no gradient (zeros); pass the same tensor at
     every step, `cuda` keeps what it makes of it. `workspace`: memory to use again; results and gradients hold
     until the next call with it (`cpu` only). `backend` auto: the one of the device that the means are on.
@@ -91,7 +91,7 @@ def rasterize(
     """
     degree = gaussians.sh_degree if sh_degree is None else min(sh_degree, gaussians.sh_degree)
     if background is None:
-        background = gaussians.means.new_zeros(3)
+        background = gaussians.means.new_tensor(camera.background) / 255
     if backend == "auto":
         backend = "cuda" if gaussians.means.is_cuda else "cpu"
     elif backend != "cuda":  # that one says itself what it misses

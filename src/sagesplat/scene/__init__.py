@@ -7,20 +7,27 @@ import numpy as np
 
 from sagesplat.errors import SceneError
 from sagesplat.scene.colmap import load_colmap
+from sagesplat.scene.detect import detect
+from sagesplat.scene.nerfstudio import load_blender, load_transforms
 from sagesplat.scene.scene import Scene
 
 __all__ = ["describe", "load_scene"]
 
 
 def load_scene(path: Path, *, downscale: int = 1, test_every: int = 8, calibrate_every: int = 0) -> Scene:
-    """The capture in a folder, as `colmap.load_colmap` reads it. Raises SceneError.
+    """The capture at a path: a COLMAP workspace, nerfstudio's transforms.json or a Blender scene.
 
+    Raises SceneError. Photos and videos without poses are none: `photos.reconstruct` makes one of them.
     Photos are `downscale` times smaller than the files in images/. Every `test_every`-th view by name is
     kept for tests, none with 0; every `calibrate_every`-th of the others for calibration.
     """
     if calibrate_every < 0 or calibrate_every == 1:
         raise SceneError(f"{path}: calibrate_every {calibrate_every} leaves nothing; take 0 or 2 and more")
-    scene = load_colmap(path, downscale=downscale, test_every=test_every)
+    kind = detect(path)
+    if kind in ("photos", "video"):
+        raise SceneError(f"{path}: {kind} without poses; `sagesplat run` finds them")
+    load = {"colmap": load_colmap, "transforms": load_transforms, "blender": load_blender}[kind]
+    scene = load(path, downscale=downscale, test_every=test_every)
     return replace(scene, calibrate_every=calibrate_every)
 
 
@@ -45,7 +52,7 @@ def describe(scene: Scene) -> list[tuple[str, str]]:
             f"x {low[0]:+.1f} to {high[0]:+.1f}, y {low[1]:+.1f} to {high[1]:+.1f} px off centre",
         ),
         ("distortion", f"{', '.join(lenses)}: undistorted when loaded" if lenses else "none"),
-        ("points", f"{len(points.xyz):,}"),
+        ("points", f"{len(points.xyz):,}" + ("" if len(points.track_points) else ", without tracks")),
         ("extent", f"{scene.extent:.3g} world units"),
     ]
     if len(points.track_points):

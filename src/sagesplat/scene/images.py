@@ -24,15 +24,24 @@ def photo_size(path: Path) -> tuple[int, int]:
         raise _unreadable(path, error) from None
 
 
+def has_alpha(path: Path) -> bool:
+    """Whether a photo has transparency, from the file's header alone. Raises SceneError."""
+    try:
+        with Image.open(path) as image:
+            return image.has_transparency_data
+    except _UNREADABLE as error:
+        raise _unreadable(path, error) from None
+
+
 def load_photo(view: View) -> UInt8[np.ndarray, "H W 3"]:
     """The photo as `view.camera` sees it: area-resampled to the camera's size, then undistorted.
 
     EXIF orientation is not applied, because COLMAP's poses are those of the stored pixels. Grey photos
-    become RGB, 16 bits become 8, and alpha goes over black, the background of training. Raises SceneError.
+    become RGB, 16 bits become 8, and alpha goes over the camera's background. Raises SceneError.
     """
     try:
         with Image.open(view.image_path) as file:
-            image = _rgb(file)
+            image = _rgb(file, view.camera.background)
     except _UNREADABLE as error:
         raise _unreadable(view.image_path, error) from None
     size = (view.camera.width, view.camera.height)
@@ -67,8 +76,8 @@ class Photos:
         return photo
 
 
-def _rgb(image: Image.Image) -> Image.Image:
-    """8-bit RGB of any mode of Pillow."""
+def _rgb(image: Image.Image, background: tuple[int, int, int]) -> Image.Image:
+    """8-bit RGB of any mode of Pillow, over a background where it has alpha."""
     if image.mode.startswith("I") or image.mode == "F":
         values = np.asarray(image, np.float64)
         # Pillow clips 16-bit greys where they should be scaled.
@@ -76,7 +85,7 @@ def _rgb(image: Image.Image) -> Image.Image:
         return Image.fromarray((values / scale).round().clip(0, 255).astype(np.uint8)).convert("RGB")
     if image.has_transparency_data:
         image = image.convert("RGBA")
-        return Image.alpha_composite(Image.new("RGBA", image.size, "black"), image).convert("RGB")
+        return Image.alpha_composite(Image.new("RGBA", image.size, (*background, 255)), image).convert("RGB")
     return image.convert("RGB")
 
 

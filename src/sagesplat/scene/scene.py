@@ -16,6 +16,7 @@ class Camera:
     K: Float32[np.ndarray, "3 3"]  # intrinsics, pixels
     width: int
     height: int
+    background: tuple[int, int, int] = (0, 0, 0)  # RGB behind the scene: alpha of photos goes over it
 
     @property
     def position(self) -> Float32[np.ndarray, "3"]:
@@ -74,6 +75,7 @@ class Scene:
     points: Points
     test_every: int = 8  # every n-th view by name is a test view; 0 = none
     calibrate_every: int = 0  # every n-th of the others calibrates promises; 0 = none
+    test_names: frozenset[str] | None = None  # test views that the dataset lists, instead of test_every
 
     @cached_property
     def extent(self) -> float:
@@ -85,6 +87,8 @@ class Scene:
     def test_ids(self) -> np.ndarray:
         """Rows of `views` that training, fitting and calibration never see."""
         every = np.arange(len(self.views))
+        if self.test_names is not None:
+            return every[[view.name in self.test_names for view in self.views]]
         return every[every % self.test_every == 0] if self.test_every else every[:0]
 
     @property

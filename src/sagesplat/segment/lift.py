@@ -69,9 +69,10 @@ def lift(
 ) -> LiftedLabels:
     """Give each point the label that most of its pixels have.
 
-    A point votes once per observation of its track, or with `votes="projection"` once per view whose frustum
-    it lies in (occluded or not). Unlabelled pixels do not vote; ties go to the label with more pixels in all
-    label images together. `views`: only these rows of `Scene.views` have a vote (default: all).
+    A point votes once per observation of its track, or with `votes="projection"`, and where a scene has no
+    tracks, once per view whose frustum it lies in (occluded or not). Unlabelled pixels do not vote; ties go
+    to the label with more pixels in all label images together. `views`: only these rows of `Scene.views`
+    have a vote (default: all).
     """
     ids = np.array(sorted(masks.taxonomy.names))
     column_of = np.zeros(ids[-1] + 1, np.int64)
@@ -79,19 +80,17 @@ def lift(
     counts = np.zeros((len(scene.points.xyz), len(ids)), np.int32)
     flat_counts = counts.reshape(-1)  # np.add.at is several times faster on one axis
     num_pixels = np.zeros(len(ids), np.int64)
-    pixels = _track_pixels(scene) if votes == "track" else _projected_pixels(scene)
+    tracked = votes == "track" and len(scene.points.track_points) > 0
+    pixels = _track_pixels(scene) if tracked else _projected_pixels(scene)
     for row, (view, (points, uv)) in enumerate(zip(scene.views, pixels, strict=True)):
         if views is not None and row not in views:
             continue
         label_ids = masks[view]
         # unsigned, unlabelled pixels are 65535: out of the way
         num_pixels += np.bincount(label_ids.view(np.uint16).ravel(), minlength=ids[-1] + 1)[ids]
-        # uv on the image's far edge or, after undistortion, outside it shows no pixel
-        inside = (uv >= 0).all(1) & (uv < (view.camera.width, view.camera.height)).all(1)
-        x, y = uv[inside].astype(np.int64).T
-        seen = label_ids[y, x]
+        seen, points = _labels_at(label_ids, points, uv)
         voted = seen != UNLABELLED
-        np.add.at(flat_counts, points[inside][voted] * len(ids) + column_of[seen[voted]], 1)
+        np.add.at(flat_counts, points[voted] * len(ids) + column_of[seen[voted]], 1)
     order = np.argsort(-num_pixels, kind="stable")  # arg max takes the first of several
     winner = order[counts[:, order].argmax(1)]
     num_votes = counts.sum(1, dtype=np.int32)
@@ -100,6 +99,31 @@ def lift(
         num_votes=num_votes,
         num_agreeing=np.take_along_axis(counts, winner[:, None], 1)[:, 0],
     )
+
+
+def agreement_in(
+    scene: Scene, masks: Masks, label_ids: Int16[np.ndarray, " P"], views: Collection[int]
+) -> float:
+    """Share of the labelled observations in `views` that show their point's label; NaN without any."""
+    same = seen = 0
+    pixels = _track_pixels(scene) if len(scene.points.track_points) else _projected_pixels(scene)
+    for row, (view, (points, uv)) in enumerate(zip(scene.views, pixels, strict=True)):
+        if row not in views:
+            continue
+        found, points = _labels_at(masks[view], points, uv)
+        both = (found != UNLABELLED) & (label_ids[points] != UNLABELLED)
+        seen += int(both.sum())
+        same += int((found == label_ids[points])[both].sum())
+    return same / seen if seen else float("nan")
+
+
+def _labels_at(
+    image: Int16[np.ndarray, "H W"], points: Int64[np.ndarray, " M"], uv: Float32[np.ndarray, "M 2"]
+) -> tuple[Int16[np.ndarray, " m"], Int64[np.ndarray, " m"]]:
+    """Labels at pixels, and their points; on the far edge or, after undistortion, outside there is none."""
+    inside = (uv >= 0).all(1) & (uv < image.shape[::-1]).all(1)
+    x, y = uv[inside].astype(np.int64).T
+    return image[y, x], points[inside]
 
 
 def _track_pixels(scene: Scene) -> Iterator[tuple[Int64[np.ndarray, " M"], Float32[np.ndarray, "M 2"]]]:

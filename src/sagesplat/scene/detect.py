@@ -1,0 +1,56 @@
+"""What kind of capture a path holds."""
+
+from pathlib import Path
+from typing import Literal
+
+from sagesplat.errors import SceneError
+
+Kind = Literal["colmap", "transforms", "blender", "photos", "video"]
+PHOTOS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif"})
+VIDEOS = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg"})
+
+
+def detect(path: Path) -> Kind:
+    """The kind of a capture, by what lies in it; the first that fits, as a COLMAP model knows most.
+
+    - colmap: cameras.bin or .txt in sparse/0 or sparse;
+    - transforms: transforms.json, or the path of any .json file;
+    - blender: transforms_train.json, or its path;
+    - photos: photos in images/, or in the folder itself;
+    - video: the path of a video file.
+
+    Raises SceneError where it is none of them.
+    """
+    if path.is_file():
+        return _of_file(path)
+    if not path.is_dir():
+        raise SceneError(f"{path}: no such file or folder; give a capture's folder or a video")
+    models = (path / "sparse" / "0", path / "sparse")
+    if any((model / name).is_file() for model in models for name in ("cameras.bin", "cameras.txt")):
+        return "colmap"
+    if (path / "transforms.json").is_file():
+        return "transforms"
+    if (path / "transforms_train.json").is_file():
+        return "blender"
+    if any(_holds_photos(folder) for folder in (path / "images", path)):
+        return "photos"
+    raise SceneError(
+        f"{path}: no capture (looked for cameras.bin and cameras.txt in sparse/0 and sparse, "
+        "transforms.json, transforms_train.json, and photos in images/ and the folder); "
+        "give a folder that has one of them, or a video file"
+    )
+
+
+def _of_file(path: Path) -> Kind:
+    suffix = path.suffix.lower()
+    if suffix == ".json":
+        return "blender" if path.name == "transforms_train.json" else "transforms"
+    if suffix in VIDEOS:
+        return "video"
+    raise SceneError(f"{path}: neither a transforms .json nor a video; give a folder, or one of these files")
+
+
+def _holds_photos(folder: Path) -> bool:
+    if not folder.is_dir():
+        return False
+    return any(file.suffix.lower() in PHOTOS and file.is_file() for file in folder.iterdir())

@@ -1,0 +1,304 @@
+"""nerfstudio's transforms.json and the Blender scenes of NeRF, made into a scene.
+
+Formats: https://docs.nerf.studio/quickstart/data_conventions.html, instant-ngp's docs/nerf_dataset_tips.md,
+and the synthetic scenes of Mildenhall et al. 2020. Poses are camera-to-world with OpenGL axes (x right, y up,
+z back). The world is that of the file: nothing is turned, moved or scaled.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from sagesplat.errors import RunError, SceneError
+from sagesplat.files import read_json
+from sagesplat.scene.colmap import MIN_VIEWS
+from sagesplat.scene.images import has_alpha, photo_size
+from sagesplat.scene.points import random_points, read_points
+from sagesplat.scene.scene import Camera, Lens, Scene, View
+from sagesplat.scene.undistort import intrinsics, is_pinhole, pinhole
+
+PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+FISHEYE = "OPENCV_FISHEYE"
+SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG")  # tried where a file_path has none
+MAX_SIDE = 10**6  # pixels
+LARGEST = 1e9  # number that float32 still has a use for
+MAX_SHEAR = 1e-2  # what rounding may leave of a rotation's R^T R - I
+BLENDER_CUBE = 1.3  # half the side of the cube that NeRF's Blender scenes fit into (3DGS's initial points)
+WHITE = (255, 255, 255)
+
+
+def load_transforms(path: Path, *, downscale: int = 1, test_every: int = 8) -> Scene:
+    """The scene of a folder with nerfstudio's or instant-ngp's transforms.json, or of such a file.
+
+    With `downscale` N the photos come from `images_N/` if the frames are in images/ and that folder exists,
+    otherwise they are area-resampled when loaded. Where the file lists train_, val_ or test_filenames, they
+    are the split (`val` only without `test`; other frames are left out) unless `test_every` is 0. The points
+    of `ply_file_path` are in the frame of the poses (`applied_transform` has been applied to both, so it is
+    not needed here); without them, `points.random_points`. Depths are not read, and neither is `mask_path`:
+    it names pixels to leave out of the loss, not categories. Raises SceneError.
+    """
+    file = path if path.suffix == ".json" else path / "transforms.json"
+    _check_settings(path, downscale, test_every)
+    content, frames = _read(file)
+    views = _views(file, frames, downscale)
+    test_names = None
+    if test_every:
+        views, test_names = _listed_split(file, content, frames, views)
+    views = _sorted(file, views, test_names)
+    listed = content.get("ply_file_path")
+    if listed is None:
+        points = random_points(views)
+    else:
+        points = read_points(file.parent / _inside(file, "ply_file_path", listed))
+    folder = file.parent
+    return Scene(folder.resolve().name, folder, views, points, test_every, test_names=test_names)
+
+
+def load_blender(path: Path, *, downscale: int = 1, test_every: int = 8) -> Scene:
+    """A Blender scene of NeRF: transforms_train.json and transforms_test.json (or _val) below `path`.
+
+    Views of the train file are for training and those of the test file for tests, as in 3DGS; the val file
+    stays unread where there is a test file. With `test_every` 0 all are for training. Photos with alpha go
+    over white. The initial points are random in the cube [-1.3, 1.3]^3. Raises SceneError.
+    """
+    _check_settings(path, downscale, test_every)
+    folder = path.parent if path.suffix == ".json" else path
+    train = folder / "transforms_train.json"
+    tests = next(
+        (f for f in (folder / "transforms_test.json", folder / "transforms_val.json") if f.is_file()), None
+    )
+    views = _views(train, _read(train)[1], downscale)
+    test_views = _views(tests, _read(tests)[1], downscale) if tests else []
+    test_names = frozenset(view.name for view in test_views) if tests and test_every else None
+    views = _sorted(train, [*views, *test_views], test_names)
+    if has_alpha(views[0].image_path):
+        views = tuple(replace(view, camera=replace(view.camera, background=WHITE)) for view in views)
+    points = random_points(views, cube=BLENDER_CUBE)
+    return Scene(folder.resolve().name, folder, views, points, test_every, test_names=test_names)
+
+
+def _check_settings(path: Path, downscale: int, test_every: int) -> None:
+    if downscale < 1 or test_every < 0 or test_every == 1:
+        raise SceneError(
+            f"{path}: downscale {downscale} and test_every {test_every} do not go together with training; "
+            "take downscale >= 1 and test_every 0 or >= 2"
+        )
+
+
+def _read(file: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """The content of a transforms file, and its frames with what it says of all of them filled in."""
+    try:
+        content = read_json(file)
+    except RunError as error:
+        raise SceneError(f"{error}; give the folder with a whole transforms file") from None
+    except RecursionError:
+        raise SceneError(f"{file}: nested too deeply; export the transforms again") from None
+    frames = content.get("frames") if isinstance(content, dict) else None
+    if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
+        raise SceneError(f'{file}: no frames; export the transforms again, with {{"frames": [...]}} in them')
+    shared = {key: value for key, value in content.items() if key != "frames"}
+    return content, [{**shared, **frame} for frame in frames]
+
+
+def _inside(file: Path, key: str, value: Any) -> PurePosixPath:
+    """A path that the file names, which has to be below the file's folder."""
+    path = PurePosixPath(value.replace("\\", "/")) if isinstance(value, str) else None
+    if path is None or not path.name or "\0" in path.name:
+        raise SceneError(f"{file}: {key} is {str(value)[:80]!r}; name a file relative to the folder")
+    if path.is_absolute() or ".." in path.parts:
+        raise SceneError(
+            f"{file}: {key} {value[:80]!r} is outside the folder; move it there and name it relative to it"
+        )
+    return path
+
+
+def _views(file: Path, frames: Sequence[dict[str, Any]], downscale: int) -> list[View]:
+    """The views of the frames, in their order; names are below images/ where all photos are there."""
+    folder = file.parent
+    paths = [_inside(file, "file_path", frame.get("file_path")) for frame in frames]
+    if all(path.parts[0] == "images" and len(path.parts) > 1 for path in paths):
+        folder, paths = folder / "images", [path.relative_to("images") for path in paths]
+    small = file.parent / f"images_{downscale}"
+    shipped = folder != file.parent and downscale > 1 and small.is_dir()
+    root, divisor = (small, 1) if shipped else (folder, downscale)
+    photos = [_photo(root, path) for path in paths]
+    missing = [path for path, photo in zip(paths, photos, strict=True) if photo is None]
+    if missing:
+        raise SceneError(
+            f"{root}: {len(missing)} of the {len(paths)} photos of {file.name} are missing, first "
+            f"{str(missing[0])!r}; add the files, or remove their frames"
+        )
+    lenses: dict[tuple, tuple[Lens, np.ndarray]] = {}  # a pinhole takes milliseconds to find
+    views = []
+    for frame, path, photo in zip(frames, paths, photos, strict=True):
+        assert photo is not None
+        try:
+            original = (_photo(folder, path) or photo) if shipped else photo
+            lens = _lens(frame, original)
+            key = (lens.model, lens.params, lens.width, lens.height)
+            if key not in lenses:
+                lenses[key] = lens, intrinsics(lens) if is_pinhole(lens) else pinhole(lens)
+            w2c = _w2c(frame.get("transform_matrix"))
+        except (TypeError, ValueError, OverflowError) as error:
+            reason = " ".join(str(error).split())
+            raise SceneError(f"{file}: frame {str(path)!r}: {reason}; export the transforms again") from None
+        camera = _camera(photo, w2c, *lenses[key], divisor)
+        lens = lenses[key][0]
+        name = photo.relative_to(root).as_posix()
+        views.append(View(name, camera, photo, None if is_pinhole(lens) else lens))
+    return views
+
+
+def _photo(root: Path, path: PurePosixPath) -> Path | None:
+    """A frame's file, whose suffix may be missing in the file_path (Blender)."""
+    for name in (path.name, *(path.name + suffix for suffix in SUFFIXES)):
+        photo = root / path.parent / name
+        try:
+            if photo.is_file():
+                return photo
+        except OSError:  # a damaged name, e.g. too long
+            return None
+    return None
+
+
+def _camera(photo: Path, w2c: np.ndarray, lens: Lens, K: np.ndarray, divisor: int) -> Camera:
+    width, height = photo_size(photo)
+    # images_N are rounded to whole pixels: both sides may be off by one, but not the aspect.
+    if abs(width / lens.width - height / lens.height) > 1 / lens.width + 1 / lens.height:
+        raise SceneError(
+            f"{photo}: {width} x {height} pixels, but its frame has another aspect, "
+            f"{lens.width} x {lens.height}; use the photos that were posed, not rotated or cropped"
+        )
+    width, height = (max(1, round(side / divisor)) for side in (width, height))
+    scale = np.array([[width / lens.width], [height / lens.height], [1.0]])
+    return Camera(w2c.astype(np.float32), (K * scale).astype(np.float32), width, height)
+
+
+def _lens(frame: dict[str, Any], photo: Path) -> Lens:
+    """A frame's lens as COLMAP has it; raises ValueError. `photo` tells the size where the frame does not.
+
+    k3 makes OPENCV COLMAP's FULL_OPENCV; k4 is for the fisheye only, since its meaning differs elsewhere.
+    """
+    model = frame.get("camera_model") or (FISHEYE if frame.get("is_fisheye") else "OPENCV")
+    if model not in (*PERSPECTIVE, FISHEYE):
+        known = ", ".join((*PERSPECTIVE, FISHEYE))
+        raise ValueError(f"camera_model {str(model)[:40]!r} is not one of {known}")
+    if frame.get("w") is None or frame.get("h") is None:
+        width, height = photo_size(photo)
+    else:
+        width, height = round(_number(frame, "w")), round(_number(frame, "h"))
+    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
+        raise ValueError(f"size {width} x {height} is out of range")
+    fx = _focal(frame, "fl_x", "camera_angle_x", width)
+    fy = _focal(frame, "fl_y", "camera_angle_y", height)
+    fx, fy = fx or fy, fy or fx
+    if fx is None or fy is None:
+        raise ValueError("neither fl_x nor camera_angle_x")
+    cx, cy = _number(frame, "cx", width / 2), _number(frame, "cy", height / 2)
+    k1, k2, k3, k4, p1, p2 = (_number(frame, key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    params = (fx, fy, cx, cy)
+    if model == FISHEYE and not (p1 or p2):
+        return Lens(FISHEYE, (*params, k1, k2, k3, k4), width, height)
+    if model == FISHEYE or k4:
+        raise ValueError(f"{model} has no {'p1 and p2' if model == FISHEYE else 'k4'}")
+    if k3:
+        return Lens("FULL_OPENCV", (*params, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0), width, height)
+    return Lens("OPENCV", (*params, k1, k2, p1, p2), width, height)
+
+
+def _focal(frame: dict[str, Any], key: str, angle: str, side: int) -> float | None:
+    """A focal length in pixels: itself, or from the angle of view in radians; None with neither."""
+    if frame.get(key) is not None:
+        focal = _number(frame, key)
+    elif frame.get(angle) is not None:
+        radians = _number(frame, angle)
+        focal = side / 2 / np.tan(radians / 2) if 0 < radians < np.pi else 0.0
+    else:
+        return None
+    if not focal > 0:
+        raise ValueError(f"{key} or {angle} is out of range")
+    return float(focal)
+
+
+def _number(frame: dict[str, Any], key: str, default: float | None = None) -> float:
+    value = frame.get(key)
+    value = default if value is None else value
+    if value is None:
+        raise ValueError(f"no {key}")
+    if not isinstance(value, int | float) or not abs(value) <= LARGEST:
+        raise ValueError(f"{key} is {str(value)[:40]!r}, no number up to {LARGEST:g}")
+    return float(value)
+
+
+def _w2c(matrix: Any) -> Float64[np.ndarray, "4 4"]:
+    """World to camera in OpenCV axes, of camera to world in OpenGL's; raises ValueError."""
+    if matrix is None:
+        raise ValueError("no transform_matrix")
+    c2w = np.array(matrix, float)
+    if c2w.shape not in ((3, 4), (4, 4)):
+        raise ValueError(f"transform_matrix has shape {c2w.shape}, not 4 x 4")
+    if not (np.abs(c2w) <= LARGEST).all():
+        raise ValueError(f"transform_matrix has values that are not finite or above {LARGEST:g}")
+    if len(c2w) == 4 and np.abs(c2w[3] - [0, 0, 0, 1]).max() > 1e-6:
+        raise ValueError("the last row of transform_matrix is not 0 0 0 1 (is it transposed?)")
+    axes = c2w[:3, :3]
+    shear = np.abs(axes.T @ axes - np.eye(3)).max()
+    if shear > MAX_SHEAR:
+        lengths = ", ".join(f"{length:.3g}" for length in np.linalg.norm(axes, axis=0))
+        raise ValueError(f"transform_matrix is no rotation (axes {lengths} long); apply the camera's scale")
+    if np.linalg.det(axes) < 0:
+        raise ValueError("transform_matrix is a reflection (left-handed axes)")
+    u, _, vt = np.linalg.svd(axes)  # the nearest rotation
+    w2c = np.eye(4)
+    w2c[:3, :3] = (u @ vt * [1, -1, -1]).T  # OpenGL's y and z point the other way
+    w2c[:3, 3] = -w2c[:3, :3] @ c2w[:3, 3]
+    return w2c
+
+
+def _listed_split(
+    file: Path, content: dict[str, Any], frames: Sequence[dict[str, Any]], views: list[View]
+) -> tuple[list[View], frozenset[str] | None]:
+    """The views that the file's lists keep, and the names of the test views; None without lists."""
+    kinds = [kind for kind in ("train", "test", "val") if content.get(f"{kind}_filenames") is not None]
+    if not kinds:
+        return views, None
+    paths = [_inside(file, "file_path", frame["file_path"]) for frame in frames]
+    name_of = {path: view.name for path, view in zip(paths, views, strict=True)}
+    names: dict[str, set[str]] = {}
+    for kind in kinds:
+        listed = content[f"{kind}_filenames"]
+        listed = [_inside(file, f"{kind}_filenames", p) for p in (listed if isinstance(listed, list) else [])]
+        unknown = [path for path in listed if path not in name_of]
+        if not listed or unknown:
+            first = f", first {str(unknown[0])!r}" if unknown else ""
+            raise SceneError(
+                f"{file}: {len(unknown)} of {len(listed)} names in {kind}_filenames are of no frame{first}; "
+                "list the file_path of frames, or leave the list out"
+            )
+        names[kind] = {name_of[path] for path in listed}
+    everything = {view.name for view in views}
+    tests = names.get("test") or names.get("val") or everything - names["train"]
+    train = names.get("train") or everything - tests
+    if train & tests:
+        raise SceneError(
+            f"{file}: {len(train & tests)} photos are listed for training and for tests, first "
+            f"{min(train & tests)!r}; take them out of one list"
+        )
+    return [view for view in views if view.name in train | tests], frozenset(tests)
+
+
+def _sorted(file: Path, views: Sequence[View], test_names: frozenset[str] | None) -> tuple[View, ...]:
+    """The views by name, which no two may share."""
+    ordered = tuple(sorted(views, key=lambda view: view.name))
+    for a, b in pairwise(ordered):
+        if a.name == b.name:
+            raise SceneError(f"{file}: the frames name {a.name!r} twice; remove one of them")
+    count = sum(view.name not in (test_names or ()) for view in ordered)
+    if count < MIN_VIEWS:
+        raise SceneError(f"{file}: {count} posed photos to train on, but it takes {MIN_VIEWS}; add some")
+    return ordered

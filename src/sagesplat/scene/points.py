@@ -1,0 +1,224 @@
+"""The points that training starts from where they do not come from COLMAP: a PLY file's, or random ones."""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
+from scipy.spatial import KDTree
+
+from sagesplat import geometry
+from sagesplat.errors import SceneError
+from sagesplat.scene.images import load_photo
+from sagesplat.scene.scene import Points, View
+
+GREY = 128
+FAR = 10.0  # how much farther than what the cameras span random points reach
+NEIGHBOURS = 4  # views, one of which has to see a random point besides its own
+COLOUR_VIEWS, COLOUR_SIDE = 16, 128  # photos, and their longer side in pixels, that colour random points
+FULL = {"f4": 255.0, "f8": 255.0, "u2": 1 / 257}  # colours of these types have another range than 0 ... 255
+TYPES = {  # PLY's own names and the newer ones
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
+    **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
+}
+
+
+def untracked(xyz: Float32[np.ndarray, "P 3"], rgb: UInt8[np.ndarray, "P 3"]) -> Points:
+    """Points without observations."""
+    return Points(xyz, rgb, np.zeros(0, np.int64), np.zeros(0, np.int32), np.zeros((0, 2), np.float32))
+
+
+def read_points(path: Path) -> Points:
+    """The vertices of a PLY file, ASCII or binary of either byte order: x y z, and red green blue or grey.
+
+    Colours are whole numbers up to 255 (65535 in 16 bits), or floats up to 1. Raises SceneError.
+    """
+    try:
+        with path.open("rb") as file:
+            order, types, count = _read_header(file)
+            table = _read_vertices(path, file, order, types, count)
+    except FileNotFoundError:
+        raise SceneError(
+            f"{path}: no such file; add it, or take ply_file_path out to start from random points"
+        ) from None
+    except (OSError, ValueError, OverflowError) as error:
+        raise SceneError(f"{path}: not readable as a PLY file ({error}); export the points again") from None
+    with np.errstate(over="ignore"):  # a double too large for float32 is then reported
+        xyz = np.stack([table[axis] for axis in "xyz"], axis=1).astype(np.float32)
+        if bad := int(np.count_nonzero(~np.isfinite(xyz).all(axis=1))):
+            raise SceneError(f"{path}: {bad} of {len(xyz)} points are not finite; export the points again")
+        rgb = np.full((len(xyz), 3), GREY, np.uint8)
+        for column, name in enumerate(("red", "green", "blue")):
+            if name in table:
+                scale = FULL.get(types[name], 1.0)
+                rgb[:, column] = np.nan_to_num(table[name] * scale).round().clip(0, 255)
+    return untracked(xyz, rgb)
+
+
+def _read_header(file: BinaryIO) -> tuple[str, dict[str, str], int]:
+    """Byte order ('' for ASCII), the properties of a vertex with their types, and the number of vertices.
+
+    The file then stands at the first of them.
+    """
+    if file.readline(16).strip() != b"ply":
+        raise ValueError("it does not begin with 'ply'")
+    order, count, element, fields = None, -1, "", {}
+    while (words := file.readline(1024).decode("utf-8", "replace").split())[:1] != ["end_header"]:
+        match words:
+            case ["format", "ascii" | "binary_little_endian" | "binary_big_endian" as name, *_]:
+                order = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}[name]
+            case ["element", element, number] if number.isdecimal():
+                if element == "vertex":
+                    count = int(number)
+                elif count < 0:
+                    raise ValueError(f"element {element} comes before the vertices")
+            case ["property", *_] if element != "vertex":
+                pass  # faces after the vertices are never read
+            case ["property", kind, name] if kind in TYPES and name not in fields:
+                fields[name] = TYPES[kind]
+            case ["comment" | "obj_info", *_]:
+                pass
+            case _:
+                raise ValueError(f"its header breaks at {' '.join(words)[:60]!r}")
+    if order is None or count < 1 or not {"x", "y", "z"} <= fields.keys():
+        raise ValueError("its header names no format, no vertices or no x, y and z")
+    return order, fields, count
+
+
+def _read_vertices(
+    path: Path, file: BinaryIO, order: str, types: dict[str, str], count: int
+) -> dict[str, np.ndarray]:
+    """The vertices, a column per property."""
+    row = np.dtype([(name, order + kind) for name, kind in types.items()])
+    # Text takes at least a digit and a space per value; the last line may lack its end.
+    smallest = row.itemsize * count if order else 2 * len(types) * count - 1
+    if smallest > path.stat().st_size - file.tell():
+        raise ValueError(f"{count} points promised, but it ends before them")
+    if order:
+        table = np.fromfile(file, row, count)
+        return {name: table[name] for name in types}
+    with warnings.catch_warnings(action="ignore"):  # of a file without numbers; its shape tells
+        values = np.loadtxt(file, comments=None, max_rows=count, ndmin=2, encoding="latin1")
+    if values.shape != (count, len(types)):
+        raise ValueError(f"{count} points of {len(types)} values promised, but there are {values.shape}")
+    return dict(zip(types, values.T, strict=True))
+
+
+def random_points(
+    views: Sequence[View], count: int = 100_000, *, seed: int = 0, cube: float | None = None
+) -> Points:
+    """`count` random points for training to start from, without tracks.
+
+    With `cube`: uniform in [-cube, cube]^3, what 3DGS does for NeRF's Blender scenes, which fit into it.
+    Otherwise on random rays of the photos: half of the points are uniform in the volume of the frusta up to
+    the far side of the ball that the cameras span around the point they look at (`focus`); the other half
+    lie beyond it, up to ten times as far, uniform in inverse depth, as mip-NeRF 360 contracts space
+    (arXiv:2111.12077). Only points that a neighbouring view sees too are kept. So objects, rooms and
+    landscapes are all covered, most where most cameras look and hardly anything just in front of a lens.
+
+    Colours are the mean of some photos where the points project to: the right mix as long as nothing is known
+    of depth. Raises SceneError.
+    """
+    rng = np.random.default_rng(seed)
+    with np.errstate(all="ignore"):  # cameras may be anywhere; what overflows is in nobody's sight
+        if cube is None:
+            xyz = _in_sight(views, count, rng)
+        else:
+            xyz = rng.uniform(-cube, cube, (count, 3)).astype(np.float32)
+        return untracked(xyz, _mean_colours(xyz, _spread(views, COLOUR_VIEWS)))
+
+
+def focus(views: Sequence[View]) -> tuple[Float64[np.ndarray, "3"], float]:
+    """The point nearest to all optical axes (least squares), and the radius of the cameras around it.
+
+    Parallel axes meet nowhere: a small weight pulls the point to one spread of the cameras before them.
+    """
+    centres = np.stack([view.camera.position for view in views]).astype(np.float64)
+    axes = np.stack([view.camera.direction for view in views]).astype(np.float64)
+    middle = centres.mean(axis=0)
+    spread = np.linalg.norm(centres - middle, axis=1).max() or 1.0  # all in one point: any length will do
+    weight = 1e-3 * len(views)
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # projects onto the plane across each axis
+    pulled = middle + spread * axes.mean(axis=0)
+    right = np.einsum("vij,vj->i", across, centres) + weight * pulled
+    point = np.linalg.solve(across.sum(axis=0) + weight * np.eye(3), right)
+    return point, float(max(np.linalg.norm(centres - point, axis=1).max(), spread))
+
+
+def _in_sight(views: Sequence[View], count: int, rng: np.random.Generator) -> Float32[np.ndarray, "P 3"]:
+    """Points on rays of the views that a neighbouring view sees too (see `random_points`)."""
+    centre, radius = focus(views)
+    neighbours = _neighbours(views)
+    w2c = np.stack([view.camera.w2c for view in views])
+    K = np.stack([view.camera.K for view in views])
+    R, t, f, c = w2c[:, :3, :3], w2c[:, :3, 3], K[:, [0, 1], [0, 1]], K[:, :2, 2]
+    sizes = np.array([(view.camera.width, view.camera.height) for view in views], np.float32)
+    reach = (np.linalg.norm(R @ centre + t, axis=1) + radius).astype(np.float32)
+    kept, found = [], 0
+    for _ in range(20):
+        of = rng.integers(len(views), size=count)
+        rays = (rng.random((count, 2), np.float32) * sizes[of] - c[of]) / f[of]
+        u = rng.random((count, 1), np.float32)
+        near, beyond = np.cbrt(u), 1 / (1 - u * (1 - 1 / FAR))
+        depth = reach[of, None] * np.where(rng.random((count, 1)) < 0.5, near, beyond)
+        local = np.append(rays, np.ones_like(u), axis=1) * depth
+        xyz = np.einsum("pij,pi->pj", R[of], local - t[of]).astype(np.float32)
+        seen = np.zeros(count, bool)
+        for by in neighbours[of].T:
+            x, y, z = (np.einsum("pij,pj->pi", R[by], xyz) + t[by]).T
+            uv = np.stack([x, y], axis=1) / z[:, None] * f[by] + c[by]
+            seen |= (z > 0) & np.all((uv >= 0) & (uv < sizes[by]), axis=1)
+        kept.append(xyz[seen])
+        found += len(kept[-1])
+        if found >= count:
+            break
+    if not found:
+        raise SceneError(
+            f"{views[0].image_path.parent}: no two photos look at the same place; check the poses"
+        )
+    return np.concatenate(kept)[:count]
+
+
+def _neighbours(views: Sequence[View]) -> Int64[np.ndarray, "V k"]:
+    """The views that are nearest to each in position and direction."""
+    centres = np.stack([view.camera.position for view in views]).astype(np.float64)
+    axes = np.stack([view.camera.direction for view in views])
+    spread = np.linalg.norm(centres - centres.mean(axis=0), axis=1).max() or 1.0
+    place = np.append(centres / spread, axes, axis=1)
+    _, rows = KDTree(place).query(place, k=min(NEIGHBOURS + 1, len(views)))
+    return np.reshape(rows, (len(views), -1))[:, 1:]  # the nearest is the view itself
+
+
+def _mean_colours(xyz: Float32[np.ndarray, "P 3"], views: Sequence[View]) -> UInt8[np.ndarray, "P 3"]:
+    """The mean colour of the photos where the points project to; grey where no photo shows them."""
+    total, seen = np.zeros((len(xyz), 3), np.float32), np.zeros(len(xyz), np.float32)
+    for view in views:
+        shrink = min(1.0, COLOUR_SIDE / max(view.camera.width, view.camera.height))
+        size = [max(1, round(side * shrink)) for side in (view.camera.width, view.camera.height)]
+        small = replace(view, camera=view.camera.resized(*size))
+        inside, pixels = _inside(xyz, small)
+        x, y = pixels[inside].T
+        total[inside] += load_photo(small)[y, x]
+        seen += inside
+    mean = total / np.maximum(seen, 1)[:, None]
+    return np.where(seen[:, None] > 0, mean.round(), GREY).astype(np.uint8)
+
+
+def _inside(
+    xyz: Float32[np.ndarray, "P 3"], view: View
+) -> tuple[Bool[np.ndarray, " P"], Int64[np.ndarray, "P 2"]]:
+    """Which points a view has in sight (occluded or not), and at which pixels (0, 0 where it has not)."""
+    camera = view.camera
+    uv, _ = geometry.project(xyz, camera.w2c, camera.K)
+    inside = np.all((uv >= 0) & (uv < [camera.width, camera.height]), axis=1)
+    return inside, np.where(inside[:, None], uv, 0).astype(np.int64)
+
+
+def _spread(views: Sequence[View], count: int) -> list[View]:
+    """At most `count` of the views, evenly over their order."""
+    rows = np.unique(np.linspace(0, len(views) - 1, min(count, len(views))).round().astype(int))
+    return [views[row] for row in rows]

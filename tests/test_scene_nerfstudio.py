@@ -1,0 +1,529 @@
+"""transforms.json of nerfstudio and Blender, listed splits, white backgrounds, and what kind a folder is."""
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from sagesplat.errors import SceneError
+from sagesplat.geometry import project, to_camera
+from sagesplat.scene import nerfstudio
+from sagesplat.scene.colmap import load_colmap
+from sagesplat.scene.colmap_write import ModelCamera, ModelImage, write_model
+from sagesplat.scene.detect import detect
+from sagesplat.scene.images import load_photo, photo_size
+from sagesplat.scene.nerfstudio import load_blender, load_transforms
+from sagesplat.scene.points import random_points
+from sagesplat.scene.scene import Camera, Points, Scene, View
+from sagesplat.scene.undistort import distort
+
+INTRINSICS = {"fl_x": 35.0, "fl_y": 36.0, "cx": 21.5, "cy": 13.25, "w": 40, "h": 30}
+# What nerfstudio does to COLMAP's world: x and y change places, z turns round.
+APPLIED = np.array([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1.0]])
+
+
+@pytest.fixture(autouse=True, scope="module")
+def few_points():
+    """A hundred thousand random points for every scene here would take half a minute."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(nerfstudio, "random_points", partial(random_points, count=300))
+        yield
+
+
+def poses(count: int) -> list[np.ndarray]:
+    """World to camera, OpenCV axes: cameras on an arc that look at points near the origin."""
+    w2c = []
+    for angle in np.linspace(-0.4, 0.4, count):
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_euler("xyz", [0.1, angle, 0.2]).as_matrix()
+        pose[:3, 3] = [0.05, -0.1, 4 + angle]
+        w2c.append(pose)
+    return w2c
+
+
+def opengl(w2c: np.ndarray) -> list[list[float]]:
+    """Camera to world in OpenGL axes, as the files have it."""
+    return (np.linalg.inv(w2c) @ np.diag([1, -1, -1, 1])).tolist()
+
+
+def save_photo(path: Path, size: tuple[int, int] = (40, 30), *, seed: int = 0, channels: int = 3) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    noise = np.random.default_rng(seed).integers(0, 256, (size[1], size[0], channels))
+    Image.fromarray(noise.astype(np.uint8)).save(path)
+
+
+def capture(folder: Path, *, views: int = 5, shared: dict | None = None, own: dict | None = None) -> dict:
+    """A nerfstudio folder without points; frames are not in the order of their names. Returns the content."""
+    frames = []
+    for i, w2c in enumerate(poses(views)):
+        name = f"images/frame_{views - i:05d}.png"
+        save_photo(folder / name, seed=i)
+        frames.append({"file_path": f"./{name}", "transform_matrix": opengl(w2c), **(own or {})})
+    content = {"camera_model": "OPENCV", **(INTRINSICS if shared is None else shared), "frames": frames}
+    write(folder, content)
+    return content
+
+
+def write(folder: Path, content: Any, name: str = "transforms.json") -> None:
+    (folder / name).write_text(json.dumps(content))
+
+
+def test_poses_names_and_intrinsics(tmp_path):
+    capture(tmp_path)
+    scene = load_transforms(tmp_path, test_every=2)
+    assert [v.name for v in scene.views] == [f"frame_{i:05d}.png" for i in range(1, 6)]
+    assert scene.test_ids.tolist() == [0, 2, 4]
+    assert (scene.name, scene.path) == (tmp_path.name, tmp_path)
+    for view, w2c in zip(scene.views, reversed(poses(5)), strict=True):
+        np.testing.assert_allclose(view.camera.w2c, w2c, atol=1e-6)
+        assert view.camera.K.tolist() == [[35, 0, 21.5], [0, 36, 13.25], [0, 0, 1]]
+        assert (view.camera.width, view.camera.height, view.lens) == (40, 30, None)
+        assert view.camera.w2c.dtype == view.camera.K.dtype == np.float32
+    assert len(scene.points.xyz) == 300
+    assert scene.extent > 0
+
+
+def test_a_file_instead_of_its_folder(tmp_path):
+    write(tmp_path, capture(tmp_path), "other.json")
+    (tmp_path / "transforms.json").unlink()
+    assert load_transforms(tmp_path / "other.json").path == tmp_path
+
+
+def test_the_image_of_the_world_is_the_same_as_colmaps(tmp_path):
+    """nerfstudio's conversion of a COLMAP model (world changed, ply changed with it) and the model itself."""
+    rng = np.random.default_rng(0)
+    xyz, rgb = rng.uniform(-0.8, 0.8, (20, 3)), rng.integers(0, 256, (20, 3)).astype(np.uint8)
+    frames, images = [], []
+    for i, w2c in enumerate(poses(4)):
+        name = f"{i}.png"
+        save_photo(tmp_path / "images" / name, seed=i)
+        c2w = APPLIED @ np.array(opengl(w2c))
+        frames.append({"file_path": f"images/{name}", "transform_matrix": c2w.tolist()})
+        images.append(ModelImage(i + 1, name, 1, w2c, np.zeros((1, 2)), np.array([0])))
+    camera = ModelCamera(1, "PINHOLE", 40, 30, (35.0, 36.0, 21.5, 13.25))
+    write_model(tmp_path / "sparse/0", [camera], images, xyz, rgb, np.zeros(20))
+    moved = xyz @ APPLIED[:3, :3].T
+    rows = [f"{x:.9f} {y:.9f} {z:.9f} {r} {g} {b}" for (x, y, z), (r, g, b) in zip(moved, rgb, strict=True)]
+    head = "ply\nformat ascii 1.0\nelement vertex 20\nproperty float x\nproperty float y\nproperty float z\n"
+    head += "".join(f"property uint8 {c}\n" for c in ("red", "green", "blue")) + "end_header\n"
+    (tmp_path / "sparse_pc.ply").write_text(head + "\n".join(rows) + "\n")
+    applied = APPLIED[:3].tolist()
+    write(
+        tmp_path,
+        {**INTRINSICS, "applied_transform": applied, "ply_file_path": "sparse_pc.ply", "frames": frames},
+    )
+    ours, theirs = load_transforms(tmp_path), load_colmap(tmp_path)
+    np.testing.assert_array_equal(ours.points.rgb, theirs.points.rgb)
+    for a, b in zip(ours.views, theirs.views, strict=True):
+        assert a.name == b.name
+        here, there = (to_camera(s.points.xyz, v.camera.w2c) for s, v in ((ours, a), (theirs, b)))
+        np.testing.assert_allclose(here, there, atol=1e-5)
+        np.testing.assert_array_equal(a.camera.K, b.camera.K)
+    assert ours.extent == pytest.approx(theirs.extent, rel=1e-5)
+
+
+LENSES = {
+    "OPENCV": ({"k1": 0.05, "k2": 0.01, "p1": 1e-3, "p2": -1e-3}, "OPENCV", (0.05, 0.01, 1e-3, -1e-3)),
+    "OPENCV_FISHEYE": (
+        {"k1": 0.05, "k2": 0.01, "k3": 1e-3, "k4": -1e-3},
+        "OPENCV_FISHEYE",
+        (0.05, 0.01, 1e-3, -1e-3),
+    ),
+    "PINHOLE": ({}, None, ()),
+    "SIMPLE_RADIAL": ({"k1": 0.02}, "OPENCV", (0.02, 0, 0, 0)),
+    "OPENCV with k3": (
+        {"camera_model": "OPENCV", "k1": 0.05, "k3": 0.02},
+        "FULL_OPENCV",
+        (0.05, 0, 0, 0, 0.02, 0, 0, 0),
+    ),
+    "instant-ngp's fisheye": ({"camera_model": None, "is_fisheye": True}, "OPENCV_FISHEYE", (0, 0, 0, 0)),
+}
+
+
+@pytest.mark.parametrize("own", [False, True])
+@pytest.mark.parametrize("model", LENSES)
+def test_distortion_becomes_a_lens(tmp_path, model, own):
+    given, name, coefficients = LENSES[model]
+    all_of = {"camera_model": model, **INTRINSICS, **given}
+    capture(tmp_path, shared={} if own else all_of, own=all_of if own else {})
+    view = load_transforms(tmp_path).views[0]
+    if name is None:
+        assert view.lens is None
+        return
+    assert view.lens is not None
+    assert view.lens.model == name
+    assert view.lens.params == (35, 36, 21.5, 13.25, *coefficients)
+    assert (view.lens.width, view.lens.height) == (40, 30)
+    assert load_photo(view).shape == (30, 40, 3)
+    corner = (np.array([0.5, 0.5]) - view.camera.K[:2, 2]) / view.camera.K[[0, 1], [0, 1]]
+    assert (distort(view.lens, corner) > 0).all()  # the pinhole's border has pixels of the photo
+
+
+def test_angle_of_view_and_defaults(tmp_path):
+    capture(tmp_path, shared={"camera_angle_x": 2 * np.arctan(0.4)})
+    camera = load_transforms(tmp_path).views[0].camera
+    np.testing.assert_allclose(camera.K, [[50, 0, 20], [0, 50, 15], [0, 0, 1]], rtol=1e-6)
+    capture(tmp_path, shared={"camera_angle_x": 2 * np.arctan(0.4), "camera_angle_y": 2 * np.arctan(0.25)})
+    assert load_transforms(tmp_path).views[0].camera.K[1, 1] == 60
+    capture(tmp_path, shared={"fl_x": 44})
+    assert load_transforms(tmp_path).views[0].camera.K[[0, 1], [0, 1]].tolist() == [44, 44]
+
+
+def test_frames_of_their_own_size(tmp_path):
+    content = capture(tmp_path)
+    save_photo(tmp_path / "images/frame_00002.png", (64, 16))
+    content["frames"][3] |= {"w": 64, "h": 16, "fl_x": 50, "cx": 32, "cy": 8}
+    write(tmp_path, content)
+    cameras = [v.camera for v in load_transforms(tmp_path).views]
+    assert [(c.width, c.height) for c in cameras[:3]] == [(40, 30), (64, 16), (40, 30)]
+    assert cameras[1].K.tolist() == [[50, 0, 32], [0, 36, 8], [0, 0, 1]]
+
+
+@pytest.mark.parametrize("stated", [True, False])
+@pytest.mark.parametrize("shipped", [True, False])
+def test_downscale(tmp_path, shipped, stated):
+    shared = dict(INTRINSICS)
+    if not stated:
+        del shared["w"], shared["h"]
+    capture(tmp_path, shared=shared)
+    if shipped:
+        for photo in (tmp_path / "images").iterdir():
+            save_photo(tmp_path / "images_4" / photo.name, (10, 7))  # 30 / 4 rounded down
+    view = load_transforms(tmp_path, downscale=4).views[0]
+    height = 7 if shipped else 8
+    assert (view.camera.width, view.camera.height) == (10, height)
+    expected = [[35 / 4, 0, 21.5 / 4], [0, 36 * height / 30, 13.25 * height / 30], [0, 0, 1]]
+    np.testing.assert_allclose(view.camera.K, expected, rtol=1e-6)
+    assert view.name == "frame_00001.png"
+    assert view.image_path.parent.name == ("images_4" if shipped else "images")
+    assert load_photo(view).shape == (height, 10, 3)
+
+
+@pytest.mark.parametrize("folder", ["mipnerf360", "rounded"])
+def test_mipnerf360_layout(tmp_path, folder):
+    """images, images_2, images_4, images_8, sparse/0 and poses_bounds.npy; sizes that N does not divide."""
+    camera = ModelCamera(1, "PINHOLE", 83, 55, (70.0, 70.0, 41.5, 27.5))
+    xyz = np.random.default_rng(0).uniform(-0.5, 0.5, (20, 3))
+    images = []
+    for i, w2c in enumerate(poses(5)):
+        local = xyz @ w2c[:3, :3].T + w2c[:3, 3]
+        uv = 70 * local[:, :2] / local[:, 2:] + [41.5, 27.5]
+        images.append(ModelImage(i + 1, f"DSC{i}.png", 1, w2c, uv, np.arange(20)))
+        for n in (1, 2, 4, 8):
+            cut = round if folder == "rounded" else int
+            name = tmp_path / ("images" if n == 1 else f"images_{n}") / f"DSC{i}.png"
+            save_photo(name, (cut(83 / n), cut(55 / n)))
+    write_model(tmp_path / "sparse/0", [camera], images, xyz, np.zeros((20, 3), np.uint8), np.zeros(20))
+    np.save(tmp_path / "poses_bounds.npy", np.zeros((5, 17)))
+    assert detect(tmp_path) == "colmap"
+    for n in (1, 2, 4, 8):
+        scene = load_colmap(tmp_path, downscale=n)
+        view = scene.views[0]
+        width, height = photo_size(view.image_path)
+        assert view.image_path.parent.name == ("images" if n == 1 else f"images_{n}")
+        assert (view.camera.width, view.camera.height) == (width, height)
+        np.testing.assert_allclose(view.camera.K[:2, 2], [width / 2, height / 2], rtol=1e-6)
+        uv, _ = project(scene.points.xyz, view.camera.w2c, view.camera.K)
+        seen = scene.points.track_views == 0
+        rows = scene.points.track_points[seen]
+        np.testing.assert_allclose(uv[rows], scene.points.track_uv[seen], atol=1e-3)
+
+
+def test_listed_split(tmp_path):
+    content = capture(tmp_path, views=8)
+    paths = [frame["file_path"] for frame in content["frames"]]  # names fall
+    content |= {"train_filenames": paths[:5], "val_filenames": paths[5:7], "test_filenames": paths[6:]}
+    write(tmp_path, content)
+    scene = load_transforms(tmp_path)
+    assert [v.name[-5] for v in scene.views] == list("1245678")  # 3 is for validation only
+    assert scene.test_ids.tolist() == [0, 1]
+    assert scene.train_ids.tolist() == [2, 3, 4, 5, 6]
+    assert load_transforms(tmp_path, test_every=0).train_ids.tolist() == list(range(8))
+    for listed, tests in (
+        ({"val_filenames": paths[:2]}, [6, 7]),
+        ({"train_filenames": [p.removeprefix("./") for p in paths[:4]]}, [0, 1, 2, 3]),
+    ):
+        plain = {key: value for key, value in content.items() if not key.endswith("_filenames")}
+        write(tmp_path, plain | listed)
+        assert load_transforms(tmp_path).test_ids.tolist() == tests
+
+
+def blender(folder: Path, *, channels: int = 4, tests: str | None = "test") -> None:
+    counts = {"train": 6, "val": 3} | ({tests: 4} if tests else {})
+    for part, count in counts.items():
+        frames = []
+        for i, w2c in enumerate(poses(count)):
+            save_photo(folder / part / f"r_{i}.png", (20, 20), seed=i, channels=channels)
+            frames.append({"file_path": f"./{part}/r_{i}", "rotation": 0.01, "transform_matrix": opengl(w2c)})
+        write(folder, {"camera_angle_x": 0.6911112, "frames": frames}, f"transforms_{part}.json")
+
+
+def test_blender(tmp_path):
+    blender(tmp_path)
+    scene = load_blender(tmp_path)
+    assert [v.name for v in scene.views] == [f"test/r_{i}.png" for i in range(4)] + [
+        f"train/r_{i}.png" for i in range(6)
+    ]
+    assert scene.test_ids.tolist() == [0, 1, 2, 3]
+    assert scene.train_ids.tolist() == list(range(4, 10))
+    np.testing.assert_allclose(scene.views[4].camera.w2c, poses(6)[0], atol=1e-6)
+    focal = 10 / np.tan(0.6911112 / 2)
+    np.testing.assert_allclose(
+        scene.views[0].camera.K, [[focal, 0, 10], [0, focal, 10], [0, 0, 1]], rtol=1e-6
+    )
+    assert np.abs(scene.points.xyz).max() <= 1.3
+    assert len(scene.points.xyz) == 300
+    assert {v.camera.background for v in scene.views} == {(255, 255, 255)}
+    with Image.open(scene.views[0].image_path) as file:
+        rgba = np.asarray(file).astype(float)
+    over = rgba[..., :3] * rgba[..., 3:] / 255 + 255 - rgba[..., 3:]
+    assert np.abs(load_photo(scene.views[0]) - over).max() <= 1
+    small = load_blender(tmp_path, downscale=2).views[0]
+    assert (small.camera.width, small.camera.K[0, 2]) == (10, 5)
+    assert small.camera.resized(5, 5).background == (255, 255, 255)
+    np.testing.assert_allclose(load_photo(small), over.reshape(10, 2, 10, 2, 3).mean((1, 3)), atol=1.5)
+
+
+def test_blender_with_other_splits(tmp_path):
+    blender(tmp_path)
+    scene = load_blender(tmp_path / "transforms_train.json", test_every=0)
+    assert len(scene.train_ids) == 10
+    (tmp_path / "transforms_test.json").unlink()
+    scene = load_blender(tmp_path)
+    assert [scene.views[row].name for row in scene.test_ids] == [f"val/r_{i}.png" for i in range(3)]
+    (tmp_path / "transforms_val.json").unlink()
+    assert load_blender(tmp_path, test_every=3).test_ids.tolist() == [0, 3]
+
+
+def test_opaque_photos_keep_the_black_background(tmp_path):
+    blender(tmp_path, channels=3)
+    assert {v.camera.background for v in load_blender(tmp_path).views} == {(0, 0, 0)}
+
+
+def test_explicit_split_of_a_scene():
+    camera = Camera(np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32), 4, 4)
+    views = tuple(View(f"{i}", camera, Path()) for i in range(10))
+    points = Points(*(np.zeros((0, 3)), np.zeros((0, 3), np.uint8)), *(np.zeros(0),) * 3)
+    scene = Scene("s", Path(), views, points, test_every=5, calibrate_every=4)
+    assert scene.test_ids.tolist() == [0, 5]
+    listed = replace(scene, test_names=frozenset({"1", "2", "9", "gone"}))
+    assert listed.test_ids.tolist() == [1, 2, 9]
+    assert listed.calibration_ids.tolist() == [4, 8]
+    assert listed.train_ids.tolist() == [0, 3, 5, 6, 7]
+    assert [listed.split(row) for row in (0, 1, 4)] == ["train", "test", "calibration"]
+    assert replace(scene, test_names=frozenset()).test_ids.tolist() == []
+
+
+def breakages() -> dict[str, Callable[[Path, dict], Any]]:
+    """Message -> what is done to a good capture; what comes back replaces transforms.json."""
+
+    def frame(**changes: Any) -> Callable[[Path, dict], dict]:
+        def change(_: Path, content: dict) -> dict:
+            content["frames"][2] |= changes
+            return content
+
+        return change
+
+    def matrix(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path, dict], dict]:
+        def apply(_: Path, content: dict) -> dict:
+            values = np.array(content["frames"][2]["transform_matrix"])
+            content["frames"][2]["transform_matrix"] = change(values).tolist()
+            return content
+
+        return apply
+
+    def nan(m: np.ndarray) -> np.ndarray:
+        m[0, 3] = np.nan
+        return m
+
+    def broken(folder: Path, _: dict) -> None:
+        (folder / "transforms.json").write_text('{"frames": [')
+
+    def deep(folder: Path, _: dict) -> None:
+        (folder / "transforms.json").write_text("[" * 200_000)
+
+    def gone(folder: Path, _: dict) -> None:
+        (folder / "images/frame_00002.png").unlink()
+        (folder / "images/frame_00004.png").unlink()
+
+    def turned(folder: Path, _: dict) -> None:
+        save_photo(folder / "images/frame_00002.png", (30, 40))
+
+    def damaged(folder: Path, _: dict) -> None:
+        (folder / "images/frame_00002.png").write_bytes(b"no photo")
+
+    def no_focal(_: Path, content: dict) -> dict:
+        return {key: value for key, value in content.items() if not key.startswith("fl_")}
+
+    return {
+        r"transforms.json: no such file": lambda f, c: (f / "transforms.json").unlink(),
+        r"not readable as JSON": broken,
+        r"transforms.json: (nested too deeply|not readable)": deep,
+        r"no frames; export": lambda f, c: {**c, "frames": []},
+        r"transforms.json: no frames": lambda f, c: [1, 2],
+        r"no frames; .* \{\"frames\": \[\.\.\.\]\}": lambda f, c: {**c, "frames": [1, 2, 3]},
+        r"2 posed photos to train on, but it takes 3": lambda f, c: {**c, "frames": c["frames"][:2]},
+        r"file_path is 'None'; name a file": frame(file_path=None),
+        r"file_path is '\.'": frame(file_path="."),
+        r"file_path '../images/a.png' is outside the folder": frame(file_path="../images/a.png"),
+        r"file_path '/images/a.png' is outside": frame(file_path="/images/a.png"),
+        r"images: 1 of the 5 photos of transforms.json are missing, first 'none.png'": frame(
+            file_path="images/none.png"
+        ),
+        r"images: 1 of the 5 photos .* are missing": frame(file_path="images/" + 300 * "a"),
+        r"images: 2 of the 5 photos of transforms.json are missing, first 'frame_00004.png'": gone,
+        r"the frames name 'frame_00001.png' twice": frame(file_path="images/frame_00001.png"),
+        r"frame 'frame_00003.png': no transform_matrix": frame(transform_matrix=None),
+        r"transform_matrix has shape \(2, 2\), not 4 x 4": frame(transform_matrix=[[1, 2], [3, 4]]),
+        r"frame 'frame_00003.png': .*; export": frame(transform_matrix=[[1, 2], [3]]),
+        r"frame 'frame_00003.png': .*; export the": frame(transform_matrix={"a": 1}),
+        r"transform_matrix has values that are not finite or above 1e\+09": matrix(nan),
+        r"no rotation \(axes 2, 2, 2 long\); apply the camera's scale": matrix(
+            lambda m: m @ np.diag([2, 2, 2, 1])
+        ),
+        r"is a reflection \(left-handed axes\)": matrix(lambda m: m @ np.diag([1, 1, -1, 1])),
+        r"last row .* transposed": matrix(lambda m: m.T),
+        r"neither fl_x nor camera_angle_x": no_focal,
+        r"fl_x or camera_angle_x is out of range": frame(fl_x=-3),
+        r"fl_x is 'wide', no number up to 1e": frame(fl_x="wide"),
+        r"cx is 'nan', no number up to 1e": frame(cx=float("nan")),
+        r"k1 is '\[1\]', no number": frame(k1=[1]),
+        r"size 0 x 30 is out of range": frame(w=0),
+        r"frame_00003.png': .*; export the transforms": frame(w=10**400),
+        r"camera_model 'EQUIRECTANGULAR' is not one of OPENCV": frame(camera_model="EQUIRECTANGULAR"),
+        r"OPENCV has no k4": frame(k4=0.1),
+        r"OPENCV_FISHEYE has no p1 and p2": frame(camera_model="OPENCV_FISHEYE", p1=0.1),
+        r"no pinhole view fits into a OPENCV camera": frame(k1=-30.0),
+        r"frame_00002.png: 30 x 40 pixels, but its frame has another aspect, 40 x 30": turned,
+        r"frame_00002.png: not readable as a photo": damaged,
+        r"ply_file_path is '3'": lambda f, c: {**c, "ply_file_path": 3},
+        r"ply_file_path '../a.ply' is outside": lambda f, c: {**c, "ply_file_path": "../a.ply"},
+        r"a.ply: no such file; add it": lambda f, c: {**c, "ply_file_path": "a.ply"},
+        r"1 of 1 names in val_filenames are of no frame, first 'x.png'": lambda f, c: {
+            **c,
+            "val_filenames": ["x.png"],
+        },
+        r"0 of 0 names in test_filenames": lambda f, c: {**c, "test_filenames": {}},
+        r"1 photos are listed for training and for tests, first 'frame_00005.png'": lambda f, c: {
+            **c,
+            "train_filenames": [x["file_path"] for x in c["frames"]],
+            "test_filenames": [c["frames"][0]["file_path"]],
+        },
+    }
+
+
+@pytest.mark.parametrize("message", breakages())
+def test_errors_are_one_line_that_begins_with_the_path(tmp_path, message):
+    content = capture(tmp_path)
+    changed = breakages()[message](tmp_path, content)
+    if changed is not None:
+        write(tmp_path, changed)
+    with pytest.raises(SceneError, match=message) as raised:
+        load_transforms(tmp_path)
+    assert str(raised.value).startswith(str(tmp_path))
+    assert "\n" not in str(raised.value)
+
+
+def test_bad_settings_and_folders(tmp_path):
+    for load in (load_transforms, load_blender):
+        with pytest.raises(SceneError, match="no such file"):
+            load(tmp_path / "none")
+        for options in ({"test_every": 1}, {"downscale": 0}):
+            with pytest.raises(SceneError, match="do not go together with training"):
+                load(tmp_path, **options)
+
+
+JUNK = (
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats()
+    | st.text(max_size=5)
+    | st.lists(st.floats(), max_size=4)
+)
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory) -> tuple[Path, dict]:
+    folder = tmp_path_factory.mktemp("good")
+    (folder / "few.ply").write_bytes(
+        b"ply\nformat ascii 1.0\nelement vertex 1\n"
+        + b"".join(b"property float %c\n" % axis for axis in b"xyz")
+        + b"end_header\n0 0 0\n"
+    )
+    content = capture(folder) | {"ply_file_path": "few.ply"}
+    return folder, content
+
+
+@settings(max_examples=150, deadline=None)
+@given(data=st.data())
+def test_junk_gives_a_scene_or_one_line(good, data):
+    folder, content = good[0], json.loads(json.dumps(good[1]))
+    keys = [*content, "k1", "k3", "p1", "is_fisheye", "camera_angle_x", "train_filenames", "val_filenames"]
+    for _ in range(data.draw(st.integers(1, 2))):
+        inner = ("file_path", "transform_matrix", "w", "fl_x", "camera_model")
+        if data.draw(st.booleans()):
+            content[data.draw(st.sampled_from(keys))] = data.draw(JUNK)
+        elif isinstance(content["frames"], list):
+            content["frames"][1][data.draw(st.sampled_from(inner))] = data.draw(JUNK)
+    write(folder, content)
+    message = f"{folder}: fine"
+    try:
+        assert np.isfinite(load_transforms(folder).extent)
+    except SceneError as error:
+        message = str(error)
+    assert message.startswith(str(folder))
+    assert "\n" not in message
+
+
+def test_detect(tmp_path):
+    capture(tmp_path / "a", views=1)
+    blender(tmp_path / "b")
+    (tmp_path / "c/sparse/0").mkdir(parents=True)
+    (tmp_path / "c/sparse/0/cameras.txt").touch()
+    shutil.copy(tmp_path / "a/transforms.json", tmp_path / "c")  # a COLMAP model knows more
+    (tmp_path / "d/sparse").mkdir(parents=True)
+    (tmp_path / "d/sparse/cameras.bin").touch()
+    save_photo(tmp_path / "e/1.PNG")
+    save_photo(tmp_path / "f/images/1.jpg")
+    (tmp_path / "walk.MP4").touch()
+    expected = {
+        "a": "transforms",
+        "a/transforms.json": "transforms",
+        "b": "blender",
+        "b/transforms_train.json": "blender",
+        "c": "colmap",
+        "d": "colmap",
+        "e": "photos",
+        "f": "photos",
+        "walk.MP4": "video",
+    }
+    assert {name: detect(tmp_path / name) for name in expected} == expected
+
+
+def test_detect_says_what_it_looked_for(tmp_path):
+    (tmp_path / "notes.txt").touch()
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty/a.png").mkdir()  # a folder is no photo
+    for name, message in (
+        (
+            "empty",
+            r"no capture \(looked for cameras.bin and cameras.txt .*transforms.json.*photos in images/",
+        ),
+        ("notes.txt", "neither a transforms .json nor a video"),
+        ("none", "no such file or folder"),
+    ):
+        with pytest.raises(SceneError, match=message) as raised:
+            detect(tmp_path / name)
+        assert str(raised.value).startswith(str(tmp_path / name))
+        assert "\n" not in str(raised.value)
