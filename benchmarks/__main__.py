@@ -12,6 +12,7 @@ import torch
 import tyro
 
 from benchmarks import audit as table_iii
+from benchmarks import deeplab as segmenting
 from benchmarks import freeze as freezing
 from benchmarks import measure, plain, workloads
 from benchmarks import plans as planning
@@ -49,6 +50,12 @@ def _finish(name: str, result: dict, write: bool) -> None:  # type: ignore[type-
 
 def _photo(scene: Scene, row: int) -> torch.Tensor:
     return torch.from_numpy(Photos(scene.views)[row]).float() / 255
+
+
+@app.command
+def deeplab(steps: int = 160, views: int = 30, write: bool = False) -> None:
+    """A small DeepLabV2 trained on the built-in garden: mIoU on views it has not seen."""
+    _finish("deeplab", segmenting.measure(steps, views), write)
 
 
 @app.command

@@ -11,11 +11,12 @@ from sagesplat.scene import load_scene
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Points, Scene, View
 from sagesplat.segment.masks import Masks, Taxonomy, read_mask
-from sagesplat.segment.onnx import OnnxSegmenter, arg_max_resized, read_classes, segment_onnx, to_input
+from sagesplat.segment.onnx import OnnxSegmenter, open_session, read_classes, segment_onnx, to_input
+from sagesplat.segment.segmenters import arg_max_resized, segment_views
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 CLASSES = {"classes": ["red", "sky", "other"], "coco_panoptic": {"red": 500, "sky": 187, "other": None}}
-FLOAT, FLOAT_ATTRIBUTE, INTS_ATTRIBUTE = 1, 1, 7
+FLOAT, INT64, INT_ATTRIBUTE, INTS_ATTRIBUTE = 1, 7, 2, 7
 
 
 def field(number, value):
@@ -31,9 +32,9 @@ def varint(value):
     return bytes([low | 0x80]) + varint(rest) if rest else bytes([low])
 
 
-def value_info(name, shape):
+def value_info(name, shape, kind=FLOAT):
     dims = b"".join(field(1, field(1 if isinstance(d, int) else 2, d)) for d in shape)
-    return field(1, name) + field(2, field(1, field(1, FLOAT) + field(2, dims)))
+    return field(1, name) + field(2, field(1, field(1, kind) + field(2, dims)))
 
 
 def node(kind, inputs, output, **ints):
@@ -44,7 +45,16 @@ def node(kind, inputs, output, **ints):
     return field(1, b"".join(field(1, i) for i in inputs) + field(2, output) + field(4, kind) + attributes)
 
 
-def write_model(path, weights, size=(16, 32), channels_first=True):
+def arg_max_node():
+    """The number of the largest channel, [1, h, w]."""
+    attributes = (("axis", 1), ("keepdims", 0))
+    fields = b"".join(
+        field(5, field(1, name) + field(3, i) + field(20, INT_ATTRIBUTE)) for name, i in attributes
+    )
+    return field(1, field(1, "logits") + field(2, "numbers") + field(4, "ArgMax") + fields)
+
+
+def write_model(path, weights, size=(16, 32), channels_first=True, arg_max=False):
     """A real ONNX model: the mean of each 4 x 4 block, then one linear map of the channels per class."""
     weights = np.array(weights, np.float32)
     x, classes = "photo", len(weights)
@@ -58,7 +68,11 @@ def write_model(path, weights, size=(16, 32), channels_first=True):
     shape = (1, 3, *size) if channels_first else (1, *size, 3)
     out = (1, classes, *(s // 4 if isinstance(s, int) else s for s in size))
     graph = nodes + field(2, "blocks") + field(5, tensor)
-    graph += field(11, value_info("photo", shape)) + field(12, value_info("logits", out))
+    result = value_info("logits", out)
+    if arg_max:
+        graph = arg_max_node().join([nodes, b""]) + graph[len(nodes) :]
+        result = value_info("numbers", (1, *out[2:]), INT64)
+    graph += field(11, value_info("photo", shape)) + field(12, result)
     path.write_bytes(field(1, 8) + field(7, graph) + field(8, field(2, 13)))
     return path
 
@@ -91,7 +105,8 @@ def test_a_model_segments_photos(tmp_path, files, channels_first):
     model = write_model(tmp_path / "model.onnx", np.eye(3)[[0, 2, 1]], channels_first=channels_first)
     photo = red_and_blue()
     photo[16:, 32:] = (0, 255, 0)
-    label_ids = OnnxSegmenter(model, files[1]).segment(photo)
+    (found,) = OnnxSegmenter(model, files[1])([photo])
+    label_ids = found.label_ids
     assert label_ids.shape == (32, 64)
     assert label_ids.dtype == np.int16
     expected = np.full((32, 64), 500)
@@ -99,6 +114,83 @@ def test_a_model_segments_photos(tmp_path, files, channels_first):
     sure = np.ones((32, 64), bool)
     sure[13:19, 29:35] = False  # where three regions meet, bilinear logits round the corners
     np.testing.assert_array_equal(label_ids[sure], expected[sure])
+
+
+def test_classes_of_one_category_are_summed(tmp_path, files):
+    ids = {"red": 500, "sky": 187, "other": 187}
+    (tmp_path / "c.json").write_text(json.dumps(CLASSES | {"coco_panoptic": ids, "mean": 0, "std": 1}))
+    model = write_model(tmp_path / "m.onnx", [[0.5, 0, 0], [0, 0, 0.2], [0, 0.1, 0]])
+    (found,) = OnnxSegmenter(model, tmp_path / "c.json")([np.full((8, 16, 3), 255, np.uint8)])
+    # the largest logit is red's, but the two others have more together
+    red, sky, other = np.exp([0.5, 0.2, 0.1]) / np.exp([0.5, 0.2, 0.1]).sum()
+    assert found.ids.tolist() == [187, 500]
+    assert found.probabilities is not None
+    assert found.probabilities.shape == (2, 4, 8)
+    np.testing.assert_allclose(found.probabilities[:, 0, 0], [sky + other, red], rtol=1e-5)
+    np.testing.assert_array_equal(found.label_ids, np.full((8, 16), 187))
+
+
+def test_what_has_no_category_has_no_probability(files):
+    (found,) = OnnxSegmenter(*files)([np.full((16, 32, 3), (0, 255, 0), np.uint8)])
+    assert (found.label_ids == -1).all()
+    assert found.probabilities is not None
+    other = np.exp(1) / (np.exp(1) + 2 * np.exp(-1))
+    np.testing.assert_allclose(found.probabilities.sum(0), 1 - other, rtol=1e-4)
+
+
+def test_a_model_that_ends_in_an_arg_max(tmp_path, files):
+    model = write_model(tmp_path / "m.onnx", np.eye(3)[[0, 2, 1]], arg_max=True)
+    (found,) = OnnxSegmenter(model, files[1])([red_and_blue()])
+    assert found.probabilities is None
+    np.testing.assert_array_equal(found.label_ids, [[500] * 32 + [187] * 32] * 32)
+    with pytest.raises(LabelError, match=r"answers with ids and not with probabilities"):
+        segment_views(
+            scene_of("a.jpg"),
+            [red_and_blue()],
+            OnnxSegmenter(model, files[1]),
+            tmp_path / "out",
+            soft=tmp_path,
+        )
+    (tmp_path / "c.json").write_text(json.dumps({"classes": ["a", "b"], "coco_panoptic": {"a": 1, "b": 2}}))
+    write_model(model, [[0, 0, 0], [0, 0, 0], [9, 9, 9]], arg_max=True)
+    with pytest.raises(LabelError, match="up to 2, but 2 classes are listed"):
+        OnnxSegmenter(model, tmp_path / "c.json")([np.full((32, 64, 3), 255, np.uint8)])
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (7, 2)])
+def test_tiny_photos(files, size):
+    (found,) = OnnxSegmenter(*files)([np.full((*size, 3), (255, 0, 0), np.uint8)])
+    np.testing.assert_array_equal(found.label_ids, np.full(size, 500))
+
+
+def test_a_network_that_overflows(tmp_path, files):
+    model = write_model(tmp_path / "m.onnx", np.full((3, 3), np.inf))
+    with pytest.raises(LabelError, match="not finite"):
+        OnnxSegmenter(model, files[1])([red_and_blue()])
+
+
+def test_classes_of_a_vocabulary(tmp_path):
+    path = tmp_path / "c.json"
+    content = {"classes": ["wall", "sky", "runway"], "vocabulary": "ade20k", "coco_panoptic": {"runway": 149}}
+    path.write_text(json.dumps(content))
+    classes = read_classes(path)
+    assert classes.taxonomy.names[187] == "sky-other-merged"
+    assert classes.label_ids[1:].tolist() == [187, 149]
+    path.write_text(json.dumps(content | {"vocabulary": "pascal"}))
+    with pytest.raises(LabelError, match="take one of coco, coco-stuff, ade20k, cityscapes"):
+        read_classes(path)
+
+
+def test_devices(files):
+    import onnxruntime
+
+    with pytest.raises(BackendUnavailable, match="is not known"):
+        open_session(files[0], 1, "tpu")
+    if "CUDAExecutionProvider" in onnxruntime.get_available_providers():
+        pytest.skip("onnxruntime has a GPU here")
+    open_session(files[0], 1, "auto")
+    with pytest.raises(BackendUnavailable, match="finds no CUDA"):
+        open_session(files[0], 1, "cuda:0")
 
 
 def test_a_killed_run_goes_on(tmp_path, files):
@@ -155,6 +247,9 @@ def test_input_and_output_are_resampled_bilinearly(tmp_path):
         ({"classes": ["sky"], "coco_panoptic": {"sky": 70000}}, "outside 0"),
         (CLASSES | {"std": 0}, "std above 0"),
         (CLASSES | {"mean": [1, 2]}, "not of the form"),
+        ({"classes": [7], "vocabulary": "coco"}, "not of the form"),
+        ({"classes": ["sky"], "vocabulary": "coco", "coco_panoptic": 7}, "not of the form"),
+        ({"classes": ["what"], "vocabulary": "coco"}, "names no label"),
     ],
 )
 def test_unusable_classes(tmp_path, content, complaint):
@@ -175,7 +270,7 @@ def test_unusable_models(tmp_path, files):
     ]
     for path, complaint in cases:
         with pytest.raises(LabelError, match=complaint) as caught:
-            OnnxSegmenter(path, classes).segment(red_and_blue())
+            OnnxSegmenter(path, classes)([red_and_blue()])
         assert "\n" not in str(caught.value)
         assert str(path) in str(caught.value)
     scene = scene_of("a.jpg")
@@ -201,6 +296,6 @@ def test_real_networks_on_a_real_photo(name):
     folder = full.path / "masks"
     given = Masks(folder, Taxonomy.read(folder / "labels.json"))[scene.views[0]]
     segmenter = OnnxSegmenter(SHARED / "models" / f"{name}.onnx", SHARED / "models" / "ade32.json")
-    found = segmenter.segment(Photos(scene.views)[0])
+    found = segmenter([Photos(scene.views)[0]])[0].label_ids
     for label_id, least in ((184, 0.8), (197, 0.8), (187, 0.9)):
         assert (found[given == label_id] == label_id).mean() > least

@@ -1,9 +1,9 @@
-"""Label images from a segmentation network in ONNX format, on the CPU."""
+"""Segmentation networks in ONNX format."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Int16, UInt8
@@ -13,21 +13,15 @@ from sagesplat.errors import BackendUnavailable, LabelError, RunError
 from sagesplat.files import read_json
 from sagesplat.scene.scene import Scene
 from sagesplat.segment import coco
-from sagesplat.segment.masks import (
-    UNLABELLED,
-    Taxonomy,
-    prepare_folder,
-    read_mask,
-    taxonomy_of,
-    write_labels,
-    write_mask,
+from sagesplat.segment.masks import UNLABELLED, Taxonomy, taxonomy_of
+from sagesplat.segment.segmenters import (
+    PhotoList,
+    Segmented,
+    answer,
+    group_classes,
+    parse_device,
+    segment_views,
 )
-
-
-class PhotoList(Protocol):
-    """What photos are taken from: by row of Scene.views, at the size of the view's camera."""
-
-    def __getitem__(self, index: int, /) -> UInt8[np.ndarray, "H W 3"]: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,16 +37,18 @@ class Classes:
 def read_classes(path: Path) -> Classes:
     """Read {"classes": [names], "coco_panoptic": {name: category id or null}, "mean": [3], "std": [3]}.
 
-    mean and std may be absent: 0.5 each, which maps 0 ... 255 to -1 ... 1. Names of categories are COCO's, or
-    the class's where COCO has none of that id. Raises LabelError.
+    With "vocabulary": "ade20k" (or another of `taxonomies.SOURCES`), "coco_panoptic" need only say what
+    differs. mean and std may be absent: 0.5 each, which maps 0 ... 255 to -1 ... 1. Names of categories are
+    COCO's, or the class's where COCO has none of that id. Raises LabelError.
     """
     try:
         content = read_json(path)
     except RunError as error:
         raise LabelError(f"{error}; it says what the classes of the model are") from None
     try:
-        classes, ids = content["classes"], content["coco_panoptic"]
-        label_ids = [UNLABELLED if ids[name] is None else int(ids[name]) for name in classes]
+        classes, ids = content["classes"], _categories(content, path)
+        found = [ids[name] for name in classes]
+        label_ids = [UNLABELLED if i is None else int(i) for i in found]
         mean, std = (np.broadcast_to(np.float32(content.get(key, 0.5)), 3) for key in ("mean", "std"))
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise LabelError(
@@ -67,12 +63,26 @@ def read_classes(path: Path) -> Classes:
     return Classes(np.array(label_ids, np.int16), taxonomy, mean, std)
 
 
-class OnnxSegmenter:
-    """A semantic segmentation network: RGB in, one logit per class and (coarser) pixel out."""
+def _categories(content: dict[str, Any], path: Path) -> dict[str, int | None]:
+    """The category of each class: listed, or that of COCO nearest to it in a known vocabulary."""
+    if "vocabulary" not in content:
+        return content["coco_panoptic"]
+    from sagesplat.segment.taxonomies import SOURCES, to_coco
 
-    def __init__(self, model: Path, classes: Path, *, threads: int = 1):
+    vocabulary, classes = content["vocabulary"], content["classes"]
+    if vocabulary not in SOURCES:
+        raise LabelError(f'{path}: "vocabulary" is {vocabulary!r}; take one of {", ".join(SOURCES)}')
+    return dict(zip(classes, to_coco(classes, vocabulary), strict=True)) | content.get("coco_panoptic", {})
+
+
+class OnnxSegmenter:
+    """A semantic segmentation network: RGB in, a logit per class and (coarser) pixel out, or class ids."""
+
+    def __init__(self, model: Path, classes: Path, *, device: str = "auto", threads: int = 1):
         self.classes = read_classes(classes)
-        self._session = open_session(model, threads)
+        self.taxonomy = self.classes.taxonomy
+        self._ids, self._group = group_classes(self.classes.label_ids.tolist())
+        self._session = open_session(model, threads, device)
         self._model = model
         entry = self._session.get_inputs()[0]
         self._input, shape = entry.name, entry.shape
@@ -86,22 +96,62 @@ class OnnxSegmenter:
             )
         self._channels, (self._height, self._width) = channels, size
 
-    def segment(self, photo: UInt8[np.ndarray, "H W 3"]) -> Int16[np.ndarray, "H W"]:
-        """The category id of each pixel, -1 where the network's class has none."""
+    def __call__(self, photos: Sequence[UInt8[np.ndarray, "H W 3"]], /) -> list[Segmented]:
+        """Label images and probabilities (softmax of the logits), one photo after the other."""
+        return [self._segment(photo) for photo in photos]
+
+    def _segment(self, photo: UInt8[np.ndarray, "H W 3"]) -> Segmented:
         height, width = photo.shape[:2]
+        output = self._run(photo)
+        if np.issubdtype(output.dtype, np.integer):
+            return self._of_numbers(output, height, width)
+        axis = class_axis(output.shape, len(self._group), self._channels)
+        if axis is None:
+            raise self._unfit(output)
+        logits = np.moveaxis(output[0], axis - 1, 0).astype(np.float32, copy=False)
+        return answer(*self._grouped(logits), self._ids, height, width)
+
+    def _run(self, photo: UInt8[np.ndarray, "H W 3"]) -> np.ndarray:
+        """The network's first output."""
         x = np.moveaxis(to_input(photo, self._height, self._width, self.classes), 2, self._channels - 1)
         try:
-            logits = np.asarray(self._session.run(None, {self._input: np.ascontiguousarray(x[None])})[0])
+            return np.asarray(self._session.run(None, {self._input: np.ascontiguousarray(x[None])})[0])
         except Exception as error:  # onnxruntime has a class of its own for each kind of failure
             raise LabelError(f"{self._model}: does not run ({_first_line(error)}); export it again") from None
-        axis = class_axis(logits.shape, len(self.classes.label_ids), self._channels)
-        if axis is None:
-            raise LabelError(
-                f"{self._model}: output of shape {list(logits.shape)}, but {len(self.classes.label_ids)} "
-                "classes are listed; take the file of classes that belongs to the model"
-            )
-        logits = np.moveaxis(logits[0], axis - 1, 0).astype(np.float32, copy=False)
-        return self.classes.label_ids[arg_max_resized(logits, height, width)]
+
+    def _grouped(
+        self, logits: Float32[np.ndarray, "C h w"]
+    ) -> tuple[Float32[np.ndarray, "K h w"], Float32[np.ndarray, "K h w"]]:
+        """Log of the summed probability of each category, up to a constant per pixel; and the probability."""
+        if not np.isfinite(logits).all():
+            raise LabelError(f"{self._model}: logits that are not finite; export it again (in 32 bits)")
+        top = logits.max(0)
+        members = np.eye(len(self._ids), dtype=np.float32)[:, self._group]
+        sums = np.tensordot(members, np.exp(logits - top), 1)
+        # Relative to the smallest float: a category far below the best is no -inf, which would spread.
+        ranks = np.log(np.maximum(sums, np.finfo(np.float32).tiny)) + top
+        return ranks, sums / sums.sum(0)
+
+    def _of_numbers(self, output: np.ndarray, height: int, width: int) -> Segmented:
+        """Label image of a network that ends in an arg max: [1, h, w] class numbers, with axes of 1."""
+        axis = next((a for a in (1, 3) if output.ndim == 4 and output.shape[a] == 1), None)
+        numbers = (output if axis is None else output.squeeze(axis))[0]
+        if (
+            numbers.ndim != 2
+            or not numbers.size
+            or not 0 <= numbers.min() <= numbers.max() < len(self._group)
+        ):
+            raise self._unfit(output)
+        rows = ((np.arange(height) + 0.5) * numbers.shape[0] / height).astype(int)
+        columns = ((np.arange(width) + 0.5) * numbers.shape[1] / width).astype(int)
+        return Segmented(self.classes.label_ids[numbers[rows[:, None], columns]], None, self._ids[:0])
+
+    def _unfit(self, output: np.ndarray) -> LabelError:
+        largest = f" up to {output.max()}" if np.issubdtype(output.dtype, np.integer) and output.size else ""
+        return LabelError(
+            f"{self._model}: output of shape {list(output.shape)}{largest}, but {len(self._group)} "
+            "classes are listed; take the file of classes that belongs to the model"
+        )
 
 
 def segment_onnx(
@@ -114,38 +164,13 @@ def segment_onnx(
     threads: int = 1,
     on_view: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Write a normalised folder of masks: label images of every view by a network, then labels.json.
-
-    A finished label image in `target` is kept, so that a killed run goes on where it was: empty the folder
-    before using another model. `on_view(done, total)` is called after each view. Raises LabelError for files
-    that cannot be used, BackendUnavailable without onnxruntime.
-    """
-    segmenter = OnnxSegmenter(model, classes, threads=threads)
-    taxonomy = segmenter.classes.taxonomy
-    occurring: set[int] = set()
-    paths = prepare_folder(target, scene.views)
-    for i, (view, path) in enumerate(zip(scene.views, paths, strict=True)):
-        label_ids = _finished(path, taxonomy, (view.camera.height, view.camera.width))
-        if label_ids is None:
-            label_ids = segmenter.segment(photos[i])
-            write_mask(path, label_ids, taxonomy)
-        occurring.update(np.unique(label_ids).tolist())
-        if on_view is not None:
-            on_view(i + 1, len(scene.views))
-    write_labels(target, taxonomy, occurring)
+    """`segment_views` with an `OnnxSegmenter` on the CPU."""
+    segmenter = OnnxSegmenter(model, classes, device="cpu", threads=threads)
+    segment_views(scene, photos, segmenter, target, on_view=on_view)
 
 
-def _finished(path: Path, taxonomy: Taxonomy, shape: Sequence[int]) -> Int16[np.ndarray, "H W"] | None:
-    """The label image of an earlier run, if it is of this size and of these categories."""
-    try:
-        label_ids = read_mask(path, taxonomy)
-    except LabelError:
-        return None
-    return label_ids if label_ids.shape == tuple(shape) else None
-
-
-def open_session(model: Path, threads: int) -> Any:
-    """An onnxruntime session on the CPU."""
+def open_session(model: Path, threads: int, device: str = "cpu") -> Any:
+    """An onnxruntime session; on a GPU where one is asked for, or with `auto` where onnxruntime knows one."""
     try:
         import onnxruntime
     except ImportError:
@@ -154,15 +179,26 @@ def open_session(model: Path, threads: int) -> Any:
         ) from None
     if not model.is_file():
         raise LabelError(f"{model}: no such file; name an ONNX model")
+    kind, index = parse_device(device)
+    on_gpu = kind != "cpu" and "CUDAExecutionProvider" in onnxruntime.get_available_providers()
+    unavailable = BackendUnavailable(
+        f"device {device}: onnxruntime finds no CUDA here; pip install onnxruntime-gpu, or use --device cpu"
+    )
+    if kind == "cuda" and not on_gpu:
+        raise unavailable
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
     options.log_severity_level = 3  # errors only
+    gpu = [("CUDAExecutionProvider", {"device_id": index})] if on_gpu else []
     try:
-        return onnxruntime.InferenceSession(str(model), options, providers=["CPUExecutionProvider"])
+        session = onnxruntime.InferenceSession(str(model), options, providers=[*gpu, "CPUExecutionProvider"])
     except Exception as error:  # onnxruntime has a class of its own for each kind of failure
         raise LabelError(
             f"{model}: no model that onnxruntime can load ({_first_line(error)}); export it again"
         ) from None
+    if kind == "cuda" and "CUDAExecutionProvider" not in session.get_providers():
+        raise unavailable  # it falls back to the CPU silently where CUDA's libraries are missing
+    return session
 
 
 def to_input(
@@ -176,23 +212,6 @@ def to_input(
 def class_axis(shape: Sequence[int], num_classes: int, likely: int) -> int | None:
     """The axis of the classes in an output of four: the input's channel axis, or else the other one."""
     return next((a for a in (likely, 4 - likely) if len(shape) == 4 and shape[a] == num_classes), None)
-
-
-def arg_max_resized(
-    logits: Float32[np.ndarray, "C h w"], height: int, width: int
-) -> Int16[np.ndarray, "H W"]:
-    """The class with the largest logit after bilinear resampling to `height` x `width`.
-
-    Class by class, so that large photos never hold all logits at full size.
-    """
-    best = np.full((height, width), -np.inf, np.float32)
-    classes = np.zeros((height, width), np.int16)
-    for c, logit in enumerate(logits):
-        resized = Image.fromarray(logit).resize((width, height), Image.Resampling.BILINEAR)
-        resized = np.asarray(resized)
-        larger = resized > best
-        best[larger], classes[larger] = resized[larger], c
-    return classes
 
 
 def _first_line(error: Exception) -> str:

@@ -1,0 +1,199 @@
+"""Segmenters: what they are asked and answer, and the loop that takes one over the views of a scene."""
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float32, Int16, UInt8
+from PIL import Image
+
+from sagesplat.errors import BackendUnavailable, LabelError, RunError
+from sagesplat.files import read_json, write_json
+from sagesplat.scene.scene import Scene, View
+from sagesplat.segment.masks import (
+    UNLABELLED,
+    Taxonomy,
+    prepare_folder,
+    read_mask,
+    write_labels,
+    write_mask,
+)
+from sagesplat.segment.soft import soft_path, write_soft
+
+NEGLIGIBLE = 0.5 / 255  # no 8-bit image of probabilities shows less
+
+
+@dataclass(frozen=True, eq=False)
+class Segmented:
+    """What a segmenter says about a photo."""
+
+    label_ids: Int16[np.ndarray, "H W"]  # category id of each pixel, -1 where it has none
+    probabilities: Float32[np.ndarray, "C h w"] | None  # 0 ... 1, at most 1 in sum; covers the whole photo
+    ids: Int16[np.ndarray, " C"]  # category id of each row of probabilities; others are negligible
+
+
+class Segmenter(Protocol):
+    """A network, or whatever else, that knows the categories of pixels."""
+
+    taxonomy: Taxonomy  # all categories that it can answer with
+
+    def __call__(self, photos: Sequence[UInt8[np.ndarray, "H W 3"]], /) -> list[Segmented]:
+        """An answer for each photo; those of one call may be computed together."""
+        ...
+
+
+class PhotoList(Protocol):
+    """What photos are taken from: by row of Scene.views, at the size of the view's camera."""
+
+    def __getitem__(self, index: int, /) -> UInt8[np.ndarray, "H W 3"]: ...
+
+
+def segment_views(
+    scene: Scene,
+    photos: PhotoList,
+    segmenter: Segmenter,
+    target: Path,
+    *,
+    batch: int = 1,
+    soft: Path | None = None,
+    on_view: Callable[[int, int], None] | None = None,
+) -> None:
+    """Write a normalised folder of masks: label images of every view, then labels.json.
+
+    Up to `batch` photos of equal size are given to the segmenter at once. With `soft`, the probabilities of
+    each view are kept there too (`soft.read_soft`). A finished label image in `target` is kept, so that a
+    killed run goes on where it was, unless it is of other categories: empty the folder before using another
+    model of the same ones. `on_view(done, total)` is called after each view. Raises LabelError.
+    """
+    if not scene.views:
+        raise LabelError(f"{scene.path}: a scene without views; there is no photo to segment")
+    taxonomy, total = segmenter.taxonomy, len(scene.views)
+    paths = prepare_folder(target, scene.views)
+    softs = [None if soft is None else soft_path(soft, view) for view in scene.views]
+    _begin(target, taxonomy, [*paths, *(path for path in softs if path is not None)])
+    occurring: set[int] = set()
+    done = 0
+
+    def finish(label_ids: Int16[np.ndarray, "H W"]) -> None:
+        nonlocal done
+        done += 1
+        occurring.update(np.unique(label_ids).tolist())
+        if on_view is not None:
+            on_view(done, total)
+
+    missing = []
+    for row, view in enumerate(scene.views):
+        path, label_ids = softs[row], None
+        if path is None or path.is_file():
+            label_ids = _finished(paths[row], taxonomy, view)
+        if label_ids is None:
+            missing.append(row)
+        else:
+            finish(label_ids)
+    for rows in _batches(scene.views, missing, batch):
+        for row, found in zip(rows, segmenter([photos[row] for row in rows]), strict=True):
+            _write(found, paths[row], softs[row], taxonomy)
+            finish(found.label_ids)
+    write_labels(target, taxonomy, occurring)
+
+
+def _begin(target: Path, taxonomy: Taxonomy, paths: Sequence[Path]) -> None:
+    """Remove what an earlier run left, unless it was of the same categories."""
+    marker, content = target / ".taxonomy.json", {str(i): name for i, name in taxonomy.names.items()}
+    try:
+        same = read_json(marker) == content
+    except RunError:
+        same = False
+    if not same:
+        for path in paths:
+            path.unlink(missing_ok=True)
+        write_json(marker, content)
+
+
+def _finished(path: Path, taxonomy: Taxonomy, view: View) -> Int16[np.ndarray, "H W"] | None:
+    """The label image of an earlier run, if it is of the view's size."""
+    try:
+        label_ids = read_mask(path, taxonomy)
+    except LabelError:
+        return None
+    return label_ids if label_ids.shape == _size(view) else None
+
+
+def _write(found: Segmented, path: Path, soft: Path | None, taxonomy: Taxonomy) -> None:
+    """Keep an answer. The label image comes last: where it exists, the probabilities do too."""
+    if soft is not None:
+        if found.probabilities is None:
+            raise LabelError(
+                f"{soft.parent}: the network answers with ids and not with probabilities; "
+                "segment without them"
+            )
+        write_soft(soft, found.probabilities, found.ids, found.label_ids.shape)
+    write_mask(path, found.label_ids, taxonomy)
+
+
+def _batches(views: Sequence[View], rows: Sequence[int], batch: int) -> Iterator[list[int]]:
+    """Rows of views of equal size, up to `batch` at once."""
+    for _, group in groupby(sorted(rows, key=lambda row: _size(views[row])), lambda row: _size(views[row])):
+        same = list(group)
+        for start in range(0, len(same), max(batch, 1)):
+            yield same[start : start + max(batch, 1)]
+
+
+def _size(view: View) -> tuple[int, int]:
+    return view.camera.height, view.camera.width
+
+
+def group_classes(label_ids: Sequence[int | None]) -> tuple[Int16[np.ndarray, " K"], np.ndarray]:
+    """The ids that classes stand for, rising, and the row [C] of each class among them.
+
+    Classes without a category share the id -1.
+    """
+    each = np.array([UNLABELLED if i is None else i for i in label_ids], np.int16)
+    return np.unique(each, return_inverse=True)
+
+
+def answer(
+    ranks: Float32[np.ndarray, "K h w"],
+    probabilities: Float32[np.ndarray, "K h w"],
+    ids: Int16[np.ndarray, " K"],
+    height: int,
+    width: int,
+) -> Segmented:
+    """Each pixel has the id of the highest rank; rows that are negligible everywhere are left out."""
+    label_ids = ids[arg_max_resized(ranks, height, width)]
+    kept = (ids != UNLABELLED) & (probabilities.max((1, 2)) >= NEGLIGIBLE)
+    return Segmented(label_ids, probabilities[kept], ids[kept])
+
+
+def arg_max_resized(
+    logits: Float32[np.ndarray, "C h w"], height: int, width: int
+) -> Int16[np.ndarray, "H W"]:
+    """The class with the largest logit after bilinear resampling to `height` x `width`.
+
+    Class by class, so that large photos never hold all logits at full size.
+    """
+    best = np.full((height, width), -np.inf, np.float32)
+    classes = np.zeros((height, width), np.int16)
+    # The best of a pixel is at least the mean: a class that is below it everywhere never wins.
+    least = logits.mean(0).min()
+    least -= 1e-4 * abs(least)  # rounding
+    for c, logit in enumerate(logits):
+        if logit.max() < least:
+            continue
+        resized = Image.fromarray(logit).resize((width, height), Image.Resampling.BILINEAR)
+        resized = np.asarray(resized)
+        larger = resized > best
+        best[larger], classes[larger] = resized[larger], c
+    return classes
+
+
+def parse_device(device: str) -> tuple[str, int]:
+    """`auto`, `cpu` or `cuda`, and which GPU: of "auto", "cpu", "cuda" or "cuda:N"."""
+    found = re.fullmatch(r"(auto|cpu|cuda)|cuda:(\d+)", device)
+    if found is None:
+        raise BackendUnavailable(f"device {device!r} is not known; use --device cpu, cuda or cuda:N")
+    return found[1] or "cuda", int(found[2] or 0)
