@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sagesplat import cli, nesting, stages
+from sagesplat import cli, labelling, nesting, stages
 from sagesplat.compare import compare
 from sagesplat.config import (
     CompareConfig,
@@ -163,8 +163,8 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Job:
     make_capture(folder / "capture", views=12, width=80, height=60)
     job = Job(RunDir(folder / "run"), lambda event: None)
     stages.open_scene(job, folder / "capture", SceneConfig())
-    stages.make_masks(job, MasksConfig())
-    stages.lift_labels(job, LiftConfig())
+    labelling.make_masks(job, MasksConfig())
+    labelling.lift_labels(job, LiftConfig())
     stages.train_levels(job, TrainConfig(max_steps=60, level_every=20, refine_every=5), 0)
     nesting.nest_levels(job, NestConfig(steps=20, levels=4, seed_steps=20), 0)
     stages.observe_levels(job, FitConfig())

@@ -11,7 +11,7 @@ import torch
 from conftest import pinhole, random_gaussians
 from PIL import Image
 
-from sagesplat import pipeline, stages
+from sagesplat import labelling, pipeline, stages
 from sagesplat.adapt.cross_view import CrossView, read_cross_view
 from sagesplat.adapt.ladder import read_ladder
 from sagesplat.adapt.observe import TOTAL, RenderedLabels, near_border, read_observations
@@ -48,8 +48,8 @@ def work(run: Path, capture: Path, config: RunConfig = CONFIG, **options) -> tup
     events: list[Event] = []
     job = Job(RunDir(run, "snapshots"), events.append, **options)
     stages.open_scene(job, capture, config.scene)
-    stages.make_masks(job, config.masks)
-    stages.lift_labels(job, config.lift)
+    labelling.make_masks(job, config.masks)
+    labelling.lift_labels(job, config.lift)
     stages.train_levels(job, config.train, config.seed)
     stages.observe_levels(job, config.fit)
     stages.fit_ladder(job, config.fit)

@@ -221,9 +221,9 @@ def test_settings_and_variants_become_the_configuration_of_each_cell(tmp_path: P
         == garden.config
         == RunConfig(
             SceneConfig(downscale=2),
-            MasksConfig(masks=tmp_path / "labels"),
-            LiftConfig("projection"),
-            TrainConfig(sh_degree=2, antialiased=True, grow_scale=1.0),
+            masks=MasksConfig(masks=tmp_path / "labels"),
+            lift=LiftConfig("projection"),
+            train=TrainConfig(sh_degree=2, antialiased=True, grow_scale=1.0),
             plan=PlanConfig(target_ssim=0.9, share=0.5, other_targets=(0.5, 1.0)),
             seed=3,
         )

@@ -15,11 +15,13 @@ from sagesplat import __version__
 from sagesplat.config import (
     CompareConfig,
     FitConfig,
+    LabelsConfig,
     LiftConfig,
     MasksConfig,
     NestConfig,
     PaperConfig,
     PlanConfig,
+    PosesConfig,
     RunConfig,
     SceneConfig,
     TrainConfig,
@@ -56,7 +58,8 @@ class Machine:
 
 
 LadderKind = Literal["nested", "snapshots"]
-Scene = Positional[Annotated[Path, arg(metavar="SCENE", help="capture: a COLMAP workspace")]]
+_CAPTURE = "capture: a COLMAP workspace, transforms.json, photos or a video"
+Scene = Positional[Annotated[Path, arg(metavar="SCENE", help=_CAPTURE)]]
 Run = Positional[Annotated[Path, arg(metavar="RUN", help="run folder")]]
 Flat = arg(name="")
 
@@ -72,7 +75,9 @@ def _job(run: Path, machine: Machine, ladder: LadderKind = "nested") -> Iterator
     with Console() as console:
         if backend == "cuda":
             console.out.print("[dim]· computing on the GPU[/]")
-        yield Job(RunDir(run, ladder), console, backend, threads, machine.force, machine.processes)
+        yield Job(
+            RunDir(run, ladder), console, backend, threads, machine.force, machine.processes, machine.device
+        )
 
 
 def _prepare(machine: Machine) -> "tuple[Backend, int]":
@@ -103,20 +108,26 @@ def run(
     scene: Scene,
     run: Run,
     scene_config: Annotated[SceneConfig, Flat] = SceneConfig(),
+    poses: PosesConfig = PosesConfig(),
     masks: Annotated[MasksConfig, Flat] = MasksConfig(),
+    labels: LabelsConfig = LabelsConfig(),
     lift: LiftConfig = LiftConfig(),
     train: TrainConfig = TrainConfig(),
     nest: NestConfig = NestConfig(),
     fit: FitConfig = FitConfig(),
     plan: Annotated[PlanConfig, Flat] = PlanConfig(),
+    fuse: bool = False,
     ladder: LadderKind = "nested",
     machine: Annotated[Machine, Flat] = Machine(),
     seed: int = 0,
 ) -> None:
-    """Everything: photos and label images in, levels, models, a plan and a report out."""
+    """Everything: photos in, levels, models, a plan and a report out.
+
+    Poses are found where the photos have none, and label images made where there are none.
+    """
     from sagesplat import pipeline
 
-    config = RunConfig(scene_config, masks, lift, train, nest, fit, plan, ladder, seed)
+    config = RunConfig(scene_config, poses, masks, labels, lift, train, nest, fit, plan, fuse, ladder, seed)
     with _job(run, machine, ladder) as job:
         pipeline.run_all(job, scene, config)
 
@@ -135,24 +146,35 @@ def masks(
     scene: Scene,
     run: Run,
     scene_config: Annotated[SceneConfig, Flat] = SceneConfig(),
+    poses: PosesConfig = PosesConfig(),
     masks: Annotated[MasksConfig, Flat] = MasksConfig(),
+    labels: LabelsConfig = LabelsConfig(),
     machine: Annotated[Machine, Flat] = Machine(),
 ) -> None:
-    """Begin a run: read the capture and bring its label images in."""
-    from sagesplat import stages
+    """Begin a run: read the capture (poses are found if there are none) and bring label images in."""
+    from sagesplat import labelling, stages
 
     with _job(run, machine) as job:
-        stages.open_scene(job, scene, scene_config)
-        stages.make_masks(job, masks)
+        stages.open_scene(job, scene, scene_config, poses)
+        labelling.make_masks(job, masks, labels)
 
 
 @command
 def lift(run: Run, lift: LiftConfig = LiftConfig(), machine: Annotated[Machine, Flat] = Machine()) -> None:
     """Vote the label images onto the points."""
-    from sagesplat import stages
+    from sagesplat import labelling
 
     with _job(run, machine) as job:
-        stages.lift_labels(job, lift)
+        labelling.lift_labels(job, lift)
+
+
+@command
+def fuse(run: Run, machine: Annotated[Machine, Flat] = Machine()) -> None:
+    """Let all views vote on the label images by way of the trained Gaussians; what follows uses them."""
+    from sagesplat import labelling
+
+    with _job(run, machine) as job:
+        labelling.fuse_masks(job)
 
 
 @command

@@ -18,17 +18,64 @@ class SceneConfig:
 
 
 @dataclass(frozen=True)
+class PosesConfig:
+    """How camera poses are found for photos that come without."""
+
+    matching: Literal["auto", "exhaustive", "sequential"] = "auto"
+    """Which photos are compared: all pairs, or neighbours by name; auto: neighbours for videos and many."""
+    camera: Literal["auto", "single", "per-folder", "per-image"] = "auto"
+    """Which photos share intrinsics; auto: those of one size, camera and zoom."""
+    model: str = "OPENCV"
+    """COLMAP's camera model."""
+    refine_principal_point: bool = False
+    """For photos that were cropped, each in its own way."""
+    max_size: int = 3200
+    """Larger side in pixels: of photos for features, and of the undistorted photos."""
+    max_frames: int = 300
+    """Frames taken of a video."""
+    min_registered: float = 0.5
+    """Share of the photos whose pose must be found."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Of features and matching."""
+    threads: int = -1
+    """-1: all cores."""
+    seed: int = 0
+
+
+@dataclass(frozen=True)
 class MasksConfig:
     """Where label images come from."""
 
-    segmenter: Literal["masks", "onnx"] = "masks"
-    """masks: ready label images; onnx: a segmentation network (pip install 'sagesplat[onnx]')."""
+    segmenter: Literal["auto", "masks", "hf", "onnx", "deeplabv2"] = "auto"
+    """masks: ready label images; hf: a network of Hugging Face; onnx: one in ONNX format; deeplabv2: the
+    paper's. auto: masks where there are some, else by --model."""
     masks: Path | None = None
     """Folder of label images (default: SCENE/masks)."""
-    model: Path | None = None
-    """The network's .onnx file."""
+    model: str | None = None
+    """The network: a name on huggingface.co or a folder (hf; default: EoMT small), a .onnx file or a
+    checkpoint."""
     classes: Path | None = None
-    """JSON with the network's class names and their category ids."""
+    """JSON with the class names of an ONNX network and their category ids."""
+    head: Literal["coco-stuff", "voc"] = "coco-stuff"
+    """What the checkpoint of deeplabv2 was trained on."""
+    crf: bool = False
+    """Let borders follow the edges of the photo (deeplabv2)."""
+    batch: int = 1
+    """Photos that a network looks at together."""
+    soft: bool = False
+    """Keep the network's probabilities too, for `fuse`."""
+
+
+@dataclass(frozen=True)
+class LabelsConfig:
+    """What becomes of the categories: first merge, then keep, then min-share."""
+
+    keep: str = ""
+    """Only these, such as "grass-merged,tree-merged"; the others become unlabelled."""
+    merge: str = ""
+    """Put together, such as "vase=potted plant,potted plant=tree-merged"."""
+    min_share: float = 0.0
+    """Categories with a smaller share of all pixels become unlabelled."""
 
 
 @dataclass(frozen=True)
@@ -206,12 +253,16 @@ class RunConfig:
     """Everything that a run needs to be done again."""
 
     scene: SceneConfig = field(default_factory=SceneConfig)
+    poses: PosesConfig = field(default_factory=PosesConfig)
     masks: MasksConfig = field(default_factory=MasksConfig)
+    labels: LabelsConfig = field(default_factory=LabelsConfig)
     lift: LiftConfig = field(default_factory=LiftConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
     nest: NestConfig = field(default_factory=NestConfig)
     fit: FitConfig = field(default_factory=FitConfig)
     plan: PlanConfig = field(default_factory=PlanConfig)
+    fuse: bool = False
+    """Let all views vote on the label images, once the scene is trained."""
     ladder: Literal["nested", "snapshots"] = "nested"
     """Levels that contain each other, or the paper's: what training recorded on its way."""
     seed: int = 0

@@ -40,6 +40,7 @@ class Job:
     threads: int = 1
     force: bool = False
     processes: int = 1  # that train together
+    device: str = "auto"  # where networks compute
 
     @cached_property
     def scene(self) -> Scene:
@@ -66,8 +67,14 @@ class Job:
 
     @cached_property
     def masks(self) -> Masks:
-        """The label images, loaded when asked for."""
+        """The label images before fusion, loaded when asked for."""
         return Masks(self.run.masks, self.taxonomy)
+
+    @property
+    def best_masks(self) -> Masks:
+        """The label images that all views agreed on, if they were asked to."""
+        fused = self.run.fused
+        return Masks(fused, self.taxonomy) if (fused / "labels.json").exists() else self.masks
 
     @cached_property
     def point_labels(self) -> np.ndarray:
@@ -100,10 +107,15 @@ class Job:
         return {**self.taxonomy.names, -1: self.taxonomy.name(-1)}
 
 
+def fusion(run: RunDir) -> list[Path]:
+    """What results change with that look at label images after training."""
+    return [run.provenance("fuse")] if (run.fused / "labels.json").exists() else []
+
+
 def label_images(job: Job, source: str) -> LabelImages:
     """The label images that came with the photos ("given"), or those of the 3D labels ("rendered")."""
     if source == "given":
-        return job.masks
+        return job.best_masks
     return RenderedLabels(job.ladder.load(job.ladder.levels[-1]), job.backend, job.antialiased)
 
 
@@ -135,7 +147,7 @@ def run_stage(
     make: Callable[[], Sequence[str]],
 ) -> None:  # fmt: skip
     """Do a stage unless its result is there already."""
-    if name != "scene" and not job.run.scene.exists():
+    if name not in ("poses", "scene") and not job.run.scene.exists():
         raise RunError(f"{job.run.path}: {NO_RUN}")
     for path in inputs:
         if not path.exists():
@@ -159,5 +171,9 @@ def fingerprint(scene: Scene) -> str:
         size = view.image_path.stat().st_size
         digest.update(f"{view.name} {size} {view.camera.width} {view.camera.height}".encode())
         digest.update(view.camera.w2c.tobytes() + view.camera.K.tobytes())
+        if any(view.camera.background):
+            digest.update(bytes(view.camera.background))
     digest.update(scene.points.xyz.tobytes())
+    if scene.test_names is not None:
+        digest.update("\n".join(sorted(scene.test_names)).encode())
     return digest.hexdigest()

@@ -12,7 +12,7 @@ from sagesplat.adapt.promised import Costs, Quality, plan_for_view, quality_at
 from sagesplat.config import FitConfig, NestConfig, TrainConfig
 from sagesplat.events import Progress
 from sagesplat.gaussians import Gaussians
-from sagesplat.job import Job, distances, label_images, run_stage
+from sagesplat.job import Job, distances, fusion, label_images, run_stage
 from sagesplat.metrics import ssim_map
 from sagesplat.output.chunks import packed, read_chunks, read_index, totals, write_chunks
 from sagesplat.raster import Workspace
@@ -42,7 +42,8 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
     def make() -> list[str]:
         full = job.snapshots.load(job.snapshots.levels[-1])
         seeds = read_level(run.seeds) if config.seed_share else None
-        ordered = nested.order(full, job.scene, job.masks, config, seeds=seeds, antialiased=job.antialiased)
+        masks = job.best_masks
+        ordered = nested.order(full, job.scene, masks, config, seeds=seeds, antialiased=job.antialiased)
         belongs = json.dumps({**settings, "scene": file_hash(run.scene), "levels": file_hash(run.levels)})
         if job.force:
             run.nest_checkpoint.unlink(missing_ok=True)
@@ -59,7 +60,7 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
         run.nest_checkpoint.unlink(missing_ok=True)
         return lines
 
-    inputs = [run.scene, run.labels, run.levels]
+    inputs = [run.scene, run.labels, run.levels, *fusion(run)]
     if config.seed_share:
         _make_seeds(job, config, seed)
         inputs.append(run.seeds)

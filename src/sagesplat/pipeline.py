@@ -4,7 +4,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from sagesplat import nesting, stages
+from sagesplat import labelling, nesting, stages
 from sagesplat.adapt.ladder import read_prefixes
 from sagesplat.adapt.plan import check_target
 from sagesplat.config import NestConfig, PlanConfig, RunConfig, TrainConfig
@@ -30,10 +30,14 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
     for target in config.plan.targets:  # before hours of training
         check_target(target)
     nested.check(config.nest)
-    stages.open_scene(job, scene, config.scene)
-    stages.make_masks(job, config.masks)
-    stages.lift_labels(job, config.lift)
+    stages.open_scene(job, scene, config.scene, config.poses)
+    labelling.make_masks(job, config.masks, config.labels)
+    labelling.lift_labels(job, config.lift)
     stages.train_levels(job, config.train, config.seed)
+    if config.fuse:
+        labelling.fuse_masks(job)
+    elif job.run.fused.exists():
+        raise RunError(f"{job.run.fused}: label images were fused; add --fuse, or delete that folder")
     if job.run.ladder == "nested":
         nesting.nest_levels(job, config.nest, config.seed)
     stages.observe_levels(job, config.fit)

@@ -13,7 +13,8 @@ from sagesplat.files import read_json, write_json
 FORMAT = 2  # of the run folder; raised when older folders can no longer be read
 
 LadderKind = Literal["nested", "snapshots"]
-_BEFORE_LADDERS = ("scene", "masks", "lift", "train")  # stages that all ladders of a run share
+# stages that all ladders of a run share
+_BEFORE_LADDERS = ("poses", "scene", "segment", "masks", "lift", "train", "fuse")
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,26 @@ class RunDir:
     def masks(self) -> Path:
         """Label images at training size, with labels.json."""
         return self.path / "masks"
+
+    @property
+    def capture(self) -> Path:
+        """The capture that was made of photos without poses."""
+        return self.path / "capture"
+
+    @property
+    def segmented(self) -> Path:
+        """Label images as they came, before categories were merged or left out."""
+        return self.path / "segmented"
+
+    @property
+    def soft(self) -> Path:
+        """A network's probabilities, of the categories in `segmented`."""
+        return self.path / "soft"
+
+    @property
+    def fused(self) -> Path:
+        """Label images on which all views agree."""
+        return self.path / "fused"
 
     @property
     def labels(self) -> Path:

@@ -1,5 +1,6 @@
 """The stages, one function each, in the order of the paper; each skips what is done and says what it did."""
 
+import hashlib
 import json
 import shutil
 from collections.abc import Callable
@@ -22,12 +23,12 @@ from sagesplat.adapt.observe import (
 from sagesplat.adapt.plan import Plan, plan_scene, plan_view, read_budget_plan, read_plans, write_plans
 from sagesplat.adapt.promise import write_promises
 from sagesplat.adapt.promised import plan_for_scene, plan_for_view, plan_within
-from sagesplat.config import FitConfig, LiftConfig, MasksConfig, PlanConfig, SceneConfig, TrainConfig
+from sagesplat.config import FitConfig, PlanConfig, PosesConfig, SceneConfig, TrainConfig
 from sagesplat.errors import RunError
 from sagesplat.events import Progress, RunDone, TableMade, Training, Warned
-from sagesplat.files import read_json, write_json
+from sagesplat.files import write_json
 from sagesplat.gaussians import Gaussians
-from sagesplat.job import Job, distances, fingerprint, label_images, run_stage
+from sagesplat.job import Job, distances, fingerprint, fusion, label_images, run_stage
 from sagesplat.output import tables
 from sagesplat.output.chunks import INDEX
 from sagesplat.output.ply import read_ply, write_ply
@@ -36,19 +37,22 @@ from sagesplat.output.summary import report_data
 from sagesplat.output.tables import Table
 from sagesplat.run_dir import RunDir, file_hash, settings_of
 from sagesplat.scene import load_scene
-from sagesplat.segment.lift import lift
-from sagesplat.segment.masks import import_masks
+from sagesplat.scene.detect import detect
 from sagesplat.train.checkpoint import read_checkpoint
 from sagesplat.train.parallel import train_together
 from sagesplat.train.stepper import tune
 from sagesplat.train.trainer import LabelFrozen, LevelSaved, Resumed, Step, Trained, train
 
 
-def open_scene(job: Job, path: Path, config: SceneConfig) -> None:
-    """Read a capture and write scene.json."""
+def open_scene(job: Job, path: Path, config: SceneConfig, poses: PosesConfig | None = None) -> None:
+    """Read a capture and write scene.json; of photos without poses, or a video, a capture is made first."""
     run = job.run
-    if run.path.exists() and not run.scene.exists() and any(run.path.iterdir()):
+    ours = run.scene.exists() or (run.capture / "sfm").exists()
+    if run.path.exists() and not ours and any(run.path.iterdir()):
         raise RunError(f"{run.path}: not empty and not a run folder; choose a new folder")
+    if detect(path) in ("photos", "video"):
+        _find_poses(job, path, poses or PosesConfig())
+        path = run.capture
     scene = load_scene(path, **asdict(config))
     settings = {"path": str(path.resolve()), **asdict(config), "fingerprint": fingerprint(scene)}
 
@@ -83,63 +87,30 @@ def open_scene(job: Job, path: Path, config: SceneConfig) -> None:
     run_stage(job, "scene", settings, [], [run.scene], make)
 
 
-def make_masks(job: Job, config: MasksConfig) -> None:
-    """Bring the label images into the run: given ones, or a segmenter's."""
-    source = config.masks or job.scene.path / "masks"
-    settings: dict[str, Any] = {"segmenter": config.segmenter}
-    if config.segmenter == "onnx":
-        if config.model is None or config.classes is None:
-            raise RunError("--segmenter onnx needs --model NETWORK.onnx and --classes CLASSES.json")
-        for file in (config.model, config.classes):
-            if not file.is_file():
-                raise RunError(f"{file}: no such file; name the network and its classes")
-        settings |= {"model": file_hash(config.model), "classes": file_hash(config.classes)}
-    else:
-        settings["source"] = file_hash(source) if source.is_dir() else str(source)
+def _find_poses(job: Job, source: Path, config: PosesConfig) -> None:
+    """Make a capture of photos or a video: cameras and points by structure from motion."""
+    from sagesplat.scene.photos import reconstruct
+
+    files = sorted(p for p in source.rglob("*") if p.is_file()) if source.is_dir() else [source]
+    state = [(str(p), p.stat().st_size, p.stat().st_mtime_ns) for p in files]
+    digest = hashlib.sha256(repr(state).encode()).hexdigest()
+    settings = {"source": str(source.resolve()), **asdict(config), "files": digest}
 
     def make() -> list[str]:
-        if config.segmenter == "onnx":
-            _segment(job, config, settings)
-        else:
-            shutil.rmtree(job.run.masks, ignore_errors=True)
-            missing = import_masks(job.scene, source, job.run.masks)
-            if missing:
-                names = ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
-                job.emit(
-                    Warned(f"{len(missing)} of {len(job.scene.views)} views have no label image: {names}")
-                )
-        return [f"{len(job.taxonomy.names)} categories: {', '.join(job.taxonomy.names.values())}"]
+        found = reconstruct(
+            source, job.run.capture, config,
+            lambda stage, done, total: job.emit(Progress("poses", done, max(total, 1), stage)),
+        )  # fmt: skip
+        for name, reason in list(found.unregistered.items())[:5]:
+            job.emit(Warned(f"{name}: {reason}"))
+        if len(found.unregistered) > 5:
+            job.emit(Warned(f"{len(found.unregistered)} photos in all left out; see capture/poses.json"))
+        return [
+            f"poses of {found.num_registered} of {found.num_photos} photos, {found.num_points:,} points, "
+            f"reprojection error {found.reprojection_error:.2f} px"
+        ]
 
-    run_stage(job, "masks", settings, [job.run.scene], [job.run.masks / "labels.json"], make)
-
-
-def _segment(job: Job, config: MasksConfig, settings: dict[str, Any]) -> None:
-    """Segment the photos; images of an interrupted attempt with the same network are kept."""
-    from sagesplat.segment.onnx import segment_onnx
-
-    assert config.model
-    assert config.classes
-    marker = job.run.masks / ".network.json"
-    if not marker.exists() or read_json(marker) != settings:
-        shutil.rmtree(job.run.masks, ignore_errors=True)
-        write_json(marker, settings)
-    segment_onnx(
-        job.scene, job.photos, config.model, config.classes, job.run.masks, threads=job.threads,
-        on_view=lambda done, total: job.emit(Progress("masks", done, total)),
-    )  # fmt: skip
-
-
-def lift_labels(job: Job, config: LiftConfig) -> None:
-    """Vote the label images onto the SfM points."""
-    run = job.run
-
-    def make() -> list[str]:
-        lifted = lift(job.scene, job.masks, votes=config.votes, views=set(job.scene.train_ids.tolist()))
-        lifted.write(run.labels)
-        return [f"{100 * lifted.agreement:.1f} % of the votes agree with the label of their point"]
-
-    labels = run.masks / "labels.json"
-    run_stage(job, "lift", asdict(config), [run.scene, run.provenance("masks"), labels], [run.labels], make)
+    run_stage(job, "poses", settings, [], [job.run.capture / "poses.json"], make)
 
 
 def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
@@ -207,7 +178,7 @@ def observe_levels(job: Job, config: FitConfig) -> None:
             f"{len(table):,} observations of {len(job.ladder.levels)} levels in {len(job.scene.views)} views"
         ]
 
-    inputs = [run.scene, run.labels, ladder_files(run)[0]]
+    inputs = [run.scene, run.labels, ladder_files(run)[0], *fusion(run)]
     settings = {"distance": config.distance, "masks": config.masks}
     run_stage(job, "observe", settings, inputs, [run.observations], make)
 
@@ -441,10 +412,9 @@ def make_report(job: Job) -> None:
         # the page leads with a target: what was composed for a budget is not what it is about
         within_budget = read_budget_plan(run.plan) is not None
         composed = compose(job, scene_plan(run, target)) if within_budget else read_ply(run.composed)
-        write_report(
-            run.report,
-            report_data(run, job.scene, job.photos, job.masks, job.ladder, composed, target, job.backend),
-        )
+        masks = job.best_masks
+        data = report_data(run, job.scene, job.photos, masks, job.ladder, composed, target, job.backend)
+        write_report(run.report, data)
         return []
 
     run_stage(

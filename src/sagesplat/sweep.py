@@ -198,16 +198,19 @@ def _share_training(runs: Path, earlier: Sequence[Cell], cell: Cell) -> None:
 
     def trained(of: Cell) -> tuple:
         c = of.config
-        return of.scene, c.scene, c.masks, c.lift, c.train, c.seed
+        return of.scene, c.scene, c.poses, c.masks, c.labels, c.lift, c.train, c.seed
 
     like = next((c for c in earlier if trained(c) == trained(cell)), None)
     new = RunDir(runs / cell.name)
     if like is None or new.path.exists() or not RunDir(runs / like.name).provenance("train").exists():
         return
     old = RunDir(runs / like.name)
-    for path in (old.masks, old.levels):  # links take no room; nothing in a run is changed in place
+    if old.capture.exists():  # it is named in there
+        return
+    # links take no room; nothing in a run is changed in place
+    for path in (old.segmented, old.masks, old.levels):
         shutil.copytree(path, new.path / path.name, copy_function=os.link)
-    stages = [old.provenance(stage) for stage in ("scene", "masks", "lift", "train")]
+    stages = [old.provenance(stage) for stage in ("scene", "segment", "masks", "lift", "train")]
     for path in (old.scene, old.labels, old.checkpoint, old.frozen, *stages):
         target = new.path / path.relative_to(old.path)
         target.parent.mkdir(exist_ok=True)

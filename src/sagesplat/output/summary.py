@@ -23,7 +23,10 @@ from sagesplat.scene.scene import Scene
 from sagesplat.segment.masks import UNLABELLED, Masks
 
 PANELS = 3  # views shown in pictures
-STAGES = ("scene", "masks", "lift", "train", "nest", "observe", "fit", "plan", "compose", "evaluate")
+STAGES = (
+    *("poses", "scene", "segment", "masks", "lift", "train", "fuse"),
+    *("nest", "observe", "fit", "plan", "compose", "evaluate"),
+)
 
 
 def report_data(

@@ -1,0 +1,212 @@
+"""The stages that label: label images of the views, labels of the points, and what all views agree on."""
+
+import shutil
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sagesplat.config import LabelsConfig, LiftConfig, MasksConfig
+from sagesplat.errors import RunError
+from sagesplat.events import Progress, Warned
+from sagesplat.files import read_json, write_json
+from sagesplat.job import Job, run_stage
+from sagesplat.run_dir import file_hash
+from sagesplat.segment.edit import Edited, edit_labels, parse_keep, parse_merge
+from sagesplat.segment.lift import agreement_in, lift
+from sagesplat.segment.masks import MAX_LABEL_ID, UNLABELLED, Masks, Taxonomy, import_masks
+from sagesplat.segment.segmenters import Segmenter, segment_views
+from sagesplat.segment.soft import read_soft, soft_path
+from sagesplat.train.fuse import Soft, fuse
+
+_SUFFIXES = {".onnx": "onnx", ".pth": "deeplabv2", ".pt": "deeplabv2", ".safetensors": "deeplabv2"}
+_MARKER = ".network.json"
+_EDIT = "edit.json"
+
+
+def make_masks(job: Job, config: MasksConfig, labels: LabelsConfig = LabelsConfig()) -> None:
+    """Bring label images into the run, given ones or a segmenter's; then merge and leave out categories."""
+    run, kind = job.run, _kind(job, config)
+    merge, keep = parse_merge(labels.merge), parse_keep(labels.keep)
+    if kind == "masks":
+        _import(job, config.masks or job.scene.path / "masks")
+    else:
+        _segment(job, config, kind)
+
+    def make() -> list[str]:
+        shutil.rmtree(run.masks, ignore_errors=True)
+        edited = edit_labels(
+            run.segmented, job.scene.views, run.masks, keep=keep, merge=merge, min_share=labels.min_share,
+            on_view=lambda done, total: job.emit(Progress("masks", done, total)),
+        )  # fmt: skip
+        write_json(run.masks / _EDIT, {**edited.record, "table": edited.table.tolist()})
+        job.__dict__.pop("taxonomy", None)  # of masks that are gone
+        return _lines(job, edited)
+
+    inputs = [run.provenance("segment"), run.segmented / "labels.json"]
+    run_stage(job, "masks", asdict(labels), inputs, [run.masks / "labels.json"], make)
+
+
+def _lines(job: Job, edited: Edited) -> list[str]:
+    lines = [f"{len(edited.taxonomy.names)} categories: {', '.join(edited.taxonomy.names.values())}"]
+    for what, gone in (("left out", edited.dropped), ("too small", edited.folded)):
+        named = ", ".join(f"{name} ({share:.1%})" for name, share in gone.items() if share)
+        if named:
+            lines.append(f"{what}: {named}")
+    return lines
+
+
+def _kind(job: Job, config: MasksConfig) -> str:
+    """The segmenter that was asked for, or follows from what there is."""
+    if config.segmenter != "auto":
+        return config.segmenter
+    if config.model:
+        return _SUFFIXES.get(Path(config.model).suffix, "hf")
+    if config.masks or (job.scene.path / "masks").is_dir():
+        return "masks"
+    return "hf"
+
+
+def _import(job: Job, source: Path) -> None:
+    """Bring ready label images into the run."""
+    run = job.run
+    settings = {"segmenter": "masks", "source": file_hash(source) if source.is_dir() else str(source)}
+
+    def make() -> list[str]:
+        shutil.rmtree(run.segmented, ignore_errors=True)
+        missing = import_masks(job.scene, source, run.segmented)
+        if missing:
+            names = ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
+            job.emit(Warned(f"{len(missing)} of {len(job.scene.views)} views have no label image: {names}"))
+        return []
+
+    run_stage(job, "segment", settings, [run.scene], [run.segmented / "labels.json"], make)
+
+
+def _segment(job: Job, config: MasksConfig, kind: str) -> None:
+    """Segment the photos; images of an interrupted attempt with the same network are kept."""
+    run = job.run
+    settings: dict[str, Any] = {"segmenter": kind, "soft": config.soft}
+    if kind == "hf":
+        settings["model"] = config.model
+    else:
+        for name, needed in (("model", True), ("classes", kind == "onnx")):
+            if needed:
+                settings[name] = file_hash(_file(kind, name, getattr(config, name)))
+    if kind == "deeplabv2":
+        settings |= {"head": config.head, "crf": config.crf}
+
+    def make() -> list[str]:
+        marker = run.segmented / _MARKER
+        if not marker.exists() or read_json(marker) != settings:
+            shutil.rmtree(run.segmented, ignore_errors=True)
+            shutil.rmtree(run.soft, ignore_errors=True)
+        segmenter = _load(job, config, kind)
+        write_json(marker, settings)
+        segment_views(
+            job.scene, job.photos, segmenter, run.segmented,
+            batch=config.batch, soft=run.soft if config.soft else None,
+            on_view=lambda done, total: job.emit(Progress("segment", done, total)),
+        )  # fmt: skip
+        return []
+
+    run_stage(job, "segment", settings, [run.scene], [run.segmented / "labels.json"], make)
+
+
+def _file(kind: str, name: str, given: str | Path | None) -> Path:
+    wanted = "--model NETWORK.onnx and --classes CLASSES.json" if kind == "onnx" else "--model CHECKPOINT.pth"
+    if given is None:
+        raise RunError(f"--segmenter {kind} needs {wanted}")
+    if not Path(given).is_file():
+        raise RunError(f"{given}: no such file; --segmenter {kind} needs {wanted}")
+    return Path(given)
+
+
+def _load(job: Job, config: MasksConfig, kind: str) -> Segmenter:
+    """The network, ready to be used."""
+    if kind == "hf":
+        from sagesplat.segment.hf import DEFAULT_MODEL, HfSegmenter
+
+        model = config.model or DEFAULT_MODEL
+        job.emit(Warned(f"network {model}; if it is not here yet, it is fetched from huggingface.co"))
+        segmenter = HfSegmenter(model, device=job.device, threads=job.threads)
+        if segmenter.note:
+            job.emit(Warned(segmenter.note))
+        return segmenter
+    model = Path(config.model or "")
+    if kind == "onnx":
+        from sagesplat.segment.onnx import OnnxSegmenter
+
+        assert config.classes
+        return OnnxSegmenter(model, config.classes, device=job.device, threads=job.threads)
+    from sagesplat.segment.deeplabv2 import DeepLabV2Segmenter, head_classes, load_deeplabv2
+
+    network = load_deeplabv2(model, head=config.head)
+    return DeepLabV2Segmenter(network, head_classes(config.head), crf=config.crf, device=job.device)
+
+
+def lift_labels(job: Job, config: LiftConfig) -> None:
+    """Vote the label images onto the SfM points."""
+    run = job.run
+
+    def make() -> list[str]:
+        if config.votes == "track" and not len(job.scene.points.track_points):
+            job.emit(Warned("the points have no tracks: all views that a point projects into vote"))
+        lifted = lift(job.scene, job.masks, votes=config.votes, views=set(job.scene.train_ids.tolist()))
+        lifted.write(run.labels)
+        return [f"{100 * lifted.agreement:.1f} % of the votes agree with the label of their point"]
+
+    labels = run.masks / "labels.json"
+    run_stage(job, "lift", asdict(config), [run.scene, run.provenance("masks"), labels], [run.labels], make)
+
+
+def fuse_masks(job: Job) -> None:
+    """Let the label images of all training views vote on the trained Gaussians, and draw the votes back.
+
+    With the probabilities of the network, where they were kept.
+    """
+    run = job.run
+    soft = _soft(job) if run.soft.is_dir() else None
+
+    def make() -> list[str]:
+        shutil.rmtree(run.fused, ignore_errors=True)
+        g = job.snapshots.load(job.snapshots.levels[-1])
+        fused = fuse(
+            g, job.scene, job.masks, run.fused, soft=soft, antialiased=job.antialiased, backend=job.backend,
+            on_view=lambda done, total: job.emit(Progress("fuse", done, total)),
+        )  # fmt: skip
+        before, after = (_agreement(job, masks) for masks in (job.masks, job.best_masks))
+        write_json(run.fused / "fused.json", {**fused.record, "agreement": [before, after]})
+        return [
+            f"{fused.changed.mean():.1%} of the pixels changed; views that had no vote agree with the points "
+            f"in {after:.1%} of what they see ({before:.1%} before)"
+        ]
+
+    inputs = [run.provenance("masks"), run.masks / "labels.json", run.levels]
+    run_stage(job, "fuse", {"soft": soft is not None}, inputs, [run.fused / "labels.json"], make)
+
+
+def _agreement(job: Job, masks: Masks) -> float:
+    """Share of what views without a vote show of the points that is the points' label; NaN without any."""
+    voters = set(job.scene.train_ids.tolist())
+    lifted = lift(job.scene, masks, views=voters)
+    others = set(range(len(job.scene.views))) - voters
+    return agreement_in(job.scene, masks, lifted.label_ids, others)
+
+
+def _soft(job: Job) -> Soft:
+    """The network's probabilities, of the categories that are left."""
+    before = Taxonomy.read(job.run.segmented / "labels.json")
+    edited = np.array(read_json(job.run.masks / _EDIT)["table"], np.int16)
+    table = np.full(MAX_LABEL_ID + 2, UNLABELLED, np.int16)  # what never was likeliest has no label
+    table[list(before.names)] = edited[list(before.names)]
+
+    def soft(row: int) -> tuple[np.ndarray, np.ndarray]:
+        ids, p = read_soft(soft_path(job.run.soft, job.scene.views[row]))
+        ids = table[ids]
+        left = np.unique(ids[ids != UNLABELLED])
+        planes = [np.where(ids == label, p, 0).sum(0) for label in left]
+        return left, np.array(planes, np.float32).reshape(len(left), *ids.shape[1:])
+
+    return soft

@@ -1,0 +1,189 @@
+"""Photos made ready for COLMAP: upright, 8-bit RGB, JPEG or PNG, under names without surprises."""
+
+import hashlib
+import os
+import re
+import shutil
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from PIL import Image, ImageOps
+
+from sagesplat.files import atomic_path
+from sagesplat.scene.images import _rgb
+
+SUFFIXES = frozenset((".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".heic", ".heif"))
+_ORIENTATION, _MAKER, _MODEL, _DETAILS, _FOCAL, _FOCAL_35 = 0x0112, 0x010F, 0x0110, 0x8769, 0x920A, 0xA405
+
+
+@dataclass(frozen=True)
+class PreparedPhoto:
+    """A photo made ready for COLMAP."""
+
+    name: str  # path below the source
+    prepared: str  # file in sfm/photos
+    final: str  # path below images/
+    camera: tuple[Any, ...]  # size, maker, model and focal lengths: photos that agree share a camera
+    state: tuple[int, int]  # bytes and time of the source
+
+
+def prepare_photos(
+    source: Path, target: Path, skipped: Path, on_photo: Callable[[int, int], None]
+) -> tuple[list[PreparedPhoto], dict[str, str]]:
+    """Bring the photos below `source` upright and to 8-bit RGB in `target`; also the unreadable, and why.
+
+    Photos below the folder `skipped` are left out. A photo that needs no change is hard-linked; one that is
+    prepared already is kept; files in `target` that belong to no photo are removed.
+    """
+    paths = _list(source, skipped)
+    target.mkdir(parents=True, exist_ok=True)
+    _register_heif()
+    photos: list[PreparedPhoto] = []
+    unreadable: dict[str, str] = {}
+    taken: set[str] = set()
+    for i, path in enumerate(paths):
+        on_photo(i, len(paths))
+        name = _clean(path.relative_to(source).as_posix())
+        key = hashlib.sha256(os.fsencode(path.relative_to(source))).hexdigest()[:16]
+        try:
+            prepared, camera, state = _prepare_photo(path, target, key)
+        except _Unreadable as error:
+            unreadable[name] = f"unreadable: {error}"
+        else:
+            final = _free(name, prepared.suffix, taken)
+            photos.append(PreparedPhoto(name, prepared.name, final, camera, state))
+    on_photo(len(paths), len(paths))
+    for old in {p.name for p in target.iterdir()} - {photo.prepared for photo in photos}:
+        (target / old).unlink()
+    return photos, unreadable
+
+
+def _list(source: Path, skipped: Path) -> list[Path]:
+    """Photos below a folder in the order of their names and numbers, hidden ones left out."""
+    skipped = skipped.resolve()
+    anywhere = not source.resolve().is_relative_to(skipped)
+    found = []
+    for path in source.rglob("*"):
+        hidden = any(part.startswith(".") for part in path.relative_to(source).parts)
+        if path.suffix.lower() not in SUFFIXES or hidden or not path.is_file():
+            continue
+        if not (anywhere and path.resolve().is_relative_to(skipped)):
+            found.append(path)
+    return sorted(found, key=_by_number)
+
+
+def _by_number(path: Path) -> list[tuple[int, str]]:
+    """Orders photo_2 before photo_10."""
+    parts = re.split(r"([0-9]+)", path.as_posix())
+    return [(int(part), "") if i % 2 else (-1, part) for i, part in enumerate(parts)]
+
+
+def _clean(name: str) -> str:
+    """A name that every file format can hold."""
+    return re.sub(r"[\x00-\x1f\x7f\ud800-\udfff]", "_", name)
+
+
+def _free(name: str, suffix: str, taken: set[str]) -> str:
+    """The name with `suffix`, its stem made unique: label images are named by stems."""
+    stem, _, old = name.rpartition(".")
+    fits = old.lower() in (("png",) if suffix == ".png" else ("jpg", "jpeg"))
+    if stem.casefold() in taken:
+        stem = f"{stem}_{old.lower()}"
+    while stem.casefold() in taken:
+        stem += "_"
+    taken.add(stem.casefold())
+    return f"{stem}.{old}" if fits else stem + suffix
+
+
+class _Unreadable(Exception):
+    """A photo that cannot be decoded."""
+
+
+def _prepare_photo(path: Path, folder: Path, key: str) -> tuple[Path, tuple[Any, ...], tuple[int, int]]:
+    """One photo as 8-bit upright RGB: hard-linked where it is so already. Raises _Unreadable."""
+    changed = None
+    try:
+        with warnings.catch_warnings(), Image.open(path) as image:
+            warnings.simplefilter("ignore")  # of large photos and odd EXIF
+            stat, exif = path.stat(), _exif(image)
+            target = folder / (key + (".png" if image.format in ("PNG", "TIFF", "BMP") else ".jpg"))
+            camera = _camera(image.size, exif)
+            done = target.is_file() and target.stat().st_mtime_ns == stat.st_mtime_ns
+            if not done:
+                changed = _changed(path, image, exif)
+    except Exception as error:  # Pillow raises errors of many kinds for damaged files
+        raise _Unreadable(" ".join(str(error).split()) or type(error).__name__) from None
+    if changed is not None:
+        with atomic_path(target) as temporary:
+            _save(changed, exif, temporary)
+            os.utime(temporary, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+    elif not done:
+        _link(path.resolve(), target)
+    return target, camera, (stat.st_size, stat.st_mtime_ns)
+
+
+def _exif(image: Image.Image) -> Image.Exif:
+    """The photo's EXIF; empty where it is damaged."""
+    try:
+        exif = image.getexif()
+        exif.get_ifd(_DETAILS)
+        return exif
+    except Exception:  # as damaged files
+        return Image.Exif()
+
+
+def _changed(path: Path, image: Image.Image, exif: Image.Exif) -> Image.Image | None:
+    """The photo as 8-bit upright RGB, or None where the file is that already; decodes it in both cases."""
+    turned = exif.get(_ORIENTATION, 1) in range(2, 9)
+    as_is = image.format in ("JPEG", "MPO", "PNG") and image.mode == "RGB" and not turned
+    if as_is and image.format == "PNG":
+        with path.open("rb") as file:
+            as_is = file.read(25)[24] == 8 and not image.has_transparency_data  # Pillow reads 16 bits as 8
+    if as_is:
+        image.draft("RGB", (image.width // 8, image.height // 8))  # finds damage at an eighth of the size
+        image.load()
+        return None
+    return _rgb(ImageOps.exif_transpose(image) if turned else image, (0, 0, 0))
+
+
+def _save(image: Image.Image, exif: Image.Exif, path: Path) -> None:
+    """Write a photo with the EXIF that COLMAP takes the focal length from."""
+    kept, details = Image.Exif(), exif.get_ifd(_DETAILS)
+    kept.update({tag: exif[tag] for tag in (_MAKER, _MODEL) if tag in exif})
+    kept.get_ifd(_DETAILS).update({tag: details[tag] for tag in (_FOCAL, _FOCAL_35) if tag in details})
+    try:
+        content = kept.tobytes()
+    except Exception:  # values that Pillow reads but cannot write
+        content = b""
+    lossy = path.suffix == ".jpg"
+    image.info.clear()
+    image.save(path, exif=content, quality=97 if lossy else -1, subsampling=0 if lossy else -1)
+
+
+def _link(path: Path, target: Path) -> None:
+    """A hard link, or a copy where the file system has none."""
+    target.unlink(missing_ok=True)
+    try:
+        os.link(path, target)
+    except OSError:
+        with atomic_path(target) as temporary:
+            shutil.copy2(path, temporary)
+
+
+def _camera(size: tuple[int, int], exif: Image.Exif) -> tuple[Any, ...]:
+    """What tells photos of one camera at one zoom: upright size, maker, model, focal lengths."""
+    details = exif.get_ifd(_DETAILS)
+    focal = [str(details.get(tag, "")) for tag in (_FOCAL, _FOCAL_35)]  # in mm, and as of 35 mm film
+    upright = size[::-1] if exif.get(_ORIENTATION, 1) in range(5, 9) else size
+    return (*upright, str(exif.get(_MAKER, "")), str(exif.get(_MODEL, "")), *focal)
+
+
+def _register_heif() -> None:
+    try:
+        import pi_heif
+    except ImportError:
+        return  # such photos are listed as unreadable
+    pi_heif.register_heif_opener()

@@ -1,0 +1,251 @@
+"""Camera poses from photos or a video: structure from motion by COLMAP (Schönberger and Frahm 2016)."""
+
+import importlib.util
+import json
+import math
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from sagesplat.config import PosesConfig
+from sagesplat.errors import BackendUnavailable, SceneError
+from sagesplat.files import read_json, write_json
+from sagesplat.scene._prepare import SUFFIXES, PreparedPhoto, prepare_photos
+from sagesplat.scene.video import extract_frames
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """What became of the photos; also in poses.json."""
+
+    workspace: Path
+    num_photos: int  # readable ones
+    num_registered: int
+    unregistered: dict[str, str]  # photo -> reason
+    num_points: int
+    reprojection_error: float  # mean, pixels
+    seconds: dict[str, float]  # by stage, of the last run
+
+
+OnProgress = Callable[[str, int, int], None]  # stage, done, total
+
+MIN_PHOTOS = 3  # the least that a scene is made of
+MANY_PHOTOS = 250  # from here on exhaustive matching takes too long
+_SCRIPT = Path(__file__).with_name("_sfm.py")
+_OWN = ("images", "sparse", "sfm")  # folders of the workspace
+
+
+def reconstruct(
+    source: Path,
+    workspace: Path,
+    config: PosesConfig = PosesConfig(),
+    on_progress: OnProgress = lambda stage, done, total: None,
+) -> Reconstruction:
+    """Find the poses of a folder of photos or of a video; make `workspace` a capture for `load_scene`.
+
+    Writes undistorted photos to images/, their model to sparse/0, with gravity along +y, and poses.json.
+    Work in progress is kept in sfm/: a killed run goes on where it was, unless photos or settings differ.
+    Stages of `on_progress` are prepare, features, matches, mapping and undistortion. Raises SceneError,
+    BackendUnavailable without pycolmap.
+    """
+    _check(source, workspace, config)
+    work, started = workspace / "sfm", time.perf_counter()
+    folder = source
+    if source.is_file():
+        folder = work / "frames"
+        extract_frames(
+            source, folder, max_frames=config.max_frames, on_frame=lambda i, n: on_progress("prepare", i, n)
+        )
+    photos, unreadable = prepare_photos(
+        folder, work / "photos", workspace, lambda i, n: on_progress("prepare", i, n)
+    )
+    if len(photos) < MIN_PHOTOS:
+        raise SceneError(_too_few(source, photos, unreadable))
+    request = _request(source, photos, config)
+    finished = _resume(workspace, request)
+    if finished and not (unreadable.keys() - finished.unregistered.keys()):
+        return finished
+    least = max(MIN_PHOTOS, math.ceil(config.min_registered * len(photos)))
+    write_json(work / "request.json", request | {"min_photos": least, "threads": config.threads})
+    seconds = {"prepare": round(time.perf_counter() - started, 2)}
+    result = _run(work, on_progress)
+    names = {photo.prepared: photo.name for photo in photos}
+    reasons = {names[prepared]: reason for prepared, reason in result["reasons"].items()}
+    found = Reconstruction(
+        workspace=workspace,
+        num_photos=len(photos),
+        num_registered=len(result["registered"]),
+        unregistered=reasons | unreadable,
+        num_points=result["num_points"],
+        reprojection_error=result["reprojection_error"],
+        seconds=seconds | result["seconds"],
+    )
+    complete = found.num_registered >= least
+    if complete:
+        _publish(workspace)
+    renamed = {photo.name: photo.final for photo in photos if photo.name != photo.final}
+    resolved = {"matching": request["matching"], "cameras": len(request["cameras"])}
+    report = asdict(found) | {"workspace": str(workspace)}
+    write_json(
+        workspace / "poses.json",
+        {"complete": complete, "settings": asdict(config), "resolved": resolved}
+        | report
+        | {"renamed": renamed},
+    )
+    if not complete:
+        share = found.num_registered / found.num_photos
+        raise SceneError(
+            f"{source}: poses found for {found.num_registered} of {found.num_photos} photos ({share:.0%}; "
+            f"{least} are needed); take photos with more overlap and texture, or try another matching, "
+            f"another camera, a larger max_size; reasons in {workspace / 'poses.json'}"
+        )
+    return found
+
+
+def _check(source: Path, workspace: Path, config: PosesConfig) -> None:
+    """What can be said before any work is done."""
+    if importlib.util.find_spec("pycolmap") is None:
+        raise BackendUnavailable("poses from photos need pycolmap; pip install 'sagesplat[poses]'")
+    if not source.exists():
+        raise SceneError(f"{source}: no such file or folder; name a folder of photos or a video")
+    if config.model not in _MODELS:
+        raise SceneError(f"{config.model}: no camera model of COLMAP; take one of {', '.join(_MODELS)}")
+    if config.max_size < 64 or not 0 <= config.min_registered <= 1:
+        raise SceneError(
+            f"max_size {config.max_size} and min_registered {config.min_registered} cannot be used; "
+            "take max_size >= 64 and min_registered between 0 and 1"
+        )
+    if config.threads < 1 and config.threads != -1:
+        raise SceneError(f"threads {config.threads} cannot be used; take 1 or more, or -1 for all cores")
+    inside, outside = source.resolve(), workspace.resolve()
+    if inside == outside or any(inside.is_relative_to(outside / name) for name in _OWN):
+        raise SceneError(f"{source}: lies where the poses would be written; name another folder for them")
+    if workspace.exists() and not workspace.is_dir():
+        raise SceneError(f"{workspace}: is no folder; name one")
+    if not (workspace / "sfm").is_dir() and any((workspace / name).exists() for name in _OWN):
+        raise SceneError(f"{workspace}: already holds a capture; name an empty folder")
+
+
+# Models whose photos COLMAP undistorts to a pinhole.
+_MODELS = (
+    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"),
+    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE"),
+)
+
+
+def _too_few(source: Path, photos: list[PreparedPhoto], unreadable: dict[str, str]) -> str:
+    found = f"{source}: {len(photos)} readable photos, but it takes {MIN_PHOTOS}"
+    if unreadable:
+        name, reason = next(iter(unreadable.items()))
+        return f"{found} ({name} {reason}{', ...' if len(unreadable) > 1 else ''}); replace the damaged files"
+    if photos and source.is_file():
+        return f"{found} frames that differ; move the camera, or take a longer video"
+    kinds = ", ".join(sorted(suffix[1:] for suffix in SUFFIXES))
+    return f"{found}; add overlapping photos ({kinds}) or name a video"
+
+
+def _request(source: Path, photos: list[PreparedPhoto], config: PosesConfig) -> dict[str, Any]:
+    """What _sfm.py is asked for; results are kept while it stays the same."""
+    matching = config.matching
+    if matching == "auto":
+        matching = "sequential" if source.is_file() or len(photos) > MANY_PHOTOS else "exhaustive"
+    key: Callable[[PreparedPhoto], Any] = {
+        "auto": lambda photo: photo.camera,
+        "single": lambda photo: None,
+        "per-folder": lambda photo: photo.name.rpartition("/")[0],
+        "per-image": lambda photo: photo.prepared,
+    }[config.camera]
+    cameras: dict[Any, list[PreparedPhoto]] = {}
+    for photo in photos:
+        cameras.setdefault(key(photo), []).append(photo)
+    for group in cameras.values():
+        if len(sizes := sorted({photo.camera[:2] for photo in group})) > 1:
+            (w, h), (w2, h2) = sizes[:2]
+            raise SceneError(
+                f"{source}: photos of {w} x {h} and {w2} x {h2} pixels cannot share a camera; "
+                "take camera auto or per-image"
+            )
+    return {
+        "order": [photo.prepared for photo in photos],
+        "names": {photo.prepared: photo.final for photo in photos},
+        "states": [photo.state for photo in photos],
+        "cameras": [[photo.prepared for photo in group] for group in cameras.values()],
+        "matching": matching,
+        "model": config.model,
+        "refine_principal_point": config.refine_principal_point,
+        "max_size": config.max_size,
+        "device": config.device,
+        "seed": config.seed,
+    }
+
+
+def _resume(workspace: Path, request: dict[str, Any]) -> Reconstruction | None:
+    """The finished result of the same request; work of another one is removed."""
+    work, report = workspace / "sfm", workspace / "poses.json"
+    request = json.loads(json.dumps(request))
+    path = work / "request.json"
+    old = read_json(path) if path.is_file() else {}
+    if {k: v for k, v in old.items() if k not in ("min_photos", "threads")} != request:
+        for name in ("database.db", "database.db-wal", "database.db-shm", "models.json", "seconds.json"):
+            (work / name).unlink(missing_ok=True)
+        report.unlink(missing_ok=True)
+        return None
+    if not (report.is_file() and (workspace / "sparse" / "0").is_dir()):
+        return None
+    content = read_json(report)
+    if not content["complete"]:
+        return None
+    fields: dict[str, Any] = {name: content[name] for name in Reconstruction.__dataclass_fields__}
+    fields["workspace"] = workspace
+    return Reconstruction(**fields)
+
+
+def _run(work: Path, on_progress: OnProgress) -> dict[str, Any]:
+    """Run _sfm.py on sfm/request.json in a process that ends with this one."""
+    log = work / "log.txt"
+    # By its path and not as a module: importing the package around it would import Pillow.
+    command = [sys.executable, "-P", str(_SCRIPT), str(work)]
+    answer: dict[str, Any] = {}
+    with (
+        log.open("w", encoding="utf-8") as stderr,
+        subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=stderr, encoding="utf-8"
+        ) as child,
+    ):
+        try:
+            assert child.stdout is not None
+            for line in child.stdout:
+                answer = json.loads(line)
+                if "stage" in answer:
+                    on_progress(answer["stage"], answer["done"], answer["total"])
+            code = child.wait()
+        finally:
+            child.kill()
+    if "unavailable" in answer:
+        raise BackendUnavailable(answer["unavailable"])
+    if code == 0 and "result" in answer:
+        return answer["result"]
+    raise SceneError(f"{work.parent}: COLMAP {_ending(code, log)}; see {log}; run again to go on")
+
+
+def _ending(code: int, log: Path) -> str:
+    if code == -signal.SIGKILL:
+        return "was killed (often for lack of memory: take a smaller max_size)"
+    if code < 0:
+        return f"crashed ({signal.Signals(-code).name})"
+    lines = log.read_text(encoding="utf-8", errors="replace").split("\n")
+    return f"failed ({next((line for line in reversed(lines) if line.strip()), 'no message')})"
+
+
+def _publish(workspace: Path) -> None:
+    """Move undistorted photos and their model to their places."""
+    for name in ("images", "sparse"):
+        shutil.rmtree(workspace / name, ignore_errors=True)
+        (workspace / "sfm" / "undistorted" / name).rename(workspace / name)
+    shutil.rmtree(workspace / "sfm" / "undistorted")

@@ -1,0 +1,162 @@
+"""Frames of a video: evenly spread, the sharpest of each stretch, none twice."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+from PIL import Image
+
+from sagesplat.errors import BackendUnavailable, SceneError
+from sagesplat.files import atomic_path, read_json, write_json
+
+SUFFIXES = frozenset(
+    (".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".mts", ".m2ts", ".mpg", ".mpeg", ".3gp")
+)
+_GREY_WIDTH = 640  # of the copies that sharpness is measured on
+_THUMB_WIDTH = 64  # of the copies that are compared
+_SAME = 1.0  # mean absolute difference in grey levels below which the camera stood still
+_TURNS = {90: Image.Transpose.ROTATE_90, 180: Image.Transpose.ROTATE_180, 270: Image.Transpose.ROTATE_270}
+
+
+def extract_frames(
+    path: Path,
+    folder: Path,
+    *,
+    max_frames: int = 300,
+    on_frame: Callable[[int, int], None] | None = None,
+) -> list[Path]:
+    """Write the frames of a video that are worth matching, as upright JPEGs named by frame number.
+
+    The video is cut into at most `max_frames` stretches of equal length, of at least three frames each where
+    it is long enough. Of each the sharpest frame is taken (largest variance of the Laplacian: Pech-Pacheco
+    et al. 2000), unless the camera has not moved since the one before. A folder that was filled from the same
+    file is left as it is. `on_frame(done, total)` counts decoded frames. Raises SceneError for a file that
+    cannot be used, BackendUnavailable without PyAV.
+    """
+    try:
+        from av.error import FFmpegError
+    except ImportError:
+        raise BackendUnavailable("frames of a video need PyAV; pip install 'sagesplat[video]'") from None
+    if max_frames < 1:
+        raise SceneError(f"{path}: max_frames {max_frames} leaves nothing; take 1 or more")
+    if not path.is_file():
+        raise SceneError(f"{path}: no such file; name a video")
+    stat = path.stat()
+    source = {"size": stat.st_size, "mtime_ns": stat.st_mtime_ns, "max_frames": max_frames}
+    if (kept := _finished(folder, source)) is not None:
+        return kept
+    folder.mkdir(parents=True, exist_ok=True)
+    for old in folder.glob("frame_*.jpg"):
+        old.unlink()
+    try:
+        paths = [_write(frame, folder, i) for i, frame in _moving(_sharpest(path, max_frames, on_frame))]
+    except (FFmpegError, ValueError) as error:
+        raise SceneError(
+            f"{path}: not readable as a video ({error.args[-1] if error.args else error}); convert it to MP4"
+        ) from None
+    if not paths:
+        raise SceneError(f"{path}: no frame can be decoded; copy or convert the video again")
+    write_json(folder / "video.json", source | {"frames": [p.name for p in paths]})
+    return paths
+
+
+def _finished(folder: Path, source: dict[str, int]) -> list[Path] | None:
+    """The frames of an earlier run on the same file, if it came to its end and all are there."""
+    if not (folder / "video.json").is_file():
+        return None
+    listed = read_json(folder / "video.json")
+    paths = [folder / name for name in listed.pop("frames", [])]
+    return paths if listed == source and all(p.is_file() for p in paths) else None
+
+
+def _sharpest(
+    path: Path, max_frames: int, on_frame: Callable[[int, int], None] | None
+) -> Iterator[tuple[int, Any, UInt8[np.ndarray, "h w"]]]:
+    """Number, frame and grey copy of the sharpest frame in each stretch."""
+    total = _count(path)
+    windows = max(1, min(max_frames, max(total // 3, min(total, 60))))
+    best: tuple[int, Any, np.ndarray] | None = None
+    best_window, best_score = 0, -1.0
+    for i, frame in enumerate(_decode(path)):
+        window = min(i * windows // max(total, 1), windows - 1)
+        if best is not None and window != best_window:
+            yield best
+            best_score = -1.0
+        grey = _grey(frame)
+        if (score := sharpness(grey)) > best_score:
+            best, best_window, best_score = (i, frame, grey), window, score
+        if on_frame is not None:
+            on_frame(min(i + 1, total), total)
+    if best is not None:
+        yield best
+
+
+def _moving(frames: Iterator[tuple[int, Any, UInt8[np.ndarray, "h w"]]]) -> Iterator[tuple[int, Any]]:
+    """Leave out frames that look like the one kept before them."""
+    last: np.ndarray | None = None
+    for i, frame, grey in frames:
+        thumb = _thumb(grey)
+        if last is None or thumb.shape != last.shape or np.abs(thumb - last).mean() >= _SAME:
+            last = thumb
+            yield i, frame
+
+
+def _count(path: Path) -> int:
+    """Frames in the file by its packets: what headers say is often missing or wrong."""
+    import av
+
+    with av.open(str(path)) as container:
+        if not container.streams.video:
+            raise SceneError(f"{path}: holds no video stream; name a video or a folder of photos")
+        return sum(1 for packet in container.demux(container.streams.video[0]) if packet.size)
+
+
+def _decode(path: Path) -> Iterator[Any]:
+    """The frames that can be decoded; damaged packets are passed over."""
+    import av
+    from av.error import InvalidDataError
+
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        stream.thread_type = "AUTO"
+        for packet in container.demux(stream):
+            try:
+                frames = packet.decode()
+            except InvalidDataError:
+                continue
+            yield from frames
+
+
+def _grey(frame: Any) -> UInt8[np.ndarray, "h w"]:
+    width = min(frame.width, _GREY_WIDTH)
+    height = max(round(frame.height * width / frame.width), 1)
+    return frame.reformat(width=width, height=height, format="gray").to_ndarray()
+
+
+def sharpness(grey: UInt8[np.ndarray, "h w"]) -> float:
+    """Variance of the Laplacian, grey levels squared; 0 for images under 3 x 3 pixels."""
+    if min(grey.shape) < 3:
+        return 0.0
+    g = grey.astype(np.float32)
+    return float((g[:-2, 1:-1] + g[2:, 1:-1] + g[1:-1, :-2] + g[1:-1, 2:] - 4 * g[1:-1, 1:-1]).var())
+
+
+def _thumb(grey: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "y x"]:
+    """Means of square blocks, so that noise does not count as motion."""
+    block = max(min(grey.shape[1] // _THUMB_WIDTH, *grey.shape), 1)
+    h, w = (n // block * block for n in grey.shape)
+    blocks = grey[:h, :w].reshape(h // block, block, w // block, block)
+    return blocks.mean(axis=(1, 3), dtype=np.float32)
+
+
+def _write(frame: Any, folder: Path, index: int) -> Path:
+    """One frame as an upright JPEG. The rotation in the file's metadata counts anticlockwise."""
+    image = frame.to_image()
+    if (turn := _TURNS.get(round(frame.rotation) % 360)) is not None:
+        image = image.transpose(turn)
+    path = folder / f"frame_{index:06d}.jpg"
+    with atomic_path(path) as temporary:
+        image.save(temporary, format="JPEG", quality=95, subsampling=0)
+    return path

@@ -1,0 +1,251 @@
+"""View-consistent label images: all views vote on the Gaussians, which are drawn back into each view."""
+
+from collections.abc import Callable, Collection
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, Int16
+from PIL import Image
+from scipy.ndimage import binary_opening
+
+from sagesplat.errors import LabelError
+from sagesplat.gaussians import Gaussians
+from sagesplat.raster import Backend, Workspace, add_weights, device_of, rasterize
+from sagesplat.scene.scene import Camera, Scene
+from sagesplat.segment.masks import (
+    UNLABELLED,
+    Masks,
+    prepare_folder,
+    write_labels,
+    write_mask,
+)
+
+Soft = Callable[[int], tuple[Int16[np.ndarray, " K"], Float32[np.ndarray, "K h w"]]]
+"""Row of Scene.views -> category ids (-1 = none; repeated ones add up), probabilities at any resolution."""
+
+THIN_RADIUS = 3  # px; what an opening by a disc of this radius removes is thin
+
+
+@dataclass(frozen=True)
+class FuseOptions:
+    """When the other views overrule a view."""
+
+    weight: float = 2.0  # exponent of the fused probabilities beside the view's own
+    confidence: float = 0.9  # probability of a hard label; any other category has the rest
+    min_share: float = 0.5  # of a pixel: what the voters have to cover of it, and the winner of their votes
+    keep_thin: float = 3.0  # exponent of the view's own probabilities at thin parts; 1 = as elsewhere
+
+
+@dataclass(frozen=True, eq=False)
+class Votes:
+    """What each Gaussian is, by all views that it paints."""
+
+    ids: Int16[np.ndarray, " C"]  # category ids in rising order, the first one -1
+    shares: Float32[
+        np.ndarray, "N C"
+    ]  # of each category in the votes; rows sum to 1, or 0 where no view voted
+
+
+@dataclass(frozen=True, eq=False)
+class Fused:
+    """What fusion did to a folder of masks."""
+
+    changed: Float32[np.ndarray, " V"]  # share of each view's pixels that have another label
+    record: dict[str, Any]  # options and result as plain values, for provenance
+
+
+def gather(
+    gaussians: Gaussians,
+    scene: Scene,
+    masks: Masks,
+    views: Collection[int],
+    *,
+    soft: Soft | None = None,
+    antialiased: bool = False,
+    on_view: Callable[[int], None] | None = None,
+) -> Votes:
+    """Let the pixels of `views` (rows of `Scene.views`) vote on the Gaussians that paint them.
+
+    A pixel's vote is its category in `masks`, or its distribution with `soft`, times the blending weight
+    (alpha times transmittance) of the Gaussian. Unlabelled is a candidate too, but views without any label
+    do not vote. `on_view(done)` is called after each view.
+    """
+    ids = np.array([UNLABELLED, *sorted(masks.taxonomy.names)], np.int16)
+    votes, workspace = np.zeros((len(gaussians), len(ids)), np.float32), Workspace()
+    for done, row in enumerate(views):
+        camera, label_ids = scene.views[row].camera, masks[scene.views[row]]
+        if (label_ids != UNLABELLED).any():
+            if soft is None:
+                columns = np.searchsorted(ids, label_ids)
+                add_weights(gaussians, camera, columns, votes, antialiased=antialiased, workspace=workspace)
+            else:
+                pixels = soft_pixels(soft, row, camera, ids)
+                _add_soft(gaussians, camera, pixels, votes, antialiased, workspace)
+        if on_view:
+            on_view(done + 1)
+    total = votes.sum(1, keepdims=True)
+    return Votes(ids, np.divide(votes, total, out=np.zeros_like(votes), where=total > 0))
+
+
+def soft_pixels(
+    soft: Soft, row: int, camera: Camera, ids: Int16[np.ndarray, " C"]
+) -> Float32[np.ndarray, "C H W"]:
+    """A view's distribution over `ids` at its own size (bilinear); the first id, -1, has what others leave.
+
+    LabelError for probabilities that are none.
+    """
+    given, probabilities = soft(row)
+    if probabilities.ndim != 3 or len(given) != len(probabilities):
+        raise LabelError(
+            f"soft labels of shape {probabilities.shape} for {len(given)} categories; give one plane for each"
+        )
+    if not (probabilities >= 0).all() or not np.isfinite(probabilities).all():
+        raise LabelError(f"soft labels of view {row} hold NaN, Inf or less than 0; give probabilities")
+    planes = np.zeros((len(ids), camera.height, camera.width), np.float32)
+    column_of = {int(label_id): column for column, label_id in enumerate(ids)}
+    for label_id, plane in zip(given.tolist(), probabilities, strict=True):
+        if column := column_of.get(label_id):  # neither unknown nor -1
+            planes[column] += _resized(plane, camera)
+    total = planes.sum(0)
+    planes /= np.maximum(total, 1)
+    planes[0] = np.maximum(1 - total, 0)
+    return planes
+
+
+def draw(
+    gaussians: Gaussians,
+    camera: Camera,
+    votes: Votes,
+    *,
+    antialiased: bool = False,
+    backend: Backend = "auto",
+    workspace: Workspace | None = None,
+) -> Float32[np.ndarray, "C H W"]:
+    """The votes on the Gaussians alpha-blended into a camera; the sum over C is what voters cover."""
+    g = gaussians.to(device_of(backend))
+    features = torch.from_numpy(votes.shares).to(g.means.device)
+    with torch.no_grad():
+        render = rasterize(
+            g, camera, sh_degree=0, features=features, antialiased=antialiased, backend=backend,
+            workspace=workspace,
+        )  # fmt: skip
+    assert render.features is not None
+    return np.moveaxis(render.features.float().cpu().numpy(), 2, 0)
+
+
+def refine(
+    label_ids: Int16[np.ndarray, "H W"],
+    drawn: Float32[np.ndarray, "C H W"],
+    ids: Int16[np.ndarray, " C"],
+    options: FuseOptions,
+    own: Float32[np.ndarray, "C H W"] | None = None,
+) -> Int16[np.ndarray, "H W"]:
+    """A view's label image with the votes of all views (`drawn`, see `draw`) taken into account.
+
+    A product of experts: the category with the largest log p_view + weight * log p_fused wins. p_view is
+    `own` (see `soft_pixels`) or comes from the label. A pixel keeps its label where voters cover less than
+    `min_share` of it or where the winner has less than that of their votes. An unlabelled pixel prefers no
+    category; no label is taken away.
+    """
+    covered = drawn.sum(0)
+    fused = drawn / np.maximum(covered, 1e-6)
+    tiny = 1 - options.confidence
+    if own is None:
+        own = np.where(label_ids == ids[:, None, None], options.confidence, tiny).astype(np.float32)
+    trust = np.where(thin_parts(label_ids), options.keep_thin, 1).astype(np.float32)
+    trust[label_ids == UNLABELLED] = 0
+    score = trust * np.log(np.maximum(own[1:], tiny / len(ids)))
+    score += options.weight * np.log(np.maximum(fused[1:], tiny / len(ids)))
+    best = score.argmax(0) + 1
+    share = np.take_along_axis(fused, best[None], 0)[0]
+    clear = (covered >= options.min_share) & (share >= options.min_share)
+    return np.where(clear, ids[best], label_ids)
+
+
+def thin_parts(label_ids: Int16[np.ndarray, "H W"], radius: int = THIN_RADIUS) -> Bool[np.ndarray, "H W"]:
+    """Pixels that an opening of their category by a disc removes: poles, legs, twigs."""
+    y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1]
+    disc = x**2 + y**2 <= radius**2
+    thin = np.zeros(label_ids.shape, bool)
+    for label_id in np.unique(label_ids[label_ids != UNLABELLED]):
+        mask = np.pad(label_ids == label_id, 2 * radius, mode="edge")  # nothing is thin by the image's border
+        inner = (slice(2 * radius, -2 * radius),) * 2
+        thin |= (mask & np.logical_not(binary_opening(mask, disc)))[inner]
+    return thin
+
+
+def fuse(
+    gaussians: Gaussians,
+    scene: Scene,
+    masks: Masks,
+    target: Path,
+    *,
+    views: Collection[int] | None = None,
+    soft: Soft | None = None,
+    options: FuseOptions | None = None,
+    antialiased: bool = False,
+    backend: Backend = "auto",
+    on_view: Callable[[int, int], None] | None = None,
+) -> Fused:
+    """Write a normalised folder of masks that agree better between views than `masks`.
+
+    `views` vote (default: the training views), all views are written. `soft`: class probabilities beside the
+    hard labels. `on_view(done, total)`: a view has voted or is written. LabelError where `target` is the
+    folder of the masks themselves, or for probabilities that are none.
+    """
+    options = options or FuseOptions()
+    voters: Collection[int] = scene.train_ids.tolist() if views is None else views
+    if target.resolve() == masks.folder.resolve():
+        raise LabelError(f"{target}: these are the masks themselves; name another folder for the fused ones")
+    total = len(voters) + len(scene.views)
+
+    def report(done: int) -> None:
+        if on_view:
+            on_view(done, total)
+
+    g = gaussians.detach().to(device_of(backend))
+    votes = gather(g, scene, masks, voters, soft=soft, antialiased=antialiased, on_view=report)
+    paths, workspace = prepare_folder(target, scene.views), Workspace()
+    occurring: set[int] = set()
+    changed: list[float] = []
+    for row, (view, path) in enumerate(zip(scene.views, paths, strict=True)):
+        before = masks[view]
+        drawn = draw(g, view.camera, votes, antialiased=antialiased, backend=backend, workspace=workspace)
+        own = None if soft is None else soft_pixels(soft, row, view.camera, votes.ids)
+        after = refine(before, drawn, votes.ids, options, own)
+        write_mask(path, after, masks.taxonomy)
+        occurring.update(np.unique(after).tolist())
+        changed.append(float((after != before).mean()))
+        report(len(voters) + row + 1)
+    write_labels(target, masks.taxonomy, occurring)
+    record = {**asdict(options), "soft": soft is not None, "changed": float(np.mean(changed))}
+    return Fused(np.array(changed, np.float32), record)
+
+
+def _add_soft(
+    gaussians: Gaussians,
+    camera: Camera,
+    pixels: Float32[np.ndarray, "C H W"],
+    votes: Float32[np.ndarray, "N C"],
+    antialiased: bool,
+    workspace: Workspace,
+) -> None:
+    """Add blending weight times distribution over a view's pixels: the gradient of a drawing of features."""
+    device = gaussians.means.device
+    weights = torch.from_numpy(np.ascontiguousarray(np.moveaxis(pixels, 0, 2))).to(device)
+    with torch.enable_grad():
+        features = torch.zeros(votes.shape, device=device, requires_grad=True)
+        render = rasterize(
+            gaussians, camera, sh_degree=0, features=features, antialiased=antialiased, workspace=workspace
+        )
+        assert render.features is not None
+        (gradient,) = torch.autograd.grad(render.features, features, weights)
+    votes += gradient.cpu().numpy()
+
+
+def _resized(plane: Float32[np.ndarray, "h w"], camera: Camera) -> Float32[np.ndarray, "H W"]:
+    image = Image.fromarray(np.ascontiguousarray(plane, np.float32))
+    return np.asarray(image.resize((camera.width, camera.height), Image.Resampling.BILINEAR))

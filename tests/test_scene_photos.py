@@ -1,0 +1,550 @@
+"""Poses from photos: rendered photos of a textured corner come back as the cameras that saw them."""
+
+import importlib.util
+import json
+import os
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+import types
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.spatial.transform import Rotation
+
+from sagesplat.errors import BackendUnavailable, SceneError
+from sagesplat.scene import load_scene, photos
+from sagesplat.scene._prepare import prepare_photos
+from sagesplat.scene.photos import PosesConfig, reconstruct
+
+WIDTH, HEIGHT, FOCAL = 240, 180, 210.0
+VIEWS = 6
+CONFIG = PosesConfig(model="SIMPLE_RADIAL", threads=1)
+needs_pycolmap = pytest.mark.skipif(
+    importlib.util.find_spec("pycolmap") is None, reason="needs pycolmap (the extra `poses`)"
+)
+
+
+@lru_cache
+def texture(seed: int, size: int = 512) -> np.ndarray:
+    """Noise of several scales, RGB."""
+    rng = np.random.default_rng(seed)
+    layers = [gaussian_filter(rng.normal(size=(size, size, 3)), (s, s, 0)) * s for s in (2, 5, 12)]
+    return np.clip(128 + 110 * np.sum(layers, axis=0), 0, 255)
+
+
+def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """w2c [4, 4] of a camera without roll, gravity along +y."""
+    z = (target - position) / np.linalg.norm(target - position)
+    x = np.cross([0.0, 1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    R = np.stack([x, np.cross(z, x), z])
+    w2c = np.eye(4)
+    w2c[:3, :3], w2c[:3, 3] = R, -R @ position
+    return w2c
+
+
+def poses() -> list[np.ndarray]:
+    """An arc of cameras before the corner, at changing heights."""
+    return [
+        look_at(np.array([3 * np.sin(a), -0.9 + 0.25 * (-1) ** i, -3 * np.cos(a)]), np.array([0.0, 0.1, 0.3]))
+        for i, a in enumerate(np.linspace(-0.45, 0.45, VIEWS))
+    ]
+
+
+def render(w2c: np.ndarray) -> Image.Image:
+    """A floor and two walls that meet in a corner, by intersecting rays with planes."""
+    u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    local = np.stack([(u - WIDTH / 2) / FOCAL, (v - HEIGHT / 2) / FOCAL, np.ones_like(u)], axis=-1)
+    rays, centre = local @ w2c[:3, :3], -w2c[:3, :3].T @ w2c[:3, 3]
+    depth, rgb = np.full(u.shape, np.inf), np.zeros((HEIGHT, WIDTH, 3))
+    planes = (([0, 1, 0], 1.0), ([0.6, 0, 0.8], 1.2), ([-0.6, 0, 0.8], 1.2))
+    for seed, (normal, offset) in enumerate(planes):
+        n = np.array(normal, float)
+        with np.errstate(divide="ignore"):
+            t = (offset - centre @ n) / (rays @ n)
+        nearer = (t > 0) & (t < depth)
+        points = centre + t[nearer][:, None] * rays[nearer]
+        first = np.array([1.0, 0, 0]) if seed == 0 else np.array([n[2], 0, -n[0]])
+        second = np.cross(n, first)
+        at = np.stack([points @ first, points @ second]) * 110 + 256
+        paint = texture(seed)
+        rgb[nearer] = np.stack(
+            [map_coordinates(paint[..., c], at, order=1, mode="mirror") for c in range(3)], 1
+        )
+        depth[nearer] = t[nearer]
+    return Image.fromarray(rgb.round().astype(np.uint8))
+
+
+@pytest.fixture(scope="module")
+def rendered() -> list[Image.Image]:
+    return [render(w2c) for w2c in poses()]
+
+
+@pytest.fixture
+def folder(rendered: list[Image.Image], tmp_path: Path) -> Path:
+    source = tmp_path / "photos"
+    source.mkdir()
+    for i, image in enumerate(rendered):
+        image.save(source / f"view {i}.png")
+    return source
+
+
+@pytest.fixture(scope="module")
+def solved(rendered: list[Image.Image], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, list]:
+    """Photos, their finished workspace, and the progress that was reported."""
+    if importlib.util.find_spec("pycolmap") is None:
+        pytest.skip("needs pycolmap (the extra `poses`)")
+    base = tmp_path_factory.mktemp("solved")
+    source, events = base / "my photos", []
+    (source / "é 1").mkdir(parents=True)
+    for i, image in enumerate(rendered[:-1]):
+        image.save(source / "é 1" / f"view {i}.png")
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    turned = rendered[-1].transpose(Image.Transpose.ROTATE_90)
+    turned.save(source / "é 1" / "view 1.jpg", quality=95, exif=exif)
+    (source / "broken.jpg").write_bytes(b"\xff\xd8\xff\xe0 no photo")
+    Image.new("RGB", (WIDTH, HEIGHT), (90, 90, 90)).save(source / "blank.png")
+    noise = np.random.default_rng(5).integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+    Image.fromarray(gaussian_filter(noise.astype(float), (1.5, 1.5, 0)).round().astype(np.uint8)).save(
+        source / "elsewhere.png"
+    )
+    reconstruct(source, base / "out", CONFIG, lambda *event: events.append(event))
+    return source, base / "out", events
+
+
+def test_the_cameras_are_found(solved: tuple[Path, Path, list]) -> None:
+    scene = load_scene(solved[1], test_every=0)
+    expected = {f"é 1/view {i}.png": w2c for i, w2c in enumerate(poses()[:-1])}
+    expected["é 1/view 1.jpg"] = poses()[-1]
+    expected["é 1/view 1_png.png"] = expected.pop("é 1/view 1.png")
+    assert {view.name for view in scene.views} == set(expected)
+    assert all(view.lens is None for view in scene.views)  # pinholes
+    truth = np.stack([-w[:3, :3].T @ w[:3, 3] for w in (expected[v.name] for v in scene.views)])
+    found = np.stack([view.camera.position for view in scene.views]).astype(float)
+    spread = [np.linalg.norm(x - x.mean(0)) for x in (truth, found)]
+    turn = Rotation.align_vectors(truth - truth.mean(0), found - found.mean(0))[0]
+    error = turn.apply(found - found.mean(0)) * spread[0] / spread[1] - (truth - truth.mean(0))
+    assert np.linalg.norm(error, axis=1).max() < 0.02 * np.linalg.norm(truth - truth.mean(0), axis=1).max()
+    focal = np.array([view.camera.K[0, 0] for view in scene.views])
+    np.testing.assert_allclose(focal, FOCAL, rtol=0.03)
+    # Gravity is +y, as in the scene that was rendered.
+    assert turn.apply([0.0, 1.0, 0.0])[1] > np.cos(np.radians(2))
+    assert len(scene.points.xyz) > 200
+    assert len(scene.points.track_points) > 2 * len(scene.points.xyz)
+
+
+def test_what_was_left_out_is_said(solved: tuple[Path, Path, list]) -> None:
+    report = json.loads((solved[1] / "poses.json").read_text())
+    reasons = report["unregistered"]
+    assert set(reasons) == {"broken.jpg", "blank.png", "elsewhere.png"}
+    assert reasons["broken.jpg"].startswith("unreadable: ")
+    assert reasons["blank.png"] == "too few features"
+    assert reasons["elsewhere.png"] == "no match with enough inliers"
+    assert (report["num_photos"], report["num_registered"], report["complete"]) == (VIEWS + 2, VIEWS, True)
+    assert report["renamed"] == {"é 1/view 1.png": "é 1/view 1_png.png"}
+    assert report["resolved"] == {"matching": "exhaustive", "cameras": 1}
+    assert report["settings"]["model"] == "SIMPLE_RADIAL"
+    assert 0 < report["reprojection_error"] < 1
+    assert list(report["seconds"]) == ["prepare", "features", "matches", "mapping", "undistortion"]
+
+
+def test_progress_by_stage(solved: tuple[Path, Path, list]) -> None:
+    stages: dict[str, list[tuple[int, int]]] = {}
+    for stage, done, total in solved[2]:
+        stages.setdefault(stage, []).append((done, total))
+    assert list(stages) == ["prepare", "features", "matches", "mapping", "undistortion"]
+    for steps in stages.values():
+        done, totals = zip(*steps, strict=True)
+        assert list(done) == sorted(done)
+        assert len(set(totals)) == 1
+        assert done[-1] == totals[-1]
+    assert stages["matches"][-1] == (28, 28)
+
+
+def test_a_finished_workspace_is_kept(
+    solved: tuple[Path, Path, list], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, out, _ = solved
+    before = (out / "poses.json").read_text()
+
+    def never(*args: Any) -> None:
+        raise AssertionError("nothing is left to do")
+
+    monkeypatch.setattr(photos, "_run", never)
+    again = reconstruct(source, out, replace(CONFIG, min_registered=0.2))
+    assert (again.num_registered, again.workspace) == (VIEWS, out)
+    assert (out / "poses.json").read_text() == before
+
+
+@needs_pycolmap
+def test_a_stopped_run_goes_on(folder: Path, tmp_path: Path) -> None:
+    out, config = tmp_path / "out", replace(CONFIG, max_size=200)
+
+    def stop(stage: str, done: int, total: int) -> None:
+        if stage == "matches":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(folder, out, config, stop)
+    assert not (out / "poses.json").exists()
+    features: list[tuple[int, int]] = []
+
+    def stop_later(stage: str, done: int, total: int) -> None:
+        if stage == "features":
+            features.append((done, total))
+        if stage == "mapping":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(folder, out, config, stop_later)
+    assert features == [(VIEWS, VIEWS)]  # all were there
+
+    def stop_at_once(stage: str, done: int, total: int) -> None:
+        if stage == "features":
+            assert (done, total) == (0, VIEWS)  # other settings start again
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(folder, out, replace(config, seed=1), stop_at_once)
+
+
+@needs_pycolmap
+def test_too_few_poses_is_one_line_and_keeps_the_work(tmp_path: Path) -> None:
+    source = tmp_path / "photos"
+    source.mkdir()
+    for i in range(3):
+        noise = np.random.default_rng(i).integers(0, 256, (60, 80, 3)).astype(np.uint8)
+        Image.fromarray(noise).save(source / f"{i}.png")
+    with pytest.raises(SceneError, match=r"poses found for 0 of 3 photos \(0%.*overlap") as raised:
+        reconstruct(source, tmp_path / "out", CONFIG)
+    assert "\n" not in str(raised.value)
+    report = json.loads((tmp_path / "out" / "poses.json").read_text())
+    assert (report["complete"], len(report["unregistered"])) == (False, 3)
+    assert (tmp_path / "out" / "sfm" / "database.db").is_file()
+    assert not (tmp_path / "out" / "sparse").exists()
+
+
+@needs_pycolmap
+def test_focal_lengths_of_exif_reach_colmap(tmp_path: Path) -> None:
+    """Through a plain JPEG, a turned one and a PNG with alpha: 35 mm on 36 mm wide film."""
+    source, noise = (
+        tmp_path / "photos",
+        np.random.default_rng(0).integers(0, 256, (48, 72, 4)).astype(np.uint8),
+    )
+    source.mkdir()
+    for name, orientation, mode in (("a.jpg", 1, "RGB"), ("b.jpg", 6, "RGB"), ("c.png", 1, "RGBA")):
+        exif = Image.Exif()
+        exif[0x0112] = orientation
+        exif.get_ifd(0x8769)[0xA405] = 35
+        Image.fromarray(noise).convert(mode).save(source / name, exif=exif)
+    with pytest.raises(SceneError, match="0 of 3 photos"):
+        reconstruct(source, tmp_path / "out", replace(CONFIG, camera="per-image"))
+    with sqlite3.connect(tmp_path / "out" / "sfm" / "database.db") as database:
+        rows = database.execute("select width, height, params, prior_focal_length from cameras").fetchall()
+    database.close()
+    assert sorted(row[:2] for row in rows) == [(48, 72), (72, 48), (72, 48)]
+    assert all(row[3] for row in rows)
+    np.testing.assert_allclose([np.frombuffer(row[2])[0] for row in rows], 70, rtol=0.05)
+
+
+def prepared(source: Path, target: Path) -> tuple[dict[str, Path], dict[str, str]]:
+    found, unreadable = prepare_photos(source, target, target.parent / "none", lambda done, total: None)
+    return {photo.final: target / photo.prepared for photo in found}, unreadable
+
+
+def read(path: Path) -> np.ndarray:
+    with Image.open(path) as image:
+        return np.asarray(image)
+
+
+def test_photos_become_upright_8_bit_rgb(tmp_path: Path) -> None:
+    source = tmp_path / "photos"
+    (source / "sub").mkdir(parents=True)
+    rgb = np.random.default_rng(0).integers(0, 256, (20, 30, 3)).astype(np.uint8)
+    grey16 = rgb[..., 0].astype(np.uint16) * 257
+    Image.fromarray(rgb).save(source / "as it is.jpg", quality=80)
+    Image.fromarray(rgb).save(source / "plain.png")
+    Image.fromarray(grey16).save(source / "grey16.png")
+    Image.fromarray(rgb).convert("CMYK").save(source / "cmyk.jpg", quality=100)
+    Image.fromarray(np.dstack([rgb, np.zeros_like(rgb[..., :1])])).save(source / "alpha.png")
+    Image.fromarray(rgb).save(source / "sub" / "lossless.bmp")
+    Image.fromarray(rgb).save(source / "sub" / "web.webp")
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(rgb).save(source / "turned.png", exif=exif)
+    (source / ".hidden.jpg").write_bytes(b"")
+    files, unreadable = prepared(source, tmp_path / "target")
+    assert not unreadable
+    assert set(files) == {
+        *("as it is.jpg", "plain.png", "grey16.png", "cmyk.jpg", "alpha.png", "turned.png"),
+        *("sub/lossless.png", "sub/web.jpg"),
+    }
+    for name in ("as it is.jpg", "plain.png"):
+        assert files[name].samefile(source / name)  # no second generation
+    pixels = {name: read(path) for name, path in files.items()}
+    assert {p.dtype for p in pixels.values()} == {np.dtype(np.uint8)}
+    assert {p.shape for name, p in pixels.items() if name != "turned.png"} == {(20, 30, 3)}
+    np.testing.assert_array_equal(pixels["turned.png"], np.rot90(rgb, -1))
+    np.testing.assert_array_equal(pixels["grey16.png"], np.repeat(rgb[..., :1], 3, axis=2))
+    np.testing.assert_array_equal(pixels["sub/lossless.png"], rgb)
+    assert pixels["alpha.png"].max() == 0
+    with Image.open(files["turned.png"]) as image:
+        assert image.getexif().get(0x0112, 1) == 1
+
+
+def test_16_bit_colour_and_a_truncated_photo(tmp_path: Path) -> None:
+    source = tmp_path / "photos"
+    source.mkdir()
+    rgb = np.random.default_rng(0).integers(0, 256, (90, 90, 3)).astype(np.uint8)
+    Image.fromarray(rgb).save(source / "cut.jpg")
+    content = (source / "cut.jpg").read_bytes()
+    (source / "cut.jpg").write_bytes(content[: len(content) // 2])
+    (source / "empty.png").write_bytes(b"")
+    Image.fromarray(rgb).save(source / "good.jpg")
+    files, unreadable = prepared(source, tmp_path / "target")
+    assert list(files) == ["good.jpg"]
+    assert set(unreadable) == {"cut.jpg", "empty.png"}
+    assert all(reason.startswith("unreadable: ") and "\n" not in reason for reason in unreadable.values())
+
+
+def test_prepared_photos_are_kept_until_the_source_changes(tmp_path: Path) -> None:
+    source = tmp_path / "photos"
+    source.mkdir()
+    for i in range(2):
+        Image.new("L", (8, 8), 50 * i).save(source / f"{i}.png")
+    first, _ = prepared(source, tmp_path / "target")
+    inodes = {name: path.stat().st_ino for name, path in first.items()}
+    Image.new("L", (8, 8), 200).save(source / "1.png")
+    os.utime(source / "1.png", (1, 1))
+    again, _ = prepared(source, tmp_path / "target")
+    assert again["0.png"].stat().st_ino == inodes["0.png"]
+    assert read(again["1.png"]).tolist()[0][0] == [200, 200, 200]
+    (source / "0.png").unlink()
+    last, _ = prepared(source, tmp_path / "target")
+    assert [p.name for p in (tmp_path / "target").iterdir()] == [last["1.png"].name]
+
+
+def test_numbers_order_photos_and_stems_stay_apart(tmp_path: Path) -> None:
+    source = tmp_path / "photos"
+    source.mkdir()
+    for name in ("p10.png", "p9.png", "a.png", "A.tiff", "a.jpg"):
+        Image.new("RGB", (8, 8)).save(source / name)
+    files, _ = prepared(source, tmp_path / "target")
+    stems = [name.rpartition(".")[0].casefold() for name in files]
+    assert len(set(stems)) == 5
+    assert list(files)[-2:] == ["p9.png", "p10.png"]
+
+
+@pytest.mark.parametrize("mode", ["single", "per-folder"])
+def test_one_camera_for_two_sizes_is_refused(tmp_path: Path, mode: Any) -> None:
+    for i in range(4):
+        Image.new("RGB", (30 + i // 2, 20)).save(tmp_path / f"{i}.png")
+    found, _ = prepare_photos(tmp_path, tmp_path / "t", tmp_path / "t", lambda done, total: None)
+    with pytest.raises(SceneError, match="30 x 20 and 31 x 20 pixels cannot share a camera"):
+        photos._request(tmp_path, found, PosesConfig(camera=mode))
+    assert [len(group) for group in photos._request(tmp_path, found, PosesConfig())["cameras"]] == [2, 2]
+    per_image = photos._request(tmp_path, found, PosesConfig(camera="per-image"))
+    assert len(per_image["cameras"]) == 4
+
+
+def test_many_photos_and_videos_are_matched_in_sequence(tmp_path: Path) -> None:
+    Image.new("RGB", (30, 20)).save(tmp_path / "a.png")
+    found, _ = prepare_photos(tmp_path, tmp_path / "t", tmp_path / "t", lambda done, total: None)
+    assert photos._request(tmp_path, found * 250, PosesConfig())["matching"] == "exhaustive"
+    assert photos._request(tmp_path, found * 251, PosesConfig())["matching"] == "sequential"
+    assert photos._request(tmp_path / "a.png", found, PosesConfig())["matching"] == "sequential"
+    chosen = PosesConfig(matching="exhaustive")
+    assert photos._request(tmp_path / "a.png", found, chosen)["matching"] == "exhaustive"
+
+
+def one_photo(folder: Path) -> None:
+    Image.new("RGB", (8, 8)).save(folder / "a.jpg")
+
+
+def all_corrupt(folder: Path) -> None:
+    for i in range(3):
+        (folder / f"{i}.jpg").write_bytes(b"no photo")
+
+
+@pytest.mark.parametrize(
+    ("fill", "message"),
+    [
+        (lambda folder: None, "0 readable photos, but it takes 3; add overlapping photos"),
+        (one_photo, "1 readable photos, but it takes 3; add"),
+        (all_corrupt, r"0 readable photos, but it takes 3 \(0\.jpg unreadable: .*\.\.\.\); replace"),
+    ],
+)
+def test_too_few_photos(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fill: Callable[[Path], None], message: str
+) -> None:
+    monkeypatch.setattr(photos.importlib.util, "find_spec", lambda name: name)
+    source = tmp_path / "photos"
+    source.mkdir()
+    fill(source)
+    with pytest.raises(SceneError, match=message):
+        reconstruct(source, tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        (PosesConfig(model="PINHOL"), "PINHOL: no camera model of COLMAP; take one of SIMPLE_PINHOLE"),
+        (PosesConfig(max_size=0), "max_size 0"),
+        (PosesConfig(min_registered=1.5), "min_registered 1.5"),
+        (PosesConfig(threads=0), "threads 0"),
+    ],
+)
+def test_settings_that_cannot_be_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, config: PosesConfig, message: str
+) -> None:
+    monkeypatch.setattr(photos.importlib.util, "find_spec", lambda name: name)
+    with pytest.raises(SceneError, match=message):
+        reconstruct(tmp_path, tmp_path / "out", config)
+
+
+def test_nothing_of_the_users_is_overwritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(photos.importlib.util, "find_spec", lambda name: name)
+    (tmp_path / "images").mkdir()
+    (tmp_path / "photos").mkdir()
+    for source in (tmp_path, tmp_path / "images"):
+        with pytest.raises(SceneError, match="lies where the poses would be written"):
+            reconstruct(source, tmp_path)
+    with pytest.raises(SceneError, match="already holds a capture; name an empty folder"):
+        reconstruct(tmp_path / "photos", tmp_path)
+    with pytest.raises(SceneError, match=r"gone: no such file or folder"):
+        reconstruct(tmp_path / "gone", tmp_path / "out")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SceneError, match="file: is no folder"):
+        reconstruct(tmp_path / "photos", tmp_path / "file")
+
+
+def test_without_pycolmap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(photos.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(BackendUnavailable, match=r"need pycolmap; pip install 'sagesplat\[poses\]'"):
+        reconstruct(tmp_path, tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("script", "message"),
+    [
+        ("import os; os.kill(os.getpid(), 11)", r"COLMAP crashed \(SIGSEGV\); see .*log\.txt"),
+        ("import os; os.kill(os.getpid(), 9)", "COLMAP was killed .*memory"),
+        ("raise ValueError('bad luck')", r"COLMAP failed \(ValueError: bad luck\)"),
+        ("raise SystemExit(3)", r"COLMAP failed \(no message\)"),
+        ("", "COLMAP failed"),
+    ],
+)
+def test_a_crash_of_the_child_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: str, message: str
+) -> None:
+    (tmp_path / "script.py").write_text(script)
+    monkeypatch.setattr(photos, "_SCRIPT", tmp_path / "script.py")
+    with pytest.raises(SceneError, match=message) as raised:
+        photos._run(tmp_path, lambda stage, done, total: None)
+    assert "\n" not in str(raised.value)
+
+
+def test_an_error_in_the_callback_ends_the_child(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    lines = """
+import json, os, time
+print(json.dumps({"stage": str(os.getpid()), "done": 0, "total": 1}), flush=True)
+time.sleep(60)
+"""
+    (tmp_path / "script.py").write_text(lines)
+    monkeypatch.setattr(photos, "_SCRIPT", tmp_path / "script.py")
+    pids: list[int] = []
+
+    def interrupt(stage: str, done: int, total: int) -> None:
+        pids.append(int(stage))
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        photos._run(tmp_path, interrupt)
+    with pytest.raises(ProcessLookupError):
+        os.kill(pids[0], signal.SIG_DFL)
+
+
+@needs_pycolmap
+def test_the_child_ends_with_its_parent_and_imports_no_pillow(tmp_path: Path) -> None:
+    code = """
+import importlib.util, sys, threading
+spec = importlib.util.spec_from_file_location("sfm", sys.argv[1])
+sfm = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(sfm)
+print(sorted(name for name in sys.modules if name.partition(".")[0] in ("PIL", "sagesplat")), flush=True)
+thread = threading.Thread(target=sfm._end_with_parent)
+thread.start()
+thread.join(60)
+"""
+    command = [sys.executable, "-P", "-c", code, str(photos._SCRIPT)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as child:
+        out, _ = child.communicate(timeout=60)  # closes standard input, as a killed parent does
+    assert (out.strip(), child.returncode) == ("[]", 1)
+
+
+def load_sfm() -> Any:
+    """The script's own functions, without COLMAP."""
+    spec = importlib.util.spec_from_file_location("sfm_alone", photos._SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    before = sys.modules.get("pycolmap")
+    sys.modules["pycolmap"] = types.ModuleType("pycolmap")
+    try:
+        spec.loader.exec_module(module)
+    finally:
+        del sys.modules["pycolmap"]
+        if before is not None:
+            sys.modules["pycolmap"] = before
+    return module
+
+
+SFM = load_sfm()
+
+
+@settings(max_examples=20)
+@given(st.integers(1, 400))
+def test_sequential_pairs(count: int) -> None:
+    pairs = SFM.sequential_pairs(count)
+    assert len(set(pairs)) == len(pairs)
+    assert all(0 <= i < j < count for i, j in pairs)
+    assert len(pairs) <= count * (SFM.OVERLAP + 9) + SFM.KEYFRAMES**2 / 2
+    listed = set(pairs)
+    assert all((i, i + d) in listed for i in range(count) for d in (*range(1, 11), 16) if i + d < count)
+    if count > 2:
+        assert (0, count - 1) in listed  # the loop is closed
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 10**6), st.booleans())
+def test_upright_finds_gravity(seed: int, facade: bool) -> None:
+    rng = np.random.default_rng(seed)
+    around = rng.normal(0, 0.1 if facade else 2, 12)
+    level = Rotation.from_euler("YX", np.stack([around, rng.normal(0, 0.05, 12)], 1))  # pan, then tilt
+    world = Rotation.from_rotvec(rng.normal(0, 1.5, 3))  # COLMAP's world is turned somehow
+    w2c = (world * level).inv().as_matrix()
+    turn = SFM.upright(w2c)
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-9)
+    assert np.linalg.det(turn) > 0
+    down = turn @ world.apply([0.0, 1.0, 0.0])
+    assert down[1] > np.cos(np.radians(12 if facade else 1e-3))
+
+
+@pytest.mark.skipif(shutil.which("nvidia-smi") is not None, reason="only where there is no GPU")
+@needs_pycolmap
+def test_cuda_where_there_is_none(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(BackendUnavailable, match="no CUDA; install pycolmap-cuda12 or take device cpu"):
+        reconstruct(folder, tmp_path / "out", replace(CONFIG, device="cuda"))

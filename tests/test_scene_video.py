@@ -1,0 +1,188 @@
+"""Frames of a video: upright, sharp, evenly spread, none twice, and one line for files that are none."""
+
+import builtins
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+
+from sagesplat.errors import BackendUnavailable, SceneError
+from sagesplat.scene.video import extract_frames, sharpness
+
+av = pytest.importorskip("av", reason="needs PyAV (the extra `video`)")
+WIDTH, HEIGHT = 128, 96
+
+
+def scenery() -> np.ndarray:
+    """A wide picture with blobs of a few pixels."""
+    noise = np.random.default_rng(0).normal(size=(HEIGHT, 1200))
+    grey = np.clip(128 + 600 * gaussian_filter(noise, 3), 0, 255)
+    return np.repeat(grey[..., None], 3, axis=2).astype(np.uint8)
+
+
+def pan(count: int, step: int = 4) -> list[np.ndarray]:
+    """Frames of a camera that moves to the right by `step` pixels each."""
+    wide = scenery()
+    return [wide[:, i * step : i * step + WIDTH] for i in range(count)]
+
+
+def write_video(path: Path, frames: list[np.ndarray]) -> Path:
+    with av.open(str(path), "w") as container:
+        stream: Any = container.add_stream("mpeg4", rate=25)
+        stream.width, stream.height, stream.pix_fmt, stream.bit_rate = WIDTH, HEIGHT, "yuv420p", 4_000_000
+        for pixels in frames:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), "rgb24")))
+        container.mux(stream.encode(None))
+    return path
+
+
+def read(path: Path) -> np.ndarray:
+    with Image.open(path) as image:
+        return np.asarray(image)
+
+
+def numbers(paths: list[Path]) -> list[int]:
+    return [int(path.stem.removeprefix("frame_")) for path in paths]
+
+
+def test_frames_are_spread_evenly(tmp_path: Path) -> None:
+    events: list[tuple[int, int]] = []
+    video = write_video(tmp_path / "my film.mp4", pan(90))
+    paths = extract_frames(video, tmp_path / "f", max_frames=10, on_frame=lambda *event: events.append(event))
+    assert [number // 9 for number in numbers(paths)] == list(range(10))
+    assert events == [(i + 1, 90) for i in range(90)]
+    for path in paths:
+        pixels = read(path)
+        assert pixels.shape == (HEIGHT, WIDTH, 3)
+        expected = pan(90)[numbers([path])[0]]
+        assert np.abs(pixels.astype(int) - expected).mean() < 12
+
+
+def test_the_sharpest_of_each_stretch_is_taken(tmp_path: Path) -> None:
+    sharp = {4, 10, 21, 28}
+    frames = [f if i in sharp else gaussian_filter(f, (3, 3, 0)) for i, f in enumerate(pan(32))]
+    paths = extract_frames(write_video(tmp_path / "a.mp4", frames), tmp_path / "f", max_frames=4)
+    assert set(numbers(paths)) == sharp
+
+
+def test_a_standing_camera_gives_one_frame(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    still = [np.clip(pan(1)[0] + rng.normal(0, 4, (HEIGHT, WIDTH, 3)), 0, 255).astype(np.uint8)] * 30
+    paths = extract_frames(write_video(tmp_path / "a.mp4", still + pan(30)), tmp_path / "f", max_frames=20)
+    assert len([i for i in numbers(paths) if i < 30]) == 1
+    assert len([i for i in numbers(paths) if i > 32]) >= 9
+
+
+def test_long_videos_keep_three_frames_to_choose_from(tmp_path: Path) -> None:
+    assert len(extract_frames(write_video(tmp_path / "a.mp4", pan(240)), tmp_path / "a")) == 80
+    assert len(extract_frames(write_video(tmp_path / "b.mp4", pan(40)), tmp_path / "b")) == 40
+
+
+@pytest.mark.parametrize(
+    ("matrix", "turns"),
+    [((0, 1, -1, 0), -1), ((-1, 0, 0, -1), 2), ((0, -1, 1, 0), 1)],
+)
+def test_rotation_in_the_metadata_is_applied(
+    tmp_path: Path, matrix: tuple[int, int, int, int], turns: int
+) -> None:
+    """Players turn clockwise by a quarter for the matrix (0, 1, -1, 0), which phones write in portrait."""
+    video = write_video(tmp_path / "a.mp4", pan(6))
+    upright = extract_frames(video, tmp_path / "upright")
+
+    def entries(a: int, b: int, c: int, d: int) -> bytes:
+        values = (a << 16, b << 16, 0, c << 16, d << 16, 0, 0, 0, 1 << 30)
+        return b"".join(value.to_bytes(4, "big", signed=True) for value in values)
+
+    content = video.read_bytes()
+    at = content.index(entries(1, 0, 0, 1), content.index(b"tkhd"))
+    turned = tmp_path / "b.mp4"
+    turned.write_bytes(content[:at] + entries(*matrix) + content[at + 36 :])
+    paths = extract_frames(turned, tmp_path / "turned")
+    assert numbers(paths) == numbers(upright)
+    for a, b in zip(upright, paths, strict=True):
+        expected = np.rot90(read(a), turns).astype(int)
+        assert np.abs(read(b) - expected).mean() < 2
+
+
+def test_frames_of_the_same_file_are_kept(tmp_path: Path) -> None:
+    video = write_video(tmp_path / "a.mp4", pan(12))
+    first = extract_frames(video, tmp_path / "f", max_frames=4)
+    times = [path.stat().st_mtime_ns for path in first]
+    assert extract_frames(video, tmp_path / "f", max_frames=4) == first
+    assert [path.stat().st_mtime_ns for path in first] == times
+    again = extract_frames(video, tmp_path / "f", max_frames=2)
+    assert sorted((tmp_path / "f").glob("*.jpg")) == again
+    again[0].unlink()
+    assert extract_frames(video, tmp_path / "f", max_frames=2) == again
+
+
+def test_a_cut_video_gives_what_it_holds(tmp_path: Path) -> None:
+    video = write_video(tmp_path / "a.mpg", pan(60))
+    content = video.read_bytes()
+    video.write_bytes(content[: len(content) // 2])
+    paths = extract_frames(video, tmp_path / "f")
+    assert 15 < len(paths) < 45
+
+
+def sound(path: Path) -> None:
+    with av.open(str(path), "w") as container:
+        stream: Any = container.add_stream("pcm_s16le", rate=8000)
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), "s16", "mono")
+        frame.sample_rate = 8000
+        container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+
+
+def headless(path: Path) -> None:
+    content = write_video(path, pan(12)).read_bytes()
+    path.write_bytes(content[: content.index(b"moov")])  # as of a recording that was broken off
+
+
+@pytest.mark.parametrize(
+    ("name", "fill", "message"),
+    [
+        ("a.mp4", lambda path: path.write_bytes(b""), "not readable as a video"),
+        ("a.mp4", lambda path: path.write_bytes(b"no video" * 99), "not readable as a video"),
+        ("a.mp4", headless, "not readable as a video"),
+        ("a.wav", sound, "holds no video stream"),
+        ("a.mp4", lambda path: None, "no such file"),
+    ],
+)
+def test_a_file_that_is_no_video_is_one_line(tmp_path: Path, name: str, fill: Any, message: str) -> None:
+    fill(tmp_path / name)
+    with pytest.raises(SceneError, match=message) as raised:
+        extract_frames(tmp_path / name, tmp_path / "f")
+    assert "\n" not in str(raised.value)
+    assert str(raised.value).startswith(str(tmp_path / name))
+
+
+def test_max_frames_of_none(tmp_path: Path) -> None:
+    with pytest.raises(SceneError, match="max_frames 0 leaves nothing"):
+        extract_frames(tmp_path / "a.mp4", tmp_path / "f", max_frames=0)
+
+
+def test_without_pyav(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = builtins.__import__
+
+    def fake(name: str, *args: Any, **options: Any) -> Any:
+        if name.partition(".")[0] == "av":
+            raise ImportError(name)
+        return real(name, *args, **options)
+
+    monkeypatch.setattr(builtins, "__import__", fake)
+    with pytest.raises(BackendUnavailable, match=r"PyAV; pip install 'sagesplat\[video\]'"):
+        extract_frames(tmp_path / "a.mp4", tmp_path / "f")
+
+
+@settings(max_examples=25)
+@given(st.integers(0, 10**6), st.floats(0.5, 3))
+def test_blur_lowers_sharpness(seed: int, sigma: float) -> None:
+    grey = np.random.default_rng(seed).integers(0, 256, (20, 24)).astype(np.uint8)
+    assert sharpness(gaussian_filter(grey, sigma)) < sharpness(grey)
+    assert sharpness(np.full((9, 9), 7, np.uint8)) == 0
+    assert sharpness(grey[:2]) == 0

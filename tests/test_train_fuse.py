@@ -1,0 +1,221 @@
+"""Fusion of label images: votes are the rasteriser's weights, wrong views are overruled, thin parts stay."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import orbit, random_gaussians
+from jaxtyping import Float32, Int16
+
+from sagesplat.errors import LabelError
+from sagesplat.gaussians import Gaussians
+from sagesplat.scene.scene import Points, Scene, View
+from sagesplat.segment.masks import Masks, Taxonomy, mask_path, write_labels, write_mask
+from sagesplat.train.fuse import FuseOptions, Votes, draw, fuse, gather, refine, soft_pixels, thin_parts
+from sagesplat.train.votes import label_weights
+
+CAR, TREE = 3, 184
+TAXONOMY = Taxonomy({CAR: "car", TREE: "tree-merged"})
+IDS = np.array([-1, CAR, TREE], np.int16)
+FAIR = FuseOptions(weight=1, confidence=0.9, min_share=0.5, keep_thin=1)
+
+
+def _scene(views: int = 4) -> tuple[Gaussians, Scene]:
+    """A dense cloud whose left half is a car and whose right half is a tree."""
+    g = random_gaussians(400, seed=5, log_scale=-1.6, logit=2.0)
+    labels = torch.where(g.means[:, 0] < 0, CAR, TREE).to(torch.int16)
+    rows = tuple(View(f"{i}.png", camera, Path(f"{i}.png")) for i, camera in enumerate(orbit(views)))
+    empty, none = np.zeros((0, 3), np.float32), np.zeros(0, np.int64)
+    points = Points(empty, empty.astype(np.uint8), none, none.astype(np.int32), empty[:, :2])
+    return replace(g, label_ids=labels), Scene("x", Path(), rows, points, 0)
+
+
+def _write(folder: Path, scene: Scene, images: list[Int16[np.ndarray, "H W"]]) -> Masks:
+    for view, image in zip(scene.views, images, strict=True):
+        write_mask(mask_path(folder, view), image, TAXONOMY)
+    write_labels(folder, TAXONOMY, set(TAXONOMY.names))
+    return Masks(folder, TAXONOMY)
+
+
+def _drawn_labels(g: Gaussians, scene: Scene) -> list[Float32[np.ndarray, "C H W"]]:
+    shares = np.stack([(g.label_ids.numpy() == i).astype(np.float32) for i in IDS], 1)
+    return [draw(g, view.camera, Votes(IDS, shares)) for view in scene.views]
+
+
+def _truth(g: Gaussians, scene: Scene) -> list[Int16[np.ndarray, "H W"]]:
+    """The label that paints most of each pixel; the car where nothing does."""
+    return [IDS[drawn.argmax(0).clip(1)] for drawn in _drawn_labels(g, scene)]
+
+
+def _one_hot(label_ids: Int16[np.ndarray, "H W"]) -> Float32[np.ndarray, "K H W"]:
+    return (label_ids == IDS[1:, None, None]).astype(np.float32)
+
+
+def test_hard_votes_are_the_weights_of_the_labels_in_shares(tmp_path: Path) -> None:
+    g, scene = _scene()
+    masks = _write(tmp_path, scene, _truth(g, scene))
+    heard: list[int] = []
+    votes = gather(g, scene, masks, [0, 2, 3], on_view=heard.append)
+    ids, weights = label_weights(g, scene, masks, [0, 2, 3])
+    assert votes.ids.tolist() == [-1, *ids]
+    seen = weights.sum(1) > 0
+    np.testing.assert_allclose(votes.shares[seen].sum(1), 1, atol=1e-5)
+    np.testing.assert_allclose(
+        votes.shares[seen, 1:], weights[seen] / weights[seen].sum(1, keepdims=True), atol=1e-5
+    )
+    assert not votes.shares[~seen].any()
+    assert heard == [1, 2, 3]
+
+
+def test_soft_votes_of_one_category_are_hard_votes(tmp_path: Path) -> None:
+    g, scene = _scene(2)
+    images = _truth(g, scene)
+    images[1][:8] = -1
+    masks = _write(tmp_path, scene, images)
+    hard = gather(g, scene, masks, [0, 1])
+    soft = gather(g, scene, masks, [0, 1], soft=lambda row: (IDS[1:], _one_hot(images[row])))
+    np.testing.assert_allclose(soft.shares, hard.shares, atol=2e-4)
+
+
+def test_even_probabilities_give_even_shares(tmp_path: Path) -> None:
+    g, scene = _scene(2)
+    masks = _write(tmp_path, scene, _truth(g, scene))
+    planes = np.stack([np.full((4, 6), p, np.float32) for p in (0.25, 0.5, 0.125)])
+    soft = gather(g, scene, masks, [0, 1], soft=lambda row: (np.array([TREE, CAR, 7], np.int16), planes))
+    seen = soft.shares.sum(1) > 0
+    np.testing.assert_allclose(soft.shares[seen], np.tile([0.25, 0.5, 0.25], (int(seen.sum()), 1)), atol=1e-4)
+
+
+def test_views_without_labels_do_not_vote(tmp_path: Path) -> None:
+    g, scene = _scene()
+    images = _truth(g, scene)
+    images[1:] = [np.full_like(image, -1) for image in images[1:]]
+    masks = _write(tmp_path, scene, images)
+    np.testing.assert_array_equal(
+        gather(g, scene, masks, range(4)).shares, gather(g, scene, masks, [0]).shares
+    )
+
+
+def test_repeated_and_unknown_categories_and_the_rest() -> None:
+    _, scene = _scene(1)
+    camera = scene.views[0].camera
+    given = np.array([CAR, CAR, 99, -1], np.int16)
+    planes = np.stack([np.full((5, 7), p, np.float32) for p in (0.25, 0.25, 0.3, 0.2)])
+    pixels = soft_pixels(lambda row: (given, planes), 0, camera, IDS)
+    assert pixels.shape == (3, camera.height, camera.width)
+    np.testing.assert_allclose(pixels[:, 0, 0], [0.5, 0.5, 0], atol=1e-6)
+    pixels = soft_pixels(lambda row: (given[:2], 4 * planes[:2]), 0, camera, IDS)
+    np.testing.assert_allclose(pixels[:, 3, 3], [0, 1, 0], atol=1e-6)  # more than 1 is scaled down
+
+
+@pytest.mark.parametrize(
+    ("planes", "message"),
+    [
+        (np.full((1, 2, 2), np.nan, np.float32), "soft labels of view 0 hold NaN, Inf or less than 0"),
+        (np.full((1, 2, 2), np.inf, np.float32), "soft labels of view 0 hold NaN"),
+        (np.full((1, 2, 2), -0.1, np.float32), "soft labels of view 0 hold NaN"),
+        (np.zeros((2, 2, 2), np.float32), "soft labels of shape (2, 2, 2) for 1 categories"),
+        (np.zeros((2, 2), np.float32), "soft labels of shape (2, 2) for 1 categories"),
+    ],
+)
+def test_probabilities_that_are_none_are_one_line(planes: np.ndarray, message: str) -> None:
+    _, scene = _scene(1)
+    with pytest.raises(LabelError) as error:
+        soft_pixels(lambda row: (IDS[1:2], planes), 0, scene.views[0].camera, IDS)
+    assert str(error.value).startswith(message)
+    assert "\n" not in str(error.value)
+
+
+def _drawn(*shares: float) -> Float32[np.ndarray, "C 1 1"]:
+    return np.array(shares, np.float32)[:, None, None]
+
+
+@pytest.mark.parametrize(
+    ("label", "shares", "expected"),
+    [
+        (CAR, (0.0, 0.2, 0.8), CAR),  # 4 to 1 against 9 to 1
+        (CAR, (0.0, 0.05, 0.95), TREE),  # 19 to 1
+        (CAR, (0.95, 0.0, 0.05), CAR),  # the winner of the votes has no label to give
+        (CAR, (0.0, 0.01, 0.48), CAR),  # voters cover less than half
+        (CAR, (0.0, 0.01, 0.6), TREE),
+        (-1, (0.0, 0.4, 0.6), TREE),
+        (-1, (0.6, 0.4, 0.0), -1),
+        (-1, (0.0, 0.0, 0.0), -1),
+        (TREE, (0.0, 0.0, 0.0), TREE),
+    ],
+)
+def test_when_a_label_is_overruled(label: int, shares: tuple[float, ...], expected: int) -> None:
+    assert refine(np.full((1, 1), label, np.int16), _drawn(*shares), IDS, FAIR).item() == expected
+
+
+def test_the_view_s_own_doubt_lets_the_others_win() -> None:
+    label_ids, drawn = np.full((1, 1), CAR, np.int16), _drawn(0.0, 0.2, 0.8)
+    for car, expected in ((0.9, CAR), (0.75, TREE)):
+        assert refine(label_ids, drawn, IDS, FAIR, _drawn(0, car, 1 - car)).item() == expected
+
+
+def test_thin_parts_are_overruled_later() -> None:
+    label_ids = np.full((40, 40), TREE, np.int16)
+    label_ids[:, 20:23] = CAR  # a pole
+    label_ids[:15, :15] = CAR  # a block
+    thin = thin_parts(label_ids)
+    assert thin[:, 20:23].all()
+    assert not thin[:12, :12].any()
+    assert not thin[25:, 30:].any()
+    drawn = np.tile(_drawn(0.0, 0.05, 0.95), (1, 40, 40))
+    assert (refine(label_ids, drawn, IDS, FAIR) == TREE).all()
+    kept = refine(label_ids, drawn, IDS, replace(FAIR, keep_thin=2))
+    assert (kept[:, 20:23] == CAR).all()
+    assert (kept[:12, :12] == TREE).all()
+
+
+def test_a_wrong_view_is_put_right_and_the_right_ones_stay(tmp_path: Path) -> None:
+    g, scene = _scene(12)
+    truth = _truth(g, scene)
+    images = [image.copy() for image in truth]
+    images[3][8:24, 4:40] = TREE + CAR - truth[3][8:24, 4:40]  # a wrong patch
+    images[5][10:20, 10:30] = -1  # a hole
+    masks = _write(tmp_path / "in", scene, images)
+    voters = [row for row in range(12) if row != 5]
+    heard: list[tuple[int, int]] = []
+    fused = fuse(
+        g, scene, masks, tmp_path / "out", views=voters,
+        on_view=lambda *progress: heard.append(progress),
+    )  # fmt: skip
+    assert heard == [(i, 23) for i in range(1, 24)]
+    after = Masks(tmp_path / "out", Taxonomy.read(tmp_path / "out" / "labels.json"))
+    covered = [drawn.sum(0) > 0.6 for drawn in _drawn_labels(g, scene)]  # elsewhere labels stay as they are
+    wrong = np.array([(i != t)[c].mean() for i, t, c in zip(images, truth, covered, strict=True)])
+    left = np.array([(after[v] != t)[c].mean() for v, t, c in zip(scene.views, truth, covered, strict=True)])
+    assert wrong[3] > 0.3
+    assert left[3] < wrong[3] / 3  # the cloud is translucent: pixels that both paint stay
+    assert left[5] < 0.25 * wrong[5]  # though it had no vote
+    assert np.delete(left, [3, 5]).max() < 0.02
+    assert fused.changed[3] == pytest.approx((after[scene.views[3]] != images[3]).mean())
+    assert fused.record["changed"] == pytest.approx(fused.changed.mean())
+    assert json.loads(json.dumps(fused.record)) == fused.record
+    again = fuse(g, scene, masks, tmp_path / "twice", views=voters)
+    np.testing.assert_array_equal(again.changed, fused.changed)  # deterministic
+
+
+def test_soft_labels_fuse_too(tmp_path: Path) -> None:
+    g, scene = _scene(6)
+    truth = _truth(g, scene)
+    masks = _write(tmp_path / "in", scene, truth)
+
+    def soft(row: int) -> tuple[Int16[np.ndarray, " K"], Float32[np.ndarray, "K H W"]]:
+        return IDS[1:], 0.1 + 0.8 * _one_hot(truth[row])
+
+    fused = fuse(g, scene, masks, tmp_path / "out", soft=soft)
+    assert fused.changed.max() < 0.02
+    assert fused.record["soft"]
+
+
+def test_the_folder_of_the_masks_is_refused(tmp_path: Path) -> None:
+    g, scene = _scene(1)
+    masks = _write(tmp_path, scene, _truth(g, scene))
+    with pytest.raises(LabelError, match="these are the masks themselves"):
+        fuse(g, scene, masks, tmp_path)
