@@ -143,5 +143,5 @@ def test_photos_without_poses_become_a_capture(
         stages.open_scene(job, capture / "images", SceneConfig(), PosesConfig(matching="sequential"))
     assert asked == [(capture / "images", PosesConfig(matching="sequential"))]
     assert Warned("a.jpg: too few features") in events
-    assert job.scene.path == (tmp_path / "run" / "capture").resolve()
+    assert job.scene.path == (tmp_path / "run" / "capture" / "images").resolve()
     assert len(job.scene.views) == 8

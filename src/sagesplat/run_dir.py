@@ -41,7 +41,7 @@ class RunDir:
 
     @property
     def capture(self) -> Path:
-        """The capture that was made of photos without poses."""
+        """The folder of the capture that was made of photos without poses."""
         return self.path / "capture"
 
     @property

@@ -47,12 +47,13 @@ from sagesplat.train.trainer import LabelFrozen, LevelSaved, Resumed, Step, Trai
 def open_scene(job: Job, path: Path, config: SceneConfig, poses: PosesConfig | None = None) -> None:
     """Read a capture and write scene.json; of photos without poses, or a video, a capture is made first."""
     run = job.run
-    ours = run.scene.exists() or (run.capture / "sfm").exists()
+    ours = run.scene.exists() or run.capture.exists()
     if run.path.exists() and not ours and any(run.path.iterdir()):
         raise RunError(f"{run.path}: not empty and not a run folder; choose a new folder")
     if detect(path) in ("photos", "video"):
-        _find_poses(job, path, poses or PosesConfig())
-        path = run.capture
+        capture = run.capture / path.resolve().stem  # the scene will have that name
+        _find_poses(job, path, capture, poses or PosesConfig())
+        path = capture
     scene = load_scene(path, **asdict(config))
     settings = {"path": str(path.resolve()), **asdict(config), "fingerprint": fingerprint(scene)}
 
@@ -87,7 +88,7 @@ def open_scene(job: Job, path: Path, config: SceneConfig, poses: PosesConfig | N
     run_stage(job, "scene", settings, [], [run.scene], make)
 
 
-def _find_poses(job: Job, source: Path, config: PosesConfig) -> None:
+def _find_poses(job: Job, source: Path, capture: Path, config: PosesConfig) -> None:
     """Make a capture of photos or a video: cameras and points by structure from motion."""
     from sagesplat.scene.photos import reconstruct
 
@@ -98,19 +99,19 @@ def _find_poses(job: Job, source: Path, config: PosesConfig) -> None:
 
     def make() -> list[str]:
         found = reconstruct(
-            source, job.run.capture, config,
+            source, capture, config,
             lambda stage, done, total: job.emit(Progress("poses", done, max(total, 1), stage)),
         )  # fmt: skip
         for name, reason in list(found.unregistered.items())[:5]:
             job.emit(Warned(f"{name}: {reason}"))
         if len(found.unregistered) > 5:
-            job.emit(Warned(f"{len(found.unregistered)} photos in all left out; see capture/poses.json"))
+            job.emit(Warned(f"{len(found.unregistered)} photos in all left out; see {capture}/poses.json"))
         return [
             f"poses of {found.num_registered} of {found.num_photos} photos, {found.num_points:,} points, "
             f"reprojection error {found.reprojection_error:.2f} px"
         ]
 
-    run_stage(job, "poses", settings, [], [job.run.capture / "poses.json"], make)
+    run_stage(job, "poses", settings, [], [capture / "poses.json"], make)
 
 
 def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
