@@ -283,7 +283,8 @@ def test_a_kill_between_members(site, tmp_path):
     assert 2 < len(left) < len(expected())
     site.asked.clear()
     fetch(site, tmp_path)
-    assert len(site.asked) == 2 + len(expected()) - len(left)
+    late = len(site.asked) - (2 + len(expected()) - len(left))
+    assert 0 <= late <= 4  # what the killed one asked for last may be answered after all
     assert contents(tmp_path).items() >= expected().items()
 
 

@@ -275,6 +275,7 @@ CONFIG = RunConfig(
 )
 STAGES = [
     "scene",
+    "segment",
     "masks",
     "lift",
     "train",

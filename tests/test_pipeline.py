@@ -20,7 +20,19 @@ from sagesplat.output.ply import read_ply
 from sagesplat.run_dir import RunDir
 from sagesplat.train.levels import read_level
 
-STAGES = ["scene", "masks", "lift", "train", "observe", "fit", "plan", "compose", "evaluate", "report"]
+STAGES = [
+    "scene",
+    "segment",
+    "masks",
+    "lift",
+    "train",
+    "observe",
+    "fit",
+    "plan",
+    "compose",
+    "evaluate",
+    "report",
+]
 CONFIG = RunConfig(train=TrainConfig(max_steps=90, level_every=30), plan=PlanConfig(target_ssim=0.4))
 
 
@@ -108,7 +120,7 @@ def test_a_killed_run_goes_on_and_ends_with_the_same_levels(
     with pytest.raises(Killed):
         pipeline.run_all(Job(RunDir(tmp_path / "run", "snapshots"), emit), capture, CONFIG)
     events = work(tmp_path / "run", capture)
-    assert named(events, StageSkipped) == ["scene", "masks", "lift"]
+    assert named(events, StageSkipped) == ["scene", "segment", "masks", "lift"]
     assert min(e.step for e in events if isinstance(e, Training)) == 61
     for level in (30, 60, 90):
         a, b = (read_level(folder / "levels" / f"{level:06d}.npz") for folder in (finished, tmp_path / "run"))

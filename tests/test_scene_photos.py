@@ -360,11 +360,22 @@ def test_one_camera_for_two_sizes_is_refused(tmp_path: Path, mode: Any) -> None:
     assert len(per_image["cameras"]) == 4
 
 
+def test_heic_photos_are_read(tmp_path: Path) -> None:
+    pytest.importorskip("pi_heif")
+    (tmp_path / "a.heic").write_bytes((Path(__file__).parent / "data" / "two_halves.heic").read_bytes())
+    (photo,), unreadable = prepare_photos(tmp_path, tmp_path / "t", tmp_path / "t", lambda done, total: None)
+    assert not unreadable
+    assert photo.final == "a.jpg"
+    image = np.asarray(Image.open(tmp_path / "t" / photo.prepared), int)
+    assert np.abs(image[10, 10] - [200, 40, 40]).max() < 20
+    assert np.abs(image[10, 50] - [40, 40, 200]).max() < 20
+
+
 def test_many_photos_and_videos_are_matched_in_sequence(tmp_path: Path) -> None:
     Image.new("RGB", (30, 20)).save(tmp_path / "a.png")
     found, _ = prepare_photos(tmp_path, tmp_path / "t", tmp_path / "t", lambda done, total: None)
-    assert photos._request(tmp_path, found * 250, PosesConfig())["matching"] == "exhaustive"
-    assert photos._request(tmp_path, found * 251, PosesConfig())["matching"] == "sequential"
+    assert photos._request(tmp_path, found * 100, PosesConfig())["matching"] == "exhaustive"
+    assert photos._request(tmp_path, found * 101, PosesConfig())["matching"] == "sequential"
     assert photos._request(tmp_path / "a.png", found, PosesConfig())["matching"] == "sequential"
     chosen = PosesConfig(matching="exhaustive")
     assert photos._request(tmp_path / "a.png", found, chosen)["matching"] == "exhaustive"

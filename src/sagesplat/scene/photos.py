@@ -36,7 +36,7 @@ class Reconstruction:
 OnProgress = Callable[[str, int, int], None]  # stage, done, total
 
 MIN_PHOTOS = 3  # the least that a scene is made of
-MANY_PHOTOS = 250  # from here on exhaustive matching takes too long
+MANY_PHOTOS = 100  # from here on matching all pairs takes too long on a CPU: four pairs a second
 _SCRIPT = Path(__file__).with_name("_sfm.py")
 _OWN = ("images", "sparse", "sfm")  # folders of the workspace
 
