@@ -88,6 +88,14 @@ def open_scene(job: Job, path: Path, config: SceneConfig, poses: PosesConfig | N
     run_stage(job, "scene", settings, [], [run.scene], make)
 
 
+_POSES = ("prepare", "features", "matches", "mapping", "undistortion")
+
+
+def _poses_progress(stage: str, done: float) -> Progress:
+    """One bar for all parts of structure from motion; mapping may go back where a model grows anew."""
+    return Progress("poses", round(100 * (_POSES.index(stage) + done)), 100 * len(_POSES), stage)
+
+
 def _find_poses(job: Job, source: Path, capture: Path, config: PosesConfig) -> None:
     """Make a capture of photos or a video: cameras and points by structure from motion."""
     from sagesplat.scene.photos import reconstruct
@@ -100,7 +108,7 @@ def _find_poses(job: Job, source: Path, capture: Path, config: PosesConfig) -> N
     def make() -> list[str]:
         found = reconstruct(
             source, capture, config,
-            lambda stage, done, total: job.emit(Progress("poses", done, max(total, 1), stage)),
+            lambda stage, done, total: job.emit(_poses_progress(stage, done / max(total, 1))),
         )  # fmt: skip
         for name, reason in list(found.unregistered.items())[:5]:
             job.emit(Warned(f"{name}: {reason}"))
