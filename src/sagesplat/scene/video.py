@@ -53,9 +53,8 @@ def extract_frames(
     try:
         paths = [_write(frame, folder, i) for i, frame in _moving(_sharpest(path, max_frames, on_frame))]
     except (FFmpegError, ValueError) as error:
-        raise SceneError(
-            f"{path}: not readable as a video ({error.args[-1] if error.args else error}); convert it to MP4"
-        ) from None
+        reason = getattr(error, "strerror", None) or error
+        raise SceneError(f"{path}: not readable as a video ({reason}); convert it to MP4") from None
     if not paths:
         raise SceneError(f"{path}: no frame can be decoded; copy or convert the video again")
     write_json(folder / "video.json", source | {"frames": [p.name for p in paths]})
