@@ -145,3 +145,16 @@ def test_photos_without_poses_become_a_capture(
     assert Warned("a.jpg: too few features") in events
     assert job.scene.path == (tmp_path / "run" / "capture" / "images").resolve()
     assert len(job.scene.views) == 8
+
+
+def test_a_run_among_the_photos_is_refused(capture: Path) -> None:
+    job = Job(RunDir(capture / "images" / "run"), lambda event: None)
+    with pytest.raises(RunError, match="lies among the photos"):
+        stages.open_scene(job, capture / "images", SceneConfig())
+
+
+def test_given_label_images_have_no_networks_probabilities(capture: Path, tmp_path: Path) -> None:
+    job, _ = begun(tmp_path / "run", capture)
+    job.run.soft.mkdir()
+    labelling.make_masks(job, MasksConfig())
+    assert not job.run.soft.exists()

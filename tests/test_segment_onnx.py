@@ -11,12 +11,17 @@ from sagesplat.scene import load_scene
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Points, Scene, View
 from sagesplat.segment.masks import Masks, Taxonomy, read_mask
-from sagesplat.segment.onnx import OnnxSegmenter, open_session, read_classes, segment_onnx, to_input
+from sagesplat.segment.onnx import OnnxSegmenter, open_session, read_classes, to_input
 from sagesplat.segment.segmenters import arg_max_resized, segment_views
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 CLASSES = {"classes": ["red", "sky", "other"], "coco_panoptic": {"red": 500, "sky": 187, "other": None}}
 FLOAT, INT64, INT_ATTRIBUTE, INTS_ATTRIBUTE = 1, 7, 2, 7
+
+
+def segment_onnx(scene, photos, model, classes, target, *, threads=1, on_view=None):
+    segmenter = OnnxSegmenter(model, classes, device="cpu", threads=threads)
+    segment_views(scene, photos, segmenter, target, on_view=on_view)
 
 
 def field(number, value):

@@ -14,6 +14,7 @@ from sagesplat.files import read_json, write_json
 from sagesplat.job import Job, run_stage
 from sagesplat.run_dir import file_hash
 from sagesplat.segment.edit import Edited, edit_labels, parse_keep, parse_merge
+from sagesplat.segment.hf import DEFAULT_MODEL
 from sagesplat.segment.lift import agreement_in, lift
 from sagesplat.segment.masks import MAX_LABEL_ID, UNLABELLED, Masks, Taxonomy, import_masks
 from sagesplat.segment.segmenters import Segmenter, segment_views
@@ -41,14 +42,13 @@ def make_masks(job: Job, config: MasksConfig, labels: LabelsConfig = LabelsConfi
             on_view=lambda done, total: job.emit(Progress("masks", done, total)),
         )  # fmt: skip
         write_json(run.masks / _EDIT, {**edited.record, "table": edited.table.tolist()})
-        job.__dict__.pop("taxonomy", None)  # of masks that are gone
-        return _lines(job, edited)
+        return _lines(edited)
 
     inputs = [run.provenance("segment"), run.segmented / "labels.json"]
     run_stage(job, "masks", asdict(labels), inputs, [run.masks / "labels.json"], make)
 
 
-def _lines(job: Job, edited: Edited) -> list[str]:
+def _lines(edited: Edited) -> list[str]:
     lines = [f"{len(edited.taxonomy.names)} categories: {', '.join(edited.taxonomy.names.values())}"]
     for what, gone in (("left out", edited.dropped), ("too small", edited.folded)):
         named = ", ".join(f"{name} ({share:.1%})" for name, share in gone.items() if share)
@@ -75,6 +75,7 @@ def _import(job: Job, source: Path) -> None:
 
     def make() -> list[str]:
         shutil.rmtree(run.segmented, ignore_errors=True)
+        shutil.rmtree(run.soft, ignore_errors=True)  # a network's, and these are not its label images
         missing = import_masks(job.scene, source, run.segmented)
         if missing:
             names = ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
@@ -89,12 +90,13 @@ def _segment(job: Job, config: MasksConfig, kind: str) -> None:
     run = job.run
     settings: dict[str, Any] = {"segmenter": kind, "soft": config.soft}
     if kind == "hf":
-        settings["model"] = config.model
+        model = config.model or DEFAULT_MODEL
+        settings["model"] = file_hash(Path(model)) if Path(model).is_dir() else model
     else:
-        for name, needed in (("model", True), ("classes", kind == "onnx")):
-            if needed:
-                settings[name] = file_hash(_file(kind, name, getattr(config, name)))
-    if kind == "deeplabv2":
+        settings["model"] = file_hash(_file(kind, config.model))
+    if kind == "onnx":
+        settings["classes"] = file_hash(_file(kind, config.classes))
+    elif kind == "deeplabv2":
         settings |= {"head": config.head, "crf": config.crf}
 
     def make() -> list[str]:
@@ -114,7 +116,7 @@ def _segment(job: Job, config: MasksConfig, kind: str) -> None:
     run_stage(job, "segment", settings, [run.scene], [run.segmented / "labels.json"], make)
 
 
-def _file(kind: str, name: str, given: str | Path | None) -> Path:
+def _file(kind: str, given: str | Path | None) -> Path:
     wanted = "--model NETWORK.onnx and --classes CLASSES.json" if kind == "onnx" else "--model CHECKPOINT.pth"
     if given is None:
         raise RunError(f"--segmenter {kind} needs {wanted}")
@@ -126,7 +128,7 @@ def _file(kind: str, name: str, given: str | Path | None) -> Path:
 def _load(job: Job, config: MasksConfig, kind: str) -> Segmenter:
     """The network, ready to be used."""
     if kind == "hf":
-        from sagesplat.segment.hf import DEFAULT_MODEL, HfSegmenter
+        from sagesplat.segment.hf import HfSegmenter
 
         model = config.model or DEFAULT_MODEL
         job.emit(Warned(f"network {model}; if it is not here yet, it is fetched from huggingface.co"))

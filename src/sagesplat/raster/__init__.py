@@ -91,7 +91,9 @@ def rasterize(
     """
     degree = gaussians.sh_degree if sh_degree is None else min(sh_degree, gaussians.sh_degree)
     if background is None:
-        background = gaussians.means.new_tensor(camera.background) / 255
+        background = gaussians.means.new_zeros(3)
+        if any(camera.background):  # copying it to a GPU each time would wait for it
+            background += background.new_tensor(camera.background) / 255
     if backend == "auto":
         backend = "cuda" if gaussians.means.is_cuda else "cpu"
     elif backend != "cuda":  # that one says itself what it misses

@@ -13,9 +13,9 @@ from typing import Any
 from PIL import Image, ImageOps
 
 from sagesplat.files import atomic_path
+from sagesplat.scene.detect import PHOTOS
 from sagesplat.scene.images import _rgb
 
-SUFFIXES = frozenset((".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".heic", ".heif"))
 _ORIENTATION, _MAKER, _MODEL, _DETAILS, _FOCAL, _FOCAL_35 = 0x0112, 0x010F, 0x0110, 0x8769, 0x920A, 0xA405
 
 
@@ -68,7 +68,7 @@ def _list(source: Path, skipped: Path) -> list[Path]:
     found = []
     for path in source.rglob("*"):
         hidden = any(part.startswith(".") for part in path.relative_to(source).parts)
-        if path.suffix.lower() not in SUFFIXES or hidden or not path.is_file():
+        if path.suffix.lower() not in PHOTOS or hidden or not path.is_file():
             continue
         if not (anywhere and path.resolve().is_relative_to(skipped)):
             found.append(path)

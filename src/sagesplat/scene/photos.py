@@ -16,7 +16,8 @@ from typing import Any
 from sagesplat.config import PosesConfig
 from sagesplat.errors import BackendUnavailable, SceneError
 from sagesplat.files import read_json, write_json
-from sagesplat.scene._prepare import SUFFIXES, PreparedPhoto, prepare_photos
+from sagesplat.scene._prepare import PreparedPhoto, prepare_photos
+from sagesplat.scene.detect import PHOTOS
 from sagesplat.scene.video import extract_frames
 
 
@@ -146,7 +147,7 @@ def _too_few(source: Path, photos: list[PreparedPhoto], unreadable: dict[str, st
         return f"{found} ({name} {reason}{', ...' if len(unreadable) > 1 else ''}); replace the damaged files"
     if photos and source.is_file():
         return f"{found} frames that differ; move the camera, or take a longer video"
-    kinds = ", ".join(sorted(suffix[1:] for suffix in SUFFIXES))
+    kinds = ", ".join(sorted(suffix[1:] for suffix in PHOTOS))
     return f"{found}; add overlapping photos ({kinds}) or name a video"
 
 

@@ -11,9 +11,6 @@ from PIL import Image
 from sagesplat.errors import BackendUnavailable, SceneError
 from sagesplat.files import atomic_path, read_json, write_json
 
-SUFFIXES = frozenset(
-    (".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".mts", ".m2ts", ".mpg", ".mpeg", ".3gp")
-)
 _GREY_WIDTH = 640  # of the copies that sharpness is measured on
 _THUMB_WIDTH = 64  # of the copies that are compared
 _SAME = 1.0  # mean absolute difference in grey levels below which the camera stood still

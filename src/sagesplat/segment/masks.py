@@ -58,7 +58,7 @@ class Taxonomy:
 
 
 class Masks:
-    """The label images of a normalised folder (what `import_masks` or `segment_onnx` wrote), read lazily.
+    """The label images of a normalised folder (what `import_masks` or `segment_views` wrote), read lazily.
 
     Images are kept until `cache_bytes` are full; the rest is read anew each time, since the stages visit all
     views in turn.

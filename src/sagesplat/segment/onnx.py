@@ -1,6 +1,6 @@
 """Segmentation networks in ONNX format."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,16 +11,13 @@ from PIL import Image
 
 from sagesplat.errors import BackendUnavailable, LabelError, RunError
 from sagesplat.files import read_json
-from sagesplat.scene.scene import Scene
 from sagesplat.segment import coco
 from sagesplat.segment.masks import UNLABELLED, Taxonomy, taxonomy_of
 from sagesplat.segment.segmenters import (
-    PhotoList,
     Segmented,
     answer,
     group_classes,
     parse_device,
-    segment_views,
 )
 
 
@@ -152,21 +149,6 @@ class OnnxSegmenter:
             f"{self._model}: output of shape {list(output.shape)}{largest}, but {len(self._group)} "
             "classes are listed; take the file of classes that belongs to the model"
         )
-
-
-def segment_onnx(
-    scene: Scene,
-    photos: PhotoList,
-    model: Path,
-    classes: Path,
-    target: Path,
-    *,
-    threads: int = 1,
-    on_view: Callable[[int, int], None] | None = None,
-) -> None:
-    """`segment_views` with an `OnnxSegmenter` on the CPU."""
-    segmenter = OnnxSegmenter(model, classes, device="cpu", threads=threads)
-    segment_views(scene, photos, segmenter, target, on_view=on_view)
 
 
 def open_session(model: Path, threads: int, device: str = "cpu") -> Any:
