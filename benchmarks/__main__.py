@@ -16,13 +16,18 @@ from benchmarks import deeplab as segmenting
 from benchmarks import freeze as freezing
 from benchmarks import measure, plain, workloads
 from benchmarks import plans as planning
+from benchmarks import segment as overlays
 from benchmarks.gpu import base, script
 from sagesplat.config import TrainConfig
+from sagesplat.demo.capture import cached_capture
 from sagesplat.gaussians import PARAMETERS, Gaussians
+from sagesplat.job import Job
 from sagesplat.raster import Backend, Workspace, add_weights, rasterize, set_threads
+from sagesplat.run_dir import RunDir
 from sagesplat.scene import load_scene
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene
+from sagesplat.segment.masks import Masks, Taxonomy, import_masks
 from sagesplat.train.trainer import Step, train
 
 RESULTS = Path(__file__).parent / "results" / "cpu"
@@ -56,6 +61,52 @@ def _photo(scene: Scene, row: int) -> torch.Tensor:
 def deeplab(steps: int = 160, views: int = 30, write: bool = False) -> None:
     """A small DeepLabV2 trained on the built-in garden: mIoU on views it has not seen."""
     _finish("deeplab", segmenting.measure(steps, views), write)
+
+
+@app.command
+def segment(
+    out: Path,
+    scene: Path | None = None,
+    models: tuple[Path, ...] = (),
+    classes: Path | None = None,
+    views: int = 5,
+    small: bool = False,
+    blend: float = 0.6,
+    given: bool = True,
+) -> None:
+    """Segmenters on a few views beside the capture's own label images: a sheet of overlays, IoU.
+
+    Args:
+        out: PNG to write.
+        scene: capture with label images (default: the built-in one).
+        models: ONNX networks.
+        classes: what their outputs mean.
+        views: rows of the sheet, evenly spaced.
+        small: also a small DeepLabV2 that learns from all other views.
+        blend: share of the colours; 1 shows no photo.
+        given: whether the sheet shows the given label images too.
+    """
+    capture = load_scene(scene or cached_capture())
+    rows = np.linspace(0, len(capture.views) - 1, views).astype(int).tolist()
+    with tempfile.TemporaryDirectory() as folder:
+        import_masks(capture, capture.path / "masks", Path(folder))
+        masks = Masks(Path(folder), Taxonomy.read(Path(folder) / "labels.json"))
+        segmenters = overlays.networks(models, classes or Path("classes.json"))
+        if small:
+            segmenters |= overlays.small_deeplab(masks, capture, Photos(capture.views), rows)
+        table, page = overlays.compare(capture, masks, segmenters, rows, blend, given)
+    page.save(out)
+    for name, found in table.items():
+        print(name, " ".join(f"{category} {iou:.2f}" for category, iou in found.items()))
+    _finish("segment", table, False)
+
+
+@app.command
+def fusion(run: Path, out: Path, views: int = 5, blend: float = 0.6) -> None:
+    """Label images of a fused run before and after, on a few views: a sheet of overlays."""
+    job = Job(RunDir(run), lambda event: None)
+    rows = np.linspace(0, len(job.scene.views) - 1, views).astype(int).tolist()
+    overlays.fusion_sheet(job, rows, blend).save(out)
 
 
 @app.command

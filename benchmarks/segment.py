@@ -1,0 +1,105 @@
+"""What segmenters find on a few views: overlays side by side, and IoU against label images that are given."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Int16, UInt8
+from PIL import Image, ImageDraw
+
+from benchmarks import deeplab
+from sagesplat.job import Job
+from sagesplat.output.figures import label_image
+from sagesplat.scene.images import Photos
+from sagesplat.scene.scene import Scene
+from sagesplat.segment import coco
+from sagesplat.segment.deeplabv2 import DeepLabV2Segmenter, HeadClasses
+from sagesplat.segment.masks import Masks, Taxonomy
+from sagesplat.segment.onnx import OnnxSegmenter
+from sagesplat.segment.segmenters import Segmenter
+
+WIDTH = 200  # px of a picture on the sheet
+SHARE = 0.01  # of the pixels that a category needs for its IoU to tell something
+
+LabelImage = Int16[np.ndarray, "H W"]
+
+
+def networks(models: Sequence[Path], classes: Path) -> dict[str, Segmenter]:
+    """ONNX networks by name."""
+    return {model.stem: OnnxSegmenter(model, classes) for model in models}
+
+
+def small_deeplab(
+    masks: Masks, scene: Scene, photos: Photos, held_out: Sequence[int]
+) -> dict[str, Segmenter]:
+    """A small DeepLabV2 that learned from all views but the held out ones, without and with the CRF."""
+    ids = sorted(masks.taxonomy.names)
+    index = np.full(max(coco.NAMES) + 2, -1, np.int16)  # the last one is for -1
+    index[ids] = np.arange(len(ids))
+    rows = [row for row in range(len(scene.views)) if row not in held_out]
+    labels = [index[masks[scene.views[row]]] for row in rows]
+    model = deeplab.train_small([photos[row] for row in rows], labels, len(ids), steps=160)
+    heads = HeadClasses(tuple(range(len(ids))), tuple(ids))
+    return {
+        name: DeepLabV2Segmenter(model, heads, size=None, crf=crf)
+        for name, crf in (("deeplabv2 (small)", False), ("with CRF", True))
+    }
+
+
+def ious(found: Sequence[LabelImage], truth: Sequence[LabelImage]) -> dict[int, float]:
+    """IoU of each category that covers enough of the truth; its unlabelled pixels do not count."""
+    p, t = (np.concatenate([image.ravel() for image in images]) for images in (found, truth))
+    p, t = p[t >= 0], t[t >= 0]
+    common = [int(i) for i, n in zip(*np.unique(t, return_counts=True), strict=True) if n >= SHARE * len(t)]
+    return {i: float(((p == i) & (t == i)).sum() / ((p == i) | (t == i)).sum()) for i in common}
+
+
+def sheet(
+    photos: Sequence[UInt8[np.ndarray, "H W 3"]],
+    columns: Mapping[str, Sequence[LabelImage]],
+    taxonomy: Taxonomy,
+    blend: float,
+) -> Image.Image:
+    """One row a view, one column a segmenter, colours over `1 - blend` of the photo, names above."""
+    height = round(WIDTH * photos[0].shape[0] / photos[0].shape[1])
+    page = Image.new("RGB", (len(columns) * (WIDTH + 4) - 4, 18 + len(photos) * (height + 4) - 4), "white")
+    ink = ImageDraw.Draw(page)
+    for x, (name, images) in enumerate(columns.items()):
+        ink.text((x * (WIDTH + 4) + 2, 3), name, "black")
+        for y, (photo, labels) in enumerate(zip(photos, images, strict=True)):
+            colours = {int(i): taxonomy.color(int(i)) for i in np.unique(labels) if i >= 0}
+            mixed = (1 - blend) * photo + blend * label_image(labels, colours)
+            picture = Image.fromarray(mixed.astype(np.uint8)).resize((WIDTH, height))
+            page.paste(picture, (x * (WIDTH + 4), 18 + y * (height + 4)))
+    return page
+
+
+def fusion_sheet(job: Job, rows: Sequence[int], blend: float) -> Image.Image:
+    """Label images of a fused run before and after."""
+    views = [job.scene.views[row] for row in rows]
+    columns = {
+        name: [masks[view] for view in views]
+        for name, masks in (("before fusion", job.masks), ("after", job.best_masks))
+    }
+    return sheet([job.photos[row] for row in rows], columns, job.taxonomy, blend)
+
+
+def compare(
+    scene: Scene,
+    masks: Masks,
+    segmenters: Mapping[str, Segmenter],
+    rows: Sequence[int],
+    blend: float,
+    given: bool,
+) -> tuple[dict[str, dict[str, float]], Image.Image]:
+    """IoU by segmenter and category, with their mean, on some views; and the sheet of overlays."""
+    photos = Photos(scene.views)
+    shown = [photos[row] for row in rows]
+    truth = [masks[scene.views[row]] for row in rows]
+    columns, table = {"given": truth} if given else {}, {}
+    for name, segmenter in segmenters.items():
+        columns[name] = [segmenter([photo])[0].label_ids for photo in shown]
+        found = {masks.taxonomy.name(i): iou for i, iou in ious(columns[name], truth).items()}
+        table[name] = found | {"mean": float(np.mean(list(found.values())))}
+    names = Taxonomy(dict(coco.NAMES) | dict(masks.taxonomy.names))
+    return table, sheet(shown, columns, names, blend)
