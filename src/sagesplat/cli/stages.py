@@ -1,0 +1,215 @@
+"""The main job and its stages."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+from sagesplat.cli.base import Flat, LadderKind, Machine, Run, Scene, command, open_job
+from sagesplat.config import (
+    FitConfig,
+    LabelsConfig,
+    LiftConfig,
+    MasksConfig,
+    NestConfig,
+    PaperConfig,
+    PlanConfig,
+    PosesConfig,
+    RunConfig,
+    SceneConfig,
+    TrainConfig,
+)
+
+
+@command
+def info(scene: Scene, scene_config: Annotated[SceneConfig, Flat] = SceneConfig()) -> None:
+    """Print what a capture holds."""
+    from sagesplat.scene import describe, load_scene
+
+    rows = describe(load_scene(scene, **asdict(scene_config)))
+    width = max(len(name) for name, _ in rows)
+    for name, value in rows:
+        print(f"{name:{width}}  {value}")
+
+
+@command
+def run(
+    scene: Scene,
+    run: Run,
+    scene_config: Annotated[SceneConfig, Flat] = SceneConfig(),
+    poses: PosesConfig = PosesConfig(),
+    masks: Annotated[MasksConfig, Flat] = MasksConfig(),
+    labels: LabelsConfig = LabelsConfig(),
+    lift: LiftConfig = LiftConfig(),
+    train: TrainConfig = TrainConfig(),
+    nest: NestConfig = NestConfig(),
+    fit: FitConfig = FitConfig(),
+    plan: Annotated[PlanConfig, Flat] = PlanConfig(),
+    fuse: bool = False,
+    ladder: LadderKind = "nested",
+    machine: Annotated[Machine, Flat] = Machine(),
+    seed: int = 0,
+) -> None:
+    """Everything: photos in, levels, models, a plan and a report out.
+
+    Poses are found where the photos have none, and label images made where there are none.
+    """
+    from sagesplat import pipeline
+
+    config = RunConfig(scene_config, poses, masks, labels, lift, train, nest, fit, plan, fuse, ladder, seed)
+    with open_job(run, machine, ladder) as job:
+        pipeline.run_all(job, scene, config)
+
+
+@command
+def demo(run: Path = Path("runs/demo"), machine: Annotated[Machine, Flat] = Machine()) -> None:
+    """Make the built-in capture, run the main job on it and say where to look."""
+    from sagesplat import pipeline
+
+    with open_job(run, machine) as job:
+        pipeline.run_demo(job)
+
+
+@command
+def masks(
+    scene: Scene,
+    run: Run,
+    scene_config: Annotated[SceneConfig, Flat] = SceneConfig(),
+    poses: PosesConfig = PosesConfig(),
+    masks: Annotated[MasksConfig, Flat] = MasksConfig(),
+    labels: LabelsConfig = LabelsConfig(),
+    machine: Annotated[Machine, Flat] = Machine(),
+) -> None:
+    """Begin a run: read the capture (poses are found if there are none) and bring label images in."""
+    from sagesplat import labelling, stages
+
+    with open_job(run, machine) as job:
+        stages.open_scene(job, scene, scene_config, poses)
+        labelling.make_masks(job, masks, labels)
+
+
+@command
+def lift(run: Run, lift: LiftConfig = LiftConfig(), machine: Annotated[Machine, Flat] = Machine()) -> None:
+    """Vote the label images onto the points."""
+    from sagesplat import labelling
+
+    with open_job(run, machine) as job:
+        labelling.lift_labels(job, lift)
+
+
+@command
+def fuse(run: Run, machine: Annotated[Machine, Flat] = Machine()) -> None:
+    """Let all views vote on the label images by way of the trained Gaussians; what follows uses them."""
+    from sagesplat import labelling
+
+    with open_job(run, machine) as job:
+        labelling.fuse_masks(job)
+
+
+@command
+def train(
+    run: Run, train: TrainConfig = TrainConfig(), machine: Annotated[Machine, Flat] = Machine(), seed: int = 0
+) -> None:
+    """Train 3DGS and record the levels; a killed training goes on."""
+    from sagesplat import stages
+
+    with open_job(run, machine) as job:
+        stages.train_levels(job, train, seed)
+
+
+@command
+def nest(
+    run: Run, nest: NestConfig = NestConfig(), machine: Annotated[Machine, Flat] = Machine(), seed: int = 0
+) -> None:
+    """Make the nested ladder: order the trained Gaussians, train their prefixes, write the chunks."""
+    from sagesplat import nesting
+
+    with open_job(run, machine) as job:
+        nesting.nest_levels(job, nest, seed)
+
+
+@command
+def observe(
+    run: Run,
+    fit: FitConfig = FitConfig(),
+    ladder: LadderKind = "nested",
+    machine: Annotated[Machine, Flat] = Machine(),
+) -> None:
+    """Measure every category at every level in every view."""
+    from sagesplat import stages
+
+    with open_job(run, machine, ladder) as job:
+        stages.observe_levels(job, fit)
+
+
+@command
+def fit(
+    run: Run,
+    fit: FitConfig = FitConfig(),
+    ladder: LadderKind = "nested",
+    machine: Annotated[Machine, Flat] = Machine(),
+) -> None:
+    """Fit SSIM over distance for every category and level."""
+    from sagesplat import stages
+
+    with open_job(run, machine, ladder) as job:
+        stages.fit_ladder(job, fit)
+
+
+@command
+def plan(
+    run: Run,
+    plan: Annotated[PlanConfig, Flat] = PlanConfig(),
+    ladder: LadderKind = "nested",
+    machine: Annotated[Machine, Flat] = Machine(),
+) -> None:
+    """Choose the cheapest levels that keep a target SSIM."""
+    from sagesplat import stages
+
+    with open_job(run, machine, ladder) as job:
+        stages.make_plan(job, plan)
+
+
+@command
+def compose(run: Run, ladder: LadderKind = "nested", machine: Annotated[Machine, Flat] = Machine()) -> None:
+    """Write the planned scene as composed.ply."""
+    from sagesplat import stages
+
+    with open_job(run, machine, ladder) as job:
+        stages.compose_plan(job)
+
+
+@command
+def evaluate(run: Run, ladder: LadderKind = "nested", machine: Annotated[Machine, Flat] = Machine()) -> None:
+    """Measure the plans on the test views, beside what was promised."""
+    from sagesplat import stages
+
+    with open_job(run, machine, ladder) as job:
+        stages.evaluate_plans(job)
+
+
+@command
+def report(
+    run: Run,
+    paper: bool = False,
+    settings: Annotated[PaperConfig, Flat] = PaperConfig(),
+    ladder: LadderKind = "nested",
+    machine: Annotated[Machine, Flat] = Machine(),
+) -> None:
+    """Write the report; with --paper, every table and figure of the paper.
+
+    Args:
+        run: run folder.
+        paper: cross-view, equal occupancy, and the paper's tables and figures, from its ladder of snapshots.
+        settings: what they look at.
+        ladder: the ladder to report on.
+        machine: where and how to compute.
+    """
+    from sagesplat import stages
+
+    with open_job(run, machine, "snapshots" if paper else ladder) as job:
+        if paper:
+            from sagesplat.paper import paper_report
+
+            paper_report(job, settings)
+        else:
+            stages.make_report(job)

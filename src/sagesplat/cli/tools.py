@@ -1,0 +1,110 @@
+"""Commands around a run: what goes in, what comes out, what the machine can do."""
+
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from sagesplat.cli.base import Flat, LadderKind, Machine, Run, command, open_job
+from sagesplat.errors import RunError
+
+
+@command
+def export(
+    run: Run,
+    out: Positional[Annotated[Path, arg(metavar="OUT")]],
+    level: int | None = None,
+    labels: tuple[str, ...] = (),
+    target_ssim: float | None = None,
+    chunks: Literal["spz", "ply"] | None = None,
+    ladder: LadderKind = "nested",
+    machine: Annotated[Machine, Flat] = Machine(),
+) -> None:
+    """Write Gaussians as a PLY: the plan's composition, or one level; or all chunks of the nested ladder.
+
+    Args:
+        run: run folder.
+        out: PLY to write, or a folder for chunks.
+        level: a level by its number (of snapshots: training step), instead of the composition.
+        labels: names of the categories to take.
+        target_ssim: the composition for this planned target (default: the budget's or the main one).
+        chunks: a file for what each level of each category adds, in this format.
+        ladder: the ladder to take them from.
+        machine: where and how to compute.
+    """
+    from sagesplat import pipeline
+
+    with open_job(run, machine, ladder) as job:
+        if chunks:
+            count = pipeline.export_chunks(job, out, chunks)
+        else:
+            count = pipeline.export_ply(job, out, level=level, labels=labels, target=target_ssim)
+    print(f"{out}: {count:,} {'chunks' if chunks else 'Gaussians'}")
+
+
+@command
+def download(
+    what: Positional[Annotated[str, arg(metavar="WHAT")]] = "",
+    folder: Positional[Annotated[Path | None, arg(metavar="FOLDER")]] = None,
+    scale: int | None = None,
+    show: Annotated[bool, arg(name="list")] = False,
+) -> None:
+    """Fetch a scene of the field, or weights that are not part of the package.
+
+    Of a scene only its own photos and model are transferred out of the official archive. What is there
+    already is kept, so a download that was cut goes on when the command is given again.
+
+    Args:
+        what: a scene, such as mipnerf360/garden; or lpips, the weights of the perceptual metric (761 MB are
+            fetched, 69 MB kept).
+        folder: where to put it (default: the folder you are in; of weights the cache, ~/.cache/sagesplat).
+        scale: photos so many times smaller, as the archive has them (default: what papers evaluate on).
+        show: list the scenes.
+    """
+    from sagesplat.console import Console
+    from sagesplat.download import download_lpips
+    from sagesplat.download_scenes import download_scene, find_scene, list_scenes
+    from sagesplat.events import Progress, StageStarted
+
+    if show:
+        for scene in list_scenes():
+            size = f"of a {scene.archive_gb:g} GB archive" if scene.archive_gb else ""
+            print(f"{scene.name:24} {scene.photos:4} photos {size:24} {scene.page}")
+        return
+    if not what:
+        raise RunError("nothing to download; name a scene (see `sagesplat download --list`) or lpips")
+
+    with Console() as console:
+        console(StageStarted("download"))
+
+        def progress(name: str, done: int, total: int) -> None:
+            console(Progress("download", done, max(total, done, 1), name))
+
+        if what == "lpips":
+            found = download_lpips(folder, on_progress=progress)
+        else:
+            print(find_scene(what).licence, file=sys.stderr)
+            found = [download_scene(what, folder or Path(), scale=scale, on_progress=progress)]
+    print("\n".join(map(str, found)))
+    if what != "lpips" and (factor := scale or find_scene(what).scale) > 1:
+        print(f"train with --downscale {factor}", file=sys.stderr)
+
+
+@command
+def doctor(build: bool = False, json: bool = False) -> None:
+    """Say what this machine can do, and what more needs.
+
+    Args:
+        build: compile gsplat's CUDA kernels now (about a minute), rather than at their first use.
+        json: print it for machines.
+    """
+    from sagesplat.doctor import as_json, examine, is_well, print_findings
+
+    findings = examine(build=build)
+    if json:
+        print(as_json(findings))
+    else:
+        print_findings(findings)
+    if not is_well(findings):
+        raise SystemExit(1)
