@@ -170,9 +170,9 @@ def damaged(path: Path, how: str) -> None:
         ("label", "20 values of label are outside"),
         ("zero", "20 Gaussians have a rotation"),
         ("cut", "20 Gaussians promised, 19 there"),
-        ("ascii", "format ascii is not read"),
+        ("ascii", "as text is not read"),
         ("header", "header breaks"),
-        ("garbage", "not a PLY file"),
+        ("garbage", "not readable as a PLY file"),
         ("huge", "20 there"),
     ],
 )

@@ -89,7 +89,7 @@ def test_without_colours_grey(tmp_path):
 BAD = {
     "no such file; add it, or take ply_file_path out": None,
     "does not begin with 'ply'": b"solid",
-    "no format, no vertices or no x": header("ascii", "float x", "float y") + b"0 0\n0 0\n0 0\n",
+    "no vertices or no x": header("ascii", "float x", "float y") + b"0 0\n0 0\n0 0\n",
     "its header breaks at 'format zip 1.0'": header("zip", *AXES),
     "its header breaks at 'property list": header("ascii", "list uchar int x"),
     "its header breaks at ''": b"ply\nformat ascii 1.0\n",
@@ -99,7 +99,7 @@ BAD = {
     "3 points of 3 values promised, but there are": header("ascii", *AXES) + b"0.5 0.5 0.5\n0.5 0.5 0.5\n",
     "not readable as a PLY file": header("ascii", *AXES) + b"0.5 0.5 0.5\n0.5 0.5 x.5\n0.5 0.5 0.5\n",
     "promised, but there are": header("ascii", *AXES) + b"\n" * 40,
-    "no format, no vertices": header("ascii", *AXES, count=0),
+    "its header names no vertices": header("ascii", *AXES, count=0),
     "1 of 3 points are not finite": header("ascii", *AXES) + b"0 0 0\nnan 0 0\n1 1 1\n",
     "2 of 3 points are not finite": header("ascii", *(p.replace("float", "double") for p in AXES))
     + b"0 0 0\n1e300 0 0\ninf 1 1\n",

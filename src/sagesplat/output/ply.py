@@ -14,14 +14,10 @@ from sagesplat import __version__
 from sagesplat.errors import DataError
 from sagesplat.files import atomic_path
 from sagesplat.gaussians import Gaussians
+from sagesplat.ply_header import read_header
 
 ROWS = 4096  # per block: every property of a block stays in the processor's cache
 BASES = (0, 3, 8, 15)  # spherical harmonics beyond the constant one, degree 0 to 3
-TYPES = {  # the format's own names and those of other writers
-    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
-    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
-    **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
-}
 
 
 def write_ply(path: Path, gaussians: Gaussians, names: dict[int, str] | None = None) -> None:
@@ -52,11 +48,15 @@ def read_ply(path: Path) -> Gaussians:
     """
     try:
         with path.open("rb") as file:
-            dtype, count = _read_header(path, file)
-            wanted = _wanted(path, dtype)
-            columns, labels = _read_body(path, file, dtype, count, wanted)
+            header = read_header(file)
+            if not header.order:
+                raise DataError(f"{path}: a PLY file as text is not read; save it as binary_little_endian")
+            wanted = _wanted(path, header.dtype)
+            columns, labels = _read_body(path, file, header.dtype, header.count, wanted)
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror}); give a splat .ply") from None
+    except ValueError as error:
+        raise DataError(f"{path}: not readable as a PLY file ({error}); give a splat .ply") from None
     _check_values(path, columns, labels, wanted)
     return _gaussians(columns, labels)
 
@@ -96,38 +96,6 @@ def _gaussians(columns: np.ndarray, labels: np.ndarray) -> Gaussians:
         shN=rows(rest.swapaxes(0, 1)),
         label_ids=torch.from_numpy(labels.astype(np.int16)),
     )
-
-
-def _read_header(path: Path, file: BinaryIO) -> tuple[np.dtype, int]:
-    """The type of a row and the number of rows; the file then stands at the first row."""
-    if file.readline(16).strip() != b"ply":
-        raise DataError(f"{path}: not a PLY file; give a splat .ply")
-    order, count, element, fields = "", -1, "", {}
-    while (words := file.readline(1024).decode("utf-8", "replace").split())[:1] != ["end_header"]:
-        match words:
-            case ["format", "binary_little_endian" | "binary_big_endian" as name, *_]:
-                order = "<" if name == "binary_little_endian" else ">"
-            case ["format", name, *_]:
-                raise DataError(f"{path}: PLY format {name} is not read; save it as binary_little_endian")
-            case ["element", element, number] if number.isdecimal():
-                if element == "vertex":
-                    count = int(number)
-                elif count < 0:
-                    raise DataError(
-                        f"{path}: element {element} comes before the vertices; save vertices only"
-                    )
-            case ["property", *_] if element != "vertex":
-                pass  # faces after the vertices are never read
-            case ["property", kind, name] if kind in TYPES and name not in fields:
-                fields[name] = TYPES[kind]
-            case ["comment" | "obj_info", *_]:
-                pass
-            case _:
-                line = " ".join(words)[:60] or "the end of the file"
-                raise DataError(f"{path}: the PLY header breaks at '{line}'; save the file again")
-    if not order or count < 0:
-        raise DataError(f"{path}: the PLY header names no format or no vertices; save the file again")
-    return np.dtype([(name, order + kind) for name, kind in fields.items()]), count
 
 
 def _wanted(path: Path, dtype: np.dtype) -> list[str]:

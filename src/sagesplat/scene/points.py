@@ -12,6 +12,7 @@ from scipy.spatial import KDTree
 
 from sagesplat import geometry
 from sagesplat.errors import SceneError
+from sagesplat.ply_header import PlyHeader, read_header
 from sagesplat.scene.images import load_photo
 from sagesplat.scene.scene import Points, View
 
@@ -20,11 +21,6 @@ FAR = 10.0  # how much farther than what the cameras span random points reach
 NEIGHBOURS = 4  # views, one of which has to see a random point besides its own
 COLOUR_VIEWS, COLOUR_SIDE = 16, 128  # photos, and their longer side in pixels, that colour random points
 FULL = {"f4": 255.0, "f8": 255.0, "u2": 1 / 257}  # colours of these types have another range than 0 ... 255
-TYPES = {  # PLY's own names and the newer ones
-    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
-    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
-    **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
-}
 
 
 def untracked(xyz: Float32[np.ndarray, "P 3"], rgb: UInt8[np.ndarray, "P 3"]) -> Points:
@@ -39,8 +35,10 @@ def read_points(path: Path) -> Points:
     """
     try:
         with path.open("rb") as file:
-            order, types, count = _read_header(file)
-            table = _read_vertices(path, file, order, types, count)
+            header = read_header(file)
+            if header.count < 1 or not {"x", "y", "z"} <= header.types.keys():
+                raise ValueError("its header names no vertices or no x, y and z")
+            table = _read_vertices(path, file, header)
     except FileNotFoundError:
         raise SceneError(
             f"{path}: no such file; add it, or take ply_file_path out to start from random points"
@@ -54,51 +52,19 @@ def read_points(path: Path) -> Points:
         rgb = np.full((len(xyz), 3), GREY, np.uint8)
         for column, name in enumerate(("red", "green", "blue")):
             if name in table:
-                scale = FULL.get(types[name], 1.0)
+                scale = FULL.get(header.types[name], 1.0)
                 rgb[:, column] = np.nan_to_num(table[name] * scale).round().clip(0, 255)
     return untracked(xyz, rgb)
 
 
-def _read_header(file: BinaryIO) -> tuple[str, dict[str, str], int]:
-    """Byte order ('' for ASCII), the properties of a vertex with their types, and the number of vertices.
-
-    The file then stands at the first of them.
-    """
-    if file.readline(16).strip() != b"ply":
-        raise ValueError("it does not begin with 'ply'")
-    order, count, element, fields = None, -1, "", {}
-    while (words := file.readline(1024).decode("utf-8", "replace").split())[:1] != ["end_header"]:
-        match words:
-            case ["format", "ascii" | "binary_little_endian" | "binary_big_endian" as name, *_]:
-                order = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}[name]
-            case ["element", element, number] if number.isdecimal():
-                if element == "vertex":
-                    count = int(number)
-                elif count < 0:
-                    raise ValueError(f"element {element} comes before the vertices")
-            case ["property", *_] if element != "vertex":
-                pass  # faces after the vertices are never read
-            case ["property", kind, name] if kind in TYPES and name not in fields:
-                fields[name] = TYPES[kind]
-            case ["comment" | "obj_info", *_]:
-                pass
-            case _:
-                raise ValueError(f"its header breaks at {' '.join(words)[:60]!r}")
-    if order is None or count < 1 or not {"x", "y", "z"} <= fields.keys():
-        raise ValueError("its header names no format, no vertices or no x, y and z")
-    return order, fields, count
-
-
-def _read_vertices(
-    path: Path, file: BinaryIO, order: str, types: dict[str, str], count: int
-) -> dict[str, np.ndarray]:
+def _read_vertices(path: Path, file: BinaryIO, header: PlyHeader) -> dict[str, np.ndarray]:
     """The vertices, a column per property."""
-    row = np.dtype([(name, order + kind) for name, kind in types.items()])
+    types, count, row = header.types, header.count, header.dtype
     # Text takes at least a digit and a space per value; the last line may lack its end.
-    smallest = row.itemsize * count if order else 2 * len(types) * count - 1
+    smallest = row.itemsize * count if header.order else 2 * len(types) * count - 1
     if smallest > path.stat().st_size - file.tell():
         raise ValueError(f"{count} points promised, but it ends before them")
-    if order:
+    if header.order:
         table = np.fromfile(file, row, count)
         return {name: table[name] for name in types}
     with warnings.catch_warnings(action="ignore"):  # of a file without numbers; its shape tells
