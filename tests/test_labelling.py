@@ -134,7 +134,7 @@ def test_photos_without_poses_become_a_capture(
         shutil.copytree(capture, workspace)
         (workspace / "poses.json").write_text("{}")
         on_progress("features", 1, 2)
-        return photos_module.Reconstruction(workspace, 9, 8, {"a.jpg": "too few features"}, 10, 0.5, {})
+        return photos_module.Reconstruction(workspace, 9, 8, {"a.jpg": "too few features"}, 10, 0.97, {})
 
     monkeypatch.setattr(photos_module, "reconstruct", reconstruct)
     events: list[Event] = []
@@ -142,7 +142,10 @@ def test_photos_without_poses_become_a_capture(
     for _ in range(2):
         stages.open_scene(job, capture / "images", SceneConfig(), PosesConfig(matching="sequential"))
     assert asked == [(capture / "images", PosesConfig(matching="sequential"))]
-    assert Warned("a.jpg: too few features") in events
+    warned = [event.text for event in events if isinstance(event, Warned)]
+    assert warned[0] == "a.jpg: too few features"
+    assert "0.97 px is high" in warned[1]
+    assert "--poses.camera per-image" in warned[1]
     assert job.scene.path == (tmp_path / "run" / "capture" / "images").resolve()
     assert len(job.scene.views) == 8
 

@@ -88,6 +88,7 @@ def open_scene(job: Job, path: Path, config: SceneConfig, poses: PosesConfig | N
     run_stage(job, "scene", settings, [], [run.scene], make)
 
 
+HIGH_ERROR = 0.8  # px; what one camera leaves where each photo has its own (dinosaur: 0.97, then 0.42)
 _POSES = ("prepare", "features", "matches", "mapping", "undistortion")
 
 
@@ -116,6 +117,10 @@ def _find_poses(job: Job, source: Path, capture: Path, config: PosesConfig) -> N
             job.emit(Warned(f"{name}: {reason}"))
         if len(found.unregistered) > 5:
             job.emit(Warned(f"{len(found.unregistered)} photos in all left out; see {capture}/poses.json"))
+        if found.reprojection_error > HIGH_ERROR and not config.refine_principal_point:
+            cure = "--poses.camera per-image --poses.refine-principal-point"
+            high = f"reprojection error {found.reprojection_error:.2f} px is high"
+            job.emit(Warned(f"{high}; if the photos were cropped or zoomed one by one, try {cure}"))
         return [
             f"poses of {found.num_registered} of {found.num_photos} photos, {found.num_points:,} points, "
             f"reprojection error {found.reprojection_error:.2f} px"
