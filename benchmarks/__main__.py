@@ -358,6 +358,16 @@ def gpu(
 
 
 @app.command
+def viewer(bundle: Path, write: bool = False) -> None:
+    """A bundle in Chromium at 2, 10, 50 Mbit/s: bytes and seconds to the first picture and to targets."""
+    from benchmarks import viewer as loading
+
+    result = loading.measure(bundle)
+    print(loading.table(result))
+    _finish("viewer", result, write)
+
+
+@app.command
 def freeze(
     scene: Path = workloads.GARDEN,
     downscale: int = 2,

@@ -249,6 +249,18 @@ class CompareConfig:
 
 
 @dataclass(frozen=True)
+class BundleConfig:
+    """What a bundle says of its scene."""
+
+    meters_per_unit: float | None = None
+    """Scale of the scene, for headsets (default: guessed from the cameras' height)."""
+    always: tuple[str, ...] = ()
+    """Categories shipped in full whatever the plan says."""
+    weights: dict[str, float] = field(default_factory=dict)
+    """How much categories count in the viewer's plans, as NAME VALUE ... (default: 1 each)."""
+
+
+@dataclass(frozen=True)
 class RunConfig:
     """Everything that a run needs to be done again."""
 

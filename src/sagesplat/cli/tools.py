@@ -1,12 +1,14 @@
 """Commands around a run: what goes in, what comes out, what the machine can do."""
 
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
 from sagesplat.cli.base import Flat, LadderKind, Machine, Run, command, open_job
+from sagesplat.config import BundleConfig
 from sagesplat.errors import RunError
 
 
@@ -108,3 +110,59 @@ def doctor(build: bool = False, json: bool = False) -> None:
         print_findings(findings)
     if not is_well(findings):
         raise SystemExit(1)
+
+
+@command
+def bundle(
+    run: Run,
+    out: Positional[Annotated[Path, arg(metavar="OUT")]],
+    config: Annotated[BundleConfig, Flat] = BundleConfig(),
+    machine: Annotated[Machine, Flat] = Machine(),
+) -> None:
+    """Write a finished run as a folder for any static web server: scene, promises and viewer.
+
+    Args:
+        run: run folder, finished with the nested ladder.
+        out: folder to write: a new or empty one, or an earlier bundle, which is replaced.
+        config: what it says of the scene.
+        machine: where and how to compute.
+    """
+    from sagesplat.bundling import bundle as write
+
+    with open_job(run, machine) as job:
+        made = write(job, out, **asdict(config))
+    megabytes = f"{made.sizes.chunks / 1e6:.1f} MB of {made.sizes.total / 1e6:.1f} MB"
+    print(f"{out}: {made.labels} categories, {made.chunks} chunks, {made.count:,} Gaussians, {megabytes}")
+
+
+@command
+def view(
+    path: Positional[Annotated[Path, arg(metavar="RUN|BUNDLE")]],
+    port: int | None = None,
+    host: str | None = None,
+    ssl_certfile: Path | None = None,
+    ssl_keyfile: Path | None = None,
+    browser: bool = True,
+    follow: bool = False,
+) -> None:
+    """Show a bundle, or a run's, in the browser; with --follow its training as it goes on.
+
+    Args:
+        path: run folder (its bundle is made if it is missing or out of date), or a bundle.
+        port: port to listen on (default: the first free one from 8000 on).
+        host: address to listen on; 0.0.0.0 lets everybody in the network in (default: this machine only).
+        ssl_certfile: certificate (PEM) for https, which headsets ask for.
+        ssl_keyfile: its key, if it is in a file of its own.
+        browser: open the browser.
+        follow: show the newest snapshot of a training that goes on.
+    """
+    from sagesplat import serve
+    from sagesplat.console import Console
+
+    certificate = {"ssl_certfile": ssl_certfile, "ssl_keyfile": ssl_keyfile}
+    with (
+        Console() as console,
+        serve.view(path, console, port=port, host=host, follow=follow, **certificate) as shown,
+    ):
+        print(*shown.urls, shown.hint, "Ctrl-C ends it", sep="\n", flush=True)
+        shown.run(browser)

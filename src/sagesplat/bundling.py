@@ -1,0 +1,301 @@
+"""Bundles of a run: everything that a viewer needs, in one static folder."""
+
+import json
+import shutil
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.distance import cdist
+
+from sagesplat.adapt.observe import large_enough, read_observations
+from sagesplat.adapt.promise import ViewModel, read_promises
+from sagesplat.errors import RunError
+from sagesplat.files import read_json, write_json
+from sagesplat.gaussians import Gaussians
+from sagesplat.job import Job, distances
+from sagesplat.output import boxes
+from sagesplat.output.bearings import FLIP, fov_y, position, quaternion
+from sagesplat.output.bundle import (
+    MANIFEST,
+    Category,
+    Contents,
+    Shot,
+    Written,
+    check_target,
+    check_viewer,
+    write_bundle,
+    write_documents,
+)
+from sagesplat.output.chunks import INDEX, read_chunks, read_index, write_chunks
+from sagesplat.run_dir import file_hash, settings_of
+from sagesplat.segment.masks import UNLABELLED
+from sagesplat.train.levels import read_level
+
+# readable on light and dark; a category gets the one that is most like its colour in the report
+_PALETTE = (
+    *("#e5484d", "#ef7d2b", "#d6a10b", "#94ad1e", "#3f9f4f", "#16a38b", "#1ba3c2", "#3f8fe0"),
+    *("#5b6bf0", "#8b5cf0", "#bf52c9", "#e0568f", "#a8744a", "#6dbd6a", "#7f7fb0", "#b38f6d"),
+)
+_GREY = "#8a94a3"
+_GROUND = {"dirt", "floor", "grass", "gravel", "ground", "pavement", "platform", "playingfield", "railroad"}
+_GROUND |= {"path", "road", "sand", "sidewalk", "snow", "soil", "street", "terrain"}
+_SUFFIXES = ("-merged", "-other", "-stuff")  # of COCO's panoptic names
+_FEW = boxes.FEW  # SfM points below which a category's Gaussians say where it is
+_OPAQUE = 0.1  # from which a Gaussian does
+_LIVE = ".live.json"  # what a live bundle was made of
+
+
+@dataclass(frozen=True)
+class BundleMade:
+    """What is in a bundle, and how well its boxes tell distances."""
+
+    path: Path
+    labels: int
+    chunks: int
+    count: int  # Gaussians
+    sizes: Written  # bytes
+    agreement: dict[int, tuple[float, float]]  # by label id: median and 95th percentile of the relative error
+    error: tuple[float, float]  # the same over all labels
+
+
+def bundle(
+    job: Job,
+    out: Path,
+    *,
+    meters_per_unit: float | None = None,
+    always: Collection[str] = (),
+    weights: Mapping[str, float] | None = None,
+    viewer: Path | None = None,
+) -> BundleMade:
+    """Write a finished run as a bundle into `out`: a new or empty folder, or an earlier bundle.
+
+    `meters_per_unit`: the scene's scale, guessed from the cameras' height if left out. `always`: categories
+    shipped in full. `weights`: of categories by name, 1 for the others. `viewer`: the built viewer, the
+    package's own if left out. RunError: a run without nested ladder or promises, another folder, unknown
+    names or an impossible number; DataError: a damaged chunk; SageError: no viewer.
+    """
+    weights = weights or {}
+    job = replace(job, run=replace(job.run, ladder="nested"))
+    _check(job, meters_per_unit, always, weights)
+    viewer = viewer or package_viewer()
+    check_target(out)
+    check_viewer(viewer)
+    chunks = read_index(job.run.chunks)
+    if any(not chunk.uri.endswith(".spz") for chunk in chunks):
+        raise RunError(f"{job.run.chunks}: not SPZ files; run `sagesplat nest` again with --force")
+    contents = replace(
+        _contents(job, read_chunks(job.run.chunks, chunks), job.antialiased),
+        chunks=chunks,
+        meters_per_unit=meters_per_unit,
+    )
+    contents = replace(contents, categories=_with_quality(job, contents.categories, always, weights))
+    written = write_bundle(out, contents, viewer)
+    agreement, error = distance_error(contents)
+    count = sum(chunk.count for chunk in chunks)
+    return BundleMade(out, len(contents.categories), len(chunks), count, written, agreement, error)
+
+
+def package_viewer() -> Path:
+    """Where the built viewer is, if it is."""
+    return Path(str(files("sagesplat"))) / "viewer" / "static"
+
+
+def live_bundle(job: Job, folder: Path, viewer: Path | None = None) -> bool:
+    """Write the newest snapshot of a training that may go on into `folder`; False if it is there already.
+
+    One level a category and no promises. Files appear whole; those that a page may still be loading stay
+    until two newer snapshots are there. RunError while there is no snapshot.
+    """
+    steps = sorted(p for p in job.run.levels.glob("*.npz") if not p.name.startswith("."))
+    if not steps:
+        raise RunError(f"{job.run.levels}: no level yet; wait, or run `sagesplat train`")
+    newest = {"level": steps[-1].name, "written": steps[-1].stat().st_mtime_ns}
+    before: dict[str, Any] = {}
+    with suppress(RunError):
+        before = read_json(folder / _LIVE)
+    if before.get("of") == newest and (folder / MANIFEST).exists():
+        return False
+    if not before:
+        check_target(folder)
+    if not (folder / "index.html").exists():
+        viewer = viewer or package_viewer()
+        check_viewer(viewer)
+        shutil.copytree(viewer, folder, dirs_exist_ok=True)
+    g = read_level(steps[-1])
+    g = g.select(torch.argsort(g.label_ids, stable=True))
+    antialiased = _antialiased(job)
+    work, target = folder / ".chunks", folder / "chunks"
+    sizes = {label: (n,) for label, n in g.counts().items()}
+    chunks = write_chunks(work, g, sizes, job.names(), antialiased=antialiased)
+    target.mkdir(exist_ok=True)
+    for chunk in chunks:
+        (work / chunk.uri).replace(target / chunk.uri)
+    shutil.rmtree(work)
+    write_documents(folder, replace(_contents(job, g, antialiased), chunks=chunks, live=True))
+    uris = [chunk.uri for chunk in chunks]
+    kept = [uris, *(version for version in before.get("kept", []) if version != uris)][:3]
+    write_json(folder / _LIVE, {"of": newest, "kept": kept})
+    for path in target.iterdir():
+        if path.name not in {uri for version in kept for uri in version}:
+            path.unlink()
+    return True
+
+
+def distance_error(contents: Contents) -> tuple[dict[int, tuple[float, float]], tuple[float, float]]:
+    """Median and 95th percentile of the relative error of distances by boxes, by label and over all.
+
+    Against d_min, in the views that show enough of a category.
+    """
+    found: dict[int, list[float]] = {}
+    for row, shot in enumerate(contents.shots):
+        camera = shot.camera
+        where = position(camera)
+        planes = boxes.frustum(where, quaternion(camera), fov_y(camera), camera.width / camera.height)
+        for category in contents.categories:
+            if category.shares is None or category.distance is None or not category.shares[row]:
+                continue
+            truth = float(category.distance[row])
+            if truth > 0:
+                told = boxes.distance(category.boxes, where, planes)
+                found.setdefault(category.label_id, []).append(abs(told - truth) / truth)
+    by_label = {label: _median_and_95th(errors) for label, errors in found.items()}
+    return by_label, _median_and_95th([e for errors in found.values() for e in errors])
+
+
+def _median_and_95th(errors: Sequence[float]) -> tuple[float, float]:
+    if not np.isfinite(errors).any():
+        return float("nan"), float("nan")
+    median, high = np.nanpercentile(errors, [50, 95])
+    return float(median), float(high)
+
+
+def _check(
+    job: Job, meters_per_unit: float | None, always: Collection[str], weights: Mapping[str, float]
+) -> None:
+    run = job.run
+    for stage, path in (("nest", run.chunks / INDEX), ("observe", run.observations), ("fit", run.promises)):
+        if not path.exists():
+            raise RunError(
+                f"{run.path}: no {path.relative_to(run.path)}; a bundle needs a finished nested ladder: "
+                f"run `sagesplat {stage}`, or `sagesplat run`"
+            )
+    fitted = read_json(run.provenance("fit"))["inputs"]
+    if fitted.get(INDEX) != file_hash(run.chunks / INDEX):
+        raise RunError(f"{run.promises}: promises of other chunks; run `sagesplat fit` again with --force")
+    if meters_per_unit is not None and not 1e-6 <= meters_per_unit <= 1e6:
+        raise RunError(f"{meters_per_unit} metres per unit are impossible; give a number such as 0.5")
+    names = set(job.names().values())
+    if unknown := sorted({*always, *weights} - names):
+        raise RunError(f"{', '.join(unknown)}: no such category; there are {', '.join(sorted(names))}")
+    for name, weight in weights.items():
+        if not 0 <= weight <= 1e6:
+            raise RunError(f"weight {weight} of {name} is impossible; give a number from 0 on, such as 2")
+
+
+def _contents(job: Job, g: Gaussians, antialiased: bool) -> Contents:
+    """All but the chunks and what is promised of them."""
+    scene, names = job.scene, job.names()
+    labels = sorted(g.counts())
+    colors = colors_of({i: job.taxonomy.color(i) for i in labels})
+    titles = {i: title_of(names[i]) if i != UNLABELLED else "everything else" for i in labels}
+    ground = [i for i in labels if _GROUND & set(titles[i].split())]
+    return Contents(
+        name=scene.name,
+        extent=scene.extent,
+        shots=[Shot(view.name, scene.split(row), view.camera) for row, view in enumerate(scene.views)],
+        categories=[
+            Category(i, names[i], titles[i], colors[i], boxes.split_boxes(_points_of(job, g, i) * FLIP))
+            for i in labels
+        ],
+        chunks=[],
+        folder=job.run.chunks,
+        sh_degree=g.sh_degree,
+        antialiased=antialiased,
+        points=scene.points.xyz,
+        ground=np.isin(job.point_labels, ground),
+    )
+
+
+def _points_of(job: Job, g: Gaussians, label: int) -> np.ndarray:
+    """SfM points of a category; where they are few, the centres of what is seen of it as well."""
+    points = job.scene.points.xyz[job.point_labels == label]
+    if len(points) >= _FEW:
+        return points
+    mine = g.of_labels([label])
+    seen = mine.select(mine.logit_opacities >= np.log(_OPAQUE / (1 - _OPAQUE)))
+    return np.concatenate([points, (seen if len(seen) else mine).means.numpy()])
+
+
+def _with_quality(
+    job: Job, categories: Sequence[Category], always: Collection[str], weights: Mapping[str, float]
+) -> list[Category]:
+    promises: dict[int, ViewModel] = read_promises(job.run.promises)
+    far = distances(job, job.fit_config.distance)
+    shares = _shares(job)
+    return [
+        replace(
+            category,
+            weight=float(weights.get(category.name, 1.0)),
+            always=category.name in always,
+            model=promises.get(category.label_id),
+            shares=shares.get(category.label_id),
+            distance=far.get(category.label_id),
+        )
+        for category in categories
+    ]
+
+
+def _shares(job: Job) -> dict[int, np.ndarray]:
+    """Of the pixels of each view, by label id; 0 for small ones."""
+    table = large_enough(read_observations(job.run.observations), job.scene, job.fit_config.min_share)
+    table = table.select(table.level == table.level.max(initial=0))
+    sizes = np.array([view.camera.width * view.camera.height for view in job.scene.views])
+    found = {label: np.zeros(len(sizes)) for label in set(table.label_id.tolist())}
+    for label, view, pixels in zip(table.label_id, table.view, table.num_pixels, strict=True):
+        found[int(label)][view] = pixels / sizes[view]
+    return found
+
+
+def title_of(name: str) -> str:
+    """A category's name for people: grass for grass-merged."""
+    for suffix in _SUFFIXES:
+        name = name.removesuffix(suffix)
+    return name.replace("-", " ")
+
+
+def colors_of(wanted: Mapping[int, tuple[int, int, int]]) -> dict[int, str]:
+    """Colours of the palette, in hue as near as can be to those wanted; all different as long as it lasts."""
+    labels = sorted(set(wanted) - {UNLABELLED})
+    colors = list(_PALETTE) * (1 + len(labels) // len(_PALETTE))
+    away = cdist([_pure(wanted[i]) for i in labels] or np.zeros((0, 3)), [_pure(_rgb(c)) for c in colors])
+    chosen = linear_sum_assignment(away**2)[1]
+    return {UNLABELLED: _GREY} | {label: colors[i] for label, i in zip(labels, chosen, strict=True)}
+
+
+def _pure(rgb: Sequence[int]) -> np.ndarray:
+    """RGB as bright as it can be."""
+    return np.array(rgb) / max(*rgb, 1)
+
+
+def _rgb(color: str) -> list[int]:
+    return [int(color[i : i + 2], 16) for i in (1, 3, 5)]
+
+
+def _antialiased(job: Job) -> bool:
+    """Whether the Gaussians are trained so; the checkpoint knows before training is done."""
+    try:
+        return bool(settings_of(job.run, "train")["antialiased"])
+    except RunError:
+        pass
+    try:
+        with np.load(job.run.checkpoint, allow_pickle=False) as file:
+            return bool(json.loads(json.loads(str(file["meta"]))["settings"])["antialiased"])
+    except (OSError, ValueError, KeyError):
+        return False  # no checkpoint yet, or one of another version

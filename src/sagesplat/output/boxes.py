@@ -1,0 +1,100 @@
+"""Where a category is, in a few boxes, and how far from a camera: what a viewer knows instead of points.
+
+Split: points whose 8th nearest neighbour is more than FAR times as far away as is usual are left out; the
+rest is halved at the median of its longest axis, again and again, into up to MOST parts of equal counts. A
+part's box reaches from the 5th to the 95th percentile of its points on each axis.
+
+Distance, from a camera's position and the half spaces of what it sees: each box stands for 27 points, at
+1/6, 1/2 and 5/6 of each of its axes. Of those that lie in all half spaces, over all boxes, the 5th percentile
+of their distances (numpy's: linear between neighbours). If there are none, but boxes that touch the frustum,
+the distance of the nearest centre of those. Else NaN: out of sight. A box touches if for each half space the
+corner that lies deepest in it is inside.
+"""
+
+import math
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
+
+MOST = 32  # boxes of a category, a power of two
+PERCENTILE = 5.0  # of distances, as in adapt.observe
+TRIM = (5.0, 95.0)  # percentiles that a box reaches to
+FAR = 5.0  # times the median distance of the NEIGHBOURS-th neighbour
+NEIGHBOURS = 8
+FEW = 20  # points of which none is left out
+_AT = np.array([1 / 6, 1 / 2, 5 / 6])
+_GRID = np.stack(np.meshgrid(_AT, _AT, _AT, indexing="ij"), -1).reshape(-1, 3)
+
+
+def split_boxes(points: Float[np.ndarray, "N 3"], most: int = MOST) -> Float[np.ndarray, "B 6"]:
+    """At most `most` boxes (smallest x y z, largest x y z) around N points, each around about as many."""
+    if not len(points):
+        return np.zeros((0, 6))
+    parts = _halved(_without_outliers(np.asarray(points, np.float64)), most)
+    return np.stack([np.percentile(part, TRIM, axis=0).ravel() for part in parts])
+
+
+def frustum(
+    position: ArrayLike, quaternion: ArrayLike, fov_y: float, aspect: float
+) -> Float[np.ndarray, "5 4"]:
+    """Half spaces (nx, ny, nz, d), n x + d >= 0 inside, of what is seen: left, right, bottom, top, front.
+
+    `quaternion`: x y z w from a camera that looks along -z, y up, to the world; `fov_y`: radians; `aspect`:
+    width over height. It begins at the camera and has no end.
+    """
+    high = math.tan(fov_y / 2)
+    wide = high * aspect
+    normals = np.array([[1, 0, -wide], [-1, 0, -wide], [0, 1, -high], [0, -1, -high], [0, 0, -1]])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    world = normals @ _rotation(quaternion).T
+    return np.column_stack([world, -world @ np.asarray(position, np.float64)])
+
+
+def touching(boxes: Float[np.ndarray, "B 6"], planes: Float[np.ndarray, "P 4"]) -> Bool[np.ndarray, " B"]:
+    """Which boxes may reach into all half spaces; without any, all do."""
+    normals, offsets = planes[:, None, :3], planes[:, None, 3]
+    deepest = np.where(normals >= 0, boxes[None, :, 3:], boxes[None, :, :3])
+    return ((deepest * normals).sum(-1) + offsets >= 0).all(0)
+
+
+def distance(boxes: Float[np.ndarray, "B 6"], position: ArrayLike, planes: Float[np.ndarray, "P 4"]) -> float:
+    """How far the closest of what is in sight is (see the module's text); NaN: nothing is."""
+    near, position = boxes[touching(boxes, planes)], np.asarray(position, np.float64)
+    if not len(near):
+        return math.nan
+    low, size = near[:, None, :3], near[:, None, 3:] - near[:, None, :3]
+    samples = (low + _GRID * size).reshape(-1, 3)
+    inside = (samples @ planes[:, :3].T + planes[:, 3] >= 0).all(1)
+    if not inside.any():
+        centres = (near[:, :3] + near[:, 3:]) / 2
+        return float(np.linalg.norm(centres - position, axis=1).min())
+    return float(np.percentile(np.linalg.norm(samples[inside] - position, axis=1), PERCENTILE))
+
+
+def _without_outliers(points: np.ndarray) -> np.ndarray:
+    if len(points) < FEW:
+        return points
+    away = np.asarray(KDTree(points).query(points, k=NEIGHBOURS + 1)[0])[:, -1]
+    return points[away <= FAR * np.median(away)]
+
+
+def _halved(points: np.ndarray, most: int) -> list[np.ndarray]:
+    if most < 2 or len(points) < 2:
+        return [points]
+    order = np.argsort(points[:, np.ptp(points, axis=0).argmax()], kind="stable")
+    half = (len(points) + 1) // 2
+    return [part for rows in (order[:half], order[half:]) for part in _halved(points[rows], most // 2)]
+
+
+def _rotation(quaternion: ArrayLike) -> np.ndarray:
+    """Of x y z w, of any length."""
+    x, y, z, w = np.asarray(quaternion, np.float64) / np.linalg.norm(np.asarray(quaternion))
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )

@@ -1,0 +1,167 @@
+"""Test vectors of what the viewer evaluates: `python tests/make_viewer_vectors.py` writes them.
+
+A case of tests/data/distances.json has boxes, a camera, its half spaces and under "expected" the distance
+(null: nothing in sight), whether the category is visible and which boxes touch; planes are to be equal to
+1e-9, distances to 1e-9 of themselves. A case of tests/data/promises.json has a label of a bundle's manifest
+(its curves), the entry of promises-*.json with the views it shares, and viewpoints with the expected mean,
+spread and bound by level and the support, to 1e-9 (null: NaN).
+"""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sagesplat.adapt.model import Eq3, SsimModel
+from sagesplat.adapt.promise import ViewModel
+from sagesplat.output import boxes
+from sagesplat.output.bundle_quality import curve_entry, promise_entry
+
+DATA = Path(__file__).parent / "data"
+Case = dict[str, Any]
+
+AHEAD = (0.0, 0.0, 0.0, 1.0)
+UNIT = [[-1, -1, -6, 1, 1, -4]]
+ROOM = [[-3, -1, -3, 3, 1, 3], [-1, 0, -9, 1, 2, -7]]
+
+
+def _distance_case(
+    name: str, found: list, position: tuple, quaternion: tuple, fov_y: float, aspect: float
+) -> Case:
+    box, planes = (
+        np.array(found, np.float64).reshape(-1, 6),
+        boxes.frustum(position, quaternion, fov_y, aspect),
+    )
+    touches = boxes.touching(box, planes)
+    camera = {"position": position, "quaternion": quaternion, "fovY": fov_y, "aspect": aspect}
+    return {
+        "name": name, "boxes": box.tolist(), "camera": camera, "frustum": planes.tolist(),
+        "expected": {
+            "distance": _plain(boxes.distance(box, position, planes)),
+            "visible": bool(touches.any()),
+            "touching": touches.tolist(),
+        },
+    }  # fmt: skip
+
+
+def distance_cases() -> list[Case]:
+    """All cases of distances.json."""
+    origin, right = (0.0, 0.0, 0.0), (0.0, math.sin(-math.pi / 4), 0.0, math.cos(-math.pi / 4))
+    by_hand = [
+        ("ahead", UNIT, origin, AHEAD, 1.0, 1.5),
+        ("behind", [[-1, -1, 4, 1, 1, 6]], origin, AHEAD, 1.0, 1.5),
+        ("beside", [[4, -1, -2, 6, 1, -1]], origin, AHEAD, 1.0, 1.0),
+        ("beside, after a turn", [[4, -1, -2, 6, 1, -1]], origin, right, 1.0, 1.0),
+        ("inside", ROOM, origin, AHEAD, 1.0, 1.5),
+        ("a corner in sight and no sample", [[2.0, -1, -6, 8, 1, -5]], origin, AHEAD, 0.9, 0.9),
+        ("a flat box", [[-1, -1, -5, 1, -1, -3]], origin, AHEAD, 1.2, 1.0),
+        ("a point", [[0, 0, -5, 0, 0, -5]], origin, AHEAD, 1.2, 1.0),
+        ("no box", [], origin, AHEAD, 1.0, 1.0),
+        ("a portrait picture", [[1.2, -1, -6, 2.2, 1, -4]], origin, AHEAD, 1.2, 0.3),
+    ]
+    rng = np.random.default_rng(8)
+    cases = [_distance_case(*case) for case in by_hand]
+    for i in range(24):
+        centre, size = rng.normal(0, 4, (int(rng.integers(1, 17)), 3)), rng.exponential(1.0, 3)
+        found = np.column_stack([centre - size, centre + size]).round(4).tolist()
+        q = rng.normal(size=4)
+        q = (q / np.linalg.norm(q)).round(6)
+        fov_y, aspect = float(rng.uniform(0.4, 1.4).__round__(3)), float(rng.uniform(0.4, 2.2).__round__(3))
+        position = tuple(rng.normal(0, 4, 3).round(4).tolist())
+        cases.append(_distance_case(f"random {i}", found, position, tuple(q.tolist()), fov_y, aspect))
+    return cases
+
+
+def model(seed: int, views: int, levels: list[int], *, unseen: bool = True) -> ViewModel:
+    """A model of a category with curves of every kind."""
+    rng = np.random.default_rng(seed)
+    kinds = ("two regimes", "one regime", "constant")
+    curves = []
+    for i, level in enumerate(levels):
+        top = 0.4 + 0.5 * (i + rng.uniform(-0.6, 0.6)) / len(levels)
+        near, far = (top, 0.4, 1.0, 1.3), (top - 0.05, 0.1, 2.5, 0.8)
+        if kinds[i % 3] != "two regimes":
+            near = far = (top, 0.2, 1.0, 1.1) if kinds[i % 3] == "one regime" else (top, 0.0, 0.0, 1.0)
+        curves.append(
+            SsimModel(7, level, Eq3(*near, *far, 2.0), (0.8, 6.0), top - 0.02, 0.03, 40, kinds[i % 3])
+        )
+    position, direction = rng.normal(0, 0.7, (views, 3)), rng.normal(size=(views, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    return ViewModel(
+        label_id=7,
+        curves=tuple(curves),
+        extent=4.5,
+        usual=float(rng.uniform(0.3, 1.2)),
+        inputs=np.column_stack([position, direction, rng.normal(0.8, 0.4, views)]),
+        unseen_inputs=(np.arange(views) % 5 == 2) & unseen,
+        lengths=tuple(rng.uniform(0.2, 1.2, 3).tolist()),  # pyright: ignore[reportArgumentType]
+        unseen=float(rng.uniform(0, 0.4)),
+        noise=float(rng.uniform(0.05, 0.3)),
+        weights=rng.normal(0, 0.05, (views, len(levels))),
+        amplitudes=rng.uniform(0.02, 0.08, len(levels)),
+        factor=float(rng.uniform(0, 2)),
+        confidence=0.95,
+        rmse=0.03,
+        status="calibrated",
+        shift=0.004,
+        mixing=0.013,
+    )
+
+
+def _promise_case(name: str, made: ViewModel, seed: int) -> Case:
+    rng = np.random.default_rng(seed)
+    flip = np.array([1, -1, -1])
+    shared = np.column_stack([made.inputs[:, :3] * made.extent, made.inputs[:, 3:6]])
+    entry = promise_entry(made, np.arange(len(shared)), np.zeros(len(shared)))
+    position, direction = rng.normal(0, 3, (8, 3)), rng.normal(size=(8, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    position[0], direction[0] = shared[0, :3], shared[0, 3:]  # a known view
+    position[1] = 1e3  # far from all
+    away = np.array([math.exp(made.inputs[0, 6]), 2.0, math.nan, 0.1, 1.9999, 3.3, 50.0, 5.0])
+    told = made.predict(away, position, direction)
+    points = [
+        {
+            "position": (position[i] * flip).tolist(), "direction": (direction[i] * flip).tolist(),
+            "distance": _plain(away[i]),
+            "mean": told.mean[i].tolist(), "spread": told.spread[i].tolist(),
+            "bound": told.bound[i].tolist(), "support": float(told.support[i]),
+        }
+        for i in range(len(away))
+    ]  # fmt: skip
+    views = (shared * np.tile(flip, 2)).tolist()
+    promises = {"version": 1, "extent": made.extent, "views": views, "labels": [entry]}
+    curves = [curve_entry(curve, exact=True) for curve in made.curves]
+    return {"name": name, "curves": curves, "promises": promises, "viewpoints": points}
+
+
+def promise_cases() -> list[Case]:
+    """All cases of promises.json, in the frame of a bundle."""
+    return [
+        _promise_case("one view, one level", model(1, 1, [1]), 1),
+        _promise_case("curves of three kinds", model(2, 6, [1, 2, 3]), 2),
+        _promise_case("levels without a promise", model(3, 9, [2, 3, 5]), 3),
+        _promise_case("no view unseen", model(4, 12, [1, 2, 3, 4], unseen=False), 4),
+        _promise_case("many views", model(5, 40, [1, 2, 3, 4, 5, 6]), 5),
+    ]
+
+
+def _plain(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def write(path: Path, cases: list[Case]) -> None:
+    """Write a file, a case a line."""
+    path.parent.mkdir(exist_ok=True)
+    path.write_text('{"cases":[\n' + ",\n".join(json.dumps(case) for case in cases) + "\n]}\n")
+
+
+def main() -> None:
+    """Write both files."""
+    write(DATA / "distances.json", distance_cases())
+    write(DATA / "promises.json", promise_cases())
+
+
+if __name__ == "__main__":
+    main()

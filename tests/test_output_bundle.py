@@ -1,0 +1,385 @@
+"""Bundles as files: boxes and distances, which way is up, rounding, the manifest and its schema."""
+
+import hashlib
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from conftest import pinhole, random_gaussians
+from hypothesis import given
+from hypothesis import strategies as st
+from make_viewer_vectors import DATA, distance_cases, model, promise_cases
+from scipy.spatial.transform import Rotation
+
+from sagesplat.adapt.promise import ViewModel
+from sagesplat.errors import DataError, RunError, SageError
+from sagesplat.output import bearings, boxes
+from sagesplat.output.bearings import FLIP
+from sagesplat.output.bundle import SCHEMA, Category, Contents, Shot, documents, is_bundle, write_bundle
+from sagesplat.output.bundle_quality import (
+    MOVES,
+    curve_entry,
+    curve_of,
+    margins,
+    model_of,
+    of_files,
+    promise_entry,
+    significant,
+)
+from sagesplat.output.chunks import write_chunks
+from sagesplat.output.spz import read_spz
+from sagesplat.scene.scene import Camera
+
+SIZES = {-1: (4, 4, 10), 3: (3, 6, 20), 184: (0, 5, 9)}
+
+
+def camera(angle: float = 0.0, tilt: float = 0.0, at: tuple = (0.0, 0.0, 0.0)) -> Camera:
+    """A camera turned by `angle` around y and then down by `tilt`."""
+    w2c = np.eye(4, dtype=np.float32)
+    w2c[:3, :3] = Rotation.from_euler("yx", [angle, tilt]).as_matrix()
+    w2c[:3, 3] = -w2c[:3, :3] @ np.array(at, np.float32)
+    return replace(pinhole(), w2c=w2c)
+
+
+# boxes
+
+
+@given(st.integers(0, 300), st.integers(0, 5))
+def test_boxes_share_the_points_evenly(count: int, power: int) -> None:
+    points = np.random.default_rng(count).normal(size=(count, 3))
+    found = boxes.split_boxes(points, 2**power)
+    assert len(found) == min(count, 2**power) or count > 20  # some may be outliers
+    assert len(found) <= 2**power
+    assert (found[:, :3] <= found[:, 3:]).all()
+    if count:
+        assert (found[:, :3] >= points.min(0)).all()
+        assert (found[:, 3:] <= points.max(0)).all()
+
+
+def test_boxes_leave_out_points_that_are_far_from_all() -> None:
+    points = np.random.default_rng(0).uniform(size=(500, 3))
+    stray = np.array([[100.0, 0, 0], [0, -100, 0]])
+    assert np.abs(boxes.split_boxes(np.concatenate([points, stray]))).max() <= 1
+
+
+def test_a_frustum_holds_what_the_camera_projects_into_its_picture() -> None:
+    at = replace(
+        camera(0.4, 0.3, (0.5, 1, -2)), K=np.array([[60, 0, 35], [0, 60, 25], [0, 0, 1]], np.float32)
+    )
+    points = np.random.default_rng(1).normal(0, 6, (500, 3))
+    local = points @ at.w2c[:3, :3].T + at.w2c[:3, 3]
+    pixels = local[:, :2] / local[:, 2:] * 60 + [35, 25]
+    inside = (local[:, 2] > 0) & ((pixels >= 0) & (pixels < [at.width, at.height])).all(1)
+    planes = boxes.frustum(
+        bearings.position(at), bearings.quaternion(at).tolist(), bearings.fov_y(at), 70 / 50
+    )
+    found = ((points * FLIP) @ planes[:, :3].T + planes[:, 3] >= 0).all(1)
+    assert 20 < inside.sum() < 200
+    np.testing.assert_array_equal(found, inside)
+
+
+@given(st.integers(0, 1000))
+def test_distance_lies_between_the_nearest_and_the_farthest_corner(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    centre, size = rng.normal(0, 4, (5, 3)), rng.uniform(0, 2, (5, 3))
+    found = np.concatenate([centre - size, centre + size], 1)
+    planes = boxes.frustum((0, 0, 0), rng.normal(size=4).tolist(), rng.uniform(0.3, 2), rng.uniform(0.3, 3))
+    seen = boxes.touching(found, planes)
+    told = boxes.distance(found, (0, 0, 0), planes)
+    assert math.isnan(told) == (not seen.any())
+    if seen.any():
+        near = np.linalg.norm(np.maximum(np.maximum(found[:, :3], -found[:, 3:]), 0), axis=1)[seen]
+        far = np.linalg.norm(np.abs(centre) + size, axis=1)[seen]
+        assert near.min() <= told <= far.max()
+
+
+def test_shared_vectors_are_what_is_computed() -> None:
+    for name, cases in (("distances", distance_cases()), ("promises", promise_cases())):
+        stored = json.loads((DATA / f"{name}.json").read_text())["cases"]
+        assert len(stored) == len(cases)
+        for old, new in zip(stored, cases, strict=True):
+            assert old["name"] == new["name"]
+            for a, b in zip(_numbers(old), _numbers(json.loads(json.dumps(new))), strict=True):
+                assert a == pytest.approx(b, rel=1e-9, abs=1e-12)
+
+
+def _numbers(value: Any) -> list[float]:
+    if isinstance(value, dict):
+        return [n for item in value.values() for n in _numbers(item)]
+    if isinstance(value, list):
+        return [n for item in value for n in _numbers(item)]
+    return [float(value)] if isinstance(value, (int, float)) else []
+
+
+# bearings
+
+
+def test_up_is_square_to_the_horizons_wherever_cameras_look() -> None:
+    rng = np.random.default_rng(0)
+    level = [camera(a, t) for a, t in zip(rng.uniform(0, 1.5, 30), rng.uniform(0.2, 0.9, 30), strict=True)]
+    up = bearings.upward(level)
+    np.testing.assert_allclose(up, [0, 1, 0], atol=1e-6)
+    mean = np.stack([bearings.rotation(c)[:, 1] for c in level]).mean(0)
+    assert np.degrees(np.arccos(mean[1] / np.linalg.norm(mean))) > 20  # which is what the mean gets wrong
+
+
+def test_up_of_parallel_cameras_is_their_own() -> None:
+    np.testing.assert_allclose(
+        bearings.upward([camera(0.3, 0.2)] * 3), bearings.rotation(camera(0.3, 0.2))[:, 1]
+    )
+
+
+def test_cameras_look_along_minus_z() -> None:
+    at = camera(0.3, 0.2, (1, 2, 3))
+    np.testing.assert_allclose(bearings.rotation(at) @ [0, 0, -1], at.direction * FLIP, atol=1e-6)
+    np.testing.assert_allclose(
+        Rotation.from_quat(bearings.quaternion(at)).as_matrix(), bearings.rotation(at), atol=1e-6
+    )
+    np.testing.assert_allclose(bearings.position(at), np.array([1, 2, 3]) * FLIP, atol=1e-6)
+
+
+def test_the_floor_is_where_the_ground_is() -> None:
+    rng, up = np.random.default_rng(0), np.array([0.0, 1.0, 0.0])
+    points = rng.uniform(-2, 2, (400, 3))
+    points[:100, 1] = -1.6 + rng.normal(0, 0.01, 100)
+    ground = np.arange(400) < 100
+    cameras = [camera()]
+    height = bearings.floor(points, ground, cameras, up, 3.0)
+    assert height == pytest.approx(-1.6, abs=0.01)
+    assert bearings.floor(points, ~ground & False, cameras, up, 3.0) == pytest.approx(-1.8, abs=0.2)
+    assert bearings.floor(points[:0], ground[:0], cameras, up, 3.0) == -3
+    assert bearings.guessed_scale(cameras, up, height) == pytest.approx(1.5 / 1.6, rel=0.01)
+    assert bearings.guessed_scale(cameras, up, 5.0) == 1  # below the floor
+    assert bearings.guessed_scale(cameras, up, -1e-9) == bearings.SCALES[1]
+
+
+# quality
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_curves_keep_what_they_say(seed: int) -> None:
+    for curve in model(seed, 3, [1, 2, 3, 4, 5, 6]).curves:
+        read = curve_of(json.loads(json.dumps(curve_entry(curve))))
+        away = np.array([*np.linspace(0, 8, 500), np.nan, curve.params.beta])
+        np.testing.assert_allclose(read(away), curve(away), atol=2e-4)
+        np.testing.assert_allclose(curve_of(curve_entry(curve, exact=True))(away), curve(away), rtol=1e-12)
+
+
+def views_of(made: ViewModel) -> np.ndarray:
+    return np.column_stack([made.inputs[:, :3] * made.extent, made.inputs[:, 3:6]]) * np.tile(FLIP, 2)
+
+
+def test_a_promise_comes_back_as_it_was() -> None:
+    made = model(2, 12, [1, 2, 4])
+    entry = json.loads(json.dumps(promise_entry(made, np.arange(12), np.zeros(12))))
+    read = model_of(entry, made.curves, views_of(made), made.extent)
+    at = np.array([2.0, np.nan]), np.ones((2, 3)), np.eye(3)[:2]
+    for a, b in zip(read.predict(*at), made.predict(*at), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-12)
+
+
+def test_levels_without_a_file_take_the_last_promise_of_what_they_show() -> None:
+    made = model(1, 5, [1, 2, 3, 4, 5])
+    told = of_files(made, [2, 4], last=5)  # nothing, A, A, B, B
+    assert told.levels == (1, 2)
+    np.testing.assert_array_equal(told.weights, made.weights[:, [2, 4]])
+    np.testing.assert_array_equal(told.amplitudes, made.amplitudes[[2, 4]])
+    assert [c.params for c in told.curves] == [made.curves[2].params, made.curves[4].params]
+    assert of_files(model(1, 5, [1]), [2, 4], last=5).curves == ()
+
+
+def test_margins_keep_the_curve_below_the_bounds() -> None:
+    made = model(5, 40, [1, 2, 3])
+    away = np.exp(made.inputs[:, 6])
+    bound = made.predict(away, made.inputs[:, :3] * made.extent, made.inputs[:, 3:6]).bound
+    below = np.stack([c(away) for c in made.curves], 1) + margins(made) <= bound + 1e-12
+    assert (below.mean(0) >= 0.95).all()
+
+
+@given(st.floats(-1e12, 1e12), st.integers(2, 15))
+def test_significant_digits(value: float, digits: int) -> None:
+    assert significant(value, digits) == pytest.approx(value, rel=10.0 ** (1 - digits))
+    assert significant([value, [1]], digits) == [significant(value, digits), [1]]
+
+
+# bundles
+
+
+@pytest.fixture
+def viewer(tmp_path: Path) -> Path:
+    folder = tmp_path / "viewer"
+    (folder / "assets").mkdir(parents=True)
+    (folder / "index.html").write_text("<!doctype html>")
+    (folder / "assets" / "index-1.js").write_text("1;")
+    (folder / "THIRD_PARTY_LICENSES.txt").write_text("MIT")
+    return folder
+
+
+@pytest.fixture
+def contents(tmp_path: Path) -> Contents:
+    """Three categories of three levels, one of them with a promise."""
+    g = random_gaussians(39, degree=1)
+    labels = torch.tensor([-1] * 10 + [3] * 20 + [184] * 9, dtype=torch.int16)
+    chunks = write_chunks(tmp_path / "chunks", replace(g, label_ids=labels), SIZES, {3: "car", 184: "tree"})
+    made = replace(model(3, 6, [1, 2, 3]), label_id=3)
+    shots = []
+    for i, row in enumerate(made.inputs):  # the model's own views
+        at = camera(at=tuple((row[:3] * made.extent).tolist()))
+        z = row[3:6]
+        x = np.cross([0.1, 1, 0.2], z)
+        w2c = at.w2c.copy()
+        w2c[:3, :3] = np.stack([x / np.linalg.norm(x), np.cross(z, x / np.linalg.norm(x)), z])
+        w2c[:3, 3] = -w2c[:3, :3] @ (row[:3] * made.extent)
+        split = "calibration" if made.unseen_inputs[i] else "train"
+        shots.append(Shot(f"{i}.jpg", split, replace(at, w2c=w2c)))
+    shots.append(Shot("none.jpg", "test", camera()))
+    points = np.random.default_rng(0).normal(size=(50, 3))
+    categories = [
+        Category(-1, "unlabelled", "everything else", "#808080", boxes.split_boxes(points)),
+        Category(3, "car", "car", "#112233", boxes.split_boxes(points), 2.0, True, made, np.full(7, 0.25)),
+        Category(184, "tree", "tree", "#445566", boxes.split_boxes(points[:3])),
+    ]
+    return Contents("tiny", made.extent, shots, categories, chunks, tmp_path / "chunks", 1, points=points)
+
+
+def manifest_of(folder: Path) -> dict[str, Any]:
+    """The manifest, checked against the schema that lies beside it."""
+    jsonschema = pytest.importorskip("jsonschema", reason="needs jsonschema to check manifests")
+    schema = json.loads((folder / SCHEMA).read_text())
+    jsonschema.Draft202012Validator.check_schema(schema)
+    manifest = json.loads((folder / "manifest.json").read_text())
+    jsonschema.Draft202012Validator(schema).validate(manifest)
+    return manifest
+
+
+def test_a_bundle_holds_what_its_manifest_says(tmp_path, contents, viewer) -> None:
+    out = tmp_path / "out"
+    written = write_bundle(out, contents, viewer)
+    manifest = manifest_of(out)
+    assert [label["id"] for label in manifest["labels"]] == [-1, 3, 184]
+    assert [[level["count"] for level in label["levels"]] for label in manifest["labels"]] == [
+        [4, 6], [3, 3, 14], [5, 4],
+    ]  # fmt: skip
+    total = 0
+    for label in manifest["labels"]:
+        for level in label["levels"]:
+            content = (out / level["uri"]).read_bytes()
+            assert len(content) == level["bytes"]
+            assert hashlib.sha256(content).hexdigest() == level["sha256"]
+            assert len(read_spz(out / level["uri"])) == level["count"]
+            total += len(content)
+    assert manifest["totals"]["bytes"] == written.chunks == total
+    assert manifest["totals"]["count"] == 39
+    assert written.manifest == (out / "manifest.json").stat().st_size
+    assert written.total == sum(p.stat().st_size for p in out.rglob("*") if p.is_file())
+    ours = {"manifest.json", "manifest.schema.json", manifest["promises"]["uri"], "chunks", "LICENSES.txt"}
+    assert {p.name for p in out.iterdir()} == ours | {"index.html", "assets", "THIRD_PARTY_LICENSES.txt"}
+    assert {entry["what"] for entry in manifest["licenses"]} >= {"three.js", "Spark"}
+    assert not list(tmp_path.glob(".out*"))
+    assert is_bundle(out)
+    for path in (out / "manifest.json", out / manifest["promises"]["uri"]):
+        assert "://" not in path.read_text()
+
+
+def test_promises_of_a_bundle_are_those_of_the_model(tmp_path, contents, viewer) -> None:
+    write_bundle(tmp_path / "out", contents, viewer)
+    manifest = manifest_of(tmp_path / "out")
+    content = (tmp_path / "out" / manifest["promises"]["uri"]).read_bytes()
+    assert hashlib.sha256(content).hexdigest() == manifest["promises"]["sha256"]
+    promises = json.loads(content)
+    (entry,) = promises["labels"]
+    views = np.array(promises["views"])
+    assert entry["shares"] == [0.25] * len(views)
+    assert len(views) == 6  # the test view taught nothing
+    quality = next(label["quality"] for label in manifest["labels"] if label["id"] == 3)
+    read = model_of(entry, [curve_of(c) for c in quality["curves"]], views, promises["extent"])
+    made = contents.categories[1].model
+    assert made is not None
+    cameras = [shot.camera for shot in contents.shots]
+    at = (
+        np.full(7, np.nan),
+        np.stack([c.position for c in cameras]),
+        np.stack([c.direction for c in cameras]),
+    )
+    np.testing.assert_allclose(read.predict(*at).bound, made.predict(*at).bound, atol=MOVES)
+    for row, shown in zip(made.inputs, views[entry["views"]] * np.tile(FLIP, 2), strict=True):
+        np.testing.assert_allclose(shown, [*row[:3] * made.extent, *row[3:6]], atol=1e-4)
+
+
+def test_the_same_contents_give_the_same_bytes(tmp_path, contents, viewer) -> None:
+    for name in ("a", "b"):
+        write_bundle(tmp_path / name, contents, viewer)
+    write_bundle(tmp_path / "b", contents, viewer)  # once more, over itself
+    a, b = (
+        {p.relative_to(tmp_path / name): p.read_bytes() for p in (tmp_path / name).rglob("*") if p.is_file()}
+        for name in ("a", "b")
+    )
+    assert a == b
+
+
+def test_an_earlier_bundle_is_replaced_and_nothing_of_it_stays(tmp_path, contents, viewer) -> None:
+    out = tmp_path / "out"
+    write_bundle(out, contents, viewer)
+    few = replace(contents, categories=contents.categories[:1], chunks=contents.chunks[:2])
+    write_bundle(out, few, viewer)
+    manifest = manifest_of(out)
+    assert manifest["promises"] is None
+    assert not list(out.glob("promises-*"))
+    assert len(list((out / "chunks").iterdir())) == 2
+
+
+def test_without_points_or_labels() -> None:
+    empty = Contents("none", 0.0, [Shot("a", "test", camera())], [], [], Path("none"), 0)
+    manifest, promises = documents(empty)
+    assert promises is None
+    assert manifest["labels"] == []
+    assert manifest["totals"] == {"count": 0, "bytes": 0, "gpuBytes": 0}
+    assert np.isfinite(manifest["start"]["target"]).all()
+
+
+def test_another_folder_is_left_alone(tmp_path, contents, viewer) -> None:
+    out = tmp_path / "photos"
+    out.mkdir()
+    write_bundle(out, contents, viewer)  # an empty one is fine
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "manifest.json").write_text('{"format": "else"}')
+    with pytest.raises(RunError, match="neither empty nor a bundle"):
+        write_bundle(other, contents, viewer)
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(RunError, match="neither empty nor a bundle"):
+        write_bundle(tmp_path / "file", contents, viewer)
+    assert (tmp_path / "file").read_text() == "x"
+    assert [p.name for p in other.iterdir()] == ["manifest.json"]
+
+
+def test_a_viewer_that_is_not_built(tmp_path, contents) -> None:
+    with pytest.raises(SageError, match="viewer not built: run `make web`"):
+        write_bundle(tmp_path / "out", contents, tmp_path / "nothing")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("missing", [False, True])
+def test_a_damaged_chunk_is_named_and_the_old_bundle_stays(tmp_path, contents, viewer, missing) -> None:
+    write_bundle(tmp_path / "out", contents, viewer)
+    path = contents.folder / contents.chunks[1].uri
+    before = path.read_bytes()
+    path.unlink()
+    if not missing:
+        path.write_bytes(before[:-1] + b"x")
+    with pytest.raises(DataError, match=rf"{contents.chunks[1].uri}: .*sagesplat nest") as caught:
+        write_bundle(tmp_path / "out", contents, viewer)
+    assert "\n" not in str(caught.value)
+    assert manifest_of(tmp_path / "out")["totals"]["count"] == 39
+    assert not list(tmp_path.glob(".out*"))
+
+
+def test_a_place_that_cannot_be_written(tmp_path, contents, viewer) -> None:
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(RunError, match="cannot be written"):
+        write_bundle(tmp_path / "file" / "out", contents, viewer)
