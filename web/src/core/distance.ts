@@ -1,0 +1,123 @@
+/**
+ * How far a label is and whether it is in sight, from its boxes. The rules are those of
+ * src/sagesplat/output/boxes.py; tests/data/distances.json holds both to them.
+ */
+
+import type { Box, Quat, Vec3, Viewpoint } from "../types";
+
+/** A label from a viewpoint. */
+export interface Sight {
+  readonly visible: boolean;
+  readonly distance: number; // the bundle's units; NaN: unknown
+  readonly size: number; // how large its boxes look: a rough measure of its share of the pixels
+}
+
+type Plane = Viewpoint["frustum"][number];
+
+const PERCENTILE = 0.05;
+const AT = [1 / 6, 1 / 2, 5 / 6]; // of a box's axes: it stands for the 27 points there
+
+/** Half spaces of what a camera sees: left, right, bottom, top, front. It begins at the camera, without end. */
+export function frustumOf(position: Vec3, quaternion: Quat, fovY: number, aspect: number): Plane[] {
+  const high = Math.tan(fovY / 2);
+  const wide = high * aspect;
+  const normals: Vec3[] = [
+    [1, 0, -wide],
+    [-1, 0, -wide],
+    [0, 1, -high],
+    [0, -1, -high],
+    [0, 0, -1],
+  ];
+  return normals.map((normal) => {
+    const [x, y, z] = rotate(quaternion, normal);
+    const length = Math.hypot(x, y, z);
+    const n = [x / length, y / length, z / length] as const;
+    return [...n, -(n[0] * position[0] + n[1] * position[1] + n[2] * position[2])] as const;
+  });
+}
+
+/** A vector turned by a quaternion x y z w of any length. */
+export function rotate(q: Quat, v: Vec3): Vec3 {
+  const length = Math.hypot(...q);
+  const [x, y, z, w] = q.map((part) => part / length) as unknown as Quat;
+  const cross = (a: Vec3): Vec3 => [y * a[2] - z * a[1], z * a[0] - x * a[2], x * a[1] - y * a[0]];
+  const once = cross(v);
+  const twice = cross(once);
+  return [
+    v[0] + 2 * (w * once[0] + twice[0]),
+    v[1] + 2 * (w * once[1] + twice[1]),
+    v[2] + 2 * (w * once[2] + twice[2]),
+  ];
+}
+
+/** How far the closest of what is in sight is: near the 5th percentile over a label's points. */
+export function look(boxes: readonly Box[], { position, frustum }: Viewpoint): Sight {
+  const near = boxes.filter((box) => touches(box, frustum));
+  if (!near.length) return { visible: false, distance: Number.NaN, size: 0 };
+  const sampled = new Float64Array(near.length * AT.length ** 3);
+  let found = 0;
+  let nearest = Infinity;
+  let size = 0;
+  for (const box of near) {
+    const away = Math.sqrt(squareTo(position, middle(box, 0), middle(box, 1), middle(box, 2)));
+    nearest = Math.min(nearest, away);
+    size += Math.min(1, halfDiagonal(box) / Math.max(away, 1e-9)) ** 2 / boxes.length;
+    found = sample(box, position, crossing(box, frustum), sampled, found);
+  }
+  return { visible: true, distance: found ? percentile(sampled.subarray(0, found)) : nearest, size };
+}
+
+/** Whether the corner of a box that lies deepest in each half space is inside. */
+export const touches = (box: Box, frustum: readonly Plane[]): boolean =>
+  frustum.every((plane) => corner(box, plane, 3) >= 0);
+
+/** The half spaces that do not hold all of a box. */
+const crossing = (box: Box, frustum: readonly Plane[]): Plane[] =>
+  frustum.filter((plane) => corner(box, plane, 0) < 0);
+
+/** Height over a plane of a box's corner that is highest (`of` 3) or lowest (0) over it. */
+function corner(b: Box, plane: Plane, of: 0 | 3): number {
+  let height = plane[3];
+  for (let axis = 0; axis < 3; axis++) {
+    const n = plane[axis] as number;
+    height += n * (b[n < 0 ? axis + 3 - of : axis + of] as number);
+  }
+  return height;
+}
+
+/** Writes the squared distances of those of a box's points that lie in all half spaces; the new end. */
+function sample(b: Box, from: Vec3, planes: readonly Plane[], into: Float64Array, start: number): number {
+  let end = start;
+  for (const i of AT) {
+    const x = b[0] + i * (b[3] - b[0]);
+    for (const j of AT) {
+      const y = b[1] + j * (b[4] - b[1]);
+      for (const k of AT) {
+        const z = b[2] + k * (b[5] - b[2]);
+        if (inside(x, y, z, planes)) into[end++] = squareTo(from, x, y, z);
+      }
+    }
+  }
+  return end;
+}
+
+function inside(x: number, y: number, z: number, planes: readonly Plane[]): boolean {
+  for (const p of planes) if (p[0] * x + p[1] * y + p[2] * z + p[3] < 0) return false;
+  return true;
+}
+
+const squareTo = (p: Vec3, x: number, y: number, z: number): number =>
+  (x - p[0]) ** 2 + (y - p[1]) ** 2 + (z - p[2]) ** 2;
+
+const middle = (b: Box, axis: number): number => ((b[axis] as number) + (b[axis + 3] as number)) / 2;
+
+const halfDiagonal = (b: Box): number => Math.sqrt(squareTo([b[0], b[1], b[2]], b[3], b[4], b[5])) / 2;
+
+/** Of distances, from their squares, linear between neighbours. */
+function percentile(squares: Float64Array): number {
+  squares.sort();
+  const rank = PERCENTILE * (squares.length - 1);
+  const low = Math.sqrt(squares[Math.floor(rank)] as number);
+  const high = Math.sqrt(squares[Math.ceil(rank)] as number);
+  return low + (high - low) * (rank - Math.floor(rank));
+}

@@ -1,0 +1,242 @@
+/** One file of a bundle over the network: its bytes, checked; how fast the link is; what is kept. */
+
+/** What of `fetch` is used here. */
+export type Fetch = (url: string, init?: RequestInit) => Promise<Reply>;
+
+/** What of `Response` is used here. */
+export interface Reply {
+  readonly ok: boolean;
+  readonly status: number;
+  readonly headers: { get(name: string): string | null };
+  readonly body: { getReader(): Reader } | null;
+  text(): Promise<string>;
+}
+
+export interface Reader {
+  read(): Promise<{ readonly done: boolean; readonly value?: Uint8Array | undefined }>;
+}
+
+/** Time, so that tests can bring their own. */
+export interface Clock {
+  now(): number; // ms
+  /** Runs something in some ms, unless the returned function is called before. */
+  after(ms: number, run: () => void): () => void;
+}
+
+/** Lower-case hexadecimal sha-256; null where the page may not compute one (plain http). */
+export type Digest = ((bytes: Uint8Array) => Promise<string>) | null;
+
+export interface File {
+  readonly uri: string;
+  readonly bytes: number;
+  readonly sha256: string;
+}
+
+/** Why a file did not come: `lasting` is no use to try again. */
+export class DownloadError extends Error {
+  override name = "DownloadError";
+  constructor(
+    message: string,
+    readonly lasting: boolean,
+  ) {
+    super(message);
+  }
+}
+
+const SILENCE = 10_000; // ms without a byte, after which a download counts as lost
+
+/** How to get files; `received` hears of every piece. */
+export interface Link {
+  readonly base: URL;
+  readonly fetch: Fetch;
+  readonly clock: Clock;
+  readonly digest: Digest;
+  received(bytes: number): void;
+}
+
+/**
+ * Gets a file once and checks it. Rejects with a DownloadError in one line.
+ *
+ * @param signal - aborts it
+ * @param again - past the browser's cache, which may hold what was found damaged
+ * @param progress - hears how many bytes are there
+ */
+export async function download(
+  link: Link,
+  file: File,
+  signal: AbortController,
+  again: boolean,
+  progress: (bytes: number) => void,
+): Promise<Uint8Array> {
+  const { fetch } = link; // the browser's own must not be called as a method
+  let silent = false;
+  const watch = () =>
+    link.clock.after(SILENCE, () => {
+      silent = true;
+      signal.abort();
+    });
+  let stop = watch();
+  try {
+    const url = new URL(file.uri, link.base).href;
+    const reply = await fetch(url, {
+      signal: signal.signal,
+      ...(again && { cache: "reload" as const }),
+    });
+    if (!reply.ok) throw refused(file, reply.status);
+    const parts: Uint8Array[] = [];
+    let size = 0;
+    await each(reply, (part) => {
+      stop();
+      stop = watch();
+      parts.push(part);
+      size += part.length;
+      link.received(part.length);
+      progress(size);
+      return size <= file.bytes;
+    });
+    stop();
+    return await intact(link, file, joined(parts, size));
+  } catch (error) {
+    if (error instanceof DownloadError) throw error;
+    throw new DownloadError(
+      `${file.uri}: ${silent ? "the server fell silent" : "the connection broke"}`,
+      false,
+    );
+  } finally {
+    stop();
+    signal.abort(); // of what is left, if it was too much or an error's page
+  }
+}
+
+/** Calls `take` for each piece of the body until it says false. */
+async function each(reply: Reply, take: (part: Uint8Array) => boolean): Promise<void> {
+  const reader = reply.body?.getReader();
+  for (;;) {
+    const next = await reader?.read();
+    if (!next || next.done) return;
+    if (next.value && !take(next.value)) return;
+  }
+}
+
+function refused(file: File, status: number): DownloadError {
+  const passes = status >= 500 || status === 408 || status === 429;
+  return new DownloadError(`${file.uri}: the server said ${status}`, !passes);
+}
+
+/** The content if it is what the manifest says. It may be damaged on the way, so it is worth a second try. */
+async function intact(link: Link, file: File, content: Uint8Array): Promise<Uint8Array> {
+  if (content.length !== file.bytes) {
+    const is = content.length < file.bytes ? `only ${content.length}` : `more than`;
+    throw new DamagedError(`${file.uri} is damaged: ${is} of ${file.bytes} bytes`, false);
+  }
+  if (link.digest && (await link.digest(content)) !== file.sha256) {
+    throw new DamagedError(`${file.uri} is damaged: its sha-256 is not that of the manifest`, false);
+  }
+  return content;
+}
+
+/** The file came, but is not what the manifest says. */
+export class DamagedError extends DownloadError {}
+
+function joined(parts: readonly Uint8Array[], size: number): Uint8Array {
+  const out = new Uint8Array(size);
+  let at = 0;
+  for (const part of parts) {
+    out.set(part, at);
+    at += part.length;
+  }
+  return out;
+}
+
+/** sha-256 by the browser, where it offers that: on https and on localhost. */
+export const digestOfBrowser: Digest = globalThis.crypto?.subtle
+  ? async (bytes) => {
+      const hash = await crypto.subtle.digest("SHA-256", bytes as Uint8Array<ArrayBuffer>);
+      return Array.from(new Uint8Array(hash), (byte) => byte.toString(16).padStart(2, "0")).join("");
+    }
+  : null;
+
+export const clockOfBrowser: Clock = {
+  now: () => performance.now(),
+  after(ms, run) {
+    const timer = setTimeout(run, ms);
+    return () => clearTimeout(timer);
+  },
+};
+
+const SAMPLE = 100; // ms of downloading behind a sample
+const MEMORY = 2000; // ms after which a sample counts for 1/e
+const QUICK = 200; // the same where the link turns out faster: it is slow only until enough is asked for
+
+/** Bytes a second over all downloads together, while there are any. */
+export class Bandwidth {
+  rate = Number.NaN;
+  private bytes = 0;
+  private busy = 0; // ms in this sample
+  private since = Number.NaN;
+
+  constructor(private readonly clock: Clock) {}
+
+  /** Downloads begin (after none), or the last one has ended. */
+  running(any: boolean): void {
+    this.count(0);
+    this.since = any ? this.clock.now() : Number.NaN;
+  }
+
+  count(bytes: number): void {
+    const now = this.clock.now();
+    if (!Number.isNaN(this.since)) {
+      this.busy += now - this.since;
+      this.since = now;
+    }
+    this.bytes += bytes;
+    if (this.busy < SAMPLE) return;
+    const rate = (1000 * this.bytes) / this.busy;
+    const old = Number.isNaN(this.rate) ? 0 : Math.exp(-this.busy / (rate > this.rate ? QUICK : MEMORY));
+    this.rate = old ? old * this.rate + (1 - old) * rate : rate;
+    this.bytes = 0;
+    this.busy = 0;
+  }
+}
+
+/** Contents by sha-256, the latest used ones up to a number of bytes. */
+export class Shelf {
+  private readonly kept = new Map<string, Uint8Array>();
+  private size = 0;
+
+  constructor(private readonly limit: number) {}
+
+  get(sha256: string): Uint8Array | undefined {
+    const content = this.kept.get(sha256);
+    if (content) this.put(sha256, content);
+    return content;
+  }
+
+  has(sha256: string): boolean {
+    return this.kept.has(sha256);
+  }
+
+  get bytes(): number {
+    return this.size;
+  }
+
+  put(sha256: string, content: Uint8Array): void {
+    this.drop(sha256);
+    this.kept.set(sha256, content);
+    this.size += content.length;
+    for (const oldest of this.kept.keys()) {
+      if (this.size <= this.limit) break;
+      this.drop(oldest);
+    }
+  }
+
+  clear(): void {
+    this.kept.clear();
+    this.size = 0;
+  }
+
+  private drop(sha256: string): void {
+    this.size -= this.kept.get(sha256)?.length ?? 0;
+    this.kept.delete(sha256);
+  }
+}

@@ -1,0 +1,52 @@
+/** What each label looks like from where the viewer stands: its distance, quality and share of the pixels. */
+
+import type { Label, Promises, Settings, Viewpoint } from "../types";
+import { look } from "./distance";
+import type { Candidate } from "./planner";
+import { byDistance, ViewModel } from "./quality";
+import type { Entry } from "./residency";
+
+/** Without promises levels are judged by the distance, shares of pixels by the size of the boxes. */
+export class Outlook {
+  readonly complete: boolean; // whether it has the promises
+  private readonly models = new Map<number, ViewModel>();
+
+  constructor(labels: readonly Label[] = [], promises: Promises | null = null) {
+    this.complete = promises !== null;
+    for (const own of promises?.labels ?? []) {
+      const label = labels.find((one) => one.id === own.id);
+      if (label && promises && ViewModel.fits(label, own)) {
+        this.models.set(own.id, new ViewModel(label, promises, own));
+      }
+    }
+  }
+
+  /** Brings what is known of a label to a viewpoint. */
+  see(entry: Entry, viewpoint: Viewpoint): void {
+    const { label } = entry;
+    const { position, direction } = viewpoint;
+    const model = this.models.get(label.id);
+    const sight = look(label.boxes, viewpoint);
+    // a label of which nobody knows where it is may be anywhere
+    entry.sight = label.boxes.length ? sight : { ...sight, visible: true };
+    entry.prediction =
+      model?.predict(sight.distance, position, direction) ?? byDistance(label, sight.distance);
+    entry.share = model ? model.share(position, direction) : this.complete ? 0 : sight.size;
+  }
+
+  /** What a label is to be planned with. */
+  candidate(entry: Entry, weights: Settings["weights"], highest: number): Candidate {
+    const { label, ladder, prediction, sight, share, wanted } = entry;
+    return {
+      label,
+      ladder,
+      highest,
+      mean: prediction.mean,
+      bound: prediction.bound,
+      weight: weights.get(label.id) ?? label.weight,
+      share,
+      visible: sight.visible,
+      previous: wanted,
+    };
+  }
+}

@@ -1,0 +1,152 @@
+/** From settings and a viewpoint to the level that each label should have. Levels are 1-based, 0 is nothing. */
+
+import type { Budget, Label, Settings } from "../types";
+import { type Allocation, bestWithin, cheapest } from "./allocate";
+
+/** What one label is to be planned with. */
+export interface Candidate {
+  readonly label: Label;
+  readonly ladder: Ladder;
+  readonly highest: number; // level that can be had; less than all where an increment is broken
+  readonly mean: readonly number[]; // by level, SSIM; NaN: unknown
+  readonly bound: readonly number[];
+  readonly weight: number; // of the label, given by people
+  readonly share: number; // of the pixels
+  readonly visible: boolean;
+  readonly previous: number; // level of the plan before, 0: none
+}
+
+/** What the levels of a label cost in full, by level. */
+export interface Ladder {
+  readonly bytes: readonly number[];
+  readonly gpuBytes: readonly number[];
+  readonly count: readonly number[];
+}
+
+export interface Plan {
+  readonly wanted: readonly number[]; // level per candidate
+  readonly status: "ok" | "infeasible" | "over budget";
+}
+
+const UNITS = ["bytes", "gpuBytes", "count"] as const;
+type Unit = (typeof UNITS)[number];
+const FINE = 2 ** 20; // steps of a budget where several units are solved as one
+const LEAST_SHARE = 1e-4; // so that nothing in sight is worth nothing
+
+/** Costs of levels as sums of their increments. */
+export function ladderOf(label: Label): Ladder {
+  const sums = (unit: Unit) => {
+    let sum = 0;
+    return label.levels.map((level) => {
+      sum += level[unit];
+      return sum;
+    });
+  };
+  return { bytes: sums("bytes"), gpuBytes: sums("gpuBytes"), count: sums("count") };
+}
+
+/** What a label at this viewpoint is worth against the others. */
+export const worth = (c: Candidate): number => (c.visible ? c.weight * Math.max(c.share, LEAST_SHARE) : 0);
+
+/** The levels to have, within the budget in all its units; the smallest composition where nothing fits. */
+export function makePlan(candidates: readonly Candidate[], settings: Settings): Plan {
+  const there = candidates.filter((c) => c.highest > 0);
+  const fixed = there.filter((c) => c.label.always);
+  const free = there.filter((c) => !c.label.always);
+  const left = lessen(settings.budget, fixed);
+  const found = free.length ? choose(free, settings, left) : { levels: [], status: statusOf(left) };
+  const levels = new Map(free.map((c, i) => [c, (found.levels[i] ?? 0) + 1]));
+  for (const c of fixed) levels.set(c, c.highest);
+  return { wanted: candidates.map((c) => levels.get(c) ?? 0), status: found.status };
+}
+
+interface Chosen {
+  readonly levels: readonly number[]; // from 0
+  readonly status: Plan["status"];
+}
+
+function choose(free: readonly Candidate[], settings: Settings, budget: Budget): Chosen {
+  if (settings.mode === "budget") return within(free, budget);
+  const asked = settings.mode === "target" ? reach(free, settings.target) : same(free, settings.mode);
+  if (fits(free, asked.levels, budget)) return asked;
+  const { levels, status } = within(free, budget);
+  return { levels, status: status === "ok" ? "infeasible" : status };
+}
+
+function same(free: readonly Candidate[], mode: "full" | "base"): Chosen {
+  return { levels: free.map((c) => (mode === "full" ? c.highest - 1 : 0)), status: "ok" };
+}
+
+/** The cheapest levels that keep a target; the lowest where nobody looks. */
+function reach(free: readonly Candidate[], target: number): Chosen {
+  const levels = free.map(() => 0);
+  const seen = free.flatMap((c, i) => (c.visible && c.weight > 0 ? [{ c, i }] : []));
+  if (!seen.length) return { levels, status: "ok" };
+  const bounds = seen.map(({ c }) => c.bound);
+  const costs = seen.map(({ c }) => costOf(c, "bytes"));
+  const found = cheapest(bounds, costs, target, { previous: seen.map(({ c }) => before(c)) });
+  seen.forEach(({ i }, row) => {
+    levels[i] = found.levels[row] ?? 0;
+  });
+  return { levels, status: found.status };
+}
+
+/** The levels of most expected SSIM within the budget in every unit. */
+function within(free: readonly Candidate[], budget: Budget): Chosen {
+  const [tightest, ...others] = [...UNITS].sort((a, b) => room(free, budget, a) - room(free, budget, b));
+  const first = best(free, (c) => costOf(c, tightest as Unit), budget[tightest as Unit]);
+  if (first.status === "over budget" || others.every((unit) => fitsIn(free, first.levels, budget, unit))) {
+    return first;
+  }
+  // the largest of the shares of all budgets is a cost that keeps each of them
+  const largest = (c: Candidate, k: number) =>
+    Math.max(...UNITS.map((unit) => (costOf(c, unit)[k] as number) / budget[unit] || 0));
+  const joint = best(free, (c) => c.label.levels.map((_, k) => Math.ceil(FINE * largest(c, k))), FINE);
+  return { levels: joint.levels, status: fits(free, joint.levels, budget) ? "ok" : "over budget" };
+}
+
+function best(
+  free: readonly Candidate[],
+  cost: (c: Candidate) => readonly number[],
+  budget: number,
+): Allocation {
+  return bestWithin(
+    free.map((c) => c.mean),
+    free.map(cost),
+    free.map(worth),
+    Math.max(budget, 0),
+    { previous: free.map(before) },
+  );
+}
+
+const before = (c: Candidate): number => (c.previous <= c.highest ? c.previous - 1 : -1);
+
+/** Cost by level; what cannot be had costs Infinity. */
+const costOf = (c: Candidate, unit: Unit): readonly number[] =>
+  c.ladder[unit].map((cost, k) => (k < c.highest ? cost : Infinity));
+
+/** Budget over what everything costs. */
+function room(free: readonly Candidate[], budget: Budget, unit: Unit): number {
+  const full = free.reduce((sum, c) => sum + (c.ladder[unit][c.highest - 1] ?? 0), 0);
+  return full > 0 ? budget[unit] / full : Infinity;
+}
+
+const fits = (free: readonly Candidate[], levels: readonly number[], budget: Budget): boolean =>
+  UNITS.every((unit) => fitsIn(free, levels, budget, unit));
+
+function fitsIn(free: readonly Candidate[], levels: readonly number[], budget: Budget, unit: Unit): boolean {
+  const cost = free.reduce((sum, c, i) => sum + (c.ladder[unit][levels[i] ?? 0] ?? 0), 0);
+  return cost <= budget[unit];
+}
+
+function lessen(budget: Budget, fixed: readonly Candidate[]): Budget {
+  const cost = (unit: Unit) => fixed.reduce((sum, c) => sum + (c.ladder[unit][c.highest - 1] ?? 0), 0);
+  return {
+    bytes: budget.bytes - cost("bytes"),
+    gpuBytes: budget.gpuBytes - cost("gpuBytes"),
+    count: budget.count - cost("count"),
+  };
+}
+
+const statusOf = (left: Budget): Plan["status"] =>
+  UNITS.every((unit) => left[unit] >= 0) ? "ok" : "over budget";

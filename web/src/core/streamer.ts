@@ -1,0 +1,346 @@
+/** Streams a bundle: from where the viewer stands to what is drawn. The only part of the core with a state. */
+
+import type { Handle, Manifest, Renderer, Settings, State, Viewpoint } from "../types";
+import { describe } from "./describe";
+import { rotate } from "./distance";
+import { type Clock, clockOfBrowser, type Digest, digestOfBrowser, type Fetch, type File } from "./download";
+import { same, sane } from "./inputs";
+import { poll } from "./live";
+import { parsePromises } from "./manifest";
+import { inOrder } from "./order";
+import { Outlook } from "./outlook";
+import { makePlan, type Plan } from "./planner";
+import { type Drawn, Entry, exchange, gpuBytesOf, Hidden, settle } from "./residency";
+import { PATIENCE, Supply } from "./supply";
+
+export interface StreamerOptions {
+  readonly manifest: Manifest;
+  readonly base: URL; // of the bundle's folder, ending in a slash
+  readonly renderer: Renderer;
+  readonly settings: Settings;
+  readonly fetch?: Fetch;
+  readonly clock?: Clock;
+  readonly now?: () => number; // ms, instead of the clock's
+  readonly digest?: Digest;
+  readonly keepBytes?: number; // of files that have come
+  readonly downloads?: number; // at once, at most
+}
+
+const PLAN_EVERY = 125; // ms
+const KEEP = 64 * 2 ** 20;
+const DECODES = 4; // at once
+const BY_DISTANCE = "levels are planned by distance alone.";
+const UNCHECKED = "Served without https: files are checked by their size only.";
+
+export class Streamer {
+  private readonly renderer: Renderer;
+  private readonly clock: Clock;
+  private readonly supply: Supply;
+  private readonly digest: Digest;
+  private readonly hidden: Hidden;
+  private readonly listeners = new Set<() => void>();
+  private waiting: (() => void)[] = [];
+  private settings: Settings;
+  private viewpoint: Viewpoint;
+  private content: Manifest;
+  private entries: Entry[];
+  private leaving: Drawn[] = []; // labels that a new manifest has no more
+  private outlook = new Outlook();
+  private planned: Plan["status"] = "ok";
+  private plannedAt = -Infinity;
+  private dirty = false;
+  private decodes = 0;
+  private pending = 0;
+  private trouble: string | null = null;
+  private known: State | null = null;
+  private told = true;
+  private phase: "new" | "running" | "disposed" = "new";
+
+  constructor(private readonly options: StreamerOptions) {
+    const { manifest, renderer, settings } = options;
+    const clock = options.clock ?? clockOfBrowser;
+    this.clock = { after: (ms, run) => clock.after(ms, run), now: options.now ?? (() => clock.now()) };
+    this.renderer = renderer;
+    this.settings = sane(settings);
+    this.content = manifest;
+    this.entries = manifest.labels.map((label) => new Entry(label));
+    this.hidden = new Hidden(renderer);
+    this.digest = options.digest === undefined ? digestOfBrowser : options.digest;
+    this.supply = new Supply({
+      base: options.base,
+      fetch: options.fetch ?? ((url, init) => fetch(url, init)),
+      clock: this.clock,
+      digest: this.digest,
+      keepBytes: options.keepBytes ?? KEEP,
+      changed: () => this.arrived(),
+      ...(options.downloads && { atOnce: options.downloads }),
+    });
+    const { position, quaternion } = manifest.start;
+    this.viewpoint = { position, direction: rotate(quaternion, [0, 0, -1]), frustum: [] };
+  }
+
+  /** The manifest in use; in a live bundle it changes. */
+  get manifest(): Manifest {
+    return this.content;
+  }
+
+  get state(): State {
+    if (this.known?.bytesLoaded !== this.supply.received) this.known = null;
+    this.known ??= this.describe();
+    return this.known;
+  }
+
+  /** Begins to load, for the bundle's own start until `update` is called. */
+  start(): void {
+    if (this.phase !== "new") return;
+    this.phase = "running";
+    this.plan();
+    if (this.content.live) this.follow();
+  }
+
+  /** Where the viewer is now. Cheap: plans at most 8 times a second, and only if something moved. */
+  update(viewpoint: Viewpoint): void {
+    if (same(viewpoint, this.viewpoint)) return;
+    this.viewpoint = viewpoint;
+    this.replan();
+  }
+
+  set(partial: Partial<Settings>): void {
+    this.settings = sane({ ...this.settings, ...partial });
+    this.hidden.shrink(this.settings.cacheBytes);
+    this.replan();
+  }
+
+  /** Calls back, at most once in a task, when the state has changed. Returns how to stop that. */
+  onChange(callback: () => void): () => void {
+    this.listeners.add(callback);
+    return () => this.listeners.delete(callback);
+  }
+
+  /** Resolves when all that the plan wants is drawn, or cannot be had for now. */
+  idle(): Promise<void> {
+    return new Promise((resolve) => {
+      this.waiting.push(resolve);
+      this.rest();
+    });
+  }
+
+  /** Tries at once what failed, say when the browser is online again. */
+  retry(): void {
+    this.supply.forgive();
+    this.trouble = null;
+    this.replan();
+  }
+
+  dispose(): void {
+    if (this.phase === "disposed") return;
+    this.phase = "disposed";
+    this.supply.close();
+    const former = [...this.leaving, ...this.entries.flatMap((e) => e.former ?? [])].flatMap(
+      (d) => d.handles,
+    );
+    const all = [...former, ...this.entries.flatMap((e) => e.handles(0, e.decoded.length))];
+    this.renderer.swap([], [...former, ...this.entries.flatMap((e) => e.handles(0, e.shown))]);
+    for (const handle of all) this.renderer.dispose(handle);
+    this.entries = [];
+    this.leaving = [];
+    this.known = null;
+    this.listeners.clear();
+    this.rest();
+  }
+
+  private replan(): void {
+    if (this.phase !== "running" || this.dirty) return;
+    const wait = this.plannedAt + PLAN_EVERY - this.clock.now();
+    this.dirty = wait > 0;
+    if (this.dirty) this.clock.after(wait, () => this.phase === "running" && this.plan());
+    else this.plan();
+  }
+
+  private plan(): void {
+    this.dirty = false;
+    this.plannedAt = this.clock.now();
+    for (const entry of this.entries) this.outlook.see(entry, this.viewpoint);
+    const candidates = this.entries.map((entry) => {
+      return this.outlook.candidate(entry, this.settings.weights, this.highest(entry));
+    });
+    const { wanted, status } = makePlan(candidates, this.settings);
+    this.planned = status;
+    this.entries.forEach((entry, i) => {
+      entry.wanted = wanted[i] ?? 0;
+      entry.candidate = candidates[i] ?? null;
+    });
+    this.work();
+  }
+
+  /** Level that a label can have: below the first increment that is broken. */
+  private highest(entry: Entry): number {
+    const broken = entry.label.levels.findIndex((file) => this.supply.failure(file)?.lasting);
+    return broken < 0 ? entry.label.levels.length : broken;
+  }
+
+  /** Draws what is there, decodes what has come, fetches what is missing. */
+  private work(): void {
+    if (this.phase !== "running") return;
+    this.draw();
+    this.hidden.shrink(this.settings.cacheBytes);
+    for (const entry of this.entries) this.decodeNext(entry);
+    const queue = inOrder(this.entries, this.supply, this.missingPromises());
+    this.pending = queue.length;
+    this.supply.keepOnly(new Set([...queue, ...this.wantedFiles()].map((file) => file.sha256)));
+    this.supply.fill(queue);
+    this.changed();
+    this.rest();
+  }
+
+  private draw(): void {
+    try {
+      settle(this.entries, this.leaving, this.hidden, this.renderer);
+    } catch (error) {
+      this.trouble = `Drawing failed (${error instanceof Error ? error.message : error}); reload the page.`;
+    }
+  }
+
+  private missingPromises(): File[] {
+    const { promises } = this.content;
+    return promises && !this.outlook.complete ? [promises] : [];
+  }
+
+  /** Files of all increments of the plan. */
+  private wantedFiles(): File[] {
+    return this.entries.flatMap((entry) => entry.files(0, entry.wanted).map(({ file }) => file));
+  }
+
+  private decodeNext(entry: Entry): void {
+    const level = entry.ready + 1;
+    const file = entry.label.levels[level - 1];
+    if (!file || level > entry.wanted || entry.decoding || this.decodes >= DECODES) return;
+    if (this.supply.failure(file)?.lasting) return;
+    const content = this.supply.take(file);
+    if (content) void this.decode(entry, file, level, content);
+  }
+
+  private async decode(entry: Entry, file: File, level: number, content: Uint8Array): Promise<void> {
+    entry.decoding = level;
+    this.decodes += 1;
+    let handle: Handle | undefined;
+    try {
+      handle = await this.renderer.decode(entry.label.id, level, content);
+    } catch {
+      this.supply.spoil(file, `${file.uri} cannot be decoded`);
+    }
+    entry.decoding = 0;
+    this.decodes -= 1;
+    if (handle && (this.phase === "disposed" || !this.entries.includes(entry))) this.renderer.dispose(handle);
+    else if (handle) {
+      entry.decoded[level - 1] = handle;
+      if (level > entry.wanted) this.hidden.add(entry, handle);
+    }
+    if (this.phase !== "running") return;
+    if (handle) this.work();
+    else this.arrived();
+  }
+
+  /** A file has come or failed, or may be tried again. */
+  private arrived(): void {
+    if (this.phase !== "running") return;
+    this.takePromises();
+    const capped = this.entries.some((entry) => entry.wanted > this.highest(entry));
+    if (capped) this.plan();
+    else this.work();
+  }
+
+  private takePromises(): void {
+    for (const file of this.missingPromises()) {
+      const content = this.supply.take(file);
+      if (!content) return;
+      try {
+        this.outlook = new Outlook(
+          this.content.labels,
+          parsePromises(new TextDecoder().decode(content), file.uri),
+        );
+        this.replan();
+      } catch (error) {
+        this.supply.spoil(file, error instanceof Error ? error.message : `${file.uri} cannot be read`);
+      }
+    }
+  }
+
+  /** Takes over the manifest of a live bundle each time it has changed and the one before is drawn. */
+  private follow(): void {
+    const { base, fetch = (url, init) => globalThis.fetch(url, init) } = this.options;
+    poll({
+      url: new URL("manifest.json", base).href,
+      fetch,
+      clock: this.clock,
+      goesOn: () => this.phase === "running" && this.content.live,
+      isFree: () => this.isIdle(),
+      found: (manifest) => this.adopt(manifest),
+      failed: (message) => {
+        this.trouble = message;
+        this.changed();
+      },
+    });
+  }
+
+  private adopt(manifest: Manifest): void {
+    const { entries, leaving } = exchange(this.entries, manifest.labels, this.hidden, this.renderer);
+    this.entries = entries;
+    this.leaving.push(...leaving);
+    if (manifest.promises?.sha256 !== this.content.promises?.sha256) {
+      this.outlook = new Outlook();
+    }
+    this.content = manifest;
+    this.trouble = null;
+    this.supply.forgive();
+    this.plan();
+  }
+
+  private isIdle(): boolean {
+    if (this.phase !== "running") return true;
+    return !this.dirty && !this.supply.running && !this.decodes && !this.pending && !this.retrying();
+  }
+
+  /** Whether something failed that will soon be tried again. */
+  private retrying(): boolean {
+    return [...this.wantedFiles(), ...this.missingPromises()].some((file) => {
+      const failure = this.supply.failure(file);
+      return failure !== undefined && !failure.lasting && failure.tries < PATIENCE;
+    });
+  }
+
+  private rest(): void {
+    if (!this.waiting.length || !this.isIdle()) return;
+    for (const resolve of this.waiting.splice(0)) resolve();
+  }
+
+  private changed(): void {
+    this.known = null;
+    if (!this.told) return;
+    this.told = false;
+    queueMicrotask(() => {
+      this.told = true;
+      for (const callback of this.listeners) callback();
+    });
+  }
+
+  private describe(): State {
+    const promises = this.content.promises && this.supply.failure(this.content.promises);
+    return describe(this.entries, {
+      planned: this.planned,
+      bytesLoaded: this.supply.received,
+      bandwidth: this.supply.bandwidth.rate,
+      pending: this.pending,
+      leavingBytes: this.leaving.reduce((sum, drawn) => sum + gpuBytesOf(drawn), 0),
+      notes: [
+        this.trouble,
+        promises && (promises.lasting || promises.tries >= PATIENCE) && `${promises.message}; ${BY_DISTANCE}`,
+        !this.digest && UNCHECKED,
+      ].map((note) => note || null),
+      failure: (entry, level) => {
+        const file = entry.label.levels[level - 1];
+        return file && this.supply.failure(file);
+      },
+    });
+  }
+}

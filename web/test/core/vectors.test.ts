@@ -1,0 +1,130 @@
+/** Promises and distances against those of the Python package. */
+
+import { describe, expect, test } from "vitest";
+import distances from "../../../tests/data/distances.json?raw";
+import promised from "../../../tests/data/promises.json?raw";
+import { frustumOf, look, touches } from "../../src/core/distance";
+import { byDistance, curveAt, ViewModel } from "../../src/core/quality";
+import type { Box, Curve, Label, Promises, Quat, Vec3, Viewpoint } from "../../src/types";
+
+interface PromiseCase {
+  name: string;
+  curves: Curve[];
+  promises: Promises;
+  viewpoints: {
+    position: Vec3;
+    direction: Vec3;
+    distance: number | null;
+    mean: number[];
+    bound: number[];
+    support: number;
+  }[];
+}
+
+interface DistanceCase {
+  name: string;
+  boxes: Box[];
+  camera: { position: Vec3; quaternion: Quat; fovY: number; aspect: number };
+  frustum: Viewpoint["frustum"];
+  expected: { distance: number | null; visible: boolean; touching: boolean[] };
+}
+
+function near(found: readonly number[], expected: readonly number[], relative = 0): void {
+  expect(found).toHaveLength(expected.length);
+  expected.forEach((value, i) => {
+    const away = Math.abs((found[i] ?? Number.NaN) - value);
+    expect(away).toBeLessThanOrEqual(1e-9 * Math.max(1, relative * Math.abs(value)));
+  });
+}
+
+const labelWith = (curves: Curve[], levels: number): Label => ({
+  id: 7,
+  name: "label",
+  title: "label",
+  color: "#000000",
+  weight: 1,
+  always: false,
+  boxes: [],
+  levels: Array.from({ length: levels }, () => ({
+    uri: "a.spz",
+    format: "spz",
+    bytes: 1,
+    gpuBytes: 1,
+    count: 1,
+    sha256: "",
+  })),
+  quality: { status: "calibrated", confidence: 0.95, margin: curves.map(() => -0.01), curves },
+});
+
+describe("promises", () => {
+  for (const c of (JSON.parse(promised) as { cases: PromiseCase[] }).cases) {
+    test(c.name, () => {
+      const own = c.promises.labels[0];
+      if (!own) throw new Error("no label");
+      const label = labelWith(c.curves, Math.max(...own.levels));
+      expect(ViewModel.fits(label, own)).toBe(true);
+      const model = new ViewModel(label, c.promises, own);
+      const ofLevels = (values: readonly number[]) => own.levels.map((k) => values[k - 1] ?? Number.NaN);
+      for (const v of c.viewpoints) {
+        const told = model.predict(v.distance ?? Number.NaN, v.position, v.direction);
+        near(ofLevels(told.mean), v.mean);
+        near(ofLevels(told.bound), v.bound);
+        near([told.support], [v.support]);
+        label.levels.forEach((_, k) => {
+          expect(Number.isNaN(told.mean[k])).toBe(!own.levels.includes(k + 1));
+        });
+      }
+    });
+  }
+});
+
+describe("distances", () => {
+  for (const c of (JSON.parse(distances) as { cases: DistanceCase[] }).cases) {
+    test(c.name, () => {
+      const { position, quaternion, fovY, aspect } = c.camera;
+      const planes = frustumOf(position, quaternion, fovY, aspect);
+      near(planes.flat(), c.frustum.flat());
+      const sight = look(c.boxes, { position, direction: [0, 0, -1], frustum: planes });
+      expect(sight.visible).toBe(c.expected.visible);
+      expect(c.boxes.map((box) => touches(box, planes))).toEqual(c.expected.touching);
+      if (c.expected.distance === null) expect(sight.distance).toBeNaN();
+      else near([sight.distance], [c.expected.distance], 1);
+    });
+  }
+});
+
+const curve: Curve = {
+  level: 2,
+  params: [0.9, 0.1, 1, 1, 0.8, 0.05, 1, 1, 3],
+  range: [0.5, 8],
+  median: 0.7,
+  rmse: 0.01,
+};
+
+test("a curve ends where its range ends, and says its median where the distance is unknown", () => {
+  expect(curveAt(curve, 1)).toBe(0.9);
+  expect(curveAt(curve, 3)).toBeCloseTo(0.8 * Math.exp(-0.1), 12);
+  expect(curveAt(curve, 100)).toBe(curveAt(curve, 8));
+  expect(curveAt(curve, 0)).toBe(curveAt(curve, 0.5));
+  expect(curveAt(curve, Infinity)).toBe(curveAt(curve, 8));
+  expect(curveAt(curve, Number.NaN)).toBe(0.7);
+});
+
+test("distance alone: levels without a curve are unknown, bounds never fall and stay within 1", () => {
+  const label = labelWith([curve, { ...curve, level: 3, median: 0.6 }], 4);
+  const { mean, bound } = byDistance(label, Number.NaN);
+  expect(mean).toEqual([Number.NaN, 0.6499999999999999, 0.6499999999999999, Number.NaN]);
+  expect(bound).toEqual([Number.NaN, 0.69, 0.69, Number.NaN]);
+  expect(byDistance({ ...label, quality: null }, 1).mean).toEqual([1, 2, 3, 4].map(() => Number.NaN));
+});
+
+test("shares of pixels come from the views near by", () => {
+  const own = (JSON.parse(promised) as { cases: PromiseCase[] }).cases[4];
+  if (!own?.promises.labels[0]) throw new Error("no case");
+  const shares = own.promises.views.map((_, i) => (i === 3 ? 0.5 : 0.1));
+  const entry = { ...own.promises.labels[0], shares, lengths: [0.01, 0.01, 1] as const };
+  const model = new ViewModel(labelWith(own.curves, 6), own.promises, entry);
+  const [x, y, z, a, b, c] = own.promises.views[3] ?? [0, 0, 0, 0, 0, 0];
+  expect(model.share([x, y, z], [a, b, c])).toBeCloseTo(0.5, 6);
+  expect(model.share([1e4, 0, 0], [0, 0, 1])).toBeCloseTo(0.1 + 0.4 / shares.length, 9);
+});

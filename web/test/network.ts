@@ -1,0 +1,195 @@
+/** How a bundle arrives over slow links: the streamer against one file and against files in their order. */
+
+import { frustumOf, rotate } from "../src/core/distance";
+import { loadManifest, parsePromises } from "../src/core/manifest";
+import { Outlook } from "../src/core/outlook";
+import { Entry } from "../src/core/residency";
+import { Streamer } from "../src/core/streamer";
+import type { Manifest, Settings, Viewpoint } from "../src/types";
+import { FakeRenderer, Network, VirtualClock } from "./simulate";
+import { BASE, NO_BUDGET } from "./worlds";
+
+/** The texts of a bundle; of its chunks only the sizes matter. */
+export interface Documents {
+  readonly manifest: string;
+  readonly promises: string;
+}
+
+/** A link with a round trip of 100 ms; without HTTP/2 a browser opens 6 connections. */
+export interface Line {
+  readonly mbit: number;
+  readonly connections: number;
+}
+
+const LATENCY = 100; // ms
+
+/** One point of a curve: ms since the start, bytes received, expected SSIM of the picture weighted by pixels. */
+export interface Sample {
+  readonly ms: number;
+  readonly bytes: number;
+  readonly ssim: number;
+  readonly whole: boolean; // everything is there, at its smallest level at least
+}
+
+const NOTHING: Sample = { ms: 0, bytes: 0, ssim: 0, whole: false };
+const FULL: Settings = {
+  mode: "full",
+  target: 0.8,
+  budget: NO_BUDGET,
+  weights: new Map(),
+  cacheBytes: 1e9,
+};
+
+/** A link with a bundle at its other end. */
+function linkTo(documents: Documents, { mbit, connections }: Line) {
+  const clock = new VirtualClock();
+  const network = new Network(clock, (mbit * 1e6) / 8, LATENCY, connections);
+  const manifest: Manifest = JSON.parse(documents.manifest);
+  const text = new TextEncoder();
+  network.files.set("manifest.json", text.encode(documents.manifest));
+  if (manifest.promises) network.files.set(manifest.promises.uri, text.encode(documents.promises));
+  for (const { uri, bytes } of manifest.labels.flatMap((label) => label.levels)) {
+    if (bytes) network.files.set(uri, new Uint8Array(bytes));
+  }
+  return { clock, network, renderer: new FakeRenderer(clock) };
+}
+
+/** Says the expected SSIM of some levels (0: nothing) at a viewpoint: 0 where nothing is drawn. */
+export function judge(manifest: Manifest, promises: string): (view: Viewpoint, levels: number[]) => number {
+  const outlook = new Outlook(manifest.labels, parsePromises(promises, "promises"));
+  const entries = manifest.labels.map((label) => new Entry(label));
+  return (view, levels) => {
+    let [sum, total] = [0, 0];
+    entries.forEach((entry, i) => {
+      outlook.see(entry, view);
+      const known = entry.prediction.mean.some((value) => !Number.isNaN(value));
+      if (!entry.sight.visible || !known) return;
+      const values = entry.prediction.mean.slice(0, levels[i] ?? 0).filter((value) => !Number.isNaN(value));
+      sum += entry.share * Math.max(0, ...values);
+      total += entry.share;
+    });
+    return total > 0 ? sum / total : 0;
+  };
+}
+
+/** The viewpoints of the capture's cameras, in their order. */
+export const cameraViews = (manifest: Manifest): Viewpoint[] =>
+  manifest.cameras.map(({ position, quaternion, fovY, width, height }) => ({
+    position,
+    direction: rotate(quaternion, [0, 0, -1]),
+    frustum: frustumOf(position, quaternion, fovY, width / height),
+  }));
+
+function startView(manifest: Manifest): Viewpoint {
+  const { position, quaternion } = manifest.start;
+  const direction = rotate(quaternion, [0, 0, -1]);
+  return { position, direction, frustum: frustumOf(position, quaternion, 0.9, 1.6) };
+}
+
+/** SSIM over time of the streamer, which fetches everything in the end or what a target asks for. */
+export async function streamed(
+  documents: Documents,
+  line: Line,
+  partial: Partial<Settings>,
+): Promise<Sample[]> {
+  const { clock, network, renderer } = linkTo(documents, line);
+  const { fetch } = network;
+  const head = documents.manifest.length;
+  const curve: Sample[] = [NOTHING];
+  const streamers = loadManifest(BASE, fetch).then((manifest) => {
+    const ssim = judge(manifest, documents.promises);
+    const view = startView(manifest);
+    const settings = { ...FULL, ...partial };
+    const streamer = new Streamer({ manifest, base: BASE, renderer, settings, clock, fetch, digest: null });
+    renderer.watch = () => {
+      const { labels, bytesLoaded, status } = streamer.state;
+      const levels = labels.map((label) => label.shown);
+      const whole = status !== "loading";
+      curve.push({ ms: clock.now(), bytes: head + bytesLoaded, ssim: ssim(view, levels), whole });
+    };
+    streamer.update(view);
+    streamer.start();
+    return streamer;
+  });
+  await clock.pass(60_000);
+  renderer.watch = () => {};
+  (await streamers).dispose();
+  return curve;
+}
+
+/** SSIM over time if all comes as one file. */
+export function oneFile(documents: Documents, { mbit }: Line): Sample[] {
+  const manifest: Manifest = JSON.parse(documents.manifest);
+  const ms = LATENCY + (8 * manifest.totals.bytes) / (mbit * 1000);
+  const full = manifest.labels.map((label) => label.levels.length);
+  const ssim = judge(manifest, documents.promises)(startView(manifest), full);
+  return [NOTHING, { ms, bytes: manifest.totals.bytes, ssim, whole: true }];
+}
+
+/** SSIM over time if increments come six at a time in the order of the manifest. */
+export async function fileOrder(documents: Documents, line: Line): Promise<Sample[]> {
+  const { clock, network } = linkTo(documents, line);
+  const manifest: Manifest = JSON.parse(documents.manifest);
+  const ssim = judge(manifest, documents.promises);
+  const view = startView(manifest);
+  const head = LATENCY + (8 * documents.manifest.length) / (line.mbit * 1000);
+  const todo = manifest.labels.flatMap((label, i) => label.levels.map((file, k) => ({ file, i, k })));
+  const here = manifest.labels.map(() => new Set<number>());
+  let bytes = documents.manifest.length;
+  const curve: Sample[] = [NOTHING];
+  const worker = async (): Promise<void> => {
+    for (let next = todo.shift(); next; next = todo.shift()) {
+      if (next.file.bytes) await (await network.fetch(new URL(next.file.uri, BASE).href)).text();
+      here[next.i]?.add(next.k);
+      bytes += next.file.bytes;
+      const levels = here.map((set) => {
+        let level = 0;
+        while (set.has(level)) level += 1;
+        return level;
+      });
+      curve.push({ ms: head + clock.now(), bytes, ssim: ssim(view, levels), whole: !levels.includes(0) });
+    }
+  };
+  const workers = [1, 2, 3, 4, 5, 6].map(worker);
+  await clock.pass(60_000);
+  await Promise.all(workers);
+  return curve;
+}
+
+/** One point of a walk. */
+export interface Step {
+  readonly second: number;
+  readonly bytes: number; // received so far
+  readonly count: number; // splats drawn
+  readonly ssim: number; // expected of what is drawn
+  readonly full: number; // expected of everything
+}
+
+/** The capture's cameras in order, one a second. */
+export async function walked(documents: Documents, line: Line, partial: Partial<Settings>): Promise<Step[]> {
+  const { clock, network, renderer } = linkTo(documents, line);
+  const manifest: Manifest = JSON.parse(documents.manifest);
+  const ssim = judge(manifest, documents.promises);
+  const full = manifest.labels.map((label) => label.levels.length);
+  const settings = { ...FULL, ...partial };
+  const { fetch } = network;
+  const streamer = new Streamer({ manifest, base: BASE, renderer, settings, clock, fetch, digest: null });
+  streamer.start();
+  const steps: Step[] = [];
+  for (const [second, view] of cameraViews(manifest).entries()) {
+    streamer.update(view);
+    await clock.pass(1000);
+    const { labels, bytesLoaded: bytes, count } = streamer.state;
+    const levels = labels.map((label) => label.shown);
+    steps.push({ second: second + 1, bytes, count, ssim: ssim(view, levels), full: ssim(view, full) });
+  }
+  streamer.dispose();
+  return steps;
+}
+
+/** Seconds until a curve reaches a part of its last value for good. */
+export function reaches(curve: readonly Sample[], part: number): number {
+  const goal = part * (curve.at(-1)?.ssim ?? Number.NaN);
+  const below = curve.findLastIndex((sample) => sample.ssim < goal);
+  return (curve[below + 1]?.ms ?? Number.NaN) / 1000;
+}

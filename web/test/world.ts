@@ -1,0 +1,91 @@
+/** A streamer in a world of its own, watched at every moment. */
+
+import { Streamer, type StreamerOptions } from "../src/core/streamer";
+import type { Manifest, Settings, State } from "../src/types";
+import { digest, FakeRenderer, Network, VirtualClock } from "./simulate";
+import { BASE, bundle, DEFAULTS, type Options } from "./worlds";
+
+export interface World {
+  readonly clock: VirtualClock;
+  readonly network: Network;
+  readonly renderer: FakeRenderer;
+  readonly manifest: Manifest;
+  readonly streamer: Streamer;
+  settings: Settings; // that hold now
+  set(partial: Partial<Settings>): void;
+  /** Lets time pass; checks what must hold at every moment. */
+  pass(ms: number): Promise<void>;
+  /** Lets time pass until the streamer is idle; fails after a minute. */
+  rest(): Promise<void>;
+}
+
+export function world(options: Options = {}, more: Partial<StreamerOptions> = {}, on?: World): World {
+  const clock = on?.clock ?? new VirtualClock();
+  const network = on?.network ?? new Network(clock);
+  const renderer = new FakeRenderer(clock);
+  const manifest = more.manifest ?? bundle(network, options);
+  const settings = more.settings ?? DEFAULTS;
+  const streamer = new Streamer({
+    manifest,
+    base: BASE,
+    renderer,
+    settings,
+    clock,
+    fetch: network.fetch,
+    digest,
+    ...more,
+  });
+  const check = watcher(streamer, renderer);
+  renderer.watch = () => queueMicrotask(check);
+  const made: World = {
+    clock,
+    network,
+    renderer,
+    manifest,
+    streamer,
+    settings,
+    set(partial) {
+      made.settings = { ...made.settings, ...partial };
+      streamer.set(partial);
+    },
+    pass: (ms) => clock.pass(ms, check),
+    async rest() {
+      let idle = false;
+      void streamer.idle().then(() => {
+        idle = true;
+      });
+      for (let second = 0; second < 60; second++) {
+        await clock.pass(1000, check);
+        if (idle) return;
+      }
+      throw new Error(`never idle: ${JSON.stringify(streamer.state)}`);
+    },
+  };
+  return made;
+}
+
+/** What must hold at every moment: no holes, and the state says what is drawn. */
+function watcher(streamer: Streamer, renderer: FakeRenderer): () => void {
+  const seen = new Set<number>();
+  const { live } = streamer.manifest; // there the old may be drawn for the new
+  return () => {
+    const { labels, count } = streamer.state;
+    for (const id of seen) if (!labels.some(({ label }) => label.id === id)) seen.delete(id);
+    let drawn = 0;
+    for (const { label, shown, wanted } of labels) {
+      const levels = renderer.levels(label.id);
+      const expected = label.levels.flatMap((file, i) => (i < shown && file.count ? [i + 1] : []));
+      if (!live && levels.join() !== expected.join()) {
+        throw new Error(`${label.name}: draws ${levels}, says ${expected}`);
+      }
+      if (seen.has(label.id) && wanted && !shown) throw new Error(`${label.name}: a hole`);
+      if (shown) seen.add(label.id);
+      drawn += label.levels.reduce((sum, file, i) => sum + (i < shown ? file.count : 0), 0);
+    }
+    if (!live && drawn !== count) throw new Error(`counts ${count}, draws ${drawn}`);
+  };
+}
+
+/** Levels that are drawn, by label. */
+export const shown = (state: State): number[] => state.labels.map((label) => label.shown);
+export const wanted = (state: State): number[] => state.labels.map((label) => label.wanted);

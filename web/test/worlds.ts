@@ -1,0 +1,130 @@
+/** Small bundles made up for tests. */
+
+import type { Label, Level, Manifest, Promises, Settings, Viewpoint } from "../src/types";
+import { fnv, type Network, seeded } from "./simulate";
+
+export const BASE = new URL("https://example.org/");
+export const NO_BUDGET = { bytes: Infinity, gpuBytes: Infinity, count: Infinity };
+export const DEFAULTS: Settings = {
+  mode: "target",
+  target: 0.8,
+  budget: NO_BUDGET,
+  weights: new Map(),
+  cacheBytes: 1e9,
+};
+/** Looks along -z from a place, without a frustum. */
+export const at = (x: number, y = 0, z = 0): Viewpoint => ({
+  position: [x, y, z],
+  direction: [0, 0, -1],
+  frustum: [],
+});
+/** Sees what is right of x = 0. */
+export const rightOf = (view: Viewpoint): Viewpoint => ({ ...view, frustum: [[1, 0, 0, 0]] });
+
+export interface Options {
+  readonly labels?: number;
+  readonly levels?: number;
+  readonly bytes?: number; // of an increment, about
+  readonly seed?: number;
+  readonly live?: boolean;
+  readonly promises?: boolean;
+}
+
+/** A bundle whose files are on a network; label i stands at x = 4 i - 8. */
+export function bundle(network: Network, options: Options = {}): Manifest {
+  const { labels = 4, levels = 5, bytes = 20_000, seed = 1, live = false, promises = true } = options;
+  const random = seeded(seed);
+  const made = Array.from({ length: labels }, (_, id) => {
+    const files = Array.from({ length: levels }, (_, k) => {
+      const size = Math.round(bytes * (0.5 + random()) * (k ? 1 : 0.3));
+      return put(network, `chunks/l${id}-${k + 1}-${seed}.spz`, size, random);
+    });
+    return labelOf(id, files, random);
+  });
+  const models = promises && labels ? promisesOf(made, random) : null;
+  return {
+    format: "sagesplat-bundle",
+    version: 1,
+    generator: "test",
+    name: "test",
+    live,
+    frame: { axes: "rub", up: [0, 1, 0], floor: -1, extent: 5, metersPerUnit: 1, scale: "given" },
+    shDegree: 3,
+    antialiased: false,
+    background: [0, 0, 0],
+    totals: totals(made),
+    labels: made,
+    promises: models && store(network, "promises-1.json", new TextEncoder().encode(JSON.stringify(models))),
+    cameras: [],
+    start: { position: [0, 0, 0], quaternion: [0, 0, 0, 1], target: [0, 0, -1] },
+    licenses: [],
+  };
+}
+
+function store(network: Network, uri: string, content: Uint8Array) {
+  network.files.set(uri, content);
+  return { uri, bytes: content.length, sha256: fnv(content) };
+}
+
+function put(network: Network, uri: string, size: number, random: () => number): Level {
+  const content = Uint8Array.from({ length: size }, () => Math.floor(256 * random()));
+  const count = Math.max(1, Math.round(size / 20));
+  return { ...store(network, uri, content), format: "spz", gpuBytes: 56 * count, count };
+}
+
+function labelOf(id: number, levels: readonly Level[], random: () => number): Label {
+  const best = 0.88 + 0.08 * random();
+  const curves = levels.map((_, k) => {
+    const top = best * (1 - 0.6 * Math.exp(-(k + 1) / 1.5));
+    const params = [top, 0.002, 2, 1.2, top - 0.02, 0.002, 2, 1.1, 20] as const;
+    return { level: k + 1, params, range: [1, 40] as const, median: top - 0.02, rmse: 0.02 };
+  });
+  const x = 4 * id - 8;
+  return {
+    id,
+    name: `label-${id}`,
+    title: `label ${id}`,
+    color: "#808080",
+    weight: 1,
+    always: false,
+    boxes: [[x - 1, -1, -6, x + 1, 1, -4]],
+    levels,
+    quality: { status: "calibrated", confidence: 0.95, margin: levels.map(() => -0.02), curves },
+  };
+}
+
+function promisesOf(labels: readonly Label[], random: () => number): Promises {
+  const views = Array.from({ length: 12 }, () => {
+    return [10 * random() - 5, 0, 4 * random(), 0, 0, -1] as const;
+  });
+  const rows = views.map((_, i) => i);
+  return {
+    version: 1,
+    extent: 5,
+    views,
+    labels: labels.map((label) => ({
+      id: label.id,
+      levels: label.levels.map((_, k) => k + 1),
+      usual: 1.6,
+      lengths: [0.5, 0.7, 0.6] as const,
+      unseen: 0.1,
+      noise: 0.1,
+      factor: 1,
+      confidence: 0.95,
+      shift: 0,
+      mixing: 0.005,
+      amplitudes: label.levels.map(() => 0.01),
+      views: rows,
+      unseenViews: rows.map((i) => (i % 4 ? 0 : 1)),
+      logDistances: rows.map(() => 1.5 + 0.3 * random()),
+      weights: rows.map(() => label.levels.map(() => 0.01 * (random() - 0.5))),
+      shares: rows.map(() => random() / labels.length),
+    })),
+  };
+}
+
+export function totals(labels: readonly Label[]): Manifest["totals"] {
+  const all = labels.flatMap((label) => label.levels);
+  const sum = (unit: "count" | "bytes" | "gpuBytes") => all.reduce((total, level) => total + level[unit], 0);
+  return { count: sum("count"), bytes: sum("bytes"), gpuBytes: sum("gpuBytes") };
+}
