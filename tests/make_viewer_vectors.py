@@ -3,8 +3,8 @@
 A case of tests/data/distances.json has boxes, a camera, its half spaces and under "expected" the distance
 (null: nothing in sight), whether the category is visible and which boxes touch; planes are to be equal to
 1e-9, distances to 1e-9 of themselves. A case of tests/data/promises.json has a label of a bundle's manifest
-(its curves), the entry of promises-*.json with the views it shares, and viewpoints with the expected mean,
-spread and bound by level and the support, to 1e-9 (null: NaN).
+(its curves), the entry of promises-*.json with the views it shares, and viewpoints with the distance, what
+it is corrected to, and the expected mean, spread and bound by level and the support, to 1e-9 (null: NaN).
 """
 
 import json
@@ -17,7 +17,7 @@ import numpy as np
 from sagesplat.adapt.model import Eq3, SsimModel
 from sagesplat.adapt.promise import ViewModel
 from sagesplat.output import boxes
-from sagesplat.output.bundle_quality import curve_entry, promise_entry
+from sagesplat.output.bundle_quality import corrected, curve_entry, promise_entry
 
 DATA = Path(__file__).parent / "data"
 Case = dict[str, Any]
@@ -114,17 +114,19 @@ def _promise_case(name: str, made: ViewModel, seed: int) -> Case:
     rng = np.random.default_rng(seed)
     flip = np.array([1, -1, -1])
     shared = np.column_stack([made.inputs[:, :3] * made.extent, made.inputs[:, 3:6]])
-    entry = promise_entry(made, np.arange(len(shared)), np.zeros(len(shared)))
+    missed = rng.normal(0, 0.2, len(shared)).round(3)
+    entry = promise_entry(made, np.arange(len(shared)), np.zeros(len(shared)), missed)
     position, direction = rng.normal(0, 3, (8, 3)), rng.normal(size=(8, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     position[0], direction[0] = shared[0, :3], shared[0, 3:]  # a known view
     position[1] = 1e3  # far from all
     away = np.array([math.exp(made.inputs[0, 6]), 2.0, math.nan, 0.1, 1.9999, 3.3, 50.0, 5.0])
     told = made.predict(away, position, direction)
+    right = corrected(made, missed, away, position, direction)
     points = [
         {
             "position": (position[i] * flip).tolist(), "direction": (direction[i] * flip).tolist(),
-            "distance": _plain(away[i]),
+            "distance": _plain(away[i]), "corrected": _plain(right[i]),
             "mean": told.mean[i].tolist(), "spread": told.spread[i].tolist(),
             "bound": told.bound[i].tolist(), "support": float(told.support[i]),
         }

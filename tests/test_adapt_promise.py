@@ -91,7 +91,7 @@ def synthetic(
     rows = np.arange(len(scene.views))
     distance, position, direction = viewpoints(scene, rows)
     x = module._inputs(distance, position, direction, scene.extent, 0.0)
-    S = module._covariance(x, x, (0.5, 0.5, 1.0)) + 1e-9 * np.eye(len(x))
+    S = module.alike(x, x, (0.5, 0.5, 1.0)) + 1e-9 * np.eye(len(x))
     field = 0.05 * np.linalg.cholesky(S) @ rng.standard_normal((len(x), 2))
     unseen = ~np.isin(rows, scene.train_ids)
     level = np.array([0.55, 0.66, 0.76, 0.85])
@@ -149,7 +149,7 @@ def test_leaving_one_out_in_closed_form_is_what_a_fit_without_the_view_says():
     x = rng.standard_normal((20, 7))
     u = np.arange(20) % 3 == 0
     residual = rng.standard_normal((20, 2))
-    S = module._covariance(x, x, (0.8, 1.2, 2.0)) + 0.3 * np.outer(u, u) + 0.1 * np.eye(20)
+    S = module.alike(x, x, (0.8, 1.2, 2.0)) + 0.3 * np.outer(u, u) + 0.1 * np.eye(20)
     inverse = module._inverse(S)
     own = np.diag(inverse)
     left_out = residual - inverse @ residual / own[:, None]
@@ -167,7 +167,7 @@ def test_slopes_of_the_covariance():
     S, slopes = module._terms(squares, u, theta)
     lengths = [float(np.exp(t)) for t in theta[:3]]
     whole = (
-        module._covariance(x, x, lengths) + np.exp(theta[3]) * np.outer(u, u) + np.exp(theta[4]) * np.eye(6)
+        module.alike(x, x, lengths) + np.exp(theta[3]) * np.outer(u, u) + np.exp(theta[4]) * np.eye(6)
     )
     np.testing.assert_allclose(S, whole, atol=1e-12)
     for i, slope in enumerate(slopes):

@@ -23,6 +23,7 @@ from sagesplat.output.bearings import FLIP
 from sagesplat.output.bundle import SCHEMA, Category, Contents, Shot, documents, is_bundle, write_bundle
 from sagesplat.output.bundle_quality import (
     MOVES,
+    corrected,
     curve_entry,
     curve_of,
     margins,
@@ -176,11 +177,22 @@ def views_of(made: ViewModel) -> np.ndarray:
 
 def test_a_promise_comes_back_as_it_was() -> None:
     made = model(2, 12, [1, 2, 4])
-    entry = json.loads(json.dumps(promise_entry(made, np.arange(12), np.zeros(12))))
+    entry = json.loads(json.dumps(promise_entry(made, np.arange(12), np.zeros(12), np.full(12, np.nan))))
     read = model_of(entry, made.curves, views_of(made), made.extent)
     at = np.array([2.0, np.nan]), np.ones((2, 3)), np.eye(3)[:2]
     for a, b in zip(read.predict(*at), made.predict(*at), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-12)
+
+
+def test_known_views_correct_the_boxes() -> None:
+    made = replace(model(2, 12, [1]), lengths=(0.05, 0.05, 1.0))  # no view is close to another
+    missed = np.linspace(-0.5, 0.5, 12)
+    position, direction = made.inputs[:, :3] * made.extent, made.inputs[:, 3:6]
+    told = np.linspace(1, 3, 12)
+    right = corrected(made, missed, told, position, direction)
+    np.testing.assert_allclose(right, told * np.exp(missed), rtol=1e-3)
+    np.testing.assert_allclose(corrected(made, missed, told, position + 1e3, direction), told, rtol=1e-9)
+    assert np.isnan(corrected(made, missed, np.full(12, np.nan), position, direction)).all()
 
 
 def test_levels_without_a_file_take_the_last_promise_of_what_they_show() -> None:

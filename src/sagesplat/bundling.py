@@ -96,6 +96,7 @@ def bundle(
         meters_per_unit=meters_per_unit,
     )
     contents = replace(contents, categories=_with_quality(job, contents.categories, always, weights))
+    contents = with_corrections(contents)
     written = write_bundle(out, contents, viewer)
     agreement, error = distance_error(contents)
     count = sum(chunk.count for chunk in chunks)
@@ -148,28 +149,39 @@ def live_bundle(job: Job, folder: Path, viewer: Path | None = None) -> bool:
     return True
 
 
+def with_corrections(contents: Contents) -> Contents:
+    """The contents with what the boxes of each category miss of its distance in each view."""
+    views = []
+    for shot in contents.shots:
+        camera = shot.camera
+        where = position(camera)
+        sees = boxes.frustum(where, quaternion(camera), fov_y(camera), camera.width / camera.height)
+        views.append((where, sees))
+
+    def missed(category: Category) -> np.ndarray:
+        told = np.array([boxes.distance(category.boxes, *view) for view in views])
+        known = np.full(len(views), np.nan) if category.distance is None else category.distance
+        right = np.where((known > 0) & (told > 0), known / np.where(told > 0, told, 1), np.nan)
+        return np.log(right)
+
+    return replace(contents, categories=[replace(c, corrections=missed(c)) for c in contents.categories])
+
+
 def distance_error(contents: Contents) -> tuple[dict[int, tuple[float, float]], tuple[float, float]]:
     """Median and 95th percentile of the relative error of distances by boxes, by label and over all.
 
     Against d_min, in the views that show enough of a category.
     """
-    found: dict[int, list[float]] = {}
-    for row, shot in enumerate(contents.shots):
-        camera = shot.camera
-        where = position(camera)
-        planes = boxes.frustum(where, quaternion(camera), fov_y(camera), camera.width / camera.height)
-        for category in contents.categories:
-            if category.shares is None or category.distance is None or not category.shares[row]:
-                continue
-            truth = float(category.distance[row])
-            if truth > 0:
-                told = boxes.distance(category.boxes, where, planes)
-                found.setdefault(category.label_id, []).append(abs(told - truth) / truth)
+    found = {
+        c.label_id: np.abs(np.expm1(-c.corrections[c.shares > 0]))
+        for c in contents.categories
+        if c.shares is not None and c.corrections is not None
+    }
     by_label = {label: _median_and_95th(errors) for label, errors in found.items()}
-    return by_label, _median_and_95th([e for errors in found.values() for e in errors])
+    return by_label, _median_and_95th(np.concatenate([*found.values(), np.zeros(0)]))
 
 
-def _median_and_95th(errors: Sequence[float]) -> tuple[float, float]:
+def _median_and_95th(errors: np.ndarray) -> tuple[float, float]:
     if not np.isfinite(errors).any():
         return float("nan"), float("nan")
     median, high = np.nanpercentile(errors, [50, 95])

@@ -100,6 +100,7 @@ export interface Promises {
     readonly unseenViews: readonly number[]; // 0 or 1 for each of them
     readonly logDistances: readonly number[];
     readonly weights: readonly (readonly number[])[]; // [n][K]
+    readonly corrections: readonly number[]; // log of each one's distance over what the boxes tell; 0: unknown
     readonly shares: readonly number[]; // of the pixels of each shared view, 0..1
   }[];
 }

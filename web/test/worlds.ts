@@ -117,6 +117,7 @@ function promisesOf(labels: readonly Label[], random: () => number): Promises {
       views: rows,
       unseenViews: rows.map((i) => (i % 4 ? 0 : 1)),
       logDistances: rows.map(() => 1.5 + 0.3 * random()),
+      corrections: rows.map(() => 0),
       weights: rows.map(() => label.levels.map(() => 0.01 * (random() - 0.5))),
       shares: rows.map(() => random() / labels.length),
     })),

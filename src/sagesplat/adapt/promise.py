@@ -115,7 +115,7 @@ class ViewModel:
 
     @cached_property
     def _factor(self) -> tuple[np.ndarray, bool]:
-        covariance = _covariance(self.inputs, self.inputs, self.lengths)
+        covariance = alike(self.inputs, self.inputs, self.lengths)
         covariance += self.unseen * np.outer(self.unseen_inputs, self.unseen_inputs)
         return cho_factor(covariance + self.noise * np.eye(self.num_views), lower=True)
 
@@ -131,13 +131,13 @@ class ViewModel:
         camera's z.
         """
         x = _inputs(distance, position, direction, self.extent, self.usual)
-        alike = _covariance(x, self.inputs, self.lengths)
-        k = alike + self.unseen * self.unseen_inputs
+        near = alike(x, self.inputs, self.lengths)
+        k = near + self.unseen * self.unseen_inputs
         mean = _at(self.curves, distance) + k @ self.weights
         known = (k.T * cho_solve(self._factor, k.T)).sum(0)
         variance = np.maximum(1 + self.unseen + self.noise - known, 0)
         spread = np.sqrt(variance)[:, None] * self.amplitudes
-        return promise(mean + self.shift, spread, self.factor, alike.max(1), self.mixing)
+        return promise(mean + self.shift, spread, self.factor, near.max(1), self.mixing)
 
 
 def promise(
@@ -277,7 +277,10 @@ def _inputs(
     return np.column_stack([position / extent, direction, log_distance]).astype(np.float64)
 
 
-def _covariance(a: np.ndarray, b: np.ndarray, lengths: Sequence[float]) -> np.ndarray:
+def alike(
+    a: Float[np.ndarray, "A 7"], b: Float[np.ndarray, "B 7"], lengths: Sequence[float]
+) -> Float[np.ndarray, "A B"]:
+    """c(x, x') of the module's text, for all pairs of inputs."""
     scale = np.repeat(lengths, [group.stop - group.start for group in GROUPS])
     away = np.sqrt(3) * cdist(a / scale, b / scale)
     return (1 + away) * np.exp(-away)

@@ -68,6 +68,7 @@ class Category:
     model: ViewModel | None = None  # with the chunks' levels; None: nothing is promised
     shares: Float[np.ndarray, " V"] | None = None  # of the pixels of each shot; None: 0
     distance: Float[np.ndarray, " V"] | None = None  # d_min in each shot; None: unknown
+    corrections: Float[np.ndarray, " V"] | None = None  # log of that over what the boxes tell; None: 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,8 +234,10 @@ def _promises(contents: Contents, models: dict[int, ViewModel]) -> bytes | None:
             continue
         shares = np.zeros(len(cameras)) if category.shares is None else category.shares
         away = np.full(len(cameras), np.nan) if category.distance is None else category.distance
+        missed = np.zeros(len(cameras)) if category.corrections is None else category.corrections
         mine = np.searchsorted(used, rows[category.label_id])
-        entries.append(rounded_entry(model, mine, shares[used], views, (away, position, direction)))
+        at = (away, position, direction)
+        entries.append(rounded_entry(model, mine, shares[used], missed[used], views, at))
     extent = next(iter(models.values())).extent
     return dumped({"version": VERSION, "extent": extent, "views": views.tolist(), "labels": entries})
 

@@ -140,6 +140,7 @@ const model = object({
   views: list(amount),
   unseenViews: list(oneOf(0, 1)),
   logDistances: list(number),
+  corrections: list(number),
   weights: list(list(number)),
   shares: list(share),
 });
@@ -150,7 +151,12 @@ export function parsePromises(json: string, file: string): Promises {
   const found = checked<Promises>(parse(json, file), promises, file);
   const wrong = found.labels.flatMap((one, i) => {
     const [n, K] = [one.views.length, one.levels.length];
-    const lengths = [one.unseenViews.length, one.logDistances.length, one.weights.length];
+    const lengths = [
+      one.unseenViews.length,
+      one.logDistances.length,
+      one.corrections.length,
+      one.weights.length,
+    ];
     const fits =
       n > 0 &&
       K > 0 &&

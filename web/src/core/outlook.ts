@@ -26,11 +26,12 @@ export class Outlook {
     const { label } = entry;
     const { position, direction } = viewpoint;
     const model = this.models.get(label.id);
-    const sight = look(label.boxes, viewpoint);
+    const seen = look(label.boxes, viewpoint);
+    const distance = model?.corrected(seen.distance, position, direction) ?? seen.distance;
+    const sight = { ...seen, distance };
     // a label of which nobody knows where it is may be anywhere
     entry.sight = label.boxes.length ? sight : { ...sight, visible: true };
-    entry.prediction =
-      model?.predict(sight.distance, position, direction) ?? byDistance(label, sight.distance);
+    entry.prediction = model?.predict(distance, position, direction) ?? byDistance(label, distance);
     entry.share = model ? model.share(position, direction) : this.complete ? 0 : sight.size;
   }
 

@@ -37,6 +37,10 @@ export function byDistance(label: Label, distance: number): Prediction {
   };
 }
 
+/** Power of the kernel that known views speak of a distance with, and the least weight that counts. */
+const LIKE = 16;
+const ENOUGH = 1e-3;
+
 type LabelPromises = Promises["labels"][number];
 
 /** A label's viewpoint model, ready to be evaluated; its Cholesky factor is made here, once. */
@@ -104,6 +108,19 @@ export class ViewModel {
     });
     const variance = Math.max(1 + own.unseen + own.noise - explained(this.factor, k), 0);
     return this.promise(mean, Math.sqrt(variance), support);
+  }
+
+  /** A distance by the boxes, corrected by what they miss at the label's own views close by; NaN stays. */
+  corrected(distance: number, position: Vec3, direction: Vec3): number {
+    const x = new Float64Array(7);
+    this.put(x, 0, position, direction, 0);
+    let [sum, total] = [0, 0];
+    this.own.corrections.forEach((correction, i) => {
+      const weight = matern(x, 0, this.inputs, i, 6) ** LIKE;
+      sum += weight * correction;
+      total += weight;
+    });
+    return distance * Math.exp(sum / (total + ENOUGH));
   }
 
   /** Share of the pixels that the label has around a viewpoint, from the known views near it, 0..1. */

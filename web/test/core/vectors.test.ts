@@ -15,6 +15,7 @@ interface PromiseCase {
     position: Vec3;
     direction: Vec3;
     distance: number | null;
+    corrected: number | null;
     mean: number[];
     bound: number[];
     support: number;
@@ -70,6 +71,9 @@ describe("promises", () => {
         near(ofLevels(told.mean), v.mean);
         near(ofLevels(told.bound), v.bound);
         near([told.support], [v.support]);
+        const right = model.corrected(v.distance ?? Number.NaN, v.position, v.direction);
+        if (v.corrected === null) expect(right).toBeNaN();
+        else near([right], [v.corrected], 1);
         label.levels.forEach((_, k) => {
           expect(Number.isNaN(told.mean[k])).toBe(!own.levels.includes(k + 1));
         });
