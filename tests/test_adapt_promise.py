@@ -166,9 +166,7 @@ def test_slopes_of_the_covariance():
     squares = [((x[:, None, g] - x[None, :, g]) ** 2).sum(-1) for g in module.GROUPS]
     S, slopes = module._terms(squares, u, theta)
     lengths = [float(np.exp(t)) for t in theta[:3]]
-    whole = (
-        module.alike(x, x, lengths) + np.exp(theta[3]) * np.outer(u, u) + np.exp(theta[4]) * np.eye(6)
-    )
+    whole = module.alike(x, x, lengths) + np.exp(theta[3]) * np.outer(u, u) + np.exp(theta[4]) * np.eye(6)
     np.testing.assert_allclose(S, whole, atol=1e-12)
     for i, slope in enumerate(slopes):
         step = 1e-6 * (np.arange(5) == i)

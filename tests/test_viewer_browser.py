@@ -1,0 +1,475 @@
+"""The viewer in a real browser, software WebGL, on a bundle small enough for that."""
+
+import base64
+import http.server
+import json
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import browser as chromium
+import numpy as np
+import pytest
+import torch
+from browser import Opened, open_page
+
+from sagesplat.bundling import package_viewer
+from sagesplat.gaussians import Gaussians
+from sagesplat.output.bundle import Category, Contents, Shot, write_bundle
+from sagesplat.output.chunks import read_chunks, write_chunks
+from sagesplat.raster import rasterize
+from sagesplat.scene.scene import Camera
+
+pytestmark = [
+    pytest.mark.skipif(chromium.missing() is not None, reason=chromium.missing() or ""),
+    pytest.mark.skipif(not (package_viewer() / "index.html").exists(), reason="the viewer is not built"),
+]
+
+IWER = Path(__file__).parent.parent / "web/node_modules/iwer/build/iwer.min.js"
+POLICY = (
+    "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; style-src 'self'; img-src 'self' data: blob:; "
+    "connect-src 'self' data: blob:; worker-src blob:; base-uri 'none'; form-action 'none'"
+)
+COLOURS = {1: (0.8, 0.2, 0.1), 2: (0.1, 0.7, 0.2), 3: (0.15, 0.25, 0.85)}
+SIZES = dict.fromkeys(COLOURS, (20, 50, 100, 200))  # splats up to each level
+WHOLE = sum(size[-1] for size in SIZES.values())
+BASE = sum(size[0] for size in SIZES.values())
+
+# the canvas, read in the task that drew it, once all is sorted
+PIXELS = """() => new Promise((resolve) => {
+  const stop = sagesplat.onSample(({ settled }) => {
+    if (!settled) return;
+    stop();
+    const gl = document.getElementById("view").getContext("webgl2");
+    const [w, h] = [gl.drawingBufferWidth, gl.drawingBufferHeight];
+    const rgba = new Uint8Array(w * h * 4);
+    gl.readPixels(0, 0, w, h, gl.RGBA, gl.UNSIGNED_BYTE, rgba);
+    let text = "";
+    for (let i = 0; i < rgba.length; i += 8192) text += String.fromCharCode(...rgba.subarray(i, i + 8192));
+    resolve([w, h, btoa(text)]);
+  });
+})"""
+# every frame: what the state says, and whether anything is on the canvas
+WATCH = """() => {
+  window.samples = [];
+  sagesplat.onSample(({ state, drawn, textures, presenting, cap }) => {
+    const gl = document.getElementById("view").getContext("webgl2");
+    const [w, h] = [gl.drawingBufferWidth, gl.drawingBufferHeight];
+    const rgba = new Uint8Array(w * h * 4);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.readPixels(0, 0, w, h, gl.RGBA, gl.UNSIGNED_BYTE, rgba);
+    const half = [0, 0];
+    for (let i = 0; i < w * h; i += 1) {
+      if (rgba[4 * i] + rgba[4 * i + 1] + rgba[4 * i + 2] > 60) half[i % w < w / 2 ? 0 : 1] += 2 / (w * h);
+    }
+    const { count, bytesShown, gpuBytes } = state;
+    const lit = (half[0] + half[1]) / 2;
+    samples.push({ count, bytesShown, gpuBytes, drawn, textures, presenting, cap, lit, half });
+  });
+}"""
+
+
+def cloud() -> Gaussians:
+    """Three walls of one colour each, side by side, the coarse splats first."""
+    rng = np.random.default_rng(0)
+    n = WHOLE
+    label = np.repeat(list(COLOURS), n // 3)
+    means = np.stack([(label - 2) * 1.4, np.zeros(n), np.full(n, 5.0)], 1)
+    means += rng.uniform(-1, 1, (n, 3)) * [0.65, 0.9, 0.3]
+    scale = np.where(np.arange(n) % (n // 3) < 20, 0.28, 0.12)
+    sh0 = (np.array([COLOURS[i] for i in label]) - 0.5) / 0.28209479
+    as_float = lambda values: torch.from_numpy(np.asarray(values, np.float32))  # noqa: E731
+    return Gaussians(
+        means=as_float(means),
+        quats=as_float(rng.normal(size=(n, 4))),
+        log_scales=as_float(np.log(scale)[:, None] + rng.uniform(-0.3, 0.3, (n, 3))),
+        logit_opacities=as_float(np.full(n, 2.0)),
+        sh0=as_float(sh0)[:, None],
+        shN=as_float(rng.normal(0, 0.05, (n, 15, 3))),
+        label_ids=torch.from_numpy(label.astype(np.int16)),
+    )
+
+
+def camera(x: float = 0.0) -> Camera:
+    w2c = np.eye(4, dtype=np.float32)
+    w2c[0, 3] = -x
+    K = np.array([[230, 0, 155], [0, 225, 104], [0, 0, 1]], np.float32)
+    return Camera(w2c, K, 320, 200)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("viewer")
+    names = {1: "brick", 2: "grass-merged", 3: "sky-other-merged"}
+    g = cloud()
+    chunks = write_chunks(folder / "chunks", g, SIZES, names)
+    places = {i: g.means[g.label_ids == i].numpy() * [1, -1, -1] for i in names}
+    categories = [
+        Category(i, name, name.split("-")[0], "#" + bytes(int(255 * c) for c in COLOURS[i]).hex(),
+                 np.concatenate([places[i].min(0), places[i].max(0)])[None])
+        for i, name in names.items()
+    ]  # fmt: skip
+    shots = [Shot(f"photo{k}.jpg", "train", camera(0.2 * k)) for k in range(3)]
+    contents = Contents(
+        "three walls", 1.0, shots, categories, chunks, folder / "chunks", 3, meters_per_unit=1.0
+    )
+    write_bundle(folder / "bundle", contents, package_viewer())
+    return folder / "bundle"
+
+
+@contextmanager
+def serve(folder: Path, spoil: dict[str, bytes | None] | None = None) -> Iterator[str]:
+    """Any static web server: no ranges, the strict policy. `spoil`: other contents, None for 404."""
+
+    class Handler(http.server.SimpleHTTPRequestHandler):
+        extensions_map = {**http.server.SimpleHTTPRequestHandler.extensions_map, ".js": "text/javascript"}  # noqa: RUF012
+
+        def __init__(self, *args: Any) -> None:
+            super().__init__(*args, directory=str(folder))
+
+        def do_GET(self) -> None:
+            other = next((v for k, v in (spoil or {}).items() if k in self.path), b"")
+            if other is None:
+                self.send_error(404)
+            elif other:
+                self.send_response(200)
+                self.send_header("Content-Length", str(len(other)))
+                self.end_headers()
+                self.wfile.write(other)
+            else:
+                super().do_GET()
+
+        def end_headers(self) -> None:
+            self.send_header("Content-Security-Policy", POLICY)
+            super().end_headers()
+
+        def log_message(self, format: str, *args: Any) -> None:
+            pass
+
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}/"
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+@pytest.fixture(scope="module")
+def site(made: Path) -> Iterator[str]:
+    with serve(made) as url:
+        yield url
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium.launch() as running:
+        yield running
+
+
+@pytest.fixture
+def viewer(site: str, browser: Any) -> Iterator[Opened]:
+    with open_page(f"{site}?ui=0", browser=browser) as opened:
+        ready(opened)
+        yield opened
+        assert opened.complaints == []
+
+
+def ready(opened: Opened, count: int = 1) -> None:
+    opened.wait_for("window.sagesplat?.state !== undefined")
+    opened.wait_for(f"sagesplat.state().count >= {count}")
+
+
+def full(opened: Opened) -> None:
+    opened.page.evaluate("sagesplat.set({ mode: 'full' })")
+    opened.wait_for(f"sagesplat.state().count === {WHOLE}")
+
+
+def pixels(opened: Opened) -> np.ndarray:
+    """The canvas as [H, W, 3] in 0 to 1."""
+    width, height, text = opened.page.evaluate(PIXELS)
+    rgba = np.frombuffer(base64.b64decode(text), np.uint8).reshape(height, width, 4)
+    return rgba[::-1, :, :3] / 255
+
+
+def settled(opened: Opened) -> np.ndarray:
+    """The canvas once two frames in a row are the same."""
+    last = pixels(opened)
+    for _ in range(60):
+        opened.page.wait_for_timeout(60)
+        now = pixels(opened)
+        if (now == last).all() and now.max() > 0.2:
+            return now
+        last = now
+    raise AssertionError("the picture does not come to rest")
+
+
+def message(opened: Opened) -> str:
+    return opened.wait_for("document.querySelector('#notice [role=alert]')?.textContent")
+
+
+# what one sees
+
+
+def test_the_picture_is_the_rasterizers(viewer: Opened, made: Path) -> None:
+    """Axes, colours, lens and order: the same photo's pose, all splats."""
+    full(viewer)
+    viewer.page.evaluate("sagesplat.goTo('photo1.jpg')")
+    shown = settled(viewer)
+    manifest = json.loads((made / "manifest.json").read_text())
+    g = read_chunks_of(made, manifest)
+    wanted = rasterize(g, camera(0.2), backend="cpu", antialiased=False).rgb.clamp(0, 1).numpy()
+    assert -10 * np.log10(((shown - wanted) ** 2).mean()) > 30  # dB
+
+
+def read_chunks_of(made: Path, manifest: dict[str, Any]) -> Gaussians:
+    from sagesplat.output.chunks import Chunk
+
+    return read_chunks(
+        made,
+        [
+            Chunk(label["id"], k, e["uri"], e["count"], e["bytes"], e["gpuBytes"], e["sha256"])
+            for label in manifest["labels"]
+            for k, e in enumerate(label["levels"], 1)
+        ],
+    )
+
+
+def test_a_walk_with_swaps_has_no_empty_frame_and_keeps_the_budget(viewer: Opened) -> None:
+    settled(viewer)
+    viewer.page.evaluate(WATCH)
+    for step in range(12):
+        limit = (WHOLE, 2 * BASE, 300)[step % 3]
+        viewer.page.evaluate(
+            """([limit, x]) => {
+              window.samples.length = 0;
+              const budget = { bytes: Infinity, gpuBytes: Infinity, count: limit };
+              sagesplat.set({ mode: "budget", budget });
+              sagesplat.setPose({ ...sagesplat.pose(), position: [x, 0, 0] });
+            }""",
+            [limit, 0.1 * (step % 5)],
+        )
+        viewer.page.wait_for_timeout(500)
+        samples = viewer.page.evaluate("samples")
+        assert samples
+        assert max(sample["count"] for sample in samples) <= limit
+        assert min(sample["lit"] for sample in samples) > 0.05
+        assert min(sample["drawn"] for sample in samples) > 0
+
+
+def test_memory_stays_flat_over_fifty_swaps(viewer: Opened) -> None:
+    full(viewer)
+    settled(viewer)
+    viewer.page.evaluate(WATCH)
+    viewer.page.evaluate("sagesplat.set({ cacheBytes: 0 })")
+    textures = []
+    for swap in range(50):
+        mode, count = (("base", BASE), ("full", WHOLE))[swap % 2]
+        viewer.page.evaluate(f"sagesplat.set({{ mode: '{mode}' }})")
+        viewer.wait_for(f"sagesplat.state().count === {count}")
+        if swap % 10 == 9:
+            settled(viewer)
+            textures.append(viewer.page.evaluate("samples.at(-1).textures"))
+            assert viewer.page.evaluate("sagesplat.state().gpuBytes") == WHOLE * 56
+    assert max(textures) - min(textures) <= 2
+    assert viewer.page.evaluate("Math.min(...samples.map((s) => s.lit))") > 0.05
+
+
+def test_it_goes_on_offline(viewer: Opened) -> None:
+    full(viewer)
+    viewer.page.context.set_offline(True)
+    viewer.page.evaluate("sagesplat.set({ mode: 'base' })")
+    viewer.wait_for(f"sagesplat.state().count === {BASE}")
+    viewer.page.evaluate("sagesplat.goTo(2)")
+    viewer.page.evaluate("sagesplat.set({ mode: 'full' })")
+    viewer.wait_for(f"sagesplat.state().count === {WHOLE}")
+    assert settled(viewer).max() > 0.2
+    viewer.page.context.set_offline(False)
+
+
+# the page
+
+
+@pytest.mark.parametrize(("size", "touch"), [((1280, 800), False), ((360, 640), True)])
+def test_panel_and_tools_fit(site: str, browser: Any, size: tuple[int, int], touch: bool) -> None:
+    with open_page(site, size, browser=browser, touch=touch) as opened:
+        ready(opened)
+        if touch:
+            opened.page.get_by_role("button", name="Panel (P)").tap()
+        opened.wait_for("document.querySelectorAll('.labels li').length === 3")
+        boxes = opened.page.evaluate(
+            """[...document.querySelectorAll('.panel, .title, .modes button, .head button')].map(
+              (e) => { const b = e.getBoundingClientRect(); return [b.left, b.top, b.right, b.bottom]; })"""
+        )
+        for left, top, right, bottom in boxes:
+            assert left >= 0
+            assert top >= 0
+            assert right <= size[0]
+            assert bottom <= size[1]
+        assert opened.page.evaluate("document.documentElement.scrollWidth") <= size[0]
+        opened.page.get_by_role("radio", name="Full").click()
+        opened.wait_for(f"sagesplat.state().count === {WHOLE}")
+        opened.wait_for("document.querySelector('.labels .level + .number').textContent === '4/4'")
+        assert opened.complaints == []
+
+
+def test_the_keyboard_is_enough(site: str, browser: Any) -> None:
+    with open_page(site, browser=browser) as opened:
+        ready(opened)
+        page = opened.page
+        at = page.evaluate("sagesplat.pose().position")
+        page.keyboard.down("w")
+        opened.wait_for(f"Math.hypot(...sagesplat.pose().position.map((v, i) => v - {at}[i])) > 0.2")
+        page.keyboard.up("w")
+        page.keyboard.press("?")
+        opened.wait_for("document.querySelector('dialog').open")
+        page.keyboard.press("Escape")
+        opened.wait_for("!document.querySelector('dialog').open")
+        page.keyboard.press("]")
+        opened.wait_for("Math.abs(sagesplat.pose().position[0]) < 1e-4")
+        page.keyboard.press("p")
+        slider = page.get_by_role("slider", name="Keep SSIM at")
+        slider.focus()
+        page.keyboard.press("ArrowRight")
+        assert page.evaluate("sagesplat.settings().target") == pytest.approx(0.81)
+        page.get_by_role("radio", name="Quality").press("ArrowRight")
+        assert page.evaluate("sagesplat.settings().mode") == "budget"
+        page.get_by_role("button", name="Hide brick").press("Enter")
+        opened.wait_for("document.querySelector('[aria-label=\"Show brick\"]')")
+        assert opened.complaints == []
+
+
+def test_full_and_adapted_side_by_side(site: str, browser: Any) -> None:
+    with open_page(site, browser=browser) as opened:
+        ready(opened)
+        opened.page.evaluate("sagesplat.set({ mode: 'base' })")
+        opened.page.evaluate("sagesplat.goTo(0)")
+        before = settled(opened)
+        opened.page.keyboard.press("c")
+        opened.page.wait_for_timeout(1500)
+        both = settled(opened)
+        assert np.abs(both[:, :140] - before[:, :140]).mean() > 0.01
+        assert np.abs(both[:, 180:] - before[:, 180:]).mean() < 0.004
+        assert opened.page.evaluate("sagesplat.state().count") == BASE
+        opened.page.keyboard.press("c")
+        after = settled(opened)
+        assert np.abs(after - before).mean() < 0.004
+        assert opened.complaints == []
+
+
+def test_labels_can_be_tinted(site: str, browser: Any) -> None:
+    with open_page(site, browser=browser) as opened:
+        ready(opened)
+        full(opened)
+        before = settled(opened)
+        opened.page.keyboard.press("t")
+        assert np.abs(settled(opened) - before).mean() > 0.005
+        assert opened.complaints == []
+
+
+# a headset
+
+
+@pytest.mark.skipif(not IWER.exists(), reason="needs iwer (npm ci in web/)")
+def test_a_headset_session(site: str, browser: Any) -> None:
+    script = IWER.read_text() + (
+        ";window.device = new IWER.XRDevice(IWER.metaQuest3); device.installRuntime({ forceInstall: true });"
+        "device.stereoEnabled = true; device.ipd = 0.3;"
+    )
+    with open_page(site, browser=browser, script=script) as opened:
+        ready(opened)
+        page = opened.page
+        page.evaluate(WATCH)
+        page.get_by_role("button", name="VR").click()
+        opened.wait_for("samples.some((s) => s.presenting)")
+        opened.wait_for("samples.at(-1).presenting && samples.at(-1).drawn > 0")
+        opened.wait_for("Math.min(...samples.at(-1).half) > 0.05")  # both eyes
+        at = page.evaluate("sagesplat.pose().position")
+        page.evaluate("device.controllers.left.updateAxes('thumbstick', 0, -1)")
+        opened.wait_for(f"Math.hypot(...sagesplat.pose().position.map((v, i) => v - {at}[i])) > 0.3")
+        page.evaluate("device.controllers.left.updateAxes('thumbstick', 0, 0)")
+        for mode, count in (("base", BASE), ("full", WHOLE)):
+            page.evaluate(f"sagesplat.set({{ mode: '{mode}' }})")
+            opened.wait_for(f"sagesplat.state().count === {count}")
+        assert page.evaluate("samples.at(-1).presenting")
+        assert page.evaluate("Math.min(...samples.filter((s) => s.presenting).map((s) => s.cap))") <= 500_000
+        page.evaluate("sagesplat.set({ mode: 'budget' })")
+        opened.wait_for("samples.at(-1).cap < 500000")  # software is slower than any headset
+        page.evaluate("document.querySelector('[title=\"Enter VR\"]').click()")  # the emulator covers it
+        opened.wait_for("!samples.at(-1).presenting")
+        assert opened.complaints == []
+
+
+# what can go wrong
+
+
+def test_a_broken_chunk_is_named_and_the_rest_lives_on(made: Path, browser: Any) -> None:
+    manifest = json.loads((made / "manifest.json").read_text())
+    brick = manifest["labels"][0]["levels"][1]
+    broken = b"\0" * brick["bytes"]
+    with serve(made, {brick["uri"]: broken}) as url, open_page(url, browser=browser) as opened:
+        ready(opened)
+        opened.page.evaluate("sagesplat.set({ mode: 'full' })")
+        opened.wait_for(f"sagesplat.state().count === {WHOLE - 180}")
+        error = opened.wait_for("sagesplat.state().labels[0].error")
+        assert Path(brick["uri"]).name in error
+        opened.wait_for("document.querySelector('.labels .error')")
+
+
+def test_a_missing_chunk_is_named(made: Path, browser: Any) -> None:
+    uri = json.loads((made / "manifest.json").read_text())["labels"][1]["levels"][2]["uri"]
+    with serve(made, {uri: None}) as url, open_page(url, browser=browser) as opened:
+        ready(opened)
+        opened.page.evaluate("sagesplat.set({ mode: 'full' })")
+        opened.wait_for(f"sagesplat.state().count === {WHOLE - 150}")
+        assert Path(uri).name in opened.wait_for("sagesplat.state().labels[1].error")
+
+
+def newer(made: Path) -> bytes:
+    return json.dumps({**json.loads((made / "manifest.json").read_text()), "version": 99}).encode()
+
+
+@pytest.mark.parametrize(
+    ("query", "manifest", "script", "said"),
+    [
+        ("", "newer", "", "99"),
+        ("", None, "", "manifest.json"),
+        ("", b"{", "", "manifest.json"),
+        ("?bundle=../elsewhere/", b"", "", "leaves this page"),
+        ("?bundle=http://example.org/", b"", "", "leaves this page"),
+        ("?target=2", b"", "", "not a number from 0 to 1"),
+        ("", b"", "HTMLCanvasElement.prototype.getContext = () => null;", "WebGL 2"),
+    ],
+)
+def test_what_cannot_be_shown_is_said(
+    made: Path, browser: Any, query: str, manifest: bytes | str | None, script: str, said: str
+) -> None:
+    content = newer(made) if manifest == "newer" else manifest
+    spoil: dict[str, bytes | None] = {} if content == b"" else {"manifest.json": content}  # type: ignore[dict-item]
+    with serve(made, spoil) as url, open_page(url + query, browser=browser, script=script) as opened:
+        assert said in message(opened)
+        assert opened.errors == []
+        assert opened.violations == []
+
+
+def test_a_lost_context_is_said(site: str, browser: Any) -> None:
+    with open_page(site, browser=browser) as opened:
+        ready(opened)
+        lose = "document.getElementById('view').getContext('webgl2').getExtension('WEBGL_lose_context')"
+        opened.page.evaluate(f"{lose}.loseContext()")
+        assert "graphics card" in message(opened)
+
+
+def test_a_window_without_area_waits(site: str, browser: Any) -> None:
+    with open_page(f"{site}?ui=0", (1, 1), browser=browser) as opened:
+        opened.page.evaluate("document.getElementById('view').style.setProperty('height', '0px')")
+        ready(opened)
+        opened.page.set_viewport_size({"width": 320, "height": 200})
+        opened.page.evaluate("document.getElementById('view').style.removeProperty('height')")
+        opened.page.evaluate("sagesplat.goTo(0)")
+        assert settled(opened).shape == (200, 320, 3)
+        assert opened.complaints == []

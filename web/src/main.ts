@@ -1,0 +1,56 @@
+import { loadManifest } from "./core/manifest";
+import { type Embed, type Options, parseOptions } from "./embed";
+import { fail, hideNotice, messageOf } from "./ui/notice";
+import { buildPage } from "./ui/page";
+import { embed, Viewer } from "./view/viewer";
+
+declare global {
+  interface Window {
+    sagesplat: Pick<Embed, "ready"> & Partial<Embed>;
+  }
+}
+
+const ready = begin();
+window.sagesplat = { ready };
+ready.catch((error: unknown) => fail(messageOf(error)));
+
+async function begin(): Promise<void> {
+  await Promise.resolve(); // so that `window.sagesplat` is there before anything can go wrong
+  const options = parseOptions(location.search, location.hash);
+  const base = new URL(`./${options.bundle}`, location.href.replace(/[?#].*/, ""));
+  const canvas = document.getElementById("view");
+  if (!(canvas instanceof HTMLCanvasElement))
+    throw new Error("This page is incomplete; copy the bundle again.");
+  if (!document.createElement("canvas").getContext("webgl2")) {
+    throw new Error("This browser has no WebGL 2; switch on hardware acceleration or use another browser.");
+  }
+  const manifest = await loadManifest(base, (url, init) => fetch(url, init));
+  open(canvas, new Viewer(canvas, manifest, base, options), options);
+}
+
+function open(canvas: HTMLCanvasElement, viewer: Viewer, options: Options): void {
+  const app = canvas.parentElement;
+  app?.removeAttribute("hidden");
+  document.title = `${viewer.manifest.name} · sagesplat`;
+  hideNotice();
+  if (app && options.ui) buildPage(app, viewer);
+  window.sagesplat = Object.assign(window.sagesplat, embed(viewer, ready));
+  canvas.addEventListener("webglcontextlost", () => {
+    fail(
+      "The graphics card dropped this page, usually for lack of memory; load it again with a smaller budget.",
+    );
+  });
+  window.addEventListener("online", () => viewer.streamer.retry());
+  followTraining(viewer);
+  viewer.start();
+}
+
+/** A live bundle is loaded anew once training is done, as it has levels then. */
+function followTraining(viewer: Viewer): void {
+  if (!viewer.manifest.live) return;
+  viewer.streamer.onChange(() => {
+    const { manifest } = viewer.streamer;
+    viewer.stage.layer.setColors(manifest);
+    if (!manifest.live) location.reload();
+  });
+}

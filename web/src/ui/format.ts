@@ -1,0 +1,28 @@
+/** "1.2 MB", with two figures or more; bytes are counted by thousands, as networks do. */
+export function formatBytes(bytes: number): string {
+  if (!Number.isFinite(bytes)) return "no limit";
+  if (bytes < 1000) return `${Math.round(bytes)} B`;
+  const kilo = bytes / 1000;
+  if (kilo < 999.5) return `${kilo < 10 ? kilo.toFixed(1) : Math.round(kilo)} kB`;
+  const mega = kilo / 1000;
+  return `${mega < 100 ? mega.toFixed(mega < 10 ? 2 : 1) : Math.round(mega)} MB`;
+}
+
+/** "980", "28 k", "1.3 M". */
+export function formatCount(count: number): string {
+  if (!Number.isFinite(count)) return "no limit";
+  if (count < 1000) return String(Math.round(count));
+  const kilo = count / 1000;
+  if (kilo < 999.5) return `${kilo < 10 ? kilo.toFixed(1) : Math.round(kilo)} k`;
+  return `${(kilo / 1000).toFixed(2)} M`;
+}
+
+/** Metres; "–" where nothing is in sight. */
+export function formatDistance(metres: number): string {
+  if (!Number.isFinite(metres)) return "–";
+  return `${metres < 10 ? metres.toFixed(1) : Math.round(metres)} m`;
+}
+
+export function formatSsim(ssim: number): string {
+  return Number.isFinite(ssim) ? ssim.toFixed(2) : "–";
+}

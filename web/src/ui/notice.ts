@@ -1,0 +1,19 @@
+import { h } from "./dom";
+
+/** A message in place of the scene, with a way out. */
+export function fail(message: string): void {
+  const again = h(
+    "button",
+    { type: "button", class: "primary", click: () => location.reload() },
+    "Try again",
+  );
+  const box = document.getElementById("notice");
+  box?.replaceChildren(h("h1", {}, "The scene cannot be shown"), h("p", { role: "alert" }, message), again);
+  box?.removeAttribute("hidden");
+}
+
+export function hideNotice(): void {
+  document.getElementById("notice")?.setAttribute("hidden", "");
+}
+
+export const messageOf = (error: unknown): string => (error instanceof Error ? error.message : String(error));

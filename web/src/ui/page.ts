@@ -1,0 +1,66 @@
+import type { Viewer } from "../view/viewer";
+import { h, setText } from "./dom";
+import { helpDialog } from "./help";
+import { Panel } from "./panel";
+import { splitSlider } from "./split";
+import { toolbar } from "./toolbar";
+import "./theme";
+
+const REFRESH = 250; // ms: numbers that change all the time
+
+/** The page around the canvas. `app` holds the canvas already. */
+export function buildPage(app: HTMLElement, viewer: Viewer): void {
+  const { manifest } = viewer;
+  const panel = new Panel(viewer);
+  const split = splitSlider(viewer);
+  const help = helpDialog();
+  const bar = h("div", { class: "progress", role: "progressbar", "aria-label": "Loading" }, h("i"));
+  const status = h("span", { class: "status", role: "status" });
+  const title = h("header", { class: "title card" }, h("h1", {}, manifest.name), status);
+  const tools = toolbar(viewer, { split, help, say });
+  app.append(bar, title, split.element, tools.element, panel.element, help);
+  viewer.stage.canvas.setAttribute(
+    "aria-label",
+    `${manifest.name}, a 3D scene. W A S D move, arrow keys turn, question mark for help.`,
+  );
+
+  let said: string | null = null;
+  function say(message: string): void {
+    said = message;
+    setTimeout(() => {
+      said = null;
+      update();
+    }, 6000);
+    update();
+  }
+
+  function update(): void {
+    const { state } = viewer;
+    const wanted = state.labels.reduce((sum, label) => sum + label.wanted, 0);
+    const shown = state.labels.reduce((sum, label) => sum + Math.min(label.shown, label.wanted), 0);
+    const done = wanted > 0 && shown >= wanted && !state.pending;
+    bar.classList.toggle("done", done);
+    bar.style.setProperty("--value", String(wanted ? shown / wanted : 0));
+    bar.setAttribute("aria-valuenow", String(Math.round((100 * shown) / Math.max(wanted, 1))));
+    status.classList.toggle("warn", Boolean(state.message || state.status === "over budget"));
+    setText(status, said ?? state.message ?? sentence(viewer, done));
+    status.title = state.message ?? "";
+    panel.update();
+    tools.update();
+    split.update();
+  }
+
+  viewer.streamer.onChange(update);
+  setInterval(update, REFRESH);
+  update();
+}
+
+function sentence(viewer: Viewer, done: boolean): string {
+  const { state, compare } = viewer;
+  if (compare.on && compare.progress < 1)
+    return `Loading the full scene, ${Math.floor(compare.progress * 100)} %`;
+  if (state.status === "over budget") return "The smallest picture is over the budget";
+  if (state.status === "infeasible") return "The best that the budget allows";
+  if (done) return viewer.manifest.live ? "Training goes on" : "";
+  return state.count ? "Refining…" : "Loading…";
+}

@@ -1,0 +1,186 @@
+import type { Settings } from "../types";
+import type { Viewer } from "../view/viewer";
+import { h, iconButton, setText } from "./dom";
+import { formatBytes, formatCount, formatSsim } from "./format";
+import { LabelTable } from "./labels";
+
+const MODES: readonly (readonly [Settings["mode"], string])[] = [
+  ["target", "Quality"],
+  ["budget", "Budget"],
+  ["full", "Full"],
+];
+const NARROW = "(max-width: 640px)";
+
+/** Mode, sliders, meters and the labels; on a phone a sheet at the bottom. */
+export class Panel {
+  readonly element: HTMLElement;
+  readonly #table: LabelTable;
+  readonly #summary = h("span", { class: "summary" });
+  readonly #meter = h("div", { class: "meter" }, h("i"));
+  readonly #facts = h("dl", { class: "facts" });
+  readonly #sliders: Slider[];
+  readonly #modes: HTMLButtonElement[];
+
+  constructor(readonly viewer: Viewer) {
+    this.#table = new LabelTable(viewer);
+    this.#modes = MODES.map(([mode, title]) =>
+      h(
+        "button",
+        { type: "button", role: "radio", "data-mode": mode, click: () => viewer.set({ mode }) },
+        title,
+      ),
+    );
+    this.#sliders = [qualitySlider(viewer), ...budgetSliders(viewer)];
+    const toggle = iconButton("chevron", "Panel (P)", () => this.toggle());
+    this.element = h(
+      "aside",
+      { class: "panel card", "aria-label": "Levels of detail" },
+      h("div", { class: "head" }, this.#summary, toggle),
+      this.#meter,
+      h(
+        "div",
+        { class: "body" },
+        h(
+          "div",
+          {
+            class: "modes",
+            role: "radiogroup",
+            "aria-label": "What decides",
+            keydown: (event) => this.#step(event),
+          },
+          ...this.#modes,
+        ),
+        ...this.#sliders.map(({ element }) => element),
+        this.#facts,
+        this.#table.element,
+      ),
+    );
+    if (matchMedia(NARROW).matches) this.element.classList.add("closed");
+    window.addEventListener("keydown", (event) => {
+      const typing = event.target instanceof HTMLElement && event.target.closest("input, select, textarea");
+      if (event.key === "p" && !typing && !event.ctrlKey && !event.metaKey) this.toggle();
+    });
+    this.#announce();
+  }
+
+  toggle(): void {
+    this.element.classList.toggle("closed");
+    this.#announce();
+  }
+
+  update(): void {
+    const { state, settings, manifest, frameMs } = this.viewer;
+    const { totals } = manifest;
+    const bytes = `${formatBytes(state.bytesShown)} of ${formatBytes(totals.bytes)}`;
+    setText(this.#summary, bytes);
+    this.#meter.style.setProperty("--value", String(state.bytesShown / Math.max(totals.bytes, 1)));
+    for (const button of this.#modes) {
+      const chosen = button.dataset.mode === settings.mode;
+      button.setAttribute("aria-checked", String(chosen));
+      button.tabIndex = chosen || settings.mode === "base" ? 0 : -1;
+    }
+    for (const slider of this.#sliders) slider.update(settings);
+    this.#state([
+      ["Splats", `${formatCount(state.count)} of ${formatCount(totals.count)}`],
+      ["GPU", `${formatBytes(state.gpuBytes)} of ${formatBytes(totals.gpuBytes)}`],
+      ["Network", `${formatBytes(state.bytesLoaded)}${rate(state.bandwidth)}`],
+      ["Frame", Number.isNaN(frameMs) ? "at rest" : `${frameMs.toFixed(frameMs < 10 ? 1 : 0)} ms`],
+    ]);
+    this.#table.update(state.labels);
+  }
+
+  /** Arrow keys choose among the modes, as in every group of radio buttons. */
+  #step(event: Event): void {
+    const by = { ArrowLeft: -1, ArrowUp: -1, ArrowRight: 1, ArrowDown: 1 }[(event as KeyboardEvent).key];
+    if (!by) return;
+    event.preventDefault();
+    event.stopPropagation();
+    const now = MODES.findIndex(([mode]) => mode === this.viewer.settings.mode);
+    const at = (Math.max(now, 0) + by + MODES.length) % MODES.length;
+    this.#modes[at]?.click();
+    this.#modes[at]?.focus();
+    this.update();
+  }
+
+  #state(facts: readonly (readonly [string, string])[]): void {
+    if (!this.#facts.childElementCount) {
+      this.#facts.append(...facts.map(([name]) => h("div", {}, h("dt", {}, name), h("dd"))));
+    }
+    const values = this.#facts.querySelectorAll("dd");
+    for (const [i, [, value]] of facts.entries()) setText(values[i] as HTMLElement, value);
+  }
+
+  #announce(): void {
+    const open = !this.element.classList.contains("closed");
+    this.element.querySelector(".head button")?.setAttribute("aria-expanded", String(open));
+    this.element.querySelector(".body")?.toggleAttribute("inert", !open);
+  }
+}
+
+const rate = (bytes: number) => (Number.isFinite(bytes) ? ` · ${formatBytes(bytes)}/s` : "");
+
+interface Slider {
+  readonly element: HTMLElement;
+  update(settings: Settings): void;
+}
+
+function slider(
+  name: string,
+  modes: readonly Settings["mode"][],
+  range: { min: number; max: number; step: number },
+  read: (settings: Settings) => number,
+  write: (value: number) => void,
+  format: (settings: Settings) => string,
+): Slider {
+  const input = h("input", {
+    type: "range",
+    ...range,
+    "aria-label": name,
+    input: () => write(input.valueAsNumber),
+  });
+  const value = h("output");
+  const element = h("label", { class: "slider" }, h("span", {}, name), value, input);
+  return {
+    element,
+    update: (settings) => {
+      element.hidden = !modes.includes(settings.mode);
+      if (document.activeElement !== input) input.valueAsNumber = read(settings);
+      setText(value, format(settings));
+      input.setAttribute("aria-valuetext", format(settings));
+    },
+  };
+}
+
+function qualitySlider(viewer: Viewer): Slider {
+  return slider(
+    "Keep SSIM at",
+    ["target"],
+    { min: 0.3, max: 0.99, step: 0.01 },
+    ({ target }) => target,
+    (target) => viewer.set({ target }),
+    ({ target }) => formatSsim(target),
+  );
+}
+
+/** One slider a unit, as a share of the full scene; its right end is no limit. */
+function budgetSliders(viewer: Viewer): Slider[] {
+  const { totals } = viewer.manifest;
+  const units = [
+    ["Download", "bytes", formatBytes],
+    ["GPU memory", "gpuBytes", formatBytes],
+    ["Splats", "count", formatCount],
+  ] as const;
+  return units.map(([name, unit, format]) =>
+    slider(
+      name,
+      ["budget"],
+      { min: 1, max: 100, step: 1 },
+      ({ budget }) => Math.min(100, (100 * budget[unit]) / totals[unit]),
+      (share) => {
+        const limit = share >= 100 ? Infinity : Math.round((totals[unit] * share) / 100);
+        viewer.set({ budget: { ...viewer.settings.budget, [unit]: limit } });
+      },
+      ({ budget }) => format(budget[unit]),
+    ),
+  );
+}

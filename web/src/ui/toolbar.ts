@@ -1,0 +1,115 @@
+import type { Viewer } from "../view/viewer";
+import { offered, type XrMode } from "../view/xr";
+import { h, iconButton, setIcon } from "./dom";
+import { messageOf } from "./notice";
+import type { Split } from "./split";
+import { nextTheme } from "./theme";
+
+const TINT = 0.75; // how much of a label's own colour
+
+interface Parts {
+  readonly split: Split;
+  readonly help: HTMLDialogElement;
+  readonly say: (message: string) => void;
+}
+
+/** Camera, photos, comparison, colours, help and headset, with a key for each. */
+export function toolbar(viewer: Viewer, parts: Parts): { element: HTMLElement; update(): void } {
+  let tinted = false;
+  const mode = iconButton("orbit", "Orbit or walk (O)", () => {
+    viewer.controls.mode = viewer.controls.mode === "orbit" ? "walk" : "orbit";
+    setIcon(mode, viewer.controls.mode);
+    parts.say(
+      viewer.controls.mode === "orbit" ? "Drag turns around the scene" : "Drag looks around, W A S D walk",
+    );
+  });
+  const compare = iconButton("compare", "Compare with the full scene (C)", () => parts.split.toggle());
+  const tint = iconButton("tint", "Colour the labels (T)", () => {
+    tinted = !tinted;
+    viewer.setTint(tinted ? TINT : 0);
+  });
+  const help = iconButton("help", "Help (?)", () => parts.help.showModal());
+  const theme = iconButton("theme", "Light or dark", () => parts.say(`Theme: ${nextTheme()}`));
+  const photos = photoPicker(viewer);
+  const element = h("nav", { class: "toolbar card", "aria-label": "View" });
+  element.append(mode, ...photos.elements, compare, tint, help, theme);
+  void addHeadsets(element, viewer, parts.say);
+
+  const keys: Record<string, () => void> = {
+    o: () => mode.click(),
+    c: () => compare.click(),
+    t: () => tint.click(),
+    "?": () => help.click(),
+    "[": () => photos.step(-1),
+    "]": () => photos.step(1),
+  };
+  window.addEventListener("keydown", (event) => {
+    const typing =
+      event.target instanceof HTMLElement && event.target.closest("input, select, textarea, dialog");
+    if (!typing && !event.ctrlKey && !event.altKey && !event.metaKey) keys[event.key]?.();
+  });
+
+  return {
+    element,
+    update: () => {
+      compare.setAttribute("aria-pressed", String(viewer.compare.on));
+      tint.setAttribute("aria-pressed", String(tinted));
+      photos.update();
+    },
+  };
+}
+
+function photoPicker(viewer: Viewer): { elements: HTMLElement[]; step(by: number): void; update(): void } {
+  const { cameras } = viewer.manifest;
+  const go = (index: number) => viewer.goTo((index + cameras.length) % cameras.length, true);
+  const step = (by: number) => cameras.length && go(viewer.photo < 0 ? (by > 0 ? 0 : -1) : viewer.photo + by);
+  const options = cameras.map(({ name }, i) => h("option", { value: i }, name));
+  const select = h(
+    "select",
+    { "aria-label": "Photo position", change: () => select.value !== "-1" && go(Number(select.value)) },
+    h("option", { value: -1 }, "Photos"),
+    ...options,
+  );
+  return {
+    elements: cameras.length
+      ? [
+          h(
+            "span",
+            { class: "photos" },
+            iconButton("previous", "Photo before ([)", () => step(-1)),
+            select,
+            iconButton("next", "Photo after (])", () => step(1)),
+          ),
+        ]
+      : [],
+    step,
+    update: () => {
+      if (document.activeElement !== select) select.value = String(viewer.photo);
+    },
+  };
+}
+
+async function addHeadsets(
+  element: HTMLElement,
+  viewer: Viewer,
+  say: (message: string) => void,
+): Promise<void> {
+  const { headset } = viewer;
+  const names: Record<XrMode, string> = { "immersive-vr": "VR", "immersive-ar": "AR" };
+  const modes = await offered();
+  for (const mode of modes) {
+    const enter = () => {
+      const change = headset.session ? headset.leave() : headset.enter(mode);
+      change.catch((error: unknown) => say(`${names[mode]} did not start: ${messageOf(error)}`));
+    };
+    const title = `Enter ${names[mode]}`;
+    element.append(h("button", { type: "button", class: "text", title, click: enter }, names[mode]));
+  }
+  if (!modes.length) return;
+  const turning = h("button", { type: "button", class: "text", title: "Turning in the headset" }, "Snap");
+  turning.addEventListener("click", () => {
+    headset.turning = headset.turning === "snap" ? "smooth" : "snap";
+    turning.textContent = headset.turning === "snap" ? "Snap" : "Smooth";
+  });
+  element.append(turning);
+}

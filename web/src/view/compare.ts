@@ -1,0 +1,50 @@
+import { Streamer } from "../core/streamer";
+import type { Manifest, Settings } from "../types";
+import type { SparkLayer } from "./spark";
+import type { Stage } from "./stage";
+
+/** The full scene beside the adapted one: a layer and a stream of its own, only while it is wanted. */
+export class Compare {
+  #streamer: Streamer | null = null;
+  #layer: SparkLayer | null = null;
+
+  constructor(
+    readonly stage: Stage,
+    readonly manifest: Manifest,
+    readonly base: URL,
+    readonly settings: () => Settings,
+  ) {}
+
+  get on(): boolean {
+    return this.#layer !== null;
+  }
+
+  /** Of the full scene's bytes, what has come: 0 to 1. */
+  get progress(): number {
+    const shown = this.#streamer?.state.bytesShown ?? 0;
+    return shown / Math.max(this.manifest.totals.bytes, 1);
+  }
+
+  start(onChange: () => void): void {
+    if (this.#layer) return;
+    const layer = this.stage.newLayer();
+    this.#layer = layer;
+    const budget = { bytes: Infinity, gpuBytes: Infinity, count: Infinity };
+    const settings: Settings = { ...this.settings(), mode: "full", budget, cacheBytes: 0 };
+    const { manifest, base } = this;
+    this.#streamer = new Streamer({ manifest, base, renderer: layer, settings });
+    this.#streamer.onChange(onChange);
+    this.#streamer.start();
+    this.stage.full = layer;
+    this.stage.invalidate();
+  }
+
+  stop(): void {
+    this.stage.full = null;
+    this.#streamer?.dispose();
+    this.#layer?.free();
+    this.#streamer = null;
+    this.#layer = null;
+    this.stage.invalidate();
+  }
+}

@@ -1,0 +1,174 @@
+import { dyno, type PackedSplats, SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
+import { Group, type Matrix4, Scene, type WebGLRenderer } from "three";
+import type { Handle, Manifest, Renderer } from "../types";
+import { rootMatrix } from "./frame";
+import { decodePart, joined, type Part } from "./splats";
+
+/** A decoded increment. */
+interface Increment extends Handle {
+  readonly part: Part;
+}
+
+/**
+ * A label's increments as one mesh: first what is shown, by level, then what has been hidden since.
+ * One mesh a label, as Spark pads every mesh to 2048 splats and draws each with a call of its own.
+ */
+interface Column {
+  readonly mesh: SplatMesh;
+  readonly source: Source;
+  shown: readonly Increment[];
+  stored: readonly Increment[];
+}
+
+/** As many of the stored splats as are shown: going down a level needs no upload. */
+class Source {
+  count = 0;
+  constructor(public splats: PackedSplats) {}
+  prepareFetchSplat = () => this.splats.prepareFetchSplat();
+  dispose = () => this.splats.dispose();
+  getNumSplats = () => this.count;
+  hasRgbDir = () => this.splats.hasRgbDir();
+  getNumSh = () => this.splats.getNumSh();
+  setMaxSh = (degree: number) => this.splats.setMaxSh(degree);
+  fetchSplat: PackedSplats["fetchSplat"] = (at) => this.splats.fetchSplat(at);
+  forEachSplat: PackedSplats["forEachSplat"] = (callback) => this.splats.forEachSplat(callback);
+}
+
+/** All labels of a scene, drawn by Spark: increments come and go, the picture never has a hole. */
+export class SparkLayer implements Renderer {
+  readonly scene = new Scene();
+  readonly root = new Group();
+  readonly spark: SparkRenderer;
+  readonly #columns = new Map<number, Column>();
+  readonly #colors = new Map<number, string>();
+  readonly #tint = new dyno.DynoFloat({ value: 0 });
+  readonly #dirty: () => void;
+
+  /** @param onDirty - a new frame is worth drawing: something was shown, hidden or sorted */
+  constructor(renderer: WebGLRenderer, manifest: Manifest, onDirty: () => void) {
+    this.#dirty = onDirty;
+    this.spark = new SparkRenderer({
+      renderer,
+      onDirty,
+      enableLod: false,
+      sortRadial: false, // as it was trained
+      accumExtSplats: true, // colours above 1 are kept until they are blended
+      maxStdDev: 3.33, // where an opaque splat falls below 1/255
+      clipXY: 2, // large splats reach into the picture from outside
+      maxPixelRadius: 2048,
+      preBlurAmount: manifest.antialiased ? 0 : 0.3,
+      blurAmount: manifest.antialiased ? 0.3 : 0,
+    });
+    this.place(rootMatrix(manifest.frame));
+    this.scene.add(this.spark, this.root);
+    this.setColors(manifest);
+  }
+
+  /** Whether the last frame showed what it should, sorted for where the camera is. */
+  get settled(): boolean {
+    const { sorting, sortDirty, display, current } = this.spark;
+    return !sorting && !sortDirty && display === current;
+  }
+
+  /** Places the bundle's frame in the scene: a similarity. */
+  place(matrix: Matrix4): void {
+    matrix.decompose(this.root.position, this.root.quaternion, this.root.scale);
+  }
+
+  /** The labels' colours; a label's mesh takes the one it finds when it is shown first. */
+  setColors({ labels }: Manifest): void {
+    for (const { id, color } of labels) this.#colors.set(id, color);
+  }
+
+  async decode(label: number, level: number, bytes: Uint8Array): Promise<Increment> {
+    const part = await decodePart(bytes);
+    return { label, level, count: part.count, part };
+  }
+
+  swap(show: readonly Handle[], hide: readonly Handle[]): void {
+    const labels = new Set([...show, ...hide].map((handle) => handle.label));
+    for (const label of labels) {
+      const column = this.#column(label);
+      const kept = column.shown.filter((part) => !hide.includes(part) && !show.includes(part));
+      const added = show.filter((handle): handle is Increment => handle.label === label);
+      column.shown = [...kept, ...added].sort((a, b) => a.level - b.level);
+      this.#arrange(column);
+    }
+    this.#dirty();
+  }
+
+  dispose(handle: Handle): void {
+    const column = this.#columns.get(handle.label);
+    if (!column) return;
+    column.shown = column.shown.filter((part) => part !== handle);
+    if (column.stored.some((part) => part === handle)) this.#store(column);
+    this.#dirty();
+  }
+
+  /** Draws a label or leaves it out; what it holds stays. */
+  setVisible(label: number, visible: boolean): void {
+    this.#column(label).mesh.visible = visible;
+    this.#dirty();
+  }
+
+  /** How much of a label's own colour is mixed in, 0 to 1. */
+  setTint(amount: number): void {
+    this.#tint.value = amount;
+    for (const { mesh } of this.#columns.values()) mesh.updateVersion();
+    this.#dirty();
+  }
+
+  /** Frees all that is on the GPU. The layer draws nothing after that. */
+  free(): void {
+    for (const { mesh, source } of this.#columns.values()) {
+      this.root.remove(mesh);
+      source.dispose();
+    }
+    this.#columns.clear();
+    this.spark.dispose();
+  }
+
+  #column(label: number): Column {
+    const known = this.#columns.get(label);
+    if (known) return known;
+    const color = this.#colors.get(label) ?? "#8a8f98";
+    const source = new Source(joined([]));
+    const mesh = new SplatMesh({ splats: source, worldModifier: tinted(color, this.#tint) });
+    mesh.raycastable = false;
+    this.root.add(mesh);
+    const column = { mesh, source, shown: [], stored: [] };
+    this.#columns.set(label, column);
+    return column;
+  }
+
+  #arrange(column: Column): void {
+    const { shown, stored, source } = column;
+    if (!shown.every((part, i) => part === stored[i])) this.#store(column);
+    else source.count = total(shown);
+  }
+
+  #store(column: Column): void {
+    const { mesh, source, shown } = column;
+    source.dispose();
+    source.splats = joined(shown.map((increment) => increment.part));
+    source.count = total(shown);
+    column.stored = shown;
+    mesh.updateGenerator();
+    mesh.updateMappingVersion(); // the old picture stays until the new one is sorted
+  }
+}
+
+const total = (parts: readonly Handle[]) => parts.reduce((sum, part) => sum + part.count, 0);
+
+/** Mixes a label's colour in, as light or dark as the scene is there. */
+function tinted(color: string, amount: InstanceType<typeof dyno.DynoFloat>) {
+  const [r = 0, g = 0, b = 0] = [1, 3, 5].map((at) => Number.parseInt(color.slice(at, at + 2), 16) / 255);
+  const vec3 = (x: number, y: number, z: number) => dyno.dynoConst("vec3", [x, y, z]);
+  return dyno.dynoBlock({ gsplat: dyno.Gsplat }, { gsplat: dyno.Gsplat }, ({ gsplat }) => {
+    if (!gsplat) throw new Error("a modifier without input");
+    const { rgb } = dyno.splitGsplat(gsplat).outputs;
+    const light = dyno.add(dyno.dynoConst("float", 0.45), dyno.dot(rgb, vec3(0.25, 0.55, 0.2)));
+    const mixed = dyno.mix(rgb, dyno.mul(vec3(r, g, b), light), amount);
+    return { gsplat: dyno.combineGsplat({ gsplat, rgb: mixed }) };
+  });
+}

@@ -1,0 +1,62 @@
+import { PackedSplats } from "@sparkjsdev/spark";
+
+const ROW = 2048; // splats in a row of Spark's textures: arrays hold whole rows
+const HARMONICS = ["sh1", "sh2", "sh3"] as const;
+const WORDS = { sh1: 2, sh2: 4, sh3: 4 } as const; // of a splat, uint32
+
+// SPZ's whole range: colours below 0 and above 1 become visible ones once harmonics are added
+const ENCODING = {
+  rgbMin: -0.45,
+  rgbMax: 1.45,
+  lnScaleMin: -12,
+  lnScaleMax: 9,
+  sh1Max: 1,
+  sh2Max: 1,
+  sh3Max: 1,
+  lodOpacity: false,
+};
+
+/** A decoded increment in main memory: Spark's packed encoding, trimmed to `count` splats. */
+export interface Part {
+  readonly count: number;
+  readonly splats: Uint32Array; // [count, 4]
+  readonly harmonics: ReadonlyMap<(typeof HARMONICS)[number], Uint32Array>;
+}
+
+/** Decodes an SPZ file in Spark's worker; rejects for one that cannot be read. */
+export async function decodePart(bytes: Uint8Array): Promise<Part> {
+  const packed = new PackedSplats({ fileBytes: bytes, splatEncoding: ENCODING });
+  await packed.initialized;
+  const count = packed.numSplats;
+  if (!packed.packedArray || count === 0) throw new Error("no splats in it");
+  const harmonics = new Map<(typeof HARMONICS)[number], Uint32Array>();
+  for (const key of HARMONICS) {
+    const words = packed.extra[key];
+    if (words instanceof Uint32Array) harmonics.set(key, words.slice(0, count * WORDS[key]));
+  }
+  const part = {
+    count,
+    splats: packed.packedArray.slice(0, count * 4),
+    harmonics,
+  };
+  packed.dispose();
+  return part;
+}
+
+/** Parts one after the other as one set of splats. A part without harmonics gets zeros. */
+export function joined(parts: readonly Part[]): PackedSplats {
+  const count = parts.reduce((sum, part) => sum + part.count, 0);
+  const rows = Math.max(1, Math.ceil(count / ROW)) * ROW;
+  const packedArray = new Uint32Array(rows * 4);
+  const extra: Record<string, Uint32Array> = {};
+  let start = 0;
+  for (const part of parts) {
+    packedArray.set(part.splats, start * 4);
+    for (const [key, words] of part.harmonics) {
+      extra[key] ??= new Uint32Array(rows * WORDS[key]);
+      extra[key].set(words, start * WORDS[key]);
+    }
+    start += part.count;
+  }
+  return new PackedSplats({ packedArray, numSplats: count, extra, splatEncoding: ENCODING });
+}

@@ -1,0 +1,132 @@
+import { Color, type Matrix4, PerspectiveCamera, SRGBColorSpace, Vector2, WebGLRenderer } from "three";
+import type { Camera, Manifest, Viewpoint } from "../types";
+import { lens, type Pose, quat, rootMatrix, transformPose, vec3, viewpoint } from "./frame";
+import { orientation, type Rig } from "./motion";
+import { SparkLayer } from "./spark";
+
+const FOV = 60; // degrees of the window's shorter side, where no photo says otherwise
+const NEAR = 0.03; // metres
+const FAR = 2000;
+
+/** The canvas: one camera, the adapted scene, and beside it the full one while the two are compared. */
+export class Stage {
+  readonly renderer: WebGLRenderer;
+  readonly camera = new PerspectiveCamera(FOV, 1, NEAR, FAR);
+  readonly layer: SparkLayer;
+  readonly root: Matrix4; // from the bundle's frame to what the camera is placed in
+  full: SparkLayer | null = null;
+  split = 0.5; // of the width that shows the full scene
+  needsFrame = true;
+  #photo: Camera | null = null;
+  #fovY: number | null = null;
+
+  /** Throws where there is no WebGL 2. */
+  constructor(
+    readonly canvas: HTMLCanvasElement,
+    readonly manifest: Manifest,
+  ) {
+    this.renderer = new WebGLRenderer({ canvas, antialias: false, powerPreference: "high-performance" });
+    this.renderer.setClearColor(background(manifest), 1);
+    this.root = rootMatrix(manifest.frame);
+    this.layer = this.newLayer();
+  }
+
+  newLayer(): SparkLayer {
+    return new SparkLayer(this.renderer, this.manifest, () => this.invalidate());
+  }
+
+  invalidate(): void {
+    this.needsFrame = true;
+  }
+
+  /** Moves the world, for a headset that cannot be moved itself; `matrix` from the world to its room. */
+  setRoom(matrix: Matrix4): void {
+    this.root.multiplyMatrices(matrix, rootMatrix(this.manifest.frame));
+    this.layer.place(this.root);
+    this.invalidate();
+  }
+
+  /** Places the camera. A photo's lens is kept until `setLens` says otherwise. */
+  place(rig: Rig): void {
+    this.camera.position.set(...rig.position);
+    this.camera.quaternion.set(...orientation(rig));
+    this.invalidate();
+  }
+
+  /** The lens of a photo, a vertical field of view in radians, or the usual one. */
+  setLens(photo: Camera | null, fovY: number | null = null): void {
+    this.#photo = photo;
+    this.#fovY = fovY;
+    this.project();
+  }
+
+  /** Fits the canvas to the window; a window without area is left alone, and so is a headset. */
+  resize(width: number, height: number, ratio: number): void {
+    if (width < 1 || height < 1 || this.renderer.xr.isPresenting) return;
+    const before = this.renderer.getSize(new Vector2());
+    if (before.x === width && before.y === height && this.renderer.getPixelRatio() === ratio) return;
+    this.renderer.setPixelRatio(ratio);
+    this.renderer.setSize(width, height, false);
+    this.project();
+    this.draw(); // a new size clears the canvas
+  }
+
+  /** Where the camera is, in the bundle's frame. */
+  pose(): Pose {
+    const { position, quaternion, projectionMatrix } = this.camera; // in a headset, three keeps it at the head
+    const fovY = 2 * Math.atan(1 / (projectionMatrix.elements[5] || 1));
+    const pose = { position: vec3(position), quaternion: quat(quaternion), fovY };
+    return transformPose(pose, this.root.clone().invert());
+  }
+
+  viewpoint(): Viewpoint {
+    this.camera.updateMatrixWorld();
+    return viewpoint(this.root, this.camera.matrixWorld, this.camera.projectionMatrix);
+  }
+
+  draw(): void {
+    this.needsFrame = false;
+    const { renderer, camera } = this;
+    if (!this.full || renderer.xr.isPresenting) {
+      renderer.render(this.layer.scene, camera);
+      return;
+    }
+    const size = renderer.getSize(new Vector2());
+    const at = Math.round(size.x * this.split);
+    renderer.setScissorTest(true);
+    renderer.setScissor(0, 0, at, size.y);
+    renderer.render(this.full.scene, camera);
+    renderer.setScissor(at, 0, size.x - at, size.y);
+    renderer.render(this.layer.scene, camera);
+    renderer.setScissorTest(false);
+  }
+
+  /** Sets the projection anew: after another size, lens, or a headset. */
+  project(): void {
+    const { x, y } = this.renderer.getSize(new Vector2());
+    const { camera } = this;
+    camera.aspect = x / y;
+    camera.fov = ((this.#fovY ?? this.#usual(camera.aspect)) * 180) / Math.PI;
+    camera.updateProjectionMatrix();
+    if (this.#photo) {
+      const [left, right, top, bottom] = lens(this.#photo, x, y).map((edge) => edge * NEAR) as [
+        number,
+        number,
+        number,
+        number,
+      ];
+      camera.projectionMatrix.makePerspective(left, right, top, bottom, NEAR, FAR);
+      camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
+    }
+    this.invalidate();
+  }
+
+  #usual(aspect: number): number {
+    const half = Math.tan((FOV * Math.PI) / 360);
+    return 2 * Math.atan(aspect < 1 ? Math.min(half / aspect, 1.2) : half);
+  }
+}
+
+function background(manifest: Manifest): Color {
+  return new Color().setRGB(...manifest.background, SRGBColorSpace);
+}

@@ -1,0 +1,222 @@
+import { Vector3 } from "three";
+import { Streamer } from "../core/streamer";
+import type { Embed, Options, Sample } from "../embed";
+import type { Budget, Manifest, Settings, State } from "../types";
+import { Compare } from "./compare";
+import { Controls } from "./controls";
+import { type Pose, quat, transformPose, vec3 } from "./frame";
+import { type Rig, rigAt } from "./motion";
+import { Stage } from "./stage";
+import { Headset } from "./xr";
+
+const CACHE = 128e6; // bytes of decoded increments that are not shown
+const UNLIMITED: Budget = { bytes: Infinity, gpuBytes: Infinity, count: Infinity };
+const SHARPEST = 2; // device pixels a CSS pixel: more costs fill rate and shows nothing
+
+/** The whole viewer without its panel: a bundle, a camera, and settings. */
+export class Viewer {
+  readonly stage: Stage;
+  readonly controls: Controls;
+  readonly streamer: Streamer;
+  readonly headset: Headset;
+  readonly compare: Compare;
+  settings: Settings;
+  frameMs = Number.NaN; // smoothed; NaN while nothing moves
+  photo = -1; // index of the photo that is shown, -1: none
+  readonly #hidden = new Set<number>();
+  readonly #samples = new Set<(sample: Sample) => void>();
+  #cap: number | null = null; // splats that the headset bears
+  #tint = 0;
+  #last = 0;
+
+  /** Throws where there is no WebGL 2. */
+  constructor(
+    canvas: HTMLCanvasElement,
+    readonly manifest: Manifest,
+    readonly base: URL,
+    options: Options,
+  ) {
+    this.stage = new Stage(canvas, manifest);
+    this.settings = startSettings(manifest, options);
+    this.controls = new Controls(canvas, this.#start(), (rig, byUser) => this.#moved(rig, byUser));
+    this.streamer = new Streamer({ manifest, base, renderer: this.stage.layer, settings: this.settings });
+    this.compare = new Compare(this.stage, manifest, base, () => this.settings);
+    this.headset = new Headset(
+      this.stage,
+      () => this.settings.budget.count,
+      (cap) => this.#capped(cap),
+    );
+    this.stage.place(this.controls.rig);
+    if (options.view !== null) this.goTo(options.view);
+  }
+
+  start(): void {
+    const { canvas, renderer } = this.stage;
+    const resize = () =>
+      this.stage.resize(canvas.clientWidth, canvas.clientHeight, Math.min(devicePixelRatio, SHARPEST));
+    new ResizeObserver(resize).observe(canvas);
+    resize();
+    this.streamer.update(this.stage.viewpoint());
+    this.streamer.start();
+    renderer.setAnimationLoop((now) => this.#frame(now));
+  }
+
+  get state(): State {
+    return this.streamer.state;
+  }
+
+  set(partial: Partial<Settings>): void {
+    this.settings = { ...this.settings, ...partial };
+    this.#apply();
+  }
+
+  isHidden(label: number): boolean {
+    return this.#hidden.has(label);
+  }
+
+  /** Leaves a label out, or draws it again; while it is out it claims nothing of the budget but its base. */
+  setHidden(label: number, hidden: boolean): void {
+    if (hidden) this.#hidden.add(label);
+    else this.#hidden.delete(label);
+    for (const layer of [this.stage.layer, this.stage.full]) layer?.setVisible(label, !hidden);
+    this.#apply();
+  }
+
+  /** Shows the full scene beside the adapted one, dressed like it. */
+  startCompare(): void {
+    this.compare.start(() => this.stage.invalidate());
+    for (const label of this.#hidden) this.stage.full?.setVisible(label, false);
+    this.stage.full?.setTint(this.#tint);
+  }
+
+  /** How much of the labels' own colours is mixed in, 0 to 1. */
+  setTint(amount: number): void {
+    this.#tint = amount;
+    for (const layer of [this.stage.layer, this.stage.full]) layer?.setTint(amount);
+  }
+
+  pose(): Pose {
+    return this.stage.pose();
+  }
+
+  setPose(pose: Pose): void {
+    this.photo = -1;
+    this.stage.setLens(null, pose.fovY ?? null);
+    this.controls.go(this.#rig(pose), false);
+  }
+
+  /** A photo's pose and lens; RangeError where there is none of that name or index. */
+  goTo(photo: string | number, smooth = false): void {
+    const { cameras } = this.manifest;
+    const index = typeof photo === "number" ? photo : cameras.findIndex(({ name }) => name === photo);
+    const camera = cameras[index];
+    if (!camera) throw new RangeError(`No photo ${photo}; there are ${cameras.length}, see \`cameras\`.`);
+    this.photo = index;
+    this.stage.setLens(camera);
+    this.controls.go(this.#rig(camera), smooth);
+  }
+
+  onSample(callback: (sample: Sample) => void): () => void {
+    this.#samples.add(callback);
+    this.stage.invalidate();
+    return () => this.#samples.delete(callback);
+  }
+
+  #start(): Rig {
+    const { start } = this.manifest;
+    return this.#rig(start, start.target);
+  }
+
+  #rig(pose: Pose, target: Pose["position"] = this.manifest.start.target): Rig {
+    const { position, quaternion } = transformPose(pose, this.stage.root);
+    const reach = new Vector3(...target).applyMatrix4(this.stage.root).distanceTo(new Vector3(...position));
+    return rigAt(position, quaternion, reach);
+  }
+
+  #moved(rig: Rig, byUser: boolean): void {
+    if (byUser && this.photo >= 0) this.photo = -1;
+    this.stage.place(rig);
+  }
+
+  #apply(): void {
+    const weights = new Map(this.settings.weights);
+    for (const label of this.#hidden) weights.set(label, 0);
+    const count = Math.min(this.settings.budget.count, this.#cap ?? Infinity);
+    this.streamer.set({ ...this.settings, weights, budget: { ...this.settings.budget, count } });
+    this.stage.invalidate();
+  }
+
+  #capped(cap: number | null): void {
+    this.#cap = cap;
+    this.#apply();
+    if (cap === null) this.#landed();
+  }
+
+  /** Back from the headset: the camera stays where the head was. */
+  #landed(): void {
+    const { position, quaternion } = this.stage.camera;
+    this.controls.go(rigAt(vec3(position), quat(quaternion), this.controls.rig.reach), false);
+  }
+
+  #frame(now: number): void {
+    const seconds = Math.min((now - this.#last) / 1000, 0.1);
+    const frameMs = now - this.#last;
+    this.#last = now;
+    const { stage, headset } = this;
+    if (headset.session) headset.update(frameMs / 1000, this.state.count);
+    else this.controls.update(seconds);
+    const { clientWidth, clientHeight } = stage.canvas;
+    const visible = clientWidth > 0 && clientHeight > 0;
+    if (!headset.session && !(stage.needsFrame && visible)) {
+      this.frameMs = Number.NaN;
+      return;
+    }
+    stage.draw();
+    this.streamer.update(stage.viewpoint());
+    this.frameMs = Number.isNaN(this.frameMs) ? frameMs : this.frameMs + (frameMs - this.frameMs) * 0.1;
+    this.#sample(now, frameMs);
+  }
+
+  #sample(time: number, frameMs: number): void {
+    if (!this.#samples.size) return;
+    const { stage, headset, state } = this;
+    const sample: Sample = {
+      time,
+      frameMs,
+      drawn: stage.layer.spark.activeSplats,
+      settled: stage.layer.settled && (stage.full?.settled ?? true),
+      textures: stage.renderer.info.memory.textures,
+      presenting: headset.session !== null,
+      cap: this.#cap ?? Infinity,
+      state,
+    };
+    for (const callback of this.#samples) callback(sample);
+  }
+}
+
+function startSettings(manifest: Manifest, options: Options): Settings {
+  const bytes = options.budget === null ? Infinity : options.budget * 1e6;
+  return {
+    mode: options.budget !== null && options.target === null ? "budget" : "target",
+    target: options.target ?? 0.8,
+    budget: { ...UNLIMITED, bytes },
+    weights: new Map(manifest.labels.map(({ id, weight }) => [id, weight])),
+    cacheBytes: CACHE,
+  };
+}
+
+/** The viewer as other scripts on the page see it. */
+export function embed(viewer: Viewer, ready: Promise<void>): Embed {
+  return {
+    ready,
+    version: viewer.manifest.generator,
+    cameras: viewer.manifest.cameras,
+    state: () => viewer.state,
+    settings: () => viewer.settings,
+    set: (partial) => viewer.set(partial),
+    pose: () => viewer.pose(),
+    setPose: (pose) => viewer.setPose(pose),
+    goTo: (photo) => viewer.goTo(photo),
+    onSample: (callback) => viewer.onSample(callback),
+  };
+}
