@@ -36,7 +36,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 
 # builds the viewer into the package; the tests check that what is committed is current
 web: $(INSTALLED)
-	$(NPM) ci --no-audit --no-fund
+	$(NPM) install --no-save --no-audit --no-fund
 	$(NPM) run build
 
 # the viewer is tested in Chromium: on Debian as root it is installed, elsewhere those tests skip without one

@@ -16,12 +16,14 @@ from sagesplat.adapt.promise import read_promises
 from sagesplat.bundling import bundle, colors_of, live_bundle, title_of
 from sagesplat.config import FitConfig, LiftConfig, MasksConfig, NestConfig, SceneConfig, TrainConfig
 from sagesplat.errors import DataError, RunError, SageError
-from sagesplat.files import write_json
+from sagesplat.files import read_json, write_json
 from sagesplat.job import Job, distances
+from sagesplat.output.bearings import camera_at
 from sagesplat.output.bundle import is_bundle
 from sagesplat.output.bundle_quality import curve_of, model_of
 from sagesplat.output.chunks import read_chunks, read_index
 from sagesplat.output.spz import read_spz
+from sagesplat.raster import rasterize
 from sagesplat.run_dir import RunDir
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -65,7 +67,7 @@ def run(trained: Path, tmp_path: Path) -> Path:
 def viewer(tmp_path: Path) -> Path:
     folder = tmp_path / "viewer"
     folder.mkdir()
-    (folder / "index.html").write_text("<!doctype html>")
+    (folder / "index.html").write_text("<!doctype html><body><!-- poster --></body>")
     return folder
 
 
@@ -91,6 +93,18 @@ def test_a_bundle_of_a_run(run: Path, tmp_path: Path, viewer: Path) -> None:
     splits = [camera["split"] for camera in manifest["cameras"]]
     assert splits == [job.scene.split(row) for row in range(len(job.scene.views))]
     assert {"train", "test", "calibration"} == set(splits)
+
+
+def test_the_poster_is_the_first_view(run: Path, tmp_path: Path, viewer: Path) -> None:
+    job, out = job_of(run), tmp_path / "out"
+    bundle(job, out, viewer=viewer)
+    assert '<img id="poster" src="poster.jpg" alt="" />' in (out / "index.html").read_text()
+    picture = np.asarray(Image.open(out / "poster.jpg"), np.float64)
+    first = read_json(out / "manifest.json")["start"]
+    camera = camera_at(np.array(first["position"]), np.array(first["quaternion"]), np.pi / 3, 640, 360)
+    g = read_chunks(job.run.chunks, read_index(job.run.chunks))
+    truth = rasterize(g, camera, backend="cpu").rgb.clamp(0, 1).numpy() * 255
+    assert np.sqrt(np.mean((picture - truth) ** 2)) < 4  # JPEG
 
 
 def test_promises_survive_the_bundle(run: Path, tmp_path: Path, viewer: Path) -> None:

@@ -184,6 +184,26 @@ def test_a_promise_comes_back_as_it_was() -> None:
         np.testing.assert_allclose(a, b, atol=1e-12)
 
 
+def test_a_camera_there_and_back() -> None:
+    camera = pinhole(64, 48)
+    back = bearings.camera_at(
+        bearings.position(camera), bearings.quaternion(camera), bearings.fov_y(camera), 64, 48
+    )
+    np.testing.assert_allclose(back.w2c, camera.w2c, atol=1e-5)
+    assert back.K[1, 1] == pytest.approx(camera.K[1, 1])
+
+
+def test_the_first_view_is_level() -> None:
+    rng = np.random.default_rng(0)
+    up = np.array([0.1, 1.0, 0.2]) / np.linalg.norm([0.1, 1.0, 0.2])
+    camera = pinhole(64, 48)
+    found = bearings.start([camera], rng.normal((0, 0, 4), size=(50, 3)), 1.0, up)
+    axes = Rotation.from_quat(found["quaternion"]).as_matrix()
+    assert axes[:, 0] @ up == pytest.approx(0, abs=1e-9)
+    ahead = (found["target"] - found["position"]) / np.linalg.norm(found["target"] - found["position"])
+    np.testing.assert_allclose(-axes[:, 2], ahead, atol=1e-9)
+
+
 def test_known_views_correct_the_boxes() -> None:
     made = replace(model(2, 12, [1]), lengths=(0.05, 0.05, 1.0))  # no view is close to another
     missed = np.linspace(-0.5, 0.5, 12)

@@ -30,7 +30,7 @@ def npm() -> Npm:
 
     made = WEB / "node_modules" / ".package-lock.json"  # npm writes it last
     if not made.exists() or made.stat().st_mtime < (WEB / "package-lock.json").stat().st_mtime:
-        installed = run("ci", "--no-audit", "--no-fund", "--fetch-retries=1")
+        installed = run("install", "--no-save", "--no-audit", "--no-fund", "--fetch-retries=1")
         if installed.returncode:
             pytest.skip(f"the npm registry does not answer: {installed.stderr.strip().splitlines()[-1:]}")
     return run

@@ -1,6 +1,8 @@
 """Bundles of a run: everything that a viewer needs, in one static folder."""
 
+import io
 import json
+import math
 import shutil
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
@@ -11,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from PIL import Image
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
@@ -21,7 +24,7 @@ from sagesplat.files import read_json, write_json
 from sagesplat.gaussians import Gaussians
 from sagesplat.job import Job, distances
 from sagesplat.output import boxes
-from sagesplat.output.bearings import FLIP, fov_y, position, quaternion
+from sagesplat.output.bearings import FLIP, camera_at, fov_y, position, quaternion
 from sagesplat.output.bundle import (
     MANIFEST,
     Category,
@@ -30,10 +33,12 @@ from sagesplat.output.bundle import (
     Written,
     check_target,
     check_viewer,
+    start_of,
     write_bundle,
     write_documents,
 )
 from sagesplat.output.chunks import INDEX, read_chunks, read_index, write_chunks
+from sagesplat.raster import rasterize
 from sagesplat.run_dir import file_hash, settings_of
 from sagesplat.segment.masks import UNLABELLED
 from sagesplat.train.levels import read_level
@@ -49,6 +54,7 @@ _GROUND |= {"path", "road", "sand", "sidewalk", "snow", "soil", "street", "terra
 _SUFFIXES = ("-merged", "-other", "-stuff")  # of COCO's panoptic names
 _FEW = boxes.FEW  # SfM points below which a category's Gaussians say where it is
 _OPAQUE = 0.1  # from which a Gaussian does
+_POSTER_SIZE, _POSTER_FOV = (640, 360), math.radians(60)  # the viewer's own field of view
 _LIVE = ".live.json"  # what a live bundle was made of
 
 
@@ -90,17 +96,30 @@ def bundle(
     chunks = read_index(job.run.chunks)
     if any(not chunk.uri.endswith(".spz") for chunk in chunks):
         raise RunError(f"{job.run.chunks}: not SPZ files; run `sagesplat nest` again with --force")
+    g = read_chunks(job.run.chunks, chunks)
     contents = replace(
-        _contents(job, read_chunks(job.run.chunks, chunks), job.antialiased),
+        _contents(job, g, job.antialiased),
         chunks=chunks,
         meters_per_unit=meters_per_unit,
     )
     contents = replace(contents, categories=_with_quality(job, contents.categories, always, weights))
     contents = with_corrections(contents)
-    written = write_bundle(out, contents, viewer)
+    written = write_bundle(out, contents, viewer, _poster(g, contents))
     agreement, error = distance_error(contents)
     count = sum(chunk.count for chunk in chunks)
     return BundleMade(out, len(contents.categories), len(chunks), count, written, agreement, error)
+
+
+def _poster(g: Gaussians, contents: Contents) -> bytes:
+    """A JPEG of the first view: the scene is seen while the viewer and the first chunks are loading."""
+    first = start_of(contents)
+    camera = camera_at(first["position"], first["quaternion"], _POSTER_FOV, *_POSTER_SIZE)
+    with torch.no_grad():
+        image = rasterize(g, camera, backend="cpu", antialiased=contents.antialiased).rgb
+    pixels = (image.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, "JPEG", quality=72, optimize=True)
+    return file.getvalue()
 
 
 def package_viewer() -> Path:

@@ -1,6 +1,8 @@
 """Events as progress bars and tables."""
 
+import sys
 import time
+from pathlib import Path
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console as RichConsole
@@ -100,8 +102,10 @@ class Console:
                 for row in rows:
                     table.add_row(*row)
                 self.out.print(table)
-            case RunDone(report):
+            case RunDone(report, run):
                 self.out.print(f"Report: {report.resolve()}", soft_wrap=True)
+                if run:
+                    self.out.print(f"Walk through it: {_program()} view {run}", soft_wrap=True)
 
     def _advance(self, name: str, done: int, total: int, text: str) -> None:
         """Move the bar; without a terminal, a line at every tenth."""
@@ -116,3 +120,9 @@ class Console:
             self.out.print(
                 f"  {name:9} {100 * done // total:3d} %  {left:5.0f} s left  {text}", soft_wrap=True
             )
+
+
+def _program() -> str:
+    """How this program was called, to be typed again."""
+    called = Path(sys.argv[0])
+    return str(called) if called.name == "sagesplat" else "sagesplat"

@@ -70,6 +70,7 @@ class RunDone:
     """The end of a run."""
 
     report: Path
+    run: Path | None = None  # where there is something to walk through (`sagesplat view`)
 
 
 Event = StageStarted | StageSkipped | Progress | Training | Warned | StageDone | TableMade | RunDone

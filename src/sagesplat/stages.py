@@ -441,4 +441,4 @@ def make_report(job: Job) -> None:
         [run.report / "index.html"],
         make,
     )
-    job.emit(RunDone(run.report / "index.html"))
+    job.emit(RunDone(run.report / "index.html", run.path if run.ladder == "nested" else None))

@@ -43,6 +43,25 @@ function open(canvas: HTMLCanvasElement, viewer: Viewer, options: Options): void
   window.addEventListener("online", () => viewer.streamer.retry());
   followTraining(viewer);
   viewer.start();
+  takeDownPoster(viewer, canvas);
+}
+
+/** The picture in the page's HTML stays until the scene is drawn, or somebody wants to move. */
+function takeDownPoster(viewer: Viewer, canvas: HTMLCanvasElement): void {
+  const poster = document.getElementById("poster");
+  if (!poster) return;
+  canvas.after(poster); // above the scene, below the panel
+  const down = () => {
+    stop();
+    poster.remove();
+  };
+  const stop = viewer.onSample(({ settled, drawn, state }) => {
+    if (settled && drawn > 0 && state.status !== "loading") down();
+  });
+  for (const event of ["pointerdown", "wheel", "keydown"] as const) {
+    canvas.addEventListener(event, down, { once: true });
+  }
+  if (viewer.photo >= 0) down(); // it shows another view
 }
 
 /** A live bundle is loaded anew once training is done, as it has levels then. */

@@ -79,17 +79,37 @@ def guessed_scale(cameras: Sequence[Camera], up: Float[np.ndarray, "3"], height:
     return float(np.clip(EYES / above, *SCALES)) if above > 0 else 1.0
 
 
-def start(cameras: Sequence[Camera], points: Float[np.ndarray, "P 3"], extent: float) -> dict[str, Any]:
-    """The photo that shows most points, and the point in the middle of it that it looks at.
+def start(
+    cameras: Sequence[Camera], points: Float[np.ndarray, "P 3"], extent: float, up: Float[np.ndarray, "3"]
+) -> dict[str, Any]:
+    """Where the photo that shows most points was taken, held level, and the point that it looks at.
 
-    `points`: in COLMAP's axes.
+    `points`: in COLMAP's axes; `up` in the bundle's.
     """
     seen = [_depths(camera, points) for camera in cameras]
     best = max(range(len(cameras)), key=lambda i: len(seen[i][0]))
     camera, central = cameras[best], seen[best][1]
     depth = float(np.median(central)) if len(central) else extent
-    turned, where = rotation(camera), position(camera)
-    return {"position": where, "quaternion": quaternion(camera), "target": where - depth * turned[:, 2]}
+    where, back = position(camera), rotation(camera)[:, 2]
+    right = np.cross(up, back)
+    turned = rotation(camera)
+    if np.linalg.norm(right) > 1e-3:  # else it looks straight up or down
+        right /= np.linalg.norm(right)
+        turned = np.stack([right, np.cross(back, right), back], 1)
+    q = Rotation.from_matrix(turned).as_quat(canonical=True)
+    return {"position": where, "quaternion": q, "target": where - depth * back}
+
+
+def camera_at(
+    where: Float[np.ndarray, "3"], q: Float[np.ndarray, "4"], fov_y: float, width: int, height: int
+) -> Camera:
+    """The camera of a pose in the bundle's axes (`position`, `quaternion`), centred, in COLMAP's."""
+    w2c = np.eye(4, dtype=np.float32)
+    w2c[:3, :3] = (FLIP[:, None] * Rotation.from_quat(q).as_matrix() * FLIP).T
+    w2c[:3, 3] = -w2c[:3, :3] @ (where * FLIP)
+    f = height / (2 * math.tan(fov_y / 2))
+    K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]], np.float32)
+    return Camera(w2c, K, width, height)
 
 
 def _depths(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

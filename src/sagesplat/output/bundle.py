@@ -34,7 +34,7 @@ from sagesplat.output.chunks import Chunk
 from sagesplat.scene.scene import Camera
 
 FORMAT, VERSION = "sagesplat-bundle", 1
-MANIFEST, SCHEMA = "manifest.json", "manifest.schema.json"
+MANIFEST, SCHEMA, POSTER = "manifest.json", "manifest.schema.json", "poster.jpg"
 THIRD_PARTY = "THIRD_PARTY_LICENSES.txt"  # of the built viewer
 _LICENSES = """\
 The viewer in this folder is part of sagesplat, licensed under the Apache License, Version 2.0
@@ -99,10 +99,11 @@ class Written:
     total: int  # with the viewer
 
 
-def write_bundle(out: Path, contents: Contents, viewer: Path) -> Written:
+def write_bundle(out: Path, contents: Contents, viewer: Path, poster: bytes | None = None) -> Written:
     """Write a bundle into a folder, which is new, empty or an earlier bundle; it is replaced as a whole.
 
-    `viewer`: the folder with the built viewer. RunError for another folder; SageError without a viewer;
+    `viewer`: the folder with the built viewer. `poster`: a JPEG of the first view, shown until the scene is
+    drawn. RunError for another folder; SageError without a viewer;
     DataError for a chunk that is missing or not what the index says.
     """
     check_target(out)
@@ -116,6 +117,8 @@ def write_bundle(out: Path, contents: Contents, viewer: Path) -> Written:
         (fresh / "chunks").mkdir()
         for chunk in contents.chunks:
             (fresh / "chunks" / chunk.uri).write_bytes(_verified(contents.folder, chunk))
+        if poster is not None:
+            _put_up(fresh, poster)
         written = write_documents(fresh, contents)
         if out.exists():
             out.rename(old)
@@ -128,6 +131,14 @@ def write_bundle(out: Path, contents: Contents, viewer: Path) -> Written:
         for folder in (fresh, old):
             shutil.rmtree(folder, ignore_errors=True)
     return written
+
+
+def _put_up(folder: Path, poster: bytes) -> None:
+    """Show a picture in the page before any script of it is there."""
+    page = folder / "index.html"
+    (folder / POSTER).write_bytes(poster)
+    text = page.read_text(encoding="utf-8")
+    write_text(page, text.replace("<!-- poster -->", f'<img id="poster" src="{POSTER}" alt="" />'))
 
 
 def write_documents(folder: Path, contents: Contents) -> Written:
@@ -211,7 +222,7 @@ def documents(contents: Contents, third_party: bool = False) -> tuple[dict[str, 
         ],
         "promises": promises and _reference(promises),
         "cameras": [_camera(shot, contents.extent) for shot in contents.shots],
-        "start": _start(contents),
+        "start": {key: significant(value) for key, value in start_of(contents).items()},
         "licenses": _license_entries(third_party),
     }
     return manifest, promises
@@ -305,12 +316,11 @@ def _camera(shot: Shot, extent: float) -> dict[str, Any]:
     }
 
 
-def _start(contents: Contents) -> dict[str, Any]:
+def start_of(contents: Contents) -> dict[str, Any]:
+    """Position, quaternion and target of the first view, in the bundle's axes."""
     cameras = [shot.camera for shot in contents.shots if shot.split == "train"]
-    found = bearings.start(
-        cameras or [shot.camera for shot in contents.shots], contents.points, contents.extent
-    )
-    return {key: significant(value) for key, value in found.items()}
+    cameras = cameras or [shot.camera for shot in contents.shots]
+    return bearings.start(cameras, contents.points, contents.extent, bearings.upward(cameras))
 
 
 def _license_entries(third_party: bool) -> list[dict[str, str]]:

@@ -8,6 +8,7 @@ export function fail(message: string): void {
     "Try again",
   );
   const box = document.getElementById("notice");
+  document.getElementById("poster")?.remove();
   box?.replaceChildren(h("h1", {}, "The scene cannot be shown"), h("p", { role: "alert" }, message), again);
   box?.removeAttribute("hidden");
 }

@@ -1,3 +1,4 @@
+import type { Settings, State } from "../types";
 import type { Viewer } from "../view/viewer";
 import { h, setText } from "./dom";
 import { helpDialog } from "./help";
@@ -60,7 +61,19 @@ function sentence(viewer: Viewer, done: boolean): string {
   if (compare.on && compare.progress < 1)
     return `Loading the full scene, ${Math.floor(compare.progress * 100)} %`;
   if (state.status === "over budget") return "The smallest picture is over the budget";
-  if (state.status === "infeasible") return "The best that the budget allows";
+  if (state.status === "infeasible") return shortfall(state, viewer.settings);
   if (done) return viewer.manifest.live ? "Training goes on" : "";
   return state.count ? "Refining…" : "Loading…";
+}
+
+/** Which labels miss the target, or that the budget is too small for what was asked. */
+function shortfall(state: State, { mode, target }: Settings): string {
+  const short = state.labels.filter(
+    (l) => l.visible && l.wanted === l.label.levels.length && l.promised < target,
+  );
+  if (mode !== "target" || !short.length) return "The best that the budget allows";
+  const names = short.map((l) => l.label.title);
+  const named =
+    names.length > 2 ? `${names.slice(0, 2).join(", ")} and ${names.length - 2} more` : names.join(" and ");
+  return `${named} cannot reach ${target.toFixed(2)}`;
 }
