@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 import types
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -523,6 +523,7 @@ class Bundling(types.ModuleType):
         self.live: bytes | None = None
         self.trouble = ""
         self.viewer: dict[str, bytes] = {}
+        self.package_viewer: Callable[[], Path] = Path
 
     def bundle(self, job, out: Path) -> None:
         self.made += 1
@@ -530,7 +531,10 @@ class Bundling(types.ModuleType):
             {"sha256": c["sha256"]} for c in json.loads((job.run.chunks / "index.json").read_text())["chunks"]
         ]
         manifest = {"format": "sagesplat-bundle", "live": False, "labels": [{"levels": levels}]}
-        write_bundle(out, {"manifest.json": json.dumps(manifest).encode(), **self.viewer})
+        page = self.viewer["index.html"].replace(
+            b"<!-- poster -->", b'<img id="poster" src="poster.jpg" alt="" />'
+        )
+        write_bundle(out, {"manifest.json": json.dumps(manifest).encode(), "index.html": page})
 
     def live_bundle(self, job, folder: Path) -> bool:
         if self.trouble:
@@ -544,10 +548,10 @@ class Bundling(types.ModuleType):
 @pytest.fixture
 def bundling(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Bundling:
     fake, package = Bundling(), tmp_path / "package"
-    fake.viewer = {"index.html": b"one"}
+    fake.viewer = {"index.html": b"one <!-- poster -->"}
     write_bundle(package / "viewer" / "static", fake.viewer)
     monkeypatch.setitem(sys.modules, "sagesplat.bundling", fake)
-    monkeypatch.setattr(serve, "files", lambda _: package)
+    fake.package_viewer = lambda: package / "viewer" / "static"
     monkeypatch.setattr(serve, "_EVERY", 0.05)
     return fake
 
@@ -579,7 +583,7 @@ def test_and_again_when_it_is_out_of_date(tmp_path: Path, bundling: Bundling, ch
         time.sleep(0.02)
         (run / "nested/promises.json").write_text("{ }")
     elif change == "viewer":
-        bundling.viewer = {"index.html": b"two"}
+        bundling.viewer = {"index.html": b"two <!-- poster -->"}
         write_bundle(tmp_path / "package" / "viewer" / "static", bundling.viewer)
     else:
         (run / "bundle/manifest.json").write_text('{"format": "sagesplat-bundle", "labels": [1]}')
@@ -612,7 +616,7 @@ def test_training_is_followed_to_its_end(tmp_path: Path, bundling: Bundling):
 
         write_run(run)
         wait_for(lambda: b'"live": false' in ask(port, "/manifest.json", if_none_match=tag)[2])
-        assert ask(port, "/")[2] == b"one"
+        assert ask(port, "/")[2].startswith(b"one")
         assert bundling.made == 1
 
 

@@ -10,7 +10,6 @@ import webbrowser
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -194,6 +193,9 @@ def _is_finished(run: RunDir) -> bool:
 
 def _is_current(run: RunDir, folder: Path) -> bool:
     """Whether a bundle has the run's chunks, promises no older than the run's, and this package's viewer."""
+    from sagesplat.bundling import package_viewer
+    from sagesplat.output.bundle import has_viewer
+
     if not (folder / MANIFEST).exists():
         return False
     manifest: Any = read_json(folder / MANIFEST)
@@ -203,13 +205,7 @@ def _is_current(run: RunDir, folder: Path) -> bool:
         return False
     chunks = {chunk["sha256"] for chunk in read_json(run.chunks / "index.json")["chunks"]}
     older = (folder / MANIFEST).stat().st_mtime < run.promises.stat().st_mtime
-    return held == chunks and not older and _page(folder) == _page(files("sagesplat") / "viewer" / "static")
-
-
-def _page(folder: Any) -> bytes | None:
-    """The viewer's page, which names all its parts by their content."""
-    page = folder / "index.html"
-    return page.read_bytes() if page.is_file() else None
+    return held == chunks and not older and has_viewer(folder, package_viewer())
 
 
 def _follow(job: "Job", site: "Site", stop: threading.Event) -> None:

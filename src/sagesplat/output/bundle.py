@@ -137,8 +137,20 @@ def _put_up(folder: Path, poster: bytes) -> None:
     """Show a picture in the page before any script of it is there."""
     page = folder / "index.html"
     (folder / POSTER).write_bytes(poster)
-    text = page.read_text(encoding="utf-8")
-    write_text(page, text.replace("<!-- poster -->", f'<img id="poster" src="{POSTER}" alt="" />'))
+    write_text(page, _with_poster(page.read_text(encoding="utf-8")))
+
+
+def _with_poster(page: str) -> str:
+    return page.replace("<!-- poster -->", f'<img id="poster" src="{POSTER}" alt="" />')
+
+
+def has_viewer(folder: Path, viewer: Path) -> bool:
+    """Whether a bundle has this viewer: its page names all its parts by their content."""
+    pages = [path / "index.html" for path in (folder, viewer)]
+    if not all(page.is_file() for page in pages):
+        return False
+    mine, page = (page.read_text(encoding="utf-8") for page in pages)
+    return mine in (page, _with_poster(page))
 
 
 def write_documents(folder: Path, contents: Contents) -> Written:
