@@ -368,6 +368,14 @@ def viewer(bundle: Path, write: bool = False) -> None:
 
 
 @app.command
+def viewer_figure(curves: Path, out: Path) -> None:
+    """Draws the curve.csv that web/test/network.report.mjs simulated."""
+    from benchmarks import viewer as loading
+
+    loading.figure(curves, out)
+
+
+@app.command
 def freeze(
     scene: Path = workloads.GARDEN,
     downscale: int = 2,

@@ -1,17 +1,28 @@
 """A bundle over slow networks: bytes and seconds to the first picture, to a target, and in all."""
 
+import csv
 import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+
 from sagesplat import serve
+from sagesplat.output.figures import STYLE
 from tests.browser import Opened, launch, open_page
 
 NETWORKS = (2.0, 10.0, 50.0)  # Mbit/s
 LATENCY = 100.0  # ms
 TARGETS = (0.7, 0.8, 0.9)
+WAYS = {
+    "streamed": ("#2f6f56", "-"),
+    "target 0.8": ("#d6a10b", "-"),
+    "file order": ("#8a94a3", "--"),
+    "one file": ("#e5484d", ":"),
+}
 _QUIET = 1.5  # seconds without a change after which nothing more comes
 _STATE = """() => {
   const view = window.sagesplat
@@ -120,3 +131,22 @@ def table(result: dict[str, Any]) -> str:
         target = "all" if row["target"] is None else f"{row['target']:g}"
         lines.append(f"| {row['mbit']:g} | {target} | {first} | {done} | {row['status']} |")
     return "\n".join(lines)
+
+
+def figure(curves: Path, out: Path) -> None:
+    """SSIM over time of curve.csv, as `node web/test/network.report.mjs` writes it: a panel for each link."""
+    with curves.open() as file:
+        rows = list(csv.DictReader(file))
+    links = sorted({float(row["mbit"]) for row in rows})
+    with rc_context(STYLE):
+        picture = Figure(figsize=(11, 3.2), layout="constrained")
+        for axes, link in zip(picture.subplots(1, len(links), sharey=True), links, strict=True):
+            for way, (color, line) in WAYS.items():
+                mine = [r for r in rows if (float(r["mbit"]), r["connections"], r["way"]) == (link, "6", way)]
+                time, ssim = ([float(r[name]) for r in mine] for name in ("seconds", "ssim"))
+                axes.step(time, ssim, line, where="post", color=color, label=way)
+            axes.set(title=f"{link:g} Mbit/s, 100 ms", xlabel="seconds", ylim=(0, None), xlim=(0, None))
+            axes.grid(True, alpha=0.3)
+        picture.axes[0].set_ylabel("expected SSIM")
+        picture.axes[0].legend()
+        picture.savefig(out, dpi=110)

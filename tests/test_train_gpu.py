@@ -79,8 +79,8 @@ def final(events):
     "config",
     [
         replace(SHORT, max_steps=8, refine_every=50),
-        replace(SHORT, absgrad=True, grow_absgrad=1e-4),
-        replace(SHORT, batch=2),
+        pytest.param(replace(SHORT, absgrad=True, grow_absgrad=1e-4), marks=pytest.mark.slow),
+        pytest.param(replace(SHORT, batch=2), marks=pytest.mark.slow),
     ],
     ids=["default", "absgrad", "batch"],
 )

@@ -48,6 +48,7 @@ def test_two_processes_do_what_one_does_with_twice_the_batch(capture, tmp_path, 
     ]
 
 
+@pytest.mark.slow
 def test_a_killed_pair_goes_on(capture, tmp_path):  # noqa: F811
     scene, photos, masks, labels = capture
     options = {"masks": masks, "settings": "s"}
