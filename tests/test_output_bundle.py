@@ -20,7 +20,16 @@ from sagesplat.adapt.promise import ViewModel
 from sagesplat.errors import DataError, RunError, SageError
 from sagesplat.output import bearings, boxes
 from sagesplat.output.bearings import FLIP
-from sagesplat.output.bundle import SCHEMA, Category, Contents, Shot, documents, is_bundle, write_bundle
+from sagesplat.output.bundle import (
+    SCHEMA,
+    Category,
+    Contents,
+    Shot,
+    documents,
+    is_bundle,
+    write_bundle,
+    write_documents,
+)
 from sagesplat.output.bundle_quality import (
     MOVES,
     corrected,
@@ -33,6 +42,7 @@ from sagesplat.output.bundle_quality import (
     significant,
 )
 from sagesplat.output.chunks import write_chunks
+from sagesplat.output.pack import Ladder, gains_of, order_of
 from sagesplat.output.spz import read_spz
 from sagesplat.scene.scene import Camera
 
@@ -310,6 +320,7 @@ def test_a_bundle_holds_what_its_manifest_says(tmp_path, contents, viewer) -> No
     assert written.manifest == (out / "manifest.json").stat().st_size
     assert written.total == sum(p.stat().st_size for p in out.rglob("*") if p.is_file())
     ours = {"manifest.json", "manifest.schema.json", manifest["promises"]["uri"], "chunks", "LICENSES.txt"}
+    ours.add(manifest["pack"]["uri"])
     assert {p.name for p in out.iterdir()} == ours | {"index.html", "assets", "THIRD_PARTY_LICENSES.txt"}
     assert {entry["what"] for entry in manifest["licenses"]} >= {"three.js", "Spark"}
     assert not list(tmp_path.glob(".out*"))
@@ -343,6 +354,82 @@ def test_promises_of_a_bundle_are_those_of_the_model(tmp_path, contents, viewer)
         np.testing.assert_allclose(shown, [*row[:3] * made.extent, *row[3:6]], atol=1e-4)
 
 
+def test_the_pack_is_the_chunks_in_its_order(tmp_path, contents, viewer) -> None:
+    out = tmp_path / "out"
+    write_bundle(out, contents, viewer)
+    manifest = manifest_of(out)
+    pack, labels = manifest["pack"], manifest["labels"]
+    files = [labels[index]["levels"][level - 1] for index, level in pack["order"]]
+    content = (out / pack["uri"]).read_bytes()
+    assert content == b"".join((out / file["uri"]).read_bytes() for file in files)
+    assert pack["bytes"] == len(content) == manifest["totals"]["bytes"]
+    assert pack["sha256"] == hashlib.sha256(content).hexdigest()
+    assert pack["uri"] == f"scene-{pack['sha256'][:12]}.pack"
+    assert sorted(pack["order"]) == [[0, 1], [0, 2], [1, 1], [1, 2], [1, 3], [2, 1], [2, 2]]
+    assert sorted(pack["order"][:3]) == [[0, 1], [1, 1], [2, 1]]  # the smallest of everything
+
+
+def test_a_live_bundle_has_no_pack(tmp_path, contents) -> None:
+    write_documents(tmp_path, replace(contents, live=True))
+    assert manifest_of(tmp_path)["pack"] is None
+    assert not list(tmp_path.glob("*.pack"))
+
+
+FRONT, BEHIND = np.array([[-1.0, -1, -6, 1, 1, -4]]), np.array([[-1.0, -1, 4, 1, 1, 6]])
+
+
+def order_at_origin(*ladders: Ladder) -> list[tuple[int, int]]:
+    """Of the view along -z from the origin."""
+    return order_of(ladders, [camera()], np.zeros(3), np.array([0.0, 0, 0, 1]))
+
+
+def test_what_is_in_sight_comes_first_in_the_pack() -> None:
+    behind, front = Ladder([10, 10], 1.0, BEHIND, None, None), Ladder([50, 50], 1.0, FRONT, None, None)
+    assert order_at_origin(behind, front) == [(1, 1), (0, 1), (1, 2), (0, 2)]
+    nowhere = replace(behind, boxes=np.zeros((0, 6)))  # may be anywhere
+    assert order_at_origin(behind, nowhere)[0] == (1, 1)
+
+
+def test_what_gains_more_a_byte_comes_first_in_the_pack() -> None:
+    one = Ladder([10, 100, 100], 1.0, FRONT, None, None)
+    heavy, dear = replace(one, weight=50.0), replace(one, sizes=[10, 1000, 1000])
+    assert order_at_origin(one, heavy) == [(1, 1), (0, 1), (1, 2), (1, 3), (0, 2), (0, 3)]
+    assert order_at_origin(dear, one)[2:] == [(1, 2), (1, 3), (0, 2), (0, 3)]
+    assert order_at_origin(one, one) == [
+        (0, 1),
+        (1, 1),
+        (0, 2),
+        (1, 2),
+        (0, 3),
+        (1, 3),
+    ]  # equals
+    assert order_at_origin(replace(one, weight=0.0)) == [(0, 1), (0, 2), (0, 3)]
+    assert order_at_origin() == []
+
+
+def test_promises_and_pixels_rule_the_order_of_the_pack() -> None:
+    made = replace(model(2, 6, [1, 2, 3]), weights=np.zeros((6, 3)))
+    flat = replace(made.curves[0], params=made.curves[0].params._replace(K1=0.3, K2=0.3, g1=0, g2=0))
+    better = replace(flat, level=2, params=flat.params._replace(K1=0.9, K2=0.9))
+    made = replace(made, curves=(flat, better, replace(better, level=3)))
+    small, large = (Ladder([10, 50, 10], 1.0, FRONT, made, np.array([s])) for s in (0.01, 0.5))
+    order = order_at_origin(small, large)
+    assert order == [(1, 1), (0, 1), (1, 2), (0, 2), (1, 3), (0, 3)]  # the last level shows no more
+
+
+@given(st.lists(st.tuples(st.integers(1, 50), st.floats(-1, 1) | st.just(math.nan)), min_size=1, max_size=9))
+def test_gains_never_rise_and_lie_on_the_hull(steps: list[tuple[int, float]]) -> None:
+    total = np.cumsum([size for size, _ in steps]).astype(float)
+    ssim = np.array([value for _, value in steps])
+    gains = gains_of(ssim, total)
+    assert len(gains) == len(steps) - 1
+    assert (gains > 0).all()
+    assert (np.diff(gains) <= 0).all()
+    reached = max(0.0, ssim[0]) + np.concatenate([[0], np.cumsum(gains * np.diff(total))])
+    known = np.isfinite(ssim)
+    assert (reached[known] >= ssim[known] - 1e-9).all()  # above every level
+
+
 def test_the_same_contents_give_the_same_bytes(tmp_path, contents, viewer) -> None:
     for name in ("a", "b"):
         write_bundle(tmp_path / name, contents, viewer)
@@ -362,6 +449,7 @@ def test_an_earlier_bundle_is_replaced_and_nothing_of_it_stays(tmp_path, content
     manifest = manifest_of(out)
     assert manifest["promises"] is None
     assert not list(out.glob("promises-*"))
+    assert [path.name for path in out.glob("scene*")] == [manifest["pack"]["uri"]]
     assert len(list((out / "chunks").iterdir())) == 2
 
 
@@ -369,6 +457,7 @@ def test_without_points_or_labels() -> None:
     empty = Contents("none", 0.0, [Shot("a", "test", camera())], [], [], Path("none"), 0)
     manifest, promises = documents(empty)
     assert promises is None
+    assert manifest["pack"] is None
     assert manifest["labels"] == []
     assert manifest["totals"] == {"count": 0, "bytes": 0, "gpuBytes": 0}
     assert np.isfinite(manifest["start"]["target"]).all()

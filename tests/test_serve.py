@@ -34,6 +34,7 @@ FILES = {
     "manifest.json": b'{"format": "sagesplat-bundle", "labels": []}',
     "index.html": b"<!doctype html><title>viewer</title>" + b"<p>text" * 500,
     CHUNK: bytes(range(256)) * 1000,
+    "scene-0123456789ab.pack": bytes(1000),
     PROMISES: b"[" + b"0.5," * 900 + b"1]",
     "assets/index-CmV_C-3Q.js": b"export const a = 1\n" * 300,
     "assets/look-1a2b3c4d.css": b"a{}",
@@ -156,7 +157,7 @@ def test_files_come_whole_with_their_media_type(port: int, name: str, kind: str)
 def test_names_with_a_hash_are_kept_for_ever_and_others_asked_about(port: int):
     kept = "public, max-age=31536000, immutable"
     for name in FILES:
-        hashed = name.startswith(("chunks/", "assets/", "promises-"))
+        hashed = name.startswith(("chunks/", "assets/", "promises-", "scene-"))
         assert ask(port, "/" + name)[1]["cache-control"] == (kept if hashed else "no-cache")
     assert ask(port, "/inside.spz")[1]["cache-control"] == "no-cache"
     assert ask(port, "/chunks/nothing-01-0123456789ab.spz")[1]["cache-control"] == "no-cache"
@@ -178,7 +179,7 @@ def test_text_is_packed_and_chunks_are_not(port: int):
         _, plain, _ = ask(port, "/" + name)
         status, headers, body = ask(port, "/" + name, accept_encoding="br, gzip;q=0.8")
         assert (status, int(headers["content-length"])) == (200, len(body))
-        if name == CHUNK:
+        if name.endswith((".spz", ".pack")):
             assert (body, headers.get("content-encoding"), headers.get("vary")) == (content, None, None)
         else:
             assert (gzip.decompress(body), headers["content-encoding"]) == (content, "gzip")

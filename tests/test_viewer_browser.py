@@ -411,7 +411,7 @@ def test_a_broken_chunk_is_named_and_the_rest_lives_on(made: Path, browser: Any)
     manifest = json.loads((made / "manifest.json").read_text())
     brick = manifest["labels"][0]["levels"][1]
     broken = b"\0" * brick["bytes"]
-    with serve(made, {brick["uri"]: broken}) as url, open_page(url, browser=browser) as opened:
+    with serve(made, {brick["uri"]: broken, ".pack": None}) as url, open_page(url, browser=browser) as opened:
         ready(opened)
         opened.page.evaluate("sagesplat.set({ mode: 'full' })")
         opened.wait_for(f"sagesplat.state().count === {WHOLE - 180}")
@@ -422,7 +422,7 @@ def test_a_broken_chunk_is_named_and_the_rest_lives_on(made: Path, browser: Any)
 
 def test_a_missing_chunk_is_named(made: Path, browser: Any) -> None:
     uri = json.loads((made / "manifest.json").read_text())["labels"][1]["levels"][2]["uri"]
-    with serve(made, {uri: None}) as url, open_page(url, browser=browser) as opened:
+    with serve(made, {uri: None, ".pack": None}) as url, open_page(url, browser=browser) as opened:
         ready(opened)
         opened.page.evaluate("sagesplat.set({ mode: 'full' })")
         opened.wait_for(f"sagesplat.state().count === {WHOLE - 150}")

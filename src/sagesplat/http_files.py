@@ -40,7 +40,9 @@ HEADERS = {
     "x-content-type-options": "nosniff",
 }
 _FOREVER = "public, max-age=31536000, immutable"
-_HASHED = re.compile(r"chunks/.+-[0-9a-f]{12}\.(spz|ply)|promises-[0-9a-f]{12}\.json|assets/.+-[\w-]{8}\.\w+")
+_HASHED = re.compile(
+    r"chunks/.+-[0-9a-f]{12}\.(spz|ply)|scene-[0-9a-f]{12}\.pack|promises-[0-9a-f]{12}\.json|assets/.+-[\w-]{8}\.\w+"
+)
 # said here: what the system's own table has differs between machines; no type is registered for splats
 _TYPES = {
     ".css": "text/css; charset=utf-8",
@@ -50,6 +52,7 @@ _TYPES = {
     ".js": "text/javascript; charset=utf-8",
     ".json": "application/json",
     ".md": "text/markdown; charset=utf-8",
+    ".pack": "application/octet-stream",
     ".png": "image/png",
     ".svg": "image/svg+xml",
     ".txt": "text/plain; charset=utf-8",
@@ -58,7 +61,7 @@ _TYPES = {
     ".webp": "image/webp",
     ".woff2": "font/woff2",
 }
-_PACKED = (".css", ".html", ".js", ".json", ".svg", ".txt", ".wasm")  # chunks are packed already
+_PACKED = (".css", ".html", ".js", ".json", ".svg", ".txt", ".wasm")  # chunks are small already
 _WAITING = "<!doctype html><title>sagesplat</title><p>{}</p><p>This page tries again by itself.</p>"
 
 

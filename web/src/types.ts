@@ -74,9 +74,18 @@ export interface Manifest {
   readonly totals: { readonly count: number; readonly bytes: number; readonly gpuBytes: number };
   readonly labels: readonly Label[];
   readonly promises: { readonly uri: string; readonly bytes: number; readonly sha256: string } | null;
+  readonly pack?: Pack | null; // older bundles have none
   readonly cameras: readonly Camera[];
   readonly start: { readonly position: Vec3; readonly quaternion: Quat; readonly target: Vec3 };
   readonly licenses: readonly { readonly what: string; readonly license: string; readonly url?: string }[];
+}
+
+/** Increments in one file, one after the other, best first: as a stream it is quicker than many files. */
+export interface Pack {
+  readonly uri: string;
+  readonly bytes: number; // the sum of those of its increments
+  readonly sha256: string;
+  readonly order: readonly (readonly [number, number])[]; // index of the label, level (1-based)
 }
 
 /** The viewpoint models of all categories: src/sagesplat/adapt/promise.py says how they are evaluated. */

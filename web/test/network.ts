@@ -48,6 +48,8 @@ function linkTo(documents: Documents, { mbit, connections }: Line) {
   const text = new TextEncoder();
   network.files.set("manifest.json", text.encode(documents.manifest));
   if (manifest.promises) network.files.set(manifest.promises.uri, text.encode(documents.promises));
+  const { pack } = manifest;
+  if (pack) network.files.set(pack.uri, new Uint8Array(pack.bytes));
   for (const { uri, bytes } of manifest.labels.flatMap((label) => label.levels)) {
     if (bytes) network.files.set(uri, new Uint8Array(bytes));
   }

@@ -54,7 +54,17 @@ export class VirtualClock implements Clock {
 }
 
 /** What to do with a request instead of answering it. */
-export type Fault = "offline" | "hang" | "cut" | "corrupt" | "truncated" | "junk" | number;
+export type Fault =
+  | "offline"
+  | "hang"
+  | "cut"
+  | "corrupt"
+  | "truncated"
+  | "longer"
+  | "bodiless"
+  | "stalls"
+  | "junk"
+  | number;
 
 interface Flow {
   left: number; // bytes until the next piece
@@ -109,6 +119,10 @@ export class Network {
       this.close();
       return this.reply(matches ? 304 : status, null, tag);
     }
+    if (fault === "bodiless") {
+      this.close();
+      return this.reply(200, null, tag);
+    }
     return this.reply(200, this.body(path, this.spoiled(content, fault), fault, signal), tag);
   };
 
@@ -119,6 +133,7 @@ export class Network {
 
   private spoiled(content: Uint8Array, fault: Fault | undefined): Uint8Array {
     if (fault === "truncated") return content.slice(0, content.length - 10);
+    if (fault === "longer") return Uint8Array.from([...content, 0]);
     if (fault !== "corrupt") return content;
     const wrong = content.slice();
     wrong[wrong.length >> 1] = (wrong[wrong.length >> 1] ?? 0) ^ 1;
@@ -155,6 +170,7 @@ export class Network {
       }
       const size = Math.min(PIECE, content.length - at);
       try {
+        if (fault === "stalls" && at > content.length / 2) await this.wait(Infinity, signal, path);
         await this.flow(size, signal, path);
       } catch (error) {
         this.close();

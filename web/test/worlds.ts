@@ -1,6 +1,6 @@
 /** Small bundles made up for tests. */
 
-import type { Label, Level, Manifest, Promises, Settings, Viewpoint } from "../src/types";
+import type { Label, Level, Manifest, Pack, Promises, Settings, Viewpoint } from "../src/types";
 import { fnv, type Network, seeded } from "./simulate";
 
 export const BASE = new URL("https://example.org/");
@@ -28,11 +28,13 @@ export interface Options {
   readonly seed?: number;
   readonly live?: boolean;
   readonly promises?: boolean;
+  readonly pack?: boolean;
 }
 
 /** A bundle whose files are on a network; label i stands at x = 4 i - 8. */
 export function bundle(network: Network, options: Options = {}): Manifest {
   const { labels = 4, levels = 5, bytes = 20_000, seed = 1, live = false, promises = true } = options;
+  const { pack = false } = options;
   const random = seeded(seed);
   const made = Array.from({ length: labels }, (_, id) => {
     const files = Array.from({ length: levels }, (_, k) => {
@@ -55,10 +57,27 @@ export function bundle(network: Network, options: Options = {}): Manifest {
     totals: totals(made),
     labels: made,
     promises: models && store(network, "promises-1.json", new TextEncoder().encode(JSON.stringify(models))),
+    ...(pack && { pack: packOf(network, made) }),
     cameras: [],
     start: { position: [0, 0, 0], quaternion: [0, 0, 0, 1], target: [0, 0, -1] },
     licenses: [],
   };
+}
+
+/** All increments, level by level. */
+export function packOf(network: Network, labels: readonly Label[]): Pack {
+  const last = Math.max(0, ...labels.map((label) => label.levels.length));
+  const order = Array.from({ length: last }, (_, k) => labels.map((_label, i) => [i, k + 1] as const)).flat();
+  const contents = order.flatMap(([i, level]) => {
+    return network.files.get(labels[i]?.levels[level - 1]?.uri ?? "") ?? [];
+  });
+  const content = new Uint8Array(contents.reduce((sum, one) => sum + one.length, 0));
+  let at = 0;
+  for (const one of contents) {
+    content.set(one, at);
+    at += one.length;
+  }
+  return { ...store(network, "scene-1.pack", content), order };
 }
 
 function store(network: Network, uri: string, content: Uint8Array) {

@@ -1,7 +1,8 @@
 """A bundle: a static folder with the chunks of a nested ladder, what is promised of them, and the viewer.
 
 manifest.json says what there is (manifest.schema.json says how), promises-*.json holds the viewpoint models,
-which the first picture need not wait for. The same contents give the same bytes: there are no times in it.
+which the first picture need not wait for, scene-*.pack all chunks once more, as one stream. The same contents
+give the same bytes: there are no times in it.
 """
 
 import hashlib
@@ -31,6 +32,7 @@ from sagesplat.output.bundle_quality import (
     significant,
 )
 from sagesplat.output.chunks import Chunk
+from sagesplat.output.pack import Ladder, order_of, write_pack
 from sagesplat.scene.scene import Camera
 
 FORMAT, VERSION = "sagesplat-bundle", 1
@@ -154,8 +156,10 @@ def has_viewer(folder: Path, viewer: Path) -> bool:
 
 
 def write_documents(folder: Path, contents: Contents) -> Written:
-    """Write all but the chunks and the viewer; the manifest last."""
+    """Write all but the chunks, which must be there, and the viewer; the manifest last."""
     manifest, promises = documents(contents, (folder / THIRD_PARTY).exists())
+    if contents.chunks and not contents.live:
+        manifest["pack"] = write_pack(folder, manifest["labels"], _order(contents))
     if promises is not None:
         (folder / manifest["promises"]["uri"]).write_bytes(promises)
     write_text(folder / SCHEMA, files("sagesplat.output").joinpath(SCHEMA).read_text(encoding="utf-8"))
@@ -204,13 +208,7 @@ def _verified(folder: Path, chunk: Chunk) -> bytes:
 
 def documents(contents: Contents, third_party: bool = False) -> tuple[dict[str, Any], bytes | None]:
     """The manifest as plain data, and the bytes of promises-*.json if anything is promised."""
-    by_label = _chunks_by_label(contents.chunks)
-    last = max((chunk.level for chunk in contents.chunks), default=0)
-    models = {
-        c.label_id: of_files(c.model, [chunk.level for chunk in by_label[c.label_id]], last)
-        for c in contents.categories
-        if c.model is not None and by_label.get(c.label_id)
-    }
+    by_label, models = _chunks_by_label(contents.chunks), _models(contents)
     promises = _promises(contents, {i: m for i, m in models.items() if m.curves})
     manifest = {
         "format": FORMAT,
@@ -233,11 +231,43 @@ def documents(contents: Contents, third_party: bool = False) -> tuple[dict[str, 
             if by_label.get(c.label_id)
         ],
         "promises": promises and _reference(promises),
+        "pack": None,
         "cameras": [_camera(shot, contents.extent) for shot in contents.shots],
         "start": {key: significant(value) for key, value in start_of(contents).items()},
         "licenses": _license_entries(third_party),
     }
     return manifest, promises
+
+
+def _models(contents: Contents) -> dict[int, ViewModel]:
+    """By label id, the models with the levels of the label's files."""
+    by_label = _chunks_by_label(contents.chunks)
+    last = max((chunk.level for chunk in contents.chunks), default=0)
+    return {
+        c.label_id: of_files(c.model, [chunk.level for chunk in by_label[c.label_id]], last)
+        for c in contents.categories
+        if c.model is not None and by_label.get(c.label_id)
+    }
+
+
+def _order(contents: Contents) -> list[tuple[int, int]]:
+    """Of the files in the pack: index of the label in the manifest, level."""
+    by_label, models = _chunks_by_label(contents.chunks), _models(contents)
+    first = start_of(contents)
+    known = np.array([shot.split != "test" for shot in contents.shots])
+    cameras = [shot.camera for shot in contents.shots if shot.split != "test"]
+    ladders = [
+        Ladder(
+            [chunk.nbytes for chunk in by_label[c.label_id]],
+            c.weight,
+            c.boxes,
+            models[c.label_id] if c.label_id in models and models[c.label_id].curves else None,
+            None if c.shares is None else c.shares[known],
+        )
+        for c in contents.categories
+        if by_label.get(c.label_id)
+    ]
+    return order_of(ladders, cameras, first["position"], first["quaternion"])
 
 
 def _promises(contents: Contents, models: dict[int, ViewModel]) -> bytes | None:

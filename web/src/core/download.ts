@@ -52,6 +52,8 @@ export interface Link {
   readonly clock: Clock;
   readonly digest: Digest;
   received(bytes: number): void;
+  /** How long a server took to answer, ms. */
+  answered(ms: number): void;
 }
 
 /**
@@ -68,34 +70,53 @@ export async function download(
   again: boolean,
   progress: (bytes: number) => void,
 ): Promise<Uint8Array> {
-  const { fetch } = link; // the browser's own must not be called as a method
+  const parts: Uint8Array[] = [];
+  let size = 0;
+  await receive(link, file, signal, { again }, (part) => {
+    parts.push(part);
+    size += part.length;
+    progress(size);
+    return size <= file.bytes;
+  });
+  return await intact(link, file, joined(parts, size));
+}
+
+/** How to receive a file. */
+export interface Manner {
+  readonly again?: boolean; // past the browser's cache
+  readonly silence?: number; // ms without a byte, after which the file counts as lost
+  readonly check?: (reply: Reply) => void; // throws for an answer that is of no use
+}
+
+/** Hands over a file's body piece by piece until `take` says false. Rejects with a DownloadError in one line. */
+export async function receive(
+  link: Link,
+  file: File,
+  signal: AbortController,
+  { again = false, silence = SILENCE, check }: Manner,
+  take: (part: Uint8Array) => boolean,
+): Promise<void> {
+  const { fetch, clock } = link; // the browser's own must not be called as a method
   let silent = false;
   const watch = () =>
-    link.clock.after(SILENCE, () => {
+    clock.after(silence, () => {
       silent = true;
       signal.abort();
     });
   let stop = watch();
   try {
     const url = new URL(file.uri, link.base).href;
-    const reply = await fetch(url, {
-      signal: signal.signal,
-      ...(again && { cache: "reload" as const }),
-    });
+    const asked = clock.now();
+    const reply = await fetch(url, { signal: signal.signal, ...(again && { cache: "reload" as const }) });
+    link.answered(clock.now() - asked);
     if (!reply.ok) throw refused(file, reply.status);
-    const parts: Uint8Array[] = [];
-    let size = 0;
+    check?.(reply);
     await each(reply, (part) => {
       stop();
       stop = watch();
-      parts.push(part);
-      size += part.length;
       link.received(part.length);
-      progress(size);
-      return size <= file.bytes;
+      return take(part);
     });
-    stop();
-    return await intact(link, file, joined(parts, size));
   } catch (error) {
     if (error instanceof DownloadError) throw error;
     throw new DownloadError(
@@ -124,7 +145,7 @@ function refused(file: File, status: number): DownloadError {
 }
 
 /** The content if it is what the manifest says. It may be damaged on the way, so it is worth a second try. */
-async function intact(link: Link, file: File, content: Uint8Array): Promise<Uint8Array> {
+export async function intact(link: Link, file: File, content: Uint8Array): Promise<Uint8Array> {
   if (content.length !== file.bytes) {
     const is = content.length < file.bytes ? `only ${content.length}` : `more than`;
     throw new DamagedError(`${file.uri} is damaged: ${is} of ${file.bytes} bytes`, false);
@@ -235,7 +256,7 @@ export class Shelf {
     this.size = 0;
   }
 
-  private drop(sha256: string): void {
+  drop(sha256: string): void {
     this.size -= this.kept.get(sha256)?.length ?? 0;
     this.kept.delete(sha256);
   }

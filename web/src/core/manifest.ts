@@ -68,6 +68,7 @@ const camera = object({
   height: positive,
   intrinsics: list(number, 4),
 });
+const pack = object({ uri: relative, bytes: amount, sha256: hash, order: list(list(amount, 2)) });
 const manifest = object({
   generator: text,
   name: text,
@@ -86,6 +87,7 @@ const manifest = object({
   totals: object({ count: amount, bytes: amount, gpuBytes: amount }),
   labels: list(label),
   promises: orNull(object({ uri: relative, bytes: amount, sha256: hash })),
+  pack: (value, path, wrong) => value !== undefined && orNull(pack)(value, path, wrong), // older bundles
   cameras: list(camera),
   start: object({ position: vec3, quaternion: list(number, 4), target: vec3 }),
   licenses: list(object({ what: text, license: text })),
@@ -101,7 +103,7 @@ export function parseManifest(json: string, file = "manifest.json"): Manifest {
     );
   }
   const found = checked<Manifest>(value, manifest, file);
-  refuse(found.labels.flatMap(oddities), file);
+  refuse([...found.labels.flatMap(oddities), ...oddPack(found)], file);
   const ids = found.labels.map((l) => l.id);
   refuse(new Set(ids).size < ids.length ? ["labels have the same id twice"] : [], file);
   return found;
@@ -122,6 +124,14 @@ function oddities(one: Label, i: number): string[] {
     wrong.push(`labels[${i}].quality.curves must be of rising levels up to ${levels.length}`);
   }
   return wrong;
+}
+
+function oddPack({ pack, labels }: Manifest): string[] {
+  if (!pack) return [];
+  const files = pack.order.map(([i, k]) => labels[i]?.levels[k - 1]);
+  const bytes = files.reduce((sum, file) => sum + (file?.bytes ?? Number.NaN), 0);
+  const once = new Set(pack.order.map((one) => one.join())).size === files.length;
+  return bytes === pack.bytes && once ? [] : ["pack.order must name levels that fill pack.bytes, each once"];
 }
 
 const view = list(number, 6);

@@ -48,9 +48,14 @@ export function steps(c: Candidate, have: number, wanted: number, weight: number
 
 /**
  * Files that are missing for the plan: the lowest levels of all labels first, then the promises, then what
- * gains most per byte.
+ * gains most per byte. The promises come last where nothing depends on them.
  */
-export function inOrder(entries: readonly Entry[], supply: Supply, promises: readonly File[]): File[] {
+export function inOrder(
+  entries: readonly Entry[],
+  supply: Supply,
+  promises: readonly File[],
+  last = false,
+): File[] {
   const base: { file: File; value: number }[] = [];
   const rest: { file: File; value: number }[] = [];
   for (const entry of entries) {
@@ -70,5 +75,7 @@ export function inOrder(entries: readonly Entry[], supply: Supply, promises: rea
     }
   }
   const best = (list: typeof base) => list.sort((a, b) => b.value - a.value).map(({ file }) => file);
-  return [...best(base), ...promises.filter((file) => !supply.rests(file)), ...best(rest)];
+  const models = promises.filter((file) => !supply.rests(file));
+  const [smallest, more] = [best(base), best(rest)];
+  return last ? [...smallest, ...more, ...models] : [...smallest, ...models, ...more];
 }

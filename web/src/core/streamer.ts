@@ -9,6 +9,7 @@ import { poll } from "./live";
 import { parsePromises } from "./manifest";
 import { inOrder } from "./order";
 import { Outlook } from "./outlook";
+import { filesOf } from "./pack";
 import { makePlan, type Plan } from "./planner";
 import { type Drawn, Entry, exchange, gpuBytesOf, Hidden, settle } from "./residency";
 import { PATIENCE, Supply } from "./supply";
@@ -29,6 +30,7 @@ export interface StreamerOptions {
 const PLAN_EVERY = 125; // ms
 const KEEP = 64 * 2 ** 20;
 const DECODES = 4; // at once
+const HOLDS_UP = 0.05; // of a pack's bytes
 const BY_DISTANCE = "levels are planned by distance alone.";
 const UNCHECKED = "Served without https: files are checked by their size only.";
 
@@ -94,6 +96,8 @@ export class Streamer {
   start(): void {
     if (this.phase !== "new") return;
     this.phase = "running";
+    const { pack } = this.content;
+    if (pack) this.supply.open(pack, filesOf(this.content));
     this.plan();
     if (this.content.live) this.follow();
   }
@@ -184,11 +188,13 @@ export class Streamer {
     if (this.phase !== "running") return;
     this.draw();
     this.hidden.shrink(this.settings.cacheBytes);
-    for (const entry of this.entries) this.decodeNext(entry);
-    const queue = inOrder(this.entries, this.supply, this.missingPromises());
+    this.decodeMore();
+    const promises = this.missingPromises();
+    const queue = inOrder(this.entries, this.supply, promises, this.promisesCanWait());
     this.pending = queue.length;
     this.supply.keepOnly(new Set([...queue, ...this.wantedFiles()].map((file) => file.sha256)));
-    this.supply.fill(queue);
+    const undecided = this.settings.mode !== "base" && promises.some((file) => !this.supply.rests(file));
+    this.supply.fill(queue, undecided);
     this.changed();
     this.rest();
   }
@@ -201,14 +207,32 @@ export class Streamer {
     }
   }
 
+  /** Whether the plan does not depend on promises, which would hold up a pack that is hardly larger. */
+  private promisesCanWait(): boolean {
+    const { mode } = this.settings;
+    const { pack, promises } = this.content;
+    if (!this.supply.streams || this.planned !== "ok" || (mode !== "full" && mode !== "base")) return false;
+    return (promises?.bytes ?? 0) > HOLDS_UP * (pack?.bytes ?? 0);
+  }
+
   private missingPromises(): File[] {
     const { promises } = this.content;
     return promises && !this.outlook.complete ? [promises] : [];
   }
 
-  /** Files of all increments of the plan. */
+  /** Files of all increments of the plan that are not decoded. */
   private wantedFiles(): File[] {
-    return this.entries.flatMap((entry) => entry.files(0, entry.wanted).map(({ file }) => file));
+    return this.entries.flatMap((entry) => {
+      const files = entry.files(0, entry.wanted);
+      return files.flatMap(({ file, level }) => (entry.decoded[level - 1] === undefined ? file : []));
+    });
+  }
+
+  /** Decodes in the order in which files have come, which is that of their worth. */
+  private decodeMore(): void {
+    const came = this.supply.waiting;
+    const place = (entry: Entry) => came.get(entry.label.levels[entry.ready]?.sha256 ?? "") ?? -1;
+    for (const entry of [...this.entries].sort((a, b) => place(a) - place(b))) this.decodeNext(entry);
   }
 
   private decodeNext(entry: Entry): void {
@@ -334,6 +358,7 @@ export class Streamer {
       leavingBytes: this.leaving.reduce((sum, drawn) => sum + gpuBytesOf(drawn), 0),
       notes: [
         this.trouble,
+        this.supply.note,
         promises && (promises.lasting || promises.tries >= PATIENCE) && `${promises.message}; ${BY_DISTANCE}`,
         !this.digest && UNCHECKED,
       ].map((note) => note || null),

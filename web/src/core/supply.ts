@@ -1,6 +1,16 @@
 /** Which files are on their way, have come or have failed. It is told what is wanted, best first. */
 
-import { Bandwidth, DamagedError, DownloadError, download, type File, type Link, Shelf } from "./download";
+import {
+  Bandwidth,
+  DamagedError,
+  DownloadError,
+  download,
+  type File,
+  intact,
+  type Link,
+  Shelf,
+} from "./download";
+import { lateIn, Pack } from "./pack";
 
 /** A file that did not come. */
 export interface Failure {
@@ -26,7 +36,7 @@ const AHEAD = 0.25; // seconds of the link's speed to keep in flight: a round tr
 const UNKNOWN = 32_768; // bytes in flight as long as the speed is not known
 const TINY = 16_384; // bytes left that are not worth an abort
 
-export interface SupplyOptions extends Omit<Link, "received"> {
+export interface SupplyOptions extends Omit<Link, "received" | "answered"> {
   readonly keepBytes: number; // of files that have come, for when they are wanted again
   readonly changed: () => void; // something came, failed or may be tried again
   readonly atOnce?: number;
@@ -35,6 +45,12 @@ export interface SupplyOptions extends Omit<Link, "received"> {
 export class Supply {
   readonly bandwidth: Bandwidth;
   received = 0; // bytes in all
+  /** Why the pack is of no use, if it is not what the manifest says. */
+  note: string | null = null;
+  private pack: Pack | null = null;
+  private damaged = 0; // files of the pack
+  private roundTrip = Infinity; // ms
+  private readonly unproven = new Set<string>(); // files of a pack that could not be checked
   private readonly loads = new Map<string, Load>();
   private readonly come = new Map<string, Uint8Array>(); // until they are taken
   private readonly failures = new Map<string, Failure>();
@@ -49,11 +65,26 @@ export class Supply {
       this.received += bytes;
       this.bandwidth.count(bytes);
     };
-    this.link = { ...options, received };
+    const answered = (ms: number) => {
+      this.roundTrip = Math.min(ms, 1.25 * this.roundTrip); // a browser's own queue is no round trip
+    };
+    this.link = { ...options, received, answered };
   }
 
   get running(): number {
-    return this.loads.size;
+    return this.loads.size + (this.pack ? 1 : 0);
+  }
+
+  /** Whether a pack is coming. */
+  get streams(): boolean {
+    return this.pack !== null;
+  }
+
+  /** Begins to receive a pack: what it brings in time is not fetched one by one. */
+  open(file: File, files: readonly File[]): void {
+    this.begin();
+    this.pack = new Pack(file, files);
+    void this.receive(this.pack);
   }
 
   /** Bytes of files kept for later. */
@@ -67,6 +98,11 @@ export class Supply {
 
   isHere(file: File): boolean {
     return this.come.has(file.sha256) || this.shelf.has(file.sha256);
+  }
+
+  /** Of files that have come and were not taken: their place in the order in which they came. */
+  get waiting(): Map<string, number> {
+    return new Map([...this.come.keys()].map((key, i) => [key, i]));
   }
 
   /** The content, if it is here; it stays on the shelf as long as there is room. */
@@ -88,15 +124,39 @@ export class Supply {
 
   /** A file that came in order, but is of no use. */
   spoil(file: File, message: string): void {
+    if (this.unproven.delete(file.sha256)) {
+      this.shelf.drop(file.sha256);
+      this.fail(file, new DamagedError(message, false));
+      return;
+    }
     this.failures.set(file.sha256, { message, lasting: true, tries: 1, until: Infinity });
   }
 
-  /** Starts the best of what is wanted, as many as the link can use. */
-  fill(wanted: readonly File[]): void {
-    for (const file of wanted) {
+  /**
+   * Starts the best of what is wanted, as many as the link can use, and stops the pack where it is no more use.
+   *
+   * @param undecided - more may be wanted soon, and what is worth more is not known well
+   */
+  fill(wanted: readonly File[], undecided = false): void {
+    const single = this.pack ? this.besides(this.pack, wanted, undecided) : wanted;
+    for (const file of single) {
       if (!this.hasRoom()) return;
       if (!this.loads.has(file.sha256) && !this.rests(file)) void this.run(file);
     }
+  }
+
+  /** Of what is wanted that which a pack does not bring, or brings late. */
+  private besides(pack: Pack, wanted: readonly File[], undecided: boolean): File[] {
+    const brought = wanted.filter((file) => !this.loads.has(file.sha256) && pack.until(file) >= 0);
+    const late = undecided ? new Set() : lateIn(pack, brought, (this.roundTrip * this.bandwidth.rate) / 1000);
+    let brings = false;
+    const single = wanted.filter((file) => {
+      const mine = pack.until(file) >= 0 && !this.loads.has(file.sha256) && !late.has(file);
+      brings ||= mine;
+      return !mine && (!brings || pack.holds(file)); // what else there is waits for what is worth more
+    });
+    if (!brings && !undecided && !pack.isHere) pack.stop();
+    return single;
   }
 
   /** Aborts what is no longer wanted, unless it is nearly there. */
@@ -116,6 +176,7 @@ export class Supply {
 
   close(): void {
     this.closed = true;
+    this.pack?.stop();
     for (const [key, load] of this.loads) this.drop(key, load);
     this.come.clear();
     this.shelf.clear();
@@ -137,15 +198,54 @@ export class Supply {
     this.end(key);
   }
 
+  private begin(): void {
+    if (!this.running) this.bandwidth.running(true);
+  }
+
   private end(key: string): void {
     this.loads.delete(key);
-    if (!this.loads.size) this.bandwidth.running(false);
+    if (!this.running) this.bandwidth.running(false);
+  }
+
+  private async receive(pack: Pack): Promise<void> {
+    try {
+      await pack.read(this.link, (file, content) => this.accept(file, content));
+    } catch (error) {
+      if (error instanceof DamagedError) this.note = `${error.message}; files are loaded one by one.`;
+    }
+    this.pack = null;
+    if (!this.running) this.bandwidth.running(false);
+    if (!this.closed) this.options.changed();
+  }
+
+  /** A file of the pack; damaged ones are fetched once more by themselves. */
+  private async accept(file: File, content: Uint8Array): Promise<void> {
+    if (this.closed || this.isHere(file)) return;
+    try {
+      await intact(this.link, file, content);
+      if (this.closed) return;
+      if (!this.link.digest) this.unproven.add(file.sha256);
+      const load = this.loads.get(file.sha256);
+      if (load) this.drop(file.sha256, load);
+      this.arrive(file, content);
+    } catch (error) {
+      this.damaged += 1;
+      if (this.damaged > 1) this.pack?.stop(); // then the rest is no better
+      this.fail(file, error);
+    }
+    this.options.changed();
+  }
+
+  private arrive(file: File, content: Uint8Array): void {
+    this.failures.delete(file.sha256);
+    this.come.set(file.sha256, content);
+    this.shelf.put(file.sha256, content);
   }
 
   private async run(file: File): Promise<void> {
     const key = file.sha256;
     const load: Load = { file, abort: new AbortController(), got: 0, dropped: false };
-    if (!this.loads.size) this.bandwidth.running(true);
+    this.begin();
     this.loads.set(key, load);
     try {
       const again = this.failures.has(key);
@@ -153,9 +253,8 @@ export class Supply {
         load.got = got;
       });
       if (load.dropped) return;
-      this.failures.delete(key);
-      this.come.set(key, content);
-      this.shelf.put(key, content);
+      this.unproven.delete(key);
+      this.arrive(file, content);
     } catch (error) {
       if (load.dropped) return;
       this.fail(file, error);

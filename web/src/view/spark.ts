@@ -62,6 +62,8 @@ export class SparkLayer implements Renderer {
     this.place(rootMatrix(manifest.frame));
     this.scene.add(this.spark, this.root);
     this.setColors(manifest);
+    // now and not as they come: splats of equal depth are drawn in the order of their meshes
+    for (const { id } of manifest.labels) this.#column(id);
   }
 
   /** Whether the last frame showed what it should, sorted for where the camera is. */

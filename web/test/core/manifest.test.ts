@@ -41,6 +41,27 @@ test("a good manifest is taken as it is", () => {
   expect(parseManifest(with_(good(), "later", { any: "thing" }))).toBeTruthy();
 });
 
+test("a pack, none, or an older bundle", () => {
+  const made = bundle(network, { labels: 2, levels: 2, bytes: 100, pack: true });
+  const whole = (): Json => JSON.parse(JSON.stringify(made));
+  expect(parseManifest(JSON.stringify(made)).pack).toEqual(made.pack);
+  expect(parseManifest(with_(whole(), "pack", null)).pack).toBeNull();
+  expect(parseManifest(with_(whole(), "pack", undefined)).pack).toBeUndefined();
+  for (const [path, value, message] of [
+    ["pack", 3, "pack must be an object"],
+    ["pack.uri", "../scene.pack", "below the bundle's folder"],
+    ["pack.sha256", "1", "pack.sha256 must be a sha-256"],
+    ["pack.bytes", -1, "pack.bytes must be a whole number"],
+    ["pack.bytes", 1, "pack.order must name levels that fill pack.bytes"],
+    ["pack.order", [[0]], "pack.order[0] must be a list of 2"],
+    ["pack.order.0", [9, 1], "pack.order must name levels"],
+    ["pack.order.0", [0, 9], "pack.order must name levels"],
+    ["pack.order.0", [0, 2], "pack.order must name levels"],
+  ] as const) {
+    expect(complaint(() => parseManifest(with_(whole(), path, value)))).toContain(message);
+  }
+});
+
 test("a level that adds nothing needs no file", () => {
   const empty = { uri: "", format: "spz", bytes: 0, gpuBytes: 0, count: 0, sha256: "" };
   expect(parseManifest(with_(good(), "labels.0.levels.1", empty)).labels[0]?.levels[1]?.count).toBe(0);

@@ -42,9 +42,12 @@ function hiddenBytes(w: World): number {
   return hidden.reduce((sum, h) => sum + (w.manifest.labels[h.label]?.levels[h.level - 1]?.gpuBytes ?? 0), 0);
 }
 
-test.each([1, 2, 3, 4, 5, 6])("walk %i: budgets, no holes, limits", async (seed) => {
+test.each([
+  ...[1, 2, 3, 4, 5, 6].map((seed) => ({ seed, pack: false })),
+  ...[1, 2, 3, 4, 5, 6].map((seed) => ({ seed, pack: true })),
+])("walk $seed: budgets, no holes, limits (pack: $pack)", async ({ seed, pack }) => {
   const random = seeded(seed);
-  const w = world({ labels: 5, levels: 5, bytes: 12_000, seed, promises: seed % 3 > 0 });
+  const w = world({ labels: 5, levels: 5, bytes: 12_000, seed, promises: seed % 3 > 0, pack });
   w.network.bandwidth = pick(random, [250_000, 1e6, 6e6]);
   let x = 0;
   let checked = 0;
@@ -81,23 +84,26 @@ test.each([1, 2, 3, 4, 5, 6])("walk %i: budgets, no holes, limits", async (seed)
   expect(w.renderer.alive.size).toBe(0);
 });
 
-test("a walk over a link that fails one time in four ends well", async () => {
-  const random = seeded(11);
-  const w = world({ labels: 4, levels: 4, bytes: 8000, seed: 11 });
-  w.set({ mode: "full" });
-  w.streamer.start();
-  for (let step = 0; step < 40; step++) {
-    if (random() < 0.5) w.network.faults.set("*", pick(random, ["offline", "cut", 503, "hang"] as const));
-    else w.network.faults.clear();
-    w.streamer.update(at(random()));
-    await w.pass(200);
-  }
-  w.network.faults.clear();
-  await w.pass(30_000);
-  await w.rest();
-  expect(w.streamer.state.labels.map((label) => label.shown)).toEqual([4, 4, 4, 4]);
-  expect(w.streamer.state.message).toBeNull();
-});
+test.each([false, true])(
+  "a walk over a link that fails one time in four ends well (pack: %s)",
+  async (pack) => {
+    const random = seeded(11);
+    const w = world({ labels: 4, levels: 4, bytes: 8000, seed: 11, pack });
+    w.set({ mode: "full" });
+    w.streamer.start();
+    for (let step = 0; step < 40; step++) {
+      if (random() < 0.5) w.network.faults.set("*", pick(random, ["offline", "cut", 503, "hang"] as const));
+      else w.network.faults.clear();
+      w.streamer.update(at(random()));
+      await w.pass(200);
+    }
+    w.network.faults.clear();
+    await w.pass(30_000);
+    await w.rest();
+    expect(w.streamer.state.labels.map((label) => label.shown)).toEqual([4, 4, 4, 4]);
+    expect(w.streamer.state.message).toBeNull();
+  },
+);
 
 test("the same walk twice asks for the same files in the same order", async () => {
   const run = async () => {
