@@ -69,8 +69,8 @@ export class Panel {
   }
 
   update(): void {
-    const { state, settings, manifest, frameMs } = this.viewer;
-    const { totals } = manifest;
+    const { state, settings, streamer, frameMs } = this.viewer;
+    const { totals } = streamer.manifest; // it grows while a training is followed
     const bytes = `${formatBytes(state.bytesShown)} of ${formatBytes(totals.bytes)}`;
     setText(this.#summary, bytes);
     this.#meter.style.setProperty("--value", String(state.bytesShown / Math.max(totals.bytes, 1)));
