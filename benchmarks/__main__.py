@@ -14,6 +14,7 @@ import tyro
 from benchmarks import audit as table_iii
 from benchmarks import deeplab as segmenting
 from benchmarks import freeze as freezing
+from benchmarks import fuzz as fuzzing
 from benchmarks import measure, plain, workloads
 from benchmarks import plans as planning
 from benchmarks import segment as overlays
@@ -365,6 +366,25 @@ def viewer(bundle: Path, write: bool = False) -> None:
     result = loading.measure(bundle)
     print(loading.table(result))
     _finish("viewer", result, write)
+
+
+@app.command
+def fuzz(
+    seconds: float = 720, only: tuple[str, ...] = (), out: Path = Path("fuzz-findings"), seed: int = 0
+) -> None:
+    """Damaged files for every reader, guided by coverage where atheris is installed; fails on findings."""
+    rows = []
+    for row in fuzzing.run(seconds, only, out, seed):
+        branches = "" if row["branches"] is None else f", {row['branches']} branches"
+        print(f"{row['reader']:20} {row['executions']:>8,} executions{branches}", flush=True)
+        for text in row["findings"].values():
+            print(f"    {text}")
+        rows.append(row)
+    found = sum(len(row["findings"]) for row in rows)
+    executions = sum(row["executions"] for row in rows)
+    _finish("fuzz", {"executions": executions, "findings": found, "readers": len(rows)}, False)
+    if found:
+        raise SystemExit(f"{found} findings; the files are in {out}")
 
 
 @app.command

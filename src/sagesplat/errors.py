@@ -27,3 +27,9 @@ class BackendUnavailable(SageError):
 
 class OutOfMemory(SageError):
     """The GPU has too little memory for what is asked of it."""
+
+
+def short(value: object) -> str:
+    """What an error says, or a value of a file, as part of one line: clipped, without line ends."""
+    text = str(value) if str(value).isprintable() else repr(str(value))
+    return text if len(text) <= 200 else f"{text[:110]}...{text[-80:]}"

@@ -64,6 +64,19 @@ class Gaussians:
         return replace(self, **{name: p.detach() for name, p in self.parameters().items()})
 
 
+def checked(g: Gaussians) -> Gaussians:
+    """The same, if its tensors are of one length and of the shapes above; else ValueError."""
+    n, k = len(g.logit_opacities), g.shN.shape[1] if g.shN.ndim == 3 else -1
+    shapes = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,)}
+    shapes |= {"sh0": (n, 1, 3), "shN": (n, k, 3), "label_ids": (n,)}
+    for name, shape in shapes.items():
+        if getattr(g, name).shape != shape or k not in (0, 3, 8, 15):
+            raise ValueError(f"{name} is of shape {list(getattr(g, name).shape)}")
+    if any(p.dtype != torch.float32 for p in g.parameters().values()) or g.label_ids.dtype != torch.int16:
+        raise ValueError("numbers of another type")
+    return g
+
+
 def concat(parts: Sequence[Gaussians]) -> Gaussians:
     """All Gaussians of several sets in order; shN is padded with zeros to the largest degree."""
     bases = max(p.shN.shape[1] for p in parts)

@@ -4,6 +4,7 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +17,8 @@ from sagesplat.adapt.observe import PERCENTILE, LabelImages, RenderedLabels, dis
 from sagesplat.config import FitConfig
 from sagesplat.errors import RunError, SageError
 from sagesplat.events import Emit, StageDone, StageSkipped, StageStarted, Warned
-from sagesplat.files import read_json
+from sagesplat.files import named_full_disk, read_json, remove_temporary, sync_changed
+from sagesplat.lock import locked
 from sagesplat.lpips import Lpips, Net, load_lpips, weights_path
 from sagesplat.raster import Backend
 from sagesplat.run_dir import RunDir, file_hash, is_done, record, settings_of
@@ -25,7 +27,9 @@ from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.segment.lift import LiftedLabels
 from sagesplat.segment.masks import Masks, Taxonomy
+from sagesplat.train import memory
 
+_CLOCK_STEP = 2.0  # seconds: some disks keep no finer time
 NETS: tuple[Net, ...] = ("alex", "vgg")
 NO_RUN = "not a run folder (no scene.json); begin with `sagesplat run SCENE RUN`"
 
@@ -41,6 +45,8 @@ class Job:
     force: bool = False
     processes: int = 1  # that train together
     device: str = "auto"  # where networks compute
+    memory_limit: int = 0  # bytes that training may use (0: what the machine has, but for a margin)
+    locks: ExitStack | None = None  # keeps the run folder locked between stages (else within each)
 
     @cached_property
     def scene(self) -> Scene:
@@ -58,7 +64,7 @@ class Job:
     @cached_property
     def photos(self) -> Photos:
         """The photos, loaded when asked for."""
-        return Photos(self.scene.views)
+        return Photos(self.scene.views, memory.photo_cache(self.memory_limit))
 
     @cached_property
     def taxonomy(self) -> Taxonomy:
@@ -146,7 +152,12 @@ def run_stage(
     job: Job, name: str, settings: dict[str, Any], inputs: Sequence[Path], outputs: Sequence[Path],
     make: Callable[[], Sequence[str]],
 ) -> None:  # fmt: skip
-    """Do a stage unless its result is there already."""
+    """Do a stage unless its result is there already.
+
+    Nobody else writes into the run folder meanwhile. A stage counts as done only once its files are on the
+    disk, and not while it is done anew. RunError where another process works on the folder, or the disk is
+    full: then what was finished stays, and the same command goes on.
+    """
     if name not in ("poses", "scene") and not job.run.scene.exists():
         raise RunError(f"{job.run.path}: {NO_RUN}")
     for path in inputs:
@@ -156,11 +167,16 @@ def run_stage(
     if is_done(job.run, name, settings, inputs, outputs, job.force):
         job.emit(StageSkipped(name))
         return
-    job.emit(StageStarted(name))
-    begin = time.perf_counter()
-    lines = make()
-    seconds = time.perf_counter() - begin
-    record(job.run, name, settings, inputs, seconds)
+    with ExitStack() as own, named_full_disk(job.run.path):
+        (job.locks or own).enter_context(locked(job.run.path))
+        remove_temporary(job.run.path, but="bundle")  # a viewer writes those, without the lock
+        job.run.provenance(name).unlink(missing_ok=True)
+        job.emit(StageStarted(name))
+        begin, since = time.perf_counter(), time.time() - _CLOCK_STEP
+        lines = make()
+        seconds = time.perf_counter() - begin
+        sync_changed(job.run.path, since)
+        record(job.run, name, settings, inputs, seconds)
     job.emit(StageDone(name, seconds, tuple(lines)))
 
 

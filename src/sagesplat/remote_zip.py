@@ -14,7 +14,7 @@ from urllib.error import HTTPError, URLError
 from urllib.request import Request, urlopen
 from zipfile import ZIP_DEFLATED, BadZipFile, ZipFile, ZipInfo
 
-from sagesplat.errors import DataError
+from sagesplat.errors import DataError, short
 
 TIMEOUT = 30  # seconds without a byte
 PAUSES = (1.0, 5.0)  # seconds before the second and the third try
@@ -56,7 +56,7 @@ class RemoteZip:
             if infos and infos[0].header_offset < 0:
                 raise BadZipFile("a member before its begin")
         except (BadZipFile, NotImplementedError, ValueError, EOFError, struct.error) as error:
-            raise DataError(f"{self.url}: not readable as a zip archive ({error}); {AGAIN}") from None
+            raise DataError(f"{self.url}: not readable as a zip archive ({short(error)}); {AGAIN}") from None
         most = HEADER + 2 * 0xFFFF
         return [
             Member(info, min(stop, info.header_offset + most + info.compress_size))
@@ -72,11 +72,11 @@ class RemoteZip:
                     crc, size = zlib.crc32(block, crc), size + len(block)
                     yield block
             except zlib.error as error:
-                raise DataError(f"{self.url}: {info.filename} is damaged ({error}); {AGAIN}") from None
+                raise DataError(f"{self.url}: {short(info.filename)} is damaged ({error}); {AGAIN}") from None
         if (size, crc) != (info.file_size, info.CRC):
             raise DataError(
-                f"{self.url}: {info.filename} is damaged ({size} bytes with CRC {crc:08x} where the archive "
-                f"lists {info.file_size} with {info.CRC:08x}); {AGAIN}"
+                f"{self.url}: {short(info.filename)} is damaged ({size} bytes with CRC {crc:08x} where "
+                f"the archive lists {info.file_size} with {info.CRC:08x}); {AGAIN}"
             )
 
     def _blocks(self, start: int, stop: int) -> Generator[bytes]:

@@ -75,6 +75,11 @@ class RunDir:
         return self.path / "checkpoint.npz"
 
     @property
+    def cap(self) -> Path:
+        """The cap of Gaussians that training began with, lowered to the memory there was."""
+        return self.path / "cap.json"
+
+    @property
     def frozen(self) -> Path:
         """Steps at which categories stopped during training."""
         return self.path / "frozen.json"
@@ -182,6 +187,8 @@ def is_done(
     if not record.exists() or not all(p.exists() for p in outputs):
         return False
     made = read_json(record)
+    if not isinstance(made, dict):
+        raise RunError(f"{record}: not the record of a stage; run it again with --force")
     if made.get("format") != FORMAT:
         raise RunError(
             f"{run.path}: a run folder of format {made.get('format')}, this sagesplat ({__version__}) reads "
@@ -201,7 +208,10 @@ def settings_of(run: RunDir, stage: str) -> dict[str, Any]:
     """The settings that a finished stage was made with."""
     if not run.provenance(stage).exists():
         raise RunError(f"{run.path}: stage {stage} is not done; run `sagesplat {stage}` or `sagesplat run`")
-    return read_json(run.provenance(stage))["settings"]
+    made = read_json(run.provenance(stage))
+    if not isinstance(made, dict) or not isinstance(made.get("settings"), dict):
+        raise RunError(f"{run.provenance(stage)}: not the record of a stage; run it again with --force")
+    return made["settings"]
 
 
 def _differences(made: dict[str, Any], settings: Mapping[str, Any], inputs: Mapping[str, str]) -> str:

@@ -7,6 +7,7 @@ import shutil
 import statistics
 import time
 import tomllib
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
@@ -20,7 +21,7 @@ from sagesplat.adapt.evaluate import read_evaluation
 from sagesplat.adapt.observe import TOTAL
 from sagesplat.adapt.plan import read_plans
 from sagesplat.config import RunConfig
-from sagesplat.errors import DataError, RunError, SageError
+from sagesplat.errors import DataError, RunError, SageError, short
 from sagesplat.events import Emit, Event, Progress, StageDone, StageStarted, TableMade, Training, Warned
 from sagesplat.files import read_json, write_text
 from sagesplat.job import Job
@@ -28,6 +29,9 @@ from sagesplat.output.tables import MB, Table, mean, promise_kept
 from sagesplat.raster import Backend
 from sagesplat.run_dir import RunDir
 
+MAX_LENGTH = 2**20  # characters of a file
+MAX_DOTS = 64  # in one line of it
+MAX_RUNS = 10_000
 BUILT_IN = "demo"  # as a scene's path: the built-in capture
 # columns of numbers, with their formats: SSIM and PSNR (dB) are of whole test views, `error` is the mean
 # error of a category's promise there; a training that went on after a kill tells the seconds since then
@@ -78,9 +82,16 @@ class _File:
 def read_sweep(path: Path) -> Sweep:
     """The cells that a sweep file asks for, by scene, variant and seed. DataError where it is not one."""
     try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path}: not readable as TOML ({error}); examples/sweep.toml shows one") from None
+        text = path.read_text(encoding="utf-8")
+        _need(len(text) <= MAX_LENGTH, f"{path}: {len(text)} characters, more than a sweep has; split it")
+        # The parser keeps every prefix of a key of many parts.
+        dots = max(line.count(".") for line in text.split("\n"))
+        _need(dots <= MAX_DOTS, f"{path}: a line with {dots} dots; write lists and tables on several lines")
+        document = tomllib.loads(text)
+    except (OSError, ValueError, RecursionError) as error:
+        raise DataError(
+            f"{path}: not readable as TOML ({short(error)}); examples/sweep.toml shows one"
+        ) from None
     folder = path.parent
     file = _set(_File(), document, f"{path}: ", folder)
     targets = sorted(round(target, 6) for target in file.targets)
@@ -90,21 +101,33 @@ def read_sweep(path: Path) -> Sweep:
     _need(targets[0] > 0 and targets[-1] <= 1, f"{path}: targets: an SSIM is above 0 and at most 1")
     _need(min(file.seeds) >= 0, f"{path}: seeds: {min(file.seeds)} is negative; take 0 or more")
     for name in (*file.scenes, *file.variants):
-        fine = re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.+-]*", name)
-        _need(fine, f"{path}: the name {name!r} makes no folder; use letters, digits, _ . + and -")
+        fine = re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,99}", name)
+        _need(fine, f"{path}: the name {short(repr(name))} makes no folder; use letters, digits, _ . + and -")
+    count = len(file.scenes) * max(1, len(file.variants)) * len(file.seeds)
+    _need(count <= MAX_RUNS, f"{path}: {count} runs, at most {MAX_RUNS} are possible; split the sweep")
     main = targets.pop(len(targets) // 2)
     cells = []
     for scene, to in file.scenes.items():
         capture = None if to == BUILT_IN else folder / to
-        _need(not capture or capture.is_dir(), f"{path}: scenes.{scene}: no folder {capture}; mend the path")
+        _need(
+            not capture or _is_folder(capture),
+            f"{path}: scenes.{scene}: no folder {short(capture)}; mend the path",
+        )
         for variant, changes in (file.variants or {"": {}}).items():
             config = _set(file.settings, changes, f"{path}: variants.{variant}.", folder)
             plan = replace(config.plan, target_ssim=main, other_targets=tuple(targets))
             cells += [Cell(scene, variant, capture, replace(config, plan=plan, seed=s)) for s in file.seeds]
     names = [cell.name.lower() for cell in cells]  # some disks know no capitals
-    for name in names:
-        _need(names.count(name) == 1, f"{path}: two runs would be called {name}; rename a scene or a variant")
+    for name, times in Counter(names).items():
+        _need(times == 1, f"{path}: two runs would be called {name}; rename a scene or a variant")
     return tuple(cells)
+
+
+def _is_folder(path: Path) -> bool:
+    try:
+        return path.is_dir()
+    except OSError:  # a name that no disk has, e.g. too long
+        return False
 
 
 def _need(fine: object, message: str) -> None:
@@ -114,13 +137,13 @@ def _need(fine: object, message: str) -> None:
 
 def _set(config: Config, table: Any, where: str, folder: Path) -> Config:
     """Settings with those of a TOML table in place; `where` is the path and key for errors."""
-    _need(isinstance(table, dict), f"{where.rstrip('.')}: {table!r} given, a table is needed")
+    _need(isinstance(table, dict), f"{where.rstrip('.')}: {short(repr(table))} given, a table is needed")
     hints = get_type_hints(type(config))
     values = {}
     for name, value in table.items():
         key = f"{where}{name}"
         _need(name not in _SET_BY, f"{key}: set by the list `{_SET_BY.get(name)}`; leave it out here")
-        _need(name in hints, f"{where}{name!r}: no such key; there are {', '.join(hints)}")
+        _need(name in hints, f"{where}{short(repr(name))}: no such key; there are {', '.join(hints)}")
         inner = getattr(config, name)
         if is_dataclass(inner):
             values[name] = _set(inner, value, f"{key}.", folder)
@@ -147,7 +170,7 @@ def _value(hint: Any, value: Any, key: str, folder: Path) -> Any:
     if kind in (bool, int, str) and type(value) is kind:
         return value
     needed = " or ".join(map(repr, of)) if kind is Literal else _NEEDED[kind]
-    raise DataError(f"{key}: {value!r} given, {needed} is needed")
+    raise DataError(f"{key}: {short(repr(value))} given, {needed} is needed")
 
 
 def run_sweep(

@@ -8,9 +8,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from sagesplat.errors import DataError
+from sagesplat.errors import DataError, short
 from sagesplat.files import atomic_path
 
+_CELL = 40  # characters of a number; numpy makes all cells of a column as wide as the widest
 Columns = TypeVar("Columns")  # a dataclass whose fields are annotated with jaxtyping arrays [R]
 
 
@@ -37,13 +38,23 @@ def from_rows(table: type[Columns], rows: Sequence[Mapping[str, float]]) -> Colu
 
 
 def read_columns(path: Path, table: type[Columns], cure: str) -> Columns:
-    """The table that `write_columns` wrote. DataError where it is not one; `cure` says what to run then."""
+    """The table that `write_columns` wrote. DataError where it is not one; `cure` says what to run then.
+
+    Memory: up to 96 bytes for each of the file's and `_CELL` characters for each number.
+    """
     types = _types(table)
     try:
         with path.open(newline="", encoding="utf-8") as file:
             header, *rows = csv.reader(file)
         cells = dict(zip(header, zip(*rows, strict=True) if rows else [()] * len(header), strict=True))
-        columns = {name: np.array(cells[name], dtype=str).astype(dtype) for name, dtype in types.items()}
+        with np.errstate(all="ignore"):  # numbers too large for float32 become infinite
+            columns = {name: _column(cells[name], dtype) for name, dtype in types.items()}
     except (OSError, KeyError, ValueError, OverflowError, csv.Error) as error:
-        raise DataError(f"{path}: not readable as {table.__name__} ({error!r}); {cure}") from None
+        raise DataError(f"{path}: not readable as {table.__name__} ({short(repr(error))}); {cure}") from None
     return table(**columns)
+
+
+def _column(cells: Sequence[str], dtype: np.dtype) -> np.ndarray:
+    if max(map(len, cells), default=0) > _CELL:
+        raise ValueError(f"a number of more than {_CELL} characters")
+    return np.array(cells, dtype=str).astype(dtype)

@@ -127,7 +127,7 @@ def _unknown(level: int, levels: list[int]) -> RunError:
 
 def read_ladder(folder: Path) -> SnapshotLadder:
     """The snapshots in a `levels` folder."""
-    files = tuple(sorted((read_header(p) for p in folder.glob("*.npz")), key=lambda f: f.step))
+    files = tuple(sorted((read_header(p) for p in folder.glob("[!.]*.npz")), key=lambda f: f.step))
     if not files:
         raise RunError(f"{folder}: no levels; run `sagesplat train` first")
     return SnapshotLadder(files)

@@ -12,7 +12,7 @@ from scipy.ndimage import median_filter
 from scipy.optimize import least_squares
 
 from sagesplat.adapt.observe import TOTAL, Observations
-from sagesplat.errors import DataError
+from sagesplat.errors import DataError, short
 from sagesplat.files import read_json, write_json
 
 NOISE = 0.05  # SSIM residual from which an observation counts as an outlier (scale of the soft L1 loss)
@@ -245,7 +245,9 @@ def read_models(path: Path) -> dict[tuple[int, int], SsimModel]:
     try:
         models = [model_from_json(entry) for entry in document["models"]]
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise DataError(f"{path}: not a file of quality models ({error!r}); fit the models again") from None
+        raise DataError(
+            f"{path}: not a file of quality models ({short(repr(error))}); fit the models again"
+        ) from None
     return {(model.label_id, model.level): model for model in models}
 
 
@@ -265,6 +267,8 @@ def model_from_json(entry: dict) -> SsimModel:
     finite = np.isfinite([*model.params, low, high, model.median, model.rmse]).all()
     if not finite or low > high or min(model.params.g1, model.params.g2) < 0:
         raise ValueError(f"category {model.label_id}, level {model.level}: numbers out of range")
+    if not (-2 <= model.label_id < 2**15 and 0 <= model.level < 2**31):
+        raise ValueError(f"category {model.label_id}, level {model.level}")
     if model.status not in STATUSES:
         raise ValueError(f"unknown status {model.status!r}")
     return model

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sagesplat.adapt.model import SsimModel
-from sagesplat.errors import DataError, RunError
+from sagesplat.errors import DataError, RunError, short
 from sagesplat.files import read_json, write_json
 from sagesplat.gaussians import BYTES_PER_GAUSSIAN
 
@@ -226,7 +226,7 @@ def _usable(path: Path) -> Iterator[None]:
     try:
         yield
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise DataError(f"{path}: not a file of plans ({error!r}); plan again") from None
+        raise DataError(f"{path}: not a file of plans ({short(repr(error))}); plan again") from None
 
 
 def _to_json(plan: Plan) -> dict[str, Any]:

@@ -45,7 +45,7 @@ from scipy.spatial.distance import cdist
 
 from sagesplat.adapt.model import SsimModel, fit_models, model_from_json
 from sagesplat.adapt.observe import TOTAL, Observations
-from sagesplat.errors import DataError, RunError
+from sagesplat.errors import DataError, RunError, short
 from sagesplat.files import read_json, write_json
 from sagesplat.scene.scene import Scene
 
@@ -399,7 +399,7 @@ def read_promises(path: Path) -> dict[int, ViewModel]:
     try:
         models = [_from_json(entry) for entry in document["promises"]]
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise DataError(f"{path}: not a file of promises ({error!r}); fit them again") from None
+        raise DataError(f"{path}: not a file of promises ({short(repr(error))}); fit them again") from None
     return {model.label_id: model for model in models}
 
 
@@ -419,7 +419,7 @@ def _from_json(entry: dict[str, Any]) -> ViewModel:
     u = np.array(entry["unseen_inputs"], bool)
     n = len(u)
     shapes = (inputs.shape, weights.shape, amplitudes.shape)
-    if not n or not curves or shapes != ((n, 7), (n, len(curves)), (len(curves),)):
+    if not n or u.shape != (n,) or not curves or shapes != ((n, 7), (n, len(curves)), (len(curves),)):
         raise ValueError("lists of unequal length")
     finite = all(
         np.isfinite(a).all() for a in (inputs, weights, amplitudes, (x, y, z), list(numbers.values()))

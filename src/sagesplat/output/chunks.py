@@ -2,7 +2,6 @@
 
 import hashlib
 import re
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
@@ -13,14 +12,15 @@ import numpy as np
 import torch
 from jaxtyping import Int64
 
-from sagesplat.errors import DataError
-from sagesplat.files import read_json, write_json
+from sagesplat.errors import DataError, short
+from sagesplat.files import atomic_folder, read_json, write_json
 from sagesplat.gaussians import Gaussians, concat
 from sagesplat.output.ply import write_ply
 from sagesplat.output.spz import SH_BITS, encode_spz, packing_order, read_spz
 
 Format = Literal["spz", "ply"]
 INDEX = "index.json"
+_URI = r"(?!\.)[A-Za-z0-9_.-]{1,200}"  # a plain file in the folder of the index
 _GPU_BYTES = (16, 24, 40, 56)  # of a splat in Spark 2.2, by degree of its harmonics
 
 
@@ -70,27 +70,23 @@ def write_chunks(
     antialiased: bool = False,
 ) -> list[Chunk]:
     """Write a ladder's increments and an index of them into a folder of their own, which is replaced."""
-    fresh = folder.with_name(f".{folder.name}-new")
-    shutil.rmtree(fresh, ignore_errors=True)
-    fresh.mkdir(parents=True)
     chunks = []
-    for label, level, rows in increments(g, sizes):
-        part = g.select(torch.from_numpy(rows))
-        temporary = fresh / f"chunk.{kind}"
-        if kind == "spz":
-            temporary.write_bytes(encode_spz(part, sh_bits=sh_bits, coarse=True, antialiased=antialiased))
-        else:
-            write_ply(temporary, part, names)
-        content = temporary.read_bytes()
-        digest = hashlib.sha256(content).hexdigest()
-        slug = re.sub(r"[^a-z0-9]+", "-", names.get(label, str(label)).lower()).strip("-")
-        uri = f"{slug}-{level:02d}-{digest[:12]}.{kind}"
-        temporary.rename(fresh / uri)
-        gpu = len(part) * _GPU_BYTES[part.sh_degree]
-        chunks.append(Chunk(label, level, uri, len(part), len(content), gpu, digest))
-    write_json(fresh / INDEX, {"format": kind, "chunks": [asdict(chunk) for chunk in chunks]})
-    shutil.rmtree(folder, ignore_errors=True)
-    fresh.rename(folder)
+    with atomic_folder(folder) as fresh:
+        for label, level, rows in increments(g, sizes):
+            part = g.select(torch.from_numpy(rows))
+            temporary = fresh / f"chunk.{kind}"
+            if kind == "spz":
+                temporary.write_bytes(encode_spz(part, sh_bits=sh_bits, coarse=True, antialiased=antialiased))
+            else:
+                write_ply(temporary, part, names)
+            content = temporary.read_bytes()
+            digest = hashlib.sha256(content).hexdigest()
+            slug = re.sub(r"[^a-z0-9]+", "-", names.get(label, str(label)).lower()).strip("-")
+            uri = f"{slug}-{level:02d}-{digest[:12]}.{kind}"
+            temporary.rename(fresh / uri)
+            gpu = len(part) * _GPU_BYTES[part.sh_degree]
+            chunks.append(Chunk(label, level, uri, len(part), len(content), gpu, digest))
+        write_json(fresh / INDEX, {"format": kind, "chunks": [asdict(chunk) for chunk in chunks]})
     return chunks
 
 
@@ -99,24 +95,47 @@ def read_index(folder: Path) -> list[Chunk]:
     document: Any = read_json(folder / INDEX)
     try:
         chunks = [Chunk(**entry) for entry in document["chunks"]]
-        if any(c.nbytes <= 0 or c.count <= 0 or c.gpu_bytes <= 0 or c.level < 1 for c in chunks):
-            raise ValueError("a chunk without content")
+        for chunk in chunks:
+            _check(chunk)
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(
-            f"{folder / INDEX}: not an index of chunks ({error!r}); run `sagesplat nest` again"
+            f"{folder / INDEX}: not an index of chunks ({short(repr(error))}); run `sagesplat nest` again"
         ) from None
     return chunks
 
 
+def _check(chunk: Chunk) -> None:
+    """ValueError for an entry that no ladder has, such as a file outside the folder."""
+    sizes = (chunk.level, chunk.count, chunk.nbytes, chunk.gpu_bytes)
+    if not all(type(size) is int and 0 < size < 2**53 for size in sizes):
+        raise ValueError("a chunk without content")
+    if type(chunk.label_id) is not int or not -1 <= chunk.label_id < 2**15:
+        raise ValueError(f"label id {chunk.label_id!r}")
+    if not isinstance(chunk.uri, str) or not re.fullmatch(_URI, chunk.uri):
+        raise ValueError(f"{chunk.uri!r} is no name of a chunk")
+    if not isinstance(chunk.sha256, str) or not re.fullmatch("[0-9a-f]{64}", chunk.sha256):
+        raise ValueError(f"{chunk.sha256!r} is no SHA-256")
+
+
 def read_chunks(folder: Path, chunks: Sequence[Chunk]) -> Gaussians:
     """What SPZ chunks hold, one after the other; DataError for a broken one."""
+    if not chunks:
+        raise DataError(f"{folder}: no chunks; run `sagesplat nest` again")
     return concat([read_spz(folder / chunk.uri, chunk.label_id) for chunk in chunks])
 
 
 def totals(chunks: Sequence[Chunk], labels: Sequence[int], levels: int, what: str) -> np.ndarray:
-    """A column of the chunks summed up to each level: int64 [L, K] for rows `labels` and levels 1 to K."""
+    """A column of the chunks summed up to each level: int64 [L, K] for rows `labels` and levels 1 to K.
+
+    DataError for a chunk of another category or level.
+    """
     table = np.zeros((len(labels), levels), np.int64)
     row = {label: i for i, label in enumerate(labels)}
     for chunk in chunks:
+        if chunk.label_id not in row or chunk.level > levels:
+            raise DataError(
+                f"{chunk.uri}: of category {chunk.label_id} and level {chunk.level}, which this run has not; "
+                "run `sagesplat nest` again"
+            )
         table[row[chunk.label_id], chunk.level - 1] += getattr(chunk, what)
     return table.cumsum(1)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from sagesplat import __version__
-from sagesplat.errors import DataError
+from sagesplat.errors import DataError, short
 from sagesplat.files import atomic_path
 from sagesplat.gaussians import Gaussians
 from sagesplat.ply_header import read_header
@@ -56,7 +56,7 @@ def read_ply(path: Path) -> Gaussians:
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror}); give a splat .ply") from None
     except ValueError as error:
-        raise DataError(f"{path}: not readable as a PLY file ({error}); give a splat .ply") from None
+        raise DataError(f"{path}: not readable as a PLY file ({short(error)}); give a splat .ply") from None
     _check_values(path, columns, labels, wanted)
     return _gaussians(columns, labels)
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sagesplat.errors import SceneError
+from sagesplat.errors import SceneError, short
 from sagesplat.scene.colmap_read import ModelPoints, read_model
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage
 from sagesplat.scene.images import photo_size
@@ -72,7 +72,8 @@ def _check_photos(folder: Path, listed: Sequence[ModelImage]) -> None:
     if missing:
         raise SceneError(
             f"{folder}: {len(missing)} of the model's {len(listed)} photos are missing, "
-            f"first {missing[0]!r}; add the files, or remove them from the model with COLMAP's image_deleter"
+            f"first {short(repr(missing[0]))}; add the files, or remove them from the model with COLMAP's "
+            "image_deleter"
         )
     names = {i.name for i in listed}
     if len(names) < len(listed):

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 from scipy.spatial.transform import Rotation
 
-from sagesplat.errors import SceneError
+from sagesplat.errors import SceneError, short
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage
 from sagesplat.scene.undistort import CAMERA_MODELS
 
@@ -37,7 +37,8 @@ class ModelPoints(NamedTuple):
 def read_model(folder: Path) -> tuple[dict[int, ModelCamera], list[ModelImage], ModelPoints]:
     """Cameras by id, posed images and points of the model in `folder`, which binary files have priority in.
 
-    Raises SceneError for content that is damaged; numbers are finite then, but otherwise as they are.
+    Raises SceneError for content that is damaged; numbers are finite then, but otherwise as they are. Takes
+    no more memory than a small multiple of the files: counts in them are checked against what is there.
     """
     suffix = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
     cameras = _read(folder / f"cameras{suffix}", _binary_cameras, _text_cameras)
@@ -65,7 +66,9 @@ def _read(path: Path, binary: Callable, text: Callable) -> Any:
     except FileNotFoundError:
         raise SceneError(f"{path}: no such file; copy the whole model (cameras, images, points3D)") from None
     except (OSError, ValueError, IndexError, OverflowError) as error:
-        raise SceneError(f"{path}: damaged or incomplete ({error}); copy or export the model again") from None
+        raise SceneError(
+            f"{path}: damaged or incomplete ({short(error)}); copy or export the model again"
+        ) from None
 
 
 class _Bytes:
@@ -123,7 +126,7 @@ def _unknown_model(path: Path, model: str) -> str:
 def _camera(id: int, name: str, width: int, height: int, params: list[float]) -> ModelCamera:
     model = CAMERA_MODELS[name]
     if len(params) != model.num_params or not np.isfinite(params).all():
-        raise ValueError(f"camera {id}: {name} has {model.num_params} finite parameters, not {params}")
+        raise ValueError(f"camera {id}: {name} has {model.num_params} finite parameters, not {params[:13]}")
     if min(params[: model.num_focal]) <= 0 or not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
         raise ValueError(f"camera {id}: focal length {params[0]} or size {width} x {height} out of range")
     return ModelCamera(id, name, width, height, tuple(params))

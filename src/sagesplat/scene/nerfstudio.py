@@ -5,7 +5,8 @@ and the synthetic scenes of Mildenhall et al. 2020. Poses are camera-to-world wi
 z back). The world is that of the file: nothing is turned, moved or scaled.
 """
 
-from collections.abc import Sequence
+from collections import ChainMap
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from sagesplat.errors import RunError, SceneError
+from sagesplat.errors import RunError, SceneError, short
 from sagesplat.files import read_json
 from sagesplat.scene.colmap import MIN_VIEWS
 from sagesplat.scene.images import has_alpha, photo_size
@@ -90,19 +91,17 @@ def _check_settings(path: Path, downscale: int, test_every: int) -> None:
         )
 
 
-def _read(file: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+def _read(file: Path) -> tuple[dict[str, Any], list[Mapping[str, Any]]]:
     """The content of a transforms file, and its frames with what it says of all of them filled in."""
     try:
         content = read_json(file)
     except RunError as error:
         raise SceneError(f"{error}; give the folder with a whole transforms file") from None
-    except RecursionError:
-        raise SceneError(f"{file}: nested too deeply; export the transforms again") from None
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
         raise SceneError(f'{file}: no frames; export the transforms again, with {{"frames": [...]}} in them')
     shared = {key: value for key, value in content.items() if key != "frames"}
-    return content, [{**shared, **frame} for frame in frames]
+    return content, [ChainMap(frame, shared) for frame in frames]  # copies would take frames x keys
 
 
 def _inside(file: Path, key: str, value: Any) -> PurePosixPath:
@@ -117,7 +116,7 @@ def _inside(file: Path, key: str, value: Any) -> PurePosixPath:
     return path
 
 
-def _views(file: Path, frames: Sequence[dict[str, Any]], downscale: int) -> list[View]:
+def _views(file: Path, frames: Sequence[Mapping[str, Any]], downscale: int) -> list[View]:
     """The views of the frames, in their order; names are below images/ where all photos are there."""
     folder = file.parent
     paths = [_inside(file, "file_path", frame.get("file_path")) for frame in frames]
@@ -131,7 +130,7 @@ def _views(file: Path, frames: Sequence[dict[str, Any]], downscale: int) -> list
     if missing:
         raise SceneError(
             f"{root}: {len(missing)} of the {len(paths)} photos of {file.name} are missing, first "
-            f"{str(missing[0])!r}; add the files, or remove their frames"
+            f"{short(repr(str(missing[0])))}; add the files, or remove their frames"
         )
     lenses: dict[tuple, tuple[Lens, np.ndarray]] = {}  # a pinhole takes milliseconds to find
     views = []
@@ -145,7 +144,7 @@ def _views(file: Path, frames: Sequence[dict[str, Any]], downscale: int) -> list
                 lenses[key] = lens, intrinsics(lens) if is_pinhole(lens) else pinhole(lens)
             w2c = _w2c(frame.get("transform_matrix"))
         except (TypeError, ValueError, OverflowError) as error:
-            reason = " ".join(str(error).split())
+            reason = short(error)
             raise SceneError(f"{file}: frame {str(path)!r}: {reason}; export the transforms again") from None
         camera = _camera(photo, w2c, *lenses[key], divisor)
         lens = lenses[key][0]
@@ -179,7 +178,7 @@ def _camera(photo: Path, w2c: np.ndarray, lens: Lens, K: np.ndarray, divisor: in
     return Camera(w2c.astype(np.float32), (K * scale).astype(np.float32), width, height)
 
 
-def _lens(frame: dict[str, Any], photo: Path) -> Lens:
+def _lens(frame: Mapping[str, Any], photo: Path) -> Lens:
     """A frame's lens as COLMAP has it; raises ValueError. `photo` tells the size where the frame does not.
 
     k3 makes OPENCV COLMAP's FULL_OPENCV; k4 is for the fisheye only, since its meaning differs elsewhere.
@@ -211,7 +210,7 @@ def _lens(frame: dict[str, Any], photo: Path) -> Lens:
     return Lens("OPENCV", (*params, k1, k2, p1, p2), width, height)
 
 
-def _focal(frame: dict[str, Any], key: str, angle: str, side: int) -> float | None:
+def _focal(frame: Mapping[str, Any], key: str, angle: str, side: int) -> float | None:
     """A focal length in pixels: itself, or from the angle of view in radians; None with neither."""
     if frame.get(key) is not None:
         focal = _number(frame, key)
@@ -225,7 +224,7 @@ def _focal(frame: dict[str, Any], key: str, angle: str, side: int) -> float | No
     return float(focal)
 
 
-def _number(frame: dict[str, Any], key: str, default: float | None = None) -> float:
+def _number(frame: Mapping[str, Any], key: str, default: float | None = None) -> float:
     value = frame.get(key)
     value = default if value is None else value
     if value is None:
@@ -261,7 +260,7 @@ def _w2c(matrix: Any) -> Float64[np.ndarray, "4 4"]:
 
 
 def _listed_split(
-    file: Path, content: dict[str, Any], frames: Sequence[dict[str, Any]], views: list[View]
+    file: Path, content: dict[str, Any], frames: Sequence[Mapping[str, Any]], views: list[View]
 ) -> tuple[list[View], frozenset[str] | None]:
     """The views that the file's lists keep, and the names of the test views; None without lists."""
     kinds = [kind for kind in ("train", "test", "val") if content.get(f"{kind}_filenames") is not None]
@@ -275,7 +274,7 @@ def _listed_split(
         listed = [_inside(file, f"{kind}_filenames", p) for p in (listed if isinstance(listed, list) else [])]
         unknown = [path for path in listed if path not in name_of]
         if not listed or unknown:
-            first = f", first {str(unknown[0])!r}" if unknown else ""
+            first = f", first {short(repr(str(unknown[0])))}" if unknown else ""
             raise SceneError(
                 f"{file}: {len(unknown)} of {len(listed)} names in {kind}_filenames are of no frame{first}; "
                 "list the file_path of frames, or leave the list out"

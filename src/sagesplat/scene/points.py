@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from scipy.spatial import KDTree
 
 from sagesplat import geometry
-from sagesplat.errors import SceneError
+from sagesplat.errors import SceneError, short
 from sagesplat.ply_header import PlyHeader, read_header
 from sagesplat.scene.images import load_photo
 from sagesplat.scene.scene import Points, View
@@ -44,7 +44,9 @@ def read_points(path: Path) -> Points:
             f"{path}: no such file; add it, or take ply_file_path out to start from random points"
         ) from None
     except (OSError, ValueError, OverflowError) as error:
-        raise SceneError(f"{path}: not readable as a PLY file ({error}); export the points again") from None
+        raise SceneError(
+            f"{path}: not readable as a PLY file ({short(error)}); export the points again"
+        ) from None
     with np.errstate(over="ignore"):  # a double too large for float32 is then reported
         xyz = np.stack([table[axis] for axis in "xyz"], axis=1).astype(np.float32)
         if bad := int(np.count_nonzero(~np.isfinite(xyz).all(axis=1))):
@@ -67,11 +69,13 @@ def _read_vertices(path: Path, file: BinaryIO, header: PlyHeader) -> dict[str, n
     if header.order:
         table = np.fromfile(file, row, count)
         return {name: table[name] for name in types}
-    with warnings.catch_warnings(action="ignore"):  # of a file without numbers; its shape tells
-        values = np.loadtxt(file, comments=None, max_rows=count, ndmin=2, encoding="latin1")
-    if values.shape != (count, len(types)):
-        raise ValueError(f"{count} points of {len(types)} values promised, but there are {values.shape}")
-    return dict(zip(types, values.T, strict=True))
+    # Told the columns, numpy allocates no more of them than there are, however long the first line is.
+    columns = np.dtype([(name, float) for name in types])
+    with warnings.catch_warnings(action="ignore"):  # of a file without numbers; the count tells
+        table = np.loadtxt(file, columns, comments=None, max_rows=count, ndmin=1, encoding="latin1")
+    if len(table) != count:
+        raise ValueError(f"{count} points of {len(types)} values promised, but there are {len(table)}")
+    return {name: table[name] for name in types}
 
 
 def random_points(

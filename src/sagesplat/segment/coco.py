@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from sagesplat.errors import LabelError, RunError
+from sagesplat.errors import LabelError, RunError, short
 from sagesplat.files import read_json
 
 _ROWS = [
@@ -53,16 +53,20 @@ def read_panoptic(folder: Path) -> Panoptic | None:
         names = {int(c["id"]): str(c["name"]) for c in content.get("categories", [])} or NAMES
         for annotation in content["annotations"]:
             file = Path(annotation["file_name"])
+            if file.is_absolute() or ".." in file.parts:
+                raise ValueError(f"{str(file)!r} is outside the folder")
             key = str(file.with_suffix(""))
             pngs[key] = (beside if beside.is_dir() else folder) / file
             segments[key] = {int(s["id"]): int(s["category_id"]) for s in annotation["segments_info"]}
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise LabelError(
-            f"{path}: not in COCO's panoptic format ({error!r}); export the annotations again"
+            f"{path}: not in COCO's panoptic format ({short(repr(error))}); export the annotations again"
         ) from None
     if any(not 0 <= segment < 2**24 for of_image in segments.values() for segment in of_image):
         raise LabelError(f"{path}: segment ids beyond R + 256 G + 65536 B; export the annotations again")
     unnamed = sorted({c for of_image in segments.values() for c in of_image.values()} - set(names))
     if unnamed:
-        raise LabelError(f'{path}: categories {unnamed[:5]} have no name; add them to its "categories"')
+        raise LabelError(
+            f'{path}: categories {short(unnamed[:5])} have no name; add them to its "categories"'
+        )
     return Panoptic(names, pngs, segments)

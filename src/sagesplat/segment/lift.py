@@ -9,8 +9,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32, Int16, Int32, Int64
 
-from sagesplat.errors import LabelError
+from sagesplat.errors import LabelError, short
 from sagesplat.files import atomic_path
+from sagesplat.npz import Npz
 from sagesplat.scene.scene import Camera, Scene
 from sagesplat.segment.masks import UNLABELLED, Masks
 
@@ -46,12 +47,12 @@ class LiftedLabels:
         """Read labels.npz; LabelError where it is missing, damaged or not of `num_points` points."""
         types = {"label_ids": np.int16, "num_votes": np.int32, "num_agreeing": np.int32}
         try:
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+            with Npz(path) as stored:
                 columns = {name: stored[name].astype(dtype, casting="safe") for name, dtype in types.items()}
         except FileNotFoundError:
             raise LabelError(f"{path}: no such file; lift the labels first") from None
-        except Exception as error:  # zipfile and numpy raise errors of many kinds for damaged files
-            raise LabelError(f"{path}: not the labels of points ({error}); lift them again") from None
+        except (OSError, KeyError, TypeError, ValueError) as error:
+            raise LabelError(f"{path}: not the labels of points ({short(error)}); lift them again") from None
         shapes = {column.shape for column in columns.values()}
         if shapes != {(num_points,)}:
             raise LabelError(

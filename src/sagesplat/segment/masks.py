@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Int16, Int32
 from PIL import Image
 
-from sagesplat.errors import LabelError, RunError
+from sagesplat.errors import LabelError, RunError, short
 from sagesplat.files import atomic_path, read_json, write_json
 from sagesplat.scene.scene import Scene, View
 from sagesplat.scene.undistort import undistort
@@ -22,6 +22,7 @@ UNLABELLED_NAME = "unlabelled"
 UNLABELLED_COLOR = (128, 128, 128)
 MAX_LABEL_ID = np.iinfo(np.int16).max
 _UNKNOWN = -2  # never leaves this file
+_DEFLATE = 1032  # times its size is all that a deflate stream can hold
 VOID_8, VOID_16 = 255, 65535  # what unlabelled pixels hold in 8- and 16-bit files, unless stated otherwise
 
 
@@ -123,7 +124,7 @@ def write_mask(path: Path, label_ids: Int16[np.ndarray, "H W"], taxonomy: Taxono
     small = max(taxonomy.names, default=0) < VOID_8
     dtype, void = (np.uint8, VOID_8) if small else (np.uint16, VOID_16)
     pixels = np.where(label_ids == UNLABELLED, void, label_ids).astype(dtype)
-    with atomic_path(path) as temporary:
+    with atomic_path(path, sync=False) as temporary:  # of many: the stage syncs them together
         Image.fromarray(pixels).save(temporary, format="PNG")
 
 
@@ -232,11 +233,11 @@ def _read_labels(path: Path) -> tuple[Taxonomy, int | None]:
         names: dict[int, Any] = {int(label_id): name for label_id, name in content["labels"].items()}
     except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise LabelError(
-            f'{path}: not of the form {{"unlabelled": 255, "labels": {{"184": "tree-merged"}}}} ({error!r}); '
-            "rewrite it so"
+            f'{path}: not of the form {{"unlabelled": 255, "labels": {{"184": "tree-merged"}}}} '
+            f"({short(repr(error))}); rewrite it so"
         ) from None
     if unlabelled is not None and not 0 <= unlabelled <= VOID_16:
-        raise LabelError(f'{path}: "unlabelled" is {unlabelled}; give a pixel value, 0 ... {VOID_16}')
+        raise LabelError(f'{path}: "unlabelled" is {short(unlabelled)}; give a pixel value, 0 ... {VOID_16}')
     if unlabelled in names:
         raise LabelError(f'{path}: {unlabelled} is "unlabelled" and has a name too; remove one of them')
     return taxonomy_of(names, path), unlabelled
@@ -246,14 +247,16 @@ def taxonomy_of(names: dict[int, Any], path: Path) -> Taxonomy:
     """A taxonomy whose ids fit and whose names are distinct: results are listed by name."""
     wrong = [label_id for label_id in names if not 0 <= label_id <= MAX_LABEL_ID]
     if wrong:
-        raise LabelError(f"{path}: label ids {wrong[:5]} are outside 0 ... {MAX_LABEL_ID}; renumber them")
+        raise LabelError(
+            f"{path}: label ids {short(wrong[:5])} are outside 0 ... {MAX_LABEL_ID}; renumber them"
+        )
     if not names:
         raise LabelError(f"{path}: names no label; list the ids of the label images")
     seen = {UNLABELLED_NAME}
     for label_id, name in names.items():
         if not isinstance(name, str) or not name.strip() or name in seen:
             raise LabelError(
-                f"{path}: label {label_id} is named {name!r}; give each id a name of its own "
+                f"{path}: label {label_id} is named {short(repr(name))}; give each id a name of its own "
                 f'(unlabelled pixels: "{UNLABELLED_NAME}": {label_id} beside "labels")'
             )
         seen.add(name)
@@ -261,20 +264,25 @@ def taxonomy_of(names: dict[int, Any], path: Path) -> Taxonomy:
 
 
 def _read_png(path: Path, segments: bool = False) -> Int32[np.ndarray, "h w"]:
-    """The ids in a PNG: grey values or palette indices, or R + 256 G + 65536 B with `segments`."""
+    """The ids in a PNG: grey values or palette indices, or R + 256 G + 65536 B with `segments`.
+
+    Memory: up to 16 bytes for each pixel, which are no more than a file of this size can hold.
+    """
     try:
         with Image.open(path, formats=["PNG"]) as image:
-            mode, pixels = image.mode, np.asarray(image).astype(np.int32)
+            mode, bits = image.mode, 24 if segments else 1
+            if image.width * image.height * bits > 8 * _DEFLATE * path.stat().st_size:
+                raise ValueError(f"{image.width} x {image.height} pixels promised, more than fit")
+            fits = mode in (("RGB", "RGBA") if segments else ("1", "L", "P", "I;16", "I"))
+            pixels = np.asarray(image).astype(np.int32) if fits else np.zeros((0, 0), np.int32)
     except FileNotFoundError:
         raise LabelError(f"{path}: no such file; make the masks again") from None
     except Exception as error:  # Pillow raises errors of many kinds for damaged files
-        raise LabelError(f"{path}: not a readable PNG ({error}); export it again") from None
-    if segments and mode in ("RGB", "RGBA"):
-        return pixels[..., 0] + 256 * pixels[..., 1] + 65536 * pixels[..., 2]
-    if segments or mode not in ("1", "L", "P", "I;16", "I"):
+        raise LabelError(f"{path}: not a readable PNG ({short(error)}); export it again") from None
+    if not fits:
         wanted = "an RGB image of segments" if segments else "one channel of 8- or 16-bit ids"
         raise LabelError(f"{path}: a PNG of mode {mode} where {wanted} is needed; convert it")
-    return pixels
+    return pixels[..., 0] + 256 * pixels[..., 1] + 65536 * pixels[..., 2] if segments else pixels
 
 
 def _translate(
@@ -284,8 +292,9 @@ def _translate(
     table = np.full(max(ids) + 2, _UNKNOWN, np.int16)  # its last entry is for all larger values
     table[list(ids)] = list(ids.values())
     label_ids = table[np.minimum(raw, len(table) - 1)]
-    unknown = np.unique(raw[label_ids == _UNKNOWN])
+    unknown = raw[label_ids == _UNKNOWN]
     if len(unknown):
+        unknown = np.unique(unknown[:10_000])  # of a large image some will do
         listed = ", ".join(map(str, unknown[:5])) + (", ..." if len(unknown) > 5 else "")
         raise LabelError(f"{path}: unknown ids {listed}; {cure}")
     return label_ids

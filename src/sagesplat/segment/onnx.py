@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float32, Int16, UInt8
 from PIL import Image
 
-from sagesplat.errors import BackendUnavailable, LabelError, RunError
+from sagesplat.errors import BackendUnavailable, LabelError, RunError, short
 from sagesplat.files import read_json
 from sagesplat.segment import coco
 from sagesplat.segment.masks import UNLABELLED, Taxonomy, taxonomy_of
@@ -46,11 +46,12 @@ def read_classes(path: Path) -> Classes:
         classes, ids = content["classes"], _categories(content, path)
         found = [ids[name] for name in classes]
         label_ids = [UNLABELLED if i is None else int(i) for i in found]
-        mean, std = (np.broadcast_to(np.float32(content.get(key, 0.5)), 3) for key in ("mean", "std"))
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        with np.errstate(over="ignore"):  # infinite then, and refused below
+            mean, std = (np.broadcast_to(np.float32(content.get(key, 0.5)), 3) for key in ("mean", "std"))
+    except (AttributeError, LookupError, TypeError, ValueError, OverflowError) as error:
         raise LabelError(
-            f'{path}: not of the form {{"classes": ["sky"], "coco_panoptic": {{"sky": 187}}}} ({error!r}); '
-            "list each class with its category id or null"
+            f'{path}: not of the form {{"classes": ["sky"], "coco_panoptic": {{"sky": 187}}}} '
+            f"({short(repr(error))}); list each class with its category id or null"
         ) from None
     if not (np.isfinite([mean, std]).all() and (std > 0).all()):
         raise LabelError(f"{path}: mean {mean.tolist()}, std {std.tolist()}; give numbers, std above 0")
@@ -68,7 +69,9 @@ def _categories(content: dict[str, Any], path: Path) -> dict[str, int | None]:
 
     vocabulary, classes = content["vocabulary"], content["classes"]
     if vocabulary not in SOURCES:
-        raise LabelError(f'{path}: "vocabulary" is {vocabulary!r}; take one of {", ".join(SOURCES)}')
+        raise LabelError(
+            f'{path}: "vocabulary" is {short(repr(vocabulary))}; take one of {", ".join(SOURCES)}'
+        )
     return dict(zip(classes, to_coco(classes, vocabulary), strict=True)) | content.get("coco_panoptic", {})
 
 

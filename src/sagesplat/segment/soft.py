@@ -6,8 +6,9 @@ import numpy as np
 from jaxtyping import Float32, Int16
 from PIL import Image
 
-from sagesplat.errors import LabelError
+from sagesplat.errors import LabelError, short
 from sagesplat.files import atomic_path
+from sagesplat.npz import Npz
 from sagesplat.scene.scene import View
 from sagesplat.segment.masks import UNLABELLED, mask_path
 
@@ -47,15 +48,16 @@ def write_soft(
 def read_soft(path: Path) -> tuple[Int16[np.ndarray, "K h w"], Float32[np.ndarray, "K h w"]]:
     """Categories and their probabilities, 0 ... 1, the likeliest first; -1 with 0 where there are fewer.
 
-    The image covers the whole photo, at a resolution of its own. Raises LabelError.
+    The image covers the whole photo, at a resolution of its own. Raises LabelError. Memory: up to eight times
+    what the file holds unpacked, and that is at most 1032 times its size.
     """
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+        with Npz(path, packed=True) as stored:
             ids, levels = stored["ids"], stored["probabilities"]
     except FileNotFoundError:
         raise LabelError(f"{path}: no such file; segment the photos again") from None
-    except Exception as error:  # zipfile and numpy raise errors of many kinds for damaged files
-        raise LabelError(f"{path}: not the probabilities of a view ({error}); segment again") from None
+    except (OSError, KeyError, ValueError) as error:
+        raise LabelError(f"{path}: not the probabilities of a view ({short(error)}); segment again") from None
     if ids.ndim != 3 or ids.shape != levels.shape or (ids.dtype, levels.dtype) != (np.int16, np.uint8):
         raise LabelError(
             f"{path}: not the probabilities of a view ({ids.shape}, {levels.shape}); segment again"

@@ -1,23 +1,52 @@
-"""Checkpoints: the whole training state in one file, so that a killed run goes on where it was."""
+"""Checkpoints: the whole training state in one file, so that a killed run goes on where it was.
+
+The one before is kept beside it (checkpoint-1.npz) for a file that got damaged.
+"""
 
 import json
+import os
+import shutil
 import zipfile
+import zlib
+from collections.abc import Mapping
 from pathlib import Path
-from tokenize import TokenError
+from typing import Any
 
 import numpy as np
 import torch
 
-from sagesplat.errors import RunError
-from sagesplat.files import atomic_path
-from sagesplat.gaussians import PARAMETERS, Gaussians
+from sagesplat.errors import RunError, short
+from sagesplat.files import atomic_path, sync_files
+from sagesplat.gaussians import PARAMETERS, Gaussians, checked
+from sagesplat.npz import Npz
 from sagesplat.train.state import TrainState
 
-_VERSION = 1
+_VERSION = 2
+# what files raise that are cut off or changed
+_DAMAGED = (OSError, KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError)
+
+
+class _Damaged(RunError):
+    """A checkpoint whose content is not what was written."""
+
+
+def previous(path: Path) -> Path:
+    """Where the checkpoint before that at `path` is kept."""
+    return path.with_name(f"{path.stem}-1{path.suffix}")
+
+
+def remove_checkpoints(path: Path) -> None:
+    """Remove a checkpoint and the one before it."""
+    for each in (path, previous(path)):
+        each.unlink(missing_ok=True)
 
 
 def write_checkpoint(path: Path, state: TrainState, settings: str) -> None:
-    """Save a state; `settings` says what run it belongs to and is checked on reading."""
+    """Save a state; `settings` says what run it belongs to and is checked on reading.
+
+    The file at `path` becomes the previous one, once the new one is on the disk and reads back as it was
+    written; at no time is there none. RunError where the disk is full: then both stay as they were.
+    """
     state = state.to(torch.device("cpu"))
     g = state.gaussians
     arrays = {name: p.numpy() for name, p in g.parameters().items()}
@@ -25,6 +54,8 @@ def write_checkpoint(path: Path, state: TrainState, settings: str) -> None:
     arrays |= {f"second/{name}": state.second[name].numpy() for name in PARAMETERS}
     if state.place is not None:
         arrays["place"] = state.place.numpy()
+    arrays |= {"label_ids": g.label_ids.numpy(), "grad_sum": state.grad_sum.numpy()}
+    arrays["grad_count"] = state.grad_count.numpy()
     meta = {
         "version": _VERSION,
         "settings": settings,
@@ -35,42 +66,115 @@ def write_checkpoint(path: Path, state: TrainState, settings: str) -> None:
         "queue": state.queue,
         "rng": state.rng.bit_generator.state,
     }
-    with atomic_path(path) as temporary:
-        np.savez(
-            temporary,
-            allow_pickle=False,
-            **arrays,
-            label_ids=g.label_ids.numpy(),
-            grad_sum=state.grad_sum.numpy(),
-            grad_count=state.grad_count.numpy(),
-            meta=np.array(json.dumps(meta)),
-        )
+    meta["crc32"] = _checksum(meta, arrays)
+    with atomic_path(path, nbytes=sum(a.nbytes for a in arrays.values())) as temporary:
+        np.savez(temporary, allow_pickle=False, **arrays, meta=np.array(json.dumps(meta)))
+        _verify(temporary, path)
+        _keep(path)
+
+
+def _checksum(meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> int:
+    """CRC-32 of all that a checkpoint holds, names and shapes included."""
+    crc = zlib.crc32(json.dumps({k: v for k, v in meta.items() if k != "crc32"}, sort_keys=True).encode())
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        crc = zlib.crc32(f"{name} {array.dtype.str} {array.shape}".encode(), crc)
+        crc = zlib.crc32(array.reshape(-1).view(np.uint8), crc)  # type: ignore[arg-type]
+    return crc
+
+
+def _verify(written: Path, path: Path) -> None:
+    """Read a file back from the disk and compare it with the checksums of what was handed over."""
+    sync_files([written])
+    with written.open("rb") as file:
+        if hasattr(os, "posix_fadvise"):  # else it would come from memory
+            os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+        with zipfile.ZipFile(file) as archive:
+            broken = archive.testzip()  # in pieces: it takes no memory
+    if broken is not None:
+        raise RunError(f"{path}: {broken} does not read back as written; check the disk, then run again")
+
+
+def _keep(path: Path) -> None:
+    """Make the checkpoint at `path` the previous one, without taking it away from there."""
+    kept = previous(path)
+    if not path.exists():
+        kept.unlink(missing_ok=True)  # of another training
+        return
+    with atomic_path(kept, sync=False) as temporary:
+        temporary.unlink()
+        try:
+            os.link(path, temporary)
+        except OSError:  # some disks have no links
+            shutil.copy2(path, temporary)
+
+
+def latest_checkpoint(path: Path, settings: str) -> tuple[TrainState, str]:
+    """The state at `path`, or the previous one where that file is damaged, and what was wrong ("": nothing).
+
+    RunError where both are damaged, or for other settings.
+    """
+    try:
+        return read_checkpoint(path, settings), ""
+    except _Damaged as error:
+        damage, kept = str(error).partition("; ")[0], previous(path)
+        if not kept.exists():
+            raise
+        try:
+            return read_checkpoint(kept, settings), damage
+        except _Damaged as second:
+            reason = str(second).partition("; ")[0]
+            raise RunError(
+                f"{damage}, and {reason}; delete both (or add --force) to train from the start"
+            ) from None
 
 
 def read_checkpoint(path: Path, settings: str) -> TrainState:
     """The state that `write_checkpoint` saved for the same settings; `RunError` for anything else."""
     cure = f"delete {path.name} (or add --force) to train from the start"
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: torch.from_numpy(file[name]) for name in file.files if name != "meta"}
+        with Npz(path) as file:
+            found = {name: file[name] for name in file.names if name != "meta"}
             meta = json.loads(str(file["meta"]))
-    except (
-        OSError, EOFError, ValueError, KeyError, RuntimeError, TokenError, zipfile.BadZipFile
-    ) as error:  # fmt: skip
-        raise RunError(f"{path}: not a readable checkpoint ({error}); {cure}") from None
-    if meta.get("version") != _VERSION:
+            version = meta.get("version")
+            intact = version != _VERSION or meta["crc32"] == _checksum(meta, found)
+    except _DAMAGED as error:
+        raise _Damaged(f"{path}: not a readable checkpoint ({short(error)}); {cure}") from None
+    if version != _VERSION:
         raise RunError(
-            f"{path}: checkpoint version {meta.get('version')}, this sagesplat reads {_VERSION}; {cure}"
+            f"{path}: checkpoint version {short(version)}, this sagesplat reads {_VERSION}; {cure}"
         )
-    if meta["settings"] != settings:
+    for name, array in found.items():
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise _Damaged(f"{path}: {short(name)} holds NaN or Inf; {cure}")
+    if not intact:
+        raise _Damaged(f"{path}: damaged, its content does not match its checksum; {cure}")
+    if meta.get("settings") != settings:
         raise RunError(f"{path}: made with other settings or inputs; {cure}")
-    for name, tensor in arrays.items():
-        if tensor.is_floating_point() and not torch.isfinite(tensor).all():
-            raise RunError(f"{path}: {name} holds NaN or Inf; {cure}")
+    try:
+        return _state(found, meta)
+    except _DAMAGED as error:  # a checksum keeps nobody from writing nonsense
+        raise _Damaged(f"{path}: not a whole checkpoint ({short(repr(error))}); {cure}") from None
+
+
+def _state(found: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> TrainState:
+    """The state of a file's content; one of `_DAMAGED` where its parts do not belong together."""
+    arrays = {name: torch.from_numpy(array) for name, array in found.items()}
     rng = np.random.default_rng()
     rng.bit_generator.state = meta["rng"]
+    gaussians = checked(Gaussians(**{n: arrays[n] for n in PARAMETERS}, label_ids=arrays["label_ids"]))
+    shapes = {
+        f"{kind}/{n}": p.shape for kind in ("first", "second") for n, p in gaussians.parameters().items()
+    }
+    shapes |= dict.fromkeys(("grad_sum", "grad_count"), gaussians.logit_opacities.shape)
+    shapes |= {"place": gaussians.logit_opacities.shape} if "place" in arrays else {}
+    if wrong := [n for n, s in shapes.items() if arrays[n].shape != s or not arrays[n].is_floating_point()]:
+        raise ValueError(f"shape of {wrong[0]}")
+    numbers = [meta["step"], meta["last_reset"] + 1, *meta["queue"]]
+    if not all(type(number) is int and 0 <= number < 2**31 for number in numbers):
+        raise ValueError("steps or views that are none")
     return TrainState(
-        gaussians=Gaussians(**{n: arrays[n] for n in PARAMETERS}, label_ids=arrays["label_ids"]),
+        gaussians=gaussians,
         first={n: arrays[f"first/{n}"] for n in PARAMETERS},
         second={n: arrays[f"second/{n}"] for n in PARAMETERS},
         grad_sum=arrays["grad_sum"],

@@ -17,14 +17,14 @@ from sagesplat.raster import Backend, device_of
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Points, Scene
 from sagesplat.segment.masks import Masks
-from sagesplat.train.checkpoint import read_checkpoint, write_checkpoint
+from sagesplat.train.checkpoint import latest_checkpoint, write_checkpoint
 from sagesplat.train.feed import Feed
 from sagesplat.train.freeze import Work, trainable_rows
 from sagesplat.train.importance import importance
 from sagesplat.train.pace import Pace
 from sagesplat.train.state import initial_state
 from sagesplat.train.stepper import Stepper
-from sagesplat.train.trainer import LOOK_EVERY, Event, finite, named_failures, train
+from sagesplat.train.trainer import LOOK_EVERY, Event, Resumed, finite, named_failures, train
 from sagesplat.train.votes import label_weights, winners
 
 CLEAR = 0.8  # share of its blending weight that a Gaussian needs in one category, else it straddles a border
@@ -156,7 +156,7 @@ def nest(
     backend: Backend = "auto",
     checkpoint: Path | None = None,
     settings: str = "",
-) -> Iterator[NestStep | Nested]:
+) -> Iterator[NestStep | Resumed | Nested]:
     """Train so that every composition of prefixes looks right; the last event is the result.
 
     Each step draws a prefix per category, log-uniform between `config.drawn_from` and all, or everything
@@ -173,7 +173,9 @@ def nest(
     state = initial_state(nested.gaussians.select(torch.from_numpy(near)), seed)
     state.place = places(labels, ranks, -near)
     if checkpoint and checkpoint.exists():
-        state = read_checkpoint(checkpoint, settings)
+        state, damage = latest_checkpoint(checkpoint, settings)
+        if damage:
+            yield Resumed(state.step, damage)
     state = state.to(device)
     categories, column = np.unique(labels, return_inverse=True)
     column = torch.from_numpy(column).to(device)

@@ -11,18 +11,18 @@ import torch
 from torch import Tensor
 
 from sagesplat.config import TrainConfig
-from sagesplat.errors import OutOfMemory, RunError
+from sagesplat.errors import DataError, OutOfMemory, RunError
 from sagesplat.gaussians import Gaussians
 from sagesplat.raster import Backend, device_of
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.segment.masks import Masks
 from sagesplat.train import densify, mcmc
-from sagesplat.train.checkpoint import read_checkpoint, write_checkpoint
+from sagesplat.train.checkpoint import latest_checkpoint, previous, write_checkpoint
 from sagesplat.train.feed import Feed
 from sagesplat.train.freeze import Work, label_quality, measured_views, trainable_rows
 from sagesplat.train.group import ALONE, Group
-from sagesplat.train.levels import write_level
+from sagesplat.train.levels import check_level, write_level
 from sagesplat.train.pace import pace
 from sagesplat.train.rest import Rest
 from sagesplat.train.state import MCMC_OPACITY, MCMC_SCALE, TrainState, from_points, initial_state
@@ -38,6 +38,7 @@ class Resumed:
     """Training goes on from a checkpoint."""
 
     step: int
+    damage: str = ""  # what was wrong with the newest one, if this is the one before
 
 
 @dataclass(frozen=True)
@@ -164,10 +165,13 @@ def _train(
     state.sort()
     checkpoint = folder / CHECKPOINT if folder else None
     if checkpoint and checkpoint.exists():
-        state = read_checkpoint(checkpoint, settings).to(device)
+        state, damage = latest_checkpoint(checkpoint, settings)
+        state = state.to(device)
         if not group.leads:  # the first has what all had seen
             state.clear_statistics()
-        yield Resumed(state.step), state
+        else:
+            _check_levels(checkpoint, state.step)
+        yield Resumed(state.step, damage), state
     folder = folder if group.leads else None
     work = Work(scene, masks, frozenset(state.frozen), device)
     rest = Rest(config.rest_share) if config.rest_share else None
@@ -216,7 +220,23 @@ def _train(
             group.collect(state.grad_sum, state.grad_count)
         if folder and records:
             write_checkpoint(folder / CHECKPOINT, state, settings)
+    if folder:
+        previous(folder / CHECKPOINT).unlink(missing_ok=True)  # nobody goes on from here
     yield Trained(state.gaussians.to("cpu"), state.step, state.frozen), state
+
+
+def _check_levels(checkpoint: Path, step: int) -> None:
+    """RunError where a level up to a step is damaged: training goes on after it and records it no more."""
+    for path in sorted((checkpoint.parent / "levels").glob("[0-9]*.npz")):
+        if int(path.stem) > step:
+            continue
+        try:
+            check_level(path)
+        except DataError as error:
+            reason = str(error).partition("; ")[0]
+            raise RunError(
+                f"{reason}; delete it to go on without that level, or {checkpoint} to train from the start"
+            ) from None
 
 
 def _refine(

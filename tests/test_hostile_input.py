@@ -1,0 +1,217 @@
+"""Files that nobody should trust: no crash, no hang, no more memory than the file's size allows.
+
+What a reader may take is stated in benchmarks/hostile_readers.py; `python -m benchmarks fuzz` tries more.
+"""
+
+import io
+import re
+import struct
+import time
+import tracemalloc
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from random import Random
+
+import numpy as np
+import pytest
+
+from benchmarks.fuzz import CORPUS
+from benchmarks.hostile import MIB, Finding, Reader, check
+from benchmarks.hostile_readers import READERS
+from benchmarks.mutate import mutate
+from sagesplat.errors import DataError, SageError
+from sagesplat.npz import Npz
+from sagesplat.output.chunks import Chunk, totals
+
+ROOT = Path(__file__).parents[1]
+BUDGET = 0.3  # seconds for each reader
+ALL = pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
+ACCEPTED = {"observations/overflow.csv"}  # infinite numbers, which are values
+Prepare = Callable[[Reader], tuple[Path, list[bytes]]]
+
+
+@pytest.fixture(scope="module")
+def prepare(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Prepare]:
+    """The folder and the sound files of a reader, which are made once; it has read them once, too."""
+    known: dict[str, tuple[Path, list[bytes]]] = {}
+
+    def of(reader: Reader) -> tuple[Path, list[bytes]]:
+        if reader.name not in known:
+            folder = tmp_path_factory.mktemp(reader.name)
+            samples = reader.make(folder)
+            for content in samples:
+                reader.read(folder, content)
+            known[reader.name] = folder, samples
+        return known[reader.name]
+
+    return of  # type: ignore[return-value]
+
+
+@ALL
+def test_sound_files_are_read_within_the_bound(reader: Reader, prepare: Prepare):
+    folder, samples = prepare(reader)
+    assert samples
+    assert [check(reader, folder, content) for content in samples] == [None] * len(samples)
+
+
+@ALL
+def test_damaged_files_are_refused_in_one_line(reader: Reader, prepare: Prepare):
+    folder, samples = prepare(reader)
+    rng, end, found = Random(7), time.monotonic() + BUDGET, []
+    while time.monotonic() < end:
+        content = mutate(rng.choice(samples), samples, rng)
+        if (finding := check(reader, folder, content)) is not None:
+            found.append((finding.text, content))
+    assert not found
+
+
+@ALL
+def test_every_prefix_is_refused_or_read(reader: Reader, prepare: Prepare):
+    folder, samples = prepare(reader)
+    content = samples[0]
+    for size in range(0, len(content), max(1, len(content) // 12)):
+        assert check(reader, folder, content[:size]) is None, size
+
+
+@pytest.mark.parametrize(
+    "path", sorted(CORPUS.glob("*/*")), ids=lambda path: path.relative_to(CORPUS).as_posix()
+)
+def test_what_once_failed(path: Path, prepare: Prepare):
+    reader = next(reader for reader in READERS if reader.name == path.parent.name)
+    folder, _ = prepare(reader)
+    assert check(reader, folder, path.read_bytes()) is None
+    if path.relative_to(CORPUS).as_posix() not in ACCEPTED:
+        with pytest.raises(SageError):
+            reader.read(folder, path.read_bytes())
+
+
+def test_every_reader_has_a_corpus_or_none_of_its_files_failed():
+    assert {path.name for path in CORPUS.iterdir()} <= {reader.name for reader in READERS}
+    assert sum(path.stat().st_size for path in CORPUS.glob("*/*")) < MIB
+
+
+def finding_of(read: Callable[[Path, bytes], object], factor: int = 1) -> Finding | None:
+    reader = Reader("x", ".x", lambda _: [], read, factor, base=0)
+    return check(reader, Path(), b"12345678" * 512)
+
+
+def test_the_oracle_sees_what_it_is_for():
+    def fail(error: BaseException) -> Callable[[Path, bytes], object]:
+        def read(_: Path, content: bytes) -> None:
+            raise error
+
+        return read
+
+    assert finding_of(lambda _, content: len(content)) is None
+    assert finding_of(fail(DataError("x: wrong; do this")), 8) is None
+    assert "not one line" in (finding_of(fail(DataError("x\ny"))) or Finding("", "")).text
+    assert "not one line" in (finding_of(fail(DataError("x" * 9999))) or Finding("", "")).text
+    assert "printed" in (finding_of(fail(DataError("\ud800"))) or Finding("", "")).text
+    assert "KeyError" in (finding_of(fail(KeyError("x"))) or Finding("", "")).kind
+    assert (finding_of(lambda _, content: np.zeros(len(content))) or Finding("", "")).kind == "memory"
+    assert finding_of(lambda _, content: np.zeros(len(content)), 9) is None
+    assert (finding_of(lambda *_: np.float32(1) / np.float32(0)) or Finding("", "")).text.startswith(
+        "Runtime"
+    )
+
+
+def test_what_takes_too_long_is_ended(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("benchmarks.hostile.SECONDS", 0.2)
+    begin = time.monotonic()
+    finding = finding_of(lambda *_: time.sleep(20))
+    assert finding is not None
+    assert "Hang" in finding.kind
+    assert time.monotonic() - begin < 10
+
+
+def test_mutations_repeat_with_their_seed_and_stay_small():
+    content = b'{"a": [1, 2, {"b": null}], "c": "text"}'
+    assert mutate(content, [content], Random(3)) == mutate(content, [content], Random(3))
+    made = {mutate(content, [content], Random(seed)) for seed in range(300)}
+    assert len(made) > 200
+    assert max(map(len, made)) <= 20_000
+
+
+def archive(path: Path, arrays: dict[str, np.ndarray], compression: int = zipfile.ZIP_STORED) -> Path:
+    with zipfile.ZipFile(path, "w", compression) as file:
+        for name, array in arrays.items():
+            body = io.BytesIO()
+            np.lib.format.write_array(body, array)
+            file.writestr(f"{name}.npy", body.getvalue())
+    return path
+
+
+def test_arrays_come_back(tmp_path: Path):
+    arrays = {
+        "a": np.arange(6, dtype=np.float32).reshape(2, 3),
+        "t": np.array("text"),
+        "e": np.zeros((4, 0, 3)),
+    }
+    arrays["f"] = np.asfortranarray(arrays["a"])
+    for compression in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        path = archive(tmp_path / "a.npz", arrays, compression)
+        with Npz(path, packed=True) as file:
+            assert file.names == list(arrays)
+            for name, array in arrays.items():
+                np.testing.assert_array_equal(file[name], array)
+                assert file[name].shape == array.shape
+            with pytest.raises(KeyError):
+                file["x"]
+    with pytest.raises(FileNotFoundError):
+        Npz(tmp_path / "b.npz")
+
+
+def test_compressed_arrays_need_leave(tmp_path: Path):
+    path = archive(tmp_path / "a.npz", {"a": np.zeros(10_000)}, zipfile.ZIP_DEFLATED)
+    with pytest.raises(ValueError, match=r"'a\.npy' is compressed"):
+        Npz(path)
+    with Npz(path, packed=True) as file:
+        assert file["a"].shape == (10_000,)
+    with pytest.raises(ValueError, match="is compressed"):
+        Npz(archive(tmp_path / "b.npz", {"a": np.zeros(10_000)}, zipfile.ZIP_LZMA), packed=True)
+
+
+def test_members_that_overlap_are_refused(tmp_path: Path):
+    """Many entries of the directory on the same bytes would read more than the file holds."""
+    path = archive(tmp_path / "a.npz", {"a": np.zeros(5_000), "b": np.zeros(1)})
+    content = path.read_bytes()
+    at = content.index(b"PK\1\2")
+    (size,) = struct.unpack("<H", content[at + 28 : at + 30])
+    entry = content[at : at + 46 + size]
+    entries = b"".join(entry.replace(b"a.npy", b"%c.npy" % (97 + i)) for i in range(20))
+    end = struct.pack("<4sHHHHIIH", b"PK\5\6", 0, 0, 20, 20, len(entries), at, 0)
+    path.write_bytes(content[:at] + entries + end)
+    with pytest.raises(ValueError, match="larger than the file"):
+        Npz(path)
+
+
+def test_a_promise_of_an_array_is_not_allocated(tmp_path: Path):
+    path = archive(tmp_path / "a.npz", {"a": np.zeros(10)})
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b"(10,), ", b"(10**9,)"[:7]).replace(b"(10,)", b"(99,)"))
+    tracemalloc.start()
+    with Npz(path) as file, pytest.raises(ValueError, match="'a' is damaged"):
+        file["a"]
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < MIB
+
+
+def test_sums_of_chunks_that_the_run_does_not_have():
+    chunk = Chunk(2, 1, "a.spz", 3, 9, 9, "0" * 64)
+    assert totals([chunk], [2], 2, "count").tolist() == [[3, 3]]
+    for labels, levels in (([5], 2), ([2], 0)):
+        with pytest.raises(DataError, match=r"a\.spz: of category 2 and level 1"):
+            totals([chunk], labels, levels, "count")
+
+
+def test_nothing_unpickles():
+    """No pickle of anybody's: numpy and torch are told so at every call, and the module is not used."""
+    calls = {r"\bnp\.load\(": "allow_pickle=False", r"\btorch\.load\(": "weights_only=True"}
+    for path in (ROOT / "src").rglob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        assert not re.search(r"^\s*(import|from) (pickle|dill|joblib|shelve|marshal)\b", text, re.M), path
+        for call, wanted in calls.items():
+            for match in re.finditer(call, text):
+                assert wanted in text[match.start() : match.start() + 120], path
