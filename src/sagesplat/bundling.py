@@ -23,6 +23,7 @@ from sagesplat.errors import RunError
 from sagesplat.files import read_json, write_json
 from sagesplat.gaussians import Gaussians
 from sagesplat.job import Job, distances
+from sagesplat.npz import Npz
 from sagesplat.output import boxes
 from sagesplat.output.bearings import FLIP, camera_at, fov_y, position, quaternion
 from sagesplat.output.bundle import (
@@ -326,7 +327,7 @@ def _antialiased(job: Job) -> bool:
     except RunError:
         pass
     try:
-        with np.load(job.run.checkpoint, allow_pickle=False) as file:
+        with Npz(job.run.checkpoint) as file:
             return bool(json.loads(json.loads(str(file["meta"]))["settings"])["antialiased"])
-    except (OSError, ValueError, KeyError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return False  # no checkpoint yet, or one of another version

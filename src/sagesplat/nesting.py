@@ -10,7 +10,7 @@ from sagesplat.adapt.observe import Observations, as_unit, large_enough, measure
 from sagesplat.adapt.promise import ViewModel, among_neighbours, fit_promises, read_promises
 from sagesplat.adapt.promised import Costs, Quality, plan_for_view, quality_at
 from sagesplat.config import FitConfig, NestConfig, TrainConfig
-from sagesplat.events import Progress
+from sagesplat.events import Progress, Warned
 from sagesplat.gaussians import Gaussians
 from sagesplat.job import Job, distances, fusion, label_images, run_stage
 from sagesplat.metrics import ssim_map
@@ -19,10 +19,11 @@ from sagesplat.raster import Workspace
 from sagesplat.run_dir import file_hash, settings_of
 from sagesplat.segment.masks import UNLABELLED
 from sagesplat.train import nested
+from sagesplat.train.checkpoint import remove_checkpoints
 from sagesplat.train.freeze import VIEWS, spread
 from sagesplat.train.levels import read_level, write_set
 from sagesplat.train.nested import Nested, NestStep
-from sagesplat.train.trainer import Step, Trained
+from sagesplat.train.trainer import Resumed, Step, Trained
 
 _TARGETS = tuple(np.arange(0.5, 0.96, 0.05).round(2).tolist())  # SSIM of the compositions that are looked at
 
@@ -46,7 +47,7 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
         ordered = nested.order(full, job.scene, masks, config, seeds=seeds, antialiased=job.antialiased)
         belongs = json.dumps({**settings, "scene": file_hash(run.scene), "levels": file_hash(run.levels)})
         if job.force:
-            run.nest_checkpoint.unlink(missing_ok=True)
+            remove_checkpoints(run.nest_checkpoint)
         trained = ordered
         for event in nested.nest(
             ordered, job.scene, job.photos, train_config(job), config,
@@ -54,10 +55,13 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
         ):  # fmt: skip
             if isinstance(event, NestStep):
                 job.emit(Progress("nest", event.step, config.steps, f"loss {event.loss:.3f}"))
+            elif isinstance(event, Resumed):
+                before = f"the checkpoint before the newest: {event.damage}"
+                job.emit(Warned(f"going on from step {event.step}, {before}"))
             else:
                 trained = event
         lines = _write_ladder(job, trained, config)
-        run.nest_checkpoint.unlink(missing_ok=True)
+        remove_checkpoints(run.nest_checkpoint)
         return lines
 
     inputs = [run.scene, run.labels, run.levels, *fusion(run)]

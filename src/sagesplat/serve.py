@@ -182,8 +182,9 @@ def _open_run(path: Path, emit: Emit) -> "Job":
     if not run.scene.exists():
         raise RunError(f"{path}: neither a bundle (no {MANIFEST}) nor a run folder (no scene.json)")
     made = read_json(run.provenance("scene")) if run.provenance("scene").exists() else {}
-    if made.get("format") != FORMAT:
-        raise RunError(f"{path}: a run folder of format {made.get('format')}, this sagesplat reads {FORMAT}")
+    found = made.get("format") if isinstance(made, dict) else None
+    if found != FORMAT:
+        raise RunError(f"{path}: a run folder of format {found}, this sagesplat reads {FORMAT}")
     return Job(run, emit)
 
 

@@ -26,7 +26,7 @@ from sagesplat.adapt.promised import plan_for_scene, plan_for_view, plan_within
 from sagesplat.config import FitConfig, PlanConfig, PosesConfig, SceneConfig, TrainConfig
 from sagesplat.errors import RunError
 from sagesplat.events import Progress, RunDone, TableMade, Training, Warned
-from sagesplat.files import write_json
+from sagesplat.files import read_json, write_json
 from sagesplat.gaussians import Gaussians
 from sagesplat.job import Job, distances, fingerprint, fusion, label_images, run_stage
 from sagesplat.output import tables
@@ -38,7 +38,8 @@ from sagesplat.output.tables import Table
 from sagesplat.run_dir import RunDir, file_hash, settings_of
 from sagesplat.scene import load_scene
 from sagesplat.scene.detect import detect
-from sagesplat.train.checkpoint import read_checkpoint
+from sagesplat.train import memory
+from sagesplat.train.checkpoint import latest_checkpoint, remove_checkpoints
 from sagesplat.train.parallel import train_together
 from sagesplat.train.stepper import tune
 from sagesplat.train.trainer import LabelFrozen, LevelSaved, Resumed, Step, Trained, train
@@ -48,7 +49,7 @@ def open_scene(job: Job, path: Path, config: SceneConfig, poses: PosesConfig | N
     """Read a capture and write scene.json; of photos without poses, or a video, a capture is made first."""
     run = job.run
     ours = run.scene.exists() or run.capture.exists()
-    if run.path.exists() and not ours and any(run.path.iterdir()):
+    if run.path.exists() and not ours and any(not p.name.startswith(".") for p in run.path.iterdir()):
         raise RunError(f"{run.path}: not empty and not a run folder; choose a new folder")
     if detect(path) in ("photos", "video"):
         capture = run.capture / path.resolve().stem  # the scene will have that name
@@ -138,20 +139,23 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
     def make() -> list[str]:
         belongs = json.dumps({**settings, "scene": file_hash(run.scene), "labels": file_hash(run.labels)})
         if job.force and run.checkpoint.exists() and not _continues(run, belongs):
-            run.checkpoint.unlink()
+            remove_checkpoints(run.checkpoint)
         if not run.checkpoint.exists():
             shutil.rmtree(run.levels, ignore_errors=True)
+            run.cap.unlink(missing_ok=True)
+        fitted = _fit_memory(job, config)
         counts: dict[str, int] = {}
         start = partial(train_together, job.processes, job.threads) if job.processes > 1 else train
         events = start(
-            job.scene, job.photos, job.point_labels, config,
+            job.scene, job.photos, job.point_labels, fitted,
             masks=job.masks if config.freeze_at is not None else None,
             seed=seed, backend=job.backend, folder=run.path, settings=belongs,
         )  # fmt: skip
         for event in events:
             match event:
-                case Resumed(step):
-                    job.emit(Warned(f"going on from step {step}"))
+                case Resumed(step, damage):
+                    before = f", the checkpoint before the newest: {damage}" if damage else ""
+                    job.emit(Warned(f"going on from step {step}{before}"))
                 case Step(step, loss, num, _):
                     job.emit(Training(step, config.max_steps, loss, counts, num))
                 case LevelSaved():
@@ -169,9 +173,20 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
     run_stage(job, "train", settings, [run.scene, run.labels], [run.levels, run.checkpoint], make)
 
 
+def _fit_memory(job: Job, config: TrainConfig) -> TrainConfig:
+    """The settings with a cap that fits into memory; a training that goes on keeps the cap it began with."""
+    if job.backend == "cuda":  # Gaussians are not in the machine's memory
+        return config
+    began = int(read_json(job.run.cap)["cap"]) if job.run.cap.exists() else 0
+    fitted = memory.fit(job.scene, config, job.memory_limit, processes=job.processes, began=began)
+    job.emit(Warned(str(fitted)))
+    write_json(job.run.cap, {"cap": fitted.lowered})
+    return fitted.config
+
+
 def _continues(run: RunDir, belongs: str) -> bool:
     try:
-        read_checkpoint(run.checkpoint, belongs)
+        latest_checkpoint(run.checkpoint, belongs)
     except RunError:
         return False
     return True

@@ -1,7 +1,7 @@
 """What all commands share."""
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -35,6 +35,9 @@ class Machine:
     """Rasteriser; reference is float64 and slow."""
     processes: int = 1
     """Train in so many processes, one per GPU; a step then looks at a photo each."""
+    memory_limit: float = 0.0
+    """GiB that training may use: the cap of Gaussians lowers itself to it (0: nine tenths of what the machine
+    or its container has)."""
     force: bool = False
     """Make results again that were made with other settings."""
 
@@ -54,12 +57,16 @@ def open_job(run: Path, machine: Machine, ladder: LadderKind = "nested") -> Iter
     from sagesplat.run_dir import RunDir
 
     backend, threads = prepare(machine)
-    with Console() as console:
+    if not machine.memory_limit >= 0:
+        raise RunError(f"--memory-limit {machine.memory_limit} is impossible; choose GiB, such as 8")
+    limit = int(machine.memory_limit * 2**30)
+    with Console() as console, ExitStack() as locks:
         if backend == "cuda":
             console.out.print("[dim]· computing on the GPU[/]")
         yield Job(
-            RunDir(run, ladder), console, backend, threads, machine.force, machine.processes, machine.device
-        )
+            RunDir(run, ladder), console, backend, threads, machine.force, machine.processes, machine.device,
+            limit, locks,
+        )  # fmt: skip
 
 
 def prepare(machine: Machine) -> "tuple[Backend, int]":
