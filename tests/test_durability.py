@@ -490,6 +490,17 @@ def test_stages_are_refused_and_readers_are_not(finished: Path, capture: Path, t
     assert content(run) == content(finished)
 
 
+def test_too_little_memory_costs_no_levels(finished: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    job = Job(RunDir(run, "snapshots"), lambda event: None, force=True, memory_limit=2**20)
+    before = content(run / "levels")
+    with pytest.raises(RunError, match="raise --memory-limit"):
+        stages.train_levels(job, replace(CONFIG.train, max_steps=99), 0)
+    assert content(run / "levels") == before
+    assert arrays(job.run.checkpoint).keys() == arrays(finished / "checkpoint.npz").keys()
+
+
 def test_a_job_may_keep_its_lock_between_stages(finished: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     shutil.copytree(finished, run)

@@ -138,12 +138,12 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
 
     def make() -> list[str]:
         belongs = json.dumps({**settings, "scene": file_hash(run.scene), "labels": file_hash(run.labels)})
-        if job.force and run.checkpoint.exists() and not _continues(run, belongs):
+        goes_on = run.checkpoint.exists() and (not job.force or _continues(run, belongs))
+        fitted, cap = _fit_memory(job, config, goes_on)  # before anything is given up
+        if not goes_on:
             remove_checkpoints(run.checkpoint)
-        if not run.checkpoint.exists():
             shutil.rmtree(run.levels, ignore_errors=True)
-            run.cap.unlink(missing_ok=True)
-        fitted = _fit_memory(job, config)
+        write_json(run.cap, {"cap": cap})
         counts: dict[str, int] = {}
         start = partial(train_together, job.processes, job.threads) if job.processes > 1 else train
         events = start(
@@ -173,15 +173,17 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
     run_stage(job, "train", settings, [run.scene, run.labels], [run.levels, run.checkpoint], make)
 
 
-def _fit_memory(job: Job, config: TrainConfig) -> TrainConfig:
-    """The settings with a cap that fits into memory; a training that goes on keeps the cap it began with."""
+def _fit_memory(job: Job, config: TrainConfig, goes_on: bool) -> tuple[TrainConfig, int]:
+    """The settings with a cap that fits into memory, and that cap (0: none needed).
+
+    A training that goes on keeps the cap it began with.
+    """
     if job.backend == "cuda":  # Gaussians are not in the machine's memory
-        return config
-    began = int(read_json(job.run.cap)["cap"]) if job.run.cap.exists() else 0
+        return config, 0
+    began = int(read_json(job.run.cap)["cap"]) if goes_on and job.run.cap.exists() else 0
     fitted = memory.fit(job.scene, config, job.memory_limit, processes=job.processes, began=began)
     job.emit(Warned(str(fitted)))
-    write_json(job.run.cap, {"cap": fitted.lowered})
-    return fitted.config
+    return fitted.config, fitted.lowered
 
 
 def _continues(run: RunDir, belongs: str) -> bool:
