@@ -211,7 +211,9 @@ def test_a_live_bundle_follows_the_training(run: Path, tmp_path: Path, viewer: P
             assert label["boxes"]
     write_json(run / "provenance" / "train.json", {"settings": {"antialiased": True}})
     later[-1].touch()
+    (viewer / "index.html").write_text("<!doctype html>of a newer package")
     assert live_bundle(job, folder, viewer)  # rewritten: a training that began again
+    assert (folder / "index.html").read_bytes() == (viewer / "index.html").read_bytes()
     assert manifest_of(folder)["antialiased"]
     (folder / "manifest.json").unlink()
     assert live_bundle(job, folder, viewer)  # repaired

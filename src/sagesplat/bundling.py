@@ -2,7 +2,6 @@
 
 import io
 import json
-import math
 import shutil
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
@@ -34,11 +33,13 @@ from sagesplat.output.bundle import (
     Written,
     check_target,
     check_viewer,
+    has_viewer,
     start_of,
     write_bundle,
     write_documents,
 )
 from sagesplat.output.chunks import INDEX, read_chunks, read_index, write_chunks
+from sagesplat.output.pack import ASPECT, FOV_Y
 from sagesplat.raster import rasterize
 from sagesplat.run_dir import file_hash, settings_of
 from sagesplat.segment.masks import UNLABELLED
@@ -55,7 +56,7 @@ _GROUND |= {"path", "road", "sand", "sidewalk", "snow", "soil", "street", "terra
 _SUFFIXES = ("-merged", "-other", "-stuff")  # of COCO's panoptic names
 _FEW = boxes.FEW  # SfM points below which a category's Gaussians say where it is
 _OPAQUE = 0.1  # from which a Gaussian does
-_POSTER_SIZE, _POSTER_FOV = (640, 360), math.radians(60)  # the viewer's own field of view
+_POSTER_HEIGHT = 360  # px
 _LIVE = ".live.json"  # what a live bundle was made of
 
 
@@ -114,7 +115,8 @@ def bundle(
 def _poster(g: Gaussians, contents: Contents) -> bytes:
     """A JPEG of the first view: the scene is seen while the viewer and the first chunks are loading."""
     first = start_of(contents)
-    camera = camera_at(first["position"], first["quaternion"], _POSTER_FOV, *_POSTER_SIZE)
+    width = round(ASPECT * _POSTER_HEIGHT)
+    camera = camera_at(first["position"], first["quaternion"], FOV_Y, width, _POSTER_HEIGHT)
     with torch.no_grad():
         image = rasterize(g, camera, backend="cpu", antialiased=contents.antialiased).rgb
     pixels = (image.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
@@ -145,8 +147,8 @@ def live_bundle(job: Job, folder: Path, viewer: Path | None = None) -> bool:
         return False
     if not before:
         check_target(folder)
-    if not (folder / "index.html").exists():
-        viewer = viewer or package_viewer()
+    viewer = viewer or package_viewer()
+    if not has_viewer(folder, viewer):  # none yet, or an older package's
         check_viewer(viewer)
         shutil.copytree(viewer, folder, dirs_exist_ok=True)
     g = read_level(steps[-1])
