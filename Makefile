@@ -31,7 +31,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	  { echo "sagesplat needs Python 3.11 or newer: make PYTHON=python3.12 ..."; exit 2; }
 	@$(PYTHON) -m venv $(VENV) || $(PYTHON) -m virtualenv $(VENV) || \
 	  { echo "no venv module: apt install python3-venv, then make again"; exit 2; }
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,onnx,hf,poses,video,heic,view]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,onnx,hf,poses,video,heic,view,ray]'
 	touch $@
 
 # builds the viewer into the package; the tests check that what is committed is current

@@ -17,6 +17,7 @@ from sagesplat.adapt.observe import PERCENTILE, LabelImages, RenderedLabels, dis
 from sagesplat.config import FitConfig
 from sagesplat.errors import RunError, SageError
 from sagesplat.events import Emit, StageDone, StageSkipped, StageStarted, Warned
+from sagesplat.executor import LOCAL, Executor
 from sagesplat.files import named_full_disk, read_json, remove_temporary, sync_changed
 from sagesplat.lock import locked
 from sagesplat.lpips import Lpips, Net, load_lpips, weights_path
@@ -47,6 +48,12 @@ class Job:
     device: str = "auto"  # where networks compute
     memory_limit: int = 0  # bytes that training may use (0: what the machine has, but for a margin)
     locks: ExitStack | None = None  # keeps the run folder locked between stages (else within each)
+    executor: Executor = LOCAL  # of pieces that do not depend on each other
+
+    @property
+    def spec(self) -> "JobSpec":
+        """What another process needs to open the same job."""
+        return JobSpec(**{f.name: getattr(self, f.name) for f in fields(JobSpec)})
 
     @cached_property
     def scene(self) -> Scene:
@@ -111,6 +118,23 @@ class Job:
     def names(self) -> dict[int, str]:
         """Category names by id, the unlabelled one included."""
         return {**self.taxonomy.names, -1: self.taxonomy.name(-1)}
+
+
+@dataclass(frozen=True)
+class JobSpec:
+    """A job without what only one process has: what a task takes along (see `Job`)."""
+
+    run: RunDir
+    backend: Backend
+    threads: int
+    force: bool
+    processes: int
+    device: str
+    memory_limit: int
+
+    def open(self, emit: Emit) -> Job:
+        """The job, in this process."""
+        return Job(emit=emit, **{f.name: getattr(self, f.name) for f in fields(self)})
 
 
 def fusion(run: RunDir) -> list[Path]:
