@@ -1,11 +1,12 @@
 """The nested ladder beside its baselines: same data, same training views, same evaluation."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
@@ -19,9 +20,10 @@ from sagesplat.adapt.promised import Costs, Quality, plan_for_scene, plan_within
 from sagesplat.config import CompareConfig
 from sagesplat.errors import RunError
 from sagesplat.events import Progress, RunDone, TableMade
+from sagesplat.executor import Local
 from sagesplat.files import read_json, write_json
 from sagesplat.gaussians import Gaussians
-from sagesplat.job import Job, load_metrics, lpips_hashes, run_stage
+from sagesplat.job import Job, Stage, load_metrics, lpips_hashes, run_stage, run_stages, work
 from sagesplat.lpips import Lpips
 from sagesplat.metrics import ssim_map
 from sagesplat.output import compare_report as report
@@ -68,13 +70,13 @@ def compare(job: Job, config: CompareConfig, copy: Path | None = None) -> list[P
     run without a finished nested ladder or without test views, and for impossible settings.
     """
     _check(job, config)
-    folder, file = job.run.path / "compare", job.run.path / "compare" / report.FILE
+    folder, file = _folder(job), _folder(job) / report.FILE
     lpips = lpips_hashes(config.lpips)
     targets = list(config.targets) or sorted({*PAPER_TARGETS, *settings_of(job.run, "plan")["targets"]})
     settings = json.loads(json.dumps(asdict(config) | {"targets": targets, "lpips": lpips}))
     is_done(job.run, "compare", settings, [], [file], job.force)  # refused before hours of training
     snapshots = _snapshots(job)
-    trained = _pruned(job, config, folder) | _mcmc(job, config, folder)
+    trained = _trained(job, [*_pruned(job, config, folder), *_mcmc(job, config, folder)])
 
     def make() -> list[str]:
         costs, quality = nesting.promised_quality(job)
@@ -108,6 +110,10 @@ def compare(job: Job, config: CompareConfig, copy: Path | None = None) -> list[P
         write_json(copy, read_json(file))
     job.emit(RunDone(folder / report.PAGE))
     return points
+
+
+def _folder(job: Job) -> Path:
+    return job.run.path / "compare"
 
 
 def _check(job: Job, config: CompareConfig) -> None:
@@ -145,60 +151,94 @@ def _snapshots(job: Job) -> Job:
     return other
 
 
-def _pruned(job: Job, config: CompareConfig, folder: Path) -> dict[Path, Contender]:
+@dataclass(frozen=True)
+class _Baseline:
+    """A set that is trained once, and kept."""
+
+    method: str
+    name: str
+    path: Path
+    step: int
+    settings: dict
+    inputs: list[Path]
+    make: Callable[[Job, Any], Gaussians]
+    of: Callable[[], Any]  # what `make` needs beside the job, computed when it is
+
+
+def _pruned(job: Job, config: CompareConfig, folder: Path) -> list[_Baseline]:
     """The last snapshot, pruned by LightGaussian's criterion (arXiv:2311.17245) and tuned."""
     last = job.snapshots.files[-1]
     steps = settings_of(job.run, "nest")["steps"] if config.tune_steps < 0 else config.tune_steps
 
     @cache
-    def full() -> tuple[Gaussians, np.ndarray]:
-        g = read_level(last.path)
+    def worth() -> np.ndarray:
         views = job.scene.train_ids.tolist()
-        return g, importance(g, job.scene, views, "weight-volume", antialiased=job.antialiased)
+        antialiased = job.antialiased
+        return importance(read_level(last.path), job.scene, views, "weight-volume", antialiased=antialiased)
 
-    def make(share: float) -> Gaussians:
-        g, worth = full()
-        return tune_composition(job, prune_to(g, max(1, round(share * len(g))), worth), steps)
-
-    found = {}
-    for share in sorted(set(config.shares)):
-        settings = {"share": share, "tune_steps": steps}
-        path = folder / f"pruned-{share:g}-{steps}.npz"
-        _keep(job, path, settings, [job.run.scene, last.path], last.step + steps, partial(make, share))
-        name = f"{share:.0%}, {steps} steps"
-        found[path] = Contender(report.PRUNED, name, last.step + steps, partial(read_level, path))
-    return found
+    return [
+        _Baseline(
+            report.PRUNED, f"{share:.0%}, {steps} steps", folder / f"pruned-{share:g}-{steps}.npz",
+            last.step + steps, {"share": share, "tune_steps": steps}, [job.run.scene, last.path],
+            _prune, lambda share=share: (share, steps, worth()),
+        )
+        for share in sorted(set(config.shares))
+    ]  # fmt: skip
 
 
-def _mcmc(job: Job, config: CompareConfig, folder: Path) -> dict[Path, Contender]:
+def _prune(job: Job, of: tuple[float, int, np.ndarray]) -> Gaussians:
+    share, steps, worth = of
+    g = read_level(job.snapshots.files[-1].path)
+    return tune_composition(job, prune_to(g, max(1, round(share * len(g))), worth), steps)
+
+
+def _mcmc(job: Job, config: CompareConfig, folder: Path) -> list[_Baseline]:
     """3DGS-MCMC from the start, its Gaussians capped at shares of the last snapshot's."""
-    run, made, found = job.run, nesting.train_config(job), {}
+    run, made, found = job.run, nesting.train_config(job), []
     full, seed = job.snapshots.size(job.snapshots.levels[-1]), settings_of(job.run, "train")["seed"]
     for share in sorted(set(config.caps)):
-        cap = round(share * full)
-        mine = capped_config(made, cap, made.max_steps)
-        path = folder / f"mcmc-{share:g}.npz"
-
-        _keep(
-            job, path, {**asdict(mine), "seed": seed}, [run.scene, run.labels], made.max_steps,
-            partial(nesting.train_capped, job, path.stem, cap, made.max_steps, seed),
+        cap, path = round(share * full), folder / f"mcmc-{share:g}.npz"
+        settings = {**asdict(capped_config(made, cap, made.max_steps)), "seed": seed}
+        of = path.stem, cap, made.max_steps, seed
+        baseline = _Baseline(
+            report.MCMC, f"cap {share:.0%}", path, made.max_steps, settings, [run.scene, run.labels],
+            _cap, lambda of=of: of,
         )  # fmt: skip
-        name = f"cap {share:.0%}"
-        found[path] = Contender(report.MCMC, name, made.max_steps, partial(read_level, path))
+        found.append(baseline)
     return found
 
 
-def _keep(
-    job: Job, path: Path, settings: dict, inputs: list[Path], step: int, make: Callable[[], Gaussians]
-) -> None:
-    """Train a set once: a stage of its own, so that a killed comparison goes on with the next one."""
+def _cap(job: Job, of: tuple[str, int, int, int]) -> Gaussians:
+    return nesting.train_capped(job, *of)
 
-    def work() -> list[str]:
-        g = make()
-        write_set(path, g, step)
-        return [f"{len(g):,} Gaussians"]
 
-    run_stage(job, path.stem, settings, inputs, [path], work)
+def _trained(job: Job, baselines: Sequence[_Baseline]) -> dict[Path, Contender]:
+    """The baselines by file, trained where they are missing.
+
+    Each is a stage of its own, so that a killed comparison goes on with the next one.
+    """
+    local = isinstance(job.executor, Local)
+    for some in [[b] for b in baselines] if local else [baselines]:
+        stages = [Stage(b.path.stem, b.settings, b.inputs, [b.path]) for b in some]
+        run_stages(job, stages, partial(_train, job, some))
+    return {b.path: Contender(b.method, b.name, b.step, partial(read_level, b.path)) for b in baselines}
+
+
+def _train(
+    job: Job, baselines: Sequence[_Baseline], missing: Sequence[int]
+) -> Iterator[tuple[int, Sequence[str]]]:
+    """Train those of these numbers."""
+    some = [baselines[number] for number in missing]
+    for i, count in work(job, "baselines", _keep, [(b.make, b.of(), b.path.name, b.step) for b in some]):
+        yield missing[i], [f"{count:,} Gaussians"]
+
+
+def _keep(job: Job, part: tuple[Callable[[Job, Any], Gaussians], Any, str, int]) -> int:
+    """Train one and write it; its number of Gaussians comes back."""
+    make, of, name, step = part
+    g = make(job, of)
+    write_set(_folder(job) / name, g, step)
+    return len(g)
 
 
 def _snapshot_points(snapshots: Job, config: CompareConfig) -> list[Contender]:

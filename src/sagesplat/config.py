@@ -147,6 +147,24 @@ class TrainConfig:
 
 
 @dataclass(frozen=True)
+class BlocksConfig:
+    """How a large scene is divided."""
+
+    count: int = 1
+    """Blocks of the ground plane, each trained like a scene of its own (all of --train holds for each); 1: the
+    scene as one."""
+    margin: float = 0.2
+    """How far training reaches beyond a block, as a share of its width."""
+    min_share: float = 0.25
+    """A photo is for a block if at least this share of the points that it sees are the block's."""
+    far_share: float = 0.5
+    """Points beyond the margin that a block begins with too, at most, as a share of its own: the background
+    of its photos."""
+    seam_steps: int = 300
+    """Training steps along the borders of each block, when the blocks are put together."""
+
+
+@dataclass(frozen=True)
 class NestConfig:
     """How a trained model becomes a ladder whose levels contain each other."""
 
@@ -270,6 +288,7 @@ class RunConfig:
     labels: LabelsConfig = field(default_factory=LabelsConfig)
     lift: LiftConfig = field(default_factory=LiftConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
+    blocks: BlocksConfig = field(default_factory=BlocksConfig)
     nest: NestConfig = field(default_factory=NestConfig)
     fit: FitConfig = field(default_factory=FitConfig)
     plan: PlanConfig = field(default_factory=PlanConfig)

@@ -1,7 +1,7 @@
 """What a run tells whoever watches it. The engine emits these and prints nothing."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 
@@ -75,3 +75,18 @@ class RunDone:
 
 Event = StageStarted | StageSkipped | Progress | Training | Warned | StageDone | TableMade | RunDone
 Emit = Callable[[Event], None]
+
+
+def named(emit: Emit, name: str) -> Emit:
+    """Passes on what a part of a larger work does, under its name; not its tables, nor what is up to date."""
+
+    def tell(event: Event) -> None:
+        match event:
+            case StageStarted() | StageDone() | Progress():
+                emit(replace(event, name=f"{name}/{event.name}"))
+            case Warned(text):
+                emit(Warned(f"{name}: {text}"))
+            case Training():
+                emit(event)
+
+    return tell

@@ -2,13 +2,14 @@
 
 import hashlib
 import json
+import socket
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, fields
-from functools import cached_property
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from sagesplat.adapt.observe import PERCENTILE, LabelImages, RenderedLabels, dis
 from sagesplat.config import FitConfig
 from sagesplat.errors import RunError, SageError
 from sagesplat.events import Emit, StageDone, StageSkipped, StageStarted, Warned
-from sagesplat.executor import LOCAL, Executor
+from sagesplat.executor import LOCAL, Executor, Local, Task
 from sagesplat.files import named_full_disk, read_json, remove_temporary, sync_changed
 from sagesplat.lock import locked
 from sagesplat.lpips import Lpips, Net, load_lpips, weights_path
@@ -32,6 +33,10 @@ from sagesplat.train import memory
 
 _CLOCK_STEP = 2.0  # seconds: some disks keep no finer time
 NETS: tuple[Net, ...] = ("alex", "vgg")
+_LOCK_WAIT = 60.0  # seconds that a task waits for one which a killed run left behind
+_PIECES = 2  # of work for each task that can run: the slower ones then have less to wait for
+Part = TypeVar("Part")
+Result = TypeVar("Result")
 NO_RUN = "not a run folder (no scene.json); begin with `sagesplat run SCENE RUN`"
 
 
@@ -49,11 +54,28 @@ class Job:
     memory_limit: int = 0  # bytes that training may use (0: what the machine has, but for a margin)
     locks: ExitStack | None = None  # keeps the run folder locked between stages (else within each)
     executor: Executor = LOCAL  # of pieces that do not depend on each other
+    lock_wait: float = 0.0  # seconds to wait for who has the run folder
 
     @property
     def spec(self) -> "JobSpec":
         """What another process needs to open the same job."""
-        return JobSpec(**{f.name: getattr(self, f.name) for f in fields(JobSpec)})
+        spec = JobSpec(**{f.name: getattr(self, f.name) for f in fields(JobSpec)})
+        return replace(
+            spec,
+            run=replace(self.run, path=self.run.path.absolute()),
+            backend=self.executor.backend or self.backend,
+            memory_limit=self.memory_limit or self.executor.memory,
+        )
+
+    @property
+    def gpus(self) -> float:
+        """GPUs that a task of this job computes on."""
+        return float(self.spec.backend == "cuda")
+
+    @property
+    def pieces(self) -> int:
+        """What to divide work by that one task would do as well."""
+        return 1 if isinstance(self.executor, Local) else _PIECES * self.executor.parallel
 
     @cached_property
     def scene(self) -> Scene:
@@ -73,26 +95,42 @@ class Job:
         """The photos, loaded when asked for."""
         return Photos(self.scene.views, memory.photo_cache(self.memory_limit))
 
-    @cached_property
+    @property
+    def has_blocks(self) -> bool:
+        """Whether the scene is trained in blocks."""
+        return (self.run.blocks / "blocks.json").exists()
+
+    @property
+    def has_parts(self) -> bool:
+        """Whether each category in each block is one of its own by now."""
+        return (self.run.parts / "labels.json").exists()
+
+    @property
     def taxonomy(self) -> Taxonomy:
         """The names of the run's categories."""
-        return Taxonomy.read(self.run.masks / "labels.json")
+        return Taxonomy.read((self.run.parts if self.has_parts else self.run.masks) / "labels.json")
 
     @cached_property
     def masks(self) -> Masks:
         """The label images before fusion, loaded when asked for."""
-        return Masks(self.run.masks, self.taxonomy)
+        return Masks(self.run.masks, Taxonomy.read(self.run.masks / "labels.json"))
+
+    @property
+    def whole_masks(self) -> Masks:
+        """The label images that all views agreed on, if they were asked to."""
+        fused = self.run.fused
+        return Masks(fused, self.masks.taxonomy) if (fused / "labels.json").exists() else self.masks
 
     @property
     def best_masks(self) -> Masks:
-        """The label images that all views agreed on, if they were asked to."""
-        fused = self.run.fused
-        return Masks(fused, self.taxonomy) if (fused / "labels.json").exists() else self.masks
+        """The same, of the parts that a scene in blocks has."""
+        return Masks(self.run.parts, self.taxonomy) if self.has_parts else self.whole_masks
 
-    @cached_property
+    @property
     def point_labels(self) -> np.ndarray:
         """Category of each SfM point."""
-        return LiftedLabels.read(self.run.labels, len(self.scene.points.xyz)).label_ids
+        path = self.run.part_labels if self.has_parts else self.run.labels
+        return LiftedLabels.read(path, len(self.scene.points.xyz)).label_ids
 
     @cached_property
     def snapshots(self) -> SnapshotLadder:
@@ -134,12 +172,58 @@ class JobSpec:
 
     def open(self, emit: Emit) -> Job:
         """The job, in this process."""
-        return Job(emit=emit, **{f.name: getattr(self, f.name) for f in fields(self)})
+        made = {f.name: getattr(self, f.name) for f in fields(self)}
+        return Job(emit=emit, lock_wait=_LOCK_WAIT, **made)
+
+
+def work(
+    job: Job, name: str, function: Callable[[Job, Part], Result], parts: Sequence[Part]
+) -> Iterator[tuple[int, Result]]:
+    """`function(job, part)` of each part, with the part's number, as they come (see `Executor.run`).
+
+    `function` is one of a module. Where the executor is another process's, it gets a job opened there.
+    """
+    if isinstance(job.executor, Local):
+        for number, part in enumerate(parts):
+            yield number, function(job, part)
+    else:
+        spec, gpus = job.spec, job.gpus
+        tasks = [Task(name, _piece, (spec, function, part), gpus) for part in parts]
+        yield from job.executor.run(tasks, job.emit)
+
+
+def work_all(
+    job: Job, name: str, function: Callable[[Job, Part], Result], parts: Sequence[Part]
+) -> list[Result]:
+    """What `work` finds, in the order of the parts."""
+    found = dict(work(job, name, function, parts))
+    return [found[number] for number in range(len(parts))]
+
+
+def _piece(spec: JobSpec, function: Callable[[Job, Any], Any], part: Any, emit: Emit) -> Any:
+    """A task: one part, in a process that may have had others of the same scene."""
+    job = spec.open(emit)
+    kept = _kept(replace(spec, force=False), job.run.scene.read_bytes())
+    vars(job).update(scene=kept.scene, photos=kept.photos)
+    return function(job, part)
+
+
+@lru_cache(maxsize=1)
+def _kept(spec: JobSpec, scene: bytes) -> Job:
+    """A job whose scene and photos serve one task after the other; `scene`: content of scene.json."""
+    capture = Path(json.loads(scene)["path"])
+    if not capture.exists():
+        raise RunError(
+            f"{capture}: {socket.gethostname()} does not see the capture; all nodes need it under this path, "
+            "on a disk that they share"
+        )
+    return spec.open(lambda event: None)
 
 
 def fusion(run: RunDir) -> list[Path]:
     """What results change with that look at label images after training."""
-    return [run.provenance("fuse")] if (run.fused / "labels.json").exists() else []
+    made = [("fuse", run.fused), ("parts", run.parts)]
+    return [run.provenance(stage) for stage, folder in made if (folder / "labels.json").exists()]
 
 
 def label_images(job: Job, source: str) -> LabelImages:
@@ -172,6 +256,16 @@ def load_metrics(job: Job, folder: Path | None, nets: Sequence[Net] = NETS) -> d
     return found
 
 
+@dataclass(frozen=True)
+class Stage:
+    """What is done once: its settings and inputs decide its outputs."""
+
+    name: str
+    settings: dict[str, Any]
+    inputs: Sequence[Path]
+    outputs: Sequence[Path]
+
+
 def run_stage(
     job: Job, name: str, settings: dict[str, Any], inputs: Sequence[Path], outputs: Sequence[Path],
     make: Callable[[], Sequence[str]],
@@ -182,26 +276,50 @@ def run_stage(
     disk, and not while it is done anew. RunError where another process works on the folder, or the disk is
     full: then what was finished stays, and the same command goes on.
     """
-    if name not in ("poses", "scene") and not job.run.scene.exists():
-        raise RunError(f"{job.run.path}: {NO_RUN}")
-    for path in inputs:
-        if not path.exists():
-            raise RunError(f"{path}: missing; run the stage before `sagesplat {name}`, or `sagesplat run`")
-    settings = json.loads(json.dumps(settings, default=str))  # as it will read back
-    if is_done(job.run, name, settings, inputs, outputs, job.force):
-        job.emit(StageSkipped(name))
+    run_stages(job, [Stage(name, settings, inputs, outputs)], lambda _: iter([(0, make())]))
+
+
+def run_stages(
+    job: Job,
+    stages: Sequence[Stage],
+    make: Callable[[Sequence[int]], Iterator[tuple[int, Sequence[str]]]],
+) -> None:
+    """Like `run_stage` for several that do not depend on each other, side by side.
+
+    `make` gets the numbers of those that are to be done, and gives each with its lines as soon as it is.
+    """
+    stages = [replace(s, settings=json.loads(json.dumps(s.settings, default=str))) for s in stages]
+    missing = [number for number, stage in enumerate(stages) if not _is_done(job, stage)]
+    if not missing:
         return
     with ExitStack() as own, named_full_disk(job.run.path):
-        (job.locks or own).enter_context(locked(job.run.path))
+        (job.locks or own).enter_context(locked(job.run.path, job.lock_wait))
         remove_temporary(job.run.path, but="bundle")  # a viewer writes those, without the lock
-        job.run.provenance(name).unlink(missing_ok=True)
-        job.emit(StageStarted(name))
+        for number in missing:
+            job.run.provenance(stages[number].name).unlink(missing_ok=True)
+            job.emit(StageStarted(stages[number].name))
         begin, since = time.perf_counter(), time.time() - _CLOCK_STEP
-        lines = make()
-        seconds = time.perf_counter() - begin
-        sync_changed(job.run.path, since)
-        record(job.run, name, settings, inputs, seconds)
-    job.emit(StageDone(name, seconds, tuple(lines)))
+        for number, lines in make(missing):
+            stage = stages[number]
+            seconds = time.perf_counter() - begin
+            sync_changed(job.run.path, since)
+            record(job.run, stage.name, stage.settings, stage.inputs, seconds)
+            job.emit(StageDone(stage.name, seconds, tuple(lines)))
+
+
+def _is_done(job: Job, stage: Stage) -> bool:
+    """Whether a stage is to be skipped, which is said; RunError where it cannot be done."""
+    if stage.name not in ("poses", "scene") and not job.run.scene.exists():
+        raise RunError(f"{job.run.path}: {NO_RUN}")
+    for path in stage.inputs:
+        if not path.exists():
+            raise RunError(
+                f"{path}: missing; run the stage before `sagesplat {stage.name}`, or `sagesplat run`"
+            )
+    done = is_done(job.run, stage.name, stage.settings, stage.inputs, stage.outputs, job.force)
+    if done:
+        job.emit(StageSkipped(stage.name))
+    return done
 
 
 def fingerprint(scene: Scene) -> str:
@@ -216,4 +334,6 @@ def fingerprint(scene: Scene) -> str:
     digest.update(scene.points.xyz.tobytes())
     if scene.test_names is not None:
         digest.update("\n".join(sorted(scene.test_names)).encode())
+    if scene.calibration_names is not None:
+        digest.update("\n".join(["", *sorted(scene.calibration_names)]).encode())
     return digest.hexdigest()

@@ -1,6 +1,7 @@
 """The stages that label: label images of the views, labels of the points, and what all views agree on."""
 
 import shutil
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -8,16 +9,17 @@ from typing import Any
 import numpy as np
 
 from sagesplat.config import LabelsConfig, LiftConfig, MasksConfig
-from sagesplat.errors import RunError
+from sagesplat.errors import LabelError, RunError
 from sagesplat.events import Progress, Warned
+from sagesplat.executor import split
 from sagesplat.files import read_json, write_json
-from sagesplat.job import Job, run_stage
+from sagesplat.job import Job, run_stage, work_all
 from sagesplat.run_dir import file_hash
 from sagesplat.segment.edit import Edited, edit_labels, parse_keep, parse_merge
 from sagesplat.segment.hf import DEFAULT_MODEL
 from sagesplat.segment.lift import agreement_in, lift
-from sagesplat.segment.masks import MAX_LABEL_ID, UNLABELLED, Masks, Taxonomy, import_masks
-from sagesplat.segment.segmenters import Segmenter, segment_views
+from sagesplat.segment.masks import MAX_LABEL_ID, UNLABELLED, Masks, Taxonomy, import_masks, write_labels
+from sagesplat.segment.segmenters import Segmenter, segment_some
 from sagesplat.segment.soft import read_soft, soft_path
 from sagesplat.train.fuse import Soft, fuse
 
@@ -104,16 +106,28 @@ def _segment(job: Job, config: MasksConfig, kind: str) -> None:
         if not marker.exists() or read_json(marker) != settings:
             shutil.rmtree(run.segmented, ignore_errors=True)
             shutil.rmtree(run.soft, ignore_errors=True)
-        segmenter = _load(job, config, kind)
         write_json(marker, settings)
-        segment_views(
-            job.scene, job.photos, segmenter, run.segmented,
-            batch=config.batch, soft=run.soft if config.soft else None,
-            on_view=lambda done, total: job.emit(Progress("segment", done, total)),
-        )  # fmt: skip
+        some = split(range(len(job.scene.views)), job.executor.parallel)  # each loads the network
+        found = work_all(job, "segment", _segment_some, [(rows, config, kind) for rows in some])
+        taxonomy = found[0][0]
+        if any(other != taxonomy for other, _ in found):
+            raise LabelError(f"{run.segmented}: the nodes' networks have other categories; make them alike")
+        write_labels(run.segmented, taxonomy, set().union(*(ids for _, ids in found)))
         return []
 
     run_stage(job, "segment", settings, [run.scene], [run.segmented / "labels.json"], make)
+
+
+def _segment_some(job: Job, part: tuple[Sequence[int], MasksConfig, str]) -> tuple[Taxonomy, set[int]]:
+    """Segment some views (rows, settings, kind of segmenter): all its categories, and the ids that occur."""
+    rows, config, kind = part
+    segmenter, run = _load(job, config, kind), job.run
+    occurring = segment_some(
+        job.scene, job.photos, segmenter, run.segmented, rows,
+        batch=config.batch, soft=run.soft if config.soft else None,
+        on_view=lambda done, total: job.emit(Progress("segment", done, total)),
+    )  # fmt: skip
+    return segmenter.taxonomy, occurring
 
 
 def _file(kind: str, given: str | Path | None) -> Path:
@@ -178,7 +192,7 @@ def fuse_masks(job: Job) -> None:
             g, job.scene, job.masks, run.fused, soft=soft, antialiased=job.antialiased, backend=job.backend,
             on_view=lambda done, total: job.emit(Progress("fuse", done, total)),
         )  # fmt: skip
-        before, after = (_agreement(job, masks) for masks in (job.masks, job.best_masks))
+        before, after = (_agreement(job, masks) for masks in (job.masks, job.whole_masks))
         write_json(run.fused / "fused.json", {**fused.record, "agreement": [before, after]})
         return [
             f"{fused.changed.mean():.1%} of the pixels changed; views that had no vote agree with the points "

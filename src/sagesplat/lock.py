@@ -6,6 +6,7 @@ import os
 import socket
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import datetime
@@ -15,21 +16,21 @@ from sagesplat.errors import RunError
 
 FILE = ".lock"
 _BUSY = (errno.EWOULDBLOCK, errno.EACCES, errno.EDEADLK)  # of flock, and of msvcrt
+_AGAIN = 0.5  # seconds between two tries
 _held: dict[Path, list[int]] = {}  # the open file, and how often this process has entered a folder
 _guard = threading.Lock()
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
+def locked(folder: Path, wait: float = 0.0) -> Iterator[None]:
     """Keep other processes from writing into `folder` (made if missing); this one may enter again.
 
-    RunError names the process that has it. Its file, FOLDER/.lock, stays; the lock goes with the process.
+    RunError names the process that has it, and still has it after `wait` seconds. Its file, FOLDER/.lock,
+    stays; the lock goes with the process.
     """
-    key = folder.resolve()
-    with _guard:
-        if key not in _held:
-            _held[key] = [_open(folder), 0]
-        _held[key][1] += 1
+    key, end = folder.resolve(), time.monotonic() + wait
+    while not _entered(folder, key, last=time.monotonic() >= end):
+        time.sleep(_AGAIN)
     try:
         yield
     finally:
@@ -37,6 +38,20 @@ def locked(folder: Path) -> Iterator[None]:
             _held[key][1] -= 1
             if not _held[key][1]:
                 os.close(_held.pop(key)[0])
+
+
+def _entered(folder: Path, key: Path, last: bool) -> bool:
+    """Whether we have the lock now; RunError where not and this was the last try."""
+    with _guard:
+        if key not in _held:
+            try:
+                _held[key] = [_open(folder), 0]
+            except RunError:
+                if last:
+                    raise
+                return False
+        _held[key][1] += 1
+        return True
 
 
 def _open(folder: Path) -> int:

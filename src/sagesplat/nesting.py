@@ -1,18 +1,21 @@
 """The nested ladder of a run: its training, its costs, and what is promised of it."""
 
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields, replace
 
 import numpy as np
 import torch
 
+from sagesplat.adapt.model import Samples, SsimModel, fit_model, samples
 from sagesplat.adapt.observe import Observations, as_unit, large_enough, measure, render_rgb
 from sagesplat.adapt.promise import ViewModel, among_neighbours, fit_promises, read_promises
 from sagesplat.adapt.promised import Costs, Quality, plan_for_view, quality_at
 from sagesplat.config import FitConfig, NestConfig, TrainConfig
 from sagesplat.events import Progress, Warned
+from sagesplat.executor import split
 from sagesplat.gaussians import Gaussians
-from sagesplat.job import Job, distances, fusion, label_images, run_stage
+from sagesplat.job import Job, distances, fusion, label_images, run_stage, work_all
 from sagesplat.metrics import ssim_map
 from sagesplat.output.chunks import packed, read_chunks, read_index, totals, write_chunks
 from sagesplat.raster import Workspace
@@ -22,7 +25,7 @@ from sagesplat.train import nested
 from sagesplat.train.checkpoint import remove_checkpoints
 from sagesplat.train.freeze import VIEWS, spread
 from sagesplat.train.levels import read_level, write_set
-from sagesplat.train.nested import Nested, NestStep
+from sagesplat.train.nested import NestStep
 from sagesplat.train.trainer import Resumed, Step, Trained
 
 _TARGETS = tuple(np.arange(0.5, 0.96, 0.05).round(2).tolist())  # SSIM of the compositions that are looked at
@@ -60,7 +63,10 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
                 job.emit(Warned(f"going on from step {event.step}, {before}"))
             else:
                 trained = event
-        lines = _write_ladder(job, trained, config)
+        counts, across = trained.gaussians.counts(), trained.boundary
+        sizes = {label: nested.level_sizes(n, config, across.get(label, 0)) for label, n in counts.items()}
+        lines = write_ladder(job, trained.gaussians, sizes, config, trained.clarity)
+        lines[0] += f", {sum(across.values()):,} of them across borders and in every level"
         remove_checkpoints(run.nest_checkpoint)
         return lines
 
@@ -99,24 +105,25 @@ def train_capped(job: Job, stage: str, cap: int, steps: int, seed: int) -> Gauss
     raise AssertionError("a training ends with what it trained")
 
 
-def _write_ladder(job: Job, trained: Nested, config: NestConfig) -> list[str]:
-    counts = trained.gaussians.counts()
-    sizes = {
-        label: nested.level_sizes(n, config, trained.boundary.get(label, 0)) for label, n in counts.items()
-    }
-    rows = packed(trained.gaussians, sizes, sh_bits=config.sh_bits)
-    ordered = trained.gaussians.select(torch.from_numpy(rows))
+def write_ladder(
+    job: Job, g: Gaussians, sizes: dict[int, tuple[int, ...]], config: NestConfig, clarity: np.ndarray
+) -> list[str]:
+    """Write Gaussians in their order, with levels of `sizes` by label id, as the run's ladder and its chunks.
+
+    `clarity` [N] of `Nested` is kept beside them.
+    """
+    rows = packed(g, sizes, sh_bits=config.sh_bits)
+    ordered = g.select(torch.from_numpy(rows))
     chunks = write_chunks(
         job.run.chunks, ordered, sizes, job.names(), sh_bits=config.sh_bits, antialiased=job.antialiased
     )
     # what is measured, planned and written from here on is what a viewer gets
     sent = read_chunks(job.run.chunks, chunks)
-    write_set(job.run.prefixes, sent, config.steps, sizes, clarity=trained.clarity[rows])
-    size, n = sum(chunk.nbytes for chunk in chunks), len(trained.gaussians)
-    across = sum(trained.boundary.values())
+    write_set(job.run.prefixes, sent, config.steps, sizes, clarity=clarity[rows])
+    size, n = sum(chunk.nbytes for chunk in chunks), len(g)
     lost = _quality(job, ordered) - _quality(job, sent)
     return [
-        f"{config.levels} levels, {n:,} Gaussians, {across:,} of them across borders and in every level",
+        f"{config.levels} levels, {n:,} Gaussians",
         f"{size / 1e6:.2f} MB in {len(chunks)} SPZ files, {size / n:.1f} bytes a Gaussian; "
         f"encoding costs {lost:.4f} of SSIM",
     ]
@@ -132,38 +139,66 @@ def _quality(job: Job, g: Gaussians) -> float:
     return float(np.mean(found))
 
 
-def fit_viewpoints(job: Job, table: Observations, config: FitConfig) -> dict[int, ViewModel]:
+def fit_curves(job: Job, table: Observations) -> dict[tuple[int, int], SsimModel]:
+    """Eq. 3 of every category at every level, from the training views."""
+    parts = split(samples(table, job.scene.train_ids), job.pieces)
+    found = [model for part in work_all(job, "fit", _fit_some, parts) for model in part]
+    return {(model.label_id, model.level): model for model in found}
+
+
+def _fit_some(job: Job, part: Sequence[Samples]) -> list[SsimModel]:
+    return [fit_model(*found) for found in part]
+
+
+def fit_viewpoints(
+    job: Job, table: Observations, config: FitConfig, curves: Mapping[tuple[int, int], SsimModel]
+) -> dict[int, ViewModel]:
     """Promises for every category but the unlabelled pixels, which nobody asks for: they are shipped whole.
 
-    `table`: observations of views that show enough of a category. Levels are measured with everything at the
-    same one; what a category gains or loses among neighbours at others is measured on compositions planned
-    for the calibration views (some training views where there are none).
+    `table`: observations of views that show enough of a category; `curves`: Eq. 3 of them. Levels
+    are measured with everything at the same one; what a category gains or loses among neighbours at others
+    is measured on compositions planned for the calibration views (some training views where there are none).
     """
     table = table.select(table.label_id != UNLABELLED)
-    promises = fit_promises(table, job.scene, config.confidence)
+    promises = fit_promises(table, job.scene, config.confidence, curves)
     far, costs = distances(job, config.distance), costs_of(job)
     quality = quality_at(costs, promises, far, [view.camera for view in job.scene.views])
-    masks = label_images(job, config.masks)
     keys = zip(table.label_id.tolist(), table.level.tolist(), table.view.tolist(), strict=True)
     alone = dict(zip(keys, table.ssim.tolist(), strict=True))
     changes: dict[int, list[float]] = {}
     rows = job.scene.calibration_ids.tolist() or spread(job.scene.train_ids.tolist(), VIEWS)
-    workspace = Workspace()
-    for done, row in enumerate(rows, 1):
-        view = job.scene.views[row]
+    planned = []
+    for row in rows:
         plans = [plan_for_view(quality, costs, target, row).levels for target in _TARGETS]
-        for levels in {tuple(plan.items()): plan for plan in plans}.values():
-            g = job.ladder.compose(levels)
-            image = render_rgb(
-                g, view.camera, backend=job.backend, antialiased=job.antialiased, workspace=workspace
-            )
-            for label, found in measure(image, as_unit(job.photos[row]), masks[view]).items():
-                key = label, levels.get(label, -1), row
-                if key in alone:
-                    ssim = found["ssim_eroded" if config.region == "eroded" else "ssim"]
-                    changes.setdefault(label, []).append(ssim - alone[key])
-        job.emit(Progress("fit", done, len(rows)))
+        planned.append((row, list({tuple(plan.items()): plan for plan in plans}.values())))
+    parts = [(some, config) for some in split(planned, job.pieces)]
+    for some in work_all(job, "fit", _measure_compositions, parts):
+        for label, level, row, ssim in some:
+            key = label, level, row
+            if key in alone:
+                changes.setdefault(label, []).append(ssim - alone[key])
     return among_neighbours(promises, {label: np.array(change) for label, change in changes.items()})
+
+
+def _measure_compositions(
+    job: Job, part: tuple[Sequence[tuple[int, list[dict[int, int]]]], FitConfig]
+) -> list[tuple[int, int, int, float]]:
+    """(label id, its level, row, SSIM) of compositions (levels by label id) in some views (rows)."""
+    planned, config = part
+    name = "ssim_eroded" if config.region == "eroded" else "ssim"
+    masks, workspace = label_images(job, config.masks), Workspace()
+    rows = []
+    for done, (row, compositions) in enumerate(planned, 1):
+        view = job.scene.views[row]
+        for levels in compositions:
+            image = render_rgb(
+                job.ladder.compose(levels), view.camera,
+                backend=job.backend, antialiased=job.antialiased, workspace=workspace,
+            )  # fmt: skip
+            found = measure(image, as_unit(job.photos[row]), masks[view])
+            rows += [(label, levels.get(label, -1), row, values[name]) for label, values in found.items()]
+        job.emit(Progress("fit", done, len(planned)))
+    return rows
 
 
 def costs_of(job: Job) -> Costs:

@@ -4,10 +4,10 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from sagesplat import labelling, nesting, stages
+from sagesplat import blocks, labelling, nesting, stages
 from sagesplat.adapt.ladder import read_prefixes
 from sagesplat.adapt.plan import check_target
-from sagesplat.config import NestConfig, PlanConfig, RunConfig, TrainConfig
+from sagesplat.config import BlocksConfig, NestConfig, PlanConfig, RunConfig, TrainConfig
 from sagesplat.demo.capture import cached_capture
 from sagesplat.errors import RunError
 from sagesplat.events import Emit, Progress, StageDone, StageStarted
@@ -30,22 +30,44 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
     for target in config.plan.targets:  # before hours of training
         check_target(target)
     nested.check(config.nest)
+    blocks.check(config.blocks)
     stages.open_scene(job, scene, config.scene, config.poses)
     labelling.make_masks(job, config.masks, config.labels)
     labelling.lift_labels(job, config.lift)
-    stages.train_levels(job, config.train, config.seed)
+    train(job, config.train, config.blocks, config.seed)
     if config.fuse:
         labelling.fuse_masks(job)
     elif job.run.fused.exists():
         raise RunError(f"{job.run.fused}: label images were fused; add --fuse, or delete that folder")
+    if job.has_blocks:
+        blocks.make_parts(job)
     if job.run.ladder == "nested":
-        nesting.nest_levels(job, config.nest, config.seed)
+        nest(job, config.nest, config.blocks, config.seed)
     stages.observe_levels(job, config.fit)
     stages.fit_ladder(job, config.fit)
     stages.make_plan(job, config.plan)
     stages.compose_plan(job)
     stages.evaluate_plans(job)
     stages.make_report(job)
+
+
+def train(job: Job, config: TrainConfig, of_blocks: BlocksConfig, seed: int) -> None:
+    """Train the scene as one, or in blocks."""
+    if of_blocks.count > 1:
+        blocks.train_blocks(job, of_blocks, config, seed)
+    elif job.has_blocks:
+        raise RunError(f"{job.run.blocks}: this run is in blocks; add --blocks.count, or begin another run")
+    else:
+        stages.train_levels(job, config, seed)
+
+
+def nest(job: Job, config: NestConfig, of_blocks: BlocksConfig, seed: int) -> None:
+    """Make the nested ladder of a trained scene, or of its blocks."""
+    if job.has_blocks:
+        blocks.nest_blocks(job, of_blocks, config, seed)
+        blocks.measure_borders(job)
+    else:
+        nesting.nest_levels(job, config, seed)
 
 
 def demo_capture(emit: Emit) -> Path:

@@ -14,7 +14,7 @@ FORMAT = 2  # of the run folder; raised when older folders can no longer be read
 
 LadderKind = Literal["nested", "snapshots"]
 # stages that all ladders of a run share
-_BEFORE_LADDERS = ("poses", "scene", "segment", "masks", "lift", "train", "fuse")
+_BEFORE_LADDERS = ("poses", "scene", "segment", "masks", "lift", "blocks", "train", "fuse", "parts")
 
 
 @dataclass(frozen=True)
@@ -83,6 +83,35 @@ class RunDir:
     def frozen(self) -> Path:
         """Steps at which categories stopped during training."""
         return self.path / "frozen.json"
+
+    @property
+    def blocks(self) -> Path:
+        """The run folders of a large scene's blocks, with blocks.json."""
+        return self.path / "blocks"
+
+    def block(self, number: int) -> "RunDir":
+        """The run folder of a block."""
+        return RunDir(self.blocks / f"{number:03d}", self.ladder)
+
+    @property
+    def core(self) -> Path:
+        """Of a block: what it adds to the nested ladder of the whole."""
+        return self.adapted / "core.npz"
+
+    @property
+    def seamed(self) -> Path:
+        """Of a block: the same, tuned along its borders."""
+        return self.adapted / "seamed.npz"
+
+    @property
+    def parts(self) -> Path:
+        """Label images of the parts of a large scene, a category in a block each, and their points."""
+        return self.path / "parts"
+
+    @property
+    def part_labels(self) -> Path:
+        """Part of each SfM point."""
+        return self.parts / "labels.npz"
 
     @property
     def prefixes(self) -> Path:

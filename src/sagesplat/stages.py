@@ -3,7 +3,7 @@
 import hashlib
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -13,10 +13,12 @@ import numpy as np
 
 from sagesplat import nesting
 from sagesplat.adapt.evaluate import evaluate
-from sagesplat.adapt.model import fit_models, read_models, write_models
+from sagesplat.adapt.model import read_models, write_models
 from sagesplat.adapt.observe import (
     TOTAL,
+    Observations,
     large_enough,
+    merge,
     observe,
     read_observations,
 )
@@ -26,9 +28,10 @@ from sagesplat.adapt.promised import plan_for_scene, plan_for_view, plan_within
 from sagesplat.config import FitConfig, PlanConfig, PosesConfig, SceneConfig, TrainConfig
 from sagesplat.errors import RunError
 from sagesplat.events import Progress, RunDone, TableMade, Training, Warned
+from sagesplat.executor import split
 from sagesplat.files import read_json, write_json
 from sagesplat.gaussians import Gaussians
-from sagesplat.job import Job, distances, fingerprint, fusion, label_images, run_stage
+from sagesplat.job import Job, distances, fingerprint, fusion, label_images, run_stage, work_all
 from sagesplat.output import tables
 from sagesplat.output.chunks import INDEX
 from sagesplat.output.ply import read_ply, write_ply
@@ -199,11 +202,9 @@ def observe_levels(job: Job, config: FitConfig) -> None:
     run = job.run
 
     def make() -> list[str]:
-        table = observe(
-            job.scene, job.photos, label_images(job, config.masks), job.ladder,
-            distances(job, config.distance), backend=job.backend, antialiased=job.antialiased,
-            progress=lambda done, total: job.emit(Progress("observe", done, total)),
-        )  # fmt: skip
+        far = distances(job, config.distance)
+        parts = [(rows, config.masks, far) for rows in split(range(len(job.scene.views)), job.pieces)]
+        table = merge(work_all(job, "observe", _observe_views, parts))
         table.write_csv(run.observations)
         seen = table.select(np.isin(table.view, job.scene.train_ids))
         _show(job, tables.ladder_table(seen, job.ladder.counts, job.ladder.recovering, job.names()))
@@ -214,6 +215,16 @@ def observe_levels(job: Job, config: FitConfig) -> None:
     inputs = [run.scene, run.labels, ladder_files(run)[0], *fusion(run)]
     settings = {"distance": config.distance, "masks": config.masks}
     run_stage(job, "observe", settings, inputs, [run.observations], make)
+
+
+def _observe_views(job: Job, part: tuple[Sequence[int], str, dict[int, np.ndarray]]) -> Observations:
+    """The observations of some views (rows, source of label images, distances in all views)."""
+    rows, masks, far = part
+    return observe(
+        job.scene, job.photos, label_images(job, masks), job.ladder, far,
+        views=rows, backend=job.backend, antialiased=job.antialiased,
+        progress=lambda done, total: job.emit(Progress("observe", done, total)),
+    )  # fmt: skip
 
 
 def ladder_files(run: RunDir) -> list[Path]:
@@ -234,12 +245,12 @@ def fit_ladder(job: Job, config: FitConfig) -> None:
     def make() -> list[str]:
         table = large_enough(read_observations(run.observations), job.scene, config.min_share)
         table = nesting.eroded(table, config.region)
-        models = fit_models(table, job.scene.train_ids)
+        models = nesting.fit_curves(job, table)
         write_models(run.models, models)
         statuses = [m.status for m in models.values()]
         lines = [", ".join(f"{statuses.count(s)} {s}" for s in sorted(set(statuses)))]
         if run.ladder == "nested":
-            promises = nesting.fit_viewpoints(job, table, config)
+            promises = nesting.fit_viewpoints(job, table, config, models)
             write_promises(run.promises, promises)
             statuses = [m.status for m in promises.values()]
             lines.append("promises: " + ", ".join(f"{statuses.count(s)} {s}" for s in sorted(set(statuses))))

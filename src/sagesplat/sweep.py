@@ -23,8 +23,9 @@ from sagesplat.adapt.plan import read_plans
 from sagesplat.config import RunConfig
 from sagesplat.errors import DataError, RunError, SageError, short
 from sagesplat.events import Emit, Event, Progress, StageDone, StageStarted, TableMade, Training, Warned
+from sagesplat.executor import LOCAL, Executor, Local, Task
 from sagesplat.files import read_json, write_text
-from sagesplat.job import Job
+from sagesplat.job import Job, JobSpec
 from sagesplat.output.tables import MB, Table, mean, promise_kept
 from sagesplat.raster import Backend
 from sagesplat.run_dir import RunDir
@@ -174,56 +175,112 @@ def _value(hint: Any, value: Any, key: str, folder: Path) -> Any:
 
 
 def run_sweep(
-    sweep: Sweep, out: Path, emit: Emit, backend: Backend = "auto", threads: int = 1, force: bool = False
+    sweep: Sweep,
+    out: Path,
+    emit: Emit,
+    backend: Backend = "auto",
+    threads: int = 1,
+    force: bool = False,
+    executor: Executor = LOCAL,
 ) -> Table:
     """Run the cells in `out`/runs, skip what is done, and return means and spreads for a terminal.
 
-    cells.csv, summary.csv and summary.md in `out` are written after each cell. A cell that fails is recorded
-    there and the next one begins; RunError at the end says which did.
+    cells.csv, summary.csv and summary.md in `out` are written after each cell, rows in the order of the
+    cells. A cell that fails is recorded there and the others go on; RunError at the end says which did.
     """
     runs = out / "runs"
     if out.exists() and not runs.exists() and any(out.iterdir()):
         raise RunError(f"{out}: not empty and not the folder of a sweep; choose a new folder")
-    rows: list[Row] = []
-    failed: list[str] = []
-    for number, cell in enumerate(sweep, 1):
-        begin = time.perf_counter()
-        job = Job(
-            RunDir(runs / cell.name, cell.config.ladder), _named(emit, cell.name), backend, threads, force
-        )
-        try:
-            _share_training(runs, sweep[: number - 1], cell)
-            pipeline.run_all(job, cell.capture or pipeline.demo_capture(job.emit), cell.config)
-            rows += _measure(cell, job)
-        except SageError as error:
-            failed.append(cell.name)
-            job.emit(Warned(str(error)))
-            nothing = [math.nan] * len(MEASURES)
-            for target in cell.config.plan.targets:
-                key = (cell.scene, cell.variant, cell.config.seed, target)
-                rows.append((*key, *nothing, f"failed: {error}"))
+    runs.mkdir(parents=True, exist_ok=True)
+    rows: dict[int, list[Row]] = {}
+    failed: dict[int, str] = {}
+    job = Job(RunDir(runs), emit, backend, threads, force, executor=executor)
+    for number, done in _run_cells(sweep, job):
+        rows[number] = done.rows
+        name = sweep[number].name
+        if done.failed:
+            failed[number] = name
         else:
-            seconds = time.perf_counter() - begin
-            emit(StageDone(cell.name, seconds, (f"run {number} of {len(sweep)}",)))
-        _write(out, rows)
-    shown = readable(summarise(rows), SHOWN)
+            emit(StageDone(name, done.seconds, (f"run {number + 1} of {len(sweep)}",)))
+        _write(out, [row for at in sorted(rows) for row in rows[at]])
+    shown = readable(summarise([row for at in sorted(rows) for row in rows[at]]), SHOWN)
     emit(TableMade(shown.title, shown.header, tuple(map(tuple, shown.cells()))))
     if failed:
+        names = ", ".join(failed[number] for number in sorted(failed))
         raise RunError(
-            f"{out}: {len(failed)} of {len(sweep)} runs failed ({', '.join(failed)}); mend what `status` in "
+            f"{out}: {len(failed)} of {len(sweep)} runs failed ({names}); mend what `status` in "
             f"{out / 'cells.csv'} says and sweep again"
         )
     return shown
 
 
-def _share_training(runs: Path, earlier: Sequence[Cell], cell: Cell) -> None:
-    """Begin with what an earlier cell has trained, if the settings up to there are the same."""
+@dataclass(frozen=True)
+class _Done:
+    """What became of a cell."""
+
+    rows: list[Row]
+    seconds: float
+    failed: bool
+
+
+def _run_cells(sweep: Sweep, job: Job) -> Iterator[tuple[int, _Done]]:
+    """The cells' results with their numbers, as they come; `job` is one on the folder of all runs.
+
+    Elsewhere a cell that shares the training of an earlier one waits for it.
+    """
+    like = {number: _trained_alike(sweep[:number], cell) for number, cell in enumerate(sweep)}
+    if isinstance(job.executor, Local):
+        for number, cell in enumerate(sweep):
+            yield number, _run_cell(cell, like[number], job)
+        return
+    if any(cell.capture is None for cell in sweep):
+        pipeline.demo_capture(job.emit)  # once, not in every process
+    ended = 0
+    job.emit(StageStarted("sweep"))
+    for first in (True, False):
+        numbers = [number for number, other in like.items() if (other is None) == first]
+        tasks = [Task("sweep", _cell, (sweep[n], like[n], job.spec), job.gpus) for n in numbers]
+        for i, done in job.executor.run(tasks, job.emit):
+            yield numbers[i], done
+            ended += 1
+            job.emit(StageStarted("sweep"))  # a bar of its own, below what was said of the cell
+            job.emit(Progress("sweep", ended, len(sweep)))
+
+
+def _cell(cell: Cell, like: Cell | None, spec: JobSpec, emit: Emit) -> _Done:
+    """A task: one cell; what it warns of is passed on, its progress is not."""
+    return _run_cell(cell, like, spec.open(lambda event: emit(event) if isinstance(event, Warned) else None))
+
+
+def _run_cell(cell: Cell, like: Cell | None, of: Job) -> _Done:
+    """Run a cell with the settings of a job on the folder of all runs."""
+    begin = time.perf_counter()
+    runs = of.run.path
+    job = replace(of, run=RunDir(runs / cell.name, cell.config.ladder), emit=_named(of.emit, cell.name))
+    try:
+        _share_training(runs, like, cell)
+        pipeline.run_all(job, cell.capture or pipeline.demo_capture(job.emit), cell.config)
+        return _Done(list(_measure(cell, job)), time.perf_counter() - begin, False)
+    except SageError as error:
+        job.emit(Warned(str(error)))
+        nothing = [math.nan] * len(MEASURES)
+        keys = [(cell.scene, cell.variant, cell.config.seed, target) for target in cell.config.plan.targets]
+        rows: list[Row] = [(*key, *nothing, f"failed: {error}") for key in keys]
+        return _Done(rows, time.perf_counter() - begin, True)
+
+
+def _trained_alike(earlier: Sequence[Cell], cell: Cell) -> Cell | None:
+    """The first cell with the same settings up to the training."""
 
     def trained(of: Cell) -> tuple:
         c = of.config
         return of.scene, c.scene, c.poses, c.masks, c.labels, c.lift, c.train, c.seed
 
-    like = next((c for c in earlier if trained(c) == trained(cell)), None)
+    return next((c for c in earlier if trained(c) == trained(cell)), None)
+
+
+def _share_training(runs: Path, like: Cell | None, cell: Cell) -> None:
+    """Begin with what an earlier cell has trained."""
     new = RunDir(runs / cell.name)
     if like is None or new.path.exists() or not RunDir(runs / like.name).provenance("train").exists():
         return

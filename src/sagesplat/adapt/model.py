@@ -75,25 +75,39 @@ class SsimModel:
         return ssim if isinstance(distance, np.ndarray) else float(ssim)
 
 
+class Samples(NamedTuple):
+    """What Eq. 3 of a category at a level is fitted to."""
+
+    label_id: int
+    level: int
+    distance: Float[np.ndarray, " n"]
+    ssim: Float[np.ndarray, " n"]
+
+
+def samples(observations: Observations, train_views: np.ndarray) -> list[Samples]:
+    """Distance and SSIM of every (category, level) seen in the training views (rows of Scene.views).
+
+    Rows of other views, rows of the whole image and rows without an SSIM are ignored.
+    """
+    use = np.isin(observations.view, train_views) & (observations.label_id != TOTAL)
+    rows = observations.select(use & np.isfinite(observations.ssim))
+    found = []
+    for label_id, level in np.unique(np.stack([rows.label_id, rows.level], 1), axis=0).tolist():
+        mine = (rows.label_id == label_id) & (rows.level == level)
+        found.append(Samples(label_id, level, rows.distance[mine], rows.ssim[mine]))
+    return found
+
+
 def fit_models(
     observations: Observations,
     train_views: np.ndarray,
     *,
     on_fit: Callable[[SsimModel], None] | None = None,
 ) -> dict[tuple[int, int], SsimModel]:
-    """Eq. 3 for every (category, level) seen in the training views (rows of Scene.views).
-
-    Rows of other views, rows of the whole image and rows without an SSIM are ignored; a pair with no row
-    left has no model.
-    """
-    use = np.isin(observations.view, train_views) & (observations.label_id != TOTAL)
-    rows = observations.select(use & np.isfinite(observations.ssim))
-    pairs = np.stack([rows.label_id, rows.level], 1)
+    """Eq. 3 for every (category, level) of `samples`; a pair with no row left has no model."""
     models = {}
-    for label_id, level in np.unique(pairs, axis=0).tolist():
-        mine = (rows.label_id == label_id) & (rows.level == level)
-        model = fit_model(label_id, level, rows.distance[mine], rows.ssim[mine])
-        models[label_id, level] = model
+    for found in samples(observations, train_views):
+        model = models[found.label_id, found.level] = fit_model(*found)
         if on_fit:
             on_fit(model)
     return models

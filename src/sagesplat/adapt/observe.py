@@ -1,6 +1,6 @@
 """Observations: the quality of each category at each level, view by view."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Protocol
@@ -190,21 +190,24 @@ def observe(
     ladder: Ladder,
     distances: Mapping[int, Float32[np.ndarray, " V"]],
     *,
+    views: Sequence[int] | None = None,
     backend: Backend = "auto",
     antialiased: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Observations:
-    """Render every level into every view and measure each category there.
+    """Render every level into every view, or some (rows of Scene.views), and measure each category there.
 
     `progress` hears (images measured, images in all).
     """
     rows: list[dict[str, float]] = []
-    inner = [erode(masks[view]) for view in scene.views]
-    done, total = 0, len(ladder.levels) * len(scene.views)
+    views = range(len(scene.views)) if views is None else views
+    inner = {row: erode(masks[scene.views[row]]) for row in views}
+    done, total = 0, len(ladder.levels) * len(views)
     workspace = Workspace()
     for level in ladder.levels:
         g = ladder.load(level).to(device_of(backend))
-        for row, view in enumerate(scene.views):
+        for row in views:
+            view = scene.views[row]
             image = render_rgb(g, view.camera, backend=backend, antialiased=antialiased, workspace=workspace)
             for label, values in measure(image, as_unit(photos[row]), masks[view], inner[row]).items():
                 distance = distances[label][row] if label in distances else np.nan
@@ -213,3 +216,11 @@ def observe(
             if progress:
                 progress(done, total)
     return from_rows(Observations, rows)
+
+
+def merge(parts: Sequence[Observations]) -> Observations:
+    """Tables of neighbouring views, in their order, as the one that all views together make."""
+    columns = {
+        f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Observations)
+    }
+    return Observations(**columns).select(np.argsort(columns["level"], kind="stable"))

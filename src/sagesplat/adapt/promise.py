@@ -173,8 +173,15 @@ def among_neighbours(
     return found
 
 
-def fit_promises(observations: Observations, scene: Scene, confidence: float = 0.95) -> dict[int, ViewModel]:
+def fit_promises(
+    observations: Observations,
+    scene: Scene,
+    confidence: float = 0.95,
+    curves: Mapping[tuple[int, int], SsimModel] | None = None,
+) -> dict[int, ViewModel]:
     """A calibrated model by label id, from the rows of the scene's training and calibration views.
+
+    `curves`: what `fit_models` finds in these rows, where it is at hand.
 
     Rows of test views and of the whole image are ignored. A category has the levels that Eq. 3 could be
     fitted for, and learns from views measured at all of them; one that no such view shows has no model.
@@ -185,8 +192,10 @@ def fit_promises(observations: Observations, scene: Scene, confidence: float = 0
             f"confidence {confidence} is impossible; choose a number between 0 and 1, such as 0.95"
         )
     rows = observations.select((observations.label_id != TOTAL) & np.isfinite(observations.ssim))
-    curves = fit_models(rows, scene.train_ids)
-    if absent := set(rows.label_id.tolist()) - {label for label, _ in curves}:  # not in any training view
+    seen = set(rows.label_id.tolist())
+    curves = fit_models(rows, scene.train_ids) if curves is None else curves
+    curves = {key: curve for key, curve in curves.items() if key[0] in seen}
+    if absent := seen - {label for label, _ in curves}:  # not in any training view
         late = rows.select(np.isin(rows.label_id, list(absent)))
         curves |= fit_models(late, scene.calibration_ids)
     models, left_out = [], []

@@ -6,6 +6,7 @@ from typing import Annotated
 
 from sagesplat.cli.base import Flat, LadderKind, Machine, Run, Scene, command, open_job
 from sagesplat.config import (
+    BlocksConfig,
     FitConfig,
     LabelsConfig,
     LiftConfig,
@@ -41,6 +42,7 @@ def run(
     labels: LabelsConfig = LabelsConfig(),
     lift: LiftConfig = LiftConfig(),
     train: TrainConfig = TrainConfig(),
+    blocks: BlocksConfig = BlocksConfig(),
     nest: NestConfig = NestConfig(),
     fit: FitConfig = FitConfig(),
     plan: Annotated[PlanConfig, Flat] = PlanConfig(),
@@ -55,7 +57,9 @@ def run(
     """
     from sagesplat import pipeline
 
-    config = RunConfig(scene_config, poses, masks, labels, lift, train, nest, fit, plan, fuse, ladder, seed)
+    config = RunConfig(
+        scene_config, poses, masks, labels, lift, train, blocks, nest, fit, plan, fuse, ladder, seed
+    )
     with open_job(run, machine, ladder) as job:
         pipeline.run_all(job, scene, config)
 
@@ -107,24 +111,41 @@ def fuse(run: Run, machine: Annotated[Machine, Flat] = Machine()) -> None:
 
 @command
 def train(
-    run: Run, train: TrainConfig = TrainConfig(), machine: Annotated[Machine, Flat] = Machine(), seed: int = 0
+    run: Run,
+    train: TrainConfig = TrainConfig(),
+    blocks: BlocksConfig = BlocksConfig(),
+    machine: Annotated[Machine, Flat] = Machine(),
+    seed: int = 0,
 ) -> None:
     """Train 3DGS and record the levels; a killed training goes on."""
-    from sagesplat import stages
+    from sagesplat import pipeline
 
     with open_job(run, machine) as job:
-        stages.train_levels(job, train, seed)
+        pipeline.train(job, train, blocks, seed)
+
+
+@command
+def parts(run: Run, machine: Annotated[Machine, Flat] = Machine()) -> None:
+    """Draw the label images of a scene in blocks: each category in each block is one of its own."""
+    from sagesplat import blocks
+
+    with open_job(run, machine) as job:
+        blocks.make_parts(job)
 
 
 @command
 def nest(
-    run: Run, nest: NestConfig = NestConfig(), machine: Annotated[Machine, Flat] = Machine(), seed: int = 0
+    run: Run,
+    nest: NestConfig = NestConfig(),
+    blocks: BlocksConfig = BlocksConfig(),
+    machine: Annotated[Machine, Flat] = Machine(),
+    seed: int = 0,
 ) -> None:
     """Make the nested ladder: order the trained Gaussians, train their prefixes, write the chunks."""
-    from sagesplat import nesting
+    from sagesplat import pipeline
 
     with open_job(run, machine) as job:
-        nesting.nest_levels(job, nest, seed)
+        pipeline.nest(job, nest, blocks, seed)
 
 
 @command

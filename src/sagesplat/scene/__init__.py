@@ -10,6 +10,7 @@ from sagesplat.scene.colmap import load_colmap
 from sagesplat.scene.detect import detect
 from sagesplat.scene.nerfstudio import load_blender, load_transforms
 from sagesplat.scene.scene import Scene
+from sagesplat.scene.stored import read_scene
 
 __all__ = ["describe", "load_scene"]
 
@@ -19,13 +20,16 @@ def load_scene(path: Path, *, downscale: int = 1, test_every: int = 8, calibrate
 
     Raises SceneError. Photos and videos without poses are none: `photos.reconstruct` makes one of them.
     Photos are `downscale` times smaller than the files in images/. Every `test_every`-th view by name is
-    kept for tests, none with 0; every `calibrate_every`-th of the others for calibration.
+    kept for tests, none with 0; every `calibrate_every`-th of the others for calibration. A stored scene is
+    as it was stored.
     """
     if calibrate_every < 0 or calibrate_every == 1:
         raise SceneError(f"{path}: calibrate_every {calibrate_every} leaves nothing; take 0 or 2 and more")
     kind = detect(path)
     if kind in ("photos", "video"):
         raise SceneError(f"{path}: {kind} without poses; `sagesplat run` finds them")
+    if kind == "stored":
+        return read_scene(path)
     load = {"colmap": load_colmap, "transforms": load_transforms, "blender": load_blender}[kind]
     scene = load(path, downscale=downscale, test_every=test_every)
     return replace(scene, calibrate_every=calibrate_every)

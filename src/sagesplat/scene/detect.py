@@ -4,8 +4,9 @@ from pathlib import Path
 from typing import Literal
 
 from sagesplat.errors import SceneError
+from sagesplat.scene import stored
 
-Kind = Literal["colmap", "transforms", "blender", "photos", "video"]
+Kind = Literal["colmap", "transforms", "blender", "stored", "photos", "video"]
 PHOTOS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif"})
 VIDEOS = frozenset(
     {".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".mts", ".m2ts", ".mpg", ".mpeg", ".3gp"}
@@ -18,6 +19,7 @@ def detect(path: Path) -> Kind:
     - colmap: cameras.bin or .txt in sparse/0 or sparse;
     - transforms: transforms.json, or the path of any .json file;
     - blender: transforms_train.json, or its path;
+    - stored: an .npz file, a part of a capture (`scene.stored`);
     - photos: photos in images/, or in the folder itself;
     - video: the path of a video file.
 
@@ -47,6 +49,8 @@ def _of_file(path: Path) -> Kind:
     suffix = path.suffix.lower()
     if suffix == ".json":
         return "blender" if path.name == "transforms_train.json" else "transforms"
+    if suffix == stored.SUFFIX:
+        return "stored"
     if suffix in VIDEOS:
         return "video"
     raise SceneError(f"{path}: neither a transforms .json nor a video; give a folder, or one of these files")

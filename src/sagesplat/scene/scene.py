@@ -76,6 +76,7 @@ class Scene:
     test_every: int = 8  # every n-th view by name is a test view; 0 = none
     calibrate_every: int = 0  # every n-th of the others calibrates promises; 0 = none
     test_names: frozenset[str] | None = None  # test views that the dataset lists, instead of test_every
+    calibration_names: frozenset[str] | None = None  # likewise, instead of calibrate_every
 
     @cached_property
     def extent(self) -> float:
@@ -95,6 +96,8 @@ class Scene:
     def calibration_ids(self) -> np.ndarray:
         """Rows of `views` that tell what a promise is worth where no photo was trained on."""
         rest = np.setdiff1d(np.arange(len(self.views)), self.test_ids)
+        if self.calibration_names is not None:
+            return rest[[self.views[i].name in self.calibration_names for i in rest]]
         return rest[self.calibrate_every // 2 :: self.calibrate_every] if self.calibrate_every else rest[:0]
 
     def split(self, row: int) -> str:

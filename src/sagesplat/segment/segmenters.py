@@ -13,6 +13,7 @@ from PIL import Image
 
 from sagesplat.errors import BackendUnavailable, LabelError, RunError
 from sagesplat.files import read_json, write_json
+from sagesplat.lock import locked
 from sagesplat.scene.scene import Scene, View
 from sagesplat.segment.masks import (
     UNLABELLED,
@@ -24,6 +25,7 @@ from sagesplat.segment.masks import (
 )
 from sagesplat.segment.soft import soft_path, write_soft
 
+_BEGINS = 60.0  # seconds that another process may take to begin a folder
 NEGLIGIBLE = 0.5 / 255  # no 8-bit image of probabilities shows less
 
 
@@ -62,19 +64,43 @@ def segment_views(
     soft: Path | None = None,
     on_view: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Write a normalised folder of masks: label images of every view, then labels.json.
+    """Write a normalised folder of masks: label images of every view, then labels.json (see `segment_some`).
+
+    Raises LabelError.
+    """
+    rows = range(len(scene.views))
+    occurring = segment_some(scene, photos, segmenter, target, rows, batch=batch, soft=soft, on_view=on_view)
+    write_labels(target, segmenter.taxonomy, occurring)
+
+
+def segment_some(
+    scene: Scene,
+    photos: PhotoList,
+    segmenter: Segmenter,
+    target: Path,
+    rows: Sequence[int],
+    *,
+    batch: int = 1,
+    soft: Path | None = None,
+    on_view: Callable[[int, int], None] | None = None,
+) -> set[int]:
+    """Write the label images of some views (rows of Scene.views); the ids that occur in them come back.
+
+    Several processes may do so with other views and the same network: the first one begins the folder.
 
     Up to `batch` photos of equal size are given to the segmenter at once. With `soft`, the probabilities of
     each view are kept there too (`soft.read_soft`). A finished label image in `target` is kept, so that a
     killed run goes on where it was, unless it is of other categories: empty the folder before using another
-    model of the same ones. `on_view(done, total)` is called after each view. Raises LabelError.
+    model of the same ones. `on_view(done, total)` is called after each view, `total` being that of `rows`.
+    Raises LabelError.
     """
     if not scene.views:
         raise LabelError(f"{scene.path}: a scene without views; there is no photo to segment")
-    taxonomy, total = segmenter.taxonomy, len(scene.views)
-    paths = prepare_folder(target, scene.views)
+    taxonomy, total = segmenter.taxonomy, len(rows)
     softs = [None if soft is None else soft_path(soft, view) for view in scene.views]
-    _begin(target, taxonomy, [*paths, *(path for path in softs if path is not None)])
+    with locked(target, _BEGINS):
+        paths = prepare_folder(target, scene.views)
+        _begin(target, taxonomy, [*paths, *(path for path in softs if path is not None)])
     occurring: set[int] = set()
     done = 0
 
@@ -86,7 +112,8 @@ def segment_views(
             on_view(done, total)
 
     missing = []
-    for row, view in enumerate(scene.views):
+    for row in rows:
+        view = scene.views[row]
         path, label_ids = softs[row], None
         if path is None or path.is_file():
             label_ids = _finished(paths[row], taxonomy, view)
@@ -94,11 +121,11 @@ def segment_views(
             missing.append(row)
         else:
             finish(label_ids)
-    for rows in _batches(scene.views, missing, batch):
-        for row, found in zip(rows, segmenter([photos[row] for row in rows]), strict=True):
+    for some in _batches(scene.views, missing, batch):
+        for row, found in zip(some, segmenter([photos[row] for row in some]), strict=True):
             _write(found, paths[row], softs[row], taxonomy)
             finish(found.label_ids)
-    write_labels(target, taxonomy, occurring)
+    return occurring
 
 
 def _begin(target: Path, taxonomy: Taxonomy, paths: Sequence[Path]) -> None:

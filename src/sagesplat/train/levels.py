@@ -93,6 +93,15 @@ def read_sizes(path: Path) -> dict[int, tuple[int, ...]]:
     return sizes
 
 
+def read_more(path: Path, name: str) -> np.ndarray[Any, Any]:
+    """An array that `write_set` recorded beside the Gaussians; DataError where there is none."""
+    with _open(path) as file:
+        try:
+            return file[f"more/{name}"]
+        except _DAMAGED as error:
+            raise DataError(f"{path}: no {name} in it ({short(error)}); make it again") from None
+
+
 def _open(path: Path) -> Npz:
     try:
         return Npz(path)

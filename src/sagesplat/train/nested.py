@@ -156,6 +156,7 @@ def nest(
     backend: Backend = "auto",
     checkpoint: Path | None = None,
     settings: str = "",
+    movable: np.ndarray | None = None,  # bool [N]
 ) -> Iterator[NestStep | Resumed | Nested]:
     """Train so that every composition of prefixes looks right; the last event is the result.
 
@@ -163,7 +164,8 @@ def nest(
     (with a probability that rises from `config.full_share`), and compares that composition with a photo,
     values rounded as the chunks will have them. Gaussians outside it, their moments included, stay as they
     are. Now and then all are sorted again by what they have become worth beside each other: of a category,
-    still first those across borders, then the seeds, then the rest.
+    still first those across borders, then the seeds, then the rest. With `movable`, the others stay as they
+    are, and the order too.
     A `checkpoint` of the same `settings` is continued.
     """
     check(config)
@@ -179,12 +181,15 @@ def nest(
     state = state.to(device)
     categories, column = np.unique(labels, return_inverse=True)
     column = torch.from_numpy(column).to(device)
-    views, sort_at = scene.train_ids.tolist(), {round(part * config.steps) for part in _SORT_AT}
+    views = scene.train_ids.tolist()
+    sort_at = {round(part * config.steps) for part in _SORT_AT} if movable is None else {}
     config_of_steps = replace(train_config, strategy="default", batch=1)
     stepper = Stepper(Feed(scene, photos, device), config_of_steps, Work(scene, None), backend)
     stepper.sh_bits = config.sh_bits
     rates = _rates(train_config, config, scene)
-    everything = trainable_rows(state.gaussians, {})
+    trainable = trainable_rows(state.gaussians, {})
+    if movable is not None:
+        trainable &= torch.from_numpy(movable[near]).to(device)
     value = 0.0
     with named_failures(lambda: f"training on compositions stopped at step {state.step}"):
         while state.step < config.steps:
@@ -199,7 +204,7 @@ def nest(
                 assert state.place is not None
                 rows = torch.nonzero(state.place < torch.from_numpy(prefix).to(device)[column])[:, 0]
             loss = stepper(
-                state, nested.gaussians.sh_degree, rates(state.step + 1), everything, drawn_rows=rows
+                state, nested.gaussians.sh_degree, rates(state.step + 1), trainable, drawn_rows=rows
             )
             saves = state.step % _SAVE_EVERY == 0
             if device.type == "cpu" or saves or state.step % LOOK_EVERY == 0:  # looking waits for a GPU

@@ -1,0 +1,246 @@
+"""A large scene in blocks of its ground plane: a k-d split balanced by points and views."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64, Int, Int64
+
+from sagesplat import geometry
+from sagesplat.errors import RunError, SceneError, short
+from sagesplat.files import read_json, write_json
+from sagesplat.scene.scene import Points, Scene
+
+MOST = 4096
+_ANGLES = np.radians(np.arange(0, 90, 7.5))  # of the grid that is cut along; the one that cuts least is taken
+_SLACK = 0.08  # share of a block's weight that a cut may be off balance, to go where little is
+_TRIES = 33  # places of a cut that are looked at
+_INNER = (2.0, 98.0)  # percentiles that a scene reaches between, for those who are to measure it
+_LEAST_UP = 0.02  # of the cameras' spread: less than that along an axis says nothing of the ground
+_MOST_SAMPLED = 200_000  # points that a split looks at
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """Boxes of the ground plane without gaps; the outer ones reach to infinity."""
+
+    axes: Float64[np.ndarray, "2 3"]  # of the ground plane, in world coordinates
+    low: Float64[np.ndarray, "B 2"]  # corners along the axes, world units; -inf at the scene's edge
+    high: Float64[np.ndarray, "B 2"]
+    margin: float  # world units that a block's training reaches beyond its border
+
+    def __len__(self) -> int:
+        return len(self.low)
+
+    def ground(self, xyz: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 2"]:
+        """Coordinates of world points in the ground plane."""
+        return xyz.astype(np.float64) @ self.axes.T
+
+    def of(self, xyz: Float[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
+        """The block that each point belongs to."""
+        at = self.ground(xyz)
+        found = np.zeros(len(at), np.int64)
+        for block in range(1, len(self)):
+            inside = (at >= self.low[block]) & (at < self.high[block])
+            found[inside.all(1)] = block
+        return found
+
+    def within(self, xyz: Float[np.ndarray, "N 3"], block: int, reach: float) -> Bool[np.ndarray, " N"]:
+        """Points of a block, or at most `reach` beyond its border along either axis."""
+        at = self.ground(xyz)
+        return ((at >= self.low[block] - reach) & (at < self.high[block] + reach)).all(1)
+
+    def to_border(self, xyz: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
+        """How far points are from the border of their block, in the ground plane, world units."""
+        at, block = self.ground(xyz), self.of(xyz)
+        return np.minimum(at - self.low[block], self.high[block] - at).min(1, initial=np.inf)
+
+    def neighbours(self) -> Bool[np.ndarray, "B B"]:
+        """Blocks whose boxes touch."""
+        touch = (self.low[:, None] <= self.high[None]) & (self.low[None] <= self.high[:, None])
+        return touch.all(2) & ~np.eye(len(self), dtype=bool)
+
+
+def split(scene: Scene, count: int, margin: float = 0.2) -> Blocks:
+    """Divide a scene into `count` blocks, each with its share of the points and of the training views.
+
+    `margin`: of a block's width. RunError where that many cannot be made.
+    """
+    cameras = np.stack([scene.views[i].camera.position for i in scene.train_ids]).astype(np.float64)
+    xyz = scene.points.xyz.astype(np.float64)
+    if not 2 <= count <= min(MOST, len(cameras), max(len(xyz), 1)):
+        raise RunError(
+            f"{scene.path}: {count} blocks of {len(cameras)} training views and {len(xyz):,} points are "
+            "impossible; choose fewer with --blocks.count (1 trains the scene as one)"
+        )
+    xyz = xyz[:: max(1, len(xyz) // _MOST_SAMPLED)]
+    plane = _ground_plane(scene, cameras)
+    places = np.concatenate([xyz, cameras]) @ plane.T
+    weights = np.repeat([1 / len(xyz), 1 / len(cameras)], [len(xyz), len(cameras)])
+    best: tuple[float, Blocks] | None = None
+    for angle in _ANGLES:
+        turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        at = places @ turn.T
+        outline = np.percentile(at[: len(xyz)], _INNER, axis=0)
+        reach = margin * float(np.sqrt(np.prod(np.ptp(outline, axis=0)) / count))
+        boxes: list[tuple[np.ndarray, np.ndarray]] = []
+        cost = _cut(at, weights, np.full(2, -np.inf), np.full(2, np.inf), outline, count, reach, boxes)
+        if best is None or cost < best[0]:
+            low, high = (np.array(corner) for corner in zip(*boxes, strict=True))
+            best = cost, Blocks(turn @ plane, low, high, reach)
+    assert best
+    return best[1]
+
+
+def _ground_plane(scene: Scene, cameras: np.ndarray) -> np.ndarray:
+    """Two unit axes [2, 3]: across what the cameras spread least along, or is up in most photos."""
+    up = -np.mean([scene.views[i].camera.w2c[1, :3] for i in scene.train_ids], axis=0)
+    up /= max(float(np.linalg.norm(up)), 1e-12)
+    spread = np.cov(cameras.T)
+    spread += _LEAST_UP * np.trace(spread) * (np.eye(3) - np.outer(up, up))
+    return np.linalg.eigh(spread)[1].T[:0:-1]
+
+
+def _cut(
+    at: np.ndarray, weights: np.ndarray, low: np.ndarray, high: np.ndarray, outline: np.ndarray,
+    count: int, reach: float, boxes: list[tuple[np.ndarray, np.ndarray]],
+) -> float:  # fmt: skip
+    """Divide a box into `count`, across its longer side where least is near; the weight beside all cuts."""
+    if count == 1:
+        boxes.append((low, high))
+        return 0.0
+    axis = int(np.argmax(np.minimum(high, outline[1]) - np.maximum(low, outline[0])))
+    first = count // 2
+    order = np.argsort(at[:, axis], kind="stable")
+    along, summed = at[order, axis], weights[order].cumsum()
+    shares = first / count + np.array([-_SLACK, _SLACK])
+    ends = along[np.searchsorted(summed, shares * summed[-1]).clip(1, len(along) - 1)]
+    tries = np.linspace(ends[0], ends[1], _TRIES)
+    padded = np.concatenate([[0.0], summed])
+    beside = padded[np.searchsorted(along, tries + reach)] - padded[np.searchsorted(along, tries - reach)]
+    centred = 1 + np.abs(np.linspace(-1, 1, _TRIES))  # of equals the most balanced
+    place = tries[np.argmin(beside * centred)]
+    left = at[:, axis] < place
+    top, bottom = high.copy(), low.copy()
+    top[axis] = bottom[axis] = place
+    cost = float(beside[np.argmin(beside * centred)])
+    cost += _cut(at[left], weights[left], low, top, outline, first, reach, boxes)
+    return cost + _cut(at[~left], weights[~left], bottom, high, outline, count - first, reach, boxes)
+
+
+def visible_shares(scene: Scene, of_points: Int[np.ndarray, " P"], count: int) -> Float64[np.ndarray, "V B"]:
+    """Share of the points that each view sees, by block: those of its tracks, or else in its frustum."""
+    seen = np.zeros((len(scene.views), count))
+    points = scene.points
+    if len(points.track_points):
+        np.add.at(seen, (points.track_views, of_points[points.track_points]), 1)
+    for row in np.flatnonzero(seen.sum(1) == 0):
+        camera = scene.views[row].camera
+        pixels, _ = geometry.project(points.xyz, camera.w2c, camera.K)
+        inside = ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(1)
+        seen[row] = np.bincount(of_points[inside], minlength=count)
+    return seen / np.maximum(seen.sum(1, keepdims=True), 1)
+
+
+def views_of(
+    scene: Scene, blocks: Blocks, shares: Float64[np.ndarray, "V B"], min_share: float
+) -> Bool[np.ndarray, "V B"]:
+    """The blocks that each view is for: those that it sees enough of, that it sees most of, that it is in."""
+    own = blocks.of(np.stack([view.camera.position for view in scene.views]))
+    every = np.arange(len(scene.views))
+    assigned = shares >= min_share
+    assigned[every, own] = True
+    assigned[every, shares.argmax(1)] = True
+    return assigned
+
+
+def part_of(
+    scene: Scene, blocks: Blocks, block: int, views: Sequence[int], far_share: float, seed: int
+) -> tuple[Scene, Int64[np.ndarray, " Q"]]:
+    """What a block is trained on: these views, and the rows of its points.
+
+    Of the points beyond the margin those that the views see stand for what is behind, at most `far_share` of
+    the near ones. RunError where a block has nothing to train on.
+    """
+    points, rows = scene.points, np.asarray(views, np.int64)
+    near = blocks.within(points.xyz, block, blocks.margin)
+    if not len(rows) or near.sum() < 4:
+        raise RunError(
+            f"{scene.path}: block {block} has {len(rows)} views and {int(near.sum())} points; "
+            "choose fewer blocks with --blocks.count"
+        )
+    far = np.flatnonzero(_seen(scene, rows) & ~near)
+    most = int(far_share * near.sum())
+    if len(far) > most:
+        far = np.random.default_rng([seed, block]).choice(far, most, replace=False)
+    kept = np.sort(np.concatenate([np.flatnonzero(near), far]))
+    place, view_place = np.full(len(points.xyz), -1), np.full(len(scene.views), -1)
+    place[kept], view_place[rows] = np.arange(len(kept)), np.arange(len(rows))
+    tracks = (place[points.track_points] >= 0) & (view_place[points.track_views] >= 0)
+    part = Points(
+        points.xyz[kept],
+        points.rgb[kept],
+        place[points.track_points[tracks]],
+        view_place[points.track_views[tracks]].astype(np.int32),
+        points.track_uv[tracks],
+    )
+    return (
+        replace(
+            scene,
+            name=f"{scene.name}, block {block}",
+            views=tuple(scene.views[i] for i in rows),
+            points=part,
+            test_names=frozenset(),
+            calibration_names=frozenset(),
+        ),
+        kept,
+    )
+
+
+def _seen(scene: Scene, rows: np.ndarray) -> np.ndarray:
+    """Points (bool [P]) in sight of some views."""
+    points = scene.points
+    seen = np.zeros(len(points.xyz), bool)
+    if len(points.track_points):
+        seen[points.track_points[np.isin(points.track_views, rows)]] = True
+        return seen
+    for row in rows:
+        camera = scene.views[row].camera
+        pixels, _ = geometry.project(points.xyz, camera.w2c, camera.K)
+        seen |= ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(1)
+    return seen
+
+
+def colours(adjacent: Bool[np.ndarray, "B B"]) -> Int64[np.ndarray, " B"]:
+    """Numbers such that adjacent blocks have different ones, few in all: those of one can change at once."""
+    found = np.full(len(adjacent), -1)
+    for block in np.argsort(-adjacent.sum(1), kind="stable"):
+        taken = set(found[adjacent[block]].tolist())
+        found[block] = next(colour for colour in range(len(adjacent)) if colour not in taken)
+    return found
+
+
+def write_blocks(path: Path, blocks: Blocks, **more: Any) -> None:
+    """Record a partition, and what else is known of it."""
+    corners = {"low": _finite(blocks.low), "high": _finite(blocks.high)}
+    write_json(path, {"axes": blocks.axes.tolist(), **corners, "margin": blocks.margin, **more})
+
+
+def read_blocks(path: Path) -> Blocks:
+    """The partition in a file; SceneError for anything else."""
+    found = read_json(path)
+    try:
+        low = np.array([[-np.inf if v is None else float(v) for v in row] for row in found["low"]])
+        high = np.array([[np.inf if v is None else float(v) for v in row] for row in found["high"]])
+        axes, margin = np.array(found["axes"], np.float64), float(found["margin"])
+        if low.shape != high.shape or low.shape[1:] != (2,) or axes.shape != (2, 3) or len(low) < 1:
+            raise ValueError(f"boxes of shape {low.shape}")
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise SceneError(f"{path}: not a partition ({short(error)}); run with --force") from None
+    return Blocks(axes, low, high, margin)
+
+
+def _finite(corners: np.ndarray) -> list[list[float | None]]:
+    return [[v if np.isfinite(v) else None for v in row] for row in corners.tolist()]

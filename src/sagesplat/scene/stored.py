@@ -1,0 +1,92 @@
+"""A scene in one file: a part of a capture that is trained by itself keeps its views and points so."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from sagesplat.errors import SceneError, short
+from sagesplat.files import atomic_path
+from sagesplat.npz import Npz
+from sagesplat.scene.scene import Camera, Lens, Points, Scene, View
+
+SUFFIX = ".npz"
+_POINTS = {
+    "xyz": (np.float32, 2),
+    "rgb": (np.uint8, 2),
+    "track_points": (np.int64, 1),
+    "track_views": (np.int32, 1),
+    "track_uv": (np.float32, 2),
+}
+
+
+def write_scene(path: Path, scene: Scene) -> None:
+    """Record views, points and splits; the photos stay where they are."""
+    views = [
+        {
+            "name": view.name,
+            "image": str(view.image_path.resolve()),
+            "size": [view.camera.width, view.camera.height],
+            "background": view.camera.background,
+            "lens": asdict(view.lens) if view.lens else None,
+        }
+        for view in scene.views
+    ]
+    names = [view.name for view in scene.views]
+    about = {
+        "name": scene.name,
+        "views": views,
+        "test": [names[i] for i in scene.test_ids],
+        "calibration": [names[i] for i in scene.calibration_ids],
+    }
+    arrays = {name: getattr(scene.points, name) for name in _POINTS}
+    with atomic_path(path) as temporary:
+        np.savez(
+            temporary, about=np.array(json.dumps(about)),
+            w2c=np.stack([view.camera.w2c for view in scene.views]),
+            K=np.stack([view.camera.K for view in scene.views]), **arrays,
+        )  # fmt: skip
+
+
+def read_scene(path: Path) -> Scene:
+    """The scene that `write_scene` wrote; SceneError for anything else."""
+    try:
+        with Npz(path) as stored:
+            about = json.loads(str(stored["about"]))
+            w2c, K = stored["w2c"].astype(np.float32), stored["K"].astype(np.float32)
+            columns = {name: stored[name].astype(kind) for name, (kind, _) in _POINTS.items()}
+        views = tuple(_view(*entry) for entry in zip(about["views"], w2c, K, strict=True))
+        points = Points(**columns)
+        _check(points, len(views))
+        test, calibration = frozenset(about["test"]), frozenset(about["calibration"])
+        return Scene(str(about["name"]), path, views, points, test_names=test, calibration_names=calibration)
+    except FileNotFoundError:
+        raise SceneError(f"{path}: no such file; name a capture") from None
+    except (OSError, KeyError, TypeError, ValueError, RecursionError) as error:
+        raise SceneError(f"{path}: not a stored scene ({short(error)}); make it again") from None
+
+
+def _view(about: dict, w2c: np.ndarray, K: np.ndarray) -> View:
+    width, height = about["size"]
+    if type(width) is not int or type(height) is not int or not (0 < width < 2**16 and 0 < height < 2**16):
+        raise ValueError(f"a view of {width!r} x {height!r} pixels")
+    if w2c.shape != (4, 4) or K.shape != (3, 3) or not (np.isfinite(w2c).all() and np.isfinite(K).all()):
+        raise ValueError(f"no camera for {about['name']}")
+    r, g, b = map(int, about["background"])
+    lens = about["lens"]
+    if lens:
+        lens = Lens(lens["model"], tuple(map(float, lens["params"])), int(lens["width"]), int(lens["height"]))
+    return View(str(about["name"]), Camera(w2c, K, width, height, (r, g, b)), Path(about["image"]), lens)
+
+
+def _check(points: Points, num_views: int) -> None:
+    """ValueError for arrays that do not fit each other."""
+    n, t = len(points.xyz), len(points.track_points)
+    shapes = {"xyz": (n, 3), "rgb": (n, 3), "track_views": (t,), "track_points": (t,), "track_uv": (t, 2)}
+    for name, shape in shapes.items():
+        if getattr(points, name).shape != shape:
+            raise ValueError(f"{name} of shape {getattr(points, name).shape}")
+    for rows, most in ((points.track_points, n), (points.track_views, num_views)):
+        if t and not 0 <= rows.min() <= rows.max() < most:
+            raise ValueError("a track of what is not there")

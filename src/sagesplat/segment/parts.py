@@ -1,0 +1,61 @@
+"""Parts of a large scene: each category in each block is one, with an id and a name of its own."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from sagesplat.errors import LabelError
+from sagesplat.segment.masks import MAX_LABEL_ID, UNLABELLED, Taxonomy
+
+_MARK = "@"  # between category and block in a part's name
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Numbers the parts: the categories of block 0, then those of block 1, ...; the unlabelled one first."""
+
+    taxonomy: Taxonomy  # of the categories
+    blocks: int
+
+    def __post_init__(self) -> None:
+        if self.blocks * len(self.categories) > MAX_LABEL_ID:
+            raise LabelError(
+                f"{self.blocks} blocks of {len(self.categories)} categories are too many; choose fewer with "
+                "--blocks.count or --labels.keep"
+            )
+
+    @cached_property
+    def categories(self) -> np.ndarray:
+        """Category ids, ascending."""
+        return np.array([UNLABELLED, *sorted(self.taxonomy.names)], np.int16)
+
+    def ids(self, label_ids: np.ndarray, block: np.ndarray | int) -> np.ndarray:
+        """Parts (int16) of category ids in blocks; arrays of one shape."""
+        column = np.searchsorted(self.categories, label_ids)
+        return (column + np.asarray(block) * len(self.categories)).astype(np.int16)
+
+    def block_of(self, part_ids: np.ndarray) -> np.ndarray:
+        """Blocks of parts."""
+        return (part_ids // len(self.categories)).astype(np.int16)
+
+    @property
+    def names(self) -> Taxonomy:
+        """The parts as a taxonomy."""
+        found = {}
+        for block in range(self.blocks):
+            for column, label in enumerate(self.categories.tolist()):
+                part = block * len(self.categories) + column
+                found[part] = f"{self.taxonomy.name(label)}{_MARK}{block}"
+        return Taxonomy(found)
+
+
+def category_of(name: str) -> str:
+    """The category in a part's name; of another name, that name."""
+    return split_name(name)[0]
+
+
+def split_name(name: str) -> tuple[str, int | None]:
+    """Category and block of a part's name; no block for a category that is in none."""
+    category, mark, block = name.rpartition(_MARK)
+    return (category, int(block)) if mark and category and block.isdecimal() else (name, None)

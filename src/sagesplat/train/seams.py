@@ -1,0 +1,98 @@
+"""Where blocks that were trained by themselves meet: cut, put together, tuned, measured."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool
+
+from sagesplat import geometry
+from sagesplat.gaussians import Gaussians, concat
+from sagesplat.metrics import psnr
+from sagesplat.scene.blocks import Blocks, visible_shares
+from sagesplat.scene.scene import Scene
+from sagesplat.segment.parts import Parts
+
+SEVERAL = 0.1  # share of what a view sees that is of other blocks, from which on it tells of seams
+_PAD = 0.25  # of the image beyond its edges: Gaussians that begin there may reach into it
+
+
+def core(
+    g: Gaussians,
+    sizes: dict[int, tuple[int, ...]],
+    clarity: np.ndarray,
+    blocks: Blocks,
+    parts: Parts,
+    block: int,
+) -> tuple[Gaussians, dict[int, tuple[int, ...]], np.ndarray]:
+    """What a block adds to the whole: its Gaussians inside its border as parts, their sizes and clarity.
+
+    `sizes` by label id, of a nested ladder, or empty. Of a category that has any, every level has one.
+    """
+    inside = blocks.of(g.means.numpy()) == block
+    labels = g.label_ids.numpy()
+    found = {}
+    for label, levels in sizes.items():
+        summed = np.concatenate([[0], inside[labels == label].cumsum()])
+        if summed[-1]:
+            part = int(parts.ids(np.array(label), block))
+            found[part] = tuple(int(max(1, summed[n])) for n in levels)
+    kept = g.select(torch.from_numpy(inside))
+    part_ids = parts.ids(kept.label_ids.numpy(), block)
+    return replace(kept, label_ids=torch.from_numpy(part_ids)), found, clarity[inside]
+
+
+def seam_views(scene: Scene, blocks: Blocks, block: int) -> list[int]:
+    """Training views of a block (rows) that see enough of others."""
+    shares = visible_shares(scene, blocks.of(scene.points.xyz), len(blocks))
+    return [row for row in scene.train_ids.tolist() if shares[row, block] < 1 - SEVERAL]
+
+
+def in_sight(g: Gaussians, scene: Scene, views: Sequence[int]) -> Bool[np.ndarray, " N"]:
+    """Gaussians whose centre is in the frustum of some of the views, or near it."""
+    seen, means = np.zeros(len(g), bool), g.means.numpy()
+    for row in views:
+        camera = scene.views[row].camera
+        pixels, _ = geometry.project(means, camera.w2c, camera.K)
+        size = np.array([camera.width, camera.height])
+        seen |= ((pixels >= -_PAD * size) & (pixels < (1 + _PAD) * size)).all(1)
+    return seen
+
+
+def around(own: Gaussians, others: Sequence[Gaussians], scene: Scene, views: Sequence[int]) -> Gaussians:
+    """A block's Gaussians, then what its views see of the others'."""
+    seen = [g.select(torch.from_numpy(in_sight(g, scene, views))) for g in others]
+    return concat([own, *seen])
+
+
+@dataclass(frozen=True)
+class Bands:
+    """Quality of a composition near the borders of blocks and away from them, over some views."""
+
+    pixels: int
+    share: float  # of the pixels that are in a band
+    psnr: float  # dB over all pixels in bands
+    psnr_inside: float  # dB over all others
+    ssim: float
+    ssim_inside: float
+
+
+def bands(in_band: Sequence[np.ndarray], squares: Sequence[np.ndarray], ssim: Sequence[np.ndarray]) -> Bands:
+    """Sum up views: pixels in a band (bool [H, W]), squared errors and SSIM there."""
+    band = np.concatenate([b.ravel() for b in in_band])
+    error, quality = (
+        np.concatenate([v.ravel() for v in maps]).astype(np.float64) for maps in (squares, ssim)
+    )
+
+    def mean(values: np.ndarray) -> float:
+        return float(values.mean()) if len(values) else np.nan
+
+    return Bands(
+        len(band),
+        mean(band),
+        float(psnr(mean(error[band]))),
+        float(psnr(mean(error[~band]))),
+        mean(quality[band]),
+        mean(quality[~band]),
+    )
