@@ -28,7 +28,8 @@ MEMORY = 16 * 2**30  # bytes of address space; torch takes some of them for itse
 # What is measured; compiled kernels cannot be
 MODULES = [
     "errors", "files", "npz", "gaussians", "ply_header", "remote_zip", "sweep",
-    "scene.colmap", "scene.colmap_read", "scene.nerfstudio", "scene.points", "scene.undistort",
+    "scene.blocks", "scene.stored", "scene.colmap", "scene.colmap_read",
+    "scene.nerfstudio", "scene.points", "scene.undistort",
     "output.ply", "output.spz", "output.chunks", "adapt.columns", "adapt.ladder", "adapt.model", "adapt.plan",
     "adapt.promise", "segment.coco", "segment.masks", "segment.onnx", "segment.soft", "segment.lift",
     "segment.taxonomies", "train.checkpoint", "train.levels",

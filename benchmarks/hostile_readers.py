@@ -23,10 +23,13 @@ from sagesplat.output.chunks import read_chunks, read_index, totals
 from sagesplat.output.ply import read_ply, write_ply
 from sagesplat.output.spz import decode_spz, encode_spz
 from sagesplat.remote_zip import TAIL, RemoteZip
+from sagesplat.scene.blocks import Blocks, read_blocks, write_blocks
 from sagesplat.scene.colmap import load_colmap
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage, write_model
 from sagesplat.scene.nerfstudio import load_transforms
 from sagesplat.scene.points import read_points
+from sagesplat.scene.scene import Camera, Lens, Points, Scene, View
+from sagesplat.scene.stored import read_scene, write_scene
 from sagesplat.segment.coco import read_panoptic
 from sagesplat.segment.lift import LiftedLabels
 from sagesplat.segment.masks import Taxonomy, read_mask, write_mask
@@ -240,6 +243,21 @@ def _lifted(folder: Path) -> list[bytes]:
     return [_written(folder / "l.npz", table.write)]
 
 
+def _stored(folder: Path) -> list[bytes]:
+    camera = Camera(np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32), 8, 6)
+    lens = Lens("OPENCV", (4.0, 4.0, 4.0, 3.0, 0.1, 0.0, 0.0, 0.0), 8, 6)
+    views = tuple(View(name, camera, Path(f"/p/{name}"), lens) for name in PHOTOS)
+    rows, xyz = np.arange(3), np.zeros((3, 3), np.float32)
+    points = Points(xyz, xyz.astype(np.uint8), rows, rows.astype(np.int32), xyz[:, :2])
+    return [_written(folder / "s.npz", lambda path: write_scene(path, Scene("s", folder, views, points)))]
+
+
+def _partition(folder: Path) -> list[bytes]:
+    low, high = np.array([[-np.inf, 0], [1, -np.inf]]), np.array([[1, np.inf], [np.inf, 2.5]])
+    blocks = Blocks(np.eye(3)[:2], low, high, 0.5)
+    return [_written(folder / "b.json", lambda path: write_blocks(path, blocks, views=[3, 4]))]
+
+
 SWEEP = """targets = [0.4, 0.3]
 seeds = [0, 5]
 settings.ladder = "snapshots"
@@ -323,6 +341,8 @@ READERS = (
     Reader("nested", ".npz", _nested, _file("n.npz", _read_nested), 48),
     Reader("soft", ".npz", _soft, _file("s.npz", read_soft), 8 * DEFLATE),
     Reader("lifted", ".npz", _lifted, _file("l.npz", lambda path: LiftedLabels.read(path, 4)), 16),
+    Reader("stored", ".npz", _stored, _file("s.npz", read_scene), JSON),
+    Reader("partition", ".json", _partition, _file("b.json", read_blocks), JSON),
     Reader("classes", ".json", _json(CLASSES, {"classes": ["sky"], "vocabulary": "ade20k"}),
            _file("c.json", read_classes), JSON),
     Reader("sweep", ".toml", lambda _: [SWEEP.encode()], _file("s.toml", read_sweep), 256, 16 * MIB),

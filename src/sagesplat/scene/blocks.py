@@ -237,7 +237,7 @@ def read_blocks(path: Path) -> Blocks:
         axes, margin = np.array(found["axes"], np.float64), float(found["margin"])
         if low.shape != high.shape or low.shape[1:] != (2,) or axes.shape != (2, 3) or len(low) < 1:
             raise ValueError(f"boxes of shape {low.shape}")
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
         raise SceneError(f"{path}: not a partition ({short(error)}); run with --force") from None
     return Blocks(axes, low, high, margin)
 

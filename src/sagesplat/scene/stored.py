@@ -63,7 +63,7 @@ def read_scene(path: Path) -> Scene:
         return Scene(str(about["name"]), path, views, points, test_names=test, calibration_names=calibration)
     except FileNotFoundError:
         raise SceneError(f"{path}: no such file; name a capture") from None
-    except (OSError, KeyError, TypeError, ValueError, RecursionError) as error:
+    except (OSError, KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise SceneError(f"{path}: not a stored scene ({short(error)}); make it again") from None
 
 
