@@ -396,6 +396,59 @@ def viewer_figure(curves: Path, out: Path) -> None:
 
 
 @app.command
+def scaling(
+    bundles: tyro.conf.Positional[tuple[Path, ...]] = (),
+    *,
+    out: Path,
+    viewers: tuple[int, ...] = (1_000, 10_000, 100_000, 1_000_000, 10_000_000),
+    seed: int = 0,
+    write: bool = False,
+) -> None:
+    """Internet scale by simulation (docs/scaling.md): visits, caches of a CDN, new trainings, money.
+
+    Args:
+        bundles: folders whose visits are recorded (none: the committed recordings).
+        out: folder for JSON, CSV and figures.
+        viewers: visits a day.
+        seed: of the simulated days.
+        write: also copy them to benchmarks/results and docs/images.
+    """
+    from benchmarks.scaling import report
+    from sagesplat.errors import SageError
+
+    try:
+        result = report.run(bundles, out, viewers, seed, lambda line: print(line, flush=True))
+    except SageError as error:
+        raise SystemExit(str(error)) from None
+    if write:
+        report.commit(out)
+    kept = ("viewers", "mb_per_visit", "pop_hits_bytes", "origin_gb", "peak_origin_requests_per_s")
+    _finish("scaling", {"days": [{name: row[name] for name in kept} for row in result["days"]]}, False)
+
+
+@app.command
+def blocks(
+    scene: Path, out: Path, count: int = 4, steps: int = 3000, nest_steps: int = 1000, seam_steps: int = 300,
+    threads: int = 1, margin: float = 0.2, write: bool = False,
+) -> None:  # fmt: skip
+    """A large scene in blocks of `steps` each, and as one with as many steps as all blocks together."""
+    from benchmarks.blocks import compare
+    from sagesplat.config import BlocksConfig, NestConfig, RunConfig, TrainConfig
+
+    def config(times: int) -> RunConfig:
+        return RunConfig(
+            train=TrainConfig(max_steps=times * steps),
+            blocks=BlocksConfig(count=count, seam_steps=seam_steps, margin=margin),
+            nest=NestConfig(steps=times * nest_steps, seed_steps=times * nest_steps, levels=12),
+        )
+
+    tables, result = compare(scene, out, config(1), config(count), threads)
+    for table in tables:
+        print(f"\n{table.title}\n\n{table.markdown()}")
+    _finish("blocks", result, write)
+
+
+@app.command
 def freeze(
     scene: Path = workloads.GARDEN,
     downscale: int = 2,

@@ -17,7 +17,7 @@ MOST = 4096
 _ANGLES = np.radians(np.arange(0, 90, 7.5))  # of the grid that is cut along; the one that cuts least is taken
 _SLACK = 0.08  # share of a block's weight that a cut may be off balance, to go where little is
 _TRIES = 33  # places of a cut that are looked at
-_INNER = (2.0, 98.0)  # percentiles that a scene reaches between, for those who are to measure it
+_NARROW = 0.25  # of a scene's length: narrower ones count as this wide
 _LEAST_UP = 0.02  # of the cameras' spread: less than that along an axis says nothing of the ground
 _MOST_SAMPLED = 200_000  # points that a split looks at
 
@@ -66,7 +66,7 @@ class Blocks:
 def split(scene: Scene, count: int, margin: float = 0.2) -> Blocks:
     """Divide a scene into `count` blocks, each with its share of the points and of the training views.
 
-    `margin`: of a block's width. RunError where that many cannot be made.
+    `margin`: of a block's width, where there are cameras. RunError where that many cannot be made.
     """
     cameras = np.stack([scene.views[i].camera.position for i in scene.train_ids]).astype(np.float64)
     xyz = scene.points.xyz.astype(np.float64)
@@ -83,8 +83,10 @@ def split(scene: Scene, count: int, margin: float = 0.2) -> Blocks:
     for angle in _ANGLES:
         turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
         at = places @ turn.T
-        outline = np.percentile(at[: len(xyz)], _INNER, axis=0)
-        reach = margin * float(np.sqrt(np.prod(np.ptp(outline, axis=0)) / count))
+        walked = at[len(xyz) :]  # what is seen may be anywhere
+        outline = np.stack([walked.min(0), walked.max(0)])
+        size = np.ptp(outline, axis=0)
+        reach = margin * float(np.sqrt(np.prod(np.maximum(size, _NARROW * size.max())) / count))
         boxes: list[tuple[np.ndarray, np.ndarray]] = []
         cost = _cut(at, weights, np.full(2, -np.inf), np.full(2, np.inf), outline, count, reach, boxes)
         if best is None or cost < best[0]:

@@ -1,0 +1,166 @@
+"""Recorded visits of bundles (web/test/visitors.report.mjs) as flat arrays."""
+
+import subprocess
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sagesplat.errors import DataError
+from sagesplat.files import read_json
+
+ROOT = Path(__file__).parents[2]
+KINDS = ("viewer", "manifest", "promises", "pack", "chunk")
+
+
+@dataclass(frozen=True, eq=False)
+class Library:
+    """Visits of some bundles: row b V + v of the visit tables is visit v of bundle b.
+
+    Every bundle has the same V visits, of the same profiles; files are padded to the longest list.
+    """
+
+    names: tuple[str, ...]  # of the bundles
+    profiles: tuple[str, ...]
+    kinds: np.ndarray  # [B, F] index into KINDS, -1: padding
+    sizes: np.ndarray  # [B, F] bytes over the network
+    hashed: np.ndarray  # [B, F] name changes with the content: kept without asking again
+    page: np.ndarray  # [B, F] hashed files of the viewer itself, the same in every bundle
+    labels: np.ndarray  # [B, F] category of a chunk, -1: none
+    profile: np.ndarray  # [V] of each visit
+    seconds: np.ndarray  # [V] that it lasts
+    start: np.ndarray  # [B V + 1] first request of each visit
+    at: np.ndarray  # [R] seconds since the visitor came
+    file: np.ndarray  # [R]
+    body: np.ndarray  # [R] bytes that a server sent
+    kept: np.ndarray  # [B V, F] came whole, so that the browser has it afterwards
+
+    @property
+    def visits(self) -> int:
+        """V, of each bundle."""
+        return len(self.profile)
+
+    @property
+    def grows(self) -> np.ndarray:
+        """[B, F] files whose bytes go with the number of Gaussians."""
+        return self.kinds >= KINDS.index("pack")
+
+    def per_visit(self) -> np.ndarray:
+        """Bytes [B, V, kind] that each visit with an empty cache takes, by kind of file."""
+        table = np.zeros((len(self.names), self.visits, len(KINDS)))
+        row = np.repeat(np.arange(len(self.start) - 1), np.diff(self.start))
+        bundle, visit = np.divmod(row, self.visits)
+        np.add.at(table, (bundle, visit, self.kinds[bundle, self.file]), self.body)
+        return table
+
+
+def read(paths: Sequence[Path], *, flight: bool = True) -> Library:
+    """Recorded visits, a file for each bundle; DataError for what is none or does not fit together.
+
+    Args:
+        paths: files of web/test/visitors.report.mjs.
+        flight: count what is on its way when a browser stops a download: a round trip's worth at the link's
+            rate, which is the most that it can be.
+    """
+    found = [_read_one(path) for path in paths]
+    if not found:
+        raise DataError("no recorded visits; give at least one file of web/test/visitors.report.mjs")
+    shapes = [[(p["name"], len(p["visits"])) for p in one["profiles"]] for one in found]
+    for path, shape in zip(paths, shapes, strict=True):
+        if shape != shapes[0]:
+            raise DataError(f"{path}: its profiles are not those of {paths[0]}; record both in the same way")
+    longest = max(len(one["files"]) for one in found)
+    tables = [_tables(one, longest, flight) for one in found]
+    joined = {name: np.stack([table[name] for table in tables]) for name in _PER_FILE}
+    flat = {
+        name: np.concatenate([table[name] for table in tables]) for name in ("at", "file", "body", "kept")
+    }
+    counts = np.concatenate([table["counts"] for table in tables])
+    return Library(
+        names=tuple(one["scene"] for one in found),
+        profiles=tuple(name for name, _ in shapes[0]),
+        profile=np.repeat(np.arange(len(shapes[0])), [count for _, count in shapes[0]]),
+        seconds=tables[0]["seconds"],
+        start=np.concatenate([[0], np.cumsum(counts)]),
+        **joined,
+        **flat,
+    )
+
+
+_PER_FILE = ("kinds", "sizes", "hashed", "page", "labels")
+
+
+def _read_one(path: Path) -> dict[str, Any]:
+    one = read_json(path)
+    if not isinstance(one, dict) or one.get("format") != "sagesplat-visits":
+        raise DataError(f"{path}: no recorded visits; make them by node web/test/visitors.report.mjs")
+    try:
+        files = len(one["files"])
+        known = all(f["kind"] in KINDS and f["bytes"] >= 0 and f["uri"] for f in one["files"])
+        rows = [row for p in one["profiles"] for visit in p["visits"] for row in visit["requests"]]
+        fine = (
+            known
+            and rows
+            and all(ms >= 0 and 0 <= file < files and min(came, default=0) >= 0 for ms, file, *came in rows)
+        )
+    except (KeyError, TypeError, IndexError, ValueError):
+        fine = False
+    if not fine:
+        raise DataError(f"{path}: its requests are damaged; record them again")
+    return one
+
+
+def _tables(one: dict[str, Any], longest: int, flight: bool) -> dict[str, np.ndarray]:
+    """The arrays of one bundle; files padded with kind -1."""
+    files = one["files"]
+    pad = [0] * (longest - len(files))
+    kinds = np.array([KINDS.index(f["kind"]) for f in files] + [-1 for _ in pad])
+    sizes = np.array([f["bytes"] for f in files] + pad, np.int64)
+    page = np.array([f["uri"].startswith("assets/") for f in files] + pad, bool)
+    hashed = (kinds >= KINDS.index("promises")) | page  # not so: index.html, poster.jpg, manifest.json
+    visits = [(p, visit) for p in one["profiles"] for visit in p["visits"]]
+    kept = np.zeros((len(visits), longest), bool)
+    at, file, body = [], [], []
+    for row, (profile, visit) in enumerate(visits):
+        on_the_way = flight * int(
+            profile["mbit"] * 125 * profile["latencyMs"]
+        )  # bytes sent before a server hears
+        for ms, index, *part in visit["requests"]:
+            came = part[0] if part else sizes[index]  # all of it is left out
+            at.append(ms / 1000)
+            file.append(index)
+            body.append(min(came + on_the_way, int(sizes[index])))
+            kept[row, index] |= came == sizes[index]
+    return {
+        "kinds": kinds,
+        "sizes": sizes,
+        "hashed": hashed,
+        "page": page,
+        "labels": np.array([f.get("label", -1) for f in files] + [-1 for _ in pad]),
+        "seconds": np.array([visit["seconds"] for _, visit in visits]),
+        "counts": np.array([len(visit["requests"]) for _, visit in visits]),
+        "at": np.array(at),
+        "file": np.array(file, np.int64),
+        "body": np.array(body, np.int64),
+        "kept": kept,
+    }
+
+
+def record(
+    bundle: Path, out: Path, *, visits: int = 24, seed: int = 1, scale: int = 1, pack: bool = True
+) -> None:
+    """Record visits of a bundle through the viewer's own planner and streamer; DataError without Node.js."""
+    command = ["node", "test/visitors.report.mjs", str(bundle.resolve()), str(out.resolve())]
+    command += ["--visits", str(visits), "--seed", str(seed), "--scale", str(scale)]
+    command += [] if pack else ["--no-pack"]
+    try:
+        done = subprocess.run(command, cwd=ROOT / "web", capture_output=True, text=True)
+    except FileNotFoundError:
+        raise DataError("recording visits needs Node.js 20 or later on PATH; install it") from None
+    if done.returncode:
+        last = next((s for s in done.stderr.splitlines() if "Error" in s), "no word of why")
+        raise DataError(
+            f"{bundle}: recording visits failed ({last.strip()}); is it a bundle, and web/ installed?"
+        )
