@@ -52,6 +52,16 @@ def test_a_second_process_is_refused_until_the_first_is_gone(tmp_path: Path) -> 
             assert json.loads((run / lock.FILE).read_text())["pid"] == os.getpid()
 
 
+def test_who_waits_gets_it_once_the_other_is_gone(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(lock, "_AGAIN", 0.05)
+    with held_by_another(tmp_path) as process:
+        with pytest.raises(RunError, match=f"process {process.pid} on"), locked(tmp_path, wait=0.2):
+            pass
+        monkeypatch.setattr(lock.time, "sleep", lambda _: (process.kill(), process.wait()))
+        with locked(tmp_path, wait=30):
+            assert json.loads((tmp_path / lock.FILE).read_text())["pid"] == os.getpid()
+
+
 def test_one_process_may_enter_again(tmp_path: Path) -> None:
     first, second = ExitStack(), ExitStack()
     first.enter_context(locked(tmp_path))

@@ -151,7 +151,7 @@ class BlocksConfig:
     """How a large scene is divided."""
 
     count: int = 1
-    """Blocks of the ground plane, each trained like a scene of its own (all of --train holds for each); 1: the
+    """Blocks of the ground plane, each trained like a scene of its own (--train holds for each); 1: the
     scene as one."""
     margin: float = 0.2
     """How far training reaches beyond a block, as a share of its width."""

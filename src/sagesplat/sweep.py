@@ -239,7 +239,9 @@ def _run_cells(sweep: Sweep, job: Job) -> Iterator[tuple[int, _Done]]:
     job.emit(StageStarted("sweep"))
     for first in (True, False):
         numbers = [number for number, other in like.items() if (other is None) == first]
-        tasks = [Task("sweep", _cell, (sweep[n], like[n], job.spec), job.gpus) for n in numbers]
+        cells = [replace(c, capture=c.capture and c.capture.absolute()) for c in (sweep[n] for n in numbers)]
+        spec, gpus = job.spec, job.gpus
+        tasks = [Task("sweep", _cell, (c, like[n], spec), gpus) for c, n in zip(cells, numbers, strict=True)]
         for i, done in job.executor.run(tasks, job.emit):
             yield numbers[i], done
             ended += 1

@@ -1,16 +1,18 @@
 """What all commands share."""
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from sagesplat.errors import RunError
+from sagesplat.errors import BackendUnavailable, RunError
 
 if TYPE_CHECKING:
+    from sagesplat.executor import Executor
     from sagesplat.job import Job
     from sagesplat.raster import Backend
 
@@ -38,6 +40,10 @@ class Machine:
     memory_limit: float = 0.0
     """GiB that training may use: the cap of Gaussians lowers itself to it (0: nine tenths of what the machine
     or its container has)."""
+    executor: str = "local"
+    """Where pieces of work are computed that do not depend on each other: local (this process, one after the
+    other), ray (the Ray cluster that runs here or that RAY_ADDRESS names, else one of this machine) or
+    ray:HOST:PORT. All nodes need the run folder and the capture under the same paths."""
     force: bool = False
     """Make results again that were made with other settings."""
 
@@ -56,17 +62,48 @@ def open_job(run: Path, machine: Machine, ladder: LadderKind = "nested") -> Iter
     from sagesplat.job import Job
     from sagesplat.run_dir import RunDir
 
-    backend, threads = prepare(machine)
     if not machine.memory_limit >= 0:
         raise RunError(f"--memory-limit {machine.memory_limit} is impossible; choose GiB, such as 8")
     limit = int(machine.memory_limit * 2**30)
-    with Console() as console, ExitStack() as locks:
+    with computing(machine, run) as (backend, threads, executor), Console() as console, ExitStack() as locks:
         if backend == "cuda":
             console.out.print("[dim]· computing on the GPU[/]")
+        if machine.executor != "local":
+            console.out.print(f"[dim]· on a Ray cluster, {executor.parallel} tasks at once[/]")
         yield Job(
             RunDir(run, ladder), console, backend, threads, machine.force, machine.processes, machine.device,
-            limit, locks,
+            limit, locks, executor,
         )  # fmt: skip
+
+
+@contextmanager
+def computing(machine: Machine, folder: Path) -> "Iterator[tuple[Backend, int, Executor]]":
+    """Backend and CPU threads of this process, and what does the tasks; `folder`: what they write into.
+
+    On a cluster with GPUs, tasks of `--device auto` and `--backend auto` use them, though this machine has
+    none: what this process itself computes, it computes on its CPU then.
+    """
+    from sagesplat.executor import LOCAL
+
+    kind, _, address = machine.executor.partition(":")
+    if kind not in ("local", "ray") or (kind == "local" and address):
+        raise RunError(f"--executor {machine.executor}: not known; use local, ray or ray:HOST:PORT")
+    backend, threads = prepare(machine)
+    if kind == "local":
+        yield backend, threads, LOCAL
+        return
+    if find_spec("ray") is None:
+        raise BackendUnavailable("--executor ray: Ray is missing; pip install 'sagesplat[ray]'")
+    from sagesplat.ray_executor import RayExecutor, connected
+
+    with connected(address) as resources:
+        auto = (machine.device, machine.backend) == ("auto", "auto")
+        elsewhere: Literal["cuda"] | None = (
+            "cuda" if auto and backend == "cpu" and resources.get("GPU") else None
+        )
+        gpus = float("cuda" in (backend, elsewhere))
+        with closing(RayExecutor(folder, threads, elsewhere, gpus)) as executor:
+            yield backend, threads, executor
 
 
 def prepare(machine: Machine) -> "tuple[Backend, int]":

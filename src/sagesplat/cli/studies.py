@@ -5,7 +5,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from sagesplat.cli.base import Flat, LadderKind, Machine, Run, command, open_job, prepare
+from sagesplat.cli.base import Flat, LadderKind, Machine, Run, command, computing, open_job
 from sagesplat.config import CompareConfig
 
 
@@ -114,7 +114,6 @@ def sweep(
     from sagesplat.sweep import read_sweep, run_sweep
 
     cells = read_sweep(file)
-    backend, threads = prepare(machine)
-    with Console() as console:
-        run_sweep(cells, out, console, backend, threads, machine.force)
+    with computing(machine, out / "runs") as (backend, threads, executor), Console() as console:
+        run_sweep(cells, out, console, backend, threads, machine.force, executor)
     print(out / "summary.md")
