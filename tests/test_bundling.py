@@ -13,7 +13,7 @@ from test_output_bundle import manifest_of
 from sagesplat import labelling, nesting, stages
 from sagesplat.adapt.observe import RenderedLabels
 from sagesplat.adapt.promise import read_promises
-from sagesplat.bundling import bundle, colors_of, live_bundle, title_of
+from sagesplat.bundling import bundle, live_bundle
 from sagesplat.config import FitConfig, LiftConfig, MasksConfig, NestConfig, SceneConfig, TrainConfig
 from sagesplat.errors import DataError, RunError, SageError
 from sagesplat.files import read_json, write_json
@@ -22,6 +22,7 @@ from sagesplat.output.bearings import camera_at
 from sagesplat.output.bundle import is_bundle
 from sagesplat.output.bundle_quality import curve_of, model_of
 from sagesplat.output.chunks import read_chunks, read_index
+from sagesplat.output.looks import colors_of, title_of
 from sagesplat.output.spz import read_spz
 from sagesplat.raster import rasterize
 from sagesplat.run_dir import RunDir
@@ -267,3 +268,18 @@ def test_a_real_run(tmp_path: Path, viewer: Path) -> None:
     up = np.array(manifest["frame"]["up"])
     heights = [np.array(camera["position"]) @ up for camera in manifest["cameras"]]
     assert 1.2 < (np.median(heights) - manifest["frame"]["floor"]) * manifest["frame"]["metersPerUnit"] < 1.8
+
+
+def test_parts_of_blocks_are_told_by_category(run: Path, tmp_path: Path, viewer: Path) -> None:
+    job, out = job_of(run), tmp_path / "out"
+    job.run.parts.mkdir(exist_ok=True)
+    shutil.copy(job.run.labels, job.run.part_labels)
+    write_json(job.run.parts / "labels.json", {"labels": {"3": "car@0", "184": "car@2"}})
+    bundle(job, out, weights={"car": 3, "car@2": 5}, always=["car"], viewer=viewer)
+    labels = {label["id"]: label for label in manifest_of(out)["labels"]}
+    a, b = labels[3], labels[184]
+    assert (a["category"], a["block"], b["category"], b["block"]) == ("car", 0, "car", 2)
+    assert (a["title"], a["color"]) == (b["title"], b["color"])
+    assert (a["weight"], b["weight"], a["always"], b["always"]) == (3, 5, True, True)
+    with pytest.raises(RunError, match=r"bike: no such category; there are car.*NAME@BLOCK"):
+        bundle(job, out, always=["bike"], viewer=viewer)

@@ -42,7 +42,7 @@ from sagesplat.output.bundle_quality import (
     significant,
 )
 from sagesplat.output.chunks import write_chunks
-from sagesplat.output.pack import Ladder, gains_of, order_of
+from sagesplat.output.pack import NEARBY, Ladder, gains_of, order_of
 from sagesplat.output.spz import read_spz
 from sagesplat.scene.scene import Camera
 
@@ -504,3 +504,20 @@ def test_a_place_that_cannot_be_written(tmp_path, contents, viewer) -> None:
     (tmp_path / "file").write_text("x")
     with pytest.raises(RunError, match="cannot be written"):
         write_bundle(tmp_path / "file" / "out", contents, viewer)
+
+
+def test_the_pack_brings_far_parts_out_of_sight_late() -> None:
+    look = camera()
+    ahead, behind = np.array([[-1.0, -1, -6, 1, 1, -4]]), np.array([[-1.0, -1, 4, 1, 1, 6]])
+    far = behind + np.array([0, 0, 90, 0, 0, 90])
+    ladders = [
+        Ladder([NEARBY, 10], 1.0, far, None, None),
+        Ladder([300, 400], 1.0, ahead, None, None),
+        Ladder([200, 300], 1.0, behind, None, None),
+    ]
+    where = bearings.position(look), bearings.quaternion(look)
+    order = order_of(ladders, [look], *where)
+    assert order.index((0, 1)) > order.index((1, 2))
+    assert order[:2] == [(1, 1), (2, 1)]
+    for label in range(3):
+        assert order.index((label, 1)) < order.index((label, 2))

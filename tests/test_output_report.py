@@ -14,6 +14,7 @@ from sagesplat.adapt.model import fit_models
 from sagesplat.adapt.observe import TOTAL, Observations, read_observations
 from sagesplat.adapt.plan import plan_scene
 from sagesplat.output import figures
+from sagesplat.output.by_category import merged
 from sagesplat.output.report import Panel, ReportData, write_report
 
 NAMES = {3: "vase", 7: "dining table", 9: "$x^2$ <b>&amp; _odd"}
@@ -200,3 +201,28 @@ def test_line_colours_are_dark_enough():
     red, green, blue = figures.ink(3, COLOURS)
     assert 0.2126 * red**2.2 + 0.7152 * green**2.2 + 0.0722 * blue**2.2 < 0.33
     assert figures.ink(9, COLOURS) == pytest.approx((90 / 255, 10 / 255, 200 / 255))
+
+
+def test_a_scene_in_blocks_is_shown_by_category(tmp_path: Path) -> None:
+    data = make(0)
+    names = {3: "grass@0", 7: "grass@1", 9: "vase@1"}
+    path = write_report(tmp_path, dataclasses.replace(data, names=names, categories={3: 3, 7: 3, 9: 9}))
+    page = Page(path)
+    head = page.text[page.text.index("What each category gets") : page.text.index("Size and quality")]
+    assert "grass" in head
+    assert "@" not in head
+    plan = (tmp_path / "tables" / "plan.csv").read_text()
+    assert all(name in plan for name in names.values())
+    sizes = (tmp_path / "tables" / "gaussians_by_level.csv").read_text().splitlines()
+    assert sizes[0].count("grass") == 1
+    row = dict(zip(sizes[0].split(","), sizes[-1].split(","), strict=True))
+    assert int(row["grass"]) == data.counts[3, 3000] + data.counts[7, 3000]
+
+
+def test_parts_are_averaged_over_their_pixels() -> None:
+    rows = [(3, 1, 0, 2.0, 0.5, 0.5, 20.0, 100), (7, 1, 0, 1.0, 0.8, np.nan, 30.0, 300)]
+    one = merged(columns(Observations, rows), {3: 3, 7: 3}, ("level", "view"))
+    assert (len(one), one.label_id[0], one.num_pixels[0], one.distance[0]) == (1, 3, 400, 1.0)
+    assert one.ssim[0] == pytest.approx(0.725)
+    assert one.ssim_eroded[0] == pytest.approx(0.5)
+    assert one.psnr[0] == pytest.approx(-10 * np.log10((1e-2 + 3 * 1e-3) / 4))

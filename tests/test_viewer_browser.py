@@ -3,6 +3,7 @@
 import base64
 import http.server
 import json
+import shutil
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -472,4 +473,43 @@ def test_a_window_without_area_waits(site: str, browser: Any) -> None:
         opened.page.evaluate("document.getElementById('view').style.removeProperty('height')")
         opened.page.evaluate("sagesplat.goTo(0)")
         assert settled(opened).shape == (200, 320, 3)
+        assert opened.complaints == []
+
+
+# a scene in blocks
+
+
+@pytest.fixture(scope="module")
+def in_blocks(made: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The walls as parts: the outer two are one category in two blocks."""
+    out = tmp_path_factory.mktemp("blocks") / "bundle"
+    shutil.copytree(made, out)
+    manifest = json.loads((out / "manifest.json").read_text())
+    for label, (category, block) in zip(
+        manifest["labels"], (("brick", 0), ("grass", 0), ("brick", 1)), strict=True
+    ):
+        label |= {"name": f"{category}@{block}", "category": category, "block": block, "title": category}
+    (out / "manifest.json").write_text(json.dumps(manifest))
+    return out
+
+
+def test_parts_are_listed_weighed_and_hidden_by_category(in_blocks: Path, browser: Any) -> None:
+    with serve(in_blocks) as url, open_page(url, (900, 640), browser=browser) as opened:
+        page = opened.page
+        ready(opened, WHOLE)
+        assert page.locator(".labels > li").count() == 2
+        bricks = page.locator(".labels > li", has_text="brick")
+        assert "2 blocks" in bricks.inner_text()
+        bricks.locator(".blocks").click()
+        assert bricks.locator(".parts .name").all_inner_texts() == ["block 0", "block 1"]
+        bricks.get_by_label("Weight of brick").select_option("4")
+        weights = page.evaluate("[...sagesplat.settings().weights.values()]")
+        assert weights == [4, 1, 4]
+        before = settled(opened)
+        page.keyboard.press("t")
+        page.keyboard.press("t")
+        assert opened.wait_for("document.querySelector('.status').textContent") == "Coloured by block"
+        assert np.abs(settled(opened) - before).max() > 0.2
+        bricks.get_by_label("Hide brick").click()
+        assert bricks.get_by_label("Show brick").count() == 1
         assert opened.complaints == []

@@ -13,8 +13,6 @@ from typing import Any
 import numpy as np
 import torch
 from PIL import Image
-from scipy.optimize import linear_sum_assignment
-from scipy.spatial.distance import cdist
 
 from sagesplat.adapt.observe import large_enough, read_observations
 from sagesplat.adapt.promise import ViewModel, read_promises
@@ -39,21 +37,16 @@ from sagesplat.output.bundle import (
     write_documents,
 )
 from sagesplat.output.chunks import INDEX, read_chunks, read_index, write_chunks
+from sagesplat.output.looks import colors_of, title_of
 from sagesplat.output.pack import ASPECT, FOV_Y
 from sagesplat.raster import rasterize
 from sagesplat.run_dir import file_hash, settings_of
 from sagesplat.segment.masks import UNLABELLED
+from sagesplat.segment.parts import split_name
 from sagesplat.train.levels import read_level
 
-# readable on light and dark; a category gets the one that is most like its colour in the report
-_PALETTE = (
-    *("#e5484d", "#ef7d2b", "#d6a10b", "#94ad1e", "#3f9f4f", "#16a38b", "#1ba3c2", "#3f8fe0"),
-    *("#5b6bf0", "#8b5cf0", "#bf52c9", "#e0568f", "#a8744a", "#6dbd6a", "#7f7fb0", "#b38f6d"),
-)
-_GREY = "#8a94a3"
 _GROUND = {"dirt", "floor", "grass", "gravel", "ground", "pavement", "platform", "playingfield", "railroad"}
 _GROUND |= {"path", "road", "sand", "sidewalk", "snow", "soil", "street", "terrain"}
-_SUFFIXES = ("-merged", "-other", "-stuff")  # of COCO's panoptic names
 _FEW = boxes.FEW  # SfM points below which a category's Gaussians say where it is
 _OPAQUE = 0.1  # from which a Gaussian does
 _POSTER_HEIGHT = 360  # px
@@ -85,8 +78,9 @@ def bundle(
     """Write a finished run as a bundle into `out`: a new or empty folder, or an earlier bundle.
 
     `meters_per_unit`: the scene's scale, guessed from the cameras' height if left out. `always`: categories
-    shipped in full. `weights`: of categories by name, 1 for the others. `viewer`: the built viewer, the
-    package's own if left out. RunError: a run without nested ladder or promises, another folder, unknown
+    shipped in full. `weights`: of categories by name, 1 for the others. A category's name means all its
+    parts in a scene in blocks, `name@block` one of them. `viewer`: the built viewer, the package's own if
+    left out. RunError: a run without nested ladder or promises, another folder, unknown
     names or an impossible number; DataError: a damaged chunk; SageError: no viewer.
     """
     weights = weights or {}
@@ -226,8 +220,12 @@ def _check(
     if meters_per_unit is not None and not 1e-6 <= meters_per_unit <= 1e6:
         raise RunError(f"{meters_per_unit} metres per unit are impossible; give a number such as 0.5")
     names = set(job.names().values())
-    if unknown := sorted({*always, *weights} - names):
-        raise RunError(f"{', '.join(unknown)}: no such category; there are {', '.join(sorted(names))}")
+    categories = {category_and_block(job, name)[0] for name in names}
+    if unknown := sorted({*always, *weights} - names - categories):
+        one = ", each also NAME@BLOCK" if job.has_parts else ""
+        raise RunError(
+            f"{', '.join(unknown)}: no such category; there are {', '.join(sorted(categories))}{one}"
+        )
     for name, weight in weights.items():
         if not 0 <= weight <= 1e6:
             raise RunError(f"weight {weight} of {name} is impossible; give a number from 0 on, such as 2")
@@ -237,16 +235,24 @@ def _contents(job: Job, g: Gaussians, antialiased: bool) -> Contents:
     """All but the chunks and what is promised of them."""
     scene, names = job.scene, job.names()
     labels = sorted(g.counts())
-    colors = colors_of({i: job.taxonomy.color(i) for i in labels})
-    titles = {i: title_of(names[i]) if i != UNLABELLED else "everything else" for i in labels}
-    ground = [i for i in labels if _GROUND & set(titles[i].split())]
+    found = {i: category_and_block(job, names[i]) for i in labels}
+    colors = _colors(job, {category for category, _ in found.values()})
+    ground = [i for i in labels if _GROUND & set(_title(job, found[i][0]).split())]
+    places = _places(job, g)
     return Contents(
         name=scene.name,
         extent=scene.extent,
         shots=[Shot(view.name, scene.split(row), view.camera) for row, view in enumerate(scene.views)],
         categories=[
-            Category(i, names[i], titles[i], colors[i], boxes.split_boxes(_points_of(job, g, i) * FLIP))
-            for i in labels
+            Category(
+                i,
+                names[i],
+                _title(job, category),
+                colors[category],
+                boxes.split_boxes(places[i] * FLIP),
+                block=block,
+            )
+            for i, (category, block) in found.items()
         ],
         chunks=[],
         folder=job.run.chunks,
@@ -257,14 +263,41 @@ def _contents(job: Job, g: Gaussians, antialiased: bool) -> Contents:
     )
 
 
-def _points_of(job: Job, g: Gaussians, label: int) -> np.ndarray:
-    """SfM points of a category; where they are few, the centres of what is seen of it as well."""
-    points = job.scene.points.xyz[job.point_labels == label]
-    if len(points) >= _FEW:
-        return points
-    mine = g.of_labels([label])
-    seen = mine.select(mine.logit_opacities >= np.log(_OPAQUE / (1 - _OPAQUE)))
-    return np.concatenate([points, (seen if len(seen) else mine).means.numpy()])
+def category_and_block(job: Job, name: str) -> tuple[str, int | None]:
+    """Of a label by name; without a block unless the scene is in blocks."""
+    return split_name(name) if job.has_parts else (name, None)
+
+
+def _title(job: Job, category: str) -> str:
+    return title_of(category) if category != job.masks.taxonomy.name(UNLABELLED) else "everything else"
+
+
+def _colors(job: Job, categories: Collection[str]) -> dict[str, str]:
+    taxonomy = job.masks.taxonomy
+    ids = [i for i in (UNLABELLED, *taxonomy.names) if taxonomy.name(i) in categories]
+    colors = colors_of({i: taxonomy.color(i) for i in ids})
+    return {taxonomy.name(i): colors[i] for i in ids}
+
+
+def _places(job: Job, g: Gaussians) -> dict[int, np.ndarray]:
+    """By label its SfM points [N, 3]; where they are few, the centres of what is seen of it as well."""
+    points, rows = job.scene.points.xyz, _rows_by_label(job.point_labels)
+    means, mine = g.means.numpy(), _rows_by_label(g.label_ids.numpy())
+    opaque = g.logit_opacities.numpy() >= np.log(_OPAQUE / (1 - _OPAQUE))
+    found = {}
+    for label, own in mine.items():
+        known = points[rows.get(label, [])]
+        if len(known) < _FEW:
+            seen = own[opaque[own]]
+            known = np.concatenate([known, means[seen if len(seen) else own]])
+        found[label] = known
+    return found
+
+
+def _rows_by_label(label_ids: np.ndarray) -> dict[int, np.ndarray]:
+    order = np.argsort(label_ids, kind="stable")
+    labels, starts = np.unique(label_ids[order], return_index=True)
+    return dict(zip(labels.tolist(), np.split(order, starts[1:]), strict=True))
 
 
 def _with_quality(
@@ -276,8 +309,8 @@ def _with_quality(
     return [
         replace(
             category,
-            weight=float(weights.get(category.name, 1.0)),
-            always=category.name in always,
+            weight=float(weights.get(category.name, weights.get(category.category, 1.0))),
+            always=category.name in always or category.category in always,
             model=promises.get(category.label_id),
             shares=shares.get(category.label_id),
             distance=far.get(category.label_id),
@@ -295,31 +328,6 @@ def _shares(job: Job) -> dict[int, np.ndarray]:
     for label, view, pixels in zip(table.label_id, table.view, table.num_pixels, strict=True):
         found[int(label)][view] = pixels / sizes[view]
     return found
-
-
-def title_of(name: str) -> str:
-    """A category's name for people: grass for grass-merged."""
-    for suffix in _SUFFIXES:
-        name = name.removesuffix(suffix)
-    return name.replace("-", " ")
-
-
-def colors_of(wanted: Mapping[int, tuple[int, int, int]]) -> dict[int, str]:
-    """Colours of the palette, in hue as near as can be to those wanted; all different as long as it lasts."""
-    labels = sorted(set(wanted) - {UNLABELLED})
-    colors = list(_PALETTE) * (1 + len(labels) // len(_PALETTE))
-    away = cdist([_pure(wanted[i]) for i in labels] or np.zeros((0, 3)), [_pure(_rgb(c)) for c in colors])
-    chosen = linear_sum_assignment(away**2)[1]
-    return {UNLABELLED: _GREY} | {label: colors[i] for label, i in zip(labels, chosen, strict=True)}
-
-
-def _pure(rgb: Sequence[int]) -> np.ndarray:
-    """RGB as bright as it can be."""
-    return np.array(rgb) / max(*rgb, 1)
-
-
-def _rgb(color: str) -> list[int]:
-    return [int(color[i : i + 2], 16) for i in (1, 3, 5)]
 
 
 def _antialiased(job: Job) -> bool:

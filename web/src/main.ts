@@ -2,6 +2,7 @@ import { loadManifest } from "./core/manifest";
 import { type Embed, type Options, parseOptions } from "./embed";
 import { fail, hideNotice, messageOf } from "./ui/notice";
 import { buildPage } from "./ui/page";
+import { colorsOf } from "./view/spark";
 import { embed, Viewer } from "./view/viewer";
 
 declare global {
@@ -69,7 +70,7 @@ function followTraining(viewer: Viewer): void {
   if (!viewer.manifest.live) return;
   viewer.streamer.onChange(() => {
     const { manifest } = viewer.streamer;
-    viewer.stage.layer.setColors(manifest);
+    viewer.stage.layer.setColors(colorsOf(manifest));
     if (!manifest.live) location.reload();
   });
 }

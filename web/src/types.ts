@@ -33,7 +33,9 @@ export interface LabelQuality {
 
 export interface Label {
   readonly id: number;
-  readonly name: string; // in the taxonomy: grass-merged
+  readonly name: string; // in the taxonomy: grass-merged; of a part of a scene in blocks: grass-merged@3
+  readonly category?: string; // of a part: grass-merged
+  readonly block?: number; // of a part: 3
   readonly title: string; // for people: grass
   readonly color: string; // #rrggbb
   readonly weight: number;

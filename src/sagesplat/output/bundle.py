@@ -34,6 +34,7 @@ from sagesplat.output.bundle_quality import (
 from sagesplat.output.chunks import Chunk
 from sagesplat.output.pack import Ladder, order_of, write_pack
 from sagesplat.scene.scene import Camera
+from sagesplat.segment.parts import split_name
 
 FORMAT, VERSION = "sagesplat-bundle", 1
 MANIFEST, SCHEMA, POSTER = "manifest.json", "manifest.schema.json", "poster.jpg"
@@ -61,7 +62,7 @@ class Category:
     """What a bundle says of a category besides its chunks."""
 
     label_id: int
-    name: str  # in the taxonomy
+    name: str  # in the taxonomy; of a part of a scene in blocks CATEGORY@BLOCK
     title: str  # for people
     color: str  # #rrggbb
     boxes: Float[np.ndarray, "B 6"]  # in the bundle's axes
@@ -71,6 +72,12 @@ class Category:
     shares: Float[np.ndarray, " V"] | None = None  # of the pixels of each shot; None: 0
     distance: Float[np.ndarray, " V"] | None = None  # d_min in each shot; None: unknown
     corrections: Float[np.ndarray, " V"] | None = None  # log of that over what the boxes tell; None: 0
+    block: int | None = None  # of the scene that it is a part of; None: in none
+
+    @property
+    def category(self) -> str:
+        """The name without the block."""
+        return self.name if self.block is None else split_name(self.name)[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -301,6 +308,7 @@ def _label(
     return {
         "id": category.label_id,
         "name": category.name,
+        **({} if category.block is None else {"category": category.category, "block": category.block}),
         "title": category.title,
         "color": category.color,
         "weight": significant(category.weight),

@@ -1,8 +1,9 @@
 """All chunks of a bundle in one file, for the first load: one stream instead of a round trip a chunk.
 
 The chunks' bytes one after the other, in the order in which they gain most for the first view: level 1 of
-every label, then what gains most expected SSIM x share of the pixels a byte. As levels come in order, one
-is worth as much as the best way that begins with it: the concave hull of SSIM over bytes, as in the viewer.
+every label in sight and of those nearby, then what gains most expected SSIM x share of the pixels a byte. As
+levels come in order, one is worth as much as the best way that begins with it: the concave hull of SSIM over
+bytes. The rules are the viewer's (web/src/core/order.ts).
 """
 
 import hashlib
@@ -23,6 +24,8 @@ from sagesplat.scene.scene import Camera
 FOV_Y, ASPECT = math.radians(60), 16 / 9  # of the first view: the viewer's own on a usual screen
 _LEAST_SHARE = 1e-4  # so that nothing in sight is worth nothing
 _LEAST = 1e-6  # what is out of sight, or gains nothing, against the rest
+NEARBY = 2**18  # bytes of lowest levels out of sight that come before anything finer
+_TURN = 0.25  # how likely it is that one turns to what is out of sight soon
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,16 +48,27 @@ def order_of(
     """(index of a ladder, level) of all files for the view from a pose in the bundle's axes."""
     planes = boxes.frustum(position, quaternion, FOV_Y, ASPECT)
     camera = camera_at(position, quaternion, FOV_Y, 16, 9)
-    ranked = []
+    ranked, behind = [], []
     for index, ladder in enumerate(ladders):
         sees = not len(ladder.boxes) or boxes.touching(ladder.boxes, planes).any()
         weight = ladder.weight * max(_share(ladder, cameras, camera, position, planes), _LEAST_SHARE)
         weight = max(weight * (1 if sees else _LEAST), _LEAST**2)
         total = np.cumsum(ladder.sizes, dtype=np.float64)
         distance = boxes.distance(ladder.boxes, position, planes)
-        gains = gains_of(_expected(ladder, camera, distance, total), total)
-        ranked.append((0, -weight / total[0], index, 1))
-        ranked += [(1, -weight * gain, index, level) for level, gain in enumerate(gains.tolist(), 2)]
+        ssim, limit = _expected(ladder, camera, distance, total), math.inf
+        if sees:
+            ranked.append((0, -weight / total[0], index, 1))
+        else:
+            around = ladder.weight * max(_apparent_size(ladder.boxes, position, planes[:0]), _LEAST_SHARE)
+            first = ssim[0] if ssim[0] > 0 else 1.0
+            limit = _TURN * around * first / total[0]
+            behind.append((-limit, index, total[0]))
+        gains = gains_of(ssim, total)
+        ranked += [(2, -min(weight * gain, limit), index, k) for k, gain in enumerate(gains.tolist(), 2)]
+    nearby = 0
+    for value, index, nbytes in sorted(behind):
+        nearby += nbytes
+        ranked.append((1 if nearby <= NEARBY else 2, value, index, 1))
     return [(index, level) for *_, index, level in sorted(ranked)]
 
 

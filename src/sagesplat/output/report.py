@@ -4,7 +4,7 @@ import base64
 import io
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +19,15 @@ from sagesplat.adapt.plan import Choice, Counts, Plan
 from sagesplat.files import write_text
 from sagesplat.gaussians import BYTES_PER_GAUSSIAN
 from sagesplat.output import figures, tables
+from sagesplat.output.by_category import Categories, merged, merged_counts, merged_plan, relabelled
 from sagesplat.output.figures import Colours, Panel
 from sagesplat.output.tables import MB, Table, name_of
+from sagesplat.segment.parts import category_of
 
 PICTURE_WIDTH = 1400  # pixels of a picture inside the page; the files beside it keep their size
 FIT_LEVELS = 4  # levels drawn in the figure of SSIM over distance
+FIT_LABELS = 9  # labels drawn there, the largest
+TABLE_ROWS = 200  # of a table inside the page; the file beside it has all
 
 Facts = Sequence[tuple[str, str]]
 
@@ -50,31 +54,37 @@ class ReportData:
     settings: Facts = ()
     timings: Sequence[tuple[str, float]] = ()  # stage, seconds
     provenance: Facts = ()  # versions, hashes of the inputs
+    categories: Categories = field(default_factory=dict)  # of the parts of a scene in blocks
 
 
 def write_report(folder: Path, data: ReportData) -> Path:
     """Write `folder`/index.html, figures/*.png|svg and tables/*.csv; the path of the page comes back.
 
     Every number is computed from `data`; evaluation rows of other views than the test views do not count, and
-    sections without data (no test views, no panels) are left out. `data.plans` must not be empty.
+    sections without data (no test views, no panels) are left out. `data.plans` must not be empty. A scene in
+    blocks is shown by category; what was fitted and planned part by part is in the tables.
     """
     unseen = np.isin(data.evaluation.view, data.test_views)
-    data = replace(data, evaluation=data.evaluation.select(unseen))
+    parts = replace(data, evaluation=data.evaluation.select(unseen))
+    data, promises = by_category(parts), relabelled(parts.evaluation, parts.categories)
     labels = tables.by_size(data.counts)
-    plots = [(name, title, _save(figure, folder, name)) for name, title, figure in _figures(data, labels)]
-    sheets = dict(_tables(data, labels))
+    drawn = _figures(data, labels, parts, promises)
+    plots = [(name, title, _save(figure, folder, name)) for name, title, figure in drawn]
+    sheets = dict(_tables(data, labels, parts, promises))
     for name, table in sheets.items():
         table.write_csv(folder / "tables" / f"{name}.csv")
-    data.observations.write_csv(folder / "tables" / "observations.csv")
-    data.evaluation.write_csv(folder / "tables" / "evaluation_rows.csv")
+    parts.observations.write_csv(folder / "tables" / "observations.csv")
+    parts.evaluation.write_csv(folder / "tables" / "evaluation_rows.csv")
     for number, panel in enumerate(data.panels):
         strip = figures.panel_strip(panel, data.colours)
         figures.save_figure(strip, folder / "figures" / f"panel_{number}")
     page = template("report.html.j2").render(
         data=data,
         version=__version__,
-        headline=_headline(data),
-        categories=_categories(data, labels),
+        headline=_headline(data, promises),
+        categories=_categories(data, labels, promises),
+        num_parts=len(parts.categories),
+        table_rows=TABLE_ROWS,
         plots={name: (title, image) for name, title, image in plots},
         sheets=sheets,
         panels=[_pictures(panel, data.colours) for panel in data.panels],
@@ -82,6 +92,21 @@ def write_report(folder: Path, data: ReportData) -> Path:
     )
     write_text(folder / "index.html", page)
     return folder / "index.html"
+
+
+def by_category(data: ReportData) -> ReportData:
+    """The same with categories instead of parts, but for models."""
+    if not data.categories:
+        return data
+    to = data.categories
+    return replace(
+        data,
+        observations=merged(data.observations, to, ("level", "view")),
+        counts=merged_counts(data.counts, to),
+        plans=[merged_plan(plan, to) for plan in data.plans],
+        evaluation=merged(data.evaluation, to, ("target", "view")),
+        names={label: category_of(name) if label in to else name for label, name in data.names.items()},
+    )
 
 
 def template(name: str) -> Template:
@@ -97,7 +122,7 @@ def main_plan(data: ReportData) -> Plan:
     return min(data.plans, key=lambda plan: abs(plan.target - data.target))
 
 
-def _headline(data: ReportData) -> dict:
+def _headline(data: ReportData, promises: Evaluation) -> dict:
     """The figures at the top of the page, all measured."""
     plan = main_plan(data)
     full = sum(tables.last_counts(data.counts).values())
@@ -115,18 +140,19 @@ def _headline(data: ReportData) -> dict:
         "full_ssim": tables.mean(whole.full_ssim),
         "full_psnr": tables.mean(whole.full_psnr),
         "num_views": len(np.unique(whole.view)),
-        "kept": tables.promise_kept(rows),
+        "kept": tables.promise_kept(promises.select(promises.target == np.float32(plan.target))),
         "infeasible": [c for c in plan.choices if c.status == "infeasible"],
         "binding": None if plan.binding is None else name_of(plan.binding, data.names),
     }
 
 
-def _categories(data: ReportData, labels: Sequence[int]) -> list[dict]:
+def _categories(data: ReportData, labels: Sequence[int], promises: Evaluation) -> list[dict]:
     """A line of the page's main table per label, the largest first."""
     plan = main_plan(data)
     full = tables.last_counts(data.counts)
     chosen: dict[int, Choice] = {choice.label_id: choice for choice in plan.choices}
     at_target = data.evaluation.target == np.float32(plan.target)
+    promised = promises.select(promises.target == np.float32(plan.target))
     lines = []
     for label_id in labels:
         rows = data.evaluation.select(at_target & (data.evaluation.label_id == label_id))
@@ -141,13 +167,13 @@ def _categories(data: ReportData, labels: Sequence[int]) -> list[dict]:
                 "of_scene": full[label_id] / max(1, *full.values()),
                 "measured": tables.mean(rows.ssim),
                 "full_ssim": tables.mean(rows.full_ssim),
-                "kept": tables.promise_kept(rows),
+                "kept": tables.promise_kept(promised.select(promised.label_id == label_id)),
             }
         )
     return lines
 
 
-def _figures(data: ReportData, labels: Sequence[int]):
+def _figures(data: ReportData, labels: Sequence[int], parts: ReportData, promises: Evaluation):
     """(file name, title, Figure) of every plot that the data allow."""
     names, colours, seen = data.names, data.colours, data.observations
     yield (
@@ -166,7 +192,7 @@ def _figures(data: ReportData, labels: Sequence[int]):
         yield (
             "promised_and_measured",
             "Promised and measured SSIM on unseen views",
-            figures.promised_and_measured(data.evaluation, labels, names, colours),
+            figures.promised_and_measured(promises, labels, names, colours),
         )
     if len(seen):
         yield (
@@ -180,27 +206,32 @@ def _figures(data: ReportData, labels: Sequence[int]):
         levels = sorted({level for _, level in data.models if level not in data.recovering})
         picked = np.geomspace(1, max(len(levels), 1), FIT_LEVELS).round().astype(int) - 1
         shown = [levels[i] for i in np.unique(picked)] if levels else []
+        fitted = tables.by_size(parts.counts)
+        few = fitted[:FIT_LABELS]
+        most = f", the {len(few)} largest of {len(fitted)}" if len(few) < len(fitted) else ""
         yield (
             "ssim_over_distance",
-            "SSIM over distance and its model",
-            figures.ssim_over_distance(seen, data.train_views, labels, names, colours, data.models, shown),
+            f"SSIM over distance and its model{most}",
+            figures.ssim_over_distance(
+                parts.observations, data.train_views, few, parts.names, colours, data.models, shown
+            ),
         )
 
 
-def _tables(data: ReportData, labels: Sequence[int]):
+def _tables(data: ReportData, labels: Sequence[int], parts: ReportData, promises: Evaluation):
     """(file name, Table) of every table that the data allow."""
     names = data.names
-    yield "plan", tables.plan_table(main_plan(data), data.counts, names)
+    yield "plan", tables.plan_table(main_plan(parts), parts.counts, parts.names)
     yield "size_by_target", tables.targets_table(data.plans, data.counts, labels, names)
     if len(data.evaluation):
-        yield "evaluation", tables.evaluation_table(data.evaluation, labels, names)
+        yield "evaluation", tables.evaluation_table(promises, labels, names)
     yield "gaussians_by_level", tables.counts_table(data.counts, labels, names)
     for which, views in (("training", data.train_views), ("test", data.test_views)):
         if len(views):
             table = tables.quality_table(data.observations, views, labels, names, which)
             yield f"ssim_by_level_{which}", table
     if data.models:
-        yield "models", tables.models_table(data.models, names)
+        yield "models", tables.models_table(data.models, parts.names)
     if data.panels:
         rows = [(p.name, p.ssim, p.psnr, p.full_ssim, p.full_psnr) for p in data.panels]
         header = ("view", "SSIM", "PSNR", "everything SSIM", "everything PSNR")

@@ -13,14 +13,15 @@ from sagesplat.adapt.observe import TOTAL, as_unit, measure, read_observations, 
 from sagesplat.adapt.plan import read_plans
 from sagesplat.files import read_json
 from sagesplat.gaussians import Gaussians
-from sagesplat.output.figures import Panel
+from sagesplat.output.figures import Colours, Panel
 from sagesplat.output.report import ReportData
 from sagesplat.raster import Backend
 from sagesplat.run_dir import RunDir
 from sagesplat.scene import describe
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
-from sagesplat.segment.masks import UNLABELLED, Masks
+from sagesplat.segment.masks import UNLABELLED, UNLABELLED_COLOR, Masks, Taxonomy
+from sagesplat.segment.parts import category_of
 
 PANELS = 3  # views shown in pictures
 STAGES = (
@@ -41,6 +42,7 @@ def report_data(
 ) -> ReportData:
     """Everything the report of a run shows; `target` is the SSIM that it leads with, `composed` its scene."""
     names = {**masks.taxonomy.names, UNLABELLED: masks.taxonomy.name(UNLABELLED)}
+    categories, colours = _parts(run, names)
     plans = read_plans(run.plan)[0]
     records = {stage: read_json(run.provenance(stage)) for stage in STAGES if run.provenance(stage).exists()}
     antialiased = bool(records["train"]["settings"]["antialiased"])
@@ -48,7 +50,7 @@ def report_data(
         title=scene.name,
         target=target,
         names=names,
-        colours={label: masks.taxonomy.color(label) for label in names},
+        colours=colours or {label: masks.taxonomy.color(label) for label in names},
         observations=read_observations(run.observations),
         train_views=scene.train_ids,
         test_views=scene.test_ids,
@@ -63,7 +65,22 @@ def report_data(
         settings=_settings(records),
         timings=[(stage, float(made["seconds"])) for stage, made in records.items()],
         provenance=_provenance(records),
+        categories=categories,
     )
+
+
+def _parts(run: RunDir, names: dict[int, str]) -> tuple[dict[int, int], Colours]:
+    """Of a scene in blocks: which label stands for a part's category, and its colour; nothing of others."""
+    if not (run.parts / "labels.json").exists():
+        return {}, {}
+    taxonomy = Taxonomy.read(run.masks / "labels.json")
+    by_name = {taxonomy.name(i): taxonomy.color(i) for i in (UNLABELLED, *taxonomy.names)}
+    of = {label: category_of(name) for label, name in sorted(names.items())}
+    stands: dict[str, int] = {}
+    for label, category in of.items():
+        stands.setdefault(category, label)
+    colours = {label: by_name.get(category, UNLABELLED_COLOR) for label, category in of.items()}
+    return {label: stands[category] for label, category in of.items() if label != UNLABELLED}, colours
 
 
 def _panels(

@@ -18,7 +18,7 @@ export interface Whole {
 export function describe(entries: readonly Entry[], whole: Whole): State {
   const labels = entries.map((entry) => labelState(entry, whole));
   const sum = (of: (label: LabelState) => number) => labels.reduce((total, label) => total + of(label), 0);
-  const first = entries.some((e) => e.wanted > 0 && !e.shown && !e.former);
+  const first = entries.some((e) => e.sight.visible && e.wanted > 0 && !e.shown && !e.former);
   const errors = labels.map((label) => label.error);
   return {
     labels,

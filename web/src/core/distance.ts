@@ -9,7 +9,7 @@ import type { Box, Quat, Vec3, Viewpoint } from "../types";
 export interface Sight {
   readonly visible: boolean;
   readonly distance: number; // the bundle's units; NaN: unknown
-  readonly size: number; // how large its boxes look: a rough measure of its share of the pixels
+  readonly size: number; // how large its boxes look, out of sight as well: about its share of the pixels
 }
 
 type Plane = Viewpoint["frustum"][number];
@@ -53,18 +53,19 @@ export function rotate(q: Quat, v: Vec3): Vec3 {
 /** How far the closest of what is in sight is: near the 5th percentile over a label's points. */
 export function look(boxes: readonly Box[], { position, frustum }: Viewpoint): Sight {
   const near = boxes.filter((box) => touches(box, frustum));
-  if (!near.length) return { visible: false, distance: Number.NaN, size: 0 };
-  const sampled = new Float64Array(near.length * AT.length ** 3);
-  let found = 0;
+  const visible = near.length > 0;
   let nearest = Infinity;
   let size = 0;
-  for (const box of near) {
+  for (const box of visible ? near : boxes) {
     const away = Math.sqrt(squareTo(position, middle(box, 0), middle(box, 1), middle(box, 2)));
     nearest = Math.min(nearest, away);
     size += Math.min(1, halfDiagonal(box) / Math.max(away, 1e-9)) ** 2 / boxes.length;
-    found = sample(box, position, crossing(box, frustum), sampled, found);
   }
-  return { visible: true, distance: found ? percentile(sampled.subarray(0, found)) : nearest, size };
+  if (!visible) return { visible, distance: Number.NaN, size };
+  const sampled = new Float64Array(near.length * AT.length ** 3);
+  let found = 0;
+  for (const box of near) found = sample(box, position, crossing(box, frustum), sampled, found);
+  return { visible, distance: found ? percentile(sampled.subarray(0, found)) : nearest, size };
 }
 
 /** Whether the corner of a box that lies deepest in each half space is inside. */

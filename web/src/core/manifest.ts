@@ -47,9 +47,15 @@ const quality = object({
     object({ level, params: list(number, 9), range: list(number, 2), median: number, rmse: fromZero }),
   ),
 });
+const optional =
+  (check: Check): Check =>
+  (value, path, wrong) =>
+    value !== undefined && check(value, path, wrong);
 const label = object({
   id: whole,
   name: text,
+  category: optional(text),
+  block: optional(amount),
   title: text,
   color,
   weight: fromZero,
@@ -87,7 +93,7 @@ const manifest = object({
   totals: object({ count: amount, bytes: amount, gpuBytes: amount }),
   labels: list(label),
   promises: orNull(object({ uri: relative, bytes: amount, sha256: hash })),
-  pack: (value, path, wrong) => value !== undefined && orNull(pack)(value, path, wrong), // older bundles
+  pack: optional(orNull(pack)), // older bundles have none
   cameras: list(camera),
   start: object({ position: vec3, quaternion: list(number, 4), target: vec3 }),
   licenses: list(object({ what: text, license: text })),
@@ -112,6 +118,9 @@ export function parseManifest(json: string, file = "manifest.json"): Manifest {
 function oddities(one: Label, i: number): string[] {
   const wrong: string[] = [];
   const { levels, quality: q, boxes } = one;
+  if ((one.category === undefined) !== (one.block === undefined)) {
+    wrong.push(`labels[${i}] must have both category and block, or neither`);
+  }
   if (!levels.length) wrong.push(`labels[${i}].levels is empty`);
   if (boxes.some((b) => b[0] > b[3] || b[1] > b[4] || b[2] > b[5])) {
     wrong.push(`labels[${i}].boxes has one whose least is above its most`);

@@ -3,7 +3,7 @@
 import type { Label, Promises, Settings, Viewpoint } from "../types";
 import { look } from "./distance";
 import type { Candidate } from "./planner";
-import { byDistance, ViewModel } from "./quality";
+import { byDistance, ViewModel, Views } from "./quality";
 import type { Entry } from "./residency";
 
 /** Without promises levels are judged by the distance, shares of pixels by the size of the boxes. */
@@ -13,11 +13,12 @@ export class Outlook {
 
   constructor(labels: readonly Label[] = [], promises: Promises | null = null) {
     this.complete = promises !== null;
-    for (const own of promises?.labels ?? []) {
-      const label = labels.find((one) => one.id === own.id);
-      if (label && promises && ViewModel.fits(label, own)) {
-        this.models.set(own.id, new ViewModel(label, promises, own));
-      }
+    if (!promises) return;
+    const views = new Views(promises);
+    const byId = new Map(labels.map((label) => [label.id, label]));
+    for (const own of promises.labels) {
+      const label = byId.get(own.id);
+      if (label && ViewModel.fits(label, own)) this.models.set(own.id, new ViewModel(label, views, own));
     }
   }
 
@@ -27,6 +28,13 @@ export class Outlook {
     const { position, direction } = viewpoint;
     const model = this.models.get(label.id);
     const seen = look(label.boxes, viewpoint);
+    if (!seen.visible && label.boxes.length) {
+      // no plan depends on what nobody sees: that it is not computed keeps scenes of many parts fast
+      entry.sight = seen;
+      entry.prediction = entry.unseen;
+      entry.share = seen.size;
+      return;
+    }
     const distance = model?.corrected(seen.distance, position, direction) ?? seen.distance;
     const sight = { ...seen, distance };
     // a label of which nobody knows where it is may be anywhere

@@ -11,7 +11,7 @@ export interface Candidate {
   readonly mean: readonly number[]; // by level, SSIM; NaN: unknown
   readonly bound: readonly number[];
   readonly weight: number; // of the label, given by people
-  readonly share: number; // of the pixels
+  readonly share: number; // of the pixels; out of sight what it might have
   readonly visible: boolean;
   readonly previous: number; // level of the plan before, 0: none
 }
@@ -46,11 +46,17 @@ export function ladderOf(label: Label): Ladder {
 }
 
 /** What a label at this viewpoint is worth against the others. */
-export const worth = (c: Candidate): number => (c.visible ? c.weight * Math.max(c.share, LEAST_SHARE) : 0);
+export const worth = (c: Candidate): number => (c.visible ? around(c) : 0);
+
+/** The same, as if it were in sight. */
+export const around = (c: Candidate): number => c.weight * Math.max(c.share, LEAST_SHARE);
 
 /** The levels to have, within the budget in all its units; the smallest composition where nothing fits. */
 export function makePlan(candidates: readonly Candidate[], settings: Settings): Plan {
-  const there = candidates.filter((c) => c.highest > 0);
+  const there = withoutFar(
+    candidates.filter((c) => c.highest > 0),
+    settings.budget,
+  );
   const fixed = there.filter((c) => c.label.always);
   const free = there.filter((c) => !c.label.always);
   const left = lessen(settings.budget, fixed);
@@ -58,6 +64,26 @@ export function makePlan(candidates: readonly Candidate[], settings: Settings): 
   const levels = new Map(free.map((c, i) => [c, (found.levels[i] ?? 0) + 1]));
   for (const c of fixed) levels.set(c, c.highest);
   return { wanted: candidates.map((c) => levels.get(c) ?? 0), status: found.status };
+}
+
+/**
+ * Without the parts of blocks out of sight that have no room even at their lowest level: those worth least go
+ * first. What is in sight stays, as does everything in a scene without blocks.
+ */
+function withoutFar(all: readonly Candidate[], budget: Budget): readonly Candidate[] {
+  const least = (c: Candidate) => (c.label.always ? c.highest : 1) - 1;
+  const over = { ...budget };
+  for (const unit of UNITS) for (const c of all) over[unit] -= c.ladder[unit][least(c)] ?? 0;
+  const lacks = () => UNITS.some((unit) => over[unit] < 0);
+  if (!lacks()) return all;
+  const far = all.filter((c) => c.label.block !== undefined && !c.visible && !c.label.always);
+  const out = new Set<Candidate>();
+  for (const c of far.sort((a, b) => around(a) - around(b))) {
+    if (!lacks()) break;
+    out.add(c);
+    for (const unit of UNITS) over[unit] += c.ladder[unit][0] ?? 0;
+  }
+  return all.filter((c) => !out.has(c));
 }
 
 interface Chosen {

@@ -43,39 +43,79 @@ const ENOUGH = 1e-3;
 
 type LabelPromises = Promises["labels"][number];
 
-/** A label's viewpoint model, ready to be evaluated; its Cholesky factor is made here, once. */
+/** The views that the models of all labels share, and how far they are from where the viewer stands. */
+export class Views {
+  readonly away: Float64Array; // [V] square of the distance over the extent
+  readonly turned: Float64Array; // [V] square of the difference of the directions
+  private readonly rows: Float64Array; // [V, 6]
+  private readonly extent: number;
+  private position: Vec3 | null = null;
+  private direction: Vec3 | null = null;
+
+  constructor({ views, extent }: Promises) {
+    this.rows = Float64Array.from(
+      views.flatMap(([x, y, z, ...d]) => [x / extent, y / extent, z / extent, ...d]),
+    );
+    this.extent = extent;
+    this.away = new Float64Array(views.length);
+    this.turned = new Float64Array(views.length);
+  }
+
+  /** Brings `away` and `turned` to a viewpoint: once for all labels. */
+  from(position: Vec3, direction: Vec3): void {
+    if (position === this.position && direction === this.direction) return;
+    [this.position, this.direction] = [position, direction];
+    const { rows, extent } = this;
+    const [x, y, z] = [position[0] / extent, position[1] / extent, position[2] / extent];
+    const [a, b, c] = direction;
+    for (let i = 0, at = 0; i < this.away.length; i++, at += 6) {
+      this.away[i] = square(x, y, z, rows, at);
+      this.turned[i] = square(a, b, c, rows, at + 3);
+    }
+  }
+
+  /** The same squares between two of the views. */
+  between(i: number, j: number): [number, number] {
+    const { rows } = this;
+    const [a, b] = [6 * i, 6 * i + 3];
+    return [
+      square(rows[a] as number, rows[a + 1] as number, rows[a + 2] as number, rows, 6 * j),
+      square(rows[b] as number, rows[b + 1] as number, rows[b + 2] as number, rows, 6 * j + 3),
+    ];
+  }
+}
+
+function square(x: number, y: number, z: number, rows: Float64Array, at: number): number {
+  const dx = x - (rows[at] as number);
+  const dy = y - (rows[at + 1] as number);
+  const dz = z - (rows[at + 2] as number);
+  return dx * dx + dy * dy + dz * dz;
+}
+
+/** A label's viewpoint model; its Cholesky factor is made when the label is first in sight. */
 export class ViewModel {
-  private readonly inputs: Float64Array; // [n, 7] over the length scales
-  private readonly all: Float64Array; // [V, 7] of all views of the bundle, for their shares of pixels
-  private readonly factor: Float64Array; // [n, n] lower
+  private factor: Float64Array | null = null; // [n, n] lower
   private readonly weights: Float64Array; // [K, n]
   private readonly unseen: Float64Array; // [n] its variance at unseen views
+  private readonly scale: Vec3; // of squares: of positions, directions, log distances
   private readonly n: number;
   private readonly curves: readonly Curve[];
   private readonly meanShare: number;
 
   constructor(
     private readonly label: Label,
-    private readonly promises: Promises,
+    private readonly views: Views,
     private readonly own: LabelPromises,
   ) {
     this.n = own.views.length;
     const curves = label.quality?.curves ?? [];
     this.curves = own.levels.flatMap((level) => curves.filter((curve) => curve.level === level));
-    this.all = new Float64Array(7 * promises.views.length);
-    promises.views.forEach((v, i) => {
-      this.put(this.all, i, [v[0], v[1], v[2]], [v[3], v[4], v[5]], 0);
-    });
-    this.inputs = new Float64Array(7 * this.n);
-    own.views.forEach((row, i) => {
-      this.inputs.set(this.all.subarray(7 * row, 7 * row + 6), 7 * i);
-      this.inputs[7 * i + 6] = (own.logDistances[i] ?? 0) / own.lengths[2];
-    });
+    const [x, y, z] = own.lengths;
+    this.scale = [x ** -2, y ** -2, z ** -2];
     this.weights = Float64Array.from(
       this.curves.flatMap((_, level) => own.weights.map((row) => row[level] ?? 0)),
     );
     this.unseen = Float64Array.from(own.unseenViews, (u) => own.unseen * u);
-    this.factor = cholesky(this.covariance(), this.n);
     this.meanShare = own.shares.reduce((sum, s) => sum + s, 0) / Math.max(own.shares.length, 1);
   }
 
@@ -91,13 +131,14 @@ export class ViewModel {
    * @param direction - in which it looks, unit length
    */
   predict(distance: number, position: Vec3, direction: Vec3): Prediction {
-    const { own, n } = this;
-    const x = new Float64Array(7);
-    this.put(x, 0, position, direction, distance > 0 && distance < Infinity ? Math.log(distance) : own.usual);
+    const { own, n, scale } = this;
+    this.views.from(position, direction);
+    const log = distance > 0 && distance < Infinity ? Math.log(distance) : own.usual;
     const k = new Float64Array(n);
     let support = 0;
     for (let i = 0; i < n; i++) {
-      const alike = matern(x, 0, this.inputs, i, 7);
+      const further = log - (own.logDistances[i] as number);
+      const alike = matern(this.square(own.views[i] as number) + further * further * scale[2]);
       support = Math.max(support, alike);
       k[i] = alike + (this.unseen[i] as number);
     }
@@ -106,34 +147,42 @@ export class ViewModel {
       for (let i = 0; i < n; i++) moved += (k[i] as number) * (this.weights[level * n + i] as number);
       return curveAt(curve, distance) + moved + own.shift;
     });
+    this.factor ??= cholesky(this.covariance(), n);
     const variance = Math.max(1 + own.unseen + own.noise - explained(this.factor, k), 0);
     return this.promise(mean, Math.sqrt(variance), support);
   }
 
   /** A distance by the boxes, corrected by what they miss at the label's own views close by; NaN stays. */
   corrected(distance: number, position: Vec3, direction: Vec3): number {
-    const x = new Float64Array(7);
-    this.put(x, 0, position, direction, 0);
+    const { views, corrections } = this.own;
+    this.views.from(position, direction);
     let [sum, total] = [0, 0];
-    this.own.corrections.forEach((correction, i) => {
-      const weight = matern(x, 0, this.inputs, i, 6) ** LIKE;
-      sum += weight * correction;
+    for (let i = 0; i < views.length; i++) {
+      const weight = matern(this.square(views[i] as number)) ** LIKE;
+      sum += weight * (corrections[i] as number);
       total += weight;
-    });
+    }
     return distance * Math.exp(sum / (total + ENOUGH));
   }
 
   /** Share of the pixels that the label has around a viewpoint, from the known views near it, 0..1. */
   share(position: Vec3, direction: Vec3): number {
-    const x = new Float64Array(7);
-    this.put(x, 0, position, direction, 0);
+    const { shares } = this.own;
+    this.views.from(position, direction);
     let [sum, total] = [0, 0];
-    this.own.shares.forEach((share, view) => {
-      const alike = matern(x, 0, this.all, view, 6);
-      sum += alike * share;
+    for (let view = 0; view < shares.length; view++) {
+      const alike = maternTable(this.square(view));
+      sum += alike * (shares[view] as number);
       total += alike;
-    });
+    }
     return total > 1e-12 ? sum / total : this.meanShare;
+  }
+
+  /** Square of the scaled difference between where the viewer stands and a view. */
+  private square(view: number): number {
+    return (
+      (this.views.away[view] as number) * this.scale[0] + (this.views.turned[view] as number) * this.scale[1]
+    );
   }
 
   private promise(mean: readonly number[], deviation: number, support: number): Prediction {
@@ -150,37 +199,38 @@ export class ViewModel {
     };
   }
 
-  private put(rows: Float64Array, i: number, position: Vec3, direction: Vec3, logDistance: number): void {
-    const { lengths } = this.own;
-    for (let axis = 0; axis < 3; axis++) {
-      rows[7 * i + axis] = (position[axis] as number) / this.promises.extent / lengths[0];
-      rows[7 * i + 3 + axis] = (direction[axis] as number) / lengths[1];
-    }
-    rows[7 * i + 6] = logDistance / lengths[2];
-  }
-
   private covariance(): Float64Array {
-    const { n, own } = this;
+    const { n, own, views, scale } = this;
     const S = new Float64Array(n * n);
     for (let i = 0; i < n; i++) {
       for (let j = 0; j <= i; j++) {
         const both = (this.unseen[i] as number) * (own.unseenViews[j] ?? 0);
-        S[i * n + j] = matern(this.inputs, i, this.inputs, j, 7) + both + (i === j ? own.noise : 0);
+        const [away, turned] = views.between(own.views[i] as number, own.views[j] as number);
+        const further = (own.logDistances[i] as number) - (own.logDistances[j] as number);
+        const alike = matern(away * scale[0] + turned * scale[1] + further * further * scale[2]);
+        S[i * n + j] = alike + both + (i === j ? own.noise : 0);
       }
     }
     return S;
   }
 }
 
-/** Matern 3/2 between two rows of 7 scaled inputs, of which the first `size` count. */
-function matern(a: Float64Array, i: number, b: Float64Array, j: number, size: number): number {
-  let square = 0;
-  for (let at = 0; at < size; at++) {
-    const away = (a[7 * i + at] as number) - (b[7 * j + at] as number);
-    square += away * away;
-  }
+/** Matern 3/2 of the square of a scaled difference. */
+function matern(square: number): number {
   const scaled = Math.sqrt(3 * square);
   return (1 + scaled) * Math.exp(-scaled);
+}
+
+const STEPS = 256; // of a table of it, in a unit of the scaled difference
+const TABLE = Float64Array.from({ length: 32 * STEPS }, (_, i) => matern((i / STEPS) ** 2 / 3));
+
+/** The same to 2e-6, without an exponential: shares of pixels take all views of a scene for each of its labels. */
+function maternTable(square: number): number {
+  const at = Math.sqrt(3 * square) * STEPS;
+  const i = Math.floor(at);
+  if (!(i < TABLE.length - 1)) return 0;
+  const low = TABLE[i] as number;
+  return low + (at - i) * ((TABLE[i + 1] as number) - low);
 }
 
 /** The lower Cholesky factor of a symmetric positive definite matrix given by its lower half, in place. */

@@ -2,8 +2,9 @@
 
 import type { Handle, Label, Level, Renderer } from "../types";
 import type { Sight } from "./distance";
+import type { Step } from "./order";
 import { type Candidate, type Ladder, ladderOf } from "./planner";
-import type { Prediction } from "./quality";
+import { byDistance, type Prediction } from "./quality";
 
 /** One label of the manifest. What is drawn are increments 1..shown, or `former` until those are there. */
 export class Entry {
@@ -16,10 +17,13 @@ export class Entry {
   sight: Sight = { visible: true, distance: Number.NaN, size: 0 };
   share = 0; // of the pixels
   candidate: Candidate | null = null; // that the plan was made with
+  steps: { candidate: Candidate; have: number; found: Step[] } | null = null; // to the plan from what is here
   prediction: Prediction = { mean: [], bound: [], support: Number.NaN };
+  readonly unseen: Prediction; // what is known while it is out of sight
 
   constructor(public label: Label) {
     this.ladder = ladderOf(label);
+    this.unseen = byDistance(label, Number.NaN);
     this.decoded = label.levels.map((file) => (file.count ? undefined : null));
   }
 

@@ -27,7 +27,9 @@ export interface StreamerOptions {
   readonly downloads?: number; // at once, at most
 }
 
-const PLAN_EVERY = 125; // ms
+const PLAN_EVERY = 125; // ms, at least
+const REST = 4; // times as long as a plan took before the next: scenes of many parts leave time to draw
+const QUICK = 4; // ms of work that needs no rest
 const KEEP = 64 * 2 ** 20;
 const DECODES = 4; // at once
 const HOLDS_UP = 0.05; // of a pack's bytes
@@ -49,7 +51,10 @@ export class Streamer {
   private leaving: Drawn[] = []; // labels that a new manifest has no more
   private outlook = new Outlook();
   private planned: Plan["status"] = "ok";
-  private plannedAt = -Infinity;
+  private nextPlan = -Infinity; // ms, not before
+  private nextWork = -Infinity;
+  private postponed = false; // work
+  private wantedKeys = new Set<string>(); // of all files of the plan
   private dirty = false;
   private decodes = 0;
   private pending = 0;
@@ -155,7 +160,7 @@ export class Streamer {
 
   private replan(): void {
     if (this.phase !== "running" || this.dirty) return;
-    const wait = this.plannedAt + PLAN_EVERY - this.clock.now();
+    const wait = this.nextPlan - this.clock.now();
     this.dirty = wait > 0;
     if (this.dirty) this.clock.after(wait, () => this.phase === "running" && this.plan());
     else this.plan();
@@ -163,7 +168,7 @@ export class Streamer {
 
   private plan(): void {
     this.dirty = false;
-    this.plannedAt = this.clock.now();
+    const begun = this.clock.now();
     for (const entry of this.entries) this.outlook.see(entry, this.viewpoint);
     const candidates = this.entries.map((entry) => {
       return this.outlook.candidate(entry, this.settings.weights, this.highest(entry));
@@ -174,6 +179,10 @@ export class Streamer {
       entry.wanted = wanted[i] ?? 0;
       entry.candidate = candidates[i] ?? null;
     });
+    this.wantedKeys = new Set(this.entries.flatMap((e) => e.files(0, e.wanted).map((f) => f.file.sha256)));
+    if (this.content.promises) this.wantedKeys.add(this.content.promises.sha256);
+    const took = this.clock.now() - begun;
+    this.nextPlan = begun + Math.max(PLAN_EVERY, (1 + REST) * took);
     this.work();
   }
 
@@ -185,16 +194,27 @@ export class Streamer {
 
   /** Draws what is there, decodes what has come, fetches what is missing. */
   private work(): void {
-    if (this.phase !== "running") return;
+    if (this.phase !== "running" || this.postponed) return;
+    const begun = this.clock.now();
+    if (begun < this.nextWork) {
+      this.postponed = true;
+      this.clock.after(this.nextWork - begun, () => {
+        this.postponed = false;
+        this.work();
+      });
+      return;
+    }
     this.draw();
     this.hidden.shrink(this.settings.cacheBytes);
     this.decodeMore();
     const promises = this.missingPromises();
     const queue = inOrder(this.entries, this.supply, promises, this.promisesCanWait());
     this.pending = queue.length;
-    this.supply.keepOnly(new Set([...queue, ...this.wantedFiles()].map((file) => file.sha256)));
+    this.supply.keepOnly(this.wantedKeys);
     const undecided = this.settings.mode !== "base" && promises.some((file) => !this.supply.rests(file));
     this.supply.fill(queue, undecided);
+    const took = this.clock.now() - begun;
+    if (took > QUICK) this.nextWork = begun + (1 + REST) * took;
     this.changed();
     this.rest();
   }
@@ -322,7 +342,14 @@ export class Streamer {
 
   private isIdle(): boolean {
     if (this.phase !== "running") return true;
-    return !this.dirty && !this.supply.running && !this.decodes && !this.pending && !this.retrying();
+    return (
+      !this.dirty &&
+      !this.postponed &&
+      !this.supply.running &&
+      !this.decodes &&
+      !this.pending &&
+      !this.retrying()
+    );
   }
 
   /** Whether something failed that will soon be tried again. */

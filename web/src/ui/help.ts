@@ -9,7 +9,7 @@ const HELP: readonly (readonly [string, string])[] = [
   ["O", "orbit or walk"],
   ["[ and ]", "photo before, photo after"],
   ["C", "compare with the full scene"],
-  ["T", "colour the labels"],
+  ["T", "colour the labels; in a scene in blocks the blocks, too"],
   ["P", "open or close the panel"],
   ["Gamepad", "left stick moves, right stick turns"],
   ["Headset", "left stick moves, right stick turns"],

@@ -2,83 +2,133 @@ import type { LabelState } from "../types";
 import type { Viewer } from "../view/viewer";
 import { h, iconButton, setIcon, setText } from "./dom";
 import { formatBytes, formatCount, formatDistance, formatSsim } from "./format";
+import { blockColor, grouped, summary } from "./groups";
 
 const WEIGHTS = [0.25, 0.5, 1, 2, 4];
 
 interface Row {
   readonly element: HTMLElement;
-  update(state: LabelState): void;
+  update(states: readonly LabelState[]): void;
 }
 
 /** The labels: colour, level, promised SSIM, size, distance, weight, and whether they are drawn. */
 export class LabelTable {
   readonly element = h("ul", { class: "labels", "aria-label": "Labels" });
-  readonly #rows = new Map<number, Row>();
+  readonly #rows = new Map<string, Row>();
 
   constructor(readonly viewer: Viewer) {}
 
   update(states: readonly LabelState[]): void {
-    for (const state of states) {
-      let row = this.#rows.get(state.label.id);
+    const groups = grouped(states);
+    for (const { key, states: labels } of groups) {
+      let row = this.#rows.get(key);
       if (!row) {
-        row = makeRow(this.viewer, state);
-        this.#rows.set(state.label.id, row);
+        row = labelRow(this.viewer, labels);
+        this.#rows.set(key, row);
         this.element.append(row.element);
       }
-      row.update(state);
+      row.update(labels);
     }
-    const sorted = [...states].sort((a, b) => b.label.levels.length && total(b) - total(a));
-    const order = sorted.map(({ label }) => this.#rows.get(label.id)?.element);
+    const order = groups.map(({ key }) => this.#rows.get(key)?.element);
     if (order.some((element, i) => element !== this.element.children[i])) {
       this.element.append(...order.filter((element) => element !== undefined));
     }
   }
 }
 
-const total = ({ label }: LabelState) => label.levels.reduce((sum, { count }) => sum + count, 0);
+/** A label by itself, or a category in blocks: then its parts are below it once somebody wants to see them. */
+function labelRow(viewer: Viewer, states: readonly LabelState[]): Row {
+  const label = states[0]?.label;
+  const title = label?.title ?? "";
+  let latest = states;
+  const ids = () => latest.map((state) => state.label.id);
+  const isHidden = () => ids().every((id) => viewer.isHidden(id));
+  const eye = iconButton("eye", "", () => viewer.setHidden(ids(), !isHidden()));
+  const facts = factsRow(viewer, title, label?.category ?? label?.name ?? "", label?.color ?? "");
+  facts.element.append(eye, weightSelect(viewer, ids, title));
+  const parts = label?.block === undefined ? null : partList(viewer, facts.element, title);
+  return {
+    element: facts.element,
+    update: (now) => {
+      latest = now;
+      facts.update(now);
+      setEye(eye, title, isHidden());
+      parts?.update(now);
+    },
+  };
+}
 
-function makeRow(viewer: Viewer, { label }: LabelState): Row {
+/** The parts of a category, by block. */
+function partList(viewer: Viewer, parent: HTMLElement, title: string): Pick<Row, "update"> {
+  const rows = new Map<number, Row>();
+  const list = h("ul", { class: "parts", "aria-label": `${title} by block`, hidden: true });
+  const more = h("button", { type: "button", class: "blocks", "aria-expanded": "false" });
+  let latest: readonly LabelState[] = [];
+  more.addEventListener("click", () => {
+    list.hidden = !list.hidden;
+    more.setAttribute("aria-expanded", String(!list.hidden));
+    update(latest);
+  });
+  parent.classList.add("category");
+  parent.append(more, list);
+
+  function update(states: readonly LabelState[]): void {
+    latest = states;
+    setText(more, states.length === 1 ? "1 block" : `${states.length} blocks`);
+    if (list.hidden) return;
+    for (const state of states) {
+      const { id, block = 0, name } = state.label;
+      let row = rows.get(id);
+      if (!row) {
+        row = factsRow(viewer, `block ${block}`, name, blockColor(block));
+        rows.set(id, row);
+        list.append(row.element);
+      }
+      row.update([state]);
+    }
+  }
+  return { update };
+}
+
+/** Colour, name, level, SSIM, size and distance. */
+function factsRow(viewer: Viewer, title: string, name: string, color: string): Row {
   const metres = viewer.manifest.frame.metersPerUnit;
   const bar = h("div", { class: "level", role: "img" }, h("i"), h("b"));
   const level = h("span", { class: "number" });
   const ssim = h("span", { class: "number ssim" });
   const facts = h("span", { class: "more" });
-  const eye = iconButton("eye", "", () => viewer.setHidden(label.id, !viewer.isHidden(label.id)));
-  const weight = weightSelect(viewer, label.id, label.title);
   const element = h(
     "li",
     {},
     h("span", { class: "swatch" }),
-    h("span", { class: "name", title: label.name }, label.title),
+    h("span", { class: "name", title: name }, title),
     ssim,
-    eye,
     bar,
     level,
     facts,
-    weight,
   );
-  element.style.setProperty("--label", label.color);
-  let last = -1;
+  element.style.setProperty("--label", color);
+  let last = Number.NaN;
 
-  function update(state: LabelState): void {
-    const hidden = viewer.isHidden(label.id);
-    const levels = state.label.levels.length;
-    bar.style.setProperty("--shown", String(state.shown / levels));
-    bar.style.setProperty("--wanted", String(state.wanted / levels));
-    bar.setAttribute("aria-label", `level ${state.shown} of ${levels}, ${state.wanted} wanted`);
-    setText(level, `${state.shown}/${levels}`);
-    setText(ssim, formatSsim(state.promised));
-    ssim.title = `promised SSIM ${formatSsim(state.promised)}, expected ${formatSsim(state.expected)}`;
-    const place = state.visible ? formatDistance(state.distance * metres) : "out of sight";
-    setText(facts, state.error ?? `${formatCount(state.count)} · ${formatBytes(state.bytes)} · ${place}`);
-    element.classList.toggle("error", state.error !== null);
-    element.classList.toggle("dim", hidden || !state.visible);
-    element.classList.toggle("busy", state.loading);
-    setEye(eye, label.title, hidden);
-    if (last >= 0 && last !== state.shown) flash(element, state.shown > last);
-    last = state.shown;
+  function update(states: readonly LabelState[]): void {
+    const now = summary(states);
+    bar.style.setProperty("--shown", String(now.shown));
+    bar.style.setProperty("--wanted", String(now.wanted));
+    bar.setAttribute(
+      "aria-label",
+      `level ${now.level}, ${Math.round(100 * now.wanted)} % of the levels wanted`,
+    );
+    setText(level, now.level);
+    setText(ssim, formatSsim(now.promised));
+    ssim.title = `promised SSIM ${formatSsim(now.promised)}, expected ${formatSsim(now.expected)}`;
+    const place = now.visible ? formatDistance(now.distance * metres) : "out of sight";
+    setText(facts, now.error ?? `${formatCount(now.count)} · ${formatBytes(now.bytes)} · ${place}`);
+    element.classList.toggle("error", now.error !== null);
+    element.classList.toggle("dim", !now.visible || states.every(({ label }) => viewer.isHidden(label.id)));
+    element.classList.toggle("busy", now.loading);
+    if (states.length === 1 && last !== now.shown && !Number.isNaN(last)) flash(element, now.shown > last);
+    last = now.shown;
   }
-
   return { element, update };
 }
 
@@ -90,19 +140,24 @@ function setEye(eye: HTMLButtonElement, title: string, hidden: boolean): void {
   setIcon(eye, hidden ? "closed" : "eye");
 }
 
-function weightSelect(viewer: Viewer, label: number, title: string): HTMLSelectElement {
+/** One weight for all labels of a row; where they differ, none is chosen. */
+function weightSelect(viewer: Viewer, ids: () => number[], title: string): HTMLSelectElement {
   const set = () => {
-    const weights = new Map(viewer.settings.weights).set(label, Number(select.value));
+    const weights = new Map(viewer.settings.weights);
+    for (const id of ids()) weights.set(id, Number(select.value));
     viewer.set({ weights });
   };
-  const current = viewer.settings.weights.get(label) ?? 1;
-  const steps = WEIGHTS.includes(current) ? WEIGHTS : [...WEIGHTS, current].sort((a, b) => a - b);
-  const options = steps.map((w) => h("option", { value: w, selected: w === current }, `× ${w}`));
+  const given = new Set(ids().map((id) => viewer.settings.weights.get(id) ?? 1));
+  const steps = [...new Set([...WEIGHTS, ...given])].sort((a, b) => a - b);
+  const options = steps.map((w) =>
+    h("option", { value: w, selected: given.size === 1 && given.has(w) }, `× ${w}`),
+  );
   const select = h(
     "select",
     { class: "weight", title: "Weight", "aria-label": `Weight of ${title}`, change: set },
     ...options,
   );
+  if (given.size > 1) select.selectedIndex = -1;
   return select;
 }
 

@@ -72,7 +72,7 @@ function shortfall(state: State, { mode, target }: Settings): string {
     (l) => l.visible && l.wanted === l.label.levels.length && l.promised < target,
   );
   if (mode !== "target" || !short.length) return "The best that the budget allows";
-  const names = short.map((l) => l.label.title);
+  const names = [...new Set(short.map((l) => l.label.title))];
   const named =
     names.length > 2 ? `${names.slice(0, 2).join(", ")} and ${names.length - 2} more` : names.join(" and ");
   return `${named} cannot reach ${target.toFixed(2)}`;

@@ -1,6 +1,7 @@
 import type { Viewer } from "../view/viewer";
 import { offered, type XrMode } from "../view/xr";
 import { h, iconButton, setIcon } from "./dom";
+import { blockColor } from "./groups";
 import { messageOf } from "./notice";
 import type { Split } from "./split";
 import { nextTheme } from "./theme";
@@ -15,7 +16,9 @@ interface Parts {
 
 /** Camera, photos, comparison, colours, help and headset, with a key for each. */
 export function toolbar(viewer: Viewer, parts: Parts): { element: HTMLElement; update(): void } {
-  let tinted = false;
+  const blocks = viewer.manifest.labels.some(({ block }) => block !== undefined);
+  const tints = blocks ? 3 : 2; // none, by label, by block
+  let tinted = 0;
   const mode = iconButton("orbit", "Orbit or walk (O)", () => {
     viewer.controls.mode = viewer.controls.mode === "orbit" ? "walk" : "orbit";
     setIcon(mode, viewer.controls.mode);
@@ -25,8 +28,10 @@ export function toolbar(viewer: Viewer, parts: Parts): { element: HTMLElement; u
   });
   const compare = iconButton("compare", "Compare with the full scene (C)", () => parts.split.toggle());
   const tint = iconButton("tint", "Colour the labels (T)", () => {
-    tinted = !tinted;
-    viewer.setTint(tinted ? TINT : 0);
+    tinted = (tinted + 1) % tints;
+    viewer.setTint(tinted ? TINT : 0, tinted === 2 ? blockColors(viewer) : undefined);
+    if (blocks)
+      parts.say(["Colours of the photos", "Coloured by category", "Coloured by block"][tinted] ?? "");
   });
   const help = iconButton("help", "Help (?)", () => parts.help.showModal());
   const theme = iconButton("theme", "Light or dark", () => parts.say(`Theme: ${nextTheme()}`));
@@ -53,11 +58,14 @@ export function toolbar(viewer: Viewer, parts: Parts): { element: HTMLElement; u
     element,
     update: () => {
       compare.setAttribute("aria-pressed", String(viewer.compare.on));
-      tint.setAttribute("aria-pressed", String(tinted));
+      tint.setAttribute("aria-pressed", String(tinted > 0));
       photos.update();
     },
   };
 }
+
+const blockColors = ({ manifest }: Viewer) =>
+  new Map(manifest.labels.map(({ id, block = 0 }) => [id, blockColor(block)]));
 
 function photoPicker(viewer: Viewer): { elements: HTMLElement[]; step(by: number): void; update(): void } {
   const { cameras } = viewer.manifest;

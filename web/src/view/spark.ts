@@ -1,8 +1,10 @@
 import { dyno, type PackedSplats, SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
-import { Group, type Matrix4, Scene, type WebGLRenderer } from "three";
+import { Group, type Matrix4, Scene, Vector3, type WebGLRenderer } from "three";
 import type { Handle, Manifest, Renderer } from "../types";
 import { rootMatrix } from "./frame";
 import { decodePart, joined, type Part } from "./splats";
+
+type Color = InstanceType<typeof dyno.DynoVec3<Vector3>>;
 
 /** A decoded increment. */
 interface Increment extends Handle {
@@ -16,6 +18,7 @@ interface Increment extends Handle {
 interface Column {
   readonly mesh: SplatMesh;
   readonly source: Source;
+  readonly color: Color;
   shown: readonly Increment[];
   stored: readonly Increment[];
 }
@@ -61,7 +64,7 @@ export class SparkLayer implements Renderer {
     });
     this.place(rootMatrix(manifest.frame));
     this.scene.add(this.spark, this.root);
-    this.setColors(manifest);
+    this.setColors(colorsOf(manifest));
     // now and not as they come: splats of equal depth are drawn in the order of their meshes
     for (const { id } of manifest.labels) this.#column(id);
   }
@@ -77,9 +80,13 @@ export class SparkLayer implements Renderer {
     matrix.decompose(this.root.position, this.root.quaternion, this.root.scale);
   }
 
-  /** The labels' colours; a label's mesh takes the one it finds when it is shown first. */
-  setColors({ labels }: Manifest): void {
-    for (const { id, color } of labels) this.#colors.set(id, color);
+  /** Colours (#rrggbb) by label. */
+  setColors(colors: ReadonlyMap<number, string>): void {
+    for (const [id, color] of colors) {
+      this.#colors.set(id, color);
+      const column = this.#columns.get(id);
+      if (column) column.color.value = rgbOf(color);
+    }
   }
 
   async decode(label: number, level: number, bytes: Uint8Array): Promise<Increment> {
@@ -133,12 +140,12 @@ export class SparkLayer implements Renderer {
   #column(label: number): Column {
     const known = this.#columns.get(label);
     if (known) return known;
-    const color = this.#colors.get(label) ?? "#8a8f98";
+    const color = new dyno.DynoVec3({ value: rgbOf(this.#colors.get(label) ?? "#8a8f98") });
     const source = new Source(joined([]));
     const mesh = new SplatMesh({ splats: source, worldModifier: tinted(color, this.#tint) });
     mesh.raycastable = false;
     this.root.add(mesh);
-    const column = { mesh, source, shown: [], stored: [] };
+    const column = { mesh, source, color, shown: [], stored: [] };
     this.#columns.set(label, column);
     return column;
   }
@@ -162,15 +169,23 @@ export class SparkLayer implements Renderer {
 
 const total = (parts: readonly Handle[]) => parts.reduce((sum, part) => sum + part.count, 0);
 
-/** Mixes a label's colour in, as light or dark as the scene is there. */
-function tinted(color: string, amount: InstanceType<typeof dyno.DynoFloat>) {
+/** The labels' own colours. */
+export const colorsOf = ({ labels }: Manifest): Map<number, string> =>
+  new Map(labels.map(({ id, color }) => [id, color]));
+
+const rgbOf = (color: string): Vector3 => {
   const [r = 0, g = 0, b = 0] = [1, 3, 5].map((at) => Number.parseInt(color.slice(at, at + 2), 16) / 255);
+  return new Vector3(r, g, b);
+};
+
+/** Mixes a label's colour in, as light or dark as the scene is there. */
+function tinted(color: Color, amount: InstanceType<typeof dyno.DynoFloat>) {
   const vec3 = (x: number, y: number, z: number) => dyno.dynoConst("vec3", [x, y, z]);
   return dyno.dynoBlock({ gsplat: dyno.Gsplat }, { gsplat: dyno.Gsplat }, ({ gsplat }) => {
     if (!gsplat) throw new Error("a modifier without input");
     const { rgb } = dyno.splitGsplat(gsplat).outputs;
     const light = dyno.add(dyno.dynoConst("float", 0.45), dyno.dot(rgb, vec3(0.25, 0.55, 0.2)));
-    const mixed = dyno.mix(rgb, dyno.mul(vec3(r, g, b), light), amount);
+    const mixed = dyno.mix(rgb, dyno.mul(color, light), amount);
     return { gsplat: dyno.combineGsplat({ gsplat, rgb: mixed }) };
   });
 }

@@ -6,6 +6,7 @@ import { Compare } from "./compare";
 import { Controls } from "./controls";
 import { type Pose, quat, transformPose, vec3 } from "./frame";
 import { type Rig, rigAt } from "./motion";
+import { colorsOf } from "./spark";
 import { Stage } from "./stage";
 import { Headset } from "./xr";
 
@@ -27,6 +28,7 @@ export class Viewer {
   readonly #samples = new Set<(sample: Sample) => void>();
   #cap: number | null = null; // splats that the headset bears
   #tint = 0;
+  #colors: ReadonlyMap<number, string> = new Map();
   #last = 0;
 
   /** Throws where there is no WebGL 2. */
@@ -74,11 +76,13 @@ export class Viewer {
     return this.#hidden.has(label);
   }
 
-  /** Leaves a label out, or draws it again; while it is out it claims nothing of the budget but its base. */
-  setHidden(label: number, hidden: boolean): void {
-    if (hidden) this.#hidden.add(label);
-    else this.#hidden.delete(label);
-    for (const layer of [this.stage.layer, this.stage.full]) layer?.setVisible(label, !hidden);
+  /** Leaves labels out, or draws them again; while they are out they claim nothing of the budget but their base. */
+  setHidden(labels: readonly number[], hidden: boolean): void {
+    for (const label of labels) {
+      if (hidden) this.#hidden.add(label);
+      else this.#hidden.delete(label);
+      for (const layer of [this.stage.layer, this.stage.full]) layer?.setVisible(label, !hidden);
+    }
     this.#apply();
   }
 
@@ -86,13 +90,18 @@ export class Viewer {
   startCompare(): void {
     this.compare.start(() => this.stage.invalidate());
     for (const label of this.#hidden) this.stage.full?.setVisible(label, false);
+    this.stage.full?.setColors(this.#colors);
     this.stage.full?.setTint(this.#tint);
   }
 
-  /** How much of the labels' own colours is mixed in, 0 to 1. */
-  setTint(amount: number): void {
+  /** How much of the labels' own colours is mixed in, 0 to 1, or of others by label. */
+  setTint(amount: number, colors?: ReadonlyMap<number, string>): void {
     this.#tint = amount;
-    for (const layer of [this.stage.layer, this.stage.full]) layer?.setTint(amount);
+    this.#colors = colors ?? colorsOf(this.streamer.manifest);
+    for (const layer of [this.stage.layer, this.stage.full]) {
+      layer?.setColors(this.#colors);
+      layer?.setTint(amount);
+    }
   }
 
   pose(): Pose {

@@ -4,7 +4,7 @@ import { describe, expect, test } from "vitest";
 import distances from "../../../tests/data/distances.json?raw";
 import promised from "../../../tests/data/promises.json?raw";
 import { frustumOf, look, touches } from "../../src/core/distance";
-import { byDistance, curveAt, ViewModel } from "../../src/core/quality";
+import { byDistance, curveAt, ViewModel, Views } from "../../src/core/quality";
 import type { Box, Curve, Label, Promises, Quat, Vec3, Viewpoint } from "../../src/types";
 
 interface PromiseCase {
@@ -64,7 +64,7 @@ describe("promises", () => {
       if (!own) throw new Error("no label");
       const label = labelWith(c.curves, Math.max(...own.levels));
       expect(ViewModel.fits(label, own)).toBe(true);
-      const model = new ViewModel(label, c.promises, own);
+      const model = new ViewModel(label, new Views(c.promises), own);
       const ofLevels = (values: readonly number[]) => own.levels.map((k) => values[k - 1] ?? Number.NaN);
       for (const v of c.viewpoints) {
         const told = model.predict(v.distance ?? Number.NaN, v.position, v.direction);
@@ -127,7 +127,7 @@ test("shares of pixels come from the views near by", () => {
   if (!own?.promises.labels[0]) throw new Error("no case");
   const shares = own.promises.views.map((_, i) => (i === 3 ? 0.5 : 0.1));
   const entry = { ...own.promises.labels[0], shares, lengths: [0.01, 0.01, 1] as const };
-  const model = new ViewModel(labelWith(own.curves, 6), own.promises, entry);
+  const model = new ViewModel(labelWith(own.curves, 6), new Views(own.promises), entry);
   const [x, y, z, a, b, c] = own.promises.views[3] ?? [0, 0, 0, 0, 0, 0];
   expect(model.share([x, y, z], [a, b, c])).toBeCloseTo(0.5, 6);
   expect(model.share([1e4, 0, 0], [0, 0, 1])).toBeCloseTo(0.1 + 0.4 / shares.length, 9);

@@ -1,0 +1,83 @@
+import type { LabelState } from "../types";
+
+/** The labels that are one category: a label by itself, or all its parts in a scene in blocks. */
+export interface Group {
+  readonly key: string;
+  readonly states: readonly LabelState[]; // the parts by block
+  readonly splats: number; // of all levels
+}
+
+/** What a group's row says. */
+export interface Summary {
+  readonly shown: number; // share of its levels
+  readonly wanted: number;
+  readonly level: string; // "2/6", "1–4/6" where its parts differ
+  readonly promised: number; // the least of what is in sight
+  readonly expected: number;
+  readonly count: number;
+  readonly bytes: number;
+  readonly distance: number; // of the nearest
+  readonly visible: boolean;
+  readonly loading: boolean;
+  readonly error: string | null;
+}
+
+/** By category, the largest first. */
+export function grouped(states: readonly LabelState[]): Group[] {
+  const found = new Map<string, LabelState[]>();
+  for (const state of states) {
+    const { label } = state;
+    const key = label.block === undefined ? `#${label.id}` : (label.category ?? label.name);
+    const known = found.get(key);
+    if (known) known.push(state);
+    else found.set(key, [state]);
+  }
+  const groups = [...found].map(([key, parts]) => ({
+    key,
+    states: parts.sort((a, b) => (a.label.block ?? 0) - (b.label.block ?? 0)),
+    splats: parts.reduce(
+      (sum, { label }) => sum + label.levels.reduce((all, { count }) => all + count, 0),
+      0,
+    ),
+  }));
+  return groups.sort((a, b) => b.splats - a.splats);
+}
+
+export function summary(states: readonly LabelState[]): Summary {
+  const sum = (of: (state: LabelState) => number) => states.reduce((total, state) => total + of(state), 0);
+  const levels = sum(({ label }) => label.levels.length);
+  const visible = states.filter((state) => state.visible);
+  const least = (of: (state: LabelState) => number) => {
+    const known = (visible.length ? visible : states).map(of).filter((value) => !Number.isNaN(value));
+    return known.length ? Math.min(...known) : Number.NaN;
+  };
+  const shown = (visible.length ? visible : states).map((state) => state.shown);
+  const [low, high] = [Math.min(...shown), Math.max(...shown)];
+  const last = Math.max(...states.map(({ label }) => label.levels.length));
+  return {
+    shown: sum((state) => state.shown) / levels,
+    wanted: sum((state) => state.wanted) / levels,
+    level: `${low === high ? low : `${low}–${high}`}/${last}`,
+    promised: least((state) => state.promised),
+    expected: least((state) => state.expected),
+    count: sum((state) => state.count),
+    bytes: sum((state) => state.bytes),
+    distance: least((state) => state.distance),
+    visible: visible.length > 0,
+    loading: states.some((state) => state.loading),
+    error: states.find((state) => state.error)?.error ?? null,
+  };
+}
+
+/** A colour for a block, as far from those before it as hues go. */
+export const blockColor = (block: number): string => {
+  const hue = (block * 137.508) % 360;
+  const channel = (at: number) => {
+    const k = (at + hue / 30) % 12;
+    const value = 0.55 - 0.3 * Math.max(-1, Math.min(k - 3, 9 - k, 1));
+    return Math.round(255 * value)
+      .toString(16)
+      .padStart(2, "0");
+  };
+  return `#${channel(0)}${channel(8)}${channel(4)}`;
+};

@@ -1,0 +1,154 @@
+/** Scenes in blocks made up for tests: a square of blocks, each with all categories, far ones the largest. */
+
+import { frustumOf, rotate } from "../src/core/distance";
+import type { Box, Label, Level, Manifest, Promises, Viewpoint } from "../src/types";
+import { fnv, type Network, seeded } from "./simulate";
+import { totals } from "./worlds";
+
+const SIDE = 10; // of a block, world units
+
+export interface BlocksOptions {
+  readonly side?: number; // blocks along it
+  readonly categories?: number;
+  readonly levels?: number;
+  readonly bytes?: number; // of all levels of a part nearby, about; of the farthest eight times as much
+  readonly views?: number; // that a part's model knows
+}
+
+/** Stands in the middle and looks along x: most blocks are behind or beside. */
+export const start = { position: [18, 1.5, 15], quaternion: [0, -Math.SQRT1_2, 0, Math.SQRT1_2] } as const;
+
+/** A bundle in side x side blocks along x and z; of increments only the sizes matter. */
+export function blocksBundle(network: Network, options: BlocksOptions = {}): Manifest {
+  const { side = 4, categories = 8, levels = 16, bytes = 24_000, views = 24 } = options;
+  const random = seeded(5);
+  const labels = Array.from({ length: side * side * categories }, (_, id) => {
+    const block = Math.floor(id / categories);
+    const [column, row] = [block % side, Math.floor(block / side)];
+    const far =
+      Math.hypot(SIDE * (column + 0.5) - start.position[0], SIDE * (row + 0.5) - start.position[2]) / 4;
+    const sizes = Array.from(
+      { length: levels },
+      (_, k) => (bytes * Math.max(1, far) * 1.3 ** k) / 1.3 ** levels,
+    );
+    return part(network, id, id % categories, block, [SIDE * column, SIDE * row], sizes, random);
+  });
+  const models = promisesOf(labels, side, views, random);
+  return {
+    format: "sagesplat-bundle",
+    version: 1,
+    generator: "test",
+    name: "blocks",
+    live: false,
+    frame: { axes: "rub", up: [0, 1, 0], floor: 0, extent: SIDE * side, metersPerUnit: 1, scale: "given" },
+    shDegree: 3,
+    antialiased: false,
+    background: [0, 0, 0],
+    totals: totals(labels),
+    labels,
+    promises: store(network, "promises-1.json", new TextEncoder().encode(JSON.stringify(models))),
+    cameras: [],
+    start: { ...start, target: [5, 1, 5] },
+    licenses: [],
+  };
+}
+
+function store(network: Network, uri: string, content: Uint8Array) {
+  network.files.set(uri, content);
+  return { uri, bytes: content.length, sha256: fnv(content) };
+}
+
+function part(
+  network: Network,
+  id: number,
+  category: number,
+  block: number,
+  [x, z]: readonly [number, number],
+  sizes: readonly number[],
+  random: () => number,
+): Label {
+  const levels = sizes.map((size, k): Level => {
+    const content = new Uint8Array(Math.max(8, Math.round(size)));
+    new DataView(content.buffer).setUint32(0, 64 * id + k); // no two files are the same
+    const count = Math.max(1, Math.round(size / 20));
+    return {
+      ...store(network, `chunks/p${id}-${k + 1}.spz`, content),
+      format: "spz",
+      gpuBytes: 56 * count,
+      count,
+    };
+  });
+  const boxes = Array.from({ length: 8 }, (): Box => {
+    const [a, b, h] = [x + 9 * random(), z + 9 * random(), 2 * random()];
+    return [a, h, b, a + 1, h + 0.5 + random(), b + 1];
+  });
+  const curves = levels.map((_, k) => {
+    const top = 0.95 * (1 - 0.5 * Math.exp(-(k + 1) / 4));
+    return {
+      level: k + 1,
+      params: [top, 0.002, 2, 1.2, top - 0.02, 0.002, 2, 1.1, 20] as const,
+      range: [1, 60] as const,
+      median: top - 0.02,
+      rmse: 0.02,
+    };
+  });
+  return {
+    id,
+    name: `category-${category}@${block}`,
+    category: `category-${category}`,
+    block,
+    title: `category ${category}`,
+    color: "#808080",
+    weight: 1,
+    always: false,
+    boxes,
+    levels,
+    quality: { status: "calibrated", confidence: 0.95, margin: levels.map(() => -0.02), curves },
+  };
+}
+
+/** Each part is known from views in and around its block, in which it has more of the pixels. */
+function promisesOf(labels: readonly Label[], side: number, views: number, random: () => number): Promises {
+  const all = Array.from({ length: side * side * views }, () => {
+    const turn = 2 * Math.PI * random();
+    const [x, z] = [SIDE * side * random(), SIDE * side * random()];
+    return [x, 1.5, z, Math.sin(turn), 0, Math.cos(turn)] as const;
+  });
+  return {
+    version: 1,
+    extent: SIDE * side,
+    views: all,
+    labels: labels.map(({ id, levels, boxes }) => {
+      const [x = 0, , z = 0] = boxes[0] ?? [];
+      const away = all.map((view) => Math.hypot(view[0] - x, view[2] - z));
+      const rows = [...away.keys()].sort((a, b) => (away[a] ?? 0) - (away[b] ?? 0)).slice(0, views);
+      return {
+        id,
+        levels: levels.map((_, k) => k + 1),
+        usual: 2,
+        lengths: [0.2, 0.7, 0.6] as const,
+        unseen: 0.1,
+        noise: 0.1,
+        factor: 1,
+        confidence: 0.95,
+        shift: 0,
+        mixing: 0.005,
+        amplitudes: levels.map(() => 0.01),
+        views: rows,
+        unseenViews: rows.map((i) => (i % 4 ? 0 : 1)),
+        logDistances: rows.map((row) => Math.log(1 + (away[row] ?? 0))),
+        corrections: rows.map(() => 0),
+        weights: rows.map(() => levels.map(() => 0.01 * (random() - 0.5))),
+        shares: away.map((d) => Math.min(0.2, 2 / (1 + d) ** 2)),
+      };
+    }),
+  };
+}
+
+/** The viewpoint at the start, turned about the vertical. */
+export function startView(turn = 0): Viewpoint {
+  const half = -Math.PI / 4 + turn / 2;
+  const quaternion = [0, Math.sin(half), 0, Math.cos(half)] as const;
+  const frustum = frustumOf(start.position, quaternion, 0.9, 1.6);
+  return { position: start.position, direction: rotate(quaternion, [0, 0, -1]), frustum };
+}
