@@ -449,6 +449,42 @@ def blocks(
 
 
 @app.command
+def faults(
+    scene: tyro.conf.Positional[str], *, out: Path,
+    only: tuple[Literal["a", "b", "c", "d", "e", "f"], ...] = (), downscale: int = 1, steps: int = 300,
+    nest_steps: int = 100, levels: int = 4, kills: int = 20, seed: int = 0, write: bool = False,
+) -> None:  # fmt: skip
+    """Nodes, drivers and runs killed at random, a full disk: the same result, and what it costs.
+
+    Args:
+        scene: a capture, or demo for the built-in one.
+        out: folder for the runs, what they print, faults.json and faults.md.
+        only: cases: undisturbed (a), on three nodes (b), nodes killed (c), driver killed (d), disk full (e),
+            run killed again and again (f).
+        downscale: times smaller photos.
+        steps: of the training of each block.
+        nest_steps: of its nested ladder, and of the small model that this begins with.
+        levels: of the ladder.
+        kills: of case f.
+        seed: of the random moments.
+        write: also put the result into benchmarks/results.
+    """
+    from benchmarks import faults as disturbing
+    from benchmarks.faults_run import Asked, settings
+    from sagesplat.errors import SageError
+
+    capture = cached_capture() if scene == "demo" else Path(scene).absolute()
+    words = settings(downscale, steps, nest_steps, levels)
+    asked = Asked(capture, out.absolute(), words, kills, seed)
+    try:
+        cases = disturbing.measure(asked, only, lambda line: print(line, flush=True))
+    except SageError as error:
+        raise SystemExit(str(error)) from None
+    name = scene if scene == "demo" else capture.name
+    print(disturbing.report(name, asked, cases, write))
+
+
+@app.command
 def freeze(
     scene: Path = workloads.GARDEN,
     downscale: int = 2,

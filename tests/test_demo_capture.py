@@ -5,7 +5,8 @@ import pytest
 from PIL import Image
 
 from sagesplat.demo import capture
-from sagesplat.demo.capture import cached_capture, demo_cameras, make_capture
+from sagesplat.demo.cameras import demo_cameras
+from sagesplat.demo.capture import cached_capture, make_capture
 from sagesplat.demo.points import UV_NOISE, project
 from sagesplat.demo.world import LABELS
 from sagesplat.errors import SceneError
@@ -124,7 +125,8 @@ def test_refusals(tmp_path):
 def test_cache_is_made_once(tmp_path, monkeypatch):
     calls = []
 
-    def fake(folder, on_view=None):
+    def fake(folder, places, on_view=None):
+        assert places == (1, 1)
         calls.append(folder)
         folder.mkdir(parents=True)
 

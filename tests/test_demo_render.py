@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sagesplat.demo.capture import demo_cameras
+from sagesplat.demo.cameras import demo_cameras
 from sagesplat.demo.raycast import hit_leaves
 from sagesplat.demo.render import camera_rays, cast_rays, lit_world, render_view
 from sagesplat.demo.world import GRASS, LEAF, PAVING, SKY, build_world

@@ -36,7 +36,8 @@ class RayExecutor:
         """`folder`: what all nodes share. Tasks take `threads` CPUs and `gpus` GPUs each, in the main."""
         self.backend: Literal["cuda"] | None = backend
         self._threads, self._gpus = threads, gpus
-        self._place = Place(folder.absolute() / f".cluster-{uuid.uuid4().hex[:12]}", Path.cwd())
+        # named as temporary files are: the next stage removes what a killed driver left
+        self._place = Place(folder.absolute() / f".cluster.tmp-{uuid.uuid4().hex[:12]}", Path.cwd())
         near = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=True)
         options = {"num_cpus": 0, "max_restarts": -1, "scheduling_strategy": near}
         self._post: Any = ray.remote(**options)(Post).remote()

@@ -15,7 +15,6 @@ from sagesplat.demo.world import (
     GRASS,
     LEAF,
     PAVING,
-    PLOT,
     ROOF,
     SKY,
     SUN,
@@ -76,16 +75,28 @@ def _lit(world: World, kind: int, at, directions, part, sun, width) -> np.ndarra
         facing = np.abs(facing) * np.where(behind, 0.75, 1.0)
         sun, sky = world.leaf_light[part].T
     else:
-        rgb = np.stack(PAINT[kind](hits), 1)
+        local, tint = _in_place(world, kind, hits)
+        rgb = np.stack(PAINT[kind](local), 1) * tint
         sky = (0.5 + 0.5 * normal[:, 2]) * (0.4 + 1.5 * at[:, 2]).clip(0, 1)
     if kind in (GRASS, PAVING):
-        sun, sky = _baked(world.ground_light, at).T
+        sun, sky = _baked(world, at).T
     rgb *= SUN_RGB * (sun * facing.clip(0))[:, None] + SKY_RGB * sky[:, None] + BOUNCE_RGB
     if kind == GLAZE:
         mirror = directions - 2 * slant[:, None] * normal
         gleam = 2.5 * sun * (mirror @ SUN).clip(0) ** 60 + 0.10 * mirror[:, 2].clip(0)
         rgb += gleam[:, None]
     return rgb
+
+
+def _in_place(world: World, kind: int, hits: Hits) -> tuple[Hits, np.ndarray | float]:
+    """Hits of one material in the coordinates of their places, and the tints [n, 3] there."""
+    if kind in (GRASS, PAVING):
+        return hits, 1.0  # one ground for all
+    place = world.body_place[hits.part // 8] if kind in (BRICK, ROOF, CORE) else world.solid_place[hits.part]
+    frame, at, normal = world.places[place], hits.at.copy(), hits.normal.copy()
+    at[:, :2] = np.einsum("nij,nj->ni", frame[:, :, :2], at[:, :2]) + frame[:, :, 2]
+    normal[:, :2] = np.einsum("nij,nj->ni", frame[:, :, :2], normal[:, :2])
+    return hits._replace(at=at, normal=normal), world.tints[place, kind]
 
 
 def dome_distance(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -122,10 +133,11 @@ def _normals(world: World, kind: int, part: np.ndarray, at: np.ndarray) -> np.nd
     return np.where(cap != 0, cap * [0, 0, 1], side)
 
 
-def _baked(light: np.ndarray, at: np.ndarray) -> np.ndarray:
+def _baked(world: World, at: np.ndarray) -> np.ndarray:
     """Bilinear look-up [n, 2] in the ground's light; its border's values outside of the plot."""
+    light, plot = world.ground_light, world.plot
     cells = len(light) - 1
-    u, v = ((at[:, :2] + PLOT) * (cells / (2 * PLOT))).clip(0, cells - 1e-6).T
+    u, v = ((at[:, :2] + plot) * (cells / (2 * plot))).clip(0, cells - 1e-6).T
     i, j = u.astype(int), v.astype(int)
     u, v, corner = (u - i)[:, None], (v - j)[:, None], i + j * len(light)
     flat = light.reshape(-1, 2)

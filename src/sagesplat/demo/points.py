@@ -1,38 +1,46 @@
 """Points and tracks of the garden, as structure from motion would find them."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import UInt8
 
 from sagesplat.demo.paint import dome_distance
 from sagesplat.demo.render import FAR, camera_rays, cast_rays, lit_world
+from sagesplat.demo.world import World
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage, write_model
 from sagesplat.scene.scene import Camera
 
-CANDIDATES = 12500  # features looked for over all views
+CANDIDATES = 12500  # features looked for over all views, per courtyard
 UV_NOISE = 0.4  # standard deviation of a feature's position, pixels
 SKY_ID = 187
 
 
 def write_points(
-    folder: Path, names: list[str], cameras: list[Camera], photos: np.ndarray, labels: np.ndarray, seed: int
+    folder: Path,
+    names: list[str],
+    cameras: list[Camera],
+    photos: UInt8[np.ndarray, "V H W 3"],
+    labels: UInt8[np.ndarray, "V H W"],
+    seed: int,
+    places: tuple[int, int] = (1, 1),
 ) -> None:
     """A model as structure from motion would give it: points of textured places, seen in 3 or more views."""
-    rng = np.random.default_rng([seed, 2])
-    xyz, home, distance = _candidates(cameras, photos, labels, seed, rng)
-    projected = [project(camera, xyz) for camera in cameras]
-    uv, depth = np.stack([p[0] for p in projected], 1), np.stack([p[1] for p in projected], 1)
-    seen = _matched(cameras, xyz, uv, home, distance, seed, rng)
-    keep = seen.sum(1) >= 3
-    xyz, uv, depth, seen = xyz[keep], uv[keep], depth[keep], seen[keep]
-    point, view = np.nonzero(seen)
-    noisy = uv[point, view] + rng.normal(0, UV_NOISE, (len(point), 2))
+    rng, world = np.random.default_rng([seed, 2]), lit_world(seed, places)
+    sought = CANDIDATES * places[0] * places[1]
+    xyz, home, distance = _candidates(world, cameras, photos, labels, sought, rng)
+    point, view, uv, depth = _matched(world, cameras, xyz, home, distance, rng)
+    keep = np.bincount(point, minlength=len(xyz)) >= 3
+    xyz, kept = xyz[keep], keep[point]
+    point, view, uv, depth = (np.cumsum(keep) - 1)[point[kept]], view[kept], uv[kept], depth[kept]
+    noisy = uv + rng.normal(0, UV_NOISE, (len(point), 2))
     size = cameras[0].width, cameras[0].height
     outside = (np.abs(noisy / size - 0.5) >= 0.5).any(1)
-    noisy[outside] = uv[point, view][outside]
-    xyz = _triangulate(cameras, xyz, point, view, noisy, uv[point, view], depth[point, view])
-    again = np.stack([project(camera, xyz)[0] for camera in cameras], 1)[point, view]
+    noisy[outside] = uv[outside]
+    xyz = _triangulate(cameras, xyz, point, view, noisy, uv, depth)
+    again = np.empty_like(noisy)
+    for i, camera in enumerate(cameras):
+        again[view == i] = project(camera, xyz)[0][point[view == i]]
     error = np.linalg.norm(again - noisy, axis=1)
     column, row = noisy.astype(int).T
     rgb = np.zeros((len(xyz), 3))
@@ -62,11 +70,16 @@ def project(camera: Camera, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _candidates(
-    cameras: list[Camera], photos: np.ndarray, labels: np.ndarray, seed: int, rng: np.random.Generator
-) -> Iterator[np.ndarray]:
+    world: World,
+    cameras: list[Camera],
+    photos: np.ndarray,
+    labels: np.ndarray,
+    sought: int,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Surface points [n, 3] under textured pixels, the view each was found in, its distance from there."""
-    per_view = min(CANDIDATES // len(cameras), labels[0].size // 2)
-    world, found = lit_world(seed), []
+    per_view = min(sought // len(cameras), labels[0].size // 2)
+    found = []
     for i, camera in enumerate(cameras):
         grey = photos[i].mean(2)
         slope = np.hypot(*np.gradient(grey))
@@ -79,37 +92,43 @@ def _candidates(
         t = cast_rays(world, origins, directions, FAR, float(1 / camera.K[0, 0]))[0]
         t = np.where(labels[i].ravel()[pick] == SKY_ID, dome_distance(origins, directions), t)
         found.append((origins + t[:, None] * directions, np.full(per_view, i), t))
-    return (np.concatenate(c) for c in zip(*found, strict=True))
+    xyz, home, distance = (np.concatenate(c) for c in zip(*found, strict=True))
+    return xyz, home, distance
 
 
 def _matched(
+    world: World,
     cameras: list[Camera],
     xyz: np.ndarray,
-    uv: np.ndarray,
     home: np.ndarray,
     distance: np.ndarray,
-    seed: int,
     rng: np.random.Generator,
-) -> np.ndarray:
-    """Which view has matched which point [n, V]: in the picture, not hidden, similar in angle and scale."""
-    world, seen = lit_world(seed), np.zeros((len(xyz), len(cameras)), bool)
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Matches, sorted by point: point, view, pixel [T, 2], camera z [T].
+
+    A view matches a point that is in the picture, not hidden, and similar in angle and scale.
+    """
     centres = np.stack([c.position for c in cameras]).astype(float)
-    first = (centres[home] - xyz) / distance[:, None]
+    first, found = (centres[home] - xyz) / distance[:, None], []
     for i, camera in enumerate(cameras):
         offset = xyz - centres[i]
         away = np.linalg.norm(offset, axis=1)
         alike = -np.einsum("ij,ij->i", offset / away[:, None], first)
         scale = np.abs(np.log(away / distance))
-        _, z = project(camera, xyz)
-        framed = (z > 0) & (np.abs(uv[:, i] / [camera.width, camera.height] - 0.5) < 0.495).all(1)
+        uv, z = project(camera, xyz)
+        framed = (z > 0) & (np.abs(uv / [camera.width, camera.height] - 0.5) < 0.495).all(1)
         # Matchers lose a feature beyond about 40 degrees and a factor of 1.8, and some by chance.
         likely = framed & (alike > 0.77) & (scale < 0.6) & (rng.random(len(xyz)) < 0.75)
         rows = np.flatnonzero(likely & (home != i))
         start = np.tile(centres[i], (len(rows), 1))
         t = cast_rays(world, start, offset[rows] / away[rows, None], away[rows], float(1 / camera.K[0, 0]))[0]
-        seen[rows, i] = t > away[rows] - 0.01 - 0.004 * away[rows]
-        seen[home == i, i] = True
-    return seen
+        seen = home == i
+        seen[rows] = t > away[rows] - 0.01 - 0.004 * away[rows]
+        rows = np.flatnonzero(seen)
+        found.append((rows, np.full(len(rows), i), uv[rows], z[rows]))
+    point, view, uv, z = (np.concatenate(c) for c in zip(*found, strict=True))
+    order = point.argsort(kind="stable")
+    return point[order], view[order], uv[order], z[order]
 
 
 def _triangulate(

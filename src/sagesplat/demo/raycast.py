@@ -110,21 +110,30 @@ def hit_body(bodies, i, ox, oy, oz, dx, dy, dz, t_max):
 
 
 @jit
-def paved(x, y):
-    """Whether the ground at (x, y) is terrace or the path to the door."""
+def paved(world, x, y):
+    """Whether the ground at (x, y) is terrace or path."""
+    terraces, paths = world.terraces, world.paths
     wobble = 0.10 * sin(3 * x + 1.3 * y) + 0.07 * sin(5.1 * y - 2.2 * x)
-    if x * x + y * y < (2.35 + wobble) ** 2:
-        return True
-    return 0 < y < 6.2 and abs(x - 0.9) < 0.62 + 0.5 * wobble
+    for i in range(terraces.shape[0]):
+        if (x - terraces[i, 0]) ** 2 + (y - terraces[i, 1]) ** 2 < (2.35 + wobble) ** 2:
+            return True
+    edge = 0.5 * wobble
+    for i in range(paths.shape[0]):
+        u, v, half_u, half_v = x - paths[i, 0], y - paths[i, 1], paths[i, 2], paths[i, 3]
+        if half_u > half_v:  # the long sides are uneven, the ends are straight
+            u, v, half_u, half_v = v, u, half_v, half_u
+        if abs(v) < half_v and abs(u) < half_u + edge:
+            return True
+    return False
 
 
 @jit
-def hit_ground(ox, oy, oz, dx, dy, dz, floor, pixel):
+def hit_ground(world, ox, oy, oz, dx, dy, dz, floor, pixel):
     """Where a ray that would meet z = 0 at distance `floor` ends: (t, material).
 
     The turf is a stack of layers with holes, so that it hides its roots from a low viewpoint.
     """
-    if paved(ox + floor * dx, oy + floor * dy):
+    if paved(world, ox + floor * dx, oy + floor * dy):
         return floor, PAVING
     for layer in range(4):
         t = floor + TURF * (1 - 0.25 * layer) / dz
@@ -164,7 +173,7 @@ def trace(world, ox, oy, oz, dx, dy, dz, t_max, pixel, any_hit):
     if row >= 0:
         t_max, material, part = t, LEAF, row
     if grounded and t_max > floor + 1.01 * TURF / dz:
-        t, ground = hit_ground(ox, oy, oz, dx, dy, dz, floor, pixel)
+        t, ground = hit_ground(world, ox, oy, oz, dx, dy, dz, floor, pixel)
         if t <= t_max:
             return t, ground, -1
     return t_max, material, part

@@ -10,8 +10,9 @@ from jaxtyping import Float32, Float64, Int16, Int64, UInt8
 from numba import get_num_threads
 
 from sagesplat.demo.paint import shade
+from sagesplat.demo.places import build_places
 from sagesplat.demo.raycast import cast
-from sagesplat.demo.world import LABEL_OF, LEAF, PAVING, PLOT, SKY, SUN, World, build_world
+from sagesplat.demo.world import LABEL_OF, LEAF, PAVING, SKY, SUN, World, build_world
 from sagesplat.scene.scene import Camera
 
 FAR = 1e9
@@ -20,11 +21,15 @@ SENSOR_NOISE = 1.0  # standard deviation, 8-bit steps
 NEEDS_RAY = 3  # materials from here on, but leaves, ask for the sun with a ray
 
 
+def lit_world(seed: int, places: tuple[int, int] = (1, 1)) -> World:
+    """The garden of a seed with its light; `places` is how many courtyards it has along x and along y."""
+    return _lit_world(seed, places)
+
+
 @lru_cache(maxsize=1)
-def lit_world(seed: int) -> World:
-    """The garden of a seed with its light."""
-    world = build_world(seed)
-    axis = np.linspace(-PLOT, PLOT, len(world.ground_light))
+def _lit_world(seed: int, places: tuple[int, int]) -> World:
+    world = build_world(seed) if places == (1, 1) else build_places(seed, places)
+    axis = np.linspace(-world.plot, world.plot, len(world.ground_light))
     ground = np.stack([*np.meshgrid(axis, axis), np.zeros((len(axis), len(axis)))], -1)
     for points, light in ((ground, world.ground_light), (world.leaves[:, :3], world.leaf_light)):
         for toward, column in ((_sun_directions(), 0), (_sky_directions(), 1)):
@@ -35,14 +40,14 @@ def lit_world(seed: int) -> World:
 
 
 def render_view(
-    camera: Camera, seed: int = 0
+    camera: Camera, seed: int = 0, places: tuple[int, int] = (1, 1)
 ) -> tuple[UInt8[np.ndarray, "H W 3"], Int16[np.ndarray, "H W"], Float32[np.ndarray, "H W"]]:
     """A photo (sRGB) with its true label ids and depths (camera z in metres, inf in the sky).
 
     Label and depth are those of the ray through the pixel's centre. The sky's clouds are painted on a
     dome of 80 m. The sensor's noise depends on seed and pose, so the same view is always the same photo.
     """
-    world, shape = lit_world(seed), (camera.height, camera.width)
+    world, shape = lit_world(seed, places), (camera.height, camera.width)
     pixel = float(1 / camera.K[0, 0])
     v, u = (np.indices(shape) + 0.5).reshape(2, -1)
     uv = np.stack([u, v], 1)

@@ -9,9 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Float64, Int16, Int64
 
+from sagesplat.demo.foliage import POTTED_PLANT, Foliage
+
 # Materials. A leaf's material is LEAF and its label its own; every other material has one label.
 SKY, GRASS, PAVING, WOOD, GLAZE, CLAY, BARK, BRICK, ROOF, CORE, LEAF = range(11)
-POTTED_PLANT, TREE = 64, 184
 LABELS = {
     64: "potted plant",
     67: "dining table",
@@ -24,9 +25,10 @@ LABELS = {
 }
 LABEL_OF = np.array([187, 193, 191, 67, 86, 64, 184, 197, 197, 184, -1], np.int16)  # by material
 
-UP = np.array([0.0, 0.0, 1.0])
 BIN = 4  # leaves per box at the bottom of the tree
-PLOT = 8.0  # the ground's light is baked on [-PLOT, PLOT] squared
+PLOT = 8.0  # half the side of the square that one courtyard takes
+DOOR_PATH = (0.9, 3.1, 0.62, 3.1)  # centre and half extents, from the table to the house
+LIGHT_CELLS = 20  # samples of the baked light per metre of ground
 SUN = np.array([-0.48, -0.52, 0.71]) / np.linalg.norm([-0.48, -0.52, 0.71])  # towards it
 
 
@@ -44,105 +46,48 @@ class World(NamedTuple):
     bodies: Float64[np.ndarray, "B 7 4"]  # planes: outward normal n and c; inside is n.p <= c
     body_material: Int64[np.ndarray, " B"]
     ground_light: Float32[np.ndarray, "G G 2"]  # baked likewise; rows run along y, columns along x
-
-
-class Foliage:
-    """Collects leaves: pointed discs, each with a pose, a colour and a label."""
-
-    def __init__(self, rng: np.random.Generator) -> None:
-        self.rng = rng
-        self.parts: list[tuple[np.ndarray, ...]] = []
-
-    def add(
-        self,
-        centre: np.ndarray,
-        facing: np.ndarray,
-        size: tuple[float, float],
-        rgb: np.ndarray,
-        label: int,
-        spread: float = 0.7,
-        along: np.ndarray | None = None,
-    ) -> None:
-        """Leaves at `centre` [n, 3], half length and width `size`, roughly `facing` [n, 3].
-
-        `along` [n, 3] is the direction of the midrib; random where it is not given.
-        """
-        rng, n = self.rng, len(centre)
-        normal = _unit(facing + spread * rng.normal(size=(n, 3)))
-        rib = rng.normal(size=(n, 3)) if along is None else along
-        u = _unit(rib - normal * (rib * normal).sum(1, keepdims=True))
-        v = np.cross(normal, u)
-        scale = rng.uniform(0.7, 1.25, (n, 1))
-        colour = rgb * rng.lognormal(0.0, 0.22, (n, 1)) * rng.lognormal(0.0, 0.06, (n, 3))
-        frame = np.concatenate([centre, normal, u / (size[0] * scale), v / (size[1] * scale)], 1)
-        reach = np.sqrt((size[0] * scale * u) ** 2 + (size[1] * scale * v) ** 2)
-        self.parts.append((frame, reach, colour, np.full(n, label)))
-
-    def crown(
-        self,
-        centre: Sequence[float],
-        radius: float,
-        count: int,
-        size: tuple[float, float],
-        rgb: Sequence[float],
-        label: int = TREE,
-    ) -> None:
-        """A crown of leaf clusters around `centre`."""
-        rng, clusters = self.rng, 26
-        at = _unit(rng.normal(size=(clusters, 3))) * rng.uniform(0.25, 0.85, (clusters, 1)) * radius
-        at[:, 2] *= 0.85
-        tint = np.array(rgb) * rng.lognormal(0, 0.18, (clusters, 1)) * rng.lognormal(0, 0.07, (clusters, 3))
-        which = rng.integers(0, clusters, count)
-        out = _unit(rng.normal(size=(count, 3)))
-        offset = out * rng.uniform(0.5, 1.0, (count, 1)) * 0.4 * radius
-        place = np.array(centre) + at[which] + offset
-        self.add(place, out + UP / 2, size, tint[which], label)
-
-    def hedge(self, low: Sequence[float], high: Sequence[float], per_metre2: float) -> None:
-        """Leaves over the faces of a box that stands on the lawn (its top and four sides)."""
-        rng, lo, hi = self.rng, np.array(low), np.array(high)
-        for axis, side in ((0, 0), (0, 1), (1, 0), (1, 1), (2, 1)):
-            extent = hi - lo
-            count = int(per_metre2 * np.prod(np.delete(extent, axis)))
-            place = lo + extent * rng.random((count, 3))
-            bumps = 0.07 * np.sin(place @ [3.1, 4.3, 5.2]) + rng.normal(0, 0.05, count)
-            place[:, axis] = (hi if side else lo)[axis] + (1 if side else -1) * bumps
-            facing = np.zeros((count, 3))
-            facing[:, axis] = 1 if side else -1
-            patch = 1 + 0.25 * np.sin(place @ [1.7, 2.3, 3.9])
-            rgb = patch[:, None] * [0.05, 0.12, 0.03]
-            self.add(place, facing + 0.4 * UP, (0.09, 0.05), rgb, TREE)
-
-    def bouquet(self, mouth: Sequence[float]) -> None:
-        """Leaves, stems and flowers that grow out of the vase's mouth."""
-        rng, base = self.rng, np.array(mouth)
-        out = _unit(rng.normal(size=(420, 3)) * [1, 1, 0.55] + [0, 0, 0.75])
-        reach = rng.uniform(0.05, 0.30, (420, 1))
-        droop = np.array([0, 0, -1.6]) * reach**2
-        rgb = np.array([0.07, 0.19, 0.04])
-        self.add(
-            base + out * reach + droop, [0, 0, 1] - 0.3 * out, (0.062, 0.02), rgb, POTTED_PLANT, 0.35, out
-        )
-        out = _unit(rng.normal(size=(34, 3)) * [1, 1, 0.5] + [0, 0, 1.1])
-        head = base + out * rng.uniform(0.24, 0.36, (34, 1))
-        self.add((base + head) / 2, rng.normal(size=(34, 3)), (0.17, 0.004), rgb, POTTED_PLANT, 0.0, out)
-        colours = np.array([[0.75, 0.10, 0.28], [0.85, 0.80, 0.75], [0.85, 0.45, 0.05]])
-        colour = colours[rng.integers(0, 3, 34)]
-        for angle in np.arange(8) * np.pi / 4:
-            side = _unit(np.cross(out, [0.3, 0.2, 1.0]))
-            petal = side * np.cos(angle) + np.cross(out, side) * np.sin(angle)
-            self.add(
-                head + 0.024 * petal, out + 0.3 * petal, (0.026, 0.013), colour, POTTED_PLANT, 0.1, petal
-            )
-        self.add(head + 0.008 * out, out, (0.012, 0.016), np.array([0.7, 0.5, 0.05]), POTTED_PLANT, 0.1)
+    plot: float  # the ground's light is baked on [-plot, plot] squared
+    terraces: Float64[np.ndarray, "P 2"]  # centres of round pavements
+    paths: Float64[np.ndarray, "K 4"]  # paved rectangles: centre and half extents
+    solid_place: Int64[np.ndarray, " S"]
+    body_place: Int64[np.ndarray, " B"]
+    places: Float64[np.ndarray, "P 2 3"]  # world to a place's own coordinates, in the plane
+    tints: Float64[np.ndarray, "P 11 3"]  # factors on a material's colour in a place
 
 
 def build_world(seed: int) -> World:
     """The garden of a seed, still without light (`render.light` bakes it)."""
     foliage = Foliage(np.random.default_rng(seed))
-    solids, bodies = _furniture(), _buildings()
+    solids, bodies = furniture(), buildings()
+    solids += [
+        (solid(1.75, 1.2, 0.0, 0.34, 0.15, 0.21), CLAY),
+        (solid(-1.7, 1.45, 0.0, 0.28, 0.12, 0.18), CLAY),
+    ]
     _plant(foliage, solids, bodies)
-    frame, reach, rgb, label = (np.concatenate(c) for c in zip(*foliage.parts, strict=True))
+    return assemble(
+        foliage.parts,
+        solids,
+        bodies,
+        plot=PLOT,
+        terraces=np.zeros((1, 2)),
+        paths=np.array([DOOR_PATH]),
+        solid_place=np.zeros(len(solids), np.int64),
+        body_place=np.zeros(len(bodies), np.int64),
+        places=np.eye(2, 3)[None],
+        tints=np.ones((1, 11, 3)),
+    )
+
+
+def assemble(
+    leaves: list[tuple[np.ndarray, ...]],
+    solids: list[tuple[list[float], int]],
+    bodies: list[tuple[np.ndarray, int]],
+    plot: float,
+    **rest: np.ndarray,
+) -> World:
+    """A world without light of `Foliage.parts`, solids and bodies with their materials; `rest` as it is."""
+    frame, reach, rgb, label = (np.concatenate(c) for c in zip(*leaves, strict=True))
+    cells = round(2 * plot * LIGHT_CELLS) + 1
     order, boxes, axes = _box_tree(frame[:, :3], reach)
     return World(
         boxes=boxes,
@@ -155,41 +100,42 @@ def build_world(seed: int) -> World:
         solid_material=np.array([m for _, m in solids]),
         bodies=np.array([planes for planes, _ in bodies]),
         body_material=np.array([m for _, m in bodies]),
-        ground_light=np.zeros((321, 321, 2), np.float32),
+        ground_light=np.zeros((cells, cells, 2), np.float32),
+        plot=plot,
+        **rest,
     )
 
 
-def _furniture() -> list[tuple[list[float], int]]:
-    """Solids of revolution: table, vase and pots (trunks come with the trees)."""
+def furniture() -> list[tuple[list[float], int]]:
+    """Solids of revolution: the table and the vase on it."""
     return [
-        (_solid(0, 0, 0.71, 0.04, 0.60, 0.60), WOOD),
-        (_solid(0, 0, 0.04, 0.67, 0.06, 0.05, 0.015, 0.01), WOOD),
-        (_solid(0, 0, 0.00, 0.05, 0.30, 0.22), WOOD),
-        (_solid(0.06, -0.03, 0.75, 0.38, 0.075, 0.075, 0.065, 0.05), GLAZE),
-        (_solid(1.75, 1.2, 0.0, 0.34, 0.15, 0.21), CLAY),
-        (_solid(-1.7, 1.45, 0.0, 0.28, 0.12, 0.18), CLAY),
+        (solid(0, 0, 0.71, 0.04, 0.60, 0.60), WOOD),
+        (solid(0, 0, 0.04, 0.67, 0.06, 0.05, 0.015, 0.01), WOOD),
+        (solid(0, 0, 0.00, 0.05, 0.30, 0.22), WOOD),
+        (solid(0.06, -0.03, 0.75, 0.38, 0.075, 0.075, 0.065, 0.05), GLAZE),
     ]
 
 
-def _solid(
+def solid(
     x: float, y: float, z: float, height: float, r0: float, r1: float, belly: float = 0, waist: float = 0
 ) -> list[float]:
+    """A row of `World.solids`: it stands at (x, y, z), radius r0 at the bottom and r1 at the top."""
     return [x, y, z, height, r0, r1, belly, waist, max(r0, r1) + abs(belly) + abs(waist)]
 
 
-def _buildings() -> list[tuple[np.ndarray, int]]:
+def buildings() -> list[tuple[np.ndarray, int]]:
     """Convex bodies: the house, its front roof, a chimney."""
-    house = _box([-4.6, 6.2, 0], [4.6, 8.6, 6])
+    house = box([-4.6, 6.2, 0], [4.6, 8.6, 6])
     slope = np.array([0, -0.66, 0.75])  # normal of the front roof; it passes through the eaves at z = 3
     eaves = slope @ [0, 6.2, 3.0]
     house[5] = [*slope, eaves]
-    roof = _box([-4.9, 5.85, 0], [4.9, 8.6, 9])
+    roof = box([-4.9, 5.85, 0], [4.9, 8.6, 9])
     roof[5] = [*slope, eaves + 0.09]
     roof[2] = [*-slope, -eaves - 0.001]
-    return [(house, BRICK), (roof, ROOF), (_box([2.2, 7.4, 3], [2.9, 8.1, 5.9]), BRICK)]
+    return [(house, BRICK), (roof, ROOF), (box([2.2, 7.4, 3], [2.9, 8.1, 5.9]), BRICK)]
 
 
-def _box(low: Sequence[float], high: Sequence[float]) -> np.ndarray:
+def box(low: Sequence[float], high: Sequence[float]) -> np.ndarray:
     """Seven planes [7, 4]: -x, -y, -z, x, y, z and one that never cuts."""
     planes = np.zeros((7, 4))
     planes[:3, :3], planes[3:6, :3] = -np.eye(3), np.eye(3)
@@ -211,11 +157,11 @@ def _plant(foliage: Foliage, solids: list, bodies: list) -> None:
         (4.6, 6.5, 7.2, 7.2),
     ):
         top = rng.uniform(1.45, 1.6)
-        bodies.append((_box([x0 + 0.1, y0 + 0.1, 0], [x1 - 0.1, y1 - 0.1, top - 0.1]), CORE))
+        bodies.append((box([x0 + 0.1, y0 + 0.1, 0], [x1 - 0.1, y1 - 0.1, top - 0.1]), CORE))
         foliage.hedge([x0, y0, 0.05], [x1, y1, top], 150)
     greens = ([0.07, 0.17, 0.03], [0.12, 0.18, 0.03], [0.05, 0.13, 0.04], [0.17, 0.15, 0.03])
     for (x, y), rgb in zip(((-4.9, -4.7), (5.1, -4.3), (5.4, 3.7), (-5.3, 4.3)), greens, strict=True):
-        solids.append((_solid(x, y, 0, 2.4, 0.11, 0.06), BARK))
+        solids.append((solid(x, y, 0, 2.4, 0.11, 0.06), BARK))
         foliage.crown([x, y, 2.8], 1.35, 3400, (0.075, 0.04), rgb)
     for i in range(11):  # behind the hedge, which hides their trunks
         angle = -0.5 * np.pi + (i - 5) * 0.43
@@ -261,7 +207,3 @@ def _box_tree(centre: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.nda
         if level:
             low, high = low.reshape(-1, 2, 3).min(1), high.reshape(-1, 2, 3).max(1)
     return order, boxes, axes
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
