@@ -1,7 +1,9 @@
 """The whole flow, from photos and label images to the report."""
 
+import math
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from sagesplat import blocks, labelling, nesting, stages
@@ -70,18 +72,18 @@ def nest(job: Job, config: NestConfig, of_blocks: BlocksConfig, seed: int) -> No
         nesting.nest_levels(job, config, seed)
 
 
-def demo_capture(emit: Emit) -> Path:
-    """The built-in capture's folder, made on the first call."""
+def demo_capture(emit: Emit, places: tuple[int, int] = (1, 1)) -> Path:
+    """The built-in capture's folder, made on the first call; `places` makes a grid of courtyards."""
     emit(StageStarted("capture"))
     begin = time.perf_counter()
-    capture = cached_capture(lambda done, total: emit(Progress("capture", done, total)))
+    capture = cached_capture(lambda done, total: emit(Progress("capture", done, total)), places)
     emit(StageDone("capture", time.perf_counter() - begin, (f"the built-in scene, in {capture}",)))
     return capture
 
 
-def run_demo(job: Job) -> None:
-    """Make the built-in capture (once) and run everything on it."""
-    run_all(job, demo_capture(job.emit), DEMO)
+def run_demo(job: Job, places: tuple[int, int] = (1, 1)) -> None:
+    """Make the built-in capture (once) and run everything on it; a grid of courtyards in as many blocks."""
+    run_all(job, demo_capture(job.emit, places), replace(DEMO, blocks=BlocksConfig(math.prod(places))))
 
 
 def export_chunks(job: Job, folder: Path, kind: Format) -> int:

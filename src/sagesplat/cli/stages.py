@@ -65,12 +65,22 @@ def run(
 
 
 @command
-def demo(run: Path = Path("runs/demo"), machine: Annotated[Machine, Flat] = Machine()) -> None:
-    """Make the built-in capture, run the main job on it and say where to look."""
+def demo(
+    run: Path = Path("runs/demo"),
+    places: tuple[int, int] = (1, 1),
+    machine: Annotated[Machine, Flat] = Machine(),
+) -> None:
+    """Make the built-in capture, run the main job on it and say where to look.
+
+    Args:
+        run: run folder.
+        places: 2 2 makes a large capture, a grid of courtyards, and trains it in as many blocks.
+        machine: where and how to compute.
+    """
     from sagesplat import pipeline
 
     with open_job(run, machine) as job:
-        pipeline.run_demo(job)
+        pipeline.run_demo(job, places)
 
 
 @command
