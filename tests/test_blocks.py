@@ -300,7 +300,7 @@ def test_bands_are_measured_apart() -> None:
 
 CONFIG = RunConfig(
     scene=SceneConfig(calibrate_every=4),
-    train=TrainConfig(max_steps=60, level_every=30),
+    train=TrainConfig(max_steps=40, level_every=20),
     blocks=BlocksConfig(count=2, seam_steps=20),
     nest=NestConfig(steps=30, levels=4, smallest=0.1, seed_steps=30),
     fit=FitConfig(),
@@ -325,7 +325,7 @@ def plain_report() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("demo") / "capture"
-    make_capture(folder, views=20, width=80, height=60)
+    make_capture(folder, views=16, width=64, height=48)
     return folder
 
 
@@ -340,12 +340,12 @@ def test_a_run_in_blocks(finished: Path, capture: Path) -> None:
     run = RunDir(finished)
     names = Taxonomy.read(run.parts / "labels.json").names
     ladder, snapshots = read_prefixes(run.prefixes), read_ladder(run.levels)
-    assert snapshots.levels == [30, 60]
+    assert snapshots.levels == [20, 40]
     assert set(ladder.sizes) <= set(names)
     assert {split_name(names[label])[1] for label in ladder.sizes} == {0, 1}
     # every Gaussian is in the block that its name says: those that were tuned may have moved a little
     blocks = read_blocks(run.blocks / "blocks.json")
-    g = snapshots.load(60)
+    g = snapshots.load(40)
     of_name = np.array([split_name(names[label])[1] for label in g.label_ids.tolist()])
     np.testing.assert_array_equal(blocks.of(g.means.numpy()), of_name)
     g = ladder.gaussians

@@ -47,6 +47,8 @@ from sagesplat.train import memory, nested, seams
 from sagesplat.train.levels import read_level, read_more, read_sizes, write_level, write_set
 from sagesplat.train.nested import Nested, NestStep
 
+_SEEN = 0.01  # of the points in a photo: then it sees the block
+
 
 def check(config: BlocksConfig) -> None:
     """RunError for settings that cannot be."""
@@ -71,11 +73,14 @@ def divide(job: Job, config: BlocksConfig, seed: int) -> Blocks:
         scene = job.scene
         blocks = split(scene, config.count, config.margin)
         of_points = blocks.of(scene.points.xyz)
-        assigned = views_of(scene, blocks, visible_shares(scene, of_points, len(blocks)), config.min_share)
+        shares = visible_shares(scene, of_points, len(blocks))
+        assigned = views_of(scene, blocks, shares, config.min_share)
         training = np.isin(np.arange(len(scene.views)), scene.train_ids)
         labels = LiftedLabels.read(run.labels, len(scene.points.xyz))
+        sees: list[list[int]] = []
         for number in range(len(blocks)):
             rows = np.flatnonzero(assigned[:, number] & training).tolist()
+            sees.append(np.flatnonzero((shares[rows] >= _SEEN).any(0)).tolist())
             part, kept = part_of(scene, blocks, number, rows, config.far_share, seed)
             _begin(run.block(number), part, labels, kept)
         for old in run.blocks.glob("[0-9]*"):
@@ -83,7 +88,7 @@ def divide(job: Job, config: BlocksConfig, seed: int) -> Blocks:
                 shutil.rmtree(old)
         views = (assigned & training[:, None]).sum(0)
         points = np.bincount(of_points, minlength=len(blocks))
-        write_blocks(file, blocks, views=views.tolist(), points=points.tolist())
+        write_blocks(file, blocks, views=views.tolist(), points=points.tolist(), sees=sees)
         return [
             f"{len(blocks)} blocks of {points.min():,} to {points.max():,} points and {views.min()} to "
             f"{views.max()} training views, {views.sum() / max(training.sum(), 1):.2f} blocks a view"
@@ -292,13 +297,13 @@ def _tune(job: Job, blocks: Blocks, config: BlocksConfig, nest: NestConfig, seed
     """Tune the blocks along their borders: neighbours one after the other, others at once."""
     run, every = job.run, range(len(blocks))
     files = [run.block(number).core for number in every]
-    colour = colours(blocks.neighbours())
+    colour, sees = colours(blocks.neighbours()), read_json(run.blocks / "blocks.json")["sees"]
     steps = replace(nest, steps=config.seam_steps)
     for now in range(int(colour.max()) + 1):
         mine = [number for number in every if colour[number] == now]
         tasks = []
         for number in mine:
-            others = [files[other] for other in every if other != number]
+            others = [files[other] for other in sees[number] if other != number]
             what = (_spec(job, number), run.blocks / "blocks.json", number, others, steps, seed)
             tasks.append(Task(f"seams of block {number}", tune_seams, what, job.gpus))
         results(job.executor, tasks, job.emit)
@@ -339,7 +344,7 @@ def _tuned(
     seed: int,
 ) -> Gaussians:
     scene = job.scene
-    g = seams.around(own, [read_level(path) for path in others], scene, views)
+    g = seams.around(own, (read_level(path) for path in others), scene, views)
     n = len(g)
     movable = np.concatenate([near, np.zeros(n - len(near), bool)])
     kept = frozenset(view.name for row, view in enumerate(scene.views) if row not in set(views))

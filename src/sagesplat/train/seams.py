@@ -1,6 +1,6 @@
 """Where blocks that were trained by themselves meet: cut, put together, tuned, measured."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -60,8 +60,8 @@ def in_sight(g: Gaussians, scene: Scene, views: Sequence[int]) -> Bool[np.ndarra
     return seen
 
 
-def around(own: Gaussians, others: Sequence[Gaussians], scene: Scene, views: Sequence[int]) -> Gaussians:
-    """A block's Gaussians, then what its views see of the others'."""
+def around(own: Gaussians, others: Iterable[Gaussians], scene: Scene, views: Sequence[int]) -> Gaussians:
+    """A block's Gaussians, then what its views see of the others', which are looked at one by one."""
     seen = [g.select(torch.from_numpy(in_sight(g, scene, views))) for g in others]
     return concat([own, *seen])
 
