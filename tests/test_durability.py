@@ -30,7 +30,7 @@ from sagesplat.errors import DataError, RunError
 from sagesplat.files import atomic_folder, atomic_path, remove_temporary, sync_changed, write_json, write_text
 from sagesplat.gaussians import PARAMETERS
 from sagesplat.job import Job, run_stage
-from sagesplat.run_dir import RunDir
+from sagesplat.run_dir import RunDir, file_hash, is_done, record
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.train import checkpoint as checkpoint_module
@@ -588,3 +588,24 @@ def test_runs_killed_at_twenty_times_end_the_same(capture: Path, finished: Path,
         run = tmp_path / f"run{turn}"
         assert killed(capture, [(run, chance.randrange(1, 250)), (run, 0)]) == [-9, 0]
         assert content(run) == content(finished)
+
+
+def test_a_stage_made_again_is_the_same_input_whatever_time_it_took(tmp_path: Path) -> None:
+    run = RunDir(tmp_path)
+    run.labels.write_bytes(b"labels")
+    record(run, "masks", {"keep": ""}, [], seconds=1.0)
+    record(run, "lift", {}, [run.provenance("masks")], seconds=1.0)
+
+    def lifted() -> bool:
+        return is_done(run, "lift", {}, [run.provenance("masks")], [run.labels], force=False)
+
+    assert lifted()
+    record(run, "masks", {"keep": ""}, [], seconds=2.0)
+    assert lifted()
+    record(run, "masks", {"keep": "grass"}, [], seconds=2.0)
+    with pytest.raises(RunError, match=r"masks\.json \(its content changed\)"):
+        lifted()
+    made = json.loads(run.provenance("lift").read_text())
+    made["inputs"] = {"masks.json": file_hash(run.provenance("masks"))}  # as older versions wrote
+    run.provenance("lift").write_text(json.dumps(made))
+    assert lifted()

@@ -1,6 +1,7 @@
 """A run folder: the names of everything in it, and what each result was made from."""
 
 import hashlib
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -200,6 +201,15 @@ def file_hash(path: Path) -> str:
     return digest.hexdigest()
 
 
+def _hashes(path: Path) -> list[str]:
+    """What an input is known by: of a stage's record first without its seconds, which differ each time."""
+    plain = file_hash(path)
+    if path.parent.name != "provenance":
+        return [plain]
+    kept = {key: value for key, value in read_json(path).items() if key != "seconds"}
+    return [hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest(), plain]
+
+
 def is_done(
     run: RunDir,
     stage: str,
@@ -223,7 +233,7 @@ def is_done(
             f"{run.path}: a run folder of format {made.get('format')}, this sagesplat ({__version__}) reads "
             f"{FORMAT}; choose another run folder"
         )
-    differs = _differences(made, settings, {p.name: file_hash(p) for p in inputs})
+    differs = _differences(made, settings, {p.name: _hashes(p) for p in inputs})
     if not differs:
         return True
     if not force:
@@ -243,12 +253,14 @@ def settings_of(run: RunDir, stage: str) -> dict[str, Any]:
     return made["settings"]
 
 
-def _differences(made: dict[str, Any], settings: Mapping[str, Any], inputs: Mapping[str, str]) -> str:
+def _differences(made: dict[str, Any], settings: Mapping[str, Any], inputs: Mapping[str, list[str]]) -> str:
     """A few words on what changed since a result was made; empty = nothing."""
     old = made.get("settings", {})
     changed = [f"{k} ({old.get(k)} then, {v} now)" for k, v in settings.items() if old.get(k) != v]
     changed += [
-        f"{name} (its content changed)" for name, h in inputs.items() if made.get("inputs", {}).get(name) != h
+        f"{name} (its content changed)"
+        for name, hashes in inputs.items()
+        if made.get("inputs", {}).get(name) not in hashes
     ]
     return ", ".join(changed[:3])
 
@@ -265,6 +277,6 @@ def record(
             "version": __version__,
             "seconds": round(seconds, 2),
             "settings": dict(settings),
-            "inputs": {p.name: file_hash(p) for p in inputs},
+            "inputs": {p.name: _hashes(p)[0] for p in inputs},
         },
     )

@@ -1,0 +1,145 @@
+"""Disturbed runs: what is compared of two run folders, what runs print, and the table."""
+
+import json
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks import faults, faults_run
+from benchmarks.faults import Outcome, tables
+from benchmarks.faults_run import AGAIN, Asked, Command, differing, digests, ends, stages, used
+from sagesplat.errors import RunError
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="kills and mounts are POSIX only")
+SAID = """✓ scene        0.5 s  46 training, 8 test views
+! block 1 (2 of 3): its process on vm was lost; done again (1 of 3)
+! block 0: needs about 0.6 GiB
+✓ block 0/train    2.0 s  13,039 Gaussians after 300 steps
+! block 1: going on from step 60
+✓ block 1/train    3.0 s  16,999 Gaussians after 300 steps
+✓ train        5.5 s  18,000 Gaussians of 2 blocks
+"""
+
+
+def record(seconds: float, levels: str = "1", masks: str = "1") -> str:
+    return json.dumps({"seconds": seconds, "inputs": {"levels": levels, "masks.json": masks}})
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """A run folder in small."""
+    run = tmp_path / "run"
+    for folder in ("provenance", "levels", "nested"):
+        (run / folder).mkdir(parents=True)
+    (run / "levels" / "000100.npz").write_bytes(bytes(5000))
+    (run / "provenance" / "train.json").write_text(record(1.5))
+    (run / "nested" / "blocks.csv").write_text("block,views,train s\n0,5,1.25\n")
+    (run / "nested" / "blocks.md").write_text("1.25")
+    (run / ".lock").write_text("1")
+    return run
+
+
+def test_seconds_are_not_compared(run: Path) -> None:
+    first = digests(run)
+    (run / "provenance" / "train.json").write_text(record(9.0, masks="2"))
+    (run / "nested" / "blocks.csv").write_text("block,views,train s\n0,5,9.75\n")
+    (run / "nested" / "blocks.md").write_text("9.75")
+    (run / ".lock").write_text("2")
+    assert differing(first, digests(run)) == []
+
+
+def test_everything_else_is(run: Path) -> None:
+    first = digests(run)
+    (run / "levels" / "000100.npz").write_bytes(bytes(4999) + b"\1")
+    (run / "provenance" / "train.json").write_text(record(1.5, levels="2"))
+    (run / "nested" / "blocks.csv").unlink()
+    (run / "nested" / ".a.tmp-1.csv").write_text("")
+    assert differing(first, digests(run)) == [
+        "levels/000100.npz",
+        "nested/.a.tmp-1.csv (left over)",
+        "nested/blocks.csv (missing)",
+        "provenance/train.json",
+    ]
+
+
+def test_room_on_a_disk_is_counted_in_blocks_and_links_once(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(bytes(5000))
+    (tmp_path / "b").write_bytes(b"1")
+    os.link(tmp_path / "a", tmp_path / "c")
+    assert used(tmp_path) == 3 * 4096
+
+
+def test_what_a_run_prints_is_understood() -> None:
+    found = stages(SAID)
+    assert found == {"scene": 0.5, "block 0/train": 2.0, "block 1/train": 3.0, "train": 5.5}
+    assert ends(found) == {"scene": 0.5, "block 0/train": 2.5, "block 1/train": 5.5, "train": 6.0}
+    assert AGAIN.findall(SAID) == [
+        "block 1 (2 of 3): its process on vm was lost; done again (1 of 3)",
+        "block 1: going on from step 60",
+    ]
+
+
+def test_the_line_of_a_full_disk() -> None:
+    line = "sagesplat: a.npz: no space left, the disk is full; free 1 MB and run the same command again\n"
+    assert faults.FULL.fullmatch(line)
+    assert not faults.FULL.fullmatch(line + "another\n")
+    assert not faults.FULL.fullmatch("Traceback\n" + line)
+
+
+def test_the_tables_say_what_was_lost_and_what_differs() -> None:
+    local = Outcome("1 thread", seconds=10.0, stages={"train": 5.5, "block 0/train": 2.0, "lift": 0.1})
+    spread = Outcome("3 nodes", seconds=8.0, stages={"train": 2.75, "lift": 0.1})
+    lost = Outcome(
+        "node killed, 1 of 3", "3 nodes", ["a node"], 1, 9.0, 2.5, ["block 1"], differing=["a", "b"]
+    )
+    full = Outcome("disk full", skipped="no root")
+    cases, speed = tables("demo", {found.case: found for found in (local, spread, lost, full)})
+    assert cases.cells() == [
+        ["1 thread", "0", "10", "–", "–", "0", "same"],
+        ["3 nodes", "0", "8", "–", "–", "0", "same"],
+        ["node killed, 1 of 3", "1", "9", "1", "2.5", "1", "no: a, b"],
+        ["disk full", "0", "0", "–", "–", "0", "skipped: no root"],
+    ]
+    assert speed.cells() == [["train", "5.5", "2.8", "2.00"], ["all", "10.0", "8.0", "1.25"]]
+
+
+def test_a_case_needs_the_undisturbed_run(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=r"faults\.json: no case '1 thread' yet; run cases a and b first$"):
+        faults.measure(Asked(tmp_path, tmp_path / "out", ()), ("f",), print)
+
+
+def program(folder: Path, monkeypatch: pytest.MonkeyPatch, does: str) -> Asked:
+    """A program in the place of sagesplat."""
+    script = folder / "program"
+    script.write_text(f"#!/bin/sh\n{does}\n")
+    script.chmod(0o755)
+    monkeypatch.setattr(faults_run, "PROGRAM", script)
+    return Asked(folder / "scene", folder / "out", ("--downscale=4",))
+
+
+def test_a_command_that_fails_is_a_problem(tmp_path: Path, monkeypatch) -> None:
+    asked = program(tmp_path, monkeypatch, 'echo "sagesplat: $*" >&2; exit 2')
+    found = faults.undisturbed(asked, 1)
+    words = f"run {asked.scene} {asked.run} --downscale=4 --threads=1"
+    assert found.problems == [f"exit code 2: sagesplat: {words}"]
+    assert faults.result(found) == found.problems[0]
+
+
+def test_a_command_is_killed(tmp_path: Path, monkeypatch) -> None:
+    asked = program(tmp_path, monkeypatch, 'echo "✓ lift         0.3 s  97 %"; exec sleep 60')
+    with Command(asked, "a") as command:
+        command.wait_for("lift")
+        assert command.done == ["lift"]
+        assert command.end(0.01) is None
+        assert command.kill()
+        assert not command.kill()
+    assert command.end() == -9
+
+
+def test_a_full_disk_is_skipped_where_nothing_can_be_mounted(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(faults.shutil, "which", lambda name: None)
+    found = faults.disk_full(Asked(tmp_path, tmp_path, ()), 10**6, lambda found: None, ray=False)
+    assert faults.result(found).startswith("skipped: ")
+    assert "mounting a tmpfs takes root" in found.skipped
