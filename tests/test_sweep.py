@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sagesplat import stages
+from sagesplat import sweep as sweep_module
 from sagesplat.adapt.plan import read_plans
 from sagesplat.config import LiftConfig, MasksConfig, PlanConfig, RunConfig, SceneConfig, TrainConfig
 from sagesplat.demo.capture import make_capture
@@ -132,6 +133,20 @@ def test_what_is_trained_alike_is_trained_once(copy: Path) -> None:
         like, minimum = (rows[variant, "5", target] for variant in ("track", "minimum"))
         assert like["3DGS PSNR"] == minimum["3DGS PSNR"]
     assert done(sweep_in(copy, text)) == [*CELLS, "plot-minimum-seed0", "plot-minimum-seed5"]
+
+
+def test_blocks_are_trained_by_each_cell(tmp_path: Path) -> None:
+    text = "targets = [0.4]\nseeds = [0]\nscenes.plot = 'demo'\nvariants.whole = {}\n"
+    text += "variants.two.blocks.count = 2\n"
+    text += "variants.near.blocks.count = 2\nvariants.near.fit.distance = 'minimum'\n"
+    whole, two, near = read_sweep(write(tmp_path, text))
+    assert sweep_module._trained_alike([whole], two) is None
+    assert sweep_module._trained_alike([whole, two], near) == two
+    made = RunDir(tmp_path / two.name)
+    made.blocks.mkdir(parents=True)
+    write_text(made.provenance("train"), "{}")
+    sweep_module._share_training(tmp_path, two, near)  # what is in a block's folder names that folder
+    assert not (tmp_path / near.name).exists()
 
 
 def test_a_cell_that_fails_is_recorded_and_the_others_go_on(copy: Path) -> None:

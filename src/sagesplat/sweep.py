@@ -22,7 +22,7 @@ from sagesplat.adapt.observe import TOTAL
 from sagesplat.adapt.plan import read_plans
 from sagesplat.config import RunConfig
 from sagesplat.errors import DataError, RunError, SageError, short
-from sagesplat.events import Emit, Event, Progress, StageDone, StageStarted, TableMade, Training, Warned
+from sagesplat.events import Emit, Progress, StageDone, StageStarted, TableMade, Warned, named
 from sagesplat.executor import LOCAL, Executor, Local, Task
 from sagesplat.files import read_json, write_text
 from sagesplat.job import Job, JobSpec
@@ -258,7 +258,7 @@ def _run_cell(cell: Cell, like: Cell | None, of: Job) -> _Done:
     """Run a cell with the settings of a job on the folder of all runs."""
     begin = time.perf_counter()
     runs = of.run.path
-    job = replace(of, run=RunDir(runs / cell.name, cell.config.ladder), emit=_named(of.emit, cell.name))
+    job = replace(of, run=RunDir(runs / cell.name, cell.config.ladder), emit=named(of.emit, cell.name))
     try:
         _share_training(runs, like, cell)
         pipeline.run_all(job, cell.capture or pipeline.demo_capture(job.emit), cell.config)
@@ -276,7 +276,7 @@ def _trained_alike(earlier: Sequence[Cell], cell: Cell) -> Cell | None:
 
     def trained(of: Cell) -> tuple:
         c = of.config
-        return of.scene, c.scene, c.poses, c.masks, c.labels, c.lift, c.train, c.seed
+        return of.scene, c.scene, c.poses, c.masks, c.labels, c.lift, c.train, c.blocks, c.seed
 
     return next((c for c in earlier if trained(c) == trained(cell)), None)
 
@@ -287,7 +287,7 @@ def _share_training(runs: Path, like: Cell | None, cell: Cell) -> None:
     if like is None or new.path.exists() or not RunDir(runs / like.name).provenance("train").exists():
         return
     old = RunDir(runs / like.name)
-    if old.capture.exists():  # it is named in there
+    if old.capture.exists() or old.blocks.exists():  # these are named in there
         return
     # links take no room; nothing in a run is changed in place
     for path in (old.segmented, old.masks, old.levels):
@@ -297,21 +297,6 @@ def _share_training(runs: Path, like: Cell | None, cell: Cell) -> None:
         target = new.path / path.relative_to(old.path)
         target.parent.mkdir(exist_ok=True)
         os.link(path, target)
-
-
-def _named(emit: Emit, cell: str) -> Emit:
-    """Passes on what a cell does, under its name; not its tables, nor what is up to date."""
-
-    def tell(event: Event) -> None:
-        match event:
-            case StageStarted() | StageDone() | Progress():
-                emit(replace(event, name=f"{cell}/{event.name}"))
-            case Warned(text):
-                emit(Warned(f"{cell}: {text}"))
-            case Training():
-                emit(event)
-
-    return tell
 
 
 def _measure(cell: Cell, job: Job) -> Iterator[Row]:
