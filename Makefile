@@ -13,9 +13,10 @@ NPM = cd web && PATH="$(NODE)/bin:$$PATH" node $(NODE)/lib/node_modules/npm/bin/
 demo: $(INSTALLED)
 	$(BIN)/sagesplat demo
 
-# two processes of one thread each: the tests are small, and idle threads would spin in each other's way
+# two processes of one thread each: the tests are small, and idle threads would spin in each other's way;
+# a file stays in one process, which makes its fixtures once
 test: lint browser
-	OMP_NUM_THREADS=1 $(BIN)/pytest -q -n 2
+	OMP_NUM_THREADS=1 $(BIN)/pytest -q -n 2 --dist loadfile
 
 test-slow: $(INSTALLED)
 	$(BIN)/pytest -q -m slow
