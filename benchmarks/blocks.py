@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from sagesplat import blocks, labelling, nesting, pipeline, stages
+from sagesplat import blocks, borders, labelling, nesting, pipeline, stages
 from sagesplat.adapt.ladder import read_prefixes
-from sagesplat.config import RunConfig
+from sagesplat.config import BlocksConfig, RunConfig
 from sagesplat.events import Emit, StageDone, StageStarted, named
 from sagesplat.executor import Local, Task
 from sagesplat.job import Job, JobSpec
@@ -18,6 +18,7 @@ from sagesplat.output.tables import Table
 from sagesplat.raster import set_threads
 from sagesplat.run_dir import RunDir
 from sagesplat.scene.blocks import read_blocks
+from sagesplat.train import seams
 
 _MIB = 2**10  # kB, as getrusage counts
 
@@ -96,19 +97,19 @@ def compare(
     blocks.train_blocks(job, in_blocks.blocks, in_blocks.train, in_blocks.seed)
     blocks.make_parts(job)
     blocks.nest_blocks(job, in_blocks.blocks, in_blocks.nest, in_blocks.seed)
-    list(fresh.run([Task("as one", as_one, (other.spec, replace(whole, blocks=type(whole.blocks)())))], tell))
+    list(fresh.run([Task("as one", as_one, (other.spec, replace(whole, blocks=BlocksConfig())))], tell))
     partition = read_blocks(job.run.blocks / "blocks.json")
     files = [job.run.block(number).core for number in range(len(partition))]
     sets = {
-        "blocks, put together": blocks.together(files)[0],
+        "blocks, put together": seams.together(files)[0],
         "blocks, tuned": read_prefixes(job.run.prefixes).gaussians,
         "as one": read_prefixes(other.run.prefixes).gaussians,
     }
     memory = Table("Peak memory and time of each task", ("task", "seconds", "MiB"), ("", ".0f", ".0f"), [])
     memory.rows.extend(fresh.measured)
     tables = [
-        blocks.balance_table(job, partition),
-        blocks.border_table(job, partition, sets),
+        borders.balance_table(job, partition),
+        borders.border_table(job, partition, sets),
         memory,
     ]
     return tables, {table.title: [table.header, *table.rows] for table in tables}

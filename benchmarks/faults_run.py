@@ -27,7 +27,6 @@ TIMES = {
     ".lock": "who had the folder last",
 }
 _LEFT_OUT = (".lock", "blocks.md", "timings.csv", "index.html")
-_RECORDS = ("segment.json", "masks.json", "fuse.json", "parts.json")  # inputs that hold seconds
 
 
 @dataclass(frozen=True)
@@ -69,8 +68,7 @@ def digests(run: Path) -> dict[str, str]:
 def _content(path: Path) -> bytes:
     if path.parent.name == "provenance":
         record = json.loads(path.read_text(encoding="utf-8"))
-        inputs = {k: v for k, v in record["inputs"].items() if k not in _RECORDS}
-        return json.dumps(record | {"seconds": 0, "inputs": inputs}).encode()
+        return json.dumps(record | {"seconds": 0}).encode()
     if path.name == "blocks.csv":
         rows = [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()]
         kept = [i for i, name in enumerate(rows[0]) if not name.endswith(" s")]

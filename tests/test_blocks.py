@@ -272,12 +272,13 @@ def test_core_keeps_order_and_levels() -> None:
     g = replace(g, means=spots)
     sizes = {label: (2, 7, n) for label, n in g.counts().items()}
     parts = Parts(Taxonomy({3: "car", 184: "tree-merged"}), 2)
-    clarity = np.arange(60, dtype=np.float32)
-    cores = [seams.core(g, sizes, clarity, blocks, parts, b) for b in range(2)]
+    cores = [seams.core(g, blocks, parts, b) for b in range(2)]
     assert sum(len(c[0]) for c in cores) == 60
-    for block, (core, levels, clear) in enumerate(cores):
+    for block, (core, inside) in enumerate(cores):
+        levels = seams.core_sizes(g.label_ids.numpy(), inside, sizes, parts, block)
         rows = np.flatnonzero(blocks.of(g.means.numpy()) == block)
-        np.testing.assert_array_equal(clear, rows)  # in the order of the whole
+        np.testing.assert_array_equal(np.flatnonzero(inside), rows)
+        np.testing.assert_array_equal(core.means, g.means[rows])  # in the order of the whole
         assert core.counts() == {part: n[-1] for part, n in levels.items()}
         for label, (low, middle, _) in sizes.items():
             mine = rows[g.label_ids.numpy()[rows] == label]

@@ -5,7 +5,6 @@ nested like any other, on whatever node, and goes on where it was killed. Put to
 block is a category of its own (`segment.parts`), which all later stages take as they take any other.
 """
 
-import os
 import shutil
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -15,17 +14,14 @@ import torch
 
 from sagesplat import nesting
 from sagesplat.adapt.ladder import read_ladder, read_prefixes
-from sagesplat.adapt.observe import RenderedLabels, as_unit, render_rgb
+from sagesplat.adapt.observe import RenderedLabels
 from sagesplat.config import BlocksConfig, NestConfig, TrainConfig
 from sagesplat.errors import RunError
-from sagesplat.events import Emit, Progress, TableMade, named
+from sagesplat.events import Emit, Progress, named
 from sagesplat.executor import Task, results
-from sagesplat.files import read_json, write_json, write_text
+from sagesplat.files import link, read_json, write_json
 from sagesplat.gaussians import Gaussians, concat
 from sagesplat.job import Job, JobSpec, fingerprint, run_stage
-from sagesplat.metrics import squared_error_map, ssim_map
-from sagesplat.output.tables import Table
-from sagesplat.raster import Workspace, device_of, rasterize
 from sagesplat.run_dir import RunDir, file_hash
 from sagesplat.scene.blocks import (
     Blocks,
@@ -64,10 +60,15 @@ def check(config: BlocksConfig) -> None:
             raise RunError(f"--blocks.{name} {value} is impossible; choose {cure}")
 
 
+def _division(config: BlocksConfig) -> dict[str, float]:
+    """The settings that decide what a block is trained on."""
+    return {name: value for name, value in asdict(config).items() if name != "seam_steps"}
+
+
 def divide(job: Job, config: BlocksConfig, seed: int) -> Blocks:
     """Divide the scene, and make a run folder for each block with its part of the capture."""
     run, file = job.run, job.run.blocks / "blocks.json"
-    settings = {k: v for k, v in asdict(config).items() if k != "seam_steps"} | {"seed": seed}
+    settings = {**_division(config), "seed": seed}
 
     def make() -> list[str]:
         scene = job.scene
@@ -110,27 +111,17 @@ def _begin(run: RunDir, scene: Scene, labels: LiftedLabels, rows: np.ndarray) ->
     write_json(run.scene, {**stored, "extent": scene.extent, "points": len(rows), "views": []})
 
 
-def _share_masks(job: Job, number: int) -> None:
+def _share_masks(job: Job, block: Job) -> None:
     """Give a block the label images of its views, and what they were made from, as links."""
-    run, fused = job.run.block(number), job.whole_masks.folder == job.run.fused
-    source = job.whole_masks.folder
+    run, source = block.run, job.whole_masks.folder
+    fused = source == job.run.fused
     target = run.fused if fused else run.masks
-    views = _job_of(job, number).scene.views
-    files = [mask_path(source, view).relative_to(source) for view in views]
+    files = [mask_path(source, view).relative_to(source) for view in block.scene.views]
     for name in [*files, Path("labels.json")]:
-        _link(source / name, target / name)
+        link(source / name, target / name)
     if fused:
-        _link(job.run.provenance("fuse"), run.provenance("fuse"))
-        _link(job.run.masks / "labels.json", run.masks / "labels.json")
-
-
-def _link(source: Path, target: Path) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    target.unlink(missing_ok=True)
-    try:
-        os.link(source, target)  # takes no room; nothing in a run is changed in place
-    except OSError:  # a disk without links
-        shutil.copyfile(source, target)
+        link(job.run.provenance("fuse"), run.provenance("fuse"))
+        link(job.run.masks / "labels.json", run.masks / "labels.json")
 
 
 def _spec(job: Job, number: int) -> JobSpec:
@@ -141,29 +132,28 @@ def _job_of(job: Job, number: int) -> Job:
     return _spec(job, number).open(job.emit)
 
 
-def _needed(job: Job, number: int, config: TrainConfig) -> int:
+def _needed(block: Job, config: TrainConfig) -> int:
     """Bytes that the training of a block is expected to need (0 on a GPU, whose memory is its own)."""
-    if job.gpus:
+    if block.gpus:
         return 0
-    spec = _spec(job, number)
-    return memory.fit(spec.open(job.emit).scene, config, spec.memory_limit, processes=job.processes).needed
+    return memory.fit(block.scene, config, block.memory_limit, processes=block.processes).needed
 
 
 def train_blocks(job: Job, config: BlocksConfig, train: TrainConfig, seed: int) -> None:
     """Divide the scene, train its blocks as tasks, and put their levels together."""
     run = job.run
     settings = {**asdict(train), "batch": max(train.batch, job.processes), "seed": seed}
-    settings["blocks"] = {k: v for k, v in asdict(config).items() if k != "seam_steps"}
+    settings["blocks"] = _division(config)
     blocks = divide(job, config, seed)
     parts = Parts(job.masks.taxonomy, len(blocks))
 
     def make() -> list[str]:
+        tasks = []
         for number in range(len(blocks)):
-            _share_masks(job, number)
-        tasks = [
-            Task(f"block {i}", train_block, (_spec(job, i), i, train, seed), job.gpus, _needed(job, i, train))
-            for i in range(len(blocks))
-        ]
+            block = _job_of(job, number)
+            _share_masks(job, block)
+            what = (_spec(job, number), number, train, seed)
+            tasks.append(Task(f"block {number}", train_block, what, job.gpus, _needed(block, train)))
         results(job.executor, tasks, job.emit)
         merged = _merge_levels(run, blocks, parts)
         return [f"{merged:,} Gaussians of {len(blocks)} blocks"]
@@ -186,7 +176,7 @@ def _merge_levels(run: RunDir, blocks: Blocks, parts: Parts) -> int:
         # blocks in which all categories stopped have ended before
         files = [[f for f in ladder.files if f.step <= step][-1:] for ladder in ladders]
         cores = [
-            seams.core(read_level(f.path), {}, np.zeros(sum(f.counts.values())), blocks, parts, number)[0]
+            seams.core(read_level(f.path), blocks, parts, number)[0]
             for number, found in enumerate(files)
             for f in found
         ]
@@ -248,7 +238,7 @@ def nest_blocks(job: Job, config: BlocksConfig, nest: NestConfig, seed: int) -> 
     def make() -> list[str]:
         every = range(len(blocks))
         for number in every:
-            _share_masks(job, number)
+            _share_masks(job, _job_of(job, number))
         tasks = [
             Task(f"block {i}", nest_block, (_spec(job, i), file, i, nest, seed), job.gpus) for i in every
         ]
@@ -256,19 +246,12 @@ def nest_blocks(job: Job, config: BlocksConfig, nest: NestConfig, seed: int) -> 
         files = [run.block(number).core for number in every]
         if config.seam_steps:
             files = _tune(job, blocks, config, nest, seed)
-        g, sizes, clarity = together(files)
+        g, sizes, clarity = seams.together(files)
         lines = nesting.write_ladder(job, g, sizes, nest, clarity)
         return [*lines, f"{len(blocks)} blocks, {config.seam_steps} steps along the borders of each"]
 
     inputs = [run.scene, run.labels, run.levels, run.provenance("parts"), file]
     run_stage(job, "nest", settings, inputs, [run.prefixes, run.chunks], make)
-
-
-def together(files: list[Path]) -> tuple[Gaussians, dict[int, tuple[int, ...]], np.ndarray]:
-    """The ladders of all blocks as one: Gaussians, sizes of levels by label id, clarity."""
-    sizes = {label: n for path in files for label, n in read_sizes(path).items()}
-    clarity = np.concatenate([read_more(path, "clarity") for path in files])
-    return concat([read_level(path) for path in files]), sizes, clarity
 
 
 def nest_block(
@@ -283,11 +266,12 @@ def nest_block(
         blocks = read_blocks(partition)
         parts = Parts(job.masks.taxonomy, len(blocks))
         whole = read_prefixes(run.prefixes)
-        clarity = read_more(run.prefixes, "clarity")
-        g, sizes, clear = seams.core(whole.gaussians, whole.sizes, clarity, blocks, parts, number)
+        g, inside = seams.core(whole.gaussians, blocks, parts, number)
         if not len(g):
             raise RunError(f"{run.path}: no Gaussians inside the block; choose fewer with --blocks.count")
-        write_set(run.core, g, config.steps, sizes, clarity=clear)
+        labels, clarity = whole.gaussians.label_ids.numpy(), read_more(run.prefixes, "clarity")
+        sizes = seams.core_sizes(labels, inside, whole.sizes, parts, number)
+        write_set(run.core, g, config.steps, sizes, clarity=clarity[inside])
         return [f"{len(g):,} of {len(whole.gaussians):,} Gaussians are inside the block"]
 
     run_stage(job, "core", {}, [run.prefixes, partition], [run.core], make)
@@ -360,96 +344,3 @@ def _tuned(
             mine = torch.isin(event.gaussians.label_ids, torch.unique(own.label_ids))
             return event.gaussians.select(mine)
     raise AssertionError("a training ends with what it trained")
-
-
-def measure_borders(job: Job) -> None:
-    """Measure the whole scene near the borders of its blocks and away from them, and how even they are."""
-    run, file = job.run, job.run.blocks / "blocks.json"
-    table_file = run.adapted / "blocks.csv"
-
-    def make() -> list[str]:
-        blocks = read_blocks(file)
-        files = [run.block(number).core for number in range(len(blocks))]
-        sets = {"put together": together(files)[0], "tuned": job.ladder.load(job.ladder.levels[-1])}
-        tables = [balance_table(job, blocks), border_table(job, blocks, sets)]
-        for table in tables:
-            job.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
-        tables[0].write_csv(table_file)
-        tables[1].write_csv(run.adapted / "borders.csv")
-        text = "\n\n".join(f"## {t.title}\n\n{t.markdown()}" for t in tables)
-        write_text(run.adapted / "blocks.md", f"{text}\n")
-        return [str(run.adapted / "blocks.md")]
-
-    inputs = [run.scene, run.prefixes, file]
-    run_stage(job, "borders", {}, inputs, [table_file, run.adapted / "borders.csv"], make)
-
-
-def balance_table(job: Job, blocks: Blocks) -> Table:
-    """Points, views, Gaussians and seconds of each block."""
-    made = read_json(job.run.blocks / "blocks.json")
-    rows: list[tuple[str | int | float, ...]] = []
-    for number in range(len(blocks)):
-        run = job.run.block(number)
-        seconds = [_seconds(run, stage) for stage in ("train", "seeds", "nest", "seams")]
-        trained = sum(read_ladder(run.levels).files[-1].counts.values())
-        kept = sum(n[-1] for n in read_sizes(run.core).values())
-        rows.append((number, made["points"][number], made["views"][number], trained, kept, *seconds))
-    header = ("block", "points", "views", "Gaussians", "inside", "train s", "seeds s", "nest s", "seams s")
-    return Table("Blocks", header, ("d", ",d", "d", ",d", ",d", ".1f", ".1f", ".1f", ".1f"), rows)
-
-
-def _seconds(run: RunDir, stage: str) -> float:
-    record = run.provenance(stage)
-    return float(read_json(record)["seconds"]) if record.exists() else float("nan")
-
-
-def border_table(job: Job, blocks: Blocks, sets: dict[str, Gaussians]) -> Table:
-    """PSNR and SSIM of whole scenes on the test views, in bands along the borders and away from them.
-
-    A pixel is in a band where Gaussians of the first set within half the margin of a border paint most of it.
-    """
-    scene = job.scene
-    rows = scene.test_ids.tolist() or scene.train_ids[:: max(1, len(scene.train_ids) // 32)].tolist()
-    first = next(iter(sets.values()))
-    near = torch.from_numpy(blocks.to_border(first.means.numpy()) < blocks.margin / 2)
-    in_band = [_shows(job, first, near, row) for row in rows]
-    workspace, body = Workspace(), []
-    for done, (name, g) in enumerate(sets.items(), 1):
-        errors, quality = [], []
-        for row in rows:
-            image = render_rgb(
-                g,
-                scene.views[row].camera,
-                backend=job.backend,
-                antialiased=job.antialiased,
-                workspace=workspace,
-            )
-            photo = as_unit(job.photos[row])
-            errors.append(squared_error_map(image, photo))
-            quality.append(ssim_map(image, photo))
-        found = seams.bands(in_band, errors, quality)
-        body.append((name, len(g), found.share, found.psnr, found.psnr_inside, found.ssim, found.ssim_inside))
-        job.emit(Progress("borders", done, len(sets)))
-    header = (
-        "scene",
-        "Gaussians",
-        "in bands",
-        "PSNR there",
-        "PSNR elsewhere",
-        "SSIM there",
-        "SSIM elsewhere",
-    )
-    title = f"Along the borders of {len(blocks)} blocks and elsewhere, {len(rows)} views"
-    return Table(title, header, ("", ",d", ".1%", ".2f", ".2f", ".4f", ".4f"), body)
-
-
-def _shows(job: Job, g: Gaussians, which: torch.Tensor, row: int) -> np.ndarray:
-    """Pixels (bool [H, W]) of a view that some Gaussians paint most of."""
-    device = device_of(job.backend)
-    with torch.no_grad():
-        render = rasterize(
-            g.to(device), job.scene.views[row].camera, features=which.float()[:, None].to(device),
-            backend=job.backend, antialiased=job.antialiased,
-        )  # fmt: skip
-    assert render.features is not None
-    return (render.features[..., 0] > 0.5 * render.alpha).cpu().numpy()

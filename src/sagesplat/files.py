@@ -131,6 +131,17 @@ def remove_temporary(folder: Path, but: str = "") -> None:
             path.unlink(missing_ok=True)
 
 
+def link(path: Path, target: Path) -> None:
+    """A hard link, which takes no room, or a copy where the file system has none."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    target.unlink(missing_ok=True)
+    try:
+        os.link(path, target)
+    except OSError:
+        with atomic_path(target) as temporary:
+            shutil.copy2(path, temporary)
+
+
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
     """A new folder beside `path` that takes its place when the block ends without an error.

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from sagesplat import blocks, labelling, nesting, stages
+from sagesplat import blocks, borders, labelling, nesting, stages
 from sagesplat.adapt.ladder import read_prefixes
 from sagesplat.adapt.plan import check_target
 from sagesplat.config import BlocksConfig, NestConfig, PlanConfig, RunConfig, TrainConfig
@@ -67,7 +67,7 @@ def nest(job: Job, config: NestConfig, of_blocks: BlocksConfig, seed: int) -> No
     """Make the nested ladder of a trained scene, or of its blocks."""
     if job.has_blocks:
         blocks.nest_blocks(job, of_blocks, config, seed)
-        blocks.measure_borders(job)
+        borders.measure_borders(job)
     else:
         nesting.nest_levels(job, config, seed)
 

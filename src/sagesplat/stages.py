@@ -148,6 +148,7 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
             shutil.rmtree(run.levels, ignore_errors=True)
         write_json(run.cap, {"cap": cap})
         counts: dict[str, int] = {}
+        names = job.names()
         start = partial(train_together, job.processes, job.threads) if job.processes > 1 else train
         events = start(
             job.scene, job.photos, job.point_labels, fitted,
@@ -162,9 +163,9 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
                 case Step(step, loss, num, _):
                     job.emit(Training(step, config.max_steps, loss, counts, num))
                 case LevelSaved():
-                    counts = {job.taxonomy.name(i): n for i, n in event.counts.items()}
+                    counts = {names[i]: n for i, n in event.counts.items()}
                 case LabelFrozen(step, label, ssim, count):
-                    name = job.taxonomy.name(label)
+                    name = names[label]
                     job.emit(
                         Warned(f"{name} stops at step {step} with SSIM {ssim:.3f} and {count:,} Gaussians")
                     )

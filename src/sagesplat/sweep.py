@@ -1,7 +1,6 @@
 """A sweep: every scene, variant of the settings and seed of one small file, summed up as mean and spread."""
 
 import math
-import os
 import re
 import shutil
 import statistics
@@ -24,7 +23,7 @@ from sagesplat.config import RunConfig
 from sagesplat.errors import DataError, RunError, SageError, short
 from sagesplat.events import Emit, Progress, StageDone, StageStarted, TableMade, Warned, named
 from sagesplat.executor import LOCAL, Executor, Local, Task
-from sagesplat.files import read_json, write_text
+from sagesplat.files import link, read_json, write_text
 from sagesplat.job import Job, JobSpec
 from sagesplat.output.tables import MB, Table, mean, promise_kept
 from sagesplat.raster import Backend
@@ -291,12 +290,10 @@ def _share_training(runs: Path, like: Cell | None, cell: Cell) -> None:
         return
     # links take no room; nothing in a run is changed in place
     for path in (old.segmented, old.masks, old.levels):
-        shutil.copytree(path, new.path / path.name, copy_function=os.link)
+        shutil.copytree(path, new.path / path.name, copy_function=lambda a, b: link(Path(a), Path(b)))
     stages = [old.provenance(stage) for stage in ("scene", "segment", "masks", "lift", "train")]
     for path in (old.scene, old.labels, old.checkpoint, old.frozen, *stages):
-        target = new.path / path.relative_to(old.path)
-        target.parent.mkdir(exist_ok=True)
-        os.link(path, target)
+        link(path, new.path / path.relative_to(old.path))
 
 
 def _measure(cell: Cell, job: Job) -> Iterator[Row]:

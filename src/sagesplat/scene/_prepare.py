@@ -3,7 +3,6 @@
 import hashlib
 import os
 import re
-import shutil
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ from typing import Any
 
 from PIL import Image, ImageOps
 
-from sagesplat.files import atomic_path
+from sagesplat.files import atomic_path, link
 from sagesplat.scene.detect import PHOTOS
 from sagesplat.scene.images import _rgb
 
@@ -121,7 +120,7 @@ def _prepare_photo(path: Path, folder: Path, key: str) -> tuple[Path, tuple[Any,
             _save(changed, exif, temporary)
             os.utime(temporary, ns=(stat.st_atime_ns, stat.st_mtime_ns))
     elif not done:
-        _link(path.resolve(), target)
+        link(path.resolve(), target)
     return target, camera, (stat.st_size, stat.st_mtime_ns)
 
 
@@ -161,16 +160,6 @@ def _save(image: Image.Image, exif: Image.Exif, path: Path) -> None:
     lossy = path.suffix == ".jpg"
     image.info.clear()
     image.save(path, exif=content, quality=97 if lossy else -1, subsampling=0 if lossy else -1)
-
-
-def _link(path: Path, target: Path) -> None:
-    """A hard link, or a copy where the file system has none."""
-    target.unlink(missing_ok=True)
-    try:
-        os.link(path, target)
-    except OSError:
-        with atomic_path(target) as temporary:
-            shutil.copy2(path, temporary)
 
 
 def _camera(size: tuple[int, int], exif: Image.Exif) -> tuple[Any, ...]:

@@ -1,7 +1,8 @@
 """Where blocks that were trained by themselves meet: cut, put together, tuned, measured."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -13,34 +14,37 @@ from sagesplat.metrics import psnr
 from sagesplat.scene.blocks import Blocks, visible_shares
 from sagesplat.scene.scene import Scene
 from sagesplat.segment.parts import Parts
+from sagesplat.train.levels import read_level, read_more, read_sizes
 
 SEVERAL = 0.1  # share of what a view sees that is of other blocks, from which on it tells of seams
 _PAD = 0.25  # of the image beyond its edges: Gaussians that begin there may reach into it
 
 
-def core(
-    g: Gaussians,
-    sizes: dict[int, tuple[int, ...]],
-    clarity: np.ndarray,
-    blocks: Blocks,
-    parts: Parts,
-    block: int,
-) -> tuple[Gaussians, dict[int, tuple[int, ...]], np.ndarray]:
-    """What a block adds to the whole: its Gaussians inside its border as parts, their sizes and clarity.
-
-    `sizes` by label id, of a nested ladder, or empty. Of a category that has any, every level has one.
-    """
+def core(g: Gaussians, blocks: Blocks, parts: Parts, block: int) -> tuple[Gaussians, Bool[np.ndarray, " N"]]:
+    """What a block adds to the whole: its Gaussians inside its border, as parts; and which ones they are."""
     inside = blocks.of(g.means.numpy()) == block
-    labels = g.label_ids.numpy()
+    kept = g.select(torch.from_numpy(inside))
+    part_ids = parts.ids(kept.label_ids.numpy(), block)
+    return replace(kept, label_ids=torch.from_numpy(part_ids)), inside
+
+
+def core_sizes(
+    labels: np.ndarray, inside: np.ndarray, sizes: Mapping[int, tuple[int, ...]], parts: Parts, block: int
+) -> dict[int, tuple[int, ...]]:
+    """Level sizes, by part, of what is inside (bool [N]) of a ladder in its order: at least one of any."""
     found = {}
     for label, levels in sizes.items():
         summed = np.concatenate([[0], inside[labels == label].cumsum()])
         if summed[-1]:
-            part = int(parts.ids(np.array(label), block))
-            found[part] = tuple(int(max(1, summed[n])) for n in levels)
-    kept = g.select(torch.from_numpy(inside))
-    part_ids = parts.ids(kept.label_ids.numpy(), block)
-    return replace(kept, label_ids=torch.from_numpy(part_ids)), found, clarity[inside]
+            found[int(parts.ids(np.array(label), block))] = tuple(int(max(1, summed[n])) for n in levels)
+    return found
+
+
+def together(files: Sequence[Path]) -> tuple[Gaussians, dict[int, tuple[int, ...]], np.ndarray]:
+    """The ladders of all blocks as one: Gaussians, sizes of levels by label id, clarity."""
+    sizes = {label: n for path in files for label, n in read_sizes(path).items()}
+    clarity = np.concatenate([read_more(path, "clarity") for path in files])
+    return concat([read_level(path) for path in files]), sizes, clarity
 
 
 def seam_views(scene: Scene, blocks: Blocks, block: int) -> list[int]:
@@ -70,7 +74,6 @@ def around(own: Gaussians, others: Iterable[Gaussians], scene: Scene, views: Seq
 class Bands:
     """Quality of a composition near the borders of blocks and away from them, over some views."""
 
-    pixels: int
     share: float  # of the pixels that are in a band
     psnr: float  # dB over all pixels in bands
     psnr_inside: float  # dB over all others
@@ -89,7 +92,6 @@ def bands(in_band: Sequence[np.ndarray], squares: Sequence[np.ndarray], ssim: Se
         return float(values.mean()) if len(values) else np.nan
 
     return Bands(
-        len(band),
         mean(band),
         float(psnr(mean(error[band]))),
         float(psnr(mean(error[~band]))),
