@@ -19,12 +19,12 @@ from benchmarks import measure, plain, workloads
 from benchmarks import plans as planning
 from benchmarks import segment as overlays
 from benchmarks.gpu import base, script
-from sagesplat.config import TrainConfig
+from sagesplat.core.config import TrainConfig
+from sagesplat.core.gaussians import PARAMETERS, Gaussians
 from sagesplat.demo.capture import cached_capture
-from sagesplat.gaussians import PARAMETERS, Gaussians
-from sagesplat.job import Job
 from sagesplat.raster import Backend, Workspace, add_weights, rasterize, set_threads
-from sagesplat.run_dir import RunDir
+from sagesplat.run.job import Job
+from sagesplat.run.run_dir import RunDir
 from sagesplat.scene import load_scene
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene
@@ -414,7 +414,7 @@ def scaling(
         write: also copy them to benchmarks/results and docs/images.
     """
     from benchmarks.scaling import report
-    from sagesplat.errors import SageError
+    from sagesplat.core.errors import SageError
 
     try:
         result = report.run(bundles, out, viewers, seed, lambda line: print(line, flush=True))
@@ -433,7 +433,7 @@ def blocks(
 ) -> None:  # fmt: skip
     """A large scene in blocks of `steps` each, and as one with as many steps as all blocks together."""
     from benchmarks.blocks import compare
-    from sagesplat.config import BlocksConfig, NestConfig, RunConfig, TrainConfig
+    from sagesplat.core.config import BlocksConfig, NestConfig, RunConfig, TrainConfig
 
     def config(times: int) -> RunConfig:
         return RunConfig(
@@ -471,7 +471,7 @@ def faults(
     """
     from benchmarks import faults as disturbing
     from benchmarks.faults_run import Asked, settings
-    from sagesplat.errors import SageError
+    from sagesplat.core.errors import SageError
 
     capture = cached_capture() if scene == "demo" else Path(scene).absolute()
     words = settings(downscale, steps, nest_steps, levels)

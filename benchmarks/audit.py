@@ -2,9 +2,9 @@
 
 from typing import NamedTuple
 
-from sagesplat.adapt.model import Eq3, SsimModel
+from sagesplat.adapt.eq3 import Eq3, SsimModel
 from sagesplat.adapt.plan import Plan, plan_view
-from sagesplat.gaussians import BYTES_PER_GAUSSIAN
+from sagesplat.core.gaussians import BYTES_PER_GAUSSIAN
 from sagesplat.output.tables import MB, Table
 
 STEPS = (5000, 10_000, 15_000, 30_000)

@@ -8,17 +8,22 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from sagesplat import blocks, borders, labelling, nesting, pipeline, stages
 from sagesplat.adapt.ladder import read_prefixes
-from sagesplat.config import BlocksConfig, RunConfig
-from sagesplat.events import Emit, StageDone, StageStarted, named
-from sagesplat.executor import Local, Task
-from sagesplat.job import Job, JobSpec
+from sagesplat.core.config import BlocksConfig, RunConfig
+from sagesplat.core.events import Emit, StageDone, StageStarted, named
 from sagesplat.output.tables import Table
 from sagesplat.raster import set_threads
-from sagesplat.run_dir import RunDir
+from sagesplat.run.executor import Local, Task
+from sagesplat.run.job import Job, JobSpec
+from sagesplat.run.run_dir import RunDir
 from sagesplat.scene.blocks import read_blocks
-from sagesplat.train import seams
+from sagesplat.stages import blocks
+from sagesplat.stages.boundaries import balance_table, border_table
+from sagesplat.stages.label import lift_labels, make_masks
+from sagesplat.stages.nest import nest_levels
+from sagesplat.stages.pipeline import train
+from sagesplat.stages.scene import open_scene
+from sagesplat.train.boundaries import together
 
 _MIB = 2**10  # kB, as getrusage counts
 
@@ -31,7 +36,7 @@ class Fresh(Local):
     measured: list[tuple[str, float, float]] = field(default_factory=list)  # name, seconds, MiB
 
     def run(self, tasks: Sequence[Task], emit: Emit) -> Iterator[tuple[int, Any]]:
-        """See `sagesplat.executor.Executor`."""
+        """See `sagesplat.run.executor.Executor`."""
         for number, task in enumerate(tasks):
             begin = time.perf_counter()
             result, peak = in_fresh_process(task, self.threads)
@@ -72,16 +77,16 @@ def tell(event: Any) -> None:
 def label(spec: JobSpec, scene: Path, config: RunConfig, emit: Emit) -> None:
     """What comes before training."""
     job = spec.open(emit)
-    stages.open_scene(job, scene, config.scene)
-    labelling.make_masks(job, config.masks, config.labels)
-    labelling.lift_labels(job, config.lift)
+    open_scene(job, scene, config.scene)
+    make_masks(job, config.masks, config.labels)
+    lift_labels(job, config.lift)
 
 
 def as_one(spec: JobSpec, config: RunConfig, emit: Emit) -> None:
     """Train and nest the scene as one."""
     job = spec.open(named(emit, "as one"))
-    pipeline.train(job, config.train, config.blocks, config.seed)
-    nesting.nest_levels(job, config.nest, config.seed)
+    train(job, config.train, config.blocks, config.seed)
+    nest_levels(job, config.nest, config.seed)
 
 
 def compare(
@@ -101,15 +106,15 @@ def compare(
     partition = read_blocks(job.run.blocks / "blocks.json")
     files = [job.run.block(number).core for number in range(len(partition))]
     sets = {
-        "blocks, put together": seams.together(files)[0],
+        "blocks, put together": together(files)[0],
         "blocks, tuned": read_prefixes(job.run.prefixes).gaussians,
         "as one": read_prefixes(other.run.prefixes).gaussians,
     }
     memory = Table("Peak memory and time of each task", ("task", "seconds", "MiB"), ("", ".0f", ".0f"), [])
     memory.rows.extend(fresh.measured)
     tables = [
-        borders.balance_table(job, partition),
-        borders.border_table(job, partition, sets),
+        balance_table(job, partition),
+        border_table(job, partition, sets),
         memory,
     ]
     return tables, {table.title: [table.header, *table.rows] for table in tables}

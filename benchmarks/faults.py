@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.faults_run import AGAIN, TIMES, Asked, Command, differing, digests, ends, stages, used
-from sagesplat.errors import RunError
+from sagesplat.core.errors import RunError
 from sagesplat.output.tables import Table
 
 RESULTS = Path(__file__).parent / "results"

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from sagesplat.adapt.observe import TOTAL, as_unit, measure, render_rgb
-from sagesplat.config import TrainConfig
+from sagesplat.core.config import TrainConfig
 from sagesplat.raster import Backend, device_of
 from sagesplat.scene import load_scene
 from sagesplat.scene.images import Photos

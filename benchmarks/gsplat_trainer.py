@@ -18,9 +18,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from sagesplat.config import TrainConfig
-from sagesplat.gaussians import Gaussians
-from sagesplat.metrics import photometric_loss
+from sagesplat.core.config import TrainConfig
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.metrics.image import photometric_loss
 from sagesplat.scene.scene import Camera
 from sagesplat.train import densify
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType, TracebackType
 
-from sagesplat.errors import SageError
+from sagesplat.core.errors import SageError
 
 MIB = 2**20
 DEFLATE = 1032  # times its size is all that a deflate stream can hold

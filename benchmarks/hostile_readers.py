@@ -12,17 +12,18 @@ import torch
 from PIL import Image
 
 from benchmarks.hostile import DEFLATE, MIB, Reader
+from sagesplat.adapt.eq3 import read_models
 from sagesplat.adapt.ladder import read_prefixes
-from sagesplat.adapt.model import read_models
 from sagesplat.adapt.observe import Observations, read_observations
 from sagesplat.adapt.plan import read_budget_plan, read_plans
-from sagesplat.adapt.promise import read_promises
-from sagesplat.files import read_json
-from sagesplat.gaussians import Gaussians
-from sagesplat.output.chunks import read_chunks, read_index, totals
-from sagesplat.output.ply import read_ply, write_ply
-from sagesplat.output.spz import decode_spz, encode_spz
-from sagesplat.remote_zip import TAIL, RemoteZip
+from sagesplat.adapt.viewpoint import read_promises
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.download.remote_zip import TAIL, RemoteZip
+from sagesplat.formats.increments import read_chunks, read_index, totals
+from sagesplat.formats.levels import read_level, write_level, write_set
+from sagesplat.formats.ply import read_ply, write_ply
+from sagesplat.formats.spz import decode_spz, encode_spz
+from sagesplat.io.files import read_json
 from sagesplat.scene.blocks import Blocks, read_blocks, write_blocks
 from sagesplat.scene.colmap import load_colmap
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage, write_model
@@ -35,9 +36,8 @@ from sagesplat.segment.lift import LiftedLabels
 from sagesplat.segment.masks import Taxonomy, read_mask, write_mask
 from sagesplat.segment.onnx import read_classes
 from sagesplat.segment.soft import read_soft, write_soft
-from sagesplat.sweep import read_sweep
+from sagesplat.studies.sweep.file import read_sweep
 from sagesplat.train.checkpoint import read_checkpoint, write_checkpoint
-from sagesplat.train.levels import read_level, write_level, write_set
 from sagesplat.train.state import initial_state
 
 PHOTOS = ("a.png", "b.png", "c.png")
@@ -160,14 +160,14 @@ CHOICE = {"label_id": 2, "level": 1, "predicted_ssim": 0.8, "distance": None, "c
 
 
 def _models(folder: Path) -> list[bytes]:
-    from sagesplat.adapt.model import STATUSES, Eq3
+    from sagesplat.adapt.eq3 import STATUSES, Eq3
 
     params = dict.fromkeys(Eq3._fields, 0.5)
     return _json({"models": [CURVE | {"params": params, "status": sorted(STATUSES)[0]}]})(folder)
 
 
 def _promises(folder: Path) -> list[bytes]:
-    from sagesplat.adapt.promise import NUMBERS, STATUSES
+    from sagesplat.adapt.viewpoint import NUMBERS, STATUSES
 
     curve = json.loads(_models(folder)[0])["models"][0]
     entry = dict.fromkeys(NUMBERS, 0.5) | {"label_id": 2, "curves": [curve], "lengths": [1, 2, 0.5]}

@@ -11,13 +11,13 @@ import numpy as np
 import torch
 from numba import njit, prange
 
-from sagesplat.config import TrainConfig
-from sagesplat.gaussians import PARAMETERS, Gaussians
-from sagesplat.metrics import photometric_loss
+from sagesplat.core.config import TrainConfig
+from sagesplat.core.gaussians import PARAMETERS, Gaussians
+from sagesplat.core.sh import num_bases
+from sagesplat.kernels.simd import fma, splat16, total
+from sagesplat.metrics.image import photometric_loss
 from sagesplat.raster import Workspace, blend, cpu, rasterize
 from sagesplat.scene.scene import Camera
-from sagesplat.sh import num_bases
-from sagesplat.simd import fma, splat16, total
 from sagesplat.train.optim import adam_step
 
 # operations that the blending loops cost per pixel and Gaussian (docs/performance.md)

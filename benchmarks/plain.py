@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
-from sagesplat import sh
-from sagesplat.gaussians import Gaussians
+from sagesplat.core import sh
+from sagesplat.core.gaussians import Gaussians
 from sagesplat.raster.reference import rotation_matrices
 from sagesplat.raster.render import ALPHA_MAX, ALPHA_MIN, BLUR, NEAR
 from sagesplat.scene.scene import Camera

@@ -8,8 +8,8 @@ from jaxtyping import Int16, UInt8
 from PIL import Image, ImageDraw
 
 from benchmarks import deeplab
-from sagesplat.job import Job
 from sagesplat.output.figures import label_image
+from sagesplat.run.job import Job
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.segment import coco

@@ -10,8 +10,8 @@ from typing import Any
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from sagesplat import serve
 from sagesplat.output.figures import STYLE
+from sagesplat.stages.view import show
 from tests.browser import Opened, launch, open_page
 
 NETWORKS = (2.0, 10.0, 50.0)  # Mbit/s
@@ -39,7 +39,7 @@ _STATE = """() => {
 
 def measure(bundle: Path, networks: Sequence[float] = NETWORKS, seconds: float = 180.0) -> dict[str, Any]:
     """Loads of a bundle with empty caches, by network: one for each target and one of everything."""
-    with serve.view(bundle, print, port=0) as view:
+    with show(bundle, print, port=0) as view:
         thread = threading.Thread(target=view.run, args=(False,))
         thread.start()
         try:

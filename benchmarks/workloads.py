@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from sagesplat.config import TrainConfig
-from sagesplat.gaussians import Gaussians
+from sagesplat.core.config import TrainConfig
+from sagesplat.core.gaussians import Gaussians
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene
 from sagesplat.train.state import from_points

@@ -6,13 +6,13 @@ python examples/01_run_from_python.py CAPTURE RUN --target-ssim 0.8
 import argparse
 from pathlib import Path
 
-from sagesplat import pipeline
 from sagesplat.adapt.plan import read_plans
-from sagesplat.config import PlanConfig, RunConfig, SceneConfig, TrainConfig
-from sagesplat.events import Event, StageDone, StageSkipped, Warned
-from sagesplat.job import Job
+from sagesplat.core.config import PlanConfig, RunConfig, SceneConfig, TrainConfig
+from sagesplat.core.events import Event, StageDone, StageSkipped, Warned
 from sagesplat.raster import set_threads
-from sagesplat.run_dir import RunDir
+from sagesplat.run.job import Job
+from sagesplat.run.run_dir import RunDir
+from sagesplat.stages.pipeline import run_all
 
 
 def show(event: Event) -> None:
@@ -43,7 +43,7 @@ def main() -> None:
         plan=PlanConfig(target_ssim=args.target_ssim),
     )
     job = Job(RunDir(args.run), show, threads=set_threads())
-    pipeline.run_all(job, args.capture, config)
+    run_all(job, args.capture, config)
 
     scene_plans, _ = read_plans(job.run.plan)
     for plan in scene_plans:

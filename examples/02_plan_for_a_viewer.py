@@ -8,13 +8,13 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
+from sagesplat.adapt.bound_plans import plan_for_view, quality_at
 from sagesplat.adapt.observe import PERCENTILE, distances_in_views
-from sagesplat.adapt.promise import read_promises
-from sagesplat.adapt.promised import plan_for_view, quality_at
-from sagesplat.job import Job
-from sagesplat.nesting import costs_of
-from sagesplat.output.ply import write_ply
-from sagesplat.run_dir import RunDir
+from sagesplat.adapt.viewpoint import read_promises
+from sagesplat.formats.ply import write_ply
+from sagesplat.run.job import Job
+from sagesplat.run.run_dir import RunDir
+from sagesplat.stages.plan import costs_of
 
 
 def main() -> None:

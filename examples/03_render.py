@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from sagesplat.output.ply import read_ply
+from sagesplat.formats.ply import read_ply
 from sagesplat.raster import rasterize, set_threads
 from sagesplat.scene import load_scene
 

@@ -12,12 +12,12 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from sagesplat.gaussians import PARAMETERS, Gaussians
+from sagesplat.core.gaussians import PARAMETERS, Gaussians
+from sagesplat.core.sh import num_bases, sh0_to_rgb
 from sagesplat.raster import Backend, Render, rasterize, set_threads
 from sagesplat.scene import load_scene
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage, write_model
 from sagesplat.scene.scene import Camera, Scene
-from sagesplat.sh import num_bases, sh0_to_rgb
 
 LABELS = (-1, 3, 184)
 

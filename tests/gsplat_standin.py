@@ -20,7 +20,7 @@ import torch
 from gsplat.cuda import _torch_impl as impl
 from torch import Tensor
 
-from sagesplat.gaussians import Gaussians
+from sagesplat.core.gaussians import Gaussians
 from sagesplat.raster import Backend, Render, cuda, rasterize
 from sagesplat.scene.scene import Camera
 

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from sagesplat.adapt.model import Eq3, SsimModel
-from sagesplat.adapt.promise import ViewModel
-from sagesplat.output import boxes
-from sagesplat.output.bundle_quality import corrected, curve_entry, promise_entry
+from sagesplat.adapt.eq3 import Eq3, SsimModel
+from sagesplat.adapt.viewpoint import ViewModel
+from sagesplat.viewer import boxes
+from sagesplat.viewer.quality import corrected, curve_entry, promise_entry
 
 DATA = Path(__file__).parent / "data"
 Case = dict[str, Any]

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import ray
 
-from sagesplat.errors import RunError
-from sagesplat.events import Progress, Warned
+from sagesplat.core.errors import RunError
+from sagesplat.core.events import Progress, Warned
 
 
 def where(number: int, emit) -> tuple[int, str]:

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sagesplat.adapt.allocate import SLACK, along, best_within, cheapest
-from sagesplat.errors import RunError
+from sagesplat.core.errors import RunError
 
 VECTORS = json.loads(make_plans.PATH.read_text())
 quick = settings(max_examples=60, deadline=None)  # a busy machine is no failure

@@ -5,7 +5,7 @@ import pytest
 from conftest import random_gaussians, write_capture
 
 from sagesplat.adapt.observe import TOTAL, as_unit, distances_in_views, erode, measure
-from sagesplat.metrics import ssim_map
+from sagesplat.metrics.image import ssim_map
 
 
 def test_distances_are_the_percentile_of_the_points_in_sight(tmp_path):

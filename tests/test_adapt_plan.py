@@ -20,9 +20,9 @@ from benchmarks.audit import (
     paper_plan,
     sums_table,
 )
-from sagesplat.adapt.model import Eq3, SsimModel
+from sagesplat.adapt.eq3 import Eq3, SsimModel
 from sagesplat.adapt.plan import plan_scene, plan_view, read_plans, write_plans
-from sagesplat.errors import DataError, RunError
+from sagesplat.core.errors import DataError, RunError
 
 
 def constant(label_id: int, level: int, ssim: float) -> SsimModel:

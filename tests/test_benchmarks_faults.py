@@ -10,7 +10,7 @@ import pytest
 from benchmarks import faults, faults_run
 from benchmarks.faults import Outcome, tables
 from benchmarks.faults_run import AGAIN, Asked, Command, differing, digests, ends, stages, used
-from sagesplat.errors import RunError
+from sagesplat.core.errors import RunError
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="kills and mounts are POSIX only")
 SAID = """✓ scene        0.5 s  46 training, 8 test views
@@ -43,7 +43,7 @@ def run(tmp_path: Path) -> Path:
 
 def test_seconds_are_not_compared(run: Path) -> None:
     first = digests(run)
-    (run / "provenance" / "train.json").write_text(record(9.0, masks="2"))
+    (run / "provenance" / "train.json").write_text(record(9.0))
     (run / "nested" / "blocks.csv").write_text("block,views,train s\n0,5,9.75\n")
     (run / "nested" / "blocks.md").write_text("9.75")
     (run / ".lock").write_text("2")

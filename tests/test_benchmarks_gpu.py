@@ -15,9 +15,9 @@ from conftest import random_gaussians, write_capture
 
 from benchmarks import gsplat_trainer
 from benchmarks.gpu import base, runs, script, split
-from sagesplat.config import TrainConfig
+from sagesplat.core.config import TrainConfig
 from sagesplat.demo.capture import make_capture
-from sagesplat.metrics import photometric_loss, ssim_map
+from sagesplat.metrics.image import photometric_loss, ssim_map
 from sagesplat.raster import cuda, rasterize
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera

@@ -69,7 +69,7 @@ def test_ctrl_c_and_a_full_disk_are_one_line_too(
 def test_flags_reach_their_settings(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from sagesplat import pipeline
+    from sagesplat.stages import pipeline
 
     seen = {}
     monkeypatch.setattr(pipeline, "run_all", lambda job, scene, config: seen.update(job=job, config=config))

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from sagesplat.core.errors import SceneError
 from sagesplat.demo import capture
 from sagesplat.demo.cameras import demo_cameras
 from sagesplat.demo.capture import cached_capture, make_capture
 from sagesplat.demo.points import UV_NOISE, project
 from sagesplat.demo.world import LABELS
-from sagesplat.errors import SceneError
 from sagesplat.scene.colmap import load_colmap
 
 VIEWS, WIDTH, HEIGHT = 12, 64, 48

@@ -3,6 +3,7 @@ import pytest
 from PIL import Image
 from scipy.spatial import KDTree
 
+from sagesplat.core.errors import SceneError
 from sagesplat.demo import capture
 from sagesplat.demo.cameras import grid_cameras
 from sagesplat.demo.capture import cached_capture, make_capture
@@ -10,7 +11,6 @@ from sagesplat.demo.places import SPACING, build_places, centres_of, ways_of
 from sagesplat.demo.points import project
 from sagesplat.demo.render import lit_world
 from sagesplat.demo.world import BRICK
-from sagesplat.errors import SceneError
 from sagesplat.scene.colmap import load_colmap
 
 PLACES, VIEWS, WIDTH, HEIGHT = (2, 2), 40, 48, 36

@@ -11,10 +11,10 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 import pytest
 import torch
 
-from sagesplat import download
-from sagesplat.download import SOURCES, Source, download_lpips
-from sagesplat.errors import DataError, RunError
-from sagesplat.lpips import Net, load_lpips, shapes
+from sagesplat.core.errors import DataError, RunError
+from sagesplat.download import weights
+from sagesplat.download.weights import SOURCES, Source, download_lpips
+from sagesplat.metrics.lpips import Net, load_lpips, shapes
 
 
 class Handler(SimpleHTTPRequestHandler):
@@ -169,14 +169,14 @@ def test_a_full_disk_or_a_closed_folder(sources, tmp_path, monkeypatch):
 
     for where in ("_fetch", "np.savez"):
         with monkeypatch.context() as patch:
-            patch.setattr(f"sagesplat.download.{where}", full)
+            patch.setattr(f"sagesplat.download.weights.{where}", full)
             with pytest.raises(RunError, match="disk is full"):
                 download_lpips(tmp_path / "cache", ["alex"], sources=sources)
         assert list((tmp_path / "cache").iterdir()) == []
 
 
 def test_a_server_that_falls_silent(sources, served, tmp_path, monkeypatch):
-    monkeypatch.setattr(download, "TIMEOUT", 0.1)
+    monkeypatch.setattr(weights, "TIMEOUT", 0.1)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         quiet = changed(sources, heads=f"http://127.0.0.1:{silent.getsockname()[1]}/alex.pth")
         with pytest.raises(DataError, match="timed out"):

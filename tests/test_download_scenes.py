@@ -22,16 +22,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from sagesplat import remote_zip
-from sagesplat.download_scenes import (
-    RemoteScene,
-    download_scene,
-    find_scene,
-    list_scenes,
-    read_registry,
-)
-from sagesplat.errors import DataError, RunError
-from sagesplat.remote_zip import RemoteZip
+from sagesplat.core.errors import DataError, RunError
+from sagesplat.download import remote_zip
+from sagesplat.download.remote_zip import RemoteZip
+from sagesplat.download.scenes import RemoteScene, download_scene, find_scene, list_scenes, read_registry
 from sagesplat.scene import load_scene
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage, write_model
 
@@ -268,7 +262,7 @@ def test_a_kill_between_members(site, tmp_path):
         import os
         from dataclasses import replace
         from pathlib import Path
-        from sagesplat.download_scenes import download_scene, find_scene
+        from sagesplat.download.scenes import download_scene, find_scene
 
         def stop(name, done, total):
             if done > total / 2:

@@ -20,22 +20,38 @@ import numpy as np
 import pytest
 import torch
 from conftest import random_gaussians, write_capture
-from test_lock import HOLDS, held_by_another
+from test_io_lock import HOLDS, held_by_another
 
-from sagesplat import job as job_module
-from sagesplat import labelling, lock, pipeline, stages
-from sagesplat.config import PlanConfig, RunConfig, TrainConfig
+from sagesplat.core.config import PlanConfig, RunConfig, TrainConfig
+from sagesplat.core.errors import DataError, RunError
+from sagesplat.core.gaussians import PARAMETERS
 from sagesplat.demo.capture import make_capture
-from sagesplat.errors import DataError, RunError
-from sagesplat.files import atomic_folder, atomic_path, remove_temporary, sync_changed, write_json, write_text
-from sagesplat.gaussians import PARAMETERS
-from sagesplat.job import Job, run_stage
-from sagesplat.run_dir import RunDir, file_hash, is_done, record
+from sagesplat.formats.levels import check_level, read_level, write_level
+from sagesplat.io import lock
+from sagesplat.io.files import (
+    atomic_folder,
+    atomic_path,
+    remove_temporary,
+    sync_changed,
+    write_json,
+    write_text,
+)
+from sagesplat.run import stage
+from sagesplat.run.job import Job
+from sagesplat.run.run_dir import RunDir, file_hash, is_done, record
+from sagesplat.run.stage import run_stage
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
+from sagesplat.stages.compose import compose_plan
+from sagesplat.stages.export import export_ply
+from sagesplat.stages.fit import fit_ladder
+from sagesplat.stages.label import lift_labels, make_masks
+from sagesplat.stages.observe import observe_levels
+from sagesplat.stages.plan import make_plan
+from sagesplat.stages.scene import open_scene
+from sagesplat.stages.train import train_levels
 from sagesplat.train import checkpoint as checkpoint_module
 from sagesplat.train.checkpoint import latest_checkpoint, previous, remove_checkpoints, write_checkpoint
-from sagesplat.train.levels import check_level, read_level, write_level
 from sagesplat.train.state import TrainState, initial_state
 from sagesplat.train.trainer import Event, Resumed, Trained, train
 
@@ -50,9 +66,9 @@ EXACT = (
 KILLED = """
 import os, sys
 from pathlib import Path
-from sagesplat.job import Job
+from sagesplat.run.job import Job
 from sagesplat.raster import set_threads
-from sagesplat.run_dir import RunDir
+from sagesplat.run.run_dir import RunDir
 from test_durability import most_stages
 
 def work(capture, run, left):
@@ -81,14 +97,14 @@ for run, left in zip(sys.argv[2::2], sys.argv[3::2]):
 
 def most_stages(job: Job, capture: Path, config: RunConfig = CONFIG) -> None:
     """A run without its report, which takes as long as all the rest."""
-    stages.open_scene(job, capture, config.scene)
-    labelling.make_masks(job, config.masks, config.labels)
-    labelling.lift_labels(job, config.lift)
-    stages.train_levels(job, config.train, config.seed)
-    stages.observe_levels(job, config.fit)
-    stages.fit_ladder(job, config.fit)
-    stages.make_plan(job, config.plan)
-    stages.compose_plan(job)
+    open_scene(job, capture, config.scene)
+    make_masks(job, config.masks, config.labels)
+    lift_labels(job, config.lift)
+    train_levels(job, config.train, config.seed)
+    observe_levels(job, config.fit)
+    fit_ladder(job, config.fit)
+    make_plan(job, config.plan)
+    compose_plan(job)
 
 
 def state_at(step: int) -> TrainState:
@@ -483,7 +499,7 @@ def test_stages_are_refused_and_readers_are_not(finished: Path, capture: Path, t
     job = Job(RunDir(run, "snapshots"), lambda event: None)
     with held_by_another(run):
         most_stages(job, capture)  # all is there: nobody writes
-        assert pipeline.export_ply(job, tmp_path / "a.ply", level=40, labels=[], target=None) > 0
+        assert export_ply(job, tmp_path / "a.ply", level=40, labels=[], target=None) > 0
         again = replace(job, force=True)
         with pytest.raises(RunError, match="works on it; wait for it or stop it"):
             most_stages(again, capture, replace(CONFIG, plan=PlanConfig(target_ssim=0.5)))
@@ -496,7 +512,7 @@ def test_too_little_memory_costs_no_levels(finished: Path, tmp_path: Path) -> No
     job = Job(RunDir(run, "snapshots"), lambda event: None, force=True, memory_limit=2**20)
     before = content(run / "levels")
     with pytest.raises(RunError, match="raise --memory-limit"):
-        stages.train_levels(job, replace(CONFIG.train, max_steps=99), 0)
+        train_levels(job, replace(CONFIG.train, max_steps=99), 0)
     assert content(run / "levels") == before
     assert arrays(job.run.checkpoint).keys() == arrays(finished / "checkpoint.npz").keys()
 
@@ -548,7 +564,7 @@ def test_a_full_disk_in_any_stage_is_one_line(finished: Path, tmp_path: Path, mo
     with space_for(10, monkeypatch), pytest.raises(RunError, match=rf"run: {FULL}"):
         run_stage(job, "extra", {}, [], [run / "plain.txt"], make)
     assert not job.run.provenance("extra").exists()
-    monkeypatch.setattr(job_module, "sync_changed", lambda *args: 1 / 0)
+    monkeypatch.setattr(stage, "sync_changed", lambda *args: 1 / 0)
     with pytest.raises(ZeroDivisionError):  # what is not on the disk is not done
         run_stage(job, "extra", {}, [], [run / "plain.txt"], make)
     assert not job.run.provenance("extra").exists()

@@ -20,9 +20,9 @@ from benchmarks.fuzz import CORPUS
 from benchmarks.hostile import MIB, Finding, Reader, check
 from benchmarks.hostile_readers import READERS
 from benchmarks.mutate import mutate
-from sagesplat.errors import DataError, SageError
-from sagesplat.npz import Npz
-from sagesplat.output.chunks import Chunk, totals
+from sagesplat.core.errors import DataError, SageError
+from sagesplat.formats.increments import Chunk, totals
+from sagesplat.io.npz import Npz
 
 ROOT = Path(__file__).parents[1]
 BUDGET = 0.3  # seconds for each reader

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from sagesplat.adapt.eq3 import fit_models
 from sagesplat.adapt.evaluate import Evaluation, read_evaluation
-from sagesplat.adapt.model import fit_models
 from sagesplat.adapt.observe import TOTAL, Observations, read_observations
 from sagesplat.adapt.plan import plan_scene
 from sagesplat.output import figures

@@ -4,8 +4,8 @@ import math
 import numpy as np
 import pytest
 
+from sagesplat.adapt.eq3 import fit_model
 from sagesplat.adapt.evaluate import Evaluation
-from sagesplat.adapt.model import fit_model
 from sagesplat.adapt.observe import TOTAL, Observations
 from sagesplat.adapt.plan import Choice, Plan
 from sagesplat.output import tables

@@ -7,18 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sagesplat import pipeline
 from sagesplat.adapt.evaluate import read_evaluation
 from sagesplat.adapt.observe import TOTAL, read_observations
 from sagesplat.adapt.plan import read_plans
-from sagesplat.config import PlanConfig, RunConfig, TrainConfig
+from sagesplat.core.config import PlanConfig, RunConfig, TrainConfig
+from sagesplat.core.errors import RunError
+from sagesplat.core.events import Event, RunDone, StageDone, StageSkipped, Training
 from sagesplat.demo.capture import make_capture
-from sagesplat.errors import RunError
-from sagesplat.events import Event, RunDone, StageDone, StageSkipped, Training
-from sagesplat.job import Job
-from sagesplat.output.ply import read_ply
-from sagesplat.run_dir import RunDir
-from sagesplat.train.levels import read_level
+from sagesplat.formats.levels import read_level
+from sagesplat.formats.ply import read_ply
+from sagesplat.run.job import Job
+from sagesplat.run.run_dir import RunDir
+from sagesplat.stages.export import export_ply
+from sagesplat.stages.pipeline import run_all
 
 STAGES = [
     "scene",
@@ -38,7 +39,7 @@ CONFIG = RunConfig(train=TrainConfig(max_steps=90, level_every=30), plan=PlanCon
 
 def work(run: Path, capture: Path, config: RunConfig = CONFIG, *, force: bool = False) -> list[Event]:
     events: list[Event] = []
-    pipeline.run_all(Job(RunDir(run, "snapshots"), events.append, force=force), capture, config)
+    run_all(Job(RunDir(run, "snapshots"), events.append, force=force), capture, config)
     return events
 
 
@@ -118,7 +119,7 @@ def test_a_killed_run_goes_on_and_ends_with_the_same_levels(
             raise Killed
 
     with pytest.raises(Killed):
-        pipeline.run_all(Job(RunDir(tmp_path / "run", "snapshots"), emit), capture, CONFIG)
+        run_all(Job(RunDir(tmp_path / "run", "snapshots"), emit), capture, CONFIG)
     events = work(tmp_path / "run", capture)
     assert named(events, StageSkipped) == ["scene", "segment", "masks", "lift"]
     assert min(e.step for e in events if isinstance(e, Training)) == 61
@@ -143,20 +144,18 @@ def test_a_folder_that_is_no_run_is_left_alone(capture: Path, tmp_path: Path) ->
 
 def test_export_takes_levels_and_categories(finished: Path, tmp_path: Path) -> None:
     job = Job(RunDir(finished, "snapshots"), print)
-    count = pipeline.export_ply(
-        job, tmp_path / "a.ply", level=60, labels=["vase", "grass-merged"], target=None
-    )
+    count = export_ply(job, tmp_path / "a.ply", level=60, labels=["vase", "grass-merged"], target=None)
     g = read_ply(tmp_path / "a.ply")
     assert len(g) == count
     assert set(g.counts()) == {86, 193}
     expected = job.ladder.load(60, [86, 193])
     np.testing.assert_array_equal(g.means, expected.means)
     with pytest.raises(RunError, match=r"a\.ply: exists"):
-        pipeline.export_ply(job, tmp_path / "a.ply", level=None, labels=[], target=None)
+        export_ply(job, tmp_path / "a.ply", level=None, labels=[], target=None)
     with pytest.raises(RunError, match="no category 'cat'"):
-        pipeline.export_ply(job, tmp_path / "b.ply", level=None, labels=["cat"], target=None)
+        export_ply(job, tmp_path / "b.ply", level=None, labels=["cat"], target=None)
     with pytest.raises(RunError, match=r"no plan for SSIM 0\.77"):
-        pipeline.export_ply(job, tmp_path / "b.ply", level=None, labels=[], target=0.77)
+        export_ply(job, tmp_path / "b.ply", level=None, labels=[], target=0.77)
 
 
 def test_a_broken_level_is_one_clear_error(finished: Path, capture: Path, tmp_path: Path) -> None:

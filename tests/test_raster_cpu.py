@@ -7,7 +7,7 @@ import pytest
 import torch
 from conftest import pinhole, random_gaussians, render_with_gradients
 
-from sagesplat.gaussians import Gaussians
+from sagesplat.core.gaussians import Gaussians
 from sagesplat.raster import Backend, set_threads
 from sagesplat.scene.scene import Camera
 

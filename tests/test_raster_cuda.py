@@ -12,7 +12,7 @@ import torch
 from conftest import pinhole, random_gaussians, render_with_gradients
 from test_raster_cpu import assert_agree, backend  # noqa: F401
 
-from sagesplat.errors import BackendUnavailable, DataError, OutOfMemory
+from sagesplat.core.errors import BackendUnavailable, DataError, OutOfMemory
 from sagesplat.raster import TILE, add_weights, blend, cuda, rasterize, resolve_backend
 
 BACKGROUND = torch.tensor([0.2, 0.3, 0.4])

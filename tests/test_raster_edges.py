@@ -8,8 +8,8 @@ from conftest import pinhole, random_gaussians, render_with_gradients
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sagesplat.errors import BackendUnavailable, DataError
-from sagesplat.gaussians import PARAMETERS
+from sagesplat.core.errors import BackendUnavailable, DataError
+from sagesplat.core.gaussians import PARAMETERS
 from sagesplat.raster import rasterize, resolve_backend
 
 BACKGROUND = torch.tensor([0.2, 0.3, 0.4])

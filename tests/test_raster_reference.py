@@ -7,7 +7,7 @@ from conftest import pinhole, random_gaussians
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from sagesplat.gaussians import PARAMETERS, Gaussians
+from sagesplat.core.gaussians import PARAMETERS, Gaussians
 from sagesplat.raster import rasterize
 from sagesplat.raster.reference import rotation_matrices
 

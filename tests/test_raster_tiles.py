@@ -9,9 +9,9 @@ from conftest import pinhole, random_gaussians, render_with_gradients
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sagesplat.kernels.workspace import Workspace
 from sagesplat.raster import rasterize, tiles
 from sagesplat.raster.cpu import _Options, _project
-from sagesplat.workspace import Workspace
 
 BACKGROUND = torch.tensor([0.2, 0.3, 0.4])
 

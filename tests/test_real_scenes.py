@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sagesplat import pipeline
 from sagesplat.adapt.evaluate import read_evaluation
 from sagesplat.adapt.observe import TOTAL
-from sagesplat.config import PlanConfig, RunConfig, SceneConfig, TrainConfig
-from sagesplat.job import Job
+from sagesplat.core.config import PlanConfig, RunConfig, SceneConfig, TrainConfig
 from sagesplat.raster import set_threads
-from sagesplat.run_dir import RunDir
+from sagesplat.run.job import Job
+from sagesplat.run.run_dir import RunDir
+from sagesplat.stages.pipeline import run_all
 
 SCENES = Path(__file__).resolve().parents[2] / "shared" / "scenes"
 
@@ -20,7 +20,7 @@ def run(name: str, folder: Path, config: RunConfig) -> tuple[float, float]:
     """Mean SSIM and PSNR of full 3DGS over the test views."""
     if not (SCENES / name).is_dir():
         pytest.skip("needs the real scenes beside the checkout")
-    pipeline.run_all(Job(RunDir(folder, "snapshots"), lambda event: None), SCENES / name, config)
+    run_all(Job(RunDir(folder, "snapshots"), lambda event: None), SCENES / name, config)
     table = read_evaluation(RunDir(folder, "snapshots").evaluation)
     whole = table.select((table.label_id == TOTAL) & (table.target == np.float32(config.plan.target_ssim)))
     return float(whole.full_ssim.mean()), float(whole.full_psnr.mean())

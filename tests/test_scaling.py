@@ -13,7 +13,7 @@ from benchmarks.scaling import figures, prices, report, theory, training
 from benchmarks.scaling.cdn import DAY, Outcome, Site, simulate
 from benchmarks.scaling.lru import HIT, MISS, VALIDATED, new_caches, serve
 from benchmarks.scaling.visits import KINDS, Library, read, record
-from sagesplat.errors import DataError
+from sagesplat.core.errors import DataError
 
 VISITS = Path(__file__).parent / "data" / "scaling_visits.json"
 RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"

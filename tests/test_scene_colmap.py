@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from sagesplat.errors import SceneError
+from sagesplat.core.errors import SceneError
 from sagesplat.scene import describe, load_scene
 from sagesplat.scene.colmap import load_colmap
 from sagesplat.scene.colmap_read import read_model

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sagesplat.errors import SceneError
+from sagesplat.core.errors import SceneError
 from sagesplat.scene import images
 from sagesplat.scene.images import Photos, load_photo, photo_size
 from sagesplat.scene.scene import Camera, View

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from sagesplat.errors import SceneError
-from sagesplat.geometry import project, to_camera
+from sagesplat.core.errors import SceneError
+from sagesplat.core.geometry import project, to_camera
 from sagesplat.scene import nerfstudio
 from sagesplat.scene.colmap import load_colmap
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage, write_model

@@ -23,7 +23,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 
-from sagesplat.errors import BackendUnavailable, SceneError
+from sagesplat.core.errors import BackendUnavailable, SceneError
 from sagesplat.scene import load_scene, photos
 from sagesplat.scene._prepare import prepare_photos
 from sagesplat.scene.photos import PosesConfig, reconstruct

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from sagesplat.errors import SceneError
-from sagesplat.geometry import project
+from sagesplat.core.errors import SceneError
+from sagesplat.core.geometry import project
 from sagesplat.scene.points import FAR, GREY, focus, random_points, read_points
 from sagesplat.scene.scene import Camera, View
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from PIL import Image
 from test_scene_colmap import capture, project
 
-from sagesplat.errors import SceneError
+from sagesplat.core.errors import SceneError
 from sagesplat.scene import describe
 from sagesplat.scene.colmap import load_colmap
 from sagesplat.scene.colmap_write import ModelCamera

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-from sagesplat.errors import BackendUnavailable, SceneError
+from sagesplat.core.errors import BackendUnavailable, SceneError
 from sagesplat.scene.video import extract_frames, sharpness
 
 av = pytest.importorskip("av", reason="needs PyAV (the extra `video`)")

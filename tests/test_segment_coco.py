@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sagesplat.errors import LabelError
+from sagesplat.core.errors import LabelError
 from sagesplat.scene.scene import Camera, Points, Scene, View
 from sagesplat.segment import coco
 from sagesplat.segment.masks import Masks, Taxonomy, import_masks

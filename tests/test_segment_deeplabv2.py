@@ -12,7 +12,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from benchmarks.deeplab import mean_iou, train_small
-from sagesplat.errors import BackendUnavailable, LabelError
+from sagesplat.core.errors import BackendUnavailable, LabelError
 from sagesplat.segment.deeplabv2 import (
     COCO_STUFF_UNUSED,
     HEADS,

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from sagesplat.errors import LabelError
+from sagesplat.core.errors import LabelError
 from sagesplat.scene.scene import Camera, View
 from sagesplat.segment import edit
 from sagesplat.segment.edit import (

@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
-from sagesplat.errors import BackendUnavailable, LabelError, OutOfMemory
+from sagesplat.core.errors import BackendUnavailable, LabelError, OutOfMemory
 from sagesplat.segment import coco
 from sagesplat.segment.hf import HfSegmenter, class_ids, torch_device
 from sagesplat.segment.segmenters import Segmenter

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sagesplat.errors import LabelError
+from sagesplat.core.errors import LabelError
 from sagesplat.scene import load_scene
 from sagesplat.scene.scene import Camera, Points, Scene, View
 from sagesplat.segment.lift import LiftedLabels, agreement_in, lift

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from sagesplat.errors import LabelError
+from sagesplat.core.errors import LabelError
 from sagesplat.scene.scene import Camera, Lens, Points, Scene, View
 from sagesplat.scene.undistort import pinhole
 from sagesplat.segment.masks import Masks, Taxonomy, import_masks, mask_path, read_mask, write_mask

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sagesplat.errors import BackendUnavailable, LabelError
+from sagesplat.core.errors import BackendUnavailable, LabelError
 from sagesplat.scene import load_scene
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Points, Scene, View

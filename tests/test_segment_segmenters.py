@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from PIL import Image
 
-from sagesplat.errors import BackendUnavailable, LabelError, SceneError
+from sagesplat.core.errors import BackendUnavailable, LabelError, SceneError
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Points, Scene, View
 from sagesplat.segment.masks import Masks, Taxonomy

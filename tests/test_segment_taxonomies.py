@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sagesplat.errors import LabelError
+from sagesplat.core.errors import LabelError
 from sagesplat.segment import coco
 from sagesplat.segment.taxonomies import SOURCES, Source, guess_source, to_coco, vocabulary
 

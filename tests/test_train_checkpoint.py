@@ -10,8 +10,8 @@ from conftest import damage, random_gaussians
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from sagesplat.errors import RunError
-from sagesplat.gaussians import PARAMETERS
+from sagesplat.core.errors import RunError
+from sagesplat.core.gaussians import PARAMETERS
 from sagesplat.train.checkpoint import read_checkpoint, write_checkpoint
 from sagesplat.train.state import TrainState, initial_state
 

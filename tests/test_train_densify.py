@@ -7,8 +7,8 @@ import pytest
 import torch
 from conftest import random_gaussians
 
-from sagesplat.config import TrainConfig
-from sagesplat.gaussians import PARAMETERS
+from sagesplat.core.config import TrainConfig
+from sagesplat.core.gaussians import PARAMETERS
 from sagesplat.raster.render import Render
 from sagesplat.train import densify
 from sagesplat.train.state import TrainState, initial_state

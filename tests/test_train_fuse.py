@@ -10,8 +10,8 @@ import torch
 from conftest import orbit, random_gaussians
 from jaxtyping import Float32, Int16
 
-from sagesplat.errors import LabelError
-from sagesplat.gaussians import Gaussians
+from sagesplat.core.errors import LabelError
+from sagesplat.core.gaussians import Gaussians
 from sagesplat.scene.scene import Points, Scene, View
 from sagesplat.segment.masks import Masks, Taxonomy, mask_path, write_labels, write_mask
 from sagesplat.train.fuse import FuseOptions, Votes, draw, fuse, gather, refine, soft_pixels, thin_parts

@@ -18,13 +18,14 @@ import gsplat_standin
 import numpy as np
 from test_train_trainer import BUSY, LABEL_IDS, scene  # noqa: F401 - a fixture
 
-from sagesplat import metrics, ssim_triton
-from sagesplat.gaussians import PARAMETERS
+from sagesplat.core.gaussians import PARAMETERS
+from sagesplat.metrics import ssim_triton
+from sagesplat.metrics.image import _PhotometricLoss
 from sagesplat.raster import Workspace
 from sagesplat.scene.images import Photos
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.train import stepper, trainer
-from sagesplat.train.freeze import Work, label_quality, measured_views
+from sagesplat.train.early_stopping import Work, label_quality, measured_views
 from sagesplat.train.stepper import Stepper
 from sagesplat.train.trainer import LabelFrozen, LevelSaved, Resumed, Step, Trained, train
 
@@ -63,7 +64,7 @@ def mask(work: Work, row: int, factor: int = 1) -> torch.Tensor | None:
 
 def cpu_loss(rgb, photo, ssim_weight, tile_mask):
     tiles = None if tile_mask is None else np.asarray(tile_mask)
-    return metrics._PhotometricLoss.apply(rgb, photo, ssim_weight, tiles, Workspace())
+    return _PhotometricLoss.apply(rgb, photo, ssim_weight, tiles, Workspace())
 
 
 def run(scene, config, **options):  # noqa: F811

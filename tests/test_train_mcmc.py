@@ -11,15 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from sagesplat.config import TrainConfig
-from sagesplat.gaussians import PARAMETERS, Gaussians
+from sagesplat.core.config import TrainConfig
+from sagesplat.core.gaussians import PARAMETERS, Gaussians
 from sagesplat.raster import rasterize, set_threads
 from sagesplat.raster.reference import rotation_matrices
 from sagesplat.scene.images import Photos
 from sagesplat.train import mcmc
-from sagesplat.train.feed import Feed
-from sagesplat.train.freeze import Work, trainable_rows
-from sagesplat.train.pace import Pace
+from sagesplat.train.early_stopping import Work, trainable_rows
+from sagesplat.train.lr_schedule import Pace
+from sagesplat.train.photo_loader import Feed
 from sagesplat.train.state import TrainState, from_points, initial_state
 from sagesplat.train.stepper import Stepper
 

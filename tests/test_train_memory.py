@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 from conftest import random_gaussians, write_capture
 
-from sagesplat.config import TrainConfig
-from sagesplat.errors import RunError
-from sagesplat.files import write_text
+from sagesplat.core.config import TrainConfig
+from sagesplat.core.errors import RunError
+from sagesplat.io.files import write_text
 from sagesplat.scene.scene import Scene
 from sagesplat.train import memory
 

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_train_freeze import CONFIG, capture  # noqa: F401 - a fixture
+from test_train_early_stopping import CONFIG, capture  # noqa: F401 - a fixture
 
-from sagesplat.config import TrainConfig
-from sagesplat.errors import RunError
-from sagesplat.gaussians import PARAMETERS
+from sagesplat.core.config import TrainConfig
+from sagesplat.core.errors import RunError
+from sagesplat.core.gaussians import PARAMETERS
 from sagesplat.train import parallel
 from sagesplat.train.parallel import train_together
 from sagesplat.train.trainer import LabelFrozen, LevelSaved, Resumed, Step, Trained, train

@@ -10,14 +10,14 @@ import pytest
 import torch
 from conftest import random_gaussians, write_capture
 
-from sagesplat.config import TrainConfig
-from sagesplat.errors import OutOfMemory, RunError
-from sagesplat.gaussians import PARAMETERS, Gaussians
+from sagesplat.core.config import TrainConfig
+from sagesplat.core.errors import OutOfMemory, RunError
+from sagesplat.core.gaussians import PARAMETERS, Gaussians
+from sagesplat.formats.levels import read_header, read_level
 from sagesplat.raster import rasterize
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.train import stepper, trainer
-from sagesplat.train.levels import read_header, read_level
 from sagesplat.train.state import from_points, initial_state
 from sagesplat.train.trainer import Event, LevelSaved, Resumed, Step, Trained, train
 

@@ -16,12 +16,12 @@ import pytest
 import torch
 from browser import Opened, open_page
 
-from sagesplat.bundling import package_viewer
-from sagesplat.gaussians import Gaussians
-from sagesplat.output.bundle import Category, Contents, Shot, write_bundle
-from sagesplat.output.chunks import read_chunks, write_chunks
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.formats.increments import read_chunks, write_chunks
 from sagesplat.raster import rasterize
 from sagesplat.scene.scene import Camera
+from sagesplat.stages.bundle import package_viewer
+from sagesplat.viewer.bundle import Category, Contents, Shot, write_bundle
 
 pytestmark = [
     pytest.mark.skipif(chromium.missing() is not None, reason=chromium.missing() or ""),
@@ -228,7 +228,7 @@ def test_the_picture_is_the_rasterizers(viewer: Opened, made: Path) -> None:
 
 
 def read_chunks_of(made: Path, manifest: dict[str, Any]) -> Gaussians:
-    from sagesplat.output.chunks import Chunk
+    from sagesplat.formats.increments import Chunk
 
     return read_chunks(
         made,

@@ -15,19 +15,15 @@ import torch
 from torch import Tensor
 
 from benchmarks.gpu.base import ROOT, Bench, Outcome
-from sagesplat.config import TrainConfig
-from sagesplat.gaussians import PARAMETERS, Gaussians
-from sagesplat.raster import (
-    Backend,
-    cuda,
-    rasterize,
-)
+from sagesplat.core.config import TrainConfig
+from sagesplat.core.gaussians import PARAMETERS, Gaussians
+from sagesplat.raster import Backend, cuda, rasterize
 from sagesplat.scene.scene import Camera
 from sagesplat.train import densify, trainer
-from sagesplat.train.feed import Feed
-from sagesplat.train.freeze import Work, trainable_rows
+from sagesplat.train.early_stopping import Work, trainable_rows
 from sagesplat.train.group import ALONE
-from sagesplat.train.pace import Pace
+from sagesplat.train.lr_schedule import Pace
+from sagesplat.train.photo_loader import Feed
 from sagesplat.train.state import TrainState, from_points, initial_state
 from sagesplat.train.stepper import Stepper
 

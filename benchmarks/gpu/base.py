@@ -11,11 +11,8 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from sagesplat.gaussians import Gaussians
-from sagesplat.raster import (
-    Backend,
-    device_of,
-)
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.raster import Backend, device_of
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.segment.masks import Masks

@@ -13,20 +13,18 @@ import torch
 from benchmarks import gsplat_trainer
 from benchmarks.gpu.base import Bench, Clock, Outcome, milliseconds, one_line, wait
 from benchmarks.gpu.split import grown, stages
-from sagesplat import metrics
 from sagesplat.adapt.observe import render_rgb
-from sagesplat.config import TrainConfig
-from sagesplat.errors import SageError
-from sagesplat.gaussians import Gaussians
-from sagesplat.lpips import Net, load_lpips
-from sagesplat.raster import (
-    rasterize,
-)
+from sagesplat.core.config import TrainConfig
+from sagesplat.core.errors import SageError
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.metrics.image import photometric_loss, psnr, ssim_map
+from sagesplat.metrics.lpips import Net, load_lpips
+from sagesplat.raster import rasterize
 from sagesplat.train import densify, trainer
-from sagesplat.train.feed import Feed
-from sagesplat.train.freeze import Work, label_quality, measured_views
+from sagesplat.train.early_stopping import Work, label_quality, measured_views
 from sagesplat.train.group import ALONE
 from sagesplat.train.parallel import train_together
+from sagesplat.train.photo_loader import Feed
 
 KEPT_BACK = 0.1  # of the time, for what comes after the long runs
 WEIGHTS = {"ours": 1.0, "gsplat": 1.3, "third": 0.8, "two_thirds": 0.7, "all": 0.5}  # time of a run, guessed
@@ -293,14 +291,14 @@ def view_quality(bench: Bench, g: Gaussians, degree: int) -> dict[str, float]:
         rgb = rasterize(g, bench.scene.views[row].camera, sh_degree=degree, backend=bench.backend).rgb
         rgb = rgb.clamp(0, 1)
         if bench.device.type == "cuda":
-            from sagesplat import ssim_triton
+            from sagesplat.metrics import ssim_triton
 
             photo = photo.to(bench.device)
             ssims.append(ssim_triton.ssim_map(rgb, photo).mean())
         else:
-            ssims.append(torch.tensor(metrics.ssim_map(rgb.numpy(), (photo.float() / 255).numpy()).mean()))
+            ssims.append(torch.tensor(ssim_map(rgb.numpy(), (photo.float() / 255).numpy()).mean()))
         errors.append((rgb - photo.float() / 255).square().mean())
-    psnrs = metrics.psnr(torch.stack(errors).double().cpu().numpy())
+    psnrs = psnr(torch.stack(errors).double().cpu().numpy())
     return {"ssim": float(torch.stack(ssims).mean()), "psnr": float(np.mean(psnrs))}
 
 
@@ -320,7 +318,7 @@ def loss_times(bench: Bench) -> dict[str, float]:
     name, recipe = gsplat_trainer.losses()
     found = {}
     for of, loss in {
-        "ours": metrics.photometric_loss,
+        "ours": photometric_loss,
         "torch": gsplat_trainer.torch_loss,
         name: recipe,
     }.items():

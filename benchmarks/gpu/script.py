@@ -22,13 +22,8 @@ from benchmarks.gpu.agreement import agreement
 from benchmarks.gpu.base import ROOT, Asked, Bench, Outcome, one_line, rounded, wait
 from benchmarks.gpu.runs import freeze, full, multi, race
 from benchmarks.gpu.split import split
-from sagesplat.errors import BackendUnavailable, SageError
-from sagesplat.raster import (
-    Backend,
-    cuda,
-    resolve_backend,
-    set_threads,
-)
+from sagesplat.core.errors import BackendUnavailable, SageError
+from sagesplat.raster import Backend, cuda, resolve_backend, set_threads
 from sagesplat.scene import load_scene
 from sagesplat.scene.images import Photos
 from sagesplat.segment.lift import lift

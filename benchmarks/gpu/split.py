@@ -13,17 +13,13 @@ from torch import Tensor
 
 from benchmarks.gpu.base import Bench, Outcome, between, mark, milliseconds, wait
 from benchmarks.measure import BACKWARD_OPERATIONS, FORWARD_OPERATIONS
-from sagesplat import metrics
-from sagesplat.config import TrainConfig
-from sagesplat.gaussians import PARAMETERS, Gaussians
-from sagesplat.raster import (
-    Workspace,
-    cuda,
-    rasterize,
-)
-from sagesplat.sh import num_bases
+from sagesplat.core.config import TrainConfig
+from sagesplat.core.gaussians import PARAMETERS, Gaussians
+from sagesplat.core.sh import num_bases
+from sagesplat.metrics.image import photometric_loss
+from sagesplat.raster import Workspace, cuda, rasterize
 from sagesplat.train import densify, optim
-from sagesplat.train.feed import Feed
+from sagesplat.train.photo_loader import Feed
 from sagesplat.train.state import initial_state
 
 # what a kernel belongs to, by its name; the first that fits
@@ -117,7 +113,7 @@ def stepping(bench: Bench, g: Gaussians, trainable: Tensor | None) -> Callable[[
             backend=bench.backend,
         )  # fmt: skip
         marks.append(mark(bench.device))
-        loss = metrics.photometric_loss(render.rgb, photo, 0.2, None, space)
+        loss = photometric_loss(render.rgb, photo, 0.2, None, space)
         marks.append(mark(bench.device))
         loss.backward()
         marks.append(mark(bench.device))

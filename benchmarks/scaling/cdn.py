@@ -10,7 +10,7 @@ import numpy as np
 
 from benchmarks.scaling.lru import HIT, MISS, SHARED, VALIDATED, Caches, new_caches, serve
 from benchmarks.scaling.visits import KINDS, Library
-from sagesplat.errors import DataError
+from sagesplat.core.errors import DataError
 
 DAY = 86_400.0  # s
 _AT_ONCE = 20_000  # visits whose requests are in memory

@@ -11,7 +11,7 @@ from benchmarks.scaling import figures, prices, training
 from benchmarks.scaling.cdn import Outcome, Site, simulate
 from benchmarks.scaling.theory import per_visit, pop_hits
 from benchmarks.scaling.visits import KINDS, ROOT, Library, read, record
-from sagesplat.files import atomic_path, read_json, write_json
+from sagesplat.io.files import atomic_path, read_json, write_json
 
 RESULTS = ROOT / "benchmarks" / "results"
 VIEWERS = (1_000, 10_000, 100_000, 1_000_000, 10_000_000)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from sagesplat.errors import DataError
+from sagesplat.core.errors import DataError
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from sagesplat.errors import DataError
-from sagesplat.files import read_json
+from sagesplat.core.errors import DataError
+from sagesplat.io.files import read_json
 
 ROOT = Path(__file__).parents[2]
 KINDS = ("viewer", "manifest", "promises", "pack", "chunk")

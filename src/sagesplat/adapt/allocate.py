@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sagesplat.adapt.knapsack import UNITS, most_within
-from sagesplat.errors import RunError
+from sagesplat.core.errors import RunError
 
 SLACK = 0.01  # SSIM that a change of level must be worth
 STATES = 4096  # partial compositions to keep before a plan is left unproven: half a millisecond

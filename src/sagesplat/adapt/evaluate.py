@@ -8,11 +8,11 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32, Int32
 
-from sagesplat.adapt.columns import from_rows, read_columns, write_columns
 from sagesplat.adapt.ladder import Ladder
 from sagesplat.adapt.observe import LabelImages, as_unit, erode, measure, render_rgb
 from sagesplat.adapt.plan import Plan
-from sagesplat.gaussians import Gaussians
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.io.columns import from_rows, read_columns, write_columns
 from sagesplat.raster import Backend, Workspace, device_of
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene

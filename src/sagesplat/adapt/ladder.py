@@ -9,9 +9,9 @@ from typing import Protocol
 import numpy as np
 import torch
 
-from sagesplat.errors import RunError
-from sagesplat.gaussians import Gaussians, concat
-from sagesplat.train.levels import LevelFile, read_header, read_level, read_sizes
+from sagesplat.core.errors import RunError
+from sagesplat.core.gaussians import Gaussians, concat
+from sagesplat.formats.levels import LevelFile, read_header, read_level, read_sizes
 
 
 class Ladder(Protocol):

@@ -10,11 +10,11 @@ import torch
 from jaxtyping import Bool, Float32, Int16, Int32, UInt8
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from sagesplat import geometry
-from sagesplat.adapt.columns import from_rows, read_columns, write_columns
 from sagesplat.adapt.ladder import Ladder
-from sagesplat.gaussians import Gaussians
-from sagesplat.metrics import means_by_label, psnr, squared_error_map, ssim_map
+from sagesplat.core import geometry
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.io.columns import from_rows, read_columns, write_columns
+from sagesplat.metrics.image import means_by_label, psnr, squared_error_map, ssim_map
 from sagesplat.raster import Backend, Workspace, device_of, rasterize
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene, View

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Int
 
-from sagesplat.adapt.model import SsimModel
-from sagesplat.errors import DataError, RunError, short
-from sagesplat.files import read_json, write_json
-from sagesplat.gaussians import BYTES_PER_GAUSSIAN
+from sagesplat.adapt.eq3 import SsimModel
+from sagesplat.core.errors import DataError, RunError, short
+from sagesplat.core.gaussians import BYTES_PER_GAUSSIAN
+from sagesplat.io.files import read_json, write_json
 
 Models = Mapping[tuple[int, int], SsimModel]  # by (label id, level)
 Counts = Mapping[tuple[int, int], int]  # Gaussians of each (label id, level)
@@ -272,3 +273,15 @@ def _from_json(entry: dict[str, Any]) -> Plan:
         unit=maybe(str, entry.get("unit")),
         fits=bool(entry.get("fits", True)),
     )
+
+
+def choose(
+    ssim: Float[np.ndarray, "L V"],
+    levels: Int[np.ndarray, " L"],
+    counts: Int[np.ndarray, " L"],
+    target: float,
+) -> Int[np.ndarray, " V"]:
+    """Row of the level that `plan.plan_view` chooses in each view, all views at once."""
+    ties = (np.broadcast_to(column[:, None], ssim.shape) for column in (-levels, counts))
+    cost = np.where(ssim >= target, counts[:, None], np.inf)
+    return np.lexsort((*ties, -ssim, cost), axis=0)[0]  # the last key decides first

@@ -9,7 +9,7 @@ import tyro
 from sagesplat import __version__
 from sagesplat.cli import stages, studies, tools  # noqa: F401  (their commands register themselves)
 from sagesplat.cli.base import COMMANDS
-from sagesplat.errors import SageError
+from sagesplat.core.errors import SageError
 
 
 def main() -> None:

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from sagesplat.errors import BackendUnavailable, RunError
+from sagesplat.core.errors import BackendUnavailable, RunError
 
 if TYPE_CHECKING:
-    from sagesplat.executor import Executor
-    from sagesplat.job import Job
     from sagesplat.raster import Backend
+    from sagesplat.run.executor import Executor
+    from sagesplat.run.job import Job
 
 COMMANDS: dict[str, Callable[..., None]] = {}
 
@@ -58,9 +58,9 @@ Flat = arg(name="")
 @contextmanager
 def open_job(run: Path, machine: Machine, ladder: LadderKind = "nested") -> Iterator["Job"]:
     """A job on a run folder, shown on the console."""
-    from sagesplat.console import Console
-    from sagesplat.job import Job
-    from sagesplat.run_dir import RunDir
+    from sagesplat.cli.console import Console
+    from sagesplat.run.job import Job
+    from sagesplat.run.run_dir import RunDir
 
     if not machine.memory_limit >= 0:
         raise RunError(f"--memory-limit {machine.memory_limit} is impossible; choose GiB, such as 8")
@@ -83,7 +83,7 @@ def computing(machine: Machine, folder: Path) -> "Iterator[tuple[Backend, int, E
     On a cluster with GPUs, tasks of `--device auto` and `--backend auto` use them, though this machine has
     none: what this process itself computes, it computes on its CPU then.
     """
-    from sagesplat.executor import LOCAL
+    from sagesplat.run.executor import LOCAL
 
     kind, _, address = machine.executor.partition(":")
     if kind not in ("local", "ray") or (kind == "local" and address):
@@ -94,7 +94,7 @@ def computing(machine: Machine, folder: Path) -> "Iterator[tuple[Backend, int, E
         return
     if find_spec("ray") is None:
         raise BackendUnavailable("--executor ray: Ray is missing; pip install 'sagesplat[ray]'")
-    from sagesplat.ray_executor import RayExecutor, connected
+    from sagesplat.run.ray_executor import RayExecutor, connected
 
     with connected(address) as resources:
         auto = (machine.device, machine.backend) == ("auto", "auto")

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated
 
 from sagesplat.cli.base import Flat, LadderKind, Machine, Run, Scene, command, open_job
-from sagesplat.config import (
+from sagesplat.core.config import (
     BlocksConfig,
     FitConfig,
     LabelsConfig,
@@ -55,7 +55,7 @@ def run(
 
     Poses are found where the photos have none, and label images made where there are none.
     """
-    from sagesplat import pipeline
+    from sagesplat.stages import pipeline
 
     config = RunConfig(
         scene_config, poses, masks, labels, lift, train, blocks, nest, fit, plan, fuse, ladder, seed
@@ -77,7 +77,7 @@ def demo(
         places: 2 2 makes a large capture, a grid of courtyards, and trains it in as many blocks.
         machine: where and how to compute.
     """
-    from sagesplat import pipeline
+    from sagesplat.stages import pipeline
 
     with open_job(run, machine) as job:
         pipeline.run_demo(job, places)
@@ -94,29 +94,30 @@ def masks(
     machine: Annotated[Machine, Flat] = Machine(),
 ) -> None:
     """Begin a run: read the capture (poses are found if there are none) and bring label images in."""
-    from sagesplat import labelling, stages
+    from sagesplat.stages.label import make_masks
+    from sagesplat.stages.scene import open_scene
 
     with open_job(run, machine) as job:
-        stages.open_scene(job, scene, scene_config, poses)
-        labelling.make_masks(job, masks, labels)
+        open_scene(job, scene, scene_config, poses)
+        make_masks(job, masks, labels)
 
 
 @command
 def lift(run: Run, lift: LiftConfig = LiftConfig(), machine: Annotated[Machine, Flat] = Machine()) -> None:
     """Vote the label images onto the points."""
-    from sagesplat import labelling
+    from sagesplat.stages.label import lift_labels
 
     with open_job(run, machine) as job:
-        labelling.lift_labels(job, lift)
+        lift_labels(job, lift)
 
 
 @command
 def fuse(run: Run, machine: Annotated[Machine, Flat] = Machine()) -> None:
     """Let all views vote on the label images by way of the trained Gaussians; what follows uses them."""
-    from sagesplat import labelling
+    from sagesplat.stages.label import fuse_masks
 
     with open_job(run, machine) as job:
-        labelling.fuse_masks(job)
+        fuse_masks(job)
 
 
 @command
@@ -128,7 +129,7 @@ def train(
     seed: int = 0,
 ) -> None:
     """Train 3DGS and record the levels; a killed training goes on."""
-    from sagesplat import pipeline
+    from sagesplat.stages import pipeline
 
     with open_job(run, machine) as job:
         pipeline.train(job, train, blocks, seed)
@@ -137,7 +138,7 @@ def train(
 @command
 def parts(run: Run, machine: Annotated[Machine, Flat] = Machine()) -> None:
     """Draw the label images of a scene in blocks: each category in each block is one of its own."""
-    from sagesplat import blocks
+    from sagesplat.stages import blocks
 
     with open_job(run, machine) as job:
         blocks.make_parts(job)
@@ -152,7 +153,7 @@ def nest(
     seed: int = 0,
 ) -> None:
     """Make the nested ladder: order the trained Gaussians, train their prefixes, write the chunks."""
-    from sagesplat import pipeline
+    from sagesplat.stages import pipeline
 
     with open_job(run, machine) as job:
         pipeline.nest(job, nest, blocks, seed)
@@ -166,10 +167,10 @@ def observe(
     machine: Annotated[Machine, Flat] = Machine(),
 ) -> None:
     """Measure every category at every level in every view."""
-    from sagesplat import stages
+    from sagesplat.stages.observe import observe_levels
 
     with open_job(run, machine, ladder) as job:
-        stages.observe_levels(job, fit)
+        observe_levels(job, fit)
 
 
 @command
@@ -180,10 +181,10 @@ def fit(
     machine: Annotated[Machine, Flat] = Machine(),
 ) -> None:
     """Fit SSIM over distance for every category and level."""
-    from sagesplat import stages
+    from sagesplat.stages.fit import fit_ladder
 
     with open_job(run, machine, ladder) as job:
-        stages.fit_ladder(job, fit)
+        fit_ladder(job, fit)
 
 
 @command
@@ -194,28 +195,28 @@ def plan(
     machine: Annotated[Machine, Flat] = Machine(),
 ) -> None:
     """Choose the cheapest levels that keep a target SSIM."""
-    from sagesplat import stages
+    from sagesplat.stages.plan import make_plan
 
     with open_job(run, machine, ladder) as job:
-        stages.make_plan(job, plan)
+        make_plan(job, plan)
 
 
 @command
 def compose(run: Run, ladder: LadderKind = "nested", machine: Annotated[Machine, Flat] = Machine()) -> None:
     """Write the planned scene as composed.ply."""
-    from sagesplat import stages
+    from sagesplat.stages.compose import compose_plan
 
     with open_job(run, machine, ladder) as job:
-        stages.compose_plan(job)
+        compose_plan(job)
 
 
 @command
 def evaluate(run: Run, ladder: LadderKind = "nested", machine: Annotated[Machine, Flat] = Machine()) -> None:
     """Measure the plans on the test views, beside what was promised."""
-    from sagesplat import stages
+    from sagesplat.stages.evaluate import evaluate_plans
 
     with open_job(run, machine, ladder) as job:
-        stages.evaluate_plans(job)
+        evaluate_plans(job)
 
 
 @command
@@ -235,12 +236,12 @@ def report(
         ladder: the ladder to report on.
         machine: where and how to compute.
     """
-    from sagesplat import stages
+    from sagesplat.stages.report import make_report
 
     with open_job(run, machine, "snapshots" if paper else ladder) as job:
         if paper:
-            from sagesplat.paper import paper_report
+            from sagesplat.studies.paper.run import paper_report
 
             paper_report(job, settings)
         else:
-            stages.make_report(job)
+            make_report(job)

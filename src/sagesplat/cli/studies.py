@@ -6,13 +6,13 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from sagesplat.cli.base import Flat, LadderKind, Machine, Run, command, computing, open_job
-from sagesplat.config import CompareConfig
+from sagesplat.core.config import CompareConfig
 
 
 @command
 def crossview(run: Run, ladder: LadderKind = "nested", machine: Annotated[Machine, Flat] = Machine()) -> None:
     """Plan every unseen view by itself, and measure promise, error and regret."""
-    from sagesplat.paper import cross_views
+    from sagesplat.studies.paper.run import cross_views
 
     with open_job(run, machine, ladder) as job:
         cross_views(job)
@@ -37,8 +37,8 @@ def transfer(
         lpips: folder with the weights of LPIPS (default: where `sagesplat download lpips` puts them).
         machine: where and how to compute.
     """
-    from sagesplat.events import TableMade
-    from sagesplat.transfer import transfer as evaluate_transfer
+    from sagesplat.core.events import TableMade
+    from sagesplat.studies.transfer.run import transfer as evaluate_transfer
 
     out = out or run_b / "transfer"
     with open_job(run_a, machine, "snapshots") as job_a, open_job(run_b, machine, "snapshots") as job_b:
@@ -63,8 +63,8 @@ def online(
         out: folder for the tables (default: RUN_STOPPED/online).
         machine: where and how to compute.
     """
-    from sagesplat.events import TableMade
-    from sagesplat.online import compare_online
+    from sagesplat.core.events import TableMade
+    from sagesplat.studies.early_stopping import compare_online
 
     out = out or stopped / "online"
     with (
@@ -91,7 +91,7 @@ def compare(
         json: write all that was measured here as well.
         machine: where and how to compute.
     """
-    from sagesplat.compare import compare as compare_methods
+    from sagesplat.studies.compare.run import compare as compare_methods
 
     with open_job(run, machine) as job:
         compare_methods(job, compare, json)
@@ -110,8 +110,9 @@ def sweep(
         out: folder for the runs and the summary; what is finished there is kept.
         machine: where and how to compute.
     """
-    from sagesplat.console import Console
-    from sagesplat.sweep import read_sweep, run_sweep
+    from sagesplat.cli.console import Console
+    from sagesplat.studies.sweep.file import read_sweep
+    from sagesplat.studies.sweep.run import run_sweep
 
     cells = read_sweep(file)
     with computing(machine, out / "runs") as (backend, threads, executor), Console() as console:

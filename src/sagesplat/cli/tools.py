@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from sagesplat.cli.base import Flat, LadderKind, Machine, Run, command, open_job
-from sagesplat.config import BundleConfig
-from sagesplat.errors import RunError
+from sagesplat.core.config import BundleConfig
+from sagesplat.core.errors import RunError
 
 
 @command
@@ -35,13 +35,13 @@ def export(
         ladder: the ladder to take them from.
         machine: where and how to compute.
     """
-    from sagesplat import pipeline
+    from sagesplat.stages.export import export_chunks, export_ply
 
     with open_job(run, machine, ladder) as job:
         if chunks:
-            count = pipeline.export_chunks(job, out, chunks)
+            count = export_chunks(job, out, chunks)
         else:
-            count = pipeline.export_ply(job, out, level=level, labels=labels, target=target_ssim)
+            count = export_ply(job, out, level=level, labels=labels, target=target_ssim)
     print(f"{out}: {count:,} {'chunks' if chunks else 'Gaussians'}")
 
 
@@ -64,10 +64,10 @@ def download(
         scale: photos so many times smaller, as the archive has them (default: what papers evaluate on).
         show: list the scenes.
     """
-    from sagesplat.console import Console
-    from sagesplat.download import download_lpips
-    from sagesplat.download_scenes import download_scene, find_scene, list_scenes
-    from sagesplat.events import Progress, StageStarted
+    from sagesplat.cli.console import Console
+    from sagesplat.core.events import Progress, StageStarted
+    from sagesplat.download.scenes import download_scene, find_scene, list_scenes
+    from sagesplat.download.weights import download_lpips
 
     if show:
         for scene in list_scenes():
@@ -101,7 +101,7 @@ def doctor(build: bool = False, json: bool = False) -> None:
         build: compile gsplat's CUDA kernels now (about a minute), rather than at their first use.
         json: print it for machines.
     """
-    from sagesplat.doctor import as_json, examine, is_well, print_findings
+    from sagesplat.cli.doctor import as_json, examine, is_well, print_findings
 
     findings = examine(build=build)
     if json:
@@ -127,7 +127,7 @@ def bundle(
         config: what it says of the scene.
         machine: where and how to compute.
     """
-    from sagesplat.bundling import bundle as write
+    from sagesplat.stages.bundle import bundle as write
 
     with open_job(run, machine) as job:
         made = write(job, out, **asdict(config))
@@ -156,13 +156,13 @@ def view(
         browser: open the browser.
         follow: show the newest snapshot of a training that goes on.
     """
-    from sagesplat import serve
-    from sagesplat.console import Console
+    from sagesplat.cli.console import Console
+    from sagesplat.stages.view import show
 
     certificate = {"ssl_certfile": ssl_certfile, "ssl_keyfile": ssl_keyfile}
     with (
         Console() as console,
-        serve.view(path, console, port=port, host=host, follow=follow, **certificate) as shown,
+        show(path, console, port=port, host=host, follow=follow, **certificate) as shown,
     ):
         print(*shown.urls, shown.hint, "Ctrl-C ends it", sep="\n", flush=True)
         shown.run(browser)

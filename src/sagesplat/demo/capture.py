@@ -10,12 +10,12 @@ import numpy as np
 from PIL import Image
 
 from sagesplat import __version__
+from sagesplat.core.errors import SceneError
 from sagesplat.demo.cameras import demo_cameras, grid_cameras
 from sagesplat.demo.points import write_points
 from sagesplat.demo.render import lit_world, render_view, threads_map
 from sagesplat.demo.world import LABELS
-from sagesplat.errors import SceneError
-from sagesplat.files import cache_folder, write_json
+from sagesplat.io.files import cache_folder, write_json
 from sagesplat.scene.scene import Camera
 
 

@@ -14,12 +14,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from sagesplat.adapt.eq3 import SsimModel
 from sagesplat.adapt.evaluate import Evaluation
-from sagesplat.adapt.model import SsimModel
 from sagesplat.adapt.observe import TOTAL, Observations
 from sagesplat.adapt.plan import Counts, Plan
-from sagesplat.files import atomic_path
-from sagesplat.gaussians import BYTES_PER_GAUSSIAN
+from sagesplat.core.gaussians import BYTES_PER_GAUSSIAN
+from sagesplat.io.files import atomic_path
 from sagesplat.output.tables import MB, last_counts, name_of, view_mean
 
 Colours = Mapping[int, tuple[int, int, int]]  # label id -> RGB, 0..255

@@ -12,12 +12,12 @@ from jinja2 import Environment, StrictUndefined, Template
 from PIL import Image
 
 from sagesplat import __version__
+from sagesplat.adapt.eq3 import SsimModel
 from sagesplat.adapt.evaluate import Evaluation
-from sagesplat.adapt.model import SsimModel
 from sagesplat.adapt.observe import TOTAL, Observations
 from sagesplat.adapt.plan import Choice, Counts, Plan
-from sagesplat.files import write_text
-from sagesplat.gaussians import BYTES_PER_GAUSSIAN
+from sagesplat.core.gaussians import BYTES_PER_GAUSSIAN
+from sagesplat.io.files import write_text
 from sagesplat.output import figures, tables
 from sagesplat.output.by_category import Categories, merged, merged_counts, merged_plan, relabelled
 from sagesplat.output.figures import Colours, Panel
@@ -78,7 +78,7 @@ def write_report(folder: Path, data: ReportData) -> Path:
     for number, panel in enumerate(data.panels):
         strip = figures.panel_strip(panel, data.colours)
         figures.save_figure(strip, folder / "figures" / f"panel_{number}")
-    page = template("report.html.j2").render(
+    page = template(Path(__file__).with_name("report.html.j2")).render(
         data=data,
         version=__version__,
         headline=_headline(data, promises),
@@ -109,12 +109,12 @@ def by_category(data: ReportData) -> ReportData:
     )
 
 
-def template(name: str) -> Template:
-    """A page's template, of the files beside this one."""
+def template(path: Path) -> Template:
+    """A page's template."""
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    return environment.from_string(Path(__file__).with_name(name).read_text("utf-8"))
+    return environment.from_string(path.read_text("utf-8"))
 
 
 def main_plan(data: ReportData) -> Plan:

@@ -5,16 +5,16 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
-from sagesplat.adapt.cross_view import CrossView
+from sagesplat.adapt.eq3 import SsimModel
 from sagesplat.adapt.evaluate import Evaluation
-from sagesplat.adapt.model import SsimModel
 from sagesplat.adapt.observe import TOTAL, Observations
 from sagesplat.adapt.plan import Counts, Plan
-from sagesplat.files import atomic_path, write_text
-from sagesplat.gaussians import BYTES_PER_GAUSSIAN
+from sagesplat.core.gaussians import BYTES_PER_GAUSSIAN
+from sagesplat.io.files import atomic_path, write_text
 from sagesplat.segment.masks import UNLABELLED, UNLABELLED_NAME
 
 MB = 1e6  # bytes
@@ -262,7 +262,31 @@ def targets_table(
     return Table("Size by target", tuple(header), formats, [*body, tuple(total)])
 
 
-def promise_kept(rows: Evaluation | CrossView) -> Kept:
+class Decisions(Protocol):
+    """Rows of (label, view, target) with what was predicted of the chosen level and what was measured."""
+
+    @property
+    def target(self) -> np.ndarray:
+        """SSIM asked for, [R]."""
+        ...
+
+    @property
+    def label_id(self) -> np.ndarray:
+        """Category, [R]."""
+        ...
+
+    @property
+    def predicted(self) -> np.ndarray:
+        """SSIM predicted of the chosen level, [R]."""
+        ...
+
+    @property
+    def ssim(self) -> np.ndarray:
+        """SSIM measured, [R]."""
+        ...
+
+
+def promise_kept(rows: Decisions) -> Kept:
     """Of the (label, view, target) rows whose predicted SSIM reaches the target, those measured there too."""
     measured = np.isfinite(rows.ssim) & (rows.label_id != TOTAL)
     promised = measured & (rows.predicted >= rows.target)

@@ -9,11 +9,11 @@ from jaxtyping import Bool, Float32, Int64
 from numba.core import config as numba_config
 from torch import Tensor
 
-from sagesplat.errors import BackendUnavailable, DataError
-from sagesplat.gaussians import PARAMETERS, Gaussians
+from sagesplat.core.errors import BackendUnavailable, DataError
+from sagesplat.core.gaussians import PARAMETERS, Gaussians
+from sagesplat.kernels.workspace import Workspace
 from sagesplat.raster.render import TILE, Render
 from sagesplat.scene.scene import Camera
-from sagesplat.workspace import Workspace
 
 __all__ = [
     "TILE", "Backend", "Render", "Workspace", "add_weights", "device_of", "rasterize", "resolve_backend",

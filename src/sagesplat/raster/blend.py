@@ -9,8 +9,7 @@ colour r, g, b, and half width and height of the bounding box [px].
 import numpy as np
 from numba import njit, prange
 
-from sagesplat.raster.render import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN
-from sagesplat.simd import (
+from sagesplat.kernels.simd import (
     ceil,
     exp2,
     floor,
@@ -27,6 +26,7 @@ from sagesplat.simd import (
     total,
     where,
 )
+from sagesplat.raster.render import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN
 
 PIXELS = TILE * TILE
 _BATCH = 16  # intersections between two looks whether a tile is opaque

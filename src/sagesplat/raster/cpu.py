@@ -8,13 +8,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sagesplat import sh
-from sagesplat.errors import DataError
-from sagesplat.gaussians import PARAMETERS, Gaussians
+from sagesplat.core import sh
+from sagesplat.core.errors import DataError
+from sagesplat.core.gaussians import PARAMETERS, Gaussians
+from sagesplat.kernels.workspace import Workspace
 from sagesplat.raster import blend, project, tiles
 from sagesplat.raster.render import Render
 from sagesplat.scene.scene import Camera
-from sagesplat.workspace import Workspace
 
 _CHUNK = 3  # channels that one blending pass takes
 

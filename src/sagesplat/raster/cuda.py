@@ -34,11 +34,11 @@ from torch import Tensor
 from torch.nn.functional import pad
 from torch.utils.weak import WeakTensorKeyDictionary
 
-from sagesplat.errors import BackendUnavailable, DataError, OutOfMemory
-from sagesplat.gaussians import PARAMETERS, Gaussians
+from sagesplat.core.errors import BackendUnavailable, DataError, OutOfMemory
+from sagesplat.core.gaussians import PARAMETERS, Gaussians
+from sagesplat.core.sh import num_bases
 from sagesplat.raster.render import BLUR, NEAR, TILE, Render
 from sagesplat.scene.scene import Camera
-from sagesplat.sh import num_bases
 
 DEVICE = "cuda"  # where tensors have to be
 PACKED = False  # project into lists of what is in view: less memory, one more wait; a benchmark may switch

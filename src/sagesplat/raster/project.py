@@ -10,11 +10,8 @@ from typing import Any
 import numpy as np
 from numba import njit, prange
 
-from sagesplat import sh
-from sagesplat.raster.blend import RECORD, TILE
-from sagesplat.raster.render import ALPHA_MIN, BLUR, FRUSTUM_MARGIN, NEAR
-from sagesplat.scene.scene import Camera
-from sagesplat.simd import (
+from sagesplat.core import sh
+from sagesplat.kernels.simd import (
     count,
     double,
     exp2,
@@ -29,6 +26,9 @@ from sagesplat.simd import (
     store,
     where,
 )
+from sagesplat.raster.blend import RECORD, TILE
+from sagesplat.raster.render import ALPHA_MIN, BLUR, FRUSTUM_MARGIN, NEAR
+from sagesplat.scene.scene import Camera
 
 LANES = 8  # the kernels need at least so many Gaussians
 _LOG2E = math.log2(math.e)

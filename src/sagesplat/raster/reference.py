@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sagesplat import sh
-from sagesplat.gaussians import PARAMETERS, Gaussians
+from sagesplat.core import sh
+from sagesplat.core.gaussians import PARAMETERS, Gaussians
 from sagesplat.raster.render import (
     ALPHA_MAX,
     ALPHA_MIN,

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit, prange
 
+from sagesplat.kernels.workspace import Workspace
 from sagesplat.raster.blend import TILE
 from sagesplat.raster.project import tile_box
 from sagesplat.raster.render import ALPHA_MIN
-from sagesplat.workspace import Workspace
 
 _CHUNKS = 16  # fixed, so that the result does not depend on the number of threads
 

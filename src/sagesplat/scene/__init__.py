@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sagesplat.errors import SceneError
+from sagesplat.core.errors import SceneError
 from sagesplat.scene.colmap import load_colmap
 from sagesplat.scene.detect import detect
 from sagesplat.scene.nerfstudio import load_blender, load_transforms

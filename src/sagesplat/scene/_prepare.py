@@ -11,7 +11,7 @@ from typing import Any
 
 from PIL import Image, ImageOps
 
-from sagesplat.files import atomic_path, link
+from sagesplat.io.files import atomic_path, link
 from sagesplat.scene.detect import PHOTOS
 from sagesplat.scene.images import _rgb
 

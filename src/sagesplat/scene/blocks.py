@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int, Int64
 
-from sagesplat import geometry
-from sagesplat.errors import RunError, SceneError, short
-from sagesplat.files import read_json, write_json
+from sagesplat.core import geometry
+from sagesplat.core.errors import RunError, SceneError, short
+from sagesplat.io.files import read_json, write_json
 from sagesplat.scene.scene import Points, Scene
 
 MOST = 4096

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sagesplat.errors import SceneError, short
+from sagesplat.core.errors import SceneError, short
 from sagesplat.scene.colmap_read import ModelPoints, read_model
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage
 from sagesplat.scene.images import photo_size

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 from scipy.spatial.transform import Rotation
 
-from sagesplat.errors import SceneError, short
+from sagesplat.core.errors import SceneError, short
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage
 from sagesplat.scene.undistort import CAMERA_MODELS
 

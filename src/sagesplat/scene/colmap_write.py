@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from scipy.spatial.transform import Rotation
 
-from sagesplat.files import atomic_path
+from sagesplat.io.files import atomic_path
 from sagesplat.scene.undistort import CAMERA_MODELS
 
 

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Literal
 
-from sagesplat.errors import SceneError
+from sagesplat.core.errors import SceneError
 from sagesplat.scene import stored
 
 Kind = Literal["colmap", "transforms", "blender", "stored", "photos", "video"]

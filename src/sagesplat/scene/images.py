@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from sagesplat.errors import SceneError
+from sagesplat.core.errors import SceneError
 from sagesplat.scene.scene import View
 from sagesplat.scene.undistort import undistort
 

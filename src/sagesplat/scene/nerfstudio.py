@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from sagesplat.errors import RunError, SceneError, short
-from sagesplat.files import read_json
+from sagesplat.core.errors import RunError, SceneError, short
+from sagesplat.io.files import read_json
 from sagesplat.scene.colmap import MIN_VIEWS
 from sagesplat.scene.images import has_alpha, photo_size
 from sagesplat.scene.points import random_points, read_points

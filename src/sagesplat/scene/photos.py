@@ -13,9 +13,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from sagesplat.config import PosesConfig
-from sagesplat.errors import BackendUnavailable, SceneError
-from sagesplat.files import read_json, write_json
+from sagesplat.core.config import PosesConfig
+from sagesplat.core.errors import BackendUnavailable, SceneError
+from sagesplat.io.files import read_json, write_json
 from sagesplat.scene._prepare import PreparedPhoto, prepare_photos
 from sagesplat.scene.detect import PHOTOS
 from sagesplat.scene.video import extract_frames

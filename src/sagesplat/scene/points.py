@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from scipy.spatial import KDTree
 
-from sagesplat import geometry
-from sagesplat.errors import SceneError, short
-from sagesplat.ply_header import PlyHeader, read_header
+from sagesplat.core import geometry
+from sagesplat.core.errors import SceneError, short
+from sagesplat.io.ply_header import PlyHeader, read_header
 from sagesplat.scene.images import load_photo
 from sagesplat.scene.scene import Points, View
 

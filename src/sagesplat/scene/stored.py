@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sagesplat.errors import SceneError, short
-from sagesplat.files import atomic_path
-from sagesplat.npz import Npz
+from sagesplat.core.errors import SceneError, short
+from sagesplat.io.files import atomic_path
+from sagesplat.io.npz import Npz
 from sagesplat.scene.scene import Camera, Lens, Points, Scene, View
 
 SUFFIX = ".npz"

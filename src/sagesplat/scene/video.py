@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from PIL import Image
 
-from sagesplat.errors import BackendUnavailable, SceneError
-from sagesplat.files import atomic_path, read_json, write_json
+from sagesplat.core.errors import BackendUnavailable, SceneError
+from sagesplat.io.files import atomic_path, read_json, write_json
 
 _GREY_WIDTH = 640  # of the copies that sharpness is measured on
 _THUMB_WIDTH = 64  # of the copies that are compared

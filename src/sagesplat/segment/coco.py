@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from sagesplat.errors import LabelError, RunError, short
-from sagesplat.files import read_json
+from sagesplat.core.errors import LabelError, RunError, short
+from sagesplat.io.files import read_json
 
 _ROWS = [
     line.split(maxsplit=2)

@@ -24,7 +24,7 @@ from PIL import Image
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from sagesplat.errors import BackendUnavailable, LabelError
+from sagesplat.core.errors import BackendUnavailable, LabelError
 from sagesplat.segment import coco
 from sagesplat.segment.crf import refine
 from sagesplat.segment.masks import Taxonomy

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int16, Int64
 
-from sagesplat.errors import LabelError
+from sagesplat.core.errors import LabelError
 from sagesplat.scene.scene import View
 from sagesplat.segment import coco
 from sagesplat.segment.masks import (

@@ -19,7 +19,7 @@ from PIL import Image
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from sagesplat.errors import BackendUnavailable, LabelError, OutOfMemory
+from sagesplat.core.errors import BackendUnavailable, LabelError, OutOfMemory
 from sagesplat.segment import coco
 from sagesplat.segment.masks import UNLABELLED, Taxonomy
 from sagesplat.segment.segmenters import Segmented, answer, group_classes, parse_device

@@ -9,9 +9,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32, Int16, Int32, Int64
 
-from sagesplat.errors import LabelError, short
-from sagesplat.files import atomic_path
-from sagesplat.npz import Npz
+from sagesplat.core.errors import LabelError, short
+from sagesplat.io.files import atomic_path
+from sagesplat.io.npz import Npz
 from sagesplat.scene.scene import Camera, Scene
 from sagesplat.segment.masks import UNLABELLED, Masks
 

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Int16, Int32
 from PIL import Image
 
-from sagesplat.errors import LabelError, RunError, short
-from sagesplat.files import atomic_path, read_json, write_json
+from sagesplat.core.errors import LabelError, RunError, short
+from sagesplat.io.files import atomic_path, read_json, write_json
 from sagesplat.scene.scene import Scene, View
 from sagesplat.scene.undistort import undistort
 from sagesplat.segment import coco

@@ -9,16 +9,11 @@ import numpy as np
 from jaxtyping import Float32, Int16, UInt8
 from PIL import Image
 
-from sagesplat.errors import BackendUnavailable, LabelError, RunError, short
-from sagesplat.files import read_json
+from sagesplat.core.errors import BackendUnavailable, LabelError, RunError, short
+from sagesplat.io.files import read_json
 from sagesplat.segment import coco
 from sagesplat.segment.masks import UNLABELLED, Taxonomy, taxonomy_of
-from sagesplat.segment.segmenters import (
-    Segmented,
-    answer,
-    group_classes,
-    parse_device,
-)
+from sagesplat.segment.segmenters import Segmented, answer, group_classes, parse_device
 
 
 @dataclass(frozen=True, eq=False)

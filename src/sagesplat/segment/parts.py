@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from sagesplat.errors import LabelError
+from sagesplat.core.errors import LabelError
 from sagesplat.segment.masks import MAX_LABEL_ID, UNLABELLED, Taxonomy
 
 _MARK = "@"  # between category and block in a part's name

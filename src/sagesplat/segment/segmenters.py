@@ -11,18 +11,11 @@ import numpy as np
 from jaxtyping import Float32, Int16, UInt8
 from PIL import Image
 
-from sagesplat.errors import BackendUnavailable, LabelError, RunError
-from sagesplat.files import read_json, write_json
-from sagesplat.lock import locked
+from sagesplat.core.errors import BackendUnavailable, LabelError, RunError
+from sagesplat.io.files import read_json, write_json
+from sagesplat.io.lock import locked
 from sagesplat.scene.scene import Scene, View
-from sagesplat.segment.masks import (
-    UNLABELLED,
-    Taxonomy,
-    prepare_folder,
-    read_mask,
-    write_labels,
-    write_mask,
-)
+from sagesplat.segment.masks import UNLABELLED, Taxonomy, prepare_folder, read_mask, write_labels, write_mask
 from sagesplat.segment.soft import soft_path, write_soft
 
 _BEGINS = 60.0  # seconds that another process may take to begin a folder

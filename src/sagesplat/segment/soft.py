@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float32, Int16
 from PIL import Image
 
-from sagesplat.errors import LabelError, short
-from sagesplat.files import atomic_path
-from sagesplat.npz import Npz
+from sagesplat.core.errors import LabelError, short
+from sagesplat.io.files import atomic_path
+from sagesplat.io.npz import Npz
 from sagesplat.scene.scene import View
 from sagesplat.segment.masks import UNLABELLED, mask_path
 

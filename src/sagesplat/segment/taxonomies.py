@@ -6,7 +6,7 @@ from functools import cache
 from pathlib import Path
 from typing import Literal, get_args
 
-from sagesplat.errors import LabelError
+from sagesplat.core.errors import LabelError
 from sagesplat.segment import coco
 
 Source = Literal["coco", "coco-stuff", "ade20k", "cityscapes"]

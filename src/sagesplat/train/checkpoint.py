@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from sagesplat.errors import RunError, short
-from sagesplat.files import atomic_path, sync_files
-from sagesplat.gaussians import PARAMETERS, Gaussians, checked
-from sagesplat.npz import Npz
+from sagesplat.core.errors import RunError, short
+from sagesplat.core.gaussians import PARAMETERS, Gaussians, checked
+from sagesplat.io.files import atomic_path, sync_files
+from sagesplat.io.npz import Npz
 from sagesplat.train.state import TrainState
 
 _VERSION = 2

@@ -8,8 +8,8 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-from sagesplat.config import TrainConfig
-from sagesplat.gaussians import PARAMETERS, Gaussians, concat
+from sagesplat.core.config import TrainConfig
+from sagesplat.core.gaussians import PARAMETERS, Gaussians, concat
 from sagesplat.raster.reference import rotation_matrices
 from sagesplat.raster.render import Render
 from sagesplat.train.state import TrainState

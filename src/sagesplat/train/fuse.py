@@ -11,17 +11,11 @@ from jaxtyping import Bool, Float32, Int16
 from PIL import Image
 from scipy.ndimage import binary_opening
 
-from sagesplat.errors import LabelError
-from sagesplat.gaussians import Gaussians
+from sagesplat.core.errors import LabelError
+from sagesplat.core.gaussians import Gaussians
 from sagesplat.raster import Backend, Workspace, add_weights, device_of, rasterize
 from sagesplat.scene.scene import Camera, Scene
-from sagesplat.segment.masks import (
-    UNLABELLED,
-    Masks,
-    prepare_folder,
-    write_labels,
-    write_mask,
-)
+from sagesplat.segment.masks import UNLABELLED, Masks, prepare_folder, write_labels, write_mask
 
 Soft = Callable[[int], tuple[Int16[np.ndarray, " K"], Float32[np.ndarray, "K h w"]]]
 """Row of Scene.views -> category ids (-1 = none; repeated ones add up), probabilities at any resolution."""

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from sagesplat.gaussians import Gaussians
+from sagesplat.core.gaussians import Gaussians
 from sagesplat.raster import Workspace, add_weights, rasterize
 from sagesplat.scene.scene import Scene
 

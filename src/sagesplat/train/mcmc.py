@@ -11,8 +11,8 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-from sagesplat.config import TrainConfig
-from sagesplat.gaussians import PARAMETERS
+from sagesplat.core.config import TrainConfig
+from sagesplat.core.gaussians import PARAMETERS
 from sagesplat.raster.reference import rotation_matrices
 from sagesplat.train import densify
 from sagesplat.train.state import TrainState

@@ -6,10 +6,10 @@ import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from sagesplat.config import TrainConfig
-from sagesplat.errors import RunError
+from sagesplat.core.config import TrainConfig
+from sagesplat.core.errors import RunError
+from sagesplat.core.sh import num_bases
 from sagesplat.scene.scene import Scene
-from sagesplat.sh import num_bases
 from sagesplat.train import densify
 
 GIB = 2**30

@@ -9,19 +9,19 @@ import torch
 from jaxtyping import Float32, Int8
 from torch import Tensor
 
-from sagesplat import geometry
-from sagesplat.config import NestConfig, TrainConfig
-from sagesplat.errors import RunError
-from sagesplat.gaussians import Gaussians, concat
+from sagesplat.core import geometry
+from sagesplat.core.config import NestConfig, TrainConfig
+from sagesplat.core.errors import RunError
+from sagesplat.core.gaussians import Gaussians, concat
 from sagesplat.raster import Backend, device_of
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Points, Scene
 from sagesplat.segment.masks import Masks
 from sagesplat.train.checkpoint import latest_checkpoint, write_checkpoint
-from sagesplat.train.feed import Feed
-from sagesplat.train.freeze import Work, trainable_rows
+from sagesplat.train.early_stopping import Work, trainable_rows
 from sagesplat.train.importance import importance
-from sagesplat.train.pace import Pace
+from sagesplat.train.lr_schedule import Pace
+from sagesplat.train.photo_loader import Feed
 from sagesplat.train.state import initial_state
 from sagesplat.train.stepper import Stepper
 from sagesplat.train.trainer import LOOK_EVERY, Event, Resumed, finite, named_failures, train

@@ -6,8 +6,8 @@ import numpy as np
 from numba import njit, prange
 from torch import Tensor
 
-from sagesplat.gaussians import PARAMETERS
-from sagesplat.sh import num_bases
+from sagesplat.core.gaussians import PARAMETERS
+from sagesplat.core.sh import num_bases
 from sagesplat.train.state import TrainState
 
 _BETA1, _BETA2, _EPS = 0.9, 0.999, 1e-15

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 import torch.distributed as dist
 
-from sagesplat.errors import RunError, SageError
+from sagesplat.core.errors import RunError, SageError
 from sagesplat.raster import set_threads
 from sagesplat.train.group import Group
 from sagesplat.train.trainer import Event, train

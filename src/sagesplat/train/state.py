@@ -6,10 +6,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sagesplat import geometry
-from sagesplat.gaussians import PARAMETERS, Gaussians, concat
+from sagesplat.core import geometry
+from sagesplat.core.gaussians import PARAMETERS, Gaussians, concat
+from sagesplat.core.sh import num_bases, rgb_to_sh0
 from sagesplat.scene.scene import Points
-from sagesplat.sh import num_bases, rgb_to_sh0
 
 INITIAL_OPACITY = 0.1
 MCMC_OPACITY, MCMC_SCALE = 0.5, 0.1  # what 3DGS-MCMC begins with; scales times those of 3DGS

@@ -7,19 +7,19 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from sagesplat.config import TrainConfig
-from sagesplat.gaussians import Gaussians
-from sagesplat.metrics import photometric_loss
+from sagesplat.core.config import TrainConfig
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.formats.quantisation import rounded
+from sagesplat.metrics.image import photometric_loss
 from sagesplat.raster import Backend, Render, Workspace, device_of, rasterize
-from sagesplat.rounding import rounded
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.train import densify, mcmc, optim
-from sagesplat.train.feed import Feed
-from sagesplat.train.freeze import Work, trainable_rows
+from sagesplat.train.early_stopping import Work, trainable_rows
+from sagesplat.train.gradient_freezing import Rest
 from sagesplat.train.group import ALONE, Group
-from sagesplat.train.pace import Pace
-from sagesplat.train.rest import Rest
+from sagesplat.train.lr_schedule import Pace
+from sagesplat.train.photo_loader import Feed
 from sagesplat.train.state import TrainState, initial_state
 
 FINISHED_SHARE = 1 / 8  # of the rounds have a view in which nothing is left to learn: it is drawn whole then

@@ -10,21 +10,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sagesplat.config import TrainConfig
-from sagesplat.errors import DataError, OutOfMemory, RunError
-from sagesplat.gaussians import Gaussians
+from sagesplat.core.config import TrainConfig
+from sagesplat.core.errors import DataError, OutOfMemory, RunError
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.formats.levels import check_level, write_level
 from sagesplat.raster import Backend, device_of
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.segment.masks import Masks
 from sagesplat.train import densify, mcmc
 from sagesplat.train.checkpoint import latest_checkpoint, previous, write_checkpoint
-from sagesplat.train.feed import Feed
-from sagesplat.train.freeze import Work, label_quality, measured_views, trainable_rows
+from sagesplat.train.early_stopping import Work, label_quality, measured_views, trainable_rows
+from sagesplat.train.gradient_freezing import Rest
 from sagesplat.train.group import ALONE, Group
-from sagesplat.train.levels import check_level, write_level
-from sagesplat.train.pace import pace
-from sagesplat.train.rest import Rest
+from sagesplat.train.lr_schedule import pace
+from sagesplat.train.photo_loader import Feed
 from sagesplat.train.state import MCMC_OPACITY, MCMC_SCALE, TrainState, from_points, initial_state
 from sagesplat.train.stepper import Stepper
 

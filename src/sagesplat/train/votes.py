@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Int16
 
-from sagesplat.gaussians import Gaussians
+from sagesplat.core.gaussians import Gaussians
 from sagesplat.raster import Workspace, add_weights
 from sagesplat.scene.scene import Scene
 from sagesplat.segment.masks import UNLABELLED, Masks

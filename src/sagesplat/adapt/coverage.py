@@ -1,0 +1,121 @@
+"""Promises put to the test: decisions on unseen views by Eq. 3, by the process's mean and by its bound."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from sagesplat.adapt.observe import Observations
+from sagesplat.adapt.plan import Counts, check_target, choose
+from sagesplat.adapt.viewpoint import ViewModel
+from sagesplat.scene.scene import Scene
+
+# the paper's; with the process, half of the errors on either side; what is promised; the measurement itself
+PREDICTORS = ("eq3", "mean", "bound", "oracle")
+
+
+@dataclass(frozen=True, eq=False)
+class Kept:
+    """One row per (target, category, predictor); means are NaN where there is nothing to average."""
+
+    target: Float[np.ndarray, " R"]  # SSIM
+    label_id: Int[np.ndarray, " R"]
+    predictor: np.ndarray  # [R] one of PREDICTORS
+    views: Int[np.ndarray, " R"]  # that show the category and were measured at all of its levels
+    feasible: Int[np.ndarray, " R"]  # of them those in which the plan says that the target is met
+    kept: Int[np.ndarray, " R"]  # of those the ones in which the chosen level measures it
+    overshoot: Float[np.ndarray, " R"]  # mean of measured - target over the feasible
+    chosen: Int[np.ndarray, " R"]  # feasible with more than the cheapest level: a plan can overshoot less
+    chosen_kept: Int[np.ndarray, " R"]
+    chosen_overshoot: Float[np.ndarray, " R"]
+    refused: Int[np.ndarray, " R"]  # some level measures the target, yet the plan says that none does
+    regret: Float[
+        np.ndarray, " R"
+    ]  # mean Gaussians above the cheapest level that would have done, where kept
+
+    def select(self, keep: np.ndarray) -> "Kept":
+        """The rows that a boolean mask or an index array names."""
+        return Kept(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+
+    def totals(self) -> dict[str, float]:
+        """All rows together, every (category, view, target) weighing the same. NaN where there is none."""
+        sums = {name: int(getattr(self, name).sum()) for name in ("feasible", "chosen", "refused")}
+        weights = {"overshoot": self.feasible, "chosen_overshoot": self.chosen, "regret": self.kept}
+        means = {name: _mean(getattr(self, name)[n > 0], n[n > 0]) for name, n in weights.items()}
+        kept = _mean(self.kept / np.maximum(self.feasible, 1), self.feasible)
+        chosen_kept = _mean(self.chosen_kept / np.maximum(self.chosen, 1), self.chosen)
+        return {**sums, "kept": kept, "chosen_kept": chosen_kept, **means}
+
+
+def score(
+    observations: Observations,
+    scene: Scene,
+    promises: Mapping[int, ViewModel],
+    counts: Counts,
+    targets: Sequence[float],
+    views: Int[np.ndarray, " U"] | None = None,
+) -> Kept:
+    """Choose the cheapest level in each view (rows of Scene.views; default: test views) and measure it.
+
+    `counts` holds the Gaussians of every (label id, level) of `promises`. Views not measured at all levels of
+    a category are left out. RunError for an impossible target.
+    """
+    for target in targets:
+        check_target(target)
+    rows = []
+    for label_id, model in promises.items():
+        levels = np.array(model.levels)
+        mine = observations.select(
+            (observations.label_id == label_id)
+            & np.isin(observations.view, scene.test_ids if views is None else views)
+            & np.isin(observations.level, levels)
+        )
+        seen, column = np.unique(mine.view, return_inverse=True)
+        measured = np.full((len(levels), len(seen)), np.nan)
+        measured[np.searchsorted(levels, mine.level), column] = mine.ssim
+        distance = np.full(len(seen), np.nan)
+        distance[column] = mine.distance
+        whole = np.isfinite(measured).all(0)
+        measured, distance = measured[:, whole], distance[whole]
+        cameras = [scene.views[row].camera for row in seen[whole]]
+        position = np.array([camera.position for camera in cameras], np.float64).reshape(-1, 3)
+        direction = np.array([camera.direction for camera in cameras], np.float64).reshape(-1, 3)
+        predicted = model.predict(distance, position, direction)
+        eq3 = np.stack([curve(distance) for curve in model.curves])
+        sizes = np.array([counts[label_id, level] for level in model.levels])
+        says = (eq3, predicted.mean.T, predicted.bound.T, measured)
+        for target in targets:
+            for predictor, ssim in zip(PREDICTORS, says, strict=True):
+                key = {"target": target, "label_id": label_id, "predictor": predictor}
+                rows.append(key | _decide(ssim, measured, levels, sizes, target))
+    return Kept(**{f.name: np.array([row[f.name] for row in rows]) for f in fields(Kept)})
+
+
+def _decide(
+    ssim: np.ndarray, measured: np.ndarray, levels: np.ndarray, counts: np.ndarray, target: float
+) -> dict[str, Any]:
+    """Some columns of Kept for one category, target and predictor; SSIM predicted and measured [K, V]."""
+    level, best = (choose(values, levels, counts, target) for values in (ssim, measured))
+    got = measured[level, np.arange(len(level))]
+    feasible = (ssim >= target).any(0)
+    kept = feasible & (got >= target)
+    chosen = feasible & (counts[level] > counts.min())
+    return {
+        "views": len(level),
+        "feasible": int(feasible.sum()),
+        "kept": int(kept.sum()),
+        "overshoot": _mean(got[feasible] - target),
+        "chosen": int(chosen.sum()),
+        "chosen_kept": int((chosen & kept).sum()),
+        "chosen_overshoot": _mean(got[chosen] - target),
+        "refused": int(((measured >= target).any(0) & ~feasible).sum()),
+        "regret": _mean((counts[level] - counts[best])[kept]),
+    }
+
+
+def _mean(values: np.ndarray, weights: np.ndarray | None = None) -> float:
+    if not values.size or (weights is not None and not weights.sum()):
+        return np.nan
+    return float(np.average(values, weights=weights))

@@ -1,0 +1,1 @@
+"""What every room uses: Gaussians, harmonics, geometry, settings, events, errors."""

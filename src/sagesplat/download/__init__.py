@@ -1,0 +1,1 @@
+"""What is fetched from elsewhere: weights, and scenes out of the archives of the field."""

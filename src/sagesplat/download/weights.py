@@ -1,0 +1,130 @@
+"""Downloads the published weights of LPIPS into the cache."""
+
+import errno
+import hashlib
+import http.client
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+from urllib.request import Request, urlopen
+
+import numpy as np
+import torch
+
+from sagesplat.core.errors import BackendUnavailable, DataError, RunError
+from sagesplat.io.files import atomic_path
+from sagesplat.metrics.lpips import Net, checked, load_lpips, shapes, weights_path
+
+TIMEOUT = 30  # seconds without a byte
+
+OnProgress = Callable[[str, int, int], None]  # name of a file, bytes done, all bytes (0 = unknown)
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where the weights of a net are published: state dicts as torch saves them."""
+
+    backbone: str  # URL: torchvision's network
+    sha256: str  # its first digits
+    convolutions: tuple[int, ...]  # their numbers among the network's features
+    heads: str  # URL: the weights of the channels
+
+
+_TORCHVISION = "https://download.pytorch.org/models"
+_LPIPS = "https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/master/lpips/weights/v0.1"
+SOURCES: Mapping[Net, Source] = {
+    "alex": Source(
+        f"{_TORCHVISION}/alexnet-owt-7be5be79.pth", "7be5be79", (0, 3, 6, 8, 10), f"{_LPIPS}/alex.pth"
+    ),
+    "vgg": Source(
+        f"{_TORCHVISION}/vgg16-397923af.pth",
+        "397923af",
+        (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28),
+        f"{_LPIPS}/vgg.pth",
+    ),
+}
+
+
+def download_lpips(
+    folder: Path | None = None,
+    nets: Sequence[Net] = ("alex", "vgg"),
+    on_progress: OnProgress | None = None,
+    *,
+    sources: Mapping[Net, Source] = SOURCES,
+) -> list[Path]:
+    """Make lpips_{net}.npz in `folder` (default: the cache) where `load_lpips` finds none; their paths.
+
+    Fetches 233 MB (alex) and 528 MB (vgg), of which the convolutions are kept: 10 and 59 MB. A file appears
+    when it is complete and checked. `on_progress` is called after each MB. Raises DataError for a download
+    that fails or is not what it should be, RunError where `folder` cannot be written.
+    """
+    paths = [weights_path(net, folder) for net in nets]
+    for net, path in zip(nets, paths, strict=True):
+        if _usable(net, path):
+            continue
+        try:
+            with atomic_path(path) as temporary:
+                np.savez(
+                    temporary, allow_pickle=False, **_fetch_weights(net, path, sources[net], on_progress)
+                )
+        except OSError as error:
+            reason = error.strerror or error
+            raise RunError(f"{path}: cannot be written ({reason}); name another folder") from error
+    return paths
+
+
+def _usable(net: Net, path: Path) -> bool:
+    try:
+        load_lpips(net, path)
+    except (BackendUnavailable, DataError):
+        return False
+    return True
+
+
+def _fetch_weights(
+    net: Net, path: Path, source: Source, on_progress: OnProgress | None
+) -> dict[str, np.ndarray]:
+    """The arrays of `path`. What is downloaded lies beside it meanwhile, in files without a name."""
+    layers = [(k, n, part) for k, n in enumerate(source.convolutions) for part in ("weight", "bias")]
+    backbone = {f"conv{k}.{part}": f"features.{n}.{part}" for k, n, part in layers}
+    heads = {f"lin{k}": f"lin{k}.model.1.weight" for k in range(5)}  # [1, C, 1, 1]
+    cure = f"try again, or copy {path.name} from another machine to {path.parent}, or give --lpips FOLDER"
+    expected, weights = shapes(net), {}
+    for url, sha256, keys in (source.heads, "", heads), (source.backbone, source.sha256, backbone):
+        with tempfile.TemporaryFile(dir=path.parent) as file:
+            try:
+                found = _fetch(url, file, on_progress)
+            except (OSError, http.client.HTTPException) as error:
+                if getattr(error, "errno", None) == errno.ENOSPC:
+                    raise
+                raise DataError(f"{url}: cannot be downloaded ({error}); {cure}") from None
+            if not found.startswith(sha256):
+                raise DataError(f"{url}: SHA-256 {found[:8]}, not {sha256}; {cure}")
+            try:
+                state = torch.load(file, map_location="cpu", weights_only=True)
+                for name, key in keys.items():
+                    weights[name] = checked(name, state[key].squeeze().numpy(), expected[name])
+            except Exception as error:  # torch has a class of its own for each kind of failure
+                reason = str(error).partition("\n")[0].partition(". ")[0]
+                raise DataError(f"{url}: not the weights of LPIPS {net} ({reason}); {cure}") from None
+    return weights
+
+
+def _fetch(url: str, file: IO[bytes], on_progress: OnProgress | None) -> str:
+    """Copy what `url` gives into `file`; its SHA-256. Raises OSError or HTTPException."""
+    digest, done = hashlib.sha256(), 0
+    request = Request(url, headers={"User-Agent": "sagesplat"})  # some servers refuse Python's own
+    with urlopen(request, timeout=TIMEOUT) as response:
+        total = int(response.headers["Content-Length"] or 0)
+        while block := response.read(1 << 20):
+            file.write(block)
+            digest.update(block)
+            done += len(block)
+            if on_progress is not None:
+                on_progress(url.rpartition("/")[2], done, total)
+    if done < total:
+        raise OSError(f"ends after {done} of {total} bytes")
+    file.seek(0)
+    return digest.hexdigest()

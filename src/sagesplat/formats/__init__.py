@@ -1,0 +1,1 @@
+"""File formats of splats: PLY, SPZ, levels, increments, and the rounding that they do."""

@@ -1,0 +1,185 @@
+"""Levels on disk: one .npz per level, its arrays by category, at most 79 bytes a Gaussian.
+
+means float32, quats int16, log_scales, logit_opacities and sh0 float16, shN int8 with a square-root scale per
+coefficient. Categories are read one by one, so that a composition touches only what it takes. Reading takes
+up to 32 bytes of memory for each of the file's.
+"""
+
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from sagesplat.core.errors import DataError, short
+from sagesplat.core.gaussians import Gaussians, checked, concat
+from sagesplat.core.sh import num_bases
+from sagesplat.io.files import atomic_path
+from sagesplat.io.npz import Npz
+
+_DAMAGED = (OSError, KeyError, TypeError, ValueError)  # what files raise that are cut off or changed
+_HALVES = ("log_scales", "logit_opacities", "sh0")
+
+
+@dataclass(frozen=True)
+class LevelFile:
+    """One recorded level: what it holds, without its Gaussians."""
+
+    path: Path
+    step: int
+    recovering: bool  # taken soon after an opacity reset
+    sh_degree: int
+    counts: dict[int, int]  # Gaussians by label id
+
+
+def write_level(folder: Path, step: int, g: Gaussians, *, recovering: bool, sh_degree: int) -> Path:
+    """Record Gaussians as a level; harmonics above `sh_degree` (not yet in use) are left out."""
+    path = folder / f"{step:06d}.npz"
+    _write(path, step, g, recovering, sh_degree, {})
+    return path
+
+
+def write_set(
+    path: Path, g: Gaussians, step: int, sizes: Mapping[int, Sequence[int]] | None = None, **more: Any
+) -> None:
+    """Record Gaussians in order; of a nested ladder with its levels' sizes by label id. `more` arrays."""
+    arrays = {f"{label}/sizes": np.array(n, np.int64) for label, n in (sizes or {}).items()}
+    _write(path, step, g, False, g.sh_degree, arrays | {f"more/{k}": np.asarray(v) for k, v in more.items()})
+
+
+def _write(
+    path: Path, step: int, g: Gaussians, recovering: bool, sh_degree: int, more: dict[str, Any]
+) -> None:
+    arrays: dict[str, np.ndarray] = {"meta": np.array([step, recovering, sh_degree], np.int64), **more}
+    for label in g.counts():
+        part = g.of_labels([label])
+        values = {name: p.detach().numpy() for name, p in part.parameters().items()}
+        quats = values["quats"] / np.linalg.norm(values["quats"], axis=1, keepdims=True)
+        coefficients = values["shN"][:, : num_bases(sh_degree) - 1]
+        scale = np.abs(coefficients).max(axis=0, initial=0)
+        share = coefficients / np.where(scale > 0, scale, 1)
+        columns = {
+            "means": values["means"],
+            "quats": np.round(quats * 32767).astype(np.int16),
+            **{name: values[name].astype(np.float16) for name in _HALVES},
+            "shN": np.round(np.sign(share) * np.sqrt(np.abs(share)) * 127).astype(np.int8),
+            "shN_scale": scale.astype(np.float32),
+        }
+        arrays |= {f"{label}/{name}": column for name, column in columns.items()}
+    with atomic_path(path, nbytes=sum(a.nbytes for a in arrays.values())) as temporary:
+        np.savez(temporary, allow_pickle=False, **arrays)
+
+
+def read_sizes(path: Path) -> dict[int, tuple[int, ...]]:
+    """Level sizes of a nested ladder by label id; `DataError` for anything else."""
+    counts = read_header(path).counts
+    with _open(path) as file:
+        try:
+            sizes = {label: tuple(map(int, file[f"{label}/sizes"])) for label in counts}
+        except _DAMAGED as error:
+            raise DataError(
+                f"{path}: not a nested ladder ({short(error)}); run `sagesplat nest` again"
+            ) from None
+    lengths = {len(s) for s in sizes.values()}
+    if (
+        len(lengths) != 1
+        or any(s != tuple(sorted(s)) or s[0] < 0 or s[-1] != counts[i] for i, s in sizes.items() if s)
+        or 0 in lengths
+    ):
+        raise DataError(f"{path}: level sizes that do not fit its Gaussians; run `sagesplat nest` again")
+    return sizes
+
+
+def read_more(path: Path, name: str) -> np.ndarray[Any, Any]:
+    """An array that `write_set` recorded beside the Gaussians; DataError where there is none."""
+    with _open(path) as file:
+        try:
+            return file[f"more/{name}"]
+        except _DAMAGED as error:
+            raise DataError(f"{path}: no {name} in it ({short(error)}); make it again") from None
+
+
+def _open(path: Path) -> Npz:
+    try:
+        return Npz(path)
+    except _DAMAGED as error:
+        raise DataError(
+            f"{path}: not a readable level ({short(error)}); run `sagesplat train` again"
+        ) from None
+
+
+def read_header(path: Path) -> LevelFile:
+    """What a level holds, without reading its Gaussians."""
+    with _open(path) as file:
+        try:
+            step, recovering, degree = (int(value) for value in file["meta"])
+            # of any array: a category whose name is damaged somewhere must not go missing unseen
+            parts = [n.split("/") for n in file.names if n != "meta"]
+            labels = sorted({int(label) for label, *kind in parts if label != "more" and kind != ["sizes"]})
+            counts = {label: len(file[f"{label}/logit_opacities"]) for label in labels}
+            if step < 0 or not 0 <= degree <= 3 or not all(-1 <= label < 2**15 for label in labels):
+                raise ValueError(f"step {step}, degree {degree}, categories {labels}")
+        except _DAMAGED as error:
+            raise DataError(f"{path}: not a level ({short(error)}); run `sagesplat train` again") from None
+    return LevelFile(path, step, bool(recovering), degree, counts)
+
+
+def read_level(path: Path, label_ids: Sequence[int] | None = None) -> Gaussians:
+    """The Gaussians of a level, or only those of some categories; `DataError` for NaN or a broken file."""
+    header = read_header(path)
+    wanted = sorted(header.counts) if label_ids is None else [i for i in label_ids if i in header.counts]
+    parts = []
+    with _open(path) as file:
+        try:
+            parts = [_decode(file, label) for label in wanted]
+        except _DAMAGED as error:
+            raise DataError(f"{path}: a broken level ({short(error)}); run `sagesplat train` again") from None
+    if not parts:
+        return _empty(header.sh_degree)
+    g = concat(parts)
+    for name, parameter in g.parameters().items():
+        if not torch.isfinite(parameter).all():
+            raise DataError(f"{path}: {name} holds NaN or Inf; run `sagesplat train` again")
+    return g
+
+
+def check_level(path: Path) -> None:
+    """`DataError` where a level's arrays are not as they were written, by their CRC-32; takes no memory."""
+    try:
+        with Npz(path), zipfile.ZipFile(path) as archive:
+            broken = archive.testzip()
+    except Exception as error:  # zipfile and zlib have a class for each kind of damage
+        broken = short(error)
+    if broken is not None:
+        raise DataError(f"{path}: a damaged level ({broken}); run `sagesplat train` again")
+
+
+def _decode(file: Npz, label: int) -> Gaussians:
+    def column(name: str) -> np.ndarray:
+        with np.errstate(all="ignore"):  # what is too large for float32 is found later
+            return file[f"{label}/{name}"].astype(np.float32)
+
+    share, scale = column("shN") / 127, column("shN_scale")
+    if share.shape[1:] != scale.shape:
+        raise ValueError(f"scales of shape {scale.shape} for harmonics of {share.shape}")
+    values = {name: column(name) for name in ("means", *_HALVES)}
+    values["quats"] = column("quats") / 32767
+    values["shN"] = np.sign(share) * share**2 * scale
+    labels = torch.full((len(values["means"]),), label, dtype=torch.int16)
+    return checked(Gaussians(**{name: torch.from_numpy(v) for name, v in values.items()}, label_ids=labels))
+
+
+def _empty(sh_degree: int) -> Gaussians:
+    shapes = {
+        "means": (0, 3),
+        "quats": (0, 4),
+        "log_scales": (0, 3),
+        "logit_opacities": (0,),
+        "sh0": (0, 1, 3),
+    }
+    values = {name: torch.zeros(shape) for name, shape in shapes.items()}
+    shN = torch.zeros(0, num_bases(sh_degree) - 1, 3)
+    return Gaussians(**values, shN=shN, label_ids=torch.zeros(0, dtype=torch.int16))

@@ -1,0 +1,147 @@
+"""Splat files in the INRIA layout that 3DGS viewers read, with the category as one more property.
+
+Per Gaussian, little endian float32: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_0.. (all red coefficients,
+then green, then blue), opacity (logit), scale_0..2 (natural log), rot_0..3 (wxyz); then `label` (int16).
+"""
+
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import torch
+
+from sagesplat import __version__
+from sagesplat.core.errors import DataError, short
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.io.files import atomic_path
+from sagesplat.io.ply_header import read_header
+
+ROWS = 4096  # per block: every property of a block stays in the processor's cache
+BASES = (0, 3, 8, 15)  # spherical harmonics beyond the constant one, degree 0 to 3
+
+
+def write_ply(path: Path, gaussians: Gaussians, names: dict[int, str] | None = None) -> None:
+    """Write a labelled scene atomically; `names` (id -> name) goes into the header as comments."""
+    parts = _matrices(gaussians)
+    properties = _properties(gaussians.shN.shape[1])
+    labels = gaussians.label_ids.cpu().numpy()
+    dtype = np.dtype([("values", "<f4", len(properties)), ("label", "<i2")])
+    comments = [f"sagesplat {__version__}"]
+    comments += [f"label {i} {' '.join(name.split())}" for i, name in sorted((names or {}).items())]
+    header = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
+    header += [f"element vertex {len(gaussians)}", *(f"property float {name}" for name in properties)]
+    header += ["property short label", "end_header", ""]
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        file.write("\n".join(header).encode())
+        for start in range(0, len(gaussians), ROWS):
+            rows = slice(start, start + ROWS)
+            block = np.empty(len(labels[rows]), dtype)
+            block["values"] = np.concatenate([part[rows] for part in parts], axis=1)
+            block["label"] = labels[rows]
+            block.tofile(file)
+
+
+def read_ply(path: Path) -> Gaussians:
+    """Read the binary splat PLY of any tool: any order of properties, degree 0 to 3, label -1 without one.
+
+    DataError where a property is missing, the file ends early, or a value is NaN or infinite.
+    """
+    try:
+        with path.open("rb") as file:
+            header = read_header(file)
+            if not header.order:
+                raise DataError(f"{path}: a PLY file as text is not read; save it as binary_little_endian")
+            wanted = _wanted(path, header.dtype)
+            columns, labels = _read_body(path, file, header.dtype, header.count, wanted)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror}); give a splat .ply") from None
+    except ValueError as error:
+        raise DataError(f"{path}: not readable as a PLY file ({short(error)}); give a splat .ply") from None
+    _check_values(path, columns, labels, wanted)
+    return _gaussians(columns, labels)
+
+
+def _properties(bases: int) -> list[str]:
+    """The float properties in INRIA's order for `bases` coefficients a colour beyond the constant one."""
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    names += [f"f_rest_{i}" for i in range(3 * bases)]
+    return [*names, "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+
+
+def _matrices(gaussians: Gaussians) -> list[np.ndarray]:
+    """Float matrices [N, *] whose columns, side by side, are `_properties`."""
+    g = gaussians.detach()
+    count = len(g)
+    parts = [g.means, torch.zeros_like(g.means), g.sh0.reshape(count, 3)]
+    parts += [g.shN.transpose(1, 2).reshape(count, 3 * g.shN.shape[1])]
+    parts += [g.logit_opacities[:, None], g.log_scales, g.quats]
+    return [part.cpu().numpy() for part in parts]
+
+
+def _gaussians(columns: np.ndarray, labels: np.ndarray) -> Gaussians:
+    """Gaussians from float32 columns [P, N] in the order of `_properties` without the normals."""
+    rest = columns[6:-8].reshape(
+        3, (len(columns) - 14) // 3, columns.shape[1]
+    )  # [3, K, N]: all red, all green, all blue
+
+    def rows(part: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(np.moveaxis(part, -1, 0)))
+
+    return Gaussians(
+        means=rows(columns[:3]),
+        quats=rows(columns[-4:]),
+        log_scales=rows(columns[-7:-4]),
+        logit_opacities=rows(columns[-8]),
+        sh0=rows(columns[None, 3:6]),
+        shN=rows(rest.swapaxes(0, 1)),
+        label_ids=torch.from_numpy(labels.astype(np.int16)),
+    )
+
+
+def _wanted(path: Path, dtype: np.dtype) -> list[str]:
+    """The float properties of the file's degree, in the order of `_properties` without the normals."""
+    present = set(dtype.names or ())
+    rest = sum(name.startswith("f_rest_") for name in present)
+    if rest % 3 or rest // 3 not in BASES:
+        allowed = ", ".join(str(3 * bases) for bases in BASES)
+        raise DataError(f"{path}: {rest} f_rest properties; degree 0 to 3 has one of {allowed}")
+    wanted = [name for name in _properties(rest // 3) if name not in ("nx", "ny", "nz")]
+    if missing := [name for name in wanted if name not in present]:
+        named = ", ".join(missing[:4]) + (", ..." if len(missing) > 4 else "")
+        raise DataError(f"{path}: {len(missing)} splat properties missing ({named}); give a 3DGS .ply")
+    return wanted
+
+
+def _read_body(
+    path: Path, file: BinaryIO, dtype: np.dtype, count: int, wanted: list[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The wanted columns as float32 [P, N] and the labels [N]."""
+    present = (path.stat().st_size - file.tell()) // dtype.itemsize
+    if present < count:
+        raise DataError(
+            f"{path}: {count} Gaussians promised, {present} there; the file is cut off, copy it again"
+        )
+    columns = np.empty((len(wanted), count), np.float32)
+    labels = np.full(count, -1, np.int64)
+    labelled = "label" in (dtype.names or ()) and dtype["label"].kind in "iu"
+    for start in range(0, count, ROWS):
+        rows = slice(start, min(start + ROWS, count))
+        block = np.fromfile(file, dtype, rows.stop - start)
+        with np.errstate(over="ignore"):  # a double too large for float32 is then reported as infinite
+            for column, name in zip(columns, wanted, strict=True):
+                column[rows] = block[name]
+        if labelled:
+            labels[rows] = block["label"]
+    return columns, labels
+
+
+def _check_values(path: Path, columns: np.ndarray, labels: np.ndarray, wanted: list[str]) -> None:
+    for column, name in zip(columns, wanted, strict=True):
+        if bad := int(np.count_nonzero(~np.isfinite(column))):
+            raise DataError(f"{path}: {bad} values of {name} are NaN or infinite; export the scene again")
+    if bad := int(np.count_nonzero(~columns[-4:].any(axis=0))):
+        raise DataError(
+            f"{path}: {bad} Gaussians have a rotation (rot_0..3) of zeros; export the scene again"
+        )
+    if bad := int(np.count_nonzero((labels < -1) | (labels > 32767))):
+        raise DataError(f"{path}: {bad} values of label are outside -1..32767; export the scene again")

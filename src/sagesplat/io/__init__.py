@@ -1,0 +1,1 @@
+"""Reading and writing without losing anything: atomic files, locks, bounded archives, tables."""

@@ -1,0 +1,1 @@
+"""Image quality: SSIM, PSNR, LPIPS, and the training loss, on the CPU and in Triton."""

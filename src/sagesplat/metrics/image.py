@@ -1,0 +1,114 @@
+"""Image quality: SSIM maps, PSNR, their means over label masks, and the training loss."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Int
+from numba import get_num_threads
+from torch import Tensor
+
+from sagesplat.kernels.workspace import Workspace
+from sagesplat.metrics import ssim_cpu
+
+SSIM_WEIGHT = 0.2  # of the published 3DGS loss: 0.8 L1 + 0.2 (1 - SSIM)
+
+
+def _scratch(width: int, space: Workspace) -> np.ndarray:
+    return space.take("ssim scratch", get_num_threads(), ssim_cpu.scratch_size(width))
+
+
+def _maps(
+    x: np.ndarray, y: np.ndarray, tile_mask: np.ndarray | None, space: Workspace
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """SSIM [C, H, W], its derivatives, the tiles that count, and the sum over those by the size of all."""
+    height, width, channels = x.shape
+    wide, sums = ssim_cpu.padded(width), np.empty((channels, ssim_cpu.strips(height)))
+    values = space.take("ssim", channels, height, wide)
+    derivatives = space.take("ssim derivatives", 3, channels, height, wide)
+    tiles = ssim_cpu.all_tiles(height, width) if tile_mask is None else tile_mask
+    ssim_cpu.compare(x, y, tiles, _scratch(width, space), values, derivatives, sums)
+    return values[..., :width], derivatives, tiles, float(sums.sum()) / x.size
+
+
+def ssim_map(
+    x: Float32[np.ndarray, "H W 3"],
+    y: Float32[np.ndarray, "H W 3"],
+    tile_mask: Bool[np.ndarray, "h w"] | None = None,
+) -> Float32[np.ndarray, "H W"]:
+    """SSIM at every pixel, averaged over the channels; images in [0, 1], 11x11 window, zero padding.
+
+    Outside a `tile_mask` (see `photometric_loss`) it is 0.
+    """
+    values, *_ = _maps(np.ascontiguousarray(x), np.ascontiguousarray(y), tile_mask, Workspace())
+    return values.mean(0)
+
+
+def squared_error_map(
+    x: Float32[np.ndarray, "H W 3"], y: Float32[np.ndarray, "H W 3"]
+) -> Float32[np.ndarray, "H W"]:
+    """Squared error at every pixel, averaged over the channels."""
+    return np.square(x - y).mean(-1)
+
+
+def psnr(mean_squared_error: float | np.ndarray) -> Any:
+    """Decibels of a mean squared error of images in [0, 1]; at most 100."""
+    return -10.0 * np.log10(np.maximum(mean_squared_error, 1e-10))
+
+
+def means_by_label(
+    values: Float[np.ndarray, "H W"], label_ids: Int[np.ndarray, "H W"]
+) -> dict[int, tuple[float, int]]:
+    """Mean of a map over each label's pixels, and how many there are, by label id."""
+    lowest = int(label_ids.min(initial=0))
+    shifted = label_ids.ravel().astype(np.int64) - lowest
+    counts = np.bincount(shifted)
+    sums = np.bincount(shifted, weights=values.ravel())
+    return {int(i) + lowest: (float(sums[i] / counts[i]), int(counts[i])) for i in np.flatnonzero(counts)}
+
+
+class _PhotometricLoss(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        rgb: Tensor,
+        photo: Tensor,
+        ssim_weight: float,
+        tile_mask: np.ndarray | None,
+        space: Workspace,
+    ) -> Tensor:
+        x, y = rgb.detach().contiguous().numpy(), photo.contiguous().numpy()
+        height, width, channels = x.shape
+        _, derivatives, tiles, quality = _maps(x, y, tile_mask, space)
+        grad, errors = space.take("ssim gradient", *x.shape), np.empty((channels, ssim_cpu.strips(height)))
+        scales = np.float32(-ssim_weight / x.size), np.float32((1 - ssim_weight) / x.size)
+        ssim_cpu.gradient(x, y, tiles, _scratch(width, space), derivatives, *scales, grad, errors)
+        ctx.grad = torch.from_numpy(grad)
+        l1, share = float(errors.sum()) / x.size, ssim_cpu.covered(tiles, height, width)
+        return torch.tensor((1 - ssim_weight) * l1 + ssim_weight * (share - quality))
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor):
+        return ctx.grad * grads[0], None, None, None, None
+
+
+def photometric_loss(
+    rgb: Float[Tensor, "H W 3"],
+    photo: Float[Tensor, "H W 3"],
+    ssim_weight: float = SSIM_WEIGHT,
+    tile_mask: Bool[np.ndarray, "h w"] | Bool[Tensor, "h w"] | None = None,
+    workspace: Workspace | None = None,
+) -> Tensor:
+    """(1 - w) L1 + w (1 - SSIM), as 3DGS trains; differentiable by `rgb`.
+
+    `tile_mask` [ceil(H/16), ceil(W/16)]: tiles that are false leave the loss: they add nothing to the sum
+    (which is divided by the number of all pixels), and the windows of others see the photo there.
+    With a `workspace`, go backward before the next call with it. On a GPU the photo may be uint8, and the
+    mask is a tensor there.
+    """
+    if rgb.is_cuda:
+        from sagesplat.metrics import ssim_triton
+
+        assert not isinstance(tile_mask, np.ndarray)
+        return ssim_triton.photometric_loss(rgb, photo, ssim_weight, tile_mask)
+    return _PhotometricLoss.apply(rgb, photo, ssim_weight, tile_mask, workspace or Workspace())  # type: ignore[return-value]

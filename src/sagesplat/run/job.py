@@ -1,0 +1,181 @@
+"""A run folder being worked on, and what its stages share."""
+
+import hashlib
+from contextlib import ExitStack
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from sagesplat.adapt.ladder import Ladder, SnapshotLadder, read_ladder, read_prefixes
+from sagesplat.core.config import FitConfig
+from sagesplat.core.errors import RunError
+from sagesplat.core.events import Emit
+from sagesplat.io.files import read_json
+from sagesplat.raster import Backend
+from sagesplat.run.executor import LOCAL, Executor, Local
+from sagesplat.run.run_dir import RunDir, settings_of
+from sagesplat.scene import load_scene
+from sagesplat.scene.images import Photos
+from sagesplat.scene.scene import Scene
+from sagesplat.segment.lift import LiftedLabels
+from sagesplat.segment.masks import Masks, Taxonomy
+from sagesplat.train import memory
+
+_PIECES = 2  # of work for each task that can run: the slower ones then have less to wait for
+_LOCK_WAIT = 60.0  # seconds that a task waits for one which a killed run left behind
+NO_RUN = "not a run folder (no scene.json); begin with `sagesplat run SCENE RUN`"
+
+
+@dataclass(frozen=True)
+class Job:
+    """A run folder being worked on, and what its stages share."""
+
+    run: RunDir
+    emit: Emit
+    backend: Backend = "auto"
+    threads: int = 1
+    force: bool = False
+    processes: int = 1  # that train together
+    device: str = "auto"  # where networks compute
+    memory_limit: int = 0  # bytes that training may use (0: what the machine has, but for a margin)
+    locks: ExitStack | None = None  # keeps the run folder locked between stages (else within each)
+    executor: Executor = LOCAL  # of pieces that do not depend on each other
+    lock_wait: float = 0.0  # seconds to wait for who has the run folder
+
+    @property
+    def spec(self) -> "JobSpec":
+        """What another process needs to open the same job."""
+        spec = JobSpec(**{f.name: getattr(self, f.name) for f in fields(JobSpec)})
+        return replace(
+            spec,
+            run=replace(self.run, path=self.run.path.absolute()),
+            backend=self.executor.backend or self.backend,
+            memory_limit=self.memory_limit or self.executor.memory,
+        )
+
+    @property
+    def gpus(self) -> float:
+        """GPUs that a task of this job computes on."""
+        return float(self.spec.backend == "cuda")
+
+    @property
+    def pieces(self) -> int:
+        """What to divide work by that one task would do as well."""
+        return 1 if isinstance(self.executor, Local) else _PIECES * self.executor.parallel
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The capture that scene.json names, unchanged since."""
+        if not self.run.scene.exists():
+            raise RunError(f"{self.run.path}: {NO_RUN}")
+        made = read_json(self.run.scene)
+        scene = load_scene(Path(made["path"]), **made["settings"])
+        if fingerprint(scene) != made["fingerprint"]:
+            raise RunError(
+                f"{made['path']}: the capture changed since this run began; choose another run folder"
+            )
+        return scene
+
+    @cached_property
+    def photos(self) -> Photos:
+        """The photos, loaded when asked for."""
+        return Photos(self.scene.views, memory.photo_cache(self.memory_limit))
+
+    @property
+    def has_blocks(self) -> bool:
+        """Whether the scene is trained in blocks."""
+        return (self.run.blocks / "blocks.json").exists()
+
+    @property
+    def has_parts(self) -> bool:
+        """Whether each category in each block is one of its own by now."""
+        return (self.run.parts / "labels.json").exists()
+
+    @property
+    def taxonomy(self) -> Taxonomy:
+        """The names of the run's categories."""
+        return Taxonomy.read((self.run.parts if self.has_parts else self.run.masks) / "labels.json")
+
+    @cached_property
+    def masks(self) -> Masks:
+        """The label images before fusion, loaded when asked for."""
+        return Masks(self.run.masks, Taxonomy.read(self.run.masks / "labels.json"))
+
+    @property
+    def whole_masks(self) -> Masks:
+        """The label images that all views agreed on, if they were asked to."""
+        fused = self.run.fused
+        return Masks(fused, self.masks.taxonomy) if (fused / "labels.json").exists() else self.masks
+
+    @property
+    def best_masks(self) -> Masks:
+        """The same, of the parts that a scene in blocks has."""
+        return Masks(self.run.parts, self.taxonomy) if self.has_parts else self.whole_masks
+
+    @property
+    def point_labels(self) -> np.ndarray:
+        """Category of each SfM point."""
+        path = self.run.part_labels if self.has_parts else self.run.labels
+        return LiftedLabels.read(path, len(self.scene.points.xyz)).label_ids
+
+    @cached_property
+    def snapshots(self) -> SnapshotLadder:
+        """The levels that training recorded."""
+        return read_ladder(self.run.levels)
+
+    @cached_property
+    def ladder(self) -> Ladder:
+        """The levels to choose from: prefixes of the nested model, or the snapshots."""
+        return read_prefixes(self.run.prefixes) if self.run.ladder == "nested" else self.snapshots
+
+    @cached_property
+    def antialiased(self) -> bool:
+        """Whether the run's Gaussians are drawn with the antialiasing filter."""
+        return bool(settings_of(self.run, "train")["antialiased"])
+
+    @property
+    def fit_config(self) -> FitConfig:
+        """How the run's levels were observed and its models fitted."""
+        made = settings_of(self.run, "observe") | settings_of(self.run, "fit")
+        return FitConfig(**{f.name: made[f.name] for f in fields(FitConfig) if f.name in made})
+
+    def names(self) -> dict[int, str]:
+        """Category names by id, the unlabelled one included."""
+        return {**self.taxonomy.names, -1: self.taxonomy.name(-1)}
+
+
+@dataclass(frozen=True)
+class JobSpec:
+    """A job without what only one process has: what a task takes along (see `Job`)."""
+
+    run: RunDir
+    backend: Backend
+    threads: int
+    force: bool
+    processes: int
+    device: str
+    memory_limit: int
+
+    def open(self, emit: Emit) -> Job:
+        """The job, in this process."""
+        made = {f.name: getattr(self, f.name) for f in fields(self)}
+        return Job(emit=emit, lock_wait=_LOCK_WAIT, **made)
+
+
+def fingerprint(scene: Scene) -> str:
+    """Changes when the poses, the points or the set of photos do."""
+    digest = hashlib.sha256()
+    for view in scene.views:
+        size = view.image_path.stat().st_size
+        digest.update(f"{view.name} {size} {view.camera.width} {view.camera.height}".encode())
+        digest.update(view.camera.w2c.tobytes() + view.camera.K.tobytes())
+        if any(view.camera.background):
+            digest.update(bytes(view.camera.background))
+    digest.update(scene.points.xyz.tobytes())
+    if scene.test_names is not None:
+        digest.update("\n".join(sorted(scene.test_names)).encode())
+    if scene.calibration_names is not None:
+        digest.update("\n".join(["", *sorted(scene.calibration_names)]).encode())
+    return digest.hexdigest()

@@ -1,0 +1,282 @@
+"""A run folder: the names of everything in it, and what each result was made from."""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from sagesplat import __version__
+from sagesplat.core.errors import RunError
+from sagesplat.io.files import read_json, write_json
+
+FORMAT = 2  # of the run folder; raised when older folders can no longer be read
+
+LadderKind = Literal["nested", "snapshots"]
+# stages that all ladders of a run share
+_BEFORE_LADDERS = ("poses", "scene", "segment", "masks", "lift", "blocks", "train", "fuse", "parts")
+
+
+@dataclass(frozen=True)
+class RunDir:
+    """Paths inside a run folder. What is made of a ladder lies in a folder of the ladder's name."""
+
+    path: Path
+    ladder: LadderKind = "nested"
+
+    @property
+    def adapted(self) -> Path:
+        """What is made of the ladder."""
+        return self.path / self.ladder
+
+    @property
+    def scene(self) -> Path:
+        """Where the capture is and how it is read."""
+        return self.path / "scene.json"
+
+    @property
+    def masks(self) -> Path:
+        """Label images at training size, with labels.json."""
+        return self.path / "masks"
+
+    @property
+    def capture(self) -> Path:
+        """The folder of the capture that was made of photos without poses."""
+        return self.path / "capture"
+
+    @property
+    def segmented(self) -> Path:
+        """Label images as they came, before categories were merged or left out."""
+        return self.path / "segmented"
+
+    @property
+    def soft(self) -> Path:
+        """A network's probabilities, of the categories in `segmented`."""
+        return self.path / "soft"
+
+    @property
+    def fused(self) -> Path:
+        """Label images on which all views agree."""
+        return self.path / "fused"
+
+    @property
+    def labels(self) -> Path:
+        """Labels of the SfM points."""
+        return self.path / "labels.npz"
+
+    @property
+    def levels(self) -> Path:
+        """The recorded levels."""
+        return self.path / "levels"
+
+    @property
+    def checkpoint(self) -> Path:
+        """Where training goes on."""
+        return self.path / "checkpoint.npz"
+
+    @property
+    def cap(self) -> Path:
+        """The cap of Gaussians that training began with, lowered to the memory there was."""
+        return self.path / "cap.json"
+
+    @property
+    def frozen(self) -> Path:
+        """Steps at which categories stopped during training."""
+        return self.path / "frozen.json"
+
+    @property
+    def blocks(self) -> Path:
+        """The run folders of a large scene's blocks, with blocks.json."""
+        return self.path / "blocks"
+
+    def block(self, number: int) -> "RunDir":
+        """The run folder of a block."""
+        return RunDir(self.blocks / f"{number:03d}", self.ladder)
+
+    @property
+    def core(self) -> Path:
+        """Of a block: what it adds to the nested ladder of the whole."""
+        return self.adapted / "core.npz"
+
+    @property
+    def seamed(self) -> Path:
+        """Of a block: the same, tuned along its borders."""
+        return self.adapted / "seamed.npz"
+
+    @property
+    def parts(self) -> Path:
+        """Label images of the parts of a large scene, a category in a block each, and their points."""
+        return self.path / "parts"
+
+    @property
+    def part_labels(self) -> Path:
+        """Part of each SfM point."""
+        return self.parts / "labels.npz"
+
+    @property
+    def prefixes(self) -> Path:
+        """The nested ladder: one ordered set of Gaussians, its levels prefixes of it."""
+        return self.adapted / "ladder.npz"
+
+    @property
+    def seeds(self) -> Path:
+        """The small model that the nested ladder begins with."""
+        return self.adapted / "seeds.npz"
+
+    @property
+    def chunks(self) -> Path:
+        """What each level of each category adds, as it is sent, with index.json."""
+        return self.adapted / "chunks"
+
+    @property
+    def nest_checkpoint(self) -> Path:
+        """Where training on compositions goes on."""
+        return self.adapted / "checkpoint.npz"
+
+    @property
+    def observations(self) -> Path:
+        """Quality per category, level and view."""
+        return self.adapted / "observations.csv"
+
+    @property
+    def models(self) -> Path:
+        """Eq. 3 per category and level."""
+        return self.adapted / "models.json"
+
+    @property
+    def promises(self) -> Path:
+        """Quality per category and level at any viewpoint, with its lower bound."""
+        return self.adapted / "promises.json"
+
+    @property
+    def plan(self) -> Path:
+        """Levels chosen."""
+        return self.adapted / "plan.json"
+
+    @property
+    def composed(self) -> Path:
+        """The scene that the plan chose."""
+        return self.adapted / "composed.ply"
+
+    @property
+    def evaluation(self) -> Path:
+        """Composed scenes on test views."""
+        return self.adapted / "evaluation.csv"
+
+    @property
+    def cross_view(self) -> Path:
+        """Unseen views, each with a plan of its own."""
+        return self.adapted / "cross_view.csv"
+
+    @property
+    def occupancy(self) -> Path:
+        """Compositions and 3DGS of the same size."""
+        return self.adapted / "occupancy.csv"
+
+    @property
+    def report(self) -> Path:
+        """The report's folder."""
+        return self.adapted / "report"
+
+    @property
+    def paper(self) -> Path:
+        """The paper's tables and figures."""
+        return self.report / "paper"
+
+    def provenance(self, stage: str) -> Path:
+        """What a stage's result was made from."""
+        folder = self.path if stage in _BEFORE_LADDERS else self.adapted
+        return folder / "provenance" / f"{stage}.json"
+
+
+def file_hash(path: Path) -> str:
+    """SHA-256 of a file, or of all files of a folder with their names."""
+    digest = hashlib.sha256()
+    for file in sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]:
+        if path.is_dir():
+            digest.update(str(file.relative_to(path)).encode())
+        with file.open("rb") as stream:
+            digest.update(hashlib.file_digest(stream, "sha256").digest())
+    return digest.hexdigest()
+
+
+def _hashes(path: Path) -> list[str]:
+    """What an input is known by: of a stage's record first without its seconds, which differ each time."""
+    plain = file_hash(path)
+    if path.parent.name != "provenance":
+        return [plain]
+    kept = {key: value for key, value in read_json(path).items() if key != "seconds"}
+    return [hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest(), plain]
+
+
+def is_done(
+    run: RunDir,
+    stage: str,
+    settings: Mapping[str, Any],
+    inputs: Sequence[Path],
+    outputs: Sequence[Path],
+    force: bool,
+) -> bool:
+    """Whether a stage's result is there, made with these settings from these inputs.
+
+    A result made otherwise is never overwritten without `force`: RunError says what differs.
+    """
+    record = run.provenance(stage)
+    if not record.exists() or not all(p.exists() for p in outputs):
+        return False
+    made = read_json(record)
+    if not isinstance(made, dict):
+        raise RunError(f"{record}: not the record of a stage; run it again with --force")
+    if made.get("format") != FORMAT:
+        raise RunError(
+            f"{run.path}: a run folder of format {made.get('format')}, this sagesplat ({__version__}) reads "
+            f"{FORMAT}; choose another run folder"
+        )
+    differs = _differences(made, settings, {p.name: _hashes(p) for p in inputs})
+    if not differs:
+        return True
+    if not force:
+        raise RunError(
+            f"{outputs[0]}: made with other {differs}; choose another run folder, or add --force to redo it"
+        )
+    return False
+
+
+def settings_of(run: RunDir, stage: str) -> dict[str, Any]:
+    """The settings that a finished stage was made with."""
+    if not run.provenance(stage).exists():
+        raise RunError(f"{run.path}: stage {stage} is not done; run `sagesplat {stage}` or `sagesplat run`")
+    made = read_json(run.provenance(stage))
+    if not isinstance(made, dict) or not isinstance(made.get("settings"), dict):
+        raise RunError(f"{run.provenance(stage)}: not the record of a stage; run it again with --force")
+    return made["settings"]
+
+
+def _differences(made: dict[str, Any], settings: Mapping[str, Any], inputs: Mapping[str, list[str]]) -> str:
+    """A few words on what changed since a result was made; empty = nothing."""
+    old = made.get("settings", {})
+    changed = [f"{k} ({old.get(k)} then, {v} now)" for k, v in settings.items() if old.get(k) != v]
+    changed += [
+        f"{name} (its content changed)"
+        for name, hashes in inputs.items()
+        if made.get("inputs", {}).get(name) not in hashes
+    ]
+    return ", ".join(changed[:3])
+
+
+def record(
+    run: RunDir, stage: str, settings: Mapping[str, Any], inputs: Sequence[Path], seconds: float
+) -> None:
+    """Write down what a finished stage's result was made from."""
+    write_json(
+        run.provenance(stage),
+        {
+            "format": FORMAT,
+            "stage": stage,
+            "version": __version__,
+            "seconds": round(seconds, 2),
+            "settings": dict(settings),
+            "inputs": {p.name: _hashes(p)[0] for p in inputs},
+        },
+    )

@@ -1,0 +1,349 @@
+"""Large scenes: blocks of the ground plane are trained by themselves and put together.
+
+A block is a run folder of its own, RUN/blocks/NNN, whose capture is a part of the scene: it is trained and
+nested like any other, on whatever node, and goes on where it was killed. Put together, each category in each
+block is a category of its own (`segment.parts`), which all later stages take as they take any other.
+"""
+
+import shutil
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from sagesplat.adapt.ladder import read_ladder, read_prefixes
+from sagesplat.adapt.observe import RenderedLabels
+from sagesplat.core.config import BlocksConfig, NestConfig, TrainConfig
+from sagesplat.core.errors import RunError
+from sagesplat.core.events import Emit, Progress, named
+from sagesplat.core.gaussians import Gaussians, concat
+from sagesplat.formats.levels import read_level, read_more, read_sizes, write_level, write_set
+from sagesplat.io.files import link, read_json, write_json
+from sagesplat.run.executor import Task, results
+from sagesplat.run.job import Job, JobSpec, fingerprint
+from sagesplat.run.run_dir import RunDir, file_hash
+from sagesplat.run.stage import run_stage
+from sagesplat.scene.blocks import (
+    Blocks,
+    colours,
+    part_of,
+    read_blocks,
+    split,
+    views_of,
+    visible_shares,
+    write_blocks,
+)
+from sagesplat.scene.scene import Scene
+from sagesplat.scene.stored import write_scene
+from sagesplat.segment.lift import LiftedLabels
+from sagesplat.segment.masks import mask_path, prepare_folder, write_labels, write_mask
+from sagesplat.segment.parts import Parts
+from sagesplat.stages.nest import nest_levels, write_ladder
+from sagesplat.stages.shared import train_config
+from sagesplat.stages.train import train_levels
+from sagesplat.train import memory, nested
+from sagesplat.train.boundaries import around, core, core_sizes, seam_views, together
+from sagesplat.train.nested import Nested, NestStep
+
+_SEEN = 0.01  # of the points in a photo: then it sees the block
+
+
+def check(config: BlocksConfig) -> None:
+    """RunError for settings that cannot be."""
+    wrong = (
+        ("count", config.count, config.count >= 1, "1 or more"),
+        ("margin", config.margin, 0 <= config.margin <= 2, "a share such as 0.2"),
+        ("min-share", config.min_share, 0 < config.min_share <= 1, "a share such as 0.25"),
+        ("far-share", config.far_share, config.far_share >= 0, "a share such as 0.5"),
+        ("seam-steps", config.seam_steps, config.seam_steps >= 0, "0 or more"),
+    )
+    for name, value, fine, cure in wrong:
+        if not fine:
+            raise RunError(f"--blocks.{name} {value} is impossible; choose {cure}")
+
+
+def _division(config: BlocksConfig) -> dict[str, float]:
+    """The settings that decide what a block is trained on."""
+    return {name: value for name, value in asdict(config).items() if name != "seam_steps"}
+
+
+def divide(job: Job, config: BlocksConfig, seed: int) -> Blocks:
+    """Divide the scene, and make a run folder for each block with its part of the capture."""
+    run, file = job.run, job.run.blocks / "blocks.json"
+    settings = {**_division(config), "seed": seed}
+
+    def make() -> list[str]:
+        scene = job.scene
+        blocks = split(scene, config.count, config.margin)
+        of_points = blocks.of(scene.points.xyz)
+        shares = visible_shares(scene, of_points, len(blocks))
+        assigned = views_of(scene, blocks, shares, config.min_share)
+        training = np.isin(np.arange(len(scene.views)), scene.train_ids)
+        labels = LiftedLabels.read(run.labels, len(scene.points.xyz))
+        sees: list[list[int]] = []
+        for number in range(len(blocks)):
+            rows = np.flatnonzero(assigned[:, number] & training).tolist()
+            sees.append(np.flatnonzero((shares[rows] >= _SEEN).any(0)).tolist())
+            part, kept = part_of(scene, blocks, number, rows, config.far_share, seed)
+            _begin(run.block(number), part, labels, kept)
+        for old in run.blocks.glob("[0-9]*"):
+            if int(old.name) >= len(blocks):
+                shutil.rmtree(old)
+        views = (assigned & training[:, None]).sum(0)
+        points = np.bincount(of_points, minlength=len(blocks))
+        write_blocks(file, blocks, views=views.tolist(), points=points.tolist(), sees=sees)
+        return [
+            f"{len(blocks)} blocks of {points.min():,} to {points.max():,} points and {views.min()} to "
+            f"{views.max()} training views, {views.sum() / max(training.sum(), 1):.2f} blocks a view"
+        ]
+
+    inputs = [run.scene, run.labels, run.provenance("masks")]
+    run_stage(job, "blocks", settings, inputs, [file], make)
+    return read_blocks(file)
+
+
+def _begin(run: RunDir, scene: Scene, labels: LiftedLabels, rows: np.ndarray) -> None:
+    """A run folder with everything that training needs."""
+    run.path.mkdir(parents=True, exist_ok=True)
+    capture = run.path / "capture.npz"
+    write_scene(capture, scene)
+    mine = LiftedLabels(labels.label_ids[rows], labels.num_votes[rows], labels.num_agreeing[rows])
+    mine.write(run.labels)
+    stored = {"path": str(capture.resolve()), "settings": {}, "fingerprint": fingerprint(scene)}
+    write_json(run.scene, {**stored, "extent": scene.extent, "points": len(rows), "views": []})
+
+
+def _share_masks(job: Job, block: Job) -> None:
+    """Give a block the label images of its views, and what they were made from, as links."""
+    run, source = block.run, job.whole_masks.folder
+    fused = source == job.run.fused
+    target = run.fused if fused else run.masks
+    files = [mask_path(source, view).relative_to(source) for view in block.scene.views]
+    for name in [*files, Path("labels.json")]:
+        link(source / name, target / name)
+    if fused:
+        link(job.run.provenance("fuse"), run.provenance("fuse"))
+        link(job.run.masks / "labels.json", run.masks / "labels.json")
+
+
+def _spec(job: Job, number: int) -> JobSpec:
+    return replace(job.spec, run=job.run.block(number))
+
+
+def _job_of(job: Job, number: int) -> Job:
+    return _spec(job, number).open(job.emit)
+
+
+def _needed(block: Job, config: TrainConfig) -> int:
+    """Bytes that the training of a block is expected to need (0 on a GPU, whose memory is its own)."""
+    if block.gpus:
+        return 0
+    return memory.fit(block.scene, config, block.memory_limit, processes=block.processes).needed
+
+
+def train_blocks(job: Job, config: BlocksConfig, train: TrainConfig, seed: int) -> None:
+    """Divide the scene, train its blocks as tasks, and put their levels together."""
+    run = job.run
+    settings = {**asdict(train), "batch": max(train.batch, job.processes), "seed": seed}
+    settings["blocks"] = _division(config)
+    blocks = divide(job, config, seed)
+    parts = Parts(job.masks.taxonomy, len(blocks))
+
+    def make() -> list[str]:
+        tasks = []
+        for number in range(len(blocks)):
+            block = _job_of(job, number)
+            _share_masks(job, block)
+            what = (_spec(job, number), number, train, seed)
+            tasks.append(Task(f"block {number}", train_block, what, job.gpus, _needed(block, train)))
+        results(job.executor, tasks, job.emit)
+        merged = _merge_levels(run, blocks, parts)
+        return [f"{merged:,} Gaussians of {len(blocks)} blocks"]
+
+    inputs = [run.scene, run.labels, run.blocks / "blocks.json"]
+    run_stage(job, "train", settings, inputs, [run.levels], make)
+
+
+def train_block(spec: JobSpec, number: int, config: TrainConfig, seed: int, emit: Emit) -> None:
+    """Train one block, in its run folder."""
+    train_levels(spec.open(named(emit, f"block {number}")), config, seed)
+
+
+def _merge_levels(run: RunDir, blocks: Blocks, parts: Parts) -> int:
+    """Record the levels of all blocks together, each inside its border; the size of the last one."""
+    ladders = [read_ladder(run.block(number).levels) for number in range(len(blocks))]
+    shutil.rmtree(run.levels, ignore_errors=True)
+    count = 0
+    for step in sorted({level for ladder in ladders for level in ladder.levels}):
+        # blocks in which all categories stopped have ended before
+        files = [[f for f in ladder.files if f.step <= step][-1:] for ladder in ladders]
+        cores = [
+            core(read_level(f.path), blocks, parts, number)[0]
+            for number, found in enumerate(files)
+            for f in found
+        ]
+        flat = [f for found in files for f in found]
+        g = concat(cores)
+        write_level(
+            run.levels, step, g, recovering=any(f.recovering for f in flat),
+            sh_degree=max(f.sh_degree for f in flat),
+        )  # fmt: skip
+        count = len(g)
+    frozen = {}
+    for number in range(len(blocks)):
+        for label, step in read_json(run.block(number).frozen).items():
+            frozen[str(int(parts.ids(np.array(int(label)), number)))] = step
+    write_json(run.frozen, frozen)
+    return count
+
+
+def make_parts(job: Job) -> None:
+    """Draw which part each pixel shows: its category, in the block whose Gaussians paint most of it."""
+    run = job.run
+    blocks, masks = read_blocks(run.blocks / "blocks.json"), job.whole_masks
+    parts = Parts(masks.taxonomy, len(blocks))
+
+    def make() -> list[str]:
+        scene, names = job.scene, parts.names
+        g = job.snapshots.load(job.snapshots.levels[-1])
+        by_block = replace(g, label_ids=torch.from_numpy(parts.block_of(g.label_ids.numpy())))
+        painted = RenderedLabels(by_block, job.backend, job.antialiased)
+        shutil.rmtree(run.parts, ignore_errors=True)
+        paths = prepare_folder(run.parts, scene.views)
+        occurring = set(g.counts())
+        for row, (view, path) in enumerate(zip(scene.views, paths, strict=True)):
+            shown = painted[view]
+            own = int(blocks.of(view.camera.position[None])[0])
+            part_ids = parts.ids(masks[view], np.where(shown < 0, own, shown))
+            write_mask(path, part_ids, names)
+            occurring |= set(np.unique(part_ids).tolist())
+            job.emit(Progress("parts", row + 1, len(scene.views)))
+        lifted = LiftedLabels.read(run.labels, len(scene.points.xyz))
+        ids = parts.ids(lifted.label_ids, blocks.of(scene.points.xyz))
+        replace(lifted, label_ids=ids).write(run.part_labels)
+        write_labels(run.parts, names, occurring | set(np.unique(ids).tolist()))
+        return [f"{len(occurring)} parts of {len(masks.taxonomy.names)} categories in {len(blocks)} blocks"]
+
+    inputs = [run.provenance("masks"), run.labels, run.levels, run.blocks / "blocks.json"]
+    if masks.folder == run.fused:
+        inputs.append(run.provenance("fuse"))
+    run_stage(job, "parts", {}, inputs, [run.parts / "labels.json", run.part_labels], make)
+
+
+def nest_blocks(job: Job, config: BlocksConfig, nest: NestConfig, seed: int) -> None:
+    """Make the nested ladders of the blocks, tune them along their borders, and put them together."""
+    run, file = job.run, job.run.blocks / "blocks.json"
+    nested.check(nest)
+    blocks = read_blocks(file)
+    settings = {**asdict(nest), "seed": seed, "seam_steps": config.seam_steps}
+
+    def make() -> list[str]:
+        every = range(len(blocks))
+        for number in every:
+            _share_masks(job, _job_of(job, number))
+        tasks = [
+            Task(f"block {i}", nest_block, (_spec(job, i), file, i, nest, seed), job.gpus) for i in every
+        ]
+        results(job.executor, tasks, job.emit)
+        files = [run.block(number).core for number in every]
+        if config.seam_steps:
+            files = _tune(job, blocks, config, nest, seed)
+        g, sizes, clarity = together(files)
+        lines = write_ladder(job, g, sizes, nest, clarity)
+        return [*lines, f"{len(blocks)} blocks, {config.seam_steps} steps along the borders of each"]
+
+    inputs = [run.scene, run.labels, run.levels, run.provenance("parts"), file]
+    run_stage(job, "nest", settings, inputs, [run.prefixes, run.chunks], make)
+
+
+def nest_block(
+    spec: JobSpec, partition: Path, number: int, config: NestConfig, seed: int, emit: Emit
+) -> None:
+    """Make the nested ladder of one block, and what of it is inside the block's border."""
+    job = spec.open(named(emit, f"block {number}"))
+    run = job.run
+    nest_levels(job, config, seed)
+
+    def make() -> list[str]:
+        blocks = read_blocks(partition)
+        parts = Parts(job.masks.taxonomy, len(blocks))
+        whole = read_prefixes(run.prefixes)
+        g, inside = core(whole.gaussians, blocks, parts, number)
+        if not len(g):
+            raise RunError(f"{run.path}: no Gaussians inside the block; choose fewer with --blocks.count")
+        labels, clarity = whole.gaussians.label_ids.numpy(), read_more(run.prefixes, "clarity")
+        sizes = core_sizes(labels, inside, whole.sizes, parts, number)
+        write_set(run.core, g, config.steps, sizes, clarity=clarity[inside])
+        return [f"{len(g):,} of {len(whole.gaussians):,} Gaussians are inside the block"]
+
+    run_stage(job, "core", {}, [run.prefixes, partition], [run.core], make)
+
+
+def _tune(job: Job, blocks: Blocks, config: BlocksConfig, nest: NestConfig, seed: int) -> list[Path]:
+    """Tune the blocks along their borders: neighbours one after the other, others at once."""
+    run, every = job.run, range(len(blocks))
+    files = [run.block(number).core for number in every]
+    colour, sees = colours(blocks.neighbours()), read_json(run.blocks / "blocks.json")["sees"]
+    steps = replace(nest, steps=config.seam_steps)
+    for now in range(int(colour.max()) + 1):
+        mine = [number for number in every if colour[number] == now]
+        tasks = []
+        for number in mine:
+            others = [files[other] for other in sees[number] if other != number]
+            what = (_spec(job, number), run.blocks / "blocks.json", number, others, steps, seed)
+            tasks.append(Task(f"seams of block {number}", tune_seams, what, job.gpus))
+        results(job.executor, tasks, job.emit)
+        for number in mine:
+            files[number] = run.block(number).seamed
+    return files
+
+
+def tune_seams(
+    spec: JobSpec, partition: Path, number: int, others: list[Path], config: NestConfig, seed: int, emit: Emit
+) -> None:
+    """Train a block's Gaussians near its border on compositions with what its views see of other blocks."""
+    job = spec.open(named(emit, f"block {number}"))
+    run = job.run
+    settings = {**asdict(config), "seed": seed, "others": [file_hash(path) for path in others]}
+
+    def make() -> list[str]:
+        blocks, own = read_blocks(partition), read_level(run.core)
+        views = seam_views(job.scene, blocks, number)
+        near = blocks.to_border(own.means.numpy()) < blocks.margin
+        tuned = own
+        if views and near.any():
+            tuned = _tuned(job, own, near, others, views, config, seed)
+        clarity = read_more(run.core, "clarity")
+        write_set(run.seamed, tuned, config.steps, read_sizes(run.core), clarity=clarity)
+        return [f"{int(near.sum()):,} of {len(own):,} Gaussians, {len(views)} views of several blocks"]
+
+    run_stage(job, "seams", settings, [run.core, partition], [run.seamed], make)
+
+
+def _tuned(
+    job: Job,
+    own: Gaussians,
+    near: np.ndarray,
+    others: list[Path],
+    views: list[int],
+    config: NestConfig,
+    seed: int,
+) -> Gaussians:
+    scene = job.scene
+    g = around(own, (read_level(path) for path in others), scene, views)
+    n = len(g)
+    movable = np.concatenate([near, np.zeros(n - len(near), bool)])
+    kept = frozenset(view.name for row, view in enumerate(scene.views) if row not in set(views))
+    narrowed = replace(scene, test_names=kept)
+    ladder = Nested(g, np.ones(n, np.float32), np.zeros(n, np.int8))
+    for event in nested.nest(
+        ladder, narrowed, job.photos, train_config(job), config,
+        seed=seed, backend=job.backend, movable=movable,
+    ):  # fmt: skip
+        if isinstance(event, NestStep):
+            job.emit(Progress("seams", event.step, config.steps, f"loss {event.loss:.3f}"))
+        elif isinstance(event, Nested):
+            mine = torch.isin(event.gaussians.label_ids, torch.unique(own.label_ids))
+            return event.gaussians.select(mine)
+    raise AssertionError("a training ends with what it trained")

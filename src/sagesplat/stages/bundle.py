@@ -1,0 +1,344 @@
+"""Bundles of a run: everything that a viewer needs, in one static folder."""
+
+import io
+import json
+import shutil
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from sagesplat.adapt.observe import large_enough, read_observations
+from sagesplat.adapt.viewpoint import ViewModel, read_promises
+from sagesplat.core.errors import RunError
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.formats.increments import INDEX, read_chunks, read_index, write_chunks
+from sagesplat.formats.levels import read_level
+from sagesplat.io.files import read_json, write_json
+from sagesplat.io.npz import Npz
+from sagesplat.raster import rasterize
+from sagesplat.run.job import Job
+from sagesplat.run.run_dir import file_hash, settings_of
+from sagesplat.segment.masks import UNLABELLED
+from sagesplat.segment.parts import split_name
+from sagesplat.stages.shared import distances
+from sagesplat.viewer import boxes
+from sagesplat.viewer.bundle import (
+    MANIFEST,
+    Category,
+    Contents,
+    Shot,
+    Written,
+    check_target,
+    check_viewer,
+    has_viewer,
+    start_of,
+    write_bundle,
+    write_documents,
+)
+from sagesplat.viewer.display_names import colors_of, title_of
+from sagesplat.viewer.frames import FLIP, camera_at, fov_y, position, quaternion
+from sagesplat.viewer.pack import ASPECT, FOV_Y
+
+_GROUND = {"dirt", "floor", "grass", "gravel", "ground", "pavement", "platform", "playingfield", "railroad"}
+_GROUND |= {"path", "road", "sand", "sidewalk", "snow", "soil", "street", "terrain"}
+_FEW = boxes.FEW  # SfM points below which a category's Gaussians say where it is
+_OPAQUE = 0.1  # from which a Gaussian does
+_POSTER_HEIGHT = 360  # px
+_LIVE = ".live.json"  # what a live bundle was made of
+
+
+@dataclass(frozen=True)
+class BundleMade:
+    """What is in a bundle, and how well its boxes tell distances."""
+
+    path: Path
+    labels: int
+    chunks: int
+    count: int  # Gaussians
+    sizes: Written  # bytes
+    agreement: dict[int, tuple[float, float]]  # by label id: median and 95th percentile of the relative error
+    error: tuple[float, float]  # the same over all labels
+
+
+def bundle(
+    job: Job,
+    out: Path,
+    *,
+    meters_per_unit: float | None = None,
+    always: Collection[str] = (),
+    weights: Mapping[str, float] | None = None,
+    viewer: Path | None = None,
+) -> BundleMade:
+    """Write a finished run as a bundle into `out`: a new or empty folder, or an earlier bundle.
+
+    `meters_per_unit`: the scene's scale, guessed from the cameras' height if left out. `always`: categories
+    shipped in full. `weights`: of categories by name, 1 for the others. A category's name means all its
+    parts in a scene in blocks, `name@block` one of them. `viewer`: the built viewer, the package's own if
+    left out. RunError: a run without nested ladder or promises, another folder, unknown
+    names or an impossible number; DataError: a damaged chunk; SageError: no viewer.
+    """
+    weights = weights or {}
+    job = replace(job, run=replace(job.run, ladder="nested"))
+    _check(job, meters_per_unit, always, weights)
+    viewer = viewer or package_viewer()
+    check_target(out)
+    check_viewer(viewer)
+    chunks = read_index(job.run.chunks)
+    if any(not chunk.uri.endswith(".spz") for chunk in chunks):
+        raise RunError(f"{job.run.chunks}: not SPZ files; run `sagesplat nest` again with --force")
+    g = read_chunks(job.run.chunks, chunks)
+    contents = replace(
+        _contents(job, g, job.antialiased),
+        chunks=chunks,
+        meters_per_unit=meters_per_unit,
+    )
+    contents = replace(contents, categories=_with_quality(job, contents.categories, always, weights))
+    contents = with_corrections(contents)
+    written = write_bundle(out, contents, viewer, _poster(g, contents))
+    agreement, error = distance_error(contents)
+    count = sum(chunk.count for chunk in chunks)
+    return BundleMade(out, len(contents.categories), len(chunks), count, written, agreement, error)
+
+
+def _poster(g: Gaussians, contents: Contents) -> bytes:
+    """A JPEG of the first view: the scene is seen while the viewer and the first chunks are loading."""
+    first = start_of(contents)
+    width = round(ASPECT * _POSTER_HEIGHT)
+    camera = camera_at(first["position"], first["quaternion"], FOV_Y, width, _POSTER_HEIGHT)
+    with torch.no_grad():
+        image = rasterize(g, camera, backend="cpu", antialiased=contents.antialiased).rgb
+    pixels = (image.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, "JPEG", quality=72, optimize=True)
+    return file.getvalue()
+
+
+def package_viewer() -> Path:
+    """Where the built viewer is, if it is."""
+    return Path(str(files("sagesplat"))) / "viewer" / "static"
+
+
+def live_bundle(job: Job, folder: Path, viewer: Path | None = None) -> bool:
+    """Write the newest snapshot of a training that may go on into `folder`; False if it is there already.
+
+    One level a category and no promises. Files appear whole; those that a page may still be loading stay
+    until two newer snapshots are there. RunError while there is no snapshot.
+    """
+    steps = sorted(p for p in job.run.levels.glob("*.npz") if not p.name.startswith("."))
+    if not steps:
+        raise RunError(f"{job.run.levels}: no level yet; wait, or run `sagesplat train`")
+    newest = {"level": steps[-1].name, "written": steps[-1].stat().st_mtime_ns}
+    before: dict[str, Any] = {}
+    with suppress(RunError):
+        before = read_json(folder / _LIVE)
+    if before.get("of") == newest and (folder / MANIFEST).exists():
+        return False
+    if not before:
+        check_target(folder)
+    viewer = viewer or package_viewer()
+    if not has_viewer(folder, viewer):  # none yet, or an older package's
+        check_viewer(viewer)
+        shutil.copytree(viewer, folder, dirs_exist_ok=True)
+    g = read_level(steps[-1])
+    g = g.select(torch.argsort(g.label_ids, stable=True))
+    antialiased = _antialiased(job)
+    work, target = folder / ".chunks", folder / "chunks"
+    sizes = {label: (n,) for label, n in g.counts().items()}
+    chunks = write_chunks(work, g, sizes, job.names(), antialiased=antialiased)
+    target.mkdir(exist_ok=True)
+    for chunk in chunks:
+        (work / chunk.uri).replace(target / chunk.uri)
+    shutil.rmtree(work)
+    write_documents(folder, replace(_contents(job, g, antialiased), chunks=chunks, live=True))
+    uris = [chunk.uri for chunk in chunks]
+    kept = [uris, *(version for version in before.get("kept", []) if version != uris)][:3]
+    write_json(folder / _LIVE, {"of": newest, "kept": kept})
+    for path in target.iterdir():
+        if path.name not in {uri for version in kept for uri in version}:
+            path.unlink()
+    return True
+
+
+def with_corrections(contents: Contents) -> Contents:
+    """The contents with what the boxes of each category miss of its distance in each view."""
+    views = []
+    for shot in contents.shots:
+        camera = shot.camera
+        where = position(camera)
+        sees = boxes.frustum(where, quaternion(camera), fov_y(camera), camera.width / camera.height)
+        views.append((where, sees))
+
+    def missed(category: Category) -> np.ndarray:
+        told = np.array([boxes.distance(category.boxes, *view) for view in views])
+        known = np.full(len(views), np.nan) if category.distance is None else category.distance
+        right = np.where((known > 0) & (told > 0), known / np.where(told > 0, told, 1), np.nan)
+        return np.log(right)
+
+    return replace(contents, categories=[replace(c, corrections=missed(c)) for c in contents.categories])
+
+
+def distance_error(contents: Contents) -> tuple[dict[int, tuple[float, float]], tuple[float, float]]:
+    """Median and 95th percentile of the relative error of distances by boxes, by label and over all.
+
+    Against d_min, in the views that show enough of a category.
+    """
+    found = {
+        c.label_id: np.abs(np.expm1(-c.corrections[c.shares > 0]))
+        for c in contents.categories
+        if c.shares is not None and c.corrections is not None
+    }
+    by_label = {label: _median_and_95th(errors) for label, errors in found.items()}
+    return by_label, _median_and_95th(np.concatenate([*found.values(), np.zeros(0)]))
+
+
+def _median_and_95th(errors: np.ndarray) -> tuple[float, float]:
+    if not np.isfinite(errors).any():
+        return float("nan"), float("nan")
+    median, high = np.nanpercentile(errors, [50, 95])
+    return float(median), float(high)
+
+
+def _check(
+    job: Job, meters_per_unit: float | None, always: Collection[str], weights: Mapping[str, float]
+) -> None:
+    run = job.run
+    for stage, path in (("nest", run.chunks / INDEX), ("observe", run.observations), ("fit", run.promises)):
+        if not path.exists():
+            raise RunError(
+                f"{run.path}: no {path.relative_to(run.path)}; a bundle needs a finished nested ladder: "
+                f"run `sagesplat {stage}`, or `sagesplat run`"
+            )
+    fitted = read_json(run.provenance("fit"))["inputs"]
+    if fitted.get(INDEX) != file_hash(run.chunks / INDEX):
+        raise RunError(f"{run.promises}: promises of other chunks; run `sagesplat fit` again with --force")
+    if meters_per_unit is not None and not 1e-6 <= meters_per_unit <= 1e6:
+        raise RunError(f"{meters_per_unit} metres per unit are impossible; give a number such as 0.5")
+    names = set(job.names().values())
+    categories = {category_and_block(job, name)[0] for name in names}
+    if unknown := sorted({*always, *weights} - names - categories):
+        one = ", each also NAME@BLOCK" if job.has_parts else ""
+        raise RunError(
+            f"{', '.join(unknown)}: no such category; there are {', '.join(sorted(categories))}{one}"
+        )
+    for name, weight in weights.items():
+        if not 0 <= weight <= 1e6:
+            raise RunError(f"weight {weight} of {name} is impossible; give a number from 0 on, such as 2")
+
+
+def _contents(job: Job, g: Gaussians, antialiased: bool) -> Contents:
+    """All but the chunks and what is promised of them."""
+    scene, names = job.scene, job.names()
+    labels = sorted(g.counts())
+    found = {i: category_and_block(job, names[i]) for i in labels}
+    colors = _colors(job, {category for category, _ in found.values()})
+    ground = [i for i in labels if _GROUND & set(_title(job, found[i][0]).split())]
+    places = _places(job, g)
+    return Contents(
+        name=scene.name,
+        extent=scene.extent,
+        shots=[Shot(view.name, scene.split(row), view.camera) for row, view in enumerate(scene.views)],
+        categories=[
+            Category(
+                i,
+                names[i],
+                _title(job, category),
+                colors[category],
+                boxes.split_boxes(places[i] * FLIP),
+                block=block,
+            )
+            for i, (category, block) in found.items()
+        ],
+        chunks=[],
+        folder=job.run.chunks,
+        sh_degree=g.sh_degree,
+        antialiased=antialiased,
+        points=scene.points.xyz,
+        ground=np.isin(job.point_labels, ground),
+    )
+
+
+def category_and_block(job: Job, name: str) -> tuple[str, int | None]:
+    """Of a label by name; without a block unless the scene is in blocks."""
+    return split_name(name) if job.has_parts else (name, None)
+
+
+def _title(job: Job, category: str) -> str:
+    return title_of(category) if category != job.masks.taxonomy.name(UNLABELLED) else "everything else"
+
+
+def _colors(job: Job, categories: Collection[str]) -> dict[str, str]:
+    taxonomy = job.masks.taxonomy
+    ids = [i for i in (UNLABELLED, *taxonomy.names) if taxonomy.name(i) in categories]
+    colors = colors_of({i: taxonomy.color(i) for i in ids})
+    return {taxonomy.name(i): colors[i] for i in ids}
+
+
+def _places(job: Job, g: Gaussians) -> dict[int, np.ndarray]:
+    """By label its SfM points [N, 3]; where they are few, the centres of what is seen of it as well."""
+    points, rows = job.scene.points.xyz, _rows_by_label(job.point_labels)
+    means, mine = g.means.numpy(), _rows_by_label(g.label_ids.numpy())
+    opaque = g.logit_opacities.numpy() >= np.log(_OPAQUE / (1 - _OPAQUE))
+    found = {}
+    for label, own in mine.items():
+        known = points[rows.get(label, [])]
+        if len(known) < _FEW:
+            seen = own[opaque[own]]
+            known = np.concatenate([known, means[seen if len(seen) else own]])
+        found[label] = known
+    return found
+
+
+def _rows_by_label(label_ids: np.ndarray) -> dict[int, np.ndarray]:
+    order = np.argsort(label_ids, kind="stable")
+    labels, starts = np.unique(label_ids[order], return_index=True)
+    return dict(zip(labels.tolist(), np.split(order, starts[1:]), strict=True))
+
+
+def _with_quality(
+    job: Job, categories: Sequence[Category], always: Collection[str], weights: Mapping[str, float]
+) -> list[Category]:
+    promises: dict[int, ViewModel] = read_promises(job.run.promises)
+    far = distances(job, job.fit_config.distance)
+    shares = _shares(job)
+    return [
+        replace(
+            category,
+            weight=float(weights.get(category.name, weights.get(category.category, 1.0))),
+            always=category.name in always or category.category in always,
+            model=promises.get(category.label_id),
+            shares=shares.get(category.label_id),
+            distance=far.get(category.label_id),
+        )
+        for category in categories
+    ]
+
+
+def _shares(job: Job) -> dict[int, np.ndarray]:
+    """Of the pixels of each view, by label id; 0 for small ones."""
+    table = large_enough(read_observations(job.run.observations), job.scene, job.fit_config.min_share)
+    table = table.select(table.level == table.level.max(initial=0))
+    sizes = np.array([view.camera.width * view.camera.height for view in job.scene.views])
+    found = {label: np.zeros(len(sizes)) for label in set(table.label_id.tolist())}
+    for label, view, pixels in zip(table.label_id, table.view, table.num_pixels, strict=True):
+        found[int(label)][view] = pixels / sizes[view]
+    return found
+
+
+def _antialiased(job: Job) -> bool:
+    """Whether the Gaussians are trained so; the checkpoint knows before training is done."""
+    try:
+        return bool(settings_of(job.run, "train")["antialiased"])
+    except RunError:
+        pass
+    try:
+        with Npz(job.run.checkpoint) as file:
+            return bool(json.loads(json.loads(str(file["meta"]))["settings"])["antialiased"])
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return False  # no checkpoint yet, or one of another version

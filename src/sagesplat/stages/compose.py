@@ -1,0 +1,40 @@
+"""Put the chosen levels together, and write the scene that the plan chose."""
+
+from sagesplat.adapt.plan import Plan
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.formats.ply import write_ply
+from sagesplat.run.job import Job
+from sagesplat.run.run_dir import settings_of
+from sagesplat.run.stage import run_stage
+from sagesplat.stages.plan import main_plan
+from sagesplat.stages.shared import ladder_files, train_config
+from sagesplat.train.stepper import tune
+
+
+def tune_composition(job: Job, g: Gaussians, steps: int) -> Gaussians:
+    """A composition trained as a whole, with the settings of the run's training; as it is for 0 steps."""
+    if steps <= 0:
+        return g
+    seed = settings_of(job.run, "train")["seed"]
+    return tune(g, job.scene, job.photos, train_config(job), steps, seed=seed, backend=job.backend)
+
+
+def compose(job: Job, plan: Plan) -> Gaussians:
+    """The composition of a plan, tuned if the run's plans are (`PlanConfig.tune_steps`)."""
+    steps = settings_of(job.run, "plan").get("tune_steps", 0)
+    return tune_composition(job, job.ladder.compose(plan.levels), steps)
+
+
+def compose_plan(job: Job) -> None:
+    """Write the scene that the plan chose."""
+    run = job.run
+
+    def make() -> list[str]:
+        plan = main_plan(run)
+        g = compose(job, plan)
+        write_ply(run.composed, g, job.names())
+        sent = "" if plan.sent is None else f", {plan.sent / 1e6:.2f} MB to send"
+        return [f"{len(g):,} Gaussians, {plan.nbytes / 1e6:.1f} MB at 248 bytes each{sent}"]
+
+    settings = {"tune_steps": settings_of(run, "plan").get("tune_steps", 0)}
+    run_stage(job, "compose", settings, [run.plan, ladder_files(run)[0]], [run.composed], make)

@@ -1,0 +1,49 @@
+"""Measure the plans on the test views."""
+
+import numpy as np
+
+from sagesplat.adapt.evaluate import evaluate
+from sagesplat.adapt.observe import TOTAL
+from sagesplat.adapt.plan import read_budget_plan, read_plans
+from sagesplat.core.events import Progress
+from sagesplat.output import tables
+from sagesplat.run.job import Job
+from sagesplat.run.run_dir import settings_of
+from sagesplat.run.stage import run_stage
+from sagesplat.stages.compose import compose
+from sagesplat.stages.plan import main_target, promised, scene_plan
+from sagesplat.stages.shared import _show, label_images, ladder_files
+
+
+def evaluate_plans(job: Job) -> None:
+    """Measure the compositions on the test views, beside the promise and the whole model."""
+    run = job.run
+
+    def make() -> list[str]:
+        fitted, within = job.fit_config, read_budget_plan(run.plan)
+        plans = [*read_plans(run.plan)[0], *([within] if within else [])]
+        table = evaluate(
+            job.scene, job.photos, label_images(job, fitted.masks), job.ladder, plans, promised(job),
+            region=fitted.region, compose=lambda plan: compose(job, plan),
+            backend=job.backend, antialiased=job.antialiased,
+            progress=lambda done, total: job.emit(Progress("evaluate", done, total)),
+        )  # fmt: skip
+        table.write_csv(run.evaluation)
+        if len(table):
+            plan = scene_plan(run, main_target(run))
+            _show(job, tables.outcome_table(plan, job.ladder.counts, table, job.names()))
+        whole = table.select(table.label_id == TOTAL)
+        lines = []
+        for target in np.unique(whole.target):
+            within_budget = np.isnan(target)
+            at = whole.select(np.isnan(whole.target) if within_budget else whole.target == target)
+            asked = "within the budget" if within_budget else f"SSIM {target:g} asked"
+            lines.append(
+                f"{asked}: test views {at.ssim.mean():.3f} / {at.psnr.mean():.2f} dB "
+                f"(everything {at.full_ssim.mean():.3f} / {at.full_psnr.mean():.2f} dB)"
+            )
+        return lines
+
+    inputs = [run.scene, run.labels, *ladder_files(run), run.plan]
+    settings = {"tune_steps": settings_of(run, "plan").get("tune_steps", 0)}
+    run_stage(job, "evaluate", settings, inputs, [run.evaluation], make)

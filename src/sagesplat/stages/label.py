@@ -1,0 +1,230 @@
+"""The stages that label: label images of the views, labels of the points, and what all views agree on."""
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sagesplat.core.config import LabelsConfig, LiftConfig, MasksConfig
+from sagesplat.core.errors import LabelError, RunError
+from sagesplat.core.events import Progress, Warned
+from sagesplat.io.files import read_json, write_json
+from sagesplat.run.executor import split
+from sagesplat.run.job import Job
+from sagesplat.run.remote import work_all
+from sagesplat.run.run_dir import file_hash
+from sagesplat.run.stage import run_stage
+from sagesplat.segment.edit import Edited, edit_labels, parse_keep, parse_merge
+from sagesplat.segment.hf import DEFAULT_MODEL
+from sagesplat.segment.lift import agreement_in, lift
+from sagesplat.segment.masks import MAX_LABEL_ID, UNLABELLED, Masks, Taxonomy, import_masks, write_labels
+from sagesplat.segment.segmenters import Segmenter, segment_some
+from sagesplat.segment.soft import read_soft, soft_path
+from sagesplat.train.fuse import Soft, fuse
+
+_SUFFIXES = {".onnx": "onnx", ".pth": "deeplabv2", ".pt": "deeplabv2", ".safetensors": "deeplabv2"}
+_MARKER = ".network.json"
+_EDIT = "edit.json"
+
+
+def make_masks(job: Job, config: MasksConfig, labels: LabelsConfig = LabelsConfig()) -> None:
+    """Bring label images into the run, given ones or a segmenter's; then merge and leave out categories."""
+    run, kind = job.run, _kind(job, config)
+    merge, keep = parse_merge(labels.merge), parse_keep(labels.keep)
+    if kind == "masks":
+        _import(job, config.masks or job.scene.path / "masks")
+    else:
+        _segment(job, config, kind)
+
+    def make() -> list[str]:
+        shutil.rmtree(run.masks, ignore_errors=True)
+        edited = edit_labels(
+            run.segmented, job.scene.views, run.masks, keep=keep, merge=merge, min_share=labels.min_share,
+            on_view=lambda done, total: job.emit(Progress("masks", done, total)),
+        )  # fmt: skip
+        write_json(run.masks / _EDIT, {**edited.record, "table": edited.table.tolist()})
+        return _lines(edited)
+
+    inputs = [run.provenance("segment"), run.segmented / "labels.json"]
+    run_stage(job, "masks", asdict(labels), inputs, [run.masks / "labels.json"], make)
+
+
+def _lines(edited: Edited) -> list[str]:
+    lines = [f"{len(edited.taxonomy.names)} categories: {', '.join(edited.taxonomy.names.values())}"]
+    for what, gone in (("left out", edited.dropped), ("too small", edited.folded)):
+        named = ", ".join(f"{name} ({share:.1%})" for name, share in gone.items() if share)
+        if named:
+            lines.append(f"{what}: {named}")
+    return lines
+
+
+def _kind(job: Job, config: MasksConfig) -> str:
+    """The segmenter that was asked for, or follows from what there is."""
+    if config.segmenter != "auto":
+        return config.segmenter
+    if config.model:
+        return _SUFFIXES.get(Path(config.model).suffix, "hf")
+    if config.masks or (job.scene.path / "masks").is_dir():
+        return "masks"
+    return "hf"
+
+
+def _import(job: Job, source: Path) -> None:
+    """Bring ready label images into the run."""
+    run = job.run
+    settings = {"segmenter": "masks", "source": file_hash(source) if source.is_dir() else str(source)}
+
+    def make() -> list[str]:
+        shutil.rmtree(run.segmented, ignore_errors=True)
+        shutil.rmtree(run.soft, ignore_errors=True)  # a network's, and these are not its label images
+        missing = import_masks(job.scene, source, run.segmented)
+        if missing:
+            names = ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
+            job.emit(Warned(f"{len(missing)} of {len(job.scene.views)} views have no label image: {names}"))
+        return []
+
+    run_stage(job, "segment", settings, [run.scene], [run.segmented / "labels.json"], make)
+
+
+def _segment(job: Job, config: MasksConfig, kind: str) -> None:
+    """Segment the photos; images of an interrupted attempt with the same network are kept."""
+    run = job.run
+    settings: dict[str, Any] = {"segmenter": kind, "soft": config.soft}
+    if kind == "hf":
+        model = config.model or DEFAULT_MODEL
+        settings["model"] = file_hash(Path(model)) if Path(model).is_dir() else model
+    else:
+        settings["model"] = file_hash(_file(kind, config.model))
+    if kind == "onnx":
+        settings["classes"] = file_hash(_file(kind, config.classes))
+    elif kind == "deeplabv2":
+        settings |= {"head": config.head, "crf": config.crf}
+
+    def make() -> list[str]:
+        marker = run.segmented / _MARKER
+        if not marker.exists() or read_json(marker) != settings:
+            shutil.rmtree(run.segmented, ignore_errors=True)
+            shutil.rmtree(run.soft, ignore_errors=True)
+        write_json(marker, settings)
+        some = split(range(len(job.scene.views)), job.executor.parallel)  # each loads the network
+        found = work_all(job, "segment", _segment_some, [(rows, config, kind) for rows in some])
+        taxonomy = found[0][0]
+        if any(other != taxonomy for other, _ in found):
+            raise LabelError(f"{run.segmented}: the nodes' networks have other categories; make them alike")
+        write_labels(run.segmented, taxonomy, set().union(*(ids for _, ids in found)))
+        return []
+
+    run_stage(job, "segment", settings, [run.scene], [run.segmented / "labels.json"], make)
+
+
+def _segment_some(job: Job, part: tuple[Sequence[int], MasksConfig, str]) -> tuple[Taxonomy, set[int]]:
+    """Segment some views (rows, settings, kind of segmenter): all its categories, and the ids that occur."""
+    rows, config, kind = part
+    segmenter, run = _load(job, config, kind), job.run
+    occurring = segment_some(
+        job.scene, job.photos, segmenter, run.segmented, rows,
+        batch=config.batch, soft=run.soft if config.soft else None,
+        on_view=lambda done, total: job.emit(Progress("segment", done, total)),
+    )  # fmt: skip
+    return segmenter.taxonomy, occurring
+
+
+def _file(kind: str, given: str | Path | None) -> Path:
+    wanted = "--model NETWORK.onnx and --classes CLASSES.json" if kind == "onnx" else "--model CHECKPOINT.pth"
+    if given is None:
+        raise RunError(f"--segmenter {kind} needs {wanted}")
+    if not Path(given).is_file():
+        raise RunError(f"{given}: no such file; --segmenter {kind} needs {wanted}")
+    return Path(given)
+
+
+def _load(job: Job, config: MasksConfig, kind: str) -> Segmenter:
+    """The network, ready to be used."""
+    if kind == "hf":
+        from sagesplat.segment.hf import HfSegmenter
+
+        model = config.model or DEFAULT_MODEL
+        job.emit(Warned(f"network {model}; if it is not here yet, it is fetched from huggingface.co"))
+        segmenter = HfSegmenter(model, device=job.device, threads=job.threads)
+        if segmenter.note:
+            job.emit(Warned(segmenter.note))
+        return segmenter
+    model = Path(config.model or "")
+    if kind == "onnx":
+        from sagesplat.segment.onnx import OnnxSegmenter
+
+        assert config.classes
+        return OnnxSegmenter(model, config.classes, device=job.device, threads=job.threads)
+    from sagesplat.segment.deeplabv2 import DeepLabV2Segmenter, head_classes, load_deeplabv2
+
+    network = load_deeplabv2(model, head=config.head)
+    return DeepLabV2Segmenter(network, head_classes(config.head), crf=config.crf, device=job.device)
+
+
+def lift_labels(job: Job, config: LiftConfig) -> None:
+    """Vote the label images onto the SfM points."""
+    run = job.run
+
+    def make() -> list[str]:
+        if config.votes == "track" and not len(job.scene.points.track_points):
+            job.emit(Warned("the points have no tracks: all views that a point projects into vote"))
+        lifted = lift(job.scene, job.masks, votes=config.votes, views=set(job.scene.train_ids.tolist()))
+        lifted.write(run.labels)
+        return [f"{100 * lifted.agreement:.1f} % of the votes agree with the label of their point"]
+
+    labels = run.masks / "labels.json"
+    run_stage(job, "lift", asdict(config), [run.scene, run.provenance("masks"), labels], [run.labels], make)
+
+
+def fuse_masks(job: Job) -> None:
+    """Let the label images of all training views vote on the trained Gaussians, and draw the votes back.
+
+    With the probabilities of the network, where they were kept.
+    """
+    run = job.run
+    soft = _soft(job) if run.soft.is_dir() else None
+
+    def make() -> list[str]:
+        shutil.rmtree(run.fused, ignore_errors=True)
+        g = job.snapshots.load(job.snapshots.levels[-1])
+        fused = fuse(
+            g, job.scene, job.masks, run.fused, soft=soft, antialiased=job.antialiased, backend=job.backend,
+            on_view=lambda done, total: job.emit(Progress("fuse", done, total)),
+        )  # fmt: skip
+        before, after = (_agreement(job, masks) for masks in (job.masks, job.whole_masks))
+        write_json(run.fused / "fused.json", {**fused.record, "agreement": [before, after]})
+        return [
+            f"{fused.changed.mean():.1%} of the pixels changed; views that had no vote agree with the points "
+            f"in {after:.1%} of what they see ({before:.1%} before)"
+        ]
+
+    inputs = [run.provenance("masks"), run.masks / "labels.json", run.levels]
+    run_stage(job, "fuse", {"soft": soft is not None}, inputs, [run.fused / "labels.json"], make)
+
+
+def _agreement(job: Job, masks: Masks) -> float:
+    """Share of what views without a vote show of the points that is the points' label; NaN without any."""
+    voters = set(job.scene.train_ids.tolist())
+    lifted = lift(job.scene, masks, views=voters)
+    others = set(range(len(job.scene.views))) - voters
+    return agreement_in(job.scene, masks, lifted.label_ids, others)
+
+
+def _soft(job: Job) -> Soft:
+    """The network's probabilities, of the categories that are left."""
+    before = Taxonomy.read(job.run.segmented / "labels.json")
+    edited = np.array(read_json(job.run.masks / _EDIT)["table"], np.int16)
+    table = np.full(MAX_LABEL_ID + 2, UNLABELLED, np.int16)  # what never was likeliest has no label
+    table[list(before.names)] = edited[list(before.names)]
+
+    def soft(row: int) -> tuple[np.ndarray, np.ndarray]:
+        ids, p = read_soft(soft_path(job.run.soft, job.scene.views[row]))
+        ids = table[ids]
+        left = np.unique(ids[ids != UNLABELLED])
+        planes = [np.where(ids == label, p, 0).sum(0) for label in left]
+        return left, np.array(planes, np.float32).reshape(len(left), *ids.shape[1:])
+
+    return soft

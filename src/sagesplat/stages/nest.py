@@ -1,0 +1,126 @@
+"""Make the nested levels of a run: order its Gaussians, train their prefixes, write the increments."""
+
+import json
+from dataclasses import asdict
+
+import numpy as np
+import torch
+
+from sagesplat.adapt.observe import as_unit, render_rgb
+from sagesplat.core.config import NestConfig
+from sagesplat.core.events import Progress, Warned
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.formats.increments import packed, read_chunks, write_chunks
+from sagesplat.formats.levels import read_level, write_set
+from sagesplat.metrics.image import ssim_map
+from sagesplat.run.job import Job
+from sagesplat.run.run_dir import file_hash
+from sagesplat.run.stage import run_stage
+from sagesplat.stages.shared import fusion, train_config
+from sagesplat.train import nested
+from sagesplat.train.checkpoint import remove_checkpoints
+from sagesplat.train.early_stopping import VIEWS, spread
+from sagesplat.train.nested import NestStep
+from sagesplat.train.trainer import Resumed, Step, Trained
+
+
+def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
+    """Order the trained Gaussians and train their prefixes; write the ladder and its chunks."""
+    run = job.run
+    nested.check(config)
+    settings = {**asdict(config), "seed": seed}
+
+    def make() -> list[str]:
+        full = job.snapshots.load(job.snapshots.levels[-1])
+        seeds = read_level(run.seeds) if config.seed_share else None
+        masks = job.best_masks
+        ordered = nested.order(full, job.scene, masks, config, seeds=seeds, antialiased=job.antialiased)
+        belongs = json.dumps({**settings, "scene": file_hash(run.scene), "levels": file_hash(run.levels)})
+        if job.force:
+            remove_checkpoints(run.nest_checkpoint)
+        trained = ordered
+        for event in nested.nest(
+            ordered, job.scene, job.photos, train_config(job), config,
+            seed=seed, backend=job.backend, checkpoint=run.nest_checkpoint, settings=belongs,
+        ):  # fmt: skip
+            if isinstance(event, NestStep):
+                job.emit(Progress("nest", event.step, config.steps, f"loss {event.loss:.3f}"))
+            elif isinstance(event, Resumed):
+                before = f"the checkpoint before the newest: {event.damage}"
+                job.emit(Warned(f"going on from step {event.step}, {before}"))
+            else:
+                trained = event
+        counts, across = trained.gaussians.counts(), trained.boundary
+        sizes = {label: nested.level_sizes(n, config, across.get(label, 0)) for label, n in counts.items()}
+        lines = write_ladder(job, trained.gaussians, sizes, config, trained.clarity)
+        lines[0] += f", {sum(across.values()):,} of them across borders and in every level"
+        remove_checkpoints(run.nest_checkpoint)
+        return lines
+
+    inputs = [run.scene, run.labels, run.levels, *fusion(run)]
+    if config.seed_share:
+        _make_seeds(job, config, seed)
+        inputs.append(run.seeds)
+    run_stage(job, "nest", settings, inputs, [run.prefixes, run.chunks], make)
+
+
+def _make_seeds(job: Job, config: NestConfig, seed: int) -> None:
+    """Train the small model that the ladder begins with: a stage, so that a killed run has it already."""
+    run, made = job.run, train_config(job)
+    full = job.snapshots.size(job.snapshots.levels[-1])
+    cap = max(1, round(config.seed_share * full))
+    settings = {**asdict(nested.capped_config(made, cap, config.seed_steps)), "seed": seed}
+
+    def make() -> list[str]:
+        g = train_capped(job, "seeds", cap, config.seed_steps, seed)
+        write_set(run.seeds, g, config.seed_steps)
+        return [f"{len(g):,} Gaussians"]
+
+    run_stage(job, "seeds", settings, [run.scene, run.labels], [run.seeds], make)
+
+
+def train_capped(job: Job, stage: str, cap: int, steps: int, seed: int) -> Gaussians:
+    """3DGS-MCMC of at most `cap` Gaussians, otherwise trained as the run; progress goes to `stage`."""
+    for event in nested.train_capped(
+        job.scene, job.photos, job.point_labels, train_config(job), cap, steps, seed=seed, backend=job.backend
+    ):
+        if isinstance(event, Step):
+            text = f"loss {event.loss:.3f}, {event.num_gaussians:,} Gaussians"
+            job.emit(Progress(stage, event.step, steps, text))
+        elif isinstance(event, Trained):
+            return event.gaussians
+    raise AssertionError("a training ends with what it trained")
+
+
+def write_ladder(
+    job: Job, g: Gaussians, sizes: dict[int, tuple[int, ...]], config: NestConfig, clarity: np.ndarray
+) -> list[str]:
+    """Write Gaussians in their order, with levels of `sizes` by label id, as the run's ladder and its chunks.
+
+    `clarity` [N] of `Nested` is kept beside them.
+    """
+    rows = packed(g, sizes, sh_bits=config.sh_bits)
+    ordered = g.select(torch.from_numpy(rows))
+    chunks = write_chunks(
+        job.run.chunks, ordered, sizes, job.names(), sh_bits=config.sh_bits, antialiased=job.antialiased
+    )
+    # what is measured, planned and written from here on is what a viewer gets
+    sent = read_chunks(job.run.chunks, chunks)
+    write_set(job.run.prefixes, sent, config.steps, sizes, clarity=clarity[rows])
+    size, n = sum(chunk.nbytes for chunk in chunks), len(g)
+    lost = _quality(job, ordered) - _quality(job, sent)
+    return [
+        f"{config.levels} levels, {n:,} Gaussians",
+        f"{size / 1e6:.2f} MB in {len(chunks)} SPZ files, {size / n:.1f} bytes a Gaussian; "
+        f"encoding costs {lost:.4f} of SSIM",
+    ]
+
+
+def _quality(job: Job, g: Gaussians) -> float:
+    """Mean SSIM over some of the training views."""
+    found = []
+    for row in spread(job.scene.train_ids.tolist(), VIEWS):
+        camera = job.scene.views[row].camera
+        image = render_rgb(g, camera, backend=job.backend, antialiased=job.antialiased)
+        found.append(ssim_map(image, as_unit(job.photos[row])).mean())
+    return float(np.mean(found))

@@ -1,0 +1,45 @@
+"""Measure every category at every level in every view."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sagesplat.adapt.observe import Observations, merge, observe
+from sagesplat.core.config import FitConfig
+from sagesplat.core.events import Progress
+from sagesplat.output import tables
+from sagesplat.run.executor import split
+from sagesplat.run.job import Job
+from sagesplat.run.remote import work_all
+from sagesplat.run.stage import run_stage
+from sagesplat.stages.shared import _show, distances, fusion, label_images, ladder_files
+
+
+def observe_levels(job: Job, config: FitConfig) -> None:
+    """Measure every category at every level in every view."""
+    run = job.run
+
+    def make() -> list[str]:
+        far = distances(job, config.distance)
+        parts = [(rows, config.masks, far) for rows in split(range(len(job.scene.views)), job.pieces)]
+        table = merge(work_all(job, "observe", _observe_views, parts))
+        table.write_csv(run.observations)
+        seen = table.select(np.isin(table.view, job.scene.train_ids))
+        _show(job, tables.ladder_table(seen, job.ladder.counts, job.ladder.recovering, job.names()))
+        return [
+            f"{len(table):,} observations of {len(job.ladder.levels)} levels in {len(job.scene.views)} views"
+        ]
+
+    inputs = [run.scene, run.labels, ladder_files(run)[0], *fusion(run)]
+    settings = {"distance": config.distance, "masks": config.masks}
+    run_stage(job, "observe", settings, inputs, [run.observations], make)
+
+
+def _observe_views(job: Job, part: tuple[Sequence[int], str, dict[int, np.ndarray]]) -> Observations:
+    """The observations of some views (rows, source of label images, distances in all views)."""
+    rows, masks, far = part
+    return observe(
+        job.scene, job.photos, label_images(job, masks), job.ladder, far,
+        views=rows, backend=job.backend, antialiased=job.antialiased,
+        progress=lambda done, total: job.emit(Progress("observe", done, total)),
+    )  # fmt: skip

@@ -1,0 +1,92 @@
+"""The whole flow, from photos and label images to the report."""
+
+import math
+import time
+from dataclasses import replace
+from pathlib import Path
+
+from sagesplat.adapt.plan import check_target
+from sagesplat.core.config import BlocksConfig, NestConfig, PlanConfig, RunConfig, TrainConfig
+from sagesplat.core.errors import RunError
+from sagesplat.core.events import Emit, Progress, StageDone, StageStarted
+from sagesplat.demo.capture import cached_capture
+from sagesplat.run.job import Job
+from sagesplat.stages import blocks
+from sagesplat.stages.boundaries import measure_borders
+from sagesplat.stages.compose import compose_plan
+from sagesplat.stages.evaluate import evaluate_plans
+from sagesplat.stages.fit import fit_ladder
+from sagesplat.stages.label import fuse_masks, lift_labels, make_masks
+from sagesplat.stages.nest import nest_levels
+from sagesplat.stages.observe import observe_levels
+from sagesplat.stages.plan import make_plan
+from sagesplat.stages.report import make_report
+from sagesplat.stages.scene import open_scene
+from sagesplat.stages.train import train_levels
+from sagesplat.train import nested
+
+# the built-in capture, within minutes on two cores
+DEMO = RunConfig(
+    train=TrainConfig(max_steps=1200, level_every=60),
+    nest=NestConfig(steps=600, levels=12, seed_steps=600),
+    plan=PlanConfig(target_ssim=0.7),
+)
+
+
+def run_all(job: Job, scene: Path, config: RunConfig) -> None:
+    """Every stage on one capture; those whose result is there already are skipped."""
+    for target in config.plan.targets:  # before hours of training
+        check_target(target)
+    nested.check(config.nest)
+    blocks.check(config.blocks)
+    open_scene(job, scene, config.scene, config.poses)
+    make_masks(job, config.masks, config.labels)
+    lift_labels(job, config.lift)
+    train(job, config.train, config.blocks, config.seed)
+    if config.fuse:
+        fuse_masks(job)
+    elif job.run.fused.exists():
+        raise RunError(f"{job.run.fused}: label images were fused; add --fuse, or delete that folder")
+    if job.has_blocks:
+        blocks.make_parts(job)
+    if job.run.ladder == "nested":
+        nest(job, config.nest, config.blocks, config.seed)
+    observe_levels(job, config.fit)
+    fit_ladder(job, config.fit)
+    make_plan(job, config.plan)
+    compose_plan(job)
+    evaluate_plans(job)
+    make_report(job)
+
+
+def train(job: Job, config: TrainConfig, of_blocks: BlocksConfig, seed: int) -> None:
+    """Train the scene as one, or in blocks."""
+    if of_blocks.count > 1:
+        blocks.train_blocks(job, of_blocks, config, seed)
+    elif job.has_blocks:
+        raise RunError(f"{job.run.blocks}: this run is in blocks; add --blocks.count, or begin another run")
+    else:
+        train_levels(job, config, seed)
+
+
+def nest(job: Job, config: NestConfig, of_blocks: BlocksConfig, seed: int) -> None:
+    """Make the nested ladder of a trained scene, or of its blocks."""
+    if job.has_blocks:
+        blocks.nest_blocks(job, of_blocks, config, seed)
+        measure_borders(job)
+    else:
+        nest_levels(job, config, seed)
+
+
+def demo_capture(emit: Emit, places: tuple[int, int] = (1, 1)) -> Path:
+    """The built-in capture's folder, made on the first call; `places` makes a grid of courtyards."""
+    emit(StageStarted("capture"))
+    begin = time.perf_counter()
+    capture = cached_capture(lambda done, total: emit(Progress("capture", done, total)), places)
+    emit(StageDone("capture", time.perf_counter() - begin, (f"the built-in scene, in {capture}",)))
+    return capture
+
+
+def run_demo(job: Job, places: tuple[int, int] = (1, 1)) -> None:
+    """Make the built-in capture (once) and run everything on it; a grid of courtyards in as many blocks."""
+    run_all(job, demo_capture(job.emit, places), replace(DEMO, blocks=BlocksConfig(math.prod(places))))

@@ -1,0 +1,36 @@
+"""Write the report."""
+
+from sagesplat.adapt.plan import read_budget_plan
+from sagesplat.core.events import RunDone
+from sagesplat.formats.ply import read_ply
+from sagesplat.output.report import write_report
+from sagesplat.run.job import Job
+from sagesplat.run.stage import run_stage
+from sagesplat.stages.compose import compose
+from sagesplat.stages.plan import main_target, scene_plan
+from sagesplat.stages.report_data import report_data
+
+
+def make_report(job: Job) -> None:
+    """Write the report."""
+    run = job.run
+
+    def make() -> list[str]:
+        target = main_target(run)
+        # the page leads with a target: what was composed for a budget is not what it is about
+        within_budget = read_budget_plan(run.plan) is not None
+        composed = compose(job, scene_plan(run, target)) if within_budget else read_ply(run.composed)
+        masks = job.best_masks
+        data = report_data(run, job.scene, job.photos, masks, job.ladder, composed, target, job.backend)
+        write_report(run.report, data)
+        return []
+
+    run_stage(
+        job,
+        "report",
+        {},
+        [run.observations, run.models, run.plan, run.evaluation],
+        [run.report / "index.html"],
+        make,
+    )
+    job.emit(RunDone(run.report / "index.html", run.path if run.ladder == "nested" else None))

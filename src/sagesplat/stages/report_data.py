@@ -1,0 +1,153 @@
+"""Gathers what the report shows from a finished run."""
+
+import json
+import platform
+
+import numpy as np
+
+from sagesplat import __version__
+from sagesplat.adapt.eq3 import read_models
+from sagesplat.adapt.evaluate import read_evaluation
+from sagesplat.adapt.ladder import Ladder
+from sagesplat.adapt.observe import TOTAL, as_unit, measure, read_observations, render_rgb
+from sagesplat.adapt.plan import read_plans
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.io.files import read_json
+from sagesplat.output.figures import Colours, Panel
+from sagesplat.output.report import ReportData
+from sagesplat.raster import Backend
+from sagesplat.run.run_dir import RunDir
+from sagesplat.scene import describe
+from sagesplat.scene.images import Photos
+from sagesplat.scene.scene import Scene
+from sagesplat.segment.masks import UNLABELLED, UNLABELLED_COLOR, Masks, Taxonomy
+from sagesplat.segment.parts import category_of
+
+PANELS = 3  # views shown in pictures
+STAGES = (
+    *("poses", "scene", "segment", "masks", "lift", "train", "fuse"),
+    *("nest", "observe", "fit", "plan", "compose", "evaluate"),
+)
+
+
+def report_data(
+    run: RunDir,
+    scene: Scene,
+    photos: Photos,
+    masks: Masks,
+    ladder: Ladder,
+    composed: Gaussians,
+    target: float,
+    backend: Backend,
+) -> ReportData:
+    """Everything the report of a run shows; `target` is the SSIM that it leads with, `composed` its scene."""
+    names = {**masks.taxonomy.names, UNLABELLED: masks.taxonomy.name(UNLABELLED)}
+    categories, colours = _parts(run, names)
+    plans = read_plans(run.plan)[0]
+    records = {stage: read_json(run.provenance(stage)) for stage in STAGES if run.provenance(stage).exists()}
+    antialiased = bool(records["train"]["settings"]["antialiased"])
+    return ReportData(
+        title=scene.name,
+        target=target,
+        names=names,
+        colours=colours or {label: masks.taxonomy.color(label) for label in names},
+        observations=read_observations(run.observations),
+        train_views=scene.train_ids,
+        test_views=scene.test_ids,
+        view_names=[view.name for view in scene.views],
+        counts=ladder.counts,
+        recovering=ladder.recovering,
+        models=read_models(run.models),
+        plans=plans,
+        evaluation=read_evaluation(run.evaluation),
+        panels=_panels(scene, photos, masks, ladder, composed, backend, antialiased),
+        scene_facts=describe(scene),
+        settings=_settings(records),
+        timings=[(stage, float(made["seconds"])) for stage, made in records.items()],
+        provenance=_provenance(records),
+        categories=categories,
+    )
+
+
+def _parts(run: RunDir, names: dict[int, str]) -> tuple[dict[int, int], Colours]:
+    """Of a scene in blocks: which label stands for a part's category, and its colour; nothing of others."""
+    if not (run.parts / "labels.json").exists():
+        return {}, {}
+    taxonomy = Taxonomy.read(run.masks / "labels.json")
+    by_name = {taxonomy.name(i): taxonomy.color(i) for i in (UNLABELLED, *taxonomy.names)}
+    of = {label: category_of(name) for label, name in sorted(names.items())}
+    stands: dict[str, int] = {}
+    for label, category in of.items():
+        stands.setdefault(category, label)
+    colours = {label: by_name.get(category, UNLABELLED_COLOR) for label, category in of.items()}
+    return {label: stands[category] for label, category in of.items() if label != UNLABELLED}, colours
+
+
+def _panels(
+    scene: Scene,
+    photos: Photos,
+    masks: Masks,
+    ladder: Ladder,
+    composed: Gaussians,
+    backend: Backend,
+    antialiased: bool,
+) -> list[Panel]:
+    """A few test views, spread over the capture, in pictures."""
+    if not len(scene.test_ids):
+        return []
+    rows = scene.test_ids[
+        np.unique(np.linspace(0, len(scene.test_ids) - 1, PANELS + 2).round().astype(int))[1:-1]
+    ]
+    if not len(rows):
+        rows = scene.test_ids[:1]
+    full = ladder.load(ladder.levels[-1])
+    panels = []
+    for row in rows.tolist():
+        view = scene.views[row]
+        photo = photos[row]
+        images = [
+            render_rgb(g, view.camera, backend=backend, antialiased=antialiased) for g in (full, composed)
+        ]
+        of_full, of_composed = (measure(image, as_unit(photo), masks[view])[TOTAL] for image in images)
+        eight_bit = [np.round(image * 255).astype(np.uint8) for image in images]
+        panels.append(
+            Panel(
+                name=view.name,
+                photo=photo,
+                full=eight_bit[0],
+                composed=eight_bit[1],
+                label_ids=masks[view],
+                ssim=of_composed["ssim"],
+                psnr=of_composed["psnr"],
+                full_ssim=of_full["ssim"],
+                full_psnr=of_full["psnr"],
+            )
+        )
+    return panels
+
+
+def _settings(records: dict[str, dict]) -> list[tuple[str, str]]:
+    """Settings by stage, fingerprints left out."""
+    rows = []
+    for stage, made in records.items():
+        for name, value in made["settings"].items():
+            text = value if isinstance(value, str) else json.dumps(value)
+            if len(text) != 64:  # a hash
+                rows.append((f"{stage}.{name}", text))
+    return rows
+
+
+def _provenance(records: dict[str, dict]) -> list[tuple[str, str]]:
+    """Versions, and the hashes that tie the results to their inputs."""
+    import numba
+    import torch
+
+    versions = [
+        ("sagesplat", __version__),
+        ("Python", platform.python_version()),
+        ("machine", f"{platform.system()} {platform.machine()}"),
+        ("torch", torch.__version__),
+        ("numba", numba.__version__),
+    ]
+    hashes = {name: h for made in records.values() for name, h in made["inputs"].items()}
+    return versions + [(f"sha256 of {name}", h) for name, h in sorted(hashes.items())]

@@ -1,0 +1,99 @@
+"""Read a capture, and find the poses of photos that come without."""
+
+import hashlib
+from dataclasses import asdict
+from pathlib import Path
+
+from sagesplat.core.config import PosesConfig, SceneConfig
+from sagesplat.core.errors import RunError
+from sagesplat.core.events import Progress, Warned
+from sagesplat.io.files import write_json
+from sagesplat.run.job import Job, fingerprint
+from sagesplat.run.stage import run_stage
+from sagesplat.scene import load_scene
+from sagesplat.scene.detect import detect
+
+
+def open_scene(job: Job, path: Path, config: SceneConfig, poses: PosesConfig | None = None) -> None:
+    """Read a capture and write scene.json; of photos without poses, or a video, a capture is made first."""
+    run = job.run
+    ours = run.scene.exists() or run.capture.exists()
+    if run.path.exists() and not ours and any(not p.name.startswith(".") for p in run.path.iterdir()):
+        raise RunError(f"{run.path}: not empty and not a run folder; choose a new folder")
+    if detect(path) in ("photos", "video"):
+        capture = run.capture / path.resolve().stem  # the scene will have that name
+        _find_poses(job, path, capture, poses or PosesConfig())
+        path = capture
+    scene = load_scene(path, **asdict(config))
+    settings = {"path": str(path.resolve()), **asdict(config), "fingerprint": fingerprint(scene)}
+
+    def make() -> list[str]:
+        write_json(
+            run.scene,
+            {
+                "path": str(path.resolve()),
+                "settings": asdict(config),
+                "fingerprint": settings["fingerprint"],
+                "extent": scene.extent,
+                "points": len(scene.points.xyz),
+                "views": [
+                    {
+                        "name": view.name,
+                        "split": scene.split(row),
+                        "width": view.camera.width,
+                        "height": view.camera.height,
+                        "K": view.camera.K.tolist(),
+                        "w2c": view.camera.w2c.tolist(),
+                    }
+                    for row, view in enumerate(scene.views)
+                ],
+            },
+        )
+        size = scene.views[0].camera
+        return [
+            f"{len(scene.train_ids)} training, {len(scene.test_ids)} test views, {size.width}x{size.height}",
+            f"{len(scene.points.xyz):,} points",
+        ]
+
+    run_stage(job, "scene", settings, [], [run.scene], make)
+
+
+HIGH_ERROR = 0.8  # px; what one camera leaves where each photo has its own (dinosaur: 0.97, then 0.42)
+_POSES = ("prepare", "features", "matches", "mapping", "undistortion")
+
+
+def _poses_progress(stage: str, done: float) -> Progress:
+    """One bar for all parts of structure from motion; mapping may go back where a model grows anew."""
+    return Progress("poses", round(100 * (_POSES.index(stage) + done)), 100 * len(_POSES), stage)
+
+
+def _find_poses(job: Job, source: Path, capture: Path, config: PosesConfig) -> None:
+    """Make a capture of photos or a video: cameras and points by structure from motion."""
+    from sagesplat.scene.photos import reconstruct
+
+    if job.run.path.resolve().is_relative_to(source.resolve()):
+        raise RunError(f"{job.run.path}: lies among the photos; name a run folder outside of {source}")
+    files = sorted(p for p in source.rglob("*") if p.is_file()) if source.is_dir() else [source]
+    state = [(str(p), p.stat().st_size, p.stat().st_mtime_ns) for p in files]
+    digest = hashlib.sha256(repr(state).encode()).hexdigest()
+    settings = {"source": str(source.resolve()), **asdict(config), "files": digest}
+
+    def make() -> list[str]:
+        found = reconstruct(
+            source, capture, config,
+            lambda stage, done, total: job.emit(_poses_progress(stage, done / max(total, 1))),
+        )  # fmt: skip
+        for name, reason in list(found.unregistered.items())[:5]:
+            job.emit(Warned(f"{name}: {reason}"))
+        if len(found.unregistered) > 5:
+            job.emit(Warned(f"{len(found.unregistered)} photos in all left out; see {capture}/poses.json"))
+        if found.reprojection_error > HIGH_ERROR and not config.refine_principal_point:
+            cure = "--poses.camera per-image --poses.refine-principal-point"
+            high = f"reprojection error {found.reprojection_error:.2f} px is high"
+            job.emit(Warned(f"{high}; if the photos were cropped or zoomed one by one, try {cure}"))
+        return [
+            f"poses of {found.num_registered} of {found.num_photos} photos, {found.num_points:,} points, "
+            f"reprojection error {found.reprojection_error:.2f} px"
+        ]
+
+    run_stage(job, "poses", settings, [], [capture / "poses.json"], make)

@@ -1,0 +1,161 @@
+"""Show a bundle, or a run, in the browser of this machine or of a headset."""
+
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sagesplat.core.errors import BackendUnavailable, RunError, SageError
+from sagesplat.core.events import Emit, Warned
+from sagesplat.io.files import read_json
+from sagesplat.run.run_dir import FORMAT, RunDir
+
+if TYPE_CHECKING:
+    from sagesplat.run.job import Job
+    from sagesplat.viewer.site import Site
+from sagesplat.viewer.server import _NO_SERVER, MANIFEST, View, _check_certificate, _hint, _urls, bind
+
+_EVERY = 2.0  # seconds between two looks at a training
+_MAKE_IT = "make one by `sagesplat bundle RUN OUT`"
+_NOTHING_YET = "Nothing has been trained yet."
+
+
+def show(
+    path: Path,
+    emit: Emit,
+    *,
+    port: int | None = None,
+    host: str | None = None,
+    ssl_certfile: Path | None = None,
+    ssl_keyfile: Path | None = None,
+    follow: bool = False,
+) -> View:
+    """A server for a bundle, or for a run folder, whose bundle is made if it is missing or out of date.
+
+    Without a host only this machine gets in, under its own names; without a port the first free one from
+    8000 on is taken. With `follow` the run's training is shown as it goes on, then its bundle. SageError: a
+    folder that is neither, a run that is not ready, a port or certificate of no use, no extra `view`.
+    """
+    try:
+        from sagesplat.viewer.site import Site, make_server
+    except ImportError:
+        raise BackendUnavailable(_NO_SERVER) from None
+    _check_certificate(ssl_certfile, ssl_keyfile)
+    site = Site(local=host is None)
+    listener = bind(host or "127.0.0.1", port)  # first: making a bundle takes its time
+    try:
+        keep = _fill(site, path, emit, follow)
+    except BaseException:
+        listener.close()
+        raise
+    server = make_server(site, ssl_certfile, ssl_keyfile)
+    secure = ssl_certfile is not None
+    urls = _urls(listener, secure)
+    return View(urls, _hint(urls, secure, host), server, listener, keep)
+
+
+def _fill(site: "Site", path: Path, emit: Emit, follow: bool) -> Callable[[threading.Event], None] | None:
+    """Put what is at `path` into a site; returns what keeps it up to date, if anything does."""
+    if is_bundle(path):
+        if follow:
+            raise RunError(f"{path}: a bundle does not change; leave out --follow, or give the run folder")
+        site.folder = path
+        return None
+    job = _open_run(path, emit)
+    if not follow:
+        site.folder = run_bundle(job)
+        return None
+    site.note = _NOTHING_YET
+    return lambda stop: _follow(job, site, stop)
+
+
+def is_bundle(path: Path) -> bool:
+    """Whether a folder is a bundle that can be shown; RunError for one that cannot, or for no folder."""
+    if not path.is_dir():
+        raise RunError(f"{path}: no such folder")
+    if not (path / MANIFEST).exists():
+        return False
+    manifest = read_json(path / MANIFEST)
+    if not isinstance(manifest, dict) or manifest.get("format") != "sagesplat-bundle":
+        raise RunError(f"{path / MANIFEST}: not of a sagesplat bundle; {_MAKE_IT}")
+    if not (path / "index.html").exists():
+        raise RunError(f"{path}: a bundle without a viewer (no index.html); {_MAKE_IT}")
+    return True
+
+
+def run_bundle(job: "Job") -> Path:
+    """The bundle of a finished run, made unless it is there and of what the run holds now."""
+    from sagesplat.stages.bundle import bundle
+
+    folder = job.run.path / "bundle"
+    if not _is_finished(job.run):
+        raise RunError(
+            f"{job.run.path}: not finished; do `sagesplat run`, or add --follow to see its training"
+        )
+    if not _is_current(job.run, folder):
+        bundle(job, folder)
+    return folder
+
+
+def _open_run(path: Path, emit: Emit) -> "Job":
+    """The run in a folder; RunError for a folder that is none, or of another format."""
+    from sagesplat.run.job import Job
+
+    run = RunDir(path)
+    if not run.scene.exists():
+        raise RunError(f"{path}: neither a bundle (no {MANIFEST}) nor a run folder (no scene.json)")
+    made = read_json(run.provenance("scene")) if run.provenance("scene").exists() else {}
+    found = made.get("format") if isinstance(made, dict) else None
+    if found != FORMAT:
+        raise RunError(f"{path}: a run folder of format {found}, this sagesplat reads {FORMAT}")
+    return Job(run, emit)
+
+
+def _is_finished(run: RunDir) -> bool:
+    return run.promises.exists() and (run.chunks / "index.json").exists()
+
+
+def _is_current(run: RunDir, folder: Path) -> bool:
+    """Whether a bundle has the run's chunks, promises no older than the run's, and this package's viewer."""
+    from sagesplat.stages.bundle import package_viewer
+    from sagesplat.viewer.bundle import has_viewer
+
+    if not (folder / MANIFEST).exists():
+        return False
+    manifest: Any = read_json(folder / MANIFEST)
+    try:
+        held = {level["sha256"] for label in manifest["labels"] for level in label["levels"]}
+    except (KeyError, TypeError):
+        return False
+    chunks = {chunk["sha256"] for chunk in read_json(run.chunks / "index.json")["chunks"]}
+    older = (folder / MANIFEST).stat().st_mtime < run.promises.stat().st_mtime
+    return held == chunks and not older and has_viewer(folder, package_viewer())
+
+
+def _follow(job: "Job", site: "Site", stop: threading.Event) -> None:
+    """Keep a site at the newest of a run, until its bundle is there."""
+    told = ""
+    while not stop.is_set():
+        try:
+            if _refresh(job, site):
+                return
+        except (SageError, OSError, ValueError) as error:  # of a moment, most often: training goes on
+            if str(error) != told and any(job.run.levels.glob("*.npz")):
+                told = site.note = str(error)
+                job.emit(Warned(told))
+        stop.wait(_EVERY)
+
+
+def _refresh(job: "Job", site: "Site") -> bool:
+    """Show the newest snapshot, or the bundle of a run that is finished: True for that."""
+    from sagesplat.stages.bundle import live_bundle
+
+    if _is_finished(job.run):
+        site.folder = run_bundle(replace(job))  # nothing remembered of a training that went on since
+        return True
+    folder = job.run.path / "bundle-live"
+    live_bundle(job, folder)
+    if (folder / MANIFEST).exists():
+        site.folder = folder
+    return False

@@ -1,0 +1,1 @@
+"""The nested levels beside their baselines."""

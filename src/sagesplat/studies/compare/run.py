@@ -1,0 +1,421 @@
+"""The nested ladder beside its baselines: same data, same training views, same evaluation."""
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cache, partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from sagesplat.adapt.allocate import along
+from sagesplat.adapt.bound_plans import Costs, Quality, plan_for_scene, plan_within
+from sagesplat.adapt.eq3 import read_models
+from sagesplat.adapt.observe import TOTAL, as_unit, large_enough, measure, read_observations, render_rgb
+from sagesplat.adapt.plan import Plan, check_target, plan_scene
+from sagesplat.core.config import CompareConfig
+from sagesplat.core.errors import RunError
+from sagesplat.core.events import Progress, RunDone, TableMade
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.formats.increments import INDEX, read_chunks, read_index, write_chunks
+from sagesplat.formats.levels import read_level, write_set
+from sagesplat.formats.spz import SH_BITS
+from sagesplat.io.files import read_json, write_json
+from sagesplat.metrics.image import ssim_map
+from sagesplat.metrics.lpips import Lpips
+from sagesplat.raster import Workspace
+from sagesplat.run.executor import Local
+from sagesplat.run.job import Job
+from sagesplat.run.remote import work
+from sagesplat.run.run_dir import RunDir, is_done, settings_of
+from sagesplat.run.stage import Stage, run_stage, run_stages
+from sagesplat.stages.compose import tune_composition
+from sagesplat.stages.fit import fit_ladder
+from sagesplat.stages.nest import train_capped
+from sagesplat.stages.observe import observe_levels
+from sagesplat.stages.plan import main_target, pixels_of, promised_quality, view_planner
+from sagesplat.stages.shared import label_images, ladder_files, train_config
+from sagesplat.studies.compare.report import (
+    CONSOLE,
+    FILE,
+    MCMC,
+    MEASURES,
+    PAGE,
+    PLANNED,
+    PRUNED,
+    SAGE,
+    SAME_SHARE,
+    SNAPSHOTS,
+    OfLabel,
+    Point,
+    Walk,
+    make_tables,
+    read_comparison,
+    walk,
+    write_comparison,
+    write_report,
+)
+from sagesplat.studies.lpips import load_metrics, lpips_hashes
+from sagesplat.studies.paper.model_size import nearest_snapshot, prune_to
+from sagesplat.train.importance import importance
+from sagesplat.train.nested import capped_config
+
+PAPER_TARGETS = (0.6, 0.7, 0.8)
+_FEWEST = 10  # Gaussians that a training can begin with
+_TOGETHER = 8  # sets in memory at a time
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A set of Gaussians to be measured, made when it is its turn."""
+
+    method: str
+    name: str
+    steps: int  # training steps that it took, from the start
+    load: Callable[[], Gaussians]
+    encoded: dict[int, int] | None = None  # bytes by label id; None: a file per category
+    target: float = np.nan  # SSIM that it was planned for
+    budget: float = np.nan  # bytes that it was planned for
+
+
+def compare(job: Job, config: CompareConfig, copy: Path | None = None) -> list[Point]:
+    """Train what is missing of the baselines, measure all sets on the test views, write RUN/compare.
+
+    `job` is one on the nested ladder. compare.json has every point; `copy` becomes the same. RunError for a
+    run without a finished nested ladder or without test views, and for impossible settings.
+    """
+    _check(job, config)
+    folder, file = _folder(job), _folder(job) / FILE
+    lpips = lpips_hashes(config.lpips)
+    targets = list(config.targets) or sorted({*PAPER_TARGETS, *settings_of(job.run, "plan")["targets"]})
+    settings = json.loads(json.dumps(asdict(config) | {"targets": targets, "lpips": lpips}))
+    is_done(job.run, "compare", settings, [], [file], job.force)  # refused before hours of training
+    snapshots = _snapshots(job)
+    trained = _trained(job, [*_pruned(job, config, folder), *_mcmc(job, config, folder)])
+
+    def make() -> list[str]:
+        costs, quality = promised_quality(job)
+        contenders = [
+            *_snapshot_points(snapshots, config),
+            *_sage(job, snapshots, targets),
+            *trained.values(),
+            *_nested(job, config, costs, quality),
+        ]
+        points = _measure(job, contenders, load_metrics(job, config.lpips))
+        walks = _walks(job, snapshots, costs, quality)
+        (folder / PAGE).unlink(missing_ok=True)  # it shows what was measured before
+        write_comparison(file, points, walks, scene=job.scene.name, views=len(job.scene.test_ids))
+        return [f"{len(points)} sets in {len(job.scene.test_ids)} test views"]
+
+    run = job.run
+    inputs = [run.scene, *ladder_files(run), run.observations, run.plan, snapshots.run.models, *trained]
+    run_stage(job, "compare", settings, inputs, [file], make)
+    points, walks = read_comparison(file)
+    tables = make_tables(points, walks, main_target(run))
+
+    def show() -> list[str]:
+        write_report(folder, tables, points, job.names())
+        return list(tables["table_2_baselines"].notes[:-2])
+
+    run_stage(job, "compared", {}, [file], [folder / PAGE], show)
+    for stem, columns in CONSOLE.items():
+        table = tables[stem].only(*columns)
+        job.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
+    if copy:
+        write_json(copy, read_json(file))
+    job.emit(RunDone(folder / PAGE))
+    return points
+
+
+def _folder(job: Job) -> Path:
+    return job.run.path / "compare"
+
+
+def _check(job: Job, config: CompareConfig) -> None:
+    run = job.run
+    if not len(job.scene.test_ids):
+        raise RunError(f"{run.path}: no test views to compare on; begin a run with --test-every 8")
+    for path in (run.prefixes, run.chunks / INDEX, run.observations, run.promises, run.plan):
+        if not path.exists():
+            raise RunError(f"{path}: missing, but all is compared with it; finish `sagesplat run` (nested)")
+    for name, shares in (("shares", config.shares), ("caps", config.caps)):
+        for share in shares:
+            if not 0 < share <= 1:
+                raise RunError(f"{run.path}: --{name} {share:g} is no share of Gaussians; choose 0.1, say")
+    wrong = (
+        ("snapshots", config.snapshots, config.snapshots >= 1, "1 or more"),
+        ("budgets", config.budgets, config.budgets >= 2, "2 or more"),
+        ("tune-steps", config.tune_steps, config.tune_steps >= -1, "0 or more, or -1"),
+    )
+    for name, value, fine, cure in wrong:
+        if not fine:
+            raise RunError(f"{run.path}: --{name} {value} is impossible; choose {cure}")
+    for target in config.targets:
+        check_target(target)
+    smallest = min(config.caps, default=1.0)
+    if round(smallest * job.snapshots.size(job.snapshots.levels[-1])) < _FEWEST:
+        raise RunError(f"{run.path}: --caps {smallest:g} leaves too few Gaussians to train; choose more")
+
+
+def _snapshots(job: Job) -> Job:
+    """The paper's job on the same run, its ladder measured and fitted as the nested one."""
+    other = replace(job, run=RunDir(job.run.path, "snapshots"))
+    vars(other).update(scene=job.scene, photos=job.photos)  # the same photos in memory, not twice
+    observe_levels(other, job.fit_config)
+    fit_ladder(other, job.fit_config)
+    return other
+
+
+@dataclass(frozen=True)
+class _Baseline:
+    """A set that is trained once, and kept."""
+
+    method: str
+    name: str
+    path: Path
+    step: int
+    settings: dict
+    inputs: list[Path]
+    make: Callable[[Job, Any], Gaussians]
+    of: Callable[[], Any]  # what `make` needs beside the job, computed when it is
+
+
+def _pruned(job: Job, config: CompareConfig, folder: Path) -> list[_Baseline]:
+    """The last snapshot, pruned by LightGaussian's criterion (arXiv:2311.17245) and tuned."""
+    last = job.snapshots.files[-1]
+    steps = settings_of(job.run, "nest")["steps"] if config.tune_steps < 0 else config.tune_steps
+
+    @cache
+    def worth() -> np.ndarray:
+        views = job.scene.train_ids.tolist()
+        antialiased = job.antialiased
+        return importance(read_level(last.path), job.scene, views, "weight-volume", antialiased=antialiased)
+
+    return [
+        _Baseline(
+            PRUNED, f"{share:.0%}, {steps} steps", folder / f"pruned-{share:g}-{steps}.npz",
+            last.step + steps, {"share": share, "tune_steps": steps}, [job.run.scene, last.path],
+            _prune, lambda share=share: (share, steps, worth()),
+        )
+        for share in sorted(set(config.shares))
+    ]  # fmt: skip
+
+
+def _prune(job: Job, of: tuple[float, int, np.ndarray]) -> Gaussians:
+    share, steps, worth = of
+    g = read_level(job.snapshots.files[-1].path)
+    return tune_composition(job, prune_to(g, max(1, round(share * len(g))), worth), steps)
+
+
+def _mcmc(job: Job, config: CompareConfig, folder: Path) -> list[_Baseline]:
+    """3DGS-MCMC from the start, its Gaussians capped at shares of the last snapshot's."""
+    run, made, found = job.run, train_config(job), []
+    full, seed = job.snapshots.size(job.snapshots.levels[-1]), settings_of(job.run, "train")["seed"]
+    for share in sorted(set(config.caps)):
+        cap, path = round(share * full), folder / f"mcmc-{share:g}.npz"
+        settings = {**asdict(capped_config(made, cap, made.max_steps)), "seed": seed}
+        of = path.stem, cap, made.max_steps, seed
+        baseline = _Baseline(
+            MCMC, f"cap {share:.0%}", path, made.max_steps, settings, [run.scene, run.labels],
+            _cap, lambda of=of: of,
+        )  # fmt: skip
+        found.append(baseline)
+    return found
+
+
+def _cap(job: Job, of: tuple[str, int, int, int]) -> Gaussians:
+    return train_capped(job, *of)
+
+
+def _trained(job: Job, baselines: Sequence[_Baseline]) -> dict[Path, Contender]:
+    """The baselines by file, trained where they are missing.
+
+    Each is a stage of its own, so that a killed comparison goes on with the next one.
+    """
+    local = isinstance(job.executor, Local)
+    for some in [[b] for b in baselines] if local else [baselines]:
+        stages = [Stage(b.path.stem, b.settings, b.inputs, [b.path]) for b in some]
+        run_stages(job, stages, partial(_train, job, some))
+    return {b.path: Contender(b.method, b.name, b.step, partial(read_level, b.path)) for b in baselines}
+
+
+def _train(
+    job: Job, baselines: Sequence[_Baseline], missing: Sequence[int]
+) -> Iterator[tuple[int, Sequence[str]]]:
+    """Train those of these numbers."""
+    some = [baselines[number] for number in missing]
+    for i, count in work(job, "baselines", _keep, [(b.make, b.of(), b.path.name, b.step) for b in some]):
+        yield missing[i], [f"{count:,} Gaussians"]
+
+
+def _keep(job: Job, part: tuple[Callable[[Job, Any], Gaussians], Any, str, int]) -> int:
+    """Train one and write it; its number of Gaussians comes back."""
+    make, of, name, step = part
+    g = make(job, of)
+    write_set(_folder(job) / name, g, step)
+    return len(g)
+
+
+def _snapshot_points(snapshots: Job, config: CompareConfig) -> list[Contender]:
+    """Settled snapshots, spread in size; of equal ones the latest."""
+    ladder = snapshots.snapshots
+    sizes = [ladder.size(level) for level in ladder.levels]
+    wanted = np.geomspace(max(1, min(sizes)), max(sizes), config.snapshots)[::-1]
+    picked = sorted({nearest_snapshot(ladder, round(size)) for size in wanted.tolist()})
+    return [Contender(SNAPSHOTS, f"step {i}", i, partial(ladder.load, i)) for i in picked]
+
+
+def _sage(job: Job, snapshots: Job, targets: Sequence[float]) -> list[Contender]:
+    """The paper's compositions for the scene (Eq. 1 with Eq. 3), from the snapshots."""
+    ladder, scene = snapshots.ladder, job.scene
+    models = read_models(snapshots.run.models)
+    table = large_enough(read_observations(snapshots.run.observations), scene, job.fit_config.min_share)
+    table = table.select((table.level == ladder.levels[-1]) & np.isin(table.view, scene.train_ids))
+    far = {label: table.distance[table.label_id == label] for label, _ in ladder.counts}
+    share = settings_of(job.run, "plan")["share"]
+    found = []
+    for target in targets:
+        plan = plan_scene(models, ladder.counts, far, target, share, recovering=ladder.recovering)
+        name = f"SSIM {target:g}, {plan.status}"
+        load = partial(ladder.compose, plan.levels)
+        found.append(Contender(SAGE, name, ladder.levels[-1], load, target=target))
+    return found
+
+
+def _nested(job: Job, config: CompareConfig, costs: Costs, quality: Quality) -> list[Contender]:
+    """Prefixes of the same share of every category, and plans: within budgets, and for the run's targets."""
+    made = settings_of(job.run, "plan")
+    shown = pixels_of(read_observations(job.run.observations), job, costs.labels, job.scene.train_ids)
+    steps = job.snapshots.levels[-1] + settings_of(job.run, "nest")["steps"]
+    sent = costs.sent.sum(0)
+    found = []
+    for k in range(costs.sent.shape[1]):
+        bytes_of = dict(zip(costs.labels, costs.sent[:, k].tolist(), strict=True))
+        load = partial(job.ladder.load, k + 1)
+        found.append(Contender(SAME_SHARE, f"level {k + 1}", steps, load, bytes_of))
+    budgets = np.ceil(np.geomspace(sent[0], sent[-1], config.budgets)).tolist()
+    plans: list[tuple[str, Plan]] = [
+        (f"{b / 1e6:.3g} MB", plan_within(quality, costs, b, "bytes", shown)) for b in budgets
+    ]
+    for target in made["targets"]:
+        plan = plan_for_scene(quality, costs, target, made["share"], shown)
+        plans.append((f"SSIM {target:g}, {plan.status}", plan))
+    seen = []
+    for name, plan in plans:
+        if plan.levels in seen and plan.budget is not None:
+            continue  # as a smaller budget's
+        seen.append(plan.levels)
+        found.append(
+            Contender(
+                PLANNED, name, steps, partial(job.ladder.compose, plan.levels),
+                {choice.label_id: choice.sent or 0 for choice in plan.choices}, plan.target,
+                np.nan if plan.budget is None else plan.budget,
+            )
+        )  # fmt: skip
+    return found
+
+
+def _measure(job: Job, contenders: Sequence[Contender], metrics: dict[str, Lpips]) -> list[Point]:
+    """All contenders on all test views, some at a time."""
+    labels = label_images(job, job.fit_config.masks)
+    tests, workspace, points = job.scene.test_ids.tolist(), Workspace(), []
+    done, total = 0, len(contenders) * len(tests)
+
+    def image_of(g: Gaussians, row: int) -> np.ndarray:
+        drawn = {"backend": job.backend, "antialiased": job.antialiased, "workspace": workspace}
+        return render_rgb(g, job.scene.views[row].camera, **drawn)
+
+    for begin in range(0, len(contenders), _TOGETHER):
+        some = contenders[begin : begin + _TOGETHER]
+        sets = [contender.load() for contender in some]
+        found: list[list[dict[str | int, float]]] = [[] for _ in some]
+        # the nested ladder is kept as it is sent
+        sent = [
+            _send(job, g) if c.encoded is None else (c.encoded, None) for c, g in zip(some, sets, strict=True)
+        ]
+        for row in tests:
+            photo, here = as_unit(job.photos[row]), labels[job.scene.views[row]]
+            of_photo = {column: metric.features(photo) for column, metric in metrics.items()}
+            for g, (_, arrived), values in zip(sets, sent, found, strict=True):
+                image = image_of(g, row)
+                values.append(_values(job, image, photo, here))
+                for column, metric in metrics.items():
+                    values[-1][column] = metric.distance(metric.features(image), of_photo[column])
+                if arrived is not None:
+                    values[-1]["ssim_sent"] = float(ssim_map(image_of(arrived, row), photo).mean())
+                done += 1
+                job.emit(Progress("compare", done, total))
+        parts = zip(some, sets, sent, found, strict=True)
+        points += [_point(c, g, encoded, values) for c, g, (encoded, _), values in parts]
+    return points
+
+
+def _values(job: Job, image: np.ndarray, photo: np.ndarray, labels: np.ndarray) -> dict[str | int, float]:
+    """What is measured of one image: of the whole by name, SSIM of its categories by label id."""
+    name = "ssim_eroded" if job.fit_config.region == "eroded" else "ssim"
+    rows, few = measure(image, photo, labels), job.fit_config.min_share * labels.size
+    whole = {"ssim": rows[TOTAL]["ssim"], "ssim_sent": rows[TOTAL]["ssim"], "psnr": rows[TOTAL]["psnr"]}
+    return whole | {i: of[name] for i, of in rows.items() if i != TOTAL and of["num_pixels"] >= few}
+
+
+def _point(
+    contender: Contender, g: Gaussians, encoded: dict[int, int], views: list[dict[str | int, float]]
+) -> Point:
+    def mean(key: str | int) -> float:
+        values = [values[key] for values in views if np.isfinite(values.get(key, np.nan))]
+        return float(np.mean(values)) if values else np.nan
+
+    counts = g.counts()
+    ids = sorted({*counts, *(key for values in views for key in values if isinstance(key, int))})
+    return Point(
+        method=contender.method,
+        name=contender.name,
+        target=contender.target,
+        budget=contender.budget,
+        count=len(g),
+        encoded=sum(encoded.values()),
+        steps=contender.steps,
+        **{name: mean(name) for name in ("ssim_sent", *MEASURES)},
+        labels={i: OfLabel(counts.get(i, 0), encoded.get(i, 0), mean(i)) for i in ids},
+    )
+
+
+def _send(job: Job, g: Gaussians) -> tuple[dict[int, int], Gaussians]:
+    """Bytes by label id, one file each made as the chunks of the nested ladder are, and what arrives."""
+    bits = tuple(settings_of(job.run, "nest").get("sh_bits", SH_BITS))
+    whole = {label: (count,) for label, count in g.counts().items()}
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "chunks"
+        chunks = write_chunks(path, g, whole, job.names(), sh_bits=bits, antialiased=job.antialiased)
+        arrived = read_chunks(path, chunks) if chunks else g
+    return {c.label_id: c.nbytes for c in chunks}, arrived
+
+
+def _walks(job: Job, snapshots: Job, costs: Costs, quality: Quality) -> list[Walk]:
+    """From view to view by name at the main target: ours with hysteresis, and the paper's plans."""
+    target, views = main_target(job.run), range(len(job.scene.views))
+    chosen = along(quality.bound, costs.sent, target=target) + 1
+    ours = [dict(zip(costs.labels, levels.tolist(), strict=True)) for levels in chosen]
+    chunks = read_index(job.run.chunks)
+    chunk_files = {
+        (label, k + 1): {c.uri: c.nbytes for c in chunks if c.label_id == label and c.level <= k + 1}
+        for label in costs.labels
+        for k in range(costs.sent.shape[1])
+    }
+    planned = view_planner(snapshots)
+    theirs = [planned(row, target).levels for row in views]
+    needed = sorted({choice for levels in theirs for choice in levels.items()})
+    level_files = {
+        (label, level): {
+            f"{label} at {level}": sum(_send(job, snapshots.ladder.load(level, [label]))[0].values())
+        }
+        for label, level in needed
+    }
+    walks = []
+    for keeps in (True, False):
+        mine = walk("nested", ours, chunk_files, keeps)
+        assert mine.replaced == 0, "a level must contain the ones below it"
+        walks += [mine, walk(SAGE, theirs, level_files, keeps)]
+    return walks

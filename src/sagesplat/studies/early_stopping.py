@@ -1,0 +1,144 @@
+"""Categories stopped during training (Fig. 1) beside snapshots of a full run composed afterwards."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from sagesplat.adapt.ladder import Ladder
+from sagesplat.adapt.observe import (
+    TOTAL,
+    Observations,
+    as_unit,
+    measure,
+    near_border,
+    read_observations,
+    render_rgb,
+)
+from sagesplat.core.errors import RunError
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.io.files import read_json
+from sagesplat.metrics.image import psnr, squared_error_map
+from sagesplat.output.tables import Table, by_size, mean, name_of
+from sagesplat.raster import Workspace
+from sagesplat.run.job import Job
+from sagesplat.run.run_dir import settings_of
+from sagesplat.train.early_stopping import measured_views
+
+BAND = 10  # px around the borders of categories
+_FREE = {"freeze_at"}  # settings that may differ between the two runs
+
+
+def compare_online(online: Job, full: Job, out: Path) -> tuple[Table, Table]:
+    """A run with --train.freeze-at against the same run without: by method, and by category.
+
+    From the full run each category takes the first level that has reached the target by the same measurement
+    that stops it during training. Both, and the whole full run, are measured on the test views. Writes
+    `out`/online.* and online_categories.*; RunError where the runs do not belong together.
+    """
+    target = _check(online, full)
+    stopped = {int(label): step for label, step in read_json(online.run.frozen).items()}
+    ladder = full.ladder
+    views = measured_views(full.scene, full.masks)
+    reached = first_levels(ladder, read_observations(full.run.observations), views, target)
+    sets = {
+        "online": online.ladder.load(online.ladder.levels[-1]),
+        "offline": ladder.compose(reached),
+        "full run": ladder.load(ladder.levels[-1]),
+    }
+    seconds = {job: read_json(job.run.provenance("train"))["seconds"] for job in (online, full)}
+    times = {"online": seconds[online], "offline": seconds[full], "full run": seconds[full]}
+    measured = {name: _measure(full, g) for name, g in sets.items()}
+    labels = by_size(ladder.counts)
+    methods = Table(
+        f"Stopped in training or composed afterwards, SSIM {target:g}: test views",
+        ("method", "Gaussians", "SSIM", "PSNR", "at borders", "inside", "training s"),
+        ("", ",d", ".3f", ".2f", ".2f", ".2f", ".1f"),
+        [
+            (name, len(g), *(measured[name][key] for key in ("ssim", "psnr", "band", "inside")), times[name])
+            for name, g in sets.items()
+        ],
+        notes=(f"Borders: PSNR within {BAND} px of another category; inside: elsewhere.",),
+    )
+    counts = {name: g.counts() for name, g in sets.items()}
+    body = []
+    for label in labels:
+        cells: list[str | int | float] = [name_of(label, full.names())]
+        for name, steps in (("online", stopped), ("offline", reached), ("full run", {})):
+            if name != "full run":
+                last = (online if name == "online" else full).ladder.levels[-1]
+                cells.append(steps.get(label, last))
+            cells += [counts[name].get(label, 0), measured[name].get(label, np.nan)]
+        body.append(tuple(cells))
+    categories = Table(
+        "By category",
+        ("category", "stops at", "Gaussians", "SSIM", "level", "Gaussians", "SSIM", "Gaussians", "SSIM"),
+        ("", ",d", ",d", ".3f", ",d", ",d", ".3f", ",d", ".3f"),
+        body,
+        groups=(("online", 3), ("offline", 3), ("full run", 2)),
+    )
+    methods.write(out / "online")
+    categories.write(out / "online_categories")
+    return methods, categories
+
+
+def first_levels(
+    ladder: Ladder, observations: Observations, views: Mapping[int, list[int]], target: float
+) -> dict[int, int]:
+    """Per category the first level whose mean SSIM over its views has reached the target, else the last."""
+    chosen = {}
+    for label in sorted({label for label, _ in ladder.counts}):
+        chosen[label] = ladder.levels[-1]
+        mine = (observations.label_id == label) & np.isin(observations.view, views.get(label, []))
+        for level in ladder.levels:
+            if mean(observations.ssim[mine & (observations.level == level)]) >= target:
+                chosen[label] = level
+                break
+    return chosen
+
+
+def _check(online: Job, full: Job) -> float:
+    """The target of the online run; RunError where the two runs cannot be compared."""
+    made, other = (settings_of(job.run, "train") for job in (online, full))
+    target = made.get("freeze_at")
+    if target is None or other.get("freeze_at") is not None:
+        raise RunError(
+            f"{online.run.path}: this run needs --train.freeze-at and {full.run.path} must not have it; "
+            "swap them, or train one of them so"
+        )
+    scenes = [read_json(job.run.scene)["fingerprint"] for job in (online, full)]
+    names = {name for name in {*made, *other} - _FREE if made.get(name) != other.get(name)}
+    if scenes[0] != scenes[1] or names:
+        what = f"settings ({', '.join(sorted(names))})" if names else "captures"
+        raise RunError(
+            f"{full.run.path}: other {what} than {online.run.path}; train one of them like the other"
+        )
+    if not full.run.observations.exists():
+        raise RunError(f"{full.run.observations}: missing; run `sagesplat observe {full.run.path}`")
+    return float(target)
+
+
+def _measure(job: Job, g: Gaussians) -> Mapping[str | int, float]:
+    """Means over the test views: SSIM and PSNR of the image, PSNR near and off borders, SSIM by label id."""
+    found: dict[str | int, list[float]] = {}
+    workspace = Workspace()
+    for row in job.scene.test_ids.tolist():
+        view = job.scene.views[row]
+        photo, label_ids = as_unit(job.photos[row]), job.masks[view]
+        image = render_rgb(
+            g, view.camera, backend=job.backend, antialiased=job.antialiased, workspace=workspace
+        )
+        error, band = squared_error_map(image, photo), near_border(label_ids, BAND)
+        values: dict[str | int, float] = {}
+        for label, quality in measure(image, photo, label_ids).items():
+            if label == TOTAL:
+                values |= {"ssim": quality["ssim"], "psnr": quality["psnr"]}
+            else:
+                values[label] = quality["ssim"]
+        for name, pixels in (("band", error[band]), ("inside", error[~band])):
+            if pixels.size:
+                values[name] = float(psnr(pixels.mean()))
+        for name, value in values.items():
+            found.setdefault(name, []).append(value)
+    empty = dict.fromkeys(("ssim", "psnr", "band", "inside"), np.nan)
+    return {**empty, **{name: float(np.mean(values)) for name, values in found.items()}}

@@ -1,0 +1,29 @@
+"""LPIPS for the studies: which weights are there, and the networks that they make."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from sagesplat.core.errors import SageError
+from sagesplat.core.events import Warned
+from sagesplat.metrics.lpips import Lpips, Net, load_lpips, weights_path
+from sagesplat.run.job import Job
+from sagesplat.run.run_dir import file_hash
+
+NETS: tuple[Net, ...] = ("alex", "vgg")
+
+
+def lpips_hashes(folder: Path | None) -> dict[str, str | None]:
+    """What tells one set of LPIPS weights from another, by network."""
+    paths = {net: weights_path(net, folder) for net in NETS}
+    return {net: file_hash(path) if path.is_file() else None for net, path in paths.items()}
+
+
+def load_metrics(job: Job, folder: Path | None, nets: Sequence[Net] = NETS) -> dict[str, Lpips]:
+    """LPIPS as the field feeds it, by column; what cannot be loaded is left out with a warning."""
+    found = {}
+    for net in nets:
+        try:
+            found[f"lpips_{net}"] = load_lpips(net, folder, as_3dgs=net == "vgg")
+        except SageError as error:
+            job.emit(Warned(f"no LPIPS ({net}): {error}"))
+    return found

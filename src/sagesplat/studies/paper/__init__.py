@@ -1,0 +1,1 @@
+"""The paper's evaluation of a run: its tables and figures."""

@@ -1,0 +1,154 @@
+"""Cross-view evaluation: each unseen view gets a plan of its own, and masks from the 3D labels."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float32, Int32
+
+from sagesplat.adapt.ladder import Ladder
+from sagesplat.adapt.observe import TOTAL, LabelImages, RenderedLabels, as_unit, measure, render_rgb
+from sagesplat.adapt.plan import Plan
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.io.columns import from_rows, read_columns, write_columns
+from sagesplat.raster import Backend, Workspace
+from sagesplat.scene.images import Photos
+from sagesplat.scene.scene import Scene
+
+NONE = -1  # level or count where there is none
+
+
+@dataclass(frozen=True, eq=False)
+class CrossView:
+    """One row per (target, view, category in sight) and one per (target, view) for the whole image."""
+
+    target: Float32[np.ndarray, " R"]  # SSIM asked for
+    view: Int32[np.ndarray, " R"]  # row in Scene.views
+    label_id: Int32[np.ndarray, " R"]  # category id, -1 = unlabelled, -2 = the whole image
+    level: Int32[np.ndarray, " R"]  # chosen for this view, a training step; -1 for the whole image
+    count: Int32[np.ndarray, " R"]  # Gaussians of that level; of the composition for the whole image
+    predicted: Float32[np.ndarray, " R"]  # promised SSIM; NaN without a model and for the whole image
+    ssim: Float32[np.ndarray, " R"]  # measured on the composed scene, over the rendered mask
+    psnr: Float32[np.ndarray, " R"]  # dB, the same
+    level_ssim: Float32[np.ndarray, " R"]  # measured with everything at the chosen level; NaN as above
+    oracle_level: Int32[np.ndarray, " R"]  # the cheapest that measures the target in this view; -1 = none
+    oracle_count: Int32[np.ndarray, " R"]  # its Gaussians
+    full_ssim: Float32[np.ndarray, " R"]  # 3DGS at its last level, the same pixels
+    full_psnr: Float32[np.ndarray, " R"]
+    num_pixels: Int32[np.ndarray, " R"]
+
+    def __len__(self) -> int:
+        return len(self.label_id)
+
+    def select(self, keep: np.ndarray) -> "CrossView":
+        """The rows that a boolean mask or an index array names."""
+        return CrossView(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+
+    @property
+    def regret(self) -> Float32[np.ndarray, " R"]:
+        """Gaussians above the cheapest level that would have done; NaN where none would, or too few came."""
+        known = (self.oracle_level != NONE) & (self.level_ssim >= self.target)
+        return np.where(known, self.count - self.oracle_count, np.nan).astype(np.float32)
+
+    def write_csv(self, path: Path) -> None:
+        """One line per row, a header first; floats so that they read back identical."""
+        write_columns(path, self)
+
+
+def read_cross_view(path: Path) -> CrossView:
+    """The table that `write_csv` wrote. DataError where it is not one."""
+    return read_columns(path, CrossView, "run `sagesplat crossview` again")
+
+
+def cross_view(
+    scene: Scene,
+    photos: Photos,
+    ladder: Ladder,
+    targets: Sequence[float],
+    plan_for: Callable[[int, float], Plan],
+    *,
+    labels: LabelImages | None = None,
+    min_share: float = 0.0,
+    region: Literal["mask", "eroded"] = "mask",
+    backend: Backend = "auto",
+    antialiased: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> CrossView:
+    """Plan each test view, compose, and measure per category, beside an oracle.
+
+    `plan_for` (row of Scene.views, target). `labels`: the pixels of each category (default: as the Gaussians
+    paint them, as nobody has masks of unseen views).
+
+    The oracle knows what every settled level measures in that view. Categories with less than `min_share` of
+    the rendered pixels are planned but make no row. `region`: where SSIM is measured. `progress` hears
+    (images measured, images in all).
+    """
+    rows: list[dict[str, float]] = []
+    labels = labels or RenderedLabels(ladder.load(ladder.levels[-1]), backend, antialiased)
+    workspace = Workspace()
+    views = scene.test_ids.tolist()
+    done, total = 0, len(views) * (len(ladder.levels) + len(targets))
+
+    def measured(g: Gaussians, row: int) -> dict[int, dict[str, float]]:
+        nonlocal done
+        view = scene.views[row]
+        image = render_rgb(g, view.camera, backend=backend, antialiased=antialiased, workspace=workspace)
+        done += 1
+        if progress:
+            progress(done, total)
+        rows = measure(image, as_unit(photos[row]), labels[view])
+        if region == "eroded":
+            rows = {label: {**values, "ssim": values["ssim_eroded"]} for label, values in rows.items()}
+        return rows
+
+    at_level: dict[int, dict[int, dict[int, dict[str, float]]]] = {}
+    for level in ladder.levels:  # one level in memory at a time
+        g = ladder.load(level)
+        at_level[level] = {row: measured(g, row) for row in views}
+    for row in views:
+        for target in targets:
+            plan = plan_for(row, target)
+            composed = measured(ladder.compose(plan.levels), row)
+            levels = {level: views_of[row] for level, views_of in at_level.items()}
+            rows += _rows(plan, composed, levels, ladder, min_share)
+    return from_rows(CrossView, rows)
+
+
+def _rows(
+    plan: Plan,
+    composed: Mapping[int, Mapping[str, float]],
+    levels: Mapping[int, Mapping[int, Mapping[str, float]]],
+    ladder: Ladder,
+    min_share: float,
+) -> list[dict[str, float]]:
+    """The rows of one view at one target; `levels` holds what each level measures there, by label."""
+    rows = []
+    chosen = {choice.label_id: choice for choice in plan.choices}
+    full = levels[ladder.levels[-1]]
+    fewest = min_share * composed[TOTAL]["num_pixels"]
+    assert plan.view is not None
+    for label, values in composed.items():
+        if values["num_pixels"] < fewest or (label != TOTAL and label not in chosen):
+            continue  # or pixels that nothing is drawn on
+        row = {
+            "target": plan.target, "view": plan.view, "label_id": label, "level": NONE, "count": plan.count,
+            "predicted": np.nan, "level_ssim": np.nan, "oracle_level": NONE, "oracle_count": NONE,
+            "ssim": values["ssim"], "psnr": values["psnr"], "num_pixels": values["num_pixels"],
+            "full_ssim": full[label]["ssim"], "full_psnr": full[label]["psnr"],
+        }  # fmt: skip
+        if label != TOTAL:
+            choice = chosen[label]
+            row |= {"level": choice.level, "count": choice.count, "predicted": choice.predicted_ssim}
+            row["level_ssim"] = levels[choice.level][label]["ssim"]
+            enough = [
+                (ladder.counts[label, level], -level)
+                for level, quality in levels.items()
+                if level not in ladder.recovering and quality[label]["ssim"] >= plan.target
+            ]
+            if enough:
+                count, level = min(enough)
+                row |= {"oracle_level": -level, "oracle_count": count}
+        rows.append(row)
+    return rows

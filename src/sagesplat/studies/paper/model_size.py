@@ -1,0 +1,130 @@
+"""Quality at equal occupancy (Table IV of the paper): compositions against 3DGS of the same size."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Int32
+
+from sagesplat.adapt.ladder import Ladder
+from sagesplat.adapt.observe import as_unit, render_rgb
+from sagesplat.adapt.plan import Plan
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.io.columns import read_columns
+from sagesplat.metrics.image import psnr, squared_error_map, ssim_map
+from sagesplat.metrics.lpips import Lpips
+from sagesplat.raster import Backend, Workspace
+from sagesplat.scene.images import Photos
+from sagesplat.scene.scene import Scene
+from sagesplat.train.importance import importance
+
+METHODS = ("SAGE", "SAGE, tuned", "3DGS, snapshot", "3DGS, pruned and tuned", "3DGS, whole")
+WHOLE = len(METHODS) - 1
+
+
+class Contender(NamedTuple):
+    """A set of Gaussians to be measured."""
+
+    target: float  # SSIM of the plan that set the size; NaN for the whole of 3DGS
+    method: int  # index in METHODS
+    gaussians: Gaussians
+
+
+@dataclass(frozen=True, eq=False)
+class Occupancy:
+    """One row per (contender, view)."""
+
+    of_view: Int32[np.ndarray, " R"]  # view that the compositions were planned for; -1 = for the scene
+    target: Float32[np.ndarray, " R"]  # SSIM of the plan that set the size; NaN for the whole of 3DGS
+    method: Int32[np.ndarray, " R"]  # index in METHODS
+    view: Int32[np.ndarray, " R"]  # row in Scene.views
+    count: Int32[np.ndarray, " R"]  # Gaussians
+    ssim: Float32[np.ndarray, " R"]
+    psnr: Float32[np.ndarray, " R"]  # dB
+    lpips_alex: Float32[np.ndarray, " R"]  # NaN where it could not be measured
+    lpips_vgg: Float32[np.ndarray, " R"]  # fed as the evaluation of 3DGS feeds it
+
+    def select(self, keep: np.ndarray) -> "Occupancy":
+        """The rows that a boolean mask or an index array names."""
+        return Occupancy(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+
+
+def read_occupancy(path: Path) -> Occupancy:
+    """The table that `columns.write_columns` wrote. DataError where it is not one."""
+    return read_columns(path, Occupancy, "run `sagesplat report --paper` again")
+
+
+def prune_to(g: Gaussians, count: int, weights: np.ndarray) -> Gaussians:
+    """The `count` Gaussians of the largest weight, in their order."""
+    kept = np.sort(np.argsort(-weights, kind="stable")[:count])
+    return g.select(torch.from_numpy(kept))
+
+
+def nearest_snapshot(ladder: Ladder, count: int) -> int:
+    """The level nearest in size to `count`, the latest of several; one soon after a reset only if all are."""
+    settled = [level for level in ladder.levels if level not in ladder.recovering] or ladder.levels
+    return min(settled, key=lambda level: (abs(ladder.size(level) - count), -level))
+
+
+def contenders(
+    scene: Scene,
+    ladder: Ladder,
+    plans: Sequence[Plan],
+    tuned: Callable[[Gaussians], Gaussians],
+    *,
+    antialiased: bool = False,
+) -> list[Contender]:
+    """For each plan: its composition, the same tuned, 3DGS's snapshot nearest in size, 3DGS pruned to it and
+    tuned; last the whole of 3DGS.
+    """
+    full = ladder.load(ladder.levels[-1])
+    weights = importance(full, scene, scene.train_ids.tolist(), antialiased=antialiased)
+    found = []
+    for plan in plans:
+        composed = ladder.compose(plan.levels)
+        sets = [
+            composed,
+            tuned(composed),
+            ladder.load(nearest_snapshot(ladder, plan.count)),
+            tuned(prune_to(full, plan.count, weights)),
+        ]
+        found += [Contender(plan.target, method, g) for method, g in enumerate(sets)]
+    return [*found, Contender(np.nan, WHOLE, full)]
+
+
+def compare(
+    scene: Scene,
+    photos: Photos,
+    views: Sequence[int],
+    sets: Sequence[Contender],
+    metrics: Mapping[str, Lpips],
+    *,
+    of_view: int = -1,
+    backend: Backend = "auto",
+    antialiased: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[dict[str, float]]:
+    """Rows of `Occupancy`: every contender in every view (rows of Scene.views).
+
+    `metrics`: LPIPS by column name. `progress` hears (images measured, images in all).
+    """
+    rows: list[dict[str, float]] = []
+    workspace = Workspace()
+    for row in views:
+        photo, camera = as_unit(photos[row]), scene.views[row].camera
+        of_photo = {name: metric.features(photo) for name, metric in metrics.items()}
+        for target, method, g in sets:
+            image = render_rgb(g, camera, backend=backend, antialiased=antialiased, workspace=workspace)
+            lpips = {n: metric.distance(metric.features(image), of_photo[n]) for n, metric in metrics.items()}
+            rows.append({
+                "of_view": of_view, "target": target, "method": method, "view": row, "count": len(g),
+                "ssim": float(ssim_map(image, photo).mean()),
+                "psnr": float(psnr(squared_error_map(image, photo).mean())),
+                "lpips_alex": np.nan, "lpips_vgg": np.nan, **lpips,
+            })  # fmt: skip
+            if progress:
+                progress(len(rows), len(views) * len(sets))
+    return rows

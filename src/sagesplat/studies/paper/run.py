@@ -1,0 +1,217 @@
+"""The paper's evaluation of a finished run, in three stages: crossview, occupancy, tables and figures."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sagesplat.adapt.coverage import PREDICTORS, score
+from sagesplat.adapt.eq3 import read_models
+from sagesplat.adapt.observe import distances_in_views, large_enough, read_observations
+from sagesplat.adapt.plan import Plan, plan_view, read_plans
+from sagesplat.adapt.viewpoint import read_promises
+from sagesplat.core.config import PaperConfig
+from sagesplat.core.errors import RunError
+from sagesplat.core.events import Progress, RunDone, TableMade
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.io.columns import from_rows, write_columns
+from sagesplat.output.tables import Table, promise_kept
+from sagesplat.run.job import Job
+from sagesplat.run.run_dir import settings_of
+from sagesplat.run.stage import run_stage
+from sagesplat.stages.compose import tune_composition
+from sagesplat.stages.fit import eroded
+from sagesplat.stages.plan import view_planner
+from sagesplat.stages.shared import distances, label_images, ladder_files
+from sagesplat.studies.lpips import load_metrics, lpips_hashes
+from sagesplat.studies.paper.cross_view import NONE, cross_view, read_cross_view
+from sagesplat.studies.paper.model_size import Occupancy, compare, contenders, read_occupancy
+from sagesplat.studies.paper.report import PaperData, Picture, four_levels, take_pictures, write_paper
+
+_IMAGES_A_TRAINING = 50  # a short training takes about as long as measuring so many images
+
+
+def paper_report(job: Job, config: PaperConfig) -> None:
+    """Everything of the paper that one run can show."""
+    cross_views(job)
+    equal_occupancy(job, config)
+    tables_and_figures(job, config)
+
+
+def cross_views(job: Job) -> None:
+    """Plan each unseen view by itself and measure what comes of it."""
+    run = job.run
+    targets = _targets(job)
+
+    def make() -> list[str]:
+        fitted = job.fit_config
+        # nobody has masks of unseen views, the paper says; a promise is measured on the photo's own
+        labels = label_images(job, fitted.masks) if run.ladder == "nested" else None
+        table = cross_view(
+            job.scene, job.photos, job.ladder, targets, view_planner(job), labels=labels,
+            min_share=fitted.min_share, region=fitted.region,
+            backend=job.backend, antialiased=job.antialiased,
+            progress=lambda done, total: job.emit(Progress("crossview", done, total)),
+        )  # fmt: skip
+        table.write_csv(run.cross_view)
+        if run.ladder == "nested":
+            kept = promises_table(job, targets)
+            kept.write(run.adapted / "promises_kept")
+            job.emit(TableMade(kept.title, kept.header, tuple(map(tuple, kept.cells()))))
+        lines = []
+        for target in np.unique(table.target):
+            fared = promise_kept(table.select(table.target == target))
+            lines.append(f"SSIM {target:g}: {fared.kept} of {fared.promised} promises kept on unseen views")
+        return lines
+
+    inputs = [run.scene, run.labels, *ladder_files(run), run.plan]
+    run_stage(job, "crossview", {"targets": targets}, inputs, [run.cross_view], make)
+
+
+def promises_table(job: Job, targets: Sequence[float]) -> Table:
+    """Decisions on test views by the paper's model, by ours and by its bound, everything at one level."""
+    run, fitted = job.run, job.fit_config
+    table = large_enough(read_observations(run.observations), job.scene, fitted.min_share)
+    table = eroded(table, fitted.region)
+    scores = score(table, job.scene, read_promises(run.promises), job.ladder.counts, targets)
+    body = []
+    for predictor in PREDICTORS:
+        totals = scores.select(scores.predictor == predictor).totals()
+        columns = ("feasible", "kept", "overshoot", "chosen_overshoot", "refused", "regret")
+        body.append((predictor, *(totals[name] for name in columns)))
+    return Table(
+        "Promises on unseen views, by what they are made from",
+        ("by", "feasible", "kept", "overshoot", "above the lowest", "refused", "regret"),
+        ("", ",d", ".1%", ".3f", ".3f", ",d", ",.0f"),
+        body,
+        notes=(
+            "(category, view, target) triples called feasible, and the share that measures the target; SSIM "
+            "above it, of all and where a level above the lowest was chosen; triples refused though a level "
+            "measures the target; Gaussians above the cheapest level that would have done. "
+            f"Targets: {', '.join(f'{t:g}' for t in targets)}. oracle: the measurement itself.",
+        ),
+    )
+
+
+def equal_occupancy(job: Job, config: PaperConfig) -> None:
+    """Compare compositions with 3DGS of the same size, on the test views and in one view."""
+    run = job.run
+    view = _view(job, config)
+    settings = {"view": view, "tune_steps": config.tune_steps, "lpips": lpips_hashes(config.lpips)}
+
+    def make() -> list[str]:
+        tests = job.scene.test_ids.tolist()
+        comparisons = [(NONE, read_plans(run.plan)[0], tests), (view, _view_plans(job, view), [view])]
+        comparisons = [c for c in comparisons if c[2]]
+        images = sum(len(views) * (4 * len(plans) + 1) for _, plans, views in comparisons)
+        trainings = sum(2 * len(plans) for _, plans, _ in comparisons)
+        done, total = 0, trainings * _IMAGES_A_TRAINING + images
+
+        def advance(by: int) -> None:
+            nonlocal done
+            done += by
+            job.emit(Progress("occupancy", done, total))
+
+        def tuned(g: Gaussians) -> Gaussians:
+            result = tune_composition(job, g, config.tune_steps)
+            advance(_IMAGES_A_TRAINING)
+            return result
+
+        metrics = load_metrics(job, config.lpips)
+        rows: list[dict[str, float]] = []
+        for of_view, plans, views in comparisons:
+            sets = contenders(job.scene, job.ladder, plans, tuned, antialiased=job.antialiased)
+            rows += compare(
+                job.scene, job.photos, views, sets, metrics, of_view=of_view,
+                backend=job.backend, antialiased=job.antialiased, progress=lambda *_: advance(1),
+            )  # fmt: skip
+        write_columns(run.occupancy, from_rows(Occupancy, rows))
+        return [f"{len(rows)} images measured"]
+
+    inputs = [run.scene, run.levels, run.models, run.observations, run.plan]
+    run_stage(job, "occupancy", settings, inputs, [run.occupancy], make)
+
+
+def tables_and_figures(job: Job, config: PaperConfig) -> None:
+    """Write report/paper."""
+    run = job.run
+    view = _view(job, config)
+
+    def make() -> list[str]:
+        ladder, taxonomy = job.ladder, job.taxonomy
+        view_plans = _view_plans(job, view)
+        reduced = {"min": 0.0, "5 %": 5.0, "mean": None}
+        by_statistic = {
+            name: distances_in_views(job.scene, job.point_labels, percentile)
+            for name, percentile in reduced.items()
+        }
+        observations, fitted = read_observations(run.observations), job.fit_config
+        rows = large_enough(observations, job.scene, fitted.min_share)
+        data = PaperData(
+            title=job.scene.name,
+            names=job.names(),
+            colours={label: taxonomy.color(label) for label in job.names()},
+            observations=observations,
+            fitted=eroded(rows, fitted.region),
+            train_views=job.scene.train_ids,
+            test_views=job.scene.test_ids,
+            view_names=[v.name for v in job.scene.views],
+            counts=ladder.counts,
+            recovering=ladder.recovering,
+            models=read_models(run.models),
+            iterations=four_levels(ladder.levels),
+            view=view,
+            distances={n: {i: float(d[view]) for i, d in table.items()} for n, table in by_statistic.items()},
+            view_plans=view_plans,
+            cross_view=read_cross_view(run.cross_view),
+            occupancy=read_occupancy(run.occupancy),
+            panels=_panels(job, config, view),
+        )
+        write_paper(run.paper, data)
+        return []
+
+    inputs = [run.observations, run.models, run.plan, run.cross_view, run.occupancy]
+    run_stage(job, "paper", {"view": view}, inputs, [run.paper / "index.html"], make)
+    job.emit(RunDone(run.paper / "index.html"))
+
+
+def _targets(job: Job) -> list[float]:
+    return list(settings_of(job.run, "plan")["targets"])
+
+
+def _view_plans(job: Job, view: int) -> list[Plan]:
+    """Plans for one view at every target, as the paper's Table III makes them: from its four iterations."""
+    levels = four_levels(job.ladder.levels)
+    counts = {key: n for key, n in job.ladder.counts.items() if key[1] in levels}
+    seen = distances(job, job.fit_config.distance)
+    here = {label: float(d[view]) for label, d in seen.items()}
+    models = read_models(job.run.models)
+    return [plan_view(models, counts, here, target, view) for target in _targets(job)]
+
+
+def _view(job: Job, config: PaperConfig) -> int:
+    """The view to look at: the one named, or the middle one of the test views (or of all)."""
+    names = [view.name for view in job.scene.views]
+    if config.view is None:
+        views = job.scene.test_ids if len(job.scene.test_ids) else np.arange(len(names))
+        return int(views[len(views) // 2])
+    matching = [row for row, name in enumerate(names) if config.view in (name, name.rpartition(".")[0])]
+    if not matching:
+        raise RunError(f"{job.scene.path}: no photo {config.view!r}; there are {names[0]} to {names[-1]}")
+    return matching[0]
+
+
+def _panels(job: Job, config: PaperConfig, view: int) -> dict[str, list[Picture]]:
+    """The view of Table III, and for cross-view two test views, in pictures."""
+    tests = job.scene.test_ids
+    rows = [view, *(int(tests[len(tests) * i // 4]) for i in (1, 3) if len(tests))]
+    metric = load_metrics(job, config.lpips, ["alex"]).get("lpips_alex")
+    full = job.ladder.load(job.ladder.levels[-1])
+    panels = {}
+    for row in dict.fromkeys(rows):
+        sets = {f"3DGS, {len(full):,}": full}
+        sets |= {f"t={p.target:g}, {p.count:,}": job.ladder.compose(p.levels) for p in _view_plans(job, row)}
+        panels[job.scene.views[row].name] = take_pictures(
+            job.photos[row], job.scene.views[row].camera, sets, metric,
+            backend=job.backend, antialiased=job.antialiased,
+        )  # fmt: skip
+    return panels

@@ -1,0 +1,1 @@
+"""Models of one run used on another."""

@@ -1,0 +1,100 @@
+"""Where blocks that were trained by themselves meet: cut, put together, tuned, measured."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool
+
+from sagesplat.core import geometry
+from sagesplat.core.gaussians import Gaussians, concat
+from sagesplat.formats.levels import read_level, read_more, read_sizes
+from sagesplat.metrics.image import psnr
+from sagesplat.scene.blocks import Blocks, visible_shares
+from sagesplat.scene.scene import Scene
+from sagesplat.segment.parts import Parts
+
+SEVERAL = 0.1  # share of what a view sees that is of other blocks, from which on it tells of seams
+_PAD = 0.25  # of the image beyond its edges: Gaussians that begin there may reach into it
+
+
+def core(g: Gaussians, blocks: Blocks, parts: Parts, block: int) -> tuple[Gaussians, Bool[np.ndarray, " N"]]:
+    """What a block adds to the whole: its Gaussians inside its border, as parts; and which ones they are."""
+    inside = blocks.of(g.means.numpy()) == block
+    kept = g.select(torch.from_numpy(inside))
+    part_ids = parts.ids(kept.label_ids.numpy(), block)
+    return replace(kept, label_ids=torch.from_numpy(part_ids)), inside
+
+
+def core_sizes(
+    labels: np.ndarray, inside: np.ndarray, sizes: Mapping[int, tuple[int, ...]], parts: Parts, block: int
+) -> dict[int, tuple[int, ...]]:
+    """Level sizes, by part, of what is inside (bool [N]) of a ladder in its order: at least one of any."""
+    found = {}
+    for label, levels in sizes.items():
+        summed = np.concatenate([[0], inside[labels == label].cumsum()])
+        if summed[-1]:
+            found[int(parts.ids(np.array(label), block))] = tuple(int(max(1, summed[n])) for n in levels)
+    return found
+
+
+def together(files: Sequence[Path]) -> tuple[Gaussians, dict[int, tuple[int, ...]], np.ndarray]:
+    """The ladders of all blocks as one: Gaussians, sizes of levels by label id, clarity."""
+    sizes = {label: n for path in files for label, n in read_sizes(path).items()}
+    clarity = np.concatenate([read_more(path, "clarity") for path in files])
+    return concat([read_level(path) for path in files]), sizes, clarity
+
+
+def seam_views(scene: Scene, blocks: Blocks, block: int) -> list[int]:
+    """Training views of a block (rows) that see enough of others."""
+    shares = visible_shares(scene, blocks.of(scene.points.xyz), len(blocks))
+    return [row for row in scene.train_ids.tolist() if shares[row, block] < 1 - SEVERAL]
+
+
+def in_sight(g: Gaussians, scene: Scene, views: Sequence[int]) -> Bool[np.ndarray, " N"]:
+    """Gaussians whose centre is in the frustum of some of the views, or near it."""
+    seen, means = np.zeros(len(g), bool), g.means.numpy()
+    for row in views:
+        camera = scene.views[row].camera
+        pixels, _ = geometry.project(means, camera.w2c, camera.K)
+        size = np.array([camera.width, camera.height])
+        seen |= ((pixels >= -_PAD * size) & (pixels < (1 + _PAD) * size)).all(1)
+    return seen
+
+
+def around(own: Gaussians, others: Iterable[Gaussians], scene: Scene, views: Sequence[int]) -> Gaussians:
+    """A block's Gaussians, then what its views see of the others', which are looked at one by one."""
+    seen = [g.select(torch.from_numpy(in_sight(g, scene, views))) for g in others]
+    return concat([own, *seen])
+
+
+@dataclass(frozen=True)
+class Bands:
+    """Quality of a composition near the borders of blocks and away from them, over some views."""
+
+    share: float  # of the pixels that are in a band
+    psnr: float  # dB over all pixels in bands
+    psnr_inside: float  # dB over all others
+    ssim: float
+    ssim_inside: float
+
+
+def bands(in_band: Sequence[np.ndarray], squares: Sequence[np.ndarray], ssim: Sequence[np.ndarray]) -> Bands:
+    """Sum up views: pixels in a band (bool [H, W]), squared errors and SSIM there."""
+    band = np.concatenate([b.ravel() for b in in_band])
+    error, quality = (
+        np.concatenate([v.ravel() for v in maps]).astype(np.float64) for maps in (squares, ssim)
+    )
+
+    def mean(values: np.ndarray) -> float:
+        return float(values.mean()) if len(values) else np.nan
+
+    return Bands(
+        mean(band),
+        float(psnr(mean(error[band]))),
+        float(psnr(mean(error[~band]))),
+        mean(quality[band]),
+        mean(quality[~band]),
+    )

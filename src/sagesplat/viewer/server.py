@@ -1,0 +1,134 @@
+"""A server for bundles that holds its port, with or without TLS."""
+
+import errno
+import os
+import socket
+import ssl
+import sys
+import threading
+import webbrowser
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sagesplat.core.errors import RunError
+
+if TYPE_CHECKING:
+    import uvicorn
+
+
+MANIFEST = "manifest.json"
+PORT = 8000
+_TRIED = 100  # ports from PORT on, where none is asked for
+_NO_SERVER = "showing a bundle needs starlette and uvicorn; pip install 'sagesplat[view]'"
+
+
+@dataclass(frozen=True)
+class View:
+    """A server that holds its port and answers once it runs; a context manager that gives the port back."""
+
+    urls: tuple[str, ...]
+    hint: str  # what a headset needs
+    _server: "uvicorn.Server"
+    _listener: socket.socket
+    _keep: Callable[[threading.Event], None] | None  # the site up to date
+
+    def run(self, browser: bool = True) -> None:
+        """Serve until Ctrl-C or `stop`, quietly; opens the browser where there is a display."""
+        stop = threading.Event()
+        if self._keep:
+            threading.Thread(target=self._keep, args=(stop,), daemon=True).start()
+        if browser and has_display():
+            threading.Thread(target=webbrowser.open, args=(self.urls[0],), daemon=True).start()
+        with suppress(KeyboardInterrupt):
+            self._server.run([self._listener])
+        stop.set()
+
+    def stop(self) -> None:
+        """End `run`, from any thread."""
+        self._server.should_exit = True
+
+    def __enter__(self) -> "View":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._listener.close()
+
+
+def bind(host: str, port: int | None) -> socket.socket:
+    """A socket on a port (0: any), or on the first free one from 8000 on; RunError where that cannot be."""
+    if port is not None and not 0 <= port < 2**16:
+        raise RunError(f"--port {port} is impossible; choose 1024 to 65535")
+    ports = range(PORT, PORT + _TRIED) if port is None else [port]
+    for number in ports:
+        listener = None
+        try:
+            family, *_, address = socket.getaddrinfo(host, number, type=socket.SOCK_STREAM)[0]
+            listener = socket.socket(family, socket.SOCK_STREAM)
+            if os.name == "posix":  # elsewhere it would share a port in use
+                listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listener.bind(address)
+            listener.listen(1024)
+            return listener
+        except OSError as error:
+            if listener:
+                listener.close()
+            if error.errno != errno.EADDRINUSE:
+                raise RunError(f"{host}:{number}: cannot listen ({error}); change --host or --port") from None
+    if port is None:
+        raise RunError(f"ports {ports[0]} to {ports[-1]} are all taken; choose another by --port")
+    raise RunError(f"port {port} is taken; choose another --port, or leave it out")
+
+
+def has_display() -> bool:
+    """Whether a browser window can open here."""
+    if sys.platform in ("win32", "darwin"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def _check_certificate(certificate: Path | None, key: Path | None) -> None:
+    if certificate is None and key is None:
+        return
+    if certificate is None:
+        raise RunError(f"{key}: a key without its certificate; add --ssl-certfile")
+    for path in filter(None, (certificate, key)):
+        if not path.is_file():
+            raise RunError(f"{path}: no such file; give a certificate and its key in PEM")
+    try:
+        # a password would be asked for on the terminal otherwise
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key, password=lambda: "")
+    except (ssl.SSLError, OSError, ValueError) as error:
+        why = getattr(error, "reason", None) or error
+        raise RunError(f"{certificate}: no certificate with its key (PEM, no password): {why}") from None
+
+
+def _urls(listener: socket.socket, secure: bool) -> tuple[str, ...]:
+    """Where a bound socket is found: the first for this machine."""
+    host, port = listener.getsockname()[:2]
+    hosts = [f"[{host}]" if ":" in host else host]
+    if host in ("0.0.0.0", "::"):
+        hosts = ["localhost", *filter(None, [_network_address()])]
+    return tuple(f"http{'s' * secure}://{name}:{port}/" for name in hosts)
+
+
+def _network_address() -> str | None:
+    """This machine's address in its network. Nothing is sent: a datagram socket only looks up the route."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))
+            return probe.getsockname()[0]
+        except OSError:
+            return None
+
+
+def _hint(urls: tuple[str, ...], secure: bool, host: str | None) -> str:
+    """One line: how a headset gets there, as browsers offer XR on localhost and https only."""
+    if secure and host is not None:
+        return f"headset: open {urls[-1]} there and accept the certificate"
+    port = urls[0].rstrip("/").rpartition(":")[2]
+    local = f"http{'s' * secure}://localhost:{port}/"
+    cable = f"by cable `adb reverse tcp:{port} tcp:{port}`, then open {local} there"
+    return f"headset: {cable}; by network --host 0.0.0.0 with --ssl-certfile and --ssl-keyfile"

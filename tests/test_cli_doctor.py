@@ -1,0 +1,160 @@
+"""What `sagesplat doctor` finds on machines of all kinds, and how it says so."""
+
+import io
+import json
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from rich.console import Console
+
+from sagesplat import cli
+from sagesplat.cli import doctor
+from sagesplat.cli.doctor import Finding
+from sagesplat.core.errors import BackendUnavailable
+from sagesplat.raster import cuda
+
+
+def printed(findings: list[Finding]) -> str:
+    out = io.StringIO()
+    doctor.print_findings(findings, Console(file=out, highlight=False, width=40))
+    return out.getvalue()
+
+
+@pytest.fixture
+def gpu(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A machine with one device, a CUDA toolkit and gsplat, not compiled yet."""
+
+    class Card:
+        name, total_memory, major, minor = "NVIDIA H200", 139 * 2**30, 9, 0
+
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda index: Card())
+    monkeypatch.setattr(cuda, "gsplat_version", lambda: "1.5.3")
+    monkeypatch.setattr(cuda, "compiled", lambda: None)
+    for name, content in (
+        ("bin/nvcc", "#!/bin/sh\necho release 13.0, V13.0.1"),
+        ("include/cuda_runtime.h", ""),
+    ):
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).write_text(content)
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("CUDA_HOME", str(tmp_path))
+    return tmp_path
+
+
+def test_here(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["sagesplat", "doctor", "--json"])
+    cli.main()
+    found = json.loads(capsys.readouterr().out)
+    assert found["well"] is True
+    by_part = {row["part"]: row for row in found["findings"]}
+    assert by_part["cpu kernels"]["state"] == "fine"
+    assert "agree with the reference" in by_part["cpu kernels"]["text"]
+    assert by_part["gsplat"]["text"] == "1.5.3"
+    assert all(row["cure"] for row in found["findings"] if row["state"] != "fine")
+    assert all("\n" not in row["text"] + row["cure"] for row in found["findings"])
+
+
+def test_kernels_that_fail_end_in_exit_code_1(capsys, monkeypatch) -> None:
+    def broken(*arguments: object, **options: object) -> None:
+        raise RuntimeError("LLVM ERROR:\nno such thing")
+
+    for kernels, says in (
+        (broken, "RuntimeError: LLVM ERROR: no such thing"),
+        (lambda *_: 0.5, "by 5.0e-01"),
+    ):
+        monkeypatch.setattr(doctor, "_error", kernels)
+        monkeypatch.setattr(sys, "argv", ["sagesplat", "doctor"])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        assert end.value.code == 1
+        lines = capsys.readouterr().out.splitlines()
+        at = next(i for i, line in enumerate(lines) if "cpu kernels" in line)
+        assert lines[at].startswith("✗")
+        assert says in lines[at]
+        assert "pip install --force-reinstall numba" in lines[at + 1]
+
+
+def test_a_machine_without_gpu(monkeypatch) -> None:
+    monkeypatch.setattr(torch.version, "cuda", None)
+    (found,) = doctor.gpus()
+    assert found.state == "gap"
+    assert found.text.endswith("is built without CUDA")
+    assert found.cure.startswith("install a build with it")
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert doctor.gpus()[0].cure == "check nvidia-smi or use --device cpu"
+    assert doctor.gsplat_kernels(build=True).text.endswith("finds no CUDA device or driver")
+
+
+def test_a_machine_with_a_gpu(gpu, monkeypatch) -> None:
+    monkeypatch.setattr(
+        doctor, "_output", lambda *words: "580.1" if words[0] == "nvidia-smi" else "release 13.0, V"
+    )
+    assert doctor.gpus()[0].text == "NVIDIA H200, 139 GiB, compute capability 9.0, driver 580.1"
+    assert doctor.compiler() == Finding("nvcc", "fine", f"13.0 at {gpu}/bin/nvcc, toolkit at {gpu}")
+    assert doctor.gsplat() == Finding("gsplat", "fine", "1.5.3")
+    found = doctor.gsplat_kernels(build=False)
+    assert (found.state, found.text) == ("gap", "not compiled yet")
+    assert found.cure == "the first use takes about a minute; sagesplat doctor --build does it now"
+    monkeypatch.setattr(cuda, "compiled", lambda: gpu / "csrc.so")
+    monkeypatch.setattr(doctor, "_error", lambda backend: {"cuda": 2e-5}[backend])
+    assert doctor.gsplat_kernels(build=False).text.startswith("agree with the reference to 2e-05")
+
+
+def test_building_now(gpu, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(doctor, "_error", lambda backend: 2e-5)
+    monkeypatch.setattr(cuda, "kernels", lambda: print("compiling"))
+    assert doctor.gsplat_kernels(build=True).state == "fine"
+    assert capsys.readouterr() == ("", "compiling\n")
+
+    def fail() -> None:
+        raise BackendUnavailable("they do not compile") from RuntimeError("nvcc fatal\nline 2")
+
+    monkeypatch.setattr(cuda, "kernels", fail)
+    found = doctor.gsplat_kernels(build=True)
+    assert (found.state, found.text) == ("gap", "they do not compile")
+    assert capsys.readouterr().err == "nvcc fatal\nline 2\n"
+
+
+def test_gaps_of_gsplat_and_its_compiler(gpu, monkeypatch) -> None:
+    (gpu / "include" / "cuda_runtime.h").unlink()
+    found = doctor.compiler()
+    assert found.state == "gap"
+    assert "no toolkit at" in found.text
+    assert "set CUDA_HOME" in found.cure
+    monkeypatch.setattr(cuda, "nvcc", lambda: None)
+    assert doctor.compiler().cure == "install the CUDA toolkit and set CUDA_HOME"
+    assert "no nvcc" in doctor.gsplat_kernels(build=True).text
+    monkeypatch.setattr(cuda, "compiled", lambda: gpu / "csrc.so")
+    assert doctor.compiler().state == "fine"
+    monkeypatch.setattr(cuda, "gsplat_version", lambda: "1.4.0")
+    assert doctor.gsplat().cure == "pip install 'gsplat>=1.5.3,<1.7'"
+    monkeypatch.setattr(cuda, "gsplat_version", lambda: None)
+    found = doctor.gsplat()
+    assert printed([found]).splitlines()[1].endswith("→ pip install 'sagesplat[cuda]'")  # no markup
+
+
+def test_extras(monkeypatch, tmp_path) -> None:
+    found = doctor.extra("onnx", "no-such-package", "something")
+    assert (found.state, found.cure) == ("gap", "pip install 'sagesplat[onnx]'")
+    assert doctor.extra("test", "pytest", "tests").text.startswith("pytest ")
+    monkeypatch.setattr(doctor, "weights_path", lambda net: tmp_path / "none.npz")
+    assert doctor.lpips().cure == "sagesplat download lpips"
+    monkeypatch.setattr(doctor, "weights_path", lambda net: tmp_path)
+    assert doctor.lpips().state == "fine"
+
+
+def test_programs_that_are_not_there_or_fail_say_nothing() -> None:
+    assert doctor._output("no-such-program") == ""
+    assert doctor._output(sys.executable, "-c", "raise SystemExit(3)") == ""
+    assert doctor._output(sys.executable, "-c", "print(5)") == "5"
+
+
+def test_lines_are_not_wrapped_where_they_are_piped() -> None:
+    long = Finding("part", "gap", "word " * 40, "cure " * 40)
+    assert len(printed([long, Finding("a longer part", "fine", "yes")]).splitlines()) == 3

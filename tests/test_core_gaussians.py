@@ -1,0 +1,63 @@
+"""The Gaussians type: rows stay together."""
+
+from dataclasses import fields
+
+import pytest
+import torch
+from conftest import random_gaussians
+
+from sagesplat.core.gaussians import PARAMETERS, Gaussians, concat
+
+
+def assert_rows(actual: Gaussians, g: Gaussians, rows: list[int]) -> None:
+    assert len(actual) == len(rows)
+    for field in fields(Gaussians):
+        assert torch.equal(getattr(actual, field.name), getattr(g, field.name)[rows]), field.name
+
+
+def test_select_keeps_every_field_of_a_row():
+    g = random_gaussians(10)
+    assert_rows(g.select(torch.tensor([4, 4, 1])), g, [4, 4, 1])
+    mask = torch.zeros(10, dtype=torch.bool)
+    mask[[2, 7]] = True
+    assert_rows(g.select(mask), g, [2, 7])
+    assert_rows(g.select(~mask & mask), g, [])
+
+
+def test_labels_are_counted_and_selected():
+    g = random_gaussians(10)  # labels -1, 3, 184 in turn
+    assert g.counts() == {-1: 4, 3: 3, 184: 3}
+    assert_rows(g.of_labels([184, -1]), g, [0, 2, 3, 5, 6, 8, 9])
+    assert_rows(g.of_labels([99]), g, [])
+    assert_rows(g.of_labels([]), g, [])
+    assert sum(len(g.of_labels([label])) for label in g.counts()) == len(g)
+    assert g.of_labels([]).counts() == {}
+
+
+@pytest.mark.parametrize(("bases", "degree"), [(0, 0), (3, 1), (8, 2), (15, 3)])
+def test_degree_and_occupancy(bases, degree):
+    g = random_gaussians(7, degree=degree)
+    assert g.shN.shape == (7, bases, 3)
+    assert g.sh_degree == degree
+    assert g.nbytes == 7 * 62 * 4  # the paper counts 62 float32 whatever the degree
+    assert tuple(g.parameters()) == PARAMETERS
+
+
+def test_concat_keeps_order_and_pads_harmonics():
+    a, b = random_gaussians(4, seed=1, degree=1), random_gaussians(3, seed=2, degree=3)
+    both = concat([a, b])
+    assert both.sh_degree == 3
+    assert_rows(both.select(torch.arange(4, 7)), b, [0, 1, 2])
+    assert torch.equal(both.shN[:4, :3], a.shN)
+    assert (both.shN[:4, 3:] == 0).all()
+    assert torch.equal(both.label_ids, torch.cat([a.label_ids, b.label_ids]))
+    assert both.label_ids.dtype == torch.int16
+
+
+def test_detach_shares_memory_without_a_graph():
+    g = random_gaussians(3)
+    leaves = {name: p.requires_grad_() for name, p in g.parameters().items()}
+    detached = g.detach()
+    for name, p in detached.parameters().items():
+        assert not p.requires_grad
+        assert p.data_ptr() == leaves[name].data_ptr()

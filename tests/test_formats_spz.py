@@ -1,0 +1,331 @@
+"""SPZ files: bytes by hand, a file of another writer, both axes by rendering, hostile bytes."""
+
+import struct
+import zlib
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from sagesplat.core.errors import DataError
+from sagesplat.core.gaussians import PARAMETERS, Gaussians
+from sagesplat.formats.quantisation import rounded
+from sagesplat.formats.spz import MAX_COUNT, decode_spz, encode_spz, packing_order, read_spz, write_spz
+from sagesplat.raster import rasterize
+from sagesplat.scene.scene import Camera
+from tests.conftest import damage, pinhole, random_gaussians
+
+DATA = Path(__file__).parent / "data"
+NO_FIXTURE = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+
+
+def pack(raw: bytes) -> bytes:
+    packer = zlib.compressobj(9, zlib.DEFLATED, 31)
+    return packer.compress(raw) + packer.flush()
+
+
+def header(count: int, *, version: int = 3, degree: int = 0, bits: int = 12, flags: int = 0) -> bytes:
+    return struct.pack("<4sIIBBBB", b"NGSP", version, count, degree, bits, flags, 0)
+
+
+def one(**changes: list) -> Gaussians:
+    """A Gaussian at the origin, or what the changes make of it."""
+    values = {
+        "means": [0.0, 0.0, 0.0],
+        "quats": [1.0, 0.0, 0.0, 0.0],
+        "log_scales": [0.0, 0.0, 0.0],
+        "sh0": [[0.0, 0.0, 0.0]],
+        "shN": np.zeros((0, 3)).tolist(),
+        **changes,
+    }
+    tensors = {key: torch.tensor([value], dtype=torch.float32) for key, value in values.items()}
+    shN = tensors.pop("shN").reshape(1, -1, 3)
+    logits = tensors.pop("logit_opacities", torch.zeros(1)).reshape(1)
+    return Gaussians(
+        **tensors, shN=shN, logit_opacities=logits, label_ids=torch.full((1,), -1, dtype=torch.int16)
+    )
+
+
+def rotations(quats: torch.Tensor) -> torch.Tensor:
+    """Unit quaternions whose first component that counts is positive."""
+    unit = quats.double() / quats.double().norm(dim=1, keepdim=True)
+    return unit * unit.gather(1, unit.abs().argmax(1, keepdim=True)).sign()
+
+
+def test_the_bytes_of_one_gaussian():
+    g = one(
+        means=[1.0, -2.0, 0.25],
+        quats=[0.5, -0.5, 0.1, 0.7],
+        log_scales=[-10.0, 0.0, 20.0],
+        logit_opacities=[0.0],
+        sh0=[[0.0, 2.0, -9.0]],
+        shN=[[0.1, -0.1, 2.0], [0.0, 0.0, 0.0], [-2.0, 0.5, 0.06]],
+    )
+    raw = zlib.decompress(encode_spz(g, fractional_bits=12, antialiased=True, frame="rdf"), 31)
+    # |q| = 1; the largest is z, number 2; x, y, w follow, times 511 sqrt 2
+    rotation = 2 << 30 | (512 | 361) << 20 | 72 << 10 | 361
+    expected = b"NGSP" + struct.pack("<IIBBBB", 3, 1, 1, 12, 1, 0)
+    expected += bytes([0x00, 0x10, 0x00, 0x00, 0xE0, 0xFF, 0x00, 0x04, 0x00])
+    expected += bytes([128, 128, 204, 0, 0, 160, 255]) + struct.pack("<I", rotation)
+    expected += bytes([144, 112, 255, 128, 128, 128, 0, 192, 136])
+    assert raw == expected
+
+
+def test_the_values_of_one_gaussian():
+    rotation = 3 << 30 | (512 | 361) << 20 | 0 << 10 | 361  # w left out: x < 0, y = 0, z > 0
+    body = bytes([0, 0x10, 0, 0, 0xE0, 0xFF, 1, 0, 0x80]) + bytes([51, 128, 0, 255, 0, 160, 255])
+    g = decode_spz(pack(header(1) + body + struct.pack("<I", rotation)), 7, frame="rdf")
+    assert g.means[0].tolist() == [1.0, -2.0, (1 - 2**23) / 4096]
+    assert g.logit_opacities.sigmoid() == pytest.approx(0.2)
+    assert g.sh0[0, 0].numpy() == pytest.approx([0.5 / 255 / 0.15, -0.5 / 0.15, 0.5 / 0.15])
+    assert g.log_scales[0].tolist() == [-10.0, 0.0, 5.9375]
+    third = 361 / 511 * 0.5**0.5
+    assert g.quats[0].numpy() == pytest.approx([(1 - 2 * third**2) ** 0.5, -third, 0, third])
+    assert g.shN.shape == (1, 0, 3)
+    assert g.label_ids.tolist() == [7]
+
+
+def test_version_2_keeps_three_parts_of_a_rotation():
+    body = bytes(9) + bytes([128, 128, 128, 128, 160, 160, 160]) + bytes([0, 127, 128])
+    g = decode_spz(pack(header(1, version=2) + body), frame="rdf")
+    assert g.quats[0].numpy() == pytest.approx([0, -1, -1 / 255, 1 / 255], abs=1e-6)
+
+
+def test_a_file_of_gsply_reads_as_it_reads_it():
+    """tests/data/gsply.spz and .npz: gsply 0.4.6 (MIT) wrote the one and read it back for the other."""
+    g = read_spz(DATA / "gsply.spz", frame="rdf")
+    with np.load(DATA / "gsply.npz") as golden:
+        for key in PARAMETERS:
+            assert np.allclose(getattr(g, key).numpy(), golden[key], rtol=0, atol=2e-5), key
+
+
+@NO_FIXTURE
+@given(
+    seed=st.integers(0, 2**31),
+    count=st.integers(0, 30),
+    degree=st.integers(0, 3),
+    extent=st.floats(1e-3, 1e6),
+    frame=st.sampled_from(["rub", "rdf"]),
+)
+def test_round_trip_within_half_a_step(seed, count, degree, extent, frame):
+    g = random_gaussians(count, seed=seed, degree=degree)
+    g = replace(g, means=(g.means - torch.tensor([0, 0, 4.0])) * extent)
+    content = encode_spz(g, frame=frame)
+    back = decode_spz(content, frame=frame)
+    step = 2.0 ** -zlib.decompress(content, 31)[13]
+    assert back.sh_degree == degree
+    assert (back.label_ids == -1).all()
+    assert ((back.means - g.means).abs() <= step * 0.501 + g.means.abs() * 1e-6).all()
+    assert ((back.log_scales - g.log_scales.clamp(-10, 5.9375)).abs() <= 1 / 32 + 1e-5).all()
+    assert ((back.logit_opacities.sigmoid() - g.logit_opacities.sigmoid()).abs() <= 0.5 / 255 + 1e-5).all()
+    assert ((back.sh0 - g.sh0.clamp(-0.5 / 0.15, 0.5 / 0.15)).abs() <= 0.5 / 38.25 + 1e-5).all()
+    assert ((rotations(back.quats) * rotations(g.quats)).sum(1).abs() > 1 - 1e-5).all()
+    assert ((back.shN[:, :3] - g.shN[:, :3]).abs() <= 1 / 32 + 1e-6).all()
+    assert ((back.shN[:, 3:] - g.shN[:, 3:]).abs() <= 1 / 16 + 1e-6).all()
+
+
+def test_a_second_round_changes_no_byte():
+    content = encode_spz(random_gaussians(200), fractional_bits=12)
+    assert encode_spz(decode_spz(content), fractional_bits=12) == content
+
+
+def turned(camera: Camera) -> Camera:
+    """The same camera in a world whose y and z point the other way."""
+    w2c = camera.w2c.copy()
+    w2c[:, 1:3] *= -1
+    return replace(camera, w2c=w2c)
+
+
+def test_a_turned_scene_looks_the_same_to_a_turned_camera():
+    g = random_gaussians(150, seed=3)
+    g = replace(g, shN=g.shN * 3)  # so that a wrong sign shows
+    content = encode_spz(g)
+    there, here = decode_spz(content, frame="rdf"), decode_spz(content)
+    assert torch.equal(there.means, here.means * torch.tensor([1.0, -1.0, -1.0]))
+    expected = rasterize(here, pinhole()).rgb
+    assert torch.allclose(rasterize(there, turned(pinhole())).rgb, expected, atol=1e-4)
+    for base in range(15):  # every sign counts
+        signs = torch.ones(15, 1)
+        signs[base] = -1
+        wrong = rasterize(replace(there, shN=there.shN * signs), turned(pinhole())).rgb
+        assert (wrong - expected).abs().max() > 0.01
+
+
+def test_the_decoded_scene_looks_like_the_scene():
+    g = random_gaussians(150, seed=4)
+    image, decoded = (rasterize(x, pinhole()).rgb for x in (g, decode_spz(encode_spz(g, sh_bits=(8, 8)))))
+    assert (image - decoded).square().mean() < 1e-4
+
+
+def test_same_bytes_every_time(tmp_path):
+    g = random_gaussians(50)
+    size = write_spz(tmp_path / "a.spz", g, antialiased=True)
+    content = (tmp_path / "a.spz").read_bytes()
+    assert content == encode_spz(g, antialiased=True)
+    assert size == len(content)
+    assert content[4:8] == bytes(4)  # no time in the gzip header
+    assert len(read_spz(tmp_path / "a.spz", 3).of_labels([3])) == 50
+
+
+def test_coarse_files_hold_what_training_draws_and_are_smaller():
+    g = random_gaussians(2000, degree=3)
+    fine, coarse = encode_spz(g), encode_spz(g, coarse=True)
+    assert len(coarse) < 0.93 * len(fine)
+    back = decode_spz(coarse)
+    drawn = rounded(g, (5, 4))
+    for name in ("sh0", "log_scales", "shN"):
+        assert torch.allclose(getattr(back, name), getattr(drawn, name), atol=1e-6), name
+    assert (torch.sigmoid(back.logit_opacities) - torch.sigmoid(g.logit_opacities)).abs().max() < 2.01 / 255
+    alike = (rotations(back.quats) * rotations(g.quats)).sum(1).abs()
+    assert torch.rad2deg(2 * torch.arccos(alike.clamp(max=1))).max() < 2
+    half_a_step = torch.exp(g.log_scales).sort(1)[0][:, 1].quantile(0.1) / 4
+    assert (back.means - g.means).abs().max() <= half_a_step
+
+
+def test_gradients_pass_rounding_as_if_it_were_not_there():
+    g = random_gaussians(20, degree=3)
+    leaves = {name: p.requires_grad_() for name, p in g.parameters().items()}
+    drawn = rounded(g, (5, 4))
+    grads = torch.autograd.grad(
+        torch.cat([p.flatten() for p in drawn.parameters().values()]).sum(), [*leaves.values()]
+    )
+    assert all(torch.equal(grad, torch.ones_like(grad)) for grad in grads)
+
+
+@pytest.mark.parametrize("sh_bits", [(5, 4), (8, 8), (1, 1), (6, 5)])
+def test_harmonics_of_zero_stay_zero_and_cost_nothing(sh_bits):
+    g = random_gaussians(2000)
+    without = replace(g, shN=torch.zeros_like(g.shN))
+    content = encode_spz(without, sh_bits=sh_bits)
+    assert (decode_spz(content).shN == 0).all()
+    assert len(content) - len(encode_spz(without, sh_degree=0)) < 2000 * 45 / 200
+
+
+def test_a_lower_degree_drops_harmonics():
+    g = random_gaussians(20, degree=2)
+    assert [decode_spz(encode_spz(g, sh_degree=d)).sh_degree for d in range(4)] == [0, 1, 2, 2]
+
+
+def test_positions_take_the_bits_that_fit():
+    def bits(g: Gaussians, wanted: int | None = None) -> int:
+        return zlib.decompress(encode_spz(g, fractional_bits=wanted), 31)[13]
+
+    assert bits(one(means=[3000.0, 0, 0], log_scales=[-9.0, -9.0, -9.0])) == 11  # the extent
+    assert bits(one(means=[3.0, 0, 0], log_scales=[-9.0, -9.0, 0.0])) == 16  # an eighth of exp(-9)
+    assert bits(one(log_scales=[9.0, 9.0, 9.0])) == 1
+    assert bits(one(), 0) == 0
+    far = one(means=[2.0**23 - 1, 0, 1 - 2.0**23])
+    assert torch.equal(decode_spz(encode_spz(far)).means, far.means)
+    with pytest.raises(DataError, match=r"a\.spz: positions reach 1e\+08.*scale the scene down"):
+        encode_spz(one(means=[1e8, 0, 0]), name="a.spz")
+    with pytest.raises(DataError, match="positions up to 5 allow 0 to 20"):
+        encode_spz(one(means=[5.0, 0, 0]), fractional_bits=21)
+
+
+def test_the_packing_order_is_an_order_that_packs():
+    g = random_gaussians(4000)
+    order = torch.from_numpy(packing_order(g))
+    assert torch.equal(order.sort().values, torch.arange(4000))
+    assert len(encode_spz(g.select(order))) < len(encode_spz(g))
+    assert len(packing_order(random_gaussians(0))) == 0
+
+
+@pytest.mark.parametrize("key", PARAMETERS)
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_nan_and_inf_are_refused(tmp_path, key, value):
+    g = random_gaussians(5)
+    getattr(g, key).view(-1)[3] = value
+    with pytest.raises(DataError, match=rf"a\.spz: 1 values of {key} are NaN or infinite"):
+        write_spz(tmp_path / "a.spz", g)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_rotation_of_zeros_is_refused():
+    with pytest.raises(DataError, match="1 Gaussians have a rotation of zeros"):
+        encode_spz(one(quats=[0.0, 0, 0, 0]))
+
+
+@pytest.mark.parametrize("size", [1e-30, 1.0, 1e30])
+def test_rotations_of_any_length(size):
+    g = one(quats=[size, -size, size / 2, 0.0])
+    assert torch.allclose(rotations(decode_spz(encode_spz(g)).quats), rotations(g.quats), atol=2e-3)
+
+
+@settings(max_examples=60, deadline=None)
+@given(values=st.lists(st.floats(width=32, allow_nan=False, allow_infinity=False), min_size=62, max_size=62))
+def test_any_finite_values_are_written_or_refused(values):
+    flat = torch.tensor(values, dtype=torch.float32)
+    quats = torch.where(flat[3:7].any(), flat[3:7], torch.ones(4))
+    g = Gaussians(
+        means=flat[None, :3].clamp(-8e6, 8e6),
+        quats=quats[None],
+        log_scales=flat[None, 7:10],
+        logit_opacities=flat[10:11],
+        sh0=flat[None, None, 11:14],
+        shN=flat[None, 14:59].reshape(1, 15, 3),
+        label_ids=torch.zeros(1, dtype=torch.int16),
+    )
+    back = decode_spz(encode_spz(g))
+    assert all(p.isfinite().all() for p in back.parameters().values())
+
+
+GOOD = encode_spz(random_gaussians(12, degree=1))
+
+
+@settings(max_examples=300, deadline=None)
+@given(data=st.data(), inside=st.booleans())
+def test_damaged_bytes_give_gaussians_or_a_data_error(data, inside):
+    content = pack(damage(zlib.decompress(GOOD, 31), data)) if inside else damage(GOOD, data)
+    with suppress(DataError):
+        g = decode_spz(content)
+        assert all(p.isfinite().all() for p in g.parameters().values())
+        assert g.quats.any(1).all()
+
+
+BODY = bytes(20)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "not an SPZ file"),
+        (b"ply\nformat", "not gzip, or damaged"),
+        (pack(b"NGSP"), "not an SPZ file"),
+        (pack(bytes(36)), "not an SPZ file"),
+        (pack(header(1, version=1) + BODY), "SPZ version 1 is not read"),
+        (pack(header(1, version=2**31) + BODY), "SPZ version 2147483648 is not read"),
+        (b"NGSP" + bytes(40), "SPZ version 4 is not read"),
+        (pack(header(1, degree=4) + BODY), "SH degree 4"),
+        (pack(header(1, bits=25) + BODY), "25 fractional bits"),
+        (pack(header(1, flags=2) + BODY), "flags 2"),
+        (pack(header(1, flags=128) + BODY), "flags 128"),
+        (pack(header(1) + BODY[1:]), "not the 1 Gaussians promised"),
+        (pack(header(1) + BODY + b"x"), "not the 1 Gaussians promised"),
+        (pack(header(1) + BODY) + b"x", "not the 1 Gaussians promised"),
+        (pack(header(1) + BODY)[:-1], "not the 1 Gaussians promised"),
+        (pack(header(0) + b"x"), "not the 0 Gaussians promised"),
+        (pack(header(2**32 - 1) + BODY), "4294967295 Gaussians promised, more than fit"),
+        (pack(header(MAX_COUNT + 1) + BODY), "10000001 Gaussians promised, more than fit"),
+        (pack(header(10) + bytes(10**7)), "not the 10 Gaussians promised"),  # a bomb: read no further
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_other_files_are_refused(tmp_path, content, message):
+    (tmp_path / "a.spz").write_bytes(content)
+    with pytest.raises(DataError, match=rf"a\.spz: .*{message}"):
+        read_spz(tmp_path / "a.spz")
+
+
+def test_a_wrong_checksum_is_refused():
+    with pytest.raises(DataError, match="incorrect data check"):
+        decode_spz(GOOD[:-8] + bytes([GOOD[-8] ^ 1]) + GOOD[-7:])
+
+
+def test_a_missing_file_is_one_line(tmp_path):
+    with pytest.raises(DataError, match=r"b\.spz: cannot be read \(No such file"):
+        read_spz(tmp_path / "b.spz")

@@ -1,0 +1,336 @@
+"""Tasks on a Ray cluster of a few nodes on this machine: spread, lost, failed, and from the command line."""
+
+import os
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import closing, nullcontext
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("ray")
+
+import ray
+from ray.cluster_utils import Cluster
+from ray_tasks import die, divide, fail, hold, where
+
+from sagesplat.cli.base import Machine, computing
+from sagesplat.core.config import FitConfig, LiftConfig, MasksConfig, SceneConfig, TrainConfig
+from sagesplat.core.errors import BackendUnavailable, RunError
+from sagesplat.core.events import Event, Progress, Warned
+from sagesplat.demo.capture import make_capture
+from sagesplat.run import ray_executor, ray_task
+from sagesplat.run.executor import LOCAL, Task, results
+from sagesplat.run.job import Job
+from sagesplat.run.ray_executor import RayExecutor, connected
+from sagesplat.run.ray_task import Failed, Place, do
+from sagesplat.run.run_dir import RunDir
+from sagesplat.stages.label import lift_labels, make_masks
+from sagesplat.stages.observe import observe_levels
+from sagesplat.stages.scene import open_scene
+from sagesplat.stages.train import train_levels
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="clusters of one machine are POSIX only")
+NODE = {"num_cpus": 1, "object_store_memory": 80 * 2**20, "include_dashboard": False}
+CODE = "import sys; from sagesplat.cli import main; sys.argv[0] = 'sagesplat'; main()"
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    """Two nodes of one CPU; their processes import this file."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        patch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
+        patch.delenv("RAY_ADDRESS", raising=False)
+        made = Cluster(initialize_head=True, head_node_args=NODE)
+        made.add_node(**NODE)
+        try:
+            with connected(str(made.address)):
+                yield made
+        finally:
+            made.shutdown()
+
+
+@pytest.fixture
+def executor(cluster: Any, tmp_path: Path) -> Iterator[RayExecutor]:
+    with closing(RayExecutor(tmp_path / "shared")) as made:
+        yield made
+    assert not list((tmp_path / "shared").glob(".cluster*"))
+
+
+def alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def wait_for(condition, seconds: float = 30.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.05)
+
+
+def test_tasks_are_spread_over_the_nodes_and_tell_what_they_do(executor: RayExecutor) -> None:
+    events: list[Event] = []
+    found = results(executor, [Task("where", where, (number,)) for number in range(4)], events.append)
+    assert [number for number, _ in found] == [0, 1, 2, 3]
+    assert len({node for _, node in found}) == 2
+    assert executor.parallel == 2
+    assert 0 < executor.memory < 10**12
+    assert [event for event in events if isinstance(event, Warned)] == [Warned("same of all")]
+    bar = [event for event in events if isinstance(event, Progress)]
+    assert bar[-1] == Progress("where", 8, 8)
+    assert [event.done for event in bar] == sorted(event.done for event in bar)
+
+
+def test_an_error_of_the_user_is_its_line_and_ends_the_others(executor: RayExecutor, tmp_path: Path) -> None:
+    begin = time.monotonic()
+    tasks = [Task("fail", fail, (number, tmp_path)) for number in range(4)]
+    with pytest.raises(RunError, match=f"^{tmp_path}: mend it$") as raised:
+        results(executor, tasks, lambda event: None)
+    assert raised.value.__cause__ is None
+    assert time.monotonic() - begin < 15
+    assert results(executor, [Task("divide", divide, (4,))], lambda event: None) == [
+        0.25
+    ]  # nobody is at work
+    assert not [path for path in tmp_path.iterdir() if path.name.isdigit()]
+
+
+def test_a_fault_of_ours_keeps_its_traceback(executor: RayExecutor) -> None:
+    with pytest.raises(ZeroDivisionError) as raised:
+        results(executor, [Task("divide", divide, (0,))], lambda event: None)
+    assert "return 1 / number" in str(raised.value.__cause__)
+
+
+def test_a_task_whose_process_dies_is_done_again(executor: RayExecutor, tmp_path: Path) -> None:
+    events: list[Event] = []
+    assert results(executor, [Task("die", die, (tmp_path, 1))], events.append) == [1]
+    (warned,) = [event.text for event in events if isinstance(event, Warned)]
+    assert warned.startswith("die (1 of 1): its process on ")
+    assert warned.endswith(" was lost; done again (1 of 3)")
+
+
+def test_a_task_that_always_dies_ends_the_run(executor: RayExecutor, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(ray_executor, "_TRIES", 1)
+    with pytest.raises(
+        RunError, match=r"^die \(1 of 1\): its process on .* was lost 2 times \(.*\); look"
+    ) as raised:
+        results(executor, [Task("die", die, (tmp_path, 9))], lambda event: None)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.slow
+def test_a_node_that_is_lost_gives_its_task_to_another(
+    executor: RayExecutor, cluster: Any, tmp_path: Path
+) -> None:
+    third: Any = cluster.add_node(**NODE)
+    events: list[Event] = []
+    lost = third.node_id
+
+    def take_away() -> None:
+        wait_for((tmp_path / f"on-{lost}").exists)
+        process = int((tmp_path / f"on-{lost}").read_text())
+        cluster.remove_node(third, allow_graceful=False)
+        wait_for(lambda: not alive(process))
+        (tmp_path / "go").touch()
+
+    thread = threading.Thread(target=take_away)
+    thread.start()
+    found = results(executor, [Task("hold", hold, (tmp_path,)) for _ in range(3)], events.append)
+    thread.join()
+    assert len(found) == 3
+    assert lost not in found
+    assert any("was lost; done again (1 of 3)" in e.text for e in events if isinstance(e, Warned))
+
+
+def test_who_waits_for_others_says_so(executor: RayExecutor, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(ray_executor, "_STALLED", 0.5)
+    others = [ray.remote(hold).remote(tmp_path, None) for _ in range(2)]  # a CPU each
+    wait_for(lambda: len(list(tmp_path.glob("on-*"))) == 2)
+    heard: list[Event] = []
+
+    def end_others(event: Event) -> None:
+        heard.append(event)
+        (tmp_path / "go").touch()
+
+    assert results(executor, [Task("divide", divide, (2,))], end_others) == [0.5]
+    assert heard == [Warned("divide: waiting for 1 CPUs of the cluster")]
+    ray.get(others)
+
+
+def test_what_no_node_has_is_refused(executor: RayExecutor, tmp_path: Path) -> None:
+    wide = RayExecutor(tmp_path / "shared", threads=64)
+    with pytest.raises(
+        RunError, match=r"divide: no node of the cluster has 64 CPUs \(.*: 1\); use --threads 1$"
+    ):
+        results(wide, [Task("divide", divide, (1,))], lambda event: None)
+    with pytest.raises(RunError, match=r"has 1 CPUs, 1 GPUs .*; use --device cpu, or add a node with a GPU"):
+        results(executor, [Task("divide", divide, (1,), gpus=1)], lambda event: None)
+    with pytest.raises(RunError, match=r"has 1 CPUs, 9313.2 GiB .*; add a larger node"):
+        results(executor, [Task("divide", divide, (1,), memory=10**13)], lambda event: None)
+
+
+def test_a_task_on_a_gpu_takes_its_share_of_the_cpus(cluster: Any, tmp_path: Path, monkeypatch) -> None:
+    nodes = [{"CPU": 16.0, "GPU": 4.0, "memory": 64e9}, {"CPU": 8.0, "memory": 8e9}]
+    monkeypatch.setattr(RayExecutor, "_nodes", lambda self: nodes)
+    on_gpus, on_cpus = RayExecutor(tmp_path, 16, gpus=1), RayExecutor(tmp_path, 4)
+    assert (on_gpus.parallel, on_gpus.memory) == (4, 16 * 10**9)
+    assert (on_cpus.parallel, on_cpus.memory) == (6, 4 * 10**9)
+    with pytest.raises(RunError, match=r"has 32 CPUs \(most CPUs: 16\); use --threads 16"):
+        results(RayExecutor(tmp_path, 32), [Task("divide", divide, (1,))], lambda event: None)
+
+
+@pytest.mark.parametrize(
+    ("options", "gpus", "found"),
+    [({}, 2, "cuda"), ({}, 0, None), ({"device": "cpu"}, 2, None), ({"backend": "cpu"}, 2, None)],
+)
+def test_gpus_of_the_cluster_are_used_unless_told_otherwise(
+    options: dict[str, Any], gpus: int, found: str | None, cluster: Any, tmp_path: Path, monkeypatch
+) -> None:
+    monkeypatch.setattr("sagesplat.raster.cuda.missing", lambda: "no GPU here")
+    monkeypatch.setattr(ray_executor, "connected", lambda _: nullcontext({"CPU": 2, "GPU": gpus}))
+    with computing(Machine(executor="ray", threads=1, **options), tmp_path) as (backend, _, executor):
+        job = Job(RunDir(tmp_path), lambda event: None, backend, executor=executor)
+        assert (backend, executor.backend) == ("cpu", found)
+        assert (job.spec.backend, job.gpus) == (found or "cpu", float(found == "cuda"))
+
+
+class NoPost:
+    """A post that nobody reads."""
+
+    tell = property(lambda self: self)
+
+    def remote(self, *_: object) -> None:
+        return None
+
+
+def test_a_node_without_the_folder_or_with_another_version_is_one_line(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(ray_task, "_VISIBLE", 0.2)
+    monkeypatch.setattr(ray, "get", lambda *_, **__: None)
+    marker = tmp_path / "marker"
+    marker.touch()
+    monkeypatch.chdir(tmp_path)
+    task = Task("divide", divide, (2,))
+    assert do(task, Place(marker, tmp_path), NoPost(), "run", 0, 1) == 0.5
+    for place, says in (
+        (Place(tmp_path / "no" / "marker", tmp_path), "does not see this folder; all nodes need it under"),
+        (Place(tmp_path / "of another disk", tmp_path), "does not see this folder"),
+        (Place(marker, tmp_path, "0.0.1"), r"not 0\.0\.1; install the same on all nodes"),
+    ):
+        failed = do(task, place, NoPost(), "run", 0, 1)
+        assert isinstance(failed, Failed)
+        with pytest.raises(RunError, match=says) as raised:
+            raise failed.error
+        assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("executor", "says"),
+    [
+        ("rey", "--executor rey: not known; use local, ray or ray:HOST:PORT"),
+        ("local:1", "--executor local:1: not known"),
+        ("ray:127.0.0.1:1", r"--executor ray:127\.0\.0\.1:1: no answer .*`ray start --head`"),
+        ("ray:nowhere.invalid:6379", "no answer"),
+        ("ray:6379", "no answer"),
+        ("ray:host:port", "no answer"),
+    ],
+)
+def test_an_executor_that_is_not_there_is_one_line(
+    executor: str, says: str, tmp_path: Path, monkeypatch
+) -> None:
+    monkeypatch.setattr(ray, "is_initialized", lambda: False)
+    with pytest.raises(RunError, match=says) as raised, computing(Machine(executor=executor), tmp_path):
+        pass
+    assert "\n" not in str(raised.value)
+
+
+def test_without_ray_the_cure_is_said(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("sagesplat.cli.base.find_spec", lambda name: None)
+    with (
+        pytest.raises(BackendUnavailable, match=r"pip install 'sagesplat\[ray\]'"),
+        computing(Machine(executor="ray"), tmp_path),
+    ):
+        pass
+
+
+def command(*words: object, **env: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", CODE, *map(str, words)],
+        capture_output=True, text=True, timeout=300, env={**os.environ, **env},
+    )  # fmt: skip
+
+
+SHORT = ("--train.max-steps", 20, "--train.level-every", 10, "--ladder", "snapshots", "--threads", 1)
+
+
+@pytest.fixture
+def trained(tmp_path: Path) -> Path:
+    """A tiny run up to its training."""
+    make_capture(tmp_path / "capture", views=8, width=64, height=48)
+    job = Job(RunDir(tmp_path / "run", "snapshots"), lambda event: None)
+    open_scene(job, tmp_path / "capture", SceneConfig())
+    make_masks(job, MasksConfig())
+    lift_labels(job, LiftConfig())
+    train_levels(job, TrainConfig(max_steps=20, level_every=10), 0)
+    return tmp_path / "run"
+
+
+OBSERVED = "snapshots/observations.csv"
+
+
+def test_a_stage_gives_the_same_on_a_cluster(executor: RayExecutor, trained: Path, tmp_path: Path) -> None:
+    shutil.copytree(trained, tmp_path / "shared")
+    for run, on in ((trained, LOCAL), (tmp_path / "shared", executor)):
+        observe_levels(Job(RunDir(run, "snapshots"), lambda event: None, executor=on), FitConfig())
+    assert (tmp_path / "shared" / OBSERVED).read_bytes() == (trained / OBSERVED).read_bytes()
+
+
+@pytest.mark.slow
+def test_the_command_line_on_a_cluster(cluster: Any, trained: Path, tmp_path: Path) -> None:
+    shutil.copytree(trained, tmp_path / "other")
+    observe_levels(Job(RunDir(trained, "snapshots"), lambda event: None), FitConfig())
+    words = ("observe", tmp_path / "other", "--ladder", "snapshots", "--threads", 1)
+    made = command(*words, "--executor", f"ray:{cluster.address}")
+    assert (made.returncode, made.stderr) == (0, "")  # nothing of Ray's
+    assert "✓ observe" in made.stdout
+    assert (tmp_path / "other" / OBSERVED).read_bytes() == (trained / OBSERVED).read_bytes()
+
+
+@pytest.mark.slow
+def test_a_cluster_of_this_machine_is_started_and_ended(tmp_path: Path) -> None:
+    make_capture(tmp_path / "capture", views=8, width=64, height=48)
+    made = command("run", tmp_path / "capture", tmp_path / "run", *SHORT, "--executor", "ray", RAY_ADDRESS="")
+    assert (made.returncode, made.stderr) == (0, "")
+    assert (tmp_path / "run" / "snapshots" / "report" / "index.html").exists()
+
+
+DRIVER = """
+import sys
+from pathlib import Path
+from ray_tasks import hold
+from sagesplat.run.executor import LOCAL, Task, results
+from sagesplat.run.job import Job
+from sagesplat.run.ray_executor import RayExecutor, connected
+with connected(sys.argv[1]):
+    folder = Path(sys.argv[2])
+    results(RayExecutor(folder / "shared"), [Task("hold", hold, (folder,))], lambda event: None)
+"""
+
+
+@pytest.mark.slow
+def test_the_tasks_of_a_killed_driver_end(cluster: Any, tmp_path: Path) -> None:
+    with subprocess.Popen([sys.executable, "-c", DRIVER, cluster.address, str(tmp_path)]) as driver:
+        wait_for(lambda: list(tmp_path.glob("on-*")), 60)
+        driver.kill()
+    (file,) = tmp_path.glob("on-*")
+    process = int(file.read_text())
+    wait_for(lambda: not alive(process))
+    wait_for(lambda: ray.available_resources().get("CPU") == 2)

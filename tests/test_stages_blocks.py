@@ -1,0 +1,396 @@
+"""Large scenes: the partition, what a block is given, what is put together, and a whole run in blocks."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import random_gaussians
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_run_executor import Shuffled
+
+from sagesplat.adapt.ladder import read_ladder, read_prefixes
+from sagesplat.core.config import (
+    BlocksConfig,
+    FitConfig,
+    NestConfig,
+    PlanConfig,
+    RunConfig,
+    SceneConfig,
+    TrainConfig,
+)
+from sagesplat.core.errors import LabelError, RunError, SceneError
+from sagesplat.core.events import Event, StageDone, StageSkipped
+from sagesplat.demo.capture import make_capture
+from sagesplat.io.files import read_json, write_text
+from sagesplat.run.job import Job
+from sagesplat.run.run_dir import RunDir
+from sagesplat.scene import load_scene
+from sagesplat.scene.blocks import (
+    colours,
+    part_of,
+    read_blocks,
+    split,
+    views_of,
+    visible_shares,
+    write_blocks,
+)
+from sagesplat.scene.scene import Camera, Lens, Points, Scene, View
+from sagesplat.scene.stored import read_scene, write_scene
+from sagesplat.segment.masks import Masks, Taxonomy
+from sagesplat.segment.parts import Parts, category_of, split_name
+from sagesplat.stages import report
+from sagesplat.stages.blocks import check
+from sagesplat.stages.pipeline import run_all
+from sagesplat.train import boundaries
+
+
+def street(places: int = 4, points: int = 200, views: int = 12, seed: int = 0, tracks: bool = True) -> Scene:
+    """Clouds of points 10 apart along a slanted line, each with cameras around it that look at it."""
+    rng = np.random.default_rng(seed)
+    along = np.array([0.8, 0.1, 0.6]) / np.linalg.norm([0.8, 0.1, 0.6])
+    up = np.array([0.0, -1.0, 0.0])
+    centres = 10 * np.arange(places)[:, None] * along
+    xyz = np.concatenate([c + rng.normal(size=(points, 3)) * [1.5, 0.4, 1.5] for c in centres])
+    K = np.array([[60, 0, 32], [0, 60, 24], [0, 0, 1]], np.float32)
+    found = []
+    for place, centre in enumerate(centres):
+        for i, angle in enumerate(2 * np.pi * np.arange(views) / views):
+            position = centre + 4 * np.array([np.cos(angle), -0.3, np.sin(angle)])
+            z = (centre - position) / np.linalg.norm(centre - position)
+            x = np.cross(-up, z)
+            x /= np.linalg.norm(x)
+            w2c = np.eye(4)
+            w2c[:3, :3] = [x, np.cross(z, x), z]
+            w2c[:3, 3] = -w2c[:3, :3] @ position
+            camera = Camera(w2c.astype(np.float32), K, 64, 48)
+            found.append(View(f"p{place}/v{i:02d}.png", camera, Path(f"/photos/p{place}/v{i:02d}.png")))
+    of_point = np.repeat(np.arange(places), points)
+    seen = rng.integers(0, views, (len(xyz), 3)) + views * of_point[:, None]
+    rows = np.repeat(np.arange(len(xyz)), 3) if tracks else np.zeros(0, int)
+    columns = seen.ravel() if tracks else np.zeros(0, int)
+    uv = rng.uniform(0, 48, (len(rows), 2)).astype(np.float32)
+    rgb = rng.integers(0, 255, (len(xyz), 3)).astype(np.uint8)
+    tracked = Points(xyz.astype(np.float32), rgb, rows.astype(np.int64), columns.astype(np.int32), uv)
+    return Scene("street", Path("/photos"), tuple(found), tracked, 8, 4)
+
+
+@settings(max_examples=25, deadline=None)
+@given(count=st.integers(2, 7), seed=st.integers(0, 9), margin=st.floats(0, 0.5))
+def test_blocks_tile_the_plane_and_share_the_work(count: int, seed: int, margin: float) -> None:
+    scene = street(seed=seed)
+    blocks = split(scene, count, margin)
+    far = np.random.default_rng(seed).normal(size=(500, 3)) * 100
+    for xyz in (scene.points.xyz, far):
+        inside = np.stack([blocks.within(xyz, b, 0.0) for b in range(count)])
+        np.testing.assert_array_equal(inside.sum(0), 1)  # no gap, no overlap
+        np.testing.assert_array_equal(inside.argmax(0), blocks.of(xyz))
+    share = np.bincount(blocks.of(scene.points.xyz), minlength=count) / len(scene.points.xyz)
+    positions = np.stack([scene.views[i].camera.position for i in scene.train_ids])
+    of_views = np.bincount(blocks.of(positions), minlength=count) / len(positions)
+    assert (share + of_views).max() < 2 * (share + of_views).min() + 0.2
+    assert (blocks.to_border(far) >= 0).all()
+    near = blocks.neighbours()
+    assert (near == near.T).all()
+    assert not near.diagonal().any()
+    shades = colours(near)
+    assert all(shades[a] != shades[b] for a, b in zip(*near.nonzero(), strict=True))
+
+
+def test_cuts_go_between_places() -> None:
+    scene = street(places=4)
+    blocks = split(scene, 4)
+    of_place = blocks.of(scene.points.xyz).reshape(4, -1)
+    assert {tuple(set(row.tolist())) for row in of_place} == {(b,) for b in of_place[:, 0].tolist()}
+    assert len(set(of_place[:, 0].tolist())) == 4
+    normal = np.cross(*blocks.axes)
+    assert abs(normal[1]) > 0.95  # up in the photos, though all places are on one line
+
+
+def test_views_are_for_the_blocks_that_they_see() -> None:
+    scene = street(places=2, views=10)
+    blocks = split(scene, 2)
+    of_points = blocks.of(scene.points.xyz)
+    shares = visible_shares(scene, of_points, 2)
+    np.testing.assert_allclose(shares.sum(1), 1)
+    assigned = views_of(scene, blocks, shares, 0.25)
+    assert assigned.any(1).all()
+    own = np.array([of_points[0] if v.name.startswith("p0") else of_points[-1] for v in scene.views])
+    assert assigned[np.arange(20), own].all()
+    blind = visible_shares(street(places=2, views=10, tracks=False), of_points, 2)
+    assert (blind[np.arange(20), own] > 0.3).all()  # by the frusta, that reach into the other place
+    assert blind[np.arange(20), own].mean() > 0.8
+
+
+def test_a_part_keeps_its_points_and_some_of_the_background() -> None:
+    scene = street(places=2, views=10)
+    wide = replace(scene.views[0], camera=scene.views[15].camera)  # one camera looks at the other place
+    seen = np.zeros(50, np.int32)
+    far = np.flatnonzero(np.arange(400) >= 200)[:50]
+    points = replace(
+        scene.points,
+        track_points=np.concatenate([scene.points.track_points, far]),
+        track_views=np.concatenate([scene.points.track_views, seen]),
+        track_uv=np.concatenate([scene.points.track_uv, np.zeros((50, 2), np.float32)]),
+    )
+    scene = replace(scene, points=points, views=(wide, *scene.views[1:]))
+    blocks = split(scene, 2)
+    mine = int(blocks.of(scene.points.xyz[:1])[0])
+    views = [0, 1, 2, 3, 9]
+    part, kept = part_of(scene, blocks, mine, views, 0.1, seed=0)
+    near = blocks.within(scene.points.xyz, mine, blocks.margin)
+    assert near[kept].sum() == near.sum()
+    assert 0 < (~near[kept]).sum() <= 0.1 * near.sum()
+    np.testing.assert_array_equal(part.points.xyz, scene.points.xyz[kept])
+    assert [v.name for v in part.views] == [scene.views[i].name for i in views]
+    assert part.train_ids.tolist() == [0, 1, 2, 3, 4]  # tests and calibration stay with the whole
+    for point, view, uv in zip(
+        part.points.track_points[:40], part.points.track_views[:40], part.points.track_uv[:40], strict=True
+    ):
+        was = (scene.points.track_points == kept[point]) & (scene.points.track_views == views[view])
+        assert (scene.points.track_uv[was] == uv).all(1).any()
+    same, _ = part_of(scene, blocks, mine, views, 0.1, seed=0)
+    np.testing.assert_array_equal(same.points.xyz, part.points.xyz)
+    with pytest.raises(RunError, match="has 0 views and"):
+        part_of(scene, blocks, mine, [], 0.1, seed=0)
+
+
+@pytest.mark.parametrize("count", [0, 1, 500])
+def test_impossible_numbers_of_blocks(count: int) -> None:
+    with pytest.raises(RunError, match=r"blocks of .* are impossible; choose fewer with --blocks\.count"):
+        split(street(), count)
+
+
+@pytest.mark.parametrize(
+    ("config", "named"),
+    [
+        (BlocksConfig(count=0), "count 0"),
+        (BlocksConfig(margin=-1), "margin -1"),
+        (BlocksConfig(min_share=0), "min-share 0"),
+        (BlocksConfig(far_share=-0.5), "far-share -0.5"),
+        (BlocksConfig(seam_steps=-1), "seam-steps -1"),
+    ],
+)
+def test_impossible_settings(config: BlocksConfig, named: str) -> None:
+    with pytest.raises(RunError, match=rf"--blocks\.{named} is impossible; choose"):
+        check(config)
+
+
+def test_partition_reads_back(tmp_path: Path) -> None:
+    blocks = split(street(), 5)
+    write_blocks(tmp_path / "blocks.json", blocks, views=[1, 2])
+    back = read_blocks(tmp_path / "blocks.json")
+    for name in ("axes", "low", "high", "margin"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(blocks, name))
+    assert read_json(tmp_path / "blocks.json")["views"] == [1, 2]
+
+
+@pytest.mark.parametrize("text", ["{}", "[]", '{"low": [[1]], "high": [[1]], "axes": [], "margin": 1}', "1"])
+def test_broken_partitions(tmp_path: Path, text: str) -> None:
+    (tmp_path / "blocks.json").write_text(text)
+    with pytest.raises(SceneError, match="not a partition"):
+        read_blocks(tmp_path / "blocks.json")
+
+
+def test_stored_scenes_read_back(tmp_path: Path) -> None:
+    scene = street(places=2)
+    lens = Lens("OPENCV", (60.0, 60.0, 32.0, 24.0, 0.1, 0.0, 0.0, 0.0), 128, 96)
+    first = replace(scene.views[0], lens=lens, camera=replace(scene.views[0].camera, background=(9, 8, 7)))
+    scene = replace(scene, views=(first, *scene.views[1:]))
+    write_scene(tmp_path / "part.npz", scene)
+    back = load_scene(tmp_path / "part.npz", test_every=3)  # the splits are those that it was stored with
+    for name in ("train_ids", "test_ids", "calibration_ids"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(scene, name))
+    for a, b in zip(back.views, scene.views, strict=True):
+        assert (a.name, a.image_path) == (b.name, b.image_path)
+        assert (a.lens and vars(a.lens)) == (b.lens and vars(b.lens))
+        assert (a.camera.width, a.camera.height, a.camera.background) == (64, 48, b.camera.background)
+        np.testing.assert_array_equal(a.camera.w2c, b.camera.w2c)
+        np.testing.assert_array_equal(a.camera.K, b.camera.K)
+    for name in ("xyz", "rgb", "track_points", "track_views", "track_uv"):
+        np.testing.assert_array_equal(getattr(back.points, name), getattr(scene.points, name))
+
+
+def test_broken_stored_scenes(tmp_path: Path) -> None:
+    path = tmp_path / "part.npz"
+    with pytest.raises(SceneError, match="no such file"):
+        read_scene(path)
+    write_scene(path, street(places=1))
+    with np.load(path) as file:
+        good = dict(file)
+    about = json.loads(str(good["about"]))
+    wrong = {
+        "no views": {"about": np.array(json.dumps({**about, "views": []}))},
+        "a huge view": {
+            "about": np.array(
+                json.dumps(
+                    {**about, "views": [{**about["views"][0], "size": [10**9, 5]}, *about["views"][1:]]}
+                )
+            )
+        },
+        "text": {"about": np.array("}{")},
+        "nothing": {"about": np.array("[]")},
+        "deep": {"about": np.array("[" * 5000)},
+        "NaN": {"K": good["K"] * np.nan},
+        "shape": {"rgb": good["rgb"][:-1]},
+        "track": {"track_points": good["track_points"] + 10**6},
+        "view": {"track_views": good["track_views"] - 1},
+    }
+    for changes in wrong.values():
+        np.savez(path, **{**good, **changes})
+        with pytest.raises(SceneError, match="not a stored scene"):
+            read_scene(path)
+    path.write_bytes(path.read_bytes()[:2000])
+    with pytest.raises(SceneError, match="not a stored scene"):
+        read_scene(path)
+
+
+def test_parts_have_names_of_their_own() -> None:
+    parts = Parts(Taxonomy({3: "car", 184: "tree-merged"}), 3)
+    ids = parts.ids(np.array([-1, 3, 184, 184]), np.array([0, 0, 1, 2]))
+    assert [parts.names.name(i) for i in ids.tolist()] == [
+        "unlabelled@0", "car@0", "tree-merged@1", "tree-merged@2",
+    ]  # fmt: skip
+    assert parts.block_of(ids).tolist() == [0, 0, 1, 2]
+    assert len(set(parts.names.names)) == 9
+    assert split_name("tree-merged@12") == ("tree-merged", 12)
+    assert split_name("a@b") == ("a@b", None)
+    assert category_of("grass") == "grass"
+    with pytest.raises(LabelError, match="are too many; choose fewer"):
+        Parts(Taxonomy({i: str(i) for i in range(100)}), 400)
+
+
+def test_core_keeps_order_and_levels() -> None:
+    scene = street(places=2)
+    blocks = split(scene, 2)
+    g = random_gaussians(60, seed=3)
+    g = g.select(torch.argsort(g.label_ids, stable=True))
+    spots = torch.from_numpy(scene.points.xyz[np.random.default_rng(0).choice(400, 60)])
+    g = replace(g, means=spots)
+    sizes = {label: (2, 7, n) for label, n in g.counts().items()}
+    parts = Parts(Taxonomy({3: "car", 184: "tree-merged"}), 2)
+    cores = [boundaries.core(g, blocks, parts, b) for b in range(2)]
+    assert sum(len(c[0]) for c in cores) == 60
+    for block, (core, inside) in enumerate(cores):
+        levels = boundaries.core_sizes(g.label_ids.numpy(), inside, sizes, parts, block)
+        rows = np.flatnonzero(blocks.of(g.means.numpy()) == block)
+        np.testing.assert_array_equal(np.flatnonzero(inside), rows)
+        np.testing.assert_array_equal(core.means, g.means[rows])  # in the order of the whole
+        assert core.counts() == {part: n[-1] for part, n in levels.items()}
+        for label, (low, middle, _) in sizes.items():
+            mine = rows[g.label_ids.numpy()[rows] == label]
+            first = np.flatnonzero(g.label_ids.numpy() == label)[0]
+            part = int(parts.ids(np.array(label), block))
+            if len(mine):
+                expected = [max(1, int((mine < first + n).sum())) for n in (low, middle)]
+                assert list(levels[part][:2]) == expected
+
+
+def test_bands_are_measured_apart() -> None:
+    band = np.zeros((4, 4), bool)
+    band[0] = True
+    error = np.where(band, 0.01, 0.0001)
+    found = boundaries.bands([band, band], [error, error], [1 - error, 1 - error])
+    assert found.share == 0.25
+    assert (found.psnr, found.psnr_inside) == (pytest.approx(20), pytest.approx(40))
+    assert (found.ssim, found.ssim_inside) == (pytest.approx(0.99), pytest.approx(0.9999))
+
+
+CONFIG = RunConfig(
+    scene=SceneConfig(calibrate_every=4),
+    train=TrainConfig(max_steps=40, level_every=20),
+    blocks=BlocksConfig(count=2, seam_steps=20),
+    nest=NestConfig(steps=30, levels=4, smallest=0.1, seed_steps=30),
+    fit=FitConfig(),
+    plan=PlanConfig(target_ssim=0.4),
+)
+
+
+def run_in_blocks(capture: Path, run: Path, config: RunConfig = CONFIG, **options) -> list[Event]:
+    events: list[Event] = []
+    run_all(Job(RunDir(run, config.ladder), events.append, "cpu", **options), capture, config)
+    return events
+
+
+@pytest.fixture(scope="module", autouse=True)
+def plain_report() -> Iterator[None]:
+    """Figures take most of the time of so small a run, and have their own tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(report, "write_report", lambda folder, _: write_text(folder / "index.html", "report"))
+        yield
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("demo") / "capture"
+    make_capture(folder, views=16, width=64, height=48)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def finished(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = tmp_path_factory.mktemp("blocks") / "run"
+    run_in_blocks(capture, run)
+    return run
+
+
+def test_a_run_in_blocks(finished: Path, capture: Path) -> None:
+    run = RunDir(finished)
+    names = Taxonomy.read(run.parts / "labels.json").names
+    ladder, snapshots = read_prefixes(run.prefixes), read_ladder(run.levels)
+    assert snapshots.levels == [20, 40]
+    assert set(ladder.sizes) <= set(names)
+    assert {split_name(names[label])[1] for label in ladder.sizes} == {0, 1}
+    # every Gaussian is in the block that its name says: those that were tuned may have moved a little
+    blocks = read_blocks(run.blocks / "blocks.json")
+    g = snapshots.load(40)
+    of_name = np.array([split_name(names[label])[1] for label in g.label_ids.tolist()])
+    np.testing.assert_array_equal(blocks.of(g.means.numpy()), of_name)
+    g = ladder.gaussians
+    of_name = np.array([split_name(names[label])[1] for label in g.label_ids.tolist()])
+    beyond = blocks.to_border(g.means.numpy())[blocks.of(g.means.numpy()) != of_name]
+    assert len(beyond) < 0.05 * len(g)
+    assert (beyond < blocks.margin / 2).all()
+    # pixels keep their category
+    scene = load_scene(capture)
+    parts, before = (Masks(f, Taxonomy.read(f / "labels.json")) for f in (run.parts, run.masks))
+    for view in scene.views[:3]:
+        of_parts = [category_of(names[i]) for i in parts[view].ravel()[::50].tolist()]
+        assert of_parts == [before.taxonomy.name(i) for i in before[view].ravel()[::50].tolist()]
+    assert {row["label_id"] for row in read_json(run.chunks / "index.json")["chunks"]} == set(ladder.sizes)
+    assert (run.adapted / "borders.csv").read_text().count("\n") == 3
+    assert "| block |" in (run.adapted / "blocks.md").read_text()
+    assert read_json(run.plan)["scene"]
+
+
+def test_a_run_in_blocks_is_done_once(finished: Path, capture: Path) -> None:
+    events = run_in_blocks(capture, finished)
+    assert not [e for e in events if isinstance(e, StageDone)]
+    assert sum(isinstance(e, StageSkipped) for e in events) == 15
+
+
+def test_blocks_are_the_same_in_any_order_and_process(finished: Path, capture: Path, tmp_path: Path) -> None:
+    executor = Shuffled()
+    run_in_blocks(capture, tmp_path / "again", executor=executor)
+    assert {"block 0", "block 1", "seams of block 0", "seams of block 1"} <= set(executor.names)
+    for name in ("nested/ladder.npz", "nested/observations.csv", "nested/plan.json", "nested/borders.csv"):
+        assert (tmp_path / "again" / name).read_bytes() == (finished / name).read_bytes(), name
+
+
+def test_a_run_keeps_its_blocks(finished: Path, capture: Path) -> None:
+    whole = replace(CONFIG, blocks=BlocksConfig())
+    with pytest.raises(RunError, match=r"this run is in blocks; add --blocks\.count"):
+        run_in_blocks(capture, finished, whole)
+    with pytest.raises(RunError, match=r"made with other count \(2 then, 3 now\)"):
+        run_in_blocks(capture, finished, replace(CONFIG, blocks=BlocksConfig(count=3, seam_steps=20)))
+
+
+def test_snapshots_of_blocks(capture: Path, tmp_path: Path) -> None:
+    config = replace(CONFIG, ladder="snapshots", fuse=True)
+    events = run_in_blocks(capture, tmp_path / "run", config)
+    assert any(isinstance(e, StageDone) and e.name == "report" for e in events)
+    assert read_json(RunDir(tmp_path / "run", "snapshots").plan)["scene"]

@@ -1,0 +1,291 @@
+"""Bundles of runs: a small one from photos to folder, those of a training that goes on, a real one."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import random_gaussians, write_capture
+from PIL import Image
+from test_viewer_bundle import manifest_of
+
+from sagesplat.adapt.observe import RenderedLabels
+from sagesplat.adapt.viewpoint import read_promises
+from sagesplat.core.config import FitConfig, LiftConfig, MasksConfig, NestConfig, SceneConfig, TrainConfig
+from sagesplat.core.errors import DataError, RunError, SageError
+from sagesplat.formats.increments import read_chunks, read_index
+from sagesplat.formats.spz import read_spz
+from sagesplat.io.files import read_json, write_json
+from sagesplat.raster import rasterize
+from sagesplat.run.job import Job
+from sagesplat.run.run_dir import RunDir
+from sagesplat.stages.bundle import bundle, live_bundle
+from sagesplat.stages.fit import fit_ladder
+from sagesplat.stages.label import lift_labels, make_masks
+from sagesplat.stages.nest import nest_levels
+from sagesplat.stages.observe import observe_levels
+from sagesplat.stages.scene import open_scene
+from sagesplat.stages.shared import distances
+from sagesplat.stages.train import train_levels
+from sagesplat.viewer.bundle import is_bundle
+from sagesplat.viewer.display_names import colors_of, title_of
+from sagesplat.viewer.frames import camera_at
+from sagesplat.viewer.quality import curve_of, model_of
+
+ROOT = Path(__file__).resolve().parents[1]
+FIT = FitConfig()
+
+
+def job_of(run: Path) -> Job:
+    return Job(RunDir(run), lambda event: None)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with all that a bundle needs."""
+    folder = tmp_path_factory.mktemp("bundling")
+    truth = random_gaussians(120, degree=1, logit=2.0)
+    images = RenderedLabels(truth, "cpu")
+    scene, masks = write_capture(folder / "capture", truth, noise=0.02), folder / "capture" / "masks"
+    masks.mkdir()
+    for view in scene.views:
+        ids = np.where(images[view] < 0, 255, images[view]).astype(np.uint8)
+        Image.fromarray(ids).save(masks / view.name)
+    write_json(masks / "labels.json", {"labels": {"3": "car", "184": "tree-merged"}})
+    job = job_of(folder / "run")
+    open_scene(job, folder / "capture", SceneConfig(test_every=4, calibrate_every=3))
+    make_masks(job, MasksConfig())
+    lift_labels(job, LiftConfig())
+    train_levels(job, TrainConfig(max_steps=6, level_every=2), 0)
+    nest_levels(job, NestConfig(steps=2, levels=4, smallest=0.1, seed_share=0), 0)
+    observe_levels(job, FIT)
+    fit_ladder(job, FIT)
+    return job.run.path
+
+
+@pytest.fixture
+def run(trained: Path, tmp_path: Path) -> Path:
+    """A copy of it to spoil."""
+    return Path(shutil.copytree(trained, tmp_path / "run"))
+
+
+@pytest.fixture
+def viewer(tmp_path: Path) -> Path:
+    folder = tmp_path / "viewer"
+    folder.mkdir()
+    (folder / "index.html").write_text("<!doctype html><body><!-- poster --></body>")
+    return folder
+
+
+def test_a_bundle_of_a_run(run: Path, tmp_path: Path, viewer: Path) -> None:
+    job, out = job_of(run), tmp_path / "out"
+    first = "car"
+    made = bundle(job, out, meters_per_unit=2.0, always=[first], weights={first: 3}, viewer=viewer)
+    manifest = manifest_of(out)
+    chunks = read_index(job.run.chunks)
+    assert (made.path, made.chunks, made.labels) == (out, len(chunks), len(manifest["labels"]))
+    assert made.count == manifest["totals"]["count"] == sum(c.count for c in chunks)
+    assert manifest["frame"]["metersPerUnit"] == 2
+    assert manifest["frame"]["scale"] == "given"
+    assert manifest["shDegree"] == read_chunks(job.run.chunks, chunks).sh_degree
+    named = {label["name"]: label for label in manifest["labels"]}
+    assert (named[first]["always"], named[first]["weight"]) == (True, 3)
+    assert [label["always"] for label in manifest["labels"]].count(True) == 1
+    assert len({label["color"] for label in manifest["labels"]}) == len(named)
+    for chunk in chunks:
+        assert (out / "chunks" / chunk.uri).read_bytes() == (job.run.chunks / chunk.uri).read_bytes()
+    for label in manifest["labels"]:
+        assert 1 <= len(label["boxes"]) <= 32
+    splits = [camera["split"] for camera in manifest["cameras"]]
+    assert splits == [job.scene.split(row) for row in range(len(job.scene.views))]
+    assert {"train", "test", "calibration"} == set(splits)
+
+
+def test_the_poster_is_the_first_view(run: Path, tmp_path: Path, viewer: Path) -> None:
+    job, out = job_of(run), tmp_path / "out"
+    bundle(job, out, viewer=viewer)
+    assert '<img id="poster" src="poster.jpg" alt="" />' in (out / "index.html").read_text()
+    picture = np.asarray(Image.open(out / "poster.jpg"), np.float64)
+    first = read_json(out / "manifest.json")["start"]
+    camera = camera_at(np.array(first["position"]), np.array(first["quaternion"]), np.pi / 3, 640, 360)
+    g = read_chunks(job.run.chunks, read_index(job.run.chunks))
+    truth = rasterize(g, camera, backend="cpu").rgb.clamp(0, 1).numpy() * 255
+    assert np.sqrt(np.mean((picture - truth) ** 2)) < 4  # JPEG
+
+
+def test_promises_survive_the_bundle(run: Path, tmp_path: Path, viewer: Path) -> None:
+    job, out = job_of(run), tmp_path / "out"
+    bundle(job, out, viewer=viewer)
+    manifest = manifest_of(out)
+    promises = json.loads((out / manifest["promises"]["uri"]).read_text())
+    quality = {label["id"]: label["quality"] for label in manifest["labels"]}
+    models, far = read_promises(job.run.promises), distances(job, FIT.distance)
+    assert {entry["id"] for entry in promises["labels"]} == set(models)
+    cameras = [view.camera for view in job.scene.views]
+    where = [np.stack([getattr(c, of) for c in cameras]).astype(float) for of in ("position", "direction")]
+    views = np.array(promises["views"])
+    for entry in promises["labels"]:
+        model = models[entry["id"]]
+        if len(entry["levels"]) < len(model.levels):
+            continue  # a level that adds nothing has no file
+        curves = [curve_of(curve) for curve in quality[entry["id"]]["curves"]]
+        told = model_of(entry, curves, views, promises["extent"]).predict(far[entry["id"]], *where)
+        np.testing.assert_allclose(told.bound, model.predict(far[entry["id"]], *where).bound, atol=1e-3)
+        assert max(entry["shares"]) > 0
+
+
+def test_the_same_run_gives_the_same_bytes(run: Path, tmp_path: Path, viewer: Path) -> None:
+    a, b = tmp_path / "a", tmp_path / "b"
+    for out in (a, b, b):
+        bundle(job_of(run), out, viewer=viewer)
+    for path in a.rglob("*"):
+        if path.is_file():
+            assert path.read_bytes() == (b / path.relative_to(a)).read_bytes()
+    assert len(list(a.rglob("*"))) == len(list(b.rglob("*")))
+
+
+@pytest.mark.parametrize(
+    ("missing", "command"),
+    [("nested/chunks", "nest"), ("nested/observations.csv", "observe"), ("nested/promises.json", "fit")],
+)
+def test_an_unfinished_run_names_the_command(run, tmp_path, viewer, missing, command) -> None:
+    path = run / missing
+    shutil.rmtree(path) if path.is_dir() else path.unlink()
+    with pytest.raises(RunError, match=rf"finished nested ladder: run `sagesplat {command}`") as caught:
+        bundle(job_of(run), tmp_path / "out", viewer=viewer)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_bad_input_is_one_line(run: Path, tmp_path: Path, viewer: Path) -> None:
+    job, out = job_of(run), tmp_path / "out"
+    with pytest.raises(RunError, match="dragon, unicorn: no such category; there are "):
+        bundle(job, out, always=["unicorn"], weights={"dragon": 2}, viewer=viewer)
+    for weight in (-1.0, float("nan"), float("inf")):
+        with pytest.raises(RunError, match=r"weight .* is impossible"):
+            bundle(job, out, weights={job.taxonomy.name(-1): weight}, viewer=viewer)
+    for scale in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(RunError, match="metres per unit are impossible"):
+            bundle(job, out, meters_per_unit=scale, viewer=viewer)
+    with pytest.raises(RunError, match="neither empty nor a bundle"):
+        bundle(job, run, viewer=viewer)
+    with pytest.raises(SageError, match="viewer not built"):
+        bundle(job, out, viewer=tmp_path / "nothing")
+    with pytest.raises(RunError, match="no nested/chunks"):
+        bundle(job_of(tmp_path / "nowhere"), out, viewer=viewer)
+    chunk = next((run / "nested" / "chunks").glob("*.spz"))
+    chunk.write_bytes(chunk.read_bytes()[:-1])
+    with pytest.raises(DataError, match=f"{chunk.name}: "):
+        bundle(job, out, viewer=viewer)
+    assert not out.exists()
+
+
+def test_promises_of_other_chunks(run: Path, tmp_path: Path, viewer: Path) -> None:
+    index = run / "nested" / "chunks" / "index.json"
+    index.write_text(index.read_text() + "\n")
+    with pytest.raises(RunError, match="promises of other chunks; run `sagesplat fit`"):
+        bundle(job_of(run), tmp_path / "out", viewer=viewer)
+
+
+def test_a_live_bundle_follows_the_training(run: Path, tmp_path: Path, viewer: Path) -> None:
+    later = sorted((run / "levels").glob("*.npz"))
+    assert len(later) == 3
+    for path in later:
+        path.rename(tmp_path / path.name)
+    (run / "provenance" / "train.json").unlink()
+    shutil.rmtree(run / "nested")
+    folder = tmp_path / "live"
+    with pytest.raises(RunError, match="no level yet"):
+        live_bundle(job_of(run), folder, viewer)
+    assert not folder.exists()
+    uris, job = [], job_of(run)
+    for path in later:
+        (tmp_path / path.name).rename(path)
+        (run / "levels" / ".half-written.npz").write_bytes(b"")  # what training is writing
+        assert live_bundle(job, folder, viewer)
+        before = (folder / "manifest.json").read_bytes()
+        assert not live_bundle(job, folder, viewer)
+        assert (folder / "manifest.json").read_bytes() == before
+        manifest = manifest_of(folder)
+        assert manifest["live"]
+        assert manifest["promises"] is None
+        assert all(len(label["levels"]) == 1 for label in manifest["labels"])
+        uris.append({label["levels"][0]["uri"] for label in manifest["labels"]})
+        for label in manifest["labels"]:
+            assert len(read_spz(folder / label["levels"][0]["uri"])) == label["levels"][0]["count"]
+            assert label["quality"] is None
+            assert label["boxes"]
+    write_json(run / "provenance" / "train.json", {"settings": {"antialiased": True}})
+    later[-1].touch()
+    (viewer / "index.html").write_text("<!doctype html>of a newer package")
+    assert live_bundle(job, folder, viewer)  # rewritten: a training that began again
+    assert (folder / "index.html").read_bytes() == (viewer / "index.html").read_bytes()
+    assert manifest_of(folder)["antialiased"]
+    (folder / "manifest.json").unlink()
+    assert live_bundle(job, folder, viewer)  # repaired
+    assert is_bundle(folder)
+    there = {f"chunks/{path.name}" for path in (folder / "chunks").iterdir()}
+    assert there >= uris[1] | uris[2]
+    assert not there & (uris[0] - uris[1] - uris[2])
+    assert not (folder / ".chunks").exists()
+
+
+def test_a_live_bundle_leaves_other_folders_alone(run: Path, tmp_path: Path, viewer: Path) -> None:
+    other = tmp_path / "photos"
+    other.mkdir()
+    (other / "a.jpg").write_text("x")
+    with pytest.raises(RunError, match="neither empty nor a bundle"):
+        live_bundle(job_of(run), other, viewer)
+
+
+@pytest.mark.parametrize(
+    ("name", "title"),
+    [
+        ("grass-merged", "grass"), ("building-other-merged", "building"), ("sky-other-merged", "sky"),
+        ("door-stuff", "door"), ("wall-brick", "wall brick"), ("dining table", "dining table"),
+    ],
+)  # fmt: skip
+def test_titles(name: str, title: str) -> None:
+    assert title_of(name) == title
+
+
+def test_colours_are_distinct_and_stay() -> None:
+    rng = np.random.default_rng(0)
+    wanted = {-1: (128, 128, 128)} | {i: tuple(rng.integers(0, 256, 3).tolist()) for i in range(40)}
+    colors = colors_of(wanted)
+    assert colors == colors_of(wanted)
+    assert set(colors) == set(wanted)
+    assert max(list(colors.values()).count(c) for c in colors.values()) == 3  # 16 in the palette
+    few = colors_of({i: wanted[i] for i in (-1, 3, 7, 9)})
+    assert len(set(few.values())) == 4
+    assert colors_of({5: (0, 200, 0)})[5] in ("#3f9f4f", "#6dbd6a")
+
+
+@pytest.mark.slow
+def test_a_real_run(tmp_path: Path, viewer: Path) -> None:
+    run = ROOT / "runs" / "dinosaur-g"
+    if not run.is_dir() or not (ROOT.parent / "shared" / "scenes" / "dinosaur").is_dir():
+        pytest.skip("needs the run dinosaur-g and the shared scenes beside the checkout")
+    made = bundle(job_of(run), tmp_path / "out", viewer=viewer)
+    manifest = manifest_of(tmp_path / "out")
+    assert made.sizes.manifest < 100_000
+    assert made.error[0] < 0.05
+    up = np.array(manifest["frame"]["up"])
+    heights = [np.array(camera["position"]) @ up for camera in manifest["cameras"]]
+    assert 1.2 < (np.median(heights) - manifest["frame"]["floor"]) * manifest["frame"]["metersPerUnit"] < 1.8
+
+
+def test_parts_of_blocks_are_told_by_category(run: Path, tmp_path: Path, viewer: Path) -> None:
+    job, out = job_of(run), tmp_path / "out"
+    job.run.parts.mkdir(exist_ok=True)
+    shutil.copy(job.run.labels, job.run.part_labels)
+    write_json(job.run.parts / "labels.json", {"labels": {"3": "car@0", "184": "car@2"}})
+    bundle(job, out, weights={"car": 3, "car@2": 5}, always=["car"], viewer=viewer)
+    labels = {label["id"]: label for label in manifest_of(out)["labels"]}
+    a, b = labels[3], labels[184]
+    assert (a["category"], a["block"], b["category"], b["block"]) == ("car", 0, "car", 2)
+    assert (a["title"], a["color"]) == (b["title"], b["color"])
+    assert (a["weight"], b["weight"], a["always"], b["always"]) == (3, 5, True, True)
+    with pytest.raises(RunError, match=r"bike: no such category; there are car.*NAME@BLOCK"):
+        bundle(job, out, always=["bike"], viewer=viewer)

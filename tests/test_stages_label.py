@@ -1,0 +1,163 @@
+"""Label images in a run: given or made, merged and left out, and agreed on by all views."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sagesplat.core.config import LabelsConfig, LiftConfig, MasksConfig, PosesConfig, SceneConfig, TrainConfig
+from sagesplat.core.errors import LabelError, RunError
+from sagesplat.core.events import Event, Warned
+from sagesplat.demo.capture import make_capture
+from sagesplat.run.job import Job
+from sagesplat.run.run_dir import RunDir
+from sagesplat.scene import photos as photos_module
+from sagesplat.segment import hf
+from sagesplat.segment.masks import Taxonomy
+from sagesplat.segment.segmenters import Segmented
+from sagesplat.stages.label import _soft, fuse_masks, lift_labels, make_masks
+from sagesplat.stages.scene import open_scene
+from sagesplat.stages.train import train_levels
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("demo") / "capture"
+    make_capture(folder, views=8, width=64, height=48)
+    return folder
+
+
+def begun(run: Path, capture: Path, **options) -> tuple[Job, list[Event]]:
+    events: list[Event] = []
+    job = Job(RunDir(run, "snapshots"), events.append, **options)
+    open_scene(job, capture, SceneConfig(calibrate_every=0))
+    return job, events
+
+
+def test_categories_are_merged_left_out_and_folded(capture: Path, tmp_path: Path) -> None:
+    job, _ = begun(tmp_path / "run", capture)
+    make_masks(job, MasksConfig())
+    before = {
+        name: np.mean([(job.masks[v] == i).mean() for v in job.scene.views])
+        for i, name in job.taxonomy.names.items()
+    }
+    first, second, *_ = sorted(before, key=lambda name: before[name])
+    job, _ = begun(tmp_path / "run", capture, force=True)
+    make_masks(job, MasksConfig(), LabelsConfig(merge=f"{first}={second}"))
+    assert first not in job.taxonomy.names.values()
+    after = {
+        name: np.mean([(job.masks[v] == i).mean() for v in job.scene.views])
+        for i, name in job.taxonomy.names.items()
+    }
+    assert after[second] == pytest.approx(before[first] + before[second])
+    job, _ = begun(tmp_path / "run", capture, force=True)
+    both = LabelsConfig(keep=f"{first},{second}", min_share=float(before[second]))
+    make_masks(job, MasksConfig(), both)
+    assert list(job.taxonomy.names.values()) == [second]
+    with pytest.raises(LabelError, match="no category 'nothing'"):
+        make_masks(job, MasksConfig(), LabelsConfig(keep="nothing"))
+
+
+class Halves:
+    """A network that calls the upper half of a photo sky and the rest grass, with some doubt."""
+
+    taxonomy = Taxonomy({187: "sky-other-merged", 193: "grass-merged"})
+    note = "names were not trusted"
+    calls = 0
+
+    def __init__(self, model, **_) -> None:
+        assert model == "some/network"
+
+    def __call__(self, photos):
+        Halves.calls += len(photos)
+        return [self.answer(photo.shape[:2]) for photo in photos]
+
+    def answer(self, shape) -> Segmented:
+        sky = np.arange(shape[0])[:, None] < np.full(shape[1], shape[0] // 2)
+        p = np.where(sky, 0.8, 0.1).astype(np.float32)
+        return Segmented(
+            np.where(sky, 187, 193).astype(np.int16), np.stack([p, 0.9 - p]), np.array([187, 193], np.int16)
+        )
+
+
+def test_a_network_labels_and_its_probabilities_are_fused(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hf, "HfSegmenter", Halves)
+    monkeypatch.setattr(Halves, "calls", 0)
+    job, events = begun(tmp_path / "run", capture)
+    config = MasksConfig(segmenter="hf", model="some/network", soft=True, batch=3)
+    make_masks(job, config)
+    assert Halves.calls == len(job.scene.views)
+    assert Warned("names were not trusted") in events
+    make_masks(job, config)  # done
+    make_masks(Job(job.run, events.append, force=True), config, LabelsConfig(merge="grass-merged=ground"))
+    assert Halves.calls == len(job.scene.views)  # other categories, the same network
+    job, _ = begun(tmp_path / "run", capture)
+    assert set(job.taxonomy.names.values()) == {"sky-other-merged", "ground"}
+    lift_labels(job, LiftConfig())
+    train_levels(job, TrainConfig(max_steps=40, level_every=40), 0)
+    assert job.best_masks is job.masks
+    fuse_masks(job)
+    assert job.best_masks.folder == job.run.fused
+    made = json.loads((job.run.fused / "fused.json").read_text())
+    assert made["soft"]
+    assert 0 < made["changed"] < 0.5
+    assert all(0 <= share <= 1 for share in made["agreement"])
+    ids, planes = _soft(job)(0)
+    assert set(ids.tolist()) == set(job.taxonomy.names)
+    assert planes.sum(0).max() <= 1
+    sky = planes[ids.tolist().index(187)]
+    assert sky[0].mean() == pytest.approx(0.8, abs=0.01)
+
+
+def test_what_a_segmenter_needs_is_said(capture: Path, tmp_path: Path) -> None:
+    job, _ = begun(tmp_path / "run", capture)
+    with pytest.raises(RunError, match=r"--segmenter onnx needs --model NETWORK\.onnx and --classes"):
+        make_masks(job, MasksConfig(segmenter="onnx"))
+    with pytest.raises(RunError, match=r"a\.pth: no such file; --segmenter deeplabv2 needs"):
+        make_masks(job, MasksConfig(model="a.pth"))
+    with pytest.raises(RunError, match=r"a\.onnx: no such file"):
+        make_masks(job, MasksConfig(model="a.onnx"))
+
+
+def test_photos_without_poses_become_a_capture(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What structure from motion itself does is tested with `scene.photos`."""
+    asked = []
+
+    def reconstruct(source, workspace, config, on_progress):
+        asked.append((source, config))
+        shutil.copytree(capture, workspace)
+        (workspace / "poses.json").write_text("{}")
+        on_progress("features", 1, 2)
+        return photos_module.Reconstruction(workspace, 9, 8, {"a.jpg": "too few features"}, 10, 0.97, {})
+
+    monkeypatch.setattr(photos_module, "reconstruct", reconstruct)
+    events: list[Event] = []
+    job = Job(RunDir(tmp_path / "run"), events.append)
+    for _ in range(2):
+        open_scene(job, capture / "images", SceneConfig(), PosesConfig(matching="sequential"))
+    assert asked == [(capture / "images", PosesConfig(matching="sequential"))]
+    warned = [event.text for event in events if isinstance(event, Warned)]
+    assert warned[0] == "a.jpg: too few features"
+    assert "0.97 px is high" in warned[1]
+    assert "--poses.camera per-image" in warned[1]
+    assert job.scene.path == (tmp_path / "run" / "capture" / "images").resolve()
+    assert len(job.scene.views) == 8
+
+
+def test_a_run_among_the_photos_is_refused(capture: Path) -> None:
+    job = Job(RunDir(capture / "images" / "run"), lambda event: None)
+    with pytest.raises(RunError, match="lies among the photos"):
+        open_scene(job, capture / "images", SceneConfig())
+
+
+def test_given_label_images_have_no_networks_probabilities(capture: Path, tmp_path: Path) -> None:
+    job, _ = begun(tmp_path / "run", capture)
+    job.run.soft.mkdir()
+    make_masks(job, MasksConfig())
+    assert not job.run.soft.exists()

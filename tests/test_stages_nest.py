@@ -1,0 +1,478 @@
+"""The nested ladder: order, training on compositions, prefixes, chunks, and a whole run with it."""
+
+import csv
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import pinhole, random_gaussians, write_capture
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sagesplat.adapt.evaluate import read_evaluation
+from sagesplat.adapt.ladder import PrefixLadder, read_prefixes
+from sagesplat.adapt.observe import TOTAL, read_observations
+from sagesplat.adapt.plan import read_budget_plan, read_plans
+from sagesplat.core.config import FitConfig, NestConfig, PlanConfig, RunConfig, SceneConfig, TrainConfig
+from sagesplat.core.errors import DataError, RunError
+from sagesplat.core.events import Event, StageDone, StageSkipped
+from sagesplat.demo.capture import make_capture
+from sagesplat.formats.increments import packed, read_chunks, read_index, totals, write_chunks
+from sagesplat.formats.levels import write_set
+from sagesplat.formats.ply import read_ply
+from sagesplat.formats.quantisation import in_buckets
+from sagesplat.run.job import Job
+from sagesplat.run.run_dir import RunDir
+from sagesplat.scene.images import Photos
+from sagesplat.scene.scene import Points, Scene, View
+from sagesplat.segment.masks import Taxonomy
+from sagesplat.stages.compose import compose_plan
+from sagesplat.stages.evaluate import evaluate_plans
+from sagesplat.stages.export import export_chunks
+from sagesplat.stages.fit import fit_ladder
+from sagesplat.stages.observe import observe_levels
+from sagesplat.stages.pipeline import run_all
+from sagesplat.stages.plan import costs_of, make_plan, pixels_of, promised_quality
+from sagesplat.studies.paper.cross_view import read_cross_view
+from sagesplat.studies.paper.run import cross_views
+from sagesplat.train import nested
+from sagesplat.train.importance import importance
+from sagesplat.train.nested import Nested, NestStep, draw_shares, level_sizes, nest, order, straddling
+
+QUICK = NestConfig(steps=12, levels=4, smallest=0.1, drawn_from=0.1)
+
+
+@given(st.integers(0, 5000), st.integers(1, 20), st.floats(0.01, 1), st.integers(0, 6000))
+def test_level_sizes_rise_to_everything(count: int, levels: int, smallest: float, boundary: int) -> None:
+    sizes = level_sizes(count, NestConfig(levels=levels, smallest=smallest), boundary)
+    assert len(sizes) == levels
+    assert sizes[-1] == count
+    assert list(sizes) == sorted(sizes)
+    if count:
+        assert sizes[0] >= min(max(1, boundary), count)
+
+
+def test_sizes_are_geometric() -> None:
+    sizes = np.array(level_sizes(10_000, NestConfig(levels=5, smallest=0.01)))
+    np.testing.assert_allclose(sizes[1:] / sizes[:-1], 100**0.25, rtol=1e-2)
+
+
+def test_a_gaussian_straddles_if_it_shows_on_both_sides() -> None:
+    weights = np.array([[90, 10], [60, 40], [0.6, 0.4], [0, 0]], np.float32)
+    assert straddling(weights, num_views=10).tolist() == [False, True, False, False]
+
+
+def test_everything_is_drawn_more_often_in_the_end() -> None:
+    config, rng = NestConfig(full_share=0.1, full_share_end=0.9, drawn_from=0.05), np.random.default_rng(0)
+    for done, share in ((0.0, 0.1), (0.5, 0.5), (1.0, 0.9)):
+        drawn = np.stack([draw_shares(rng, 3, config, done) for _ in range(2000)])
+        assert (drawn == 1).all(1).mean() == pytest.approx(share, abs=0.04)
+        assert drawn.min() >= 0.05 - 1e-6
+        parts = np.log(drawn[(drawn < 1).any(1)])
+        assert parts.mean() == pytest.approx(np.log(0.05) / 2, abs=0.15)  # log-uniform
+        assert abs(np.corrcoef(parts.T)[0, 1]) < 0.2  # each category by itself
+
+
+@pytest.fixture
+def seen() -> Scene:
+    """Two views and nothing else."""
+    none, no_views = np.zeros((0, 3), np.float32), np.zeros(0, np.int32)
+    points = Points(none, none.astype(np.uint8), np.zeros(0, np.int64), no_views, none[:, :2])
+    views = tuple(View(f"{i}", pinhole(angle=0.1 * i), Path("none")) for i in range(2))
+    return Scene("two", Path("none"), views, points, test_every=0)
+
+
+@pytest.mark.parametrize("criterion", ["weight", "weight-volume", "peak", "sensitivity", "opacity"])
+def test_importance_ranks_what_shows_above_what_does_not(seen, criterion) -> None:
+    g = random_gaussians(40, logit=2.0)
+    means = g.means.clone()
+    means[0] = torch.tensor([0.0, 0.0, -5.0])  # behind the camera
+    g = replace(g, means=means)
+    worth = importance(g, seen, [0, 1], criterion)
+    assert worth.shape == (40,)
+    assert worth.dtype == np.float32
+    assert (worth >= 0).all()
+    if criterion == "opacity":
+        np.testing.assert_allclose(worth, torch.sigmoid(g.logit_opacities))
+    else:
+        assert worth[0] == 0
+        assert (worth > 0).sum() > 20
+
+
+def test_sensitivity_is_the_change_when_a_gaussian_fades(seen) -> None:
+    """One Gaussian alone: its picture is proportional to its opacity, so fading removes all of it."""
+    from sagesplat.raster import rasterize
+
+    g = random_gaussians(40, logit=-3.0).select(torch.tensor([5]))
+    with torch.no_grad():
+        energy = sum(float((rasterize(g, v.camera).rgb ** 2).sum()) for v in seen.views)
+    found = np.mean([importance(g, seen, [0, 1], "sensitivity", seed=s)[0] for s in range(200)])
+    assert found == pytest.approx(energy, rel=0.2)
+
+
+def ordered(count: int = 60) -> Nested:
+    g = random_gaussians(count, degree=1)
+    labels = torch.sort(torch.arange(count) % 3).values.to(torch.int16)
+    ranks = np.full(count, 2, np.int8)
+    ranks[20:22] = 0  # the first two of category 1
+    return Nested(replace(g, label_ids=labels), np.ones(count, np.float32), ranks)
+
+
+def trained(scene: Scene, start: Nested, config: NestConfig, **options) -> Nested:
+    *steps, last = nest(start, scene, Photos(scene.views), TrainConfig(), config, **options)
+    assert [s.step for s in steps if isinstance(s, NestStep)][-1] == config.steps
+    assert isinstance(last, Nested)
+    return last
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    return write_capture(tmp_path / "capture", random_gaussians(60, seed=3))
+
+
+def test_training_lowers_the_loss_of_prefixes_and_keeps_the_order(scene: Scene, monkeypatch) -> None:
+    monkeypatch.setattr(nested, "_SORT_AT", ())
+    start = ordered()
+    config = NestConfig(steps=40, levels=3, drawn_from=0.2)
+    events = list(nest(start, scene, Photos(scene.views), TrainConfig(), config))
+    result = events[-1]
+    assert isinstance(result, Nested)
+    assert torch.equal(result.gaussians.label_ids, start.gaussians.label_ids)
+    moved = (result.gaussians.means - start.gaussians.means).norm(dim=1)
+    spread = (start.gaussians.means[None] - start.gaussians.means[:, None]).norm(dim=2)
+    assert moved.max() < spread[spread > 0].median()  # every row is still the Gaussian that it was
+    losses = [e.loss for e in events if isinstance(e, NestStep)]
+    assert np.mean(losses[-10:]) < np.mean(losses[:10])
+
+
+def test_they_are_sorted_again_by_what_they_have_become_worth(scene: Scene, monkeypatch) -> None:
+    monkeypatch.setattr(nested, "_SORT_AT", (0,))
+    start, config = ordered(), replace(QUICK, steps=1)
+    result = trained(scene, start, config)
+    worth = importance(start.gaussians, scene, scene.train_ids.tolist(), config.criterion)
+    rows = np.lexsort((-worth, start.ranks, start.gaussians.label_ids.numpy()))
+    assert (rows != np.arange(60)).any()
+    assert (result.ranks == start.ranks[rows]).all()
+    assert torch.allclose(result.gaussians.means, start.gaussians.means[torch.from_numpy(rows)], atol=1e-2)
+
+
+def test_what_is_not_drawn_stays_as_it_is(scene: Scene, monkeypatch) -> None:
+    """With the smallest prefix drawn only (a share that rounds to one Gaussian), no other row moves."""
+    monkeypatch.setattr(nested, "_SORT_AT", ())
+    start = ordered()
+    config = replace(QUICK, steps=3, drawn_from=1e-9, full_share=0.0, full_share_end=0.0)
+    result = trained(scene, start, config, seed=1)
+    moved = (result.gaussians.means != start.gaussians.means).any(1).numpy()
+    first = np.isin(np.arange(60), [0, 20, 40])
+    assert moved[first].any()
+    few = moved.nonzero()[0] % 20
+    assert len(few) < 40
+
+
+def test_a_killed_training_goes_on_bit_for_bit(scene: Scene, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(nested, "_SAVE_EVERY", 4)
+    whole = trained(scene, ordered(), QUICK)
+    file = tmp_path / "state.npz"
+    events = nest(ordered(), scene, Photos(scene.views), TrainConfig(), QUICK, checkpoint=file, settings="a")
+    for event in events:
+        if isinstance(event, NestStep) and event.step == 6:
+            break
+    resumed = trained(scene, ordered(), QUICK, checkpoint=file, settings="a")
+    for name, value in whole.gaussians.parameters().items():
+        assert torch.equal(value, resumed.gaussians.parameters()[name]), name
+    with pytest.raises(RunError, match="other settings"):
+        next(iter(nest(ordered(), scene, Photos(scene.views), TrainConfig(), QUICK, checkpoint=file)))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"levels": 0}, "--nest.levels 0"),
+        ({"smallest": 0.0}, "--nest.smallest"),
+        ({"drawn_from": 0.0}, "--nest.drawn-from"),
+        ({"full_share": 1.5}, "--nest.full-share"),
+        ({"sh_bits": (9, 4)}, "--nest.sh-bits"),
+        ({"steps": -1}, "--nest.steps"),
+        ({"gain": 0.0}, "--nest.gain"),
+    ],
+)
+def test_impossible_settings_are_one_line(scene, wrong, says) -> None:
+    with pytest.raises(RunError, match=says):
+        next(iter(nest(ordered(), scene, Photos(scene.views), TrainConfig(), replace(QUICK, **wrong))))
+
+
+def test_harmonics_in_buckets_are_multiples_and_zero_stays_zero() -> None:
+    shN = torch.linspace(-1.2, 1.2, 15 * 3 * 7).reshape(7, 15, 3)
+    shN[0] = 0
+    found = in_buckets(shN, (5, 4))
+    assert torch.equal(found[0], torch.zeros(15, 3))
+    assert torch.equal(found[:, :3] * 16, (found[:, :3] * 16).round())
+    assert torch.equal(found[:, 3:] * 8, (found[:, 3:] * 8).round())
+    assert (found - shN.clamp(-1, 1)).abs().max() <= 0.0625
+
+
+@pytest.fixture
+def ladder(tmp_path: Path) -> PrefixLadder:
+    start = ordered()
+    sizes = {0: (1, 5, 20), 1: (2, 2, 20), 2: (20, 20, 20)}
+    write_set(tmp_path / "ladder.npz", start.gaussians, 12, sizes, clarity=start.clarity)
+    return read_prefixes(tmp_path / "ladder.npz")
+
+
+def test_every_level_begins_with_the_one_below(ladder: PrefixLadder) -> None:
+    assert ladder.levels == [1, 2, 3]
+    assert ladder.counts[1, 2] == 2
+    assert ladder.size(2) == 27
+    for low, high in ((1, 2), (2, 3)):
+        for label in ladder.sizes:
+            below, above = (ladder.load(level, [label]).means for level in (low, high))
+            assert torch.equal(above[: len(below)], below)
+    mixed = ladder.compose({0: 3, 2: 1})
+    assert mixed.counts() == {0: 20, 2: 20}
+    with pytest.raises(RunError, match="level 4 is not in the ladder"):
+        ladder.load(4)
+
+
+def test_a_ladder_that_does_not_fit_its_gaussians_is_refused(tmp_path: Path) -> None:
+    g = ordered().gaussians
+    for sizes in ({0: (5, 1, 20)}, {0: (1, 2, 19)}, {0: (1, 20)}):
+        whole = {1: (1, 2, 20), 2: (1, 2, 20), **sizes}
+        write_set(tmp_path / "ladder.npz", g, 1, whole)
+        with pytest.raises(DataError, match=r"ladder\.npz: level sizes"):
+            read_prefixes(tmp_path / "ladder.npz")
+    with pytest.raises(RunError, match="run `sagesplat nest`"):
+        read_prefixes(tmp_path / "nothing.npz")
+
+
+def test_chunks_hold_what_each_level_adds(tmp_path: Path) -> None:
+    sizes = {0: (1, 5, 20), 1: (2, 2, 20), 2: (20, 20, 20)}
+    g = ordered().gaussians
+    g = g.select(torch.from_numpy(packed(g, sizes)))
+    chunks = write_chunks(tmp_path / "chunks", g, sizes, {0: "a b", 1: "c", 2: "d"})
+    assert [(c.label_id, c.level, c.count) for c in chunks] == [
+        (0, 1, 1), (0, 2, 4), (0, 3, 15), (1, 1, 2), (1, 3, 18), (2, 1, 20)
+    ]  # fmt: skip
+    assert chunks[0].uri.startswith("a-b-01-")
+    for chunk in chunks:
+        assert (tmp_path / "chunks" / chunk.uri).stat().st_size == chunk.nbytes
+    assert read_index(tmp_path / "chunks") == chunks
+    sent = read_chunks(tmp_path / "chunks", chunks)
+    assert torch.equal(sent.label_ids, g.label_ids)
+    np.testing.assert_allclose(sent.means, g.means, atol=0.02)
+    np.testing.assert_allclose(totals(chunks, [0, 1, 2], 3, "count"), list(sizes.values()))
+    again = write_chunks(tmp_path / "again", g, sizes, {0: "a b", 1: "c", 2: "d"})
+    assert again == chunks  # their names are hashes of their bytes
+    plain = write_chunks(tmp_path / "plys", g, sizes, {0: "a b", 1: "c", 2: "d"}, kind="ply")
+    part = read_ply(tmp_path / "plys" / plain[1].uri)
+    np.testing.assert_array_equal(part.means, g.means[1:5])
+    (tmp_path / "chunks" / "index.json").write_text('{"chunks": [{"label_id": 0}]}')
+    with pytest.raises(DataError, match="not an index of chunks"):
+        read_index(tmp_path / "chunks")
+
+
+CONFIG = RunConfig(
+    scene=SceneConfig(calibrate_every=4),
+    train=TrainConfig(max_steps=90, level_every=30),
+    nest=NestConfig(steps=40, levels=5, smallest=0.1, seed_steps=30),
+    plan=PlanConfig(target_ssim=0.4),
+)
+STAGES = [
+    "scene",
+    "segment",
+    "masks",
+    "lift",
+    "train",
+    "seeds",
+    "nest",
+    "observe",
+    "fit",
+    "plan",
+    "compose",
+    "evaluate",
+    "report",
+]
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("demo") / "capture"
+    make_capture(folder, views=16, width=80, height=60)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def finished(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = tmp_path_factory.mktemp("run") / "run"
+    events: list[Event] = []
+    run_all(Job(RunDir(run), events.append), capture, CONFIG)
+    assert [e.name for e in events if isinstance(e, StageDone)] == STAGES
+    return run
+
+
+def quiet(run: Path, **options) -> Job:
+    return Job(RunDir(run), lambda event: None, **options)
+
+
+def test_a_run_makes_a_nested_ladder_by_default(finished: Path) -> None:
+    job = quiet(finished)
+    table = read_observations(job.run.observations)
+    assert set(table.level) == {1, 2, 3, 4, 5}
+    whole = table.select((table.label_id == TOTAL) & np.isin(table.view, job.scene.train_ids))
+    ssim = [whole.ssim[whole.level == level].mean() for level in job.ladder.levels]
+    assert ssim == sorted(ssim)
+    assert len(job.scene.calibration_ids) == 3
+    scene_plans, view_plans = read_plans(job.run.plan)
+    assert [p.target for p in scene_plans] == [0.3, 0.4, 0.5]
+    assert len(view_plans) == 16
+    sent = [p.sent for p in scene_plans]
+    assert None not in sent
+    chunks = read_index(job.run.chunks)
+    for choice in scene_plans[1].choices:
+        mine = [c for c in chunks if c.label_id == choice.label_id and c.level <= choice.level]
+        assert choice.sent == sum(c.nbytes for c in mine)
+        assert choice.count == sum(c.count for c in mine)
+    assert len(read_ply(job.run.composed)) == scene_plans[1].count
+    evaluation = read_evaluation(job.run.evaluation)
+    assert set(evaluation.view) == {0, 8}
+    promised = evaluation.select(evaluation.label_id != TOTAL)
+    assert np.isfinite(promised.predicted).mean() > 0.8
+    assert "grass-merged" in (job.run.report / "index.html").read_text()
+
+
+def test_nothing_is_left_to_do_and_the_papers_ladder_lies_beside_it(finished: Path, capture: Path) -> None:
+    events: list[Event] = []
+    run_all(Job(RunDir(finished), events.append), capture, CONFIG)
+    assert [e.name for e in events if isinstance(e, StageSkipped)] == STAGES
+    job = Job(RunDir(finished, "snapshots"), events.append)
+    observe_levels(job, FitConfig())
+    assert set(read_observations(job.run.observations).level) == {30, 60, 90}
+    assert set(read_observations(RunDir(finished).observations).level) == {1, 2, 3, 4, 5}
+    fit_ladder(job, FitConfig())
+    with pytest.raises(RunError, match="--budget needs the nested ladder"):
+        make_plan(job, PlanConfig(budget=1e5))
+
+
+def test_budgets_are_kept_and_more_bytes_promise_more(finished: Path, tmp_path: Path) -> None:
+    shutil.copytree(finished, tmp_path / "run")
+    job = quiet(tmp_path / "run", force=True)
+    full = costs_of(job)
+    for unit in ("bytes", "gpu-bytes", "count"):
+        costs, promised = full.of(unit), []
+        for share in (0.3, 0.6, 1.0):
+            budget = float(share * costs[:, -1].sum())
+            make_plan(job, PlanConfig(target_ssim=0.4, budget=budget, budget_unit=unit))
+            plan = read_budget_plan(job.run.plan)
+            assert plan is not None
+            assert plan.status == "ok"
+            rows = {label: i for i, label in enumerate(full.labels)}
+            assert sum(costs[rows[c.label_id], c.level - 1] for c in plan.choices) <= budget
+            promised.append(sum(c.count for c in plan.choices))
+        assert promised == sorted(promised)
+    compose_plan(job)
+    plan = read_budget_plan(job.run.plan)
+    assert plan is not None
+    assert len(read_ply(job.run.composed)) == plan.count
+    costs, quality = promised_quality(job)
+    table = read_observations(job.run.observations)
+    shown = pixels_of(table, job, costs.labels, job.scene.train_ids)
+    best = (quality.mean * shown[..., None]).sum(0) / shown.sum(0)[:, None]
+    for row, choice in enumerate(plan.choices):  # all that money can buy
+        assert choice.status == "no model" or choice.predicted_ssim == pytest.approx(best[row].max())
+    evaluate_plans(job)
+    assert np.isnan(read_evaluation(job.run.evaluation).target).any()
+    make_plan(job, PlanConfig(target_ssim=0.4, budget=10.0))
+    plan = read_budget_plan(job.run.plan)
+    assert plan is not None
+    assert plan.status == "over budget"
+    assert {c.level for c in plan.choices} == {1}
+    name = job.names()[full.labels[-1]]
+    make_plan(job, PlanConfig(target_ssim=0.4, budget=1e5, weights={name: 5.0}))
+    with pytest.raises(RunError, match="no category 'nothing'"):
+        make_plan(job, PlanConfig(target_ssim=0.4, budget=1e5, weights={"nothing": 5.0}))
+
+
+def test_all_infeasible_is_a_plan_with_a_status(finished: Path, tmp_path: Path) -> None:
+    shutil.copytree(finished, tmp_path / "run")
+    job = quiet(tmp_path / "run", force=True)
+    make_plan(job, PlanConfig(target_ssim=1.0))
+    plans, _ = read_plans(job.run.plan)
+    assert plans[-1].status == "infeasible"
+    assert {c.status for c in plans[-1].choices} <= {"infeasible", "no model"}
+
+
+def test_an_impossible_confidence_is_one_line(finished: Path, tmp_path: Path) -> None:
+    shutil.copytree(finished, tmp_path / "run")
+    for confidence in (0.0, 1.0, 2.0):
+        with pytest.raises(RunError, match="confidence"):
+            fit_ladder(quiet(tmp_path / "run", force=True), FitConfig(confidence=confidence))
+
+
+def test_each_view_is_planned_by_its_bound(finished: Path, tmp_path: Path) -> None:
+    shutil.copytree(finished, tmp_path / "run")
+    job = quiet(tmp_path / "run")
+    cross_views(job)
+    table = read_cross_view(job.run.cross_view)
+    parts = table.select((table.label_id != TOTAL) & np.isfinite(table.predicted))
+    assert set(parts.level) <= {1, 2, 3, 4, 5}
+    feasible = parts.select(parts.predicted >= parts.target)
+    assert len(feasible)
+    by = {
+        row["by"]: row
+        for row in csv.DictReader((job.run.adapted / "promises_kept.csv").read_text().splitlines())
+    }
+    assert set(by) == {"eq3", "mean", "bound", "oracle"}
+    assert float(by["oracle"]["kept"]) == 1
+
+
+def test_without_calibration_views_a_run_still_promises(capture: Path, tmp_path: Path) -> None:
+    config = replace(CONFIG, scene=SceneConfig(calibrate_every=0), train=TrainConfig(max_steps=20))
+    job = quiet(tmp_path / "run")
+    run_all(job, capture, replace(config, nest=replace(QUICK, steps=2, seed_share=0.0)))
+    assert read_plans(job.run.plan)[0]
+
+
+def test_seeds_come_first_and_take_the_place_of_the_least_worthy(scene: Scene) -> None:
+    class OneLabel:
+        """Every pixel is of category 3."""
+
+        taxonomy = Taxonomy({3: "thing"})
+
+        def __getitem__(self, view: View) -> np.ndarray:
+            return np.full((view.camera.height, view.camera.width), 3, np.int16)
+
+    g = random_gaussians(50, seed=3)
+    seeds = random_gaussians(8, seed=4)
+    found = order(g, scene, OneLabel(), QUICK, seeds=seeds)  # type: ignore[arg-type]
+    assert len(found.gaussians) == 50
+    assert found.boundary == {3: 0}
+    assert sorted(found.gaussians.means[:8].tolist()) == sorted(seeds.means.tolist())
+    worth = importance(g, scene, scene.train_ids.tolist(), QUICK.criterion)
+    worthiest = g.means[torch.from_numpy(np.argsort(-worth, kind="stable")[:42].copy())]
+    assert torch.equal(found.gaussians.means[8:], worthiest)
+
+
+def test_chunks_are_exported_as_files(finished: Path, tmp_path: Path) -> None:
+    job = quiet(finished)
+    for kind in ("spz", "ply"):
+        count = export_chunks(job, tmp_path / kind, kind)
+        chunks = read_index(tmp_path / kind)
+        assert count == len(chunks) == len(list((tmp_path / kind).glob(f"*.{kind}")))
+        assert sum(c.count for c in chunks) == len(job.ladder.load(5))
+    counts = [[c.count for c in read_index(folder)] for folder in (tmp_path / "ply", job.run.chunks)]
+    assert counts[0] == counts[1]
+    with pytest.raises(RunError, match="exists"):
+        export_chunks(job, tmp_path / "ply", "ply")
+    with pytest.raises(RunError, match="snapshots have no chunks"):
+        export_chunks(Job(RunDir(finished, "snapshots"), print), tmp_path / "none", "ply")
+
+
+def test_one_gaussian_is_a_category_too(tmp_path: Path) -> None:
+    g = ordered().gaussians.select(torch.tensor([0, 20, 21]))
+    sizes = {label: level_sizes(n, QUICK) for label, n in g.counts().items()}
+    assert sizes[0] == (1, 1, 1, 1)
+    chunks = write_chunks(tmp_path / "chunks", g, sizes, {0: "a", 1: "b"})
+    assert [(c.label_id, c.level) for c in chunks] == [(0, 1), (1, 1), (1, 4)]
+    assert totals(chunks, [0, 1], 4, "count").tolist() == [[1, 1, 1, 1], [1, 1, 1, 2]]

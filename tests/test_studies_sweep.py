@@ -1,0 +1,367 @@
+"""A sweep on a small procedural capture: cells, resuming, failures, and the sums by hand."""
+
+import csv
+import math
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sagesplat.adapt.plan import read_plans
+from sagesplat.core.config import LiftConfig, MasksConfig, PlanConfig, RunConfig, SceneConfig, TrainConfig
+from sagesplat.core.errors import DataError, RunError
+from sagesplat.core.events import Event, StageDone, TableMade, Training, Warned
+from sagesplat.demo.capture import make_capture
+from sagesplat.io.files import write_text
+from sagesplat.run.run_dir import RunDir
+from sagesplat.stages import report
+from sagesplat.studies.sweep.file import read_sweep
+from sagesplat.studies.sweep.report import MEASURES, Row, readable, summarise
+from sagesplat.studies.sweep.run import _share_training, _trained_alike, run_sweep
+
+ROOT = Path(__file__).parents[1]
+TEXT = """
+targets = [0.4, 0.3]
+seeds = [0, 5]
+settings.ladder = "snapshots"
+settings.train = { max_steps = 60, level_every = 20, refine_every = 5 }
+scenes.plot = "capture"
+variants.track = {}
+variants.projection.lift.votes = "projection"
+"""
+CELLS = ["plot-track-seed0", "plot-track-seed5", "plot-projection-seed0", "plot-projection-seed5"]
+TABLES = ("cells.csv", "summary.csv", "summary.md")
+
+
+def write(folder: Path, text: str) -> Path:
+    (folder / "capture").mkdir(exist_ok=True)
+    (folder / "sweep.toml").write_text(text)
+    return folder / "sweep.toml"
+
+
+def sweep_in(folder: Path, text: str = TEXT, *, force: bool = False) -> list[Event]:
+    events: list[Event] = []
+    run_sweep(read_sweep(write(folder, text)), folder / "out", events.append, force=force)
+    return events
+
+
+def done(events: list[Event]) -> list[str]:
+    return [event.name for event in events if isinstance(event, StageDone)]
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def plain_report() -> Iterator[None]:
+    """Figures take most of the time of so small a run, and have their own tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(report, "write_report", lambda folder, _: write_text(folder / "index.html", "report"))
+        yield
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the capture, the file and the finished sweep."""
+    folder = tmp_path_factory.mktemp("sweep")
+    make_capture(folder / "capture", views=12, width=80, height=60)
+    events = sweep_in(folder)
+    assert [name for name in done(events) if "/" not in name] == CELLS
+    assert done(events).count("plot-track-seed5/train") == 1
+    assert isinstance(events[-1], TableMade)
+    return folder
+
+
+@pytest.fixture
+def copy(finished: Path, tmp_path: Path) -> Path:
+    """The finished sweep, to be spoilt; the link keeps the capture where it was."""
+    shutil.copytree(finished / "out", tmp_path / "out")
+    (tmp_path / "capture").symlink_to(finished / "capture")
+    return tmp_path
+
+
+def test_every_cell_and_target_is_a_row_that_agrees_with_its_run(finished: Path) -> None:
+    rows = rows_of(finished / "out" / "cells.csv")
+    assert [(r["variant"], r["seed"], r["target"]) for r in rows] == [
+        (variant, seed, target)
+        for variant in ("track", "projection")
+        for seed in ("0", "5")
+        for target in ("0.3", "0.4")
+    ]
+    for row in rows:
+        run = RunDir(finished / "out" / "runs" / f"plot-{row['variant']}-seed{row['seed']}", "snapshots")
+        plan = next(p for p in read_plans(run.plan)[0] if p.target == float(row["target"]))
+        assert int(row["Gaussians"]) == plan.count
+        assert row["status"] == plan.status
+        assert 0 < float(row["of 3DGS"]) <= 1
+        assert float(row["share kept"]) == pytest.approx(int(row["kept"]) / int(row["promised"]))
+        assert 0 < float(row["SSIM"]) <= float(row["3DGS SSIM"]) + 0.1
+        assert 5 < float(row["PSNR"]) < 40
+    assert min(float(row["of 3DGS"]) for row in rows) < 0.95
+    assert len({row["3DGS PSNR"] for row in rows}) == 4  # every seed and variant was a training of its own
+    summary = rows_of(finished / "out" / "summary.csv")
+    assert [(r["variant"], r["target"], r["n"]) for r in summary] == [
+        (variant, target, "2") for variant in ("track", "projection") for target in ("0.3", "0.4")
+    ]
+    pair = [float(r["SSIM"]) for r in rows if (r["variant"], r["target"]) == ("projection", "0.4")]
+    assert float(summary[3]["SSIM"]) == pytest.approx(sum(pair) / 2)
+    assert float(summary[3]["SSIM sd"]) == pytest.approx(abs(pair[0] - pair[1]) / math.sqrt(2))
+    lines = (finished / "out" / "summary.md").read_text().splitlines()
+    assert len(lines) == 4 + len(summary)
+    assert {line.count("|") for line in lines[2:]} == {len(MEASURES) + 6}
+    assert f"{float(summary[3]['SSIM']):.3f}±{float(summary[3]['SSIM sd']):.3f}" in lines[-1]
+
+
+def test_a_second_sweep_has_nothing_to_do_and_says_the_same(finished: Path) -> None:
+    before = [(finished / "out" / name).read_bytes() for name in TABLES]
+    assert done(sweep_in(finished)) == CELLS
+    assert [(finished / "out" / name).read_bytes() for name in TABLES] == before
+
+
+def test_what_is_trained_alike_is_trained_once(copy: Path) -> None:
+    text = TEXT + "variants.minimum.fit.distance = 'minimum'\n"
+    events = sweep_in(copy, text)
+    stages_of = [name.split("/")[1] for name in done(events) if name.startswith("plot-minimum-seed5/")]
+    assert stages_of == ["observe", "fit", "plan", "compose", "evaluate", "report"]
+    rows = {(r["variant"], r["seed"], r["target"]): r for r in rows_of(copy / "out" / "cells.csv")}
+    for target in ("0.3", "0.4"):
+        like, minimum = (rows[variant, "5", target] for variant in ("track", "minimum"))
+        assert like["3DGS PSNR"] == minimum["3DGS PSNR"]
+    assert done(sweep_in(copy, text)) == [*CELLS, "plot-minimum-seed0", "plot-minimum-seed5"]
+
+
+def test_blocks_are_trained_by_each_cell(tmp_path: Path) -> None:
+    text = "targets = [0.4]\nseeds = [0]\nscenes.plot = 'demo'\nvariants.whole = {}\n"
+    text += "variants.two.blocks.count = 2\n"
+    text += "variants.near.blocks.count = 2\nvariants.near.fit.distance = 'minimum'\n"
+    whole, two, near = read_sweep(write(tmp_path, text))
+    assert _trained_alike([whole], two) is None
+    assert _trained_alike([whole, two], near) == two
+    made = RunDir(tmp_path / two.name)
+    made.blocks.mkdir(parents=True)
+    write_text(made.provenance("train"), "{}")
+    _share_training(tmp_path, two, near)  # what is in a block's folder names that folder
+    assert not (tmp_path / near.name).exists()
+
+
+def test_a_cell_that_fails_is_recorded_and_the_others_go_on(copy: Path) -> None:
+    (copy / "empty").mkdir()
+    sweep = read_sweep(write(copy, TEXT.replace("scenes", 'scenes.bad = "empty"\nscenes')))
+    events: list[Event] = []
+    with pytest.raises(RunError, match=r"out: 4 of 8 runs failed \(bad-track-seed0, .*cells\.csv") as raised:
+        run_sweep(sweep, copy / "out", events.append)
+    assert "\n" not in str(raised.value)
+    assert done(events) == CELLS
+    warnings = [event.text for event in events if isinstance(event, Warned)]
+    assert len(warnings) == 4
+    assert warnings[0].startswith("bad-track-seed0: ")
+    assert isinstance(events[-1], TableMade)
+    rows = rows_of(copy / "out" / "cells.csv")
+    assert len(rows) == 16
+    assert rows[0]["status"].startswith("failed: ")
+    assert rows[0]["SSIM"] == ""
+    summary = rows_of(copy / "out" / "summary.csv")
+    assert [row["n"] for row in summary] == ["0"] * 4 + ["2"] * 4
+    assert (summary[0]["SSIM"], summary[0]["SSIM sd"]) == ("", "")
+
+
+def test_changed_settings_fail_unless_forced(copy: Path) -> None:
+    text = TEXT.replace("variants.projection.lift", "#").replace("5]", "]").replace("[0.4, 0.3]", "[0.35]")
+    with pytest.raises(RunError, match="1 of 1 runs failed"):
+        sweep_in(copy, text)
+    assert "add --force" in rows_of(copy / "out" / "cells.csv")[0]["status"]
+    assert done(sweep_in(copy, text, force=True)) == [
+        *(f"plot-track-seed0/{stage}" for stage in ("plan", "compose", "evaluate", "report")),
+        "plot-track-seed0",
+    ]
+    (row,) = rows_of(copy / "out" / "summary.csv")
+    assert (row["n"], row["target"], row["SSIM sd"]) == ("1", "0.35", "")
+    assert row["SSIM"]
+
+
+def test_without_test_views_quality_is_unknown(copy: Path) -> None:
+    text = TEXT.replace("60", "10").replace("settings", "settings.scene.test_every = 0\nsettings", 1)
+    sweep = read_sweep(write(copy, text))[:1]
+    (row,) = run_sweep(sweep, copy / "new", lambda _: None).rows[:1]
+    assert row[-2:] == ("–", "–")
+    (row, _) = rows_of(copy / "new" / "cells.csv")
+    assert int(row["Gaussians"]) > 0
+    assert (row["SSIM"], row["3DGS PSNR"], row["promised"], row["share kept"]) == ("", "", "0", "")
+
+
+def test_an_interrupted_sweep_keeps_what_is_done(copy: Path) -> None:
+    def interrupt(event: Event) -> None:
+        if isinstance(event, Training):
+            raise KeyboardInterrupt
+
+    sweep = read_sweep(write(copy, TEXT.replace("5]", "1]")))
+    with pytest.raises(KeyboardInterrupt):
+        run_sweep(sweep, copy / "out", interrupt)
+    assert {row["seed"] for row in rows_of(copy / "out" / "cells.csv")} == {"0"}
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
+    sweep = read_sweep(write(tmp_path, TEXT))
+    with pytest.raises(RunError, match="not empty and not the folder of a sweep"):
+        run_sweep(sweep, tmp_path, print)
+    assert {path.name for path in tmp_path.iterdir()} == {"capture", "sweep.toml"}
+
+
+def test_settings_and_variants_become_the_configuration_of_each_cell(tmp_path: Path) -> None:
+    text = """
+        targets = [0.9, 0.5, 1]
+        seeds = [3]
+        [settings]
+        scene.downscale = 2
+        masks.masks = "labels"
+        train = { sh_degree = 1, antialiased = true, grow_scale = 1 }
+        plan.share = 0.5
+        [scenes]
+        plot = "capture"
+        garden = "demo"
+        [variants.a]
+        train.sh_degree = 2
+        lift.votes = "projection"
+    """
+    plot, garden = read_sweep(write(tmp_path, text))
+    assert (plot.name, plot.capture) == ("plot-a-seed3", tmp_path / "capture")
+    assert (garden.name, garden.capture) == ("garden-a-seed3", None)
+    assert (
+        plot.config
+        == garden.config
+        == RunConfig(
+            SceneConfig(downscale=2),
+            masks=MasksConfig(masks=tmp_path / "labels"),
+            lift=LiftConfig("projection"),
+            train=TrainConfig(sh_degree=2, antialiased=True, grow_scale=1.0),
+            plan=PlanConfig(target_ssim=0.9, share=0.5, other_targets=(0.5, 1.0)),
+            seed=3,
+        )
+    )
+    assert isinstance(plot.config.train.grow_scale, float)
+    assert plot.config.plan.targets == [0.5, 0.9, 1.0]
+
+
+def test_without_variants_a_cell_is_a_scene_and_a_seed(tmp_path: Path) -> None:
+    text = 'targets = [0.8]\nseeds = [0, 1]\nscenes.plot = "capture"'
+    sweep = read_sweep(write(tmp_path, text))
+    assert [cell.name for cell in sweep] == ["plot-seed0", "plot-seed1"]
+    assert [cell.config for cell in sweep] == [
+        RunConfig(plan=PlanConfig(other_targets=()), seed=seed) for seed in (0, 1)
+    ]
+
+
+def test_the_example_is_a_sweep() -> None:
+    sweep = read_sweep(ROOT / "examples" / "sweep.toml")
+    assert {cell.capture for cell in sweep} == {None}
+
+
+HEAD = 'targets = [0.8]\nseeds = [0]\nscenes.plot = "capture"\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("targets = [", "not readable as TOML"),
+        (HEAD + "x = 1", "'x': no such key; there are targets, seeds"),
+        (HEAD + "settings.train.steps = 1", r"settings\.train\.'steps': no such key; there are max_steps"),
+        (HEAD + '"a\\nb" = 1', r"'a\\nb': no such key"),
+        (HEAD + "settings.train.max_steps = 0.5", r"settings\.train\.max_steps: 0\.5 given, a whole number"),
+        (HEAD + "settings.train.max_steps = true", "True given, a whole number"),
+        (HEAD + "settings.train.antialiased = 1", "1 given, true or false"),
+        (HEAD + "settings.train.grow_grad = nan", "nan given, a finite number"),
+        (HEAD + "settings.train.grow_grad = -inf", "-inf given, a finite number"),
+        (HEAD + f"settings.train.grow_grad = 1{'0' * 400}", "0 given, a finite number"),
+        (HEAD + "settings.train.freeze_at = 'x'", "'x' given, a finite number"),
+        (HEAD + "settings.train = 3", r"settings\.train: 3 given, a table"),
+        (HEAD + "settings = 3", "settings: 3 given, a table"),
+        (HEAD + "settings.masks.masks = 3", r"settings\.masks\.masks: 3 given, a path in quotes"),
+        (
+            HEAD + "settings.lift.votes = 'all'",
+            r"lift\.votes: 'all' given, 'track' or 'projection' is needed",
+        ),
+        (HEAD + "settings.lift.votes = ['track']", "given, 'track' or 'projection' is needed"),
+        (HEAD + "settings.seed = 1", r"settings\.seed: set by the list `seeds`"),
+        (HEAD + "settings.plan.target_ssim = 1", r"settings\.plan\.target_ssim: set by the list `targets`"),
+        (HEAD + "variants.a.plan.other_targets = [1]", r"variants\.a\.plan\.other_targets: set by the list"),
+        (HEAD + "variants.a.lift.vote = 1", r"variants\.a\.lift\.'vote': no such key; there are votes"),
+        (HEAD + "variants.a = 1", r"variants\.a: 1 given, a table"),
+        (HEAD + "variants.'a/b' = {}", "the name 'a/b' makes no folder"),
+        (HEAD + "variants.'' = {}", "the name '' makes no folder"),
+        (HEAD + "scenes.'..' = 'capture'", r"the name '\.\.' makes no folder"),
+        (HEAD + "scenes.plöt = 'capture'", "not readable as TOML|makes no folder"),
+        (HEAD + "scenes.Plot = 'capture'", "two runs would be called plot-seed0"),
+        (
+            HEAD + "scenes.plot-a = 'capture'\nvariants = {b = {}, a-b = {}}",
+            "two runs .* called plot-a-b-seed0",
+        ),
+        (HEAD + "scenes.other = 'nowhere'", r"scenes\.other: no folder .*nowhere"),
+        (HEAD + "scenes.other = 3", r"scenes\.other: 3 given, text in quotes"),
+        (HEAD.replace("scenes.plot", "#"), "scenes: missing or empty"),
+        (HEAD.replace("[0]", "[]"), "seeds: missing or empty"),
+        (HEAD.replace("targets", "#"), "targets: missing or empty"),
+        (HEAD.replace("[0]", "[1, 2, 1]"), "seeds: two are equal"),
+        (HEAD.replace("[0]", "[-1]"), "seeds: -1 is negative"),
+        (HEAD.replace("[0]", "[0, 1.0]"), r"seeds\[1\]: 1\.0 given, a whole number"),
+        (HEAD.replace("[0]", "3"), "seeds: 3 given, a list"),
+        (HEAD.replace("0.8", "0.8, 0.80000001"), "targets: two are equal"),
+        (HEAD.replace("0.8", "0.8, 0"), "targets: an SSIM is above 0 and at most 1"),
+        (HEAD.replace("0.8", "1.1"), "targets: an SSIM is above 0 and at most 1"),
+        (HEAD.replace("0.8", "nan"), r"targets\[0\]: nan given, a finite number"),
+    ],
+)
+def test_what_is_wrong_with_a_file_is_one_line(tmp_path: Path, text: str, message: str) -> None:
+    path = write(tmp_path, text)
+    with pytest.raises(DataError, match=rf"sweep\.toml: .*{message}|sweep\.toml: ({message})") as raised:
+        read_sweep(path)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_missing_file_and_one_that_is_no_text_are_one_line(tmp_path: Path) -> None:
+    (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe")
+    for name in ("none.toml", "bytes.toml"):
+        with pytest.raises(DataError, match=rf"{name}: not readable"):
+            read_sweep(tmp_path / name)
+
+
+def row(seed: int, ssim: float, *, scene: str = "a", status: str = "ok") -> Row:
+    values = dict.fromkeys(MEASURES, math.nan) | {"Gaussians": 100 * (seed + 1), "SSIM": ssim}
+    return (scene, "", seed, 0.8, *values.values(), status)
+
+
+def test_sums_by_hand() -> None:
+    failed = ("a", "", 3, 0.8, *[math.nan] * len(MEASURES), "failed: why")
+    rows = [row(0, 0.7), row(1, 0.8, status="infeasible"), row(2, 0.9), failed, row(0, math.nan, scene="b")]
+    table = summarise(rows)
+    a, b = (dict(zip(table.header, values, strict=True)) for values in table.rows)
+    assert (a["scene"], a["target"], a["n"], a["ok"]) == ("a", 0.8, 3, 2)
+    assert (a["Gaussians"], a["Gaussians sd"]) == (200, 100)
+    assert a["SSIM"] == pytest.approx(0.8)
+    assert a["SSIM sd"] == pytest.approx(0.1)
+    assert (b["n"], b["Gaussians"]) == (1, 100)
+    assert all(math.isnan(float(b[name])) for name in ("Gaussians sd", "SSIM", "SSIM sd"))
+    shown = readable(table, ("Gaussians", "SSIM"))
+    assert shown.header == ("scene", "variant", "target", "n", "ok", "Gaussians", "SSIM")
+    assert shown.rows == [
+        ("a", "", "0.8", "3", "2", "200±100", "0.800±0.100"),
+        ("b", "", "0.8", "1", "1", "100", "–"),
+    ]
+
+
+@given(st.lists(st.floats(0, 1) | st.just(math.nan), min_size=1, max_size=8))
+@settings(max_examples=60, deadline=None)
+def test_spread_is_that_of_the_known_values(values: list[float]) -> None:
+    table = summarise([row(seed, value) for seed, value in enumerate(values)])
+    (sums,) = (dict(zip(table.header, r, strict=True)) for r in table.rows)
+    known = np.array([v for v in values if not math.isnan(v)])
+    assert sums["n"] == len(values)
+    expected = known.mean() if len(known) else math.nan
+    assert sums["SSIM"] == pytest.approx(expected, nan_ok=True)
+    expected = known.std(ddof=1) if len(known) > 1 else math.nan
+    assert sums["SSIM sd"] == pytest.approx(expected, nan_ok=True)

@@ -1,0 +1,517 @@
+"""Bundles as files: boxes and distances, which way is up, rounding, the manifest and its schema."""
+
+import hashlib
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from conftest import pinhole, random_gaussians
+from hypothesis import given
+from hypothesis import strategies as st
+from make_viewer_vectors import DATA, distance_cases, model, promise_cases
+from scipy.spatial.transform import Rotation
+
+from sagesplat.adapt.viewpoint import ViewModel
+from sagesplat.core.errors import DataError, RunError, SageError
+from sagesplat.formats.increments import write_chunks
+from sagesplat.formats.spz import read_spz
+from sagesplat.scene.scene import Camera
+from sagesplat.viewer import boxes, frames
+from sagesplat.viewer.bundle import (
+    SCHEMA,
+    Category,
+    Contents,
+    Shot,
+    documents,
+    is_bundle,
+    write_bundle,
+    write_documents,
+)
+from sagesplat.viewer.frames import FLIP
+from sagesplat.viewer.pack import NEARBY, Ladder, gains_of, order_of
+from sagesplat.viewer.quality import (
+    MOVES,
+    corrected,
+    curve_entry,
+    curve_of,
+    margins,
+    model_of,
+    of_files,
+    promise_entry,
+    significant,
+)
+
+SIZES = {-1: (4, 4, 10), 3: (3, 6, 20), 184: (0, 5, 9)}
+
+
+def camera(angle: float = 0.0, tilt: float = 0.0, at: tuple = (0.0, 0.0, 0.0)) -> Camera:
+    """A camera turned by `angle` around y and then down by `tilt`."""
+    w2c = np.eye(4, dtype=np.float32)
+    w2c[:3, :3] = Rotation.from_euler("yx", [angle, tilt]).as_matrix()
+    w2c[:3, 3] = -w2c[:3, :3] @ np.array(at, np.float32)
+    return replace(pinhole(), w2c=w2c)
+
+
+# boxes
+
+
+@given(st.integers(0, 300), st.integers(0, 5))
+def test_boxes_share_the_points_evenly(count: int, power: int) -> None:
+    points = np.random.default_rng(count).normal(size=(count, 3))
+    found = boxes.split_boxes(points, 2**power)
+    assert len(found) == min(count, 2**power) or count > 20  # some may be outliers
+    assert len(found) <= 2**power
+    assert (found[:, :3] <= found[:, 3:]).all()
+    if count:
+        assert (found[:, :3] >= points.min(0)).all()
+        assert (found[:, 3:] <= points.max(0)).all()
+
+
+def test_boxes_leave_out_points_that_are_far_from_all() -> None:
+    points = np.random.default_rng(0).uniform(size=(500, 3))
+    stray = np.array([[100.0, 0, 0], [0, -100, 0]])
+    assert np.abs(boxes.split_boxes(np.concatenate([points, stray]))).max() <= 1
+
+
+def test_a_frustum_holds_what_the_camera_projects_into_its_picture() -> None:
+    at = replace(
+        camera(0.4, 0.3, (0.5, 1, -2)), K=np.array([[60, 0, 35], [0, 60, 25], [0, 0, 1]], np.float32)
+    )
+    points = np.random.default_rng(1).normal(0, 6, (500, 3))
+    local = points @ at.w2c[:3, :3].T + at.w2c[:3, 3]
+    pixels = local[:, :2] / local[:, 2:] * 60 + [35, 25]
+    inside = (local[:, 2] > 0) & ((pixels >= 0) & (pixels < [at.width, at.height])).all(1)
+    planes = boxes.frustum(frames.position(at), frames.quaternion(at).tolist(), frames.fov_y(at), 70 / 50)
+    found = ((points * FLIP) @ planes[:, :3].T + planes[:, 3] >= 0).all(1)
+    assert 20 < inside.sum() < 200
+    np.testing.assert_array_equal(found, inside)
+
+
+@given(st.integers(0, 1000))
+def test_distance_lies_between_the_nearest_and_the_farthest_corner(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    centre, size = rng.normal(0, 4, (5, 3)), rng.uniform(0, 2, (5, 3))
+    found = np.concatenate([centre - size, centre + size], 1)
+    planes = boxes.frustum((0, 0, 0), rng.normal(size=4).tolist(), rng.uniform(0.3, 2), rng.uniform(0.3, 3))
+    seen = boxes.touching(found, planes)
+    told = boxes.distance(found, (0, 0, 0), planes)
+    assert math.isnan(told) == (not seen.any())
+    if seen.any():
+        near = np.linalg.norm(np.maximum(np.maximum(found[:, :3], -found[:, 3:]), 0), axis=1)[seen]
+        far = np.linalg.norm(np.abs(centre) + size, axis=1)[seen]
+        assert near.min() <= told <= far.max()
+
+
+def test_shared_vectors_are_what_is_computed() -> None:
+    for name, cases in (("distances", distance_cases()), ("promises", promise_cases())):
+        stored = json.loads((DATA / f"{name}.json").read_text())["cases"]
+        assert len(stored) == len(cases)
+        for old, new in zip(stored, cases, strict=True):
+            assert old["name"] == new["name"]
+            for a, b in zip(_numbers(old), _numbers(json.loads(json.dumps(new))), strict=True):
+                assert a == pytest.approx(b, rel=1e-9, abs=1e-12)
+
+
+def _numbers(value: Any) -> list[float]:
+    if isinstance(value, dict):
+        return [n for item in value.values() for n in _numbers(item)]
+    if isinstance(value, list):
+        return [n for item in value for n in _numbers(item)]
+    return [float(value)] if isinstance(value, (int, float)) else []
+
+
+# bearings
+
+
+def test_up_is_square_to_the_horizons_wherever_cameras_look() -> None:
+    rng = np.random.default_rng(0)
+    level = [camera(a, t) for a, t in zip(rng.uniform(0, 1.5, 30), rng.uniform(0.2, 0.9, 30), strict=True)]
+    up = frames.upward(level)
+    np.testing.assert_allclose(up, [0, 1, 0], atol=1e-6)
+    mean = np.stack([frames.rotation(c)[:, 1] for c in level]).mean(0)
+    assert np.degrees(np.arccos(mean[1] / np.linalg.norm(mean))) > 20  # which is what the mean gets wrong
+
+
+def test_up_of_parallel_cameras_is_their_own() -> None:
+    np.testing.assert_allclose(frames.upward([camera(0.3, 0.2)] * 3), frames.rotation(camera(0.3, 0.2))[:, 1])
+
+
+def test_cameras_look_along_minus_z() -> None:
+    at = camera(0.3, 0.2, (1, 2, 3))
+    np.testing.assert_allclose(frames.rotation(at) @ [0, 0, -1], at.direction * FLIP, atol=1e-6)
+    np.testing.assert_allclose(
+        Rotation.from_quat(frames.quaternion(at)).as_matrix(), frames.rotation(at), atol=1e-6
+    )
+    np.testing.assert_allclose(frames.position(at), np.array([1, 2, 3]) * FLIP, atol=1e-6)
+
+
+def test_the_floor_is_where_the_ground_is() -> None:
+    rng, up = np.random.default_rng(0), np.array([0.0, 1.0, 0.0])
+    points = rng.uniform(-2, 2, (400, 3))
+    points[:100, 1] = -1.6 + rng.normal(0, 0.01, 100)
+    ground = np.arange(400) < 100
+    cameras = [camera()]
+    height = frames.floor(points, ground, cameras, up, 3.0)
+    assert height == pytest.approx(-1.6, abs=0.01)
+    assert frames.floor(points, ~ground & False, cameras, up, 3.0) == pytest.approx(-1.8, abs=0.2)
+    assert frames.floor(points[:0], ground[:0], cameras, up, 3.0) == -3
+    assert frames.guessed_scale(cameras, up, height) == pytest.approx(1.5 / 1.6, rel=0.01)
+    assert frames.guessed_scale(cameras, up, 5.0) == 1  # below the floor
+    assert frames.guessed_scale(cameras, up, -1e-9) == frames.SCALES[1]
+
+
+# quality
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_curves_keep_what_they_say(seed: int) -> None:
+    for curve in model(seed, 3, [1, 2, 3, 4, 5, 6]).curves:
+        read = curve_of(json.loads(json.dumps(curve_entry(curve))))
+        away = np.array([*np.linspace(0, 8, 500), np.nan, curve.params.beta])
+        np.testing.assert_allclose(read(away), curve(away), atol=2e-4)
+        np.testing.assert_allclose(curve_of(curve_entry(curve, exact=True))(away), curve(away), rtol=1e-12)
+
+
+def views_of(made: ViewModel) -> np.ndarray:
+    return np.column_stack([made.inputs[:, :3] * made.extent, made.inputs[:, 3:6]]) * np.tile(FLIP, 2)
+
+
+def test_a_promise_comes_back_as_it_was() -> None:
+    made = model(2, 12, [1, 2, 4])
+    entry = json.loads(json.dumps(promise_entry(made, np.arange(12), np.zeros(12), np.full(12, np.nan))))
+    read = model_of(entry, made.curves, views_of(made), made.extent)
+    at = np.array([2.0, np.nan]), np.ones((2, 3)), np.eye(3)[:2]
+    for a, b in zip(read.predict(*at), made.predict(*at), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-12)
+
+
+def test_a_camera_there_and_back() -> None:
+    camera = pinhole(64, 48)
+    back = frames.camera_at(frames.position(camera), frames.quaternion(camera), frames.fov_y(camera), 64, 48)
+    np.testing.assert_allclose(back.w2c, camera.w2c, atol=1e-5)
+    assert back.K[1, 1] == pytest.approx(camera.K[1, 1])
+
+
+def test_the_first_view_is_level() -> None:
+    rng = np.random.default_rng(0)
+    up = np.array([0.1, 1.0, 0.2]) / np.linalg.norm([0.1, 1.0, 0.2])
+    camera = pinhole(64, 48)
+    found = frames.start([camera], rng.normal((0, 0, 4), size=(50, 3)), 1.0, up)
+    axes = Rotation.from_quat(found["quaternion"]).as_matrix()
+    assert axes[:, 0] @ up == pytest.approx(0, abs=1e-9)
+    ahead = (found["target"] - found["position"]) / np.linalg.norm(found["target"] - found["position"])
+    np.testing.assert_allclose(-axes[:, 2], ahead, atol=1e-9)
+
+
+def test_known_views_correct_the_boxes() -> None:
+    made = replace(model(2, 12, [1]), lengths=(0.05, 0.05, 1.0))  # no view is close to another
+    missed = np.linspace(-0.5, 0.5, 12)
+    position, direction = made.inputs[:, :3] * made.extent, made.inputs[:, 3:6]
+    told = np.linspace(1, 3, 12)
+    right = corrected(made, missed, told, position, direction)
+    np.testing.assert_allclose(right, told * np.exp(missed), rtol=1e-3)
+    np.testing.assert_allclose(corrected(made, missed, told, position + 1e3, direction), told, rtol=1e-9)
+    assert np.isnan(corrected(made, missed, np.full(12, np.nan), position, direction)).all()
+
+
+def test_levels_without_a_file_take_the_last_promise_of_what_they_show() -> None:
+    made = model(1, 5, [1, 2, 3, 4, 5])
+    told = of_files(made, [2, 4], last=5)  # nothing, A, A, B, B
+    assert told.levels == (1, 2)
+    np.testing.assert_array_equal(told.weights, made.weights[:, [2, 4]])
+    np.testing.assert_array_equal(told.amplitudes, made.amplitudes[[2, 4]])
+    assert [c.params for c in told.curves] == [made.curves[2].params, made.curves[4].params]
+    assert of_files(model(1, 5, [1]), [2, 4], last=5).curves == ()
+
+
+def test_margins_keep_the_curve_below_the_bounds() -> None:
+    made = model(5, 40, [1, 2, 3])
+    away = np.exp(made.inputs[:, 6])
+    bound = made.predict(away, made.inputs[:, :3] * made.extent, made.inputs[:, 3:6]).bound
+    below = np.stack([c(away) for c in made.curves], 1) + margins(made) <= bound + 1e-12
+    assert (below.mean(0) >= 0.95).all()
+
+
+@given(st.floats(-1e12, 1e12), st.integers(2, 15))
+def test_significant_digits(value: float, digits: int) -> None:
+    assert significant(value, digits) == pytest.approx(value, rel=10.0 ** (1 - digits))
+    assert significant([value, [1]], digits) == [significant(value, digits), [1]]
+
+
+# bundles
+
+
+@pytest.fixture
+def viewer(tmp_path: Path) -> Path:
+    folder = tmp_path / "viewer"
+    (folder / "assets").mkdir(parents=True)
+    (folder / "index.html").write_text("<!doctype html>")
+    (folder / "assets" / "index-1.js").write_text("1;")
+    (folder / "THIRD_PARTY_LICENSES.txt").write_text("MIT")
+    return folder
+
+
+@pytest.fixture
+def contents(tmp_path: Path) -> Contents:
+    """Three categories of three levels, one of them with a promise."""
+    g = random_gaussians(39, degree=1)
+    labels = torch.tensor([-1] * 10 + [3] * 20 + [184] * 9, dtype=torch.int16)
+    chunks = write_chunks(tmp_path / "chunks", replace(g, label_ids=labels), SIZES, {3: "car", 184: "tree"})
+    made = replace(model(3, 6, [1, 2, 3]), label_id=3)
+    shots = []
+    for i, row in enumerate(made.inputs):  # the model's own views
+        at = camera(at=tuple((row[:3] * made.extent).tolist()))
+        z = row[3:6]
+        x = np.cross([0.1, 1, 0.2], z)
+        w2c = at.w2c.copy()
+        w2c[:3, :3] = np.stack([x / np.linalg.norm(x), np.cross(z, x / np.linalg.norm(x)), z])
+        w2c[:3, 3] = -w2c[:3, :3] @ (row[:3] * made.extent)
+        split = "calibration" if made.unseen_inputs[i] else "train"
+        shots.append(Shot(f"{i}.jpg", split, replace(at, w2c=w2c)))
+    shots.append(Shot("none.jpg", "test", camera()))
+    points = np.random.default_rng(0).normal(size=(50, 3))
+    categories = [
+        Category(-1, "unlabelled", "everything else", "#808080", boxes.split_boxes(points)),
+        Category(3, "car", "car", "#112233", boxes.split_boxes(points), 2.0, True, made, np.full(7, 0.25)),
+        Category(184, "tree", "tree", "#445566", boxes.split_boxes(points[:3])),
+    ]
+    return Contents("tiny", made.extent, shots, categories, chunks, tmp_path / "chunks", 1, points=points)
+
+
+def manifest_of(folder: Path) -> dict[str, Any]:
+    """The manifest, checked against the schema that lies beside it."""
+    jsonschema = pytest.importorskip("jsonschema", reason="needs jsonschema to check manifests")
+    schema = json.loads((folder / SCHEMA).read_text())
+    jsonschema.Draft202012Validator.check_schema(schema)
+    manifest = json.loads((folder / "manifest.json").read_text())
+    jsonschema.Draft202012Validator(schema).validate(manifest)
+    return manifest
+
+
+def test_a_bundle_holds_what_its_manifest_says(tmp_path, contents, viewer) -> None:
+    out = tmp_path / "out"
+    written = write_bundle(out, contents, viewer)
+    manifest = manifest_of(out)
+    assert [label["id"] for label in manifest["labels"]] == [-1, 3, 184]
+    assert [[level["count"] for level in label["levels"]] for label in manifest["labels"]] == [
+        [4, 6], [3, 3, 14], [5, 4],
+    ]  # fmt: skip
+    total = 0
+    for label in manifest["labels"]:
+        for level in label["levels"]:
+            content = (out / level["uri"]).read_bytes()
+            assert len(content) == level["bytes"]
+            assert hashlib.sha256(content).hexdigest() == level["sha256"]
+            assert len(read_spz(out / level["uri"])) == level["count"]
+            total += len(content)
+    assert manifest["totals"]["bytes"] == written.chunks == total
+    assert manifest["totals"]["count"] == 39
+    assert written.manifest == (out / "manifest.json").stat().st_size
+    assert written.total == sum(p.stat().st_size for p in out.rglob("*") if p.is_file())
+    ours = {"manifest.json", "manifest.schema.json", manifest["promises"]["uri"], "chunks", "LICENSES.txt"}
+    ours.add(manifest["pack"]["uri"])
+    assert {p.name for p in out.iterdir()} == ours | {"index.html", "assets", "THIRD_PARTY_LICENSES.txt"}
+    assert {entry["what"] for entry in manifest["licenses"]} >= {"three.js", "Spark"}
+    assert not list(tmp_path.glob(".out*"))
+    assert is_bundle(out)
+    for path in (out / "manifest.json", out / manifest["promises"]["uri"]):
+        assert "://" not in path.read_text()
+
+
+def test_promises_of_a_bundle_are_those_of_the_model(tmp_path, contents, viewer) -> None:
+    write_bundle(tmp_path / "out", contents, viewer)
+    manifest = manifest_of(tmp_path / "out")
+    content = (tmp_path / "out" / manifest["promises"]["uri"]).read_bytes()
+    assert hashlib.sha256(content).hexdigest() == manifest["promises"]["sha256"]
+    promises = json.loads(content)
+    (entry,) = promises["labels"]
+    views = np.array(promises["views"])
+    assert entry["shares"] == [0.25] * len(views)
+    assert len(views) == 6  # the test view taught nothing
+    quality = next(label["quality"] for label in manifest["labels"] if label["id"] == 3)
+    read = model_of(entry, [curve_of(c) for c in quality["curves"]], views, promises["extent"])
+    made = contents.categories[1].model
+    assert made is not None
+    cameras = [shot.camera for shot in contents.shots]
+    at = (
+        np.full(7, np.nan),
+        np.stack([c.position for c in cameras]),
+        np.stack([c.direction for c in cameras]),
+    )
+    np.testing.assert_allclose(read.predict(*at).bound, made.predict(*at).bound, atol=MOVES)
+    for row, shown in zip(made.inputs, views[entry["views"]] * np.tile(FLIP, 2), strict=True):
+        np.testing.assert_allclose(shown, [*row[:3] * made.extent, *row[3:6]], atol=1e-4)
+
+
+def test_the_pack_is_the_chunks_in_its_order(tmp_path, contents, viewer) -> None:
+    out = tmp_path / "out"
+    write_bundle(out, contents, viewer)
+    manifest = manifest_of(out)
+    pack, labels = manifest["pack"], manifest["labels"]
+    files = [labels[index]["levels"][level - 1] for index, level in pack["order"]]
+    content = (out / pack["uri"]).read_bytes()
+    assert content == b"".join((out / file["uri"]).read_bytes() for file in files)
+    assert pack["bytes"] == len(content) == manifest["totals"]["bytes"]
+    assert pack["sha256"] == hashlib.sha256(content).hexdigest()
+    assert pack["uri"] == f"scene-{pack['sha256'][:12]}.pack"
+    assert sorted(pack["order"]) == [[0, 1], [0, 2], [1, 1], [1, 2], [1, 3], [2, 1], [2, 2]]
+    assert sorted(pack["order"][:3]) == [[0, 1], [1, 1], [2, 1]]  # the smallest of everything
+
+
+def test_a_live_bundle_has_no_pack(tmp_path, contents) -> None:
+    write_documents(tmp_path, replace(contents, live=True))
+    assert manifest_of(tmp_path)["pack"] is None
+    assert not list(tmp_path.glob("*.pack"))
+
+
+FRONT, BEHIND = np.array([[-1.0, -1, -6, 1, 1, -4]]), np.array([[-1.0, -1, 4, 1, 1, 6]])
+
+
+def order_at_origin(*ladders: Ladder) -> list[tuple[int, int]]:
+    """Of the view along -z from the origin."""
+    return order_of(ladders, [camera()], np.zeros(3), np.array([0.0, 0, 0, 1]))
+
+
+def test_what_is_in_sight_comes_first_in_the_pack() -> None:
+    behind, front = Ladder([10, 10], 1.0, BEHIND, None, None), Ladder([50, 50], 1.0, FRONT, None, None)
+    assert order_at_origin(behind, front) == [(1, 1), (0, 1), (1, 2), (0, 2)]
+    nowhere = replace(behind, boxes=np.zeros((0, 6)))  # may be anywhere
+    assert order_at_origin(behind, nowhere)[0] == (1, 1)
+
+
+def test_what_gains_more_a_byte_comes_first_in_the_pack() -> None:
+    one = Ladder([10, 100, 100], 1.0, FRONT, None, None)
+    heavy, dear = replace(one, weight=50.0), replace(one, sizes=[10, 1000, 1000])
+    assert order_at_origin(one, heavy) == [(1, 1), (0, 1), (1, 2), (1, 3), (0, 2), (0, 3)]
+    assert order_at_origin(dear, one)[2:] == [(1, 2), (1, 3), (0, 2), (0, 3)]
+    assert order_at_origin(one, one) == [
+        (0, 1),
+        (1, 1),
+        (0, 2),
+        (1, 2),
+        (0, 3),
+        (1, 3),
+    ]  # equals
+    assert order_at_origin(replace(one, weight=0.0)) == [(0, 1), (0, 2), (0, 3)]
+    assert order_at_origin() == []
+
+
+def test_promises_and_pixels_rule_the_order_of_the_pack() -> None:
+    made = replace(model(2, 6, [1, 2, 3]), weights=np.zeros((6, 3)))
+    flat = replace(made.curves[0], params=made.curves[0].params._replace(K1=0.3, K2=0.3, g1=0, g2=0))
+    better = replace(flat, level=2, params=flat.params._replace(K1=0.9, K2=0.9))
+    made = replace(made, curves=(flat, better, replace(better, level=3)))
+    small, large = (Ladder([10, 50, 10], 1.0, FRONT, made, np.array([s])) for s in (0.01, 0.5))
+    order = order_at_origin(small, large)
+    assert order == [(1, 1), (0, 1), (1, 2), (0, 2), (1, 3), (0, 3)]  # the last level shows no more
+
+
+@given(st.lists(st.tuples(st.integers(1, 50), st.floats(-1, 1) | st.just(math.nan)), min_size=1, max_size=9))
+def test_gains_never_rise_and_lie_on_the_hull(steps: list[tuple[int, float]]) -> None:
+    total = np.cumsum([size for size, _ in steps]).astype(float)
+    ssim = np.array([value for _, value in steps])
+    gains = gains_of(ssim, total)
+    assert len(gains) == len(steps) - 1
+    assert (gains > 0).all()
+    assert (np.diff(gains) <= 0).all()
+    reached = max(0.0, ssim[0]) + np.concatenate([[0], np.cumsum(gains * np.diff(total))])
+    known = np.isfinite(ssim)
+    assert (reached[known] >= ssim[known] - 1e-9).all()  # above every level
+
+
+def test_the_same_contents_give_the_same_bytes(tmp_path, contents, viewer) -> None:
+    for name in ("a", "b"):
+        write_bundle(tmp_path / name, contents, viewer)
+    write_bundle(tmp_path / "b", contents, viewer)  # once more, over itself
+    a, b = (
+        {p.relative_to(tmp_path / name): p.read_bytes() for p in (tmp_path / name).rglob("*") if p.is_file()}
+        for name in ("a", "b")
+    )
+    assert a == b
+
+
+def test_an_earlier_bundle_is_replaced_and_nothing_of_it_stays(tmp_path, contents, viewer) -> None:
+    out = tmp_path / "out"
+    write_bundle(out, contents, viewer)
+    few = replace(contents, categories=contents.categories[:1], chunks=contents.chunks[:2])
+    write_bundle(out, few, viewer)
+    manifest = manifest_of(out)
+    assert manifest["promises"] is None
+    assert not list(out.glob("promises-*"))
+    assert [path.name for path in out.glob("scene*")] == [manifest["pack"]["uri"]]
+    assert len(list((out / "chunks").iterdir())) == 2
+
+
+def test_without_points_or_labels() -> None:
+    empty = Contents("none", 0.0, [Shot("a", "test", camera())], [], [], Path("none"), 0)
+    manifest, promises = documents(empty)
+    assert promises is None
+    assert manifest["pack"] is None
+    assert manifest["labels"] == []
+    assert manifest["totals"] == {"count": 0, "bytes": 0, "gpuBytes": 0}
+    assert np.isfinite(manifest["start"]["target"]).all()
+
+
+def test_another_folder_is_left_alone(tmp_path, contents, viewer) -> None:
+    out = tmp_path / "photos"
+    out.mkdir()
+    write_bundle(out, contents, viewer)  # an empty one is fine
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "manifest.json").write_text('{"format": "else"}')
+    with pytest.raises(RunError, match="neither empty nor a bundle"):
+        write_bundle(other, contents, viewer)
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(RunError, match="neither empty nor a bundle"):
+        write_bundle(tmp_path / "file", contents, viewer)
+    assert (tmp_path / "file").read_text() == "x"
+    assert [p.name for p in other.iterdir()] == ["manifest.json"]
+
+
+def test_a_viewer_that_is_not_built(tmp_path, contents) -> None:
+    with pytest.raises(SageError, match="viewer not built: run `make web`"):
+        write_bundle(tmp_path / "out", contents, tmp_path / "nothing")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("missing", [False, True])
+def test_a_damaged_chunk_is_named_and_the_old_bundle_stays(tmp_path, contents, viewer, missing) -> None:
+    write_bundle(tmp_path / "out", contents, viewer)
+    path = contents.folder / contents.chunks[1].uri
+    before = path.read_bytes()
+    path.unlink()
+    if not missing:
+        path.write_bytes(before[:-1] + b"x")
+    with pytest.raises(DataError, match=rf"{contents.chunks[1].uri}: .*sagesplat nest") as caught:
+        write_bundle(tmp_path / "out", contents, viewer)
+    assert "\n" not in str(caught.value)
+    assert manifest_of(tmp_path / "out")["totals"]["count"] == 39
+    assert not list(tmp_path.glob(".out*"))
+
+
+def test_a_place_that_cannot_be_written(tmp_path, contents, viewer) -> None:
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(RunError, match="cannot be written"):
+        write_bundle(tmp_path / "file" / "out", contents, viewer)
+
+
+def test_the_pack_brings_far_parts_out_of_sight_late() -> None:
+    look = camera()
+    ahead, behind = np.array([[-1.0, -1, -6, 1, 1, -4]]), np.array([[-1.0, -1, 4, 1, 1, 6]])
+    far = behind + np.array([0, 0, 90, 0, 0, 90])
+    ladders = [
+        Ladder([NEARBY, 10], 1.0, far, None, None),
+        Ladder([300, 400], 1.0, ahead, None, None),
+        Ladder([200, 300], 1.0, behind, None, None),
+    ]
+    where = frames.position(look), frames.quaternion(look)
+    order = order_of(ladders, [look], *where)
+    assert order.index((0, 1)) > order.index((1, 2))
+    assert order[:2] == [(1, 1), (2, 1)]
+    for label in range(3):
+        assert order.index((label, 1)) < order.index((label, 2))
