@@ -86,7 +86,6 @@ def write_paper(folder: Path, data: PaperData) -> Path:
     page = template(Path(__file__).with_name("paper.html.j2")).render(
         title=title, tables=tables, pictures=pictures
     )
-    write_text(folder / "index.html", page)
     return folder / "index.html"
 
 
