@@ -129,7 +129,7 @@ def garden(
     result |= {"steps": steps, "threads": used, **measure.parts(g, camera, photo, degree, repeats)}
     if not steps:  # the trainer's own step, photo, statistics and all
         labels = np.full(len(g), -1, np.int16)
-        config = TrainConfig(max_steps=30_000, level_every=30_000, pace="published")
+        config = TrainConfig(max_steps=30_000, level_every=30_000, lr_schedule="published")
         events = train(capture, Photos(capture.views), labels, config)
         result["step_ms"] = measure.milliseconds(lambda: next(e for e in events if isinstance(e, Step)), 40)
     result |= measure.blending(g, camera, repeats) | {"peak_mib": measure.peak_mib()}
@@ -428,8 +428,8 @@ def scaling(
 
 @app.command
 def blocks(
-    scene: Path, out: Path, count: int = 4, steps: int = 3000, nest_steps: int = 1000, seam_steps: int = 300,
-    threads: int = 1, margin: float = 0.2, write: bool = False,
+    scene: Path, out: Path, count: int = 4, steps: int = 3000, nest_steps: int = 1000,
+    boundary_steps: int = 300, threads: int = 1, margin: float = 0.2, write: bool = False,
 ) -> None:  # fmt: skip
     """A large scene in blocks of `steps` each, and as one with as many steps as all blocks together."""
     from benchmarks.blocks import compare
@@ -438,8 +438,8 @@ def blocks(
     def config(times: int) -> RunConfig:
         return RunConfig(
             train=TrainConfig(max_steps=times * steps),
-            blocks=BlocksConfig(count=count, seam_steps=seam_steps, margin=margin),
-            nest=NestConfig(steps=times * nest_steps, seed_steps=times * nest_steps, levels=12),
+            blocks=BlocksConfig(count=count, boundary_steps=boundary_steps, margin=margin),
+            nest=NestConfig(steps=times * nest_steps, base_steps=times * nest_steps, levels=12),
         )
 
     tables, result = compare(scene, out, config(1), config(count), threads)
@@ -490,7 +490,7 @@ def freeze(
     downscale: int = 2,
     steps: int = 3000,
     targets: tuple[float, ...] = (0.8, 0.87),
-    rest_share: float = 0.0,
+    gradient_freeze_share: float = 0.0,
     threads: int = 0,
     write: bool = False,
 ) -> None:
@@ -500,7 +500,7 @@ def freeze(
     with tempfile.TemporaryDirectory() as folder:
         capture = freezing.open_capture(scene, Path(folder), downscale)
         freezing.timed(capture, replace(config, max_steps=20, freeze_at=0.01))  # kernels are compiled now
-        result = freezing.compare(capture, config, list(targets), rest_share)
+        result = freezing.compare(capture, config, list(targets), gradient_freeze_share)
     for name, run in result.items():
         if name != "pixel_shares":
             times = " ".join(f"{ms:.0f}" for ms in run["ms_per_step"])

@@ -100,11 +100,11 @@ def compare(
     for each in (job, other):
         label(each.spec, scene, in_blocks, tell)
     blocks.train_blocks(job, in_blocks.blocks, in_blocks.train, in_blocks.seed)
-    blocks.make_parts(job)
+    blocks.label_block_categories(job)
     blocks.nest_blocks(job, in_blocks.blocks, in_blocks.nest, in_blocks.seed)
     list(fresh.run([Task("as one", as_one, (other.spec, replace(whole, blocks=BlocksConfig())))], tell))
     partition = read_blocks(job.run.blocks / "blocks.json")
-    files = [job.run.block(number).core for number in range(len(partition))]
+    files = [job.run.block(number).interior for number in range(len(partition))]
     sets = {
         "blocks, put together": together(files)[0],
         "blocks, tuned": read_prefixes(job.run.prefixes).gaussians,

@@ -19,7 +19,7 @@ from sagesplat.adapt.plan import read_budget_plan, read_plans
 from sagesplat.adapt.viewpoint import read_promises
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.download.remote_zip import TAIL, RemoteZip
-from sagesplat.formats.increments import read_chunks, read_index, totals
+from sagesplat.formats.increments import read_increments, read_index, totals
 from sagesplat.formats.levels import read_level, write_level, write_set
 from sagesplat.formats.ply import read_ply, write_ply
 from sagesplat.formats.spz import decode_spz, encode_spz
@@ -171,14 +171,14 @@ def _promises(folder: Path) -> list[bytes]:
 
     curve = json.loads(_models(folder)[0])["models"][0]
     entry = dict.fromkeys(NUMBERS, 0.5) | {"label_id": 2, "curves": [curve], "lengths": [1, 2, 0.5]}
-    entry |= {"inputs": [[0.1] * 7, [0.2] * 7], "unseen_inputs": [False, True], "weights": [[0.1], [0.2]]}
+    entry |= {"inputs": [[0.1] * 7, [0.2] * 7], "heldout_inputs": [False, True], "weights": [[0.1], [0.2]]}
     return _json({"promises": [entry | {"amplitudes": [0.1], "status": sorted(STATUSES)[0]}]})(folder)
 
 
 def _plans(folder: Path) -> list[bytes]:
     from sagesplat.adapt.plan import STATUSES
 
-    choices = [CHOICE | {"status": sorted(STATUSES)[0], "sent": 9}]
+    choices = [CHOICE | {"status": sorted(STATUSES)[0], "transfer_bytes": 9}]
     plan = {"target": 0.8, "view": None, "share": 0.9, "choices": choices}
     budget = plan | {"target": None, "budget": 1e6, "unit": "bytes", "fits": True}
     return _json({"targets": [0.8], "scene": [plan], "views": [plan | {"view": 1}], "budget": budget})(folder)
@@ -200,7 +200,7 @@ def _read_index(path: Path) -> None:
     chunks = read_index(path.parent)
     totals(chunks, [2, 5], 3, "nbytes")
     if len(chunks) < 10:  # what many chunks hold is not bounded by their index
-        read_chunks(path.parent, chunks)
+        read_increments(path.parent, chunks)
 
 
 def _observations(folder: Path) -> list[bytes]:

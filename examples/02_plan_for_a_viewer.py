@@ -48,7 +48,7 @@ def main() -> None:
         name, kept = job.names()[c.label_id], f"SSIM at least {c.predicted_ssim:.3f}, {c.status}"
         print(f"{name:24} level {c.level:3}  {c.count:9,} Gaussians  distance {c.distance:6.2f}  {kept}")
     write_ply(args.ply, job.ladder.compose(plan.levels), job.names())
-    print(f"{args.ply}: {plan.count:,} Gaussians, {plan.sent or 0:,} bytes to send")
+    print(f"{args.ply}: {plan.count:,} Gaussians, {plan.transfer_bytes or 0:,} bytes to send")
 
 
 if __name__ == "__main__":

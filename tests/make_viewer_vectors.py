@@ -93,20 +93,20 @@ def model(seed: int, views: int, levels: list[int], *, unseen: bool = True) -> V
         label_id=7,
         curves=tuple(curves),
         extent=4.5,
-        usual=float(rng.uniform(0.3, 1.2)),
+        median_log_distance=float(rng.uniform(0.3, 1.2)),
         inputs=np.column_stack([position, direction, rng.normal(0.8, 0.4, views)]),
-        unseen_inputs=(np.arange(views) % 5 == 2) & unseen,
+        heldout_inputs=(np.arange(views) % 5 == 2) & unseen,
         lengths=tuple(rng.uniform(0.2, 1.2, 3).tolist()),  # pyright: ignore[reportArgumentType]
-        unseen=float(rng.uniform(0, 0.4)),
+        heldout_variance=float(rng.uniform(0, 0.4)),
         noise=float(rng.uniform(0.05, 0.3)),
         weights=rng.normal(0, 0.05, (views, len(levels))),
         amplitudes=rng.uniform(0.02, 0.08, len(levels)),
-        factor=float(rng.uniform(0, 2)),
+        multiplier=float(rng.uniform(0, 2)),
         confidence=0.95,
         rmse=0.03,
         status="calibrated",
-        shift=0.004,
-        mixing=0.013,
+        composition_bias=0.004,
+        composition_std=0.013,
     )
 
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from sagesplat.adapt.coverage import PREDICTORS, Kept, score
+from sagesplat.adapt.coverage import PREDICTORS, Decisions, score
 from sagesplat.adapt.observe import TOTAL, Observations
 from sagesplat.adapt.viewpoint import (
     EASY,
@@ -22,9 +22,9 @@ from sagesplat.adapt.viewpoint import (
     _inverse,
     _terms,
     _to_json,
-    alike,
     decisions,
     fit_promises,
+    matern32,
     promise,
     read_promises,
     write_promises,
@@ -98,7 +98,7 @@ def synthetic(
     rows = np.arange(len(scene.views))
     distance, position, direction = viewpoints(scene, rows)
     x = _inputs(distance, position, direction, scene.extent, 0.0)
-    S = alike(x, x, (0.5, 0.5, 1.0)) + 1e-9 * np.eye(len(x))
+    S = matern32(x, x, (0.5, 0.5, 1.0)) + 1e-9 * np.eye(len(x))
     field = 0.05 * np.linalg.cholesky(S) @ rng.standard_normal((len(x), 2))
     unseen = ~np.isin(rows, scene.train_ids)
     level = np.array([0.55, 0.66, 0.76, 0.85])
@@ -144,8 +144,8 @@ def test_promises_are_kept_on_unseen_views(confidence):
             totals = result.select(result.predictor == predictor).totals()
             overshoot.setdefault(predictor, []).append(totals["overshoot"])
             if predictor == "bound":
-                feasible += totals["feasible"]
-                kept += totals["kept"] * totals["feasible"]
+                feasible += totals["accepted"]
+                kept += totals["kept"] * totals["accepted"]
     assert confidence - 0.015 < kept / feasible < confidence + 0.04
     mean = {name: np.mean(values) for name, values in overshoot.items()}
     assert mean["eq3"] < mean["oracle"] < mean["bound"] < mean["oracle"] + 0.05
@@ -156,7 +156,7 @@ def test_leaving_one_out_in_closed_form_is_what_a_fit_without_the_view_says():
     x = rng.standard_normal((20, 7))
     u = np.arange(20) % 3 == 0
     residual = rng.standard_normal((20, 2))
-    S = alike(x, x, (0.8, 1.2, 2.0)) + 0.3 * np.outer(u, u) + 0.1 * np.eye(20)
+    S = matern32(x, x, (0.8, 1.2, 2.0)) + 0.3 * np.outer(u, u) + 0.1 * np.eye(20)
     inverse = _inverse(S)
     own = np.diag(inverse)
     left_out = residual - inverse @ residual / own[:, None]
@@ -173,7 +173,7 @@ def test_slopes_of_the_covariance():
     squares = [((x[:, None, g] - x[None, :, g]) ** 2).sum(-1) for g in GROUPS]
     S, slopes = _terms(squares, u, theta)
     lengths = [float(np.exp(t)) for t in theta[:3]]
-    whole = alike(x, x, lengths) + np.exp(theta[3]) * np.outer(u, u) + np.exp(theta[4]) * np.eye(6)
+    whole = matern32(x, x, lengths) + np.exp(theta[3]) * np.outer(u, u) + np.exp(theta[4]) * np.eye(6)
     np.testing.assert_allclose(S, whole, atol=1e-12)
     for i, slope in enumerate(slopes):
         step = 1e-6 * (np.arange(5) == i)
@@ -200,23 +200,23 @@ def test_formulas_of_the_module_text(model):
     entry = json.loads(json.dumps(_to_json(model)))
     distance, position, direction = viewpoints(SCENE, SCENE.test_ids[:1])
     x = np.array([*position[0] / entry["extent"], *direction[0], np.log(distance[0])])
-    X, u = np.array(entry["inputs"]), np.array(entry["unseen_inputs"], float)
+    X, u = np.array(entry["inputs"]), np.array(entry["heldout_inputs"], float)
 
     def c(a, b):
         r2 = sum(((a[g] - b[g]) ** 2).sum() / ll**2 for g, ll in zip(GROUPS, entry["lengths"], strict=True))
         return (1 + np.sqrt(3 * r2)) * np.exp(-np.sqrt(3 * r2))
 
     S = np.array([[c(a, b) for b in X] for a in X])
-    S += entry["unseen"] * np.outer(u, u) + entry["noise"] * np.eye(len(X))
-    k = np.array([c(x, b) for b in X]) + entry["unseen"] * u
+    S += entry["heldout_variance"] * np.outer(u, u) + entry["noise"] * np.eye(len(X))
+    k = np.array([c(x, b) for b in X]) + entry["heldout_variance"] * u
     mean = [curve(float(distance[0])) for curve in model.curves] + k @ np.array(entry["weights"])
-    variance = 1 + entry["unseen"] + entry["noise"] - k @ np.linalg.solve(S, k)
+    variance = 1 + entry["heldout_variance"] + entry["noise"] - k @ np.linalg.solve(S, k)
     spread = np.array(entry["amplitudes"]) * np.sqrt(variance)
     predicted = model.predict(distance, position, direction)
     np.testing.assert_allclose(predicted.spread[0], spread, rtol=1e-6)
     assert (np.diff(mean) > 0).all()
     np.testing.assert_allclose(predicted.mean[0], mean, rtol=1e-6)
-    bound = np.maximum.accumulate(mean - entry["factor"] * spread)
+    bound = np.maximum.accumulate(mean - entry["multiplier"] * spread)
     np.testing.assert_allclose(predicted.bound[0], bound, rtol=1e-6)
 
 
@@ -255,7 +255,7 @@ def test_a_category_is_bounded_by_its_own_errors_where_it_has_enough():
     stray = 0.1 * rng.standard_normal(len(SCENE.views))[wild.view] * unseen
     wild = replace(wild, ssim=(wild.ssim + stray).astype(np.float32))
     promises = fit_promises(together(plain, wild), SCENE)
-    assert promises[2].factor > 1.3 * promises[1].factor
+    assert promises[2].multiplier > 1.3 * promises[1].multiplier
 
 
 def test_labels_with_hardly_any_data():
@@ -306,7 +306,7 @@ def test_labels_with_hardly_any_data():
     counts = {(label, level): level for label, model in promises.items() for level in model.levels}
     observations = together(*parts.values())
     result = score(observations, SCENE, promises, counts, [0.6])
-    assert isinstance(result, Kept)
+    assert isinstance(result, Decisions)
     assert set(result.label_id) == set(promises)
     assert np.isnan(result.select(result.label_id == 1).totals()["overshoot"])  # in no test view
 
@@ -316,11 +316,11 @@ def test_without_calibration_views_training_views_stand_in_and_the_status_says_s
     model = fit_promises(synthetic(scene, 1), scene)[5]
     assert model.status == "uncalibrated"
     assert model.num_calibration == 0
-    assert 0.3 < model.factor <= 4
+    assert 0.3 < model.multiplier <= 4
     few = synthetic(scene, 1)
     model = fit_promises(few.select(np.isin(few.view, scene.train_ids[:6])), scene)[5]
     assert model.status == "uncalibrated"
-    assert model.factor == pytest.approx(1.645, abs=0.001)
+    assert model.multiplier == pytest.approx(1.645, abs=0.001)
     assert fit_promises(few.select(few.label_id < 0), scene) == {}
 
 
@@ -343,16 +343,16 @@ def test_score_by_hand(model):
     got = measured[np.arange(len(level)), level]
     kept = feasible & (got >= 0.7)
     assert row.views[0] == len(level)
-    assert row.feasible[0] == feasible.sum()
+    assert row.accepted[0] == feasible.sum()
     assert row.kept[0] == kept.sum()
     assert row.overshoot[0] == pytest.approx(np.mean(got[feasible] - 0.7))
-    assert row.refused[0] == (~feasible & (measured >= 0.7).any(1)).sum()
+    assert row.false_rejections[0] == (~feasible & (measured >= 0.7).any(1)).sum()
     oracle = (measured >= 0.7).argmax(1)
     assert row.regret[0] == pytest.approx(10 * np.mean((level - oracle)[kept]))
     best = result.select(result.predictor == "oracle").totals()
     assert best["kept"] == 1
     assert best["regret"] == 0
-    assert best["refused"] == 0
+    assert best["false_rejections"] == 0
     with pytest.raises(RunError, match="target"):
         score(observations, SCENE, {5: model}, counts, [1.5])
 
@@ -373,7 +373,7 @@ def test_round_trip(tmp_path, model):
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("status", "good"), ("noise", 0), ("lengths", [1, 1]), ("weights", [[1.0]]), ("factor", None),
+    [("status", "good"), ("noise", 0), ("lengths", [1, 1]), ("weights", [[1.0]]), ("multiplier", None),
      ("curves", []), ("extent", "far"), ("inputs", []), ("amplitudes", [1, 2, 3, float("nan")])],
 )  # fmt: skip
 def test_spoilt_files_are_one_line(tmp_path, model, name, value):

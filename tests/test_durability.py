@@ -389,7 +389,7 @@ def test_other_settings_do_not_fall_back(tmp_path: Path) -> None:
 def test_the_checksum_sees_what_the_archive_does_not(tmp_path: Path) -> None:
     """Arrays that are intact by themselves, but of another checkpoint."""
     path = tmp_path / "checkpoint.npz"
-    for name, other in (("means", "first/means"), ("grad_sum", "grad_count"), ("meta", "")):
+    for name, other in (("means", "exp_avg/means"), ("grad_sum", "grad_count"), ("meta", "")):
         write_checkpoint(path, state_at(10), "s")
         found = arrays(path)
         if other:

@@ -21,7 +21,7 @@ from benchmarks.hostile import MIB, Finding, Reader, check
 from benchmarks.hostile_readers import READERS
 from benchmarks.mutate import mutate
 from sagesplat.core.errors import DataError, SageError
-from sagesplat.formats.increments import Chunk, totals
+from sagesplat.formats.increments import Increment, totals
 from sagesplat.io.npz import Npz
 
 ROOT = Path(__file__).parents[1]
@@ -199,7 +199,7 @@ def test_a_promise_of_an_array_is_not_allocated(tmp_path: Path):
 
 
 def test_sums_of_chunks_that_the_run_does_not_have():
-    chunk = Chunk(2, 1, "a.spz", 3, 9, 9, "0" * 64)
+    chunk = Increment(2, 1, "a.spz", 3, 9, 9, "0" * 64)
     assert totals([chunk], [2], 2, "count").tolist() == [[3, 3]]
     for labels, levels in (([5], 2), ([2], 0)):
         with pytest.raises(DataError, match=r"a\.spz: of category 2 and level 1"):

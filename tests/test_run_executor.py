@@ -15,7 +15,7 @@ from sagesplat.core.errors import LabelError, RunError
 from sagesplat.core.events import Event, Progress, StageDone, StageStarted, Training, Warned
 from sagesplat.demo.capture import make_capture
 from sagesplat.io.files import write_text
-from sagesplat.run.executor import LOCAL, Post, Task, Together, results, split
+from sagesplat.run.executor import LOCAL, EventBuffer, ProgressAggregator, Task, results, split
 from sagesplat.run.job import Job
 from sagesplat.run.remote import work_all
 from sagesplat.run.run_dir import RunDir
@@ -36,7 +36,7 @@ from sagesplat.studies.sweep.run import run_sweep
 
 CONFIG = RunConfig(
     train=TrainConfig(max_steps=40, level_every=20),
-    nest=NestConfig(steps=6, levels=3, seed_steps=10),
+    nest=NestConfig(steps=6, levels=3, base_steps=10),
     plan=PlanConfig(target_ssim=0.4),
 )
 COMPARE = CompareConfig(
@@ -56,7 +56,7 @@ class Shuffled:
         self.names: list[str] = []
 
     def run(self, tasks: Sequence[Task], emit) -> Iterator[tuple[int, Any]]:
-        together = Together(tasks, emit)
+        together = ProgressAggregator(tasks, emit)
         self.names += [task.name for task in tasks]
         for number in self.random.permutation(len(tasks)).tolist():
             task = pickle.loads(pickle.dumps(tasks[number]))
@@ -124,7 +124,7 @@ def test_a_split_keeps_all_items_in_pieces_alike(parts: int) -> None:
 def test_progress_of_several_tasks_is_one_bar() -> None:
     heard: list[Event] = []
     tasks = [Task("observe", square), Task("observe", square), Task("other", square)]
-    together = Together(tasks, heard.append)
+    together = ProgressAggregator(tasks, heard.append)
     together.tell(0, Progress("x", 2, 10))
     together.tell(1, Progress("x", 5, 20, "text"))
     together.tell(0, Training(4, 10, 0.5, {}, 7))
@@ -142,7 +142,7 @@ def test_progress_of_several_tasks_is_one_bar() -> None:
 
 def test_a_warning_of_several_tasks_is_said_once() -> None:
     heard: list[Event] = []
-    together = Together([Task("a", square), Task("a", square), Task("b", square)], heard.append)
+    together = ProgressAggregator([Task("a", square), Task("a", square), Task("b", square)], heard.append)
     for number in (0, 1, 0, 2, 2):
         together.tell(number, Warned("same"))
     together.tell(1, StageDone("a", 1.0, ()))
@@ -150,7 +150,7 @@ def test_a_warning_of_several_tasks_is_said_once() -> None:
 
 
 def test_the_post_gives_each_event_once() -> None:
-    post = Post()
+    post = EventBuffer()
     post.tell("run", 3, Warned("text"))
     assert post.take() == [("run", 3, Warned("text"))]
     assert post.take() == []

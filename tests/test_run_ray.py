@@ -28,7 +28,7 @@ from sagesplat.run import ray_executor, ray_task
 from sagesplat.run.executor import LOCAL, Task, results
 from sagesplat.run.job import Job
 from sagesplat.run.ray_executor import RayExecutor, connected
-from sagesplat.run.ray_task import Failed, Place, do
+from sagesplat.run.ray_task import Failed, WorkerEnvironment, run_task
 from sagesplat.run.run_dir import RunDir
 from sagesplat.stages.label import lift_labels, make_masks
 from sagesplat.stages.observe import observe_levels
@@ -219,13 +219,16 @@ def test_a_node_without_the_folder_or_with_another_version_is_one_line(tmp_path:
     marker.touch()
     monkeypatch.chdir(tmp_path)
     task = Task("divide", divide, (2,))
-    assert do(task, Place(marker, tmp_path), NoPost(), "run", 0, 1) == 0.5
-    for place, says in (
-        (Place(tmp_path / "no" / "marker", tmp_path), "does not see this folder; all nodes need it under"),
-        (Place(tmp_path / "of another disk", tmp_path), "does not see this folder"),
-        (Place(marker, tmp_path, "0.0.1"), r"not 0\.0\.1; install the same on all nodes"),
+    assert run_task(task, WorkerEnvironment(marker, tmp_path), NoPost(), "run", 0, 1) == 0.5
+    for environment, says in (
+        (
+            WorkerEnvironment(tmp_path / "no" / "marker", tmp_path),
+            "does not see this folder; all nodes need it under",
+        ),
+        (WorkerEnvironment(tmp_path / "of another disk", tmp_path), "does not see this folder"),
+        (WorkerEnvironment(marker, tmp_path, "0.0.1"), r"not 0\.0\.1; install the same on all nodes"),
     ):
-        failed = do(task, place, NoPost(), "run", 0, 1)
+        failed = run_task(task, environment, NoPost(), "run", 0, 1)
         assert isinstance(failed, Failed)
         with pytest.raises(RunError, match=says) as raised:
             raise failed.error

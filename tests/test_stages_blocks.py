@@ -41,8 +41,8 @@ from sagesplat.scene.blocks import (
 )
 from sagesplat.scene.scene import Camera, Lens, Points, Scene, View
 from sagesplat.scene.stored import read_scene, write_scene
+from sagesplat.segment.block_categories import BlockCategories, category_of, split_name
 from sagesplat.segment.masks import Masks, Taxonomy
-from sagesplat.segment.parts import Parts, category_of, split_name
 from sagesplat.stages import report
 from sagesplat.stages.blocks import check
 from sagesplat.stages.pipeline import run_all
@@ -172,7 +172,7 @@ def test_impossible_numbers_of_blocks(count: int) -> None:
         (BlocksConfig(margin=-1), "margin -1"),
         (BlocksConfig(min_share=0), "min-share 0"),
         (BlocksConfig(far_share=-0.5), "far-share -0.5"),
-        (BlocksConfig(seam_steps=-1), "seam-steps -1"),
+        (BlocksConfig(boundary_steps=-1), "seam-steps -1"),
     ],
 )
 def test_impossible_settings(config: BlocksConfig, named: str) -> None:
@@ -250,7 +250,7 @@ def test_broken_stored_scenes(tmp_path: Path) -> None:
 
 
 def test_parts_have_names_of_their_own() -> None:
-    parts = Parts(Taxonomy({3: "car", 184: "tree-merged"}), 3)
+    parts = BlockCategories(Taxonomy({3: "car", 184: "tree-merged"}), 3)
     ids = parts.ids(np.array([-1, 3, 184, 184]), np.array([0, 0, 1, 2]))
     assert [parts.names.name(i) for i in ids.tolist()] == [
         "unlabelled@0", "car@0", "tree-merged@1", "tree-merged@2",
@@ -261,7 +261,7 @@ def test_parts_have_names_of_their_own() -> None:
     assert split_name("a@b") == ("a@b", None)
     assert category_of("grass") == "grass"
     with pytest.raises(LabelError, match="are too many; choose fewer"):
-        Parts(Taxonomy({i: str(i) for i in range(100)}), 400)
+        BlockCategories(Taxonomy({i: str(i) for i in range(100)}), 400)
 
 
 def test_core_keeps_order_and_levels() -> None:
@@ -272,11 +272,11 @@ def test_core_keeps_order_and_levels() -> None:
     spots = torch.from_numpy(scene.points.xyz[np.random.default_rng(0).choice(400, 60)])
     g = replace(g, means=spots)
     sizes = {label: (2, 7, n) for label, n in g.counts().items()}
-    parts = Parts(Taxonomy({3: "car", 184: "tree-merged"}), 2)
-    cores = [boundaries.core(g, blocks, parts, b) for b in range(2)]
+    parts = BlockCategories(Taxonomy({3: "car", 184: "tree-merged"}), 2)
+    cores = [boundaries.interior(g, blocks, parts, b) for b in range(2)]
     assert sum(len(c[0]) for c in cores) == 60
     for block, (core, inside) in enumerate(cores):
-        levels = boundaries.core_sizes(g.label_ids.numpy(), inside, sizes, parts, block)
+        levels = boundaries.interior_sizes(g.label_ids.numpy(), inside, sizes, parts, block)
         rows = np.flatnonzero(blocks.of(g.means.numpy()) == block)
         np.testing.assert_array_equal(np.flatnonzero(inside), rows)
         np.testing.assert_array_equal(core.means, g.means[rows])  # in the order of the whole
@@ -303,8 +303,8 @@ def test_bands_are_measured_apart() -> None:
 CONFIG = RunConfig(
     scene=SceneConfig(calibrate_every=4),
     train=TrainConfig(max_steps=40, level_every=20),
-    blocks=BlocksConfig(count=2, seam_steps=20),
-    nest=NestConfig(steps=30, levels=4, smallest=0.1, seed_steps=30),
+    blocks=BlocksConfig(count=2, boundary_steps=20),
+    nest=NestConfig(steps=30, levels=4, smallest=0.1, base_steps=30),
     fit=FitConfig(),
     plan=PlanConfig(target_ssim=0.4),
 )
@@ -340,7 +340,7 @@ def finished(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_run_in_blocks(finished: Path, capture: Path) -> None:
     run = RunDir(finished)
-    names = Taxonomy.read(run.parts / "labels.json").names
+    names = Taxonomy.read(run.block_categories / "labels.json").names
     ladder, snapshots = read_prefixes(run.prefixes), read_ladder(run.levels)
     assert snapshots.levels == [20, 40]
     assert set(ladder.sizes) <= set(names)
@@ -357,11 +357,13 @@ def test_a_run_in_blocks(finished: Path, capture: Path) -> None:
     assert (beyond < blocks.margin / 2).all()
     # pixels keep their category
     scene = load_scene(capture)
-    parts, before = (Masks(f, Taxonomy.read(f / "labels.json")) for f in (run.parts, run.masks))
+    parts, before = (Masks(f, Taxonomy.read(f / "labels.json")) for f in (run.block_categories, run.masks))
     for view in scene.views[:3]:
         of_parts = [category_of(names[i]) for i in parts[view].ravel()[::50].tolist()]
         assert of_parts == [before.taxonomy.name(i) for i in before[view].ravel()[::50].tolist()]
-    assert {row["label_id"] for row in read_json(run.chunks / "index.json")["chunks"]} == set(ladder.sizes)
+    assert {row["label_id"] for row in read_json(run.increments / "index.json")["chunks"]} == set(
+        ladder.sizes
+    )
     assert (run.adapted / "borders.csv").read_text().count("\n") == 3
     assert "| block |" in (run.adapted / "blocks.md").read_text()
     assert read_json(run.plan)["scene"]
@@ -386,7 +388,7 @@ def test_a_run_keeps_its_blocks(finished: Path, capture: Path) -> None:
     with pytest.raises(RunError, match=r"this run is in blocks; add --blocks\.count"):
         run_in_blocks(capture, finished, whole)
     with pytest.raises(RunError, match=r"made with other count \(2 then, 3 now\)"):
-        run_in_blocks(capture, finished, replace(CONFIG, blocks=BlocksConfig(count=3, seam_steps=20)))
+        run_in_blocks(capture, finished, replace(CONFIG, blocks=BlocksConfig(count=3, boundary_steps=20)))
 
 
 def test_snapshots_of_blocks(capture: Path, tmp_path: Path) -> None:

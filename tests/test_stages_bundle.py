@@ -14,7 +14,7 @@ from sagesplat.adapt.observe import RenderedLabels
 from sagesplat.adapt.viewpoint import read_promises
 from sagesplat.core.config import FitConfig, LiftConfig, MasksConfig, NestConfig, SceneConfig, TrainConfig
 from sagesplat.core.errors import DataError, RunError, SageError
-from sagesplat.formats.increments import read_chunks, read_index
+from sagesplat.formats.increments import read_increments, read_index
 from sagesplat.formats.spz import read_spz
 from sagesplat.io.files import read_json, write_json
 from sagesplat.raster import rasterize
@@ -58,7 +58,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     make_masks(job, MasksConfig())
     lift_labels(job, LiftConfig())
     train_levels(job, TrainConfig(max_steps=6, level_every=2), 0)
-    nest_levels(job, NestConfig(steps=2, levels=4, smallest=0.1, seed_share=0), 0)
+    nest_levels(job, NestConfig(steps=2, levels=4, smallest=0.1, base_share=0), 0)
     observe_levels(job, FIT)
     fit_ladder(job, FIT)
     return job.run.path
@@ -83,18 +83,18 @@ def test_a_bundle_of_a_run(run: Path, tmp_path: Path, viewer: Path) -> None:
     first = "car"
     made = bundle(job, out, meters_per_unit=2.0, always=[first], weights={first: 3}, viewer=viewer)
     manifest = manifest_of(out)
-    chunks = read_index(job.run.chunks)
+    chunks = read_index(job.run.increments)
     assert (made.path, made.chunks, made.labels) == (out, len(chunks), len(manifest["labels"]))
     assert made.count == manifest["totals"]["count"] == sum(c.count for c in chunks)
     assert manifest["frame"]["metersPerUnit"] == 2
     assert manifest["frame"]["scale"] == "given"
-    assert manifest["shDegree"] == read_chunks(job.run.chunks, chunks).sh_degree
+    assert manifest["shDegree"] == read_increments(job.run.increments, chunks).sh_degree
     named = {label["name"]: label for label in manifest["labels"]}
     assert (named[first]["always"], named[first]["weight"]) == (True, 3)
     assert [label["always"] for label in manifest["labels"]].count(True) == 1
     assert len({label["color"] for label in manifest["labels"]}) == len(named)
     for chunk in chunks:
-        assert (out / "chunks" / chunk.uri).read_bytes() == (job.run.chunks / chunk.uri).read_bytes()
+        assert (out / "chunks" / chunk.uri).read_bytes() == (job.run.increments / chunk.uri).read_bytes()
     for label in manifest["labels"]:
         assert 1 <= len(label["boxes"]) <= 32
     splits = [camera["split"] for camera in manifest["cameras"]]
@@ -109,7 +109,7 @@ def test_the_poster_is_the_first_view(run: Path, tmp_path: Path, viewer: Path) -
     picture = np.asarray(Image.open(out / "poster.jpg"), np.float64)
     first = read_json(out / "manifest.json")["start"]
     camera = camera_at(np.array(first["position"]), np.array(first["quaternion"]), np.pi / 3, 640, 360)
-    g = read_chunks(job.run.chunks, read_index(job.run.chunks))
+    g = read_increments(job.run.increments, read_index(job.run.increments))
     truth = rasterize(g, camera, backend="cpu").rgb.clamp(0, 1).numpy() * 255
     assert np.sqrt(np.mean((picture - truth) ** 2)) < 4  # JPEG
 
@@ -147,7 +147,7 @@ def test_the_same_run_gives_the_same_bytes(run: Path, tmp_path: Path, viewer: Pa
 
 @pytest.mark.parametrize(
     ("missing", "command"),
-    [("nested/chunks", "nest"), ("nested/observations.csv", "observe"), ("nested/promises.json", "fit")],
+    [("nested/increments", "nest"), ("nested/observations.csv", "observe"), ("nested/promises.json", "fit")],
 )
 def test_an_unfinished_run_names_the_command(run, tmp_path, viewer, missing, command) -> None:
     path = run / missing
@@ -172,9 +172,9 @@ def test_bad_input_is_one_line(run: Path, tmp_path: Path, viewer: Path) -> None:
         bundle(job, run, viewer=viewer)
     with pytest.raises(SageError, match="viewer not built"):
         bundle(job, out, viewer=tmp_path / "nothing")
-    with pytest.raises(RunError, match="no nested/chunks"):
+    with pytest.raises(RunError, match="no nested/increments"):
         bundle(job_of(tmp_path / "nowhere"), out, viewer=viewer)
-    chunk = next((run / "nested" / "chunks").glob("*.spz"))
+    chunk = next((run / "nested" / "increments").glob("*.spz"))
     chunk.write_bytes(chunk.read_bytes()[:-1])
     with pytest.raises(DataError, match=f"{chunk.name}: "):
         bundle(job, out, viewer=viewer)
@@ -182,7 +182,7 @@ def test_bad_input_is_one_line(run: Path, tmp_path: Path, viewer: Path) -> None:
 
 
 def test_promises_of_other_chunks(run: Path, tmp_path: Path, viewer: Path) -> None:
-    index = run / "nested" / "chunks" / "index.json"
+    index = run / "nested" / "increments" / "index.json"
     index.write_text(index.read_text() + "\n")
     with pytest.raises(RunError, match="promises of other chunks; run `sagesplat fit`"):
         bundle(job_of(run), tmp_path / "out", viewer=viewer)
@@ -278,9 +278,9 @@ def test_a_real_run(tmp_path: Path, viewer: Path) -> None:
 
 def test_parts_of_blocks_are_told_by_category(run: Path, tmp_path: Path, viewer: Path) -> None:
     job, out = job_of(run), tmp_path / "out"
-    job.run.parts.mkdir(exist_ok=True)
-    shutil.copy(job.run.labels, job.run.part_labels)
-    write_json(job.run.parts / "labels.json", {"labels": {"3": "car@0", "184": "car@2"}})
+    job.run.block_categories.mkdir(exist_ok=True)
+    shutil.copy(job.run.labels, job.run.block_category_labels)
+    write_json(job.run.block_categories / "labels.json", {"labels": {"3": "car@0", "184": "car@2"}})
     bundle(job, out, weights={"car": 3, "car@2": 5}, always=["car"], viewer=viewer)
     labels = {label["id"]: label for label in manifest_of(out)["labels"]}
     a, b = labels[3], labels[184]

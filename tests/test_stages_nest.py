@@ -20,7 +20,7 @@ from sagesplat.core.config import FitConfig, NestConfig, PlanConfig, RunConfig, 
 from sagesplat.core.errors import DataError, RunError
 from sagesplat.core.events import Event, StageDone, StageSkipped
 from sagesplat.demo.capture import make_capture
-from sagesplat.formats.increments import packed, read_chunks, read_index, totals, write_chunks
+from sagesplat.formats.increments import packed, read_increments, read_index, totals, write_increments
 from sagesplat.formats.levels import write_set
 from sagesplat.formats.ply import read_ply
 from sagesplat.formats.quantisation import in_buckets
@@ -31,7 +31,7 @@ from sagesplat.scene.scene import Points, Scene, View
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.stages.compose import compose_plan
 from sagesplat.stages.evaluate import evaluate_plans
-from sagesplat.stages.export import export_chunks
+from sagesplat.stages.export import export_increments
 from sagesplat.stages.fit import fit_ladder
 from sagesplat.stages.observe import observe_levels
 from sagesplat.stages.pipeline import run_all
@@ -40,7 +40,7 @@ from sagesplat.studies.paper.cross_view import read_cross_view
 from sagesplat.studies.paper.run import cross_views
 from sagesplat.train import nested
 from sagesplat.train.importance import importance
-from sagesplat.train.nested import Nested, NestStep, draw_shares, level_sizes, nest, order, straddling
+from sagesplat.train.nested import Nested, NestStep, draw_shares, is_boundary, level_sizes, nest, order
 
 QUICK = NestConfig(steps=12, levels=4, smallest=0.1, drawn_from=0.1)
 
@@ -62,7 +62,7 @@ def test_sizes_are_geometric() -> None:
 
 def test_a_gaussian_straddles_if_it_shows_on_both_sides() -> None:
     weights = np.array([[90, 10], [60, 40], [0.6, 0.4], [0, 0]], np.float32)
-    assert straddling(weights, num_views=10).tolist() == [False, True, False, False]
+    assert is_boundary(weights, num_views=10).tolist() == [False, True, False, False]
 
 
 def test_everything_is_drawn_more_often_in_the_end() -> None:
@@ -196,7 +196,7 @@ def test_a_killed_training_goes_on_bit_for_bit(scene: Scene, tmp_path: Path, mon
         ({"full_share": 1.5}, "--nest.full-share"),
         ({"sh_bits": (9, 4)}, "--nest.sh-bits"),
         ({"steps": -1}, "--nest.steps"),
-        ({"gain": 0.0}, "--nest.gain"),
+        ({"lr_multiplier": 0.0}, "--nest.lr-multiplier"),
     ],
 )
 def test_impossible_settings_are_one_line(scene, wrong, says) -> None:
@@ -218,7 +218,7 @@ def test_harmonics_in_buckets_are_multiples_and_zero_stays_zero() -> None:
 def ladder(tmp_path: Path) -> PrefixLadder:
     start = ordered()
     sizes = {0: (1, 5, 20), 1: (2, 2, 20), 2: (20, 20, 20)}
-    write_set(tmp_path / "ladder.npz", start.gaussians, 12, sizes, clarity=start.clarity)
+    write_set(tmp_path / "ladder.npz", start.gaussians, 12, sizes, purity=start.purity)
     return read_prefixes(tmp_path / "ladder.npz")
 
 
@@ -251,7 +251,7 @@ def test_chunks_hold_what_each_level_adds(tmp_path: Path) -> None:
     sizes = {0: (1, 5, 20), 1: (2, 2, 20), 2: (20, 20, 20)}
     g = ordered().gaussians
     g = g.select(torch.from_numpy(packed(g, sizes)))
-    chunks = write_chunks(tmp_path / "chunks", g, sizes, {0: "a b", 1: "c", 2: "d"})
+    chunks = write_increments(tmp_path / "chunks", g, sizes, {0: "a b", 1: "c", 2: "d"})
     assert [(c.label_id, c.level, c.count) for c in chunks] == [
         (0, 1, 1), (0, 2, 4), (0, 3, 15), (1, 1, 2), (1, 3, 18), (2, 1, 20)
     ]  # fmt: skip
@@ -259,13 +259,13 @@ def test_chunks_hold_what_each_level_adds(tmp_path: Path) -> None:
     for chunk in chunks:
         assert (tmp_path / "chunks" / chunk.uri).stat().st_size == chunk.nbytes
     assert read_index(tmp_path / "chunks") == chunks
-    sent = read_chunks(tmp_path / "chunks", chunks)
+    sent = read_increments(tmp_path / "chunks", chunks)
     assert torch.equal(sent.label_ids, g.label_ids)
     np.testing.assert_allclose(sent.means, g.means, atol=0.02)
     np.testing.assert_allclose(totals(chunks, [0, 1, 2], 3, "count"), list(sizes.values()))
-    again = write_chunks(tmp_path / "again", g, sizes, {0: "a b", 1: "c", 2: "d"})
+    again = write_increments(tmp_path / "again", g, sizes, {0: "a b", 1: "c", 2: "d"})
     assert again == chunks  # their names are hashes of their bytes
-    plain = write_chunks(tmp_path / "plys", g, sizes, {0: "a b", 1: "c", 2: "d"}, kind="ply")
+    plain = write_increments(tmp_path / "plys", g, sizes, {0: "a b", 1: "c", 2: "d"}, kind="ply")
     part = read_ply(tmp_path / "plys" / plain[1].uri)
     np.testing.assert_array_equal(part.means, g.means[1:5])
     (tmp_path / "chunks" / "index.json").write_text('{"chunks": [{"label_id": 0}]}')
@@ -276,7 +276,7 @@ def test_chunks_hold_what_each_level_adds(tmp_path: Path) -> None:
 CONFIG = RunConfig(
     scene=SceneConfig(calibrate_every=4),
     train=TrainConfig(max_steps=90, level_every=30),
-    nest=NestConfig(steps=40, levels=5, smallest=0.1, seed_steps=30),
+    nest=NestConfig(steps=40, levels=5, smallest=0.1, base_steps=30),
     plan=PlanConfig(target_ssim=0.4),
 )
 STAGES = [
@@ -285,7 +285,7 @@ STAGES = [
     "masks",
     "lift",
     "train",
-    "seeds",
+    "base",
     "nest",
     "observe",
     "fit",
@@ -327,12 +327,12 @@ def test_a_run_makes_a_nested_ladder_by_default(finished: Path) -> None:
     scene_plans, view_plans = read_plans(job.run.plan)
     assert [p.target for p in scene_plans] == [0.3, 0.4, 0.5]
     assert len(view_plans) == 16
-    sent = [p.sent for p in scene_plans]
+    sent = [p.transfer_bytes for p in scene_plans]
     assert None not in sent
-    chunks = read_index(job.run.chunks)
+    chunks = read_index(job.run.increments)
     for choice in scene_plans[1].choices:
         mine = [c for c in chunks if c.label_id == choice.label_id and c.level <= choice.level]
-        assert choice.sent == sum(c.nbytes for c in mine)
+        assert choice.transfer_bytes == sum(c.nbytes for c in mine)
         assert choice.count == sum(c.count for c in mine)
     assert len(read_ply(job.run.composed)) == scene_plans[1].count
     evaluation = read_evaluation(job.run.evaluation)
@@ -430,7 +430,7 @@ def test_each_view_is_planned_by_its_bound(finished: Path, tmp_path: Path) -> No
 def test_without_calibration_views_a_run_still_promises(capture: Path, tmp_path: Path) -> None:
     config = replace(CONFIG, scene=SceneConfig(calibrate_every=0), train=TrainConfig(max_steps=20))
     job = quiet(tmp_path / "run")
-    run_all(job, capture, replace(config, nest=replace(QUICK, steps=2, seed_share=0.0)))
+    run_all(job, capture, replace(config, nest=replace(QUICK, steps=2, base_share=0.0)))
     assert read_plans(job.run.plan)[0]
 
 
@@ -444,11 +444,11 @@ def test_seeds_come_first_and_take_the_place_of_the_least_worthy(scene: Scene) -
             return np.full((view.camera.height, view.camera.width), 3, np.int16)
 
     g = random_gaussians(50, seed=3)
-    seeds = random_gaussians(8, seed=4)
-    found = order(g, scene, OneLabel(), QUICK, seeds=seeds)  # type: ignore[arg-type]
+    base = random_gaussians(8, seed=4)
+    found = order(g, scene, OneLabel(), QUICK, base=base)  # type: ignore[arg-type]
     assert len(found.gaussians) == 50
     assert found.boundary == {3: 0}
-    assert sorted(found.gaussians.means[:8].tolist()) == sorted(seeds.means.tolist())
+    assert sorted(found.gaussians.means[:8].tolist()) == sorted(base.means.tolist())
     worth = importance(g, scene, scene.train_ids.tolist(), QUICK.criterion)
     worthiest = g.means[torch.from_numpy(np.argsort(-worth, kind="stable")[:42].copy())]
     assert torch.equal(found.gaussians.means[8:], worthiest)
@@ -457,22 +457,22 @@ def test_seeds_come_first_and_take_the_place_of_the_least_worthy(scene: Scene) -
 def test_chunks_are_exported_as_files(finished: Path, tmp_path: Path) -> None:
     job = quiet(finished)
     for kind in ("spz", "ply"):
-        count = export_chunks(job, tmp_path / kind, kind)
+        count = export_increments(job, tmp_path / kind, kind)
         chunks = read_index(tmp_path / kind)
         assert count == len(chunks) == len(list((tmp_path / kind).glob(f"*.{kind}")))
         assert sum(c.count for c in chunks) == len(job.ladder.load(5))
-    counts = [[c.count for c in read_index(folder)] for folder in (tmp_path / "ply", job.run.chunks)]
+    counts = [[c.count for c in read_index(folder)] for folder in (tmp_path / "ply", job.run.increments)]
     assert counts[0] == counts[1]
     with pytest.raises(RunError, match="exists"):
-        export_chunks(job, tmp_path / "ply", "ply")
+        export_increments(job, tmp_path / "ply", "ply")
     with pytest.raises(RunError, match="snapshots have no chunks"):
-        export_chunks(Job(RunDir(finished, "snapshots"), print), tmp_path / "none", "ply")
+        export_increments(Job(RunDir(finished, "snapshots"), print), tmp_path / "none", "ply")
 
 
 def test_one_gaussian_is_a_category_too(tmp_path: Path) -> None:
     g = ordered().gaussians.select(torch.tensor([0, 20, 21]))
     sizes = {label: level_sizes(n, QUICK) for label, n in g.counts().items()}
     assert sizes[0] == (1, 1, 1, 1)
-    chunks = write_chunks(tmp_path / "chunks", g, sizes, {0: "a", 1: "b"})
+    chunks = write_increments(tmp_path / "chunks", g, sizes, {0: "a", 1: "b"})
     assert [(c.label_id, c.level) for c in chunks] == [(0, 1), (1, 1), (1, 4)]
     assert totals(chunks, [0, 1], 4, "count").tolist() == [[1, 1, 1, 1], [1, 1, 1, 2]]

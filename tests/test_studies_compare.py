@@ -173,7 +173,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Job:
     make_masks(job, MasksConfig())
     lift_labels(job, LiftConfig())
     train_levels(job, TrainConfig(max_steps=60, level_every=20, refine_every=5), 0)
-    nest_levels(job, NestConfig(steps=20, levels=4, seed_steps=20), 0)
+    nest_levels(job, NestConfig(steps=20, levels=4, base_steps=20), 0)
     observe_levels(job, FitConfig())
     fit_ladder(job, FitConfig())
     make_plan(job, PlanConfig(target_ssim=0.4))
@@ -213,7 +213,7 @@ def test_everything_is_measured(compared):
         assert np.isfinite([p.ssim, p.ssim_sent, p.psnr]).all()
         assert math.isnan(p.lpips_alex)
         assert abs(p.ssim - p.ssim_sent) < 0.05
-    assert by_method[SAME_SHARE][-1].encoded == sum(c.nbytes for c in read_index(job.run.chunks))
+    assert by_method[SAME_SHARE][-1].encoded == sum(c.nbytes for c in read_index(job.run.increments))
     assert len(walks) == 4
     assert all(w.first > 0 for w in walks)
     assert all(w.replaced == 0 for w in walks if w.method == "nested")

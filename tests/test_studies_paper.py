@@ -35,11 +35,11 @@ from sagesplat.stages.pipeline import run_all
 from sagesplat.stages.plan import make_plan
 from sagesplat.stages.scene import open_scene
 from sagesplat.stages.train import train_levels
-from sagesplat.studies.early_stopping import compare_online
+from sagesplat.studies.early_stopping import compare_early_stopping
 from sagesplat.studies.paper.cross_view import CrossView, read_cross_view
-from sagesplat.studies.paper.model_size import METHODS, WHOLE, nearest_snapshot, prune_to, read_occupancy
 from sagesplat.studies.paper.report import four_levels
 from sagesplat.studies.paper.run import paper_report
+from sagesplat.studies.paper.same_size import METHODS, WHOLE, nearest_snapshot, prune_to, read_occupancy
 from sagesplat.train.importance import importance
 
 CONFIG = RunConfig(train=TrainConfig(max_steps=90, level_every=15), plan=PlanConfig(target_ssim=0.4))
@@ -169,7 +169,7 @@ def test_regret_by_hand():
 
 def test_equal_occupancy_means_equal_counts(finished):
     job, _ = finished
-    rows = read_occupancy(job.run.occupancy)
+    rows = read_occupancy(job.run.same_size)
     full = job.ladder.size(job.ladder.levels[-1])
     for of_view in np.unique(rows.of_view):
         for target in (0.3, 0.4, 0.5):
@@ -193,7 +193,7 @@ def test_a_second_report_has_nothing_to_do_and_another_view_needs_force(finished
     assert [e.name for e in events if isinstance(e, StageSkipped)] == ["crossview", "occupancy", "paper"]
     with pytest.raises(RunError, match=r"no photo 'nothing'; there are view_000"):
         paper_report(again, replace(PAPER, view="nothing"))
-    with pytest.raises(RunError, match=r"occupancy\.csv: made with other .*--force"):
+    with pytest.raises(RunError, match=r"same_size\.csv: made with other .*--force"):
         paper_report(again, replace(PAPER, lpips=job.run.path / "nowhere", view=job.scene.views[3].name))
 
 
@@ -203,7 +203,7 @@ def test_a_capture_without_test_views(capture, tmp_path):
     paper_report(job, replace(PAPER, lpips=tmp_path, tune_steps=0))
     assert not (job.run.paper / "table_1_test.csv").exists()
     assert not (job.run.paper / "cross_view.csv").exists()
-    assert set(read_occupancy(job.run.occupancy).of_view) == {6}
+    assert set(read_occupancy(job.run.same_size).of_view) == {6}
 
 
 def test_categories_that_hardly_occur(capture, tmp_path):
@@ -306,7 +306,7 @@ def test_online_against_offline(capture, finished, tmp_path):
     stops = read_json(online.run.frozen)
     assert stops
     assert sum(isinstance(e, Warned) and "stops at step" in e.text for e in events) == len(stops)
-    methods, categories = compare_online(online, full, tmp_path / "out")
+    methods, categories = compare_early_stopping(online, full, tmp_path / "out")
     assert [row[0] for row in methods.rows] == ["online", "offline", "full run"]
     assert np.isfinite([value for row in methods.rows for value in row[1:]]).all()
     for row in categories.rows:
@@ -321,13 +321,13 @@ def test_online_against_offline(capture, finished, tmp_path):
         if step == first:
             assert chosen[full.names()[int(label)]] == first
     with pytest.raises(RunError, match=r"this run needs --train.freeze-at .* must not have it"):
-        compare_online(full, online, tmp_path)
+        compare_early_stopping(full, online, tmp_path)
     other = Job(RunDir(tmp_path / "other", "snapshots"), lambda event: None)
     shutil.copytree(full.run.path, other.run.path)
     made = other.run.provenance("train")
     made.write_text(made.read_text().replace('"seed": 0', '"seed": 5'))
     with pytest.raises(RunError, match=r"other settings \(seed\)"):
-        compare_online(online, other, tmp_path)
+        compare_early_stopping(online, other, tmp_path)
 
 
 def test_rendered_labels_take_what_paints_most():

@@ -30,13 +30,13 @@ def start(shape: tuple[int, ...]) -> list[np.ndarray]:
 
 def plain_adam(parameter: Tensor, grads: list[np.ndarray], lr: float) -> tuple[Tensor, Tensor, Tensor]:
     """Kingma and Ba 2015, algorithm 1; float64."""
-    first = second = torch.zeros_like(parameter)
+    exp_avg = exp_avg_sq = torch.zeros_like(parameter)
     for step, grad in enumerate(grads, start=1):
         g = torch.from_numpy(grad).double()
-        first, second = 0.9 * first + 0.1 * g, 0.999 * second + 0.001 * g * g
-        unbiased = first / (1 - 0.9**step), second / (1 - 0.999**step)
+        exp_avg, exp_avg_sq = 0.9 * exp_avg + 0.1 * g, 0.999 * exp_avg_sq + 0.001 * g * g
+        unbiased = exp_avg / (1 - 0.9**step), exp_avg_sq / (1 - 0.999**step)
         parameter = parameter - lr * unbiased[0] / (unbiased[1].sqrt() + 1e-15)
-    return parameter, first, second
+    return parameter, exp_avg, exp_avg_sq
 
 
 # around the block of 1024 values
@@ -51,13 +51,13 @@ def test_steps_are_adams_and_the_cpus(shape):
         optim.adam_step(of_cpu[0], grad, *of_cpu[1:], lr=3e-3, step=step, trainable=everything)
     expected = plain_adam(torch.from_numpy(arrays[0]).double(), grads, 3e-3)
     largest = torch.from_numpy(np.abs(grads).max(0) + 1e-30)
-    parameter, first, second = (a.cpu().double() for a in actual)
+    parameter, exp_avg, exp_avg_sq = (a.cpu().double() for a in actual)
     close = torch.testing.assert_close
     # the CPU's 1 - 0.999 is one of float32, 1.3e-5 off
     for reference, rtol in ((expected, 1e-6), ([torch.from_numpy(a).double() for a in of_cpu], 3e-5)):
         close(parameter, reference[0], rtol=2e-7, atol=2e-7)
-        close(first / largest, reference[1] / largest, rtol=0, atol=2e-7)
-        close(second, reference[2], rtol=rtol, atol=1e-30)
+        close(exp_avg / largest, reference[1] / largest, rtol=0, atol=2e-7)
+        close(exp_avg_sq, reference[2], rtol=rtol, atol=1e-30)
     assert (parameter - torch.from_numpy(arrays[0])).abs().max() > 5e-3
 
 
@@ -109,12 +109,12 @@ def test_columns_without_gradient_can_be_left_out():
 
 
 def test_a_leaf_moves_in_place_by_a_gradient_in_other_memory():
-    (value, first, second), (grad,) = on_device(start((20, 3))), gradients((20, 3), 1)
-    expected = [a.cpu().numpy().copy() for a in (value, first, second)]
+    (value, exp_avg, exp_avg_sq), (grad,) = on_device(start((20, 3))), gradients((20, 3), 1)
+    expected = [a.cpu().numpy().copy() for a in (value, exp_avg, exp_avg_sq)]
     optim.adam_step(expected[0], grad, *expected[1:], lr=0.1, step=1, trainable=np.ones(20, bool))
     leaf = value.requires_grad_()
     turned = torch.from_numpy(np.ascontiguousarray(grad.T)).to(DEVICE).T
-    adam_step(leaf, turned, first, second, lr=0.1, step=1, trainable=None)
+    adam_step(leaf, turned, exp_avg, exp_avg_sq, lr=0.1, step=1, trainable=None)
     torch.testing.assert_close(leaf.detach().cpu(), torch.from_numpy(expected[0]), rtol=1e-6, atol=2e-6)
 
 
@@ -131,8 +131,8 @@ def test_more_values_than_32_bits_count():
     n = 2**31 // 64 + 3
     if torch.cuda.mem_get_info()[0] < 5 * 4 * 64 * n:
         pytest.skip("needs 43 GB on the GPU")
-    parameter, first, second = (torch.zeros(n, 64, device=DEVICE) for _ in range(3))
+    parameter, exp_avg, exp_avg_sq = (torch.zeros(n, 64, device=DEVICE) for _ in range(3))
     grad = torch.ones(n, 64, device=DEVICE)
-    adam_step(parameter, grad, first, second, lr=0.5, step=1, trainable=None)
+    adam_step(parameter, grad, exp_avg, exp_avg_sq, lr=0.5, step=1, trainable=None)
     assert float(parameter.min()) == pytest.approx(-0.5)
     assert float(parameter.max()) == pytest.approx(-0.5)

@@ -20,7 +20,7 @@ def some_state() -> TrainState:
     """A state in the middle of a run."""
     state = initial_state(random_gaussians(9, degree=1), seed=3)
     generator = torch.Generator().manual_seed(4)
-    for moments in (state.first, state.second):
+    for moments in (state.exp_avg, state.exp_avg_sq):
         for p in moments.values():
             p += torch.rand(p.shape, generator=generator)
     state.grad_sum += torch.rand(9, generator=generator)
@@ -46,8 +46,8 @@ def test_round_trip_is_identical(tmp_path):
         assert torch.equal(getattr(back.gaussians, name), expected)
         assert getattr(back.gaussians, name).dtype == expected.dtype
     for name in PARAMETERS:
-        assert torch.equal(back.first[name], state.first[name])
-        assert torch.equal(back.second[name], state.second[name])
+        assert torch.equal(back.exp_avg[name], state.exp_avg[name])
+        assert torch.equal(back.exp_avg_sq[name], state.exp_avg_sq[name])
     assert torch.equal(back.grad_sum, state.grad_sum)
     assert torch.equal(back.grad_count, state.grad_count)
     assert (back.queue, back.step, back.last_reset) == ([4, 1, 7], 1200, 1000)
@@ -76,7 +76,7 @@ def test_other_versions_are_refused(tmp_path):
         read_checkpoint(path, "a")
 
 
-@pytest.mark.parametrize("name", ["means", "shN", "first/quats", "second/sh0", "grad_sum"])
+@pytest.mark.parametrize("name", ["means", "shN", "exp_avg/quats", "exp_avg_sq/sh0", "grad_sum"])
 def test_not_finite_is_refused(tmp_path, name):
     path = tmp_path / "checkpoint.npz"
     write_checkpoint(path, some_state(), "a")

@@ -30,7 +30,7 @@ def state_of(log_sizes: list[float], grads: list[float], opacity: float = 0.5) -
         logit_opacities=torch.full((n,), float(np.log(opacity / (1 - opacity)))),
     )
     state = initial_state(g, seed=0)
-    for moments in (state.first, state.second):
+    for moments in (state.exp_avg, state.exp_avg_sq):
         for name in PARAMETERS:
             moments[name] = (
                 torch.arange(1.0, n + 1).reshape(-1, *[1] * (moments[name].ndim - 1)) + moments[name]
@@ -47,8 +47,10 @@ def all_of(state: TrainState) -> torch.Tensor:
 def assert_consistent(state: TrainState) -> None:
     n = len(state.gaussians)
     for name, p in state.gaussians.parameters().items():
-        assert state.first[name].shape == p.shape
-        assert torch.equal(state.first[name], state.second[name])  # they started equal and move together
+        assert state.exp_avg[name].shape == p.shape
+        assert torch.equal(
+            state.exp_avg[name], state.exp_avg_sq[name]
+        )  # they started equal and move together
         assert p.is_contiguous()  # Adam works on its memory
     assert state.gaussians.label_ids.shape == state.grad_sum.shape == state.grad_count.shape == (n,)
     assert not state.grad_sum.any()
@@ -63,7 +65,7 @@ def test_small_ones_are_cloned():
     parents = torch.tensor([0, 1, 2, 0, 2])
     for name in (*PARAMETERS, "label_ids"):
         assert torch.equal(getattr(state.gaussians, name), getattr(before, name)[parents])
-    for moments in (state.first, state.second):
+    for moments in (state.exp_avg, state.exp_avg_sq):
         assert moments["means"][:, 0].tolist() == [1, 2, 3, 0, 0]  # the copy starts afresh
 
 
@@ -81,7 +83,7 @@ def test_large_ones_are_split():
         assert torch.equal(getattr(after, name), getattr(before, name)[parents])
     children, parents = slice(1, None), parents[1:]
     torch.testing.assert_close(after.log_scales[children].exp() * 1.6, before.log_scales[parents].exp())
-    assert (state.first["means"][children] == 0).all()
+    assert (state.exp_avg["means"][children] == 0).all()
     # children are drawn from the parent: in its own axes, in units of its sizes, they are standard normal
     shift = after.means[children] - before.means[parents]
     rotation = densify.rotation_matrices(before.quats[parents])
@@ -98,7 +100,7 @@ def test_faint_ones_go_and_huge_ones_only_after_a_reset():
     densify.refine(state, CONFIG, EXTENT, ROOM, all_of(state))
     assert_consistent(state)
     assert torch.equal(state.gaussians.label_ids, labels[1:])
-    assert state.first["means"][:, 0].tolist() == [2, 3, 4]  # moments move with their rows
+    assert state.exp_avg["means"][:, 0].tolist() == [2, 3, 4]  # moments move with their rows
     state.last_reset = 100
     densify.refine(state, CONFIG, EXTENT, ROOM, all_of(state))
     assert torch.equal(state.gaussians.label_ids, labels[[1, 3]])
@@ -110,7 +112,7 @@ def test_the_cap_holds_and_the_strongest_go_first(room, grown):
     densify.refine(state, CONFIG, EXTENT, room, all_of(state))
     assert len(state.gaussians) == 7 + grown
     if room == 2:  # rows 1 and 3, both split
-        assert state.first["means"][:, 0].tolist() == [1, 3, 5, 6, 7, 0, 0, 0, 0]
+        assert state.exp_avg["means"][:, 0].tolist() == [1, 3, 5, 6, 7, 0, 0, 0, 0]
 
 
 def test_frozen_rows_neither_grow_nor_go():
@@ -121,7 +123,7 @@ def test_frozen_rows_neither_grow_nor_go():
     densify.refine(state, CONFIG, EXTENT, ROOM, torch.zeros(4, dtype=torch.bool))
     for name in (*PARAMETERS, "label_ids"):
         assert torch.equal(getattr(state.gaussians, name), getattr(before, name))
-    assert state.first["means"][:, 0].tolist() == [1, 2, 3, 4]
+    assert state.exp_avg["means"][:, 0].tolist() == [1, 2, 3, 4]
 
 
 def test_everything_may_go():
@@ -142,7 +144,7 @@ def test_a_reset_lowers_opacities_of_trainable_rows():
     opacities = state.gaussians.logit_opacities.sigmoid()
     expected = torch.tensor([0.01, torch.tensor(-7.0).sigmoid(), 0.01, 0.5])
     torch.testing.assert_close(opacities, expected)
-    for moments in (state.first, state.second):
+    for moments in (state.exp_avg, state.exp_avg_sq):
         assert moments["logit_opacities"].tolist() == [0, 0, 0, 4]
         assert moments["means"][:, 0].tolist() == [1, 2, 3, 4]
     assert state.last_reset == 3000
@@ -177,7 +179,7 @@ def test_schedule_is_the_published_one_at_full_length():
 
 @pytest.mark.parametrize("steps", [1, 30, 300, 3000, 7000, 60_000])
 def test_schedule_scales_with_the_length(steps):
-    plan = densify.schedule(TrainConfig(max_steps=steps, pace="published"))
+    plan = densify.schedule(TrainConfig(max_steps=steps, lr_schedule="published"))
     assert plan.level_every == -(-steps // 30)
     assert plan.refine_stop == max(1, steps // 2)
     assert plan.reset_every == max(1500, steps // 10)  # a model needs time to come back
@@ -188,7 +190,7 @@ def test_schedule_scales_with_the_length(steps):
 @pytest.mark.parametrize(("steps", "stop"), [(900, 630), (2000, 1200), (3000, 1500), (30_000, 15_000)])
 def test_short_runs_of_the_fast_pace_grow_for_longer(steps, stop):
     fast, published = (
-        densify.schedule(TrainConfig(max_steps=steps, pace=pace)) for pace in ("fast", "published")
+        densify.schedule(TrainConfig(max_steps=steps, lr_schedule=pace)) for pace in ("fast", "published")
     )
     assert fast.refine_stop == stop
     assert replace(fast, refine_stop=published.refine_stop) == published

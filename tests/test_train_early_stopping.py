@@ -20,9 +20,15 @@ from sagesplat.scene.images import Photos
 from sagesplat.segment.lift import lift
 from sagesplat.segment.masks import Masks, Taxonomy, import_masks
 from sagesplat.train import stepper, trainer
-from sagesplat.train.early_stopping import Work, active_tiles, label_quality, measured_views, trainable_rows
+from sagesplat.train.early_stopping import (
+    ActiveTiles,
+    active_tiles,
+    label_quality,
+    measured_views,
+    trainable_rows,
+)
 from sagesplat.train.lr_schedule import smaller
-from sagesplat.train.photo_loader import Feed
+from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.state import initial_state
 from sagesplat.train.stepper import Stepper, tune
 from sagesplat.train.trainer import LabelFrozen, LevelSaved, Resumed, Step, Trained, train
@@ -30,7 +36,7 @@ from sagesplat.train.trainer import LabelFrozen, LevelSaved, Resumed, Step, Trai
 CPU = torch.device("cpu")
 # densification from step 24 to 60 every 6, resets at 40, the SH degree rises every 4 steps
 CONFIG = TrainConfig(
-    max_steps=120, level_every=10, refine_start=24, refine_every=6, reset_every=40, pace="published"
+    max_steps=120, level_every=10, refine_start=24, refine_every=6, reset_every=40, lr_schedule="published"
 )
 
 
@@ -60,7 +66,7 @@ def levels(monkeypatch) -> dict[int, Gaussians]:
 def measured(g: Gaussians, capture, degree: int) -> dict[int, float]:
     """SSIM by label, as it decides who stops."""
     scene, photos, masks, _ = capture
-    work, feed = Work(scene, masks), Feed(scene, photos, CPU)
+    work, feed = ActiveTiles(scene, masks), PhotoLoader(scene, photos, CPU)
     return label_quality(g, work, feed, measured_views(scene, masks), CONFIG, degree, backend="cpu")
 
 
@@ -249,9 +255,9 @@ def test_finished_views_are_drawn_in_one_round_of_eight(capture):
     rare = min((label for label in seen if seen[label]), key=lambda label: seen[label])
     assert seen[rare] < len(shown)
     some = everything - {rare}
-    work = Work(scene, masks, some)
+    work = ActiveTiles(scene, masks, some)
     unfinished = {row for row in shown if shown[row] - some}
-    picked = Stepper(Feed(scene, photos, CPU), CONFIG, work)
+    picked = Stepper(PhotoLoader(scene, photos, CPU), CONFIG, work)
     views = [picked._next_view(state) for _ in range(2000)]
     assert unfinished
     assert {row for row in shown if not work.finished(row)} == unfinished
@@ -259,7 +265,7 @@ def test_finished_views_are_drawn_in_one_round_of_eight(capture):
     busy = np.mean([counts[row] for row in unfinished])
     for row in set(shown) - unfinished:
         assert counts[row] < 0.4 * busy
-    done = Work(scene, masks, everything)
+    done = ActiveTiles(scene, masks, everything)
     assert all(done.finished(row) for row in shown)
     assert done.tiles(int(scene.train_ids[0])) is not None
 

@@ -25,7 +25,7 @@ from sagesplat.raster import Workspace
 from sagesplat.scene.images import Photos
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.train import stepper, trainer
-from sagesplat.train.early_stopping import Work, label_quality, measured_views
+from sagesplat.train.early_stopping import ActiveTiles, label_quality, measured_views
 from sagesplat.train.stepper import Stepper
 from sagesplat.train.trainer import LabelFrozen, LevelSaved, Resumed, Step, Trained, train
 
@@ -52,12 +52,12 @@ def on_gpu(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> N
     gsplat_standin.install(monkeypatch)
     for module in (trainer, stepper):
         monkeypatch.setattr(module, "device_of", lambda *_: CPU)
-    monkeypatch.setattr(Work, "mask", mask)
+    monkeypatch.setattr(ActiveTiles, "mask", mask)
     monkeypatch.setattr(torch.Tensor, "is_cuda", property(lambda _: True), raising=False)
     monkeypatch.setattr(trainer, "LOOK_EVERY", 1)
 
 
-def mask(work: Work, row: int, factor: int = 1) -> torch.Tensor | None:
+def mask(work: ActiveTiles, row: int, factor: int = 1) -> torch.Tensor | None:
     tiles = work.tiles(row, factor)
     return None if tiles is None else torch.from_numpy(tiles)
 
@@ -153,8 +153,8 @@ def watched_states(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_quality_is_what_the_cpu_measures(scene, on_gpu, monkeypatch):  # noqa: F811
     g = final(run(scene, SHORT))
-    work, rows = Work(scene, Halves()), measured_views(scene, Halves())  # type: ignore[arg-type]
-    feed = stepper.Feed(scene, Photos(scene.views), CPU)
+    work, rows = ActiveTiles(scene, Halves()), measured_views(scene, Halves())  # type: ignore[arg-type]
+    feed = stepper.PhotoLoader(scene, Photos(scene.views), CPU)
     there = label_quality(g, work, feed, rows, SHORT, 3, backend="cuda")
     monkeypatch.undo()
     here = label_quality(g, work, feed, rows, SHORT, 3, backend="cpu")

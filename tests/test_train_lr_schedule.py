@@ -8,7 +8,7 @@ from sagesplat.core.config import TrainConfig
 from sagesplat.core.gaussians import PARAMETERS
 from sagesplat.scene.scene import Camera
 from sagesplat.train import densify
-from sagesplat.train.lr_schedule import Pace, detail, pace, smaller
+from sagesplat.train.lr_schedule import LrSchedule, detail, lr_schedule, smaller
 
 
 def noise(height: int, width: int, cells: int = 1) -> np.ndarray:
@@ -19,9 +19,9 @@ def noise(height: int, width: int, cells: int = 1) -> np.ndarray:
 
 
 def test_the_published_pace_is_3dgs_and_full_size():
-    config = TrainConfig(pace="published", max_steps=1000)
-    published = pace(config, 2.0, [])
-    first, last = published.rates(0), published.rates(1000)
+    config = TrainConfig(lr_schedule="published", max_steps=1000)
+    published = lr_schedule(config, 2.0, [])
+    first, last = published.learning_rates(0), published.learning_rates(1000)
     assert first["means"] == pytest.approx(2 * 1.6e-4)
     assert last["means"] == pytest.approx(2 * 1.6e-6)
     for name in PARAMETERS[1:]:
@@ -30,13 +30,16 @@ def test_the_published_pace_is_3dgs_and_full_size():
 
 
 def test_the_fast_pace_begins_with_larger_steps_and_ends_with_smaller_ones():
-    config = TrainConfig(pace="fast", max_steps=1000)
+    config = TrainConfig(lr_schedule="fast", max_steps=1000)
     fast, published = (
-        pace(config, 2.0, [noise(64, 64)]),
-        Pace(TrainConfig(pace="published", max_steps=1000), 2.0),
+        lr_schedule(config, 2.0, [noise(64, 64)]),
+        LrSchedule(TrainConfig(lr_schedule="published", max_steps=1000), 2.0),
     )
     for name in PARAMETERS:
-        gains = [fast.rates(step)[name] / published.rates(step)[name] for step in range(0, 1001, 50)]
+        gains = [
+            fast.learning_rates(step)[name] / published.learning_rates(step)[name]
+            for step in range(0, 1001, 50)
+        ]
         assert gains[0] > 2
         assert (np.diff(gains) <= 1e-9).all()
         if name != "means":  # whose published rate falls to a hundredth by itself
@@ -54,8 +57,8 @@ def test_detail_is_what_a_smaller_photo_keeps():
 
 
 def test_smooth_photos_stay_small_for_longer():
-    config = TrainConfig(pace="fast", max_steps=1000)
-    rough, smooth = (pace(config, 1.0, [noise(900, 1000, cells)]) for cells in (1, 16))
+    config = TrainConfig(lr_schedule="fast", max_steps=1000)
+    rough, smooth = (lr_schedule(config, 1.0, [noise(900, 1000, cells)]) for cells in (1, 16))
     for run in (rough, smooth):
         factors = [run.factor(step) for step in range(1, 1001)]
         assert factors[0] == 4
@@ -66,7 +69,7 @@ def test_smooth_photos_stay_small_for_longer():
 
 @pytest.mark.parametrize("size", [(256, 256), (399, 700)])
 def test_small_photos_are_not_made_smaller(size):
-    assert pace(TrainConfig(pace="fast"), 1.0, [noise(*size, cells=8)]).coarse == ()
+    assert lr_schedule(TrainConfig(lr_schedule="fast"), 1.0, [noise(*size, cells=8)]).coarse == ()
 
 
 def test_a_smaller_photo_has_a_smaller_camera():

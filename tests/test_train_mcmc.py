@@ -17,9 +17,9 @@ from sagesplat.raster import rasterize, set_threads
 from sagesplat.raster.reference import rotation_matrices
 from sagesplat.scene.images import Photos
 from sagesplat.train import mcmc
-from sagesplat.train.early_stopping import Work, trainable_rows
-from sagesplat.train.lr_schedule import Pace
-from sagesplat.train.photo_loader import Feed
+from sagesplat.train.early_stopping import ActiveTiles, trainable_rows
+from sagesplat.train.lr_schedule import LrSchedule
+from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.state import TrainState, from_points, initial_state
 from sagesplat.train.stepper import Stepper
 
@@ -31,7 +31,7 @@ def state_of(g: Gaussians, seed: int = 0) -> TrainState:
     """Moments and statistics are those of no other row."""
     state = initial_state(g, seed)
     n = len(g)
-    for moments in (state.first, state.second):
+    for moments in (state.exp_avg, state.exp_avg_sq):
         for name in PARAMETERS:
             moments[name] += torch.arange(1.0, n + 1).reshape(-1, *[1] * (moments[name].ndim - 1))
     state.grad_sum, state.grad_count = torch.arange(n) + 0.5, torch.arange(n) + 1.0
@@ -41,7 +41,7 @@ def state_of(g: Gaussians, seed: int = 0) -> TrainState:
 def snapshot(state: TrainState) -> dict[str, Tensor]:
     g = state.gaussians
     tensors = {"label_ids": g.label_ids, "sum": state.grad_sum, "count": state.grad_count, **g.parameters()}
-    for key, moments in (("first", state.first), ("second", state.second)):
+    for key, moments in (("exp_avg", state.exp_avg), ("exp_avg_sq", state.exp_avg_sq)):
         tensors |= {f"{key} {name}": m for name, m in moments.items()}
     return {name: t.clone() for name, t in tensors.items()}
 
@@ -139,7 +139,7 @@ def test_the_dead_take_everything_from_their_hosts():
             assert torch.equal(getattr(g, name)[row], getattr(g, name)[host])
     fresh = dead.clone()
     fresh[list(hosts)] = True
-    for key in ("first", "second"):
+    for key in ("exp_avg", "exp_avg_sq"):
         for name in PARAMETERS:
             moments = getattr(state, key)[name]
             assert not moments[fresh].any()
@@ -203,10 +203,15 @@ def test_growth_keeps_to_the_cap_and_withholds_what_stopped(drawn, most, rounds)
                 assert torch.equal(tensor[:n][~trainable], before[name][~trainable])
         for row in range(n, n + added):
             hosts = living.clone()
-            for name in (*PARAMETERS, "label_ids", *(f"first {name}" for name in PARAMETERS), "second sh0"):
+            for name in (
+                *PARAMETERS,
+                "label_ids",
+                *(f"exp_avg {name}" for name in PARAMETERS),
+                "exp_avg_sq sh0",
+            ):
                 hosts &= (after[name][:n] == after[name][row]).reshape(n, -1).all(-1)
             assert hosts.any()
-            assert not after["second means"][row].any()
+            assert not after["exp_avg_sq means"][row].any()
         assert all(p.is_contiguous() for p in state.gaussians.parameters().values())
         trainable = trainable_rows(state.gaussians, dict.fromkeys(stopped, 1))
 
@@ -267,7 +272,7 @@ def test_the_kernel_computes_what_torch_does():
     seed = np.uint64(np.random.default_rng(0).integers(1 << 63))
     normal = torch.tensor([[mcmc._normal(seed, np.uint64(3 * i + k)) for k in range(3)] for i in range(500)])
     expected = g.means.clone()
-    mcmc.wander(expected, g.quats, g.log_scales, g.logit_opacities, trainable, 20.0, normal)
+    mcmc.sgld_noise(expected, g.quats, g.log_scales, g.logit_opacities, trainable, 20.0, normal)
     before = g.means.clone()
     mcmc.perturb(state, 20.0, trainable)
     torch.testing.assert_close(state.gaussians.means, expected, rtol=1e-4, atol=1e-5)
@@ -332,8 +337,8 @@ def test_a_chain_learns(tmp_path):
     config = TrainConfig(max_steps=105, sh_degree=0, strategy="mcmc")
     labels = np.array([-1, 3, 184], np.int16)[np.arange(60) % 3]
     state = initial_state(from_points(scene.points, labels, 0), seed=0)
-    feed = Feed(scene, Photos(scene.views), torch.device("cpu"))
-    stepper, pace = Stepper(feed, config, Work(scene, None)), Pace(config, scene.extent)
+    feed = PhotoLoader(scene, Photos(scene.views), torch.device("cpu"))
+    stepper, lr_schedule = Stepper(feed, config, ActiveTiles(scene, None)), LrSchedule(config, scene.extent)
     losses, kept = [], torch.empty(0)
     trainable = all_of(state)
     for step in range(1, 106):
@@ -341,7 +346,17 @@ def test_a_chain_learns(tmp_path):
             state.frozen = {3: step}
             trainable = trainable_rows(state.gaussians, state.frozen)
             kept = state.gaussians.of_labels([3]).means.sort(0).values
-        losses.append(float(stepper(state, 0, pace.rates(step), trainable, wander=pace.wander(step))))
+        losses.append(
+            float(
+                stepper(
+                    state,
+                    0,
+                    lr_schedule.learning_rates(step),
+                    trainable,
+                    sgld_noise=lr_schedule.sgld_noise(step),
+                )
+            )
+        )
         if 14 <= step < 90 and step % 7 == 0:
             mcmc.relocate(state, config, trainable)
             mcmc.add(state, config, 90, trainable)

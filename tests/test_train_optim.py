@@ -21,17 +21,17 @@ def test_steps_are_torchs(shape):
     start = np.random.default_rng(0).normal(size=shape).astype(np.float32)
     expected = torch.tensor(start, requires_grad=True)
     adam = torch.optim.Adam([expected], lr=3e-3, betas=(0.9, 0.999), eps=1e-15)
-    actual, first, second = start.copy(), np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    actual, exp_avg, exp_avg_sq = start.copy(), np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     everything = np.ones(shape[0], bool)
     grads = gradients(shape, 6)
     for step, grad in enumerate(grads, start=1):
         expected.grad = torch.from_numpy(grad)
         adam.step()
-        adam_step(actual, grad, first, second, lr=3e-3, step=step, trainable=everything)
+        adam_step(actual, grad, exp_avg, exp_avg_sq, lr=3e-3, step=step, trainable=everything)
     state = adam.state[expected]
     largest = np.abs(grads).max(0) + 1e-30
-    np.testing.assert_allclose(first / largest, state["exp_avg"].numpy() / largest, atol=1e-6)
-    np.testing.assert_allclose(second, state["exp_avg_sq"].numpy(), rtol=3e-5, atol=1e-30)
+    np.testing.assert_allclose(exp_avg / largest, state["exp_avg"].numpy() / largest, atol=1e-6)
+    np.testing.assert_allclose(exp_avg_sq, state["exp_avg_sq"].numpy(), rtol=3e-5, atol=1e-30)
     np.testing.assert_allclose(actual, expected.detach().numpy(), rtol=1e-6, atol=1e-6)
     assert np.abs(actual - start).max() > 5e-3
 

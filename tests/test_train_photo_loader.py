@@ -6,7 +6,7 @@ import torch
 from conftest import pinhole
 
 from sagesplat.scene.scene import Points, Scene, View
-from sagesplat.train.photo_loader import Feed
+from sagesplat.train.photo_loader import PhotoLoader
 
 
 class Album:
@@ -35,17 +35,17 @@ def scene(tmp_path) -> Scene:
 
 def test_a_cpu_gets_unit_floats(scene):
     album = Album(4)
-    photo, camera = Feed(scene, album, torch.device("cpu"))(2)  # type: ignore[arg-type]
+    photo, camera = PhotoLoader(scene, album, torch.device("cpu"))(2)  # type: ignore[arg-type]
     np.testing.assert_array_equal(photo.numpy(), album.photos[2].astype(np.float32) / 255)
     assert (camera.width, camera.height) == (30, 20)
-    small, seen = Feed(scene, album, torch.device("cpu"))(2, 2)  # type: ignore[arg-type]
+    small, seen = PhotoLoader(scene, album, torch.device("cpu"))(2, 2)  # type: ignore[arg-type]
     assert small.shape == (seen.height, seen.width, 3) == (10, 15, 3)
 
 
 def test_a_device_keeps_bytes_up_to_its_limit_and_fetches_the_rest_ahead(scene):
     """On the meta device, which takes tensors like a GPU and holds nothing."""
     album = Album(4)
-    feed = Feed(scene, album, torch.device("meta"), limit=2 * 20 * 30 * 3)  # type: ignore[arg-type]
+    feed = PhotoLoader(scene, album, torch.device("meta"), limit=2 * 20 * 30 * 3)  # type: ignore[arg-type]
     for row in (0, 1, 2, 3) * 2:
         photo, camera = feed(row)
         assert (photo.dtype, photo.device.type, tuple(photo.shape)) == (torch.uint8, "meta", (20, 30, 3))
@@ -63,7 +63,7 @@ def test_what_goes_wrong_ahead_is_told_at_its_step(scene):
         def __getitem__(self, row: int) -> np.ndarray:
             raise OSError("gone")
 
-    feed = Feed(scene, Broken(4), torch.device("meta"), limit=0)  # type: ignore[arg-type]
+    feed = PhotoLoader(scene, Broken(4), torch.device("meta"), limit=0)  # type: ignore[arg-type]
     feed.expect(1)
     with pytest.raises(OSError, match="gone"):
         feed(1)

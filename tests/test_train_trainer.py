@@ -23,7 +23,7 @@ from sagesplat.train.trainer import Event, LevelSaved, Resumed, Step, Trained, t
 
 LABEL_IDS = np.array([-1, 3, 184], np.int16)[np.arange(60) % 3]
 # 8 views, of which 7 train; densification from step 12 to 29, a reset after step 20, levels every 12 steps
-BUSY = TrainConfig(max_steps=60, level_every=12, refine_every=7, reset_every=20, pace="published")
+BUSY = TrainConfig(max_steps=60, level_every=12, refine_every=7, reset_every=20, lr_schedule="published")
 
 
 @pytest.fixture(scope="module")
@@ -179,7 +179,7 @@ def test_from_points(scene):
     state = initial_state(g, seed=0)
     assert state.step == 0
     assert state.last_reset == -1
-    assert not any(p.any() for p in (*state.first.values(), *state.second.values()))
+    assert not any(p.any() for p in (*state.exp_avg.values(), *state.exp_avg_sq.values()))
 
 
 @pytest.mark.parametrize(
@@ -215,12 +215,12 @@ def test_gaussians_that_rest_stay_as_they_are(scene, monkeypatch):
         return rasterize(*args, **options)
 
     monkeypatch.setattr(stepper, "rasterize", watched)
-    events = list(run(scene, replace(BUSY, rest_share=0.8)))
+    events = list(run(scene, replace(BUSY, gradient_freeze_share=0.8)))
     assert [share for share in awake if share < 1]
     assert awake[-1] < 1 or awake[-8] < 1  # after densification every other stretch
     assert final(events) is not None
     with pytest.raises(RunError, match=r"--train.rest-share 1.0 is no share"):
-        list(run(scene, replace(BUSY, rest_share=1.0)))
+        list(run(scene, replace(BUSY, gradient_freeze_share=1.0)))
 
 
 LESS = "out of memory; lower --train.max-gaussians"

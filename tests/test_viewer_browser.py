@@ -17,11 +17,11 @@ import torch
 from browser import Opened, open_page
 
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.formats.increments import read_chunks, write_chunks
+from sagesplat.formats.increments import read_increments, write_increments
 from sagesplat.raster import rasterize
 from sagesplat.scene.scene import Camera
 from sagesplat.stages.bundle import package_viewer
-from sagesplat.viewer.bundle import Category, Contents, Shot, write_bundle
+from sagesplat.viewer.bundle import CameraEntry, Category, Contents, write_bundle
 
 pytestmark = [
     pytest.mark.skipif(chromium.missing() is not None, reason=chromium.missing() or ""),
@@ -105,14 +105,14 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("viewer")
     names = {1: "brick", 2: "grass-merged", 3: "sky-other-merged"}
     g = cloud()
-    chunks = write_chunks(folder / "chunks", g, SIZES, names)
+    chunks = write_increments(folder / "chunks", g, SIZES, names)
     places = {i: g.means[g.label_ids == i].numpy() * [1, -1, -1] for i in names}
     categories = [
         Category(i, name, name.split("-")[0], "#" + bytes(int(255 * c) for c in COLOURS[i]).hex(),
                  np.concatenate([places[i].min(0), places[i].max(0)])[None])
         for i, name in names.items()
     ]  # fmt: skip
-    shots = [Shot(f"photo{k}.jpg", "train", camera(0.2 * k)) for k in range(3)]
+    shots = [CameraEntry(f"photo{k}.jpg", "train", camera(0.2 * k)) for k in range(3)]
     contents = Contents(
         "three walls", 1.0, shots, categories, chunks, folder / "chunks", 3, meters_per_unit=1.0
     )
@@ -228,12 +228,12 @@ def test_the_picture_is_the_rasterizers(viewer: Opened, made: Path) -> None:
 
 
 def read_chunks_of(made: Path, manifest: dict[str, Any]) -> Gaussians:
-    from sagesplat.formats.increments import Chunk
+    from sagesplat.formats.increments import Increment
 
-    return read_chunks(
+    return read_increments(
         made,
         [
-            Chunk(label["id"], k, e["uri"], e["count"], e["bytes"], e["gpuBytes"], e["sha256"])
+            Increment(label["id"], k, e["uri"], e["count"], e["bytes"], e["gpuBytes"], e["sha256"])
             for label in manifest["labels"]
             for k, e in enumerate(label["levels"], 1)
         ],

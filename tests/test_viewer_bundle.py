@@ -18,15 +18,15 @@ from scipy.spatial.transform import Rotation
 
 from sagesplat.adapt.viewpoint import ViewModel
 from sagesplat.core.errors import DataError, RunError, SageError
-from sagesplat.formats.increments import write_chunks
+from sagesplat.formats.increments import write_increments
 from sagesplat.formats.spz import read_spz
 from sagesplat.scene.scene import Camera
 from sagesplat.viewer import boxes, frames
 from sagesplat.viewer.bundle import (
     SCHEMA,
+    CameraEntry,
     Category,
     Contents,
-    Shot,
     documents,
     is_bundle,
     write_bundle,
@@ -261,7 +261,9 @@ def contents(tmp_path: Path) -> Contents:
     """Three categories of three levels, one of them with a promise."""
     g = random_gaussians(39, degree=1)
     labels = torch.tensor([-1] * 10 + [3] * 20 + [184] * 9, dtype=torch.int16)
-    chunks = write_chunks(tmp_path / "chunks", replace(g, label_ids=labels), SIZES, {3: "car", 184: "tree"})
+    chunks = write_increments(
+        tmp_path / "chunks", replace(g, label_ids=labels), SIZES, {3: "car", 184: "tree"}
+    )
     made = replace(model(3, 6, [1, 2, 3]), label_id=3)
     shots = []
     for i, row in enumerate(made.inputs):  # the model's own views
@@ -271,9 +273,9 @@ def contents(tmp_path: Path) -> Contents:
         w2c = at.w2c.copy()
         w2c[:3, :3] = np.stack([x / np.linalg.norm(x), np.cross(z, x / np.linalg.norm(x)), z])
         w2c[:3, 3] = -w2c[:3, :3] @ (row[:3] * made.extent)
-        split = "calibration" if made.unseen_inputs[i] else "train"
-        shots.append(Shot(f"{i}.jpg", split, replace(at, w2c=w2c)))
-    shots.append(Shot("none.jpg", "test", camera()))
+        split = "calibration" if made.heldout_inputs[i] else "train"
+        shots.append(CameraEntry(f"{i}.jpg", split, replace(at, w2c=w2c)))
+    shots.append(CameraEntry("none.jpg", "test", camera()))
     points = np.random.default_rng(0).normal(size=(50, 3))
     categories = [
         Category(-1, "unlabelled", "everything else", "#808080", boxes.split_boxes(points)),
@@ -448,7 +450,7 @@ def test_an_earlier_bundle_is_replaced_and_nothing_of_it_stays(tmp_path, content
 
 
 def test_without_points_or_labels() -> None:
-    empty = Contents("none", 0.0, [Shot("a", "test", camera())], [], [], Path("none"), 0)
+    empty = Contents("none", 0.0, [CameraEntry("a", "test", camera())], [], [], Path("none"), 0)
     manifest, promises = documents(empty)
     assert promises is None
     assert manifest["pack"] is None

@@ -532,7 +532,8 @@ class Bundling(types.ModuleType):
     def bundle(self, job, out: Path) -> None:
         self.made += 1
         levels = [
-            {"sha256": c["sha256"]} for c in json.loads((job.run.chunks / "index.json").read_text())["chunks"]
+            {"sha256": c["sha256"]}
+            for c in json.loads((job.run.increments / "index.json").read_text())["chunks"]
         ]
         manifest = {"format": "sagesplat-bundle", "live": False, "labels": [{"levels": levels}]}
         page = self.viewer["index.html"].replace(
@@ -563,7 +564,7 @@ def bundling(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Bundling:
 def write_run(folder: Path, chunks: bool = True) -> Path:
     contents = {"scene.json": b"{}", "provenance/scene.json": json.dumps({"format": FORMAT}).encode()}
     if chunks:
-        contents["nested/chunks/index.json"] = b'{"chunks": [{"sha256": "aa"}, {"sha256": "bb"}]}'
+        contents["nested/increments/index.json"] = b'{"chunks": [{"sha256": "aa"}, {"sha256": "bb"}]}'
         contents["nested/promises.json"] = b"{}"
     return write_bundle(folder, contents)
 
@@ -582,7 +583,7 @@ def test_and_again_when_it_is_out_of_date(tmp_path: Path, bundling: Bundling, ch
     with show(run, print, port=0):
         pass
     if change == "chunks":
-        (run / "nested/chunks/index.json").write_text('{"chunks": [{"sha256": "aa"}]}')
+        (run / "nested/increments/index.json").write_text('{"chunks": [{"sha256": "aa"}]}')
     elif change == "promises":
         time.sleep(0.02)
         (run / "nested/promises.json").write_text("{ }")

@@ -20,10 +20,10 @@ from sagesplat.core.gaussians import PARAMETERS, Gaussians
 from sagesplat.raster import Backend, cuda, rasterize
 from sagesplat.scene.scene import Camera
 from sagesplat.train import densify, trainer
-from sagesplat.train.early_stopping import Work, trainable_rows
+from sagesplat.train.early_stopping import ActiveTiles, trainable_rows
 from sagesplat.train.group import ALONE
-from sagesplat.train.lr_schedule import Pace
-from sagesplat.train.photo_loader import Feed
+from sagesplat.train.lr_schedule import LrSchedule
+from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.state import TrainState, from_points, initial_state
 from sagesplat.train.stepper import Stepper
 
@@ -124,16 +124,22 @@ def compared(bench: Bench, options: dict[str, Any], count: int = 80) -> dict[str
 def frozen_kept(bench: Bench, steps: int) -> dict[str, Any]:
     """Train beside a frozen category, with densification and a reset: do its rows keep every bit?"""
     every = steps // 5
-    config = TrainConfig(max_steps=steps, pace="published", refine_every=every, refine_start=1, grow_grad=0)
+    config = TrainConfig(
+        max_steps=steps, lr_schedule="published", refine_every=every, refine_start=1, grow_grad=0
+    )
     scene, labels = bench.scene, bench.labels
     if len(np.unique(labels)) < 2:
         labels = (scene.points.xyz[:, 0] > np.median(scene.points.xyz[:, 0])).astype(np.int16)
     label = Counter(labels.tolist()).most_common(1)[0][0]
     state = initial_state(from_points(scene.points, labels, 3), 0).to(bench.device)
     state.frozen = {label: 0}
-    work = Work(scene, bench.masks, frozenset(state.frozen), bench.device)
-    stepper = Stepper(Feed(scene, bench.photos, bench.device), config, work, bench.backend)
-    rates, before, begun = Pace(config, scene.extent).rates, rows_of(state, label), len(state.gaussians)
+    work = ActiveTiles(scene, bench.masks, frozenset(state.frozen), bench.device)
+    stepper = Stepper(PhotoLoader(scene, bench.photos, bench.device), config, work, bench.backend)
+    rates, before, begun = (
+        LrSchedule(config, scene.extent).learning_rates,
+        rows_of(state, label),
+        len(state.gaussians),
+    )
     trainable = trainable_rows(state.gaussians, state.frozen)
     for step in range(1, steps + 1):
         stepper(state, min(3, step // every), rates(step), trainable, observing=True)

@@ -21,10 +21,10 @@ from sagesplat.metrics.image import photometric_loss, psnr, ssim_map
 from sagesplat.metrics.lpips import Net, load_lpips
 from sagesplat.raster import rasterize
 from sagesplat.train import densify, trainer
-from sagesplat.train.early_stopping import Work, label_quality, measured_views
+from sagesplat.train.early_stopping import ActiveTiles, label_quality, measured_views
 from sagesplat.train.group import ALONE
 from sagesplat.train.parallel import train_together
-from sagesplat.train.photo_loader import Feed
+from sagesplat.train.photo_loader import PhotoLoader
 
 KEPT_BACK = 0.1  # of the time, for what comes after the long runs
 WEIGHTS = {"ours": 1.0, "gsplat": 1.3, "third": 0.8, "two_thirds": 0.7, "all": 0.5}  # time of a run, guessed
@@ -146,7 +146,10 @@ def multi(bench: Bench) -> Outcome:
     if bench.small or torch.cuda.device_count() < 2:
         return Outcome("skipped", "no GPU" if bench.small else "one GPU")
     steps = min(bench.asked.steps, 1000)
-    config, args = TrainConfig(max_steps=steps, pace="published"), (bench.scene, bench.photos, bench.labels)
+    config, args = (
+        TrainConfig(max_steps=steps, lr_schedule="published"),
+        (bench.scene, bench.photos, bench.labels),
+    )
     seconds = {}
     for name, events in {
         "one": trainer.train(*args, config, backend="cuda"),
@@ -181,12 +184,12 @@ def _train(bench: Bench, name: str) -> Run:
     if bench.left() < KEPT_BACK * 60 * bench.asked.minutes:
         raise RuntimeError("no time left")
     if name in ("ours", "gsplat"):
-        config = TrainConfig(max_steps=steps_of(bench), pace="published")
+        config = TrainConfig(max_steps=steps_of(bench), lr_schedule="published")
     elif bench.masks is None:
         raise RuntimeError("no label images: nothing to freeze")
     else:
         target = targets(run_of(bench, "ours").label_ssim)[name]
-        config = TrainConfig(max_steps=steps_of(bench), pace="published", freeze_at=target)
+        config = TrainConfig(max_steps=steps_of(bench), lr_schedule="published", freeze_at=target)
     run = watch(bench, name, config, (gsplats if name == "gsplat" else ours)(bench, config))
     if name == "ours":
         bench.trained = run.gaussians
@@ -252,7 +255,10 @@ def watch(bench: Bench, name: str, config: TrainConfig, moments: Iterator[Moment
             point |= {"frozen": len(moment.frozen), "skipped": skipped(bench, moment.frozen)}
             curve.append(point)
         if name == "ours" and bench.masks and not label_ssim and step >= config.max_steps / 3:
-            work, feed = Work(bench.scene, bench.masks), Feed(bench.scene, bench.photos, bench.device)
+            work, feed = (
+                ActiveTiles(bench.scene, bench.masks),
+                PhotoLoader(bench.scene, bench.photos, bench.device),
+            )
             label_ssim = label_quality(
                 moment.gaussians, work, feed, measured_views(bench.scene, bench.masks), config, degree,
                 backend=bench.backend,
@@ -277,7 +283,7 @@ def skipped(bench: Bench, frozen: Mapping[int, int]) -> float:
     """Share of the tiles of training views that show nothing but what is frozen."""
     if not frozen or bench.masks is None:
         return 0.0
-    work = Work(bench.scene, bench.masks, frozenset(frozen))
+    work = ActiveTiles(bench.scene, bench.masks, frozenset(frozen))
     found = [work.tiles(row) for row in bench.scene.train_ids.tolist()[::8]]
     return float(np.mean([1 - tiles.mean() for tiles in found if tiles is not None]))
 

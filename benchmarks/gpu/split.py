@@ -19,7 +19,7 @@ from sagesplat.core.sh import num_bases
 from sagesplat.metrics.image import photometric_loss
 from sagesplat.raster import Workspace, cuda, rasterize
 from sagesplat.train import densify, optim
-from sagesplat.train.photo_loader import Feed
+from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.state import initial_state
 
 # what a kernel belongs to, by its name; the first that fits
@@ -101,7 +101,11 @@ def stepping(bench: Bench, g: Gaussians, trainable: Tensor | None) -> Callable[[
     state = initial_state(g.to("cpu"), 0).to(bench.device)
     state.gaussians = replace(g, **{name: p.detach().clone() for name, p in g.parameters().items()})
     everything = torch.ones(len(g), dtype=torch.bool, device=bench.device)
-    feed, space, rows = Feed(bench.scene, bench.photos, bench.device), Workspace(), bench.scene.train_ids
+    feed, space, rows = (
+        PhotoLoader(bench.scene, bench.photos, bench.device),
+        Workspace(),
+        bench.scene.train_ids,
+    )
     rates: dict[str, float] = dict.fromkeys(PARAMETERS, 1e-9)
 
     def step(turn: int) -> list[Any]:

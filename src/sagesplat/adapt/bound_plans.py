@@ -22,12 +22,12 @@ class Costs:
 
     labels: tuple[int, ...]  # ids, ascending
     count: Int[np.ndarray, "L K"]  # Gaussians
-    sent: Int[np.ndarray, "L K"]  # bytes of the chunks
+    transfer_bytes: Int[np.ndarray, "L K"]  # bytes of the chunks
     gpu: Int[np.ndarray, "L K"]  # bytes on the viewer's GPU
 
     def of(self, unit: Unit) -> Int[np.ndarray, "L K"]:
         """The costs in a unit."""
-        return {"bytes": self.sent, "gpu-bytes": self.gpu, "count": self.count}[unit]
+        return {"bytes": self.transfer_bytes, "gpu-bytes": self.gpu, "count": self.count}[unit]
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ def plan_for_view(quality: Quality, costs: Costs, target: float, view: int) -> P
     """The cheapest levels whose bounds reach `target` in one view; "infeasible" where none does."""
     check_target(target)
     bound = quality.bound[view]
-    found = cheapest(bound, costs.sent, target)
+    found = cheapest(bound, costs.transfer_bytes, target)
     return Plan(float(target), view, _choices(found, bound, quality.distance[view], costs))
 
 
@@ -84,7 +84,7 @@ def plan_for_scene(
     check_target(target)
     check_share(share)
     bound = np.stack([_kept_in(quality.bound[shown[:, i] > 0, i], share) for i in range(len(costs.labels))])
-    found = cheapest(bound, costs.sent, target)
+    found = cheapest(bound, costs.transfer_bytes, target)
     nowhere = np.full(len(costs.labels), np.nan)
     return Plan(float(target), None, _choices(found, bound, nowhere, costs), float(share))
 
@@ -139,7 +139,7 @@ def _choices(
                 distance=float(distance[i]),
                 count=int(costs.count[i, level]),
                 status=status if known else "no model",
-                sent=int(costs.sent[i, level]),
+                transfer_bytes=int(costs.transfer_bytes[i, level]),
             )
         )
     return tuple(choices)

@@ -17,34 +17,36 @@ PREDICTORS = ("eq3", "mean", "bound", "oracle")
 
 
 @dataclass(frozen=True, eq=False)
-class Kept:
+class Decisions:
     """One row per (target, category, predictor); means are NaN where there is nothing to average."""
 
     target: Float[np.ndarray, " R"]  # SSIM
     label_id: Int[np.ndarray, " R"]
     predictor: np.ndarray  # [R] one of PREDICTORS
     views: Int[np.ndarray, " R"]  # that show the category and were measured at all of its levels
-    feasible: Int[np.ndarray, " R"]  # of them those in which the plan says that the target is met
+    accepted: Int[np.ndarray, " R"]  # of them those in which the plan says that the target is met
     kept: Int[np.ndarray, " R"]  # of those the ones in which the chosen level measures it
     overshoot: Float[np.ndarray, " R"]  # mean of measured - target over the feasible
     chosen: Int[np.ndarray, " R"]  # feasible with more than the cheapest level: a plan can overshoot less
     chosen_kept: Int[np.ndarray, " R"]
     chosen_overshoot: Float[np.ndarray, " R"]
-    refused: Int[np.ndarray, " R"]  # some level measures the target, yet the plan says that none does
+    false_rejections: Int[
+        np.ndarray, " R"
+    ]  # some level measures the target, yet the plan says that none does
     regret: Float[
         np.ndarray, " R"
     ]  # mean Gaussians above the cheapest level that would have done, where kept
 
-    def select(self, keep: np.ndarray) -> "Kept":
+    def select(self, keep: np.ndarray) -> "Decisions":
         """The rows that a boolean mask or an index array names."""
-        return Kept(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+        return Decisions(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
     def totals(self) -> dict[str, float]:
         """All rows together, every (category, view, target) weighing the same. NaN where there is none."""
-        sums = {name: int(getattr(self, name).sum()) for name in ("feasible", "chosen", "refused")}
-        weights = {"overshoot": self.feasible, "chosen_overshoot": self.chosen, "regret": self.kept}
+        sums = {name: int(getattr(self, name).sum()) for name in ("accepted", "chosen", "false_rejections")}
+        weights = {"overshoot": self.accepted, "chosen_overshoot": self.chosen, "regret": self.kept}
         means = {name: _mean(getattr(self, name)[n > 0], n[n > 0]) for name, n in weights.items()}
-        kept = _mean(self.kept / np.maximum(self.feasible, 1), self.feasible)
+        kept = _mean(self.kept / np.maximum(self.accepted, 1), self.accepted)
         chosen_kept = _mean(self.chosen_kept / np.maximum(self.chosen, 1), self.chosen)
         return {**sums, "kept": kept, "chosen_kept": chosen_kept, **means}
 
@@ -56,7 +58,7 @@ def score(
     counts: Counts,
     targets: Sequence[float],
     views: Int[np.ndarray, " U"] | None = None,
-) -> Kept:
+) -> Decisions:
     """Choose the cheapest level in each view (rows of Scene.views; default: test views) and measure it.
 
     `counts` holds the Gaussians of every (label id, level) of `promises`. Views not measured at all levels of
@@ -90,7 +92,7 @@ def score(
             for predictor, ssim in zip(PREDICTORS, says, strict=True):
                 key = {"target": target, "label_id": label_id, "predictor": predictor}
                 rows.append(key | _decide(ssim, measured, levels, sizes, target))
-    return Kept(**{f.name: np.array([row[f.name] for row in rows]) for f in fields(Kept)})
+    return Decisions(**{f.name: np.array([row[f.name] for row in rows]) for f in fields(Decisions)})
 
 
 def _decide(
@@ -99,18 +101,18 @@ def _decide(
     """Some columns of Kept for one category, target and predictor; SSIM predicted and measured [K, V]."""
     level, best = (choose(values, levels, counts, target) for values in (ssim, measured))
     got = measured[level, np.arange(len(level))]
-    feasible = (ssim >= target).any(0)
-    kept = feasible & (got >= target)
-    chosen = feasible & (counts[level] > counts.min())
+    accepted = (ssim >= target).any(0)
+    kept = accepted & (got >= target)
+    chosen = accepted & (counts[level] > counts.min())
     return {
         "views": len(level),
-        "feasible": int(feasible.sum()),
+        "accepted": int(accepted.sum()),
         "kept": int(kept.sum()),
-        "overshoot": _mean(got[feasible] - target),
+        "overshoot": _mean(got[accepted] - target),
         "chosen": int(chosen.sum()),
         "chosen_kept": int((chosen & kept).sum()),
         "chosen_overshoot": _mean(got[chosen] - target),
-        "refused": int(((measured >= target).any(0) & ~feasible).sum()),
+        "false_rejections": int(((measured >= target).any(0) & ~accepted).sum()),
         "regret": _mean((counts[level] - counts[best])[kept]),
     }
 

@@ -31,7 +31,7 @@ class Choice:
     distance: float  # of the view, world units; NaN in a scene and where unknown
     count: int  # Gaussians
     status: str  # one of STATUSES; "infeasible" is the best attainable, "no model" the highest level
-    sent: int | None = None  # bytes of its chunks; None where the ladder has none
+    transfer_bytes: int | None = None  # bytes of its chunks; None where the ladder has none
 
     @property
     def nbytes(self) -> int:
@@ -67,9 +67,9 @@ class Plan:
         return sum(choice.nbytes for choice in self.choices)
 
     @property
-    def sent(self) -> int | None:
+    def transfer_bytes(self) -> int | None:
         """Bytes of the chunks to send; None where the ladder has none."""
-        sizes = [choice.sent for choice in self.choices]
+        sizes = [choice.transfer_bytes for choice in self.choices]
         return None if None in sizes else sum(size for size in sizes if size is not None)
 
     @property
@@ -239,7 +239,7 @@ def _to_json(plan: Plan) -> dict[str, Any]:
     ]
     own = {f.name: getattr(plan, f.name) for f in fields(plan) if f.name != "choices"}
     own["target"] = None if math.isnan(plan.target) else plan.target
-    totals = {n: getattr(plan, n) for n in ("count", "nbytes", "sent", "status", "binding")}
+    totals = {n: getattr(plan, n) for n in ("count", "nbytes", "transfer_bytes", "status", "binding")}
     return {**own, **totals, "choices": choices}
 
 
@@ -258,7 +258,7 @@ def _from_json(entry: dict[str, Any]) -> Plan:
             distance=number(choice["distance"]),
             count=int(choice["count"]),
             status=str(choice["status"]),
-            sent=maybe(int, choice.get("sent")),
+            transfer_bytes=maybe(int, choice.get("transfer_bytes")),
         )
         for choice in entry["choices"]
     )

@@ -7,22 +7,25 @@ One kernel serves all levels of a category, only its amplitude differs. All that
     x        = (position / extent, direction, log distance): 7 numbers, 3 groups with a length scale each
     a(x, x') = sqrt(3 * sum over the groups of |x - x'|^2 / length^2)
     c(x, x') = (1 + a) exp(-a)                                        Matern 3/2
-    S_ij     = c(x_i, x_j) + unseen * u_i * u_j + noise * [i = j]     u: 0 at photos trained on, else 1
-    k_i      = c(x, x_i) + unseen * u_i
-    mean_k   = m_k(d) + sum_i k_i * weights_ik + shift                made monotone over the levels:
+    S_ij     = c(x_i, x_j) + heldout_variance * u_i * u_j + noise * [i = j]
+               u: 0 at photos trained on, else 1
+    k_i      = c(x, x_i) + heldout_variance * u_i
+    mean_k   = m_k(d) + sum_i k_i * weights_ik + composition_bias     made monotone over the levels:
                half of (the largest up to k + the smallest from k on), kept in [-1, 1]
-    spread_k = amplitudes_k * sqrt(1 + unseen + noise - k' S^-1 k)    S: n <= 200, one Cholesky factor
-    bound_k  = the largest over j <= k of mean_j - sqrt((factor * spread_j)^2 + mixing^2)
+    spread_k = amplitudes_k * sqrt(1 + heldout_variance + noise - k' S^-1 k)
+               S: n <= 200, one Cholesky factor
+    bound_k  = the largest over j <= k of mean_j - sqrt((multiplier * spread_j)^2 + composition_std^2)
     support  = max_i c(x, x_i)                                        1 at a known view, 0 far from all
 
-`unseen` is the variance of a constant by which views that training never saw differ: calibration views tell
-what it is. An unknown distance (NaN) counts as `usual` in x, and m_k is then the median.
+`heldout_variance` is the variance of a constant by which views that training never saw differ: calibration
+views tell what it is. An unknown distance (NaN) counts as `median_log_distance` in x, and m_k is then the
+median.
 
-`factor` makes the decisions come true, not each number: among calibration views, each predicted without
+`multiplier` makes the decisions come true, not each number: among calibration views, each predicted without
 itself, the cheapest level whose bound reaches a target may miss it for at most 1 - confidence of all targets
 that the plan calls feasible: conformal risk control (Angelopoulos et al. 2022). One more view that misses all
 its targets is counted in, as the quantile of split conformal prediction does (Vovk et al. 2005), with as many
-targets as a view has on average. Each category's own errors scale its factor as far as they are many, the
+targets as a view has on average. Each category's own errors scale its multiplier as far as they are many, the
 others' stand in for the rest. The promise is on average over views like the calibration views and over all
 categories together, as far as their errors are exchangeable: those of one view, and of views close together,
 are alike, so a single capture can stray from it by a few percent. Without enough calibration views (19 pairs
@@ -55,16 +58,26 @@ STATUSES = (
     "uncalibrated",  # too few in all: by training views left out of the fit, which look better than new ones
 )
 GROUPS = (slice(0, 3), slice(3, 6), slice(6, 7))  # of the inputs: position, direction, log distance
-# logs of the hyperparameters (lengths of GROUPS; unseen and noise over the amplitude's square): where they
-# are sought, one standard deviation of the prior, and the bounds in standard deviations
+# logs of the hyperparameters (lengths of GROUPS; heldout variance and noise over the amplitude's square):
+# where they are sought, one standard deviation of the prior, and the bounds in standard deviations
 PRIOR = np.log([0.3, 0.5, 0.5, 0.1, 0.1])
 PRIOR_WIDTH = np.array([0.7, 0.7, 0.7, 1.5, 1.5])
 PRIOR_REACH = 3.0
 FEW = 0.1  # SSIM that a category's spread is uncertain by if seen in one view; falls as 1 / views
 OWN_VIEWS = 8  # calibration views from which a category's own errors count more than those of the others
 EASY = 0.1  # SSIM; targets this far below the cheapest level's bound would hide misses of the others
-NUMBERS = ("extent", "usual", "unseen", "noise", "factor", "confidence", "rmse", "shift", "mixing")
-FACTORS = np.arange(4.0, -0.01, -0.02)  # widest bound first
+NUMBERS = (
+    "extent",
+    "median_log_distance",
+    "heldout_variance",
+    "noise",
+    "multiplier",
+    "confidence",
+    "rmse",
+    "composition_bias",
+    "composition_std",
+)
+MULTIPLIERS = np.arange(4.0, -0.01, -0.02)  # widest bound first
 
 
 class Prediction(NamedTuple):
@@ -83,20 +96,22 @@ class ViewModel:
     label_id: int
     curves: tuple[SsimModel, ...]  # Eq. 3 of each level, ascending
     extent: float  # of the scene, world units
-    usual: float  # log distance, for viewpoints that know none
+    median_log_distance: float  # log distance, for viewpoints that know none
     inputs: Float[np.ndarray, "n 7"]  # of training and calibration views: position / extent, direction, log d
-    unseen_inputs: Bool[np.ndarray, " n"]  # the calibration views
+    heldout_inputs: Bool[np.ndarray, " n"]  # the calibration views
     lengths: tuple[float, float, float]  # of the three groups of inputs
-    unseen: float  # variances over that of the process
+    heldout_variance: float  # variances over that of the process
     noise: float
     weights: Float[np.ndarray, "n K"]  # SSIM
     amplitudes: Float[np.ndarray, " K"]  # SSIM
-    factor: float  # conformal: spreads from mean to bound
+    multiplier: float  # conformal: spreads from mean to bound
     confidence: float  # share of feasible decisions that hold
     rmse: float  # of its views, each predicted without itself; SSIM over all levels
     status: str  # one of STATUSES
-    shift: float = 0.0  # what a category gains or loses where its neighbours are at other levels, SSIM
-    mixing: float = 0.0  # what to leave for that, SSIM
+    composition_bias: float = (
+        0.0  # what a category gains or loses where its neighbours are at other levels, SSIM
+    )
+    composition_std: float = 0.0  # what to leave for that, SSIM
 
     @property
     def levels(self) -> tuple[int, ...]:
@@ -111,12 +126,12 @@ class ViewModel:
     @property
     def num_calibration(self) -> int:
         """Those of them that training never saw."""
-        return int(self.unseen_inputs.sum())
+        return int(self.heldout_inputs.sum())
 
     @cached_property
-    def _factor(self) -> tuple[np.ndarray, bool]:
-        covariance = alike(self.inputs, self.inputs, self.lengths)
-        covariance += self.unseen * np.outer(self.unseen_inputs, self.unseen_inputs)
+    def _cholesky(self) -> tuple[np.ndarray, bool]:
+        covariance = matern32(self.inputs, self.inputs, self.lengths)
+        covariance += self.heldout_variance * np.outer(self.heldout_inputs, self.heldout_inputs)
         return cho_factor(covariance + self.noise * np.eye(self.num_views), lower=True)
 
     def predict(
@@ -130,32 +145,34 @@ class ViewModel:
         Distances to the category and positions in world units, NaN = distance unknown; unit directions of the
         camera's z.
         """
-        x = _inputs(distance, position, direction, self.extent, self.usual)
-        near = alike(x, self.inputs, self.lengths)
-        k = near + self.unseen * self.unseen_inputs
+        x = _inputs(distance, position, direction, self.extent, self.median_log_distance)
+        near = matern32(x, self.inputs, self.lengths)
+        k = near + self.heldout_variance * self.heldout_inputs
         mean = _at(self.curves, distance) + k @ self.weights
-        known = (k.T * cho_solve(self._factor, k.T)).sum(0)
-        variance = np.maximum(1 + self.unseen + self.noise - known, 0)
+        known = (k.T * cho_solve(self._cholesky, k.T)).sum(0)
+        variance = np.maximum(1 + self.heldout_variance + self.noise - known, 0)
         spread = np.sqrt(variance)[:, None] * self.amplitudes
-        return promise(mean + self.shift, spread, self.factor, near.max(1), self.mixing)
+        return promise(
+            mean + self.composition_bias, spread, self.multiplier, near.max(1), self.composition_std
+        )
 
 
 def promise(
     mean: Float[np.ndarray, "V K"],
     spread: Float[np.ndarray, "V K"],
-    factor: float | Float[np.ndarray, "V 1"],
+    multiplier: float | Float[np.ndarray, "V 1"],
     support: Float[np.ndarray, " V"],
-    mixing: float = 0.0,
+    composition_std: float = 0.0,
 ) -> Prediction:
     """Monotone mean and bound from the process's own mean and spread."""
     # Halfway between the largest so far and the smallest to come: as good as least squares, and one line.
     rising = np.maximum.accumulate(mean, 1)
     mean = np.clip((rising + np.minimum.accumulate(mean[:, ::-1], 1)[:, ::-1]) / 2, -1, 1)
-    low = mean - np.hypot(factor * spread, mixing)
+    low = mean - np.hypot(multiplier * spread, composition_std)
     return Prediction(mean, spread, np.maximum.accumulate(low, 1), support)
 
 
-def among_neighbours(
+def in_composition(
     models: Mapping[int, ViewModel], changes: Mapping[int, Float[np.ndarray, " n"]]
 ) -> dict[int, ViewModel]:
     """The models of categories in compositions, where their neighbours stand at other levels.
@@ -168,7 +185,7 @@ def among_neighbours(
         change = np.asarray(changes.get(label, ()), np.float64)
         if len(change):
             left = max(NormalDist().inv_cdf(model.confidence), 0.0) * float(change.std())
-            model = replace(model, shift=float(change.mean()), mixing=left)
+            model = replace(model, composition_bias=float(change.mean()), composition_std=left)
         found[label] = model
     return found
 
@@ -238,11 +255,11 @@ def _fit(
         return None
 
     measured = np.log(distance[distance > 0])
-    usual = float(np.median(measured)) if len(measured) else 0.0
+    median_log_distance = float(np.median(measured)) if len(measured) else 0.0
     cameras = [scene.views[row].camera for row in views]
     position, direction = (np.stack([getattr(c, of) for c in cameras]) for of in ("position", "direction"))
     extent = scene.extent if scene.extent > 0 else 1.0  # all cameras in one place
-    x = _inputs(distance, position, direction, extent, usual)
+    x = _inputs(distance, position, direction, extent, median_log_distance)
     u = np.isin(views, scene.calibration_ids)
     residual = ssim - _at(curves, distance)
     squares = [cdist(x[:, group], x[:, group], "sqeuclidean") for group in GROUPS]
@@ -253,20 +270,20 @@ def _fit(
     own = np.diag(inverse)[:, None]
     mean, spread, _, _ = promise(ssim - weights / own, amplitudes / np.sqrt(own), 0.0, np.ones(len(views)))
     left_out = _LeftOut(ssim, mean, spread)
-    position_length, direction_length, distance_length, unseen, noise = np.exp(theta).tolist()
+    position_length, direction_length, distance_length, heldout_variance, noise = np.exp(theta).tolist()
     model = ViewModel(
         label_id=curves[0].label_id,
         curves=curves,
         extent=extent,
-        usual=usual,
+        median_log_distance=median_log_distance,
         inputs=x,
-        unseen_inputs=u,
+        heldout_inputs=u,
         lengths=(position_length, direction_length, distance_length),
-        unseen=unseen,
+        heldout_variance=heldout_variance,
         noise=noise,
         weights=weights,
         amplitudes=amplitudes,
-        factor=0.0,
+        multiplier=0.0,
         confidence=confidence,
         rmse=float(np.sqrt(np.mean((mean - ssim) ** 2))),
         status="uncalibrated",
@@ -279,32 +296,36 @@ def _at(curves: tuple[SsimModel, ...], distance: np.ndarray) -> np.ndarray:
 
 
 def _inputs(
-    distance: np.ndarray, position: np.ndarray, direction: np.ndarray, extent: float, usual: float
+    distance: np.ndarray,
+    position: np.ndarray,
+    direction: np.ndarray,
+    extent: float,
+    median_log_distance: float,
 ) -> np.ndarray:
     known = np.isfinite(distance) & (distance > 0)
-    log_distance = np.where(known, np.log(np.where(known, distance, 1.0)), usual)
+    log_distance = np.where(known, np.log(np.where(known, distance, 1.0)), median_log_distance)
     return np.column_stack([position / extent, direction, log_distance]).astype(np.float64)
 
 
-def alike(
+def matern32(
     a: Float[np.ndarray, "A 7"], b: Float[np.ndarray, "B 7"], lengths: Sequence[float]
 ) -> Float[np.ndarray, "A B"]:
     """c(x, x') of the module's text, for all pairs of inputs."""
     scale = np.repeat(lengths, [group.stop - group.start for group in GROUPS])
-    away = np.sqrt(3) * cdist(a / scale, b / scale)
-    return (1 + away) * np.exp(-away)
+    scaled_distance = np.sqrt(3) * cdist(a / scale, b / scale)
+    return (1 + scaled_distance) * np.exp(-scaled_distance)
 
 
 def _terms(
     squares: list[np.ndarray], u: np.ndarray, theta: np.ndarray
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """S and its derivatives by the log hyperparameters, from squared distances in each group, [n, n] each."""
-    *lengths, unseen, noise = np.exp(theta)
+    *lengths, heldout_variance, noise = np.exp(theta)
     scaled = [3 * square / length**2 for square, length in zip(squares, lengths, strict=True)]
-    away = np.sqrt(np.sum(scaled, 0))
-    fall = np.exp(-away)
-    offset, own = unseen * np.outer(u, u), noise * np.eye(len(u))
-    return (1 + away) * fall + offset + own, [*(s * fall for s in scaled), offset, own]
+    scaled_distance = np.sqrt(np.sum(scaled, 0))
+    exp_neg_r = np.exp(-scaled_distance)
+    offset, own = heldout_variance * np.outer(u, u), noise * np.eye(len(u))
+    return (1 + scaled_distance) * exp_neg_r + offset + own, [*(s * exp_neg_r for s in scaled), offset, own]
 
 
 def _inverse(S: np.ndarray) -> np.ndarray:
@@ -317,7 +338,7 @@ def _variances(residual: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def _hyperparameters(squares: list[np.ndarray], u: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """Logs of lengths, unseen and noise: marginal likelihood averaged over the levels, times the prior."""
+    """Logs of lengths, heldout variance and noise: marginal likelihood, mean over levels, times the prior."""
 
     def cost(theta: np.ndarray) -> tuple[float, np.ndarray]:
         S, slopes = _terms(squares, u, theta)
@@ -339,23 +360,23 @@ def _calibrated(models: list[ViewModel], left_out: list[_LeftOut], confidence: f
     if not models:
         return []
     own = [
-        _LeftOut(*(part[m.unseen_inputs] for part in out)) for m, out in zip(models, left_out, strict=True)
+        _LeftOut(*(part[m.heldout_inputs] for part in out)) for m, out in zip(models, left_out, strict=True)
     ]
-    proven = sum(len(out.ssim) for out in own) >= _fewest(confidence)
-    used = own if proven else left_out
+    calibrated = sum(len(out.ssim) for out in own) >= _fewest(confidence)
+    used = own if calibrated else left_out
     errors = [out.errors for out in used]
-    usual = OWN_VIEWS * np.concatenate(errors).mean()
+    median_log_distance = OWN_VIEWS * np.concatenate(errors).mean()
     # what a category's scale is without the view that it is tried on
-    tried = [np.sqrt((usual + e.sum() - e) / (OWN_VIEWS + len(e) - 1)) for e in errors]
-    factor = _decision_factor(used, tried, confidence)
-    if factor is None:  # a scene of a few views: as if errors were Gaussian
+    tried = [np.sqrt((median_log_distance + e.sum() - e) / (OWN_VIEWS + len(e) - 1)) for e in errors]
+    multiplier = _conformal_multiplier(used, tried, confidence)
+    if multiplier is None:  # a scene of a few views: as if errors were Gaussian
         gaussian = max(NormalDist().inv_cdf(confidence), 0.0)
-        return [replace(model, factor=gaussian) for model in models]
+        return [replace(model, multiplier=gaussian) for model in models]
     done = []
     for model, e in zip(models, errors, strict=True):
-        scale = math.sqrt((usual + e.sum()) / (OWN_VIEWS + len(e)))
-        status = "uncalibrated" if not proven else "calibrated" if len(e) >= OWN_VIEWS else "pooled"
-        done.append(replace(model, factor=factor * scale, status=status))
+        scale = math.sqrt((median_log_distance + e.sum()) / (OWN_VIEWS + len(e)))
+        status = "uncalibrated" if not calibrated else "calibrated" if len(e) >= OWN_VIEWS else "pooled"
+        done.append(replace(model, multiplier=multiplier * scale, status=status))
     return done
 
 
@@ -364,8 +385,8 @@ def _fewest(confidence: float) -> float:
     return confidence / (1 - confidence) - 1e-9
 
 
-def _decision_factor(used: list[_LeftOut], scales: list[np.ndarray], confidence: float) -> float | None:
-    """The smallest factor from which on decisions miss no more than they may; None from too few views."""
+def _conformal_multiplier(used: list[_LeftOut], scales: list[np.ndarray], confidence: float) -> float | None:
+    """The smallest multiplier from which on decisions miss no more than they may; None from too few views."""
     widest = max(out.ssim.shape[1] for out in used)
     # a category with fewer levels repeats its last: no decision falls there
     ssim, mean, spread = (
@@ -375,12 +396,12 @@ def _decision_factor(used: list[_LeftOut], scales: list[np.ndarray], confidence:
     if len(ssim) < _fewest(confidence):
         return None
     spread *= np.concatenate(scales)[:, None]
-    best = FACTORS[0]
-    for factor in FACTORS:
-        missed, asked = decisions(ssim, promise(mean, spread, factor, np.empty(0)).bound)
-        if missed.sum() + asked.mean() > (1 - confidence) * (asked.sum() + asked.mean()):
+    best = MULTIPLIERS[0]
+    for multiplier in MULTIPLIERS:
+        violated, total_risk = decisions(ssim, promise(mean, spread, multiplier, np.empty(0)).bound)
+        if violated.sum() + total_risk.mean() > (1 - confidence) * (total_risk.sum() + total_risk.mean()):
             break
-        best = factor
+        best = multiplier
     return float(best)
 
 
@@ -393,8 +414,8 @@ def decisions(
     EASY below the lowest bound are left out of both.
     """
     below = np.concatenate([bound[:, :1] - EASY, bound[:, :-1]], 1)
-    missed = np.maximum(bound - np.maximum(below, ssim), 0).sum(1)
-    return missed, bound[:, -1] - below[:, 0]
+    violated = np.maximum(bound - np.maximum(below, ssim), 0).sum(1)
+    return violated, bound[:, -1] - below[:, 0]
 
 
 def write_promises(path: Path, models: Mapping[int, ViewModel]) -> None:
@@ -425,7 +446,7 @@ def _from_json(entry: dict[str, Any]) -> ViewModel:
         np.array(entry[k], np.float64) for k in ("inputs", "weights", "amplitudes")
     )
     numbers = {name: float(entry[name]) for name in NUMBERS}
-    u = np.array(entry["unseen_inputs"], bool)
+    u = np.array(entry["heldout_inputs"], bool)
     n = len(u)
     shapes = (inputs.shape, weights.shape, amplitudes.shape)
     if not n or u.shape != (n,) or not curves or shapes != ((n, 7), (n, len(curves)), (len(curves),)):
@@ -433,14 +454,18 @@ def _from_json(entry: dict[str, Any]) -> ViewModel:
     finite = all(
         np.isfinite(a).all() for a in (inputs, weights, amplitudes, (x, y, z), list(numbers.values()))
     )
-    if not finite or min(x, y, z, numbers["extent"], numbers["noise"]) <= 0 or numbers["unseen"] < 0:
+    if (
+        not finite
+        or min(x, y, z, numbers["extent"], numbers["noise"]) <= 0
+        or numbers["heldout_variance"] < 0
+    ):
         raise ValueError("numbers out of range")
     if entry["status"] not in STATUSES:
         raise ValueError(f"unknown status {entry['status']!r}")
     return ViewModel(
         label_id=int(entry["label_id"]),
         curves=curves,
-        unseen_inputs=u,
+        heldout_inputs=u,
         lengths=(x, y, z),
         status=entry["status"],
         inputs=inputs,

@@ -141,7 +141,7 @@ def parts(run: Run, machine: Annotated[Machine, Flat] = Machine()) -> None:
     from sagesplat.stages import blocks
 
     with open_job(run, machine) as job:
-        blocks.make_parts(job)
+        blocks.label_block_categories(job)
 
 
 @command

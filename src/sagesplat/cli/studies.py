@@ -64,14 +64,14 @@ def online(
         machine: where and how to compute.
     """
     from sagesplat.core.events import TableMade
-    from sagesplat.studies.early_stopping import compare_online
+    from sagesplat.studies.early_stopping import compare_early_stopping
 
     out = out or stopped / "online"
     with (
         open_job(stopped, machine, "snapshots") as job_online,
         open_job(full, machine, "snapshots") as job_full,
     ):
-        table, _ = compare_online(job_online, job_full, out)
+        table, _ = compare_early_stopping(job_online, job_full, out)
         job_online.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
     print(out)
 

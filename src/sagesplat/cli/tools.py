@@ -35,11 +35,11 @@ def export(
         ladder: the ladder to take them from.
         machine: where and how to compute.
     """
-    from sagesplat.stages.export import export_chunks, export_ply
+    from sagesplat.stages.export import export_increments, export_ply
 
     with open_job(run, machine, ladder) as job:
         if chunks:
-            count = export_chunks(job, out, chunks)
+            count = export_increments(job, out, chunks)
         else:
             count = export_ply(job, out, level=level, labels=labels, target=target_ssim)
     print(f"{out}: {count:,} {'chunks' if chunks else 'Gaussians'}")

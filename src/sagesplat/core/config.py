@@ -91,7 +91,7 @@ class TrainConfig:
     """3D Gaussian splatting as published. Step numbers are for a 30 000-step run and scale with max_steps."""
 
     max_steps: int = 7000
-    pace: Literal["fast", "published"] = "fast"
+    lr_schedule: Literal["fast", "published"] = "fast"
     """fast: larger steps at first, and smaller photos where they tell as much; published: 3DGS's rates."""
     level_every: int = 0
     """Record a level every so many steps (0: a thirtieth of max_steps)."""
@@ -141,7 +141,7 @@ class TrainConfig:
     """Record a level that falls on an opacity reset right after it (as the paper may have), not before."""
     freeze_at: float | None = None
     """Stop each category when its mean SSIM on the training views reaches this (Fig. 1 of the paper)."""
-    rest_share: float = 0.0
+    gradient_freeze_share: float = 0.0
     """To compare with: after densification, the Gaussians whose gradients are within this smallest share rest
     every other hundred steps (GSta). A run that is interrupted then goes on a little differently."""
 
@@ -160,7 +160,7 @@ class BlocksConfig:
     far_share: float = 0.5
     """Points beyond the margin that a block begins with too, at most, as a share of its own: the background
     of its photos."""
-    seam_steps: int = 300
+    boundary_steps: int = 300
     """Training steps along the borders of each block, when the blocks are put together."""
 
 
@@ -176,9 +176,9 @@ class NestConfig:
     """Share of a category's Gaussians in its lowest level."""
     drawn_from: float = 0.05
     """Share of a category in the smallest prefix that training looks at: fewer serve easy categories only."""
-    seed_share: float = 0.2
+    base_share: float = 0.2
     """Share of the Gaussians, the first of all, that a small 3DGS-MCMC training makes; 0: none."""
-    seed_steps: int = 3000
+    base_steps: int = 3000
     """Steps of that training."""
     full_share: float = 0.1
     """Share of the steps that look at everything, to begin with."""
@@ -188,7 +188,7 @@ class NestConfig:
     """Bits of harmonics in the chunks, of degree 1 and of those above; training gets used to them."""
     criterion: Literal["weight", "weight-volume", "peak", "sensitivity", "opacity"] = "sensitivity"
     """What orders the Gaussians of a category; docs/nested.md compares them."""
-    gain: float = 4.0
+    lr_multiplier: float = 4.0
     """Rates to begin with, times those of a published run's last third; they fall to a twentieth."""
 
 

@@ -25,7 +25,7 @@ _GPU_BYTES = (16, 24, 40, 56)  # of a splat in Spark 2.2, by degree of its harmo
 
 
 @dataclass(frozen=True)
-class Chunk:
+class Increment:
     """What a level adds to the one below it."""
 
     label_id: int
@@ -59,7 +59,7 @@ def increments(g: Gaussians, sizes: Mapping[int, Sequence[int]]) -> list[tuple[i
     return parts
 
 
-def write_chunks(
+def write_increments(
     folder: Path,
     g: Gaussians,
     sizes: Mapping[int, Sequence[int]],
@@ -68,7 +68,7 @@ def write_chunks(
     kind: Format = "spz",
     sh_bits: tuple[int, int] = SH_BITS,
     antialiased: bool = False,
-) -> list[Chunk]:
+) -> list[Increment]:
     """Write a ladder's increments and an index of them into a folder of their own, which is replaced."""
     chunks = []
     with atomic_folder(folder) as fresh:
@@ -85,16 +85,16 @@ def write_chunks(
             uri = f"{slug}-{level:02d}-{digest[:12]}.{kind}"
             temporary.rename(fresh / uri)
             gpu = len(part) * _GPU_BYTES[part.sh_degree]
-            chunks.append(Chunk(label, level, uri, len(part), len(content), gpu, digest))
+            chunks.append(Increment(label, level, uri, len(part), len(content), gpu, digest))
         write_json(fresh / INDEX, {"format": kind, "chunks": [asdict(chunk) for chunk in chunks]})
     return chunks
 
 
-def read_index(folder: Path) -> list[Chunk]:
+def read_index(folder: Path) -> list[Increment]:
     """The index that `write_chunks` wrote; DataError for unusable content."""
     document: Any = read_json(folder / INDEX)
     try:
-        chunks = [Chunk(**entry) for entry in document["chunks"]]
+        chunks = [Increment(**entry) for entry in document["chunks"]]
         for chunk in chunks:
             _check(chunk)
     except (KeyError, TypeError, ValueError) as error:
@@ -104,7 +104,7 @@ def read_index(folder: Path) -> list[Chunk]:
     return chunks
 
 
-def _check(chunk: Chunk) -> None:
+def _check(chunk: Increment) -> None:
     """ValueError for an entry that no ladder has, such as a file outside the folder."""
     sizes = (chunk.level, chunk.count, chunk.nbytes, chunk.gpu_bytes)
     if not all(type(size) is int and 0 < size < 2**53 for size in sizes):
@@ -117,14 +117,14 @@ def _check(chunk: Chunk) -> None:
         raise ValueError(f"{chunk.sha256!r} is no SHA-256")
 
 
-def read_chunks(folder: Path, chunks: Sequence[Chunk]) -> Gaussians:
+def read_increments(folder: Path, chunks: Sequence[Increment]) -> Gaussians:
     """What SPZ chunks hold, one after the other; DataError for a broken one."""
     if not chunks:
         raise DataError(f"{folder}: no chunks; run `sagesplat nest` again")
     return concat([read_spz(folder / chunk.uri, chunk.label_id) for chunk in chunks])
 
 
-def totals(chunks: Sequence[Chunk], labels: Sequence[int], levels: int, what: str) -> np.ndarray:
+def totals(chunks: Sequence[Increment], labels: Sequence[int], levels: int, what: str) -> np.ndarray:
     """A column of the chunks summed up to each level: int64 [L, K] for rows `labels` and levels 1 to K.
 
     DataError for a chunk of another category or level.

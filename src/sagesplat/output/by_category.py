@@ -79,7 +79,7 @@ def _together(label: int, choices: Sequence[Choice]) -> Choice:
     if len(choices) == 1:
         return replace(choices[0], label_id=label)
     states = {choice.status for choice in choices}
-    sent = [choice.sent for choice in choices if choice.sent is not None]
+    transfer_bytes = [choice.transfer_bytes for choice in choices if choice.transfer_bytes is not None]
     return Choice(
         label,
         max(choice.level for choice in choices),
@@ -87,7 +87,7 @@ def _together(label: int, choices: Sequence[Choice]) -> Choice:
         _least([choice.distance for choice in choices]),
         sum(choice.count for choice in choices),
         next(status for status in ("infeasible", "ok", "no model") if status in states),
-        sum(sent) if len(sent) == len(choices) else None,
+        sum(transfer_bytes) if len(transfer_bytes) == len(choices) else None,
     )
 
 

@@ -22,7 +22,7 @@ from sagesplat.output import figures, tables
 from sagesplat.output.by_category import Categories, merged, merged_counts, merged_plan, relabelled
 from sagesplat.output.figures import Colours, Panel
 from sagesplat.output.tables import MB, Table, name_of
-from sagesplat.segment.parts import category_of
+from sagesplat.segment.block_categories import category_of
 
 PICTURE_WIDTH = 1400  # pixels of a picture inside the page; the files beside it keep their size
 FIT_LEVELS = 4  # levels drawn in the figure of SSIM over distance

@@ -82,7 +82,7 @@ def split(items: Sequence[Item], parts: int) -> list[Sequence[Item]]:
     return [items[a:b] for a, b in pairwise(ends)]
 
 
-class Together:
+class ProgressAggregator:
     """Passes on what tasks tell; those of one name as if they were one.
 
     Their progress is summed (who has not told any yet counts as the mean of the others), and what several of
@@ -136,7 +136,7 @@ class Together:
         self._emit(Progress(name, round(reached), round(whole), text))
 
 
-class Post:
+class EventBuffer:
     """Keeps what tasks tell until it is fetched: an actor, which may be lost with what it holds."""
 
     def __init__(self) -> None:

@@ -89,14 +89,16 @@ class Job:
         return (self.run.blocks / "blocks.json").exists()
 
     @property
-    def has_parts(self) -> bool:
+    def has_block_categories(self) -> bool:
         """Whether each category in each block is one of its own by now."""
-        return (self.run.parts / "labels.json").exists()
+        return (self.run.block_categories / "labels.json").exists()
 
     @property
     def taxonomy(self) -> Taxonomy:
         """The names of the run's categories."""
-        return Taxonomy.read((self.run.parts if self.has_parts else self.run.masks) / "labels.json")
+        return Taxonomy.read(
+            (self.run.block_categories if self.has_block_categories else self.run.masks) / "labels.json"
+        )
 
     @cached_property
     def masks(self) -> Masks:
@@ -112,12 +114,14 @@ class Job:
     @property
     def best_masks(self) -> Masks:
         """The same, of the parts that a scene in blocks has."""
-        return Masks(self.run.parts, self.taxonomy) if self.has_parts else self.whole_masks
+        return (
+            Masks(self.run.block_categories, self.taxonomy) if self.has_block_categories else self.whole_masks
+        )
 
     @property
     def point_labels(self) -> np.ndarray:
         """Category of each SfM point."""
-        path = self.run.part_labels if self.has_parts else self.run.labels
+        path = self.run.block_category_labels if self.has_block_categories else self.run.labels
         return LiftedLabels.read(path, len(self.scene.points.xyz)).label_ids
 
     @cached_property

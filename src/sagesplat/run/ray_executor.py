@@ -18,8 +18,8 @@ from sagesplat import __version__
 from sagesplat.core.errors import RunError, short
 from sagesplat.core.events import Emit, Event, Warned
 from sagesplat.io.files import write_text
-from sagesplat.run.executor import Post, Task, Together
-from sagesplat.run.ray_task import ANSWER, Failed, Place, do
+from sagesplat.run.executor import EventBuffer, ProgressAggregator, Task
+from sagesplat.run.ray_task import ANSWER, Failed, WorkerEnvironment, run_task
 
 _TRIES = 3  # of a task, after the first
 _POLL = 0.1  # seconds between two looks at what happened
@@ -37,10 +37,12 @@ class RayExecutor:
         self.backend: Literal["cuda"] | None = backend
         self._threads, self._gpus = threads, gpus
         # named as temporary files are: the next stage removes what a killed driver left
-        self._place = Place(folder.absolute() / f".cluster.tmp-{uuid.uuid4().hex[:12]}", Path.cwd())
+        self._place = WorkerEnvironment(
+            folder.absolute() / f".cluster.tmp-{uuid.uuid4().hex[:12]}", Path.cwd()
+        )
         near = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=True)
         options = {"num_cpus": 0, "max_restarts": -1, "scheduling_strategy": near}
-        self._post: Any = ray.remote(**options)(Post).remote()
+        self._post: Any = ray.remote(**options)(EventBuffer).remote()
         self._taking: Any = None
 
     @property
@@ -67,7 +69,7 @@ class RayExecutor:
         for task in tasks:
             self._check_possible(task)
         write_text(self._place.marker, "")
-        run, together = uuid.uuid4().hex, Together(tasks, emit)
+        run, together = uuid.uuid4().hex, ProgressAggregator(tasks, emit)
         pending = {self._submit(task, run, number): number for number, task in enumerate(tasks)}
         lost, at = dict.fromkeys(range(len(tasks)), 0), dict[int, str]()
         active, said = time.monotonic(), False
@@ -112,7 +114,7 @@ class RayExecutor:
         asked = {"num_cpus": cpus, "num_gpus": task.gpus, "max_retries": 0, "scheduling_strategy": "SPREAD"}
         if task.memory:
             asked["memory"] = task.memory
-        return ray.remote(**asked)(do).remote(task, self._place, self._post, run, number, cpus)
+        return ray.remote(**asked)(run_task).remote(task, self._place, self._post, run, number, cpus)
 
     def _result(self, done: Any) -> Any:
         """What a task returned; its own error where it raised one, RayError where it was lost."""
@@ -128,7 +130,7 @@ class RayExecutor:
                 raise cause from error  # which shows where it came from
             raise
 
-    def _listen(self, run: str, together: Together, at: dict[int, str], wait: float) -> None:
+    def _listen(self, run: str, together: ProgressAggregator, at: dict[int, str], wait: float) -> None:
         """Pass on what the tasks told; all of it that came before now, where there is time to `wait`."""
         told: list[tuple[str, int, Event | str]] = []
         try:

@@ -31,7 +31,7 @@ class Failed:
 
 
 @dataclass(frozen=True)
-class Place:
+class WorkerEnvironment:
     """What a task has to find on its node."""
 
     marker: Path  # a file of ours in the folder that all nodes share
@@ -39,13 +39,15 @@ class Place:
     version: str = __version__
 
 
-def do(task: Task, place: Place, post: Any, run: str, number: int, threads: int) -> Any:
+def run_task(
+    task: Task, environment: WorkerEnvironment, post: Any, run: str, number: int, threads: int
+) -> Any:
     """A task, in a process of its node; `Failed` where the user has to mend something."""
     tell = _Tell(post, run, number)
     try:
-        _check(place)
+        _check(environment)
         with suppress(OSError):
-            os.chdir(place.cwd)
+            os.chdir(environment.cwd)
         _set_threads(threads)
         return task.function(*task.arguments, tell)
     except SageError as error:
@@ -54,19 +56,19 @@ def do(task: Task, place: Place, post: Any, run: str, number: int, threads: int)
         tell.flush()
 
 
-def _check(place: Place) -> None:
+def _check(environment: WorkerEnvironment) -> None:
     """RunError on a node that does not see the run folder, or has another version of this package."""
     host = socket.gethostname()
-    if place.version != __version__:
+    if environment.version != __version__:
         raise RunError(
-            f"{host} has sagesplat {__version__}, not {place.version}; install the same on all nodes"
+            f"{host} has sagesplat {__version__}, not {environment.version}; install the same on all nodes"
         )
     end = time.monotonic() + _VISIBLE
-    while not place.marker.exists():
+    while not environment.marker.exists():
         if time.monotonic() > end:
             raise RunError(
-                f"{place.marker.parent}: {host} does not see this folder; all nodes need it under this path, "
-                "on a disk that they share"
+                f"{environment.marker.parent}: {host} does not see this folder; all nodes need it under this "
+                "path, on a disk that they share"
             )
         time.sleep(_POLL)
 

@@ -11,11 +11,21 @@ from sagesplat import __version__
 from sagesplat.core.errors import RunError
 from sagesplat.io.files import read_json, write_json
 
-FORMAT = 2  # of the run folder; raised when older folders can no longer be read
+FORMAT = 3  # of the run folder; raised when older folders can no longer be read
 
 LadderKind = Literal["nested", "snapshots"]
 # stages that all ladders of a run share
-_BEFORE_LADDERS = ("poses", "scene", "segment", "masks", "lift", "blocks", "train", "fuse", "parts")
+_BEFORE_LADDERS = (
+    "poses",
+    "scene",
+    "segment",
+    "masks",
+    "lift",
+    "blocks",
+    "train",
+    "fuse",
+    "block_categories",
+)
 
 
 @dataclass(frozen=True)
@@ -95,24 +105,24 @@ class RunDir:
         return RunDir(self.blocks / f"{number:03d}", self.ladder)
 
     @property
-    def core(self) -> Path:
+    def interior(self) -> Path:
         """Of a block: what it adds to the nested ladder of the whole."""
-        return self.adapted / "core.npz"
+        return self.adapted / "interior.npz"
 
     @property
-    def seamed(self) -> Path:
+    def tuned_interior(self) -> Path:
         """Of a block: the same, tuned along its borders."""
-        return self.adapted / "seamed.npz"
+        return self.adapted / "tuned_interior.npz"
 
     @property
-    def parts(self) -> Path:
+    def block_categories(self) -> Path:
         """Label images of the parts of a large scene, a category in a block each, and their points."""
-        return self.path / "parts"
+        return self.path / "block_categories"
 
     @property
-    def part_labels(self) -> Path:
+    def block_category_labels(self) -> Path:
         """Part of each SfM point."""
-        return self.parts / "labels.npz"
+        return self.block_categories / "labels.npz"
 
     @property
     def prefixes(self) -> Path:
@@ -120,14 +130,14 @@ class RunDir:
         return self.adapted / "ladder.npz"
 
     @property
-    def seeds(self) -> Path:
+    def base_model(self) -> Path:
         """The small model that the nested ladder begins with."""
-        return self.adapted / "seeds.npz"
+        return self.adapted / "base.npz"
 
     @property
-    def chunks(self) -> Path:
+    def increments(self) -> Path:
         """What each level of each category adds, as it is sent, with index.json."""
-        return self.adapted / "chunks"
+        return self.adapted / "increments"
 
     @property
     def nest_checkpoint(self) -> Path:
@@ -170,9 +180,9 @@ class RunDir:
         return self.adapted / "cross_view.csv"
 
     @property
-    def occupancy(self) -> Path:
+    def same_size(self) -> Path:
         """Compositions and 3DGS of the same size."""
-        return self.adapted / "occupancy.csv"
+        return self.adapted / "same_size.csv"
 
     @property
     def report(self) -> Path:

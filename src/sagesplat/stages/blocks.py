@@ -2,7 +2,7 @@
 
 A block is a run folder of its own, RUN/blocks/NNN, whose capture is a part of the scene: it is trained and
 nested like any other, on whatever node, and goes on where it was killed. Put together, each category in each
-block is a category of its own (`segment.parts`), which all later stages take as they take any other.
+block is a category of its own (`segment.block_categories`), and all later stages take it like any other.
 """
 
 import shutil
@@ -36,14 +36,14 @@ from sagesplat.scene.blocks import (
 )
 from sagesplat.scene.scene import Scene
 from sagesplat.scene.stored import write_scene
+from sagesplat.segment.block_categories import BlockCategories
 from sagesplat.segment.lift import LiftedLabels
 from sagesplat.segment.masks import mask_path, prepare_folder, write_labels, write_mask
-from sagesplat.segment.parts import Parts
 from sagesplat.stages.nest import nest_levels, write_ladder
 from sagesplat.stages.shared import train_config
 from sagesplat.stages.train import train_levels
 from sagesplat.train import memory, nested
-from sagesplat.train.boundaries import around, core, core_sizes, seam_views, together
+from sagesplat.train.boundaries import around, boundary_views, interior, interior_sizes, together
 from sagesplat.train.nested import Nested, NestStep
 
 _SEEN = 0.01  # of the points in a photo: then it sees the block
@@ -56,7 +56,7 @@ def check(config: BlocksConfig) -> None:
         ("margin", config.margin, 0 <= config.margin <= 2, "a share such as 0.2"),
         ("min-share", config.min_share, 0 < config.min_share <= 1, "a share such as 0.25"),
         ("far-share", config.far_share, config.far_share >= 0, "a share such as 0.5"),
-        ("seam-steps", config.seam_steps, config.seam_steps >= 0, "0 or more"),
+        ("seam-steps", config.boundary_steps, config.boundary_steps >= 0, "0 or more"),
     )
     for name, value, fine, cure in wrong:
         if not fine:
@@ -148,7 +148,7 @@ def train_blocks(job: Job, config: BlocksConfig, train: TrainConfig, seed: int) 
     settings = {**asdict(train), "batch": max(train.batch, job.processes), "seed": seed}
     settings["blocks"] = _division(config)
     blocks = divide(job, config, seed)
-    parts = Parts(job.masks.taxonomy, len(blocks))
+    parts = BlockCategories(job.masks.taxonomy, len(blocks))
 
     def make() -> list[str]:
         tasks = []
@@ -170,7 +170,7 @@ def train_block(spec: JobSpec, number: int, config: TrainConfig, seed: int, emit
     train_levels(spec.open(named(emit, f"block {number}")), config, seed)
 
 
-def _merge_levels(run: RunDir, blocks: Blocks, parts: Parts) -> int:
+def _merge_levels(run: RunDir, blocks: Blocks, parts: BlockCategories) -> int:
     """Record the levels of all blocks together, each inside its border; the size of the last one."""
     ladders = [read_ladder(run.block(number).levels) for number in range(len(blocks))]
     shutil.rmtree(run.levels, ignore_errors=True)
@@ -179,7 +179,7 @@ def _merge_levels(run: RunDir, blocks: Blocks, parts: Parts) -> int:
         # blocks in which all categories stopped have ended before
         files = [[f for f in ladder.files if f.step <= step][-1:] for ladder in ladders]
         cores = [
-            core(read_level(f.path), blocks, parts, number)[0]
+            interior(read_level(f.path), blocks, parts, number)[0]
             for number, found in enumerate(files)
             for f in found
         ]
@@ -198,19 +198,19 @@ def _merge_levels(run: RunDir, blocks: Blocks, parts: Parts) -> int:
     return count
 
 
-def make_parts(job: Job) -> None:
+def label_block_categories(job: Job) -> None:
     """Draw which part each pixel shows: its category, in the block whose Gaussians paint most of it."""
     run = job.run
     blocks, masks = read_blocks(run.blocks / "blocks.json"), job.whole_masks
-    parts = Parts(masks.taxonomy, len(blocks))
+    parts = BlockCategories(masks.taxonomy, len(blocks))
 
     def make() -> list[str]:
         scene, names = job.scene, parts.names
         g = job.snapshots.load(job.snapshots.levels[-1])
         by_block = replace(g, label_ids=torch.from_numpy(parts.block_of(g.label_ids.numpy())))
         painted = RenderedLabels(by_block, job.backend, job.antialiased)
-        shutil.rmtree(run.parts, ignore_errors=True)
-        paths = prepare_folder(run.parts, scene.views)
+        shutil.rmtree(run.block_categories, ignore_errors=True)
+        paths = prepare_folder(run.block_categories, scene.views)
         occurring = set(g.counts())
         for row, (view, path) in enumerate(zip(scene.views, paths, strict=True)):
             shown = painted[view]
@@ -221,14 +221,16 @@ def make_parts(job: Job) -> None:
             job.emit(Progress("parts", row + 1, len(scene.views)))
         lifted = LiftedLabels.read(run.labels, len(scene.points.xyz))
         ids = parts.ids(lifted.label_ids, blocks.of(scene.points.xyz))
-        replace(lifted, label_ids=ids).write(run.part_labels)
-        write_labels(run.parts, names, occurring | set(np.unique(ids).tolist()))
+        replace(lifted, label_ids=ids).write(run.block_category_labels)
+        write_labels(run.block_categories, names, occurring | set(np.unique(ids).tolist()))
         return [f"{len(occurring)} parts of {len(masks.taxonomy.names)} categories in {len(blocks)} blocks"]
 
     inputs = [run.provenance("masks"), run.labels, run.levels, run.blocks / "blocks.json"]
     if masks.folder == run.fused:
         inputs.append(run.provenance("fuse"))
-    run_stage(job, "parts", {}, inputs, [run.parts / "labels.json", run.part_labels], make)
+    run_stage(
+        job, "parts", {}, inputs, [run.block_categories / "labels.json", run.block_category_labels], make
+    )
 
 
 def nest_blocks(job: Job, config: BlocksConfig, nest: NestConfig, seed: int) -> None:
@@ -236,7 +238,7 @@ def nest_blocks(job: Job, config: BlocksConfig, nest: NestConfig, seed: int) -> 
     run, file = job.run, job.run.blocks / "blocks.json"
     nested.check(nest)
     blocks = read_blocks(file)
-    settings = {**asdict(nest), "seed": seed, "seam_steps": config.seam_steps}
+    settings = {**asdict(nest), "seed": seed, "seam_steps": config.boundary_steps}
 
     def make() -> list[str]:
         every = range(len(blocks))
@@ -246,15 +248,15 @@ def nest_blocks(job: Job, config: BlocksConfig, nest: NestConfig, seed: int) -> 
             Task(f"block {i}", nest_block, (_spec(job, i), file, i, nest, seed), job.gpus) for i in every
         ]
         results(job.executor, tasks, job.emit)
-        files = [run.block(number).core for number in every]
-        if config.seam_steps:
+        files = [run.block(number).interior for number in every]
+        if config.boundary_steps:
             files = _tune(job, blocks, config, nest, seed)
-        g, sizes, clarity = together(files)
-        lines = write_ladder(job, g, sizes, nest, clarity)
-        return [*lines, f"{len(blocks)} blocks, {config.seam_steps} steps along the borders of each"]
+        g, sizes, purity = together(files)
+        lines = write_ladder(job, g, sizes, nest, purity)
+        return [*lines, f"{len(blocks)} blocks, {config.boundary_steps} steps along the borders of each"]
 
     inputs = [run.scene, run.labels, run.levels, run.provenance("parts"), file]
-    run_stage(job, "nest", settings, inputs, [run.prefixes, run.chunks], make)
+    run_stage(job, "nest", settings, inputs, [run.prefixes, run.increments], make)
 
 
 def nest_block(
@@ -267,39 +269,39 @@ def nest_block(
 
     def make() -> list[str]:
         blocks = read_blocks(partition)
-        parts = Parts(job.masks.taxonomy, len(blocks))
+        parts = BlockCategories(job.masks.taxonomy, len(blocks))
         whole = read_prefixes(run.prefixes)
-        g, inside = core(whole.gaussians, blocks, parts, number)
+        g, inside = interior(whole.gaussians, blocks, parts, number)
         if not len(g):
             raise RunError(f"{run.path}: no Gaussians inside the block; choose fewer with --blocks.count")
-        labels, clarity = whole.gaussians.label_ids.numpy(), read_more(run.prefixes, "clarity")
-        sizes = core_sizes(labels, inside, whole.sizes, parts, number)
-        write_set(run.core, g, config.steps, sizes, clarity=clarity[inside])
+        labels, purity = whole.gaussians.label_ids.numpy(), read_more(run.prefixes, "purity")
+        sizes = interior_sizes(labels, inside, whole.sizes, parts, number)
+        write_set(run.interior, g, config.steps, sizes, purity=purity[inside])
         return [f"{len(g):,} of {len(whole.gaussians):,} Gaussians are inside the block"]
 
-    run_stage(job, "core", {}, [run.prefixes, partition], [run.core], make)
+    run_stage(job, "core", {}, [run.prefixes, partition], [run.interior], make)
 
 
 def _tune(job: Job, blocks: Blocks, config: BlocksConfig, nest: NestConfig, seed: int) -> list[Path]:
     """Tune the blocks along their borders: neighbours one after the other, others at once."""
     run, every = job.run, range(len(blocks))
-    files = [run.block(number).core for number in every]
+    files = [run.block(number).interior for number in every]
     colour, sees = colours(blocks.neighbours()), read_json(run.blocks / "blocks.json")["sees"]
-    steps = replace(nest, steps=config.seam_steps)
+    steps = replace(nest, steps=config.boundary_steps)
     for now in range(int(colour.max()) + 1):
         mine = [number for number in every if colour[number] == now]
         tasks = []
         for number in mine:
             others = [files[other] for other in sees[number] if other != number]
             what = (_spec(job, number), run.blocks / "blocks.json", number, others, steps, seed)
-            tasks.append(Task(f"seams of block {number}", tune_seams, what, job.gpus))
+            tasks.append(Task(f"seams of block {number}", tune_boundaries, what, job.gpus))
         results(job.executor, tasks, job.emit)
         for number in mine:
-            files[number] = run.block(number).seamed
+            files[number] = run.block(number).tuned_interior
     return files
 
 
-def tune_seams(
+def tune_boundaries(
     spec: JobSpec, partition: Path, number: int, others: list[Path], config: NestConfig, seed: int, emit: Emit
 ) -> None:
     """Train a block's Gaussians near its border on compositions with what its views see of other blocks."""
@@ -308,17 +310,17 @@ def tune_seams(
     settings = {**asdict(config), "seed": seed, "others": [file_hash(path) for path in others]}
 
     def make() -> list[str]:
-        blocks, own = read_blocks(partition), read_level(run.core)
-        views = seam_views(job.scene, blocks, number)
+        blocks, own = read_blocks(partition), read_level(run.interior)
+        views = boundary_views(job.scene, blocks, number)
         near = blocks.to_border(own.means.numpy()) < blocks.margin
         tuned = own
         if views and near.any():
             tuned = _tuned(job, own, near, others, views, config, seed)
-        clarity = read_more(run.core, "clarity")
-        write_set(run.seamed, tuned, config.steps, read_sizes(run.core), clarity=clarity)
+        purity = read_more(run.interior, "purity")
+        write_set(run.tuned_interior, tuned, config.steps, read_sizes(run.interior), purity=purity)
         return [f"{int(near.sum()):,} of {len(own):,} Gaussians, {len(views)} views of several blocks"]
 
-    run_stage(job, "seams", settings, [run.core, partition], [run.seamed], make)
+    run_stage(job, "seams", settings, [run.interior, partition], [run.tuned_interior], make)
 
 
 def _tuned(

@@ -29,7 +29,7 @@ def measure_borders(job: Job) -> None:
 
     def make() -> list[str]:
         blocks = read_blocks(file)
-        files = [run.block(number).core for number in range(len(blocks))]
+        files = [run.block(number).interior for number in range(len(blocks))]
         sets = {"put together": together(files)[0], "tuned": job.ladder.load(job.ladder.levels[-1])}
         tables = [balance_table(job, blocks), border_table(job, blocks, sets)]
         for table in tables:
@@ -50,9 +50,9 @@ def balance_table(job: Job, blocks: Blocks) -> Table:
     rows: list[tuple[str | int | float, ...]] = []
     for number in range(len(blocks)):
         run = job.run.block(number)
-        seconds = [_seconds(run, stage) for stage in ("train", "seeds", "nest", "seams")]
+        seconds = [_seconds(run, stage) for stage in ("train", "base", "nest", "seams")]
         trained = sum(read_ladder(run.levels).files[-1].counts.values())
-        kept = sum(n[-1] for n in read_sizes(run.core).values())
+        kept = sum(n[-1] for n in read_sizes(run.interior).values())
         rows.append((number, made["points"][number], made["views"][number], trained, kept, *seconds))
     header = ("block", "points", "views", "Gaussians", "inside", "train s", "seeds s", "nest s", "seams s")
     return Table("Blocks", header, ("d", ",d", "d", ",d", ",d", ".1f", ".1f", ".1f", ".1f"), rows)

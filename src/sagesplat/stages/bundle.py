@@ -18,23 +18,23 @@ from sagesplat.adapt.observe import large_enough, read_observations
 from sagesplat.adapt.viewpoint import ViewModel, read_promises
 from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.formats.increments import INDEX, read_chunks, read_index, write_chunks
+from sagesplat.formats.increments import INDEX, read_increments, read_index, write_increments
 from sagesplat.formats.levels import read_level
 from sagesplat.io.files import read_json, write_json
 from sagesplat.io.npz import Npz
 from sagesplat.raster import rasterize
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import file_hash, settings_of
+from sagesplat.segment.block_categories import split_name
 from sagesplat.segment.masks import UNLABELLED
-from sagesplat.segment.parts import split_name
 from sagesplat.stages.shared import distances
 from sagesplat.viewer import boxes
 from sagesplat.viewer.bundle import (
     MANIFEST,
+    BundleSizes,
+    CameraEntry,
     Category,
     Contents,
-    Shot,
-    Written,
     check_target,
     check_viewer,
     has_viewer,
@@ -62,7 +62,7 @@ class BundleMade:
     labels: int
     chunks: int
     count: int  # Gaussians
-    sizes: Written  # bytes
+    sizes: BundleSizes  # bytes
     agreement: dict[int, tuple[float, float]]  # by label id: median and 95th percentile of the relative error
     error: tuple[float, float]  # the same over all labels
 
@@ -90,10 +90,10 @@ def bundle(
     viewer = viewer or package_viewer()
     check_target(out)
     check_viewer(viewer)
-    chunks = read_index(job.run.chunks)
+    chunks = read_index(job.run.increments)
     if any(not chunk.uri.endswith(".spz") for chunk in chunks):
-        raise RunError(f"{job.run.chunks}: not SPZ files; run `sagesplat nest` again with --force")
-    g = read_chunks(job.run.chunks, chunks)
+        raise RunError(f"{job.run.increments}: not SPZ files; run `sagesplat nest` again with --force")
+    g = read_increments(job.run.increments, chunks)
     contents = replace(
         _contents(job, g, job.antialiased),
         chunks=chunks,
@@ -151,7 +151,7 @@ def live_bundle(job: Job, folder: Path, viewer: Path | None = None) -> bool:
     antialiased = _antialiased(job)
     work, target = folder / ".chunks", folder / "chunks"
     sizes = {label: (n,) for label, n in g.counts().items()}
-    chunks = write_chunks(work, g, sizes, job.names(), antialiased=antialiased)
+    chunks = write_increments(work, g, sizes, job.names(), antialiased=antialiased)
     target.mkdir(exist_ok=True)
     for chunk in chunks:
         (work / chunk.uri).replace(target / chunk.uri)
@@ -209,21 +209,25 @@ def _check(
     job: Job, meters_per_unit: float | None, always: Collection[str], weights: Mapping[str, float]
 ) -> None:
     run = job.run
-    for stage, path in (("nest", run.chunks / INDEX), ("observe", run.observations), ("fit", run.promises)):
+    for stage, path in (
+        ("nest", run.increments / INDEX),
+        ("observe", run.observations),
+        ("fit", run.promises),
+    ):
         if not path.exists():
             raise RunError(
                 f"{run.path}: no {path.relative_to(run.path)}; a bundle needs a finished nested ladder: "
                 f"run `sagesplat {stage}`, or `sagesplat run`"
             )
     fitted = read_json(run.provenance("fit"))["inputs"]
-    if fitted.get(INDEX) != file_hash(run.chunks / INDEX):
+    if fitted.get(INDEX) != file_hash(run.increments / INDEX):
         raise RunError(f"{run.promises}: promises of other chunks; run `sagesplat fit` again with --force")
     if meters_per_unit is not None and not 1e-6 <= meters_per_unit <= 1e6:
         raise RunError(f"{meters_per_unit} metres per unit are impossible; give a number such as 0.5")
     names = set(job.names().values())
     categories = {category_and_block(job, name)[0] for name in names}
     if unknown := sorted({*always, *weights} - names - categories):
-        one = ", each also NAME@BLOCK" if job.has_parts else ""
+        one = ", each also NAME@BLOCK" if job.has_block_categories else ""
         raise RunError(
             f"{', '.join(unknown)}: no such category; there are {', '.join(sorted(categories))}{one}"
         )
@@ -243,7 +247,7 @@ def _contents(job: Job, g: Gaussians, antialiased: bool) -> Contents:
     return Contents(
         name=scene.name,
         extent=scene.extent,
-        shots=[Shot(view.name, scene.split(row), view.camera) for row, view in enumerate(scene.views)],
+        shots=[CameraEntry(view.name, scene.split(row), view.camera) for row, view in enumerate(scene.views)],
         categories=[
             Category(
                 i,
@@ -256,7 +260,7 @@ def _contents(job: Job, g: Gaussians, antialiased: bool) -> Contents:
             for i, (category, block) in found.items()
         ],
         chunks=[],
-        folder=job.run.chunks,
+        folder=job.run.increments,
         sh_degree=g.sh_degree,
         antialiased=antialiased,
         points=scene.points.xyz,
@@ -266,7 +270,7 @@ def _contents(job: Job, g: Gaussians, antialiased: bool) -> Contents:
 
 def category_and_block(job: Job, name: str) -> tuple[str, int | None]:
     """Of a label by name; without a block unless the scene is in blocks."""
-    return split_name(name) if job.has_parts else (name, None)
+    return split_name(name) if job.has_block_categories else (name, None)
 
 
 def _title(job: Job, category: str) -> str:

@@ -33,8 +33,10 @@ def compose_plan(job: Job) -> None:
         plan = main_plan(run)
         g = compose(job, plan)
         write_ply(run.composed, g, job.names())
-        sent = "" if plan.sent is None else f", {plan.sent / 1e6:.2f} MB to send"
-        return [f"{len(g):,} Gaussians, {plan.nbytes / 1e6:.1f} MB at 248 bytes each{sent}"]
+        transfer_bytes = (
+            "" if plan.transfer_bytes is None else f", {plan.transfer_bytes / 1e6:.2f} MB to send"
+        )
+        return [f"{len(g):,} Gaussians, {plan.nbytes / 1e6:.1f} MB at 248 bytes each{transfer_bytes}"]
 
     settings = {"tune_steps": settings_of(run, "plan").get("tune_steps", 0)}
     run_stage(job, "compose", settings, [run.plan, ladder_files(run)[0]], [run.composed], make)

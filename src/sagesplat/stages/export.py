@@ -5,7 +5,7 @@ from pathlib import Path
 
 from sagesplat.adapt.ladder import read_prefixes
 from sagesplat.core.errors import RunError
-from sagesplat.formats.increments import INDEX, Format, write_chunks
+from sagesplat.formats.increments import INDEX, Format, write_increments
 from sagesplat.formats.ply import write_ply
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import settings_of
@@ -14,14 +14,14 @@ from sagesplat.stages.plan import main_plan, scene_plan
 from sagesplat.stages.shared import label_named
 
 
-def export_chunks(job: Job, folder: Path, kind: Format) -> int:
+def export_increments(job: Job, folder: Path, kind: Format) -> int:
     """Write what each level of each category adds as files of their own; returns how many."""
     if job.run.ladder != "nested":
         raise RunError(f"{job.run.path}: snapshots have no chunks; leave out --ladder snapshots")
     if folder.exists() and not (job.force and (folder / INDEX).exists()):
         raise RunError(f"{folder}: exists; choose a new folder (--force replaces one of chunks)")
     ladder, made = read_prefixes(job.run.prefixes), settings_of(job.run, "nest")
-    chunks = write_chunks(
+    chunks = write_increments(
         folder, ladder.gaussians, ladder.sizes, job.names(), kind=kind,
         sh_bits=tuple(made["sh_bits"]), antialiased=job.antialiased,
     )  # fmt: skip

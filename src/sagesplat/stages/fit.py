@@ -16,7 +16,7 @@ from sagesplat.adapt.observe import (
     read_observations,
     render_rgb,
 )
-from sagesplat.adapt.viewpoint import ViewModel, among_neighbours, fit_promises, write_promises
+from sagesplat.adapt.viewpoint import ViewModel, fit_promises, in_composition, write_promises
 from sagesplat.core.config import FitConfig
 from sagesplat.core.events import Progress
 from sagesplat.formats.increments import INDEX
@@ -71,7 +71,7 @@ def fit_viewpoints(
             key = label, level, row
             if key in alone:
                 changes.setdefault(label, []).append(ssim - alone[key])
-    return among_neighbours(promises, {label: np.array(change) for label, change in changes.items()})
+    return in_composition(promises, {label: np.array(change) for label, change in changes.items()})
 
 
 def _measure_compositions(
@@ -122,5 +122,5 @@ def fit_ladder(job: Job, config: FitConfig) -> None:
     inputs, outputs = [run.scene, run.observations], [run.models]
     if run.ladder == "nested":
         settings["confidence"] = config.confidence
-        inputs, outputs = [*inputs, run.prefixes, run.chunks / INDEX], [*outputs, run.promises]
+        inputs, outputs = [*inputs, run.prefixes, run.increments / INDEX], [*outputs, run.promises]
     run_stage(job, "fit", settings, inputs, outputs, make)

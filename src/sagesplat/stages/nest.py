@@ -10,7 +10,7 @@ from sagesplat.adapt.observe import as_unit, render_rgb
 from sagesplat.core.config import NestConfig
 from sagesplat.core.events import Progress, Warned
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.formats.increments import packed, read_chunks, write_chunks
+from sagesplat.formats.increments import packed, read_increments, write_increments
 from sagesplat.formats.levels import read_level, write_set
 from sagesplat.metrics.image import ssim_map
 from sagesplat.run.job import Job
@@ -32,16 +32,18 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
 
     def make() -> list[str]:
         full = job.snapshots.load(job.snapshots.levels[-1])
-        seeds = read_level(run.seeds) if config.seed_share else None
+        base = read_level(run.base_model) if config.base_share else None
         masks = job.best_masks
-        ordered = nested.order(full, job.scene, masks, config, seeds=seeds, antialiased=job.antialiased)
-        belongs = json.dumps({**settings, "scene": file_hash(run.scene), "levels": file_hash(run.levels)})
+        ordered = nested.order(full, job.scene, masks, config, base=base, antialiased=job.antialiased)
+        checkpoint_key = json.dumps(
+            {**settings, "scene": file_hash(run.scene), "levels": file_hash(run.levels)}
+        )
         if job.force:
             remove_checkpoints(run.nest_checkpoint)
         trained = ordered
         for event in nested.nest(
             ordered, job.scene, job.photos, train_config(job), config,
-            seed=seed, backend=job.backend, checkpoint=run.nest_checkpoint, settings=belongs,
+            seed=seed, backend=job.backend, checkpoint=run.nest_checkpoint, settings=checkpoint_key,
         ):  # fmt: skip
             if isinstance(event, NestStep):
                 job.emit(Progress("nest", event.step, config.steps, f"loss {event.loss:.3f}"))
@@ -52,31 +54,31 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
                 trained = event
         counts, across = trained.gaussians.counts(), trained.boundary
         sizes = {label: nested.level_sizes(n, config, across.get(label, 0)) for label, n in counts.items()}
-        lines = write_ladder(job, trained.gaussians, sizes, config, trained.clarity)
+        lines = write_ladder(job, trained.gaussians, sizes, config, trained.purity)
         lines[0] += f", {sum(across.values()):,} of them across borders and in every level"
         remove_checkpoints(run.nest_checkpoint)
         return lines
 
     inputs = [run.scene, run.labels, run.levels, *fusion(run)]
-    if config.seed_share:
-        _make_seeds(job, config, seed)
-        inputs.append(run.seeds)
-    run_stage(job, "nest", settings, inputs, [run.prefixes, run.chunks], make)
+    if config.base_share:
+        _make_base_model(job, config, seed)
+        inputs.append(run.base_model)
+    run_stage(job, "nest", settings, inputs, [run.prefixes, run.increments], make)
 
 
-def _make_seeds(job: Job, config: NestConfig, seed: int) -> None:
+def _make_base_model(job: Job, config: NestConfig, seed: int) -> None:
     """Train the small model that the ladder begins with: a stage, so that a killed run has it already."""
     run, made = job.run, train_config(job)
     full = job.snapshots.size(job.snapshots.levels[-1])
-    cap = max(1, round(config.seed_share * full))
-    settings = {**asdict(nested.capped_config(made, cap, config.seed_steps)), "seed": seed}
+    cap = max(1, round(config.base_share * full))
+    settings = {**asdict(nested.capped_config(made, cap, config.base_steps)), "seed": seed}
 
     def make() -> list[str]:
-        g = train_capped(job, "seeds", cap, config.seed_steps, seed)
-        write_set(run.seeds, g, config.seed_steps)
+        g = train_capped(job, "base", cap, config.base_steps, seed)
+        write_set(run.base_model, g, config.base_steps)
         return [f"{len(g):,} Gaussians"]
 
-    run_stage(job, "seeds", settings, [run.scene, run.labels], [run.seeds], make)
+    run_stage(job, "base", settings, [run.scene, run.labels], [run.base_model], make)
 
 
 def train_capped(job: Job, stage: str, cap: int, steps: int, seed: int) -> Gaussians:
@@ -93,7 +95,7 @@ def train_capped(job: Job, stage: str, cap: int, steps: int, seed: int) -> Gauss
 
 
 def write_ladder(
-    job: Job, g: Gaussians, sizes: dict[int, tuple[int, ...]], config: NestConfig, clarity: np.ndarray
+    job: Job, g: Gaussians, sizes: dict[int, tuple[int, ...]], config: NestConfig, purity: np.ndarray
 ) -> list[str]:
     """Write Gaussians in their order, with levels of `sizes` by label id, as the run's ladder and its chunks.
 
@@ -101,12 +103,12 @@ def write_ladder(
     """
     rows = packed(g, sizes, sh_bits=config.sh_bits)
     ordered = g.select(torch.from_numpy(rows))
-    chunks = write_chunks(
-        job.run.chunks, ordered, sizes, job.names(), sh_bits=config.sh_bits, antialiased=job.antialiased
+    chunks = write_increments(
+        job.run.increments, ordered, sizes, job.names(), sh_bits=config.sh_bits, antialiased=job.antialiased
     )
     # what is measured, planned and written from here on is what a viewer gets
-    sent = read_chunks(job.run.chunks, chunks)
-    write_set(job.run.prefixes, sent, config.steps, sizes, clarity=clarity[rows])
+    sent = read_increments(job.run.increments, chunks)
+    write_set(job.run.prefixes, sent, config.steps, sizes, purity=purity[rows])
     size, n = sum(chunk.nbytes for chunk in chunks), len(g)
     lost = _quality(job, ordered) - _quality(job, sent)
     return [

@@ -28,7 +28,7 @@ from sagesplat.train import nested
 # the built-in capture, within minutes on two cores
 DEMO = RunConfig(
     train=TrainConfig(max_steps=1200, level_every=60),
-    nest=NestConfig(steps=600, levels=12, seed_steps=600),
+    nest=NestConfig(steps=600, levels=12, base_steps=600),
     plan=PlanConfig(target_ssim=0.7),
 )
 
@@ -48,7 +48,7 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
     elif job.run.fused.exists():
         raise RunError(f"{job.run.fused}: label images were fused; add --fuse, or delete that folder")
     if job.has_blocks:
-        blocks.make_parts(job)
+        blocks.label_block_categories(job)
     if job.run.ladder == "nested":
         nest(job, config.nest, config.blocks, config.seed)
     observe_levels(job, config.fit)

@@ -24,9 +24,11 @@ def costs_of(job: Job) -> Costs:
     """What the levels of the run's nested ladder cost."""
     labels = sorted({label for label, _ in job.ladder.counts})
     levels = len(job.ladder.levels)
-    chunks = read_index(job.run.chunks)
-    count, sent, gpu = (totals(chunks, labels, levels, name) for name in ("count", "nbytes", "gpu_bytes"))
-    return Costs(tuple(labels), count, sent, gpu)
+    chunks = read_index(job.run.increments)
+    count, transfer_bytes, gpu = (
+        totals(chunks, labels, levels, name) for name in ("count", "nbytes", "gpu_bytes")
+    )
+    return Costs(tuple(labels), count, transfer_bytes, gpu)
 
 
 def promised_quality(job: Job) -> tuple[Costs, Quality]:
@@ -65,15 +67,16 @@ def make_plan(job: Job, config: PlanConfig) -> None:
             weights = {label_named(job, name): weight for name, weight in config.weights.items()}
             within = plan_within(quality, costs, config.budget, config.budget_unit, shown, weights)
         write_plans(run.plan, scene_plans, view_plans, within)
-        full = int(costs.sent[:, -1].sum())
+        full = int(costs.transfer_bytes[:, -1].sum())
         lines = [
-            f"SSIM {p.target:g}: {p.sent / 1e6:.2f} of {full / 1e6:.2f} MB, {p.count:,} Gaussians, {p.status}"
+            f"SSIM {p.target:g}: {p.transfer_bytes / 1e6:.2f} of {full / 1e6:.2f} MB, {p.count:,} Gaussians, "
+            f"{p.status}"
             for p in scene_plans
-            if p.sent is not None
+            if p.transfer_bytes is not None
         ]
-        if within and within.sent is not None:
+        if within and within.transfer_bytes is not None:
             lines.append(
-                f"budget {config.budget:,g} {config.budget_unit}: {within.sent / 1e6:.2f} MB, "
+                f"budget {config.budget:,g} {config.budget_unit}: {within.transfer_bytes / 1e6:.2f} MB, "
                 f"{within.count:,} Gaussians, {within.status}"
             )
         return lines

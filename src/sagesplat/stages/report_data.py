@@ -20,8 +20,8 @@ from sagesplat.run.run_dir import RunDir
 from sagesplat.scene import describe
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
+from sagesplat.segment.block_categories import category_of
 from sagesplat.segment.masks import UNLABELLED, UNLABELLED_COLOR, Masks, Taxonomy
-from sagesplat.segment.parts import category_of
 
 PANELS = 3  # views shown in pictures
 STAGES = (
@@ -71,7 +71,7 @@ def report_data(
 
 def _parts(run: RunDir, names: dict[int, str]) -> tuple[dict[int, int], Colours]:
     """Of a scene in blocks: which label stands for a part's category, and its colour; nothing of others."""
-    if not (run.parts / "labels.json").exists():
+    if not (run.block_categories / "labels.json").exists():
         return {}, {}
     taxonomy = Taxonomy.read(run.masks / "labels.json")
     by_name = {taxonomy.name(i): taxonomy.color(i) for i in (UNLABELLED, *taxonomy.names)}

@@ -23,7 +23,7 @@ def train_config(job: Job) -> TrainConfig:
 
 def fusion(run: RunDir) -> list[Path]:
     """What results change with that look at label images after training."""
-    made = [("fuse", run.fused), ("parts", run.parts)]
+    made = [("fuse", run.fused), ("parts", run.block_categories)]
     return [run.provenance(stage) for stage, folder in made if (folder / "labels.json").exists()]
 
 
@@ -43,7 +43,7 @@ def distances(job: Job, distance: str) -> dict[int, np.ndarray]:
 def ladder_files(run: RunDir) -> list[Path]:
     """What the run's levels, and the models of their quality, are read from."""
     if run.ladder == "nested":
-        return [run.prefixes, run.chunks / INDEX, run.promises]
+        return [run.prefixes, run.increments / INDEX, run.promises]
     return [run.levels, run.models]
 
 

@@ -25,10 +25,12 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
     settings = {**asdict(config), "batch": max(config.batch, job.processes), "seed": seed}
 
     def make() -> list[str]:
-        belongs = json.dumps({**settings, "scene": file_hash(run.scene), "labels": file_hash(run.labels)})
-        goes_on = run.checkpoint.exists() and (not job.force or _continues(run, belongs))
-        fitted, cap = _fit_memory(job, config, goes_on)  # before anything is given up
-        if not goes_on:
+        checkpoint_key = json.dumps(
+            {**settings, "scene": file_hash(run.scene), "labels": file_hash(run.labels)}
+        )
+        resuming = run.checkpoint.exists() and (not job.force or _continues(run, checkpoint_key))
+        fitted, cap = _fit_memory(job, config, resuming)  # before anything is given up
+        if not resuming:
             remove_checkpoints(run.checkpoint)
             shutil.rmtree(run.levels, ignore_errors=True)
         write_json(run.cap, {"cap": cap})
@@ -38,7 +40,7 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
         events = start(
             job.scene, job.photos, job.point_labels, fitted,
             masks=job.masks if config.freeze_at is not None else None,
-            seed=seed, backend=job.backend, folder=run.path, settings=belongs,
+            seed=seed, backend=job.backend, folder=run.path, settings=checkpoint_key,
         )  # fmt: skip
         for event in events:
             match event:
@@ -62,22 +64,22 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
     run_stage(job, "train", settings, [run.scene, run.labels], [run.levels, run.checkpoint], make)
 
 
-def _fit_memory(job: Job, config: TrainConfig, goes_on: bool) -> tuple[TrainConfig, int]:
+def _fit_memory(job: Job, config: TrainConfig, resuming: bool) -> tuple[TrainConfig, int]:
     """The settings with a cap that fits into memory, and that cap (0: none needed).
 
     A training that goes on keeps the cap it began with.
     """
     if job.backend == "cuda":  # Gaussians are not in the machine's memory
         return config, 0
-    began = int(read_json(job.run.cap)["cap"]) if goes_on and job.run.cap.exists() else 0
+    began = int(read_json(job.run.cap)["cap"]) if resuming and job.run.cap.exists() else 0
     fitted = memory.fit(job.scene, config, job.memory_limit, processes=job.processes, began=began)
     job.emit(Warned(str(fitted)))
     return fitted.config, fitted.lowered
 
 
-def _continues(run: RunDir, belongs: str) -> bool:
+def _continues(run: RunDir, checkpoint_key: str) -> bool:
     try:
-        latest_checkpoint(run.checkpoint, belongs)
+        latest_checkpoint(run.checkpoint, checkpoint_key)
     except RunError:
         return False
     return True

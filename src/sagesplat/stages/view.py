@@ -113,7 +113,7 @@ def _open_run(path: Path, emit: Emit) -> "Job":
 
 
 def _is_finished(run: RunDir) -> bool:
-    return run.promises.exists() and (run.chunks / "index.json").exists()
+    return run.promises.exists() and (run.increments / "index.json").exists()
 
 
 def _is_current(run: RunDir, folder: Path) -> bool:
@@ -128,7 +128,7 @@ def _is_current(run: RunDir, folder: Path) -> bool:
         held = {level["sha256"] for label in manifest["labels"] for level in label["levels"]}
     except (KeyError, TypeError):
         return False
-    chunks = {chunk["sha256"] for chunk in read_json(run.chunks / "index.json")["chunks"]}
+    chunks = {chunk["sha256"] for chunk in read_json(run.increments / "index.json")["chunks"]}
     older = (folder / MANIFEST).stat().st_mtime < run.promises.stat().st_mtime
     return held == chunks and not older and has_viewer(folder, package_viewer())
 

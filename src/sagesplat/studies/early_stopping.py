@@ -29,7 +29,7 @@ BAND = 10  # px around the borders of categories
 _FREE = {"freeze_at"}  # settings that may differ between the two runs
 
 
-def compare_online(online: Job, full: Job, out: Path) -> tuple[Table, Table]:
+def compare_early_stopping(online: Job, full: Job, out: Path) -> tuple[Table, Table]:
     """A run with --train.freeze-at against the same run without: by method, and by category.
 
     From the full run each category takes the first level that has reached the target by the same measurement

@@ -16,10 +16,10 @@ _BETA1, _BETA2, _EPS = tl.constexpr(0.9), tl.constexpr(0.999), tl.constexpr(1e-1
 
 @_jit
 def _update(
-    parameter, grad, first, second, trainable, count, rate, correction,
+    parameter, grad, exp_avg, exp_avg_sq, trainable, count, rate, correction,
     WIDTH: tl.constexpr, COLUMNS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """`count` values: the first COLUMNS of every row of WIDTH."""
+    """`count` values: the exp_avg COLUMNS of every row of WIDTH."""
     at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = at < count
     row = at // COLUMNS
@@ -28,22 +28,22 @@ def _update(
     if COLUMNS != WIDTH:
         at = row * WIDTH + at % COLUMNS
     g = tl.load(grad + at, mask=here)
-    m = _BETA1 * tl.load(first + at, mask=here) + (1 - _BETA1) * g
-    v = _BETA2 * tl.load(second + at, mask=here) + (1 - _BETA2) * g * g
+    m = _BETA1 * tl.load(exp_avg + at, mask=here) + (1 - _BETA1) * g
+    v = _BETA2 * tl.load(exp_avg_sq + at, mask=here) + (1 - _BETA2) * g * g
     p = tl.load(parameter + at, mask=here) - rate * m / (tl.sqrt(v) * correction + _EPS)
-    tl.store(first + at, m, mask=here)
-    tl.store(second + at, v, mask=here)
+    tl.store(exp_avg + at, m, mask=here)
+    tl.store(exp_avg_sq + at, v, mask=here)
     tl.store(parameter + at, p, mask=here)
 
 
 def adam_step(
     parameter: Tensor,  # [N, ...] float32, contiguous, changed in place
     grad: Tensor,
-    first: Tensor,  # moments, contiguous, changed in place
-    second: Tensor,
+    exp_avg: Tensor,  # moments, contiguous, changed in place
+    exp_avg_sq: Tensor,
     *,
     lr: float,
-    step: int,  # 1 for the first
+    step: int,  # 1 for the exp_avg
     trainable: Tensor | None,  # bool [N]; None: all rows
     columns: int | None = None,
 ) -> None:
@@ -56,7 +56,7 @@ def adam_step(
     count = len(parameter) * columns
     if count:
         _update[(triton.cdiv(count, _BLOCK),)](
-            parameter.detach().view(-1), grad.detach().contiguous(), first.view(-1), second.view(-1),
+            parameter.detach().view(-1), grad.detach().contiguous(), exp_avg.view(-1), exp_avg_sq.view(-1),
             None if trainable is None else trainable.contiguous().view(torch.uint8),
             count, float(lr / (1 - 0.9**step)), (1 - 0.999**step) ** -0.5,
             WIDTH=width, COLUMNS=columns, BLOCK=_BLOCK,

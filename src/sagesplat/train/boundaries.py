@@ -14,13 +14,15 @@ from sagesplat.formats.levels import read_level, read_more, read_sizes
 from sagesplat.metrics.image import psnr
 from sagesplat.scene.blocks import Blocks, visible_shares
 from sagesplat.scene.scene import Scene
-from sagesplat.segment.parts import Parts
+from sagesplat.segment.block_categories import BlockCategories
 
 SEVERAL = 0.1  # share of what a view sees that is of other blocks, from which on it tells of seams
 _PAD = 0.25  # of the image beyond its edges: Gaussians that begin there may reach into it
 
 
-def core(g: Gaussians, blocks: Blocks, parts: Parts, block: int) -> tuple[Gaussians, Bool[np.ndarray, " N"]]:
+def interior(
+    g: Gaussians, blocks: Blocks, parts: BlockCategories, block: int
+) -> tuple[Gaussians, Bool[np.ndarray, " N"]]:
     """What a block adds to the whole: its Gaussians inside its border, as parts; and which ones they are."""
     inside = blocks.of(g.means.numpy()) == block
     kept = g.select(torch.from_numpy(inside))
@@ -28,8 +30,12 @@ def core(g: Gaussians, blocks: Blocks, parts: Parts, block: int) -> tuple[Gaussi
     return replace(kept, label_ids=torch.from_numpy(part_ids)), inside
 
 
-def core_sizes(
-    labels: np.ndarray, inside: np.ndarray, sizes: Mapping[int, tuple[int, ...]], parts: Parts, block: int
+def interior_sizes(
+    labels: np.ndarray,
+    inside: np.ndarray,
+    sizes: Mapping[int, tuple[int, ...]],
+    parts: BlockCategories,
+    block: int,
 ) -> dict[int, tuple[int, ...]]:
     """Level sizes, by part, of what is inside (bool [N]) of a ladder in its order: at least one of any."""
     found = {}
@@ -43,11 +49,11 @@ def core_sizes(
 def together(files: Sequence[Path]) -> tuple[Gaussians, dict[int, tuple[int, ...]], np.ndarray]:
     """The ladders of all blocks as one: Gaussians, sizes of levels by label id, clarity."""
     sizes = {label: n for path in files for label, n in read_sizes(path).items()}
-    clarity = np.concatenate([read_more(path, "clarity") for path in files])
-    return concat([read_level(path) for path in files]), sizes, clarity
+    purity = np.concatenate([read_more(path, "clarity") for path in files])
+    return concat([read_level(path) for path in files]), sizes, purity
 
 
-def seam_views(scene: Scene, blocks: Blocks, block: int) -> list[int]:
+def boundary_views(scene: Scene, blocks: Blocks, block: int) -> list[int]:
     """Training views of a block (rows) that see enough of others."""
     shares = visible_shares(scene, blocks.of(scene.points.xyz), len(blocks))
     return [row for row in scene.train_ids.tolist() if shares[row, block] < 1 - SEVERAL]

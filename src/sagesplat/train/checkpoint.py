@@ -21,7 +21,7 @@ from sagesplat.io.files import atomic_path, sync_files
 from sagesplat.io.npz import Npz
 from sagesplat.train.state import TrainState
 
-_VERSION = 2
+_VERSION = 3
 # what files raise that are cut off or changed
 _DAMAGED = (OSError, KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError)
 
@@ -50,10 +50,10 @@ def write_checkpoint(path: Path, state: TrainState, settings: str) -> None:
     state = state.to(torch.device("cpu"))
     g = state.gaussians
     arrays = {name: p.numpy() for name, p in g.parameters().items()}
-    arrays |= {f"first/{name}": state.first[name].numpy() for name in PARAMETERS}
-    arrays |= {f"second/{name}": state.second[name].numpy() for name in PARAMETERS}
-    if state.place is not None:
-        arrays["place"] = state.place.numpy()
+    arrays |= {f"exp_avg/{name}": state.exp_avg[name].numpy() for name in PARAMETERS}
+    arrays |= {f"exp_avg_sq/{name}": state.exp_avg_sq[name].numpy() for name in PARAMETERS}
+    if state.order_share is not None:
+        arrays["order_share"] = state.order_share.numpy()
     arrays |= {"label_ids": g.label_ids.numpy(), "grad_sum": state.grad_sum.numpy()}
     arrays["grad_count"] = state.grad_count.numpy()
     meta = {
@@ -122,8 +122,8 @@ def latest_checkpoint(path: Path, settings: str) -> tuple[TrainState, str]:
             raise
         try:
             return read_checkpoint(kept, settings), damage
-        except _Damaged as second:
-            reason = str(second).partition("; ")[0]
+        except _Damaged as exp_avg_sq:
+            reason = str(exp_avg_sq).partition("; ")[0]
             raise RunError(
                 f"{damage}, and {reason}; delete both (or add --force) to train from the start"
             ) from None
@@ -164,10 +164,12 @@ def _state(found: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> TrainSta
     rng.bit_generator.state = meta["rng"]
     gaussians = checked(Gaussians(**{n: arrays[n] for n in PARAMETERS}, label_ids=arrays["label_ids"]))
     shapes = {
-        f"{kind}/{n}": p.shape for kind in ("first", "second") for n, p in gaussians.parameters().items()
+        f"{kind}/{n}": p.shape
+        for kind in ("exp_avg", "exp_avg_sq")
+        for n, p in gaussians.parameters().items()
     }
     shapes |= dict.fromkeys(("grad_sum", "grad_count"), gaussians.logit_opacities.shape)
-    shapes |= {"place": gaussians.logit_opacities.shape} if "place" in arrays else {}
+    shapes |= {"order_share": gaussians.logit_opacities.shape} if "order_share" in arrays else {}
     if wrong := [n for n, s in shapes.items() if arrays[n].shape != s or not arrays[n].is_floating_point()]:
         raise ValueError(f"shape of {wrong[0]}")
     numbers = [meta["step"], meta["last_reset"] + 1, *meta["queue"]]
@@ -175,8 +177,8 @@ def _state(found: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> TrainSta
         raise ValueError("steps or views that are none")
     return TrainState(
         gaussians=gaussians,
-        first={n: arrays[f"first/{n}"] for n in PARAMETERS},
-        second={n: arrays[f"second/{n}"] for n in PARAMETERS},
+        exp_avg={n: arrays[f"exp_avg/{n}"] for n in PARAMETERS},
+        exp_avg_sq={n: arrays[f"exp_avg_sq/{n}"] for n in PARAMETERS},
         grad_sum=arrays["grad_sum"],
         grad_count=arrays["grad_count"],
         rng=rng,
@@ -185,5 +187,5 @@ def _state(found: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> TrainSta
         last_reset=meta["last_reset"],
         frozen={int(label): int(step) for label, step in meta.get("frozen", ())},
         withheld=int(meta.get("withheld", 0)),
-        place=arrays.get("place"),
+        order_share=arrays.get("order_share"),
     )

@@ -43,7 +43,7 @@ def schedule(config: TrainConfig) -> Schedule:
     reset_every = max(scaled(config.reset_every), min(config.reset_every, _RESET_FLOOR))
     stop = config.refine_stop if config.strategy == "default" else max(config.refine_stop, _MCMC_STOP)
     refine_start, refine_stop = min(config.refine_start, config.max_steps // 5), scaled(stop)
-    if config.pace == "fast":  # short runs too must have the time to grow
+    if config.lr_schedule == "fast":  # short runs too must have the time to grow
         enough = refine_start + _ENOUGH_REFINEMENTS * config.refine_every
         refine_stop = max(refine_stop, min(enough, int(_LATEST_STOP * config.max_steps)))
     return Schedule(
@@ -146,6 +146,6 @@ def reset_opacities(state: TrainState, config: TrainConfig, trainable: Tensor) -
     name = PARAMETERS[3]
     logits = getattr(state.gaussians, name)
     logits[trainable] = logits[trainable].clamp_max(ceiling)
-    for moments in (state.first[name], state.second[name]):
+    for moments in (state.exp_avg[name], state.exp_avg_sq[name]):
         moments[trainable] = 0
     state.last_reset = state.step

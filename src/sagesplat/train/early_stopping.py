@@ -15,7 +15,7 @@ from sagesplat.raster import TILE, Backend, Workspace, rasterize
 from sagesplat.scene.scene import Scene
 from sagesplat.segment.masks import Masks
 from sagesplat.train.group import ALONE, Group
-from sagesplat.train.photo_loader import Feed
+from sagesplat.train.photo_loader import PhotoLoader
 
 VIEWS = 16  # training views that a measurement takes, evenly spread: it must stay cheap
 _RARE_VIEWS = 8  # that a category is measured on where fewer of those show it
@@ -43,7 +43,7 @@ def spread(rows: list[int], count: int) -> list[int]:
 
 
 @dataclass(frozen=True, eq=False)
-class Work:
+class ActiveTiles:
     """What the categories that have stopped leave to learn: tiles of 16 px that show another one."""
 
     scene: Scene
@@ -93,8 +93,8 @@ def active_tiles(
 
 def label_quality(
     gaussians: Gaussians,
-    work: Work,
-    feed: Feed,
+    work: ActiveTiles,
+    feed: PhotoLoader,
     views: Mapping[int, Sequence[int]],
     config: TrainConfig,
     sh_degree: int,

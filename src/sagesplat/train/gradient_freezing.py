@@ -10,7 +10,7 @@ _WATCHED = ("means", "sh0")  # position and base colour, as GSta
 
 
 @dataclass(eq=False)
-class Rest:
+class GradientFreezing:
     """Every other stretch of steps, Gaussians whose gradients were among the smallest in the one before rest.
 
     `share`: those rest whose summed gradient norms lie in this lowest share for position and for colour too.

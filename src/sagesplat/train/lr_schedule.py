@@ -15,34 +15,36 @@ from sagesplat.core.config import TrainConfig
 from sagesplat.core.gaussians import PARAMETERS
 from sagesplat.scene.scene import Camera
 
-# Of the fast pace: how many times the published rates to begin with, those of the means apart, from which
-# share of the run on the others shrink, and to how much of what they began with.
+# Of the fast schedule: multiplier of the published learning rates at the start (the means have their own),
+# share of the run from which on the others shrink, and to how much of what they began with.
 _GAIN, _MEANS_GAIN, _SHRINK_FROM, _SHRINK_TO = 4.0, 4.0, 0.3, 0.1
-_MEANS_SHRINK_TO = 0.01  # of the published pace too
+_MEANS_SHRINK_TO = 0.01  # of the published schedule too
 _FACTORS = (4, 2)  # how many times smaller photos may be
 _SMALLEST = 200  # pixels of the shorter side: what is smaller costs less than the Gaussians do
 _LEARNT_BY = 0.5  # share of the run in which everything up to full resolution has had its turn
 
 
 @dataclass(frozen=True)
-class Pace:
+class LrSchedule:
     """Rates and resolutions of one run."""
 
     config: TrainConfig
     extent: float
     coarse: tuple[tuple[int, int], ...] = ()  # (last step, how many times smaller), ascending
 
-    def rates(self, step: int) -> dict[str, float]:
+    def learning_rates(self, step: int) -> dict[str, float]:
         """Adam's rate for each parameter at a step."""
         config, share = self.config, step / self.config.max_steps
-        rates = {name: getattr(config, f"{name}_lr") for name in PARAMETERS}
-        rates["means"] *= self.extent * _MEANS_SHRINK_TO**share
-        if config.pace == "fast":
+        learning_rates = {name: getattr(config, f"{name}_lr") for name in PARAMETERS}
+        learning_rates["means"] *= self.extent * _MEANS_SHRINK_TO**share
+        if config.lr_schedule == "fast":
             gain = _GAIN * _SHRINK_TO ** max(0.0, (share - _SHRINK_FROM) / (1 - _SHRINK_FROM))
-            rates = {n: rate * (_MEANS_GAIN if n == "means" else gain) for n, rate in rates.items()}
-        return rates
+            learning_rates = {
+                n: rate * (_MEANS_GAIN if n == "means" else gain) for n, rate in learning_rates.items()
+            }
+        return learning_rates
 
-    def wander(self, step: int) -> float:
+    def sgld_noise(self, step: int) -> float:
         """MCMC's noise at a step, in 1 / world units: the published rate of the means times `mcmc_noise`, as
         if the scene were scaled to an extent of 1.
         """
@@ -58,21 +60,21 @@ class Pace:
         return next((factor for last, factor in self.coarse if step <= last), 1)
 
 
-def pace(config: TrainConfig, extent: float, photos: list[UInt8[np.ndarray, "H W 3"]]) -> Pace:
+def lr_schedule(config: TrainConfig, extent: float, photos: list[UInt8[np.ndarray, "H W 3"]]) -> LrSchedule:
     """The pace of a run, from the frequency content of some of its photos.
 
     Photos `factor` times smaller show the share `detail` of what the photos hold, and that share of the first
     half of the run is over when the next larger ones come.
     """
     coarse, last = [], 0
-    if config.pace == "fast":
+    if config.lr_schedule == "fast":
         shortest = min(min(p.shape[:2]) for p in photos)
         for factor in (f for f in _FACTORS if shortest >= f * _SMALLEST):
             until = round(_LEARNT_BY * config.max_steps * float(np.mean([detail(p, factor) for p in photos])))
             if until > last:
                 coarse.append((until, factor))
                 last = until
-    return Pace(config, extent, tuple(coarse))
+    return LrSchedule(config, extent, tuple(coarse))
 
 
 def detail(photo: UInt8[np.ndarray, "H W 3"], factor: int) -> float:

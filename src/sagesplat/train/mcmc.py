@@ -60,8 +60,8 @@ def relocate(state: TrainState, config: TrainConfig, trainable: Tensor) -> int:
         labels[dead] = labels[hosts]
         for name, p in state.gaussians.parameters().items():
             p[dead] = p[hosts]
-            state.first[name][dead] = 0
-            state.second[name][dead] = 0
+            state.exp_avg[name][dead] = 0
+            state.exp_avg_sq[name][dead] = 0
     return len(hosts)
 
 
@@ -103,8 +103,8 @@ def _land(state: TrainState, config: TrainConfig, living: Tensor, count: int) ->
     g.logit_opacities[places] = logits.clamp_min(lowest).float()
     g.log_scales[places] += log_factors[:, None].float()
     for name in PARAMETERS:
-        state.first[name][places] = 0
-        state.second[name][places] = 0
+        state.exp_avg[name][places] = 0
+        state.exp_avg_sq[name][places] = 0
     return hosts
 
 
@@ -119,7 +119,7 @@ def perturb(state: TrainState, rate: float, trainable: Tensor) -> None:
     if g.means.is_cuda:
         generator = torch.Generator(g.means.device).manual_seed(seed)
         normal = torch.randn(g.means.shape, generator=generator, device=g.means.device)
-        wander(g.means, g.quats, g.log_scales, g.logit_opacities, trainable, rate, normal)
+        sgld_noise(g.means, g.quats, g.log_scales, g.logit_opacities, trainable, rate, normal)
     else:
         _perturb(
             g.means.numpy(), g.quats.numpy(), g.log_scales.numpy(), g.logit_opacities.numpy(),
@@ -127,7 +127,7 @@ def perturb(state: TrainState, rate: float, trainable: Tensor) -> None:
         )  # fmt: skip
 
 
-def wander(
+def sgld_noise(
     means: Tensor,
     quats: Tensor,
     log_scales: Tensor,

@@ -18,10 +18,10 @@ from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Points, Scene
 from sagesplat.segment.masks import Masks
 from sagesplat.train.checkpoint import latest_checkpoint, write_checkpoint
-from sagesplat.train.early_stopping import Work, trainable_rows
+from sagesplat.train.early_stopping import ActiveTiles, trainable_rows
 from sagesplat.train.importance import importance
-from sagesplat.train.lr_schedule import Pace
-from sagesplat.train.photo_loader import Feed
+from sagesplat.train.lr_schedule import LrSchedule
+from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.state import initial_state
 from sagesplat.train.stepper import Stepper
 from sagesplat.train.trainer import LOOK_EVERY, Event, Resumed, finite, named_failures, train
@@ -39,7 +39,7 @@ class Nested:
     """Gaussians in the order in which they are shipped: by category, the worthiest first."""
 
     gaussians: Gaussians
-    clarity: Float32[np.ndarray, " N"]  # share of a Gaussian's blending weight in its own category; 1 unseen
+    purity: Float32[np.ndarray, " N"]  # share of a Gaussian's blending weight in its own category; 1 unseen
     ranks: Int8[np.ndarray, " N"]  # in each category: 0 those across two categories, then 1 seeds, 2 the rest
 
     @property
@@ -73,7 +73,7 @@ def order(
     masks: Masks,
     config: NestConfig,
     *,
-    seeds: Gaussians | None = None,
+    base: Gaussians | None = None,
     antialiased: bool = False,
 ) -> Nested:
     """Vote on labels by what each Gaussian paints, and order each category by worth.
@@ -86,22 +86,22 @@ def order(
     views = scene.train_ids.tolist()
     worth = importance(g, scene, views, config.criterion, antialiased=antialiased)
     ranks = np.full(len(g), 2, np.int8)
-    if seeds is not None and len(seeds):
-        kept = np.sort(np.argsort(-worth, kind="stable")[: max(len(g) - len(seeds), 0)])
-        of_seeds = importance(seeds, scene, views, config.criterion, antialiased=antialiased)
-        g = concat([seeds, g.select(torch.from_numpy(kept))])
-        worth = np.concatenate([of_seeds, worth[kept]])
-        ranks = np.repeat(np.array([1, 2], np.int8), [len(seeds), len(kept)])
+    if base is not None and len(base):
+        kept = np.sort(np.argsort(-worth, kind="stable")[: max(len(g) - len(base), 0)])
+        of_base = importance(base, scene, views, config.criterion, antialiased=antialiased)
+        g = concat([base, g.select(torch.from_numpy(kept))])
+        worth = np.concatenate([of_base, worth[kept]])
+        ranks = np.repeat(np.array([1, 2], np.int8), [len(base), len(kept)])
     ids, weights = label_weights(g, scene, masks, views, antialiased=antialiased)
     g = replace(g, label_ids=winners(g, ids, weights))
     total = weights.sum(1)
     labels = g.label_ids.numpy()
     column = np.searchsorted(ids, labels).clip(0, max(len(ids) - 1, 0))
     mine = weights[np.arange(len(g)), column] if len(ids) else total
-    clarity = np.where(total > 0, mine / np.maximum(total, 1e-12), 1).astype(np.float32)
-    ranks[straddling(weights, len(views))] = 0  # whichever side is there needs them
+    purity = np.where(total > 0, mine / np.maximum(total, 1e-12), 1).astype(np.float32)
+    ranks[is_boundary(weights, len(views))] = 0  # whichever side is there needs them
     rows = np.lexsort((-worth, ranks, labels))  # the last key decides first
-    return Nested(g.select(torch.from_numpy(rows)), clarity[rows], ranks[rows])
+    return Nested(g.select(torch.from_numpy(rows)), purity[rows], ranks[rows])
 
 
 def with_at_most(scene: Scene, labels: np.ndarray, count: int, seed: int) -> tuple[Scene, np.ndarray]:
@@ -120,7 +120,7 @@ def with_at_most(scene: Scene, labels: np.ndarray, count: int, seed: int) -> tup
 def capped_config(config: TrainConfig, cap: int, steps: int) -> TrainConfig:
     """3DGS-MCMC with at most `cap` Gaussians, otherwise as `config`; nothing is recorded on the way."""
     mcmc = replace(config, strategy="mcmc", max_gaussians=cap, max_steps=steps, level_every=steps)
-    return replace(mcmc, freeze_at=None, rest_share=0.0)
+    return replace(mcmc, freeze_at=None, gradient_freeze_share=0.0)
 
 
 def train_capped(
@@ -139,7 +139,7 @@ def train_capped(
     yield from train(some, photos, labels, capped_config(config, cap, steps), seed=seed, backend=backend)
 
 
-def straddling(weights: Float32[np.ndarray, "N L"], num_views: int) -> np.ndarray:
+def is_boundary(weights: Float32[np.ndarray, "N L"], num_views: int) -> np.ndarray:
     """Gaussians (bool [N]) of which no category has 80 % of the weight, and which show on both sides."""
     total, top = weights.sum(1), weights.max(1, initial=0)
     return (top < CLEAR * total) & (total - top > _VISIBLE * num_views)
@@ -173,7 +173,7 @@ def nest(
     near = geometry.morton_order(nested.gaussians.means.numpy())  # neighbours in space are drawn together
     labels, ranks = nested.gaussians.label_ids.numpy()[near], nested.ranks[near]
     state = initial_state(nested.gaussians.select(torch.from_numpy(near)), seed)
-    state.place = places(labels, ranks, -near)
+    state.order_share = order_shares(labels, ranks, -near)
     if checkpoint and checkpoint.exists():
         state, damage = latest_checkpoint(checkpoint, settings)
         if damage:
@@ -184,7 +184,7 @@ def nest(
     views = scene.train_ids.tolist()
     sort_at = {round(part * config.steps) for part in _SORT_AT} if movable is None else {}
     config_of_steps = replace(train_config, strategy="default", batch=1)
-    stepper = Stepper(Feed(scene, photos, device), config_of_steps, Work(scene, None), backend)
+    stepper = Stepper(PhotoLoader(scene, photos, device), config_of_steps, ActiveTiles(scene, None), backend)
     stepper.sh_bits = config.sh_bits
     rates = _rates(train_config, config, scene)
     trainable = trainable_rows(state.gaussians, {})
@@ -197,12 +197,12 @@ def nest(
                 worth = importance(
                     state.gaussians, scene, views, config.criterion, antialiased=train_config.antialiased
                 )
-                state.place = places(labels, ranks, worth).to(device)
+                state.order_share = order_shares(labels, ranks, worth).to(device)
             prefix = draw_shares(state.rng, len(categories), config, state.step / config.steps)
             rows = None
             if (prefix < 1).any():
-                assert state.place is not None
-                rows = torch.nonzero(state.place < torch.from_numpy(prefix).to(device)[column])[:, 0]
+                assert state.order_share is not None
+                rows = torch.nonzero(state.order_share < torch.from_numpy(prefix).to(device)[column])[:, 0]
             loss = stepper(
                 state, nested.gaussians.sh_degree, rates(state.step + 1), trainable, drawn_rows=rows
             )
@@ -212,14 +212,14 @@ def nest(
             if checkpoint and saves:
                 write_checkpoint(checkpoint, state, settings)
             yield NestStep(state.step, value)
-    assert state.place is not None
-    rows = np.lexsort((state.place.cpu().numpy(), labels))
+    assert state.order_share is not None
+    rows = np.lexsort((state.order_share.cpu().numpy(), labels))
     yield Nested(
-        state.gaussians.to("cpu").select(torch.from_numpy(rows)), nested.clarity[near][rows], ranks[rows]
+        state.gaussians.to("cpu").select(torch.from_numpy(rows)), nested.purity[near][rows], ranks[rows]
     )
 
 
-def places(labels: np.ndarray, ranks: np.ndarray, worth: np.ndarray) -> Tensor:
+def order_shares(labels: np.ndarray, ranks: np.ndarray, worth: np.ndarray) -> Tensor:
     """Share of its category that comes before each Gaussian (float32 [N]): by rank, then by worth."""
     rows = np.lexsort((-worth, ranks, labels))
     _, first, counts = np.unique(labels[rows], return_index=True, return_counts=True)
@@ -242,11 +242,13 @@ def _rates(
     train_config: TrainConfig, config: NestConfig, scene: Scene
 ) -> Callable[[int], Mapping[str, float]]:
     """Adam's rates by step."""
-    third = Pace(replace(train_config, max_steps=3, pace="published"), scene.extent).rates(2)
+    third = LrSchedule(
+        replace(train_config, max_steps=3, lr_schedule="published"), scene.extent
+    ).learning_rates(2)
 
     def rates(step: int) -> Mapping[str, float]:
-        gain = config.gain * _SHRINK_TO ** (step / config.steps)
-        return {name: gain * rate for name, rate in third.items()}
+        multiplier = config.lr_multiplier * _SHRINK_TO ** (step / config.steps)
+        return {name: multiplier * rate for name, rate in third.items()}
 
     return rates
 
@@ -261,9 +263,9 @@ def check(config: NestConfig) -> None:
         ("full-share", config.full_share, 0 <= config.full_share <= 1, "a share such as 0.1"),
         ("full-share-end", config.full_share_end, 0 <= config.full_share_end <= 1, "a share such as 0.9"),
         ("sh-bits", config.sh_bits, all(1 <= b <= 8 for b in config.sh_bits), "1 to 8, such as 5 4"),
-        ("seed-share", config.seed_share, 0 <= config.seed_share < 1, "a share such as 0.1, or 0"),
-        ("seed-steps", config.seed_steps, config.seed_steps >= 1, "1 or more"),
-        ("gain", config.gain, config.gain > 0, "a number such as 4"),
+        ("base-share", config.base_share, 0 <= config.base_share < 1, "a share such as 0.1, or 0"),
+        ("base-steps", config.base_steps, config.base_steps >= 1, "1 or more"),
+        ("lr-multiplier", config.lr_multiplier, config.lr_multiplier > 0, "a number such as 4"),
     )
     for name, value, fine, cure in wrong:
         if not fine:

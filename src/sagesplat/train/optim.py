@@ -15,20 +15,20 @@ _CHUNK = 4096
 
 
 @njit(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", cache=True)
-def _update(parameter, grad, first, second, rate, correction):
+def _update(parameter, grad, exp_avg, exp_avg_sq, rate, correction):
     b1, b2, eps = np.float32(_BETA1), np.float32(_BETA2), np.float32(_EPS)
     new1, new2 = np.float32(1 - _BETA1), np.float32(1 - _BETA2)
     for i in range(np.uint64(len(parameter))):
         g = grad[i]
-        m = b1 * first[i] + new1 * g
-        v = b2 * second[i] + new2 * g * g
-        first[i] = m
-        second[i] = v
+        m = b1 * exp_avg[i] + new1 * g
+        v = b2 * exp_avg_sq[i] + new2 * g * g
+        exp_avg[i] = m
+        exp_avg_sq[i] = v
         parameter[i] -= rate * m / (np.sqrt(v) * correction + eps)
 
 
 @njit(parallel=True, cache=True)
-def _update_rows(parameter, grad, first, second, rate, correction, trainable, columns):
+def _update_rows(parameter, grad, exp_avg, exp_avg_sq, rate, correction, trainable, columns):
     """Flat arrays of N * width values; runs of trainable rows are updated together."""
     n = len(trainable)
     width = len(parameter) // n
@@ -41,21 +41,21 @@ def _update_rows(parameter, grad, first, second, rate, correction, trainable, co
             if columns < width:
                 for r in range(row, stop):
                     a, b = r * width, r * width + columns
-                    _update(parameter[a:b], grad[a:b], first[a:b], second[a:b], rate, correction)
+                    _update(parameter[a:b], grad[a:b], exp_avg[a:b], exp_avg_sq[a:b], rate, correction)
             elif stop > row:
                 a, b = row * width, stop * width
-                _update(parameter[a:b], grad[a:b], first[a:b], second[a:b], rate, correction)
+                _update(parameter[a:b], grad[a:b], exp_avg[a:b], exp_avg_sq[a:b], rate, correction)
             row = stop + 1
 
 
 def adam_step(
     parameter: np.ndarray,  # [N, ...] float32, changed in place
     grad: np.ndarray,
-    first: np.ndarray,  # moments, changed in place
-    second: np.ndarray,
+    exp_avg: np.ndarray,  # moments, changed in place
+    exp_avg_sq: np.ndarray,
     *,
     lr: float,
-    step: int,  # 1 for the first
+    step: int,  # 1 for the exp_avg
     trainable: np.ndarray,  # bool [N]
     columns: int | None = None,
 ) -> None:
@@ -67,8 +67,8 @@ def adam_step(
         rate = np.float32(lr / (1 - _BETA1**step))
         correction = np.float32((1 - _BETA2**step) ** -0.5)
         _update_rows(
-            parameter.reshape(-1), np.ascontiguousarray(grad).reshape(-1), first.reshape(-1),
-            second.reshape(-1),
+            parameter.reshape(-1), np.ascontiguousarray(grad).reshape(-1), exp_avg.reshape(-1),
+            exp_avg_sq.reshape(-1),
             rate, correction, trainable, parameter.size if columns is None else columns,
         )  # fmt: skip
 
@@ -82,7 +82,7 @@ def update(
 ) -> None:
     """Adam's step number `state.step` on all parameters, on the device that they are on."""
     for name in PARAMETERS:
-        tensors = getattr(state.gaussians, name), grads[name], state.first[name], state.second[name]
+        tensors = getattr(state.gaussians, name), grads[name], state.exp_avg[name], state.exp_avg_sq[name]
         how = {
             "lr": rates[name],
             "step": state.step,
@@ -93,5 +93,5 @@ def update(
 
             adam_triton.adam_step(*tensors, trainable=trainable, **how)
         else:
-            parameter, grad, first, second = (t.detach().numpy() for t in tensors)
-            adam_step(parameter, grad, first, second, trainable=trainable.numpy(), **how)
+            parameter, grad, exp_avg, exp_avg_sq = (t.detach().numpy() for t in tensors)
+            adam_step(parameter, grad, exp_avg, exp_avg_sq, trainable=trainable.numpy(), **how)

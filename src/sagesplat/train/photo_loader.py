@@ -15,7 +15,7 @@ _MEMORY_SHARE = 0.25  # of a GPU's free memory, for photos
 
 
 @dataclass(eq=False)
-class Feed:
+class PhotoLoader:
     """Photos by view and size. On a GPU they stay as bytes until a limit is reached; later ones travel each
     time, from pinned memory, and are fetched ahead of their step.
     """

@@ -20,8 +20,8 @@ class TrainState:
     """Gaussians, Adam's moments, densification statistics and the order of the views."""
 
     gaussians: Gaussians
-    first: dict[str, Tensor]  # Adam's moments by parameter name
-    second: dict[str, Tensor]
+    exp_avg: dict[str, Tensor]  # Adam's moments by parameter name
+    exp_avg_sq: dict[str, Tensor]
     grad_sum: Tensor  # [N] summed screen-space gradient norms, half images
     grad_count: Tensor  # [N] times seen
     rng: np.random.Generator
@@ -30,7 +30,9 @@ class TrainState:
     last_reset: int = -1  # step of the last opacity reset, -1 = none yet
     frozen: dict[int, int] = field(default_factory=dict)  # label id -> step from which on it stays as it is
     withheld: int = 0  # Gaussians that categories would have got, had they not stopped
-    place: Tensor | None = None  # [N] share of its category that comes before it: only of a nested ladder
+    order_share: Tensor | None = (
+        None  # [N] share of its category that comes before it: only of a nested ladder
+    )
 
     def replace_rows(self, keep: Tensor, new: Gaussians) -> None:
         """Keep some rows (bool [N]) and append new Gaussians with fresh moments and statistics."""
@@ -38,8 +40,8 @@ class TrainState:
         self.gaussians = concat([kept, new])
         for name in PARAMETERS:
             fresh = torch.zeros_like(getattr(new, name))
-            self.first[name] = torch.cat([self.first[name][keep], fresh])
-            self.second[name] = torch.cat([self.second[name][keep], fresh])
+            self.exp_avg[name] = torch.cat([self.exp_avg[name][keep], fresh])
+            self.exp_avg_sq[name] = torch.cat([self.exp_avg_sq[name][keep], fresh])
         self.clear_statistics()
 
     def sort(self) -> None:
@@ -48,7 +50,7 @@ class TrainState:
             return
         order = torch.from_numpy(geometry.morton_order(self.gaussians.means.numpy()))
         self.gaussians = self.gaussians.select(order)
-        for moments in (self.first, self.second):
+        for moments in (self.exp_avg, self.exp_avg_sq):
             for name in PARAMETERS:
                 moments[name] = moments[name][order]
         self.grad_sum, self.grad_count = self.grad_sum[order], self.grad_count[order]
@@ -60,13 +62,13 @@ class TrainState:
 
     def to(self, device: torch.device) -> "TrainState":
         """The same on a device; tensors that are there already are shared."""
-        first, second = (
-            {name: m.to(device) for name, m in moments.items()} for moments in (self.first, self.second)
+        exp_avg, exp_avg_sq = (
+            {name: m.to(device) for name, m in moments.items()} for moments in (self.exp_avg, self.exp_avg_sq)
         )
         return replace(
-            self, gaussians=self.gaussians.to(device), first=first, second=second,
+            self, gaussians=self.gaussians.to(device), exp_avg=exp_avg, exp_avg_sq=exp_avg_sq,
             grad_sum=self.grad_sum.to(device), grad_count=self.grad_count.to(device),
-            place=None if self.place is None else self.place.to(device),
+            order_share=None if self.order_share is None else self.order_share.to(device),
         )  # fmt: skip
 
 
@@ -95,9 +97,9 @@ def from_points(
 
 
 def initial_state(gaussians: Gaussians, seed: int) -> TrainState:
-    """A state before the first step."""
-    first, second = (
+    """A state before the exp_avg step."""
+    exp_avg, exp_avg_sq = (
         {name: torch.zeros_like(p) for name, p in gaussians.parameters().items()} for _ in range(2)
     )
     zeros = torch.zeros(len(gaussians))
-    return TrainState(gaussians, first, second, zeros, zeros.clone(), np.random.default_rng(seed), [])
+    return TrainState(gaussians, exp_avg, exp_avg_sq, zeros, zeros.clone(), np.random.default_rng(seed), [])

@@ -15,11 +15,11 @@ from sagesplat.raster import Backend, Render, Workspace, device_of, rasterize
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.train import densify, mcmc, optim
-from sagesplat.train.early_stopping import Work, trainable_rows
-from sagesplat.train.gradient_freezing import Rest
+from sagesplat.train.early_stopping import ActiveTiles, trainable_rows
+from sagesplat.train.gradient_freezing import GradientFreezing
 from sagesplat.train.group import ALONE, Group
-from sagesplat.train.lr_schedule import Pace
-from sagesplat.train.photo_loader import Feed
+from sagesplat.train.lr_schedule import LrSchedule
+from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.state import TrainState, initial_state
 
 FINISHED_SHARE = 1 / 8  # of the rounds have a view in which nothing is left to learn: it is drawn whole then
@@ -29,12 +29,12 @@ FINISHED_SHARE = 1 / 8  # of the rounds have a view in which nothing is left to 
 class Stepper:
     """Takes training steps on a state: render views, compare them with their photos, move the Gaussians."""
 
-    feed: Feed
+    photo_loader: PhotoLoader
     config: TrainConfig
-    work: Work
+    active_tiles: ActiveTiles
     backend: Backend = "auto"
     group: Group = ALONE
-    rest: Rest | None = None
+    gradient_freezing: GradientFreezing | None = None
     sh_bits: tuple[int, int] | None = None  # draw Gaussians rounded as SPZ files will hold them
     drawn: float = 1.0  # share of the tiles that the last step drew
     workspace: Workspace = field(default_factory=Workspace)
@@ -43,11 +43,11 @@ class Stepper:
         self,
         state: TrainState,
         degree: int,
-        rates: Mapping[str, float],
+        learning_rates: Mapping[str, float],
         trainable: Tensor,
         factor: int = 1,
         observing: bool = False,
-        wander: float = 0.0,
+        sgld_noise: float = 0.0,
         drawn_rows: Tensor | None = None,
     ) -> Tensor:
         """One step on photos `factor` times smaller; the loss, on the device.
@@ -58,7 +58,7 @@ class Stepper:
         batch = max(self.config.batch, self.group.size)
         views = self.group.share([self._next_view(state) for _ in range(batch)])
         if state.queue:
-            self.feed.expect(state.queue[-1 - self.group.rank % len(state.queue)], factor)
+            self.photo_loader.expect(state.queue[-1 - self.group.rank % len(state.queue)], factor)
         shown = state.gaussians if drawn_rows is None else state.gaussians.select(drawn_rows)
         leaves = {name: p.detach().requires_grad_() for name, p in shown.parameters().items()}
         moving = replace(shown, **leaves)
@@ -88,33 +88,33 @@ class Stepper:
             grads = {name: grad / batch for name, grad in grads.items()}
         if drawn_rows is not None:
             grads, trainable = _spread(grads, drawn_rows, trainable)
-        if self.rest:
-            self.rest.watch(grads)
+        if self.gradient_freezing:
+            self.gradient_freezing.watch(grads)
         state.step += 1
         if self.config.strategy == "mcmc":
-            weights = self.config.mcmc_opacity, self.config.mcmc_scale / self.feed.scene.extent
+            weights = self.config.mcmc_opacity, self.config.mcmc_scale / self.photo_loader.scene.extent
             mcmc.add_regularisation_gradients(state, grads, *weights, trainable)
-        scaled = {name: rate * math.sqrt(batch) for name, rate in rates.items()}
+        scaled = {name: rate * math.sqrt(batch) for name, rate in learning_rates.items()}
         optim.update(state, grads, scaled, degree, trainable)
-        if wander:
-            mcmc.perturb(state, wander, trainable)
+        if sgld_noise:
+            mcmc.perturb(state, sgld_noise, trainable)
         return total / batch
 
     def _draw(
         self, moving: Gaussians, view: int, degree: int, trainable: Tensor, factor: int
     ) -> tuple[Tensor, Render]:
-        photo, camera = self.feed(view, factor)
+        photo, camera = self.photo_loader(view, factor)
         # nobody may paint over what is finished, so it is looked at now and then
-        finished, left = self.work.finished(view), self.work.tiles(view, factor)
+        finished, left = self.active_tiles.finished(view), self.active_tiles.tiles(view, factor)
         self.drawn += 1.0 if finished or left is None else float(left.mean())
-        tiles = None if finished else self.work.mask(view, factor)
+        tiles = None if finished else self.active_tiles.mask(view, factor)
         render = rasterize(
             moving,
             camera,
             sh_degree=degree,
             antialiased=self.config.antialiased,
             tile_mask=tiles,
-            trainable=trainable if self.work.frozen or self.rest else None,
+            trainable=trainable if self.active_tiles.frozen or self.gradient_freezing else None,
             absgrad=self.config.absgrad,
             workspace=self.workspace,
             backend=self.backend,
@@ -126,8 +126,8 @@ class Stepper:
         while not state.queue:
             state.queue = [
                 view
-                for view in state.rng.permutation(self.feed.scene.train_ids).tolist()
-                if not self.work.finished(view) or state.rng.random() < FINISHED_SHARE
+                for view in state.rng.permutation(self.photo_loader.scene.train_ids).tolist()
+                if not self.active_tiles.finished(view) or state.rng.random() < FINISHED_SHARE
             ]
         return state.queue.pop()
 
@@ -158,13 +158,15 @@ def tune(
     The rates are those of the last third of a published run of three times `steps`.
     """
     config = replace(config, strategy="default", batch=1)
-    rates = Pace(replace(config, max_steps=3 * steps, pace="published"), scene.extent).rates
+    learning_rates = LrSchedule(
+        replace(config, max_steps=3 * steps, lr_schedule="published"), scene.extent
+    ).learning_rates
     device = device_of(backend)
     copies = {name: p.detach().clone() for name, p in gaussians.parameters().items()}
     state = initial_state(replace(gaussians, **copies).to(device), seed)
     state.sort()
-    stepper = Stepper(Feed(scene, photos, device), config, Work(scene, None), backend)
+    stepper = Stepper(PhotoLoader(scene, photos, device), config, ActiveTiles(scene, None), backend)
     everything = trainable_rows(state.gaussians, {})
     for step in range(1, steps + 1):
-        stepper(state, gaussians.sh_degree, rates(2 * steps + step), everything)
+        stepper(state, gaussians.sh_degree, learning_rates(2 * steps + step), everything)
     return state.gaussians.to("cpu")

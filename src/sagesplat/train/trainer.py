@@ -20,11 +20,11 @@ from sagesplat.scene.scene import Scene
 from sagesplat.segment.masks import Masks
 from sagesplat.train import densify, mcmc
 from sagesplat.train.checkpoint import latest_checkpoint, previous, write_checkpoint
-from sagesplat.train.early_stopping import Work, label_quality, measured_views, trainable_rows
-from sagesplat.train.gradient_freezing import Rest
+from sagesplat.train.early_stopping import ActiveTiles, label_quality, measured_views, trainable_rows
+from sagesplat.train.gradient_freezing import GradientFreezing
 from sagesplat.train.group import ALONE, Group
-from sagesplat.train.lr_schedule import pace
-from sagesplat.train.photo_loader import Feed
+from sagesplat.train.lr_schedule import lr_schedule
+from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.state import MCMC_OPACITY, MCMC_SCALE, TrainState, from_points, initial_state
 from sagesplat.train.stepper import Stepper
 
@@ -158,7 +158,9 @@ def _train(
     """The events of `train`, each with the state that it comes from."""
     plan = densify.schedule(config)
     some = scene.train_ids[:: max(1, len(scene.train_ids) // 8)]
-    run_pace = pace(config, scene.extent, [photos[i] for i in some] if config.pace == "fast" else [])
+    schedule_of_run = lr_schedule(
+        config, scene.extent, [photos[i] for i in some] if config.lr_schedule == "fast" else []
+    )
     device = device_of(backend, group.rank)
     begin = (MCMC_OPACITY, MCMC_SCALE) if config.strategy == "mcmc" else ()
     state = initial_state(from_points(scene.points, label_ids, config.sh_degree, *begin), seed).to(device)
@@ -173,9 +175,13 @@ def _train(
             _check_levels(checkpoint, state.step)
         yield Resumed(state.step, damage), state
     folder = folder if group.leads else None
-    work = Work(scene, masks, frozenset(state.frozen), device)
-    rest = Rest(config.rest_share) if config.rest_share else None
-    stepper = Stepper(Feed(scene, photos, device), config, work, backend, group, rest)
+    active_tiles = ActiveTiles(scene, masks, frozenset(state.frozen), device)
+    gradient_freezing = (
+        GradientFreezing(config.gradient_freeze_share) if config.gradient_freeze_share else None
+    )
+    stepper = Stepper(
+        PhotoLoader(scene, photos, device), config, active_tiles, backend, group, gradient_freezing
+    )
     trainable = trainable_rows(state.gaussians, state.frozen)
     looked_at = measured_views(scene, masks) if config.freeze_at is not None and masks is not None else {}
     awake, learning, value = trainable, bool(trainable.any()), 0.0
@@ -184,10 +190,12 @@ def _train(
         last = step == config.max_steps
         records = step % plan.level_every == 0 or last
         refining = plan.refine_start < step < plan.refine_stop
-        degree, factor = _sh_degree(step - 1, config, plan), run_pace.factor(step)
+        degree, factor = _sh_degree(step - 1, config, plan), schedule_of_run.factor(step)
         observing = config.strategy == "default" and step < plan.refine_stop
-        wander = run_pace.wander(step) if config.strategy == "mcmc" else 0.0
-        loss = stepper(state, degree, run_pace.rates(step), awake, factor, observing, wander)
+        sgld_noise = schedule_of_run.sgld_noise(step) if config.strategy == "mcmc" else 0.0
+        loss = stepper(
+            state, degree, schedule_of_run.learning_rates(step), awake, factor, observing, sgld_noise
+        )
         if device.type == "cpu" or records or step % LOOK_EVERY == 0:  # looking waits for a GPU
             value = finite(loss, step)
         yield Step(step, value, len(state.gaussians), stepper.drawn), state
@@ -198,20 +206,20 @@ def _train(
         if records and config.freeze_at is not None and masks is not None:
             degree = _sh_degree(step, config, plan)
             quality = label_quality(
-                state.gaussians, stepper.work, stepper.feed, looked_at, config, degree,
+                state.gaussians, stepper.active_tiles, stepper.photo_loader, looked_at, config, degree,
                 backend=backend, workspace=stepper.workspace, group=group,
             )  # fmt: skip
             for event in _freeze(state, quality, config.freeze_at):
                 yield event, state
-            if len(state.frozen) > len(stepper.work.frozen):
-                stepper.work = Work(scene, masks, frozenset(state.frozen), device)
+            if len(state.frozen) > len(stepper.active_tiles.frozen):
+                stepper.active_tiles = ActiveTiles(scene, masks, frozenset(state.frozen), device)
             awake = trainable = trainable_rows(state.gaussians, state.frozen)
             learning = bool(trainable.any())
         if refining and step % config.refine_every == 0:
-            _refine(state, config, plan, scene, trainable, group, run_pace.factor(step))
+            _refine(state, config, plan, scene, trainable, group, schedule_of_run.factor(step))
             awake = trainable = trainable_rows(state.gaussians, state.frozen)
-        if rest and step % config.refine_every == 0:
-            awake = rest.turn(trainable)
+        if gradient_freezing and step % config.refine_every == 0:
+            awake = gradient_freezing.turn(trainable)
         if resets:
             densify.reset_opacities(state, config, trainable)
         if records and late:
@@ -274,8 +282,10 @@ def _check(config: TrainConfig, masks: Masks | None) -> None:
     target = config.freeze_at
     if target is not None and not 0 < target <= 1:
         raise RunError(f"--train.freeze-at {target} is no SSIM to reach; choose a number such as 0.8")
-    if not 0 <= config.rest_share < 1:
-        raise RunError(f"--train.rest-share {config.rest_share} is no share; choose a number such as 0.5")
+    if not 0 <= config.gradient_freeze_share < 1:
+        raise RunError(
+            f"--train.rest-share {config.gradient_freeze_share} is no share; choose a number such as 0.5"
+        )
     if target is not None and masks is None:
         raise RunError("--train.freeze-at needs label images to measure categories on; bring masks")
 

@@ -19,10 +19,10 @@ from jaxtyping import Bool, Float
 from sagesplat import __version__
 from sagesplat.adapt.viewpoint import ViewModel
 from sagesplat.core.errors import DataError, RunError, SageError
-from sagesplat.formats.increments import Chunk
+from sagesplat.formats.increments import Increment
 from sagesplat.io.files import read_json, write_text
 from sagesplat.scene.scene import Camera
-from sagesplat.segment.parts import split_name
+from sagesplat.segment.block_categories import split_name
 from sagesplat.viewer import frames
 from sagesplat.viewer.frames import FLIP
 from sagesplat.viewer.pack import Ladder, order_of, write_pack
@@ -49,7 +49,7 @@ decides how it may be used.
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
+class CameraEntry:
     """A photo's camera."""
 
     name: str
@@ -86,9 +86,9 @@ class Contents:
 
     name: str
     extent: float  # of the cameras
-    shots: Sequence[Shot]  # at least one
+    shots: Sequence[CameraEntry]  # at least one
     categories: Sequence[Category]
-    chunks: Sequence[Chunk]  # SPZ; of the categories above
+    chunks: Sequence[Increment]  # SPZ; of the categories above
     folder: Path  # where the chunks are
     sh_degree: int
     antialiased: bool = False
@@ -99,7 +99,7 @@ class Contents:
 
 
 @dataclass(frozen=True)
-class Written:
+class BundleSizes:
     """Sizes of a bundle, bytes."""
 
     manifest: int
@@ -108,7 +108,7 @@ class Written:
     total: int  # with the viewer
 
 
-def write_bundle(out: Path, contents: Contents, viewer: Path, poster: bytes | None = None) -> Written:
+def write_bundle(out: Path, contents: Contents, viewer: Path, poster: bytes | None = None) -> BundleSizes:
     """Write a bundle into a folder, which is new, empty or an earlier bundle; it is replaced as a whole.
 
     `viewer`: the folder with the built viewer. `poster`: a JPEG of the first view, shown until the scene is
@@ -162,7 +162,7 @@ def has_viewer(folder: Path, viewer: Path) -> bool:
     return mine in (page, _with_poster(page))
 
 
-def write_documents(folder: Path, contents: Contents) -> Written:
+def write_documents(folder: Path, contents: Contents) -> BundleSizes:
     """Write all but the chunks, which must be there, and the viewer; the manifest last."""
     manifest, promises = documents(contents, (folder / THIRD_PARTY).exists())
     if contents.chunks and not contents.live:
@@ -174,7 +174,7 @@ def write_documents(folder: Path, contents: Contents) -> Written:
     text = dumped(manifest)
     write_text(folder / MANIFEST, text.decode())
     total = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-    return Written(len(text), len(promises or b""), manifest["totals"]["bytes"], total)
+    return BundleSizes(len(text), len(promises or b""), manifest["totals"]["bytes"], total)
 
 
 def check_target(out: Path) -> None:
@@ -199,7 +199,7 @@ def check_viewer(viewer: Path) -> None:
         raise SageError(f"{viewer}: viewer not built: run `make web` (installed packages have it)")
 
 
-def _verified(folder: Path, chunk: Chunk) -> bytes:
+def _verified(folder: Path, chunk: Increment) -> bytes:
     try:
         content = (folder / chunk.uri).read_bytes()
     except OSError as error:
@@ -303,7 +303,7 @@ def _promises(contents: Contents, models: dict[int, ViewModel]) -> bytes | None:
 
 
 def _label(
-    category: Category, chunks: Sequence[Chunk], model: ViewModel | None, extent: float
+    category: Category, chunks: Sequence[Increment], model: ViewModel | None, extent: float
 ) -> dict[str, Any]:
     return {
         "id": category.label_id,
@@ -329,8 +329,8 @@ def _label(
     }
 
 
-def _chunks_by_label(chunks: Sequence[Chunk]) -> dict[int, list[Chunk]]:
-    found: dict[int, list[Chunk]] = {}
+def _chunks_by_label(chunks: Sequence[Increment]) -> dict[int, list[Increment]]:
+    found: dict[int, list[Increment]] = {}
     for chunk in sorted(chunks, key=lambda c: c.level):
         found.setdefault(chunk.label_id, []).append(chunk)
     return found
@@ -352,7 +352,7 @@ def _frame(contents: Contents) -> dict[str, Any]:
     }
 
 
-def _camera(shot: Shot, extent: float) -> dict[str, Any]:
+def _camera(shot: CameraEntry, extent: float) -> dict[str, Any]:
     camera, K = shot.camera, shot.camera.K
     return {
         "name": shot.name,

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from sagesplat.adapt.viewpoint import ViewModel, alike
+from sagesplat.adapt.viewpoint import ViewModel, matern32
 from sagesplat.scene.scene import Camera
 from sagesplat.viewer import boxes
 from sagesplat.viewer.frames import camera_at
@@ -125,7 +125,7 @@ def _share(
         np.array([[*one.position / extent, *one.direction, 0.0] for one in some], np.float64)
         for some in ([camera], cameras)
     )
-    near = alike(here, known, ladder.model.lengths)[0]
+    near = matern32(here, known, ladder.model.lengths)[0]
     return float(near @ ladder.shares / near.sum()) if near.sum() > 1e-12 else float(ladder.shares.mean())
 
 

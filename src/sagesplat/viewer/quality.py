@@ -12,14 +12,17 @@ from jaxtyping import Float, Int
 from scipy.spatial.distance import cdist
 
 from sagesplat.adapt.eq3 import Eq3, SsimModel
-from sagesplat.adapt.viewpoint import ViewModel, alike
+from sagesplat.adapt.viewpoint import ViewModel, matern32
 from sagesplat.viewer.frames import FLIP
 
 MOVES = 5e-4  # SSIM that rounding may move a bound by in any of the scene's views
 CURVE_MOVES = 1e-4  # SSIM that rounding may move a curve by
 LIKE = 16  # power of the kernel that known views speak of a distance with: only those close by count
 _ENOUGH = 1e-3  # of such weight; below it the boxes alone tell
-_NUMBERS = ("usual", "unseen", "noise", "factor", "confidence", "shift", "mixing")
+_WIRE = {  # names in promises-*.json, which viewers read, of what `ViewModel` has
+    "usual": "median_log_distance", "unseen": "heldout_variance", "noise": "noise", "factor": "multiplier",
+    "confidence": "confidence", "shift": "composition_bias", "mixing": "composition_std",
+}  # fmt: skip
 
 
 def of_files(model: ViewModel, files: Sequence[int], last: int) -> ViewModel:
@@ -119,17 +122,17 @@ def promise_entry(
     return {
         "id": model.label_id,
         "levels": list(model.levels),
-        "usual": short(model.usual),
+        "usual": short(model.median_log_distance),
         "lengths": short(model.lengths),
-        "unseen": short(model.unseen),
+        "unseen": short(model.heldout_variance),
         "noise": short(model.noise),
-        "factor": short(model.factor),
+        "factor": short(model.multiplier),
         "confidence": model.confidence,
-        "shift": short(model.shift),
-        "mixing": short(model.mixing),
+        "shift": short(model.composition_bias),
+        "mixing": short(model.composition_std),
         "amplitudes": short(model.amplitudes),
         "views": rows.tolist(),
-        "unseenViews": model.unseen_inputs.astype(int).tolist(),
+        "unseenViews": model.heldout_inputs.astype(int).tolist(),
         "logDistances": (
             model.inputs[:, 6] if decimals is None else model.inputs[:, 6].round(decimals)
         ).tolist(),
@@ -150,13 +153,13 @@ def model_of(
         curves=tuple(curve for curve in curves if curve.level in entry["levels"]),
         extent=extent,
         inputs=np.column_stack([mine[:, :3] / extent, mine[:, 3:], entry["logDistances"]]),
-        unseen_inputs=np.array(entry["unseenViews"], bool),
+        heldout_inputs=np.array(entry["unseenViews"], bool),
         lengths=(x, y, z),
         weights=np.array(entry["weights"]),
         amplitudes=np.array(entry["amplitudes"]),
         rmse=math.nan,
         status="",
-        **{name: entry[name] for name in _NUMBERS},
+        **{field: entry[name] for name, field in _WIRE.items()},
     )
 
 
@@ -174,7 +177,7 @@ def corrected(
     """
     here = np.column_stack([position / model.extent, direction, np.zeros(len(position))])
     known = np.column_stack([model.inputs[:, :6], np.zeros(model.num_views)])
-    weights = alike(here, known, model.lengths) ** LIKE
+    weights = matern32(here, known, model.lengths) ** LIKE
     return distance * np.exp(weights @ corrections / (weights.sum(1) + _ENOUGH))
 
 

@@ -19,7 +19,7 @@ from sagesplat.core.config import CompareConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Progress, RunDone, TableMade
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.formats.increments import INDEX, read_chunks, read_index, write_chunks
+from sagesplat.formats.increments import INDEX, read_increments, read_index, write_increments
 from sagesplat.formats.levels import read_level, write_set
 from sagesplat.formats.spz import SH_BITS
 from sagesplat.io.files import read_json, write_json
@@ -58,7 +58,7 @@ from sagesplat.studies.compare.report import (
     write_report,
 )
 from sagesplat.studies.lpips import load_metrics, lpips_hashes
-from sagesplat.studies.paper.model_size import nearest_snapshot, prune_to
+from sagesplat.studies.paper.same_size import nearest_snapshot, prune_to
 from sagesplat.train.importance import importance
 from sagesplat.train.nested import capped_config
 
@@ -137,7 +137,7 @@ def _check(job: Job, config: CompareConfig) -> None:
     run = job.run
     if not len(job.scene.test_ids):
         raise RunError(f"{run.path}: no test views to compare on; begin a run with --test-every 8")
-    for path in (run.prefixes, run.chunks / INDEX, run.observations, run.promises, run.plan):
+    for path in (run.prefixes, run.increments / INDEX, run.observations, run.promises, run.plan):
         if not path.exists():
             raise RunError(f"{path}: missing, but all is compared with it; finish `sagesplat run` (nested)")
     for name, shares in (("shares", config.shares), ("caps", config.caps)):
@@ -289,10 +289,10 @@ def _nested(job: Job, config: CompareConfig, costs: Costs, quality: Quality) -> 
     made = settings_of(job.run, "plan")
     shown = pixels_of(read_observations(job.run.observations), job, costs.labels, job.scene.train_ids)
     steps = job.snapshots.levels[-1] + settings_of(job.run, "nest")["steps"]
-    sent = costs.sent.sum(0)
+    sent = costs.transfer_bytes.sum(0)
     found = []
-    for k in range(costs.sent.shape[1]):
-        bytes_of = dict(zip(costs.labels, costs.sent[:, k].tolist(), strict=True))
+    for k in range(costs.transfer_bytes.shape[1]):
+        bytes_of = dict(zip(costs.labels, costs.transfer_bytes[:, k].tolist(), strict=True))
         load = partial(job.ladder.load, k + 1)
         found.append(Contender(SAME_SHARE, f"level {k + 1}", steps, load, bytes_of))
     budgets = np.ceil(np.geomspace(sent[0], sent[-1], config.budgets)).tolist()
@@ -310,7 +310,7 @@ def _nested(job: Job, config: CompareConfig, costs: Costs, quality: Quality) -> 
         found.append(
             Contender(
                 PLANNED, name, steps, partial(job.ladder.compose, plan.levels),
-                {choice.label_id: choice.sent or 0 for choice in plan.choices}, plan.target,
+                {choice.label_id: choice.transfer_bytes or 0 for choice in plan.choices}, plan.target,
                 np.nan if plan.budget is None else plan.budget,
             )
         )  # fmt: skip
@@ -388,21 +388,21 @@ def _send(job: Job, g: Gaussians) -> tuple[dict[int, int], Gaussians]:
     whole = {label: (count,) for label, count in g.counts().items()}
     with TemporaryDirectory() as folder:
         path = Path(folder) / "chunks"
-        chunks = write_chunks(path, g, whole, job.names(), sh_bits=bits, antialiased=job.antialiased)
-        arrived = read_chunks(path, chunks) if chunks else g
+        chunks = write_increments(path, g, whole, job.names(), sh_bits=bits, antialiased=job.antialiased)
+        arrived = read_increments(path, chunks) if chunks else g
     return {c.label_id: c.nbytes for c in chunks}, arrived
 
 
 def _walks(job: Job, snapshots: Job, costs: Costs, quality: Quality) -> list[Walk]:
     """From view to view by name at the main target: ours with hysteresis, and the paper's plans."""
     target, views = main_target(job.run), range(len(job.scene.views))
-    chosen = along(quality.bound, costs.sent, target=target) + 1
+    chosen = along(quality.bound, costs.transfer_bytes, target=target) + 1
     ours = [dict(zip(costs.labels, levels.tolist(), strict=True)) for levels in chosen]
-    chunks = read_index(job.run.chunks)
+    chunks = read_index(job.run.increments)
     chunk_files = {
         (label, k + 1): {c.uri: c.nbytes for c in chunks if c.label_id == label and c.level <= k + 1}
         for label in costs.labels
-        for k in range(costs.sent.shape[1])
+        for k in range(costs.transfer_bytes.shape[1])
     }
     planned = view_planner(snapshots)
     theirs = [planned(row, target).levels for row in views]

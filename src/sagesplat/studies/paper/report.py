@@ -23,7 +23,7 @@ from sagesplat.output.tables import MB, Table, by_size, last_counts, mean, name_
 from sagesplat.raster import Backend
 from sagesplat.scene.scene import Camera
 from sagesplat.studies.paper.cross_view import NONE, CrossView
-from sagesplat.studies.paper.model_size import METHODS, WHOLE, Occupancy
+from sagesplat.studies.paper.same_size import METHODS, WHOLE, SameSize
 
 ITERATIONS = (1 / 6, 1 / 3, 1 / 2, 1.0)  # of the run: the paper's 5000, 10 000, 15 000 and 30 000
 
@@ -60,7 +60,7 @@ class PaperData:
     distances: Mapping[str, Mapping[int, float]]  # "min", "5 %", "mean" -> label id -> world units, in `view`
     view_plans: Sequence[Plan]  # for `view`, one per target, from `iterations` alone
     cross_view: CrossView
-    occupancy: Occupancy
+    same_size: SameSize
     panels: Mapping[str, Sequence[Picture]]  # view name -> photo, 3DGS, one per target
 
 
@@ -86,6 +86,7 @@ def write_paper(folder: Path, data: PaperData) -> Path:
     page = template(Path(__file__).with_name("paper.html.j2")).render(
         title=title, tables=tables, pictures=pictures
     )
+    write_text(folder / "index.html", page)
     return folder / "index.html"
 
 
@@ -94,9 +95,9 @@ def _tables(data: PaperData, labels: Sequence[int]):
         if len(views):
             yield f"table_1_{which}", quality_and_counts(data, labels, views, which)
     yield "table_3_view", one_view(data, labels)
-    yield "table_4_view", equal_occupancy(data.occupancy, data.view, data.view_names[data.view])
+    yield "table_4_view", equal_size(data.same_size, data.view, data.view_names[data.view])
     if len(data.test_views):
-        yield "table_4_test", equal_occupancy(data.occupancy, NONE, "mean of the test views")
+        yield "table_4_test", equal_size(data.same_size, NONE, "mean of the test views")
         yield "cross_view", cross_view_table(data.cross_view, labels, data.names, data.counts)
     if data.models:
         yield "equation_3", curves_and_constants(data, labels)
@@ -219,9 +220,9 @@ def one_view(data: PaperData, labels: Sequence[int]) -> Table:
     )
 
 
-def equal_occupancy(occupancy: Occupancy, of_view: int, where: str) -> Table:
+def equal_size(same_size: SameSize, of_view: int, where: str) -> Table:
     """Table IV: compositions and 3DGS of the same size; `of_view` as in `Occupancy`."""
-    rows = occupancy.select(occupancy.of_view == of_view)
+    rows = same_size.select(same_size.of_view == of_view)
     body, best = [], {}
     quality = {"ssim": 1, "psnr": 1, "lpips_alex": -1, "lpips_vgg": -1}  # larger or smaller is better
     for target in sorted(t for t in np.unique(rows.target) if not np.isnan(t)):

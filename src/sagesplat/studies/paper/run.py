@@ -24,8 +24,8 @@ from sagesplat.stages.plan import view_planner
 from sagesplat.stages.shared import distances, label_images, ladder_files
 from sagesplat.studies.lpips import load_metrics, lpips_hashes
 from sagesplat.studies.paper.cross_view import NONE, cross_view, read_cross_view
-from sagesplat.studies.paper.model_size import Occupancy, compare, contenders, read_occupancy
 from sagesplat.studies.paper.report import PaperData, Picture, four_levels, take_pictures, write_paper
+from sagesplat.studies.paper.same_size import SameSize, compare, contenders, read_occupancy
 
 _IMAGES_A_TRAINING = 50  # a short training takes about as long as measuring so many images
 
@@ -33,7 +33,7 @@ _IMAGES_A_TRAINING = 50  # a short training takes about as long as measuring so 
 def paper_report(job: Job, config: PaperConfig) -> None:
     """Everything of the paper that one run can show."""
     cross_views(job)
-    equal_occupancy(job, config)
+    equal_size(job, config)
     tables_and_figures(job, config)
 
 
@@ -76,15 +76,15 @@ def promises_table(job: Job, targets: Sequence[float]) -> Table:
     body = []
     for predictor in PREDICTORS:
         totals = scores.select(scores.predictor == predictor).totals()
-        columns = ("feasible", "kept", "overshoot", "chosen_overshoot", "refused", "regret")
+        columns = ("accepted", "kept", "overshoot", "chosen_overshoot", "false_rejections", "regret")
         body.append((predictor, *(totals[name] for name in columns)))
     return Table(
         "Promises on unseen views, by what they are made from",
-        ("by", "feasible", "kept", "overshoot", "above the lowest", "refused", "regret"),
+        ("by", "accepted", "kept", "overshoot", "above the lowest", "false rejections", "regret"),
         ("", ",d", ".1%", ".3f", ".3f", ",d", ",.0f"),
         body,
         notes=(
-            "(category, view, target) triples called feasible, and the share that measures the target; SSIM "
+            "(category, view, target) triples accepted, and the share that measures the target; SSIM "
             "above it, of all and where a level above the lowest was chosen; triples refused though a level "
             "measures the target; Gaussians above the cheapest level that would have done. "
             f"Targets: {', '.join(f'{t:g}' for t in targets)}. oracle: the measurement itself.",
@@ -92,7 +92,7 @@ def promises_table(job: Job, targets: Sequence[float]) -> Table:
     )
 
 
-def equal_occupancy(job: Job, config: PaperConfig) -> None:
+def equal_size(job: Job, config: PaperConfig) -> None:
     """Compare compositions with 3DGS of the same size, on the test views and in one view."""
     run = job.run
     view = _view(job, config)
@@ -124,11 +124,11 @@ def equal_occupancy(job: Job, config: PaperConfig) -> None:
                 job.scene, job.photos, views, sets, metrics, of_view=of_view,
                 backend=job.backend, antialiased=job.antialiased, progress=lambda *_: advance(1),
             )  # fmt: skip
-        write_columns(run.occupancy, from_rows(Occupancy, rows))
+        write_columns(run.same_size, from_rows(SameSize, rows))
         return [f"{len(rows)} images measured"]
 
     inputs = [run.scene, run.levels, run.models, run.observations, run.plan]
-    run_stage(job, "occupancy", settings, inputs, [run.occupancy], make)
+    run_stage(job, "occupancy", settings, inputs, [run.same_size], make)
 
 
 def tables_and_figures(job: Job, config: PaperConfig) -> None:
@@ -163,13 +163,13 @@ def tables_and_figures(job: Job, config: PaperConfig) -> None:
             distances={n: {i: float(d[view]) for i, d in table.items()} for n, table in by_statistic.items()},
             view_plans=view_plans,
             cross_view=read_cross_view(run.cross_view),
-            occupancy=read_occupancy(run.occupancy),
+            same_size=read_occupancy(run.same_size),
             panels=_panels(job, config, view),
         )
         write_paper(run.paper, data)
         return []
 
-    inputs = [run.observations, run.models, run.plan, run.cross_view, run.occupancy]
+    inputs = [run.observations, run.models, run.plan, run.cross_view, run.same_size]
     run_stage(job, "paper", {"view": view}, inputs, [run.paper / "index.html"], make)
     job.emit(RunDone(run.paper / "index.html"))
 

@@ -12,7 +12,7 @@ _MARK = "@"  # between category and block in a part's name
 
 
 @dataclass(frozen=True)
-class Parts:
+class BlockCategories:
     """Numbers the parts: the categories of block 0, then those of block 1, ...; the unlabelled one first."""
 
     taxonomy: Taxonomy  # of the categories

@@ -34,7 +34,7 @@ class Contender(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Occupancy:
+class SameSize:
     """One row per (contender, view)."""
 
     of_view: Int32[np.ndarray, " R"]  # view that the compositions were planned for; -1 = for the scene
@@ -47,14 +47,14 @@ class Occupancy:
     lpips_alex: Float32[np.ndarray, " R"]  # NaN where it could not be measured
     lpips_vgg: Float32[np.ndarray, " R"]  # fed as the evaluation of 3DGS feeds it
 
-    def select(self, keep: np.ndarray) -> "Occupancy":
+    def select(self, keep: np.ndarray) -> "SameSize":
         """The rows that a boolean mask or an index array names."""
-        return Occupancy(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+        return SameSize(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
 
-def read_occupancy(path: Path) -> Occupancy:
+def read_occupancy(path: Path) -> SameSize:
     """The table that `columns.write_columns` wrote. DataError where it is not one."""
-    return read_columns(path, Occupancy, "run `sagesplat report --paper` again")
+    return read_columns(path, SameSize, "run `sagesplat report --paper` again")
 
 
 def prune_to(g: Gaussians, count: int, weights: np.ndarray) -> Gaussians:
