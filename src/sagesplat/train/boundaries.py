@@ -49,7 +49,7 @@ def interior_sizes(
 def together(files: Sequence[Path]) -> tuple[Gaussians, dict[int, tuple[int, ...]], np.ndarray]:
     """The ladders of all blocks as one: Gaussians, sizes of levels by label id, clarity."""
     sizes = {label: n for path in files for label, n in read_sizes(path).items()}
-    purity = np.concatenate([read_more(path, "clarity") for path in files])
+    purity = np.concatenate([read_more(path, "purity") for path in files])
     return concat([read_level(path) for path in files]), sizes, purity
 
 
