@@ -1,6 +1,7 @@
 """A run folder being worked on, and what its stages share."""
 
 import hashlib
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -43,6 +44,7 @@ class Job:
     locks: ExitStack | None = None  # keeps the run folder locked between stages (else within each)
     executor: Executor = LOCAL  # of pieces that do not depend on each other
     lock_wait: float = 0.0  # seconds to wait for who has the run folder
+    before_redo: Callable[[str, str], None] | None = None  # told of a stage to be forced, and what differs
 
     @property
     def spec(self) -> "JobSpec":
