@@ -29,7 +29,7 @@ from sagesplat.stages.scene import open_scene
 from sagesplat.stages.shared import distances
 from sagesplat.stages.train import train_levels
 from sagesplat.viewer.bundle import is_bundle
-from sagesplat.viewer.display_names import colors_of, title_of
+from sagesplat.viewer.display_names import colors_of
 from sagesplat.viewer.frames import camera_at
 from sagesplat.viewer.quality import curve_of, model_of
 

@@ -10,6 +10,7 @@ from sagesplat.output import tables
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import settings_of
 from sagesplat.run.stage import run_stage
+from sagesplat.segment.display_names import titles
 from sagesplat.stages.compose import compose
 from sagesplat.stages.plan import main_target, promised, scene_plan
 from sagesplat.stages.shared import _show, label_images, ladder_files
@@ -31,7 +32,7 @@ def evaluate_plans(job: Job) -> None:
         table.write_csv(run.evaluation)
         if len(table):
             plan = scene_plan(run, main_target(run))
-            _show(job, tables.outcome_table(plan, job.ladder.counts, table, job.names()))
+            _show(job, tables.outcome_table(plan, job.ladder.counts, table, titles(job.names())))
         whole = table.select(table.label_id == TOTAL)
         lines = []
         for target in np.unique(whole.target):
