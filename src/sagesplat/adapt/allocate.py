@@ -136,13 +136,13 @@ def choose(
     """The cheapest level whose SSIM reaches `target`, else the best one; and whether one reaches it.
 
     Every plan for a target chooses by this rule, whatever predicts the SSIM and whatever a level costs. Of
-    equal levels the module's rules take the one of lower index. `otherwise`: what makes a level the best where
-    none reaches the target, the first key first (default: its SSIM). A level of unknown SSIM (NaN) or infinite
-    cost is never chosen while there is another.
+    equal levels the module's rules take the one of lower index. `otherwise`: what makes a level the best
+    where none reaches the target, the first key first (default: its SSIM). A level of unknown SSIM (NaN) or
+    of infinite cost is never chosen while there is another.
     """
     usable = np.isfinite(cost) & ~np.isnan(quality)
     good = usable & (quality >= target)
-    met = good.any(-1)
+    met = np.asarray(good.any(-1))
     best = [-key for key in otherwise or (quality,)]
     return np.where(met, _first(good, cost, -quality), _first(usable, *best, cost)), met
 
