@@ -37,11 +37,10 @@ class Method(Protocol):
 
     def fit(self, table: Observations, config: FitConfig, curves: Curves) -> list[str]:
         """Fit what there is beside Eq. 3; `table`: of views that show enough of a category."""
-        ...
+        return []
 
     def check(self, config: PlanConfig) -> None:
         """RunError for a plan that cannot be made of these levels."""
-        ...
 
     def predicted(self, label_id: int, level: int, row: int) -> float:
         """SSIM that plans count on in a view (row of Scene.views); NaN where nothing is known."""
@@ -64,12 +63,12 @@ class Method(Protocol):
         ...
 
     def unseen_labels(self) -> LabelImages | None:
-        """The label images that test views are measured with; None: as the Gaussians paint them."""
-        ...
+        """The label images of test views; None: as the Gaussians paint them, as the paper has no others."""
+        return None
 
     def coverage(self, targets: Sequence[float]) -> Decisions | None:
         """How decisions by a lower confidence bound fare on test views; None without such a bound."""
-        ...
+        return None
 
 
 class Snapshots(Method):
@@ -96,10 +95,6 @@ class Snapshots(Method):
         """Of the training views that show enough of a category, by label id."""
         seen = _training_rows(self.job)
         return {label: seen.distance[seen.label_id == label] for label, _ in self.job.ladder.counts}
-
-    def fit(self, table: Observations, config: FitConfig, curves: Curves) -> list[str]:
-        """See `Method`."""
-        return []
 
     def check(self, config: PlanConfig) -> None:
         """See `Method`."""
@@ -133,14 +128,6 @@ class Snapshots(Method):
         """See `Method`."""
         full = self.job.ladder.size(self.job.ladder.levels[-1])
         return f"{plan.count:,} of {full:,} Gaussians"
-
-    def unseen_labels(self) -> LabelImages | None:
-        """See `Method`: nobody has masks of unseen views, the paper says."""
-        return None
-
-    def coverage(self, targets: Sequence[float]) -> Decisions | None:
-        """See `Method`."""
-        return None
 
 
 class NestedLevels(Method):
@@ -187,9 +174,6 @@ class NestedLevels(Method):
         write_promises(self.job.run.promises, promises)
         statuses = [model.status for model in promises.values()]
         return ["promises: " + ", ".join(f"{statuses.count(s)} {s}" for s in sorted(set(statuses)))]
-
-    def check(self, config: PlanConfig) -> None:
-        """See `Method`."""
 
     def predicted(self, label_id: int, level: int, row: int) -> float:
         """See `Method`."""

@@ -78,7 +78,7 @@ def promises_table(scores: Decisions, targets: Sequence[float]) -> Table:
             "accepted: (category, view, target) triples whose target is predicted to be met; kept: the "
             "share of them that measures it (empirical coverage); overshoot: SSIM above the target, of all "
             "accepted and where a level above the lowest was chosen; false rejections: triples not accepted "
-            "though a level measures the target; regret: transfer bytes above the cheapest level that measures it. "
+            "though a level measures the target; regret: transfer bytes above the cheapest level that does. "
             f"Targets: {', '.join(f'{t:g}' for t in targets)}. oracle: the measurement itself.",
         ),
     )
