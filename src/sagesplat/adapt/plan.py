@@ -27,7 +27,7 @@ class Choice:
     """The level of one category."""
 
     label_id: int
-    level: int  # training step of the level
+    level: int  # of snapshots the training step, of nested levels 1 to K
     predicted_ssim: float  # in a scene: what at least `share` of the views reach; NaN without a model
     distance: float  # of the view, world units; NaN in a scene and where unknown
     count: int  # Gaussians
