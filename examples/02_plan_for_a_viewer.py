@@ -14,7 +14,7 @@ from sagesplat.adapt.viewpoint import read_promises
 from sagesplat.formats.ply import write_ply
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
-from sagesplat.stages.plan import costs_of
+from sagesplat.stages.methods import NestedLevels
 
 
 def main() -> None:
@@ -29,7 +29,7 @@ def main() -> None:
     args = parser.parse_args()
 
     job = Job(RunDir(args.run), emit=lambda event: None)  # scene, labels and ladder, read when asked for
-    costs, promises = costs_of(job), read_promises(job.run.promises)
+    costs, promises = NestedLevels(job).costs, read_promises(job.run.promises)
     views = {view.name: view for view in job.scene.views}
     if args.view not in views:
         parser.error(f"no view {args.view!r}; there are {', '.join(list(views)[:5])}, ...")
