@@ -59,6 +59,7 @@ class LevelSaved:
     path: Path | None
     counts: dict[int, int]
     recovering: bool
+    gaussians: Gaussians  # on the training device; the next step changes them in place
 
 
 @dataclass(frozen=True)
@@ -309,7 +310,7 @@ def _save_level(
         path = write_level(
             folder / "levels", state.step, state.gaussians.to("cpu"), recovering=recovering, sh_degree=degree
         )
-    return LevelSaved(state.step, path, state.gaussians.counts(), recovering)
+    return LevelSaved(state.step, path, state.gaussians.counts(), recovering, state.gaussians)
 
 
 def _sh_degree(step: int, config: TrainConfig, plan: densify.Schedule) -> int:
