@@ -17,7 +17,7 @@ FILES = {
     "a/short.py": "def f():\n    return 1\n\n\ndef g():\n    x = 2\n    y = 3\n    return x + y\n",
     "b/__init__.py": "from .two import later\n",
     "b/two.py": "def later():\n    import toy.c\n\n    return toy.c\n",
-    "c.py": "from typing import TYPE_CHECKING\nfrom toy.a import one\n\nif TYPE_CHECKING:\n    import toy.d\n",
+    "c.py": "import typing\nfrom toy.a import one\n\nif typing.TYPE_CHECKING:\n    import toy.d\n",
     "d.py": "import json\nfrom toy.c import one\n",
 }
 
