@@ -82,9 +82,19 @@ def segment_views(
     soft: Path | None = None,
     on_view: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Write a normalised folder of masks: label images of every view, then labels.json (see `segment_some`).
+    """Write the label image of every view with a segmentation network, then labels.json.
 
-    Raises LabelError.
+    Args:
+        scene: The capture.
+        photos: Its photos, uint8 [H, W, 3] by row of `scene.views`.
+        segmenter: Maps photos to label images; it has a `taxonomy`.
+        target: Folder to write: PNGs named like the photos, and labels.json.
+        batch: Photos that the network computes at once.
+        soft: Folder for the probabilities; None: they are not kept.
+        on_view: Called with (views done, views in all).
+
+    Raises:
+        LabelError: If the network's answer cannot be used or the folder cannot be written.
     """
     rows = range(len(scene.views))
     occurring = segment_some(scene, photos, segmenter, target, rows, batch=batch, soft=soft, on_view=on_view)
