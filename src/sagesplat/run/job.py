@@ -1,6 +1,7 @@
 """A run folder being worked on, and what its stages share."""
 
 import hashlib
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -44,6 +45,7 @@ class Job:
     executor: Executor = LOCAL  # of pieces that do not depend on each other
     lock_wait: float = 0.0  # seconds to wait for who has the run folder
     source: "Job | None" = None  # job of the same scene: share its scene and photos, do not load them again
+    before_redo: Callable[[str, str], None] | None = None  # told of a stage to be forced, and what differs
 
     @property
     def spec(self) -> "JobSpec":

@@ -33,7 +33,7 @@ def make_masks(job: Job, config: MasksConfig, labels: LabelsConfig = LabelsConfi
     run, kind = job.run, _kind(job, config)
     merge, keep = parse_merge(labels.merge), parse_keep(labels.keep)
     if kind == "masks":
-        _import(job, config.masks or job.scene.path / "masks")
+        _import(job, config)
     else:
         _segment(job, config, kind)
 
@@ -68,9 +68,18 @@ def _kind(job: Job, config: MasksConfig) -> str:
     return segmenter_for(config.model)
 
 
-def _import(job: Job, source: Path) -> None:
+def _note_options(job: Job, config: MasksConfig) -> None:
+    """Keep how the label images were asked for, paths absolute: the defaults of the next command."""
+    options = asdict(config)
+    for name in ("masks", "model", "classes"):
+        if options[name] is not None and Path(options[name]).exists():
+            options[name] = str(Path(options[name]).resolve())
+    write_json(job.run.segmentation, {k: str(v) if isinstance(v, Path) else v for k, v in options.items()})
+
+
+def _import(job: Job, config: MasksConfig) -> None:
     """Import existing label images."""
-    run = job.run
+    run, source = job.run, config.masks or job.scene.path / "masks"
     settings = {"segmenter": "masks", "source": file_hash(source) if source.is_dir() else str(source)}
 
     def make() -> list[str]:
@@ -80,6 +89,7 @@ def _import(job: Job, source: Path) -> None:
         if missing:
             names = ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
             job.emit(Warned(f"{len(missing)} of {len(job.scene.views)} views have no label image: {names}"))
+        _note_options(job, config)
         return []
 
     run_stage(job, "segment", settings, [run.scene], [run.segmented / "labels.json"], make)
@@ -104,6 +114,7 @@ def _segment(job: Job, config: MasksConfig, kind: str) -> None:
         if any(other != taxonomy for other, _ in found):
             raise LabelError(f"{run.segmented}: the nodes' networks have other categories; make them alike")
         write_labels(run.segmented, taxonomy, set().union(*(ids for _, ids in found)))
+        _note_options(job, config)
         return []
 
     run_stage(job, "segment", settings, [run.scene], [run.segmented / "labels.json"], make)
