@@ -47,11 +47,23 @@ def run_stage(
     job: Job, name: str, settings: dict[str, Any], inputs: Sequence[Path], outputs: Sequence[Path],
     make: Callable[[], Sequence[str]], *, swaps: bool = False,
 ) -> None:  # fmt: skip
-    """Do a stage unless its result is there already.
+    """Do a stage, unless its result is there already: made with the same settings from the same inputs.
 
-    Nobody else writes into the run folder meanwhile. A stage counts as done only once its files are on the
-    disk, and not while it is done anew. RunError where another process works on the folder, or the disk is
-    full: then what was finished stays, and the same command goes on.
+    The run folder is locked meanwhile. A stage counts as done only once its files are on the disk, and not
+    while it is redone.
+
+    Args:
+        job: The run folder, and where events go.
+        name: Of the stage; its record is provenance/NAME.json.
+        settings: Everything that the result depends on, besides the inputs; JSON.
+        inputs: Files and folders that it is made from; their hashes are recorded.
+        outputs: Files and folders that it makes.
+        make: Does the work and returns lines that sum up the result.
+
+    Raises:
+        RunError: If an input is missing, the result was made with other settings (without `job.force`),
+            another process works on the folder, or the disk is full. What was finished stays: the same
+            command resumes.
     """
     run_stages(job, [Stage(name, settings, inputs, outputs, swaps)], lambda _: iter([(0, make())]))
 

@@ -37,7 +37,21 @@ DEMO = RunConfig(
 
 
 def run_all(job: Job, scene: Path, config: RunConfig) -> None:
-    """Every stage on one capture; those whose result is there already are skipped."""
+    """Run every stage on one capture. Stages whose results are there already are skipped.
+
+    Args:
+        job: The run folder, and where events go. Results for the paper's levels or for the nested ladder go
+            to folders of their own: `job.run.ladder`.
+        scene: The capture.
+        config: Settings of all stages.
+
+    Raises:
+        SageError: For anything wrong with the capture, the settings, the run folder or the machine. Settings
+            are checked before hours of training.
+
+    Example:
+        `sagesplat.run_scene` opens a job and calls this.
+    """
     for target in config.plan.targets:  # before hours of training
         check_target(target)
     nested.check(config.nest)
