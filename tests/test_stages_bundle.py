@@ -239,17 +239,6 @@ def test_a_live_bundle_leaves_other_folders_alone(run: Path, tmp_path: Path, vie
         live_bundle(job_of(run), other, viewer)
 
 
-@pytest.mark.parametrize(
-    ("name", "title"),
-    [
-        ("grass-merged", "grass"), ("building-other-merged", "building"), ("sky-other-merged", "sky"),
-        ("door-stuff", "door"), ("wall-brick", "wall brick"), ("dining table", "dining table"),
-    ],
-)  # fmt: skip
-def test_titles(name: str, title: str) -> None:
-    assert title_of(name) == title
-
-
 def test_colours_are_distinct_and_stay() -> None:
     rng = np.random.default_rng(0)
     wanted = {-1: (128, 128, 128)} | {i: tuple(rng.integers(0, 256, 3).tolist()) for i in range(40)}
