@@ -90,9 +90,7 @@ def run_bundle(job: "Job") -> Path:
 
     folder = job.run.path / "bundle"
     if not _is_finished(job.run):
-        raise RunError(
-            f"{job.run.path}: not finished; do `sagesplat run`, or add --follow to see its training"
-        )
+        raise RunError(f"{job.run.path}: not finished; run `sagesplat run` again, or add --follow")
     if not _is_current(job.run, folder):
         bundle(job, folder)
     return folder
@@ -108,7 +106,10 @@ def _open_run(path: Path, emit: Emit) -> "Job":
     made = read_json(run.provenance("scene")) if run.provenance("scene").exists() else {}
     found = made.get("format") if isinstance(made, dict) else None
     if found != FORMAT:
-        raise RunError(f"{path}: a run folder of format {found}, this sagesplat reads {FORMAT}")
+        raise RunError(
+            f"{path}: a run folder of format {found}, this sagesplat reads {FORMAT}; make a new one with "
+            "`sagesplat run`"
+        )
     return Job(run, emit)
 
 
