@@ -1,13 +1,15 @@
 """Put the chosen levels together, and write the scene that the plan chose."""
 
+from pathlib import Path
+
 from sagesplat.adapt.plan import Plan
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.ply import write_ply
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import settings_of
+from sagesplat.run.run_dir import RunDir, settings_of
 from sagesplat.run.stage import run_stage
 from sagesplat.stages.plan import main_plan
-from sagesplat.stages.shared import ladder_files, train_config
+from sagesplat.stages.shared import label_image_inputs, ladder_files, train_config
 from sagesplat.train.stepper import tune
 
 
@@ -39,4 +41,10 @@ def compose_plan(job: Job) -> None:
         return [f"{len(g):,} Gaussians, {plan.nbytes / 1e6:.1f} MB at 248 bytes each{transfer_bytes}"]
 
     settings = {"tune_steps": settings_of(run, "plan").get("tune_steps", 0)}
-    run_stage(job, "compose", settings, [run.plan, ladder_files(run)[0]], [run.composed], make)
+    run_stage(job, "compose", settings, compose_inputs(run), [run.composed], make)
+
+
+def compose_inputs(run: RunDir) -> list[Path]:
+    """What a plan's composition is made from."""
+    made = [run.provenance("plan"), run.provenance("train"), *label_image_inputs(run)]
+    return [run.scene, run.plan, ladder_files(run)[0], *made]

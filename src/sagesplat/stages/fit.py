@@ -18,16 +18,18 @@ from sagesplat.adapt.observe import (
 )
 from sagesplat.adapt.viewpoint import ViewModel, fit_promises, in_composition, write_promises
 from sagesplat.core.config import FitConfig
+from sagesplat.core.errors import RunError
 from sagesplat.core.events import Progress
 from sagesplat.formats.increments import INDEX
 from sagesplat.raster import Workspace
 from sagesplat.run.executor import split
 from sagesplat.run.job import Job
 from sagesplat.run.remote import work_all
+from sagesplat.run.run_dir import RunDir, settings_of
 from sagesplat.run.stage import run_stage
 from sagesplat.segment.masks import UNLABELLED
 from sagesplat.stages.plan import costs_of
-from sagesplat.stages.shared import distances, label_images
+from sagesplat.stages.shared import distances, label_image_inputs, label_images
 from sagesplat.train.early_stopping import VIEWS, spread
 
 _TARGETS = tuple(np.arange(0.5, 0.96, 0.05).round(2).tolist())  # SSIM of the compositions that are looked at
@@ -119,8 +121,21 @@ def fit_ladder(job: Job, config: FitConfig) -> None:
         return lines
 
     settings: dict[str, Any] = {"min_share": config.min_share, "region": config.region}
-    inputs, outputs = [run.scene, run.observations], [run.models]
+    inputs, outputs = [run.scene, run.provenance("observe"), run.observations], [run.models]
     if run.ladder == "nested":
         settings["confidence"] = config.confidence
+        _check_observed(run, config)
+        inputs += [run.labels, run.provenance("train"), *label_image_inputs(run)]
         inputs, outputs = [*inputs, run.prefixes, run.increments / INDEX], [*outputs, run.promises]
     run_stage(job, "fit", settings, inputs, outputs, make)
+
+
+def _check_observed(run: RunDir, config: FitConfig) -> None:
+    """RunError where the levels were observed with other distances or label images than `config` names."""
+    made = settings_of(run, "observe")
+    for name, wanted in (("distance", config.distance), ("masks", config.masks)):
+        if made[name] != wanted:
+            raise RunError(
+                f"{run.observations}: observed with {name} {made[name]}; add --fit.{name} {made[name]}, or "
+                f"observe again: `sagesplat observe {run.path} --fit.{name} {wanted} --force`"
+            )

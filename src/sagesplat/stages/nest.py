@@ -1,6 +1,5 @@
 """Make the nested levels of a run: order its Gaussians, train their prefixes, write the increments."""
 
-import json
 from dataclasses import asdict
 
 import numpy as np
@@ -14,9 +13,9 @@ from sagesplat.formats.increments import packed, read_increments, write_incremen
 from sagesplat.formats.levels import read_level, write_set
 from sagesplat.metrics.image import ssim_map
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import file_hash
+from sagesplat.run.run_dir import checkpoint_key
 from sagesplat.run.stage import run_stage
-from sagesplat.stages.shared import fusion, train_config
+from sagesplat.stages.shared import label_image_inputs, train_config
 from sagesplat.train import nested
 from sagesplat.train.checkpoint import remove_checkpoints
 from sagesplat.train.early_stopping import VIEWS, spread
@@ -35,15 +34,13 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
         base = read_level(run.base_model) if config.base_share else None
         masks = job.best_masks
         ordered = nested.order(full, job.scene, masks, config, base=base, antialiased=job.antialiased)
-        checkpoint_key = json.dumps(
-            {**settings, "scene": file_hash(run.scene), "levels": file_hash(run.levels)}
-        )
         if job.force:
             remove_checkpoints(run.nest_checkpoint)
         trained = ordered
         for event in nested.nest(
             ordered, job.scene, job.photos, train_config(job), config,
-            seed=seed, backend=job.backend, checkpoint=run.nest_checkpoint, settings=checkpoint_key,
+            seed=seed, backend=job.backend, checkpoint=run.nest_checkpoint,
+            settings=checkpoint_key(run, settings, inputs),
         ):  # fmt: skip
             if isinstance(event, NestStep):
                 job.emit(Progress("nest", event.step, config.steps, f"loss {event.loss:.3f}"))
@@ -59,7 +56,7 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
         remove_checkpoints(run.nest_checkpoint)
         return lines
 
-    inputs = [run.scene, run.labels, run.levels, *fusion(run)]
+    inputs = [run.scene, run.labels, run.levels, run.provenance("train"), *label_image_inputs(run)]
     if config.base_share:
         _make_base_model(job, config, seed)
         inputs.append(run.base_model)

@@ -17,7 +17,7 @@ from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir, settings_of
 from sagesplat.run.stage import run_stage
 from sagesplat.stages import plan as nesting
-from sagesplat.stages.shared import distances, label_named, ladder_files
+from sagesplat.stages.shared import distances, label_image_inputs, label_named, ladder_files
 
 
 def costs_of(job: Job) -> Costs:
@@ -108,7 +108,8 @@ def make_plan(job: Job, config: PlanConfig) -> None:
     nested = run.ladder == "nested"
     if config.budget and not nested:
         raise RunError("--budget needs the nested ladder; leave out --ladder snapshots")
-    inputs = [run.scene, *ladder_files(run), run.observations]
+    inputs = [run.scene, run.labels, *label_image_inputs(run), *ladder_files(run), run.observations]
+    inputs += [run.provenance("observe"), run.provenance("fit")]
     settings = asdict(config) | {"targets": config.targets}
     run_stage(job, "plan", settings, inputs, [run.plan], from_promises if nested else from_models)
 

@@ -1,16 +1,16 @@
 """Train 3DGS from the labelled points and record the levels."""
 
-import json
 import shutil
 from dataclasses import asdict
 from functools import partial
+from pathlib import Path
 
 from sagesplat.core.config import TrainConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Training, Warned
 from sagesplat.io.files import read_json, write_json
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import RunDir, file_hash
+from sagesplat.run.run_dir import RunDir, checkpoint_key
 from sagesplat.run.stage import run_stage
 from sagesplat.train import memory
 from sagesplat.train.checkpoint import latest_checkpoint, remove_checkpoints
@@ -23,12 +23,11 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
     run = job.run
     # what a step looks at decides the result, not who does the work
     settings = {**asdict(config), "batch": max(config.batch, job.processes), "seed": seed}
+    inputs = train_inputs(run, config)
 
     def make() -> list[str]:
-        checkpoint_key = json.dumps(
-            {**settings, "scene": file_hash(run.scene), "labels": file_hash(run.labels)}
-        )
-        resuming = run.checkpoint.exists() and (not job.force or _continues(run, checkpoint_key))
+        key = checkpoint_key(run, settings, inputs)
+        resuming = run.checkpoint.exists() and (not job.force or _continues(run, key))
         fitted, cap = _fit_memory(job, config, resuming)  # before anything is given up
         if not resuming:
             remove_checkpoints(run.checkpoint)
@@ -40,7 +39,7 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
         events = start(
             job.scene, job.photos, job.point_labels, fitted,
             masks=job.masks if config.freeze_at is not None else None,
-            seed=seed, backend=job.backend, folder=run.path, settings=checkpoint_key,
+            seed=seed, backend=job.backend, folder=run.path, settings=key,
         )  # fmt: skip
         for event in events:
             match event:
@@ -61,7 +60,12 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
                     return [f"{len(gaussians):,} Gaussians after {step} steps"]
         return []
 
-    run_stage(job, "train", settings, [run.scene, run.labels], [run.levels, run.checkpoint], make)
+    run_stage(job, "train", settings, inputs, [run.levels, run.checkpoint], make)
+
+
+def train_inputs(run: RunDir, config: TrainConfig) -> list[Path]:
+    """What a training reads besides photos: label images only where categories may stop early."""
+    return [run.scene, run.labels, *([run.provenance("masks")] if config.freeze_at is not None else [])]
 
 
 def _fit_memory(job: Job, config: TrainConfig, resuming: bool) -> tuple[TrainConfig, int]:
@@ -77,9 +81,9 @@ def _fit_memory(job: Job, config: TrainConfig, resuming: bool) -> tuple[TrainCon
     return fitted.config, fitted.lowered
 
 
-def _continues(run: RunDir, checkpoint_key: str) -> bool:
+def _continues(run: RunDir, key: str) -> bool:
     try:
-        latest_checkpoint(run.checkpoint, checkpoint_key)
+        latest_checkpoint(run.checkpoint, key)
     except RunError:
         return False
     return True
