@@ -10,7 +10,7 @@ from sagesplat.output import tables
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import settings_of
 from sagesplat.run.stage import run_stage
-from sagesplat.stages.compose import compose
+from sagesplat.stages.compose import compose, compose_inputs
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.plan import main_target, scene_plan
 from sagesplat.stages.shared import _show, label_images
@@ -45,6 +45,7 @@ def evaluate_plans(job: Job) -> None:
             )
         return lines
 
-    inputs = [run.scene, run.labels, *method.files, run.plan]
+    fitted = [run.provenance("observe"), run.provenance("fit")]
+    inputs = [run.labels, *method.files, *fitted, *compose_inputs(job)]
     settings = {"tune_steps": settings_of(run, "plan").get("tune_steps", 0)}
     run_stage(job, "evaluate", settings, inputs, [run.evaluation], make)
