@@ -31,7 +31,7 @@ from sagesplat.stages.train import train_levels
 from sagesplat.train.checkpoint import write_checkpoint
 from sagesplat.train.state import initial_state
 from sagesplat.viewer.bundle import is_bundle
-from sagesplat.viewer.display_names import colors_of, title_of
+from sagesplat.viewer.display_names import colors_of
 from sagesplat.viewer.frames import camera_at
 from sagesplat.viewer.quality import curve_of, model_of
 
@@ -250,17 +250,6 @@ def test_a_live_bundle_leaves_other_folders_alone(run: Path, tmp_path: Path, vie
     (other / "a.jpg").write_text("x")
     with pytest.raises(RunError, match="neither empty nor a bundle"):
         live_bundle(job_of(run), other, viewer)
-
-
-@pytest.mark.parametrize(
-    ("name", "title"),
-    [
-        ("grass-merged", "grass"), ("building-other-merged", "building"), ("sky-other-merged", "sky"),
-        ("door-stuff", "door"), ("wall-brick", "wall brick"), ("dining table", "dining table"),
-    ],
-)  # fmt: skip
-def test_titles(name: str, title: str) -> None:
-    assert title_of(name) == title
 
 
 def test_colours_are_distinct_and_stay() -> None:

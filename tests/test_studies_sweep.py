@@ -418,3 +418,21 @@ def test_spread_is_that_of_the_known_values(values: list[float]) -> None:
     assert sums["SSIM"] == pytest.approx(expected, nan_ok=True)
     expected = known.std(ddof=1) if len(known) > 1 else math.nan
     assert sums["SSIM sd"] == pytest.approx(expected, nan_ok=True)
+
+
+def test_settings_by_their_old_names_are_read_and_told(tmp_path: Path) -> None:
+    text = (
+        TEXT
+        + """
+variants.old.train = { pace = "published", rest_share = 0.5 }
+variants.old.nest = { seed_share = 0.1, seed_steps = 7, gain = 2.0 }
+variants.old.blocks = { seam_steps = 9 }
+"""
+    )
+    told: list[str] = []
+    config = read_sweep(write(tmp_path, text), told.append)[-1].config
+    assert (config.train.lr_schedule, config.train.gradient_freeze_share) == ("published", 0.5)
+    assert (config.nest.base_share, config.nest.base_steps, config.nest.lr_multiplier) == (0.1, 7, 2.0)
+    assert config.blocks.boundary_steps == 9
+    assert len(told) == 6
+    assert "variants.old.train.pace is called lr_schedule now" in told[0]

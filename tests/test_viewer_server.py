@@ -497,7 +497,7 @@ def test_without_the_extra(bundle: Path, monkeypatch: pytest.MonkeyPatch):
         ({"scene.json": b"{}", "provenance/scene.json": b'{"format": 1}'}, r"a run folder of format 1, this"),
         (
             {"scene.json": b"{}", "provenance/scene.json": json.dumps({"format": FORMAT}).encode()},
-            r"not finished; do `sagesplat run`, or add --follow",
+            r"not finished; run `sagesplat run` again, or add --follow",
         ),
     ],
 )

@@ -10,6 +10,7 @@ from sagesplat.output import tables
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import settings_of
 from sagesplat.run.stage import run_stage
+from sagesplat.segment.display_names import titles
 from sagesplat.stages.compose import compose, compose_inputs
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.plan import main_target, scene_plan
@@ -32,7 +33,7 @@ def evaluate_plans(job: Job) -> None:
         table.write_csv(run.evaluation)
         if len(table):
             plan = scene_plan(run, main_target(run))
-            _show(job, tables.outcome_table(plan, job.ladder.counts, table, job.names()))
+            _show(job, tables.outcome_table(plan, job.ladder.counts, table, titles(job.names())))
         whole = table.select(table.label_id == TOTAL)
         lines = []
         for target in np.unique(whole.target):

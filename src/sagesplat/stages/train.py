@@ -11,6 +11,7 @@ from sagesplat.io.files import read_json, write_json
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir, checkpoint_key
 from sagesplat.run.stage import run_stage
+from sagesplat.segment.display_names import titles
 from sagesplat.train import memory
 from sagesplat.train.checkpoint import can_resume, remove_checkpoints
 from sagesplat.train.parallel import train_together
@@ -35,7 +36,7 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
         place.path.mkdir(exist_ok=True)
         write_json(place.cap, {"cap": cap, "settings": settings})
         counts: dict[str, int] = {}
-        names = job.names()
+        names = titles(job.names())
         start = partial(train_together, job.processes, job.threads) if job.processes > 1 else train
         events = start(
             job.scene, job.photos, job.point_labels, fitted,

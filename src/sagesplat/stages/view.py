@@ -90,9 +90,7 @@ def run_bundle(job: "Job") -> Path:
 
     folder = job.run.path / "bundle"
     if not _is_finished(job.run):
-        raise RunError(
-            f"{job.run.path}: not finished; do `sagesplat run`, or add --follow to see its training"
-        )
+        raise RunError(f"{job.run.path}: not finished; run `sagesplat run` again, or add --follow")
     if not _is_current(job.run, folder):
         bundle(job, folder)
     return folder
