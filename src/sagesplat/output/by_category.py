@@ -28,7 +28,9 @@ def merged(rows: Rows, categories: Categories, keys: Sequence[str]) -> Rows:
     rows = relabelled(rows, categories)
     names = [f.name for f in fields(rows)]
     # numbered by value, as rows without a target (NaN) belong together too
-    key = np.stack([np.unique(getattr(rows, name), return_inverse=True)[1] for name in ("label_id", *keys)], 1)
+    key = np.stack(
+        [np.unique(getattr(rows, name), return_inverse=True)[1] for name in ("label_id", *keys)], 1
+    )
     _, first, group = np.unique(key, axis=0, return_index=True, return_inverse=True)
     group, pixels = group.ravel(), rows.num_pixels.astype(np.float64)
 
