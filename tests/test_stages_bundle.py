@@ -20,6 +20,7 @@ from sagesplat.io.files import read_json, write_json
 from sagesplat.raster import rasterize
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
+from sagesplat.segment.display_names import title_of
 from sagesplat.stages.bundle import bundle, live_bundle
 from sagesplat.stages.fit import fit_ladder
 from sagesplat.stages.label import lift_labels, make_masks
@@ -29,7 +30,7 @@ from sagesplat.stages.scene import open_scene
 from sagesplat.stages.shared import distances
 from sagesplat.stages.train import train_levels
 from sagesplat.viewer.bundle import is_bundle
-from sagesplat.viewer.display_names import colors_of, title_of
+from sagesplat.viewer.display_names import colors_of
 from sagesplat.viewer.frames import camera_at
 from sagesplat.viewer.quality import curve_of, model_of
 

@@ -178,7 +178,7 @@ def _figures(data: ReportData, labels: Sequence[int], parts: ReportData, promise
     names, colours, seen = data.names, data.colours, data.observations
     yield (
         "size_by_target",
-        "Occupancy by target and category",
+        "Model size by target and category",
         figures.size_by_target(data.plans, data.counts, labels, names, colours),
     )
     if len(data.evaluation):
@@ -234,7 +234,7 @@ def _tables(data: ReportData, labels: Sequence[int], parts: ReportData, promises
         yield "models", tables.models_table(data.models, parts.names)
     if data.panels:
         rows = [(p.name, p.ssim, p.psnr, p.full_ssim, p.full_psnr) for p in data.panels]
-        header = ("view", "SSIM", "PSNR", "everything SSIM", "everything PSNR")
+        header = ("view", "SSIM", "PSNR", "full model SSIM", "full model PSNR")
         yield "panels", Table("Views shown above", header, ("", ".3f", ".2f", ".3f", ".2f"), rows)
     if data.timings:
         yield "timings", Table("Time by stage", ("stage", "seconds"), ("", ",.1f"), list(data.timings))
@@ -253,7 +253,7 @@ def _pictures(panel: Panel, colours: Colours) -> dict:
         "panel": panel,
         "ratio": f"{panel.photo.shape[1]} / {panel.photo.shape[0]}",
         "pictures": [
-            ("everything", _picture(panel.full, "JPEG")),
+            ("full model", _picture(panel.full, "JPEG")),
             ("photo", _picture(panel.photo, "JPEG")),
             ("categories", _picture(labels, "PNG")),
             ("error", _picture(error, "JPEG")),

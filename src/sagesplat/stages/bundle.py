@@ -26,6 +26,7 @@ from sagesplat.raster import rasterize
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import file_hash, settings_of
 from sagesplat.segment.block_categories import split_name
+from sagesplat.segment.display_names import title_of
 from sagesplat.segment.masks import UNLABELLED
 from sagesplat.stages.shared import distances
 from sagesplat.viewer import boxes
@@ -42,7 +43,7 @@ from sagesplat.viewer.bundle import (
     write_bundle,
     write_documents,
 )
-from sagesplat.viewer.display_names import colors_of, title_of
+from sagesplat.viewer.display_names import colors_of
 from sagesplat.viewer.frames import FLIP, camera_at, fov_y, position, quaternion
 from sagesplat.viewer.pack import ASPECT, FOV_Y
 

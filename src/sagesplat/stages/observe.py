@@ -12,6 +12,7 @@ from sagesplat.run.executor import split
 from sagesplat.run.job import Job
 from sagesplat.run.remote import work_all
 from sagesplat.run.stage import run_stage
+from sagesplat.segment.display_names import titles
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.shared import _show, distances, fusion, label_images
 
@@ -26,7 +27,7 @@ def observe_levels(job: Job, config: FitConfig) -> None:
         table = merge(work_all(job, "observe", _observe_views, parts))
         table.write_csv(run.observations)
         seen = table.select(np.isin(table.view, job.scene.train_ids))
-        _show(job, tables.ladder_table(seen, job.ladder.counts, job.ladder.recovering, job.names()))
+        _show(job, tables.ladder_table(seen, job.ladder.counts, job.ladder.recovering, titles(job.names())))
         return [
             f"{len(table):,} observations of {len(job.ladder.levels)} levels in {len(job.scene.views)} views"
         ]

@@ -21,6 +21,7 @@ from sagesplat.scene import describe
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.segment.block_categories import category_of
+from sagesplat.segment.display_names import titles
 from sagesplat.segment.masks import UNLABELLED, UNLABELLED_COLOR, Masks, Taxonomy
 
 PANELS = 3  # views shown in pictures
@@ -49,7 +50,7 @@ def report_data(
     return ReportData(
         title=scene.name,
         target=target,
-        names=names,
+        names=titles(names),
         colours=colours or {label: masks.taxonomy.color(label) for label in names},
         observations=read_observations(run.observations),
         train_views=scene.train_ids,

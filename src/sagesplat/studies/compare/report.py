@@ -79,7 +79,7 @@ class Point:
 
     @property
     def raw(self) -> int:
-        """Occupancy as the paper counts it, bytes."""
+        """Bytes as the paper counts model size: 248 a Gaussian."""
         return self.count * BYTES_PER_GAUSSIAN
 
 

@@ -29,6 +29,7 @@ from sagesplat.run.job import Job
 from sagesplat.run.remote import work
 from sagesplat.run.run_dir import RunDir, is_done, settings_of
 from sagesplat.run.stage import Stage, run_stage, run_stages
+from sagesplat.segment.display_names import titles
 from sagesplat.stages.compose import tune_composition
 from sagesplat.stages.fit import fit_ladder
 from sagesplat.stages.methods import NestedLevels, Snapshots, method_of
@@ -115,7 +116,7 @@ def compare(job: Job, config: CompareConfig, copy: Path | None = None) -> list[P
     tables = make_tables(points, walks, main_target(run))
 
     def show() -> list[str]:
-        write_report(folder, tables, points, job.names())
+        write_report(folder, tables, points, titles(job.names()))
         return list(tables["table_2_baselines"].notes[:-2])
 
     run_stage(job, "compared", {}, [file], [folder / PAGE], show)
