@@ -270,7 +270,7 @@ def test_chunks_hold_what_each_level_adds(tmp_path: Path) -> None:
     part = read_ply(tmp_path / "plys" / plain[1].uri)
     np.testing.assert_array_equal(part.means, g.means[1:5])
     (tmp_path / "chunks" / "index.json").write_text('{"chunks": [{"label_id": 0}]}')
-    with pytest.raises(DataError, match="not an index of chunks"):
+    with pytest.raises(DataError, match="not an index of increments"):
         read_index(tmp_path / "chunks")
 
 

@@ -47,13 +47,34 @@ def cheapest(
     previous: Int[np.ndarray, "L"] | None = None,
     slack: float = SLACK,
 ) -> Allocation:
-    """Per label the cheapest level whose promised SSIM reaches `target`, else the best one ("infeasible").
+    """Choose per label the cheapest level whose promised SSIM reaches a target.
 
-    With the `previous` levels (-1 = none) a label goes up at once where its level no longer keeps the target,
-    but comes down only to a level that keeps it by `slack` more, or by half of what is left to 1 if that is
-    less; where nothing reaches the target it stays if that is within `slack` of the best. The target is kept
-    wherever it can be, and promises that swing by less than the slack never bring a left level back, if they
-    rise along the levels. `weight` (1 without) is for `value` alone. RunError for impossible arguments.
+    With `previous` levels there is hysteresis. A label goes up at once where its level no longer reaches the
+    target. It comes down only to a level that reaches it by `slack` more, or by half of what is left to 1 if
+    that is less. Where nothing reaches the target it stays if that is within `slack` of the best. So promises
+    that vary by less than the slack never alternate between two levels, if they rise along the levels.
+
+    Args:
+        quality: [L, K], promised SSIM of each label and level; NaN: no promise.
+        cost: [L, K], whole numbers; inf: a level that cannot be had.
+        target: SSIM, for all labels or [L].
+        weight: [L], for `value` alone; None: 1 each.
+        previous: [L], the levels before, -1: none.
+        slack: SSIM.
+
+    Returns:
+        A level per label (column of `quality`); where none reaches the target the best one, "infeasible".
+
+    Raises:
+        RunError: For impossible arguments.
+
+    Example:
+        >>> import numpy as np
+        >>> from sagesplat.adapt.allocate import cheapest
+        >>> quality, cost = np.array([[0.6, 0.8, 0.9], [0.3, 0.4, 0.5]]), np.array([[1, 4, 9], [2, 3, 4]])
+        >>> found = cheapest(quality, cost, target=0.7)
+        >>> found.levels.tolist(), found.status, found.missed.tolist()
+        ([1, 2], 'infeasible', [False, True])
     """
     quality, cost, weight, previous = _arguments(quality, cost, weight, previous, slack)
     q, c, promised = _known(quality, cost)
@@ -75,13 +96,37 @@ def best_within(
     slack: float = SLACK,
     states: int = STATES,
 ) -> Allocation:
-    """The levels of most weight x promised SSIM whose cost is at most `budget`, in the unit of the costs.
+    """Choose the levels of the largest sum of weight x promised SSIM within a budget.
 
-    Exact if about `states` partial compositions suffice (0: do not try), else no worse than plain greedy;
-    `optimal` says which. With the `previous` levels (-1 = none) a label that keeps its level counts as
-    `slack` SSIM better: promises that stay within less than slack / 2 of some values never bring back a
-    composition that was left, as each change gains on those values. Where the smallest composition does not
-    fit it is the answer, "over budget". RunError for impossible arguments.
+    A multiple-choice knapsack: Pareto fronts label by label, cut by a Lagrangian bound (Kellerer, Pferschy
+    and Pisinger 2004, ch. 11). Exact if about `states` partial compositions suffice, else no worse than
+    greedy; `optimal` says which. With `previous` levels a label that keeps its level counts as `slack` SSIM
+    better. Promises that stay within slack / 2 of some values then never bring back a composition that was
+    left, as each change gains on those values.
+
+    Args:
+        quality: [L, K], promised SSIM of each label and level; NaN: no promise.
+        cost: [L, K], whole numbers; inf: a level that cannot be had.
+        weight: [L]; a label of weight 0 stays at its cheapest level.
+        budget: In the unit of the costs.
+        previous: [L], the levels before, -1: none.
+        slack: SSIM.
+        states: Partial compositions to keep; 0: greedy alone.
+
+    Returns:
+        A level per label (column of `quality`). Where the smallest composition does not fit: that one, with
+        status "over budget".
+
+    Raises:
+        RunError: For impossible arguments.
+
+    Example:
+        >>> import numpy as np
+        >>> from sagesplat.adapt.allocate import best_within
+        >>> quality, cost = np.array([[0.6, 0.8, 0.9], [0.3, 0.4, 0.5]]), np.array([[1, 4, 9], [2, 3, 4]])
+        >>> found = best_within(quality, cost, np.array([2.0, 1.0]), budget=8)
+        >>> found.levels.tolist(), found.cost, found.optimal
+        ([1, 2], 8, True)
     """
     quality, cost, weight, previous = _arguments(quality, cost, weight, previous, slack)
     budget = _budget(budget)

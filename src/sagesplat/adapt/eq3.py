@@ -104,7 +104,21 @@ def fit_models(
     *,
     on_fit: Callable[[SsimModel], None] | None = None,
 ) -> dict[tuple[int, int], SsimModel]:
-    """Eq. 3 for every (category, level) of `samples`; a pair with no row left has no model."""
+    """Fit Eq. 3 of the paper, SSIM over distance, to every category and level.
+
+        SSIM(d) = K1 exp(-g1 |d - mu1|^a1) for d < beta, else K2 exp(-g2 |d - mu2|^a2)
+
+    Fewer parameters are used where they serve as well: one regime, or a constant (`SsimModel.status`).
+
+    Args:
+        observations: Rows of `observe`. Only training views, single categories and finite SSIM are used.
+        train_views: Rows of `Scene.views`.
+        on_fit: Called with each model.
+
+    Returns:
+        Models by (label id, level). A pair without any row has none; "not converged" is a status, not an
+            error.
+    """
     models = {}
     for found in samples(observations, train_views):
         model = models[found.label_id, found.level] = fit_model(*found)

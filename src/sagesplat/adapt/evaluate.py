@@ -64,11 +64,23 @@ def evaluate(
     antialiased: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Evaluation:
-    """Measure each plan's composition and the full model on the test views, beside what is predicted there.
+    """Measure the composition of each plan and the full model on the test views, next to the predictions.
 
-    `predicted` (label id, level, row of Scene.views): SSIM, NaN where nothing is known. `region`: where a
-    category's SSIM is measured. `compose`: the Gaussians of a plan (default: its levels as they are).
-    `progress` gets (images measured, number of images).
+    Args:
+        scene: The capture; `scene.test_ids` are measured.
+        photos: Its photos.
+        masks: Label images, [H, W] of category ids; indexed by view.
+        ladder: The levels.
+        plans: What to compose.
+        predicted: SSIM expected of (label id, level, row of `Scene.views`); NaN: none.
+        region: Where a category's SSIM is measured: on its mask, or on the mask eroded by 5 px.
+        compose: The Gaussians of a plan; None: its levels as they are.
+        backend: Rasteriser; decides the device.
+        antialiased: How the model was trained.
+        progress: Called with (images measured, images in all).
+
+    Returns:
+        One row per (plan, view, category), and one per (plan, view) for the full image.
     """
     ssim = "ssim_eroded" if region == "eroded" else "ssim"
     rows: list[dict[str, float]] = []

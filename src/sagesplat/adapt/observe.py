@@ -195,9 +195,28 @@ def observe(
     antialiased: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Observations:
-    """Render every level into every view, or some (rows of Scene.views), and measure each category there.
+    """Render every level into views of the scene and measure SSIM and PSNR of each category there.
 
-    `progress` hears (images measured, images in all).
+    Args:
+        scene: The capture.
+        photos: Its photos.
+        masks: Label images, [H, W] of category ids; indexed by view.
+        ladder: The levels.
+        distances: d_min by label id, float32 [V] in world units (`distances_in_views`); NaN: not in sight.
+        views: Rows of `scene.views`; None: all.
+        backend: Rasteriser; decides the device.
+        antialiased: How the model was trained.
+        progress: Called with (images measured, images in all).
+
+    Returns:
+        One row per (category, level, view), and one for the full image with label id `TOTAL`.
+
+    Example:
+        >>> from sagesplat import open_run
+        >>> from sagesplat.adapt.observe import distances_in_views, observe
+        >>> run = open_run("runs/garden").job  # doctest: +SKIP
+        >>> near = distances_in_views(run.scene, run.point_labels)  # doctest: +SKIP
+        >>> table = observe(run.scene, run.photos, run.best_masks, run.ladder, near)  # doctest: +SKIP
     """
     rows: list[dict[str, float]] = []
     views = range(len(scene.views)) if views is None else views

@@ -101,11 +101,38 @@ def plan_view(
     *,
     recovering: Collection[int] = (),
 ) -> Plan:
-    """Eq. 1 for one view: per category of `counts` the cheapest level predicted to reach `target`.
+    """Choose the cheapest level of each category that is predicted to reach a target in one view (Eq. 1).
 
-    Where no level does, the one with the best prediction, "infeasible". `distances` maps label ids to world
-    units; a category that is missing there, or NaN, is predicted by its median. Levels in `recovering` (just
-    after an opacity reset) are taken only where a category has no other. RunError for an impossible target.
+        level = argmin count(level) subject to SSIM(level, distance) >= target, for each category by itself
+
+    Where no level reaches the target, the one with the best prediction is taken, with status "infeasible".
+
+    Args:
+        models: Eq. 3 by (label id, level).
+        counts: Gaussians by (label id, level).
+        distances: d_min by label id, world units. A category that is missing, or NaN, is predicted by its
+            median.
+        target: SSIM, above 0 and at most 1.
+        view: Row in `Scene.views`, for the record; None: no view of the scene.
+        recovering: Levels recorded just after an opacity reset: taken only where there is no other.
+
+    Returns:
+        One choice per category of `counts`.
+
+    Raises:
+        RunError: For an impossible target.
+
+    Example:
+        >>> from sagesplat.adapt.eq3 import Eq3, SsimModel
+        >>> from sagesplat.adapt.plan import plan_view
+        >>> def model(level, k):  # SSIM k at distance 0, falling by exp(-0.1 d)
+        ...     curve = Eq3(k, 0.1, 0.0, 1.0, k, 0.1, 0.0, 1.0, 0.0)
+        ...     return SsimModel(3, level, curve, (0.0, 10.0), k, 0.0, 9, "one regime")
+        >>> models, counts = {(3, 1): model(1, 0.7), (3, 2): model(2, 0.95)}, {(3, 1): 100, (3, 2): 900}
+        >>> plan_view(models, counts, {3: 1.0}, 0.6, None).levels
+        {3: 1}
+        >>> plan_view(models, counts, {3: 1.0}, 0.8, None).levels
+        {3: 2}
     """
     check_target(target)
     choices = []
@@ -124,10 +151,21 @@ def plan_scene(
     *,
     recovering: Collection[int] = (),
 ) -> Plan:
-    """Eq. 1 for a scene: per category the cheapest level that reaches `target` in `share` of its views.
+    """Choose the cheapest level of each category that reaches a target in a share of the views (Eq. 1).
 
-    Where no level does, the one that reaches it in most views, then the best on average, "infeasible".
-    `distances` maps label ids to one distance per view, world units; see `plan_view` for the rest.
+    Where no level does, the one that reaches it in most views is taken, then the best on average, with status
+    "infeasible". Other arguments and errors are those of `plan_view`.
+
+    Args:
+        models: Eq. 3 by (label id, level).
+        counts: Gaussians by (label id, level).
+        distances: By label id, d_min in each view that shows the category, [V] in world units.
+        target: SSIM, above 0 and at most 1.
+        share: Of the views, above 0 and at most 1.
+        recovering: See `plan_view`.
+
+    Returns:
+        One choice per category of `counts`.
     """
     check_target(target)
     check_share(share)

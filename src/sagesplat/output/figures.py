@@ -70,7 +70,15 @@ def ink(label_id: int, colours: Colours) -> tuple[float, float, float]:
 
 
 def label_image(label_ids: Int[np.ndarray, "H W"], colours: Colours) -> UInt8[np.ndarray, "H W 3"]:
-    """The label map in the taxonomy's colours; unlabelled in grey."""
+    """Draw a label map in the colours of its taxonomy.
+
+    Args:
+        label_ids: [H, W], category ids; -1: unlabelled.
+        colours: RGB, 0 to 255, by category id; grey where there is none.
+
+    Returns:
+        uint8 [H, W, 3].
+    """
     image = np.full((*label_ids.shape, 3), 128, np.uint8)
     for label_id in np.unique(label_ids).tolist():
         image[label_ids == label_id] = colours.get(label_id, (128, 128, 128))

@@ -16,15 +16,33 @@ __all__ = ["describe", "load_scene"]
 
 
 def load_scene(path: Path, *, downscale: int = 1, test_every: int = 8, calibrate_every: int = 0) -> Scene:
-    """The capture at a path: a COLMAP workspace, nerfstudio's transforms.json or a Blender scene.
+    """Load a capture: posed photos and structure-from-motion points.
 
-    Raises SceneError. Photos and videos without poses are none: `photos.reconstruct` makes one of them.
-    Photos are `downscale` times smaller than the files in images/. Every `test_every`-th view by name is
-    kept for tests, none with 0; every `calibrate_every`-th of the others for calibration. A stored scene is
-    as it was stored.
+    The format is detected: a COLMAP workspace, nerfstudio's transforms.json, a Blender scene, or a scene that
+    sagesplat stored. Photos and videos without poses are not captures: `photos.reconstruct` makes one of
+    them.
+
+    Args:
+        path: Folder of the capture, or its transforms.json.
+        downscale: Photos are this many times smaller than the files in images/. Intrinsics follow.
+        test_every: Every n-th view by name is a test view; 0: none. A split that the dataset lists is kept.
+        calibrate_every: Every n-th of the other views calibrates promises; 0: none, 1 is refused.
+
+    Returns:
+        The scene. Photos themselves are read when they are needed (`scene.images.Photos`). A stored scene is
+        returned as it was stored, whatever the arguments.
+
+    Raises:
+        SceneError: If nothing at `path` is a capture, a file of it is damaged, or an argument is impossible.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from sagesplat import load_scene
+        >>> scene = load_scene(Path("captures/garden"), downscale=4)  # doctest: +SKIP
+        >>> scene.views[0].camera.K, scene.points.xyz.shape  # doctest: +SKIP
     """
     if calibrate_every < 0 or calibrate_every == 1:
-        raise SceneError(f"{path}: calibrate_every {calibrate_every} leaves nothing; take 0 or 2 and more")
+        raise SceneError(f"{path}: calibrate_every {calibrate_every} leaves nothing; take 0 or >= 2")
     kind = detect(path)
     if kind in ("photos", "video"):
         raise SceneError(f"{path}: {kind} without poses; `sagesplat run` finds them")
@@ -36,7 +54,7 @@ def load_scene(path: Path, *, downscale: int = 1, test_every: int = 8, calibrate
 
 
 def describe(scene: Scene) -> list[tuple[str, str]]:
-    """What `sagesplat info` prints of a scene: pairs of a name and its value."""
+    """The rows that `sagesplat info` prints about a scene: (name, value)."""
     views, points = scene.views, scene.points
     sizes = sorted({(v.camera.width, v.camera.height) for v in views})
     Ks = {v.camera.K.tobytes() for v in views}
@@ -75,7 +93,7 @@ def describe(scene: Scene) -> list[tuple[str, str]]:
 
 
 def _depth_and_error(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Per observation: depth of its point in its view, world units, and reprojection error, pixels."""
+    """Per observation: depth of the point in the view, world units [T], and reprojection error, px [T]."""
     points = scene.points
     w2c = np.stack([v.camera.w2c for v in scene.views])[points.track_views]
     K = np.stack([v.camera.K for v in scene.views])[points.track_views]

@@ -161,8 +161,7 @@ def _check(job: Job, config: CompareConfig) -> None:
 
 def _snapshots(job: Job) -> Job:
     """The paper's job on the same run, its ladder measured and fitted as the nested one."""
-    other = replace(job, run=RunDir(job.run.path, "snapshots"))
-    vars(other).update(scene=job.scene, photos=job.photos)  # the same photos in memory, not twice
+    other = replace(job, run=RunDir(job.run.path, "snapshots"), source=job)
     observe_levels(other, job.fit_config)
     fit_ladder(other, job.fit_config)
     return other
