@@ -225,12 +225,12 @@ def choose_snapshot(
 
 
 def check_target(target: float) -> None:
-    """RunError for an SSIM that cannot be asked for."""
+    """RunError for an SSIM that no plan can have as its target."""
     _check("target SSIM", target)
 
 
 def check_share(share: float) -> None:
-    """RunError for a share of views that cannot be asked for."""
+    """RunError for an impossible share of views."""
     _check("share of views", share)
 
 

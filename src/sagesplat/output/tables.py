@@ -267,7 +267,7 @@ class Decisions(Protocol):
 
     @property
     def target(self) -> np.ndarray:
-        """SSIM asked for, [R]."""
+        """Target SSIM, [R]."""
         ...
 
     @property

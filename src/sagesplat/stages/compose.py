@@ -1,4 +1,4 @@
-"""Put the chosen levels together, and write the scene that the plan chose."""
+"""Compose the chosen levels, and write the composed scene."""
 
 from sagesplat.adapt.plan import Plan
 from sagesplat.core.gaussians import Gaussians

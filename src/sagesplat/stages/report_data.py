@@ -71,7 +71,7 @@ def report_data(
 
 
 def _parts(run: RunDir, names: dict[int, str]) -> tuple[dict[int, int], Colours]:
-    """Of a scene in blocks: which label stands for a part's category, and its colour; nothing of others."""
+    """Of a scene in blocks: the label of each per-block category's category, and its colour; else nothing."""
     if not (run.block_categories / "labels.json").exists():
         return {}, {}
     taxonomy = Taxonomy.read(run.masks / "labels.json")

@@ -34,7 +34,7 @@ def compare_early_stopping(stopped: Job, full: Job, out: Path) -> tuple[Table, T
     """A run with --train.freeze-at against the same run without: by method, and by category.
 
     From the full run each category takes the first level that has reached the target by the same measurement
-    that stops it during training. Both, and the whole full run, are measured on the test views. Writes
+    that stops it during training. Both, and the full run, are measured on the test views. Writes
     `out`/early_stopping.* and early_stopping_categories.*; RunError where the runs differ in more than that.
     """
     target = _check(stopped, full)

@@ -1,4 +1,4 @@
-"""What one run's quality models are worth in another: tables and a figure."""
+"""How well the quality models of one run predict another: tables and a figure."""
 
 import math
 from collections.abc import Sequence
