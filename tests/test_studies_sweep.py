@@ -102,12 +102,12 @@ def test_every_cell_and_target_is_a_row_that_agrees_with_its_run(finished: Path)
         plan = next(p for p in read_plans(run.plan)[0] if p.target == float(row["target"]))
         assert int(row["Gaussians"]) == plan.count
         assert row["status"] == plan.status
-        assert 0 < float(row["of 3DGS"]) <= 1
+        assert 0 < float(row["of full model"]) <= 1
         assert float(row["share kept"]) == pytest.approx(int(row["kept"]) / int(row["promised"]))
-        assert 0 < float(row["SSIM"]) <= float(row["3DGS SSIM"]) + 0.1
+        assert 0 < float(row["SSIM"]) <= float(row["full SSIM"]) + 0.1
         assert 5 < float(row["PSNR"]) < 40
-    assert min(float(row["of 3DGS"]) for row in rows) < 0.95
-    assert len({row["3DGS PSNR"] for row in rows}) == 4  # every seed and variant was a training of its own
+    assert min(float(row["of full model"]) for row in rows) < 0.95
+    assert len({row["full PSNR"] for row in rows}) == 4  # every seed and variant was a training of its own
     summary = rows_of(finished / "out" / "summary.csv")
     assert [(r["variant"], r["target"], r["n"]) for r in summary] == [
         (variant, target, "2") for variant in ("track", "projection") for target in ("0.3", "0.4")
@@ -135,7 +135,7 @@ def test_what_is_trained_alike_is_trained_once(copy: Path) -> None:
     rows = {(r["variant"], r["seed"], r["target"]): r for r in rows_of(copy / "out" / "cells.csv")}
     for target in ("0.3", "0.4"):
         like, minimum = (rows[variant, "5", target] for variant in ("track", "minimum"))
-        assert like["3DGS PSNR"] == minimum["3DGS PSNR"]
+        assert like["full PSNR"] == minimum["full PSNR"]
     assert done(sweep_in(copy, text)) == [*CELLS, "plot-minimum-seed0", "plot-minimum-seed5"]
 
 
@@ -245,7 +245,7 @@ def test_without_test_views_quality_is_unknown(copy: Path) -> None:
     assert row[-2:] == ("–", "–")
     (row, _) = rows_of(copy / "new" / "cells.csv")
     assert int(row["Gaussians"]) > 0
-    assert (row["SSIM"], row["3DGS PSNR"], row["promised"], row["share kept"]) == ("", "", "0", "")
+    assert (row["SSIM"], row["full PSNR"], row["promised"], row["share kept"]) == ("", "", "0", "")
 
 
 def test_an_interrupted_sweep_keeps_what_is_done(copy: Path) -> None:

@@ -1,4 +1,4 @@
-"""Put the chosen levels together, and write the scene that the plan chose."""
+"""Compose the chosen levels, and write the composed scene."""
 
 from pathlib import Path
 

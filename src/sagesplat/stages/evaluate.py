@@ -18,7 +18,7 @@ from sagesplat.stages.shared import _show, label_images
 
 
 def evaluate_plans(job: Job) -> None:
-    """Measure the compositions on the test views, beside the promise and the whole model."""
+    """Measure the compositions on the test views, beside what was promised and the full model."""
     run, method = job.run, method_of(job)
 
     def make() -> list[str]:
@@ -42,7 +42,7 @@ def evaluate_plans(job: Job) -> None:
             asked = "within the budget" if within_budget else f"SSIM {target:g} asked"
             lines.append(
                 f"{asked}: test views {at.ssim.mean():.3f} / {at.psnr.mean():.2f} dB "
-                f"(everything {at.full_ssim.mean():.3f} / {at.full_psnr.mean():.2f} dB)"
+                f"(full model {at.full_ssim.mean():.3f} / {at.full_psnr.mean():.2f} dB)"
             )
         return lines
 

@@ -22,6 +22,7 @@ from sagesplat.scene import describe
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.segment.block_categories import category_of
+from sagesplat.segment.display_names import titles
 from sagesplat.segment.masks import UNLABELLED, UNLABELLED_COLOR, Masks, Taxonomy
 
 PANELS = 3  # views shown in pictures
@@ -50,7 +51,7 @@ def report_data(
     return ReportData(
         title=scene.name,
         target=target,
-        names=names,
+        names=titles(names),
         colours=colours or {label: masks.taxonomy.color(label) for label in names},
         observations=read_observations(run.observations),
         train_views=scene.train_ids,
@@ -77,7 +78,7 @@ def stage_records(run: RunDir) -> list[Path]:
 
 
 def _parts(run: RunDir, names: dict[int, str]) -> tuple[dict[int, int], Colours]:
-    """Of a scene in blocks: which label stands for a part's category, and its colour; nothing of others."""
+    """Of a scene in blocks: the label of each per-block category's category, and its colour; else nothing."""
     if not (run.block_categories / "labels.json").exists():
         return {}, {}
     taxonomy = Taxonomy.read(run.masks / "labels.json")
