@@ -2,6 +2,7 @@
 
 import pytest
 
+from sagesplat.segment.coco import NAMES
 from sagesplat.segment.display_names import title_of, titles
 
 
@@ -23,3 +24,9 @@ def test_names_that_become_the_same_stay_as_they_are() -> None:
 
 def test_categories_of_blocks_keep_their_block() -> None:
     assert titles({1: "grass-merged@0", 2: "grass-merged@1"}) == {1: "grass@0", 2: "grass@1"}
+
+
+def test_no_two_of_cocos_share_a_title() -> None:
+    shown = titles(NAMES).values()
+    assert len(set(shown)) == len(NAMES)
+    assert not [title for title in shown if "-" in title]

@@ -170,7 +170,8 @@ def fuse_masks(job: Job) -> None:
             f"in {after:.1%} of what they see ({before:.1%} before)"
         ]
 
-    inputs = [run.provenance("masks"), run.masks / "labels.json", run.levels]
+    made = [run.provenance(stage) for stage in ("masks", "train")]
+    inputs = [run.scene, run.masks / "labels.json", run.levels, *made]
     run_stage(job, "fuse", {"soft": soft is not None}, inputs, [run.fused / "labels.json"], make)
 
 

@@ -147,8 +147,8 @@ class NestedLevels(Method):
     def costs(self) -> Costs:
         """What the levels cost."""
         labels = sorted({label for label, _ in self.job.ladder.counts})
-        chunks, levels = read_index(self.job.run.increments), len(self.job.ladder.levels)
-        columns = (totals(chunks, labels, levels, name) for name in ("count", "nbytes", "gpu_bytes"))
+        increments, levels = read_index(self.job.run.increments), len(self.job.ladder.levels)
+        columns = (totals(increments, labels, levels, name) for name in ("count", "nbytes", "gpu_bytes"))
         return Costs(tuple(labels), *columns)
 
     @cached_property
