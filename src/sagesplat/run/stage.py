@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from sagesplat.core.errors import RunError
+from sagesplat.core.errors import RunError, SageError
 from sagesplat.core.events import StageDone, StageSkipped, StageStarted
 from sagesplat.io.files import named_full_disk, read_json, remove_temporary, sync_changed
 from sagesplat.io.lock import locked
@@ -59,6 +59,7 @@ def run_stage(
         inputs: Files and folders that it is made from; their hashes are recorded.
         outputs: Files and folders that it makes.
         make: Does the work and returns lines that sum up the result.
+        swaps: Whether the old result and its record stay until `make` takes them away.
 
     Raises:
         RunError: If an input is missing, the result was made with other settings (without `job.force`),
@@ -124,5 +125,8 @@ def _follows(job: Job, stage: Stage) -> bool:
     record = job.run.provenance(stage.name)
     if stage.name not in _DERIVED or not record.exists():
         return False
-    made = read_json(record)
+    try:
+        made = read_json(record)
+    except SageError:  # a broken record is told where it is compared
+        return False
     return isinstance(made, dict) and made.get("settings") == stage.settings
