@@ -19,18 +19,10 @@ from sagesplat import cli
 ROOT = Path(__file__).parents[1]
 DOCS = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
 FOREIGN = {  # flags of other tools
-    "--mode", "--no-index", "--find-links", "--revision", "--extra", "--system-site-packages", "--upgrade",
+    "--fix", "--address", "--no-index", "--find-links", "--revision", "--extra", "--upgrade",
 }  # fmt: skip
 COMMANDS = {*cli.COMMANDS, "early-stopping"}
-FOREIGN_FILES = {
-    "stages/NAME.py",
-    "simple_trainer.py",
-    "train.py",
-    "loss_utils.py",
-    "default.py",
-    "mcmc.py",
-    "utils.py",
-}
+FOREIGN_FILES = {"stages/NAME.py", "simple_trainer.py"}  # a placeholder; gsplat's
 
 
 @cache
