@@ -169,11 +169,11 @@ def damaged(path: Path, how: str) -> None:
         ("rest", "1 f_rest properties"),
         ("label", "20 values of label are outside"),
         ("zero", "20 Gaussians have a rotation"),
-        ("cut", "20 Gaussians promised, 19 there"),
-        ("ascii", "as text is not read"),
+        ("cut", "20 Gaussians announced, 19 present"),
+        ("ascii", "text PLY is not supported"),
         ("header", "header breaks"),
         ("garbage", "not readable as a PLY file"),
-        ("huge", "20 there"),
+        ("huge", "20 present"),
     ],
 )
 def test_damage_is_named_in_one_line(tmp_path, how, words):

@@ -202,7 +202,7 @@ def test_sums_of_chunks_that_the_run_does_not_have():
     chunk = Increment(2, 1, "a.spz", 3, 9, 9, "0" * 64)
     assert totals([chunk], [2], 2, "count").tolist() == [[3, 3]]
     for labels, levels in (([5], 2), ([2], 0)):
-        with pytest.raises(DataError, match=r"a\.spz: of category 2 and level 1"):
+        with pytest.raises(DataError, match=r"a\.spz: this run has no category 2, level 1"):
             totals([chunk], labels, levels, "count")
 
 

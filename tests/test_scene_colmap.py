@@ -191,7 +191,7 @@ def breakages() -> dict:
         r"images: 2 of the model's 5 photos are missing, first 'part 1/02.png'": lambda f: shutil.rmtree(
             f / "images/part 1"
         ),
-        r"30 x 40 pixels, but its camera has another aspect, 40 x 30": shrink,
+        r"30 x 40 pixels, but its camera has another aspect ratio, 40 x 30": shrink,
         r"camera model number 200 is unknown": unknown,
         r"points3D.bin: damaged or incomplete \(it ends within a record": count,
         r"sparse/0: no 3D points": no_points,

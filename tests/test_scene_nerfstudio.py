@@ -404,7 +404,7 @@ def breakages() -> dict[str, Callable[[Path, dict], Any]]:
         r"OPENCV has no k4": frame(k4=0.1),
         r"OPENCV_FISHEYE has no p1 and p2": frame(camera_model="OPENCV_FISHEYE", p1=0.1),
         r"no pinhole view fits into a OPENCV camera": frame(k1=-30.0),
-        r"frame_00002.png: 30 x 40 pixels, but its frame has another aspect, 40 x 30": turned,
+        r"frame_00002.png: 30 x 40 pixels, but its camera has another aspect ratio, 40 x 30": turned,
         r"frame_00002.png: not readable as a photo": damaged,
         r"ply_file_path is '3'": lambda f, c: {**c, "ply_file_path": 3},
         r"ply_file_path '../a.ply' is outside": lambda f, c: {**c, "ply_file_path": "../a.ply"},
@@ -439,7 +439,7 @@ def test_bad_settings_and_folders(tmp_path):
         with pytest.raises(SceneError, match="no such file"):
             load(tmp_path / "none")
         for options in ({"test_every": 1}, {"downscale": 0}):
-            with pytest.raises(SceneError, match="do not go together with training"):
+            with pytest.raises(SceneError, match="cannot be used; take downscale >= 1"):
                 load(tmp_path, **options)
 
 

@@ -412,7 +412,7 @@ def test_too_few_photos(
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        (PosesConfig(model="PINHOL"), "PINHOL: no camera model of COLMAP; take one of SIMPLE_PINHOLE"),
+        (PosesConfig(model="PINHOL"), "PINHOL: COLMAP cannot undistort it; take one of SIMPLE_PINHOLE"),
         (PosesConfig(max_size=0), "max_size 0"),
         (PosesConfig(min_registered=1.5), "min_registered 1.5"),
         (PosesConfig(threads=0), "threads 0"),
@@ -438,7 +438,7 @@ def test_nothing_of_the_users_is_overwritten(tmp_path: Path, monkeypatch: pytest
     with pytest.raises(SceneError, match=r"gone: no such file or folder"):
         reconstruct(tmp_path / "gone", tmp_path / "out")
     (tmp_path / "file").write_text("")
-    with pytest.raises(SceneError, match="file: is no folder"):
+    with pytest.raises(SceneError, match="file: is not a folder"):
         reconstruct(tmp_path / "photos", tmp_path / "file")
 
 

@@ -87,18 +87,18 @@ def test_without_colours_grey(tmp_path):
 
 
 BAD = {
-    "no such file; add it, or take ply_file_path out": None,
+    "no such file; add it, or remove ply_file_path": None,
     "does not begin with 'ply'": b"solid",
     "no vertices or no x": header("ascii", "float x", "float y") + b"0 0\n0 0\n0 0\n",
     "its header breaks at 'format zip 1.0'": header("zip", *AXES),
     "its header breaks at 'property list": header("ascii", "list uchar int x"),
     "its header breaks at ''": b"ply\nformat ascii 1.0\n",
     "element camera comes before": b"ply\nformat ascii 1.0\nelement camera 1\nelement vertex 1\nend_header\n",
-    "3 points promised, but it ends": header("binary_little_endian", *AXES) + XYZ.tobytes()[:-1],
-    "9{20} points promised": header("binary_big_endian", *AXES, count=int("9" * 20)) + bytes(99),
-    "3 points of 3 values promised, but there are": header("ascii", *AXES) + b"0.5 0.5 0.5\n0.5 0.5 0.5\n",
+    "3 points announced, but the file ends": header("binary_little_endian", *AXES) + XYZ.tobytes()[:-1],
+    "9{20} points announced": header("binary_big_endian", *AXES, count=int("9" * 20)) + bytes(99),
+    "3 points of 3 values announced, but there are": header("ascii", *AXES) + b"0.5 0.5 0.5\n0.5 0.5 0.5\n",
     "not readable as a PLY file": header("ascii", *AXES) + b"0.5 0.5 0.5\n0.5 0.5 x.5\n0.5 0.5 0.5\n",
-    "promised, but there are": header("ascii", *AXES) + b"\n" * 40,
+    "announced, but there are": header("ascii", *AXES) + b"\n" * 40,
     "its header names no vertices": header("ascii", *AXES, count=0),
     "1 of 3 points are not finite": header("ascii", *AXES) + b"0 0 0\nnan 0 0\n1 1 1\n",
     "2 of 3 points are not finite": header("ascii", *(p.replace("float", "double") for p in AXES))
@@ -280,5 +280,5 @@ def test_colour_is_the_mean_of_the_photos_that_show_a_point(tmp_path):
 def test_photos_that_share_nothing_are_refused(tmp_path):
     apart = [looking(np.array([0, 0, 0.0]), np.array([x, 0, 0.0])) for x in (1, -1)]
     for poses in (apart, apart[:1]):
-        with pytest.raises(SceneError, match="no two photos look at the same place"):
+        with pytest.raises(SceneError, match="no two photos show the same part"):
             random_points(views_of(poses, tmp_path), 100)

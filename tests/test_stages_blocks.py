@@ -172,7 +172,7 @@ def test_impossible_numbers_of_blocks(count: int) -> None:
         (BlocksConfig(margin=-1), "margin -1"),
         (BlocksConfig(min_share=0), "min-share 0"),
         (BlocksConfig(far_share=-0.5), "far-share -0.5"),
-        (BlocksConfig(boundary_steps=-1), "seam-steps -1"),
+        (BlocksConfig(boundary_steps=-1), "boundary-steps -1"),
     ],
 )
 def test_impossible_settings(config: BlocksConfig, named: str) -> None:

@@ -12,6 +12,7 @@ Rules that a second implementation must share, so that both give the same levels
 - A label of weight 0 has no value: within a budget it stays at its cheapest level.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -171,6 +172,26 @@ def along(
     return plan
 
 
+def choose(
+    quality: Float[np.ndarray, "... K"],
+    cost: Float[np.ndarray, "... K"] | Int[np.ndarray, "... K"],
+    target: float | Float[np.ndarray, "... 1"],
+    otherwise: Sequence[Float[np.ndarray, "... K"] | Int[np.ndarray, "... K"]] = (),
+) -> tuple[Int[np.ndarray, "..."], Bool[np.ndarray, "..."]]:
+    """The cheapest level whose SSIM reaches `target`, else the best one; and whether one reaches it.
+
+    Every plan for a target chooses by this rule, whatever predicts the SSIM and whatever a level costs. Of
+    equal levels the module's rules take the one of lower index. `otherwise`: what makes a level the best
+    where none reaches the target, the first key first (default: its SSIM). A level of unknown SSIM (NaN) or
+    of infinite cost is never chosen while there is another.
+    """
+    usable = np.isfinite(cost) & ~np.isnan(quality)
+    good = usable & (quality >= target)
+    met = np.asarray(good.any(-1))
+    best = [-key for key in otherwise or (quality,)]
+    return np.where(met, _first(good, cost, -quality), _first(usable, *best, cost)), met
+
+
 def _known(quality, cost):
     """Quality without NaN, cost with inf for what is passed over, both [..., L, K]; which labels promise."""
     finite = np.isfinite(cost)
@@ -194,9 +215,7 @@ def _first(allowed, *keys):
 def _reaching(q, c, promised, target, slack):
     """Level of each label without hysteresis, whether one reaches the target, level to come down to or -1."""
     usable = np.isfinite(c)
-    good = usable & (q >= target[:, None])
-    met = good.any(-1)
-    wanted = np.where(met, _first(good, c, -q), _first(usable, -q, c))
+    wanted, met = choose(q, c, target[:, None])
     highest = q.shape[-1] - 1 - usable[..., ::-1].argmax(-1)
     safe = usable & (q >= (target + np.minimum(slack, (1 - target) / 2))[:, None])
     lower = np.where(safe.any(-1), _first(safe, c, -q), -1)

@@ -25,7 +25,7 @@ class Evaluation:
     target: Float32[np.ndarray, " R"]  # SSIM asked for; NaN for a plan within a budget
     view: Int32[np.ndarray, " R"]  # row in Scene.views
     label_id: Int32[np.ndarray, " R"]  # category id, -1 = unlabelled, -2 = the whole image
-    level: Int32[np.ndarray, " R"]  # the level chosen, a training step; -1 for the whole image
+    level: Int32[np.ndarray, " R"]  # the level chosen; -1 for the whole image
     predicted: Float32[np.ndarray, " R"]  # promised SSIM; NaN for the whole image
     ssim: Float32[np.ndarray, " R"]  # measured on the composed scene, over the category's pixels
     psnr: Float32[np.ndarray, " R"]  # dB, the same

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
+from sagesplat.adapt.allocate import choose
 from sagesplat.adapt.eq3 import SsimModel
 from sagesplat.core.errors import DataError, RunError, short
 from sagesplat.core.gaussians import BYTES_PER_GAUSSIAN
@@ -26,7 +27,7 @@ class Choice:
     """The level of one category."""
 
     label_id: int
-    level: int  # training step of the level
+    level: int  # of snapshots the training step, of nested levels 1 to K
     predicted_ssim: float  # in a scene: what at least `share` of the views reach; NaN without a model
     distance: float  # of the view, world units; NaN in a scene and where unknown
     count: int  # Gaussians
@@ -198,21 +199,29 @@ def _choose(
 ) -> Choice:
     """The level of one category; `levels` maps each candidate to its count."""
     last = max(levels)
-    if (label_id, last) not in models:  # never seen: no promise to make, nothing to leave out
+    if (label_id, last) not in models:  # never seen: nothing is predicted, nothing is left out
         return Choice(label_id, last, math.nan, distance, levels[last], "no model")
+    steps = sorted(levels)
+    counts = np.array([levels[step] for step in steps])
+    ssim = np.stack([models[label_id, step](distances) for step in steps])
     needed = max(1, math.ceil(share * len(distances) - 1e-9))
-    feasible, all_levels = [], []
-    for level, count in levels.items():
-        ssim = models[label_id, level](distances)
-        promised = float(np.sort(ssim)[-needed])  # the lowest among the best `needed` views
-        reached = int((ssim >= target).sum())
-        choice = Choice(
-            label_id, level, promised, distance, count, "ok" if reached >= needed else "infeasible"
-        )
-        all_levels.append(((-reached, -float(ssim.mean()), count, -level), choice))
-        if reached >= needed:
-            feasible.append(((count, -promised, -level), choice))
-    return min(feasible or all_levels)[1]
+    predicted = np.sort(ssim, 1)[:, -needed]  # what the best `needed` views reach
+    most_views = (ssim >= target).sum(1), ssim.mean(1)
+    found, met = choose_snapshot(predicted, counts, target, most_views)
+    at = int(found)
+    status = "ok" if met else "infeasible"
+    return Choice(label_id, steps[at], float(predicted[at]), distance, int(counts[at]), status)
+
+
+def choose_snapshot(
+    ssim: Float[np.ndarray, "... K"],
+    counts: Int[np.ndarray, " K"],
+    target: float,
+    otherwise: Sequence[Float[np.ndarray, "... K"] | Int[np.ndarray, "... K"]] = (),
+) -> tuple[Int[np.ndarray, "..."], Bool[np.ndarray, "..."]]:
+    """`allocate.choose` for K snapshots in order of their steps: of equal ones the latest."""
+    found, met = choose(ssim[..., ::-1], counts[::-1], target, [key[..., ::-1] for key in otherwise])
+    return len(counts) - 1 - found, met
 
 
 def check_target(target: float) -> None:
@@ -311,15 +320,3 @@ def _from_json(entry: dict[str, Any]) -> Plan:
         unit=maybe(str, entry.get("unit")),
         fits=bool(entry.get("fits", True)),
     )
-
-
-def choose(
-    ssim: Float[np.ndarray, "L V"],
-    levels: Int[np.ndarray, " L"],
-    counts: Int[np.ndarray, " L"],
-    target: float,
-) -> Int[np.ndarray, " V"]:
-    """Row of the level that `plan.plan_view` chooses in each view, all views at once."""
-    ties = (np.broadcast_to(column[:, None], ssim.shape) for column in (-levels, counts))
-    cost = np.where(ssim >= target, counts[:, None], np.inf)
-    return np.lexsort((*ties, -ssim, cost), axis=0)[0]  # the last key decides first

@@ -69,6 +69,12 @@ def is_well(findings: Sequence[Finding]) -> bool:
     return all(finding.state != "broken" for finding in findings)
 
 
+def unbuilt(findings: Sequence[Finding]) -> str:
+    """Why gsplat's kernels could not be compiled, and the cure; empty where they are."""
+    gaps = [f for f in findings if f.part == "cuda kernels" and f.state != "fine"]
+    return "; ".join(text for f in gaps for text in (f.text, f.cure) if text)
+
+
 def processor() -> Finding:
     """Its name, cores and vectors, as numba's kernels see them."""
     import llvmlite.binding as llvm

@@ -1,8 +1,8 @@
-"""Errors a user can cause. Each message is one line: the path, what is wrong, the cure."""
+"""Errors that a user can cause. Each message is one line: the path, what is wrong, what to do."""
 
 
 class SageError(Exception):
-    """Base of every error that the command line prints as one line with exit code 2."""
+    """Base class of the errors that the CLI prints as one line, with exit code 2."""
 
 
 class SceneError(SageError):
@@ -10,26 +10,26 @@ class SceneError(SageError):
 
 
 class LabelError(SageError):
-    """Label images or a taxonomy that cannot be used."""
+    """Label images or a taxonomy that are invalid."""
 
 
 class RunError(SageError):
-    """A run folder that does not fit what is asked of it."""
+    """A run folder or setting that does not allow the requested operation."""
 
 
 class DataError(SageError):
-    """A file of Gaussians or a table with content that cannot be used."""
+    """A file of Gaussians or a table with invalid content."""
 
 
 class BackendUnavailable(SageError):
-    """A named backend or optional dependency that this machine does not have."""
+    """A requested backend or optional dependency that is not available."""
 
 
 class OutOfMemory(SageError):
-    """The GPU has too little memory for what is asked of it."""
+    """Too little GPU memory for the requested operation."""
 
 
 def short(value: object) -> str:
-    """What an error says, or a value of a file, as part of one line: clipped, without line ends."""
+    """The text of a value or an error for a one-line message: printable, at most about 200 characters."""
     text = str(value) if str(value).isprintable() else repr(str(value))
     return text if len(text) <= 200 else f"{text[:110]}...{text[-80:]}"

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-BYTES_PER_GAUSSIAN = 248  # 62 float32, the INRIA PLY: what the paper counts as occupancy
+BYTES_PER_GAUSSIAN = 248  # 62 float32, as in INRIA's PLY: the model size that the paper counts
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 
@@ -34,12 +34,12 @@ class Gaussians:
 
     @property
     def sh_degree(self) -> int:
-        """The degree that shN has room for."""
+        """Degree of the spherical harmonics in shN."""
         return {0: 0, 3: 1, 8: 2, 15: 3}[self.shN.shape[1]]
 
     @property
     def nbytes(self) -> int:
-        """Occupancy as the paper counts it: 248 bytes a Gaussian."""
+        """Model size as the paper counts it: 248 bytes per Gaussian."""
         return len(self) * BYTES_PER_GAUSSIAN
 
     def parameters(self) -> dict[str, Tensor]:
@@ -47,11 +47,11 @@ class Gaussians:
         return {name: getattr(self, name) for name in PARAMETERS}
 
     def select(self, index: Tensor) -> "Gaussians":
-        """The rows that a boolean mask or an index tensor names."""
+        """The Gaussians that a boolean mask or an index tensor selects."""
         return Gaussians(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
     def of_labels(self, label_ids: Sequence[int]) -> "Gaussians":
-        """The rows of some categories."""
+        """The Gaussians of these categories."""
         wanted = torch.tensor(list(label_ids), dtype=self.label_ids.dtype, device=self.label_ids.device)
         return self.select(torch.isin(self.label_ids, wanted))
 
@@ -61,16 +61,16 @@ class Gaussians:
         return dict(zip(ids.tolist(), counts.tolist(), strict=True))
 
     def to(self, device: torch.device | str) -> "Gaussians":
-        """The same on a device; tensors that are there already are shared."""
+        """The same Gaussians on a device; tensors already there are shared."""
         return Gaussians(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
 
     def detach(self) -> "Gaussians":
-        """The same tensors outside any graph."""
+        """The same Gaussians, detached from the autograd graph."""
         return replace(self, **{name: p.detach() for name, p in self.parameters().items()})
 
 
 def checked(g: Gaussians) -> Gaussians:
-    """The same, if its tensors are of one length and of the shapes above; else ValueError."""
+    """`g` itself; ValueError unless its tensors have the shapes and types above."""
     n, k = len(g.logit_opacities), g.shN.shape[1] if g.shN.ndim == 3 else -1
     shapes = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,)}
     shapes |= {"sh0": (n, 1, 3), "shN": (n, k, 3), "label_ids": (n,)}
@@ -78,12 +78,12 @@ def checked(g: Gaussians) -> Gaussians:
         if getattr(g, name).shape != shape or k not in (0, 3, 8, 15):
             raise ValueError(f"{name} is of shape {list(getattr(g, name).shape)}")
     if any(p.dtype != torch.float32 for p in g.parameters().values()) or g.label_ids.dtype != torch.int16:
-        raise ValueError("numbers of another type")
+        raise ValueError("parameters are not float32, or label_ids not int16")
     return g
 
 
 def concat(parts: Sequence[Gaussians]) -> Gaussians:
-    """All Gaussians of several sets in order; shN is padded with zeros to the largest degree."""
+    """The Gaussians of several sets, in order; shN is zero-padded to the largest degree."""
     bases = max(p.shN.shape[1] for p in parts)
     padded = [
         replace(p, shN=torch.nn.functional.pad(p.shN, (0, 0, 0, bases - p.shN.shape[1]))) for p in parts

@@ -1,4 +1,4 @@
-"""Geometry on plain arrays: projection and nearest neighbours."""
+"""Geometry on plain arrays: projection, nearest neighbours, Morton order."""
 
 import numpy as np
 from jaxtyping import Float32, Int64
@@ -15,14 +15,14 @@ def mean_neighbour_distance(xyz: Float32[np.ndarray, "P 3"], k: int = 3) -> Floa
 
 
 def to_camera(xyz: Float32[np.ndarray, "P 3"], w2c: Float32[np.ndarray, "4 4"]) -> Float32[np.ndarray, "P 3"]:
-    """World points in a camera's frame."""
+    """World points in camera coordinates."""
     return xyz @ w2c[:3, :3].T + w2c[:3, 3]
 
 
 def project(
     xyz: Float32[np.ndarray, "P 3"], w2c: Float32[np.ndarray, "4 4"], K: Float32[np.ndarray, "3 3"]
 ) -> tuple[Float32[np.ndarray, "P 2"], Float32[np.ndarray, " P"]]:
-    """Pixels and depths of world points; pixels of points behind the camera are NaN."""
+    """Pixels and depths (camera z, world units) of world points; pixels behind the camera are NaN."""
     points = to_camera(xyz, w2c)
     depths = points[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -31,10 +31,10 @@ def project(
 
 
 def morton_order(points: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
-    """Rows of points along a curve that keeps neighbours together (Morton's, 10 bits an axis)."""
+    """Rows of the points along Morton's space-filling curve, 10 bits per axis."""
     if not len(points):
         return np.zeros(0, np.int64)
-    low, high = np.percentile(points, [1, 99], axis=0)  # floaters would leave a few cells for all others
+    low, high = np.percentile(points, [1, 99], axis=0)  # floaters would squeeze the rest
     cells = ((points - low) / np.maximum(high - low, 1e-12) * 1024).clip(0, 1023).astype(np.int64)
     codes = np.zeros(len(points), np.int64)
     for bit in range(10):

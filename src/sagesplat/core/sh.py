@@ -1,4 +1,4 @@
-"""Real spherical harmonics up to degree 3, in the order and sign that splat files use."""
+"""Real spherical harmonics up to degree 3, in the order and with the signs of 3DGS."""
 
 import math
 
@@ -17,12 +17,12 @@ _C322 = math.sqrt(105 / (16 * math.pi))
 
 
 def num_bases(degree: int) -> int:
-    """Number of basis functions up to `degree`, the constant one included."""
+    """Number of basis functions up to `degree`, including the constant one."""
     return (degree + 1) ** 2
 
 
 def rgb_to_sh0(rgb: Tensor) -> Tensor:
-    """The constant coefficient that shows `rgb` in [0, 1] from everywhere."""
+    """The degree-0 coefficient that gives the colour `rgb`, in [0, 1], in all directions."""
     return (rgb - 0.5) / C0
 
 
@@ -32,7 +32,7 @@ def sh0_to_rgb(sh0: Tensor) -> Tensor:
 
 
 def bases(x, y, z):
-    """All 16 basis functions at unit direction (x, y, z): floats, tensors, vectors of kernels."""
+    """The 16 basis functions at the unit direction (x, y, z), for floats, tensors or kernel vectors."""
     return (
         C0,
         -_C1 * y,
@@ -54,7 +54,7 @@ def bases(x, y, z):
 
 
 def direction_gradient(x, y, z, g):
-    """d(sum_k g[k] * basis_k) / d(x, y, z) for 16 weights `g`, of what type ever."""
+    """d(sum_k g[k] * basis_k) / d(x, y, z) for 16 weights `g`, for the same types as `bases`."""
     xx, yy, zz = x * x, y * y, z * z
     dx = -_C1 * g[3] + _C2 * y * g[4] - 2 * _C20 * x * g[6] - _C2 * z * g[7] + 2 * _C22 * x * g[8]
     dx += -6 * _C33 * x * y * g[9] + _C32 * y * z * g[10] + 2 * _C31 * x * y * g[11]

@@ -1,1 +1,1 @@
-"""A procedural capture of a small garden: photos, poses, points and label images made on the spot."""
+"""A procedural capture of a small garden: rendered photos, poses, points and label images."""

@@ -1,4 +1,4 @@
-"""Where the photos of the garden are taken from."""
+"""Camera poses for the photos of the garden."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from sagesplat.scene.scene import Camera
 
 
 def demo_cameras(views: int, width: int, height: int, seed: int) -> list[Camera]:
-    """Two orbits around the table at different heights, and a sixth of the views from nearer or farther."""
+    """Cameras on two orbits around the table at different heights; a sixth of them nearer or farther."""
     rng = np.random.default_rng([seed, 1])
     others = views // 6
     near, lower = (others + 1) // 2, (views - others) // 2
@@ -21,7 +21,7 @@ def demo_cameras(views: int, width: int, height: int, seed: int) -> list[Camera]
         [2 * np.pi * (np.arange(ring[0]) + rng.random()) / max(ring[0], 1) for ring in rings]
     )
     radius, z, aim = np.repeat(np.array(rings)[:, 1:], [ring[0] for ring in rings], axis=0).T
-    order = turn.argsort(kind="stable")  # by angle, so that every n-th view is of any ring
+    order = turn.argsort(kind="stable")  # by angle, so that every n-th view comes from all rings
     place = np.stack([radius * np.cos(turn), radius * np.sin(turn), z], 1)[order]
     target = np.stack([0 * aim, 0 * aim, aim], 1)[order]
     place += rng.uniform(-1, 1, place.shape) * [0.15, 0.15, 0.2]
@@ -45,7 +45,7 @@ def _look(place: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def grid_cameras(places: tuple[int, int], views: int, width: int, height: int, seed: int) -> list[Camera]:
-    """Orbits in every courtyard of a grid, and a fifth of the views from the ways between them."""
+    """Cameras on orbits in every courtyard of a grid, and a fifth of them on the ways in between."""
     centres, ways = centres_of(places), ways_of(places)
     walking = views // 5
     K, cameras = _intrinsics(width, height), []
@@ -58,7 +58,7 @@ def grid_cameras(places: tuple[int, int], views: int, width: int, height: int, s
             start, end = centres[way[:: 1 - 2 * (k % 2)]]
             share = 0.17 + 0.66 * (k + rng.random()) / count
             here, target = start + share * (end - start), end
-            if k % 3 == 1:  # from behind one place over both
+            if k % 3 == 1:  # from behind one courtyard, over both
                 here = start + (0.35 * share - 0.5) * (end - start)
             elif k % 3 == 2:  # across the grid, which is centred at the origin
                 target = -here
@@ -72,7 +72,7 @@ def grid_cameras(places: tuple[int, int], views: int, width: int, height: int, s
 
 
 def _shares(total: int, parts: int) -> list[int]:
-    """`total` in `parts` nearly equal whole numbers."""
+    """`total` as a sum of `parts` nearly equal integers."""
     return [total * (i + 1) // parts - total * i // parts for i in range(parts)]
 
 

@@ -1,4 +1,4 @@
-"""Writes the garden as a capture: a COLMAP workspace with photos, poses, points and label images."""
+"""Writes the garden as a capture: a COLMAP workspace with label images."""
 
 import hashlib
 import shutil
@@ -29,13 +29,12 @@ def make_capture(
     places: tuple[int, int] = (1, 1),
     on_view: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Photograph the garden into `folder`: images/*.png, masks/*.png with labels.json, sparse/0/*.bin.
+    """Render the garden into `folder`: images/*.png, masks/*.png with labels.json, sparse/0/*.bin.
 
-    `places` (nx, ny) makes a large capture: a grid of different courtyards, photographed from orbits in each
-    and, a fifth of the views, from the ways between them. The bytes depend on the arguments alone. The folder
-    appears when it is complete, so a killed run leaves no half capture. `on_view(done, views)` is called
-    after each photo. Raises SceneError where `folder` exists or cannot be made, and where `places` or `views`
-    are too few.
+    `places` (nx, ny) makes a large capture: a grid of different courtyards, with photos from orbits in each
+    and, a fifth of them, from the ways in between. The files depend on the arguments only. The folder is
+    written atomically. `on_view(done, views)` is called after each photo. SceneError if `folder` exists or
+    cannot be written, or `places` or `views` are too few.
     """
     if views < 3:
         raise SceneError(f"{folder}: {views} views; a capture needs at least 3")
@@ -108,7 +107,7 @@ def _write(
     names = [f"view_{i:0{digits}d}.png" for i in range(len(cameras))]
     for below in ("images", "masks", "sparse/0"):
         (folder / below).mkdir(parents=True)
-    lit_world(seed, places)  # before the threads, which share it
+    lit_world(seed, places)  # cached here, before threads use it
     shape = len(cameras), cameras[0].height, cameras[0].width
     photos, labels = np.empty((*shape, 3), np.uint8), np.empty(shape, np.uint8)
     for done, (rgb, label, _) in enumerate(threads_map(lambda c: render_view(c, seed, places), cameras)):

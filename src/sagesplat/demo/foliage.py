@@ -1,4 +1,4 @@
-"""Leaves by the thousand: crowns, hedges, bouquets."""
+"""Leaves of crowns, hedges and bouquets."""
 
 from collections.abc import Sequence
 
@@ -10,7 +10,7 @@ PETALS = ((0.75, 0.10, 0.28), (0.85, 0.80, 0.75), (0.85, 0.45, 0.05))
 
 
 class Foliage:
-    """Collects leaves: pointed discs, each with a pose, a colour and a label."""
+    """Leaves as pointed discs, each with a pose, a colour and a label."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.rng = rng
@@ -26,9 +26,9 @@ class Foliage:
         spread: float = 0.7,
         along: np.ndarray | None = None,
     ) -> None:
-        """Leaves at `centre` [n, 3], half length and width `size`, roughly `facing` [n, 3].
+        """Add leaves at `centre` [n, 3], with half length and half width `size`, roughly `facing` [n, 3].
 
-        `along` [n, 3] is the direction of the midrib; random where it is not given.
+        `along` [n, 3] is the direction of the midrib; random by default.
         """
         rng, n = self.rng, len(centre)
         normal = _unit(facing + spread * rng.normal(size=(n, 3)))
@@ -50,7 +50,7 @@ class Foliage:
         rgb: Sequence[float],
         label: int = TREE,
     ) -> None:
-        """A crown of leaf clusters around `centre`."""
+        """Add a crown of leaf clusters around `centre`."""
         rng, clusters = self.rng, 26
         at = _unit(rng.normal(size=(clusters, 3))) * rng.uniform(0.25, 0.85, (clusters, 1)) * radius
         at[:, 2] *= 0.85
@@ -62,7 +62,7 @@ class Foliage:
         self.add(place, out + UP / 2, size, tint[which], label)
 
     def hedge(self, low: Sequence[float], high: Sequence[float], per_metre2: float) -> None:
-        """Leaves over the faces of a box that stands on the lawn (its top and four sides)."""
+        """Add leaves on the top and the four sides of a box that stands on the lawn."""
         rng, lo, hi = self.rng, np.array(low), np.array(high)
         for axis, side in ((0, 0), (0, 1), (1, 0), (1, 1), (2, 1)):
             extent = hi - lo
@@ -77,7 +77,7 @@ class Foliage:
             self.add(place, facing + 0.4 * UP, (0.09, 0.05), rgb, TREE)
 
     def bouquet(self, mouth: Sequence[float], petals: Sequence[Sequence[float]] = PETALS) -> None:
-        """Leaves, stems and flowers that grow out of the vase's mouth."""
+        """Add leaves, stems and flowers that grow out of the vase's mouth."""
         rng, base = self.rng, np.array(mouth)
         out = _unit(rng.normal(size=(420, 3)) * [1, 1, 0.55] + [0, 0, 0.75])
         reach = rng.uniform(0.05, 0.30, (420, 1))

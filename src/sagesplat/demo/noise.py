@@ -1,16 +1,17 @@
-"""Value noise, the stuff that the garden's textures are made of."""
+"""Value noise for the garden's textures."""
 
 from math import floor
 
 import numpy as np
 from jaxtyping import Float64
-from numba import njit
+
+from sagesplat.kernels.jit import njit
 
 jit = njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
 
 
 def dice(i, j):
-    """A number in [0, 1) for a pair of integers, or for arrays of them."""
+    """A pseudorandom number in [0, 1) for a pair of integers, or for arrays of them."""
     h = (i * 374761393 + j * 668265263) & 0xFFFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
     return ((h ^ (h >> 16)) & 0xFFFFFF) / 16777216.0
@@ -33,7 +34,7 @@ def noise(x, y):
 
 @jit
 def fbm_at(x, y, scale, octaves, footprint):
-    """Noise over several octaves, about -0.5 to 0.5; octaves finer than the footprint fade out."""
+    """Sum of noise octaves, about -0.5 to 0.5; octaves finer than `footprint` fade out."""
     total, weight = 0.0, 0.5
     for k in range(octaves):
         keep = min(scale / footprint - 0.8, 1.0)

@@ -1,4 +1,4 @@
-"""Several courtyards in a grid: one ground, one sky, houses and tall hedges around the outside only."""
+"""A grid of courtyards with one ground and one sky; houses and tall hedges stand around the outside only."""
 
 from typing import NamedTuple
 
@@ -35,10 +35,10 @@ ROOFS = ([1, 1, 1], [0.45, 0.8, 1.1], [0.7, 0.9, 0.8], [0.5, 0.6, 0.7])
 
 
 class Place(NamedTuple):
-    """Where a courtyard lies and how it is turned."""
+    """Position and orientation of a courtyard."""
 
     centre: np.ndarray  # [2]
-    turn: np.ndarray  # [2, 2], its own coordinates to the world's: a quarter turn, perhaps mirrored
+    turn: np.ndarray  # [2, 2], courtyard to world: a rotation by quarter turns, possibly mirrored
     outward: list[np.ndarray]  # directions [2] without a neighbour
     house: bool  # at the place's own north (+y), which is then outward
 
@@ -50,14 +50,14 @@ def centres_of(places: tuple[int, int]) -> np.ndarray:
 
 
 def ways_of(places: tuple[int, int]) -> np.ndarray:
-    """Pairs [K, 2] of neighbours, as rows of `centres_of`."""
+    """Pairs [K, 2] of neighbouring courtyards, as rows of `centres_of`."""
     centres = centres_of(places)
     apart = np.abs(centres[:, None] - centres).sum(2)
     return np.argwhere(np.triu(np.isclose(apart, SPACING)))
 
 
 def build_places(seed: int, places: tuple[int, int]) -> World:
-    """A grid of courtyards, each planted and coloured in its own way; still without light."""
+    """The world of a grid of courtyards with different plants and colours, without light."""
     leaves, solids, bodies, solid_place, body_place, paths = [], [], [], [], [], []
     layout = _layout(places)
     tints = np.ones((len(layout), 11, 3))
@@ -93,7 +93,7 @@ def build_places(seed: int, places: tuple[int, int]) -> World:
 
 
 def _layout(places: tuple[int, int]) -> list[Place]:
-    """Where the courtyards are; the outer ones have a house on a side without a neighbour."""
+    """The courtyards of a grid; outer ones have a house on a side without a neighbour."""
     layout = []
     limits = np.array(places) - 1
     for i, centre in enumerate(centres_of(places)):
@@ -107,7 +107,7 @@ def _layout(places: tuple[int, int]) -> list[Place]:
 
 
 def _courtyard(rng: np.random.Generator, house: bool) -> tuple[Foliage, list, list]:
-    """Foliage, solids and bodies of a place in its own coordinates."""
+    """Foliage, solids and bodies of a courtyard, in its own coordinates."""
     foliage, solids, bodies = Foliage(rng), furniture(), buildings() if house else []
     foliage.bouquet([0.06, -0.03, 1.13], [FLOWERS[i] for i in rng.permutation(len(FLOWERS))[:2]])
     count = int(rng.integers(3, 6))
@@ -133,7 +133,7 @@ def _courtyard(rng: np.random.Generator, house: bool) -> tuple[Foliage, list, li
 
 
 def _surroundings(rng: np.random.Generator, layout: list[Place]) -> tuple[Foliage, list]:
-    """Tall hedges and trees around the whole grid; also the hedges' dark insides."""
+    """Tall hedges and trees around the grid, and the bodies of the hedges' dark insides."""
     foliage, bodies = Foliage(rng), []
     for place in layout:
         north = place.turn @ [0, 1]
@@ -160,12 +160,12 @@ def _surroundings(rng: np.random.Generator, layout: list[Place]) -> tuple[Foliag
 
 
 def _hedge_end(place: Place, direction: np.ndarray) -> float:
-    """How far a hedge reaches from its middle: to the next place's hedge, or around the corner."""
+    """Length of a hedge from its middle: to the next courtyard's hedge, or around the corner."""
     return 7.2 if any((direction == side).all() for side in place.outward) else SPACING / 2
 
 
 def _around(turn: float, half: np.ndarray, away: float) -> np.ndarray:
-    """A point [2] `away` metres outside of the rectangle of half extents `half`."""
+    """A point [2] `away` metres outside the rectangle of half extents `half`, in direction `turn`."""
     out = np.array([np.cos(turn), np.sin(turn)])
     return half * (1.4 * out).clip(-1, 1) + away * out
 

@@ -1,4 +1,4 @@
-"""Points and tracks of the garden, as structure from motion would find them."""
+"""Simulated structure from motion of the garden: points and tracks."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from sagesplat.demo.world import World
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage, write_model
 from sagesplat.scene.scene import Camera
 
-CANDIDATES = 12500  # features looked for over all views, per courtyard
+CANDIDATES = 12500  # features sampled over all views, per courtyard
 UV_NOISE = 0.4  # standard deviation of a feature's position, pixels
 SKY_ID = 187
 
@@ -25,7 +25,7 @@ def write_points(
     seed: int,
     places: tuple[int, int] = (1, 1),
 ) -> None:
-    """A model as structure from motion would give it: points of textured places, seen in 3 or more views."""
+    """Write a simulated COLMAP model: points on textured surfaces, seen in at least 3 views."""
     rng, world = np.random.default_rng([seed, 2]), lit_world(seed, places)
     sought = CANDIDATES * places[0] * places[1]
     xyz, home, distance = _candidates(world, cameras, photos, labels, sought, rng)
@@ -77,9 +77,9 @@ def _candidates(
     sought: int,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Surface points [n, 3] under textured pixels, the view each was found in, its distance from there."""
+    """Surface points [n, 3] at textured pixels, the view [n] of each, and its distance [n] from that view."""
     per_view = min(sought // len(cameras), labels[0].size // 2)
-    found = []
+    sampled = []
     for i, camera in enumerate(cameras):
         grey = photos[i].mean(2)
         slope = np.hypot(*np.gradient(grey))
@@ -91,8 +91,8 @@ def _candidates(
         origins, directions, _ = camera_rays(camera, uv)
         t = cast_rays(world, origins, directions, FAR, float(1 / camera.K[0, 0]))[0]
         t = np.where(labels[i].ravel()[pick] == SKY_ID, dome_distance(origins, directions), t)
-        found.append((origins + t[:, None] * directions, np.full(per_view, i), t))
-    xyz, home, distance = (np.concatenate(c) for c in zip(*found, strict=True))
+        sampled.append((origins + t[:, None] * directions, np.full(per_view, i), t))
+    xyz, home, distance = (np.concatenate(c) for c in zip(*sampled, strict=True))
     return xyz, home, distance
 
 
@@ -104,29 +104,30 @@ def _matched(
     distance: np.ndarray,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Matches, sorted by point: point, view, pixel [T, 2], camera z [T].
+    """Observations, sorted by point: point [T], view [T], pixel [T, 2], camera z [T].
 
-    A view matches a point that is in the picture, not hidden, and similar in angle and scale.
+    A view observes a point that is in the image, not occluded, and similar in viewing angle and scale to the
+    view that it was sampled in.
     """
     centres = np.stack([c.position for c in cameras]).astype(float)
-    first, found = (centres[home] - xyz) / distance[:, None], []
+    towards_home, observed = (centres[home] - xyz) / distance[:, None], []
     for i, camera in enumerate(cameras):
         offset = xyz - centres[i]
         away = np.linalg.norm(offset, axis=1)
-        alike = -np.einsum("ij,ij->i", offset / away[:, None], first)
+        cosine = -np.einsum("ij,ij->i", offset / away[:, None], towards_home)
         scale = np.abs(np.log(away / distance))
         uv, z = project(camera, xyz)
         framed = (z > 0) & (np.abs(uv / [camera.width, camera.height] - 0.5) < 0.495).all(1)
-        # Matchers lose a feature beyond about 40 degrees and a factor of 1.8, and some by chance.
-        likely = framed & (alike > 0.77) & (scale < 0.6) & (rng.random(len(xyz)) < 0.75)
+        # Matchers lose features beyond about 40 degrees or a scale factor of 1.8, and some at random.
+        likely = framed & (cosine > 0.77) & (scale < 0.6) & (rng.random(len(xyz)) < 0.75)
         rows = np.flatnonzero(likely & (home != i))
         start = np.tile(centres[i], (len(rows), 1))
         t = cast_rays(world, start, offset[rows] / away[rows, None], away[rows], float(1 / camera.K[0, 0]))[0]
         seen = home == i
         seen[rows] = t > away[rows] - 0.01 - 0.004 * away[rows]
         rows = np.flatnonzero(seen)
-        found.append((rows, np.full(len(rows), i), uv[rows], z[rows]))
-    point, view, uv, z = (np.concatenate(c) for c in zip(*found, strict=True))
+        observed.append((rows, np.full(len(rows), i), uv[rows], z[rows]))
+    point, view, uv, z = (np.concatenate(c) for c in zip(*observed, strict=True))
     order = point.argsort(kind="stable")
     return point[order], view[order], uv[order], z[order]
 
@@ -140,13 +141,13 @@ def _triangulate(
     uv: np.ndarray,
     z: np.ndarray,
 ) -> np.ndarray:
-    """Least-squares points of noisy features: one Gauss-Newton step from the truth."""
+    """Points [n, 3] triangulated from noisy features: one Gauss-Newton step from the ground truth."""
     w2c, focal = np.stack([c.w2c for c in cameras])[view].astype(float), float(cameras[0].K[0, 0])
     centred = (uv - cameras[0].K[:2, 2]) / focal
     J = focal / z[:, None, None] * (w2c[:, :2, :3] - centred[:, :, None] * w2c[:, 2:3, :3])
     normal, right = np.zeros((len(xyz), 3, 3)), np.zeros((len(xyz), 3))
     np.add.at(normal, point, J.transpose(0, 2, 1) @ J)
     np.add.at(right, point, np.einsum("tij,ti->tj", J, noisy - uv))
-    # A weak pull to the truth keeps points of narrow tracks (the far sky) from running off along their ray.
+    # A weak prior keeps points of tracks with a small baseline (the far sky) from diverging along their rays.
     prior = 1e-3 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
     return xyz + np.linalg.solve(normal + prior, right[..., None])[..., 0]

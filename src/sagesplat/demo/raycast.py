@@ -1,4 +1,4 @@
-"""What a ray meets in the garden. Numba kernels over scalars."""
+"""Ray casting in the garden: numba kernels over scalars."""
 
 from math import sin, sqrt
 
@@ -12,9 +12,9 @@ radius = jit(radius_at)
 
 @jit
 def hit_leaves(world, ox, oy, oz, dx, dy, dz, t_max, any_hit):
-    """Nearest leaf closer than `t_max`: (t, row), row -1 without one. The near child goes first.
+    """Nearest leaf closer than `t_max`: (t, row), with row -1 for none. The nearer child is visited first.
 
-    The tree is complete, so the way back needs no stack: a bit per level says which child was done.
+    The tree is complete, so that traversal needs no stack: one bit per level says which child was visited.
     """
     ix, iy, iz = 1 / (dx or 1e-9), 1 / (dy or 1e-9), 1 / (dz or 1e-9)
     boxes, axes, f = world.boxes, world.axes, world.leaves
@@ -60,7 +60,7 @@ def hit_leaves(world, ox, oy, oz, dx, dy, dz, t_max, any_hit):
 
 @jit
 def hit_solid(solids, i, ox, oy, oz, dx, dy, dz, t_max):
-    """Distance to solid of revolution i, or `t_max`: clip to its cylinder, march, bisect."""
+    """Distance to solid of revolution i, or `t_max`: clips to its cylinder, marches, bisects."""
     x, y, z = ox - solids[i, 0], oy - solids[i, 1], oz - solids[i, 2]
     a, b, c = dx * dx + dy * dy + 1e-12, x * dx + y * dy, x * x + y * y - solids[i, 8] ** 2
     root = b * b - a * c
@@ -93,7 +93,7 @@ def hit_solid(solids, i, ox, oy, oz, dx, dy, dz, t_max):
 
 @jit
 def hit_body(bodies, i, ox, oy, oz, dx, dy, dz, t_max):
-    """Distance to convex body i and the plane that was entered; (t_max, -1) past it."""
+    """Distance to convex body i, and the plane through which the ray enters; (t_max, -1) for a miss."""
     near, far, face = 1e-4, t_max, -1
     for k in range(bodies.shape[1]):
         slope = bodies[i, k, 0] * dx + bodies[i, k, 1] * dy + bodies[i, k, 2] * dz
@@ -129,9 +129,9 @@ def paved(world, x, y):
 
 @jit
 def hit_ground(world, ox, oy, oz, dx, dy, dz, floor, pixel):
-    """Where a ray that would meet z = 0 at distance `floor` ends: (t, material).
+    """(t, material) of a ray that reaches z = 0 at distance `floor`.
 
-    The turf is a stack of layers with holes, so that it hides its roots from a low viewpoint.
+    The turf is a stack of layers with holes, so that a low viewpoint does not see its roots.
     """
     if paved(world, ox + floor * dx, oy + floor * dy):
         return floor, PAVING
@@ -144,16 +144,16 @@ def hit_ground(world, ox, oy, oz, dx, dy, dz, floor, pixel):
 
 @jit
 def blades(x, y, footprint):
-    """Height of the grass at (x, y), 0 to 1: tufts and, from near, single blades."""
+    """Height of the grass at (x, y), 0 to 1: tufts and, at close range, single blades."""
     lean = 0.02 * sin(7 * x + 3 * y)
     return 0.5 + 1.3 * fbm_at(x + lean, y - lean, 0.09, 3, footprint)
 
 
 @jit
 def trace(world, ox, oy, oz, dx, dy, dz, t_max, pixel, any_hit):
-    """Nearest hit of a ray of unit direction: (t, material, part); material SKY if none below `t_max`.
+    """Nearest hit of a ray with unit direction: (t, material, part); material SKY for none below `t_max`.
 
-    `part` is the row of the leaf or solid, or 8 * body + plane. With `any_hit`, the first one found.
+    `part` is the row of the leaf or solid, or 8 * body + plane. With `any_hit`, the first hit found.
     """
     material, part = SKY, -1
     floor = -oz / dz if dz < -1e-6 and oz > 0 else t_max
@@ -181,9 +181,9 @@ def trace(world, ox, oy, oz, dx, dy, dz, t_max, pixel, any_hit):
 
 @jit
 def cast(world, origins, directions, t_max, pixel, any_hit, t, material, part):
-    """Casts rays [n, 3] of unit direction and fills t, material and part [n] (see `trace`).
+    """Cast rays [n, 3] with unit directions; fills t, material and part [n] (see `trace`).
 
-    `t_max` [n] limits each ray; `pixel` is a pixel's width at distance 1.
+    `t_max` [n] limits each ray; `pixel` is the width of a pixel at distance 1.
     """
     for i in range(len(t)):
         ox, oy, oz = origins[i, 0], origins[i, 1], origins[i, 2]

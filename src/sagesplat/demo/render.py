@@ -1,4 +1,4 @@
-"""Views of the garden: colour, label and depth of every pixel."""
+"""Renders the garden: colour, label and depth of every pixel."""
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -16,13 +16,13 @@ from sagesplat.demo.world import LABEL_OF, LEAF, PAVING, SKY, SUN, World, build_
 from sagesplat.scene.scene import Camera
 
 FAR = 1e9
-HORIZON = 20.0  # nothing farther away throws a shadow here
+HORIZON = 20.0  # metres; nothing farther away casts a shadow
 SENSOR_NOISE = 1.0  # standard deviation, 8-bit steps
-NEEDS_RAY = 3  # materials from here on, but leaves, ask for the sun with a ray
+NEEDS_RAY = 3  # materials from this one on, except leaves, cast a shadow ray
 
 
 def lit_world(seed: int, places: tuple[int, int] = (1, 1)) -> World:
-    """The garden of a seed with its light; `places` is how many courtyards it has along x and along y."""
+    """The garden of a seed with baked light; `places`: number of courtyards along x and y."""
     return _lit_world(seed, places)
 
 
@@ -42,10 +42,10 @@ def _lit_world(seed: int, places: tuple[int, int]) -> World:
 def render_view(
     camera: Camera, seed: int = 0, places: tuple[int, int] = (1, 1)
 ) -> tuple[UInt8[np.ndarray, "H W 3"], Int16[np.ndarray, "H W"], Float32[np.ndarray, "H W"]]:
-    """A photo (sRGB) with its true label ids and depths (camera z in metres, inf in the sky).
+    """A photo (sRGB) with its ground-truth label ids and depths (camera z in metres, inf in the sky).
 
-    Label and depth are those of the ray through the pixel's centre. The sky's clouds are painted on a
-    dome of 80 m. The sensor's noise depends on seed and pose, so the same view is always the same photo.
+    Label and depth are those of the ray through the pixel's centre. The clouds are on a dome of 80 m radius.
+    The sensor noise depends on seed and pose, so a view always gives the same photo.
     """
     world, shape = lit_world(seed, places), (camera.height, camera.width)
     pixel = float(1 / camera.K[0, 0])
@@ -57,7 +57,7 @@ def render_view(
     depth = np.where(material == SKY, np.inf, t * z_share).astype(np.float32)
     tone = _develop(rgb.mean(1))
     rough = _edges(material.reshape(shape), part.reshape(shape), tone.reshape(shape)).ravel()
-    for k in range(1, 4):  # three more rays around the centre where the picture is not smooth
+    for k in range(1, 4):  # three more rays per pixel where the image is not smooth
         offset = 0.38 * np.array([np.cos(2.1 * k), np.sin(2.1 * k)])
         rgb[rough] += _sample(world, camera, uv[rough] + offset, pixel, k)[1]
     rgb[rough] /= 4
@@ -96,7 +96,7 @@ def camera_rays(camera: Camera, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray,
 
 
 def _sample(world: World, camera: Camera, uv: np.ndarray, pixel: float, k: int):
-    """Hits and linear colours of rays through uv; ray k of a pixel looks at point k of the sun."""
+    """Hits, linear RGB and camera z per distance of rays through uv; shadow rays aim at sun point k."""
     origins, directions, z_share = camera_rays(camera, uv)
     hit = cast_rays(world, origins, directions, FAR, pixel)
     t, material = hit[:2]
@@ -109,9 +109,9 @@ def _sample(world: World, camera: Camera, uv: np.ndarray, pixel: float, k: int):
 
 
 def _edges(material: np.ndarray, part: np.ndarray, tone: np.ndarray) -> np.ndarray:
-    """Pixels [H, W] that one ray does not describe: borders of parts and contrast (`tone` is sRGB).
+    """Pixels [H, W] that need more than one ray: borders of parts, and high contrast (`tone` is sRGB).
 
-    Paving and sky have no hard lines: their textures fade below a pixel's width.
+    Paving and sky have no hard edges: their textures fade out below a pixel's width.
     """
     rough = np.zeros(tone.shape, bool)
     plain = (material == PAVING) | (material == SKY)
@@ -124,28 +124,28 @@ def _edges(material: np.ndarray, part: np.ndarray, tone: np.ndarray) -> np.ndarr
 
 
 def _develop(rgb: np.ndarray) -> np.ndarray:
-    """Linear light to sRGB in [0, 1] with a soft shoulder (Reinhard's curve, white at 3)."""
+    """Linear RGB to sRGB in [0, 1], tone-mapped by Reinhard's curve with white at 3."""
     light = 1.15 * rgb.clip(0)
     light = (light * (1 + light / 9) / (1 + light)).clip(0, 1)
     return np.where(light < 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
 
 
 def _sun_directions() -> np.ndarray:
-    """Four points of the sun's disc [4, 3]."""
+    """Directions [4, 3] to four points of the sun's disc."""
     turn = 2.4 * np.arange(4)
     offset = 0.012 * np.stack([np.cos(turn), np.sin(turn), 0 * turn], 1)
     return (SUN + offset) / np.linalg.norm(SUN + offset, axis=1, keepdims=True)
 
 
 def _sky_directions() -> np.ndarray:
-    """Eight directions, dense around the zenith like the cosine of a level surface [8, 3]."""
+    """Eight directions [8, 3], cosine-weighted around the zenith."""
     turn, rise = 2.39996 * np.arange(8), np.sqrt((np.arange(8) + 0.5) / 8)
     side = np.sqrt(1 - rise**2)
     return np.stack([side * np.cos(turn), side * np.sin(turn), rise], 1)
 
 
 def _open_share(world: World, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Share of the directions [k, 3] in which points [n, 3] see the sky."""
+    """Share [n] of the directions [k, 3] in which points [n, 3] see the sky."""
 
     def one(direction: np.ndarray) -> np.ndarray:
         rays = np.tile(direction, (len(points), 1))
@@ -155,6 +155,6 @@ def _open_share(world: World, points: np.ndarray, directions: np.ndarray) -> np.
 
 
 def threads_map(function, items) -> Iterator:
-    """`map` on as many threads as numba may use: the kernels let go of the interpreter."""
+    """`map` on as many threads as numba may use; the kernels release the GIL."""
     with ThreadPoolExecutor(get_num_threads()) as pool:
         yield from pool.map(function, items)

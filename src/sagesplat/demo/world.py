@@ -1,6 +1,6 @@
-"""The modelled garden as arrays: leaves in a tree of boxes, solids of revolution, convex bodies.
+"""The garden as arrays: leaves in a bounding-volume hierarchy, solids of revolution, convex bodies.
 
-World units are metres, z points up, the table stands at the origin, the house to the north (+y).
+World units are metres and z points up. The table is at the origin, the house to the north (+y).
 """
 
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from jaxtyping import Float32, Float64, Int16, Int64
 
 from sagesplat.demo.foliage import POTTED_PLANT, Foliage
 
-# Materials. A leaf's material is LEAF and its label its own; every other material has one label.
+# Materials. Leaves (LEAF) have a label each; every other material has one label.
 SKY, GRASS, PAVING, WOOD, GLAZE, CLAY, BARK, BRICK, ROOF, CORE, LEAF = range(11)
 LABELS = {
     64: "potted plant",
@@ -26,37 +26,37 @@ LABELS = {
 LABEL_OF = np.array([187, 193, 191, 67, 86, 64, 184, 197, 197, 184, -1], np.int16)  # by material
 
 BIN = 4  # leaves per box at the bottom of the tree
-PLOT = 8.0  # half the side of the square that one courtyard takes
+PLOT = 8.0  # half the side of the square of one courtyard
 DOOR_PATH = (0.9, 3.1, 0.62, 3.1)  # centre and half extents, from the table to the house
 LIGHT_CELLS = 20  # samples of the baked light per metre of ground
 SUN = np.array([-0.48, -0.52, 0.71]) / np.linalg.norm([-0.48, -0.52, 0.71])  # towards it
 
 
 class World(NamedTuple):
-    """Everything that a ray can meet; a NamedTuple because numba takes it as it is."""
+    """All geometry of the scene; a NamedTuple, since numba can compile functions of one."""
 
     boxes: Float64[np.ndarray, "2*bins 6"]  # heap order, root at 1: lowest and highest corner
     axes: Int64[np.ndarray, " bins"]  # axis along which the children of a box differ
     leaves: Float64[np.ndarray, "L 12"]  # centre, unit normal, and two axes divided by their squared length
     leaf_rgb: Float32[np.ndarray, "L 3"]  # linear albedo
-    leaf_light: Float32[np.ndarray, "L 2"]  # baked: visible share of the sun and of the sky
+    leaf_light: Float32[np.ndarray, "L 2"]  # baked: visible shares of the sun and of the sky
     leaf_label: Int16[np.ndarray, " L"]
     solids: Float64[np.ndarray, "S 9"]  # x, y, bottom, height, r0, r1, belly, waist; largest radius
     solid_material: Int64[np.ndarray, " S"]
     bodies: Float64[np.ndarray, "B 7 4"]  # planes: outward normal n and c; inside is n.p <= c
     body_material: Int64[np.ndarray, " B"]
-    ground_light: Float32[np.ndarray, "G G 2"]  # baked likewise; rows run along y, columns along x
+    ground_light: Float32[np.ndarray, "G G 2"]  # baked likewise; rows along y, columns along x
     plot: float  # the ground's light is baked on [-plot, plot] squared
     terraces: Float64[np.ndarray, "P 2"]  # centres of round pavements
     paths: Float64[np.ndarray, "K 4"]  # paved rectangles: centre and half extents
     solid_place: Int64[np.ndarray, " S"]
     body_place: Int64[np.ndarray, " B"]
-    places: Float64[np.ndarray, "P 2 3"]  # world to a place's own coordinates, in the plane
-    tints: Float64[np.ndarray, "P 11 3"]  # factors on a material's colour in a place
+    places: Float64[np.ndarray, "P 2 3"]  # world to courtyard, in the ground plane
+    tints: Float64[np.ndarray, "P 11 3"]  # colour factors of a material in a courtyard
 
 
 def build_world(seed: int) -> World:
-    """The garden of a seed, still without light (`render.light` bakes it)."""
+    """The garden of a seed, without light (`render.lit_world` bakes it)."""
     foliage = Foliage(np.random.default_rng(seed))
     solids, bodies = furniture(), buildings()
     solids += [
@@ -85,7 +85,7 @@ def assemble(
     plot: float,
     **rest: np.ndarray,
 ) -> World:
-    """A world without light of `Foliage.parts`, solids and bodies with their materials; `rest` as it is."""
+    """A world without light from `Foliage.parts`, solids and bodies with materials; `rest`: other fields."""
     frame, reach, rgb, label = (np.concatenate(c) for c in zip(*leaves, strict=True))
     cells = round(2 * plot * LIGHT_CELLS) + 1
     order, boxes, axes = _box_tree(frame[:, :3], reach)
@@ -119,7 +119,7 @@ def furniture() -> list[tuple[list[float], int]]:
 def solid(
     x: float, y: float, z: float, height: float, r0: float, r1: float, belly: float = 0, waist: float = 0
 ) -> list[float]:
-    """A row of `World.solids`: it stands at (x, y, z), radius r0 at the bottom and r1 at the top."""
+    """A row of `World.solids` at (x, y, z), with radius r0 at the bottom and r1 at the top."""
     return [x, y, z, height, r0, r1, belly, waist, max(r0, r1) + abs(belly) + abs(waist)]
 
 
@@ -136,7 +136,7 @@ def buildings() -> list[tuple[np.ndarray, int]]:
 
 
 def box(low: Sequence[float], high: Sequence[float]) -> np.ndarray:
-    """Seven planes [7, 4]: -x, -y, -z, x, y, z and one that never cuts."""
+    """A body of seven planes [7, 4]: -x, -y, -z, x, y, z and one that never intersects."""
     planes = np.zeros((7, 4))
     planes[:3, :3], planes[3:6, :3] = -np.eye(3), np.eye(3)
     planes[:, 3] = [*(-np.array(low)), *high, 1]
@@ -144,7 +144,7 @@ def box(low: Sequence[float], high: Sequence[float]) -> np.ndarray:
 
 
 def _plant(foliage: Foliage, solids: list, bodies: list) -> None:
-    """Bouquet, shrubs, hedges and trees."""
+    """Add bouquet, shrubs, hedges and trees."""
     rng = foliage.rng
     foliage.bouquet([0.06, -0.03, 1.13])
     foliage.crown([1.75, 1.2, 0.62], 0.34, 700, (0.05, 0.02), [0.05, 0.14, 0.04], POTTED_PLANT)
@@ -163,7 +163,7 @@ def _plant(foliage: Foliage, solids: list, bodies: list) -> None:
     for (x, y), rgb in zip(((-4.9, -4.7), (5.1, -4.3), (5.4, 3.7), (-5.3, 4.3)), greens, strict=True):
         solids.append((solid(x, y, 0, 2.4, 0.11, 0.06), BARK))
         foliage.crown([x, y, 2.8], 1.35, 3400, (0.075, 0.04), rgb)
-    for i in range(11):  # behind the hedge, which hides their trunks
+    for i in range(11):  # behind the hedge, which hides the trunks
         angle = -0.5 * np.pi + (i - 5) * 0.43
         x, y = rng.uniform(10, 13) * np.array([np.cos(angle), np.sin(angle)])
         foliage.crown([x, y, rng.uniform(2.8, 3.8)], 2.4, 1600, (0.17, 0.09), greens[rng.integers(3)])
@@ -184,11 +184,11 @@ def radius_at(solid, height):
 
 
 def _box_tree(centre: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A complete binary tree of boxes over leaves with half extents `reach`.
+    """A complete binary tree of bounding boxes over leaves with half extents `reach`.
 
-    Returns the leaves' order (BIN in a row share a bottom box; some leaves stand twice to fill the tree),
-    the boxes and the splitting axes in heap order. Level by level, each run of leaves is sorted along
-    its longest axis and cut in the middle.
+    Returns the order of the leaves, the boxes and the splitting axes, the latter two in heap order. BIN
+    consecutive leaves share a box at the bottom; some leaves occur twice to fill the tree. Level by level,
+    each range of leaves is sorted along its longest axis and split in the middle.
     """
     depth = int(np.ceil(np.log2(len(centre) / BIN)))
     order = np.arange(BIN << depth) * len(centre) // (BIN << depth)

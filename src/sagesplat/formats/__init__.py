@@ -1,1 +1,1 @@
-"""File formats of splats: PLY, SPZ, levels, increments, and the rounding that they do."""
+"""File formats of Gaussians: PLY, SPZ, levels, increments, and SPZ's quantisation."""

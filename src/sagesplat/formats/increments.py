@@ -1,4 +1,4 @@
-"""Chunks of a nested ladder: one file per category and level, each only what the level adds."""
+"""Increments of nested levels: one file per category and level, with the Gaussians that the level adds."""
 
 import hashlib
 import re
@@ -20,17 +20,17 @@ from sagesplat.io.files import atomic_folder, read_json, write_json
 
 Format = Literal["spz", "ply"]
 INDEX = "index.json"
-_URI = r"(?!\.)[A-Za-z0-9_.-]{1,200}"  # a plain file in the folder of the index
-_GPU_BYTES = (16, 24, 40, 56)  # of a splat in Spark 2.2, by degree of its harmonics
+_URI = r"(?!\.)[A-Za-z0-9_.-]{1,200}"  # a plain file name
+_GPU_BYTES = (16, 24, 40, 56)  # per Gaussian in Spark 2.2, by SH degree
 
 
 @dataclass(frozen=True)
 class Increment:
-    """What a level adds to the one below it."""
+    """The Gaussians that a level of a category adds to the level below it, as a file."""
 
     label_id: int
     level: int
-    uri: str  # below the chunks' folder; its hash makes it cacheable for ever
+    uri: str  # file name in the folder of the index; it holds a hash, so it can be cached for ever
     count: int  # Gaussians
     nbytes: int
     gpu_bytes: int
@@ -40,7 +40,7 @@ class Increment:
 def packed(
     g: Gaussians, sizes: Mapping[int, Sequence[int]], *, sh_bits: tuple[int, int] = SH_BITS
 ) -> Int64[np.ndarray, " N"]:
-    """Rows by category and level, and inside a level, where the order is free, as they compress best."""
+    """Rows sorted by category and level, and within a level, where any order is valid, by `packing_order`."""
     rows = [
         part[packing_order(g.select(torch.from_numpy(part)), sh_bits=sh_bits)]
         for _, _, part in increments(g, sizes)
@@ -49,14 +49,17 @@ def packed(
 
 
 def increments(g: Gaussians, sizes: Mapping[int, Sequence[int]]) -> list[tuple[int, int, np.ndarray]]:
-    """(label id, level, rows that it adds) of a ladder; levels that add nothing are left out."""
-    labels, parts = g.label_ids.numpy(), []
+    """(label id, level, added rows) of every level that adds Gaussians.
+
+    `sizes`: by label id, the number of Gaussians in each level.
+    """
+    labels, added = g.label_ids.numpy(), []
     for label in sorted(sizes):
         rows = np.flatnonzero(labels == label)
         for level, (low, high) in enumerate(pairwise((0, *sizes[label])), 1):
             if high > low:
-                parts.append((label, level, rows[low:high]))
-    return parts
+                added.append((label, level, rows[low:high]))
+    return added
 
 
 def write_increments(
@@ -69,12 +72,16 @@ def write_increments(
     sh_bits: tuple[int, int] = SH_BITS,
     antialiased: bool = False,
 ) -> list[Increment]:
-    """Write a ladder's increments and an index of them into a folder of their own, which is replaced."""
-    chunks = []
+    """Write the increments of nested levels and their index; `folder` is replaced.
+
+    `sizes`: by label id, the number of Gaussians in each level. `names`: label id -> category. `sh_bits` and
+    `antialiased` as in `encode_spz`.
+    """
+    written = []
     with atomic_folder(folder) as fresh:
         for label, level, rows in increments(g, sizes):
             part = g.select(torch.from_numpy(rows))
-            temporary = fresh / f"chunk.{kind}"
+            temporary = fresh / f"increment.{kind}"
             if kind == "spz":
                 temporary.write_bytes(encode_spz(part, sh_bits=sh_bits, coarse=True, antialiased=antialiased))
             else:
@@ -85,57 +92,58 @@ def write_increments(
             uri = f"{slug}-{level:02d}-{digest[:12]}.{kind}"
             temporary.rename(fresh / uri)
             gpu = len(part) * _GPU_BYTES[part.sh_degree]
-            chunks.append(Increment(label, level, uri, len(part), len(content), gpu, digest))
-        write_json(fresh / INDEX, {"format": kind, "chunks": [asdict(chunk) for chunk in chunks]})
-    return chunks
+            written.append(Increment(label, level, uri, len(part), len(content), gpu, digest))
+        write_json(fresh / INDEX, {"format": kind, "chunks": [asdict(one) for one in written]})
+    return written
 
 
 def read_index(folder: Path) -> list[Increment]:
-    """The index that `write_chunks` wrote; DataError for unusable content."""
+    """The increments that `write_increments` listed; DataError for an invalid index."""
     document: Any = read_json(folder / INDEX)
     try:
-        chunks = [Increment(**entry) for entry in document["chunks"]]
-        for chunk in chunks:
-            _check(chunk)
+        listed = [Increment(**entry) for entry in document["chunks"]]
+        for increment in listed:
+            _check(increment)
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(
-            f"{folder / INDEX}: not an index of chunks ({short(repr(error))}); run `sagesplat nest` again"
+            f"{folder / INDEX}: not an index of increments ({short(repr(error))}); run `sagesplat nest` again"
         ) from None
-    return chunks
+    return listed
 
 
-def _check(chunk: Increment) -> None:
-    """ValueError for an entry that no ladder has, such as a file outside the folder."""
-    sizes = (chunk.level, chunk.count, chunk.nbytes, chunk.gpu_bytes)
+def _check(increment: Increment) -> None:
+    """ValueError for an impossible entry, such as a file outside the folder."""
+    sizes = (increment.level, increment.count, increment.nbytes, increment.gpu_bytes)
     if not all(type(size) is int and 0 < size < 2**53 for size in sizes):
-        raise ValueError("a chunk without content")
-    if type(chunk.label_id) is not int or not -1 <= chunk.label_id < 2**15:
-        raise ValueError(f"label id {chunk.label_id!r}")
-    if not isinstance(chunk.uri, str) or not re.fullmatch(_URI, chunk.uri):
-        raise ValueError(f"{chunk.uri!r} is no name of a chunk")
-    if not isinstance(chunk.sha256, str) or not re.fullmatch("[0-9a-f]{64}", chunk.sha256):
-        raise ValueError(f"{chunk.sha256!r} is no SHA-256")
+        raise ValueError("an increment without content")
+    if type(increment.label_id) is not int or not -1 <= increment.label_id < 2**15:
+        raise ValueError(f"label id {increment.label_id!r}")
+    if not isinstance(increment.uri, str) or not re.fullmatch(_URI, increment.uri):
+        raise ValueError(f"{increment.uri!r} is not a file name of an increment")
+    if not isinstance(increment.sha256, str) or not re.fullmatch("[0-9a-f]{64}", increment.sha256):
+        raise ValueError(f"{increment.sha256!r} is not a SHA-256")
 
 
-def read_increments(folder: Path, chunks: Sequence[Increment]) -> Gaussians:
-    """What SPZ chunks hold, one after the other; DataError for a broken one."""
-    if not chunks:
-        raise DataError(f"{folder}: no chunks; run `sagesplat nest` again")
-    return concat([read_spz(folder / chunk.uri, chunk.label_id) for chunk in chunks])
+def read_increments(folder: Path, listed: Sequence[Increment]) -> Gaussians:
+    """The Gaussians of SPZ increments, concatenated; DataError for a missing or damaged file."""
+    if not listed:
+        raise DataError(f"{folder}: no increments; run `sagesplat nest` again")
+    return concat([read_spz(folder / increment.uri, increment.label_id) for increment in listed])
 
 
-def totals(chunks: Sequence[Increment], labels: Sequence[int], levels: int, what: str) -> np.ndarray:
-    """A column of the chunks summed up to each level: int64 [L, K] for rows `labels` and levels 1 to K.
+def totals(listed: Sequence[Increment], labels: Sequence[int], levels: int, what: str) -> np.ndarray:
+    """Cumulative sums over the levels of a field of the increments: int64 [L, K].
 
-    DataError for a chunk of another category or level.
+    Rows are `labels`, columns the levels 1 to K; `what` is count, nbytes or gpu_bytes. DataError for an
+    increment of another category or level.
     """
     table = np.zeros((len(labels), levels), np.int64)
     row = {label: i for i, label in enumerate(labels)}
-    for chunk in chunks:
-        if chunk.label_id not in row or chunk.level > levels:
+    for increment in listed:
+        if increment.label_id not in row or increment.level > levels:
             raise DataError(
-                f"{chunk.uri}: of category {chunk.label_id} and level {chunk.level}, which this run has not; "
+                f"{increment.uri}: this run has no category {increment.label_id}, level {increment.level}; "
                 "run `sagesplat nest` again"
             )
-        table[row[chunk.label_id], chunk.level - 1] += getattr(chunk, what)
+        table[row[increment.label_id], increment.level - 1] += getattr(increment, what)
     return table.cumsum(1)

@@ -1,8 +1,8 @@
-"""Levels on disk: one .npz per level, its arrays by category, at most 79 bytes a Gaussian.
+"""Level files: one .npz per level, with one set of arrays per category, at most 79 bytes per Gaussian.
 
-means float32, quats int16, log_scales, logit_opacities and sh0 float16, shN int8 with a square-root scale per
-coefficient. Categories are read one by one, so that a composition touches only what it takes. Reading takes
-up to 32 bytes of memory for each of the file's.
+means are float32, quats int16, log_scales, logit_opacities and sh0 float16, shN int8 on a square-root scale
+per coefficient. Single categories can be read, so a composition reads only what it uses. Reading needs
+at most 32 bytes of memory per byte of the file.
 """
 
 import zipfile
@@ -20,23 +20,23 @@ from sagesplat.core.sh import num_bases
 from sagesplat.io.files import atomic_path
 from sagesplat.io.npz import Npz
 
-_DAMAGED = (OSError, KeyError, TypeError, ValueError)  # what files raise that are cut off or changed
+_DAMAGED = (OSError, KeyError, TypeError, ValueError)  # raised for truncated or damaged files
 _HALVES = ("log_scales", "logit_opacities", "sh0")
 
 
 @dataclass(frozen=True)
 class LevelFile:
-    """One recorded level: what it holds, without its Gaussians."""
+    """The header of a level file: its content without the Gaussians."""
 
     path: Path
     step: int
-    recovering: bool  # taken soon after an opacity reset
+    recovering: bool  # recorded soon after an opacity reset, before the quality recovered
     sh_degree: int
     counts: dict[int, int]  # Gaussians by label id
 
 
 def write_level(folder: Path, step: int, g: Gaussians, *, recovering: bool, sh_degree: int) -> Path:
-    """Record Gaussians as a level; harmonics above `sh_degree` (not yet in use) are left out."""
+    """Write Gaussians as the level FOLDER/STEP.npz, without SH coefficients above `sh_degree`; its path."""
     path = folder / f"{step:06d}.npz"
     _write(path, step, g, recovering, sh_degree, {})
     return path
@@ -45,7 +45,7 @@ def write_level(folder: Path, step: int, g: Gaussians, *, recovering: bool, sh_d
 def write_set(
     path: Path, g: Gaussians, step: int, sizes: Mapping[int, Sequence[int]] | None = None, **more: Any
 ) -> None:
-    """Record Gaussians in order; of a nested ladder with its levels' sizes by label id. `more` arrays."""
+    """Write Gaussians in order, with the sizes of nested levels by label id, and further arrays `more`."""
     arrays = {f"{label}/sizes": np.array(n, np.int64) for label, n in (sizes or {}).items()}
     _write(path, step, g, False, g.sh_degree, arrays | {f"more/{k}": np.asarray(v) for k, v in more.items()})
 
@@ -74,14 +74,14 @@ def _write(
 
 
 def read_sizes(path: Path) -> dict[int, tuple[int, ...]]:
-    """Level sizes of a nested ladder by label id; `DataError` for anything else."""
+    """Level sizes by label id, as written by `write_set`; DataError for a file without them."""
     counts = read_header(path).counts
     with _open(path) as file:
         try:
             sizes = {label: tuple(map(int, file[f"{label}/sizes"])) for label in counts}
         except _DAMAGED as error:
             raise DataError(
-                f"{path}: not a nested ladder ({short(error)}); run `sagesplat nest` again"
+                f"{path}: not nested levels ({short(error)}); run `sagesplat nest` again"
             ) from None
     lengths = {len(s) for s in sizes.values()}
     if (
@@ -94,12 +94,12 @@ def read_sizes(path: Path) -> dict[int, tuple[int, ...]]:
 
 
 def read_more(path: Path, name: str) -> np.ndarray[Any, Any]:
-    """An array that `write_set` recorded beside the Gaussians; DataError where there is none."""
+    """A further array that `write_set` wrote; DataError if there is none."""
     with _open(path) as file:
         try:
             return file[f"more/{name}"]
         except _DAMAGED as error:
-            raise DataError(f"{path}: no {name} in it ({short(error)}); make it again") from None
+            raise DataError(f"{path}: no {name} in it ({short(error)}); run `sagesplat nest` again") from None
 
 
 def _open(path: Path) -> Npz:
@@ -112,13 +112,13 @@ def _open(path: Path) -> Npz:
 
 
 def read_header(path: Path) -> LevelFile:
-    """What a level holds, without reading its Gaussians."""
+    """The header of a level file, without reading its Gaussians. DataError for another file."""
     with _open(path) as file:
         try:
             step, recovering, degree = (int(value) for value in file["meta"])
-            # of any array: a category whose name is damaged somewhere must not go missing unseen
-            parts = [n.split("/") for n in file.names if n != "meta"]
-            labels = sorted({int(label) for label, *kind in parts if label != "more" and kind != ["sizes"]})
+            # of all arrays: a category with a damaged array name must not be lost silently
+            names = [n.split("/") for n in file.names if n != "meta"]
+            labels = sorted({int(label) for label, *kind in names if label != "more" and kind != ["sizes"]})
             counts = {label: len(file[f"{label}/logit_opacities"]) for label in labels}
             if step < 0 or not 0 <= degree <= 3 or not all(-1 <= label < 2**15 for label in labels):
                 raise ValueError(f"step {step}, degree {degree}, categories {labels}")
@@ -163,7 +163,7 @@ def read_level(path: Path, label_ids: Sequence[int] | None = None) -> Gaussians:
 
 
 def check_level(path: Path) -> None:
-    """`DataError` where a level's arrays are not as they were written, by their CRC-32; takes no memory."""
+    """DataError if a level's CRC-32 checksums do not match; reads in small blocks of memory."""
     try:
         with Npz(path), zipfile.ZipFile(path) as archive:
             broken = archive.testzip()
@@ -175,7 +175,7 @@ def check_level(path: Path) -> None:
 
 def _decode(file: Npz, label: int) -> Gaussians:
     def column(name: str) -> np.ndarray:
-        with np.errstate(all="ignore"):  # what is too large for float32 is found later
+        with np.errstate(all="ignore"):  # values too large for float32 become Inf, which is checked later
             return file[f"{label}/{name}"].astype(np.float32)
 
     share, scale = column("shN") / 127, column("shN_scale")

@@ -1,4 +1,4 @@
-"""Splat files in the INRIA layout that 3DGS viewers read, with the category as one more property.
+"""PLY files of Gaussians in INRIA's layout, which 3DGS viewers read, with the category as an extra property.
 
 Per Gaussian, little endian float32: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_0.. (all red coefficients,
 then green, then blue), opacity (logit), scale_0..2 (natural log), rot_0..3 (wxyz); then `label` (int16).
@@ -16,8 +16,8 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.files import atomic_path
 from sagesplat.io.ply_header import read_header
 
-ROWS = 4096  # per block: every property of a block stays in the processor's cache
-BASES = (0, 3, 8, 15)  # spherical harmonics beyond the constant one, degree 0 to 3
+ROWS = 4096  # Gaussians per block, so that a block fits into the processor's cache
+BASES = (0, 3, 8, 15)  # SH coefficients beyond the constant one, by degree 0 to 3
 
 
 def write_ply(path: Path, gaussians: Gaussians, names: dict[int, str] | None = None) -> None:
@@ -86,7 +86,7 @@ def read_ply(path: Path) -> Gaussians:
         with path.open("rb") as file:
             header = read_header(file)
             if not header.order:
-                raise DataError(f"{path}: a PLY file as text is not read; save it as binary_little_endian")
+                raise DataError(f"{path}: text PLY is not supported; save it as binary_little_endian")
             wanted = _wanted(path, header.dtype)
             columns, labels = _read_body(path, file, header.dtype, header.count, wanted)
     except OSError as error:
@@ -98,14 +98,14 @@ def read_ply(path: Path) -> Gaussians:
 
 
 def _properties(bases: int) -> list[str]:
-    """The float properties in INRIA's order for `bases` coefficients a colour beyond the constant one."""
+    """The float properties in INRIA's order, for `bases` SH coefficients beyond the constant one."""
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
     names += [f"f_rest_{i}" for i in range(3 * bases)]
     return [*names, "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
 
 
 def _matrices(gaussians: Gaussians) -> list[np.ndarray]:
-    """Float matrices [N, *] whose columns, side by side, are `_properties`."""
+    """Float matrices [N, *] whose concatenated columns are `_properties`."""
     g = gaussians.detach()
     count = len(g)
     parts = [g.means, torch.zeros_like(g.means), g.sh0.reshape(count, 3)]
@@ -115,7 +115,7 @@ def _matrices(gaussians: Gaussians) -> list[np.ndarray]:
 
 
 def _gaussians(columns: np.ndarray, labels: np.ndarray) -> Gaussians:
-    """Gaussians from float32 columns [P, N] in the order of `_properties` without the normals."""
+    """Gaussians from float32 columns [P, N] in the order of `_properties`, without normals."""
     rest = columns[6:-8].reshape(
         3, (len(columns) - 14) // 3, columns.shape[1]
     )  # [3, K, N]: all red, all green, all blue
@@ -135,7 +135,7 @@ def _gaussians(columns: np.ndarray, labels: np.ndarray) -> Gaussians:
 
 
 def _wanted(path: Path, dtype: np.dtype) -> list[str]:
-    """The float properties of the file's degree, in the order of `_properties` without the normals."""
+    """The float properties to read, by the file's SH degree: `_properties` without normals."""
     present = set(dtype.names or ())
     rest = sum(name.startswith("f_rest_") for name in present)
     if rest % 3 or rest // 3 not in BASES:
@@ -155,7 +155,7 @@ def _read_body(
     present = (path.stat().st_size - file.tell()) // dtype.itemsize
     if present < count:
         raise DataError(
-            f"{path}: {count} Gaussians promised, {present} there; the file is cut off, copy it again"
+            f"{path}: {count} Gaussians announced, {present} present; the file is truncated, copy it again"
         )
     columns = np.empty((len(wanted), count), np.float32)
     labels = np.full(count, -1, np.int64)

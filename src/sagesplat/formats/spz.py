@@ -1,17 +1,19 @@
-"""SPZ, the small splat files of web viewers: version 3 is written, 2 and 3 are read.
+"""SPZ, compressed Gaussians for web viewers: writes version 3, reads versions 2 and 3.
 
 Niantic's format (MIT, github.com/nianticlabs/spz). One gzip member, little endian: a header of 16 bytes
-(magic, version, count as uint32; SH degree, fractional bits, flags, 0), then one attribute after the other:
+(magic, version, count as uint32; SH degree, fractional bits, flags, 0), then the attributes, with these bytes
+per Gaussian:
 
     9    x y z, signed fixed point of 24 bits
     1    opacity times 255
     3    (0.15 sh0 + 0.5) 255
     3    (log scale + 10) 16
-    4    rotation, uint32: 2 bits say which of x y z w is largest; it is positive and left out. A sign and
-         9 bits of each other, in order: magnitude times 511 sqrt(2). Version 2: 3 bytes, x y z where w >= 0
-    3 K  128 + 128 times the harmonics, RGB last
+    4    rotation, uint32: 2 bits for the index of the largest of x y z w, which is positive and omitted, then
+         a sign and 9 bits of each other, in order: magnitude times 511 sqrt(2). Version 2: 3 bytes, x y z
+         with w >= 0
+    3 K  128 + 128 times the SH coefficients, RGB last
 
-`coarse` files are ordinary ones whose values are multiples of larger steps than the format could hold.
+In `coarse` files values are multiples of larger steps than the format allows: they compress better.
 """
 
 import struct
@@ -39,19 +41,19 @@ from sagesplat.io.files import atomic_path
 
 Frame = Literal["rub", "rdf"]  # axes in the file: right, up, back (SPZ's own); right, down, front (COLMAP's)
 
-SH_BITS = (5, 4)  # of degree 1, of those above: the reference's
-MAX_BITS = 24  # readers refuse more
-MAX_COUNT = 10_000_000  # the reference's reader refuses more
+SH_BITS = (5, 4)  # of degree 1, of degrees 2 and 3; as in the reference implementation
+MAX_BITS = 24  # fractional bits; readers refuse more
+MAX_COUNT = 10_000_000  # Gaussians; the reference implementation reads no more
 _HEADER = struct.Struct("<4sIIBBBB")
 _MAGIC = b"NGSP"
 _ANTIALIASED = 1  # the flag
-_LARGEST = 2**23 - 1  # of a position, both ways
-_DEFLATE = 1032  # times its size is all that a deflate stream can hold
-_BASES = (0, 3, 8, 15)  # harmonics beyond the constant one, degree 0 to 3
+_LARGEST = 2**23 - 1  # magnitude of a fixed-point coordinate
+_DEFLATE = 1032  # largest expansion ratio of a deflate stream
+_BASES = (0, 3, 8, 15)  # SH coefficients beyond the constant one, by degree 0 to 3
 _COARSE = 4, COLOUR_STEP, SCALE_STEP, 8  # steps of opacities, colours, scales and rotations
-_SMALLER = 511 * 2**0.5  # no quaternion's second largest exceeds sqrt(1/2)
-_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # than the largest
-_FLIP = np.array([1, -1, -1], np.float32)  # from one frame to the other: positions, and quaternions' x y z
+_SMALLER = 511 * 2**0.5  # a quaternion's second largest component is at most sqrt(1/2)
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # components other than the largest
+_FLIP = np.array([1, -1, -1], np.float32)  # between the frames: positions, and x y z of quaternions
 _FLIP_SH = np.sign(np.divide(bases(3, -4, -5), bases(3, 4, 5)))[1:, None].astype(np.float32)
 
 
@@ -151,9 +153,9 @@ def encode_spz(
         _bytes(128 + 128 * in_buckets(torch.from_numpy(harmonics), sh_bits)),
     ]
     header = _HEADER.pack(_MAGIC, 3, len(g), degree, bits, _ANTIALIASED if antialiased else 0, 0)
-    packer = zlib.compressobj(9, zlib.DEFLATED, 31, 9, zlib.Z_FILTERED)  # 31: gzip, without a time
+    packer = zlib.compressobj(9, zlib.DEFLATED, 31, 9, zlib.Z_FILTERED)  # 31: gzip, without a time stamp
     content = packer.compress(header)
-    for attribute in attributes:  # blocks of their own, with codes of their own: 5 % smaller
+    for attribute in attributes:  # separate deflate blocks, each with its own codes: 5 % smaller
         content += packer.compress(attribute.tobytes()) + packer.flush(zlib.Z_BLOCK)
     return content + packer.flush()
 
@@ -161,10 +163,10 @@ def encode_spz(
 def packing_order(
     g: Gaussians, *, sh_degree: int | None = None, sh_bits: tuple[int, int] = SH_BITS
 ) -> Int64[np.ndarray, " N"]:
-    """Rows in an order that packs 3 to 5 % smaller than Morton's: by harmonics, and by colour within.
+    """The order by SH coefficients, then colour, which compresses 3 to 5 % better than Morton order.
 
-    For `g.select(torch.from_numpy(order))`, with the options of `encode_spz`. Neighbours in the file are then
-    not neighbours in space, which some viewers draw faster.
+    Use it as `g.select(torch.from_numpy(order))`, with the options of `encode_spz`. Neighbours in the file
+    are then not neighbours in space; some viewers draw spatially sorted files faster.
     """
     g = g.detach().to("cpu")
     degree = g.sh_degree if sh_degree is None else min(sh_degree, g.sh_degree)
@@ -201,7 +203,7 @@ def decode_spz(content: bytes, label_id: int = -1, *, frame: Frame = "rub", name
         DataError: For another format or version, or a file that is damaged, cut off or too long.
     """
     if content.startswith(_MAGIC):
-        raise DataError(f"{name}: SPZ version 4 is not read; save it as version 3")
+        raise DataError(f"{name}: SPZ version 4 is not supported; save it as version 3")
     unpacker = zlib.decompressobj(31)
     try:
         header = unpacker.decompress(content, _HEADER.size)
@@ -209,12 +211,12 @@ def decode_spz(content: bytes, label_id: int = -1, *, frame: Frame = "rub", name
         widths = (9, 1, 3, 3, version + 1, 3 * _BASES[degree])
         size = count * sum(widths)
         if count > MAX_COUNT or size > _DEFLATE * len(content):
-            raise DataError(f"{name}: {count} Gaussians promised, more than fit; copy it again")
-        body = unpacker.decompress(unpacker.unconsumed_tail, size + 1)  # one more, to see whether it goes on
+            raise DataError(f"{name}: {count} Gaussians announced, more than fit; copy it again")
+        body = unpacker.decompress(unpacker.unconsumed_tail, size + 1)  # one byte more, to detect excess data
     except zlib.error as error:
         raise DataError(f"{name}: not gzip, or damaged ({error}); give an .spz of version 2 or 3") from None
     if len(body) != size or not unpacker.eof or unpacker.unused_data:
-        raise DataError(f"{name}: not the {count} Gaussians promised; the file is damaged, copy it again")
+        raise DataError(f"{name}: not the {count} Gaussians announced; the file is damaged, copy it again")
     parts = np.split(np.frombuffer(body, np.uint8), count * np.cumsum(widths[:-1]))
     positions, alphas, colours, scales, rotations, harmonics = (
         part.reshape(count, width) for part, width in zip(parts, widths, strict=True)
@@ -262,7 +264,7 @@ def _fractional_bits(
 
 
 def _enough_bits(log_scales: np.ndarray, parts: int) -> int:
-    """Bits of a step that is a part of the middle axis of nine in ten; some readers ask for 1 or more."""
+    """Fractional bits of a step of 1/`parts` of the middle axis of 90 % of the Gaussians; at least 1."""
     if not len(log_scales):
         return 1
     small = float(np.quantile(np.sort(log_scales.astype(np.float64), axis=1)[:, 1], 0.1))
@@ -270,7 +272,7 @@ def _enough_bits(log_scales: np.ndarray, parts: int) -> int:
 
 
 def _flip(means: np.ndarray, quats: np.ndarray, harmonics: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Means [N, 3], quaternions wxyz [N, 4] and harmonics [N, K, 3] with y and z turned round."""
+    """Means [N, 3], quaternions wxyz [N, 4] and SH coefficients [N, K, 3] with y and z negated."""
     signs = np.concatenate([np.ones(1, np.float32), _FLIP])
     return means * _FLIP, quats * signs, harmonics * _FLIP_SH[: harmonics.shape[1]]
 
@@ -280,7 +282,7 @@ def _bytes(values: torch.Tensor, step: int = 1) -> np.ndarray:
 
 
 def _pack_rotations(quats: np.ndarray, step: int) -> np.ndarray:
-    """Uint32 [N] of quaternions wxyz [N, 4] of any length."""
+    """Packed quaternions, uint32 [N], from wxyz [N, 4] of any length."""
     q = np.roll(quats.astype(np.float64), -1, axis=1)
     largest = np.abs(q).argmax(1)
     q /= (np.linalg.norm(q, axis=1) * np.sign(q[np.arange(len(q)), largest]))[:, None]
@@ -293,7 +295,7 @@ def _pack_rotations(quats: np.ndarray, step: int) -> np.ndarray:
 
 
 def _unpack_rotations(packed: np.ndarray) -> np.ndarray:
-    """Quaternions wxyz float32 [N, 4] of version 3's bytes [N, 4]."""
+    """Quaternions wxyz float32 [N, 4] from version 3's bytes [N, 4]."""
     fields = np.ascontiguousarray(packed).view("<u4") >> np.array([20, 10, 0], np.uint32)
     others = np.where(fields & 512, -1.0, 1.0) * (fields & 511) / _SMALLER
     largest = packed[:, 3] >> 6
@@ -304,32 +306,32 @@ def _unpack_rotations(packed: np.ndarray) -> np.ndarray:
 
 
 def _first_three(packed: np.ndarray) -> np.ndarray:
-    """Quaternions wxyz float32 [N, 4] of version 2's bytes [N, 3]."""
+    """Quaternions wxyz float32 [N, 4] from version 2's bytes [N, 3]."""
     xyz = packed / 127.5 - 1
     w = np.sqrt((1 - (xyz**2).sum(1, keepdims=True)).clip(0))
     return np.concatenate([w, xyz], axis=1).astype(np.float32)
 
 
 def _fixed(positions: np.ndarray) -> np.ndarray:
-    """Integers [N, 3] of 24 bits, little endian, signed, from bytes [N, 9]."""
+    """Signed 24-bit little-endian integers [N, 3] from bytes [N, 9]."""
     wide = np.zeros((len(positions), 3, 4), np.uint8)
     wide[..., 1:] = positions.reshape(-1, 3, 3)
     return wide.view("<i4")[..., 0] >> 8
 
 
 def _read_header(name: str, header: bytes) -> tuple[int, int, int, int]:
-    """Version, count, degree and fractional bits."""
+    """Version, count, SH degree and fractional bits. DataError for an unsupported header."""
     if len(header) < _HEADER.size or not header.startswith(_MAGIC):
         raise DataError(f"{name}: not an SPZ file; give an .spz of version 2 or 3")
     _, version, count, degree, bits, flags, _ = _HEADER.unpack(header)
     if version not in (2, 3):
-        raise DataError(f"{name}: SPZ version {version} is not read; save it as version 3")
+        raise DataError(f"{name}: SPZ version {version} is not supported; save it as version 3")
     if degree >= len(_BASES) or bits > MAX_BITS:
         raise DataError(
-            f"{name}: SH degree {degree}, {bits} fractional bits; at most 3 and {MAX_BITS} are read"
+            f"{name}: SH degree {degree}, {bits} fractional bits; at most 3 and {MAX_BITS} are supported"
         )
-    if flags & ~_ANTIALIASED:  # extensions may change the axes, a tree the meaning of opacities
+    if flags & ~_ANTIALIASED:  # extensions may change the axes, an LOD tree the meaning of opacities
         raise DataError(
-            f"{name}: extensions or a tree of detail (flags {flags}) are not read; save it without"
+            f"{name}: extensions or an LOD tree (flags {flags}) are not supported; save it without"
         )
     return version, count, degree, bits

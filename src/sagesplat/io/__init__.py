@@ -1,1 +1,1 @@
-"""Reading and writing without losing anything: atomic files, locks, bounded archives, tables."""
+"""Files: atomic writes, locks, .npz archives with bounded memory, tables, PLY headers."""

@@ -1,4 +1,4 @@
-"""Tables as frozen dataclasses of equal-length numpy columns, kept as CSV."""
+"""Tables as frozen dataclasses of equal-length numpy columns, stored as CSV."""
 
 import csv
 from collections.abc import Mapping, Sequence
@@ -11,14 +11,14 @@ import numpy as np
 from sagesplat.core.errors import DataError, short
 from sagesplat.io.files import atomic_path
 
-_CELL = 40  # characters of a number; numpy makes all cells of a column as wide as the widest
+_CELL = 40  # characters of a number, at most: numpy pads all cells of a column to the widest
 Columns = TypeVar("Columns")  # a dataclass whose fields are annotated with jaxtyping arrays [R]
 
 
 def write_columns(path: Path, table: Any) -> None:
-    """Write a dataclass of columns [R]: a header, one line per row, floats that read back identical."""
+    """Write a table as CSV: a header and one line per row; floats read back exactly."""
     names = [f.name for f in fields(table)]
-    # numpy prints the shortest text that gives the same float32 again
+    # numpy prints the shortest text that reads back as the same float32
     columns = [getattr(table, name).astype(str).tolist() for name in names]
     with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
@@ -31,16 +31,16 @@ def _types(table: type) -> dict[str, np.dtype]:
 
 
 def from_rows(table: type[Columns], rows: Sequence[Mapping[str, float]]) -> Columns:
-    """A table from rows that name its columns."""
+    """A table from rows: column name -> value."""
     return table(
         **{name: np.array([row[name] for row in rows], dtype) for name, dtype in _types(table).items()}
     )
 
 
 def read_columns(path: Path, table: type[Columns], cure: str) -> Columns:
-    """The table that `write_columns` wrote. DataError where it is not one; `cure` says what to run then.
+    """The table that `write_columns` wrote. DataError for another file; `cure` is the error's advice.
 
-    Memory: up to 96 bytes for each of the file's and `_CELL` characters for each number.
+    Needs at most 96 bytes of memory per byte of the file, plus `_CELL` characters per number.
     """
     types = _types(table)
     try:

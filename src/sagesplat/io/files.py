@@ -1,4 +1,4 @@
-"""Files written whole or not at all, and the cache's folder."""
+"""Atomic files and folders, JSON files, and the cache folder."""
 
 import errno
 import json
@@ -14,23 +14,24 @@ from typing import Any
 from sagesplat.core.errors import RunError, short
 
 _FULL = {errno.ENOSPC: "the disk is full", errno.EDQUOT: "the quota is used up"}
-_TEMPORARY = "tmp-"  # in the names of files that are not complete yet
+_TEMPORARY = "tmp-"  # in the names of incomplete files and folders
 _MB = 10**6
 
 
 def cache_folder() -> Path:
-    """$SAGESPLAT_CACHE, or $XDG_CACHE_HOME/sagesplat, or ~/.cache/sagesplat: what every run may share."""
+    """The cache shared by all runs: $SAGESPLAT_CACHE, $XDG_CACHE_HOME/sagesplat, or ~/.cache/sagesplat."""
     default = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sagesplat"
     return Path(os.environ.get("SAGESPLAT_CACHE") or default)
 
 
 @contextmanager
 def atomic_path(path: Path, *, nbytes: int = 0, sync: bool = True) -> Iterator[Path]:
-    """A temporary path beside `path` that takes its place when the block ends without an error.
+    """A temporary path beside `path`, which replaces it when the block ends without an error.
 
-    After a crash or a power cut `path` has its old content or all of the new one. `sync=False`: the promise
-    holds for power cuts only after `sync_files`, which is cheaper for many small files. `nbytes`: expected
-    size, for the message of a full disk. Raises RunError where the disk is full; nothing is left behind.
+    After a crash or a power cut, `path` has either its old content or all of the new content. With
+    `sync=False` that holds for power cuts only after `sync_files`, which is cheaper for many small files.
+    `nbytes`: expected size, for the message about a full disk. RunError if the disk is full. No temporary
+    file is left behind.
     """
     with named_full_disk(path, nbytes):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -43,7 +44,7 @@ def atomic_path(path: Path, *, nbytes: int = 0, sync: bool = True) -> Iterator[P
             temporary.chmod(0o644)
             yield temporary
             if sync:
-                sync_files([temporary])  # before the new name is there: some disks write names first
+                sync_files([temporary])  # before the rename: some file systems write names before content
             temporary.replace(path)
             if sync:
                 _sync_folder(path.parent)
@@ -59,7 +60,7 @@ def atomic_path(path: Path, *, nbytes: int = 0, sync: bool = True) -> Iterator[P
 
 @contextmanager
 def named_full_disk(path: Path, nbytes: int = 0) -> Iterator[None]:
-    """RunError in one line where the block, which writes `nbytes` to `path`, finds the disk full."""
+    """RunError if the disk is full in the block, which writes about `nbytes` to `path`."""
     try:
         yield
     except OSError as error:
@@ -71,7 +72,7 @@ def named_full_disk(path: Path, nbytes: int = 0) -> Iterator[None]:
 def _full(path: Path, error: OSError, nbytes: int) -> RunError:
     free = 0
     with suppress(OSError):
-        if error.errno == errno.ENOSPC:  # what a quota leaves is not asked for so easily
+        if error.errno == errno.ENOSPC:  # what a quota leaves cannot be queried portably
             free = shutil.disk_usage(path.parent).free
     megabytes = max(1, math.ceil((nbytes - free) / _MB))
     return RunError(
@@ -85,7 +86,7 @@ def _size(path: Path) -> int:
 
 
 def sync_files(paths: Iterable[Path]) -> None:
-    """Wait until the content of files is on the disk. Their names take `sync_changed`, or `atomic_path`."""
+    """Flush the content of files to disk. Their names are flushed by `sync_changed` and `atomic_path`."""
     for path in paths:
         handle = os.open(path, os.O_RDWR if os.name == "nt" else os.O_RDONLY)
         try:
@@ -95,12 +96,12 @@ def sync_files(paths: Iterable[Path]) -> None:
 
 
 def _sync_folder(path: Path) -> None:
-    if os.name != "nt":  # which knows no such thing
+    if os.name != "nt":  # Windows cannot flush folders
         sync_files([path])
 
 
 def sync_changed(folder: Path, since: float) -> None:
-    """Wait until everything in a folder that changed since a time (seconds since 1970) is on the disk."""
+    """Flush to disk everything in a folder that changed since a time (seconds since 1970)."""
     for root, _, names in os.walk(folder):
         changed = [path for path in (Path(root, n) for n in names) if _changed(path) >= since]
         sync_files(changed)
@@ -109,12 +110,12 @@ def sync_changed(folder: Path, since: float) -> None:
 
 
 def _changed(path: Path) -> float:
-    """When a file was written, or got its name; never, where it is no file or folder any more."""
+    """Time of a file's last change of content or name, seconds since 1970; 0 if it no longer exists."""
     try:
-        found = path.stat()
+        status = path.stat()
     except FileNotFoundError:
         return 0.0
-    return max(found.st_mtime, found.st_ctime) if path.is_file() or path.is_dir() else 0.0
+    return max(status.st_mtime, status.st_ctime) if path.is_file() or path.is_dir() else 0.0
 
 
 def remove_temporary(folder: Path, but: str = "") -> None:
@@ -132,7 +133,7 @@ def remove_temporary(folder: Path, but: str = "") -> None:
 
 
 def link(path: Path, target: Path) -> None:
-    """A hard link, which takes no room, or a copy where the file system has none."""
+    """Make `target` a hard link to `path`, or a copy if the file system has no hard links."""
     target.parent.mkdir(parents=True, exist_ok=True)
     target.unlink(missing_ok=True)
     try:
@@ -170,12 +171,12 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Replace a JSON file atomically (keys in the order given)."""
+    """Replace a JSON file atomically; keys keep their order."""
     write_text(path, json.dumps(value, indent=1) + "\n")
 
 
 def read_json(path: Path) -> Any:
-    """A JSON file, or a RunError of one line. Memory: up to 64 bytes for each of the file's."""
+    """The content of a JSON file. RunError if it is unreadable. Memory: up to 64 bytes per byte."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:

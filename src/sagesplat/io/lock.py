@@ -1,4 +1,4 @@
-"""One process at a time writes into a run folder. A lock ends with its process, however that ends."""
+"""A lock per run folder, so that only one process writes into it; released when the process ends."""
 
 import errno
 import json
@@ -15,18 +15,18 @@ from pathlib import Path
 from sagesplat.core.errors import RunError
 
 FILE = ".lock"
-_BUSY = (errno.EWOULDBLOCK, errno.EACCES, errno.EDEADLK)  # of flock, and of msvcrt
+_BUSY = (errno.EWOULDBLOCK, errno.EACCES, errno.EDEADLK)  # errors of flock and msvcrt for a lock that is held
 _AGAIN = 0.5  # seconds between two tries
-_held: dict[Path, list[int]] = {}  # the open file, and how often this process has entered a folder
+_held: dict[Path, list[int]] = {}  # folder -> [open file, number of times this process has entered]
 _guard = threading.Lock()
 
 
 @contextmanager
 def locked(folder: Path, wait: float = 0.0) -> Iterator[None]:
-    """Keep other processes from writing into `folder` (made if missing); this one may enter again.
+    """Hold the lock of `folder` (created if missing) during the block; the lock is re-entrant.
 
-    RunError names the process that has it, and still has it after `wait` seconds. Its file, FOLDER/.lock,
-    stays; the lock goes with the process.
+    RunError, with the name of the process that holds it, if it cannot be had within `wait` seconds. The file
+    FOLDER/.lock remains; the lock itself is released when the process ends, even by a kill.
     """
     key, end = folder.resolve(), time.monotonic() + wait
     while not _entered(folder, key, last=time.monotonic() >= end):
@@ -41,7 +41,7 @@ def locked(folder: Path, wait: float = 0.0) -> Iterator[None]:
 
 
 def _entered(folder: Path, key: Path, last: bool) -> bool:
-    """Whether we have the lock now; RunError where not and this was the last try."""
+    """Whether this process holds the lock now; RunError if it does not and this was the `last` try."""
     with _guard:
         if key not in _held:
             try:
@@ -55,7 +55,7 @@ def _entered(folder: Path, key: Path, last: bool) -> bool:
 
 
 def _open(folder: Path) -> int:
-    """The lock's file, locked and with our name in it."""
+    """The open lock file, locked, with this process's description in it."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / FILE
     handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
@@ -68,18 +68,18 @@ def _open(folder: Path) -> int:
         raise RunError(
             f"{path}: cannot be locked ({error.strerror}); choose a run folder on another disk"
         ) from None
-    with suppress(OSError):  # a full disk: the lock is what counts, not the name in it
+    with suppress(OSError):  # e.g. a full disk: the lock holds without the description
         os.ftruncate(handle, 0)
         os.write(handle, json.dumps(_ourselves()).encode())
     return handle
 
 
 def _take(handle: int) -> None:
-    """Lock a file, or OSError at once."""
+    """Lock a file; OSError immediately if it is locked."""
     if sys.platform == "win32":
         import msvcrt
 
-        os.lseek(handle, 1 << 30, os.SEEK_SET)  # others may read what is before
+        os.lseek(handle, 1 << 30, os.SEEK_SET)  # others can still read the bytes before
         msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
         os.lseek(handle, 0, os.SEEK_SET)
     else:
@@ -95,10 +95,10 @@ def _ourselves() -> dict[str, str | int]:
 
 
 def _holder(path: Path) -> str:
-    """Who has the lock, in words."""
+    """A description of the process that holds the lock."""
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        who = f"process {found['pid']} on {found['host']}"
-        return f"{who} (`{found['command']}`, since {found['since']})"
-    except (OSError, ValueError, KeyError, TypeError):  # it has not written its name yet
+        holder = json.loads(path.read_text(encoding="utf-8"))
+        who = f"process {holder['pid']} on {holder['host']}"
+        return f"{who} (`{holder['command']}`, since {holder['since']})"
+    except (OSError, ValueError, KeyError, TypeError):  # it has not written its description yet
         return "another process"

@@ -1,4 +1,4 @@
-"""Reads numpy's .npz files that may come from anybody: no pickles, and no more memory than they can fill."""
+"""Reads untrusted .npz files: no pickles, and memory bounded by the file's size."""
 
 import math
 import zipfile
@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 
-_DEFLATE = 1032  # times its size is all that a deflate stream can hold
-_KINDS = "biufU"  # of numbers, and of text
+_DEFLATE = 1032  # largest expansion ratio of a deflate stream
+_KINDS = "biufU"  # numpy kinds that are read: numbers and text
 
 
 class Npz:
-    """The arrays of an .npz file by name, each read when it is asked for.
+    """The arrays of an .npz file by name, each read on access.
 
-    Memory for all of them together stays within the file's size; `packed` files may be compressed, and then
-    within 1032 times the size. OSError where there is no such file, KeyError where there is no such array,
-    ValueError with a short line for everything else.
+    All arrays together need no more memory than the file's size. With `packed` the file may be compressed;
+    then the bound is 1032 times the size. OSError if the file cannot be opened, KeyError for a missing
+    array, ValueError with a short message for any other defect.
     """
 
     def __init__(self, path: Path, *, packed: bool = False):
@@ -46,7 +46,7 @@ class Npz:
 
     @property
     def names(self) -> list[str]:
-        """Of the arrays, in the file's order."""
+        """Names of the arrays, in the file's order."""
         return list(self._infos)
 
     def __getitem__(self, name: str) -> np.ndarray[Any, Any]:
@@ -55,11 +55,11 @@ class Npz:
             self._check_header(info)
             with self._file.open(info) as member:
                 return np.lib.format.read_array(member, allow_pickle=False)
-        except Exception as error:  # of many kinds too
+        except Exception as error:  # numpy and zlib raise many kinds, too
             raise ValueError(f"array {name[:40]!r} is damaged: {str(error)[:100]}") from None
 
     def _check_header(self, info: zipfile.ZipInfo) -> None:
-        """ValueError where an array is not as large as its header says, which numpy allocates first."""
+        """ValueError if the member's size is not the announced one, which numpy allocates up front."""
         with self._file.open(info) as member:
             if np.lib.format.read_magic(member) != (1, 0):
                 raise ValueError("not version 1.0 of the format")
@@ -74,7 +74,7 @@ class Npz:
 
 
 def _check(infos: list[zipfile.ZipInfo], most: int, packed: bool) -> None:
-    """ValueError where members are packed in other ways, overlap, or promise more than they can hold."""
+    """ValueError if members use another compression, overlap, or announce more than they can hold."""
     allowed = {zipfile.ZIP_STORED: 1} | ({zipfile.ZIP_DEFLATED: _DEFLATE} if packed else {})
     if sum(info.compress_size for info in infos) > most:
         raise ValueError("its members are larger than the file")

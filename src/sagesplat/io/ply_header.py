@@ -1,11 +1,11 @@
-"""Headers of PLY files (Turk 1994): the order of bytes and the properties of a vertex."""
+"""Headers of PLY files (Turk 1994): byte order, and the properties of a vertex."""
 
 from dataclasses import dataclass
 from typing import BinaryIO
 
 import numpy as np
 
-TYPES = {  # the format's own names and those of other writers
+TYPES = {  # names of the specification, and those that other software writes
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
     **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
@@ -14,20 +14,20 @@ TYPES = {  # the format's own names and those of other writers
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """What a PLY file says of its vertices."""
+    """The description of a PLY file's vertices."""
 
-    order: str  # of bytes: "<", ">", or "" for text
-    types: dict[str, str]  # numpy's, by property
+    order: str  # byte order: "<", ">", or "" for text
+    types: dict[str, str]  # property -> numpy type
     count: int
 
     @property
     def dtype(self) -> np.dtype:
-        """Of one vertex in a binary file."""
+        """Numpy type of a vertex in a binary file."""
         return np.dtype([(name, self.order + kind) for name, kind in self.types.items()])
 
 
 def read_header(file: BinaryIO) -> PlyHeader:
-    """Read up to the first vertex, where the file then stands. ValueError where it is no PLY header."""
+    """Read the header; the file is then at the first vertex. ValueError for an invalid header."""
     if file.readline(16).strip() != b"ply":
         raise ValueError("it does not begin with 'ply'")
     order, count, element, types = None, -1, "", {}

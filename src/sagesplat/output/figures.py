@@ -211,9 +211,8 @@ def promised_and_measured(
     """Measured against promised SSIM on unseen views, a dot per (label, view, target)."""
     figure = Figure(figsize=PAIR, layout="constrained")
     axes = figure.subplots()
-    rows = evaluation.select(
-        (evaluation.label_id != TOTAL) & np.isfinite(evaluation.ssim + evaluation.predicted)
-    )
+    known = np.isfinite(evaluation.ssim + evaluation.predicted + evaluation.target)  # no target: a budget
+    rows = evaluation.select((evaluation.label_id != TOTAL) & known)
     handles = []
     for label_id in labels:
         mine = rows.select(rows.label_id == label_id)

@@ -7,8 +7,9 @@ colour r, g, b, and half width and height of the bounding box [px].
 """
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from sagesplat.kernels.jit import njit
 from sagesplat.kernels.simd import (
     ceil,
     exp2,

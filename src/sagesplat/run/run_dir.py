@@ -61,6 +61,11 @@ class RunDir:
         return self.path / "segmented"
 
     @property
+    def segmentation(self) -> Path:
+        """How the label images in `segmented` were asked for."""
+        return self.segmented / "options.json"
+
+    @property
     def soft(self) -> Path:
         """A network's probabilities, of the categories in `segmented`."""
         return self.path / "soft"
@@ -87,8 +92,13 @@ class RunDir:
 
     @property
     def cap(self) -> Path:
-        """The cap of Gaussians that training began with, lowered to the memory there was."""
+        """What training began with: its settings, and its cap of Gaussians, lowered to the memory."""
         return self.path / "cap.json"
+
+    @property
+    def replacement(self) -> "RunDir":
+        """Where a forced training makes its results, until they are whole."""
+        return RunDir(self.path / "replacement", self.ladder)
 
     @property
     def frozen(self) -> Path:

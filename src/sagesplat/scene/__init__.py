@@ -42,7 +42,7 @@ def load_scene(path: Path, *, downscale: int = 1, test_every: int = 8, calibrate
         >>> scene.views[0].camera.K, scene.points.xyz.shape  # doctest: +SKIP
     """
     if calibrate_every < 0 or calibrate_every == 1:
-        raise SceneError(f"{path}: calibrate_every {calibrate_every} leaves nothing; take 0 or 2 and more")
+        raise SceneError(f"{path}: calibrate_every {calibrate_every} leaves nothing; take 0 or >= 2")
     kind = detect(path)
     if kind in ("photos", "video"):
         raise SceneError(f"{path}: {kind} without poses; `sagesplat run` finds them")
@@ -54,7 +54,7 @@ def load_scene(path: Path, *, downscale: int = 1, test_every: int = 8, calibrate
 
 
 def describe(scene: Scene) -> list[tuple[str, str]]:
-    """What `sagesplat info` prints of a scene: pairs of a name and its value."""
+    """The rows that `sagesplat info` prints about a scene: (name, value)."""
     views, points = scene.views, scene.points
     sizes = sorted({(v.camera.width, v.camera.height) for v in views})
     Ks = {v.camera.K.tobytes() for v in views}
@@ -93,7 +93,7 @@ def describe(scene: Scene) -> list[tuple[str, str]]:
 
 
 def _depth_and_error(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Per observation: depth of its point in its view, world units, and reprojection error, pixels."""
+    """Per observation: depth of the point in the view, world units [T], and reprojection error, px [T]."""
     points = scene.points
     w2c = np.stack([v.camera.w2c for v in scene.views])[points.track_views]
     K = np.stack([v.camera.K for v in scene.views])[points.track_views]

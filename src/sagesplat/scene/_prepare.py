@@ -1,4 +1,4 @@
-"""Photos made ready for COLMAP: upright, 8-bit RGB, JPEG or PNG, under names without surprises."""
+"""Converts photos for COLMAP: upright, 8-bit RGB, as JPEG or PNG, under safe file names."""
 
 import hashlib
 import os
@@ -20,22 +20,23 @@ _ORIENTATION, _MAKER, _MODEL, _DETAILS, _FOCAL, _FOCAL_35 = 0x0112, 0x010F, 0x01
 
 @dataclass(frozen=True)
 class PreparedPhoto:
-    """A photo made ready for COLMAP."""
+    """A photo as COLMAP reads it."""
 
     name: str  # path below the source
     prepared: str  # file in sfm/photos
     final: str  # path below images/
-    camera: tuple[Any, ...]  # size, maker, model and focal lengths: photos that agree share a camera
-    state: tuple[int, int]  # bytes and time of the source
+    camera: tuple[Any, ...]  # size, maker, model, focal lengths; photos with equal values share a camera
+    state: tuple[int, int]  # size in bytes and modification time (ns) of the source
 
 
 def prepare_photos(
     source: Path, target: Path, skipped: Path, on_photo: Callable[[int, int], None]
 ) -> tuple[list[PreparedPhoto], dict[str, str]]:
-    """Bring the photos below `source` upright and to 8-bit RGB in `target`; also the unreadable, and why.
+    """Convert the photos below `source` to upright 8-bit RGB in `target`.
 
-    Photos below the folder `skipped` are left out. A photo that needs no change is hard-linked; one that is
-    prepared already is kept; files in `target` that belong to no photo are removed.
+    Returns the converted photos, and for each unreadable one (name -> reason). Photos below the folder
+    `skipped` are ignored. A photo that needs no change is hard-linked. One that was converted before is kept.
+    Other files in `target` are removed.
     """
     paths = _list(source, skipped)
     target.mkdir(parents=True, exist_ok=True)
@@ -61,32 +62,32 @@ def prepare_photos(
 
 
 def _list(source: Path, skipped: Path) -> list[Path]:
-    """Photos below a folder in the order of their names and numbers, hidden ones left out."""
+    """Photos below a folder, without hidden ones, sorted by name with numbers by value."""
     skipped = skipped.resolve()
-    anywhere = not source.resolve().is_relative_to(skipped)
-    found = []
+    outside = not source.resolve().is_relative_to(skipped)
+    photos = []
     for path in source.rglob("*"):
         hidden = any(part.startswith(".") for part in path.relative_to(source).parts)
         if path.suffix.lower() not in PHOTOS or hidden or not path.is_file():
             continue
-        if not (anywhere and path.resolve().is_relative_to(skipped)):
-            found.append(path)
-    return sorted(found, key=_by_number)
+        if not (outside and path.resolve().is_relative_to(skipped)):
+            photos.append(path)
+    return sorted(photos, key=_by_number)
 
 
 def _by_number(path: Path) -> list[tuple[int, str]]:
-    """Orders photo_2 before photo_10."""
+    """Sort key that puts photo_2 before photo_10."""
     parts = re.split(r"([0-9]+)", path.as_posix())
     return [(int(part), "") if i % 2 else (-1, part) for i, part in enumerate(parts)]
 
 
 def _clean(name: str) -> str:
-    """A name that every file format can hold."""
+    """The name without control characters and invalid Unicode, which COLMAP and JSON cannot hold."""
     return re.sub(r"[\x00-\x1f\x7f\ud800-\udfff]", "_", name)
 
 
 def _free(name: str, suffix: str, taken: set[str]) -> str:
-    """The name with `suffix`, its stem made unique: label images are named by stems."""
+    """The name with `suffix` and a stem that is not in `taken`: label images are named by stems."""
     stem, _, old = name.rpartition(".")
     fits = old.lower() in (("png",) if suffix == ".png" else ("jpg", "jpeg"))
     if stem.casefold() in taken:
@@ -102,11 +103,14 @@ class _Unreadable(Exception):
 
 
 def _prepare_photo(path: Path, folder: Path, key: str) -> tuple[Path, tuple[Any, ...], tuple[int, int]]:
-    """One photo as 8-bit upright RGB: hard-linked where it is so already. Raises _Unreadable."""
+    """Write one photo as upright 8-bit RGB, or hard-link it if it is one. Raises _Unreadable.
+
+    Returns the file, the camera key and the source's size and time.
+    """
     changed = None
     try:
         with warnings.catch_warnings(), Image.open(path) as image:
-            warnings.simplefilter("ignore")  # of large photos and odd EXIF
+            warnings.simplefilter("ignore")  # about large photos and invalid EXIF
             stat, exif = path.stat(), _exif(image)
             target = folder / (key + (".png" if image.format in ("PNG", "TIFF", "BMP") else ".jpg"))
             camera = _camera(image.size, exif)
@@ -125,17 +129,17 @@ def _prepare_photo(path: Path, folder: Path, key: str) -> tuple[Path, tuple[Any,
 
 
 def _exif(image: Image.Image) -> Image.Exif:
-    """The photo's EXIF; empty where it is damaged."""
+    """The photo's EXIF; empty if it is damaged."""
     try:
         exif = image.getexif()
         exif.get_ifd(_DETAILS)
         return exif
-    except Exception:  # as damaged files
+    except Exception:  # Pillow raises errors of many kinds here too
         return Image.Exif()
 
 
 def _changed(path: Path, image: Image.Image, exif: Image.Exif) -> Image.Image | None:
-    """The photo as 8-bit upright RGB, or None where the file is that already; decodes it in both cases."""
+    """The photo as upright 8-bit RGB, or None if the file is that already; decodes it in both cases."""
     turned = exif.get(_ORIENTATION, 1) in range(2, 9)
     as_is = image.format in ("JPEG", "MPO", "PNG") and image.mode == "RGB" and not turned
     if as_is and image.format == "PNG":
@@ -149,7 +153,7 @@ def _changed(path: Path, image: Image.Image, exif: Image.Exif) -> Image.Image | 
 
 
 def _save(image: Image.Image, exif: Image.Exif, path: Path) -> None:
-    """Write a photo with the EXIF that COLMAP takes the focal length from."""
+    """Write a photo with the EXIF tags from which COLMAP derives the focal length."""
     kept, details = Image.Exif(), exif.get_ifd(_DETAILS)
     kept.update({tag: exif[tag] for tag in (_MAKER, _MODEL) if tag in exif})
     kept.get_ifd(_DETAILS).update({tag: details[tag] for tag in (_FOCAL, _FOCAL_35) if tag in details})
@@ -163,9 +167,9 @@ def _save(image: Image.Image, exif: Image.Exif, path: Path) -> None:
 
 
 def _camera(size: tuple[int, int], exif: Image.Exif) -> tuple[Any, ...]:
-    """What tells photos of one camera at one zoom: upright size, maker, model, focal lengths."""
+    """Key of photos with one camera and zoom: upright size, maker, model, focal lengths."""
     details = exif.get_ifd(_DETAILS)
-    focal = [str(details.get(tag, "")) for tag in (_FOCAL, _FOCAL_35)]  # in mm, and as of 35 mm film
+    focal = [str(details.get(tag, "")) for tag in (_FOCAL, _FOCAL_35)]  # in mm, and 35 mm equivalent
     upright = size[::-1] if exif.get(_ORIENTATION, 1) in range(5, 9) else size
     return (*upright, str(exif.get(_MAKER, "")), str(exif.get(_MODEL, "")), *focal)
 
@@ -174,5 +178,5 @@ def _register_heif() -> None:
     try:
         import pi_heif
     except ImportError:
-        return  # such photos are listed as unreadable
+        return  # HEIF photos are then listed as unreadable
     pi_heif.register_heif_opener()

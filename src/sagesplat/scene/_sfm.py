@@ -1,9 +1,9 @@
-"""Structure from motion by COLMAP, as a script in a process of its own: `python -P _sfm.py FOLDER`.
+"""Structure from motion by COLMAP, as a script in its own process: `python -P _sfm.py FOLDER`.
 
-It imports nothing of the package and nothing that imports Pillow: the two libraries have broken the heap of
-a process that held both. The request is FOLDER/request.json. Progress, errors and the result go to standard
-output as lines of JSON, COLMAP's own log to standard error. The process ends with its parent: at the end of
-standard input.
+It imports nothing from the package and nothing that imports Pillow: pycolmap and Pillow in one process have
+corrupted its heap. The request is FOLDER/request.json. Progress, errors and the result go to standard output
+as lines of JSON, COLMAP's log to standard error. The process exits at the end of standard input, that is,
+when its parent exits.
 """
 
 import json
@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-FEW_FEATURES = 50  # less cannot give the 30 correspondences that registration asks for
-MIN_INLIERS = 15  # of a pair of photos that counts as matched; COLMAP's default
-OVERLAP = 10  # neighbours on each side in sequential matching
-KEYFRAMES = 30  # evenly spread photos that sequential matching compares all with all, to close loops
+FEW_FEATURES = 50  # registration needs 30 correspondences, which fewer features rarely give
+MIN_INLIERS = 15  # of a matched pair of photos; COLMAP's default
+OVERLAP = 10  # next photos that each photo is matched with in sequential matching
+KEYFRAMES = 30  # evenly spaced photos that sequential matching matches exhaustively, to close loops
 PAIRS_AT_A_TIME = 200
 
 Send = Callable[[dict[str, Any]], None]
@@ -31,7 +31,7 @@ OnProgress = Callable[[int, int], None]
 
 
 def sequential_pairs(count: int) -> list[tuple[int, int]]:
-    """Neighbours up to OVERLAP, neighbours at powers of two (COLMAP's quadratic overlap), and keyframes."""
+    """Pairs of neighbours up to OVERLAP, at powers of two (COLMAP's quadratic overlap), and of keyframes."""
     steps = sorted({*range(1, OVERLAP + 1), *(2**k for k in range(count.bit_length()))})
     pairs = {(i, i + step) for step in steps for i in range(count - step)}
     keys = np.unique(np.linspace(0, count - 1, min(KEYFRAMES, count)).astype(int)).tolist()
@@ -39,16 +39,16 @@ def sequential_pairs(count: int) -> list[tuple[int, int]]:
 
 
 def all_pairs(count: int) -> list[tuple[int, int]]:
-    """Every photo with every other."""
+    """All pairs of photos (exhaustive matching)."""
     return [(i, j) for i in range(count) for j in range(i + 1, count)]
 
 
 def upright(rotations: np.ndarray) -> np.ndarray:
-    """The rotation of the world [3, 3] that turns gravity to +y, from cameras' w2c rotations [N, 3, 3].
+    """The world rotation [3, 3] that maps gravity to +y, from the cameras' w2c rotations [N, 3, 3].
 
-    Photos are mostly taken without roll: gravity is the direction that is most nearly perpendicular to all
-    cameras' x axes. Where these are all alike, so that the direction is not determined, it is the mean of the
-    cameras' y axes. Identity where neither says anything.
+    Most photos are taken without roll. So gravity is estimated as the direction most nearly perpendicular to
+    all cameras' x axes. If these are nearly parallel, it is the mean of the cameras' y axes. The result is
+    the identity if that mean vanishes as well.
     """
     x, down = rotations[:, 0], rotations[:, 1].mean(axis=0)
     values, vectors = np.linalg.eigh(x.T @ x / len(x))
@@ -58,7 +58,7 @@ def upright(rotations: np.ndarray) -> np.ndarray:
     if length < 0.2:
         return np.eye(3)
     down = down / length
-    ahead = np.eye(3)[2] - down[2] * down  # keeps z where it is as far as possible
+    ahead = np.eye(3)[2] - down[2] * down  # changes z as little as possible
     if np.linalg.norm(ahead) < 1e-3:
         ahead = np.eye(3)[0] - down[0] * down
     ahead /= np.linalg.norm(ahead)
@@ -66,7 +66,7 @@ def upright(rotations: np.ndarray) -> np.ndarray:
 
 
 class Stages:
-    """The request and the folder it works in: one method per stage."""
+    """The stages of a request, one method each, and the folder that they work in."""
 
     def __init__(self, folder: Path, request: dict[str, Any]):
         self.folder, self.request = folder, request
@@ -78,7 +78,7 @@ class Stages:
         self.reader = pycolmap.ImageReaderOptions(camera_model=request["model"])
 
     def features(self, on_progress: OnProgress) -> None:
-        """Enter photos and cameras, then SIFT for the photos that have none yet."""
+        """Add photos and cameras to the database; extract SIFT features of photos without any."""
         with pycolmap.Database.open(self.database) as database:
             known = {image.name for image in database.read_all_images()}
         for group in self.request["cameras"]:
@@ -101,7 +101,7 @@ class Stages:
                 self.database,
                 self.photos,
                 names,
-                pycolmap.CameraMode.PER_IMAGE,  # does not count: the cameras are entered already
+                pycolmap.CameraMode.PER_IMAGE,  # no effect: the cameras are in the database already
                 self.reader,
                 options,
                 self.device,
@@ -132,7 +132,7 @@ class Stages:
         on_progress(len(wanted), len(wanted))
 
     def mapping(self, on_progress: OnProgress) -> None:
-        """Incremental mapping: the largest model in model/, upright; what became of photos in models.json."""
+        """Incremental mapping: write the largest model, upright, to model/ and a report to models.json."""
         if (self.folder / "models.json").is_file():
             return
         total, done = len(self.order), 0
@@ -176,7 +176,7 @@ class Stages:
         return options
 
     def _result(self, models: list[Any]) -> dict[str, Any]:
-        """Registered photos, the largest model's numbers, and why each of the others is not in it."""
+        """Registered photos, statistics of the largest model, and the reason for each unregistered photo."""
         members = [{model.image(i).name for i in model.reg_image_ids()} for model in models]
         registered = sorted(members[0]) if members else []
         left = [name for name in self.order if name not in registered]
@@ -188,7 +188,7 @@ class Stages:
         }
 
     def _reasons(self, names: list[str], smaller: list[set[str]]) -> dict[str, str]:
-        """Why each photo is not in the largest model."""
+        """Photo -> why it is not in the largest model."""
         with pycolmap.Database.open(self.database) as database:
             pairs, inliers = database.read_two_view_geometry_num_inliers()
             kept = [pair for pair, count in zip(pairs, inliers, strict=True) if count >= MIN_INLIERS]
@@ -209,7 +209,7 @@ class Stages:
         return reasons
 
     def undistortion(self, on_progress: OnProgress) -> None:
-        """Pinhole photos and their model in undistorted/, under the photos' own names."""
+        """Write undistorted photos and their pinhole model to undistorted/, under the photos' own names."""
         target, total = _empty(self.folder / "undistorted"), len(self.order)
         on_progress(0, total)
         options = pycolmap.UndistortCameraOptions(max_image_size=self.request["max_size"])
@@ -235,14 +235,14 @@ class Stages:
 
 
 def _empty(folder: Path) -> Path:
-    """A new folder in the place of an old one."""
+    """The folder, emptied or created."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     return folder
 
 
 def _replace(path: Path, content: dict[str, Any]) -> None:
-    """Replace a JSON file as a whole."""
+    """Replace a JSON file atomically."""
     temporary = path.with_suffix(".part")
     temporary.write_text(json.dumps(content))
     temporary.replace(path)
@@ -255,14 +255,14 @@ def _end_with_parent() -> None:
 
 
 def run(folder: Path, send: Send) -> None:
-    """All stages of the request in `folder`; undistortion only with enough photos registered."""
+    """Run all stages of the request in `folder`; undistortion only if enough photos are registered."""
     request = json.loads((folder / "request.json").read_text(encoding="utf-8"))
     if request["device"] == "cuda" and not pycolmap.has_cuda:
         send({"unavailable": "this pycolmap has no CUDA; install pycolmap-cuda12 or take device cpu"})
         return
     pycolmap.set_random_seed(request["seed"])
     stages, times = Stages(folder, request), folder / "seconds.json"
-    seconds = json.loads(times.read_text()) if times.is_file() else {}  # earlier runs count too
+    seconds = json.loads(times.read_text()) if times.is_file() else {}  # of earlier, killed runs
     for name in ("features", "matches", "mapping", "undistortion"):
         started = time.perf_counter()
         getattr(stages, name)(
@@ -270,18 +270,18 @@ def run(folder: Path, send: Send) -> None:
         )
         seconds[name] = round(seconds.get(name, 0) + time.perf_counter() - started, 2)
         _replace(times, seconds)
-        if name == "mapping" and len(_found(folder)["registered"]) < request["min_photos"]:
+        if name == "mapping" and len(_result(folder)["registered"]) < request["min_photos"]:
             break
-    send({"result": _found(folder) | {"seconds": seconds}})
+    send({"result": _result(folder) | {"seconds": seconds}})
 
 
-def _found(folder: Path) -> dict[str, Any]:
+def _result(folder: Path) -> dict[str, Any]:
     return json.loads((folder / "models.json").read_text(encoding="utf-8"))
 
 
 def main() -> None:
-    """Run the request; COLMAP's own prints to standard output go to the log."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
+    """Run the request in the folder argv[1]; what COLMAP prints to standard output goes to the log."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
     threading.Thread(target=_end_with_parent, daemon=True).start()
     channel = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)

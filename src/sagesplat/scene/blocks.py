@@ -1,4 +1,4 @@
-"""A large scene in blocks of its ground plane: a k-d split balanced by points and views."""
+"""Splits a large scene into blocks of its ground plane: a k-d tree balanced by points and views."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,60 +13,60 @@ from sagesplat.core.errors import RunError, SceneError, short
 from sagesplat.io.files import read_json, write_json
 from sagesplat.scene.scene import Points, Scene
 
-MOST = 4096
-_ANGLES = np.radians(np.arange(0, 90, 7.5))  # of the grid that is cut along; the one that cuts least is taken
-_SLACK = 0.08  # share of a block's weight that a cut may be off balance, to go where little is
-_TRIES = 33  # places of a cut that are looked at
-_NARROW = 0.25  # of a scene's length: narrower ones count as this wide
-_LEAST_UP = 0.02  # of the cameras' spread: less than that along an axis says nothing of the ground
-_MOST_SAMPLED = 200_000  # points that a split looks at
+MOST = 4096  # blocks
+_ANGLES = np.radians(np.arange(0, 90, 7.5))  # orientations of the split; the one of least cost is taken
+_SLACK = 0.08  # of the weight by which a cut may be unbalanced, to run through a sparse region
+_TRIES = 33  # positions that are tried for a cut
+_NARROW = 0.25  # least width of a scene as a share of its length, for the margin
+_LEAST_UP = 0.02  # share of the cameras' variance that is added along their mean up direction
+_MOST_SAMPLED = 200_000  # points that a split considers
 
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """Boxes of the ground plane without gaps; the outer ones reach to infinity."""
+    """B boxes that tile the ground plane; the outer ones extend to infinity."""
 
     axes: Float64[np.ndarray, "2 3"]  # of the ground plane, in world coordinates
     low: Float64[np.ndarray, "B 2"]  # corners along the axes, world units; -inf at the scene's edge
     high: Float64[np.ndarray, "B 2"]
-    margin: float  # world units that a block's training reaches beyond its border
+    margin: float  # world units beyond its border that a block is trained on
 
     def __len__(self) -> int:
         return len(self.low)
 
     def ground(self, xyz: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 2"]:
-        """Coordinates of world points in the ground plane."""
+        """Ground-plane coordinates of world points, world units."""
         return xyz.astype(np.float64) @ self.axes.T
 
     def of(self, xyz: Float[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
-        """The block that each point belongs to."""
+        """The block that contains each world point."""
         at = self.ground(xyz)
-        found = np.zeros(len(at), np.int64)
+        blocks = np.zeros(len(at), np.int64)
         for block in range(1, len(self)):
             inside = (at >= self.low[block]) & (at < self.high[block])
-            found[inside.all(1)] = block
-        return found
+            blocks[inside.all(1)] = block
+        return blocks
 
     def within(self, xyz: Float[np.ndarray, "N 3"], block: int, reach: float) -> Bool[np.ndarray, " N"]:
-        """Points of a block, or at most `reach` beyond its border along either axis."""
+        """Which points are in a block, or at most `reach` world units beyond its border along either axis."""
         at = self.ground(xyz)
         return ((at >= self.low[block] - reach) & (at < self.high[block] + reach)).all(1)
 
     def to_border(self, xyz: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
-        """How far points are from the border of their block, in the ground plane, world units."""
+        """Distance of points from the border of their block, in the ground plane, world units."""
         at, block = self.ground(xyz), self.of(xyz)
         return np.minimum(at - self.low[block], self.high[block] - at).min(1, initial=np.inf)
 
     def neighbours(self) -> Bool[np.ndarray, "B B"]:
-        """Blocks whose boxes touch."""
+        """Pairs of distinct blocks whose boxes touch."""
         touch = (self.low[:, None] <= self.high[None]) & (self.low[None] <= self.high[:, None])
         return touch.all(2) & ~np.eye(len(self), dtype=bool)
 
 
 def split(scene: Scene, count: int, margin: float = 0.2) -> Blocks:
-    """Divide a scene into `count` blocks, each with its share of the points and of the training views.
+    """Split a scene into `count` blocks with about equal numbers of points and of training views.
 
-    `margin`: of a block's width, where there are cameras. RunError where that many cannot be made.
+    `margin`: as a share of a block's mean width within the cameras' bounds. RunError for an impossible count.
     """
     cameras = np.stack([scene.views[i].camera.position for i in scene.train_ids]).astype(np.float64)
     xyz = scene.points.xyz.astype(np.float64)
@@ -83,8 +83,8 @@ def split(scene: Scene, count: int, margin: float = 0.2) -> Blocks:
     for angle in _ANGLES:
         turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
         at = places @ turn.T
-        walked = at[len(xyz) :]  # what is seen may be anywhere
-        outline = np.stack([walked.min(0), walked.max(0)])
+        at_cameras = at[len(xyz) :]  # the bounds of points would include a far background
+        outline = np.stack([at_cameras.min(0), at_cameras.max(0)])
         size = np.ptp(outline, axis=0)
         reach = margin * float(np.sqrt(np.prod(np.maximum(size, _NARROW * size.max())) / count))
         boxes: list[tuple[np.ndarray, np.ndarray]] = []
@@ -97,7 +97,7 @@ def split(scene: Scene, count: int, margin: float = 0.2) -> Blocks:
 
 
 def _ground_plane(scene: Scene, cameras: np.ndarray) -> np.ndarray:
-    """Two unit axes [2, 3]: across what the cameras spread least along, or is up in most photos."""
+    """Two unit axes [2, 3] across the up direction: the cameras' least variance, or else up in the photos."""
     up = -np.mean([scene.views[i].camera.w2c[1, :3] for i in scene.train_ids], axis=0)
     up /= max(float(np.linalg.norm(up)), 1e-12)
     spread = np.cov(cameras.T)
@@ -109,7 +109,7 @@ def _cut(
     at: np.ndarray, weights: np.ndarray, low: np.ndarray, high: np.ndarray, outline: np.ndarray,
     count: int, reach: float, boxes: list[tuple[np.ndarray, np.ndarray]],
 ) -> float:  # fmt: skip
-    """Divide a box into `count`, across its longer side where least is near; the weight beside all cuts."""
+    """Append `count` boxes to `boxes`, split across the longer side; the cost: the weight near all cuts."""
     if count == 1:
         boxes.append((low, high))
         return 0.0
@@ -122,7 +122,7 @@ def _cut(
     tries = np.linspace(ends[0], ends[1], _TRIES)
     padded = np.concatenate([[0.0], summed])
     beside = padded[np.searchsorted(along, tries + reach)] - padded[np.searchsorted(along, tries - reach)]
-    centred = 1 + np.abs(np.linspace(-1, 1, _TRIES))  # of equals the most balanced
+    centred = 1 + np.abs(np.linspace(-1, 1, _TRIES))  # prefers the most balanced of equal cuts
     place = tries[np.argmin(beside * centred)]
     left = at[:, axis] < place
     top, bottom = high.copy(), low.copy()
@@ -133,7 +133,10 @@ def _cut(
 
 
 def visible_shares(scene: Scene, of_points: Int[np.ndarray, " P"], count: int) -> Float64[np.ndarray, "V B"]:
-    """Share of the points that each view sees, by block: those of its tracks, or else in its frustum."""
+    """For each view, the share of its visible points in each block.
+
+    Visible are the points of its tracks, or without any those in its frustum.
+    """
     seen = np.zeros((len(scene.views), count))
     points = scene.points
     if len(points.track_points):
@@ -149,7 +152,10 @@ def visible_shares(scene: Scene, of_points: Int[np.ndarray, " P"], count: int) -
 def views_of(
     scene: Scene, blocks: Blocks, shares: Float64[np.ndarray, "V B"], min_share: float
 ) -> Bool[np.ndarray, "V B"]:
-    """The blocks that each view is for: those that it sees enough of, that it sees most of, that it is in."""
+    """The blocks that each view is assigned to.
+
+    These are the blocks with at least `min_share` of its visible points, the one with most, and its own.
+    """
     own = blocks.of(np.stack([view.camera.position for view in scene.views]))
     every = np.arange(len(scene.views))
     assigned = shares >= min_share
@@ -161,10 +167,10 @@ def views_of(
 def part_of(
     scene: Scene, blocks: Blocks, block: int, views: Sequence[int], far_share: float, seed: int
 ) -> tuple[Scene, Int64[np.ndarray, " Q"]]:
-    """What a block is trained on: these views, and the rows of its points.
+    """The scene that a block is trained on, with only these views, and the rows of its points.
 
-    Of the points beyond the margin those that the views see stand for what is behind, at most `far_share` of
-    the near ones. RunError where a block has nothing to train on.
+    It has the points within the margin. As background it also has points beyond it that the views see, at
+    most `far_share` times as many. RunError for a block without views or points.
     """
     points, rows = scene.points, np.asarray(views, np.int64)
     near = blocks.within(points.xyz, block, blocks.margin)
@@ -202,7 +208,7 @@ def part_of(
 
 
 def _seen(scene: Scene, rows: np.ndarray) -> np.ndarray:
-    """Points (bool [P]) in sight of some views."""
+    """Which points (bool [P]) any of the views sees."""
     points = scene.points
     seen = np.zeros(len(points.xyz), bool)
     if len(points.track_points):
@@ -216,27 +222,27 @@ def _seen(scene: Scene, rows: np.ndarray) -> np.ndarray:
 
 
 def colours(adjacent: Bool[np.ndarray, "B B"]) -> Int64[np.ndarray, " B"]:
-    """Numbers such that adjacent blocks have different ones, few in all: those of one can change at once."""
-    found = np.full(len(adjacent), -1)
+    """A greedy graph colouring: adjacent blocks differ. Blocks of one colour can be changed concurrently."""
+    chosen = np.full(len(adjacent), -1)
     for block in np.argsort(-adjacent.sum(1), kind="stable"):
-        taken = set(found[adjacent[block]].tolist())
-        found[block] = next(colour for colour in range(len(adjacent)) if colour not in taken)
-    return found
+        taken = set(chosen[adjacent[block]].tolist())
+        chosen[block] = next(colour for colour in range(len(adjacent)) if colour not in taken)
+    return chosen
 
 
 def write_blocks(path: Path, blocks: Blocks, **more: Any) -> None:
-    """Record a partition, and what else is known of it."""
+    """Write a partition to a JSON file, with further entries `more`."""
     corners = {"low": _finite(blocks.low), "high": _finite(blocks.high)}
     write_json(path, {"axes": blocks.axes.tolist(), **corners, "margin": blocks.margin, **more})
 
 
 def read_blocks(path: Path) -> Blocks:
-    """The partition in a file; SceneError for anything else."""
-    found = read_json(path)
+    """The partition that `write_blocks` wrote; SceneError for any other content."""
+    content = read_json(path)
     try:
-        low = np.array([[-np.inf if v is None else float(v) for v in row] for row in found["low"]])
-        high = np.array([[np.inf if v is None else float(v) for v in row] for row in found["high"]])
-        axes, margin = np.array(found["axes"], np.float64), float(found["margin"])
+        low = np.array([[-np.inf if v is None else float(v) for v in row] for row in content["low"]])
+        high = np.array([[np.inf if v is None else float(v) for v in row] for row in content["high"]])
+        axes, margin = np.array(content["axes"], np.float64), float(content["margin"])
         if low.shape != high.shape or low.shape[1:] != (2,) or axes.shape != (2, 3) or len(low) < 1:
             raise ValueError(f"boxes of shape {low.shape}")
     except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:

@@ -1,4 +1,4 @@
-"""COLMAP workspaces: photos beside a sparse model, made into a scene."""
+"""Loads COLMAP workspaces: a folder of photos and a sparse model."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,32 +8,26 @@ import numpy as np
 from sagesplat.core.errors import SceneError, short
 from sagesplat.scene.colmap_read import ModelPoints, read_model
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage
-from sagesplat.scene.images import photo_size
-from sagesplat.scene.scene import Camera, Lens, Points, Scene, View
+from sagesplat.scene.loading import MIN_VIEWS, camera_of, check_settings
+from sagesplat.scene.scene import Lens, Points, Scene, View
 from sagesplat.scene.undistort import distort, intrinsics, is_pinhole, pinhole
-
-MIN_VIEWS = 3
 
 
 def load_colmap(path: Path, *, downscale: int = 1, test_every: int = 8, images: str | None = None) -> Scene:
     """The scene of a COLMAP workspace: `images/` and `sparse/0` (or `sparse`) below `path`.
 
-    With `downscale` N the photos come from `images_N/` if that folder exists, otherwise from `images/`
-    with area resampling when they are loaded; `images` names another folder below `path`. Distorted
-    cameras become pinholes (`undistort.pinhole`), and their tracks move along. Observations that fall
-    outside their view are left out. Raises SceneError.
+    With `downscale` N the photos are read from `images_N/` if that folder exists. Otherwise they are read
+    from `images/` and area-resampled. `images` names another folder below `path`. Distorted cameras are
+    replaced by pinholes (`undistort.pinhole`), and their observations are undistorted. Observations outside
+    the image are dropped. Raises SceneError.
     """
-    if downscale < 1 or test_every < 0 or test_every == 1:
-        raise SceneError(
-            f"{path}: downscale {downscale} and test_every {test_every} do not go together with training; "
-            "take downscale >= 1 and test_every 0 or >= 2"
-        )
+    check_settings(path, downscale, test_every)
     model = _find_model(path)
-    with np.errstate(all="ignore"):  # damaged numbers overflow; what counts is checked to be finite
+    with np.errstate(all="ignore"):  # damaged numbers overflow; the results are checked to be finite
         cameras, listed, points = read_model(model)
         if len(listed) < MIN_VIEWS:
             raise SceneError(
-                f"{model}: {len(listed)} posed photos, but it takes {MIN_VIEWS}; add some, run COLMAP"
+                f"{model}: {len(listed)} posed photos, but it takes {MIN_VIEWS}; add photos, run COLMAP"
             )
         if not len(points.xyz):
             raise SceneError(f"{model}: no 3D points; run COLMAP's mapper or point_triangulator again")
@@ -58,7 +52,7 @@ def _find_model(path: Path) -> Path:
 
 
 def _find_photos(path: Path, images: str | None, downscale: int) -> tuple[Path, int]:
-    """The folder of the photos and what is left to downscale at load."""
+    """The folder of the photos, and the factor by which they are still to be downscaled."""
     if images is None and downscale > 1 and (path / f"images_{downscale}").is_dir():
         return path / f"images_{downscale}", 1
     folder = path / (images or "images")
@@ -105,17 +99,7 @@ def _views(
     views = []
     for image in listed:
         lens = lenses[image.camera_id]
-        width, height = photo_size(folder / image.name)
-        # images_N are rounded to whole pixels: both sides may be off by one, but not the aspect.
-        if abs(width / lens.width - height / lens.height) > 1 / lens.width + 1 / lens.height:
-            raise SceneError(
-                f"{folder / image.name}: {width} x {height} pixels, but its camera has another aspect, "
-                f"{lens.width} x {lens.height}; use the photos that COLMAP was run on, not rotated or cropped"
-            )
-        width, height = (max(1, round(side / divisor)) for side in (width, height))
-        scale = np.array([[width / lens.width], [height / lens.height], [1.0]])
-        K = (Ks[image.camera_id] * scale).astype(np.float32)
-        camera = Camera(image.w2c.astype(np.float32), K, width, height)
+        camera = camera_of(folder / image.name, image.w2c, lens, Ks[image.camera_id], divisor)
         distorted = None if is_pinhole(lens) else lens
         views.append(View(image.name, camera, folder / image.name, distorted))
     return tuple(views)
@@ -124,7 +108,7 @@ def _views(
 def _scene_points(
     cameras: dict[int, ModelCamera], listed: Sequence[ModelImage], views: Sequence[View], points: ModelPoints
 ) -> Points:
-    """Points with their tracks, which are read from the images: each observation there names its point."""
+    """The points and their tracks, in pixels of the views; tracks are read from the images' observations."""
     track_points, track_views, track_uv = [], [], []
     for row, (image, view) in enumerate(zip(listed, views, strict=True)):
         camera, model = view.camera, cameras[image.camera_id]
@@ -136,7 +120,7 @@ def _scene_points(
         if view.lens is not None:
             xyz = points.xyz[at] @ image.w2c[:3, :3].T + image.w2c[:3, 3]
             rays = xyz[:, :2] / np.where(xyz[:, 2:] > 0, xyz[:, 2:], np.nan)
-            # The pinhole's projection, and beside it what the keypoint was off by in the distorted photo.
+            # The pinhole's projection, plus the keypoint's reprojection error in the distorted photo.
             ideal = rays * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
             uv = ideal + (uv - distort(view.lens, rays) * scale)
         uv = uv.astype(np.float32)

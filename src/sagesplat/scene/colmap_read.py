@@ -1,7 +1,7 @@
 """Reads COLMAP models, text and binary, of any COLMAP version.
 
-Format: https://colmap.github.io/format.html. Since 3.12 a model has rigs and frames too; the images still
-carry their poses, so both are left alone.
+Format: https://colmap.github.io/format.html. Models since 3.12 also have rigs and frames. They are ignored,
+since images still hold their own poses.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from sagesplat.scene.undistort import CAMERA_MODELS
 
 MODEL_NAMES = {model.id: name for name, model in CAMERA_MODELS.items()}
 MAX_SIDE = 10**6  # pixels
-# One record of each binary file, up to its part of variable length.
+# The fixed-length part of a record in each binary file.
 CAMERA = np.dtype([("id", "<u4"), ("model", "<i4"), ("width", "<u8"), ("height", "<u8")])
 IMAGE = np.dtype([("id", "<u4"), ("pose", "<f8", 7), ("camera", "<u4")])
 OBSERVATION = np.dtype([("uv", "<f8", 2), ("point", "<i8")])
@@ -27,7 +27,7 @@ POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", 
 
 
 class ModelPoints(NamedTuple):
-    """points3D without its tracks, which the images repeat."""
+    """points3D without its tracks: the images hold the same observations."""
 
     ids: Int64[np.ndarray, " P"]  # sorted
     xyz: Float64[np.ndarray, "P 3"]
@@ -35,10 +35,10 @@ class ModelPoints(NamedTuple):
 
 
 def read_model(folder: Path) -> tuple[dict[int, ModelCamera], list[ModelImage], ModelPoints]:
-    """Cameras by id, posed images and points of the model in `folder`, which binary files have priority in.
+    """Cameras by id, posed images and points of the model in `folder`; binary files are preferred to text.
 
-    Raises SceneError for content that is damaged; numbers are finite then, but otherwise as they are. Takes
-    no more memory than a small multiple of the files: counts in them are checked against what is there.
+    SceneError for missing or damaged files. All numbers are finite, but not checked further. Memory stays
+    within a small multiple of the file sizes: the counts in the files are not trusted.
     """
     suffix = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
     cameras = _read(folder / f"cameras{suffix}", _binary_cameras, _text_cameras)
@@ -60,7 +60,7 @@ def _read(path: Path, binary: Callable, text: Callable) -> Any:
             data = _Bytes(path.read_bytes())
             value = binary(path, data)
             if data.at != len(data.data):
-                raise ValueError(f"{len(data.data) - data.at} bytes too many")
+                raise ValueError(f"{len(data.data) - data.at} bytes more than expected")
             return value
         return text(path, [line.strip() for line in path.read_text(encoding="utf-8").split("\n")])
     except FileNotFoundError:
@@ -72,7 +72,7 @@ def _read(path: Path, binary: Callable, text: Callable) -> Any:
 
 
 class _Bytes:
-    """A binary file and how far it has been read; never allocates more than the file holds."""
+    """A binary file and the read position; never allocates more than the file holds."""
 
     def __init__(self, data: bytes):
         self.data, self.at = data, 0
@@ -157,7 +157,7 @@ def _text_images(path: Path, lines: list[str]) -> list[ModelImage]:
 
 
 def _images(rows: list[tuple], poses: list[np.ndarray]) -> list[ModelImage]:
-    """Images with `point_rows` still holding point ids; poses are qw qx qy qz tx ty tz."""
+    """The images, with point ids still in `point_rows`; poses are qw qx qy qz tx ty tz, world to camera."""
     if not rows:
         return []
     pose = np.stack(poses)
@@ -175,7 +175,7 @@ def _images(rows: list[tuple], poses: list[np.ndarray]) -> list[ModelImage]:
 
 def _binary_points(path: Path, data: _Bytes) -> ModelPoints:
     number, starts = data.count(), []
-    for _ in range(number):  # the tracks, which the images repeat, are skipped
+    for _ in range(number):  # tracks are skipped: the images hold them too
         starts.append(data.at)
         data.skip(POINT.itemsize)
         data.skip(8 * data.count())

@@ -1,6 +1,7 @@
-"""Writes COLMAP models, text and binary: what the demo capture and the tests are made of.
+"""Writes COLMAP models, text and binary, for the demo capture and the tests.
 
-Format: https://colmap.github.io/format.html (the part that COLMAP before 3.12 reads too: no rigs, no frames).
+Format: https://colmap.github.io/format.html, without rigs and frames, which COLMAP before 3.12
+cannot read.
 """
 
 import struct
@@ -18,7 +19,7 @@ from sagesplat.scene.undistort import CAMERA_MODELS
 
 @dataclass(frozen=True, eq=False)
 class ModelCamera:
-    """A line of cameras.txt."""
+    """A camera of a model (a line of cameras.txt)."""
 
     id: int
     model: str  # COLMAP's name, e.g. "PINHOLE"
@@ -29,14 +30,14 @@ class ModelCamera:
 
 @dataclass(frozen=True, eq=False)
 class ModelImage:
-    """Two lines of images.txt; an observation that belongs to no point has row -1."""
+    """A posed image of a model and its M keypoints (two lines of images.txt)."""
 
     id: int
     name: str  # path below the image folder
     camera_id: int
     w2c: Float[np.ndarray, "4 4"]  # world to camera
     uv: Float[np.ndarray, "M 2"]  # pixels, the first pixel's centre is at (0.5, 0.5)
-    point_rows: Int[np.ndarray, " M"]  # rows of the model's xyz, -1 = none
+    point_rows: Int[np.ndarray, " M"]  # rows of the model's xyz; -1: not triangulated
 
 
 def write_model(
@@ -59,7 +60,7 @@ def write_model(
 
 
 def _tracks(images: Sequence[ModelImage], num_points: int) -> list[np.ndarray]:
-    """Per point its observations [L, 2]: image id and index into the image's uv."""
+    """For each point its observations [L, 2]: image id, and row of the image's uv."""
     rows = np.concatenate([i.point_rows for i in images])
     ids = np.concatenate([np.full(len(i.point_rows), i.id) for i in images])
     index = np.concatenate([np.arange(len(i.point_rows)) for i in images])
@@ -70,7 +71,7 @@ def _tracks(images: Sequence[ModelImage], num_points: int) -> list[np.ndarray]:
 
 
 def _pose(image: ModelImage) -> list[float]:
-    """qw qx qy qz tx ty tz."""
+    """The image's pose as qw qx qy qz tx ty tz, world to camera."""
     quat = Rotation.from_matrix(image.w2c[:3, :3]).as_quat(canonical=True, scalar_first=True)
     return [*quat.tolist(), *np.asarray(image.w2c[:3, 3], float).tolist()]
 

@@ -1,4 +1,4 @@
-"""What kind of capture a path holds."""
+"""Detects the kind of capture at a path."""
 
 from pathlib import Path
 from typing import Literal
@@ -14,16 +14,16 @@ VIDEOS = frozenset(
 
 
 def detect(path: Path) -> Kind:
-    """The kind of a capture, by what lies in it; the first that fits, as a COLMAP model knows most.
+    """The kind of capture at a path: the first of these that matches.
 
     - colmap: cameras.bin or .txt in sparse/0 or sparse;
-    - transforms: transforms.json, or the path of any .json file;
-    - blender: transforms_train.json, or its path;
-    - stored: an .npz file, a part of a capture (`scene.stored`);
+    - transforms: transforms.json in the folder, or the path of any .json file;
+    - blender: transforms_train.json in the folder, or its path;
+    - stored: an .npz file, such as the capture of one block (`scene.stored`);
     - photos: photos in images/, or in the folder itself;
     - video: the path of a video file.
 
-    Raises SceneError where it is none of them.
+    Raises SceneError if none matches.
     """
     if path.is_file():
         return _of_file(path)

@@ -1,4 +1,4 @@
-"""Photos from disk: 8-bit RGB at the size of their view."""
+"""Reads photos as 8-bit RGB, at the size of their view's camera."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,12 +11,12 @@ from sagesplat.core.errors import SceneError
 from sagesplat.scene.scene import View
 from sagesplat.scene.undistort import undistort
 
-# What Pillow raises for files that are damaged, no image, or too large to be one.
+# What Pillow raises for files that are damaged, not images, or too large.
 _UNREADABLE = (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError)
 
 
 def photo_size(path: Path) -> tuple[int, int]:
-    """Width and height in stored pixels, from the file's header alone. Raises SceneError."""
+    """Width and height in pixels, before EXIF rotation, from the file's header. Raises SceneError."""
     try:
         with Image.open(path) as image:
             return image.size
@@ -25,7 +25,7 @@ def photo_size(path: Path) -> tuple[int, int]:
 
 
 def has_alpha(path: Path) -> bool:
-    """Whether a photo has transparency, from the file's header alone. Raises SceneError."""
+    """Whether a photo has an alpha channel, from the file's header. Raises SceneError."""
     try:
         with Image.open(path) as image:
             return image.has_transparency_data
@@ -36,8 +36,8 @@ def has_alpha(path: Path) -> bool:
 def load_photo(view: View) -> UInt8[np.ndarray, "H W 3"]:
     """The photo as `view.camera` sees it: area-resampled to the camera's size, then undistorted.
 
-    EXIF orientation is not applied, because COLMAP's poses are those of the stored pixels. Grey photos
-    become RGB, 16 bits become 8, and alpha goes over the camera's background. Raises SceneError.
+    EXIF orientation is not applied, because COLMAP's poses refer to the stored pixels. Grey photos
+    become RGB, 16 bits become 8, and alpha is composited over the camera's background. Raises SceneError.
     """
     try:
         with Image.open(view.image_path) as file:
@@ -46,15 +46,15 @@ def load_photo(view: View) -> UInt8[np.ndarray, "H W 3"]:
         raise _unreadable(view.image_path, error) from None
     size = (view.camera.width, view.camera.height)
     if image.size != size:
-        image = image.resize(size, Image.Resampling.BOX)  # before undistortion, which costs more
+        image = image.resize(size, Image.Resampling.BOX)  # first, as undistortion costs more per pixel
     return undistort(np.array(image), view.lens, view.camera, order=1)
 
 
 class Photos:
-    """`photos[i]` is the photo of `views[i]`, uint8 [H, W, 3], loaded when it is asked for.
+    """A sequence of photos, uint8 [H, W, 3], one per view, loaded on access.
 
-    Photos are kept until `cache_bytes` are full; the rest is read anew each time. Nothing is evicted:
-    training visits all views in turn, where a least-recently-used cache never hits.
+    Photos are cached until the cache holds `cache_bytes`; the others are read again on each access. Nothing
+    is evicted: training cycles through all views, where an LRU cache would never hit.
     """
 
     def __init__(self, views: Sequence[View], cache_bytes: int = 2**30):
@@ -77,10 +77,10 @@ class Photos:
 
 
 def _rgb(image: Image.Image, background: tuple[int, int, int]) -> Image.Image:
-    """8-bit RGB of any mode of Pillow, over a background where it has alpha."""
+    """The image, of any Pillow mode, as 8-bit RGB; alpha is composited over `background`."""
     if image.mode.startswith("I") or image.mode == "F":
         values = np.asarray(image, np.float64)
-        # Pillow clips 16-bit greys where they should be scaled.
+        # Pillow's own conversion clips 16-bit greys instead of scaling them.
         scale = 257 if image.mode.startswith("I") and values.max() > 255 else 1
         return Image.fromarray((values / scale).round().clip(0, 255).astype(np.uint8)).convert("RGB")
     if image.has_transparency_data:
@@ -92,5 +92,5 @@ def _rgb(image: Image.Image, background: tuple[int, int, int]) -> Image.Image:
 def _unreadable(path: Path, error: BaseException) -> SceneError:
     reason = " ".join(str(error).split())
     return SceneError(
-        f"{path}: not readable as a photo ({reason}); replace the file or take it out of the model"
+        f"{path}: not readable as a photo ({reason}); replace the file, or remove it from the model"
     )

@@ -1,8 +1,8 @@
-"""nerfstudio's transforms.json and the Blender scenes of NeRF, made into a scene.
+"""Loads nerfstudio's transforms.json and the Blender scenes of NeRF.
 
 Formats: https://docs.nerf.studio/quickstart/data_conventions.html, instant-ngp's docs/nerf_dataset_tips.md,
 and the synthetic scenes of Mildenhall et al. 2020. Poses are camera-to-world with OpenGL axes (x right, y up,
-z back). The world is that of the file: nothing is turned, moved or scaled.
+z back). The world frame is the file's: it is not rotated, moved or scaled.
 """
 
 from collections import ChainMap
@@ -17,34 +17,33 @@ from jaxtyping import Float64
 
 from sagesplat.core.errors import RunError, SceneError, short
 from sagesplat.io.files import read_json
-from sagesplat.scene.colmap import MIN_VIEWS
 from sagesplat.scene.images import has_alpha, photo_size
+from sagesplat.scene.loading import MAX_SIDE, MIN_VIEWS, camera_of, check_settings
 from sagesplat.scene.points import random_points, read_points
-from sagesplat.scene.scene import Camera, Lens, Scene, View
+from sagesplat.scene.scene import Lens, Scene, View
 from sagesplat.scene.undistort import intrinsics, is_pinhole, pinhole
 
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 FISHEYE = "OPENCV_FISHEYE"
-SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG")  # tried where a file_path has none
-MAX_SIDE = 10**6  # pixels
-LARGEST = 1e9  # number that float32 still has a use for
-MAX_SHEAR = 1e-2  # what rounding may leave of a rotation's R^T R - I
+SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG")  # tried if a file_path has none
+LARGEST = 1e9  # largest number accepted; float32 is too coarse beyond
+MAX_SHEAR = 1e-2  # largest |R^T R - I| that rounding explains
 BLENDER_CUBE = 1.3  # half the side of the cube that NeRF's Blender scenes fit into (3DGS's initial points)
 WHITE = (255, 255, 255)
 
 
 def load_transforms(path: Path, *, downscale: int = 1, test_every: int = 8) -> Scene:
-    """The scene of a folder with nerfstudio's or instant-ngp's transforms.json, or of such a file.
+    """The scene of nerfstudio's or instant-ngp's transforms.json; `path` is the file or its folder.
 
-    With `downscale` N the photos come from `images_N/` if the frames are in images/ and that folder exists,
-    otherwise they are area-resampled when loaded. Where the file lists train_, val_ or test_filenames, they
-    are the split (`val` only without `test`; other frames are left out) unless `test_every` is 0. The points
-    of `ply_file_path` are in the frame of the poses (`applied_transform` has been applied to both, so it is
-    not needed here); without them, `points.random_points`. Depths are not read, and neither is `mask_path`:
-    it names pixels to leave out of the loss, not categories. Raises SceneError.
+    With `downscale` N the photos are read from `images_N/` if the frames are in images/ and that folder
+    exists. Otherwise they are area-resampled. If the file lists train_, val_ or test_filenames, they define
+    the split unless `test_every` is 0: `val` is used only without `test`, and unlisted frames are dropped.
+    Points are read from `ply_file_path`, else made by `points.random_points`. They are in the frame of the
+    poses: `applied_transform` has been applied to both. Depths are not read. Neither is `mask_path`, which
+    excludes pixels from the loss and does not name categories. Raises SceneError.
     """
     file = path if path.suffix == ".json" else path / "transforms.json"
-    _check_settings(path, downscale, test_every)
+    check_settings(path, downscale, test_every)
     content, frames = _read(file)
     views = _views(file, frames, downscale)
     test_names = None
@@ -61,13 +60,13 @@ def load_transforms(path: Path, *, downscale: int = 1, test_every: int = 8) -> S
 
 
 def load_blender(path: Path, *, downscale: int = 1, test_every: int = 8) -> Scene:
-    """A Blender scene of NeRF: transforms_train.json and transforms_test.json (or _val) below `path`.
+    """The scene of a NeRF Blender folder: transforms_train.json, and transforms_test.json or else _val.
 
-    Views of the train file are for training and those of the test file for tests, as in 3DGS; the val file
-    stays unread where there is a test file. With `test_every` 0 all are for training. Photos with alpha go
-    over white. The initial points are random in the cube [-1.3, 1.3]^3. Raises SceneError.
+    The train file's views are training views and the test file's are test views, as in 3DGS. With
+    `test_every` 0 all are training views. Photos with alpha are composited over white. The initial points
+    are random in the cube [-1.3, 1.3]^3. Raises SceneError.
     """
-    _check_settings(path, downscale, test_every)
+    check_settings(path, downscale, test_every)
     folder = path.parent if path.suffix == ".json" else path
     train = folder / "transforms_train.json"
     tests = next(
@@ -83,20 +82,12 @@ def load_blender(path: Path, *, downscale: int = 1, test_every: int = 8) -> Scen
     return Scene(folder.resolve().name, folder, views, points, test_every, test_names=test_names)
 
 
-def _check_settings(path: Path, downscale: int, test_every: int) -> None:
-    if downscale < 1 or test_every < 0 or test_every == 1:
-        raise SceneError(
-            f"{path}: downscale {downscale} and test_every {test_every} do not go together with training; "
-            "take downscale >= 1 and test_every 0 or >= 2"
-        )
-
-
 def _read(file: Path) -> tuple[dict[str, Any], list[Mapping[str, Any]]]:
-    """The content of a transforms file, and its frames with what it says of all of them filled in."""
+    """The content of a transforms file, and its frames with the file's shared values filled in."""
     try:
         content = read_json(file)
     except RunError as error:
-        raise SceneError(f"{error}; give the folder with a whole transforms file") from None
+        raise SceneError(f"{error}; give a folder with a complete transforms file") from None
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
         raise SceneError(f'{file}: no frames; export the transforms again, with {{"frames": [...]}} in them')
@@ -105,7 +96,7 @@ def _read(file: Path) -> tuple[dict[str, Any], list[Mapping[str, Any]]]:
 
 
 def _inside(file: Path, key: str, value: Any) -> PurePosixPath:
-    """A path that the file names, which has to be below the file's folder."""
+    """`value` as a path relative to the file's folder; SceneError if it leads outside."""
     path = PurePosixPath(value.replace("\\", "/")) if isinstance(value, str) else None
     if path is None or not path.name or "\0" in path.name:
         raise SceneError(f"{file}: {key} is {str(value)[:80]!r}; name a file relative to the folder")
@@ -117,7 +108,7 @@ def _inside(file: Path, key: str, value: Any) -> PurePosixPath:
 
 
 def _views(file: Path, frames: Sequence[Mapping[str, Any]], downscale: int) -> list[View]:
-    """The views of the frames, in their order; names are below images/ where all photos are there."""
+    """The views of the frames, in order; names are relative to images/ if all photos are in it."""
     folder = file.parent
     paths = [_inside(file, "file_path", frame.get("file_path")) for frame in frames]
     if all(path.parts[0] == "images" and len(path.parts) > 1 for path in paths):
@@ -132,7 +123,7 @@ def _views(file: Path, frames: Sequence[Mapping[str, Any]], downscale: int) -> l
             f"{root}: {len(missing)} of the {len(paths)} photos of {file.name} are missing, first "
             f"{short(repr(str(missing[0])))}; add the files, or remove their frames"
         )
-    lenses: dict[tuple, tuple[Lens, np.ndarray]] = {}  # a pinhole takes milliseconds to find
+    lenses: dict[tuple, tuple[Lens, np.ndarray]] = {}  # computing a pinhole takes milliseconds
     views = []
     for frame, path, photo in zip(frames, paths, photos, strict=True):
         assert photo is not None
@@ -146,15 +137,15 @@ def _views(file: Path, frames: Sequence[Mapping[str, Any]], downscale: int) -> l
         except (TypeError, ValueError, OverflowError) as error:
             reason = short(error)
             raise SceneError(f"{file}: frame {str(path)!r}: {reason}; export the transforms again") from None
-        camera = _camera(photo, w2c, *lenses[key], divisor)
-        lens = lenses[key][0]
+        lens, K = lenses[key]
+        camera = camera_of(photo, w2c, lens, K, divisor)
         name = photo.relative_to(root).as_posix()
         views.append(View(name, camera, photo, None if is_pinhole(lens) else lens))
     return views
 
 
 def _photo(root: Path, path: PurePosixPath) -> Path | None:
-    """A frame's file, whose suffix may be missing in the file_path (Blender)."""
+    """A frame's file; Blender scenes leave its suffix out of the file_path."""
     for name in (path.name, *(path.name + suffix for suffix in SUFFIXES)):
         photo = root / path.parent / name
         try:
@@ -165,23 +156,11 @@ def _photo(root: Path, path: PurePosixPath) -> Path | None:
     return None
 
 
-def _camera(photo: Path, w2c: np.ndarray, lens: Lens, K: np.ndarray, divisor: int) -> Camera:
-    width, height = photo_size(photo)
-    # images_N are rounded to whole pixels: both sides may be off by one, but not the aspect.
-    if abs(width / lens.width - height / lens.height) > 1 / lens.width + 1 / lens.height:
-        raise SceneError(
-            f"{photo}: {width} x {height} pixels, but its frame has another aspect, "
-            f"{lens.width} x {lens.height}; use the photos that were posed, not rotated or cropped"
-        )
-    width, height = (max(1, round(side / divisor)) for side in (width, height))
-    scale = np.array([[width / lens.width], [height / lens.height], [1.0]])
-    return Camera(w2c.astype(np.float32), (K * scale).astype(np.float32), width, height)
-
-
 def _lens(frame: Mapping[str, Any], photo: Path) -> Lens:
-    """A frame's lens as COLMAP has it; raises ValueError. `photo` tells the size where the frame does not.
+    """A frame's lens as a COLMAP camera model; `photo` gives the size if the frame does not.
 
-    k3 makes OPENCV COLMAP's FULL_OPENCV; k4 is for the fisheye only, since its meaning differs elsewhere.
+    With k3, OPENCV becomes COLMAP's FULL_OPENCV. k4 is accepted for the fisheye only, since other models
+    define it differently. Raises ValueError.
     """
     model = frame.get("camera_model") or (FISHEYE if frame.get("is_fisheye") else "OPENCV")
     if model not in (*PERSPECTIVE, FISHEYE):
@@ -211,7 +190,7 @@ def _lens(frame: Mapping[str, Any], photo: Path) -> Lens:
 
 
 def _focal(frame: Mapping[str, Any], key: str, angle: str, side: int) -> float | None:
-    """A focal length in pixels: itself, or from the angle of view in radians; None with neither."""
+    """The focal length in pixels: `key`, or from the field of view `angle` in radians; None with neither."""
     if frame.get(key) is not None:
         focal = _number(frame, key)
     elif frame.get(angle) is not None:
@@ -235,7 +214,7 @@ def _number(frame: Mapping[str, Any], key: str, default: float | None = None) ->
 
 
 def _w2c(matrix: Any) -> Float64[np.ndarray, "4 4"]:
-    """World to camera in OpenCV axes, of camera to world in OpenGL's; raises ValueError."""
+    """World to camera with OpenCV axes, from camera to world with OpenGL axes. Raises ValueError."""
     if matrix is None:
         raise ValueError("no transform_matrix")
     c2w = np.array(matrix, float)
@@ -254,7 +233,7 @@ def _w2c(matrix: Any) -> Float64[np.ndarray, "4 4"]:
         raise ValueError("transform_matrix is a reflection (left-handed axes)")
     u, _, vt = np.linalg.svd(axes)  # the nearest rotation
     w2c = np.eye(4)
-    w2c[:3, :3] = (u @ vt * [1, -1, -1]).T  # OpenGL's y and z point the other way
+    w2c[:3, :3] = (u @ vt * [1, -1, -1]).T  # y and z have opposite directions in OpenGL
     w2c[:3, 3] = -w2c[:3, :3] @ c2w[:3, 3]
     return w2c
 
@@ -262,7 +241,7 @@ def _w2c(matrix: Any) -> Float64[np.ndarray, "4 4"]:
 def _listed_split(
     file: Path, content: dict[str, Any], frames: Sequence[Mapping[str, Any]], views: list[View]
 ) -> tuple[list[View], frozenset[str] | None]:
-    """The views that the file's lists keep, and the names of the test views; None without lists."""
+    """The views that the file's lists name, and the names of the test views (None without lists)."""
     kinds = [kind for kind in ("train", "test", "val") if content.get(f"{kind}_filenames") is not None]
     if not kinds:
         return views, None
@@ -280,9 +259,9 @@ def _listed_split(
                 "list the file_path of frames, or leave the list out"
             )
         names[kind] = {name_of[path] for path in listed}
-    everything = {view.name for view in views}
-    tests = names.get("test") or names.get("val") or everything - names["train"]
-    train = names.get("train") or everything - tests
+    every = {view.name for view in views}
+    tests = names.get("test") or names.get("val") or every - names["train"]
+    train = names.get("train") or every - tests
     if train & tests:
         raise SceneError(
             f"{file}: {len(train & tests)} photos are listed for training and for tests, first "
@@ -292,7 +271,7 @@ def _listed_split(
 
 
 def _sorted(file: Path, views: Sequence[View], test_names: frozenset[str] | None) -> tuple[View, ...]:
-    """The views by name, which no two may share."""
+    """The views sorted by name. SceneError for a duplicate name, or too few training views."""
     ordered = tuple(sorted(views, key=lambda view: view.name))
     for a, b in pairwise(ordered):
         if a.name == b.name:

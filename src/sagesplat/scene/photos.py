@@ -1,4 +1,4 @@
-"""Camera poses from photos or a video: structure from motion by COLMAP (Schönberger and Frahm 2016)."""
+"""Camera poses of photos or a video, by structure from motion with COLMAP (Schönberger and Frahm 2016)."""
 
 import importlib.util
 import json
@@ -23,7 +23,7 @@ from sagesplat.scene.video import extract_frames
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """What became of the photos; also in poses.json."""
+    """The result of structure from motion; also in poses.json."""
 
     workspace: Path
     num_photos: int  # readable ones
@@ -36,10 +36,10 @@ class Reconstruction:
 
 OnProgress = Callable[[str, int, int], None]  # stage, done, total
 
-MIN_PHOTOS = 3  # the least that a scene is made of
-MANY_PHOTOS = 100  # from here on matching all pairs takes too long on a CPU: four pairs a second
+MIN_PHOTOS = 3  # registered photos that a scene needs
+MANY_PHOTOS = 100  # with more, exhaustive matching takes too long on a CPU (four pairs a second)
 _SCRIPT = Path(__file__).with_name("_sfm.py")
-_OWN = ("images", "sparse", "sfm")  # folders of the workspace
+_OWN = ("images", "sparse", "sfm")  # folders that `reconstruct` writes
 
 
 def reconstruct(
@@ -48,12 +48,12 @@ def reconstruct(
     config: PosesConfig = PosesConfig(),
     on_progress: OnProgress = lambda stage, done, total: None,
 ) -> Reconstruction:
-    """Find the poses of a folder of photos or of a video; make `workspace` a capture for `load_scene`.
+    """Estimate the poses of a folder of photos or of a video; make `workspace` a capture for `load_scene`.
 
-    Writes undistorted photos to images/, their model to sparse/0, with gravity along +y, and poses.json.
-    Work in progress is kept in sfm/: a killed run goes on where it was, unless photos or settings differ.
-    Stages of `on_progress` are prepare, features, matches, mapping and undistortion. Raises SceneError,
-    BackendUnavailable without pycolmap.
+    Writes undistorted photos to images/, their COLMAP model to sparse/0, with gravity along +y, and
+    poses.json. Intermediate results are kept in sfm/: a killed run resumes, unless
+    photos or settings changed. The stages of `on_progress` are prepare, features, matches, mapping and
+    undistortion. Raises SceneError, and BackendUnavailable without pycolmap.
     """
     _check(source, workspace, config)
     work, started = workspace / "sfm", time.perf_counter()
@@ -78,7 +78,7 @@ def reconstruct(
     result = _run(work, on_progress)
     names = {photo.prepared: photo.name for photo in photos}
     reasons = {names[prepared]: reason for prepared, reason in result["reasons"].items()}
-    found = Reconstruction(
+    reconstruction = Reconstruction(
         workspace=workspace,
         num_photos=len(photos),
         num_registered=len(result["registered"]),
@@ -87,12 +87,12 @@ def reconstruct(
         reprojection_error=result["reprojection_error"],
         seconds=seconds | result["seconds"],
     )
-    complete = found.num_registered >= least
+    complete = reconstruction.num_registered >= least
     if complete:
         _publish(workspace)
     renamed = {photo.name: photo.final for photo in photos if photo.name != photo.final}
     resolved = {"matching": request["matching"], "cameras": len(request["cameras"])}
-    report = asdict(found) | {"workspace": str(workspace)}
+    report = asdict(reconstruction) | {"workspace": str(workspace)}
     write_json(
         workspace / "poses.json",
         {"complete": complete, "settings": asdict(config), "resolved": resolved}
@@ -100,23 +100,23 @@ def reconstruct(
         | {"renamed": renamed},
     )
     if not complete:
-        share = found.num_registered / found.num_photos
+        registered, total = reconstruction.num_registered, reconstruction.num_photos
         raise SceneError(
-            f"{source}: poses found for {found.num_registered} of {found.num_photos} photos ({share:.0%}; "
+            f"{source}: poses found for {registered} of {total} photos ({registered / total:.0%}; "
             f"{least} are needed); take photos with more overlap and texture, or try another matching, "
             f"another camera, a larger max_size; reasons in {workspace / 'poses.json'}"
         )
-    return found
+    return reconstruction
 
 
 def _check(source: Path, workspace: Path, config: PosesConfig) -> None:
-    """What can be said before any work is done."""
+    """SceneError or BackendUnavailable for what can be rejected before any work."""
     if importlib.util.find_spec("pycolmap") is None:
         raise BackendUnavailable("poses from photos need pycolmap; pip install 'sagesplat[poses]'")
     if not source.exists():
         raise SceneError(f"{source}: no such file or folder; name a folder of photos or a video")
     if config.model not in _MODELS:
-        raise SceneError(f"{config.model}: no camera model of COLMAP; take one of {', '.join(_MODELS)}")
+        raise SceneError(f"{config.model}: COLMAP cannot undistort it; take one of {', '.join(_MODELS)}")
     if config.max_size < 64 or not 0 <= config.min_registered <= 1:
         raise SceneError(
             f"max_size {config.max_size} and min_registered {config.min_registered} cannot be used; "
@@ -126,14 +126,14 @@ def _check(source: Path, workspace: Path, config: PosesConfig) -> None:
         raise SceneError(f"threads {config.threads} cannot be used; take 1 or more, or -1 for all cores")
     inside, outside = source.resolve(), workspace.resolve()
     if inside == outside or any(inside.is_relative_to(outside / name) for name in _OWN):
-        raise SceneError(f"{source}: lies where the poses would be written; name another folder for them")
+        raise SceneError(f"{source}: lies where the poses would be written; name another for the poses")
     if workspace.exists() and not workspace.is_dir():
-        raise SceneError(f"{workspace}: is no folder; name one")
+        raise SceneError(f"{workspace}: is not a folder; name a folder")
     if not (workspace / "sfm").is_dir() and any((workspace / name).exists() for name in _OWN):
         raise SceneError(f"{workspace}: already holds a capture; name an empty folder")
 
 
-# Models whose photos COLMAP undistorts to a pinhole.
+# Camera models that COLMAP can undistort to a pinhole.
 _MODELS = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"),
     *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE"),
@@ -141,18 +141,19 @@ _MODELS = (
 
 
 def _too_few(source: Path, photos: list[PreparedPhoto], unreadable: dict[str, str]) -> str:
-    found = f"{source}: {len(photos)} readable photos, but it takes {MIN_PHOTOS}"
+    problem = f"{source}: {len(photos)} readable photos, but it takes {MIN_PHOTOS}"
     if unreadable:
         name, reason = next(iter(unreadable.items()))
-        return f"{found} ({name} {reason}{', ...' if len(unreadable) > 1 else ''}); replace the damaged files"
+        more = ", ..." if len(unreadable) > 1 else ""
+        return f"{problem} ({name} {reason}{more}); replace the damaged files"
     if photos and source.is_file():
-        return f"{found} frames that differ; move the camera, or take a longer video"
+        return f"{problem} frames that differ; move the camera, or take a longer video"
     kinds = ", ".join(sorted(suffix[1:] for suffix in PHOTOS))
-    return f"{found}; add overlapping photos ({kinds}) or name a video"
+    return f"{problem}; add overlapping photos ({kinds}) or name a video"
 
 
 def _request(source: Path, photos: list[PreparedPhoto], config: PosesConfig) -> dict[str, Any]:
-    """What _sfm.py is asked for; results are kept while it stays the same."""
+    """The request to _sfm.py; intermediate results are kept as long as it does not change."""
     matching = config.matching
     if matching == "auto":
         matching = "sequential" if source.is_file() or len(photos) > MANY_PHOTOS else "exhaustive"
@@ -187,7 +188,7 @@ def _request(source: Path, photos: list[PreparedPhoto], config: PosesConfig) -> 
 
 
 def _resume(workspace: Path, request: dict[str, Any]) -> Reconstruction | None:
-    """The finished result of the same request; work of another one is removed."""
+    """The finished result of the same request, if any; results of another request are removed."""
     work, report = workspace / "sfm", workspace / "poses.json"
     request = json.loads(json.dumps(request))
     path = work / "request.json"
@@ -208,9 +209,9 @@ def _resume(workspace: Path, request: dict[str, Any]) -> Reconstruction | None:
 
 
 def _run(work: Path, on_progress: OnProgress) -> dict[str, Any]:
-    """Run _sfm.py on sfm/request.json in a process that ends with this one."""
+    """Run _sfm.py on sfm/request.json in a child process that exits with this one; its result."""
     log = work / "log.txt"
-    # By its path and not as a module: importing the package around it would import Pillow.
+    # By its path, not as a module: importing the package would import Pillow.
     command = [sys.executable, "-P", str(_SCRIPT), str(work)]
     answer: dict[str, Any] = {}
     with (
@@ -232,7 +233,7 @@ def _run(work: Path, on_progress: OnProgress) -> dict[str, Any]:
         raise BackendUnavailable(answer["unavailable"])
     if code == 0 and "result" in answer:
         return answer["result"]
-    raise SceneError(f"{work.parent}: COLMAP {_ending(code, log)}; see {log}; run again to go on")
+    raise SceneError(f"{work.parent}: COLMAP {_ending(code, log)}; see {log}; run it again to resume")
 
 
 def _ending(code: int, log: Path) -> str:
@@ -245,7 +246,7 @@ def _ending(code: int, log: Path) -> str:
 
 
 def _publish(workspace: Path) -> None:
-    """Move undistorted photos and their model to their places."""
+    """Move the undistorted photos and their model to images/ and sparse/."""
     for name in ("images", "sparse"):
         shutil.rmtree(workspace / name, ignore_errors=True)
         (workspace / "sfm" / "undistorted" / name).rename(workspace / name)

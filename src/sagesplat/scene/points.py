@@ -1,4 +1,4 @@
-"""The points that training starts from where they do not come from COLMAP: a PLY file's, or random ones."""
+"""Initial points for training without COLMAP: read from a PLY file, or random."""
 
 import warnings
 from collections.abc import Sequence
@@ -17,21 +17,22 @@ from sagesplat.scene.images import load_photo
 from sagesplat.scene.scene import Points, View
 
 GREY = 128
-FAR = 10.0  # how much farther than what the cameras span random points reach
-NEIGHBOURS = 4  # views, one of which has to see a random point besides its own
-COLOUR_VIEWS, COLOUR_SIDE = 16, 128  # photos, and their longer side in pixels, that colour random points
-FULL = {"f4": 255.0, "f8": 255.0, "u2": 1 / 257}  # colours of these types have another range than 0 ... 255
+FAR = 10.0  # random points reach this many times as far as the volume that the cameras span
+NEIGHBOURS = 4  # views, at least one of which must also see a random point
+COLOUR_VIEWS, COLOUR_SIDE = 16, 128  # photos that colour random points; their longer side, px
+FULL = {"f4": 255.0, "f8": 255.0, "u2": 1 / 257}  # scale to 0 ... 255 by type of colour property
 
 
 def untracked(xyz: Float32[np.ndarray, "P 3"], rgb: UInt8[np.ndarray, "P 3"]) -> Points:
-    """Points without observations."""
+    """Points without tracks."""
     return Points(xyz, rgb, np.zeros(0, np.int64), np.zeros(0, np.int32), np.zeros((0, 2), np.float32))
 
 
 def read_points(path: Path) -> Points:
     """The vertices of a PLY file, ASCII or binary of either byte order: x y z, and red green blue or grey.
 
-    Colours are whole numbers up to 255 (65535 in 16 bits), or floats up to 1. Raises SceneError.
+    Colours are whole numbers up to 255 (65535 in 16 bits), or floats up to 1. Points without colours
+    are grey. Raises SceneError.
     """
     try:
         with path.open("rb") as file:
@@ -41,7 +42,7 @@ def read_points(path: Path) -> Points:
             table = _read_vertices(path, file, header)
     except FileNotFoundError:
         raise SceneError(
-            f"{path}: no such file; add it, or take ply_file_path out to start from random points"
+            f"{path}: no such file; add it, or remove ply_file_path to start from random points"
         ) from None
     except (OSError, ValueError, OverflowError) as error:
         raise SceneError(
@@ -60,41 +61,40 @@ def read_points(path: Path) -> Points:
 
 
 def _read_vertices(path: Path, file: BinaryIO, header: PlyHeader) -> dict[str, np.ndarray]:
-    """The vertices, a column per property."""
+    """The vertices: property -> column [P]."""
     types, count, row = header.types, header.count, header.dtype
-    # Text takes at least a digit and a space per value; the last line may lack its end.
+    # In text, a value takes at least a digit and a separator; the last line end may be missing.
     smallest = row.itemsize * count if header.order else 2 * len(types) * count - 1
     if smallest > path.stat().st_size - file.tell():
-        raise ValueError(f"{count} points promised, but it ends before them")
+        raise ValueError(f"{count} points announced, but the file ends before them")
     if header.order:
         table = np.fromfile(file, row, count)
         return {name: table[name] for name in types}
-    # Told the columns, numpy allocates no more of them than there are, however long the first line is.
+    # With named columns numpy allocates only these, however long the first line is.
     columns = np.dtype([(name, float) for name in types])
-    with warnings.catch_warnings(action="ignore"):  # of a file without numbers; the count tells
+    with warnings.catch_warnings(action="ignore"):  # about files without numbers; see the count
         table = np.loadtxt(file, columns, comments=None, max_rows=count, ndmin=1, encoding="latin1")
     if len(table) != count:
-        raise ValueError(f"{count} points of {len(types)} values promised, but there are {len(table)}")
+        raise ValueError(f"{count} points of {len(types)} values announced, but there are {len(table)}")
     return {name: table[name] for name in types}
 
 
 def random_points(
     views: Sequence[View], count: int = 100_000, *, seed: int = 0, cube: float | None = None
 ) -> Points:
-    """`count` random points for training to start from, without tracks.
+    """`count` random initial points, without tracks.
 
-    With `cube`: uniform in [-cube, cube]^3, what 3DGS does for NeRF's Blender scenes, which fit into it.
-    Otherwise on random rays of the photos: half of the points are uniform in the volume of the frusta up to
-    the far side of the ball that the cameras span around the point they look at (`focus`); the other half
-    lie beyond it, up to ten times as far, uniform in inverse depth, as mip-NeRF 360 contracts space
-    (arXiv:2111.12077). Only points that a neighbouring view sees too are kept. So objects, rooms and
-    landscapes are all covered, most where most cameras look and hardly anything just in front of a lens.
+    With `cube` they are uniform in [-cube, cube]^3, as 3DGS initialises NeRF's Blender scenes. Otherwise they
+    lie on random rays of the photos. Half of them are uniform in the volume of the frusta, up to the far side
+    of the sphere that the cameras span around their `focus`. The other half lie beyond it, up to ten times as
+    far, uniform in inverse depth, like the space contraction of mip-NeRF 360 (arXiv:2111.12077). Only points
+    that a neighbouring view sees too are kept. This covers objects, rooms and landscapes. The density is
+    highest where most cameras look, and low just in front of a lens.
 
-    Colours are the mean of some photos where the points project to: the right mix as long as nothing is known
-    of depth. Raises SceneError.
+    A point's colour is the mean over some photos at its projections. Raises SceneError.
     """
     rng = np.random.default_rng(seed)
-    with np.errstate(all="ignore"):  # cameras may be anywhere; what overflows is in nobody's sight
+    with np.errstate(all="ignore"):  # cameras may be anywhere; points that overflow are in no view
         if cube is None:
             xyz = _in_sight(views, count, rng)
         else:
@@ -103,14 +103,15 @@ def random_points(
 
 
 def focus(views: Sequence[View]) -> tuple[Float64[np.ndarray, "3"], float]:
-    """The point nearest to all optical axes (least squares), and the radius of the cameras around it.
+    """The point nearest to all optical axes (least squares), and the cameras' largest distance from it.
 
-    Parallel axes meet nowhere: a small weight pulls the point to one spread of the cameras before them.
+    Parallel axes have no such point. So a small weight pulls it towards a point in front of the cameras, as
+    far away as the cameras are spread.
     """
     centres = np.stack([view.camera.position for view in views]).astype(np.float64)
     axes = np.stack([view.camera.direction for view in views]).astype(np.float64)
     middle = centres.mean(axis=0)
-    spread = np.linalg.norm(centres - middle, axis=1).max() or 1.0  # all in one point: any length will do
+    spread = np.linalg.norm(centres - middle, axis=1).max() or 1.0  # any length, if all are in one point
     weight = 1e-3 * len(views)
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # projects onto the plane across each axis
     pulled = middle + spread * axes.mean(axis=0)
@@ -120,7 +121,7 @@ def focus(views: Sequence[View]) -> tuple[Float64[np.ndarray, "3"], float]:
 
 
 def _in_sight(views: Sequence[View], count: int, rng: np.random.Generator) -> Float32[np.ndarray, "P 3"]:
-    """Points on rays of the views that a neighbouring view sees too (see `random_points`)."""
+    """Points on rays of the views that a neighbouring view sees too, at most `count` of them."""
     centre, radius = focus(views)
     neighbours = _neighbours(views)
     w2c = np.stack([view.camera.w2c for view in views])
@@ -128,7 +129,7 @@ def _in_sight(views: Sequence[View], count: int, rng: np.random.Generator) -> Fl
     R, t, f, c = w2c[:, :3, :3], w2c[:, :3, 3], K[:, [0, 1], [0, 1]], K[:, :2, 2]
     sizes = np.array([(view.camera.width, view.camera.height) for view in views], np.float32)
     reach = (np.linalg.norm(R @ centre + t, axis=1) + radius).astype(np.float32)
-    kept, found = [], 0
+    kept, num_kept = [], 0
     for _ in range(20):
         of = rng.integers(len(views), size=count)
         rays = (rng.random((count, 2), np.float32) * sizes[of] - c[of]) / f[of]
@@ -143,18 +144,18 @@ def _in_sight(views: Sequence[View], count: int, rng: np.random.Generator) -> Fl
             uv = np.stack([x, y], axis=1) / z[:, None] * f[by] + c[by]
             seen |= (z > 0) & np.all((uv >= 0) & (uv < sizes[by]), axis=1)
         kept.append(xyz[seen])
-        found += len(kept[-1])
-        if found >= count:
+        num_kept += len(kept[-1])
+        if num_kept >= count:
             break
-    if not found:
+    if not num_kept:
         raise SceneError(
-            f"{views[0].image_path.parent}: no two photos look at the same place; check the poses"
+            f"{views[0].image_path.parent}: no two photos show the same part of the scene; check the poses"
         )
     return np.concatenate(kept)[:count]
 
 
 def _neighbours(views: Sequence[View]) -> Int64[np.ndarray, "V k"]:
-    """The views that are nearest to each in position and direction."""
+    """Rows of the k nearest views of each view, by position and direction."""
     centres = np.stack([view.camera.position for view in views]).astype(np.float64)
     axes = np.stack([view.camera.direction for view in views])
     spread = np.linalg.norm(centres - centres.mean(axis=0), axis=1).max() or 1.0
@@ -164,7 +165,7 @@ def _neighbours(views: Sequence[View]) -> Int64[np.ndarray, "V k"]:
 
 
 def _mean_colours(xyz: Float32[np.ndarray, "P 3"], views: Sequence[View]) -> UInt8[np.ndarray, "P 3"]:
-    """The mean colour of the photos where the points project to; grey where no photo shows them."""
+    """Mean colour over the photos at the points' projections; grey for points in no photo."""
     total, seen = np.zeros((len(xyz), 3), np.float32), np.zeros(len(xyz), np.float32)
     for view in views:
         shrink = min(1.0, COLOUR_SIDE / max(view.camera.width, view.camera.height))
@@ -181,7 +182,7 @@ def _mean_colours(xyz: Float32[np.ndarray, "P 3"], views: Sequence[View]) -> UIn
 def _inside(
     xyz: Float32[np.ndarray, "P 3"], view: View
 ) -> tuple[Bool[np.ndarray, " P"], Int64[np.ndarray, "P 2"]]:
-    """Which points a view has in sight (occluded or not), and at which pixels (0, 0 where it has not)."""
+    """Which points project into a view (occluded or not), and their pixels (0, 0 for the others)."""
     camera = view.camera
     uv, _ = geometry.project(xyz, camera.w2c, camera.K)
     inside = np.all((uv >= 0) & (uv < [camera.width, camera.height]), axis=1)
@@ -189,6 +190,6 @@ def _inside(
 
 
 def _spread(views: Sequence[View], count: int) -> list[View]:
-    """At most `count` of the views, evenly over their order."""
+    """At most `count` of the views, evenly spaced in their order."""
     rows = np.unique(np.linspace(0, len(views) - 1, min(count, len(views))).round().astype(int))
     return [views[row] for row in rows]

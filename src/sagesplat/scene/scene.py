@@ -1,4 +1,4 @@
-"""Cameras, views, points and the scene they make (OpenCV axes: x right, y down, z forward)."""
+"""The types Camera, View, Points and Scene (OpenCV axes: x right, y down, z forward)."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -16,7 +16,7 @@ class Camera:
     K: Float32[np.ndarray, "3 3"]  # intrinsics, pixels
     width: int
     height: int
-    background: tuple[int, int, int] = (0, 0, 0)  # RGB behind the scene: alpha of photos goes over it
+    background: tuple[int, int, int] = (0, 0, 0)  # RGB; photos with alpha are composited over it
 
     @property
     def position(self) -> Float32[np.ndarray, "3"]:
@@ -29,14 +29,14 @@ class Camera:
         return self.w2c[2, :3]
 
     def resized(self, width: int, height: int) -> "Camera":
-        """The same view on an image of `width` x `height` pixels."""
+        """The same camera for an image of `width` x `height` pixels."""
         scale = np.array([width / self.width, height / self.height, 1.0], np.float32)
         return replace(self, K=(self.K * scale[:, None]).astype(np.float32), width=width, height=height)
 
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """A COLMAP camera that is not a pinhole: what `images.load_photo` undistorts from."""
+    """A COLMAP camera model with its parameters: `images.load_photo` undistorts photos by it."""
 
     model: str  # COLMAP's name, e.g. "OPENCV"
     params: tuple[float, ...]  # in COLMAP's order, pixels of width x height (the file may be smaller)
@@ -51,12 +51,12 @@ class View:
     name: str  # path below the image folder, as COLMAP lists it
     camera: Camera  # pinhole, at the size that training uses
     image_path: Path
-    lens: Lens | None = None  # set where the file on disk has to be undistorted
+    lens: Lens | None = None  # None: the file on disk needs no undistortion
 
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Structure-from-motion points and the observations (tracks) behind them."""
+    """Structure-from-motion points and their tracks (T observations of points in views)."""
 
     xyz: Float32[np.ndarray, "P 3"]  # world
     rgb: UInt8[np.ndarray, "P 3"]
@@ -74,9 +74,9 @@ class Scene:
     views: tuple[View, ...]
     points: Points
     test_every: int = 8  # every n-th view by name is a test view; 0 = none
-    calibrate_every: int = 0  # every n-th of the others calibrates promises; 0 = none
-    test_names: frozenset[str] | None = None  # test views that the dataset lists, instead of test_every
-    calibration_names: frozenset[str] | None = None  # likewise, instead of calibrate_every
+    calibrate_every: int = 0  # every n-th of the others is a calibration view; 0 = none
+    test_names: frozenset[str] | None = None  # overrides test_every: test views that the data set lists
+    calibration_names: frozenset[str] | None = None  # likewise overrides calibrate_every
 
     @cached_property
     def extent(self) -> float:
@@ -86,7 +86,7 @@ class Scene:
 
     @property
     def test_ids(self) -> np.ndarray:
-        """Rows of `views` that training, fitting and calibration never see."""
+        """Rows of the test views, which training, fitting and calibration never use."""
         every = np.arange(len(self.views))
         if self.test_names is not None:
             return every[[view.name in self.test_names for view in self.views]]
@@ -94,19 +94,20 @@ class Scene:
 
     @property
     def calibration_ids(self) -> np.ndarray:
-        """Rows of `views` that tell what a promise is worth where no photo was trained on."""
+        """Rows of the calibration views: held out from training, used to calibrate the quality bounds."""
         rest = np.setdiff1d(np.arange(len(self.views)), self.test_ids)
         if self.calibration_names is not None:
             return rest[[self.views[i].name in self.calibration_names for i in rest]]
         return rest[self.calibrate_every // 2 :: self.calibrate_every] if self.calibrate_every else rest[:0]
 
     def split(self, row: int) -> str:
-        """What a view is for: train, calibration or test."""
-        of_others = "calibration" if row in self.calibration_ids else "train"
-        return "test" if row in self.test_ids else of_others
+        """The split that a view is in: train, calibration or test."""
+        if row in self.test_ids:
+            return "test"
+        return "calibration" if row in self.calibration_ids else "train"
 
     @property
     def train_ids(self) -> np.ndarray:
-        """Rows of `views` that training may use."""
-        kept = np.concatenate([self.test_ids, self.calibration_ids])
-        return np.setdiff1d(np.arange(len(self.views)), kept)
+        """Rows of the training views."""
+        held_out = np.concatenate([self.test_ids, self.calibration_ids])
+        return np.setdiff1d(np.arange(len(self.views)), held_out)

@@ -1,4 +1,4 @@
-"""A scene in one file: a part of a capture that is trained by itself keeps its views and points so."""
+"""A scene in one .npz file: cameras, points and splits, such as those of one block of a large scene."""
 
 import json
 from dataclasses import asdict
@@ -22,7 +22,7 @@ _POINTS = {
 
 
 def write_scene(path: Path, scene: Scene) -> None:
-    """Record views, points and splits; the photos stay where they are."""
+    """Write views, points and splits to a file, which refers to the photos by absolute path."""
     views = [
         {
             "name": view.name,
@@ -62,7 +62,7 @@ def read_scene(path: Path) -> Scene:
         test, calibration = frozenset(about["test"]), frozenset(about["calibration"])
         return Scene(str(about["name"]), path, views, points, test_names=test, calibration_names=calibration)
     except FileNotFoundError:
-        raise SceneError(f"{path}: no such file; name a capture") from None
+        raise SceneError(f"{path}: no such file; give the path of a capture") from None
     except (OSError, KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise SceneError(f"{path}: not a stored scene ({short(error)}); make it again") from None
 
@@ -81,7 +81,7 @@ def _view(about: dict, w2c: np.ndarray, K: np.ndarray) -> View:
 
 
 def _check(points: Points, num_views: int) -> None:
-    """ValueError for arrays that do not fit each other."""
+    """ValueError for arrays of inconsistent shapes, or tracks of missing points or views."""
     n, t = len(points.xyz), len(points.track_points)
     shapes = {"xyz": (n, 3), "rgb": (n, 3), "track_views": (t,), "track_points": (t,), "track_uv": (t, 2)}
     for name, shape in shapes.items():
@@ -89,4 +89,4 @@ def _check(points: Points, num_views: int) -> None:
             raise ValueError(f"{name} of shape {getattr(points, name).shape}")
     for rows, most in ((points.track_points, n), (points.track_views, num_views)):
         if t and not 0 <= rows.min() <= rows.max() < most:
-            raise ValueError("a track of what is not there")
+            raise ValueError("a track of a missing point or view")

@@ -1,6 +1,6 @@
-"""COLMAP's camera models, and the pinhole image behind a distorted one.
+"""COLMAP's camera models, and undistortion to a pinhole camera.
 
-Written from the definitions in COLMAP's documentation (https://colmap.github.io/cameras.html) and in
+Implemented from the definitions in COLMAP's documentation (https://colmap.github.io/cameras.html) and in
 Kannala & Brandt 2006 (fisheye), Devernay & Faugeras 2001 (FOV), Weng et al. 1992 (thin prism).
 """
 
@@ -12,12 +12,12 @@ from scipy.ndimage import map_coordinates
 
 from sagesplat.scene.scene import Camera, Lens
 
-# A pinhole cannot hold a fisheye's rim: the centre keeps at least half its resolution, the rim is cut off.
+# A pinhole cannot show a fisheye's rim: it is cropped so that the centre keeps at least half its resolution.
 MIN_ZOOM, MAX_ZOOM = 0.5, 4.0
 
 
 class CameraModel(NamedTuple):
-    """One of COLMAP's models: params are focal lengths, principal point, distortion coefficients."""
+    """A COLMAP camera model; its params are focal lengths, principal point, distortion coefficients."""
 
     id: int
     num_focal: int  # 1: f, 2: fx and fy
@@ -25,7 +25,7 @@ class CameraModel(NamedTuple):
 
     @property
     def num_params(self) -> int:
-        """Length of params."""
+        """Number of parameters."""
         return self.num_focal + 2 + self.num_distortion
 
 
@@ -45,20 +45,20 @@ CAMERA_MODELS = {
 
 
 def is_pinhole(lens: Lens) -> bool:
-    """Whether the lens has nothing to undistort, by its model or with all coefficients zero."""
+    """Whether the lens has no distortion, by its model or since all coefficients are zero."""
     model = CAMERA_MODELS[lens.model]
     return "FISHEYE" not in lens.model and not any(lens.params[model.num_focal + 2 :])
 
 
 def intrinsics(lens: Lens) -> Float[np.ndarray, "3 3"]:
-    """The lens's K without its distortion, in pixels of the lens."""
+    """K of the lens without its distortion, in pixels of the lens."""
     focal = CAMERA_MODELS[lens.model].num_focal
     cx, cy = lens.params[focal : focal + 2]
     return np.array([[lens.params[0], 0, cx], [0, lens.params[focal - 1], cy], [0, 0, 1]])
 
 
 def distort(lens: Lens, rays: Float[np.ndarray, "*N 2"]) -> Float[np.ndarray, "*N 2"]:
-    """Where the lens images the rays (x / z, y / z), in pixels of the lens."""
+    """Distorted projections, in pixels of the lens, of rays (x / z, y / z)."""
     model = CAMERA_MODELS[lens.model]
     coefficients = lens.params[model.num_focal + 2 :]
     x, y = rays[..., 0], rays[..., 1]
@@ -110,10 +110,10 @@ def _fov(x, y, r2, omega):
 
 
 def pinhole(lens: Lens) -> Float[np.ndarray, "3 3"]:
-    """K of the pinhole image that takes the place of the lens's, with its size and principal point.
+    """K of the pinhole camera that replaces the lens, with the same image size and principal point.
 
-    Both focal lengths are scaled by the smallest zoom in [0.5, 4] at which every pixel of the border still
-    has a source pixel: the widest view without blanks. Raises ValueError where there is none.
+    Both focal lengths are scaled by the smallest zoom in [0.5, 4] at which every border pixel still has a
+    source pixel: the widest view without blank pixels. Raises ValueError if there is none.
     """
     width, height = lens.width, lens.height
     K = intrinsics(lens)
@@ -127,7 +127,7 @@ def pinhole(lens: Lens) -> Float[np.ndarray, "3 3"]:
     def fits(zoom: float) -> bool:
         uv = distort(lens, out * rays / zoom)
         inside = (uv[-1] > 0.499) & (uv[-1] < np.array([width, height]) - 0.499)
-        # Past the fold of its polynomial a model maps rays back into the image: those are no pixels of it.
+        # Beyond the maximum of its polynomial a model maps rays back into the image. Such pixels are invalid.
         grows = np.diff(np.linalg.norm(uv - K[:2, 2], axis=-1), axis=0) >= 0
         return bool(inside.all() and grows.all())
 
@@ -145,10 +145,10 @@ def pinhole(lens: Lens) -> Float[np.ndarray, "3 3"]:
 def undistort(
     image: Shaped[np.ndarray, "h w *C"], lens: Lens | None, camera: Camera, order: int
 ) -> Shaped[np.ndarray, "H W *C"]:
-    """The image as `camera` sees it, in the camera's size and the image's dtype.
+    """The image resampled for the pinhole `camera`, in the camera's size and the image's dtype.
 
-    The image shows all of the lens's frame, at any resolution. `order` 1 is bilinear, for photos; 0 is
-    nearest, for label images. Without a lens the image is returned as it is.
+    The image covers the full frame of the lens, at any resolution. `order` 1 interpolates bilinearly, for
+    photos; 0 takes the nearest pixel, for label images. Without a lens the image is returned unchanged.
     """
     if lens is None:
         return image

@@ -1,4 +1,4 @@
-"""Frames of a video: evenly spread, the sharpest of each stretch, none twice."""
+"""Extracts frames from a video: the sharpest of each interval, without duplicates."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -11,9 +11,9 @@ from PIL import Image
 from sagesplat.core.errors import BackendUnavailable, SceneError
 from sagesplat.io.files import atomic_path, read_json, write_json
 
-_GREY_WIDTH = 640  # of the copies that sharpness is measured on
-_THUMB_WIDTH = 64  # of the copies that are compared
-_SAME = 1.0  # mean absolute difference in grey levels below which the camera stood still
+_GREY_WIDTH = 640  # px, of the copies that sharpness is measured on
+_THUMB_WIDTH = 64  # px, of the copies that are compared for motion
+_SAME = 1.0  # mean absolute difference, grey levels, below which the camera has not moved
 _TURNS = {90: Image.Transpose.ROTATE_90, 180: Image.Transpose.ROTATE_180, 270: Image.Transpose.ROTATE_270}
 
 
@@ -24,13 +24,13 @@ def extract_frames(
     max_frames: int = 300,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> list[Path]:
-    """Write the frames of a video that are worth matching, as upright JPEGs named by frame number.
+    """Write selected frames of a video as upright JPEGs named by frame number; their paths.
 
-    The video is cut into at most `max_frames` stretches of equal length, of at least three frames each where
-    it is long enough. Of each the sharpest frame is taken (largest variance of the Laplacian: Pech-Pacheco
-    et al. 2000), unless the camera has not moved since the one before. A folder that was filled from the same
-    file is left as it is. `on_frame(done, total)` counts decoded frames. Raises SceneError for a file that
-    cannot be used, BackendUnavailable without PyAV.
+    The video is divided into at most `max_frames` intervals of equal length, of at least three frames each if
+    it is long enough. The sharpest frame of each is selected (largest variance of the Laplacian: Pech-Pacheco
+    et al. 2000), unless the camera has not moved since the previous one. Frames already extracted from the
+    same file are reused. `on_frame(done, total)` counts decoded frames. Raises SceneError for an unusable
+    file, and BackendUnavailable without PyAV.
     """
     try:
         from av.error import FFmpegError
@@ -59,7 +59,7 @@ def extract_frames(
 
 
 def _finished(folder: Path, source: dict[str, int]) -> list[Path] | None:
-    """The frames of an earlier run on the same file, if it came to its end and all are there."""
+    """The frames of an earlier, finished run on the same file, if all are there."""
     if not (folder / "video.json").is_file():
         return None
     listed = read_json(folder / "video.json")
@@ -70,7 +70,7 @@ def _finished(folder: Path, source: dict[str, int]) -> list[Path] | None:
 def _sharpest(
     path: Path, max_frames: int, on_frame: Callable[[int, int], None] | None
 ) -> Iterator[tuple[int, Any, UInt8[np.ndarray, "h w"]]]:
-    """Number, frame and grey copy of the sharpest frame in each stretch."""
+    """Number, frame and grey copy of the sharpest frame in each interval."""
     total = _count(path)
     windows = max(1, min(max_frames, max(total // 3, min(total, 60))))
     best: tuple[int, Any, np.ndarray] | None = None
@@ -90,7 +90,7 @@ def _sharpest(
 
 
 def _moving(frames: Iterator[tuple[int, Any, UInt8[np.ndarray, "h w"]]]) -> Iterator[tuple[int, Any]]:
-    """Leave out frames that look like the one kept before them."""
+    """Number and frame, without frames that look like the previous one kept."""
     last: np.ndarray | None = None
     for i, frame, grey in frames:
         thumb = _thumb(grey)
@@ -100,7 +100,7 @@ def _moving(frames: Iterator[tuple[int, Any, UInt8[np.ndarray, "h w"]]]) -> Iter
 
 
 def _count(path: Path) -> int:
-    """Frames in the file by its packets: what headers say is often missing or wrong."""
+    """Number of frames, counted by packets: the header's count is often missing or wrong."""
     import av
 
     with av.open(str(path)) as container:
@@ -110,7 +110,7 @@ def _count(path: Path) -> int:
 
 
 def _decode(path: Path) -> Iterator[Any]:
-    """The frames that can be decoded; damaged packets are passed over."""
+    """The frames that can be decoded; damaged packets are skipped."""
     import av
     from av.error import InvalidDataError
 
@@ -140,7 +140,7 @@ def sharpness(grey: UInt8[np.ndarray, "h w"]) -> float:
 
 
 def _thumb(grey: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "y x"]:
-    """Means of square blocks, so that noise does not count as motion."""
+    """Means of square blocks of pixels, so that noise does not count as motion."""
     block = max(min(grey.shape[1] // _THUMB_WIDTH, *grey.shape), 1)
     h, w = (n // block * block for n in grey.shape)
     blocks = grey[:h, :w].reshape(h // block, block, w // block, block)

@@ -5,12 +5,13 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Float32, Int16, UInt8
 from PIL import Image
 
+from sagesplat.core.config import MasksConfig
 from sagesplat.core.errors import BackendUnavailable, LabelError, RunError
 from sagesplat.io.files import read_json, write_json
 from sagesplat.io.lock import locked
@@ -39,6 +40,30 @@ class Segmenter(Protocol):
     def __call__(self, photos: Sequence[UInt8[np.ndarray, "H W 3"]], /) -> list[Segmented]:
         """An answer for each photo; those of one call may be computed together."""
         ...
+
+
+@dataclass(frozen=True)
+class SegmenterFactory:
+    """How one kind of segmenter is made from `--segmenter` and its settings; `registry` lists all kinds."""
+
+    settings: Callable[[MasksConfig], dict[str, Any]]
+    """What the answers depend on, by name: plain values, and paths of files or folders whose content counts.
+
+    Raises RunError where a setting is missing or a file does not exist.
+    """
+    load: Callable[[MasksConfig, str, int, Callable[[str], None]], Segmenter]
+    """(settings, device, threads, warn) -> the segmenter; `warn` takes lines for the user."""
+    suffixes: tuple[str, ...] = ()
+    """Of `--model`, with `--segmenter auto`."""
+
+
+def existing_file(path: str | Path | None, needs: str) -> Path:
+    """A file that a setting names; RunError where it is not set or does not exist. `needs`: the cure."""
+    if path is None:
+        raise RunError(needs)
+    if not Path(path).is_file():
+        raise RunError(f"{path}: no such file; {needs}")
+    return Path(path)
 
 
 class PhotoList(Protocol):

@@ -25,7 +25,7 @@ from sagesplat.run.job import NO_RUN, Job
 from sagesplat.run.run_dir import LadderKind, RunDir
 from sagesplat.scene.scene import Camera, Scene, View
 from sagesplat.stages import pipeline
-from sagesplat.stages.plan import costs_of
+from sagesplat.stages.methods import NestedLevels
 
 
 def ignore(event: Event) -> None:
@@ -136,7 +136,7 @@ class FinishedRun:
     @cached_property
     def costs(self) -> Costs:
         """Gaussians and bytes of each category's levels; of a nested ladder."""
-        return costs_of(self.job)
+        return NestedLevels(self.job).costs
 
     def plan_camera(self, camera: Camera, target_ssim: float) -> Plan:
         """The cheapest level of each category whose predicted SSIM reaches a target from one camera (Eq. 1).

@@ -56,7 +56,7 @@ def check(config: BlocksConfig) -> None:
         ("margin", config.margin, 0 <= config.margin <= 2, "a share such as 0.2"),
         ("min-share", config.min_share, 0 < config.min_share <= 1, "a share such as 0.25"),
         ("far-share", config.far_share, config.far_share >= 0, "a share such as 0.5"),
-        ("seam-steps", config.boundary_steps, config.boundary_steps >= 0, "0 or more"),
+        ("boundary-steps", config.boundary_steps, config.boundary_steps >= 0, "0 or more"),
     )
     for name, value, fine, cure in wrong:
         if not fine:
@@ -158,11 +158,12 @@ def train_blocks(job: Job, config: BlocksConfig, train: TrainConfig, seed: int) 
             what = (_spec(job, number), number, train, seed)
             tasks.append(Task(f"block {number}", train_block, what, job.gpus, _needed(block, train)))
         results(job.executor, tasks, job.emit)
+        run.provenance("train").unlink(missing_ok=True)  # from here on the earlier levels are gone
         merged = _merge_levels(run, blocks, parts)
         return [f"{merged:,} Gaussians of {len(blocks)} blocks"]
 
     inputs = [run.scene, run.labels, run.blocks / "blocks.json"]
-    run_stage(job, "train", settings, inputs, [run.levels], make)
+    run_stage(job, "train", settings, inputs, [run.levels], make, swaps=True)
 
 
 def train_block(spec: JobSpec, number: int, config: TrainConfig, seed: int, emit: Emit) -> None:
@@ -256,7 +257,7 @@ def nest_blocks(job: Job, config: BlocksConfig, nest: NestConfig, seed: int) -> 
         return [*lines, f"{len(blocks)} blocks, {config.boundary_steps} steps along the borders of each"]
 
     inputs = [run.scene, run.labels, run.levels, run.provenance("parts"), file]
-    run_stage(job, "nest", settings, inputs, [run.prefixes, run.increments], make)
+    run_stage(job, "nest", settings, inputs, [run.prefixes, run.increments], make, swaps=True)
 
 
 def nest_block(

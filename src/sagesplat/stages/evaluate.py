@@ -11,19 +11,20 @@ from sagesplat.run.job import Job
 from sagesplat.run.run_dir import settings_of
 from sagesplat.run.stage import run_stage
 from sagesplat.stages.compose import compose
-from sagesplat.stages.plan import main_target, promised, scene_plan
-from sagesplat.stages.shared import _show, label_images, ladder_files
+from sagesplat.stages.methods import method_of
+from sagesplat.stages.plan import main_target, scene_plan
+from sagesplat.stages.shared import _show, label_images
 
 
 def evaluate_plans(job: Job) -> None:
     """Measure the compositions on the test views, beside the promise and the whole model."""
-    run = job.run
+    run, method = job.run, method_of(job)
 
     def make() -> list[str]:
         fitted, within = job.fit_config, read_budget_plan(run.plan)
         plans = [*read_plans(run.plan)[0], *([within] if within else [])]
         table = evaluate(
-            job.scene, job.photos, label_images(job, fitted.masks), job.ladder, plans, promised(job),
+            job.scene, job.photos, label_images(job, fitted.masks), job.ladder, plans, method.predicted,
             region=fitted.region, compose=lambda plan: compose(job, plan),
             backend=job.backend, antialiased=job.antialiased,
             progress=lambda done, total: job.emit(Progress("evaluate", done, total)),
@@ -44,6 +45,6 @@ def evaluate_plans(job: Job) -> None:
             )
         return lines
 
-    inputs = [run.scene, run.labels, *ladder_files(run), run.plan]
+    inputs = [run.scene, run.labels, *method.files, run.plan]
     settings = {"tune_steps": settings_of(run, "plan").get("tune_steps", 0)}
     run_stage(job, "evaluate", settings, inputs, [run.evaluation], make)

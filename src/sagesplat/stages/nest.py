@@ -2,12 +2,14 @@
 
 import json
 from dataclasses import asdict
+from pathlib import Path
 
 import numpy as np
 import torch
 
 from sagesplat.adapt.observe import as_unit, render_rgb
 from sagesplat.core.config import NestConfig
+from sagesplat.core.errors import RunError
 from sagesplat.core.events import Progress, Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.increments import packed, read_increments, write_increments
@@ -18,7 +20,7 @@ from sagesplat.run.run_dir import file_hash
 from sagesplat.run.stage import run_stage
 from sagesplat.stages.shared import fusion, train_config
 from sagesplat.train import nested
-from sagesplat.train.checkpoint import remove_checkpoints
+from sagesplat.train.checkpoint import latest_checkpoint, remove_checkpoints
 from sagesplat.train.early_stopping import VIEWS, spread
 from sagesplat.train.nested import NestStep
 from sagesplat.train.trainer import Resumed, Step, Trained
@@ -38,7 +40,7 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
         checkpoint_key = json.dumps(
             {**settings, "scene": file_hash(run.scene), "levels": file_hash(run.levels)}
         )
-        if job.force:
+        if job.force and not _continues(run.nest_checkpoint, checkpoint_key):
             remove_checkpoints(run.nest_checkpoint)
         trained = ordered
         for event in nested.nest(
@@ -63,7 +65,16 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
     if config.base_share:
         _make_base_model(job, config, seed)
         inputs.append(run.base_model)
-    run_stage(job, "nest", settings, inputs, [run.prefixes, run.increments], make)
+    run_stage(job, "nest", settings, inputs, [run.prefixes, run.increments], make, swaps=True)
+
+
+def _continues(checkpoint: Path, checkpoint_key: str) -> bool:
+    """Whether a checkpoint belongs to these settings and can be read."""
+    try:
+        latest_checkpoint(checkpoint, checkpoint_key)
+    except (RunError, OSError):
+        return False
+    return True
 
 
 def _make_base_model(job: Job, config: NestConfig, seed: int) -> None:
@@ -97,10 +108,11 @@ def train_capped(job: Job, stage: str, cap: int, steps: int, seed: int) -> Gauss
 def write_ladder(
     job: Job, g: Gaussians, sizes: dict[int, tuple[int, ...]], config: NestConfig, purity: np.ndarray
 ) -> list[str]:
-    """Write Gaussians in their order, with levels of `sizes` by label id, as the run's ladder and its chunks.
+    """Write Gaussians in their order, with levels of `sizes` by label id, as the run's ladder and increments.
 
-    `clarity` [N] of `Nested` is kept beside them.
+    `purity` [N] of `Nested` is kept beside them. Returns lines that sum it up.
     """
+    job.run.provenance("nest").unlink(missing_ok=True)  # from here on the earlier ladder is gone
     rows = packed(g, sizes, sh_bits=config.sh_bits)
     ordered = g.select(torch.from_numpy(rows))
     chunks = write_increments(
@@ -110,11 +122,11 @@ def write_ladder(
     sent = read_increments(job.run.increments, chunks)
     write_set(job.run.prefixes, sent, config.steps, sizes, purity=purity[rows])
     size, n = sum(chunk.nbytes for chunk in chunks), len(g)
-    lost = _quality(job, ordered) - _quality(job, sent)
+    unrounded, decoded = _quality(job, ordered), _quality(job, sent)
     return [
         f"{config.levels} levels, {n:,} Gaussians",
         f"{size / 1e6:.2f} MB in {len(chunks)} SPZ files, {size / n:.1f} bytes a Gaussian; "
-        f"encoding costs {lost:.4f} of SSIM",
+        f"training views: SSIM {decoded:.4f} as decoded, {unrounded:.4f} before rounding",
     ]
 
 

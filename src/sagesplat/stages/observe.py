@@ -12,7 +12,8 @@ from sagesplat.run.executor import split
 from sagesplat.run.job import Job
 from sagesplat.run.remote import work_all
 from sagesplat.run.stage import run_stage
-from sagesplat.stages.shared import _show, distances, fusion, label_images, ladder_files
+from sagesplat.stages.methods import method_of
+from sagesplat.stages.shared import _show, distances, fusion, label_images
 
 
 def observe_levels(job: Job, config: FitConfig) -> None:
@@ -30,7 +31,7 @@ def observe_levels(job: Job, config: FitConfig) -> None:
             f"{len(table):,} observations of {len(job.ladder.levels)} levels in {len(job.scene.views)} views"
         ]
 
-    inputs = [run.scene, run.labels, ladder_files(run)[0], *fusion(run)]
+    inputs = [run.scene, run.labels, method_of(job).level_files[0], *fusion(run)]
     settings = {"distance": config.distance, "masks": config.masks}
     run_stage(job, "observe", settings, inputs, [run.observations], make)
 

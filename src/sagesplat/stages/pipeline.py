@@ -4,13 +4,16 @@ import math
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from sagesplat.adapt.plan import check_target
-from sagesplat.core.config import BlocksConfig, NestConfig, PlanConfig, RunConfig, TrainConfig
+from sagesplat.core.config import BlocksConfig, FitConfig, NestConfig, PlanConfig, RunConfig, TrainConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit, Progress, StageDone, StageStarted
 from sagesplat.demo.capture import cached_capture
 from sagesplat.run.job import Job
+from sagesplat.run.recorded import recorded_settings
+from sagesplat.run.run_dir import RunDir
 from sagesplat.stages import blocks
 from sagesplat.stages.boundaries import measure_borders
 from sagesplat.stages.compose import compose_plan
@@ -71,6 +74,29 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
     compose_plan(job)
     evaluate_plans(job)
     make_report(job)
+
+
+def observe_snapshots(job: Job) -> None:
+    """Measure the training snapshots of a run, as its levels were measured; `job` is one on the snapshots."""
+    observe_levels(job, _recorded(job).get("fit", FitConfig()))
+
+
+def adapt_snapshots(job: Job) -> None:
+    """Measure, model and plan the training snapshots of a run, with the settings that it was made with.
+
+    `job` is one on the snapshots. Stages that are done are skipped.
+    """
+    known = _recorded(job)
+    fit: FitConfig = known.get("fit", FitConfig())
+    observe_levels(job, fit)
+    fit_ladder(job, fit)
+    make_plan(job, replace(known.get("plan", PlanConfig()), budget=0.0, weights={}))
+
+
+def _recorded(job: Job) -> dict[str, Any]:
+    """What the run records of its snapshots, else of its nested levels."""
+    nested_levels = recorded_settings(RunDir(job.run.path, "nested"))
+    return nested_levels | recorded_settings(RunDir(job.run.path, "snapshots"))
 
 
 def train(job: Job, config: TrainConfig, of_blocks: BlocksConfig, seed: int) -> None:

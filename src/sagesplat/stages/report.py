@@ -7,6 +7,7 @@ from sagesplat.output.report import write_report
 from sagesplat.run.job import Job
 from sagesplat.run.stage import run_stage
 from sagesplat.stages.compose import compose
+from sagesplat.stages.methods import method_of
 from sagesplat.stages.plan import main_target, scene_plan
 from sagesplat.stages.report_data import report_data
 
@@ -33,4 +34,4 @@ def make_report(job: Job) -> None:
         [run.report / "index.html"],
         make,
     )
-    job.emit(RunDone(run.report / "index.html", run.path if run.ladder == "nested" else None))
+    job.emit(RunDone(run.report / "index.html", run.path if method_of(job).streams else None))

@@ -3,11 +3,12 @@
 from collections.abc import Mapping
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 
 from sagesplat.core.gaussians import PARAMETERS
 from sagesplat.core.sh import num_bases
+from sagesplat.kernels.jit import njit
 from sagesplat.train.state import TrainState
 
 _BETA1, _BETA2, _EPS = 0.9, 0.999, 1e-15
