@@ -42,7 +42,7 @@ def as_text(table: tables.Table, path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_last_level_is_3dgs():
+def test_the_last_level_is_the_full_model():
     assert tables.last_counts(COUNTS) == {3: 40, 7: 60, -1: 5}
     assert tables.by_size(COUNTS) == LABELS
     assert [tables.name_of(i, NAMES) for i in (7, -1, TOTAL, 9)] == [
@@ -76,11 +76,11 @@ def test_plan_and_targets(tmp_path):
     rows = as_text(tables.plan_table(plan, COUNTS, NAMES), tmp_path / "t.csv")
     assert [row["category"] for row in rows] == ["dining, table", "vase", "unlabelled"]
     assert [row["status"] for row in rows] == ["infeasible", "ok", "no model"]
-    assert float(rows[1]["of all"]) == 0.25
+    assert float(rows[1]["of full model"]) == 0.25
     assert float(rows[1]["MB"]) == 10 * 248 / 1e6
     assert rows[2]["promised SSIM"] == ""
     rows = as_text(tables.targets_table([plan, plan], COUNTS, LABELS, NAMES), tmp_path / "t.csv")
-    assert rows[-1]["3DGS Gaussians"] == "105"
+    assert rows[-1]["full model Gaussians"] == "105"
     assert rows[-1]["t=0.6 Gaussians"] == "75"
     assert rows[-1]["t=0.6 status"] == "infeasible"
 

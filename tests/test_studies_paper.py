@@ -1,4 +1,4 @@
-"""The paper's tables and figures, cross-view plans, equal occupancy, and online against offline."""
+"""The paper's tables and figures, cross-view plans, equal model size, and early stopping."""
 
 import csv
 import shutil
@@ -25,6 +25,7 @@ from sagesplat.output.tables import Table
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.scene.scene import View
+from sagesplat.segment.display_names import titles
 from sagesplat.stages.compose import compose_plan
 from sagesplat.stages.evaluate import evaluate_plans
 from sagesplat.stages.export import export_ply
@@ -39,7 +40,7 @@ from sagesplat.studies.early_stopping import compare_early_stopping
 from sagesplat.studies.paper.cross_view import CrossView, read_cross_view
 from sagesplat.studies.paper.report import four_levels
 from sagesplat.studies.paper.run import paper_report
-from sagesplat.studies.paper.same_size import METHODS, WHOLE, nearest_snapshot, prune_to, read_occupancy
+from sagesplat.studies.paper.same_size import FULL, METHODS, nearest_snapshot, prune_to, read_same_size
 from sagesplat.train.importance import importance
 
 CONFIG = RunConfig(train=TrainConfig(max_steps=90, level_every=15), plan=PlanConfig(target_ssim=0.4))
@@ -104,7 +105,7 @@ def test_every_table_and_figure_is_there(finished):
 def test_tables_i_and_ii_repeat_the_observations(finished):
     job, _ = finished
     table = read_observations(job.run.observations)
-    row = next(r for r in rows_of(job.run.paper / "table_1_test.csv") if r["category"] == "grass-merged")
+    row = next(r for r in rows_of(job.run.paper / "table_1_test.csv") if r["category"] == "grass")
     mine = (table.label_id == 193) & (table.level == 45) & np.isin(table.view, job.scene.test_ids)
     assert float(row["45 SSIM"]) == pytest.approx(table.ssim[mine].mean(), abs=1e-6)
     assert int(row["90 Gaussians"]) == job.ladder.counts[193, 90]
@@ -119,7 +120,7 @@ def test_table_iii_marks_what_was_selected(finished):
     view = job.scene.test_ids[len(job.scene.test_ids) // 2]
     table = read_observations(job.run.observations)
     for row in rows[:-1]:
-        label = next(i for i, name in job.names().items() if name == row["category"])
+        label = next(i for i, name in titles(job.names()).items() if name == row["category"])
         chosen = [part.rpartition(": ")[2] for part in row["marks"].split("; ")]
         assert ", ".join(chosen).count(",") == 2  # every target chose one of the four iterations
         assert float(row["distance min"]) <= float(row["distance 5 %"]) <= float(row["distance mean"])
@@ -167,20 +168,20 @@ def test_regret_by_hand():
     np.testing.assert_array_equal(CrossView(**columns).regret, [10, np.nan, np.nan, 0])
 
 
-def test_equal_occupancy_means_equal_counts(finished):
+def test_equal_model_size_means_equal_counts(finished):
     job, _ = finished
-    rows = read_occupancy(job.run.same_size)
+    rows = read_same_size(job.run.same_size)
     full = job.ladder.size(job.ladder.levels[-1])
     for of_view in np.unique(rows.of_view):
         for target in (0.3, 0.4, 0.5):
             at = (rows.of_view == of_view) & (rows.target == np.float32(target))
-            counts = {METHODS[m]: set(rows.count[at & (rows.method == m)]) for m in range(WHOLE)}
+            counts = {METHODS[m]: set(rows.count[at & (rows.method == m)]) for m in range(FULL)}
             assert counts["SAGE"] == counts["SAGE, tuned"] == counts["3DGS, pruned and tuned"]
             level = nearest_snapshot(job.ladder, counts["SAGE"].pop())
             assert counts["3DGS, snapshot"] == {
                 sum(n for (_, i), n in job.ladder.counts.items() if i == level)
             }
-    assert set(rows.count[rows.method == WHOLE]) == {full}
+    assert set(rows.count[rows.method == FULL]) == {full}
     assert np.isnan(rows.lpips_alex).all()  # no weights were there
     assert np.isfinite(rows.ssim + rows.psnr).all()
 
@@ -190,7 +191,7 @@ def test_a_second_report_has_nothing_to_do_and_another_view_needs_force(finished
     events: list[Event] = []
     again = Job(job.run, events.append)
     paper_report(again, replace(PAPER, lpips=job.run.path / "nowhere"))
-    assert [e.name for e in events if isinstance(e, StageSkipped)] == ["crossview", "occupancy", "paper"]
+    assert [e.name for e in events if isinstance(e, StageSkipped)] == ["crossview", "same-size", "paper"]
     with pytest.raises(RunError, match=r"no photo 'nothing'; there are view_000"):
         paper_report(again, replace(PAPER, view="nothing"))
     with pytest.raises(RunError, match=r"same_size\.csv: made with other .*--force"):
@@ -203,7 +204,7 @@ def test_a_capture_without_test_views(capture, tmp_path):
     paper_report(job, replace(PAPER, lpips=tmp_path, tune_steps=0))
     assert not (job.run.paper / "table_1_test.csv").exists()
     assert not (job.run.paper / "cross_view.csv").exists()
-    assert set(read_occupancy(job.run.same_size).of_view) == {6}
+    assert set(read_same_size(job.run.same_size).of_view) == {6}
 
 
 def test_categories_that_hardly_occur(capture, tmp_path):
@@ -299,7 +300,7 @@ def test_tuned_compositions_are_the_same_set_made_better(finished, tmp_path):
     assert torch.equal(read_ply(tmp_path / "a.ply").means, read_ply(tuned.run.composed).means)
 
 
-def test_online_against_offline(capture, finished, tmp_path):
+def test_early_stopping_beside_a_composition(capture, finished, tmp_path):
     full, _ = finished
     config = replace(CONFIG, train=replace(CONFIG.train, freeze_at=0.45))
     online, events = work(tmp_path / "online", capture, config)
@@ -307,10 +308,10 @@ def test_online_against_offline(capture, finished, tmp_path):
     assert stops
     assert sum(isinstance(e, Warned) and "stops at step" in e.text for e in events) == len(stops)
     methods, categories = compare_early_stopping(online, full, tmp_path / "out")
-    assert [row[0] for row in methods.rows] == ["online", "offline", "full run"]
+    assert [row[0] for row in methods.rows] == ["early stopping", "composed", "full run"]
     assert np.isfinite([value for row in methods.rows for value in row[1:]]).all()
     for row in categories.rows:
-        label = next(i for i, name in full.names().items() if name == row[0])
+        label = next(i for i, name in titles(full.names()).items() if name == row[0])
         assert row[1] == stops.get(str(label), 90)
         assert row[2] == online.ladder.counts[label, online.ladder.levels[-1]]
         assert row[5] == full.ladder.counts[label, row[4]]
@@ -319,7 +320,7 @@ def test_online_against_offline(capture, finished, tmp_path):
     chosen = {row[0]: row[4] for row in categories.rows}
     for label, step in stops.items():
         if step == first:
-            assert chosen[full.names()[int(label)]] == first
+            assert chosen[titles(full.names())[int(label)]] == first
     with pytest.raises(RunError, match=r"this run needs --train.freeze-at .* must not have it"):
         compare_early_stopping(full, online, tmp_path)
     other = Job(RunDir(tmp_path / "other", "snapshots"), lambda event: None)

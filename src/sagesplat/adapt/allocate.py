@@ -3,7 +3,7 @@
 Rules that a second implementation must share, so that both give the same levels (tests/data/plans.json):
 - Of equal levels the cheaper comes first, then the one of higher quality, then the lower index. Compositions
   within a budget: more value, then less cost, then the lower level at the first label where they differ;
-  where a label's cheapest levels are worth the same, the rule for levels says which of them takes part.
+  where a label's cheapest levels have the same value, the rule for levels decides between them.
 - Costs are whole numbers. Values are whole multiples of 2**-40 of the total weight, by floor(x + 0.5): sums
   of both are exact in float64 in any order. Weights and reported values are summed label by label.
 - A level whose cost is infinite cannot be had. A level without a promise (NaN) is passed over where its label
@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float, Int
 from sagesplat.adapt.knapsack import UNITS, most_within
 from sagesplat.core.errors import RunError
 
-SLACK = 0.01  # SSIM that a change of level must be worth
+SLACK = 0.01  # least gain of SSIM for a change of level
 STATES = 4096  # partial compositions to keep before a plan is left unproven: half a millisecond
 
 
@@ -33,7 +33,7 @@ class Allocation:
     status: str  # "ok"; "infeasible": a label misses the target; "over budget": the smallest does not fit
     cost: int  # of the composition, in the unit of the costs
     value: float  # sum of weight x promised SSIM; labels without a promise count as in the module's rules
-    bound: float  # no composition within the budget has more, what `previous` is worth included
+    bound: float  # no composition within the budget has more; the bonus for `previous` levels included
     optimal: bool  # proven: by the module's rules nothing comes before this
     missed: Bool[np.ndarray, "L"]  # labels with promises of which none reaches the target
 

@@ -22,7 +22,7 @@ class Costs:
 
     labels: tuple[int, ...]  # ids, ascending
     count: Int[np.ndarray, "L K"]  # Gaussians
-    transfer_bytes: Int[np.ndarray, "L K"]  # bytes of the chunks
+    transfer_bytes: Int[np.ndarray, "L K"]  # bytes of the increments
     gpu: Int[np.ndarray, "L K"]  # bytes on the viewer's GPU
 
     def of(self, unit: Unit) -> Int[np.ndarray, "L K"]:
@@ -63,9 +63,9 @@ def quality_at(
     for i, label in enumerate(costs.labels):
         far[:, i] = distances.get(label, far[:, i])
         if label in promises:
-            told = promises[label].predict(far[:, i], position, direction)
+            predicted = promises[label].predict(far[:, i], position, direction)
             known = np.array(promises[label].levels) - 1
-            mean[:, i, known], bound[:, i, known] = told.mean, told.bound
+            mean[:, i, known], bound[:, i, known] = predicted.mean, predicted.bound
     return Quality(mean, bound, far)
 
 

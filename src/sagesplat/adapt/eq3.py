@@ -16,7 +16,7 @@ from sagesplat.core.errors import DataError, short
 from sagesplat.io.files import read_json, write_json
 
 NOISE = 0.05  # SSIM residual from which an observation counts as an outlier (scale of the soft L1 loss)
-FLOOR = 0.003  # SSIM residual below which a better fit is not worth a parameter
+FLOOR = 0.003  # SSIM residual below which a better fit does not justify a parameter
 REGIME_SIZE = 4  # parameters of one regime: K, gamma, mu, alpha
 SIDE = 6  # fewest observations on a side of beta
 STATUSES = ("two regimes", "one regime", "constant", "not converged")

@@ -1,4 +1,4 @@
-"""Evaluation: composed scenes measured on views that nothing was fitted to, beside the promise."""
+"""Evaluation: composed scenes measured on views that nothing was fitted to, beside the prediction."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
@@ -22,14 +22,14 @@ from sagesplat.scene.scene import Scene
 class Evaluation:
     """One row per (target, view, category) and one per (target, view) for the whole image; equal lengths."""
 
-    target: Float32[np.ndarray, " R"]  # SSIM asked for; NaN for a plan within a budget
+    target: Float32[np.ndarray, " R"]  # SSIM; NaN for a plan within a budget
     view: Int32[np.ndarray, " R"]  # row in Scene.views
     label_id: Int32[np.ndarray, " R"]  # category id, -1 = unlabelled, -2 = the whole image
     level: Int32[np.ndarray, " R"]  # the level chosen; -1 for the whole image
-    predicted: Float32[np.ndarray, " R"]  # promised SSIM; NaN for the whole image
+    predicted: Float32[np.ndarray, " R"]  # SSIM that the plan counts on; NaN for the whole image
     ssim: Float32[np.ndarray, " R"]  # measured on the composed scene, over the category's pixels
     psnr: Float32[np.ndarray, " R"]  # dB, the same
-    full_ssim: Float32[np.ndarray, " R"]  # 3DGS at its last level, the same pixels
+    full_ssim: Float32[np.ndarray, " R"]  # of the full model: every category at its last level
     full_psnr: Float32[np.ndarray, " R"]  # dB, the same
     num_pixels: Int32[np.ndarray, " R"]
 
@@ -56,7 +56,7 @@ def evaluate(
     masks: LabelImages,
     ladder: Ladder,
     plans: Sequence[Plan],
-    promised: Callable[[int, int, int], float],
+    predicted: Callable[[int, int, int], float],
     *,
     region: Literal["mask", "eroded"] = "mask",
     compose: Callable[[Plan], Gaussians] | None = None,
@@ -72,7 +72,7 @@ def evaluate(
         masks: Label images, [H, W] of category ids; indexed by view.
         ladder: The levels.
         plans: What to compose.
-        promised: Predicted SSIM of (label id, level, row of `Scene.views`); NaN: none.
+        predicted: SSIM expected of (label id, level, row of `Scene.views`); NaN: none.
         region: Where a category's SSIM is measured: on its mask, or on the mask eroded by 5 px.
         compose: The Gaussians of a plan; None: its levels as they are.
         backend: Rasteriser; decides the device.
@@ -107,7 +107,7 @@ def evaluate(
                 level = plan.levels.get(label, -1)
                 rows.append({
                     "target": plan.target, "view": row, "label_id": label, "level": level,
-                    "predicted": promised(label, level, row) if label in plan.levels else np.nan,
+                    "predicted": predicted(label, level, row) if label in plan.levels else np.nan,
                     "ssim": values[ssim], "psnr": values["psnr"], "num_pixels": values["num_pixels"],
                     "full_ssim": full[row][label][ssim], "full_psnr": full[row][label]["psnr"],
                 })  # fmt: skip

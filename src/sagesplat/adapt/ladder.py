@@ -1,4 +1,4 @@
-"""The ladder: every recorded level of every category, read from disk only when asked for."""
+"""The levels of every category, snapshots or nested, read from disk on demand."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

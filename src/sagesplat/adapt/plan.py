@@ -32,11 +32,11 @@ class Choice:
     distance: float  # of the view, world units; NaN in a scene and where unknown
     count: int  # Gaussians
     status: str  # one of STATUSES; "infeasible" is the best attainable, "no model" the highest level
-    transfer_bytes: int | None = None  # bytes of its chunks; None where the ladder has none
+    transfer_bytes: int | None = None  # of its increments; None for snapshots
 
     @property
     def nbytes(self) -> int:
-        """Occupancy as the paper counts it."""
+        """Bytes as the paper counts model size: 248 a Gaussian."""
         return self.count * BYTES_PER_GAUSSIAN
 
 
@@ -64,12 +64,12 @@ class Plan:
 
     @property
     def nbytes(self) -> int:
-        """Occupancy of the composition as the paper counts it."""
+        """Bytes of the composition as the paper counts model size."""
         return sum(choice.nbytes for choice in self.choices)
 
     @property
     def transfer_bytes(self) -> int | None:
-        """Bytes of the chunks to send; None where the ladder has none."""
+        """Bytes of the increments to send; None for snapshots."""
         sizes = [choice.transfer_bytes for choice in self.choices]
         return None if None in sizes else sum(size for size in sizes if size is not None)
 
@@ -225,12 +225,12 @@ def choose_snapshot(
 
 
 def check_target(target: float) -> None:
-    """RunError for an SSIM that cannot be asked for."""
+    """RunError for an SSIM that no plan can have as its target."""
     _check("target SSIM", target)
 
 
 def check_share(share: float) -> None:
-    """RunError for a share of views that cannot be asked for."""
+    """RunError for an impossible share of views."""
     _check("share of views", share)
 
 

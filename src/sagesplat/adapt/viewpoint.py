@@ -1,4 +1,4 @@
-"""Calibrated promises: SSIM of a category at each level from any viewpoint, with a bound that is kept.
+"""The viewpoint model: SSIM of a category at each level from any viewpoint, with a lower confidence bound.
 
 Eq. 3 over distance (`adapt.model`) is the mean m_k(d) of level k; a Gaussian process over the viewpoint
 models what is left of it (Rasmussen & Williams 2006, eqs. 2.25, 2.26, 5.8; 5.10-5.12 for leaving one out).
@@ -23,7 +23,7 @@ median.
 
 `multiplier` makes the decisions come true, not each number: among calibration views, each predicted without
 itself, the cheapest level whose bound reaches a target may miss it for at most 1 - confidence of all targets
-that the plan calls feasible: conformal risk control (Angelopoulos et al. 2022). One more view that misses all
+that the plan accepts: conformal risk control (Angelopoulos et al. 2022). One more view that misses all
 its targets is counted in, as the quantile of split conformal prediction does (Vovk et al. 2005), with as many
 targets as a view has on average. Each category's own errors scale its multiplier as far as they are many, the
 others' stand in for the rest. The promise is on average over views like the calibration views and over all
@@ -65,7 +65,7 @@ PRIOR_WIDTH = np.array([0.7, 0.7, 0.7, 1.5, 1.5])
 PRIOR_REACH = 3.0
 FEW = 0.1  # SSIM that a category's spread is uncertain by if seen in one view; falls as 1 / views
 OWN_VIEWS = 8  # calibration views from which a category's own errors count more than those of the others
-EASY = 0.1  # SSIM; targets this far below the cheapest level's bound would hide misses of the others
+EASY = 0.1  # SSIM; targets further below the cheapest level's bound would hide violations of the others
 NUMBERS = (
     "extent",
     "median_log_distance",
@@ -105,7 +105,7 @@ class ViewModel:
     weights: Float[np.ndarray, "n K"]  # SSIM
     amplitudes: Float[np.ndarray, " K"]  # SSIM
     multiplier: float  # conformal: spreads from mean to bound
-    confidence: float  # share of feasible decisions that hold
+    confidence: float  # share of accepted decisions that hold
     rmse: float  # of its views, each predicted without itself; SSIM over all levels
     status: str  # one of STATUSES
     composition_bias: float = (
@@ -192,7 +192,7 @@ def promise(
 def in_composition(
     models: Mapping[int, ViewModel], changes: Mapping[int, Float[np.ndarray, " n"]]
 ) -> dict[int, ViewModel]:
-    """The models of categories in compositions, where their neighbours stand at other levels.
+    """The models of categories in composition, beside others at other levels.
 
     `changes`: by label id, SSIM measured in planned compositions minus SSIM measured with everything at the
     same level. Their mean shifts the category's mean, their spread widens its bound at its confidence.
@@ -383,7 +383,7 @@ def _hyperparameters(squares: list[np.ndarray], u: np.ndarray, residual: np.ndar
 
 
 def _calibrated(models: list[ViewModel], left_out: list[_LeftOut], confidence: float) -> list[ViewModel]:
-    """The models with their factors."""
+    """The models with their conformal multipliers."""
     if not models:
         return []
     own = [
@@ -392,28 +392,28 @@ def _calibrated(models: list[ViewModel], left_out: list[_LeftOut], confidence: f
     calibrated = sum(len(out.ssim) for out in own) >= _fewest(confidence)
     used = own if calibrated else left_out
     errors = [out.errors for out in used]
-    median_log_distance = OWN_VIEWS * np.concatenate(errors).mean()
+    pooled = OWN_VIEWS * np.concatenate(errors).mean()
     # what a category's scale is without the view that it is tried on
-    tried = [np.sqrt((median_log_distance + e.sum() - e) / (OWN_VIEWS + len(e) - 1)) for e in errors]
+    tried = [np.sqrt((pooled + e.sum() - e) / (OWN_VIEWS + len(e) - 1)) for e in errors]
     multiplier = _conformal_multiplier(used, tried, confidence)
     if multiplier is None:  # a scene of a few views: as if errors were Gaussian
         gaussian = max(NormalDist().inv_cdf(confidence), 0.0)
         return [replace(model, multiplier=gaussian) for model in models]
     done = []
     for model, e in zip(models, errors, strict=True):
-        scale = math.sqrt((median_log_distance + e.sum()) / (OWN_VIEWS + len(e)))
+        scale = math.sqrt((pooled + e.sum()) / (OWN_VIEWS + len(e)))
         status = "uncalibrated" if not calibrated else "calibrated" if len(e) >= OWN_VIEWS else "pooled"
         done.append(replace(model, multiplier=multiplier * scale, status=status))
     return done
 
 
 def _fewest(confidence: float) -> float:
-    """Views that can prove it: among fewer, not even a record without a miss does."""
+    """Views needed to calibrate at a confidence: with fewer, even no violation at all is not enough."""
     return confidence / (1 - confidence) - 1e-9
 
 
 def _conformal_multiplier(used: list[_LeftOut], scales: list[np.ndarray], confidence: float) -> float | None:
-    """The smallest multiplier from which on decisions miss no more than they may; None from too few views."""
+    """The smallest multiplier from which on the risk stays within 1 - confidence; None from too few views."""
     widest = max(out.ssim.shape[1] for out in used)
     # a category with fewer levels repeats its last: no decision falls there
     ssim, mean, spread = (

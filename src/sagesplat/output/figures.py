@@ -48,7 +48,7 @@ STYLE: dict[Any, Any] = {
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """One view in pictures: the photo, 3DGS at its last level, the composed scene, the label map."""
+    """One view in pictures: the photo, the full model, the composed scene, the label map."""
 
     name: str
     photo: UInt8[np.ndarray, "H W 3"]
@@ -172,11 +172,11 @@ def ssim_over_distance(
 def size_by_target(
     plans: Sequence[Plan], counts: Counts, labels: Sequence[int], names: Mapping[int, str], colours: Colours
 ) -> Figure:
-    """Occupancy of 3DGS and of the plan for each target, stacked by label; hatched = target out of reach."""
+    """Size of the full model and of each target's plan, stacked by label; hatched = target out of reach."""
     figure = Figure(figsize=(9, 0.52 * (len(plans) + 1) + 1.6), layout="constrained")
     axes = figure.subplots()
     full = {i: n * BYTES_PER_GAUSSIAN for i, n in last_counts(counts).items()}
-    bars = [("everything", full, set())]
+    bars = [("full model", full, set())]
     for plan in plans:
         infeasible = {c.label_id for c in plan.choices if c.status == "infeasible"}
         bars.append((f"SSIM ≥ {plan.target:g}", {c.label_id: c.nbytes for c in plan.choices}, infeasible))
@@ -194,7 +194,7 @@ def size_by_target(
     axes.set_yticks(range(len(bars)), [bar[0] for bar in bars])
     axes.invert_yaxis()
     axes.grid(axis="y", visible=False)
-    axes.set(xlabel="occupancy (MB, 248 bytes a Gaussian)", xlim=(0, 1.16 * whole / MB))
+    axes.set(xlabel="model size (MB, 248 bytes a Gaussian)", xlim=(0, 1.16 * whole / MB))
     handles = [Patch(color=ink(i, colours), label=name_of(i, names)) for i in labels]
     if any(bar[2] for bar in bars):
         handles.append(
@@ -243,7 +243,7 @@ def quality_over_size(
     evaluation: Evaluation,
     recovering: frozenset[int],
 ) -> Figure:
-    """Whole-image SSIM on unseen views over occupancy: 3DGS at each level, and the plan for each target."""
+    """Whole-image SSIM on unseen views over model size: one level for all, and each target's plan."""
     figure = Figure(figsize=PAIR, layout="constrained")
     axes = figure.subplots()
     rows = observations.select(np.isin(observations.view, test_views))
@@ -262,7 +262,7 @@ def quality_over_size(
     axes.plot(*np.array(composed).reshape(-1, 3).T[:2], "o-", color=ACCENT, ms=6, label="composed by plan")
     for x, y, target in composed:
         axes.annotate(f"t = {target:g}", (x, y), (7, -11), textcoords="offset points", color=ACCENT)
-    axes.set(xlabel="occupancy (MB, 248 bytes a Gaussian)", ylabel="SSIM of the whole image")
+    axes.set(xlabel="model size (MB, 248 bytes a Gaussian)", ylabel="SSIM of the whole image")
     axes.margins(0.08, 0.12)
     axes.legend(loc="lower right")
     return figure
@@ -270,10 +270,10 @@ def quality_over_size(
 
 @rc_context(STYLE)
 def panel_strip(panel: Panel, colours: Colours) -> Figure:
-    """Figs. 4 and 5: photo, 3DGS, composed scene, label map and error of the composed scene side by side."""
+    """Figs. 4 and 5, side by side: photo, full model, composed scene, label map, its error."""
     pictures = [
         ("photo", panel.photo),
-        (f"everything  {panel.full_psnr:.2f} dB / {panel.full_ssim:.3f}", panel.full),
+        (f"full model  {panel.full_psnr:.2f} dB / {panel.full_ssim:.3f}", panel.full),
         (f"composed  {panel.psnr:.2f} dB / {panel.ssim:.3f}", panel.composed),
         ("categories", label_image(panel.label_ids, colours)),
         ("error of composed", error_image(panel.composed, panel.photo)),

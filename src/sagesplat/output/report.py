@@ -54,7 +54,7 @@ class ReportData:
     settings: Facts = ()
     timings: Sequence[tuple[str, float]] = ()  # stage, seconds
     provenance: Facts = ()  # versions, hashes of the inputs
-    categories: Categories = field(default_factory=dict)  # of the parts of a scene in blocks
+    categories: Categories = field(default_factory=dict)  # of per-block categories
 
 
 def write_report(folder: Path, data: ReportData) -> Path:
@@ -62,19 +62,19 @@ def write_report(folder: Path, data: ReportData) -> Path:
 
     Every number is computed from `data`; evaluation rows of other views than the test views do not count, and
     sections without data (no test views, no panels) are left out. `data.plans` must not be empty. A scene in
-    blocks is shown by category; what was fitted and planned part by part is in the tables.
+    blocks is shown by category; what was fitted and planned per block is in the tables.
     """
     unseen = np.isin(data.evaluation.view, data.test_views)
-    parts = replace(data, evaluation=data.evaluation.select(unseen))
-    data, promises = by_category(parts), relabelled(parts.evaluation, parts.categories)
+    per_block = replace(data, evaluation=data.evaluation.select(unseen))
+    data, promises = by_category(per_block), relabelled(per_block.evaluation, per_block.categories)
     labels = tables.by_size(data.counts)
-    drawn = _figures(data, labels, parts, promises)
+    drawn = _figures(data, labels, per_block, promises)
     plots = [(name, title, _save(figure, folder, name)) for name, title, figure in drawn]
-    sheets = dict(_tables(data, labels, parts, promises))
+    sheets = dict(_tables(data, labels, per_block, promises))
     for name, table in sheets.items():
         table.write_csv(folder / "tables" / f"{name}.csv")
-    parts.observations.write_csv(folder / "tables" / "observations.csv")
-    parts.evaluation.write_csv(folder / "tables" / "evaluation_rows.csv")
+    per_block.observations.write_csv(folder / "tables" / "observations.csv")
+    per_block.evaluation.write_csv(folder / "tables" / "evaluation_rows.csv")
     for number, panel in enumerate(data.panels):
         strip = figures.panel_strip(panel, data.colours)
         figures.save_figure(strip, folder / "figures" / f"panel_{number}")
@@ -83,7 +83,7 @@ def write_report(folder: Path, data: ReportData) -> Path:
         version=__version__,
         headline=_headline(data, promises),
         categories=_categories(data, labels, promises),
-        num_parts=len(parts.categories),
+        num_parts=len(per_block.categories),
         table_rows=TABLE_ROWS,
         plots={name: (title, image) for name, title, image in plots},
         sheets=sheets,
@@ -95,7 +95,7 @@ def write_report(folder: Path, data: ReportData) -> Path:
 
 
 def by_category(data: ReportData) -> ReportData:
-    """The same with categories instead of parts, but for models."""
+    """The same by category instead of per-block category, models excepted."""
     if not data.categories:
         return data
     to = data.categories
@@ -173,12 +173,12 @@ def _categories(data: ReportData, labels: Sequence[int], promises: Evaluation) -
     return lines
 
 
-def _figures(data: ReportData, labels: Sequence[int], parts: ReportData, promises: Evaluation):
+def _figures(data: ReportData, labels: Sequence[int], per_block: ReportData, promises: Evaluation):
     """(file name, title, Figure) of every plot that the data allow."""
     names, colours, seen = data.names, data.colours, data.observations
     yield (
         "size_by_target",
-        "Occupancy by target and category",
+        "Model size by target and category",
         figures.size_by_target(data.plans, data.counts, labels, names, colours),
     )
     if len(data.evaluation):
@@ -206,22 +206,22 @@ def _figures(data: ReportData, labels: Sequence[int], parts: ReportData, promise
         levels = sorted({level for _, level in data.models if level not in data.recovering})
         picked = np.geomspace(1, max(len(levels), 1), FIT_LEVELS).round().astype(int) - 1
         shown = [levels[i] for i in np.unique(picked)] if levels else []
-        fitted = tables.by_size(parts.counts)
+        fitted = tables.by_size(per_block.counts)
         few = fitted[:FIT_LABELS]
         most = f", the {len(few)} largest of {len(fitted)}" if len(few) < len(fitted) else ""
         yield (
             "ssim_over_distance",
             f"SSIM over distance and its model{most}",
             figures.ssim_over_distance(
-                parts.observations, data.train_views, few, parts.names, colours, data.models, shown
+                per_block.observations, data.train_views, few, per_block.names, colours, data.models, shown
             ),
         )
 
 
-def _tables(data: ReportData, labels: Sequence[int], parts: ReportData, promises: Evaluation):
+def _tables(data: ReportData, labels: Sequence[int], per_block: ReportData, promises: Evaluation):
     """(file name, Table) of every table that the data allow."""
     names = data.names
-    yield "plan", tables.plan_table(main_plan(parts), parts.counts, parts.names)
+    yield "plan", tables.plan_table(main_plan(per_block), per_block.counts, per_block.names)
     yield "size_by_target", tables.targets_table(data.plans, data.counts, labels, names)
     if len(data.evaluation):
         yield "evaluation", tables.evaluation_table(promises, labels, names)
@@ -231,10 +231,10 @@ def _tables(data: ReportData, labels: Sequence[int], parts: ReportData, promises
             table = tables.quality_table(data.observations, views, labels, names, which)
             yield f"ssim_by_level_{which}", table
     if data.models:
-        yield "models", tables.models_table(data.models, parts.names)
+        yield "models", tables.models_table(data.models, per_block.names)
     if data.panels:
         rows = [(p.name, p.ssim, p.psnr, p.full_ssim, p.full_psnr) for p in data.panels]
-        header = ("view", "SSIM", "PSNR", "everything SSIM", "everything PSNR")
+        header = ("view", "SSIM", "PSNR", "full model SSIM", "full model PSNR")
         yield "panels", Table("Views shown above", header, ("", ".3f", ".2f", ".3f", ".2f"), rows)
     if data.timings:
         yield "timings", Table("Time by stage", ("stage", "seconds"), ("", ",.1f"), list(data.timings))
@@ -253,7 +253,7 @@ def _pictures(panel: Panel, colours: Colours) -> dict:
         "panel": panel,
         "ratio": f"{panel.photo.shape[1]} / {panel.photo.shape[0]}",
         "pictures": [
-            ("everything", _picture(panel.full, "JPEG")),
+            ("full model", _picture(panel.full, "JPEG")),
             ("photo", _picture(panel.photo, "JPEG")),
             ("categories", _picture(labels, "PNG")),
             ("error", _picture(error, "JPEG")),

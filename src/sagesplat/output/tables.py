@@ -1,4 +1,4 @@
-"""The tables of a run: what the paper prints as Tables I to III, the plan, the models and the promise."""
+"""The tables of a run: what the paper prints as Tables I to III, the plan, the models and their coverage."""
 
 import csv
 import math
@@ -111,7 +111,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Kept:
-    """How a promise fared: rows in which the model promised the target, and those that reached it."""
+    """Empirical coverage of a promise: rows in which the target was promised, and those that measured it."""
 
     promised: int
     kept: int
@@ -136,7 +136,7 @@ def by_size(counts: Counts) -> list[int]:
 
 
 def last_counts(counts: Counts) -> dict[int, int]:
-    """Number of Gaussians of each label at the last level: the whole 3DGS model."""
+    """Gaussians of each label in the full model, the last level: of snapshots it is 3DGS itself."""
     last: dict[int, int] = {}
     for (label_id, _), count in sorted(counts.items(), key=lambda item: item[0][1]):
         last[label_id] = count
@@ -209,10 +209,10 @@ def outcome_table(plan: Plan, counts: Counts, evaluation: Evaluation, names: Map
     share = plan.count / max(1, sum(full.values()))
     measured = (mean(whole.ssim), mean(whole.full_ssim))
     body.append((name_of(TOTAL, names), math.nan, plan.count, share, math.nan, *measured, plan.status))
-    header = ("category", "level", "Gaussians", "share", "promised", "test", "all", "status")
+    header = ("category", "level", "Gaussians", "share", "promised", "test", "full", "status")
     formats = ("", "d", ",d", ".0%", ".3f", ".3f", ".3f", "")
     return Table(
-        f"Plan for SSIM {plan.target:g}: promised, and measured on test views beside everything",
+        f"Plan for SSIM {plan.target:g}: promised, and measured on test views beside the full model",
         header,
         formats,
         body,
@@ -228,7 +228,7 @@ def plan_table(plan: Plan, counts: Counts, names: Mapping[int, str]) -> Table:
         cells = (choice.level, choice.count, share, choice.nbytes / MB)
         name = name_of(choice.label_id, names)
         body.append((name, *cells, choice.distance, choice.predicted_ssim, choice.status))
-    header = ("category", "level", "Gaussians", "of all", "MB", "distance", "promised SSIM", "status")
+    header = ("category", "level", "Gaussians", "of full model", "MB", "distance", "promised SSIM", "status")
     formats = ("", ",d", ",d", ".1%", ".2f", ".3f", ".3f", "")
     return Table(f"Plan for SSIM {plan.target:g}", header, formats, body)
 
@@ -236,9 +236,9 @@ def plan_table(plan: Plan, counts: Counts, names: Mapping[int, str]) -> Table:
 def targets_table(
     plans: Sequence[Plan], counts: Counts, labels: Sequence[int], names: Mapping[int, str]
 ) -> Table:
-    """Table III: Gaussians, bytes and status of every label for 3DGS and for each target."""
+    """Table III: Gaussians, bytes and status of every label for the full model and for each target."""
     full = last_counts(counts)
-    header = ["category", "3DGS Gaussians", "3DGS MB"]
+    header = ["category", "full model Gaussians", "full model MB"]
     for plan in plans:
         header += [f"t={plan.target:g} {column}" for column in ("level", "Gaussians", "MB", "status")]
     chosen = [{choice.label_id: choice for choice in plan.choices} for plan in plans]
@@ -267,7 +267,7 @@ class Decisions(Protocol):
 
     @property
     def target(self) -> np.ndarray:
-        """SSIM asked for, [R]."""
+        """Target SSIM, [R]."""
         ...
 
     @property
@@ -316,7 +316,7 @@ def evaluation_table(evaluation: Evaluation, labels: Sequence[int], names: Mappi
                 (float(f"{target:g}"), name_of(label_id, names), len(rows), *share, *promise, *others)
             )
     header = ("target", "category", "views", "promised", "kept", "share kept", "promised SSIM", "SSIM")
-    header += ("error of promise", "3DGS SSIM", "PSNR", "3DGS PSNR")
+    header += ("error of promise", "full model SSIM", "PSNR", "full model PSNR")
     formats = ("g", "", ",d", ",d", ",d", ".0%", ".3f", ".3f", ".3f", ".3f", ".2f", ".2f")
     return Table("Promise against measurement, unseen views", header, formats, body)
 

@@ -104,9 +104,8 @@ def _is_done(job: Job, stage: Stage) -> bool:
         raise RunError(f"{job.run.path}: {NO_RUN}")
     for path in stage.inputs:
         if not path.exists():
-            raise RunError(
-                f"{path}: missing; run the stage before `sagesplat {stage.name}`, or `sagesplat run`"
-            )
+            command = stage.name.replace("_", "-")
+            raise RunError(f"{path}: missing; run the stage before `sagesplat {command}`, or `sagesplat run`")
     what = job.run, stage.name, stage.settings, stage.inputs, stage.outputs
     if is_done(*what, job.force or _follows(job, stage)):
         job.emit(StageSkipped(stage.name))

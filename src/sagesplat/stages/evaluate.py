@@ -10,14 +10,15 @@ from sagesplat.output import tables
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import settings_of
 from sagesplat.run.stage import run_stage
-from sagesplat.stages.compose import compose
+from sagesplat.segment.display_names import titles
+from sagesplat.stages.compose import compose, compose_inputs
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.plan import main_target, scene_plan
 from sagesplat.stages.shared import _show, label_images
 
 
 def evaluate_plans(job: Job) -> None:
-    """Measure the compositions on the test views, beside the promise and the whole model."""
+    """Measure the compositions on the test views, beside what was promised and the full model."""
     run, method = job.run, method_of(job)
 
     def make() -> list[str]:
@@ -32,7 +33,7 @@ def evaluate_plans(job: Job) -> None:
         table.write_csv(run.evaluation)
         if len(table):
             plan = scene_plan(run, main_target(run))
-            _show(job, tables.outcome_table(plan, job.ladder.counts, table, job.names()))
+            _show(job, tables.outcome_table(plan, job.ladder.counts, table, titles(job.names())))
         whole = table.select(table.label_id == TOTAL)
         lines = []
         for target in np.unique(whole.target):
@@ -41,10 +42,11 @@ def evaluate_plans(job: Job) -> None:
             asked = "within the budget" if within_budget else f"SSIM {target:g} asked"
             lines.append(
                 f"{asked}: test views {at.ssim.mean():.3f} / {at.psnr.mean():.2f} dB "
-                f"(everything {at.full_ssim.mean():.3f} / {at.full_psnr.mean():.2f} dB)"
+                f"(full model {at.full_ssim.mean():.3f} / {at.full_psnr.mean():.2f} dB)"
             )
         return lines
 
-    inputs = [run.scene, run.labels, *method.files, run.plan]
+    fitted = [run.provenance("observe"), run.provenance("fit")]
+    inputs = [run.labels, *method.files, *fitted, *compose_inputs(job)]
     settings = {"tune_steps": settings_of(run, "plan").get("tune_steps", 0)}
     run_stage(job, "evaluate", settings, inputs, [run.evaluation], make)

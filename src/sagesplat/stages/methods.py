@@ -122,7 +122,7 @@ class Snapshots(Method):
 
     def plan_budget(self, config: PlanConfig) -> Plan:
         """See `Method`."""
-        raise RunError("--budget needs the nested ladder; leave out --ladder snapshots")
+        raise RunError("--budget needs the nested ladder; use --ladder nested")
 
     def amount(self, plan: Plan) -> str:
         """See `Method`."""
@@ -147,8 +147,8 @@ class NestedLevels(Method):
     def costs(self) -> Costs:
         """What the levels cost."""
         labels = sorted({label for label, _ in self.job.ladder.counts})
-        chunks, levels = read_index(self.job.run.increments), len(self.job.ladder.levels)
-        columns = (totals(chunks, labels, levels, name) for name in ("count", "nbytes", "gpu_bytes"))
+        increments, levels = read_index(self.job.run.increments), len(self.job.ladder.levels)
+        columns = (totals(increments, labels, levels, name) for name in ("count", "nbytes", "gpu_bytes"))
         return Costs(tuple(labels), *columns)
 
     @cached_property

@@ -2,6 +2,7 @@
 
 import json
 import platform
+from pathlib import Path
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from sagesplat.scene import describe
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.segment.block_categories import category_of
+from sagesplat.segment.display_names import titles
 from sagesplat.segment.masks import UNLABELLED, UNLABELLED_COLOR, Masks, Taxonomy
 
 PANELS = 3  # views shown in pictures
@@ -44,12 +46,12 @@ def report_data(
     names = {**masks.taxonomy.names, UNLABELLED: masks.taxonomy.name(UNLABELLED)}
     categories, colours = _parts(run, names)
     plans = read_plans(run.plan)[0]
-    records = {stage: read_json(run.provenance(stage)) for stage in STAGES if run.provenance(stage).exists()}
+    records = {path.stem: read_json(path) for path in stage_records(run)}
     antialiased = bool(records["train"]["settings"]["antialiased"])
     return ReportData(
         title=scene.name,
         target=target,
-        names=names,
+        names=titles(names),
         colours=colours or {label: masks.taxonomy.color(label) for label in names},
         observations=read_observations(run.observations),
         train_views=scene.train_ids,
@@ -69,8 +71,14 @@ def report_data(
     )
 
 
+def stage_records(run: RunDir) -> list[Path]:
+    """The records of the stages that a run's results were made by: not of one whose result was deleted."""
+    stages = [stage for stage in STAGES if stage != "fuse" or (run.fused / "labels.json").exists()]
+    return [path for path in map(run.provenance, stages) if path.exists()]
+
+
 def _parts(run: RunDir, names: dict[int, str]) -> tuple[dict[int, int], Colours]:
-    """Of a scene in blocks: which label stands for a part's category, and its colour; nothing of others."""
+    """Of a scene in blocks: the label of each per-block category's category, and its colour; else nothing."""
     if not (run.block_categories / "labels.json").exists():
         return {}, {}
     taxonomy = Taxonomy.read(run.masks / "labels.json")

@@ -23,31 +23,32 @@ from sagesplat.output.tables import Table, by_size, mean, name_of
 from sagesplat.raster import Workspace
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import settings_of
+from sagesplat.segment.display_names import titles
 from sagesplat.train.early_stopping import measured_views
 
 BAND = 10  # px around the borders of categories
 _FREE = {"freeze_at"}  # settings that may differ between the two runs
 
 
-def compare_early_stopping(online: Job, full: Job, out: Path) -> tuple[Table, Table]:
+def compare_early_stopping(stopped: Job, full: Job, out: Path) -> tuple[Table, Table]:
     """A run with --train.freeze-at against the same run without: by method, and by category.
 
     From the full run each category takes the first level that has reached the target by the same measurement
-    that stops it during training. Both, and the whole full run, are measured on the test views. Writes
-    `out`/online.* and online_categories.*; RunError where the runs do not belong together.
+    that stops it during training. Both, and the full run, are measured on the test views. Writes
+    `out`/early_stopping.* and early_stopping_categories.*; RunError where the runs differ in more than that.
     """
-    target = _check(online, full)
-    stopped = {int(label): step for label, step in read_json(online.run.frozen).items()}
+    target = _check(stopped, full)
+    stops = {int(label): step for label, step in read_json(stopped.run.frozen).items()}
     ladder = full.ladder
     views = measured_views(full.scene, full.masks)
     reached = first_levels(ladder, read_observations(full.run.observations), views, target)
     sets = {
-        "online": online.ladder.load(online.ladder.levels[-1]),
-        "offline": ladder.compose(reached),
+        "early stopping": stopped.ladder.load(stopped.ladder.levels[-1]),
+        "composed": ladder.compose(reached),
         "full run": ladder.load(ladder.levels[-1]),
     }
-    seconds = {job: read_json(job.run.provenance("train"))["seconds"] for job in (online, full)}
-    times = {"online": seconds[online], "offline": seconds[full], "full run": seconds[full]}
+    seconds = {job: read_json(job.run.provenance("train"))["seconds"] for job in (stopped, full)}
+    times = {"early stopping": seconds[stopped], "composed": seconds[full], "full run": seconds[full]}
     measured = {name: _measure(full, g) for name, g in sets.items()}
     labels = by_size(ladder.counts)
     methods = Table(
@@ -63,10 +64,10 @@ def compare_early_stopping(online: Job, full: Job, out: Path) -> tuple[Table, Ta
     counts = {name: g.counts() for name, g in sets.items()}
     body = []
     for label in labels:
-        cells: list[str | int | float] = [name_of(label, full.names())]
-        for name, steps in (("online", stopped), ("offline", reached), ("full run", {})):
+        cells: list[str | int | float] = [name_of(label, titles(full.names()))]
+        for name, steps in (("early stopping", stops), ("composed", reached), ("full run", {})):
             if name != "full run":
-                last = (online if name == "online" else full).ladder.levels[-1]
+                last = (stopped if name == "early stopping" else full).ladder.levels[-1]
                 cells.append(steps.get(label, last))
             cells += [counts[name].get(label, 0), measured[name].get(label, np.nan)]
         body.append(tuple(cells))
@@ -75,10 +76,10 @@ def compare_early_stopping(online: Job, full: Job, out: Path) -> tuple[Table, Ta
         ("category", "stops at", "Gaussians", "SSIM", "level", "Gaussians", "SSIM", "Gaussians", "SSIM"),
         ("", ",d", ",d", ".3f", ",d", ",d", ".3f", ",d", ".3f"),
         body,
-        groups=(("online", 3), ("offline", 3), ("full run", 2)),
+        groups=(("early stopping", 3), ("composed", 3), ("full run", 2)),
     )
-    methods.write(out / "online")
-    categories.write(out / "online_categories")
+    methods.write(out / "early_stopping")
+    categories.write(out / "early_stopping_categories")
     return methods, categories
 
 
@@ -97,21 +98,21 @@ def first_levels(
     return chosen
 
 
-def _check(online: Job, full: Job) -> float:
-    """The target of the online run; RunError where the two runs cannot be compared."""
-    made, other = (settings_of(job.run, "train") for job in (online, full))
+def _check(stopped: Job, full: Job) -> float:
+    """The target of the stopped run; RunError where the two runs cannot be compared."""
+    made, other = (settings_of(job.run, "train") for job in (stopped, full))
     target = made.get("freeze_at")
     if target is None or other.get("freeze_at") is not None:
         raise RunError(
-            f"{online.run.path}: this run needs --train.freeze-at and {full.run.path} must not have it; "
+            f"{stopped.run.path}: this run needs --train.freeze-at and {full.run.path} must not have it; "
             "swap them, or train one of them so"
         )
-    scenes = [read_json(job.run.scene)["fingerprint"] for job in (online, full)]
+    scenes = [read_json(job.run.scene)["fingerprint"] for job in (stopped, full)]
     names = {name for name in {*made, *other} - _FREE if made.get(name) != other.get(name)}
     if scenes[0] != scenes[1] or names:
         what = f"settings ({', '.join(sorted(names))})" if names else "captures"
         raise RunError(
-            f"{full.run.path}: other {what} than {online.run.path}; train one of them like the other"
+            f"{full.run.path}: other {what} than {stopped.run.path}; train one of them like the other"
         )
     if not full.run.observations.exists():
         raise RunError(f"{full.run.observations}: missing; run `sagesplat observe {full.run.path}`")

@@ -1,4 +1,4 @@
-"""The nested ladder beside its baselines: what was measured, what is saved at equal quality, and a walk."""
+"""Nested levels beside their baselines: what was measured, what is saved at equal quality, and a walk."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -52,7 +52,7 @@ Size = Literal["raw", "encoded"]
 
 @dataclass(frozen=True)
 class OfLabel:
-    """A category's part in a point."""
+    """One category of a point."""
 
     count: int
     encoded: int  # bytes
@@ -79,7 +79,7 @@ class Point:
 
     @property
     def raw(self) -> int:
-        """Occupancy as the paper counts it, bytes."""
+        """Bytes as the paper counts model size: 248 a Gaussian."""
         return self.count * BYTES_PER_GAUSSIAN
 
 

@@ -1,4 +1,4 @@
-"""The nested ladder beside its baselines: same data, same training views, same evaluation."""
+"""Nested levels beside their baselines: same data, same training views, same evaluation."""
 
 import json
 from collections.abc import Callable, Iterator, Sequence
@@ -29,6 +29,7 @@ from sagesplat.run.job import Job
 from sagesplat.run.remote import work
 from sagesplat.run.run_dir import RunDir, is_done, settings_of
 from sagesplat.run.stage import Stage, run_stage, run_stages
+from sagesplat.segment.display_names import titles
 from sagesplat.stages.compose import tune_composition
 from sagesplat.stages.fit import fit_ladder
 from sagesplat.stages.methods import NestedLevels, Snapshots, method_of
@@ -90,7 +91,7 @@ def compare(job: Job, config: CompareConfig, copy: Path | None = None) -> list[P
     lpips = lpips_hashes(config.lpips)
     targets = list(config.targets) or sorted({*PAPER_TARGETS, *settings_of(job.run, "plan")["targets"]})
     settings = json.loads(json.dumps(asdict(config) | {"targets": targets, "lpips": lpips}))
-    is_done(job.run, "compare", settings, [], [file], job.force)  # refused before hours of training
+    is_done(job.run, "compare", settings, None, [file], job.force)  # refused before hours of training
     snapshots = _snapshots(job)
     trained = _trained(job, [*_pruned(job, config, folder), *_mcmc(job, config, folder)])
 
@@ -115,7 +116,7 @@ def compare(job: Job, config: CompareConfig, copy: Path | None = None) -> list[P
     tables = make_tables(points, walks, main_target(run))
 
     def show() -> list[str]:
-        write_report(folder, tables, points, job.names())
+        write_report(folder, tables, points, titles(job.names()))
         return list(tables["table_2_baselines"].notes[:-2])
 
     run_stage(job, "compared", {}, [file], [folder / PAGE], show)
@@ -186,7 +187,7 @@ def _pruned(job: Job, config: CompareConfig, folder: Path) -> list[_Baseline]:
     steps = settings_of(job.run, "nest")["steps"] if config.tune_steps < 0 else config.tune_steps
 
     @cache
-    def worth() -> np.ndarray:
+    def weights() -> np.ndarray:
         views = job.scene.train_ids.tolist()
         antialiased = job.antialiased
         return importance(read_level(last.path), job.scene, views, "weight-volume", antialiased=antialiased)
@@ -195,16 +196,16 @@ def _pruned(job: Job, config: CompareConfig, folder: Path) -> list[_Baseline]:
         _Baseline(
             PRUNED, f"{share:.0%}, {steps} steps", folder / f"pruned-{share:g}-{steps}.npz",
             last.step + steps, {"share": share, "tune_steps": steps}, [job.run.scene, last.path],
-            _prune, lambda share=share: (share, steps, worth()),
+            _prune, lambda share=share: (share, steps, weights()),
         )
         for share in sorted(set(config.shares))
     ]  # fmt: skip
 
 
 def _prune(job: Job, of: tuple[float, int, np.ndarray]) -> Gaussians:
-    share, steps, worth = of
+    share, steps, weights = of
     g = read_level(job.snapshots.files[-1].path)
-    return tune_composition(job, prune_to(g, max(1, round(share * len(g))), worth), steps)
+    return tune_composition(job, prune_to(g, max(1, round(share * len(g))), weights), steps)
 
 
 def _mcmc(job: Job, config: CompareConfig, folder: Path) -> list[_Baseline]:
@@ -230,7 +231,7 @@ def _cap(job: Job, of: tuple[str, int, int, int]) -> Gaussians:
 def _trained(job: Job, baselines: Sequence[_Baseline]) -> dict[Path, Contender]:
     """The baselines by file, trained where they are missing.
 
-    Each is a stage of its own, so that a killed comparison goes on with the next one.
+    Each is a stage of its own, so that a killed comparison resumes with the next one.
     """
     local = isinstance(job.executor, Local)
     for some in [[b] for b in baselines] if local else [baselines]:
@@ -323,7 +324,7 @@ def _measure(job: Job, contenders: Sequence[Contender], metrics: dict[str, Lpips
         some = contenders[begin : begin + _TOGETHER]
         sets = [contender.load() for contender in some]
         found: list[list[dict[str | int, float]]] = [[] for _ in some]
-        # the nested ladder is kept as it is sent
+        # nested levels are measured as decoded from their increments
         sent = [
             _send(job, g) if c.encoded is None else (c.encoded, None) for c, g in zip(some, sets, strict=True)
         ]
@@ -375,14 +376,14 @@ def _point(
 
 
 def _send(job: Job, g: Gaussians) -> tuple[dict[int, int], Gaussians]:
-    """Bytes by label id, one file each made as the chunks of the nested ladder are, and what arrives."""
+    """Bytes by label id, one file each encoded as increments are, and what a viewer decodes from them."""
     bits = tuple(settings_of(job.run, "nest").get("sh_bits", SH_BITS))
     whole = {label: (count,) for label, count in g.counts().items()}
     with TemporaryDirectory() as folder:
-        path = Path(folder) / "chunks"
-        chunks = write_increments(path, g, whole, job.names(), sh_bits=bits, antialiased=job.antialiased)
-        arrived = read_increments(path, chunks) if chunks else g
-    return {c.label_id: c.nbytes for c in chunks}, arrived
+        path = Path(folder) / "increments"
+        increments = write_increments(path, g, whole, job.names(), sh_bits=bits, antialiased=job.antialiased)
+        arrived = read_increments(path, increments) if increments else g
+    return {c.label_id: c.nbytes for c in increments}, arrived
 
 
 def _walks(nested: NestedLevels, sage: Snapshots) -> list[Walk]:
@@ -391,9 +392,9 @@ def _walks(nested: NestedLevels, sage: Snapshots) -> list[Walk]:
     target, views = main_target(job.run), range(len(job.scene.views))
     chosen = along(nested.quality.bound, costs.transfer_bytes, target=target) + 1
     ours = [dict(zip(costs.labels, levels.tolist(), strict=True)) for levels in chosen]
-    chunks = read_index(job.run.increments)
-    chunk_files = {
-        (label, k + 1): {c.uri: c.nbytes for c in chunks if c.label_id == label and c.level <= k + 1}
+    increments = read_index(job.run.increments)
+    increment_files = {
+        (label, k + 1): {c.uri: c.nbytes for c in increments if c.label_id == label and c.level <= k + 1}
         for label in costs.labels
         for k in range(costs.transfer_bytes.shape[1])
     }
@@ -407,7 +408,7 @@ def _walks(nested: NestedLevels, sage: Snapshots) -> list[Walk]:
     }
     walks = []
     for keeps in (True, False):
-        mine = walk("nested", ours, chunk_files, keeps)
+        mine = walk("nested", ours, increment_files, keeps)
         assert mine.replaced == 0, "a level must contain the ones below it"
         walks += [mine, walk(SAGE, theirs, level_files, keeps)]
     return walks

@@ -24,18 +24,18 @@ NONE = -1  # level or count where there is none
 class CrossView:
     """One row per (target, view, category in sight) and one per (target, view) for the whole image."""
 
-    target: Float32[np.ndarray, " R"]  # SSIM asked for
+    target: Float32[np.ndarray, " R"]  # SSIM
     view: Int32[np.ndarray, " R"]  # row in Scene.views
     label_id: Int32[np.ndarray, " R"]  # category id, -1 = unlabelled, -2 = the whole image
     level: Int32[np.ndarray, " R"]  # chosen for this view; -1 for the whole image
     count: Int32[np.ndarray, " R"]  # Gaussians of that level; of the composition for the whole image
-    predicted: Float32[np.ndarray, " R"]  # promised SSIM; NaN without a model and for the whole image
+    predicted: Float32[np.ndarray, " R"]  # that the plan counts on; NaN without a model
     ssim: Float32[np.ndarray, " R"]  # measured on the composed scene, over the rendered mask
     psnr: Float32[np.ndarray, " R"]  # dB, the same
-    level_ssim: Float32[np.ndarray, " R"]  # measured with everything at the chosen level; NaN as above
+    level_ssim: Float32[np.ndarray, " R"]  # measured with all categories at the chosen level; NaN as above
     oracle_level: Int32[np.ndarray, " R"]  # the cheapest that measures the target in this view; -1 = none
     oracle_count: Int32[np.ndarray, " R"]  # its Gaussians
-    full_ssim: Float32[np.ndarray, " R"]  # 3DGS at its last level, the same pixels
+    full_ssim: Float32[np.ndarray, " R"]  # of the full model: every category at its last level
     full_psnr: Float32[np.ndarray, " R"]
     num_pixels: Int32[np.ndarray, " R"]
 
@@ -48,7 +48,7 @@ class CrossView:
 
     @property
     def regret(self) -> Float32[np.ndarray, " R"]:
-        """Gaussians above the cheapest level that would have done; NaN where none would, or too few came."""
+        """Gaussians above the cheapest level that measures the target; NaN unless the chosen one does too."""
         known = (self.oracle_level != NONE) & (self.level_ssim >= self.target)
         return np.where(known, self.count - self.oracle_count, np.nan).astype(np.float32)
 

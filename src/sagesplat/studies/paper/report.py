@@ -23,7 +23,7 @@ from sagesplat.output.tables import MB, Table, by_size, last_counts, mean, name_
 from sagesplat.raster import Backend
 from sagesplat.scene.scene import Camera
 from sagesplat.studies.paper.cross_view import NONE, CrossView
-from sagesplat.studies.paper.same_size import METHODS, WHOLE, SameSize
+from sagesplat.studies.paper.same_size import FULL, METHODS, SameSize
 
 ITERATIONS = (1 / 6, 1 / 3, 1 / 2, 1.0)  # of the run: the paper's 5000, 10 000, 15 000 and 30 000
 
@@ -170,7 +170,7 @@ def curves_and_constants(data: PaperData, labels: Sequence[int]) -> Table:
 
 
 def one_view(data: PaperData, labels: Sequence[int]) -> Table:
-    """Table III: distances, SSIM at each iteration, counts and occupancy for 3DGS and each target, in a view.
+    """Table III: distances, SSIM at each iteration, counts and sizes for 3DGS and each target, in a view.
 
     An SSIM carries the targets for which its iteration was selected.
     """
@@ -221,32 +221,32 @@ def one_view(data: PaperData, labels: Sequence[int]) -> Table:
 
 
 def equal_size(same_size: SameSize, of_view: int, where: str) -> Table:
-    """Table IV: compositions and 3DGS of the same size; `of_view` as in `Occupancy`."""
+    """Table IV: compositions and 3DGS of the same size; `of_view` as in `SameSize`."""
     rows = same_size.select(same_size.of_view == of_view)
     body, best = [], {}
     quality = {"ssim": 1, "psnr": 1, "lpips_alex": -1, "lpips_vgg": -1}  # larger or smaller is better
     for target in sorted(t for t in np.unique(rows.target) if not np.isnan(t)):
         first = len(body)
-        for method in range(WHOLE):
+        for method in range(FULL):
             here = rows.select((rows.target == target) & (rows.method == method))
             values = [mean(getattr(here, name)) for name in quality]
-            occupied = mean(here.count.astype(float)) * BYTES_PER_GAUSSIAN / MB
-            body.append((f"t={target:g}", METHODS[method], occupied, *values))
+            megabytes = mean(here.count.astype(float)) * BYTES_PER_GAUSSIAN / MB
+            body.append((f"t={target:g}", METHODS[method], megabytes, *values))
         for column, sign in enumerate(quality.values(), 3):
             scores = [sign * float(row[column]) for row in body[first:]]
             if not np.isnan(scores).all():
                 best[first + int(np.nanargmax(scores)), column] = "best"
-    here = rows.select(rows.method == WHOLE)
+    here = rows.select(rows.method == FULL)
     values = [mean(getattr(here, name)) for name in quality]
-    occupied = mean(here.count.astype(float)) * BYTES_PER_GAUSSIAN / MB
-    body.append(("", METHODS[WHOLE], occupied, *values))
+    megabytes = mean(here.count.astype(float)) * BYTES_PER_GAUSSIAN / MB
+    body.append(("", METHODS[FULL], megabytes, *values))
     notes = (
         "LPIPS (VGG) is fed images in [0, 1], as the evaluation of 3DGS feeds it; Alex as its authors do.",
     )
     if np.isnan(rows.lpips_alex).all() or np.isnan(rows.lpips_vgg).all():
         notes += ("LPIPS not measured: no weights; run `sagesplat download lpips` and report again.",)
     return Table(
-        f"Table IV: quality at equal occupancy, {where}",
+        f"Table IV: quality at equal model size, {where}",
         ("size of", "method", "MB", "SSIM", "PSNR", "LPIPS (Alex)", "LPIPS (VGG)"),
         ("", "", ".2f", ".3f", ".2f", ".3f", ".3f"),
         body,

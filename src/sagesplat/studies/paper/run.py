@@ -1,4 +1,4 @@
-"""The paper's evaluation of a finished run, in three stages: crossview, occupancy, tables and figures."""
+"""The paper's evaluation of a finished run, in three stages: crossview, same-size, tables and figures."""
 
 from collections.abc import Sequence
 
@@ -17,13 +17,14 @@ from sagesplat.output.tables import Table, promise_kept
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import settings_of
 from sagesplat.run.stage import run_stage
+from sagesplat.segment.display_names import titles
 from sagesplat.stages.compose import tune_composition
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.shared import distances, observed
 from sagesplat.studies.lpips import load_metrics, lpips_hashes
 from sagesplat.studies.paper.cross_view import NONE, cross_view, read_cross_view
 from sagesplat.studies.paper.report import PaperData, Picture, four_levels, take_pictures, write_paper
-from sagesplat.studies.paper.same_size import SameSize, compare, contenders, read_occupancy
+from sagesplat.studies.paper.same_size import SameSize, compare, contenders, read_same_size
 
 _IMAGES_A_TRAINING = 50  # a short training takes about as long as measuring so many images
 
@@ -36,7 +37,7 @@ def paper_report(job: Job, config: PaperConfig) -> None:
 
 
 def cross_views(job: Job) -> None:
-    """Plan each unseen view by itself and measure what comes of it."""
+    """Plan each unseen view by itself and measure its composition."""
     run, method, targets = job.run, method_of(job), _targets(job)
 
     def make() -> list[str]:
@@ -101,7 +102,7 @@ def equal_size(job: Job, config: PaperConfig) -> None:
         def advance(by: int) -> None:
             nonlocal done
             done += by
-            job.emit(Progress("occupancy", done, total))
+            job.emit(Progress("same-size", done, total))
 
         def tuned(g: Gaussians) -> Gaussians:
             result = tune_composition(job, g, config.tune_steps)
@@ -120,7 +121,7 @@ def equal_size(job: Job, config: PaperConfig) -> None:
         return [f"{len(rows)} images measured"]
 
     inputs = [run.scene, run.levels, run.models, run.observations, run.plan]
-    run_stage(job, "occupancy", settings, inputs, [run.same_size], make)
+    run_stage(job, "same-size", settings, inputs, [run.same_size], make)
 
 
 def tables_and_figures(job: Job, config: PaperConfig) -> None:
@@ -138,7 +139,7 @@ def tables_and_figures(job: Job, config: PaperConfig) -> None:
         }
         data = PaperData(
             title=job.scene.name,
-            names=job.names(),
+            names=titles(job.names()),
             colours={label: taxonomy.color(label) for label in job.names()},
             observations=read_observations(run.observations),
             fitted=observed(job, job.fit_config),
@@ -153,7 +154,7 @@ def tables_and_figures(job: Job, config: PaperConfig) -> None:
             distances={n: {i: float(d[view]) for i, d in table.items()} for n, table in by_statistic.items()},
             view_plans=view_plans,
             cross_view=read_cross_view(run.cross_view),
-            same_size=read_occupancy(run.same_size),
+            same_size=read_same_size(run.same_size),
             panels=_panels(job, config, view),
         )
         write_paper(run.paper, data)

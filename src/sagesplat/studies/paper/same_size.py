@@ -1,4 +1,4 @@
-"""Quality at equal occupancy (Table IV of the paper): compositions against 3DGS of the same size."""
+"""Quality at equal model size (Table IV of the paper): compositions against 3DGS of the same size."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -21,14 +21,14 @@ from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.train.importance import importance
 
-METHODS = ("SAGE", "SAGE, tuned", "3DGS, snapshot", "3DGS, pruned and tuned", "3DGS, whole")
-WHOLE = len(METHODS) - 1
+METHODS = ("SAGE", "SAGE, tuned", "3DGS, snapshot", "3DGS, pruned and tuned", "3DGS, full model")
+FULL = len(METHODS) - 1
 
 
 class Contender(NamedTuple):
     """A set of Gaussians to be measured."""
 
-    target: float  # SSIM of the plan that set the size; NaN for the whole of 3DGS
+    target: float  # SSIM of the plan that set the size; NaN for the full model of 3DGS
     method: int  # index in METHODS
     gaussians: Gaussians
 
@@ -38,7 +38,7 @@ class SameSize:
     """One row per (contender, view)."""
 
     of_view: Int32[np.ndarray, " R"]  # view that the compositions were planned for; -1 = for the scene
-    target: Float32[np.ndarray, " R"]  # SSIM of the plan that set the size; NaN for the whole of 3DGS
+    target: Float32[np.ndarray, " R"]  # SSIM of the plan that set the size; NaN for the full model of 3DGS
     method: Int32[np.ndarray, " R"]  # index in METHODS
     view: Int32[np.ndarray, " R"]  # row in Scene.views
     count: Int32[np.ndarray, " R"]  # Gaussians
@@ -52,7 +52,7 @@ class SameSize:
         return SameSize(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
 
-def read_occupancy(path: Path) -> SameSize:
+def read_same_size(path: Path) -> SameSize:
     """The table that `columns.write_columns` wrote. DataError where it is not one."""
     return read_columns(path, SameSize, "run `sagesplat report --paper` again")
 
@@ -78,7 +78,7 @@ def contenders(
     antialiased: bool = False,
 ) -> list[Contender]:
     """For each plan: its composition, the same tuned, 3DGS's snapshot nearest in size, 3DGS pruned to it and
-    tuned; last the whole of 3DGS.
+    tuned; last the full model of 3DGS.
     """
     full = ladder.load(ladder.levels[-1])
     weights = importance(full, scene, scene.train_ids.tolist(), antialiased=antialiased)
@@ -92,7 +92,7 @@ def contenders(
             tuned(prune_to(full, plan.count, weights)),
         ]
         found += [Contender(plan.target, method, g) for method, g in enumerate(sets)]
-    return [*found, Contender(np.nan, WHOLE, full)]
+    return [*found, Contender(np.nan, FULL, full)]
 
 
 def compare(
@@ -107,7 +107,7 @@ def compare(
     antialiased: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[dict[str, float]]:
-    """Rows of `Occupancy`: every contender in every view (rows of Scene.views).
+    """Rows of `SameSize`: every contender in every view (rows of Scene.views).
 
     `metrics`: LPIPS by column name. `progress` hears (images measured, images in all).
     """

@@ -8,14 +8,15 @@ from pathlib import Path
 from sagesplat.io.files import write_text
 from sagesplat.output.tables import Table
 
-# columns of numbers, with their formats: SSIM and PSNR (dB) are of whole test views, `error` is the mean
-# error of a category's promise there; a training that went on after a kill tells the seconds since then
+# columns of numbers, with their formats: SSIM and PSNR (dB) are of whole test views, "full" is the full model
+# (the last level: of snapshots 3DGS itself), `error` the mean error of a category's prediction there; a
+# training that resumed after a kill counts the seconds since then
 MEASURES = {
-    "Gaussians": ",.0f", "of 3DGS": ".1%", "MB": ".2f", "SSIM": ".3f", "3DGS SSIM": ".3f",
-    "PSNR": ".2f", "3DGS PSNR": ".2f", "promised": ".1f", "kept": ".1f", "share kept": ".1%",
+    "Gaussians": ",.0f", "of full model": ".1%", "MB": ".2f", "SSIM": ".3f", "full SSIM": ".3f",
+    "PSNR": ".2f", "full PSNR": ".2f", "promised": ".1f", "kept": ".1f", "share kept": ".1%",
     "error": ".3f", "training s": ".1f",
 }  # fmt: skip
-SHOWN = ("of 3DGS", "SSIM", "share kept")  # what 80 characters have room for
+SHOWN = ("of full model", "SSIM", "share kept")  # what 80 characters have room for
 Row = tuple[str | int | float, ...]
 
 

@@ -1,6 +1,7 @@
-"""What one run's quality models are worth in another: tables and a figure."""
+"""How well the quality models of one run predict another: tables and a figure."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from matplotlib.lines import Line2D
 
 from sagesplat.output.figures import FAINT, INK, STYLE
 from sagesplat.output.tables import Table, mean
+from sagesplat.segment.display_names import titles
 from sagesplat.studies.transfer.score import (
     NORMALISATIONS,
     PREDICTORS,
@@ -30,10 +32,18 @@ LINES = {
 AVERAGED = ("ssim_error", "bias", "outside", "iteration_error", "hit", "regret", "regret_share")
 
 
+def _shown(names: Sequence[str]) -> dict[str, str]:
+    """For people, by stored name."""
+    stored = list(dict.fromkeys(names))
+    return dict(zip(stored, titles(dict(enumerate(stored))).values(), strict=True))
+
+
 def transfer_table(scores: Transfer) -> Table:
     """Every row of the evaluation."""
     formats = ("", "g", "", "", ",d", ".3f", "+.3f", ".0%", ",d", ",.0f", ".0%", ",d", ",.0f", ".1%")
     columns = {f.name: getattr(scores, f.name).tolist() for f in fields(scores)}
+    shown = _shown(columns["category"])
+    columns["category"] = [shown[name] for name in columns["category"]]
     return Table(
         "Cross-scene, by category", tuple(columns), formats, list(zip(*columns.values(), strict=True))
     )
@@ -69,6 +79,7 @@ def transfer_figure(a: FittedRun, b: FittedRun) -> Figure:
     A panel per shared category; pale where a distance lies beyond those that a curve was fitted to.
     """
     found = shared_categories(a, b)
+    shown = _shown([shared.name for shared in found])
     columns = min(3, math.ceil(math.sqrt(len(found))))
     lines = math.ceil(len(found) / columns)
     figure = Figure(figsize=(3.6 * columns, 2.6 * lines + 0.4 + 1.4 / columns), layout="constrained")
@@ -79,7 +90,7 @@ def transfer_figure(a: FittedRun, b: FittedRun) -> Figure:
         test = np.isin(mine.view, b.test_views)
         axes.plot(mine.distance[~test], mine.ssim[~test], ".", color=FAINT, ms=4, alpha=0.6, mew=0)
         axes.plot(mine.distance[test], mine.ssim[test], "o", mfc="none", mec=FAINT, ms=4, mew=0.8)
-        axes.set_title(shared.name, loc="left", fontweight="bold")
+        axes.set_title(shown[shared.name], loc="left", fontweight="bold")
         if not len(mine):
             continue
         distance = np.linspace(mine.distance.min(), mine.distance.max(), 300)
