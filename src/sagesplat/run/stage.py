@@ -59,6 +59,7 @@ def run_stage(
         inputs: Files and folders that it is made from; their hashes are recorded.
         outputs: Files and folders that it makes.
         make: Does the work and returns lines that sum up the result.
+        swaps: The old result and its record stay until `make` removes them.
 
     Raises:
         RunError: If an input is missing, the result was made with other settings (without `job.force`),
