@@ -1,4 +1,4 @@
-"""Put the chosen levels together, and write the scene that the plan chose."""
+"""Makes the composed scene, from the levels that the plan chose."""
 
 from sagesplat.adapt.plan import Plan
 from sagesplat.core.gaussians import Gaussians

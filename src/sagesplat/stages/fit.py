@@ -1,4 +1,4 @@
-"""Fit the quality models: Eq. 3 over distance, and the viewpoint model with its lower bound."""
+"""Makes the quality models, from the observations: Eq. 3, and viewpoint models with a lower bound."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
