@@ -463,7 +463,7 @@ def test_a_lost_context_is_said(site: str, browser: Any) -> None:
         ready(opened)
         lose = "document.getElementById('view').getContext('webgl2').getExtension('WEBGL_lose_context')"
         opened.page.evaluate(f"{lose}.loseContext()")
-        assert "graphics card" in message(opened)
+        assert "GPU context was lost" in message(opened)
 
 
 def test_a_window_without_area_waits(site: str, browser: Any) -> None:
