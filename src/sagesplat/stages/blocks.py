@@ -26,11 +26,11 @@ from sagesplat.run.run_dir import RunDir, file_hash
 from sagesplat.run.stage import run_stage
 from sagesplat.scene.blocks import (
     Blocks,
-    colours,
-    part_of,
+    assigned_views,
+    graph_colouring,
     read_blocks,
     split,
-    views_of,
+    training_scene,
     visible_shares,
     write_blocks,
 )
@@ -78,14 +78,14 @@ def divide(job: Job, config: BlocksConfig, seed: int) -> Blocks:
         blocks = split(scene, config.count, config.margin)
         of_points = blocks.of(scene.points.xyz)
         shares = visible_shares(scene, of_points, len(blocks))
-        assigned = views_of(scene, blocks, shares, config.min_share)
+        assigned = assigned_views(scene, blocks, shares, config.min_share)
         training = np.isin(np.arange(len(scene.views)), scene.train_ids)
         labels = LiftedLabels.read(run.labels, len(scene.points.xyz))
         sees: list[list[int]] = []
         for number in range(len(blocks)):
             rows = np.flatnonzero(assigned[:, number] & training).tolist()
             sees.append(np.flatnonzero((shares[rows] >= _SEEN).any(0)).tolist())
-            part, kept = part_of(scene, blocks, number, rows, config.far_share, seed)
+            part, kept = training_scene(scene, blocks, number, rows, config.far_share, seed)
             _begin(run.block(number), part, labels, kept)
         for old in run.blocks.glob("[0-9]*"):
             if int(old.name) >= len(blocks):
@@ -291,7 +291,7 @@ def _tune(job: Job, blocks: Blocks, config: BlocksConfig, nest: NestConfig, seed
     """Tune the blocks along their boundaries, neighbours one after the other; the files with the results."""
     run, every = job.run, range(len(blocks))
     files = [run.block(number).interior for number in every]
-    colour, sees = colours(blocks.neighbours()), read_json(run.blocks / "blocks.json")["sees"]
+    colour, sees = graph_colouring(blocks.neighbours()), read_json(run.blocks / "blocks.json")["sees"]
     steps = replace(nest, steps=config.boundary_steps)
     for now in range(int(colour.max()) + 1):
         mine = [number for number in every if colour[number] == now]
