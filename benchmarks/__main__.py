@@ -514,6 +514,23 @@ def freeze(
 
 
 @app.command
+def structure(src: tuple[Path, ...] = (Path("src/sagesplat"),), write: bool = False) -> None:
+    """How the package is built: entries, imports between them, cycles, lengths; of several checkouts in turn.
+
+    Args:
+        src: folders of packages, such as src/sagesplat; the name of each becomes a column.
+        write: also put the figures into benchmarks/results.
+    """
+    from benchmarks import structure as building
+
+    if missing := [str(path) for path in src if not (path / "__init__.py").exists()]:
+        raise SystemExit(f"{missing[0]}: not a Python package; name its folder, such as src/sagesplat")
+    results = {str(path): building.measure(path.resolve()) for path in src}
+    print(building.table(results))
+    _finish("structure", results, write)
+
+
+@app.command
 def plans(positions: int = 1000, write: bool = False) -> None:
     """Levels for a target and within a budget: time of one plan and of a path, by labels and levels."""
     rows = [planning.measure(positions, *size) for size in planning.SIZES]

@@ -12,7 +12,7 @@ import torch
 from numba import njit, prange
 
 from sagesplat.core.config import TrainConfig
-from sagesplat.core.gaussians import PARAMETERS, Gaussians
+from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.sh import num_bases
 from sagesplat.kernels.simd import fma, splat16, total
 from sagesplat.metrics.image import photometric_loss
@@ -61,7 +61,7 @@ def _count_pairs(records, starts, ends, ids, tiles_x):
         x0, y0 = np.float32(tile % tiles_x * blend.TILE), np.float32(tile // tiles_x * blend.TILE)
         for first in range(starts[tile], ends[tile], 16):
             last = min(first + 16, ends[tile])
-            blend._gather(records, ids, first, last, x0, y0, batch, rows)  # pyright: ignore[reportCallIssue]
+            blend.gather_batch(records, ids, first, last, x0, y0, batch, rows)  # pyright: ignore[reportCallIssue]
             for j in range(last - first):
                 pairs += max(0, int(rows[1, j]) - int(rows[0, j])) * blend.TILE
     return pairs
@@ -69,9 +69,7 @@ def _count_pairs(records, starts, ends, ids, tiles_x):
 
 def blending(g: Gaussians, camera: Camera, repeats: int) -> dict[str, float]:
     """The two blending loops alone: milliseconds, and pairs a second."""
-    options = cpu._Options(camera, 0, False, None, Workspace())
-    records, depths, radii = cpu._project(options, cpu._arrays([getattr(g, n) for n in PARAMETERS]))
-    found = cpu._intersections(options, records, depths, radii)
+    records, radii, found = cpu.intersections(g, camera, Workspace())
     size, num = (camera.height, camera.width), len(found.starts) - 1
     image, left, ends = np.zeros((*size, 3), np.float32), np.zeros(size, np.float32), np.zeros(num, np.int64)
     black, sums = np.zeros(3, np.float32), np.zeros((len(found.ids), blend.SUMS), np.float32)

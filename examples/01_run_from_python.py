@@ -6,13 +6,19 @@ python examples/01_run_from_python.py CAPTURE RUN --target-ssim 0.8
 import argparse
 from pathlib import Path
 
-from sagesplat.adapt.plan import read_plans
-from sagesplat.core.config import PlanConfig, RunConfig, SceneConfig, TrainConfig
-from sagesplat.core.events import Event, StageDone, StageSkipped, Warned
-from sagesplat.raster import set_threads
-from sagesplat.run.job import Job
-from sagesplat.run.run_dir import RunDir
-from sagesplat.stages.pipeline import run_all
+from sagesplat import (
+    Event,
+    NestConfig,
+    PlanConfig,
+    RunConfig,
+    SageError,
+    SceneConfig,
+    StageDone,
+    StageSkipped,
+    TrainConfig,
+    Warned,
+    run_scene,
+)
 
 
 def show(event: Event) -> None:
@@ -34,24 +40,26 @@ def main() -> None:
     parser.add_argument("run", type=Path, help="run folder, made if it is not there")
     parser.add_argument("--target-ssim", type=float, default=0.8)
     parser.add_argument("--max-steps", type=int, default=7000)
+    parser.add_argument("--nest-steps", type=int, default=3000, help="of the nested levels")
     parser.add_argument("--downscale", type=int, default=1)
     args = parser.parse_args()
 
     config = RunConfig(
         scene=SceneConfig(downscale=args.downscale),
         train=TrainConfig(max_steps=args.max_steps),
+        nest=NestConfig(steps=args.nest_steps, base_steps=args.nest_steps),
         plan=PlanConfig(target_ssim=args.target_ssim),
     )
-    job = Job(RunDir(args.run), show, threads=set_threads())
-    run_all(job, args.capture, config)
-
-    scene_plans, _ = read_plans(job.run.plan)
-    for plan in scene_plans:
+    run = run_scene(args.capture, args.run, config, on_event=show)
+    for plan in run.plans:
         print(f"\nSSIM {plan.target:g}: {plan.count:,} Gaussians, {plan.nbytes / 1e6:.1f} MB, {plan.status}")
         for choice in plan.choices:
-            name = job.names()[choice.label_id]
+            name = run.names[choice.label_id]
             print(f"  {name:24} level {choice.level:6}  {choice.count:9,}  {choice.status}")
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except (SageError, OSError) as error:  # one line: what is wrong, and what to do
+        raise SystemExit(f"{Path(__file__).name}: {error}") from None

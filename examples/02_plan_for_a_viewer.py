@@ -8,13 +8,7 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from sagesplat.adapt.bound_plans import plan_for_view, quality_at
-from sagesplat.adapt.observe import PERCENTILE, distances_in_views
-from sagesplat.adapt.viewpoint import read_promises
-from sagesplat.formats.ply import write_ply
-from sagesplat.run.job import Job
-from sagesplat.run.run_dir import RunDir
-from sagesplat.stages.plan import costs_of
+from sagesplat import SageError, open_run, write_ply
 
 
 def main() -> None:
@@ -28,28 +22,26 @@ def main() -> None:
     parser.add_argument("--back", type=float, default=0.0, help="world units")
     args = parser.parse_args()
 
-    job = Job(RunDir(args.run), emit=lambda event: None)  # scene, labels and ladder, read when asked for
-    costs, promises = costs_of(job), read_promises(job.run.promises)
-    views = {view.name: view for view in job.scene.views}
+    run = open_run(args.run)
+    views = {view.name: view for view in run.scene.views}
     if args.view not in views:
         parser.error(f"no view {args.view!r}; there are {', '.join(list(views)[:5])}, ...")
-
-    view = views[args.view]
-    w2c = view.camera.w2c.copy()
+    w2c = views[args.view].camera.w2c.copy()
     w2c[2, 3] += args.back  # the world moves away along the camera's z
-    viewer = replace(view, camera=replace(view.camera, w2c=w2c))
+    viewer = replace(views[args.view].camera, w2c=w2c)
 
-    # The distances must be measured as those that the promises were fitted to.
-    percentile = PERCENTILE if job.fit_config.distance == "percentile" else 0.0
-    far = distances_in_views(replace(job.scene, views=(viewer,)), job.point_labels, percentile)
-
-    plan = plan_for_view(quality_at(costs, promises, far, [viewer.camera]), costs, args.target_ssim, 0)
-    for c in plan.choices:
-        name, kept = job.names()[c.label_id], f"SSIM at least {c.predicted_ssim:.3f}, {c.status}"
-        print(f"{name:24} level {c.level:3}  {c.count:9,} Gaussians  distance {c.distance:6.2f}  {kept}")
-    write_ply(args.ply, job.ladder.compose(plan.levels), job.names())
+    plan = run.plan_camera(viewer, args.target_ssim)
+    for choice in plan.choices:
+        print(
+            f"{run.names[choice.label_id]:24} level {choice.level:3}  {choice.count:9,} Gaussians  "
+            f"distance {choice.distance:6.2f}  SSIM at least {choice.predicted_ssim:.3f}, {choice.status}"
+        )
+    write_ply(args.ply, run.compose(plan), run.names)
     print(f"{args.ply}: {plan.count:,} Gaussians, {plan.transfer_bytes or 0:,} bytes to send")
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except (SageError, OSError) as error:  # one line: what is wrong, and what to do
+        raise SystemExit(f"{Path(__file__).name}: {error}") from None

@@ -10,9 +10,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from sagesplat.formats.ply import read_ply
-from sagesplat.raster import rasterize, set_threads
-from sagesplat.scene import load_scene
+from sagesplat import SageError, load_scene, rasterize, read_ply, set_threads
 
 
 def main() -> None:
@@ -43,4 +41,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except (SageError, OSError) as error:  # one line: what is wrong, and what to do
+        raise SystemExit(f"{Path(__file__).name}: {error}") from None

@@ -12,18 +12,16 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageOps
 
-from sagesplat.output.figures import label_image
-from sagesplat.segment.hf import DEFAULT_MODEL, HfSegmenter
-from sagesplat.segment.onnx import OnnxSegmenter
+from sagesplat import HfSegmenter, OnnxSegmenter, SageError, label_image
+
+EOMT = "tue-mps/coco_panoptic_eomt_small_640_2x"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("out", type=Path, help="folder for the overlays")
     parser.add_argument("photos", type=Path, nargs="+", help="photos")
-    parser.add_argument(
-        "--model", default=DEFAULT_MODEL, help="a name on huggingface.co, a folder, or NETWORK.onnx"
-    )
+    parser.add_argument("--model", default=EOMT, help="a name on huggingface.co, a folder, or NETWORK.onnx")
     parser.add_argument("--classes", type=Path, help="what the outputs of an ONNX network mean")
     args = parser.parse_args()
 
@@ -44,4 +42,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except (SageError, OSError) as error:  # one line: what is wrong, and what to do
+        raise SystemExit(f"{Path(__file__).name}: {error}") from None

@@ -309,6 +309,8 @@ def test_labels_with_hardly_any_data():
     assert isinstance(result, Decisions)
     assert set(result.label_id) == set(promises)
     assert np.isnan(result.select(result.label_id == 1).totals()["overshoot"])  # in no test view
+    planned = {key: cost for key, cost in counts.items() if key[0] != 5}  # no Gaussians of 5: in no plan
+    assert set(score(observations, SCENE, promises, planned, [0.6]).label_id) == set(promises) - {5}
 
 
 def test_without_calibration_views_training_views_stand_in_and_the_status_says_so():

@@ -1,5 +1,6 @@
 """Benchmarks run, and the torch rasteriser that they compare with shows the same image."""
 
+import ast
 import json
 import subprocess
 import sys
@@ -17,6 +18,28 @@ ROOT = Path(__file__).parents[1]
 def test_the_plain_rasteriser_shows_the_same():
     g, camera = random_gaussians(80, seed=2, degree=1), pinhole(70, 50)
     assert (plain.render(g, camera, degree=1) - rasterize(g, camera, sh_degree=1).rgb).abs().max() < 2e-3
+
+
+def test_benchmarks_use_public_names_only():
+    allowed = {"_fields", "_exit"}  # of NamedTuple, of os
+    private = []
+    for path in sorted((ROOT / "benchmarks").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = []
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(
+                ("sagesplat", "benchmarks")
+            ):
+                names = [*(node.module or "").split("."), *(n.name for n in node.names)]
+            elif isinstance(node, ast.Attribute) and not (
+                isinstance(node.value, ast.Name) and node.value.id in ("self", "cls")
+            ):
+                names = [node.attr]
+            private += [
+                f"{path.relative_to(ROOT)}:{node.lineno} {name}"
+                for name in names
+                if name.startswith("_") and not name.startswith("__") and name not in allowed
+            ]
+    assert private == []
 
 
 def test_blending_ends_with_one_line_of_json():

@@ -11,7 +11,7 @@ from sagesplat.adapt.evaluate import read_evaluation
 from sagesplat.adapt.observe import TOTAL, read_observations
 from sagesplat.adapt.plan import read_plans
 from sagesplat.core.config import PlanConfig, RunConfig, TrainConfig
-from sagesplat.core.errors import RunError
+from sagesplat.core.errors import DataError, RunError
 from sagesplat.core.events import Event, RunDone, StageDone, StageSkipped, Training
 from sagesplat.demo.capture import make_capture
 from sagesplat.formats.levels import read_level
@@ -162,5 +162,5 @@ def test_a_broken_level_is_one_clear_error(finished: Path, capture: Path, tmp_pa
     run = tmp_path / "run"
     shutil.copytree(finished, run)
     (run / "levels" / "000060.npz").write_bytes(b"PK\x03\x04 broken")
-    with pytest.raises(RunError, match=r"made with other levels \(its content changed\)"):
+    with pytest.raises(DataError, match=r"levels/000060\.npz: not a readable level"):
         work(run, capture)

@@ -191,6 +191,19 @@ def test_a_task_opens_the_job_of_its_scene(finished: Path, tmp_path: Path, monke
     assert (job.pieces, replace(job, executor=LOCAL).pieces, job.gpus) == (6, 1, 0)
 
 
+def photos_of(job: Job, number: int) -> tuple[int, int]:
+    return id(job.scene), id(job.photos)
+
+
+def test_tasks_of_one_process_share_the_scene_and_the_photos(finished: Path) -> None:
+    job = Job(RunDir(finished), lambda event: None, executor=Shuffled())
+    assert len(set(work_all(job, "look", photos_of, [1, 2, 3]))) == 1
+    opened = job.spec.open(print, source=job)
+    assert opened.scene is job.scene
+    assert opened.photos is job.photos
+    assert replace(opened, run=RunDir(finished, "snapshots")).photos is job.photos
+
+
 def test_what_an_executor_has_decides_what_tasks_compute_with(tmp_path: Path) -> None:
     executor = Shuffled()
     executor.backend, executor.memory = "cuda", 5 * 10**9

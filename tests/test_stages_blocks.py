@@ -172,7 +172,7 @@ def test_impossible_numbers_of_blocks(count: int) -> None:
         (BlocksConfig(margin=-1), "margin -1"),
         (BlocksConfig(min_share=0), "min-share 0"),
         (BlocksConfig(far_share=-0.5), "far-share -0.5"),
-        (BlocksConfig(boundary_steps=-1), "seam-steps -1"),
+        (BlocksConfig(boundary_steps=-1), "boundary-steps -1"),
     ],
 )
 def test_impossible_settings(config: BlocksConfig, named: str) -> None:
@@ -378,7 +378,7 @@ def test_a_run_in_blocks_is_done_once(finished: Path, capture: Path) -> None:
 def test_blocks_are_the_same_in_any_order_and_process(finished: Path, capture: Path, tmp_path: Path) -> None:
     executor = Shuffled()
     run_in_blocks(capture, tmp_path / "again", executor=executor)
-    assert {"block 0", "block 1", "seams of block 0", "seams of block 1"} <= set(executor.names)
+    assert {"block 0", "block 1", "boundaries of block 0", "boundaries of block 1"} <= set(executor.names)
     for name in ("nested/ladder.npz", "nested/observations.csv", "nested/plan.json", "nested/borders.csv"):
         assert (tmp_path / "again" / name).read_bytes() == (finished / name).read_bytes(), name
 

@@ -33,9 +33,10 @@ from sagesplat.stages.compose import compose_plan
 from sagesplat.stages.evaluate import evaluate_plans
 from sagesplat.stages.export import export_increments
 from sagesplat.stages.fit import fit_ladder
+from sagesplat.stages.methods import NestedLevels
 from sagesplat.stages.observe import observe_levels
 from sagesplat.stages.pipeline import run_all
-from sagesplat.stages.plan import costs_of, make_plan, pixels_of, promised_quality
+from sagesplat.stages.plan import make_plan
 from sagesplat.studies.paper.cross_view import read_cross_view
 from sagesplat.studies.paper.run import cross_views
 from sagesplat.train import nested
@@ -358,7 +359,7 @@ def test_nothing_is_left_to_do_and_the_papers_ladder_lies_beside_it(finished: Pa
 def test_budgets_are_kept_and_more_bytes_promise_more(finished: Path, tmp_path: Path) -> None:
     shutil.copytree(finished, tmp_path / "run")
     job = quiet(tmp_path / "run", force=True)
-    full = costs_of(job)
+    full = NestedLevels(job).costs
     for unit in ("bytes", "gpu-bytes", "count"):
         costs, promised = full.of(unit), []
         for share in (0.3, 0.6, 1.0):
@@ -375,9 +376,8 @@ def test_budgets_are_kept_and_more_bytes_promise_more(finished: Path, tmp_path: 
     plan = read_budget_plan(job.run.plan)
     assert plan is not None
     assert len(read_ply(job.run.composed)) == plan.count
-    costs, quality = promised_quality(job)
-    table = read_observations(job.run.observations)
-    shown = pixels_of(table, job, costs.labels, job.scene.train_ids)
+    nested = NestedLevels(job)
+    quality, shown = nested.quality, nested.shown
     best = (quality.mean * shown[..., None]).sum(0) / shown.sum(0)[:, None]
     for row, choice in enumerate(plan.choices):  # all that money can buy
         assert choice.status == "no model" or choice.predicted_ssim == pytest.approx(best[row].max())

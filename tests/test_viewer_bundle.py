@@ -488,6 +488,34 @@ def test_a_damaged_chunk_is_named_and_the_old_bundle_stays(tmp_path, contents, v
     assert not list(tmp_path.glob(".out*"))
 
 
+def test_a_bundle_that_cannot_be_swapped_in_leaves_the_earlier_one(
+    tmp_path, contents, viewer, monkeypatch
+) -> None:
+    out = tmp_path / "out"
+    write_bundle(out, contents, viewer)
+    before = {path.relative_to(out): path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    rename, failed = Path.rename, []
+
+    def fails(self: Path, target: Path) -> Path:
+        if target == out and not failed:
+            failed.append(self)
+            raise PermissionError(13, "Permission denied")
+        return rename(self, target)
+
+    few = replace(contents, categories=contents.categories[:1], chunks=contents.chunks[:2])
+    monkeypatch.setattr(Path, "rename", fails)
+    with pytest.raises(RunError, match="cannot be written"):
+        write_bundle(out, few, viewer)
+    assert failed
+    assert {path.relative_to(out): path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+    out.rename(tmp_path / ".out.earlier")  # as a kill in the middle of the swap leaves it
+    (tmp_path / ".out.tmp-new").mkdir()
+    with pytest.raises(DataError):
+        write_bundle(out, replace(few, folder=tmp_path), viewer)
+    assert {path.relative_to(out): path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+    assert not list(tmp_path.glob(".out*"))
+
+
 def test_a_place_that_cannot_be_written(tmp_path, contents, viewer) -> None:
     (tmp_path / "file").write_text("x")
     with pytest.raises(RunError, match="cannot be written"):

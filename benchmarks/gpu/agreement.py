@@ -19,9 +19,8 @@ from sagesplat.core.config import TrainConfig
 from sagesplat.core.gaussians import PARAMETERS, Gaussians
 from sagesplat.raster import Backend, cuda, rasterize
 from sagesplat.scene.scene import Camera
-from sagesplat.train import densify, trainer
+from sagesplat.train import densify
 from sagesplat.train.early_stopping import ActiveTiles, trainable_rows
-from sagesplat.train.group import ALONE
 from sagesplat.train.lr_schedule import LrSchedule
 from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.state import TrainState, from_points, initial_state
@@ -141,12 +140,16 @@ def frozen_kept(bench: Bench, steps: int) -> dict[str, Any]:
         len(state.gaussians),
     )
     trainable = trainable_rows(state.gaussians, state.frozen)
+    plan, camera = densify.schedule(config), scene.views[0].camera
+    num_pixels = camera.width * camera.height
     for step in range(1, steps + 1):
         stepper(state, min(3, step // every), rates(step), trainable, observing=True)
         if step == 3 * every:
             densify.reset_opacities(state, config, trainable)
         if step % every == 0:
-            trainer._refine(state, config, densify.schedule(config), scene, trainable, ALONE, 1)
+            most = densify.budget(config, plan, step, num_pixels, num_pixels, len(scene.points.xyz))
+            densify.refine(state, config, scene.extent, densify.room(state, most, trainable), trainable)
+            state.sort()
             trainable = trainable_rows(state.gaussians, state.frozen)
     after = rows_of(state, label)
     kept = before.shape == after.shape and bool((before == after).all())

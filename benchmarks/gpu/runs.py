@@ -22,7 +22,6 @@ from sagesplat.metrics.lpips import Net, load_lpips
 from sagesplat.raster import rasterize
 from sagesplat.train import densify, trainer
 from sagesplat.train.early_stopping import ActiveTiles, label_quality, measured_views
-from sagesplat.train.group import ALONE
 from sagesplat.train.parallel import train_together
 from sagesplat.train.photo_loader import PhotoLoader
 
@@ -219,12 +218,16 @@ def steps_of(bench: Bench) -> int:
 def ours(bench: Bench, config: TrainConfig) -> Iterator[Moment]:
     """Our trainer, at its levels and at its end."""
     masks = bench.masks if config.freeze_at is not None else None
-    events = trainer._train(
-        bench.scene, bench.photos, bench.labels, config, masks, 0, bench.backend, None, "", ALONE
+    events = trainer.train(
+        bench.scene, bench.photos, bench.labels, config, masks=masks, backend=bench.backend
     )
-    for event, state in events:
-        if isinstance(event, trainer.LevelSaved | trainer.Trained):
-            yield Moment(state.step, state.gaussians, dict(state.frozen))
+    frozen: dict[int, int] = {}
+    for event in events:
+        match event:
+            case trainer.LabelFrozen(step, label_id):
+                frozen[label_id] = step
+            case trainer.LevelSaved(step) | trainer.Trained(step=step):
+                yield Moment(step, event.gaussians.to(bench.device), dict(frozen))
 
 
 def gsplats(bench: Bench, config: TrainConfig) -> Iterator[Moment]:

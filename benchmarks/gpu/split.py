@@ -146,14 +146,14 @@ def ceilings(device: torch.device) -> dict[str, float]:
 def binning(bench: Bench, g: Gaussians) -> dict[str, float]:
     """Time of the lists of tiles: on the device, and until the host may go on; it waits for their length."""
     camera = bench.scene.views[int(bench.scene.train_ids[0])].camera
-    splats = cuda._splat(g, camera, 3, False)
-    tiles = cuda._Tiles(splats, camera, None)
-    on_device = milliseconds(bench.device, lambda: cuda._Tiles(splats, camera, None))
+    splats = cuda.splat(g, camera, 3, False)
+    tiles = cuda.Tiles(splats, camera, None)
+    on_device = milliseconds(bench.device, lambda: cuda.Tiles(splats, camera, None))
     waits = []
     for _ in range(20):
         wait(bench.device)
         begin = time.perf_counter()
-        cuda._Tiles(splats, camera, None)
+        cuda.Tiles(splats, camera, None)
         waits.append(1e3 * (time.perf_counter() - begin))
     return {"intersections": len(tiles.ids), "device_ms": on_device, "host_ms": float(np.median(waits))}
 

@@ -1,3 +1,88 @@
-"""sagesplat: semantic-driven adaptive Gaussian splatting."""
+"""sagesplat: semantic-driven adaptive Gaussian splatting.
+
+Everything that a script needs is here, and is loaded when it is first used: `import sagesplat` itself loads
+neither torch nor numba. The examples in `examples/` import from here alone.
+
+    run_scene, open_run, FinishedRun           the whole pipeline; a finished run
+    RunConfig, SceneConfig, TrainConfig, NestConfig, PlanConfig    settings
+    Event, StageDone, StageSkipped, Warned     what `run_scene` tells its caller
+    load_scene, Scene, View, Camera            captures
+    Gaussians, read_ply, write_ply, read_spz, write_spz    splat files
+    rasterize, Render, set_threads             rendering, with gradients
+    train_gaussians                            the training loop, as a generator of events
+    Plan, ViewModel, read_plans, read_promises    plans and the SSIM models behind them
+    Taxonomy, HfSegmenter, OnnxSegmenter, label_image      label images
+    SageError                                  what a user can cause
+
+No name here is that of a subpackage. `sagesplat.run` and `sagesplat.train` are folders of modules: a function
+of that name would be hidden as soon as somebody imports the folder. So the functions are called `run_scene`
+and `train_gaussians`.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from sagesplat.adapt.plan import Plan, read_plans
+    from sagesplat.adapt.viewpoint import ViewModel, read_promises
+    from sagesplat.core.config import NestConfig, PlanConfig, RunConfig, SceneConfig, TrainConfig
+    from sagesplat.core.errors import SageError
+    from sagesplat.core.events import Event, StageDone, StageSkipped, Warned
+    from sagesplat.core.gaussians import Gaussians
+    from sagesplat.formats.ply import read_ply, write_ply
+    from sagesplat.formats.spz import read_spz, write_spz
+    from sagesplat.output.figures import label_image
+    from sagesplat.raster import Render, rasterize, set_threads
+    from sagesplat.scene import load_scene
+    from sagesplat.scene.scene import Camera, Scene, View
+    from sagesplat.segment.hf import HfSegmenter
+    from sagesplat.segment.masks import Taxonomy
+    from sagesplat.segment.onnx import OnnxSegmenter
+    from sagesplat.stages.api import FinishedRun, open_run, run_scene
+    from sagesplat.train.trainer import train as train_gaussians
+
+__all__ = [
+    "Camera", "Event", "FinishedRun", "Gaussians", "HfSegmenter", "NestConfig", "OnnxSegmenter", "Plan",
+    "PlanConfig", "Render", "RunConfig", "SageError", "Scene", "SceneConfig", "StageDone", "StageSkipped",
+    "Taxonomy", "TrainConfig", "View", "ViewModel", "Warned", "label_image", "load_scene", "open_run",
+    "rasterize", "read_plans", "read_ply", "read_promises", "read_spz", "run_scene", "set_threads",
+    "train_gaussians", "write_ply", "write_spz",
+]  # fmt: skip
+
+# by module, below sagesplat
+_EXPORTS = {
+    "adapt.plan": "Plan read_plans",
+    "adapt.viewpoint": "ViewModel read_promises",
+    "core.config": "NestConfig PlanConfig RunConfig SceneConfig TrainConfig",
+    "core.errors": "SageError",
+    "core.events": "Event StageDone StageSkipped Warned",
+    "core.gaussians": "Gaussians",
+    "formats.ply": "read_ply write_ply",
+    "formats.spz": "read_spz write_spz",
+    "output.figures": "label_image",
+    "raster": "Render rasterize set_threads",
+    "scene": "load_scene",
+    "scene.scene": "Camera Scene View",
+    "segment.hf": "HfSegmenter",
+    "segment.masks": "Taxonomy",
+    "segment.onnx": "OnnxSegmenter",
+    "stages.api": "FinishedRun open_run run_scene",
+    "train.trainer": "train_gaussians",
+}
+_MODULE_OF = {name: module for module, names in _EXPORTS.items() for name in names.split()}
+_NAME_THERE = {"train_gaussians": "train"}
+
+
+def __getattr__(name: str) -> Any:
+    """An exported name, loaded on its first use."""
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module 'sagesplat' has no attribute {name!r}")
+    value = getattr(import_module(f"sagesplat.{_MODULE_OF[name]}"), _NAME_THERE.get(name, name))
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -12,6 +12,7 @@ Rules that a second implementation must share, so that both give the same levels
 - A label of weight 0 has no value: within a budget it stays at its cheapest level.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,13 +47,34 @@ def cheapest(
     previous: Int[np.ndarray, "L"] | None = None,
     slack: float = SLACK,
 ) -> Allocation:
-    """Per label the cheapest level whose promised SSIM reaches `target`, else the best one ("infeasible").
+    """Choose per label the cheapest level whose promised SSIM reaches a target.
 
-    With the `previous` levels (-1 = none) a label goes up at once where its level no longer keeps the target,
-    but comes down only to a level that keeps it by `slack` more, or by half of what is left to 1 if that is
-    less; where nothing reaches the target it stays if that is within `slack` of the best. The target is kept
-    wherever it can be, and promises that swing by less than the slack never bring a left level back, if they
-    rise along the levels. `weight` (1 without) is for `value` alone. RunError for impossible arguments.
+    With `previous` levels there is hysteresis. A label goes up at once where its level no longer reaches the
+    target. It comes down only to a level that reaches it by `slack` more, or by half of what is left to 1 if
+    that is less. Where nothing reaches the target it stays if that is within `slack` of the best. So promises
+    that vary by less than the slack never alternate between two levels, if they rise along the levels.
+
+    Args:
+        quality: [L, K], promised SSIM of each label and level; NaN: no promise.
+        cost: [L, K], whole numbers; inf: a level that cannot be had.
+        target: SSIM, for all labels or [L].
+        weight: [L], for `value` alone; None: 1 each.
+        previous: [L], the levels before, -1: none.
+        slack: SSIM.
+
+    Returns:
+        A level per label (column of `quality`); where none reaches the target the best one, "infeasible".
+
+    Raises:
+        RunError: For impossible arguments.
+
+    Example:
+        >>> import numpy as np
+        >>> from sagesplat.adapt.allocate import cheapest
+        >>> quality, cost = np.array([[0.6, 0.8, 0.9], [0.3, 0.4, 0.5]]), np.array([[1, 4, 9], [2, 3, 4]])
+        >>> found = cheapest(quality, cost, target=0.7)
+        >>> found.levels.tolist(), found.status, found.missed.tolist()
+        ([1, 2], 'infeasible', [False, True])
     """
     quality, cost, weight, previous = _arguments(quality, cost, weight, previous, slack)
     q, c, promised = _known(quality, cost)
@@ -74,13 +96,37 @@ def best_within(
     slack: float = SLACK,
     states: int = STATES,
 ) -> Allocation:
-    """The levels of most weight x promised SSIM whose cost is at most `budget`, in the unit of the costs.
+    """Choose the levels of the largest sum of weight x promised SSIM within a budget.
 
-    Exact if about `states` partial compositions suffice (0: do not try), else no worse than plain greedy;
-    `optimal` says which. With the `previous` levels (-1 = none) a label that keeps its level counts as
-    `slack` SSIM better: promises that stay within less than slack / 2 of some values never bring back a
-    composition that was left, as each change gains on those values. Where the smallest composition does not
-    fit it is the answer, "over budget". RunError for impossible arguments.
+    A multiple-choice knapsack: Pareto fronts label by label, cut by a Lagrangian bound (Kellerer, Pferschy
+    and Pisinger 2004, ch. 11). Exact if about `states` partial compositions suffice, else no worse than
+    greedy; `optimal` says which. With `previous` levels a label that keeps its level counts as `slack` SSIM
+    better. Promises that stay within slack / 2 of some values then never bring back a composition that was
+    left, as each change gains on those values.
+
+    Args:
+        quality: [L, K], promised SSIM of each label and level; NaN: no promise.
+        cost: [L, K], whole numbers; inf: a level that cannot be had.
+        weight: [L]; a label of weight 0 stays at its cheapest level.
+        budget: In the unit of the costs.
+        previous: [L], the levels before, -1: none.
+        slack: SSIM.
+        states: Partial compositions to keep; 0: greedy alone.
+
+    Returns:
+        A level per label (column of `quality`). Where the smallest composition does not fit: that one, with
+        status "over budget".
+
+    Raises:
+        RunError: For impossible arguments.
+
+    Example:
+        >>> import numpy as np
+        >>> from sagesplat.adapt.allocate import best_within
+        >>> quality, cost = np.array([[0.6, 0.8, 0.9], [0.3, 0.4, 0.5]]), np.array([[1, 4, 9], [2, 3, 4]])
+        >>> found = best_within(quality, cost, np.array([2.0, 1.0]), budget=8)
+        >>> found.levels.tolist(), found.cost, found.optimal
+        ([1, 2], 8, True)
     """
     quality, cost, weight, previous = _arguments(quality, cost, weight, previous, slack)
     budget = _budget(budget)
@@ -126,6 +172,26 @@ def along(
     return plan
 
 
+def choose(
+    quality: Float[np.ndarray, "... K"],
+    cost: Float[np.ndarray, "... K"] | Int[np.ndarray, "... K"],
+    target: float | Float[np.ndarray, "... 1"],
+    otherwise: Sequence[Float[np.ndarray, "... K"] | Int[np.ndarray, "... K"]] = (),
+) -> tuple[Int[np.ndarray, "..."], Bool[np.ndarray, "..."]]:
+    """The cheapest level whose SSIM reaches `target`, else the best one; and whether one reaches it.
+
+    Every plan for a target chooses by this rule, whatever predicts the SSIM and whatever a level costs. Of
+    equal levels the module's rules take the one of lower index. `otherwise`: what makes a level the best
+    where none reaches the target, the first key first (default: its SSIM). A level of unknown SSIM (NaN) or
+    of infinite cost is never chosen while there is another.
+    """
+    usable = np.isfinite(cost) & ~np.isnan(quality)
+    good = usable & (quality >= target)
+    met = np.asarray(good.any(-1))
+    best = [-key for key in otherwise or (quality,)]
+    return np.where(met, _first(good, cost, -quality), _first(usable, *best, cost)), met
+
+
 def _known(quality, cost):
     """Quality without NaN, cost with inf for what is passed over, both [..., L, K]; which labels promise."""
     finite = np.isfinite(cost)
@@ -149,9 +215,7 @@ def _first(allowed, *keys):
 def _reaching(q, c, promised, target, slack):
     """Level of each label without hysteresis, whether one reaches the target, level to come down to or -1."""
     usable = np.isfinite(c)
-    good = usable & (q >= target[:, None])
-    met = good.any(-1)
-    wanted = np.where(met, _first(good, c, -q), _first(usable, -q, c))
+    wanted, met = choose(q, c, target[:, None])
     highest = q.shape[-1] - 1 - usable[..., ::-1].argmax(-1)
     safe = usable & (q >= (target + np.minimum(slack, (1 - target) / 2))[:, None])
     lower = np.where(safe.any(-1), _first(safe, c, -q), -1)

@@ -45,9 +45,16 @@ def quality_at(
     distances: Mapping[int, Float[np.ndarray, " V"]],
     cameras: Sequence[Camera],
 ) -> Quality:
-    """What the promises say of any V viewpoints, whether a photo was taken there or not.
+    """Predict every category at every level from V viewpoints.
 
-    `distances`: by label id, of the closest points in sight (see `observe.distances_in_views`), NaN: none.
+    Args:
+        costs: The levels that there are.
+        promises: Models by label id.
+        distances: d_min by label id, [V] in world units (`observe.distances_in_views`); NaN: not in sight.
+        cameras: V viewpoints; no photo has to be taken there.
+
+    Returns:
+        mean and bound [V, L, K] in SSIM, NaN for categories without a model; distance [V, L].
     """
     shape = len(cameras), *costs.count.shape
     position = np.stack([camera.position for camera in cameras])
@@ -63,7 +70,20 @@ def quality_at(
 
 
 def plan_for_view(quality: Quality, costs: Costs, target: float, view: int) -> Plan:
-    """The cheapest levels whose bounds reach `target` in one view; "infeasible" where none does."""
+    """Choose the cheapest level of each category whose lower bound reaches a target in one view.
+
+    Args:
+        quality: Predictions of `quality_at`.
+        costs: What the levels cost; bytes to send are minimised.
+        target: SSIM, above 0 and at most 1.
+        view: Row of `quality`.
+
+    Returns:
+        One choice per category; "infeasible" where no level reaches the target.
+
+    Raises:
+        RunError: For an impossible target.
+    """
     check_target(target)
     bound = quality.bound[view]
     found = cheapest(bound, costs.transfer_bytes, target)
@@ -77,9 +97,20 @@ def plan_for_scene(
     share: float,
     shown: Float[np.ndarray, "V L"],
 ) -> Plan:
-    """The cheapest levels whose bounds reach `target` in a `share` of the views that show the category.
+    """Choose the cheapest level of each category whose lower bound reaches a target in a share of the views.
 
-    `shown`: pixels of each category in each view to plan for, 0 where it does not count.
+    Args:
+        quality: Predictions of `quality_at`.
+        costs: What the levels cost; bytes to send are minimised.
+        target: SSIM, above 0 and at most 1.
+        share: Of the views that show the category, above 0 and at most 1.
+        shown: [V, L], pixels of each category in each view; 0: the view does not count for it.
+
+    Returns:
+        One choice per category; "infeasible" where no level reaches the target.
+
+    Raises:
+        RunError: For an impossible target or share.
     """
     check_target(target)
     check_share(share)
@@ -98,10 +129,22 @@ def plan_within(
     weights: Mapping[int, float] | None = None,
     view: int | None = None,
 ) -> Plan:
-    """The levels of most expected SSIM within a budget, weighted by pixels and by `weights` (by label id).
+    """Choose the levels of the highest expected SSIM within a budget.
 
-    For one view, or for all views that `shown` has pixels of. A budget below the smallest composition:
-    that one, with status "over budget".
+    The sum over categories of weight x pixels x mean SSIM is maximised: a multiple-choice knapsack
+    (`allocate.best_within`).
+
+    Args:
+        quality: Predictions of `quality_at`.
+        costs: What the levels cost.
+        budget: Most that the composition may cost, in `unit`.
+        unit: "bytes" to send, "gpu-bytes" on the viewer's GPU, or "count" of Gaussians.
+        shown: [V, L], pixels of each category in each view.
+        weights: Factors by label id (1 where none is given).
+        view: Row of `quality` to plan for; None: all views that `shown` has pixels of.
+
+    Returns:
+        One choice per category. Status "over budget": the smallest composition, where even that does not fit.
     """
     rows = [view] if view is not None else np.flatnonzero(shown.any(1)).tolist()
     pixels = shown[rows]

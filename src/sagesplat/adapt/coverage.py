@@ -1,4 +1,4 @@
-"""Promises put to the test: decisions on unseen views by Eq. 3, by the process's mean and by its bound."""
+"""Empirical coverage: decisions on unseen views by Eq. 3, by the viewpoint model's mean and by its bound."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from sagesplat.adapt.allocate import choose
 from sagesplat.adapt.observe import Observations
-from sagesplat.adapt.plan import Counts, check_target, choose
+from sagesplat.adapt.plan import check_target
 from sagesplat.adapt.viewpoint import ViewModel
 from sagesplat.scene.scene import Scene
 
-# the paper's; with the process, half of the errors on either side; what is promised; the measurement itself
+# the paper's model; the viewpoint model's mean; its lower confidence bound; the measurement itself
 PREDICTORS = ("eq3", "mean", "bound", "oracle")
 
 
@@ -26,16 +27,14 @@ class Decisions:
     views: Int[np.ndarray, " R"]  # that show the category and were measured at all of its levels
     accepted: Int[np.ndarray, " R"]  # of them those in which the plan says that the target is met
     kept: Int[np.ndarray, " R"]  # of those the ones in which the chosen level measures it
-    overshoot: Float[np.ndarray, " R"]  # mean of measured - target over the feasible
-    chosen: Int[np.ndarray, " R"]  # feasible with more than the cheapest level: a plan can overshoot less
+    overshoot: Float[np.ndarray, " R"]  # mean of measured - target over the accepted
+    chosen: Int[np.ndarray, " R"]  # accepted with more than the cheapest level: a plan can overshoot less
     chosen_kept: Int[np.ndarray, " R"]
     chosen_overshoot: Float[np.ndarray, " R"]
-    false_rejections: Int[
-        np.ndarray, " R"
-    ]  # some level measures the target, yet the plan says that none does
-    regret: Float[
-        np.ndarray, " R"
-    ]  # mean Gaussians above the cheapest level that would have done, where kept
+    # views in which some level measures the target, yet the plan says that none does
+    false_rejections: Int[np.ndarray, " R"]
+    # mean cost above the cheapest level that measures the target, where kept; in the unit of the costs
+    regret: Float[np.ndarray, " R"]
 
     def select(self, keep: np.ndarray) -> "Decisions":
         """The rows that a boolean mask or an index array names."""
@@ -55,20 +54,23 @@ def score(
     observations: Observations,
     scene: Scene,
     promises: Mapping[int, ViewModel],
-    counts: Counts,
+    costs: Mapping[tuple[int, int], int],
     targets: Sequence[float],
     views: Int[np.ndarray, " U"] | None = None,
 ) -> Decisions:
     """Choose the cheapest level in each view (rows of Scene.views; default: test views) and measure it.
 
-    `counts` holds the Gaussians of every (label id, level) of `promises`. Views not measured at all levels of
-    a category are left out. RunError for an impossible target.
+    `costs`: of each (label id, level), in the unit that plans minimise. Categories without costs have no
+    Gaussians: no plan has them, and they are left out. So are views not measured at all levels of a category.
+    RunError for an impossible target.
     """
     for target in targets:
         check_target(target)
     rows = []
     for label_id, model in promises.items():
         levels = np.array(model.levels)
+        if (label_id, model.levels[0]) not in costs:
+            continue
         mine = observations.select(
             (observations.label_id == label_id)
             & np.isin(observations.view, scene.test_ids if views is None else views)
@@ -86,24 +88,24 @@ def score(
         direction = np.array([camera.direction for camera in cameras], np.float64).reshape(-1, 3)
         predicted = model.predict(distance, position, direction)
         eq3 = np.stack([curve(distance) for curve in model.curves])
-        sizes = np.array([counts[label_id, level] for level in model.levels])
+        cost = np.array([costs[label_id, level] for level in model.levels])
         says = (eq3, predicted.mean.T, predicted.bound.T, measured)
         for target in targets:
             for predictor, ssim in zip(PREDICTORS, says, strict=True):
                 key = {"target": target, "label_id": label_id, "predictor": predictor}
-                rows.append(key | _decide(ssim, measured, levels, sizes, target))
+                rows.append(key | _decide(ssim, measured, cost, target))
     return Decisions(**{f.name: np.array([row[f.name] for row in rows]) for f in fields(Decisions)})
 
 
 def _decide(
-    ssim: np.ndarray, measured: np.ndarray, levels: np.ndarray, counts: np.ndarray, target: float
+    ssim: Float[np.ndarray, "K V"], measured: Float[np.ndarray, "K V"], cost: np.ndarray, target: float
 ) -> dict[str, Any]:
-    """Some columns of Kept for one category, target and predictor; SSIM predicted and measured [K, V]."""
-    level, best = (choose(values, levels, counts, target) for values in (ssim, measured))
+    """Some columns of `Decisions` for one category, target and predictor; `cost` [K] of its levels."""
+    level, accepted = choose(ssim.T, cost, target)
+    best, reachable = choose(measured.T, cost, target)
     got = measured[level, np.arange(len(level))]
-    accepted = (ssim >= target).any(0)
     kept = accepted & (got >= target)
-    chosen = accepted & (counts[level] > counts.min())
+    chosen = accepted & (cost[level] > cost.min())
     return {
         "views": len(level),
         "accepted": int(accepted.sum()),
@@ -112,8 +114,8 @@ def _decide(
         "chosen": int(chosen.sum()),
         "chosen_kept": int((chosen & kept).sum()),
         "chosen_overshoot": _mean(got[chosen] - target),
-        "false_rejections": int(((measured >= target).any(0) & ~accepted).sum()),
-        "regret": _mean((counts[level] - counts[best])[kept]),
+        "false_rejections": int((reachable & ~accepted).sum()),
+        "regret": _mean((cost[level] - cost[best])[kept]),
     }
 
 

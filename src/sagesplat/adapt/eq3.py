@@ -55,7 +55,7 @@ class SsimModel:
     """What SSIM to expect of one category at one level, by distance."""
 
     label_id: int
-    level: int  # training step of the level
+    level: int  # of snapshots the training step, of nested levels 1 to K
     params: Eq3  # one regime or a constant: both halves are equal
     d_range: tuple[float, float]  # smallest and largest distance fitted, world units; (0, 0) = none known
     median: float  # SSIM where the distance is unknown
@@ -104,7 +104,21 @@ def fit_models(
     *,
     on_fit: Callable[[SsimModel], None] | None = None,
 ) -> dict[tuple[int, int], SsimModel]:
-    """Eq. 3 for every (category, level) of `samples`; a pair with no row left has no model."""
+    """Fit Eq. 3 of the paper, SSIM over distance, to every category and level.
+
+        SSIM(d) = K1 exp(-g1 |d - mu1|^a1) for d < beta, else K2 exp(-g2 |d - mu2|^a2)
+
+    Fewer parameters are used where they serve as well: one regime, or a constant (`SsimModel.status`).
+
+    Args:
+        observations: Rows of `observe`. Only training views, single categories and finite SSIM are used.
+        train_views: Rows of `Scene.views`.
+        on_fit: Called with each model.
+
+    Returns:
+        Models by (label id, level). A pair without any row has none; "not converged" is a status, not an
+            error.
+    """
     models = {}
     for found in samples(observations, train_views):
         model = models[found.label_id, found.level] = fit_model(*found)

@@ -25,7 +25,7 @@ class Evaluation:
     target: Float32[np.ndarray, " R"]  # SSIM asked for; NaN for a plan within a budget
     view: Int32[np.ndarray, " R"]  # row in Scene.views
     label_id: Int32[np.ndarray, " R"]  # category id, -1 = unlabelled, -2 = the whole image
-    level: Int32[np.ndarray, " R"]  # the level chosen, a training step; -1 for the whole image
+    level: Int32[np.ndarray, " R"]  # the level chosen; -1 for the whole image
     predicted: Float32[np.ndarray, " R"]  # promised SSIM; NaN for the whole image
     ssim: Float32[np.ndarray, " R"]  # measured on the composed scene, over the category's pixels
     psnr: Float32[np.ndarray, " R"]  # dB, the same
@@ -64,11 +64,23 @@ def evaluate(
     antialiased: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Evaluation:
-    """Measure each plan's composition and the whole model on the test views, beside what is promised there.
+    """Measure the composition of each plan and the full model on the test views, next to the predictions.
 
-    `promised` (label id, level, row of Scene.views): SSIM, NaN where nothing is. `region`: where a category's
-    SSIM is measured. `compose`: the Gaussians of a plan (default: its levels as they are). `progress` hears
-    (images measured, images in all).
+    Args:
+        scene: The capture; `scene.test_ids` are measured.
+        photos: Its photos.
+        masks: Label images, [H, W] of category ids; indexed by view.
+        ladder: The levels.
+        plans: What to compose.
+        promised: Predicted SSIM of (label id, level, row of `Scene.views`); NaN: none.
+        region: Where a category's SSIM is measured: on its mask, or on the mask eroded by 5 px.
+        compose: The Gaussians of a plan; None: its levels as they are.
+        backend: Rasteriser; decides the device.
+        antialiased: How the model was trained.
+        progress: Called with (images measured, images in all).
+
+    Returns:
+        One row per (plan, view, category), and one per (plan, view) for the full image.
     """
     ssim = "ssim_eroded" if region == "eroded" else "ssim"
     rows: list[dict[str, float]] = []

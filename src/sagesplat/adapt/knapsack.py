@@ -8,7 +8,8 @@ of all (Kellerer, Pferschy and Pisinger 2004, ch. 11). Costs and values are whol
 import math
 
 import numpy as np
-from numba import njit
+
+from sagesplat.kernels.jit import njit
 
 UNITS = 2.0**40  # of value in the total weight
 

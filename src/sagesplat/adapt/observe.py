@@ -28,7 +28,7 @@ class Observations:
     """One row per (category, level, view); columns of equal length."""
 
     label_id: Int32[np.ndarray, " R"]  # category id, -1 = unlabelled, -2 = the whole image
-    level: Int32[np.ndarray, " R"]  # training step of the level
+    level: Int32[np.ndarray, " R"]  # of snapshots the training step, of nested levels 1 to K
     view: Int32[np.ndarray, " R"]  # row in Scene.views
     distance: Float32[np.ndarray, " R"]  # d_min of method A, world units; NaN where nothing is in sight
     ssim: Float32[np.ndarray, " R"]  # mean of the SSIM map over the category's pixels
@@ -195,9 +195,28 @@ def observe(
     antialiased: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Observations:
-    """Render every level into every view, or some (rows of Scene.views), and measure each category there.
+    """Render every level into views of the scene and measure SSIM and PSNR of each category there.
 
-    `progress` hears (images measured, images in all).
+    Args:
+        scene: The capture.
+        photos: Its photos.
+        masks: Label images, [H, W] of category ids; indexed by view.
+        ladder: The levels.
+        distances: d_min by label id, float32 [V] in world units (`distances_in_views`); NaN: not in sight.
+        views: Rows of `scene.views`; None: all.
+        backend: Rasteriser; decides the device.
+        antialiased: How the model was trained.
+        progress: Called with (images measured, images in all).
+
+    Returns:
+        One row per (category, level, view), and one for the full image with label id `TOTAL`.
+
+    Example:
+        >>> from sagesplat import open_run
+        >>> from sagesplat.adapt.observe import distances_in_views, observe
+        >>> run = open_run("runs/garden").job  # doctest: +SKIP
+        >>> near = distances_in_views(run.scene, run.point_labels)  # doctest: +SKIP
+        >>> table = observe(run.scene, run.photos, run.best_masks, run.ladder, near)  # doctest: +SKIP
     """
     rows: list[dict[str, float]] = []
     views = range(len(scene.views)) if views is None else views

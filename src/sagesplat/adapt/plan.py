@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
+from sagesplat.adapt.allocate import choose
 from sagesplat.adapt.eq3 import SsimModel
 from sagesplat.core.errors import DataError, RunError, short
 from sagesplat.core.gaussians import BYTES_PER_GAUSSIAN
@@ -26,7 +27,7 @@ class Choice:
     """The level of one category."""
 
     label_id: int
-    level: int  # training step of the level
+    level: int  # of snapshots the training step, of nested levels 1 to K
     predicted_ssim: float  # in a scene: what at least `share` of the views reach; NaN without a model
     distance: float  # of the view, world units; NaN in a scene and where unknown
     count: int  # Gaussians
@@ -100,11 +101,38 @@ def plan_view(
     *,
     recovering: Collection[int] = (),
 ) -> Plan:
-    """Eq. 1 for one view: per category of `counts` the cheapest level predicted to reach `target`.
+    """Choose the cheapest level of each category that is predicted to reach a target in one view (Eq. 1).
 
-    Where no level does, the one with the best prediction, "infeasible". `distances` maps label ids to world
-    units; a category that is missing there, or NaN, is predicted by its median. Levels in `recovering` (just
-    after an opacity reset) are taken only where a category has no other. RunError for an impossible target.
+        level = argmin count(level) subject to SSIM(level, distance) >= target, for each category by itself
+
+    Where no level reaches the target, the one with the best prediction is taken, with status "infeasible".
+
+    Args:
+        models: Eq. 3 by (label id, level).
+        counts: Gaussians by (label id, level).
+        distances: d_min by label id, world units. A category that is missing, or NaN, is predicted by its
+            median.
+        target: SSIM, above 0 and at most 1.
+        view: Row in `Scene.views`, for the record; None: no view of the scene.
+        recovering: Levels recorded just after an opacity reset: taken only where there is no other.
+
+    Returns:
+        One choice per category of `counts`.
+
+    Raises:
+        RunError: For an impossible target.
+
+    Example:
+        >>> from sagesplat.adapt.eq3 import Eq3, SsimModel
+        >>> from sagesplat.adapt.plan import plan_view
+        >>> def model(level, k):  # SSIM k at distance 0, falling by exp(-0.1 d)
+        ...     curve = Eq3(k, 0.1, 0.0, 1.0, k, 0.1, 0.0, 1.0, 0.0)
+        ...     return SsimModel(3, level, curve, (0.0, 10.0), k, 0.0, 9, "one regime")
+        >>> models, counts = {(3, 1): model(1, 0.7), (3, 2): model(2, 0.95)}, {(3, 1): 100, (3, 2): 900}
+        >>> plan_view(models, counts, {3: 1.0}, 0.6, None).levels
+        {3: 1}
+        >>> plan_view(models, counts, {3: 1.0}, 0.8, None).levels
+        {3: 2}
     """
     check_target(target)
     choices = []
@@ -123,10 +151,21 @@ def plan_scene(
     *,
     recovering: Collection[int] = (),
 ) -> Plan:
-    """Eq. 1 for a scene: per category the cheapest level that reaches `target` in `share` of its views.
+    """Choose the cheapest level of each category that reaches a target in a share of the views (Eq. 1).
 
-    Where no level does, the one that reaches it in most views, then the best on average, "infeasible".
-    `distances` maps label ids to one distance per view, world units; see `plan_view` for the rest.
+    Where no level does, the one that reaches it in most views is taken, then the best on average, with status
+    "infeasible". Other arguments and errors are those of `plan_view`.
+
+    Args:
+        models: Eq. 3 by (label id, level).
+        counts: Gaussians by (label id, level).
+        distances: By label id, d_min in each view that shows the category, [V] in world units.
+        target: SSIM, above 0 and at most 1.
+        share: Of the views, above 0 and at most 1.
+        recovering: See `plan_view`.
+
+    Returns:
+        One choice per category of `counts`.
     """
     check_target(target)
     check_share(share)
@@ -160,21 +199,29 @@ def _choose(
 ) -> Choice:
     """The level of one category; `levels` maps each candidate to its count."""
     last = max(levels)
-    if (label_id, last) not in models:  # never seen: no promise to make, nothing to leave out
+    if (label_id, last) not in models:  # never seen: nothing is predicted, nothing is left out
         return Choice(label_id, last, math.nan, distance, levels[last], "no model")
+    steps = sorted(levels)
+    counts = np.array([levels[step] for step in steps])
+    ssim = np.stack([models[label_id, step](distances) for step in steps])
     needed = max(1, math.ceil(share * len(distances) - 1e-9))
-    feasible, all_levels = [], []
-    for level, count in levels.items():
-        ssim = models[label_id, level](distances)
-        promised = float(np.sort(ssim)[-needed])  # the lowest among the best `needed` views
-        reached = int((ssim >= target).sum())
-        choice = Choice(
-            label_id, level, promised, distance, count, "ok" if reached >= needed else "infeasible"
-        )
-        all_levels.append(((-reached, -float(ssim.mean()), count, -level), choice))
-        if reached >= needed:
-            feasible.append(((count, -promised, -level), choice))
-    return min(feasible or all_levels)[1]
+    predicted = np.sort(ssim, 1)[:, -needed]  # what the best `needed` views reach
+    most_views = (ssim >= target).sum(1), ssim.mean(1)
+    found, met = choose_snapshot(predicted, counts, target, most_views)
+    at = int(found)
+    status = "ok" if met else "infeasible"
+    return Choice(label_id, steps[at], float(predicted[at]), distance, int(counts[at]), status)
+
+
+def choose_snapshot(
+    ssim: Float[np.ndarray, "... K"],
+    counts: Int[np.ndarray, " K"],
+    target: float,
+    otherwise: Sequence[Float[np.ndarray, "... K"] | Int[np.ndarray, "... K"]] = (),
+) -> tuple[Int[np.ndarray, "..."], Bool[np.ndarray, "..."]]:
+    """`allocate.choose` for K snapshots in order of their steps: of equal ones the latest."""
+    found, met = choose(ssim[..., ::-1], counts[::-1], target, [key[..., ::-1] for key in otherwise])
+    return len(counts) - 1 - found, met
 
 
 def check_target(target: float) -> None:
@@ -273,15 +320,3 @@ def _from_json(entry: dict[str, Any]) -> Plan:
         unit=maybe(str, entry.get("unit")),
         fits=bool(entry.get("fits", True)),
     )
-
-
-def choose(
-    ssim: Float[np.ndarray, "L V"],
-    levels: Int[np.ndarray, " L"],
-    counts: Int[np.ndarray, " L"],
-    target: float,
-) -> Int[np.ndarray, " V"]:
-    """Row of the level that `plan.plan_view` chooses in each view, all views at once."""
-    ties = (np.broadcast_to(column[:, None], ssim.shape) for column in (-levels, counts))
-    cost = np.where(ssim >= target, counts[:, None], np.inf)
-    return np.lexsort((*ties, -ssim, cost), axis=0)[0]  # the last key decides first

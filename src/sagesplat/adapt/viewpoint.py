@@ -140,10 +140,27 @@ class ViewModel:
         position: Float[np.ndarray, "V 3"],
         direction: Float[np.ndarray, "V 3"],
     ) -> Prediction:
-        """SSIM to expect where no photo was trained on.
+        """Predict the SSIM of each level at V viewpoints, whether a photo was taken there or not.
 
-        Distances to the category and positions in world units, NaN = distance unknown; unit directions of the
-        camera's z.
+        The mean is Eq. 3 plus a Gaussian process over the viewpoint; the bound is conformal (formulas: the
+        module's docstring).
+
+        Args:
+            distance: [V], d_min to the category in world units; NaN: unknown.
+            position: [V, 3], camera centres in world units.
+            direction: [V, 3], unit viewing directions (the camera's z) in the world.
+
+        Returns:
+            mean, spread and bound [V, K] in SSIM, each column a level; support [V]: 1 at a known viewpoint, 0
+            far from all.
+
+        Example:
+            >>> import numpy as np
+            >>> from sagesplat import open_run
+            >>> run = open_run("runs/garden")  # doctest: +SKIP
+            >>> near = np.array([3.0])  # world units
+            >>> camera, model = run.scene.views[0].camera, run.promises[184]  # doctest: +SKIP
+            >>> model.predict(near, camera.position[None], camera.direction[None]).bound  # doctest: +SKIP
         """
         x = _inputs(distance, position, direction, self.extent, self.median_log_distance)
         near = matern32(x, self.inputs, self.lengths)
@@ -196,13 +213,23 @@ def fit_promises(
     confidence: float = 0.95,
     curves: Mapping[tuple[int, int], SsimModel] | None = None,
 ) -> dict[int, ViewModel]:
-    """A calibrated model by label id, from the rows of the scene's training and calibration views.
+    """Fit a calibrated SSIM model per category: Eq. 3, a Gaussian process, and a conformal multiplier.
 
-    `curves`: what `fit_models` finds in these rows, where it is at hand.
+    Rows of test views and of the full image are ignored. A category has the levels that Eq. 3 could be fitted
+    for, and learns from the views measured at all of them.
 
-    Rows of test views and of the whole image are ignored. A category has the levels that Eq. 3 could be
-    fitted for, and learns from views measured at all of them; one that no such view shows has no model.
-    RunError for an impossible confidence.
+    Args:
+        observations: Rows of `observe`.
+        scene: The capture; its training and calibration views are used.
+        confidence: 1 - the accepted risk of a violated target, between 0 and 1 (conformal risk control,
+            Angelopoulos et al. 2022).
+        curves: Result of `fit_models` on the same rows, if it is at hand.
+
+    Returns:
+        Models by label id. A category that no view shows at all levels has none.
+
+    Raises:
+        RunError: For an impossible confidence.
     """
     if not 0 < confidence < 1:
         raise RunError(

@@ -1,14 +1,16 @@
 """The command line: one short function per command, each loads, calls and saves."""
 
 import os
+import shutil
 import sys
+import textwrap
 from typing import NoReturn
-
-import tyro
 
 from sagesplat import __version__
 from sagesplat.cli import stages, studies, tools  # noqa: F401  (their commands register themselves)
 from sagesplat.cli.base import COMMANDS
+from sagesplat.cli.help import help_of
+from sagesplat.cli.parse import arguments, current_command
 from sagesplat.core.errors import SageError
 
 
@@ -18,14 +20,19 @@ def main() -> None:
     if name in ("-h", "--help", "--version"):
         print(f"sagesplat {__version__}" if name == "--version" else _overview())
         return
+    name = current_command(name)
     if name not in COMMANDS:
         _fail(f"no command {name!r}; there are {', '.join(COMMANDS)}")
+    function = COMMANDS[name]
+    if {"-h", "--help", "--help-all"} & set(words):
+        print(help_of(name, function, everything="--help-all" in words))
+        raise SystemExit(0)
     try:
-        tyro.cli(COMMANDS[name], prog=f"sagesplat {name}", args=words)
+        function(**arguments(name, function, words))
     except SageError as error:
         _fail(str(error))
     except KeyboardInterrupt:
-        _fail("interrupted; what is finished is kept: run the same command again to go on")
+        _fail("interrupted; finished stages and checkpoints are kept: run the same command again to resume")
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except OSError as error:
@@ -35,10 +42,12 @@ def main() -> None:
 
 def _overview() -> str:
     """What `sagesplat --help` prints."""
+    width = max(60, min(110, shutil.get_terminal_size().columns))
     lines = ["usage: sagesplat COMMAND ...", "", "Semantic-driven adaptive Gaussian splatting.", ""]
     for name, function in COMMANDS.items():
-        lines.append(f"  {name:10}{(function.__doc__ or '').splitlines()[0]}")
-    return "\n".join([*lines, "", "`sagesplat COMMAND --help` lists the settings of a command."])
+        text = f"  {name:18}{(function.__doc__ or '').splitlines()[0]}"
+        lines += textwrap.wrap(text, width, subsequent_indent=" " * 20, drop_whitespace=True)
+    return "\n".join([*lines, "", "`sagesplat COMMAND --help` lists the options of a command."])
 
 
 def _fail(message: str) -> NoReturn:

@@ -1,5 +1,6 @@
 """What all commands share."""
 
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
@@ -12,56 +13,87 @@ from tyro.conf import Positional, arg
 from sagesplat.core.errors import BackendUnavailable, RunError
 
 if TYPE_CHECKING:
+    from sagesplat.cli.console import Console
     from sagesplat.raster import Backend
     from sagesplat.run.executor import Executor
     from sagesplat.run.job import Job
+    from sagesplat.run.run_dir import RunDir
 
 COMMANDS: dict[str, Callable[..., None]] = {}
 
 
 def command(function: Callable[..., None]) -> Callable[..., None]:
     """Make a function a command of its name. Only the one that is called gets a parser: that takes time."""
-    COMMANDS[function.__name__] = function
+    COMMANDS[function.__name__.replace("_", "-")] = function
     return function
 
 
 @dataclass(frozen=True)
-class Machine:
-    """Where and how a command computes."""
+class Redo:
+    """Earlier results."""
+
+    force: bool = False
+    """Redo results that were made with other settings. Says first what is redone and how long it took, and
+    asks on a terminal."""
+    yes: bool = False
+    """Do not ask before redoing."""
+
+
+@dataclass(frozen=True)
+class Device:
+    """Device."""
 
     threads: int = 0
     """CPU threads (0: all cores)."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """auto: a CUDA GPU where there is one that works (see `sagesplat doctor`), else the CPU."""
+    """auto: a CUDA GPU if one works (see `sagesplat doctor`), else the CPU."""
     backend: Literal["auto", "cpu", "cuda", "reference"] = "auto"
-    """Rasteriser; reference is float64 and slow."""
-    processes: int = 1
-    """Train in so many processes, one per GPU; a step then looks at a photo each."""
-    memory_limit: float = 0.0
-    """GiB that training may use: the cap of Gaussians lowers itself to it (0: nine tenths of what the machine
-    or its container has)."""
+    """Rasteriser. auto: the one of the device; reference: float64 in PyTorch, slow."""
+
+
+@dataclass(frozen=True)
+class Compute(Device, Redo):
+    """Device and earlier results, of commands that compute."""
+
+
+@dataclass(frozen=True)
+class Parallel(Compute):
+    """Tasks of a command, on one machine or a cluster."""
+
     executor: str = "local"
-    """Where pieces of work are computed that do not depend on each other: local (this process, one after the
-    other), ray (the Ray cluster that runs here or that RAY_ADDRESS names, else one of this machine) or
-    ray:HOST:PORT. All nodes need the run folder and the capture under the same paths."""
-    force: bool = False
-    """Make results again that were made with other settings."""
+    """Where independent tasks run. local: in this process, one after the other; ray: on the Ray cluster of
+    RAY_ADDRESS, or one that is started on this machine; ray:HOST:PORT: on that cluster. All nodes need the
+    run folder and the capture under the same paths."""
+
+
+@dataclass(frozen=True)
+class Machine(Parallel):
+    """Training processes and memory."""
+
+    processes: int = 1
+    """Training processes, one per GPU. Each step uses at least one photo per process."""
+    memory_limit: float = 0.0
+    """Memory limit of training, GiB; the maximum number of Gaussians is lowered to fit (0: 90 % of the
+    memory of the machine or container)."""
 
 
 LadderKind = Literal["nested", "snapshots"]
 _CAPTURE = "capture: a COLMAP workspace, transforms.json, photos or a video"
 Scene = Positional[Annotated[Path, arg(metavar="SCENE", help=_CAPTURE)]]
 Run = Positional[Annotated[Path, arg(metavar="RUN", help="run folder")]]
+Ladder = Annotated[LadderKind, arg(help="Levels: nested (prefixes of one model) or the training snapshots.")]
+Seed = Annotated[int, arg(help="Seed of the random numbers.")]
 Flat = arg(name="")
 
 
 @contextmanager
-def open_job(run: Path, machine: Machine, ladder: LadderKind = "nested") -> Iterator["Job"]:
-    """A job on a run folder, shown on the console."""
+def open_job(run: Path, options: Redo | Device, ladder: LadderKind = "nested") -> Iterator["Job"]:
+    """A job on a run folder, shown on the console; options that a command does not have are the defaults."""
     from sagesplat.cli.console import Console
     from sagesplat.run.job import Job
     from sagesplat.run.run_dir import RunDir
 
+    machine = Machine(**vars(options))
     if not machine.memory_limit >= 0:
         raise RunError(f"--memory-limit {machine.memory_limit} is impossible; choose GiB, such as 8")
     limit = int(machine.memory_limit * 2**30)
@@ -70,10 +102,37 @@ def open_job(run: Path, machine: Machine, ladder: LadderKind = "nested") -> Iter
             console.out.print("[dim]· computing on the GPU[/]")
         if machine.executor != "local":
             console.out.print(f"[dim]· on a Ray cluster, {executor.parallel} tasks at once[/]")
+        folder = RunDir(run, ladder)
         yield Job(
-            RunDir(run, ladder), console, backend, threads, machine.force, machine.processes, machine.device,
-            limit, locks, executor,
+            folder, console, backend, threads, machine.force, machine.processes, machine.device,
+            limit, locks, executor, before_redo=_approval(folder, console, machine.yes),
         )  # fmt: skip
+
+
+def _approval(run: "RunDir", console: "Console", yes: bool) -> Callable[[str, str], None]:
+    """Says once what --force redoes, and how long that took; on a terminal it is asked whether to."""
+    from sagesplat.cli.layout import duration
+    from sagesplat.run.recorded import stage_seconds
+    from sagesplat.run.stage import following
+
+    asked = False
+
+    def approve(stage: str, difference: str) -> None:
+        nonlocal asked
+        if asked:
+            return
+        asked = True
+        took = stage_seconds(run)
+        later = [name for name in following(stage) if name in took]
+        text = f"--force: {difference}; {stage} is redone (it took {duration(took.get(stage, 0.0))})"
+        if later:
+            seconds = duration(sum(took[name] for name in later))
+            text += f"; made from it, in {seconds}: {', '.join(later)}"
+        console.say(text)
+        if not yes and sys.stdin.isatty() and console.out.is_terminal and not console.ask("Redo?"):
+            raise RunError(f"{run.path}: nothing was redone; leave out --force to keep what is there")
+
+    return approve
 
 
 @contextmanager

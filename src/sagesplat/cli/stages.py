@@ -4,7 +4,21 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
-from sagesplat.cli.base import Flat, LadderKind, Machine, Run, Scene, command, open_job
+from tyro.conf import Positional, arg
+
+from sagesplat.cli.base import (
+    Compute,
+    Flat,
+    Ladder,
+    Machine,
+    Parallel,
+    Redo,
+    Run,
+    Scene,
+    Seed,
+    command,
+    open_job,
+)
 from sagesplat.core.config import (
     BlocksConfig,
     FitConfig,
@@ -19,6 +33,8 @@ from sagesplat.core.config import (
     SceneConfig,
     TrainConfig,
 )
+
+_FUSE = "Fuse the label images of all views through the trained Gaussians, before the levels are made."
 
 
 @command
@@ -46,14 +62,16 @@ def run(
     nest: NestConfig = NestConfig(),
     fit: FitConfig = FitConfig(),
     plan: Annotated[PlanConfig, Flat] = PlanConfig(),
-    fuse: bool = False,
-    ladder: LadderKind = "nested",
+    fuse: Annotated[bool, arg(help=_FUSE)] = False,
+    ladder: Ladder = "nested",
     machine: Annotated[Machine, Flat] = Machine(),
-    seed: int = 0,
+    seed: Seed = 0,
 ) -> None:
-    """Everything: photos in, levels, models, a plan and a report out.
+    """Run the whole pipeline: photos in, levels, quality models, a plan and a report out.
 
-    Poses are found where the photos have none, and label images made where there are none.
+    Camera poses are estimated if the photos have none, and label images are made if there are none. Finished
+    stages are skipped, and a killed run resumes. Options that an earlier command on RUN was given are the
+    defaults of the next one.
     """
     from sagesplat.stages import pipeline
 
@@ -66,16 +84,15 @@ def run(
 
 @command
 def demo(
-    run: Path = Path("runs/demo"),
+    run: Positional[Annotated[Path, arg(metavar="RUN")]] = Path("runs/demo"),
     places: tuple[int, int] = (1, 1),
     machine: Annotated[Machine, Flat] = Machine(),
 ) -> None:
-    """Make the built-in capture, run the main job on it and say where to look.
+    """Run the whole pipeline on the built-in capture, and say where to look.
 
     Args:
-        run: run folder.
-        places: 2 2 makes a large capture, a grid of courtyards, and trains it in as many blocks.
-        machine: where and how to compute.
+        run: run folder
+        places: rows and columns of courtyards; more than one makes a large scene, trained in that many blocks
     """
     from sagesplat.stages import pipeline
 
@@ -91,9 +108,9 @@ def masks(
     poses: PosesConfig = PosesConfig(),
     masks: Annotated[MasksConfig, Flat] = MasksConfig(),
     labels: LabelsConfig = LabelsConfig(),
-    machine: Annotated[Machine, Flat] = Machine(),
+    machine: Annotated[Parallel, Flat] = Parallel(),
 ) -> None:
-    """Begin a run: read the capture (poses are found if there are none) and bring label images in."""
+    """Begin a run: read the capture, estimate its camera poses if need be, make or import label images."""
     from sagesplat.stages.label import make_masks
     from sagesplat.stages.scene import open_scene
 
@@ -103,8 +120,8 @@ def masks(
 
 
 @command
-def lift(run: Run, lift: LiftConfig = LiftConfig(), machine: Annotated[Machine, Flat] = Machine()) -> None:
-    """Vote the label images onto the points."""
+def lift(run: Run, lift: LiftConfig = LiftConfig(), machine: Annotated[Redo, Flat] = Redo()) -> None:
+    """Transfer the labels of the images to the 3D points of the capture."""
     from sagesplat.stages.label import lift_labels
 
     with open_job(run, machine) as job:
@@ -112,8 +129,8 @@ def lift(run: Run, lift: LiftConfig = LiftConfig(), machine: Annotated[Machine, 
 
 
 @command
-def fuse(run: Run, machine: Annotated[Machine, Flat] = Machine()) -> None:
-    """Let all views vote on the label images by way of the trained Gaussians; what follows uses them."""
+def fuse(run: Run, machine: Annotated[Compute, Flat] = Compute()) -> None:
+    """Fuse the label images of all views through the trained Gaussians; later stages use the fused ones."""
     from sagesplat.stages.label import fuse_masks
 
     with open_job(run, machine) as job:
@@ -126,9 +143,9 @@ def train(
     train: TrainConfig = TrainConfig(),
     blocks: BlocksConfig = BlocksConfig(),
     machine: Annotated[Machine, Flat] = Machine(),
-    seed: int = 0,
+    seed: Seed = 0,
 ) -> None:
-    """Train 3DGS and record the levels; a killed training goes on."""
+    """Train 3DGS and record snapshots; a killed training resumes."""
     from sagesplat.stages import pipeline
 
     with open_job(run, machine) as job:
@@ -136,8 +153,8 @@ def train(
 
 
 @command
-def parts(run: Run, machine: Annotated[Machine, Flat] = Machine()) -> None:
-    """Draw the label images of a scene in blocks: each category in each block is one of its own."""
+def block_categories(run: Run, machine: Annotated[Compute, Flat] = Compute()) -> None:
+    """Render the label images of a scene in blocks; each (block, category) pair becomes a category."""
     from sagesplat.stages import blocks
 
     with open_job(run, machine) as job:
@@ -149,10 +166,10 @@ def nest(
     run: Run,
     nest: NestConfig = NestConfig(),
     blocks: BlocksConfig = BlocksConfig(),
-    machine: Annotated[Machine, Flat] = Machine(),
-    seed: int = 0,
+    machine: Annotated[Parallel, Flat] = Parallel(),
+    seed: Seed = 0,
 ) -> None:
-    """Make the nested ladder: order the trained Gaussians, train their prefixes, write the chunks."""
+    """Make the nested levels: order the trained Gaussians, train prefixes, write the increments."""
     from sagesplat.stages import pipeline
 
     with open_job(run, machine) as job:
@@ -163,10 +180,10 @@ def nest(
 def observe(
     run: Run,
     fit: FitConfig = FitConfig(),
-    ladder: LadderKind = "nested",
-    machine: Annotated[Machine, Flat] = Machine(),
+    ladder: Ladder = "nested",
+    machine: Annotated[Parallel, Flat] = Parallel(),
 ) -> None:
-    """Measure every category at every level in every view."""
+    """Measure SSIM and PSNR of every category at every level in every view."""
     from sagesplat.stages.observe import observe_levels
 
     with open_job(run, machine, ladder) as job:
@@ -177,10 +194,10 @@ def observe(
 def fit(
     run: Run,
     fit: FitConfig = FitConfig(),
-    ladder: LadderKind = "nested",
-    machine: Annotated[Machine, Flat] = Machine(),
+    ladder: Ladder = "nested",
+    machine: Annotated[Parallel, Flat] = Parallel(),
 ) -> None:
-    """Fit SSIM over distance for every category and level."""
+    """Fit the quality models: SSIM of every category and level, as a function of viewpoint."""
     from sagesplat.stages.fit import fit_ladder
 
     with open_job(run, machine, ladder) as job:
@@ -191,10 +208,10 @@ def fit(
 def plan(
     run: Run,
     plan: Annotated[PlanConfig, Flat] = PlanConfig(),
-    ladder: LadderKind = "nested",
-    machine: Annotated[Machine, Flat] = Machine(),
+    ladder: Ladder = "nested",
+    machine: Annotated[Redo, Flat] = Redo(),
 ) -> None:
-    """Choose the cheapest levels that keep a target SSIM."""
+    """Choose the cheapest level of each category that reaches a target SSIM, or the best within a budget."""
     from sagesplat.stages.plan import make_plan
 
     with open_job(run, machine, ladder) as job:
@@ -202,8 +219,8 @@ def plan(
 
 
 @command
-def compose(run: Run, ladder: LadderKind = "nested", machine: Annotated[Machine, Flat] = Machine()) -> None:
-    """Write the planned scene as composed.ply."""
+def compose(run: Run, ladder: Ladder = "nested", machine: Annotated[Compute, Flat] = Compute()) -> None:
+    """Write the scene that the plan chose as composed.ply."""
     from sagesplat.stages.compose import compose_plan
 
     with open_job(run, machine, ladder) as job:
@@ -211,8 +228,8 @@ def compose(run: Run, ladder: LadderKind = "nested", machine: Annotated[Machine,
 
 
 @command
-def evaluate(run: Run, ladder: LadderKind = "nested", machine: Annotated[Machine, Flat] = Machine()) -> None:
-    """Measure the plans on the test views, beside what was promised."""
+def evaluate(run: Run, ladder: Ladder = "nested", machine: Annotated[Compute, Flat] = Compute()) -> None:
+    """Render the planned scenes in the test views: measured SSIM beside the predicted one."""
     from sagesplat.stages.evaluate import evaluate_plans
 
     with open_job(run, machine, ladder) as job:
@@ -224,24 +241,26 @@ def report(
     run: Run,
     paper: bool = False,
     settings: Annotated[PaperConfig, Flat] = PaperConfig(),
-    ladder: LadderKind = "nested",
-    machine: Annotated[Machine, Flat] = Machine(),
+    ladder: Ladder = "nested",
+    machine: Annotated[Parallel, Flat] = Parallel(),
 ) -> None:
-    """Write the report; with --paper, every table and figure of the paper.
+    """Write the report; with --paper, the tables and figures of the paper.
 
     Args:
-        run: run folder.
-        paper: cross-view, equal occupancy, and the paper's tables and figures, from its ladder of snapshots.
-        settings: what they look at.
-        ladder: the ladder to report on.
-        machine: where and how to compute.
+        run: run folder
+        paper: evaluate as in the paper (cross-view, equal model size), with the training snapshots as levels;
+            their stages are run first where they are missing
     """
+    from sagesplat.stages import pipeline
     from sagesplat.stages.report import make_report
 
     with open_job(run, machine, "snapshots" if paper else ladder) as job:
         if paper:
+            from sagesplat.studies.lpips import warn_of_lpips
             from sagesplat.studies.paper.run import paper_report
 
+            warn_of_lpips(job, settings.lpips)
+            pipeline.adapt_snapshots(job)
             paper_report(job, settings)
         else:
             make_report(job)

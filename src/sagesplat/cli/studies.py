@@ -1,17 +1,18 @@
-"""Commands that compare: methods, scenes, settings, viewpoints."""
+"""Commands that compare methods, scenes, settings and viewpoints."""
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from sagesplat.cli.base import Flat, LadderKind, Machine, Run, command, computing, open_job
+from sagesplat.cli.base import Compute, Flat, Ladder, Machine, Parallel, Run, command, computing, open_job
 from sagesplat.core.config import CompareConfig
 
 
 @command
-def crossview(run: Run, ladder: LadderKind = "nested", machine: Annotated[Machine, Flat] = Machine()) -> None:
-    """Plan every unseen view by itself, and measure promise, error and regret."""
+def crossview(run: Run, ladder: Ladder = "nested", machine: Annotated[Compute, Flat] = Compute()) -> None:
+    """Plan every test view by itself; measure the prediction error, the coverage and the regret."""
     from sagesplat.studies.paper.run import cross_views
 
     with open_job(run, machine, ladder) as job:
@@ -25,23 +26,27 @@ def transfer(
     out: Path | None = None,
     targets: tuple[float, ...] = (),
     lpips: Path | None = None,
-    machine: Annotated[Machine, Flat] = Machine(),
+    machine: Annotated[Parallel, Flat] = Parallel(),
 ) -> None:
-    """Predict run B with the quality models of run A (cross-scene).
+    """Predict the quality of run B with the models of run A (cross-scene).
+
+    Both runs are compared by their training snapshots, whose stages are run first where they are missing.
 
     Args:
-        run_a: run folder whose models are used.
-        run_b: run folder that they are used on.
-        out: folder for tables and figures (default: RUN_B/transfer).
-        targets: SSIM targets (default: those that B was planned for).
-        lpips: folder with the weights of LPIPS (default: where `sagesplat download lpips` puts them).
-        machine: where and how to compute.
+        run_a: run folder whose quality models predict
+        run_b: run folder whose quality is predicted
+        out: folder for tables and figures (default: RUN_B/transfer)
+        targets: SSIM targets (default: those that B was planned for)
+        lpips: folder with the LPIPS weights (default: where `sagesplat download lpips` puts them)
     """
     from sagesplat.core.events import TableMade
+    from sagesplat.stages import pipeline
     from sagesplat.studies.transfer.run import transfer as evaluate_transfer
 
     out = out or run_b / "transfer"
     with open_job(run_a, machine, "snapshots") as job_a, open_job(run_b, machine, "snapshots") as job_b:
+        pipeline.adapt_snapshots(job_a)
+        pipeline.adapt_snapshots(job_b)
         table, line = evaluate_transfer(job_a, job_b, out, targets, lpips)
         table = table.only("split", "predictor", "ssim error", "iteration error", "hit", "regret share")
         job_b.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
@@ -49,30 +54,32 @@ def transfer(
 
 
 @command
-def online(
+def early_stopping(
     stopped: Positional[Annotated[Path, arg(metavar="RUN_STOPPED")]],
     full: Positional[Annotated[Path, arg(metavar="RUN_FULL")]],
     out: Path | None = None,
-    machine: Annotated[Machine, Flat] = Machine(),
+    machine: Annotated[Parallel, Flat] = Parallel(),
 ) -> None:
-    """A run with --train.freeze-at beside snapshots of the same run without, composed for that target.
+    """Compare early stopping per category (--train.freeze-at) with composing snapshots of a full training.
 
     Args:
-        stopped: run folder trained with --train.freeze-at.
-        full: run folder trained alike, but without.
-        out: folder for the tables (default: RUN_STOPPED/online).
-        machine: where and how to compute.
+        stopped: run folder trained with --train.freeze-at
+        full: run folder trained with the same settings, but without it; its snapshots are measured if they
+            are not yet
+        out: folder for the tables (default: RUN_STOPPED/early_stopping)
     """
     from sagesplat.core.events import TableMade
+    from sagesplat.stages import pipeline
     from sagesplat.studies.early_stopping import compare_early_stopping
 
-    out = out or stopped / "online"
+    out = out or stopped / "early_stopping"
     with (
-        open_job(stopped, machine, "snapshots") as job_online,
+        open_job(stopped, machine, "snapshots") as job_stopped,
         open_job(full, machine, "snapshots") as job_full,
     ):
-        table, _ = compare_early_stopping(job_online, job_full, out)
-        job_online.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
+        pipeline.observe_snapshots(job_full)
+        table, _ = compare_early_stopping(job_stopped, job_full, out)
+        job_stopped.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
     print(out)
 
 
@@ -81,19 +88,19 @@ def compare(
     run: Run,
     compare: Annotated[CompareConfig, Flat] = CompareConfig(),
     json: Path | None = None,
-    machine: Annotated[Machine, Flat] = Machine(),
+    machine: Annotated[Compute, Flat] = Compute(),
 ) -> None:
-    """The nested ladder beside its baselines: 3DGS, SAGE, 3DGS pruned and tuned, 3DGS-MCMC.
+    """Compare the nested levels with baselines: 3DGS, SAGE, 3DGS pruned and tuned, 3DGS-MCMC.
 
     Args:
-        run: run folder, finished with the nested ladder.
-        compare: which baselines; those that are trained are kept in RUN/compare.
-        json: write all that was measured here as well.
-        machine: where and how to compute.
+        run: run folder, finished with the nested levels; trained baselines are kept in RUN/compare
+        json: file to write every measurement to, as JSON
     """
     from sagesplat.studies.compare.run import compare as compare_methods
+    from sagesplat.studies.lpips import warn_of_lpips
 
     with open_job(run, machine) as job:
+        warn_of_lpips(job, compare.lpips)
         compare_methods(job, compare, json)
 
 
@@ -103,18 +110,17 @@ def sweep(
     out: Positional[Annotated[Path, arg(metavar="OUT")]],
     machine: Annotated[Machine, Flat] = Machine(),
 ) -> None:
-    """Run scenes, variants of settings, targets and seeds of one small file; mean and spread come out.
+    """Run the scenes, settings, targets and seeds listed in a file; summarise by mean and spread.
 
     Args:
-        file: what to run; examples/sweep.toml shows one.
-        out: folder for the runs and the summary; what is finished there is kept.
-        machine: where and how to compute.
+        file: what to run, in TOML; examples/sweep.toml is an example
+        out: folder for the runs and the summary; finished runs in it are kept
     """
     from sagesplat.cli.console import Console
     from sagesplat.studies.sweep.file import read_sweep
     from sagesplat.studies.sweep.run import run_sweep
 
-    cells = read_sweep(file)
+    cells = read_sweep(file, lambda text: print(f"sagesplat: {text}", file=sys.stderr))
     with computing(machine, out / "runs") as (backend, threads, executor), Console() as console:
         run_sweep(cells, out, console, backend, threads, machine.force, executor)
     print(out / "summary.md")

@@ -7,9 +7,9 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from sagesplat.cli.base import Flat, LadderKind, Machine, Run, command, open_job
+from sagesplat.cli.base import Compute, Device, Flat, Ladder, Run, command, open_job
 from sagesplat.core.config import BundleConfig
-from sagesplat.core.errors import RunError
+from sagesplat.core.errors import BackendUnavailable, RunError
 
 
 @command
@@ -20,20 +20,18 @@ def export(
     labels: tuple[str, ...] = (),
     target_ssim: float | None = None,
     chunks: Literal["spz", "ply"] | None = None,
-    ladder: LadderKind = "nested",
-    machine: Annotated[Machine, Flat] = Machine(),
+    ladder: Ladder = "nested",
+    machine: Annotated[Compute, Flat] = Compute(),
 ) -> None:
-    """Write Gaussians as a PLY: the plan's composition, or one level; or all chunks of the nested ladder.
+    """Write Gaussians as a PLY: the planned scene or one level; or the increments of the nested levels.
 
     Args:
-        run: run folder.
-        out: PLY to write, or a folder for chunks.
-        level: a level by its number (of snapshots: training step), instead of the composition.
-        labels: names of the categories to take.
-        target_ssim: the composition for this planned target (default: the budget's or the main one).
-        chunks: a file for what each level of each category adds, in this format.
-        ladder: the ladder to take them from.
-        machine: where and how to compute.
+        run: run folder
+        out: PLY to write, or with --chunks a folder
+        level: number of a level (of snapshots: its training step) to write instead of the planned scene
+        labels: names of the categories to write (default: all)
+        target_ssim: write the scene planned for this SSIM (default: for the budget, else the main target)
+        chunks: write the increment of each level of each category as a file of this format
     """
     from sagesplat.stages.export import export_increments, export_ply
 
@@ -52,17 +50,17 @@ def download(
     scale: int | None = None,
     show: Annotated[bool, arg(name="list")] = False,
 ) -> None:
-    """Fetch a scene of the field, or weights that are not part of the package.
+    """Download a benchmark scene, or network weights that are not part of the package.
 
-    Of a scene only its own photos and model are transferred out of the official archive. What is there
-    already is kept, so a download that was cut goes on when the command is given again.
+    Of a scene only its own photos and model are transferred out of the official archive. Files that are
+    there already are kept, so an interrupted download resumes when the command is given again.
 
     Args:
         what: a scene, such as mipnerf360/garden; or lpips, the weights of the perceptual metric (761 MB are
-            fetched, 69 MB kept).
-        folder: where to put it (default: the folder you are in; of weights the cache, ~/.cache/sagesplat).
-        scale: photos so many times smaller, as the archive has them (default: what papers evaluate on).
-        show: list the scenes.
+            fetched, 69 MB kept)
+        folder: where to put it (default: the current folder; weights: ~/.cache/sagesplat)
+        scale: downscaling factor of the photos, as the archive has them (default: the one papers evaluate on)
+        show: list the scenes
     """
     from sagesplat.cli.console import Console
     from sagesplat.core.events import Progress, StageStarted
@@ -95,13 +93,13 @@ def download(
 
 @command
 def doctor(build: bool = False, json: bool = False) -> None:
-    """Say what this machine can do, and what more needs.
+    """Check this machine: what works, what is missing and how to get it.
 
     Args:
-        build: compile gsplat's CUDA kernels now (about a minute), rather than at their first use.
-        json: print it for machines.
+        build: compile gsplat's CUDA kernels now (about a minute) rather than at their first use
+        json: print the findings as JSON
     """
-    from sagesplat.cli.doctor import as_json, examine, is_well, print_findings
+    from sagesplat.cli.doctor import as_json, examine, is_well, print_findings, unbuilt
 
     findings = examine(build=build)
     if json:
@@ -110,6 +108,8 @@ def doctor(build: bool = False, json: bool = False) -> None:
         print_findings(findings)
     if not is_well(findings):
         raise SystemExit(1)
+    if build and (why := unbuilt(findings)):
+        raise BackendUnavailable(f"--build: nothing was built: {why}")
 
 
 @command
@@ -117,15 +117,13 @@ def bundle(
     run: Run,
     out: Positional[Annotated[Path, arg(metavar="OUT")]],
     config: Annotated[BundleConfig, Flat] = BundleConfig(),
-    machine: Annotated[Machine, Flat] = Machine(),
+    machine: Annotated[Device, Flat] = Device(),
 ) -> None:
-    """Write a finished run as a folder for any static web server: scene, promises and viewer.
+    """Write a finished run as a folder for any static web server: scene, quality models and viewer.
 
     Args:
-        run: run folder, finished with the nested ladder.
-        out: folder to write: a new or empty one, or an earlier bundle, which is replaced.
-        config: what it says of the scene.
-        machine: where and how to compute.
+        run: run folder, finished with the nested levels
+        out: folder to write: a new or empty one, or an earlier bundle, which is replaced
     """
     from sagesplat.stages.bundle import bundle as write
 
@@ -145,16 +143,16 @@ def view(
     browser: bool = True,
     follow: bool = False,
 ) -> None:
-    """Show a bundle, or a run's, in the browser; with --follow its training as it goes on.
+    """Show a run or a bundle in the browser; with --follow a training in progress.
 
     Args:
-        path: run folder (its bundle is made if it is missing or out of date), or a bundle.
-        port: port to listen on (default: the first free one from 8000 on).
-        host: address to listen on; 0.0.0.0 lets everybody in the network in (default: this machine only).
-        ssl_certfile: certificate (PEM) for https, which headsets ask for.
-        ssl_keyfile: its key, if it is in a file of its own.
-        browser: open the browser.
-        follow: show the newest snapshot of a training that goes on.
+        path: run folder (its bundle is made if it is missing or out of date), or a bundle
+        port: port to listen on (default: the first free one from 8000)
+        host: address to listen on; 0.0.0.0 serves the whole network (default: this machine only)
+        ssl_certfile: certificate (PEM) for https, which headsets require
+        ssl_keyfile: key of the certificate, if it is a separate file
+        browser: open the browser
+        follow: show the newest snapshot of a training in progress
     """
     from sagesplat.cli.console import Console
     from sagesplat.stages.view import show

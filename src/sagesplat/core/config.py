@@ -7,39 +7,41 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class SceneConfig:
-    """How a capture is read."""
+    """How the capture is read."""
 
     downscale: int = 1
-    """Train on photos made this many times smaller (images_N is used where it is shipped)."""
+    """Downscaling factor of the photos that are trained on. images_N is read where the capture has it."""
     test_every: int = 8
-    """Every n-th view by name is a test view, seen by nothing but the evaluation; 0 = none."""
+    """Every n-th view by name is a test view, used for evaluation only; 0: none."""
     calibrate_every: int = 8
-    """Every n-th of the others is kept from training too, to calibrate the promises on; 0 = none."""
+    """Every n-th of the other views is held out of training, to calibrate the quality models; 0: none."""
 
 
 @dataclass(frozen=True)
 class PosesConfig:
-    """How camera poses are found for photos that come without."""
+    """Camera poses, estimated by COLMAP for photos that have none."""
 
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
-    """Which photos are compared: all pairs, or neighbours by name; auto: neighbours for videos and many."""
+    """Photo pairs that are matched. exhaustive: all; sequential: neighbours by name; auto: sequential for
+    videos and for large sets."""
     camera: Literal["auto", "single", "per-folder", "per-image"] = "auto"
-    """Which photos share intrinsics; auto: those of one size, camera and zoom."""
+    """Photos that share intrinsics. auto: those of the same size, camera and focal length."""
     model: str = "OPENCV"
-    """COLMAP's camera model."""
+    """Camera model of COLMAP."""
     refine_principal_point: bool = False
-    """For photos that were cropped, each in its own way."""
+    """Estimate the principal point too, for photos that were cropped one by one."""
     max_size: int = 3200
-    """Larger side in pixels: of photos for features, and of the undistorted photos."""
+    """Longer side of the photos for feature extraction, and of the undistorted photos, pixels."""
     max_frames: int = 300
-    """Frames taken of a video."""
+    """Frames that are taken from a video."""
     min_registered: float = 0.5
-    """Share of the photos whose pose must be found."""
+    """Fraction of the photos that must get a pose."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Of features and matching."""
+    """Device for feature extraction and matching."""
     threads: int = -1
-    """-1: all cores."""
+    """CPU threads (-1: all cores)."""
     seed: int = 0
+    """Seed of RANSAC and of the mapping."""
 
 
 @dataclass(frozen=True)
@@ -47,184 +49,208 @@ class MasksConfig:
     """Where label images come from."""
 
     segmenter: Literal["auto", "masks", "hf", "onnx", "deeplabv2"] = "auto"
-    """masks: ready label images; hf: a network of Hugging Face; onnx: one in ONNX format; deeplabv2: the
-    paper's. auto: masks where there are some, else by --model."""
+    """Source of the label images. masks: image files; hf: a network of Hugging Face; onnx: a network in ONNX
+    format; deeplabv2: the network of the paper; auto: masks if the capture has them, else by the suffix
+    of --model."""
     masks: Path | None = None
     """Folder of label images (default: SCENE/masks)."""
     model: str | None = None
-    """The network: a name on huggingface.co or a folder (hf; default: EoMT small), a .onnx file or a
-    checkpoint."""
+    """Network: a name on huggingface.co or a folder (hf; default: EoMT small), a .onnx file, or a checkpoint
+    (deeplabv2)."""
     classes: Path | None = None
-    """JSON with the class names of an ONNX network and their category ids."""
+    """JSON file with the class names of an ONNX network and their category ids."""
     head: Literal["coco-stuff", "voc"] = "coco-stuff"
-    """What the checkpoint of deeplabv2 was trained on."""
+    """Data set that the deeplabv2 checkpoint was trained on."""
     crf: bool = False
-    """Let borders follow the edges of the photo (deeplabv2)."""
+    """Refine the label images with a dense CRF (deeplabv2)."""
     batch: int = 1
-    """Photos that a network looks at together."""
+    """Photos per forward pass of the network."""
     soft: bool = False
-    """Keep the network's probabilities too, for `fuse`."""
+    """Store the class probabilities too; label fusion then uses them."""
 
 
 @dataclass(frozen=True)
 class LabelsConfig:
-    """What becomes of the categories: first merge, then keep, then min-share."""
+    """Changes to the categories: merge first, then keep, then the minimum share."""
 
     keep: str = ""
-    """Only these, such as "grass-merged,tree-merged"; the others become unlabelled."""
+    """Keep these categories, e.g. "grass-merged,tree-merged"; all others become unlabelled."""
     merge: str = ""
-    """Put together, such as "vase=potted plant,potted plant=tree-merged"."""
+    """Merge categories, e.g. "vase=potted plant,potted plant=tree-merged"."""
     min_share: float = 0.0
-    """Categories with a smaller share of all pixels become unlabelled."""
+    """Categories that cover less than this fraction of all pixels become unlabelled."""
 
 
 @dataclass(frozen=True)
 class LiftConfig:
-    """How label images become labels of points."""
+    """Label transfer from the images to the 3D points."""
 
     votes: Literal["track", "projection"] = "track"
-    """Which pixels vote on a point: those of its track, or all views it projects into."""
+    """Views that vote on the label of a point. track: those in which COLMAP observed it; projection: all
+    views that it projects into."""
 
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """3D Gaussian splatting as published. Step numbers are for a 30 000-step run and scale with max_steps."""
+    """3DGS training (step numbers are for 30,000 steps and scale with --train.max-steps)."""
 
     max_steps: int = 7000
+    """Training steps."""
     lr_schedule: Literal["fast", "published"] = "fast"
-    """fast: larger steps at first, and smaller photos where they tell as much; published: 3DGS's rates."""
+    """Learning rates. fast: larger at first, on downscaled photos where those have the same detail;
+    published: as in 3DGS."""
     level_every: int = 0
-    """Record a level every so many steps (0: a thirtieth of max_steps)."""
+    """Steps between two snapshots, not scaled (0: a thirtieth of --train.max-steps)."""
     sh_degree: int = 3
+    """Degree of the spherical harmonics."""
     ssim_weight: float = 0.2
+    """Weight of 1 - SSIM in the loss; L1 has the rest."""
     antialiased: bool = False
-    """Scale opacities by the area that the screen-space low-pass adds."""
+    """Compensate opacities for the screen-space low-pass filter (Mip-Splatting)."""
     batch: int = 1
-    """Photos a step looks at (at least one per process); rates grow by its square root, max_steps does not
-    shrink."""
+    """Photos per step, at least one per process. Learning rates grow with its square root; the number of
+    steps stays."""
     means_lr: float = 1.6e-4
-    """Times the scene's extent; falls exponentially to a hundredth."""
+    """Learning rate of the means, times the scene extent; decays exponentially to 1 %."""
     quats_lr: float = 1e-3
+    """Learning rate of the quaternions."""
     log_scales_lr: float = 5e-3
+    """Learning rate of the log scales."""
     logit_opacities_lr: float = 5e-2
+    """Learning rate of the opacity logits."""
     sh0_lr: float = 2.5e-3
+    """Learning rate of the SH coefficients of degree 0."""
     shN_lr: float = 1.25e-4
+    """Learning rate of the SH coefficients of higher degrees."""
     strategy: Literal["default", "mcmc"] = "default"
-    """How Gaussians come and go: clone, split, prune, reset as 3DGS, or relocation and noise as 3DGS-MCMC."""
+    """Densification. default: clone, split, prune and reset as 3DGS; mcmc: relocation and noise as
+    3DGS-MCMC."""
     refine_every: int = 100
-    """Densify every so many steps (not scaled: its statistics need the views)."""
+    """Steps between two densifications, not scaled: the gradient statistics need the views."""
     refine_start: int = 500
-    """Not scaled either (at most a fifth of the run): before, gradients say little."""
+    """First step of densification, not scaled, at most a fifth of the training."""
     refine_stop: int = 15_000
+    """Last step of densification."""
     reset_every: int = 3000
-    """Opacities are reset every so many steps while densification runs."""
+    """Steps between two opacity resets, while densification runs."""
     raise_sh_every: int = 1000
+    """Steps between two increases of the SH degree."""
     grow_grad: float = 2e-4
-    """Mean screen-space gradient (half images) above which a Gaussian is cloned or split."""
+    """Clone or split Gaussians whose mean screen-space gradient (in half image widths) is above this."""
     absgrad: bool = False
-    """Densify by sums of absolute gradients over pixels (AbsGS), above grow_absgrad."""
+    """Densify by absolute gradients (AbsGS), with the threshold --train.grow-absgrad."""
     grow_absgrad: float = 8e-4
+    """Threshold of the absolute gradient, in half image widths."""
     grow_scale: float = 0.01
-    """Split rather than clone above this share of the extent."""
+    """Split Gaussians larger than this fraction of the scene extent; clone smaller ones."""
     prune_opacity: float = 5e-3
+    """Prune Gaussians of lower opacity."""
     prune_scale: float = 0.1
-    """After the first reset, Gaussians larger than this share of the extent go."""
+    """After the first opacity reset, prune Gaussians larger than this fraction of the scene extent."""
     max_gaussians: int = 0
-    """Cap of densification, reached in a straight line (0: by the size of the photos)."""
+    """Maximum number of Gaussians; the limit grows linearly during densification (0: choose from the image
+    size)."""
     mcmc_noise: float = 5e5
-    """Times the rate of the means: how far MCMC's Gaussians wander."""
+    """SGLD noise of 3DGS-MCMC, times the learning rate of the means."""
     mcmc_opacity: float = 0.01
-    """Weight of the mean opacity in MCMC's loss."""
+    """Weight of the mean opacity in the loss (3DGS-MCMC)."""
     mcmc_scale: float = 0.01
-    """Weight of the mean scale in MCMC's loss."""
+    """Weight of the mean scale in the loss (3DGS-MCMC)."""
     levels_after_reset: bool = False
-    """Record a level that falls on an opacity reset right after it (as the paper may have), not before."""
+    """Record a snapshot that falls on an opacity reset after the reset, as the paper may have, not before."""
     freeze_at: float | None = None
-    """Stop each category when its mean SSIM on the training views reaches this (Fig. 1 of the paper)."""
+    """Stop each category when its mean SSIM in the training views reaches this (Fig. 1 of the paper)."""
     gradient_freeze_share: float = 0.0
-    """To compare with: after densification, the Gaussians whose gradients are within this smallest share rest
-    every other hundred steps (GSta). A run that is interrupted then goes on a little differently."""
+    """Freeze the fraction of Gaussians with the smallest gradients in alternate 100-step windows after
+    densification (GSta), as a baseline. A run that resumes is then not bit for bit the same."""
 
 
 @dataclass(frozen=True)
 class BlocksConfig:
-    """How a large scene is divided."""
+    """Blocks of a large scene."""
 
     count: int = 1
-    """Blocks of the ground plane, each trained like a scene of its own (--train holds for each); 1: the
-    scene as one."""
+    """Ground-plane blocks that are trained independently and merged; 1: no blocks. The --train options hold
+    for each block."""
     margin: float = 0.2
-    """How far training reaches beyond a block, as a share of its width."""
+    """Width of the training margin around a block, as a fraction of the block's width."""
     min_share: float = 0.25
-    """A photo is for a block if at least this share of the points that it sees are the block's."""
+    """Assign a photo to a block if at least this fraction of the points that it sees lies in the block."""
     far_share: float = 0.5
-    """Points beyond the margin that a block begins with too, at most, as a share of its own: the background
-    of its photos."""
+    """Limit on the initial points outside the margin (the background of the photos), as a fraction of the
+    block's own points."""
     boundary_steps: int = 300
-    """Training steps along the borders of each block, when the blocks are put together."""
+    """Boundary tuning: training steps on the Gaussians near the border of each block, after merging."""
 
 
 @dataclass(frozen=True)
 class NestConfig:
-    """How a trained model becomes a ladder whose levels contain each other."""
+    """Nested levels: prefixes of one ordered model."""
 
     steps: int = 3000
-    """Training steps on random compositions."""
+    """Training steps on random compositions of levels."""
     levels: int = 16
-    """Prefixes that are measured and planned with, in geometric steps of their size."""
+    """Levels per category; their sizes grow geometrically."""
     smallest: float = 0.01
-    """Share of a category's Gaussians in its lowest level."""
+    """Size of the lowest level, as a fraction of the category's Gaussians."""
     drawn_from: float = 0.05
-    """Share of a category in the smallest prefix that training looks at: fewer serve easy categories only."""
+    """Size of the smallest prefix that training samples, as a fraction of the category's Gaussians. Smaller
+    values favour categories that are easy to represent."""
     base_share: float = 0.2
-    """Share of the Gaussians, the first of all, that a small 3DGS-MCMC training makes; 0: none."""
+    """Size of the base model, as a fraction of all Gaussians; it is a small 3DGS-MCMC model that forms the
+    lowest levels; 0: none."""
     base_steps: int = 3000
-    """Steps of that training."""
+    """Training steps of the base model."""
     full_share: float = 0.1
-    """Share of the steps that look at everything, to begin with."""
+    """Fraction of the first steps that sample the full model; changes linearly to --nest.full-share-end."""
     full_share_end: float = 0.9
-    """The same at the end: the whole model needs the last word."""
+    """Fraction of the last steps that sample the full model."""
     sh_bits: tuple[int, int] = (5, 4)
-    """Bits of harmonics in the chunks, of degree 1 and of those above; training gets used to them."""
+    """Bits per SH coefficient in the increments: of degree 1, and of higher degrees. Training uses the
+    rounded values."""
     criterion: Literal["weight", "weight-volume", "peak", "sensitivity", "opacity"] = "sensitivity"
-    """What orders the Gaussians of a category; docs/nested.md compares them."""
+    """Importance that orders the Gaussians of a category; docs/nested.md compares them."""
     lr_multiplier: float = 4.0
-    """Rates to begin with, times those of a published run's last third; they fall to a twentieth."""
+    """Initial learning rates as a multiple of 3DGS's late learning rates; they decay to 5 %."""
 
 
 @dataclass(frozen=True)
 class FitConfig:
-    """How the quality models are fitted."""
+    """Quality models and what they are measured on."""
 
     distance: Literal["percentile", "minimum"] = "percentile"
-    """d_min of a category in a view: 5th percentile over its points in sight, or the paper's minimum."""
+    """Distance of a category in a view. percentile: 5th percentile over its visible points; minimum: as in
+    the paper."""
     masks: Literal["given", "rendered"] = "given"
-    """Pixels of a category: those of the label image, or those that its Gaussians paint most of."""
+    """Pixels of a category. given: of the label image; rendered: where its Gaussians have the largest
+    weight."""
     region: Literal["mask", "eroded"] = "mask"
-    """Where a category is measured: all its pixels, or those at least 5 px from another category."""
+    """Pixels that are measured. mask: all of the category; eroded: those at least 5 px from other
+    categories."""
     min_share: float = 5e-4
-    """A view counts for a category if this share of its pixels, at least, is of the category."""
+    """Ignore a category in views where it covers less than this fraction of the pixels."""
     confidence: float = 0.95
-    """Share of the promises that are to be kept on views that nobody took a photo from."""
+    """Target coverage of the lower confidence bounds, for views without a photo."""
 
 
 @dataclass(frozen=True)
 class PlanConfig:
-    """What is promised."""
+    """Target quality or budget."""
 
     target_ssim: float = 0.8
+    """SSIM that the planned scene must reach."""
     share: float = 0.95
-    """Share of the training views in which a category's level must reach the target."""
+    """Fraction of the training views in which the level of a category must reach the target."""
     tune_steps: int = 0
-    """Train a composition as a whole for so many steps, so that its categories fit each other."""
+    """Training steps on the planned scene, which adapt its categories to each other."""
     other_targets: tuple[float, ...] | None = None
-    """Targets planned and measured beside the main one (default: 0.1 below and above)."""
+    """Further SSIM targets to plan and measure (default: 0.1 below and above)."""
     budget: float = 0.0
-    """Compose for a budget instead of the main target; 0: no budget."""
+    """Plan for the best quality within this budget instead of the target SSIM; 0: no budget."""
     budget_unit: Literal["bytes", "gpu-bytes", "count"] = "bytes"
-    """Bytes to send, bytes on the viewer's GPU, or Gaussians."""
+    """Unit of the budget: bytes to transfer, bytes of GPU memory in the viewer, or Gaussians."""
     weights: dict[str, float] = field(default_factory=dict)
-    """How much a category counts within the budget, by name (1 unless named)."""
+    """Weights of categories within the budget, by name (1 unless named)."""
 
     @property
     def targets(self) -> list[float]:
@@ -236,51 +262,52 @@ class PlanConfig:
 
 @dataclass(frozen=True)
 class PaperConfig:
-    """What the paper's tables and figures look at."""
+    """The paper's tables and figures."""
 
     view: str | None = None
     """Photo of Tables III and IV and of Fig. 4 (default: the middle one of the test views)."""
     lpips: Path | None = None
-    """Folder with the weights of LPIPS (default: where `sagesplat download lpips` puts them)."""
+    """Folder with the LPIPS weights (default: where `sagesplat download lpips` puts them)."""
     tune_steps: int = 500
-    """Training steps of pruned 3DGS, and of tuned compositions, in Table IV."""
+    """Training steps of pruned 3DGS and of tuned compositions in Table IV."""
 
 
 @dataclass(frozen=True)
 class CompareConfig:
-    """Which baselines stand beside the nested ladder."""
+    """Baselines beside the nested levels."""
 
     targets: tuple[float, ...] = ()
-    """SSIM that SAGE composes for (default: 0.6 0.7 0.8, and what the run was planned for)."""
+    """SSIM targets for SAGE compositions (default: 0.6 0.7 0.8 and the targets of the run)."""
     snapshots: int = 10
-    """At most so many of the training's snapshots, spread in size."""
+    """Maximum number of training snapshots to compare, evenly spaced in size."""
     shares: tuple[float, ...] = (0.05, 0.1, 0.2, 0.35, 0.5, 0.7)
-    """Shares of its Gaussians that the last snapshot is pruned to."""
+    """Sizes that the last snapshot is pruned to, as fractions of its Gaussians."""
     tune_steps: int = 500
-    """Training steps of a pruned one; -1: as many as the nested ladder was trained on compositions."""
+    """Training steps after pruning; -1: as many as the nested levels had."""
     caps: tuple[float, ...] = (0.1, 0.2, 0.35, 0.5, 1.0)
-    """Caps of 3DGS-MCMC, each trained from the start, as shares of the last snapshot's Gaussians."""
+    """Sizes of 3DGS-MCMC models, trained from the start, as fractions of the last snapshot's Gaussians."""
     budgets: int = 12
-    """Budgets of bytes that the nested ladder is planned for, in geometric steps."""
+    """Number of byte budgets that the nested levels are planned for, in geometric steps."""
     lpips: Path | None = None
-    """Folder with the weights of LPIPS (default: where `sagesplat download lpips` puts them)."""
+    """Folder with the LPIPS weights (default: where `sagesplat download lpips` puts them)."""
 
 
 @dataclass(frozen=True)
 class BundleConfig:
-    """What a bundle says of its scene."""
+    """Contents of the bundle."""
 
     meters_per_unit: float | None = None
-    """Scale of the scene, for headsets (default: guessed from the cameras' height)."""
+    """Scale of the scene in metres per unit, for headsets (default: estimated from the height of the
+    cameras)."""
     always: tuple[str, ...] = ()
-    """Categories shipped in full whatever the plan says."""
+    """Categories that are always shipped in full."""
     weights: dict[str, float] = field(default_factory=dict)
-    """How much categories count in the viewer's plans, as NAME VALUE ... (default: 1 each)."""
+    """Weights of categories in the viewer's plans, as NAME VALUE ... (default: 1 each)."""
 
 
 @dataclass(frozen=True)
 class RunConfig:
-    """Everything that a run needs to be done again."""
+    """Everything that a run needs to be repeated."""
 
     scene: SceneConfig = field(default_factory=SceneConfig)
     poses: PosesConfig = field(default_factory=PosesConfig)
@@ -293,7 +320,8 @@ class RunConfig:
     fit: FitConfig = field(default_factory=FitConfig)
     plan: PlanConfig = field(default_factory=PlanConfig)
     fuse: bool = False
-    """Let all views vote on the label images, once the scene is trained."""
+    """Fuse the label images of all views through the trained Gaussians."""
     ladder: Literal["nested", "snapshots"] = "nested"
-    """Levels that contain each other, or the paper's: what training recorded on its way."""
+    """Levels: nested (prefixes of one model), or the snapshots of training as in the paper."""
     seed: int = 0
+    """Seed of the random numbers."""

@@ -14,7 +14,12 @@ PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """N Gaussians with a category each. `label_ids` are category ids, -1 = unlabelled."""
+    """N labelled 3D Gaussians: float32 tensors on one device, named as in gsplat.
+
+    `log_scales` and `logit_opacities` hold what is optimised: the logarithm of the standard deviations, and
+    the opacity before the sigmoid. `label_ids` are category ids, -1: unlabelled. Clones and splits inherit
+    them.
+    """
 
     means: Float[Tensor, "N 3"]  # world
     quats: Float[Tensor, "N 4"]  # wxyz, any length but zero

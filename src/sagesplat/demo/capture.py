@@ -65,10 +65,20 @@ def make_capture(
 def cached_capture(
     on_view: Callable[[int, int], None] | None = None, places: tuple[int, int] = (1, 1)
 ) -> Path:
-    """The demo capture's folder, made on the first call; of a grid of places, 105 small photos of each.
+    """Return the folder of the built-in capture, made on the first call.
 
-    It lies in the cache (`files.cache_folder`), under a name that changes with the version and with the code
+    It is in the cache (`files.cache_folder`), under a name that changes with the version and with the code
     that draws it.
+
+    Args:
+        on_view: Called with (views drawn, views in all).
+        places: Courtyards along x and y. (1, 1): one, in photos of full size; else 105 small photos of each.
+
+    Returns:
+        A COLMAP workspace with label images.
+
+    Raises:
+        SceneError: If the cache cannot be written.
     """
     code = b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
     release = hashlib.sha256(__version__.encode() + code).hexdigest()[:12]

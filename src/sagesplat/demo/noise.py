@@ -4,7 +4,8 @@ from math import floor
 
 import numpy as np
 from jaxtyping import Float64
-from numba import njit
+
+from sagesplat.kernels.jit import njit
 
 jit = njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
 

@@ -128,7 +128,23 @@ def read_header(path: Path) -> LevelFile:
 
 
 def read_level(path: Path, label_ids: Sequence[int] | None = None) -> Gaussians:
-    """The Gaussians of a level, or only those of some categories; `DataError` for NaN or a broken file."""
+    """Read the Gaussians of a level file.
+
+    Args:
+        path: levels/NNNNNN.npz, or the nested ladder's ladder.npz.
+        label_ids: Only these categories are read, in this order; None: all, ascending.
+
+    Returns:
+        Their Gaussians on the CPU, by category; none for categories that the level does not have.
+
+    Raises:
+        DataError: If the file is damaged or holds NaN or Inf.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from sagesplat.formats.levels import read_level
+        >>> trees = read_level(Path("runs/garden/levels/007000.npz"), [184])  # doctest: +SKIP
+    """
     header = read_header(path)
     wanted = sorted(header.counts) if label_ids is None else [i for i in label_ids if i in header.counts]
     parts = []

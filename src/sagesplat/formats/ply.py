@@ -21,7 +21,30 @@ BASES = (0, 3, 8, 15)  # SH coefficients beyond the constant one, by degree 0 to
 
 
 def write_ply(path: Path, gaussians: Gaussians, names: dict[int, str] | None = None) -> None:
-    """Write a labelled scene atomically; `names` (id -> name) goes into the header as comments."""
+    """Write a labelled scene as a binary splat PLY in INRIA's layout, atomically.
+
+    Every viewer of 3DGS reads it: the labels are one more property (`short label`) that others skip.
+
+    Args:
+        path: The .ply file; replaced if it is there.
+        gaussians: N Gaussians on any device.
+        names: Category names by label id; they go into the header as comments.
+
+    Raises:
+        OSError: If the file cannot be written.
+
+    Example:
+        >>> import tempfile, torch
+        >>> from pathlib import Path
+        >>> from sagesplat import Gaussians, read_ply, write_ply
+        >>> z = torch.zeros
+        >>> ids = torch.zeros(5, dtype=torch.int16)
+        >>> g = Gaussians(z(5, 3), z(5, 4) + 1, z(5, 3), z(5), z(5, 1, 3), z(5, 3, 3), ids)
+        >>> path = Path(tempfile.mkdtemp()) / "scene.ply"
+        >>> write_ply(path, g, {0: "tree"})
+        >>> len(read_ply(path)), read_ply(path).sh_degree
+        (5, 1)
+    """
     parts = _matrices(gaussians)
     properties = _properties(gaussians.shN.shape[1])
     labels = gaussians.label_ids.cpu().numpy()
@@ -42,9 +65,22 @@ def write_ply(path: Path, gaussians: Gaussians, names: dict[int, str] | None = N
 
 
 def read_ply(path: Path) -> Gaussians:
-    """Read the binary splat PLY of any tool: any order of properties, degree 0 to 3, label -1 without one.
+    """Read the binary splat PLY of any tool.
 
-    DataError where a property is missing, the file ends early, or a value is NaN or infinite.
+    Args:
+        path: The .ply file. Properties may come in any order; harmonics are of degree 0 to 3.
+
+    Returns:
+        The Gaussians, float32 on the CPU; label ids are -1 where the file has none.
+
+    Raises:
+        DataError: If a property is missing, the file is text, ends early, or holds NaN or Inf.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from sagesplat import read_ply
+        >>> g = read_ply(Path("runs/garden/nested/composed.ply"))  # doctest: +SKIP
+        >>> g.of_labels([184]).nbytes  # doctest: +SKIP
     """
     try:
         with path.open("rb") as file:

@@ -67,7 +67,11 @@ def write_spz(
     coarse: bool = False,
     frame: Frame = "rub",
 ) -> int:
-    """Write `encode_spz` to a file atomically; the number of bytes. DataError as there."""
+    """Write an SPZ file atomically. Arguments and errors are those of `encode_spz`.
+
+    Returns:
+        The size of the file in bytes.
+    """
     content = encode_spz(
         g,
         sh_degree=sh_degree,
@@ -94,20 +98,41 @@ def encode_spz(
     frame: Frame = "rub",
     name: str = "SPZ",
 ) -> bytes:
-    """SPZ version 3 of N Gaussians in COLMAP's axes. Rows keep their order, labels are left out.
+    """Encode N Gaussians in COLMAP's axes as SPZ version 3 (Niantic). Labels are left out.
 
-    `sh_degree`: at most this (default: all there are). `antialiased`: how the scene was trained, for viewers.
-    `fractional_bits`: positions in steps of 2^-bits world units (default: steps of at most an eighth of the
-    size of nine in ten Gaussians, or what the extent allows). `sh_bits`: bits, 1 to 8, of the harmonics of
-    degree 1 and of those above; fewer make a smaller file. `frame`: the axes to write. Opacities are rounded
-    to 1/255, log scales to 1/16 within [-10, 5.94], sh0 to 0.026 within [-3.33, 3.33], harmonics to
-    2^(1 - bits) within [-1, 1); what lies outside is cut. Harmonics of zero stay zero.
+    Opacities are rounded to 1/255, log scales to 1/16 within [-10, 5.94], sh0 to 0.026 within [-3.33, 3.33],
+    harmonics to 2^(1 - bits) within [-1, 1). Rows keep their order. Values outside are clipped. Harmonics of
+    zero stay zero. The same input gives the same bytes.
 
-    `coarse`: positions in steps of at most half that size, opacities in 4/255, log scales in 1/8, sh0 in
-    0.052, rotations to about half a degree: a tenth smaller, for 0.0008 to 0.0017 of SSIM on `garden`.
+    Args:
+        g: The Gaussians, on any device.
+        sh_degree: Harmonics up to this degree are written; None: all there are.
+        antialiased: How the scene was trained; a flag for viewers.
+        fractional_bits: Positions are rounded to 2^-bits world units. None: to at most an eighth of the size
+            of nine in ten Gaussians, or what the extent allows.
+        sh_bits: Bits, 1 to 8, of the harmonics of degree 1 and of those above. Fewer give a smaller file.
+        coarse: Larger steps: positions to half of that size, opacities to 4/255, log scales to 1/8, sh0 to
+            0.052, rotations to about half a degree. A tenth smaller, for 0.0008 to 0.0017 of SSIM on
+            `garden`.
+        frame: Axes to write: "rub" (right, up, back: SPZ's own) or "rdf" (right, down, front: COLMAP's).
+        name: What errors call the file.
 
-    Same input, same bytes. DataError, beginning with `name`: NaN or Inf, a rotation of zeros, too many
-    Gaussians, positions that do not fit.
+    Returns:
+        The file's content, gzip-compressed.
+
+    Raises:
+        DataError: For NaN or Inf, a quaternion of zeros, too many Gaussians, or positions that do not fit.
+
+    Example:
+        >>> import torch
+        >>> from sagesplat import Gaussians
+        >>> from sagesplat.formats.spz import decode_spz, encode_spz
+        >>> z = torch.zeros
+        >>> ids = torch.zeros(5, dtype=torch.int16)
+        >>> g = Gaussians(z(5, 3), z(5, 4) + 1, z(5, 3), z(5), z(5, 1, 3), z(5, 3, 3), ids)
+        >>> content = encode_spz(g)
+        >>> len(content) < 150, len(decode_spz(content, label_id=184))
+        (True, 5)
     """
     g = g.detach().to("cpu")
     _check(name, g)
@@ -150,7 +175,7 @@ def packing_order(
 
 
 def read_spz(path: Path, label_id: int = -1, *, frame: Frame = "rub") -> Gaussians:
-    """The Gaussians of an SPZ file, version 2 or 3, by `decode_spz`. DataError as there."""
+    """Read an SPZ file, version 2 or 3: `decode_spz` of its content. DataError where it cannot be read."""
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -159,12 +184,22 @@ def read_spz(path: Path, label_id: int = -1, *, frame: Frame = "rub") -> Gaussia
 
 
 def decode_spz(content: bytes, label_id: int = -1, *, frame: Frame = "rub", name: str = "SPZ") -> Gaussians:
-    """N Gaussians in COLMAP's axes, all of category `label_id`, from SPZ version 2 or 3 with axes `frame`.
+    """Decode SPZ version 2 or 3 into N Gaussians in COLMAP's axes.
 
     Opacities of 0 and 255 become those a quarter of a step further inside, so that their logits are finite.
     Memory stays within what the header promises, and the promise within what `content` can hold.
 
-    DataError, beginning with `name`: another format or version; a file that is damaged, cut off or goes on.
+    Args:
+        content: The file's bytes.
+        label_id: Category of all Gaussians: SPZ holds no labels.
+        frame: Axes that the file has: "rub" (SPZ's own) or "rdf" (COLMAP's).
+        name: What errors call the file.
+
+    Returns:
+        The Gaussians, float32 on the CPU. `encode_spz` shows an example.
+
+    Raises:
+        DataError: For another format or version, or a file that is damaged, cut off or too long.
     """
     if content.startswith(_MAGIC):
         raise DataError(f"{name}: SPZ version 4 is not supported; save it as version 3")

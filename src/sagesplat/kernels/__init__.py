@@ -1,1 +1,1 @@
-"""Vectors of 16 and 8 for numba kernels, and the memory that their calls share."""
+"""What numba kernels share: their cache, vectors of 16 and 8 lanes, and reusable memory."""

@@ -36,9 +36,27 @@ def ssim_map(
     y: Float32[np.ndarray, "H W 3"],
     tile_mask: Bool[np.ndarray, "h w"] | None = None,
 ) -> Float32[np.ndarray, "H W"]:
-    """SSIM at every pixel, averaged over the channels; images in [0, 1], 11x11 window, zero padding.
+    """Compute SSIM at every pixel, averaged over the channels (Wang et al. 2004).
 
-    Outside a `tile_mask` (see `photometric_loss`) it is 0.
+        SSIM = (2 mx my + C1) (2 sxy + C2) / ((mx^2 + my^2 + C1) (sx^2 + sy^2 + C2))
+
+    with a Gaussian window of 11 x 11 pixels (sigma 1.5), zero padding, C1 = 0.01^2 and C2 = 0.03^2, as in
+    3DGS.
+
+    Args:
+        x: Image in [0, 1].
+        y: Image in [0, 1].
+        tile_mask: bool [ceil(H/16), ceil(W/16)]; the result is 0 where it is False.
+
+    Returns:
+        SSIM in [-1, 1] at each pixel.
+
+    Example:
+        >>> import numpy as np
+        >>> from sagesplat.metrics.image import ssim_map
+        >>> photo = np.random.default_rng(0).random((32, 48, 3), np.float32)
+        >>> bool(np.allclose(ssim_map(photo, photo), 1, atol=1e-5)), ssim_map(photo, 1 - photo).shape
+        (True, (32, 48))
     """
     values, *_ = _maps(np.ascontiguousarray(x), np.ascontiguousarray(y), tile_mask, Workspace())
     return values.mean(0)
@@ -52,7 +70,13 @@ def squared_error_map(
 
 
 def psnr(mean_squared_error: float | np.ndarray) -> Any:
-    """Decibels of a mean squared error of images in [0, 1]; at most 100."""
+    """Convert a mean squared error of images in [0, 1] to PSNR: -10 log10(error) dB, at most 100.
+
+    Example:
+        >>> from sagesplat.metrics.image import psnr
+        >>> round(float(psnr(0.001)), 6)
+        30.0
+    """
     return -10.0 * np.log10(np.maximum(mean_squared_error, 1e-10))
 
 
@@ -99,12 +123,27 @@ def photometric_loss(
     tile_mask: Bool[np.ndarray, "h w"] | Bool[Tensor, "h w"] | None = None,
     workspace: Workspace | None = None,
 ) -> Tensor:
-    """(1 - w) L1 + w (1 - SSIM), as 3DGS trains; differentiable by `rgb`.
+    """Compute the training loss of 3DGS: (1 - w) L1 + w (1 - SSIM); differentiable by `rgb`.
 
-    `tile_mask` [ceil(H/16), ceil(W/16)]: tiles that are false leave the loss: they add nothing to the sum
-    (which is divided by the number of all pixels), and the windows of others see the photo there.
-    With a `workspace`, go backward before the next call with it. On a GPU the photo may be uint8, and the
-    mask is a tensor there.
+    Args:
+        rgb: Rendered image, [H, W, 3].
+        photo: The photo in [0, 1]; on a GPU it may be uint8.
+        ssim_weight: w, 0.2 in Kerbl et al. 2023, eq. 7.
+        tile_mask: bool [ceil(H/16), ceil(W/16)], a tensor on a GPU. Tiles that are False add nothing to the
+            sum, which is divided by the number of all pixels; windows of other tiles see the photo there.
+        workspace: Memory to use again (CPU only). Go backward before the next call with it.
+
+    Returns:
+        The loss, a scalar.
+
+    Example:
+        >>> import torch
+        >>> from sagesplat.metrics.image import photometric_loss
+        >>> rgb, photo = torch.full((32, 32, 3), 0.5, requires_grad=True), torch.full((32, 32, 3), 0.6)
+        >>> loss = photometric_loss(rgb, photo)
+        >>> loss.backward()
+        >>> bool(loss > 0), rgb.grad.shape
+        (True, torch.Size([32, 32, 3]))
     """
     if rgb.is_cuda:
         from sagesplat.metrics import ssim_triton

@@ -7,8 +7,9 @@ from typing import Any
 
 import numba
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from sagesplat.kernels.jit import njit
 from sagesplat.kernels.simd import load16, load_blue, load_green, load_red, store, total, where
 
 WINDOW = 11

@@ -1,4 +1,4 @@
-"""Results of parts of a scene in blocks put together by category, for people to read."""
+"""Results of a scene in blocks, merged by category, for people to read."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
@@ -11,23 +11,26 @@ from sagesplat.adapt.observe import Observations
 from sagesplat.adapt.plan import Choice, Counts, Plan
 
 Rows = TypeVar("Rows", Observations, Evaluation)
-Categories = Mapping[int, int]  # part -> label that stands for its category; others stay as they are
+Categories = Mapping[int, int]  # label of a category in a block -> label of its category; others stay
 
 
 def relabelled(rows: Rows, categories: Categories) -> Rows:
-    """The same rows, with categories instead of parts."""
+    """The same rows, with categories instead of per-block categories."""
     label_ids = [categories.get(label, label) for label in rows.label_id.tolist()]
     return replace(rows, label_id=np.array(label_ids, rows.label_id.dtype))
 
 
 def merged(rows: Rows, categories: Categories, keys: Sequence[str]) -> Rows:
-    """One row for all parts of a category with the same `keys`; means are over pixels.
+    """One row for all blocks of a category with the same `keys`; means are over pixels.
 
     Distances are the closest, levels the highest, PSNR is of the mean squared error.
     """
     rows = relabelled(rows, categories)
     names = [f.name for f in fields(rows)]
-    key = np.column_stack([getattr(rows, name).astype(np.float64) for name in ("label_id", *keys)])
+    # numbered by value, as rows without a target (NaN) belong together too
+    key = np.stack(
+        [np.unique(getattr(rows, name), return_inverse=True)[1] for name in ("label_id", *keys)], 1
+    )
     _, first, group = np.unique(key, axis=0, return_index=True, return_inverse=True)
     group, pixels = group.ravel(), rows.num_pixels.astype(np.float64)
 

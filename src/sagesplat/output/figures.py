@@ -70,7 +70,15 @@ def ink(label_id: int, colours: Colours) -> tuple[float, float, float]:
 
 
 def label_image(label_ids: Int[np.ndarray, "H W"], colours: Colours) -> UInt8[np.ndarray, "H W 3"]:
-    """The label map in the taxonomy's colours; unlabelled in grey."""
+    """Draw a label map in the colours of its taxonomy.
+
+    Args:
+        label_ids: [H, W], category ids; -1: unlabelled.
+        colours: RGB, 0 to 255, by category id; grey where there is none.
+
+    Returns:
+        uint8 [H, W, 3].
+    """
     image = np.full((*label_ids.shape, 3), 128, np.uint8)
     for label_id in np.unique(label_ids).tolist():
         image[label_ids == label_id] = colours.get(label_id, (128, 128, 128))
@@ -203,9 +211,8 @@ def promised_and_measured(
     """Measured against promised SSIM on unseen views, a dot per (label, view, target)."""
     figure = Figure(figsize=PAIR, layout="constrained")
     axes = figure.subplots()
-    rows = evaluation.select(
-        (evaluation.label_id != TOTAL) & np.isfinite(evaluation.ssim + evaluation.predicted)
-    )
+    known = np.isfinite(evaluation.ssim + evaluation.predicted + evaluation.target)  # no target: a budget
+    rows = evaluation.select((evaluation.label_id != TOTAL) & known)
     handles = []
     for label_id in labels:
         mine = rows.select(rows.label_id == label_id)

@@ -295,16 +295,21 @@ def promise_kept(rows: Decisions) -> Kept:
 
 
 def evaluation_table(evaluation: Evaluation, labels: Sequence[int], names: Mapping[int, str]) -> Table:
-    """Promise against measurement for every target and label, and for the whole image."""
+    """Promise against measurement for every target and label, and for the whole image.
+
+    A plan within a budget has no target and promises none: its rows come last.
+    """
     body = []
     for target in np.unique(evaluation.target):
+        asked = np.isnan(evaluation.target) if np.isnan(target) else evaluation.target == target
         for label_id in [*labels, TOTAL]:
-            rows = evaluation.select((evaluation.target == target) & (evaluation.label_id == label_id))
+            rows = evaluation.select(asked & (evaluation.label_id == label_id))
             rows = rows.select(np.isfinite(rows.ssim))
             if not len(rows):
                 continue
             kept = promise_kept(rows)
-            share = (math.nan,) * 3 if label_id == TOTAL else (kept.promised, kept.kept, kept.share)
+            none = label_id == TOTAL or np.isnan(target)
+            share = (math.nan,) * 3 if none else (kept.promised, kept.kept, kept.share)
             promise = (mean(rows.predicted), mean(rows.ssim), mean(np.abs(rows.predicted - rows.ssim)))
             others = (mean(rows.full_ssim), mean(rows.psnr), mean(rows.full_psnr))
             body.append(

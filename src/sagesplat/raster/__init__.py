@@ -52,7 +52,14 @@ def device_of(backend: Backend, rank: int = 0) -> torch.device:
 
 
 def set_threads(threads: int = 0) -> int:
-    """Let kernels and torch use so many threads (0: one per core); the number comes back."""
+    """Set the number of CPU threads of kernels and torch, for the whole process.
+
+    Args:
+        threads: Number of threads; 0: one per core. More than the cores are cut to the cores.
+
+    Returns:
+        The number that is used.
+    """
     most = numba_config.NUMBA_NUM_THREADS  # pyright: ignore[reportAttributeAccessIssue]
     threads = min(threads, most) if threads > 0 else most
     numba.set_num_threads(threads)
@@ -76,18 +83,47 @@ def rasterize(
 ) -> Render:
     """Render Gaussians into a camera, with gradients for all their parameters and for `features`.
 
-    `sh_degree`: harmonics up to this degree (default: all there are). `background` [3] lies behind everything
-    (default: the camera's). `features` [N, C] are blended like colours, over zero. `antialiased` scales
-    opacities by the area that the low-pass adds (Mip-Splatting's 2D filter as gsplat has it). `tile_mask`
-    bool [ceil(H/16), ceil(W/16)]: tiles that are false show the background and take no gradient.
-    `trainable` bool [N]: rows that are false are drawn, but get no gradient (zeros); pass the same tensor at
-    every step, `cuda` keeps what it makes of it. `workspace`: memory to use again; results and gradients hold
-    until the next call with it (`cpu` only). `backend` auto: the one of the device that the means are on.
+    Gaussians are projected by EWA splatting and blended front to back in tiles of 16 x 16 pixels
+    (Kerbl et al. 2023, eqs. 3 to 6). Constants are gsplat's: see `raster.render`.
 
-    The 2D means of the result carry a `.grad` after `backward()`: loss per pixel; with `absgrad` the sums
-    over pixels of the absolute gradients (AbsGS, arXiv:2404.10484). Raises `DataError` for NaN or Inf (`cpu`
-    only: `cuda` does not wait for the device to look), for tensors on several devices and for shapes that do
-    not fit, `BackendUnavailable` for what this machine does not have, `OutOfMemory` from `cuda`.
+    Args:
+        gaussians: N Gaussians, all tensors on one device.
+        camera: Pose, intrinsics in pixels, and size of the image (H, W).
+        sh_degree: Harmonics up to this degree are used; None: all there are.
+        background: RGB in [0, 1] behind everything, [3]; None: the camera's.
+        features: [N, C], blended like colours, over zero; C is any number.
+        antialiased: Scale opacities by what the low-pass adds to the area (Mip-Splatting's 2D filter).
+        tile_mask: bool [ceil(H/16), ceil(W/16)]; tiles that are False show the background, without gradients.
+        trainable: bool [N]; rows that are False are drawn, and their gradients are zero. Pass the same tensor
+            at every step: `cuda` caches what it derives from it.
+        absgrad: `means2d.grad` sums the absolute gradients over pixels (AbsGS, arXiv:2404.10484).
+        workspace: Memory to use again (`cpu` only). Results and gradients hold until the next call with it.
+        backend: "cpu", "cuda", "reference" (float64, slow) or "auto": the one of the device of the means.
+
+    Returns:
+        rgb [H, W, 3], alpha [H, W], features [H, W, C] or None, means2d [N, 2] px, radii [N] px (0: not
+        drawn). After `backward()`, `means2d.grad` [N, 2] holds the gradient of the loss per pixel.
+
+    Raises:
+        DataError: For NaN or Inf (`cpu` only: `cuda` would have to wait for the device), tensors on several
+            devices, or shapes that do not fit.
+        BackendUnavailable: For a backend that this machine does not have.
+        OutOfMemory: From `cuda`.
+
+    Example:
+        >>> import numpy as np, torch
+        >>> from sagesplat import Camera, Gaussians, rasterize
+        >>> K = np.array([[60, 0, 32], [0, 60, 24], [0, 0, 1]], np.float32)  # pixels
+        >>> camera = Camera(np.eye(4, dtype=np.float32), K, width=64, height=48)
+        >>> g = Gaussians(
+        ...     means=torch.tensor([[0.0, 0.0, 4.0]]), quats=torch.tensor([[1.0, 0, 0, 0]]),
+        ...     log_scales=torch.full((1, 3), -1.0), logit_opacities=torch.tensor([2.0]),
+        ...     sh0=torch.ones(1, 1, 3), shN=torch.zeros(1, 0, 3),
+        ...     label_ids=torch.zeros(1, dtype=torch.int16),
+        ... )
+        >>> render = rasterize(g, camera)
+        >>> render.rgb.shape, bool(render.alpha[24, 32] > 0.8)
+        (torch.Size([48, 64, 3]), True)
     """
     degree = gaussians.sh_degree if sh_degree is None else min(sh_degree, gaussians.sh_degree)
     if background is None:

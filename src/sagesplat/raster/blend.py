@@ -7,8 +7,9 @@ colour r, g, b, and half width and height of the bounding box [px].
 """
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from sagesplat.kernels.jit import njit
 from sagesplat.kernels.simd import (
     ceil,
     exp2,
@@ -45,7 +46,7 @@ _SHARED = 6 * PIXELS  # where a Gaussian's values that depend on the row alone l
 
 
 @njit(error_model="numpy", forceinline=True, cache=True)
-def _gather(records, ids, first, last, x0, y0, batch, rows):
+def gather_batch(records, ids, first, last, x0, y0, batch, rows):
     """Copy the records of a batch to where they are near; rows [2, 16]: first and last + 1 that each reaches.
 
     The highest point of an ellipse between two columns is its top, or lies on the column next to the top.
@@ -132,7 +133,7 @@ def forward(records, starts, ids, row_order, width, height, background, image, l
             end = starts[tile]
             while end < starts[tile + 1] and _most(state) >= _T_MIN:
                 first, end = end, min(end + _BATCH, starts[tile + 1])
-                _gather(records, ids, first, end, x0, y0, batch, rows)
+                gather_batch(records, ids, first, end, x0, y0, batch, rows)
                 for j in range(end - first):
                     lo, hi = int(rows[0, j]), int(rows[1, j])
                     if lo < hi:
@@ -261,7 +262,7 @@ def backward(
                     state[5 * PIXELS + p] = -grad_left[y, x]
             for first in range(starts[tile], ends[tile], _BATCH):
                 last = min(first + _BATCH, ends[tile])
-                _gather(records, ids, first, last, x0, y0, batch, rows)
+                gather_batch(records, ids, first, last, x0, y0, batch, rows)
                 for j in range(last - first):
                     lo, hi, slot = int(rows[0, j]), int(rows[1, j]), slots[first + j]
                     if lo < hi and radii[ids[first + j]] > 0:
@@ -309,7 +310,7 @@ def weigh(records, starts, ids, slots, row_order, width, height, columns_of, sum
             end = starts[tile]
             while end < starts[tile + 1] and _most(state) >= _T_MIN:
                 first, end = end, min(end + _BATCH, starts[tile + 1])
-                _gather(records, ids, first, end, x0, y0, batch, rows)
+                gather_batch(records, ids, first, end, x0, y0, batch, rows)
                 for j in range(end - first):
                     lo, hi, slot = int(rows[0, j]), int(rows[1, j]), slots[first + j]
                     # as a colour of 1 over a plane of zeros, each weight is left behind

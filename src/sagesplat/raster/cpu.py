@@ -211,6 +211,18 @@ def render(
     return Render(rgb, alpha, None if features is None else painted, means2d, radii)
 
 
+def intersections(
+    g: Gaussians, camera: Camera, workspace: Workspace, *, antialiased: bool = False
+) -> tuple[np.ndarray, np.ndarray, tiles.Intersections]:
+    """What the blending kernels take of a view: records [N, 11] (see `blend`), radii [N] px, tile lists.
+
+    All three hold until the next call with the same `workspace`. Raises `DataError` for NaN or Inf.
+    """
+    options = _Options(camera, 0, antialiased, None, workspace)
+    records, depths, radii = _project(options, _arrays([getattr(g, name) for name in PARAMETERS]))
+    return records, radii, _intersections(options, records, depths, radii)
+
+
 def add_weights(
     g: Gaussians,
     camera: Camera,
@@ -221,12 +233,11 @@ def add_weights(
     workspace: Workspace | None,
 ) -> None:
     """See `sagesplat.raster.add_weights`."""
-    options = _Options(camera, 0, antialiased, None, workspace or Workspace())
-    projected = _project(options, _arrays([getattr(g, name) for name in PARAMETERS]))
-    found = _intersections(options, *projected)
-    sums = options.workspace.take("weights", len(found.ids), out.shape[1])
+    workspace = workspace or Workspace()
+    records, _, found = intersections(g, camera, workspace, antialiased=antialiased)
+    sums = workspace.take("weights", len(found.ids), out.shape[1])
     blend.weigh(
-        projected[0], found.starts, found.ids, found.slots, found.row_order, camera.width, camera.height,
+        records, found.starts, found.ids, found.slots, found.row_order, camera.width, camera.height,
         columns_of, sums,
     )  # fmt: skip
     blend.add_by_gaussian(found.offsets, sums, out)

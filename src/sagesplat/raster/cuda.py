@@ -154,7 +154,7 @@ def named_out_of_memory() -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class _Splats:
+class Splats:
     """Projected Gaussians, M of them. Rows with radius 0 hold anything, NaN too."""
 
     radii: Tensor  # int32 [M, 2], px
@@ -177,12 +177,13 @@ def _take(g: Gaussians, rows: Tensor) -> Gaussians:
     return replace(g, **{name: getattr(g, name).index_select(0, rows) for name in PARAMETERS})
 
 
-def _splat(g: Gaussians, camera: Camera, degree: int, antialiased: bool) -> _Splats:
+def splat(g: Gaussians, camera: Camera, degree: int, antialiased: bool) -> Splats:
+    """Project Gaussians into a view and shade them with harmonics up to `degree`."""
     opacities = g.logit_opacities.sigmoid()
     if len(g) == 0:  # gsplat divides by their number; all parameters take part, so that all get gradients
         none = g.means.new_zeros(0, 2, dtype=torch.int32)
         conics, colors = g.quats[:, :3] * g.log_scales, g.sh0[:, 0] + g.shN.sum(1)
-        return _Splats(none, g.means[:, :2], g.means[:, 2], conics, opacities, colors, None)
+        return Splats(none, g.means[:, :2], g.means[:, 2], conics, opacities, colors, None)
     pose = np.concatenate([camera.w2c.ravel(), camera.K.ravel(), camera.position]).astype(np.float32)
     pose = torch.from_numpy(pose).to(g.means.device, non_blocking=True)  # one copy, too small to wait for
     found: Any = kernels().fully_fused_projection(
@@ -203,7 +204,7 @@ def _splat(g: Gaussians, camera: Camera, degree: int, antialiased: bool) -> _Spl
     coefficients = torch.cat([g.sh0, g.shN[:, : num_bases(degree) - 1]], 1)
     seen = (radii > 0).all(-1)
     colors = kernels().spherical_harmonics(degree, g.means - pose[25:], coefficients, masks=seen)
-    return _Splats(radii, means2d, depths, conics, opacities, (colors + 0.5).clamp_min(0), rows)
+    return Splats(radii, means2d, depths, conics, opacities, (colors + 0.5).clamp_min(0), rows)
 
 
 def _rows(trainable: Tensor) -> tuple[Tensor, Tensor]:
@@ -218,19 +219,19 @@ def _rows(trainable: Tensor) -> tuple[Tensor, Tensor]:
 
 def _project(
     g: Gaussians, camera: Camera, degree: int, antialiased: bool, trainable: Tensor | None
-) -> _Splats:
+) -> Splats:
     """All Gaussians; those that are not trainable in a call of their own, without a graph."""
     if trainable is None or len(_rows(trainable)[1]) == 0:
-        return _splat(g, camera, degree, antialiased)
+        return splat(g, camera, degree, antialiased)
     moving, still = _rows(trainable)
-    parts = [_splat(_take(g, moving), camera, degree, antialiased)]
+    parts = [splat(_take(g, moving), camera, degree, antialiased)]
     with torch.no_grad():
-        parts.append(_splat(_take(g, still), camera, degree, antialiased))
+        parts.append(splat(_take(g, still), camera, degree, antialiased))
     groups = [
         rows if p.rows is None else rows[p.rows] for rows, p in zip((moving, still), parts, strict=True)
     ]
-    names = [f.name for f in fields(_Splats) if f.name != "rows"]
-    return _Splats(**{n: torch.cat([getattr(p, n) for p in parts]) for n in names}, rows=torch.cat(groups))
+    names = [f.name for f in fields(Splats) if f.name != "rows"]
+    return Splats(**{n: torch.cat([getattr(p, n) for p in parts]) for n in names}, rows=torch.cat(groups))
 
 
 # --- pixels ---------------------------------------------------------------------------------------------
@@ -274,10 +275,10 @@ def _takes_conics(isect_tiles: Callable[..., Any]) -> bool:
     return "conics" in inspect.signature(isect_tiles).parameters
 
 
-class _Tiles:
+class Tiles:
     """Which Gaussians touch which tiles of a view, and passes over its pixels."""
 
-    def __init__(self, splats: _Splats, camera: Camera, tile_mask: Tensor | None) -> None:
+    def __init__(self, splats: Splats, camera: Camera, tile_mask: Tensor | None) -> None:
         self.size = camera.width, camera.height
         self.mask, self.pixels = None, None
         across, down = -(-camera.width // TILE), -(-camera.height // TILE)
@@ -352,7 +353,7 @@ def render(
         raise DataError(f"absgrad works with at most {limit - 3} features on cuda; render the others apart")
 
     mask = None if tile_mask is None else torch.as_tensor(tile_mask, device=g.means.device)
-    tiles = _Tiles(splats, camera, mask)
+    tiles = Tiles(splats, camera, mask)
     behind = pad(background.detach().float(), (0, channels.shape[1] - 3))
     shapes = splats.means2d[None], splats.conics, splats.opacities
     parameters = [getattr(g, name) for name in PARAMETERS]
@@ -390,7 +391,7 @@ def add_weights(
     """See `sagesplat.raster.add_weights`. Each 32 columns are a forward and a backward pass."""
     with torch.no_grad():
         splats = _project(g, camera, 0, antialiased, None)
-        tiles = _Tiles(splats, camera, None)
+        tiles = Tiles(splats, camera, None)
     columns = torch.as_tensor(columns_of, device=g.means.device)
     for start in range(0, out.shape[1], _CHANNELS[-1]):
         some = torch.arange(start, min(start + _CHANNELS[-1], out.shape[1]), device=columns.device)

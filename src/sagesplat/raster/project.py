@@ -8,9 +8,10 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from sagesplat.core import sh
+from sagesplat.kernels.jit import njit
 from sagesplat.kernels.simd import (
     count,
     double,

@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from sagesplat.kernels.jit import njit
 from sagesplat.kernels.workspace import Workspace
 from sagesplat.raster.blend import TILE
 from sagesplat.raster.project import tile_box

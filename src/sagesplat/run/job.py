@@ -1,6 +1,7 @@
 """A run folder being worked on, and what its stages share."""
 
 import hashlib
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -43,6 +44,8 @@ class Job:
     locks: ExitStack | None = None  # keeps the run folder locked between stages (else within each)
     executor: Executor = LOCAL  # of pieces that do not depend on each other
     lock_wait: float = 0.0  # seconds to wait for who has the run folder
+    source: "Job | None" = None  # job of the same scene: share its scene and photos, do not load them again
+    before_redo: Callable[[str, str], None] | None = None  # told of a stage to be forced, and what differs
 
     @property
     def spec(self) -> "JobSpec":
@@ -68,6 +71,8 @@ class Job:
     @cached_property
     def scene(self) -> Scene:
         """The capture that scene.json names, unchanged since."""
+        if self.source is not None:
+            return self.source.scene
         if not self.run.scene.exists():
             raise RunError(f"{self.run.path}: {NO_RUN}")
         made = read_json(self.run.scene)
@@ -81,6 +86,8 @@ class Job:
     @cached_property
     def photos(self) -> Photos:
         """The photos, loaded when asked for."""
+        if self.source is not None:
+            return self.source.photos
         return Photos(self.scene.views, memory.photo_cache(self.memory_limit))
 
     @property
@@ -162,10 +169,10 @@ class JobSpec:
     device: str
     memory_limit: int
 
-    def open(self, emit: Emit) -> Job:
-        """The job, in this process."""
+    def open(self, emit: Emit, source: Job | None = None) -> Job:
+        """The job, in this process; it shares the scene and the photos of `source`."""
         made = {f.name: getattr(self, f.name) for f in fields(self)}
-        return Job(emit=emit, lock_wait=_LOCK_WAIT, **made)
+        return Job(emit=emit, lock_wait=_LOCK_WAIT, source=source, **made)
 
 
 def fingerprint(scene: Scene) -> str:

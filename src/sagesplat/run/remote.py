@@ -43,10 +43,8 @@ def work_all(
 
 def _piece(spec: JobSpec, function: Callable[[Job, Any], Any], part: Any, emit: Emit) -> Any:
     """A task: one part, in a process that may have had others of the same scene."""
-    job = spec.open(emit)
-    kept = _kept(replace(spec, force=False), job.run.scene.read_bytes())
-    vars(job).update(scene=kept.scene, photos=kept.photos)
-    return function(job, part)
+    kept = _kept(replace(spec, force=False), spec.run.scene.read_bytes())
+    return function(spec.open(emit, kept), part)
 
 
 @lru_cache(maxsize=1)

@@ -10,12 +10,26 @@ from typing import Any
 
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import StageDone, StageSkipped, StageStarted
-from sagesplat.io.files import named_full_disk, remove_temporary, sync_changed
+from sagesplat.io.files import named_full_disk, read_json, remove_temporary, sync_changed
 from sagesplat.io.lock import locked
 from sagesplat.run.job import NO_RUN, Job
 from sagesplat.run.run_dir import is_done, record
 
 _CLOCK_STEP = 2.0  # seconds: some disks keep no finer time
+# Stages that are made of earlier results within minutes: they follow those without --force, as long as
+# their own settings are the same. The settings of the second ones are the plan's.
+_DERIVED = {"observe", "fit", "plan", "crossview", "occupancy", "paper"}
+_OF_PLAN = {"compose", "evaluate", "report"}
+_ORDER = (
+    "poses", "scene", "segment", "masks", "lift", "blocks", "train", "fuse", "block_categories", "parts",
+    "base", "nest", "observe", "fit", "plan", "compose", "evaluate", "report", "crossview", "occupancy",
+    "paper",
+)  # fmt: skip
+
+
+def following(stage: str) -> tuple[str, ...]:
+    """The stages of a run that may depend on one."""
+    return _ORDER[_ORDER.index(stage) + 1 :] if stage in _ORDER else ()
 
 
 @dataclass(frozen=True)
@@ -26,19 +40,32 @@ class Stage:
     settings: dict[str, Any]
     inputs: Sequence[Path]
     outputs: Sequence[Path]
+    swaps: bool = False  # the old result and its record stay until `make` takes them away
 
 
 def run_stage(
     job: Job, name: str, settings: dict[str, Any], inputs: Sequence[Path], outputs: Sequence[Path],
-    make: Callable[[], Sequence[str]],
+    make: Callable[[], Sequence[str]], *, swaps: bool = False,
 ) -> None:  # fmt: skip
-    """Do a stage unless its result is there already.
+    """Do a stage, unless its result is there already: made with the same settings from the same inputs.
 
-    Nobody else writes into the run folder meanwhile. A stage counts as done only once its files are on the
-    disk, and not while it is done anew. RunError where another process works on the folder, or the disk is
-    full: then what was finished stays, and the same command goes on.
+    The run folder is locked meanwhile. A stage counts as done only once its files are on the disk, and not
+    while it is redone.
+
+    Args:
+        job: The run folder, and where events go.
+        name: Of the stage; its record is provenance/NAME.json.
+        settings: Everything that the result depends on, besides the inputs; JSON.
+        inputs: Files and folders that it is made from; their hashes are recorded.
+        outputs: Files and folders that it makes.
+        make: Does the work and returns lines that sum up the result.
+
+    Raises:
+        RunError: If an input is missing, the result was made with other settings (without `job.force`),
+            another process works on the folder, or the disk is full. What was finished stays: the same
+            command resumes.
     """
-    run_stages(job, [Stage(name, settings, inputs, outputs)], lambda _: iter([(0, make())]))
+    run_stages(job, [Stage(name, settings, inputs, outputs, swaps)], lambda _: iter([(0, make())]))
 
 
 def run_stages(
@@ -58,7 +85,8 @@ def run_stages(
         (job.locks or own).enter_context(locked(job.run.path, job.lock_wait))
         remove_temporary(job.run.path, but="bundle")  # a viewer writes those, without the lock
         for number in missing:
-            job.run.provenance(stages[number].name).unlink(missing_ok=True)
+            if not stages[number].swaps:
+                job.run.provenance(stages[number].name).unlink(missing_ok=True)
             job.emit(StageStarted(stages[number].name))
         begin, since = time.perf_counter(), time.time() - _CLOCK_STEP
         for number, lines in make(missing):
@@ -75,10 +103,26 @@ def _is_done(job: Job, stage: Stage) -> bool:
         raise RunError(f"{job.run.path}: {NO_RUN}")
     for path in stage.inputs:
         if not path.exists():
-            raise RunError(
-                f"{path}: missing; run the stage before `sagesplat {stage.name}`, or `sagesplat run`"
-            )
-    done = is_done(job.run, stage.name, stage.settings, stage.inputs, stage.outputs, job.force)
-    if done:
+            command = stage.name.replace("_", "-")
+            raise RunError(f"{path}: missing; run the stage before `sagesplat {command}`, or `sagesplat run`")
+    what = job.run, stage.name, stage.settings, stage.inputs, stage.outputs
+    if is_done(*what, job.force or _follows(job, stage)):
         job.emit(StageSkipped(stage.name))
-    return done
+        return True
+    if job.force and job.before_redo and not _follows(job, stage):
+        try:
+            is_done(*what, force=False)
+        except RunError as refusal:
+            job.before_redo(stage.name, str(refusal).partition("; ")[0])
+    return False
+
+
+def _follows(job: Job, stage: Stage) -> bool:
+    """Whether a stage may be made again without --force: for new inputs alone, and within minutes."""
+    if stage.name in _OF_PLAN:
+        return True
+    record = job.run.provenance(stage.name)
+    if stage.name not in _DERIVED or not record.exists():
+        return False
+    made = read_json(record)
+    return isinstance(made, dict) and made.get("settings") == stage.settings

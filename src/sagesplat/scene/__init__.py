@@ -16,12 +16,30 @@ __all__ = ["describe", "load_scene"]
 
 
 def load_scene(path: Path, *, downscale: int = 1, test_every: int = 8, calibrate_every: int = 0) -> Scene:
-    """The capture at a path: a COLMAP workspace, nerfstudio's transforms.json or a Blender scene.
+    """Load a capture: posed photos and structure-from-motion points.
 
-    Raises SceneError. Photos and videos without poses are none: `photos.reconstruct` makes one of them.
-    Photos are `downscale` times smaller than the files in images/. Every `test_every`-th view by name is
-    kept for tests, none with 0; every `calibrate_every`-th of the others for calibration. A stored scene is
-    as it was stored.
+    The format is detected: a COLMAP workspace, nerfstudio's transforms.json, a Blender scene, or a scene that
+    sagesplat stored. Photos and videos without poses are not captures: `photos.reconstruct` makes one of
+    them.
+
+    Args:
+        path: Folder of the capture, or its transforms.json.
+        downscale: Photos are this many times smaller than the files in images/. Intrinsics follow.
+        test_every: Every n-th view by name is a test view; 0: none. A split that the dataset lists is kept.
+        calibrate_every: Every n-th of the other views calibrates promises; 0: none, 1 is refused.
+
+    Returns:
+        The scene. Photos themselves are read when they are needed (`scene.images.Photos`). A stored scene is
+        returned as it was stored, whatever the arguments.
+
+    Raises:
+        SceneError: If nothing at `path` is a capture, a file of it is damaged, or an argument is impossible.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from sagesplat import load_scene
+        >>> scene = load_scene(Path("captures/garden"), downscale=4)  # doctest: +SKIP
+        >>> scene.views[0].camera.K, scene.points.xyz.shape  # doctest: +SKIP
     """
     if calibrate_every < 0 or calibrate_every == 1:
         raise SceneError(f"{path}: calibrate_every {calibrate_every} leaves nothing; take 0 or >= 2")

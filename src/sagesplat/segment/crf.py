@@ -9,9 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64, UInt8
-from numba import njit
 from scipy.ndimage import gaussian_filter
 from scipy.special import softmax
+
+from sagesplat.kernels.jit import njit
 
 _LEAST = 1e-5  # probability: no label is impossible
 

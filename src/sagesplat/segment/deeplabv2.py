@@ -12,7 +12,7 @@ in 0 ... 255 less a mean.
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -24,11 +24,19 @@ from PIL import Image
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from sagesplat.core.config import MasksConfig
 from sagesplat.core.errors import BackendUnavailable, LabelError
 from sagesplat.segment import coco
 from sagesplat.segment.crf import refine
 from sagesplat.segment.masks import Taxonomy
-from sagesplat.segment.segmenters import Segmented, answer, group_classes, parse_device
+from sagesplat.segment.segmenters import (
+    Segmented,
+    SegmenterFactory,
+    answer,
+    existing_file,
+    group_classes,
+    parse_device,
+)
 from sagesplat.segment.taxonomies import to_coco, vocabulary
 
 Head = Literal["coco-stuff", "voc"]
@@ -351,3 +359,16 @@ def _refine(
     refined = np.zeros_like(p)
     refined[rows] = refine(p[rows] / p[rows].sum(0), photo)
     return refined
+
+
+def _settings(config: MasksConfig) -> dict[str, Any]:
+    model = existing_file(config.model, "--segmenter deeplabv2 needs --model CHECKPOINT.pth")
+    return {"model": model, "head": config.head, "crf": config.crf}
+
+
+def _load(config: MasksConfig, device: str, threads: int, warn: Callable[[str], None]) -> DeepLabV2Segmenter:
+    network = load_deeplabv2(Path(config.model or ""), head=config.head)
+    return DeepLabV2Segmenter(network, head_classes(config.head), crf=config.crf, device=device)
+
+
+FACTORY = SegmenterFactory(_settings, _load, (".pth", ".pt", ".safetensors"))

@@ -7,7 +7,7 @@ so that instances and panoptic merging are not needed.
 
 import re
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -19,10 +19,17 @@ from PIL import Image
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from sagesplat.core.config import MasksConfig
 from sagesplat.core.errors import BackendUnavailable, LabelError, OutOfMemory
 from sagesplat.segment import coco
 from sagesplat.segment.masks import UNLABELLED, Taxonomy
-from sagesplat.segment.segmenters import Segmented, answer, group_classes, parse_device
+from sagesplat.segment.segmenters import (
+    Segmented,
+    SegmenterFactory,
+    answer,
+    group_classes,
+    parse_device,
+)
 
 DEFAULT_MODEL = "tue-mps/coco_panoptic_eomt_small_640_2x"
 FAMILIES = ("detr", "eomt", "eomt_dinov3", "mask2former", "maskformer", "oneformer")
@@ -321,3 +328,22 @@ def _quiet() -> Iterator[None]:
 def _first_line(error: Exception) -> str:
     """What an error says, without the lists and advice that transformers adds."""
     return textwrap.shorten(str(error).strip().partition("\n")[0], 200, placeholder=" ...")
+
+
+def _settings(config: MasksConfig) -> dict[str, Any]:
+    model = config.model or DEFAULT_MODEL
+    return {"model": Path(model) if Path(model).is_dir() else model}
+
+
+def _load_segmenter(
+    config: MasksConfig, device: str, threads: int, warn: Callable[[str], None]
+) -> HfSegmenter:
+    model = config.model or DEFAULT_MODEL
+    warn(f"network {model}; if it is not on this machine yet, it is downloaded from huggingface.co")
+    segmenter = HfSegmenter(model, device=device, threads=threads)
+    if segmenter.note:
+        warn(segmenter.note)
+    return segmenter
+
+
+FACTORY = SegmenterFactory(_settings, _load_segmenter)

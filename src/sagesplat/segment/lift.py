@@ -68,12 +68,18 @@ def lift(
     votes: Literal["track", "projection"] = "track",
     views: Collection[int] | None = None,
 ) -> LiftedLabels:
-    """Give each point the label that most of its pixels have.
+    """Transfer 2D labels to the SfM points: each point takes the label that most of its pixels have.
 
-    A point votes once per observation of its track, or with `votes="projection"`, and where a scene has no
-    tracks, once per view whose frustum it lies in (occluded or not). Unlabelled pixels do not vote; ties go
-    to the label with more pixels in all label images together. `views`: only these rows of `Scene.views`
-    have a vote (default: all).
+    Args:
+        scene: The capture.
+        masks: Label images, [H, W] of category ids; unlabelled pixels do not vote.
+        votes: "track": a point votes once per observation of its track. "projection": once per view whose
+            frustum it is in, occluded or not; used too where a scene has no tracks.
+        views: Rows of `Scene.views` that vote; None: all.
+
+    Returns:
+        Label ids int16 [P] (-1: no vote), and how many votes each point had and how many agreed. Ties go to
+        the label with more pixels in all label images.
     """
     ids = np.array(sorted(masks.taxonomy.names))
     column_of = np.zeros(ids[-1] + 1, np.int64)

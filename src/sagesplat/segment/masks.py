@@ -28,7 +28,14 @@ VOID_8, VOID_16 = 255, 65535  # what unlabelled pixels hold in 8- and 16-bit fil
 
 @dataclass(frozen=True)
 class Taxonomy:
-    """The categories of a scene."""
+    """The categories of a scene: names by id, COCO panoptic's where there is a mapping.
+
+    Example:
+        >>> from sagesplat import Taxonomy
+        >>> names = Taxonomy({3: "car", 184: "tree-merged"})
+        >>> names.name(184), names.name(-1), len(names.color(3))
+        ('tree-merged', 'unlabelled', 3)
+    """
 
     names: dict[int, str]  # category id -> name, ids in rising order
 
@@ -129,13 +136,22 @@ def write_mask(path: Path, label_ids: Int16[np.ndarray, "H W"], taxonomy: Taxono
 
 
 def import_masks(scene: Scene, source: Path, target: Path) -> list[str]:
-    """Normalise label images: one per view at the size of its camera, ids checked, and a labels.json.
+    """Import label images: one per view at the size of its camera, with ids checked, and a labels.json.
 
-    `source` holds PNGs named like the photos (x.png or x.jpg.png for x.jpg): 8- or 16-bit ids with a
-    labels.json {"unlabelled": 255, "labels": {"184": "tree-merged"}}, where "unlabelled" may be absent (then
-    255, in 16 bits 65535); or COCO panoptic PNGs with their JSON. Images are undistorted like the photos and
-    resampled to the nearest pixel. Views without an image become unlabelled everywhere; their names are
-    returned. LabelError where the images cannot be used.
+    Images are undistorted like the photos and resampled to the nearest pixel.
+
+    Args:
+        scene: The capture.
+        source: Folder of PNGs named like the photos (x.png or x.jpg.png for x.jpg). Either 8- or 16-bit ids
+            with a labels.json {"unlabelled": 255, "labels": {"184": "tree-merged"}}, where "unlabelled" may
+            be absent (then 255, in 16 bits 65535); or COCO panoptic PNGs with their JSON.
+        target: Folder to write.
+
+    Returns:
+        Names of the views without an image: they are unlabelled everywhere.
+
+    Raises:
+        LabelError: If the images cannot be used, or no view has one.
     """
     if source.resolve() == target.resolve():
         raise LabelError(f"{source}: these are the masks of the run itself; name the folder they came from")

@@ -1,6 +1,6 @@
 """Segmentation networks in ONNX format."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,11 +9,19 @@ import numpy as np
 from jaxtyping import Float32, Int16, UInt8
 from PIL import Image
 
+from sagesplat.core.config import MasksConfig
 from sagesplat.core.errors import BackendUnavailable, LabelError, RunError, short
 from sagesplat.io.files import read_json
 from sagesplat.segment import coco
 from sagesplat.segment.masks import UNLABELLED, Taxonomy, taxonomy_of
-from sagesplat.segment.segmenters import Segmented, answer, group_classes, parse_device
+from sagesplat.segment.segmenters import (
+    Segmented,
+    SegmenterFactory,
+    answer,
+    existing_file,
+    group_classes,
+    parse_device,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,3 +204,20 @@ def class_axis(shape: Sequence[int], num_classes: int, likely: int) -> int | Non
 
 def _first_line(error: Exception) -> str:
     return str(error).strip().partition("\n")[0]
+
+
+_NEEDS = "--segmenter onnx needs --model NETWORK.onnx and --classes CLASSES.json"
+
+
+def _settings(config: MasksConfig) -> dict[str, Any]:
+    return {
+        "model": existing_file(config.model, _NEEDS),
+        "classes": existing_file(config.classes, _NEEDS),
+    }
+
+
+def _load(config: MasksConfig, device: str, threads: int, warn: Callable[[str], None]) -> OnnxSegmenter:
+    return OnnxSegmenter(**_settings(config), device=device, threads=threads)
+
+
+FACTORY = SegmenterFactory(_settings, _load, (".onnx",))

@@ -5,12 +5,13 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Float32, Int16, UInt8
 from PIL import Image
 
+from sagesplat.core.config import MasksConfig
 from sagesplat.core.errors import BackendUnavailable, LabelError, RunError
 from sagesplat.io.files import read_json, write_json
 from sagesplat.io.lock import locked
@@ -41,6 +42,30 @@ class Segmenter(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class SegmenterFactory:
+    """How one kind of segmenter is made from `--segmenter` and its settings; `registry` lists all kinds."""
+
+    settings: Callable[[MasksConfig], dict[str, Any]]
+    """What the answers depend on, by name: plain values, and paths of files or folders whose content counts.
+
+    Raises RunError where a setting is missing or a file does not exist.
+    """
+    load: Callable[[MasksConfig, str, int, Callable[[str], None]], Segmenter]
+    """(settings, device, threads, warn) -> the segmenter; `warn` takes lines for the user."""
+    suffixes: tuple[str, ...] = ()
+    """Of `--model`, with `--segmenter auto`."""
+
+
+def existing_file(path: str | Path | None, needs: str) -> Path:
+    """A file that a setting names; RunError where it is not set or does not exist. `needs`: the cure."""
+    if path is None:
+        raise RunError(needs)
+    if not Path(path).is_file():
+        raise RunError(f"{path}: no such file; {needs}")
+    return Path(path)
+
+
 class PhotoList(Protocol):
     """What photos are taken from: by row of Scene.views, at the size of the view's camera."""
 
@@ -57,9 +82,19 @@ def segment_views(
     soft: Path | None = None,
     on_view: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Write a normalised folder of masks: label images of every view, then labels.json (see `segment_some`).
+    """Write the label image of every view with a segmentation network, then labels.json.
 
-    Raises LabelError.
+    Args:
+        scene: The capture.
+        photos: Its photos, uint8 [H, W, 3] by row of `scene.views`.
+        segmenter: Maps photos to label images; it has a `taxonomy`.
+        target: Folder to write: PNGs named like the photos, and labels.json.
+        batch: Photos that the network computes at once.
+        soft: Folder for the probabilities; None: they are not kept.
+        on_view: Called with (views done, views in all).
+
+    Raises:
+        LabelError: If the network's answer cannot be used or the folder cannot be written.
     """
     rows = range(len(scene.views))
     occurring = segment_some(scene, photos, segmenter, target, rows, batch=batch, soft=soft, on_view=on_view)

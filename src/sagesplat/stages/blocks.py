@@ -22,7 +22,7 @@ from sagesplat.formats.levels import read_level, read_more, read_sizes, write_le
 from sagesplat.io.files import link, read_json, write_json
 from sagesplat.run.executor import Task, results
 from sagesplat.run.job import Job, JobSpec, fingerprint
-from sagesplat.run.run_dir import RunDir, file_hash
+from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
 from sagesplat.scene.blocks import (
     Blocks,
@@ -40,8 +40,8 @@ from sagesplat.segment.block_categories import BlockCategories
 from sagesplat.segment.lift import LiftedLabels
 from sagesplat.segment.masks import mask_path, prepare_folder, write_labels, write_mask
 from sagesplat.stages.nest import nest_levels, write_ladder
-from sagesplat.stages.shared import train_config
-from sagesplat.stages.train import train_levels
+from sagesplat.stages.shared import label_image_inputs, train_config
+from sagesplat.stages.train import train_inputs, train_levels
 from sagesplat.train import memory, nested
 from sagesplat.train.boundaries import around, boundary_views, interior, interior_sizes, together
 from sagesplat.train.nested import Nested, NestStep
@@ -56,7 +56,7 @@ def check(config: BlocksConfig) -> None:
         ("margin", config.margin, 0 <= config.margin <= 2, "a share such as 0.2"),
         ("min-share", config.min_share, 0 < config.min_share <= 1, "a share such as 0.25"),
         ("far-share", config.far_share, config.far_share >= 0, "a share such as 0.5"),
-        ("seam-steps", config.boundary_steps, config.boundary_steps >= 0, "0 or more"),
+        ("boundary-steps", config.boundary_steps, config.boundary_steps >= 0, "0 or more"),
     )
     for name, value, fine, cure in wrong:
         if not fine:
@@ -65,7 +65,7 @@ def check(config: BlocksConfig) -> None:
 
 def _division(config: BlocksConfig) -> dict[str, float]:
     """The settings that decide what a block is trained on."""
-    return {name: value for name, value in asdict(config).items() if name != "seam_steps"}
+    return {name: value for name, value in asdict(config).items() if name != "boundary_steps"}
 
 
 def divide(job: Job, config: BlocksConfig, seed: int) -> Blocks:
@@ -115,16 +115,19 @@ def _begin(run: RunDir, scene: Scene, labels: LiftedLabels, rows: np.ndarray) ->
 
 
 def _share_masks(job: Job, block: Job) -> None:
-    """Give a block the label images of its views, and what they were made from, as links."""
-    run, source = block.run, job.whole_masks.folder
-    fused = source == job.run.fused
-    target = run.fused if fused else run.masks
-    files = [mask_path(source, view).relative_to(source) for view in block.scene.views]
-    for name in [*files, Path("labels.json")]:
-        link(source / name, target / name)
-    if fused:
-        link(job.run.provenance("fuse"), run.provenance("fuse"))
-        link(job.run.masks / "labels.json", run.masks / "labels.json")
+    """Give a block the label images of its views, and the records of who made them, as links.
+
+    Links of what the run has no more are removed: the block would take fused label images that were deleted.
+    """
+    of, run = job.run, block.run
+    for stage, source, target in (("masks", of.masks, run.masks), ("fuse", of.fused, run.fused)):
+        shutil.rmtree(target, ignore_errors=True)
+        run.provenance(stage).unlink(missing_ok=True)
+        if not (source / "labels.json").exists() or not of.provenance(stage).exists():
+            continue
+        for path in [*(mask_path(source, view) for view in block.scene.views), source / "labels.json"]:
+            link(path, target / path.relative_to(source))
+        link(of.provenance(stage), run.provenance(stage))
 
 
 def _spec(job: Job, number: int) -> JobSpec:
@@ -158,11 +161,12 @@ def train_blocks(job: Job, config: BlocksConfig, train: TrainConfig, seed: int) 
             what = (_spec(job, number), number, train, seed)
             tasks.append(Task(f"block {number}", train_block, what, job.gpus, _needed(block, train)))
         results(job.executor, tasks, job.emit)
+        run.provenance("train").unlink(missing_ok=True)  # from here on the earlier levels are gone
         merged = _merge_levels(run, blocks, parts)
         return [f"{merged:,} Gaussians of {len(blocks)} blocks"]
 
-    inputs = [run.scene, run.labels, run.blocks / "blocks.json"]
-    run_stage(job, "train", settings, inputs, [run.levels], make)
+    inputs = [*train_inputs(run, train), run.blocks / "blocks.json", run.provenance("blocks")]
+    run_stage(job, "train", settings, inputs, [run.levels], make, swaps=True)
 
 
 def train_block(spec: JobSpec, number: int, config: TrainConfig, seed: int, emit: Emit) -> None:
@@ -221,7 +225,7 @@ def label_block_categories(job: Job) -> None:
             part_ids = parts.ids(masks[view], np.where(shown < 0, own, shown))
             write_mask(path, part_ids, names)
             occurring |= set(np.unique(part_ids).tolist())
-            job.emit(Progress("parts", row + 1, len(scene.views)))
+            job.emit(Progress("block_categories", row + 1, len(scene.views)))
         lifted = LiftedLabels.read(run.labels, len(scene.points.xyz))
         ids = parts.ids(lifted.label_ids, blocks.of(scene.points.xyz))
         replace(lifted, label_ids=ids).write(run.block_category_labels)
@@ -230,12 +234,12 @@ def label_block_categories(job: Job) -> None:
             f"{len(occurring)} per-block categories of {len(masks.taxonomy.names)} in {len(blocks)} blocks"
         ]
 
-    inputs = [run.provenance("masks"), run.labels, run.levels, run.blocks / "blocks.json"]
+    made = [run.provenance(stage) for stage in ("train", "masks")]
+    inputs = [run.scene, run.labels, run.levels, run.blocks / "blocks.json", run.masks / "labels.json", *made]
     if masks.folder == run.fused:
         inputs.append(run.provenance("fuse"))
-    run_stage(
-        job, "parts", {}, inputs, [run.block_categories / "labels.json", run.block_category_labels], make
-    )
+    outputs = [run.block_categories / "labels.json", run.block_category_labels]
+    run_stage(job, "block_categories", {}, inputs, outputs, make)
 
 
 def nest_blocks(job: Job, config: BlocksConfig, nest: NestConfig, seed: int) -> None:
@@ -243,7 +247,7 @@ def nest_blocks(job: Job, config: BlocksConfig, nest: NestConfig, seed: int) -> 
     run, file = job.run, job.run.blocks / "blocks.json"
     nested.check(nest)
     blocks = read_blocks(file)
-    settings = {**asdict(nest), "seed": seed, "seam_steps": config.boundary_steps}
+    settings = {**asdict(nest), "seed": seed, "boundary_steps": config.boundary_steps}
 
     def make() -> list[str]:
         every = range(len(blocks))
@@ -260,8 +264,8 @@ def nest_blocks(job: Job, config: BlocksConfig, nest: NestConfig, seed: int) -> 
         lines = write_ladder(job, g, sizes, nest, purity)
         return [*lines, f"{len(blocks)} blocks, {config.boundary_steps} steps of boundary tuning each"]
 
-    inputs = [run.scene, run.labels, run.levels, run.provenance("parts"), file]
-    run_stage(job, "nest", settings, inputs, [run.prefixes, run.increments], make)
+    inputs = [run.scene, run.labels, run.levels, run.provenance("train"), *label_image_inputs(run), file]
+    run_stage(job, "nest", settings, inputs, [run.prefixes, run.increments], make, swaps=True)
 
 
 def nest_block(
@@ -284,7 +288,8 @@ def nest_block(
         write_set(run.interior, g, config.steps, sizes, purity=purity[inside])
         return [f"{len(g):,} of {len(full.gaussians):,} Gaussians are inside the block"]
 
-    run_stage(job, "core", {}, [run.prefixes, partition], [run.interior], make)
+    inputs = [run.prefixes, run.masks / "labels.json", partition]
+    run_stage(job, "interior", {}, inputs, [run.interior], make)
 
 
 def _tune(job: Job, blocks: Blocks, config: BlocksConfig, nest: NestConfig, seed: int) -> list[Path]:
@@ -299,7 +304,7 @@ def _tune(job: Job, blocks: Blocks, config: BlocksConfig, nest: NestConfig, seed
         for number in mine:
             others = [files[other] for other in sees[number] if other != number]
             what = (_spec(job, number), run.blocks / "blocks.json", number, others, steps, seed)
-            tasks.append(Task(f"seams of block {number}", tune_boundaries, what, job.gpus))
+            tasks.append(Task(f"boundaries of block {number}", tune_boundaries, what, job.gpus))
         results(job.executor, tasks, job.emit)
         for number in mine:
             files[number] = run.block(number).tuned_interior
@@ -312,7 +317,7 @@ def tune_boundaries(
     """Train a block's Gaussians near its border on compositions with visible Gaussians of other blocks."""
     job = spec.open(named(emit, f"block {number}"))
     run = job.run
-    settings = {**asdict(config), "seed": seed, "others": [file_hash(path) for path in others]}
+    settings = {**asdict(config), "seed": seed}
 
     def make() -> list[str]:
         blocks, own = read_blocks(partition), read_level(run.interior)
@@ -325,7 +330,8 @@ def tune_boundaries(
         write_set(run.tuned_interior, tuned, config.steps, read_sizes(run.interior), purity=purity)
         return [f"{int(near.sum()):,} of {len(own):,} Gaussians, {len(views)} views of several blocks"]
 
-    run_stage(job, "seams", settings, [run.interior, partition], [run.tuned_interior], make)
+    inputs = [run.scene, run.provenance("train"), run.interior, partition, *others]
+    run_stage(job, "boundaries", settings, inputs, [run.tuned_interior], make)
 
 
 def _tuned(
@@ -349,7 +355,7 @@ def _tuned(
         seed=seed, backend=job.backend, movable=movable,
     ):  # fmt: skip
         if isinstance(event, NestStep):
-            job.emit(Progress("seams", event.step, config.steps, f"loss {event.loss:.3f}"))
+            job.emit(Progress("boundaries", event.step, config.steps, f"loss {event.loss:.3f}"))
         elif isinstance(event, Nested):
             mine = torch.isin(event.gaussians.label_ids, torch.unique(own.label_ids))
             return event.gaussians.select(mine)

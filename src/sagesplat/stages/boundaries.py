@@ -19,6 +19,7 @@ from sagesplat.scene.blocks import Blocks, read_blocks
 from sagesplat.train.boundaries import bands, together
 from sagesplat.train.early_stopping import spread
 
+_TIMED = ("train", "base", "nest", "boundaries")  # stages of a block whose seconds are shown
 _VIEWS = 32  # training views that are measured if there are no test views
 
 
@@ -40,7 +41,8 @@ def measure_borders(job: Job) -> None:
         write_text(run.adapted / "blocks.md", f"{text}\n")
         return [str(run.adapted / "blocks.md")]
 
-    inputs = [run.scene, run.prefixes, file]
+    made = [run.block(i).provenance(s) for i in range(len(read_blocks(file))) for s in (*_TIMED, "interior")]
+    inputs = [run.scene, run.provenance("train"), run.prefixes, file, *(p for p in made if p.exists())]
     run_stage(job, "borders", {}, inputs, [table_file, run.adapted / "borders.csv"], make)
 
 
@@ -50,11 +52,11 @@ def balance_table(job: Job, blocks: Blocks) -> Table:
     rows: list[tuple[str | int | float, ...]] = []
     for number in range(len(blocks)):
         run = job.run.block(number)
-        seconds = [_seconds(run, stage) for stage in ("train", "base", "nest", "seams")]
+        seconds = [_seconds(run, stage) for stage in _TIMED]
         trained = sum(read_ladder(run.levels).files[-1].counts.values())
         kept = sum(n[-1] for n in read_sizes(run.interior).values())
         rows.append((number, made["points"][number], made["views"][number], trained, kept, *seconds))
-    header = ("block", "points", "views", "Gaussians", "inside", "train s", "seeds s", "nest s", "seams s")
+    header = ("block", "points", "views", "Gaussians", "inside", *(f"{stage} s" for stage in _TIMED))
     return Table("Blocks", header, ("d", ",d", "d", ",d", ",d", ".1f", ".1f", ".1f", ".1f"), rows)
 
 

@@ -24,8 +24,9 @@ from sagesplat.io.files import read_json, write_json
 from sagesplat.io.npz import Npz
 from sagesplat.raster import rasterize
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import file_hash, settings_of
+from sagesplat.run.run_dir import is_made_from, settings_of
 from sagesplat.segment.block_categories import split_name
+from sagesplat.segment.display_names import title_of
 from sagesplat.segment.masks import UNLABELLED
 from sagesplat.stages.shared import distances
 from sagesplat.viewer import boxes
@@ -39,7 +40,7 @@ from sagesplat.viewer.bundle import (
     write_documents,
 )
 from sagesplat.viewer.corrections import distance_error, with_corrections
-from sagesplat.viewer.display_names import colors_of, title_of
+from sagesplat.viewer.display_names import colors_of
 from sagesplat.viewer.frames import FLIP, camera_at
 from sagesplat.viewer.manifest import CameraEntry, Category, Contents, start_of
 from sagesplat.viewer.pack import ASPECT, FOV_Y
@@ -178,8 +179,7 @@ def _check(
                 f"{run.path}: no {path.relative_to(run.path)}; a bundle needs a finished nested ladder: "
                 f"run `sagesplat {stage}`, or `sagesplat run`"
             )
-    fitted = read_json(run.provenance("fit"))["inputs"]
-    if fitted.get(INDEX) != file_hash(run.increments / INDEX):
+    if not is_made_from(run, "fit", run.increments / INDEX):
         raise RunError(f"{run.promises}: fitted to other increments; run `sagesplat fit` again with --force")
     if meters_per_unit is not None and not 1e-6 <= meters_per_unit <= 1e6:
         raise RunError(f"{meters_per_unit} metres per unit are impossible; give a number such as 0.5")
@@ -304,6 +304,6 @@ def _antialiased(job: Job) -> bool:
         pass
     try:
         with Npz(job.run.checkpoint) as file:
-            return bool(json.loads(json.loads(str(file["meta"]))["settings"])["antialiased"])
+            return bool(json.loads(json.loads(str(file["meta"]))["settings"])["settings"]["antialiased"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return False  # no checkpoint yet, or one of another version

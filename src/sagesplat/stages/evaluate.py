@@ -10,20 +10,22 @@ from sagesplat.output import tables
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import settings_of
 from sagesplat.run.stage import run_stage
-from sagesplat.stages.compose import compose
-from sagesplat.stages.plan import main_target, promised, scene_plan
-from sagesplat.stages.shared import _show, label_images, ladder_files
+from sagesplat.segment.display_names import titles
+from sagesplat.stages.compose import compose, compose_inputs
+from sagesplat.stages.methods import method_of
+from sagesplat.stages.plan import main_target, scene_plan
+from sagesplat.stages.shared import _show, label_images
 
 
 def evaluate_plans(job: Job) -> None:
     """Measure the compositions on the test views, beside the promise and the whole model."""
-    run = job.run
+    run, method = job.run, method_of(job)
 
     def make() -> list[str]:
         fitted, within = job.fit_config, read_budget_plan(run.plan)
         plans = [*read_plans(run.plan)[0], *([within] if within else [])]
         table = evaluate(
-            job.scene, job.photos, label_images(job, fitted.masks), job.ladder, plans, promised(job),
+            job.scene, job.photos, label_images(job, fitted.masks), job.ladder, plans, method.predicted,
             region=fitted.region, compose=lambda plan: compose(job, plan),
             backend=job.backend, antialiased=job.antialiased,
             progress=lambda done, total: job.emit(Progress("evaluate", done, total)),
@@ -31,7 +33,7 @@ def evaluate_plans(job: Job) -> None:
         table.write_csv(run.evaluation)
         if len(table):
             plan = scene_plan(run, main_target(run))
-            _show(job, tables.outcome_table(plan, job.ladder.counts, table, job.names()))
+            _show(job, tables.outcome_table(plan, job.ladder.counts, table, titles(job.names())))
         whole = table.select(table.label_id == TOTAL)
         lines = []
         for target in np.unique(whole.target):
@@ -44,6 +46,7 @@ def evaluate_plans(job: Job) -> None:
             )
         return lines
 
-    inputs = [run.scene, run.labels, *ladder_files(run), run.plan]
+    fitted = [run.provenance("observe"), run.provenance("fit")]
+    inputs = [run.labels, *method.files, *fitted, *compose_inputs(job)]
     settings = {"tune_steps": settings_of(run, "plan").get("tune_steps", 0)}
     run_stage(job, "evaluate", settings, inputs, [run.evaluation], make)

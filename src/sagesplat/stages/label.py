@@ -4,12 +4,11 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sagesplat.core.config import LabelsConfig, LiftConfig, MasksConfig
-from sagesplat.core.errors import LabelError, RunError
+from sagesplat.core.errors import LabelError
 from sagesplat.core.events import Progress, Warned
 from sagesplat.io.files import read_json, write_json
 from sagesplat.run.executor import split
@@ -18,24 +17,23 @@ from sagesplat.run.remote import work_all
 from sagesplat.run.run_dir import file_hash
 from sagesplat.run.stage import run_stage
 from sagesplat.segment.edit import Edited, edit_labels, parse_keep, parse_merge
-from sagesplat.segment.hf import DEFAULT_MODEL
 from sagesplat.segment.lift import agreement_in, lift
 from sagesplat.segment.masks import MAX_LABEL_ID, UNLABELLED, Masks, Taxonomy, import_masks, write_labels
-from sagesplat.segment.segmenters import Segmenter, segment_some
+from sagesplat.segment.registry import SEGMENTERS, segmenter_for
+from sagesplat.segment.segmenters import segment_some
 from sagesplat.segment.soft import read_soft, soft_path
 from sagesplat.train.fuse import Soft, fuse
 
-_SUFFIXES = {".onnx": "onnx", ".pth": "deeplabv2", ".pt": "deeplabv2", ".safetensors": "deeplabv2"}
 _MARKER = ".network.json"
 _EDIT = "edit.json"
 
 
 def make_masks(job: Job, config: MasksConfig, labels: LabelsConfig = LabelsConfig()) -> None:
-    """Bring label images into the run, given ones or a segmenter's; then merge and leave out categories."""
-    run, kind = job.run, _kind(job, config)
+    """Import label images or segment the photos, then merge and drop categories."""
+    run, kind = job.run, segmenter_kind(job.scene.path, config)
     merge, keep = parse_merge(labels.merge), parse_keep(labels.keep)
     if kind == "masks":
-        _import(job, config.masks or job.scene.path / "masks")
+        _import(job, config)
     else:
         _segment(job, config, kind)
 
@@ -61,20 +59,27 @@ def _lines(edited: Edited) -> list[str]:
     return lines
 
 
-def _kind(job: Job, config: MasksConfig) -> str:
-    """The segmenter that was asked for, or follows from what there is."""
+def segmenter_kind(capture: Path, config: MasksConfig) -> str:
+    """The segmenter that was asked for, or with "auto" the one that the settings and the capture imply."""
     if config.segmenter != "auto":
         return config.segmenter
-    if config.model:
-        return _SUFFIXES.get(Path(config.model).suffix, "hf")
-    if config.masks or (job.scene.path / "masks").is_dir():
+    if not config.model and (config.masks or (capture / "masks").is_dir()):
         return "masks"
-    return "hf"
+    return segmenter_for(config.model)
 
 
-def _import(job: Job, source: Path) -> None:
-    """Bring ready label images into the run."""
-    run = job.run
+def _note_options(job: Job, config: MasksConfig) -> None:
+    """Keep how the label images were asked for, paths absolute: the defaults of the next command."""
+    options = asdict(config)
+    for name in ("masks", "model", "classes"):
+        if options[name] is not None and Path(options[name]).exists():
+            options[name] = str(Path(options[name]).resolve())
+    write_json(job.run.segmentation, {k: str(v) if isinstance(v, Path) else v for k, v in options.items()})
+
+
+def _import(job: Job, config: MasksConfig) -> None:
+    """Import existing label images."""
+    run, source = job.run, config.masks or job.scene.path / "masks"
     settings = {"segmenter": "masks", "source": file_hash(source) if source.is_dir() else str(source)}
 
     def make() -> list[str]:
@@ -84,6 +89,7 @@ def _import(job: Job, source: Path) -> None:
         if missing:
             names = ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
             job.emit(Warned(f"{len(missing)} of {len(job.scene.views)} views have no label image: {names}"))
+        _note_options(job, config)
         return []
 
     run_stage(job, "segment", settings, [run.scene], [run.segmented / "labels.json"], make)
@@ -92,16 +98,9 @@ def _import(job: Job, source: Path) -> None:
 def _segment(job: Job, config: MasksConfig, kind: str) -> None:
     """Segment the photos; images of an interrupted attempt with the same network are kept."""
     run = job.run
-    settings: dict[str, Any] = {"segmenter": kind, "soft": config.soft}
-    if kind == "hf":
-        model = config.model or DEFAULT_MODEL
-        settings["model"] = file_hash(Path(model)) if Path(model).is_dir() else model
-    else:
-        settings["model"] = file_hash(_file(kind, config.model))
-    if kind == "onnx":
-        settings["classes"] = file_hash(_file(kind, config.classes))
-    elif kind == "deeplabv2":
-        settings |= {"head": config.head, "crf": config.crf}
+    own = SEGMENTERS[kind].settings(config)
+    hashed = {name: file_hash(v) if isinstance(v, Path) else v for name, v in own.items()}
+    settings = {"segmenter": kind, "soft": config.soft, **hashed}
 
     def make() -> list[str]:
         marker = run.segmented / _MARKER
@@ -115,6 +114,7 @@ def _segment(job: Job, config: MasksConfig, kind: str) -> None:
         if any(other != taxonomy for other, _ in found):
             raise LabelError(f"{run.segmented}: the nodes' networks have other categories; make them alike")
         write_labels(run.segmented, taxonomy, set().union(*(ids for _, ids in found)))
+        _note_options(job, config)
         return []
 
     run_stage(job, "segment", settings, [run.scene], [run.segmented / "labels.json"], make)
@@ -123,45 +123,14 @@ def _segment(job: Job, config: MasksConfig, kind: str) -> None:
 def _segment_some(job: Job, part: tuple[Sequence[int], MasksConfig, str]) -> tuple[Taxonomy, set[int]]:
     """Segment some views (rows, settings, kind of segmenter): all its categories, and the ids that occur."""
     rows, config, kind = part
-    segmenter, run = _load(job, config, kind), job.run
+    run, warn = job.run, lambda text: job.emit(Warned(text))
+    segmenter = SEGMENTERS[kind].load(config, job.device, job.threads, warn)
     occurring = segment_some(
         job.scene, job.photos, segmenter, run.segmented, rows,
         batch=config.batch, soft=run.soft if config.soft else None,
         on_view=lambda done, total: job.emit(Progress("segment", done, total)),
     )  # fmt: skip
     return segmenter.taxonomy, occurring
-
-
-def _file(kind: str, given: str | Path | None) -> Path:
-    wanted = "--model NETWORK.onnx and --classes CLASSES.json" if kind == "onnx" else "--model CHECKPOINT.pth"
-    if given is None:
-        raise RunError(f"--segmenter {kind} needs {wanted}")
-    if not Path(given).is_file():
-        raise RunError(f"{given}: no such file; --segmenter {kind} needs {wanted}")
-    return Path(given)
-
-
-def _load(job: Job, config: MasksConfig, kind: str) -> Segmenter:
-    """The network, ready to be used."""
-    if kind == "hf":
-        from sagesplat.segment.hf import HfSegmenter
-
-        model = config.model or DEFAULT_MODEL
-        job.emit(Warned(f"network {model}; if it is not here yet, it is fetched from huggingface.co"))
-        segmenter = HfSegmenter(model, device=job.device, threads=job.threads)
-        if segmenter.note:
-            job.emit(Warned(segmenter.note))
-        return segmenter
-    model = Path(config.model or "")
-    if kind == "onnx":
-        from sagesplat.segment.onnx import OnnxSegmenter
-
-        assert config.classes
-        return OnnxSegmenter(model, config.classes, device=job.device, threads=job.threads)
-    from sagesplat.segment.deeplabv2 import DeepLabV2Segmenter, head_classes, load_deeplabv2
-
-    network = load_deeplabv2(model, head=config.head)
-    return DeepLabV2Segmenter(network, head_classes(config.head), crf=config.crf, device=job.device)
 
 
 def lift_labels(job: Job, config: LiftConfig) -> None:
@@ -201,7 +170,8 @@ def fuse_masks(job: Job) -> None:
             f"in {after:.1%} of what they see ({before:.1%} before)"
         ]
 
-    inputs = [run.provenance("masks"), run.masks / "labels.json", run.levels]
+    made = [run.provenance(stage) for stage in ("masks", "train")]
+    inputs = [run.scene, run.masks / "labels.json", run.levels, *made]
     run_stage(job, "fuse", {"soft": soft is not None}, inputs, [run.fused / "labels.json"], make)
 
 

@@ -1,6 +1,5 @@
 """Makes the nested levels and their increments, from the trained Gaussians: orders them, trains prefixes."""
 
-import json
 from dataclasses import asdict
 
 import numpy as np
@@ -14,11 +13,11 @@ from sagesplat.formats.increments import packed, read_increments, write_incremen
 from sagesplat.formats.levels import read_level, write_set
 from sagesplat.metrics.image import ssim_map
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import file_hash
+from sagesplat.run.run_dir import checkpoint_key
 from sagesplat.run.stage import run_stage
-from sagesplat.stages.shared import fusion, train_config
+from sagesplat.stages.shared import label_image_inputs, train_config
 from sagesplat.train import nested
-from sagesplat.train.checkpoint import remove_checkpoints
+from sagesplat.train.checkpoint import can_resume, remove_checkpoints
 from sagesplat.train.early_stopping import VIEWS, spread
 from sagesplat.train.nested import NestStep
 from sagesplat.train.trainer import Resumed, Step, Trained
@@ -35,15 +34,13 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
         base = read_level(run.base_model) if config.base_share else None
         masks = job.best_masks
         ordered = nested.order(full, job.scene, masks, config, base=base, antialiased=job.antialiased)
-        checkpoint_key = json.dumps(
-            {**settings, "scene": file_hash(run.scene), "levels": file_hash(run.levels)}
-        )
-        if job.force:
+        key = checkpoint_key(run, settings, inputs)
+        if job.force and not can_resume(run.nest_checkpoint, key):
             remove_checkpoints(run.nest_checkpoint)
         trained = ordered
         for event in nested.nest(
             ordered, job.scene, job.photos, train_config(job), config,
-            seed=seed, backend=job.backend, checkpoint=run.nest_checkpoint, settings=checkpoint_key,
+            seed=seed, backend=job.backend, checkpoint=run.nest_checkpoint, settings=key,
         ):  # fmt: skip
             if isinstance(event, NestStep):
                 job.emit(Progress("nest", event.step, config.steps, f"loss {event.loss:.3f}"))
@@ -59,11 +56,11 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
         remove_checkpoints(run.nest_checkpoint)
         return lines
 
-    inputs = [run.scene, run.labels, run.levels, *fusion(run)]
+    inputs = [run.scene, run.labels, run.levels, run.provenance("train"), *label_image_inputs(run)]
     if config.base_share:
         _make_base_model(job, config, seed)
         inputs.append(run.base_model)
-    run_stage(job, "nest", settings, inputs, [run.prefixes, run.increments], make)
+    run_stage(job, "nest", settings, inputs, [run.prefixes, run.increments], make, swaps=True)
 
 
 def _make_base_model(job: Job, config: NestConfig, seed: int) -> None:
@@ -97,10 +94,11 @@ def train_capped(job: Job, stage: str, cap: int, steps: int, seed: int) -> Gauss
 def write_ladder(
     job: Job, g: Gaussians, sizes: dict[int, tuple[int, ...]], config: NestConfig, purity: np.ndarray
 ) -> list[str]:
-    """Write Gaussians in their order, with levels of `sizes` by label id, as the run's ladder and its chunks.
+    """Write Gaussians in their order, with levels of `sizes` by label id, as the run's ladder and increments.
 
-    `clarity` [N] of `Nested` is kept beside them.
+    `purity` [N] of `Nested` is kept beside them. Returns lines that sum it up.
     """
+    job.run.provenance("nest").unlink(missing_ok=True)  # from here on the earlier ladder is gone
     rows = packed(g, sizes, sh_bits=config.sh_bits)
     ordered = g.select(torch.from_numpy(rows))
     chunks = write_increments(
@@ -110,11 +108,11 @@ def write_ladder(
     sent = read_increments(job.run.increments, chunks)
     write_set(job.run.prefixes, sent, config.steps, sizes, purity=purity[rows])
     size, n = sum(chunk.nbytes for chunk in chunks), len(g)
-    lost = _quality(job, ordered) - _quality(job, sent)
+    unrounded, decoded = _quality(job, ordered), _quality(job, sent)
     return [
         f"{config.levels} levels, {n:,} Gaussians",
         f"{size / 1e6:.2f} MB in {len(chunks)} SPZ files, {size / n:.1f} bytes a Gaussian; "
-        f"encoding costs {lost:.4f} of SSIM",
+        f"training views: SSIM {decoded:.4f} as decoded, {unrounded:.4f} before rounding",
     ]
 
 

@@ -12,7 +12,9 @@ from sagesplat.run.executor import split
 from sagesplat.run.job import Job
 from sagesplat.run.remote import work_all
 from sagesplat.run.stage import run_stage
-from sagesplat.stages.shared import _show, distances, fusion, label_images, ladder_files
+from sagesplat.segment.display_names import titles
+from sagesplat.stages.methods import method_of
+from sagesplat.stages.shared import _show, distances, label_image_inputs, label_images
 
 
 def observe_levels(job: Job, config: FitConfig) -> None:
@@ -25,12 +27,13 @@ def observe_levels(job: Job, config: FitConfig) -> None:
         table = merge(work_all(job, "observe", _observe_views, parts))
         table.write_csv(run.observations)
         seen = table.select(np.isin(table.view, job.scene.train_ids))
-        _show(job, tables.ladder_table(seen, job.ladder.counts, job.ladder.recovering, job.names()))
+        _show(job, tables.ladder_table(seen, job.ladder.counts, job.ladder.recovering, titles(job.names())))
         return [
             f"{len(table):,} observations of {len(job.ladder.levels)} levels in {len(job.scene.views)} views"
         ]
 
-    inputs = [run.scene, run.labels, ladder_files(run)[0], *fusion(run)]
+    levels = method_of(job).level_files[0]
+    inputs = [run.scene, run.labels, run.provenance("train"), levels, *label_image_inputs(run)]
     settings = {"distance": config.distance, "masks": config.masks}
     run_stage(job, "observe", settings, inputs, [run.observations], make)
 

@@ -4,13 +4,16 @@ import math
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from sagesplat.adapt.plan import check_target
-from sagesplat.core.config import BlocksConfig, NestConfig, PlanConfig, RunConfig, TrainConfig
+from sagesplat.core.config import BlocksConfig, FitConfig, NestConfig, PlanConfig, RunConfig, TrainConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit, Progress, StageDone, StageStarted
 from sagesplat.demo.capture import cached_capture
 from sagesplat.run.job import Job
+from sagesplat.run.recorded import recorded_settings
+from sagesplat.run.run_dir import RunDir
 from sagesplat.stages import blocks
 from sagesplat.stages.boundaries import measure_borders
 from sagesplat.stages.compose import compose_plan
@@ -20,6 +23,7 @@ from sagesplat.stages.label import fuse_masks, lift_labels, make_masks
 from sagesplat.stages.nest import nest_levels
 from sagesplat.stages.observe import observe_levels
 from sagesplat.stages.plan import make_plan
+from sagesplat.stages.preflight import check_segmenter, check_training
 from sagesplat.stages.report import make_report
 from sagesplat.stages.scene import open_scene
 from sagesplat.stages.train import train_levels
@@ -34,12 +38,29 @@ DEMO = RunConfig(
 
 
 def run_all(job: Job, scene: Path, config: RunConfig) -> None:
-    """Every stage on one capture; those whose result is there already are skipped."""
+    """Run every stage on one capture. Stages whose results are there already are skipped.
+
+    Args:
+        job: The run folder, and where events go. Results for the paper's levels or for the nested ladder go
+            to folders of their own: `job.run.ladder`.
+        scene: The capture.
+        config: Settings of all stages.
+
+    Raises:
+        SageError: For anything wrong with the capture, the settings, the run folder or the machine. Settings
+            are checked before hours of training.
+
+    Example:
+        `sagesplat.run_scene` opens a job and calls this.
+    """
     for target in config.plan.targets:  # before hours of training
         check_target(target)
     nested.check(config.nest)
     blocks.check(config.blocks)
+    check_segmenter(job, scene, config.masks)
     open_scene(job, scene, config.scene, config.poses)
+    if config.blocks.count == 1:
+        check_training(job, config.train)
     make_masks(job, config.masks, config.labels)
     lift_labels(job, config.lift)
     train(job, config.train, config.blocks, config.seed)
@@ -57,6 +78,29 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
     compose_plan(job)
     evaluate_plans(job)
     make_report(job)
+
+
+def observe_snapshots(job: Job) -> None:
+    """Measure the training snapshots of a run, as its levels were measured; `job` is one on the snapshots."""
+    observe_levels(job, _recorded(job).get("fit", FitConfig()))
+
+
+def adapt_snapshots(job: Job) -> None:
+    """Measure, model and plan the training snapshots of a run, with the settings that it was made with.
+
+    `job` is one on the snapshots. Stages that are done are skipped.
+    """
+    known = _recorded(job)
+    fit: FitConfig = known.get("fit", FitConfig())
+    observe_levels(job, fit)
+    fit_ladder(job, fit)
+    make_plan(job, replace(known.get("plan", PlanConfig()), budget=0.0, weights={}))
+
+
+def _recorded(job: Job) -> dict[str, Any]:
+    """What the run records of its snapshots, else of its nested levels."""
+    nested_levels = recorded_settings(RunDir(job.run.path, "nested"))
+    return nested_levels | recorded_settings(RunDir(job.run.path, "snapshots"))
 
 
 def train(job: Job, config: TrainConfig, of_blocks: BlocksConfig, seed: int) -> None:

@@ -74,7 +74,7 @@ def _find_poses(job: Job, source: Path, capture: Path, config: PosesConfig) -> N
     if job.run.path.resolve().is_relative_to(source.resolve()):
         raise RunError(f"{job.run.path}: lies among the photos; name a run folder outside of {source}")
     files = sorted(p for p in source.rglob("*") if p.is_file()) if source.is_dir() else [source]
-    state = [(str(p), p.stat().st_size, p.stat().st_mtime_ns) for p in files]
+    state = [(str(p.relative_to(source)), p.stat().st_size, p.stat().st_mtime_ns) for p in files]
     digest = hashlib.sha256(repr(state).encode()).hexdigest()
     settings = {"source": str(source.resolve()), **asdict(config), "files": digest}
 

@@ -1,15 +1,22 @@
 """Helpers that several stages share: settings, label images and distances of a run."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 
-from sagesplat.adapt.observe import PERCENTILE, LabelImages, RenderedLabels, distances_in_views
-from sagesplat.core.config import TrainConfig
+from sagesplat.adapt.observe import (
+    PERCENTILE,
+    LabelImages,
+    Observations,
+    RenderedLabels,
+    distances_in_views,
+    large_enough,
+    read_observations,
+)
+from sagesplat.core.config import FitConfig, TrainConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import TableMade
-from sagesplat.formats.increments import INDEX
 from sagesplat.output.tables import Table
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir, settings_of
@@ -21,9 +28,9 @@ def train_config(job: Job) -> TrainConfig:
     return TrainConfig(**{f.name: made[f.name] for f in fields(TrainConfig) if f.name in made})
 
 
-def fusion(run: RunDir) -> list[Path]:
-    """What results change with that look at label images after training."""
-    made = [("fuse", run.fused), ("parts", run.block_categories)]
+def label_image_inputs(run: RunDir) -> list[Path]:
+    """What decides the label images that stages after training look at: the records of who made them."""
+    made = [("masks", run.masks), ("fuse", run.fused), ("block_categories", run.block_categories)]
     return [run.provenance(stage) for stage, folder in made if (folder / "labels.json").exists()]
 
 
@@ -40,11 +47,10 @@ def distances(job: Job, distance: str) -> dict[int, np.ndarray]:
     return distances_in_views(job.scene, job.point_labels, percentile)
 
 
-def ladder_files(run: RunDir) -> list[Path]:
-    """What the run's levels, and the models of their quality, are read from."""
-    if run.ladder == "nested":
-        return [run.prefixes, run.increments / INDEX, run.promises]
-    return [run.levels, run.models]
+def observed(job: Job, config: FitConfig) -> Observations:
+    """The rows of views that show enough of a category, with SSIM of the region that models are fitted to."""
+    table = large_enough(read_observations(job.run.observations), job.scene, config.min_share)
+    return replace(table, ssim=table.ssim_eroded) if config.region == "eroded" else table
 
 
 def _show(job: Job, table: Table) -> None:

@@ -5,11 +5,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 
 from sagesplat.core.config import TrainConfig
 from sagesplat.core.gaussians import PARAMETERS, Gaussians, concat
+from sagesplat.kernels.jit import njit
 from sagesplat.raster.reference import rotation_matrices
 from sagesplat.raster.render import Render
 from sagesplat.train.state import TrainState

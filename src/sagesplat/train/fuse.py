@@ -184,11 +184,29 @@ def fuse(
     backend: Backend = "auto",
     on_view: Callable[[int, int], None] | None = None,
 ) -> Fused:
-    """Write a normalised folder of masks that agree better between views than `masks`.
+    """Fuse the label images of all views by way of the trained Gaussians, and write the result.
 
-    `views` vote (default: the training views), all views are written. `soft`: class probabilities beside the
-    hard labels. `on_view(done, total)`: a view has voted or is written. LabelError where `target` is the
-    folder of the masks themselves, or for probabilities that are none.
+    Every Gaussian collects the labels of the pixels that it contributes to, weighted by alpha x
+    transmittance. The labelled Gaussians are then rendered into each view and combined with its own label
+    image.
+
+    Args:
+        gaussians: The trained model.
+        scene: The capture.
+        masks: Label images to start from.
+        target: Folder to write, in the format of `import_masks`.
+        views: Rows of `Scene.views` that vote; None: the training views. All views are written.
+        soft: Class probabilities beside the hard labels.
+        options: Weights and thresholds.
+        antialiased: How the model was trained.
+        backend: Rasteriser; decides the device.
+        on_view: Called with (views done, views in all); a view votes once and is written once.
+
+    Returns:
+        The share of changed pixels in each view, and a record of the options.
+
+    Raises:
+        LabelError: If `target` is the folder of `masks`, or `soft` holds no probabilities.
     """
     options = options or FuseOptions()
     voters: Collection[int] = scene.train_ids.tolist() if views is None else views

@@ -8,11 +8,12 @@ import math
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 
 from sagesplat.core.config import TrainConfig
 from sagesplat.core.gaussians import PARAMETERS
+from sagesplat.kernels.jit import njit
 from sagesplat.raster.reference import rotation_matrices
 from sagesplat.train import densify
 from sagesplat.train.state import TrainState

@@ -158,15 +158,31 @@ def nest(
     settings: str = "",
     movable: np.ndarray | None = None,  # bool [N]
 ) -> Iterator[NestStep | Resumed | Nested]:
-    """Train so that every composition of prefixes looks right; the last event is the result.
+    """Train a nested ladder: afterwards every composition of prefixes renders well.
 
-    Each step draws a prefix per category, log-uniform between `config.drawn_from` and all, or everything
-    (with a probability that rises from `config.full_share`), and compares that composition with a photo,
-    values rounded as the chunks will have them. Gaussians outside it, their moments included, stay as they
-    are. Now and then all are sorted again by what they have become worth beside each other: of a category,
-    still first those across borders, then the seeds, then the rest. With `movable`, the others stay as they
-    are, and the order too.
-    A `checkpoint` of the same `settings` is continued.
+    Each step draws a prefix of every category, log-uniform between `config.drawn_from` and 1, or the full
+    model (with a probability that rises from `config.full_share` to `config.full_share_end`), and compares
+    the composition with a photo. Values are rounded as the increments will hold them. Gaussians outside the
+    composition, and their Adam moments, stay as they are. At five steps all Gaussians are sorted again by
+    importance: in each category boundary Gaussians stay first, then the base model, then the others.
+
+    Args:
+        nested: The ordered model to start from (`order`).
+        scene: The capture; `scene.train_ids` are used.
+        photos: Its photos.
+        train_config: Settings of the training that made the model.
+        config: Steps, levels and learning-rate multiplier of this one.
+        seed: Of all random numbers.
+        backend: Rasteriser; decides the device.
+        checkpoint: Where to save every 500 steps; one of the same `settings` is resumed.
+        settings: What a checkpoint has to have been written with.
+        movable: bool [N]; the others keep their values, and all keep their order. None: all are trained.
+
+    Yields:
+        `NestStep` at every step, `Resumed` after a damaged checkpoint, and the trained `Nested` last.
+
+    Raises:
+        RunError: For impossible settings, a loss that is not finite, or memory that runs out.
     """
     check(config)
     device = device_of(backend)

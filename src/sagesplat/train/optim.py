@@ -3,11 +3,12 @@
 from collections.abc import Mapping
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 
 from sagesplat.core.gaussians import PARAMETERS
 from sagesplat.core.sh import num_bases
+from sagesplat.kernels.jit import njit
 from sagesplat.train.state import TrainState
 
 _BETA1, _BETA2, _EPS = 0.9, 0.999, 1e-15
@@ -55,7 +56,7 @@ def adam_step(
     exp_avg_sq: np.ndarray,
     *,
     lr: float,
-    step: int,  # 1 for the exp_avg
+    step: int,  # 1 for the first
     trainable: np.ndarray,  # bool [N]
     columns: int | None = None,
 ) -> None:

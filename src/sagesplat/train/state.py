@@ -30,12 +30,11 @@ class TrainState:
     last_reset: int = -1  # step of the last opacity reset, -1 = none yet
     frozen: dict[int, int] = field(default_factory=dict)  # label id -> step from which on it stays as it is
     withheld: int = 0  # Gaussians that categories would have got, had they not stopped
-    order_share: Tensor | None = (
-        None  # [N] share of its category that comes before it: only of a nested ladder
-    )
+    order_share: Tensor | None = None  # [N] of a nested model: share of its category that comes before it
 
     def replace_rows(self, keep: Tensor, new: Gaussians) -> None:
         """Keep some rows (bool [N]) and append new Gaussians with fresh moments and statistics."""
+        assert self.order_share is None, "the rows of a nested model stay"
         kept = self.gaussians.select(keep)
         self.gaussians = concat([kept, new])
         for name in PARAMETERS:
@@ -54,6 +53,8 @@ class TrainState:
             for name in PARAMETERS:
                 moments[name] = moments[name][order]
         self.grad_sum, self.grad_count = self.grad_sum[order], self.grad_count[order]
+        if self.order_share is not None:
+            self.order_share = self.order_share[order]
 
     def clear_statistics(self) -> None:
         """Start the densification statistics again."""
@@ -97,7 +98,7 @@ def from_points(
 
 
 def initial_state(gaussians: Gaussians, seed: int) -> TrainState:
-    """A state before the exp_avg step."""
+    """A state before the first step."""
     exp_avg, exp_avg_sq = (
         {name: torch.zeros_like(p) for name, p in gaussians.parameters().items()} for _ in range(2)
     )

@@ -59,6 +59,7 @@ class LevelSaved:
     path: Path | None
     counts: dict[int, int]
     recovering: bool
+    gaussians: Gaussians  # on the training device; the next step changes them in place
 
 
 @dataclass(frozen=True)
@@ -96,13 +97,41 @@ def train(
     settings: str = "",
     group: Group = ALONE,
 ) -> Iterator[Event]:
-    """Train on the training views; levels and the checkpoint go into `folder` (levels/, checkpoint.npz).
+    """Train 3D Gaussians on the training views of a scene: a generator of events.
 
-    With `config.freeze_at`, categories are measured on `masks` whenever a level is recorded; one that has
-    reached it stays bit for bit as it is, and training ends when all have. A checkpoint found in `folder`
-    that belongs to the same `settings` is continued. The processes of a `group` train one model together:
-    all call this with the same arguments, the first one writes. Raises `RunError` where the loss stops being
-    finite, memory runs out or a GPU fails, and for settings that cannot be.
+    Loss, learning rates and densification are those of 3DGS (Kerbl et al. 2023), or of 3DGS-MCMC with
+    `config.strategy="mcmc"`. With `config.freeze_at`, the SSIM of each category is measured whenever a level
+    is recorded. A category that reaches the target keeps every bit from then on, and training ends when all
+    have.
+
+    Args:
+        scene: The capture; `scene.train_ids` are used.
+        photos: Its photos, uint8 [H, W, 3] by row of `scene.views`.
+        label_ids: int16 [P], category of each SfM point; -1: unlabelled. Clones and splits inherit it.
+        config: Steps, learning rates, densification and levels.
+        masks: Label images; needed for `config.freeze_at`.
+        seed: Of all random numbers. The same seed gives the same bits on the CPU.
+        backend: Rasteriser, see `rasterize`; decides the device.
+        folder: Levels and a checkpoint are written here (levels/, checkpoint.npz); None: nothing is written.
+        settings: A checkpoint in `folder` is resumed if it was written with the same text.
+        group: Processes that train one model together. All call this with the same arguments.
+
+    Yields:
+        `Resumed` first where a checkpoint was found, `Step` at every step, `LevelSaved`, `LabelFrozen`, and
+        `Trained` last, with the Gaussians on the CPU.
+
+    Raises:
+        RunError: If the loss is not finite, memory runs out, a GPU fails, or a setting is impossible.
+
+    Example:
+        >>> from pathlib import Path
+        >>> import numpy as np
+        >>> from sagesplat import TrainConfig, load_scene, train_gaussians
+        >>> from sagesplat.scene.images import Photos
+        >>> scene = load_scene(Path("captures/garden"), downscale=4)  # doctest: +SKIP
+        >>> labels = np.full(len(scene.points.xyz), -1, np.int16)  # doctest: +SKIP
+        >>> for event in train_gaussians(scene, Photos(scene.views), labels, TrainConfig()):  # doctest: +SKIP
+        ...     print(event)
     """
     _check(config, masks)
     state: TrainState | None = None
@@ -309,7 +338,7 @@ def _save_level(
         path = write_level(
             folder / "levels", state.step, state.gaussians.to("cpu"), recovering=recovering, sh_degree=degree
         )
-    return LevelSaved(state.step, path, state.gaussians.counts(), recovering)
+    return LevelSaved(state.step, path, state.gaussians.counts(), recovering, state.gaussians)
 
 
 def _sh_degree(step: int, config: TrainConfig, plan: densify.Schedule) -> int:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from sagesplat.core.errors import DataError, RunError, SageError
 from sagesplat.formats.increments import Increment
-from sagesplat.io.files import read_json, write_text
+from sagesplat.io.files import atomic_folder, read_json, write_text
 from sagesplat.viewer.manifest import FORMAT, THIRD_PARTY, Contents, documents, pack_order
 from sagesplat.viewer.pack import write_pack
 from sagesplat.viewer.quality import dumped
@@ -40,6 +40,8 @@ class BundleSizes:
 def write_bundle(out: Path, contents: Contents, viewer: Path, poster: bytes | None = None) -> BundleSizes:
     """Write a bundle into a folder, which is new, empty or an earlier bundle; it is replaced as a whole.
 
+    Where that fails, or is killed, the earlier bundle is kept (see `atomic_folder`).
+
     `viewer`: the folder with the built viewer. `poster`: a JPEG of the first view, shown until the scene is
     drawn. RunError for another folder; SageError without a viewer;
     DataError for a chunk that is missing or not what the index says.
@@ -47,28 +49,19 @@ def write_bundle(out: Path, contents: Contents, viewer: Path, poster: bytes | No
     check_target(out)
     check_viewer(viewer)
     out = out.resolve()
-    fresh, old = (out.with_name(f".{out.name}-{what}") for what in ("new", "old"))
-    for folder in (fresh, old):
-        shutil.rmtree(folder, ignore_errors=True)
     try:
-        shutil.copytree(viewer, fresh)
-        (fresh / "chunks").mkdir()
-        for chunk in contents.chunks:
-            (fresh / "chunks" / chunk.uri).write_bytes(_verified(contents.folder, chunk))
-        if poster is not None:
-            _put_up(fresh, poster)
-        written = write_documents(fresh, contents)
-        if out.exists():
-            out.rename(old)
-        fresh.rename(out)
+        with atomic_folder(out) as fresh:
+            shutil.copytree(viewer, fresh, dirs_exist_ok=True)
+            (fresh / "chunks").mkdir()
+            for chunk in contents.chunks:
+                (fresh / "chunks" / chunk.uri).write_bytes(_verified(contents.folder, chunk))
+            if poster is not None:
+                _put_up(fresh, poster)
+            return write_documents(fresh, contents)
     except OSError as error:
         raise RunError(
             f"{out}: cannot be written ({error.strerror}); free some space or name another folder"
         ) from error
-    finally:
-        for folder in (fresh, old):
-            shutil.rmtree(folder, ignore_errors=True)
-    return written
 
 
 def _put_up(folder: Path, poster: bytes) -> None:

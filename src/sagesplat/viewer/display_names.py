@@ -1,4 +1,4 @@
-"""Titles and colours of categories, for people."""
+"""Colours of categories, for people."""
 
 from collections.abc import Mapping, Sequence
 
@@ -14,14 +14,6 @@ _PALETTE = (
     *("#5b6bf0", "#8b5cf0", "#bf52c9", "#e0568f", "#a8744a", "#6dbd6a", "#7f7fb0", "#b38f6d"),
 )
 _GREY = "#8a94a3"
-_SUFFIXES = ("-merged", "-other", "-stuff")  # of COCO's panoptic names
-
-
-def title_of(name: str) -> str:
-    """A category's name for people: grass for grass-merged."""
-    for suffix in _SUFFIXES:
-        name = name.removesuffix(suffix)
-    return name.replace("-", " ")
 
 
 def colors_of(wanted: Mapping[int, tuple[int, int, int]]) -> dict[int, str]:

@@ -11,11 +11,9 @@ from typing import Any
 import numpy as np
 
 from sagesplat.adapt.allocate import along
-from sagesplat.adapt.bound_plans import Costs, Quality, plan_for_scene, plan_within
-from sagesplat.adapt.eq3 import read_models
-from sagesplat.adapt.observe import TOTAL, as_unit, large_enough, measure, read_observations, render_rgb
-from sagesplat.adapt.plan import Plan, check_target, plan_scene
-from sagesplat.core.config import CompareConfig
+from sagesplat.adapt.observe import TOTAL, as_unit, measure, render_rgb
+from sagesplat.adapt.plan import Plan, check_target
+from sagesplat.core.config import CompareConfig, PlanConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Progress, RunDone, TableMade
 from sagesplat.core.gaussians import Gaussians
@@ -33,10 +31,11 @@ from sagesplat.run.run_dir import RunDir, is_done, settings_of
 from sagesplat.run.stage import Stage, run_stage, run_stages
 from sagesplat.stages.compose import tune_composition
 from sagesplat.stages.fit import fit_ladder
+from sagesplat.stages.methods import NestedLevels, Snapshots, method_of
 from sagesplat.stages.nest import train_capped
 from sagesplat.stages.observe import observe_levels
-from sagesplat.stages.plan import main_target, pixels_of, promised_quality, view_planner
-from sagesplat.stages.shared import label_images, ladder_files, train_config
+from sagesplat.stages.plan import main_target
+from sagesplat.stages.shared import label_images, train_config
 from sagesplat.studies.compare.report import (
     CONSOLE,
     FILE,
@@ -91,26 +90,26 @@ def compare(job: Job, config: CompareConfig, copy: Path | None = None) -> list[P
     lpips = lpips_hashes(config.lpips)
     targets = list(config.targets) or sorted({*PAPER_TARGETS, *settings_of(job.run, "plan")["targets"]})
     settings = json.loads(json.dumps(asdict(config) | {"targets": targets, "lpips": lpips}))
-    is_done(job.run, "compare", settings, [], [file], job.force)  # refused before hours of training
+    is_done(job.run, "compare", settings, None, [file], job.force)  # refused before hours of training
     snapshots = _snapshots(job)
     trained = _trained(job, [*_pruned(job, config, folder), *_mcmc(job, config, folder)])
 
     def make() -> list[str]:
-        costs, quality = promised_quality(job)
+        nested, sage = NestedLevels(job), Snapshots(snapshots)
         contenders = [
             *_snapshot_points(snapshots, config),
-            *_sage(job, snapshots, targets),
+            *_sage(sage, targets, settings_of(job.run, "plan")["share"]),
             *trained.values(),
-            *_nested(job, config, costs, quality),
+            *_nested(nested, config),
         ]
         points = _measure(job, contenders, load_metrics(job, config.lpips))
-        walks = _walks(job, snapshots, costs, quality)
+        walks = _walks(nested, sage)
         (folder / PAGE).unlink(missing_ok=True)  # it shows what was measured before
         write_comparison(file, points, walks, scene=job.scene.name, views=len(job.scene.test_ids))
         return [f"{len(points)} sets in {len(job.scene.test_ids)} test views"]
 
     run = job.run
-    inputs = [run.scene, *ladder_files(run), run.observations, run.plan, snapshots.run.models, *trained]
+    inputs = [run.scene, *method_of(job).files, run.observations, run.plan, snapshots.run.models, *trained]
     run_stage(job, "compare", settings, inputs, [file], make)
     points, walks = read_comparison(file)
     tables = make_tables(points, walks, main_target(run))
@@ -161,8 +160,7 @@ def _check(job: Job, config: CompareConfig) -> None:
 
 def _snapshots(job: Job) -> Job:
     """The paper's job on the same run, its ladder measured and fitted as the nested one."""
-    other = replace(job, run=RunDir(job.run.path, "snapshots"))
-    vars(other).update(scene=job.scene, photos=job.photos)  # the same photos in memory, not twice
+    other = replace(job, run=RunDir(job.run.path, "snapshots"), source=job)
     observe_levels(other, job.fit_config)
     fit_ladder(other, job.fit_config)
     return other
@@ -267,27 +265,21 @@ def _snapshot_points(snapshots: Job, config: CompareConfig) -> list[Contender]:
     return [Contender(SNAPSHOTS, f"step {i}", i, partial(ladder.load, i)) for i in picked]
 
 
-def _sage(job: Job, snapshots: Job, targets: Sequence[float]) -> list[Contender]:
+def _sage(sage: Snapshots, targets: Sequence[float], share: float) -> list[Contender]:
     """The paper's compositions for the scene (Eq. 1 with Eq. 3), from the snapshots."""
-    ladder, scene = snapshots.ladder, job.scene
-    models = read_models(snapshots.run.models)
-    table = large_enough(read_observations(snapshots.run.observations), scene, job.fit_config.min_share)
-    table = table.select((table.level == ladder.levels[-1]) & np.isin(table.view, scene.train_ids))
-    far = {label: table.distance[table.label_id == label] for label, _ in ladder.counts}
-    share = settings_of(job.run, "plan")["share"]
-    found = []
+    ladder, found = sage.job.ladder, []
     for target in targets:
-        plan = plan_scene(models, ladder.counts, far, target, share, recovering=ladder.recovering)
+        plan = sage.plan_scene(target, share)
         name = f"SSIM {target:g}, {plan.status}"
         load = partial(ladder.compose, plan.levels)
         found.append(Contender(SAGE, name, ladder.levels[-1], load, target=target))
     return found
 
 
-def _nested(job: Job, config: CompareConfig, costs: Costs, quality: Quality) -> list[Contender]:
+def _nested(nested: NestedLevels, config: CompareConfig) -> list[Contender]:
     """Prefixes of the same share of every category, and plans: within budgets, and for the run's targets."""
+    job, costs = nested.job, nested.costs
     made = settings_of(job.run, "plan")
-    shown = pixels_of(read_observations(job.run.observations), job, costs.labels, job.scene.train_ids)
     steps = job.snapshots.levels[-1] + settings_of(job.run, "nest")["steps"]
     sent = costs.transfer_bytes.sum(0)
     found = []
@@ -297,10 +289,10 @@ def _nested(job: Job, config: CompareConfig, costs: Costs, quality: Quality) -> 
         found.append(Contender(SAME_SHARE, f"level {k + 1}", steps, load, bytes_of))
     budgets = np.ceil(np.geomspace(sent[0], sent[-1], config.budgets)).tolist()
     plans: list[tuple[str, Plan]] = [
-        (f"{b / 1e6:.3g} MB", plan_within(quality, costs, b, "bytes", shown)) for b in budgets
+        (f"{b / 1e6:.3g} MB", nested.plan_budget(PlanConfig(budget=b))) for b in budgets
     ]
     for target in made["targets"]:
-        plan = plan_for_scene(quality, costs, target, made["share"], shown)
+        plan = nested.plan_scene(target, made["share"])
         plans.append((f"SSIM {target:g}, {plan.status}", plan))
     seen = []
     for name, plan in plans:
@@ -393,10 +385,11 @@ def _send(job: Job, g: Gaussians) -> tuple[dict[int, int], Gaussians]:
     return {c.label_id: c.nbytes for c in chunks}, arrived
 
 
-def _walks(job: Job, snapshots: Job, costs: Costs, quality: Quality) -> list[Walk]:
+def _walks(nested: NestedLevels, sage: Snapshots) -> list[Walk]:
     """From view to view by name at the main target: ours with hysteresis, and the paper's plans."""
+    job, costs = nested.job, nested.costs
     target, views = main_target(job.run), range(len(job.scene.views))
-    chosen = along(quality.bound, costs.transfer_bytes, target=target) + 1
+    chosen = along(nested.quality.bound, costs.transfer_bytes, target=target) + 1
     ours = [dict(zip(costs.labels, levels.tolist(), strict=True)) for levels in chosen]
     chunks = read_index(job.run.increments)
     chunk_files = {
@@ -404,12 +397,11 @@ def _walks(job: Job, snapshots: Job, costs: Costs, quality: Quality) -> list[Wal
         for label in costs.labels
         for k in range(costs.transfer_bytes.shape[1])
     }
-    planned = view_planner(snapshots)
-    theirs = [planned(row, target).levels for row in views]
+    theirs = [sage.plan_view(row, target).levels for row in views]
     needed = sorted({choice for levels in theirs for choice in levels.items()})
     level_files = {
         (label, level): {
-            f"{label} at {level}": sum(_send(job, snapshots.ladder.load(level, [label]))[0].values())
+            f"{label} at {level}": sum(_send(job, sage.job.ladder.load(level, [label]))[0].values())
         }
         for label, level in needed
     }

@@ -27,7 +27,7 @@ class CrossView:
     target: Float32[np.ndarray, " R"]  # SSIM asked for
     view: Int32[np.ndarray, " R"]  # row in Scene.views
     label_id: Int32[np.ndarray, " R"]  # category id, -1 = unlabelled, -2 = the whole image
-    level: Int32[np.ndarray, " R"]  # chosen for this view, a training step; -1 for the whole image
+    level: Int32[np.ndarray, " R"]  # chosen for this view; -1 for the whole image
     count: Int32[np.ndarray, " R"]  # Gaussians of that level; of the composition for the whole image
     predicted: Float32[np.ndarray, " R"]  # promised SSIM; NaN without a model and for the whole image
     ssim: Float32[np.ndarray, " R"]  # measured on the composed scene, over the rendered mask

@@ -4,11 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sagesplat.adapt.coverage import PREDICTORS, score
+from sagesplat.adapt.coverage import PREDICTORS, Decisions
 from sagesplat.adapt.eq3 import read_models
-from sagesplat.adapt.observe import distances_in_views, large_enough, read_observations
+from sagesplat.adapt.observe import distances_in_views, read_observations
 from sagesplat.adapt.plan import Plan, plan_view, read_plans
-from sagesplat.adapt.viewpoint import read_promises
 from sagesplat.core.config import PaperConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Progress, RunDone, TableMade
@@ -19,9 +18,8 @@ from sagesplat.run.job import Job
 from sagesplat.run.run_dir import settings_of
 from sagesplat.run.stage import run_stage
 from sagesplat.stages.compose import tune_composition
-from sagesplat.stages.fit import eroded
-from sagesplat.stages.plan import view_planner
-from sagesplat.stages.shared import distances, label_images, ladder_files
+from sagesplat.stages.methods import method_of
+from sagesplat.stages.shared import distances, observed
 from sagesplat.studies.lpips import load_metrics, lpips_hashes
 from sagesplat.studies.paper.cross_view import NONE, cross_view, read_cross_view
 from sagesplat.studies.paper.report import PaperData, Picture, four_levels, take_pictures, write_paper
@@ -39,22 +37,19 @@ def paper_report(job: Job, config: PaperConfig) -> None:
 
 def cross_views(job: Job) -> None:
     """Plan each unseen view by itself and measure what comes of it."""
-    run = job.run
-    targets = _targets(job)
+    run, method, targets = job.run, method_of(job), _targets(job)
 
     def make() -> list[str]:
         fitted = job.fit_config
-        # nobody has masks of unseen views, the paper says; a promise is measured on the photo's own
-        labels = label_images(job, fitted.masks) if run.ladder == "nested" else None
         table = cross_view(
-            job.scene, job.photos, job.ladder, targets, view_planner(job), labels=labels,
+            job.scene, job.photos, job.ladder, targets, method.plan_view, labels=method.unseen_labels(),
             min_share=fitted.min_share, region=fitted.region,
             backend=job.backend, antialiased=job.antialiased,
             progress=lambda done, total: job.emit(Progress("crossview", done, total)),
         )  # fmt: skip
         table.write_csv(run.cross_view)
-        if run.ladder == "nested":
-            kept = promises_table(job, targets)
+        if scores := method.coverage(targets):
+            kept = promises_table(scores, targets)
             kept.write(run.adapted / "promises_kept")
             job.emit(TableMade(kept.title, kept.header, tuple(map(tuple, kept.cells()))))
         lines = []
@@ -63,30 +58,27 @@ def cross_views(job: Job) -> None:
             lines.append(f"SSIM {target:g}: {fared.kept} of {fared.promised} promises kept on unseen views")
         return lines
 
-    inputs = [run.scene, run.labels, *ladder_files(run), run.plan]
+    inputs = [run.scene, run.labels, *method.files, run.plan]
     run_stage(job, "crossview", {"targets": targets}, inputs, [run.cross_view], make)
 
 
-def promises_table(job: Job, targets: Sequence[float]) -> Table:
-    """Decisions on test views by the paper's model, by ours and by its bound, everything at one level."""
-    run, fitted = job.run, job.fit_config
-    table = large_enough(read_observations(run.observations), job.scene, fitted.min_share)
-    table = eroded(table, fitted.region)
-    scores = score(table, job.scene, read_promises(run.promises), job.ladder.counts, targets)
+def promises_table(scores: Decisions, targets: Sequence[float]) -> Table:
+    """Decisions on test views by Eq. 3, by our model and by its bound, all categories at the same level."""
     body = []
     for predictor in PREDICTORS:
         totals = scores.select(scores.predictor == predictor).totals()
         columns = ("accepted", "kept", "overshoot", "chosen_overshoot", "false_rejections", "regret")
         body.append((predictor, *(totals[name] for name in columns)))
     return Table(
-        "Promises on unseen views, by what they are made from",
+        "Coverage on unseen views, by what predicts the SSIM",
         ("by", "accepted", "kept", "overshoot", "above the lowest", "false rejections", "regret"),
         ("", ",d", ".1%", ".3f", ".3f", ",d", ",.0f"),
         body,
         notes=(
-            "(category, view, target) triples accepted, and the share that measures the target; SSIM "
-            "above it, of all and where a level above the lowest was chosen; triples refused though a level "
-            "measures the target; Gaussians above the cheapest level that would have done. "
+            "accepted: (category, view, target) triples whose target is predicted to be met; kept: the "
+            "share of them that measures it (empirical coverage); overshoot: SSIM above the target, of all "
+            "accepted and where a level above the lowest was chosen; false rejections: triples not accepted "
+            "though a level measures the target; regret: transfer bytes above the cheapest level that does. "
             f"Targets: {', '.join(f'{t:g}' for t in targets)}. oracle: the measurement itself.",
         ),
     )
@@ -144,14 +136,12 @@ def tables_and_figures(job: Job, config: PaperConfig) -> None:
             name: distances_in_views(job.scene, job.point_labels, percentile)
             for name, percentile in reduced.items()
         }
-        observations, fitted = read_observations(run.observations), job.fit_config
-        rows = large_enough(observations, job.scene, fitted.min_share)
         data = PaperData(
             title=job.scene.name,
             names=job.names(),
             colours={label: taxonomy.color(label) for label in job.names()},
-            observations=observations,
-            fitted=eroded(rows, fitted.region),
+            observations=read_observations(run.observations),
+            fitted=observed(job, job.fit_config),
             train_views=job.scene.train_ids,
             test_views=job.scene.test_ids,
             view_names=[v.name for v in job.scene.views],

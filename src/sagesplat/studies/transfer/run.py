@@ -2,13 +2,11 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from sagesplat.adapt.eq3 import read_models
-from sagesplat.adapt.observe import large_enough, read_observations
 from sagesplat.adapt.plan import check_target, plan_view
 from sagesplat.core.errors import RunError, SageError
 from sagesplat.core.events import Warned
@@ -17,7 +15,7 @@ from sagesplat.output.figures import save_figure
 from sagesplat.output.tables import Table
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import settings_of
-from sagesplat.stages.shared import distances
+from sagesplat.stages.shared import distances, observed
 from sagesplat.studies.paper.report import Picture, panel, take_pictures
 from sagesplat.studies.transfer import score
 from sagesplat.studies.transfer.report import headline, summary_table, transfer_figure, transfer_table
@@ -88,13 +86,10 @@ def load_fitted(job: Job) -> FittedRun:
     for path in (run.labels, run.observations, run.models):
         if not path.exists():
             raise RunError(f"{path}: missing; finish this run with `sagesplat run`")
-    rows = large_enough(read_observations(run.observations), scene, job.fit_config.min_share)
-    if job.fit_config.region == "eroded":
-        rows = replace(rows, ssim=rows.ssim_eroded)
     return FittedRun(
         name=str(run.path),
         names=job.names(),
-        observations=rows,
+        observations=observed(job, job.fit_config),
         models=read_models(run.models),
         counts=job.ladder.counts,
         recovering=job.ladder.recovering,

@@ -1,0 +1,175 @@
+"""From words to a command's arguments: old names, the run's own settings, errors in one line."""
+
+import inspect
+import io
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import fields, is_dataclass
+from difflib import get_close_matches
+from functools import wraps
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from sagesplat.cli.help import Flag, flags_of
+from sagesplat.core.errors import SageError
+
+OLD_COMMANDS = {"online": "early-stopping", "parts": "block-categories"}
+OLD_FLAGS = {
+    "--train.pace": "--train.lr-schedule",
+    "--train.rest-share": "--train.gradient-freeze-share",
+    "--nest.seed-share": "--nest.base-share",
+    "--nest.seed-steps": "--nest.base-steps",
+    "--nest.gain": "--nest.lr-multiplier",
+    "--blocks.seam-steps": "--blocks.boundary-steps",
+}
+_SOURCES = {"--segmenter", "--masks", "--model", "--classes"}  # of label images: one given, all are anew
+
+
+class UsageError(SageError):
+    """Words that are no arguments of the command."""
+
+
+def arguments(name: str, function: Callable[..., None], words: Sequence[str]) -> dict[str, Any]:
+    """The arguments of a command: given flags win, else what the run folder records, else the defaults.
+
+    Raises UsageError.
+    """
+    if name == "demo":  # whose folder is positional now
+        words = [word.removeprefix("--run=") for word in words if word != "--run"]
+    words = _renamed(words)
+    values = _parse(name, function, words)
+    known = _recorded(name, function, values, words)
+    return _parse(name, _with_defaults(function, known), words) if known else values
+
+
+def current_command(name: str) -> str:
+    """A command's name, also for one that had another until the last release."""
+    if name in OLD_COMMANDS:
+        _say(f"the command {name} is called {OLD_COMMANDS[name]} now; the old name will go")
+    return OLD_COMMANDS.get(name, name)
+
+
+def _renamed(words: Sequence[str]) -> list[str]:
+    """Words with flags as they are called now."""
+    renamed = []
+    for word in words:
+        flag, equals, value = word.partition("=")
+        new = OLD_FLAGS.get(flag.replace("_", "-"))
+        if new:
+            _say(f"{flag} is called {new} now; the old name will go")
+        renamed.append(f"{new}{equals}{value}" if new else word)
+    return renamed
+
+
+def _say(text: str) -> None:
+    print(f"sagesplat: {text}", file=sys.stderr)
+
+
+def _parse(name: str, function: Callable[..., None], words: Sequence[str]) -> dict[str, Any]:
+    """The arguments that words mean; UsageError, one line, where they mean none."""
+
+    @wraps(function)
+    def take(*_: Any, **values: Any) -> dict[str, Any]:
+        return values
+
+    take.__signature__ = inspect.signature(function)  # pyright: ignore[reportAttributeAccessIssue]
+    printed, prog = io.StringIO(), f"sagesplat {name}"
+    try:
+        with redirect_stdout(printed), redirect_stderr(printed):
+            values, unknown = tyro.cli(
+                take, prog=prog, args=words, return_unknown_args=True, add_help=False, config=()
+            )
+    except SystemExit as end:
+        if not end.code:  # what tyro prints for shells
+            print(printed.getvalue(), end="")
+            raise
+        raise UsageError(f"{_flat(printed.getvalue())}; see `{prog} --help`") from None
+    if unknown:
+        raise UsageError(f"{_unknown(function, unknown)}; see `{prog} --help`")
+    return values
+
+
+def _unknown(function: Callable[..., None], words: Sequence[str]) -> str:
+    """What is wrong with words that are no arguments, with the nearest flag."""
+    word = next((word for word in words if word.startswith("-")), words[0])
+    flag = word.partition("=")[0]
+    if not flag.startswith("-"):
+        return f"{word!r} is one argument too many"
+    known = [f.name for f in flags_of(function) if f.name.startswith("--")]
+    last = {known_flag.rpartition(".")[2]: known_flag for known_flag in known}
+    near = get_close_matches(flag, known, n=1, cutoff=0.5)
+    near = near or [last[m] for m in get_close_matches(flag.strip("-"), last, n=1, cutoff=0.6)]
+    return f"no option {flag}" + (f"; did you mean {near[0]}?" if near else "")
+
+
+def _flat(message: str) -> str:
+    """What tyro says under a title and between rules, as one line."""
+    parts: list[list[str]] = [[]]
+    for line in message.splitlines():
+        text = line.strip("│|╭╮╰╯+ ")
+        if text and not text.strip("─-"):
+            parts.append([])
+        elif text:
+            parts[-1].append(text)
+    body = parts[0][1:] or [line for part in parts[1:2] for line in part]
+    return " ".join(body).rstrip(".:")
+
+
+def _with_defaults(function: Callable[..., None], values: Mapping[str, Any]) -> Callable[..., None]:
+    """The command with other defaults for some of its parameters."""
+
+    @wraps(function)
+    def command(*args: Any, **options: Any) -> None:
+        function(*args, **options)
+
+    signature = inspect.signature(function)
+    changed = [p.replace(default=values.get(p.name, p.default)) for p in signature.parameters.values()]
+    command.__signature__ = signature.replace(parameters=changed)  # pyright: ignore[reportAttributeAccessIssue]
+    return command
+
+
+def _recorded(
+    name: str, function: Callable[..., None], values: Mapping[str, Any], words: Sequence[str]
+) -> dict[str, Any]:
+    """Parameters of a command whose values its run folder records; says which are not the defaults."""
+    path = values.get("run")
+    if not isinstance(path, Path) or not (path / "provenance").is_dir():
+        return {}
+    from sagesplat.run.recorded import recorded_ladder, recorded_settings
+    from sagesplat.run.run_dir import RunDir
+
+    given = {word.partition("=")[0].replace("_", "-").replace("--no-", "--") for word in words}
+    ladder = values.get("ladder") if "--ladder" in given else recorded_ladder(path)
+    known = recorded_settings(RunDir(path, ladder or "nested"), of=name) | {"ladder": ladder}
+    if given & _SOURCES:
+        known.pop("masks", None)
+    known = {key: value for key, value in known.items() if key in values}
+    changed = [
+        _typed(flag, now)
+        for flag in flags_of(function)
+        if flag.name not in given and (now := _now(flag, known, flag.default)) != flag.default
+    ]
+    if changed:
+        _say(f"settings of {path}: {' '.join(changed)}")
+    return known
+
+
+def _now(flag: Flag, known: Mapping[str, Any], default: Any) -> Any:
+    """The recorded value of a flag."""
+    value = known.get(flag.setting[0], default)
+    if len(flag.setting) == 2 and is_dataclass(value) and flag.setting[0] in known:
+        assert flag.setting[1] in {field.name for field in fields(value)}
+        return getattr(value, flag.setting[1])
+    return default if len(flag.setting) == 2 else value
+
+
+def _typed(flag: Flag, value: Any) -> str:
+    """A flag with its value, as one types them."""
+    if isinstance(value, bool):
+        return flag.name if value else flag.name.replace("--", "--no-", 1)
+    parts = [x for pair in value.items() for x in pair] if isinstance(value, dict) else value
+    text = " ".join(map(str, parts)) if isinstance(parts, tuple | list) else str(parts)
+    return f"{flag.name} {text}"

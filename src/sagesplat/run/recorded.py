@@ -1,0 +1,110 @@
+"""The settings that a run folder knows: defaults of the next command on it."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+from sagesplat.core.config import (
+    BlocksConfig,
+    FitConfig,
+    LabelsConfig,
+    LiftConfig,
+    MasksConfig,
+    NestConfig,
+    PlanConfig,
+    PosesConfig,
+    SceneConfig,
+    TrainConfig,
+)
+from sagesplat.run.run_dir import FORMAT, LadderKind, RunDir
+
+Config = TypeVar("Config")
+_PATHS = {"masks", "classes"}  # fields of MasksConfig that are paths
+
+
+def recorded_ladder(path: Path) -> LadderKind:
+    """The kind of levels that a run has results of: snapshots only where there are no others."""
+    kinds: tuple[LadderKind, ...] = ("nested", "snapshots")
+    made = [kind for kind in kinds if (RunDir(path, kind).adapted / "provenance").is_dir()]
+    return "snapshots" if made == ["snapshots"] else "nested"
+
+
+def recorded_settings(run: RunDir, of: str = "run") -> dict[str, Any]:
+    """What a run's records hold, by the name of the setting in `RunConfig` (with `scene_config` for `scene`).
+
+    A stage that was never done is left out, and so is what cannot be read: the stage itself says what is
+    wrong with it. A training that was begun and killed counts. `of`: the command that asks; the seed is that
+    of its stage.
+    """
+    train = _made(run, "train") or _begun(run)
+    nest = _made(run, "nest")
+    observed = {**_made(run, "observe"), **_made(run, "fit")}
+    tuned = nest.get("boundary_steps", nest.get("seam_steps"))
+    boundary = {} if tuned is None else {"boundary_steps": tuned}
+    known: dict[str, Any] = {
+        "scene_config": _config(SceneConfig, _read(run.scene).get("settings")),
+        "poses": _config(PosesConfig, _made(run, "poses")),
+        "masks": _config(MasksConfig, _paths(_read(run.segmentation))),
+        "labels": _config(LabelsConfig, _made(run, "masks")),
+        "lift": _config(LiftConfig, _made(run, "lift")),
+        "train": _config(TrainConfig, train),
+        "blocks": _config(BlocksConfig, {**_made(run, "blocks"), **boundary}),
+        "nest": _config(NestConfig, nest),
+        "fit": _config(FitConfig, observed),
+        "plan": _config(PlanConfig, _made(run, "plan")),
+        "seed": (nest if of == "nest" and nest else train).get("seed"),
+        "fuse": True if run.provenance("fuse").exists() else None,
+    }
+    return {name: value for name, value in known.items() if value is not None}
+
+
+def stage_seconds(run: RunDir) -> dict[str, float]:
+    """How long each finished stage of a run took, by its name."""
+    folders = dict.fromkeys([run.path / "provenance", run.adapted / "provenance"])
+    found = {}
+    for folder in folders:
+        for path in sorted(folder.glob("*.json")):
+            seconds = _read(path).get("seconds")
+            if isinstance(seconds, int | float):
+                found[path.stem] = float(seconds)
+    return found
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """A JSON object, empty where there is none that can be read."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def _made(run: RunDir, stage: str) -> dict[str, Any]:
+    """The settings of a finished stage, empty where it is not done or of another format."""
+    made = _read(run.provenance(stage))
+    settings = made.get("settings")
+    return settings if made.get("format") == FORMAT and isinstance(settings, dict) else {}
+
+
+def _begun(run: RunDir) -> dict[str, Any]:
+    """The settings of a training that did not end: of the run, or of its first block."""
+    for folder in (run.replacement, run, run.block(0)):
+        settings = _read(folder.cap).get("settings")
+        if isinstance(settings, dict):
+            return settings
+    return {}
+
+
+def _paths(settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {k: Path(v) if k in _PATHS and v is not None else v for k, v in settings.items()}
+
+
+def _config(kind: type[Config], settings: Any) -> Config | None:
+    """Settings of a kind from a JSON object; None where it holds none of them."""
+    if not isinstance(settings, Mapping):
+        return None
+    names = [field.name for field in fields(kind)]  # pyright: ignore[reportArgumentType]
+    values = {k: tuple(v) if isinstance(v, list) else v for k, v in settings.items() if k in names}
+    return kind(**values) if values else None

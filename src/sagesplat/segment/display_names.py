@@ -1,0 +1,30 @@
+"""Names of categories, for people."""
+
+from collections import Counter
+from collections.abc import Mapping
+
+from sagesplat.segment.block_categories import split_name
+
+_SUFFIXES = ("-merged", "-other", "-stuff")  # of COCO's panoptic names
+
+
+def title_of(name: str) -> str:
+    """A category's name for people: grass for grass-merged."""
+    for suffix in _SUFFIXES:
+        name = name.removesuffix(suffix)
+    return name.replace("-", " ")
+
+
+def titles(names: Mapping[int, str]) -> dict[int, str]:
+    """Names for people by label id; names whose short forms are the same keep their full ones.
+
+    The categories of blocks keep their block: grass@2 for grass-merged@2.
+    """
+    short = {label: _short(name) for label, name in names.items()}
+    times = Counter(short.values())
+    return {label: short[label] if times[short[label]] == 1 else name for label, name in names.items()}
+
+
+def _short(name: str) -> str:
+    category, block = split_name(name)
+    return title_of(category) if block is None else f"{title_of(category)}@{block}"

@@ -1,0 +1,181 @@
+"""What a script calls: the whole pipeline on a capture, and the results of a finished run.
+
+`import sagesplat` exports these names. They do what the commands `sagesplat run`, `plan` and `compose` do.
+"""
+
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from sagesplat.adapt.bound_plans import Costs, plan_for_view, quality_at
+from sagesplat.adapt.eq3 import read_models
+from sagesplat.adapt.observe import PERCENTILE, distances_in_views
+from sagesplat.adapt.plan import Plan, plan_view, read_plans
+from sagesplat.adapt.viewpoint import ViewModel, read_promises
+from sagesplat.core.config import RunConfig
+from sagesplat.core.errors import RunError
+from sagesplat.core.events import Emit, Event
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.raster import Backend, cuda, resolve_backend, set_threads
+from sagesplat.run.job import NO_RUN, Job
+from sagesplat.run.run_dir import LadderKind, RunDir
+from sagesplat.scene.scene import Camera, Scene, View
+from sagesplat.stages import pipeline
+from sagesplat.stages.methods import NestedLevels
+
+
+def ignore(event: Event) -> None:
+    """The default receiver of events: none."""
+
+
+def run_scene(
+    scene: Path | str,
+    folder: Path | str,
+    config: RunConfig = RunConfig(),  # noqa: B008 - frozen
+    *,
+    on_event: Emit = ignore,
+    device: str = "auto",
+    backend: Backend = "auto",
+    threads: int = 0,
+    force: bool = False,
+) -> "FinishedRun":
+    """Run the whole pipeline on a capture: what the command `sagesplat run SCENE RUN` does.
+
+    Stages whose results are in `folder` already, made with the same settings, are skipped. A killed run is
+    resumed by the same call.
+
+    Args:
+        scene: The capture: a COLMAP workspace, nerfstudio's transforms.json, a Blender scene, a folder of
+            photos or a video.
+        folder: The run folder; made if it is not there.
+        config: Settings of every stage.
+        on_event: Called with each event (`StageDone`, `Warned`, ...). Nothing is printed otherwise.
+        device: "auto" (a CUDA GPU where there is one that works), "cpu" or "cuda".
+        backend: Rasteriser: "auto", "cpu", "cuda" or "reference".
+        threads: CPU threads; 0: one per core. Set for the whole process.
+        force: Redo results that were made with other settings.
+
+    Returns:
+        The finished run.
+
+    Raises:
+        SageError: For anything wrong with the capture, the settings, the run folder or the machine. The
+            message is one line: path, problem, cure.
+
+    Example:
+        >>> from sagesplat import RunConfig, TrainConfig, run_scene
+        >>> config = RunConfig(train=TrainConfig(max_steps=3000))
+        >>> run = run_scene("captures/garden", "runs/garden", config, on_event=print)  # doctest: +SKIP
+        >>> run.plans[0].count  # doctest: +SKIP
+    """
+    if (device, backend) == ("auto", "auto") and cuda.missing() is None:
+        device = "cuda"
+    backend, threads = resolve_backend(backend, device), set_threads(threads)
+    run = RunDir(Path(folder), config.ladder)
+    with ExitStack() as locks:  # nobody else writes into the folder between two stages
+        job = Job(run, on_event, backend, threads, force, device=device, locks=locks)
+        pipeline.run_all(job, Path(scene), config)
+    return open_run(folder, config.ladder)
+
+
+def open_run(folder: Path | str, ladder: LadderKind = "nested") -> "FinishedRun":
+    """Open a finished run; its files are read when they are first asked for.
+
+    Args:
+        folder: The run folder.
+        ladder: Which levels to look at: "nested" (prefixes of one model) or "snapshots" (the paper's).
+
+    Returns:
+        The run's scene, levels, plans and SSIM models.
+
+    Raises:
+        RunError: If `folder` is not a run folder.
+
+    Example:
+        >>> from sagesplat import open_run
+        >>> run = open_run("runs/garden")  # doctest: +SKIP
+        >>> plan = run.plan_camera(run.scene.views[0].camera, target_ssim=0.8)  # doctest: +SKIP
+        >>> gaussians = run.compose(plan)  # doctest: +SKIP
+    """
+    run = RunDir(Path(folder), ladder)
+    if not run.scene.exists():
+        raise RunError(f"{run.path}: {NO_RUN}")
+    return FinishedRun(Job(run, ignore))
+
+
+@dataclass(frozen=True, eq=False)
+class FinishedRun:
+    """The results of a run folder. Made by `open_run` and `run_scene`."""
+
+    job: Job
+
+    @property
+    def scene(self) -> Scene:
+        """The capture that the run was made from. SceneError or RunError where it is gone or changed."""
+        return self.job.scene
+
+    @cached_property
+    def names(self) -> dict[int, str]:
+        """Category names by label id; -1 is the unlabelled one."""
+        return self.job.names()
+
+    @cached_property
+    def plans(self) -> tuple[Plan, ...]:
+        """The scene's plans, one per target SSIM, ascending. RunError before `sagesplat plan`."""
+        return read_plans(self.job.run.plan)[0]
+
+    @cached_property
+    def promises(self) -> dict[int, ViewModel]:
+        """The SSIM model of each category, by label id (nested ladder). RunError before `sagesplat fit`."""
+        return read_promises(self.job.run.promises)
+
+    @cached_property
+    def costs(self) -> Costs:
+        """Gaussians and bytes of each category's levels; of a nested ladder."""
+        return NestedLevels(self.job).costs
+
+    def plan_camera(self, camera: Camera, target_ssim: float) -> Plan:
+        """The cheapest level of each category whose predicted SSIM reaches a target from one camera (Eq. 1).
+
+        The camera may be anywhere: no photo has to be taken there. For a nested ladder the prediction is the
+        calibrated lower bound of the promises, for snapshots it is Eq. 3 at the category's distance.
+
+        Args:
+            camera: The viewer's: pose in the world of `scene`, intrinsics and image size in pixels.
+            target_ssim: SSIM that every category is to reach, above 0 and at most 1.
+
+        Returns:
+            One level per category; `status` is "infeasible" where a category cannot reach the target.
+
+        Raises:
+            RunError: For an impossible target, or before the run has models.
+        """
+        view = View("viewer", camera, Path())
+        # Distances have to be measured as those that the models were fitted to.
+        percentile = PERCENTILE if self.job.fit_config.distance == "percentile" else 0.0
+        viewer = replace(self.scene, views=(view,))
+        distances = distances_in_views(viewer, self.job.point_labels, percentile)
+        if self.job.run.ladder == "nested":
+            quality = quality_at(self.costs, self.promises, distances, [camera])
+            return replace(plan_for_view(quality, self.costs, target_ssim, 0), view=None)
+        ladder, models = self.job.ladder, read_models(self.job.run.models)
+        near = {label: float(np.float64(d[0])) for label, d in distances.items()}
+        return plan_view(models, ladder.counts, near, target_ssim, None, recovering=ladder.recovering)
+
+    def compose(self, plan: Plan | Mapping[int, int]) -> Gaussians:
+        """The Gaussians of a plan: each category at its level.
+
+        Args:
+            plan: A plan, or levels by label id.
+
+        Returns:
+            All categories merged, on the CPU. `write_ply` and `write_spz` save them.
+
+        Raises:
+            RunError: For a level that the ladder does not have.
+        """
+        return self.job.ladder.compose(plan.levels if isinstance(plan, Plan) else plan)

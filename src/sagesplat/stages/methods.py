@@ -1,0 +1,223 @@
+"""How a scene is adapted: the paper's snapshots or nested levels, behind one protocol.
+
+Stages and studies ask `method_of` what they need and never which of the two it is.
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from sagesplat.adapt.bound_plans import Costs, Quality, plan_for_scene, plan_for_view, plan_within, quality_at
+from sagesplat.adapt.coverage import Decisions, score
+from sagesplat.adapt.eq3 import SsimModel, read_models
+from sagesplat.adapt.observe import LabelImages, Observations
+from sagesplat.adapt.plan import Plan, plan_scene, plan_view
+from sagesplat.adapt.viewpoint import read_promises, write_promises
+from sagesplat.core.config import FitConfig, PlanConfig
+from sagesplat.core.errors import RunError
+from sagesplat.formats.increments import INDEX, read_index, totals
+from sagesplat.run.job import Job
+from sagesplat.stages.shared import distances, label_images, label_named, observed
+from sagesplat.stages.viewpoints import fit_viewpoints
+
+Curves = Mapping[tuple[int, int], SsimModel]  # Eq. 3 by (label id, level)
+
+
+class Method(Protocol):
+    """Levels of a run, what predicts their SSIM, and what they cost. The levels themselves: `Job.ladder`."""
+
+    level_files: Sequence[Path]  # what the levels are read from
+    model_files: Sequence[Path]  # what `fit` leaves
+    files: Sequence[Path]  # what a plan, and all that is made from it, depends on
+    fit_settings: tuple[str, ...]  # fields of FitConfig that the models depend on
+    streams: bool  # whether a viewer can load the levels
+
+    def fit(self, table: Observations, config: FitConfig, curves: Curves) -> list[str]:
+        """Fit what there is beside Eq. 3; `table`: of views that show enough of a category."""
+        return []
+
+    def check(self, config: PlanConfig) -> None:
+        """RunError for a plan that cannot be made of these levels."""
+
+    def predicted(self, label_id: int, level: int, row: int) -> float:
+        """SSIM that plans count on in a view (row of Scene.views); NaN where nothing is known."""
+        ...
+
+    def plan_view(self, row: int, target: float) -> Plan:
+        """The cheapest levels predicted to reach `target` in a view, seen or not."""
+        ...
+
+    def plan_scene(self, target: float, share: float) -> Plan:
+        """The cheapest levels predicted to reach `target` in a `share` of the training views."""
+        ...
+
+    def plan_budget(self, config: PlanConfig) -> Plan:
+        """The levels of most predicted SSIM within the budget."""
+        ...
+
+    def amount(self, plan: Plan) -> str:
+        """What a plan takes of all there is, for people."""
+        ...
+
+    def unseen_labels(self) -> LabelImages | None:
+        """The label images of test views; None: as the Gaussians paint them, as the paper has no others."""
+        return None
+
+    def coverage(self, targets: Sequence[float]) -> Decisions | None:
+        """How decisions by a lower confidence bound fare on test views; None without such a bound."""
+        return None
+
+
+class Snapshots(Method):
+    """The paper's: snapshots of the training, Eq. 3 over distance, the fewest Gaussians (Eq. 1)."""
+
+    fit_settings = ("min_share", "region")
+    streams = False
+
+    def __init__(self, job: Job) -> None:
+        self.job = job
+        self.level_files, self.model_files = [job.run.levels], [job.run.models]
+        self.files = [*self.level_files, *self.model_files]
+
+    @cached_property
+    def _models(self) -> Curves:
+        return read_models(self.job.run.models)
+
+    @cached_property
+    def _distances(self) -> dict[int, np.ndarray]:
+        return distances(self.job, self.job.fit_config.distance)
+
+    @cached_property
+    def _training_distances(self) -> dict[int, np.ndarray]:
+        """Of the training views that show enough of a category, by label id."""
+        seen = _training_rows(self.job)
+        return {label: seen.distance[seen.label_id == label] for label, _ in self.job.ladder.counts}
+
+    def check(self, config: PlanConfig) -> None:
+        """See `Method`."""
+        if config.budget:
+            self.plan_budget(config)
+
+    def predicted(self, label_id: int, level: int, row: int) -> float:
+        """See `Method`."""
+        model = self._models.get((label_id, level))
+        return model(self._distance(label_id, row)) if model else np.nan
+
+    def _distance(self, label_id: int, row: int) -> float:
+        return float(self._distances[label_id][row]) if label_id in self._distances else np.nan
+
+    def plan_view(self, row: int, target: float) -> Plan:
+        """See `Method`."""
+        ladder = self.job.ladder
+        here = {label: self._distance(label, row) for label in self._distances}
+        return plan_view(self._models, ladder.counts, here, target, row, recovering=ladder.recovering)
+
+    def plan_scene(self, target: float, share: float) -> Plan:
+        """See `Method`."""
+        ladder, far = self.job.ladder, self._training_distances
+        return plan_scene(self._models, ladder.counts, far, target, share, recovering=ladder.recovering)
+
+    def plan_budget(self, config: PlanConfig) -> Plan:
+        """See `Method`."""
+        raise RunError("--budget needs the nested ladder; use --ladder nested")
+
+    def amount(self, plan: Plan) -> str:
+        """See `Method`."""
+        full = self.job.ladder.size(self.job.ladder.levels[-1])
+        return f"{plan.count:,} of {full:,} Gaussians"
+
+
+class NestedLevels(Method):
+    """Ours: prefixes of one model, a lower confidence bound of SSIM by viewpoint, the fewest bytes."""
+
+    fit_settings = ("min_share", "region", "confidence")
+    streams = True
+
+    def __init__(self, job: Job) -> None:
+        run = job.run
+        self.job = job
+        self.level_files = [run.prefixes, run.increments / INDEX]
+        self.model_files = [run.models, run.promises]
+        self.files = [*self.level_files, run.promises]
+
+    @cached_property
+    def costs(self) -> Costs:
+        """What the levels cost."""
+        labels = sorted({label for label, _ in self.job.ladder.counts})
+        chunks, levels = read_index(self.job.run.increments), len(self.job.ladder.levels)
+        columns = (totals(chunks, labels, levels, name) for name in ("count", "nbytes", "gpu_bytes"))
+        return Costs(tuple(labels), *columns)
+
+    @cached_property
+    def quality(self) -> Quality:
+        """What is predicted of the levels in every view of the scene."""
+        job = self.job
+        far = distances(job, job.fit_config.distance)
+        cameras = [view.camera for view in job.scene.views]
+        return quality_at(self.costs, read_promises(job.run.promises), far, cameras)
+
+    @cached_property
+    def shown(self) -> np.ndarray:
+        """Pixels of each category in each training view, float64 [V, L]; 0 for small shares."""
+        seen, pixels = _training_rows(self.job), np.zeros(self.quality.distance.shape)
+        for i, label in enumerate(self.costs.labels):
+            mine = seen.select(seen.label_id == label)
+            pixels[mine.view, i] = mine.num_pixels
+        return pixels
+
+    def fit(self, table: Observations, config: FitConfig, curves: Curves) -> list[str]:
+        """See `Method`."""
+        promises = fit_viewpoints(self.job, self.costs, table, config, curves)
+        write_promises(self.job.run.promises, promises)
+        statuses = [model.status for model in promises.values()]
+        return ["promises: " + ", ".join(f"{statuses.count(s)} {s}" for s in sorted(set(statuses)))]
+
+    def predicted(self, label_id: int, level: int, row: int) -> float:
+        """See `Method`."""
+        return float(self.quality.bound[row, self.costs.labels.index(label_id), level - 1])
+
+    def plan_view(self, row: int, target: float) -> Plan:
+        """See `Method`."""
+        return plan_for_view(self.quality, self.costs, target, row)
+
+    def plan_scene(self, target: float, share: float) -> Plan:
+        """See `Method`."""
+        return plan_for_scene(self.quality, self.costs, target, share, self.shown)
+
+    def plan_budget(self, config: PlanConfig) -> Plan:
+        """See `Method`."""
+        weights = {label_named(self.job, name): weight for name, weight in config.weights.items()}
+        return plan_within(self.quality, self.costs, config.budget, config.budget_unit, self.shown, weights)
+
+    def amount(self, plan: Plan) -> str:
+        """See `Method`."""
+        full = int(self.costs.transfer_bytes[:, -1].sum())
+        return f"{(plan.transfer_bytes or 0) / 1e6:.2f} of {full / 1e6:.2f} MB, {plan.count:,} Gaussians"
+
+    def unseen_labels(self) -> LabelImages | None:
+        """See `Method`: a promise is measured on the photo's own."""
+        return label_images(self.job, self.job.fit_config.masks)
+
+    def coverage(self, targets: Sequence[float]) -> Decisions | None:
+        """See `Method`; every category at the same level, costs in transfer bytes."""
+        job = self.job
+        sent = zip(self.costs.labels, self.costs.transfer_bytes.tolist(), strict=True)
+        costs = {(label, level): n for label, row in sent for level, n in enumerate(row, 1)}
+        return score(
+            observed(job, job.fit_config), job.scene, read_promises(job.run.promises), costs, targets
+        )
+
+
+def _training_rows(job: Job) -> Observations:
+    """A row for each training view that shows enough of a category; what it measures is of the last level."""
+    table = observed(job, job.fit_config)
+    last = table.level == job.ladder.levels[-1]
+    return table.select(last & np.isin(table.view, job.scene.train_ids))
+
+
+def method_of(job: Job) -> Method:
+    """The method of the run's ladder."""
+    return (NestedLevels if job.run.ladder == "nested" else Snapshots)(job)

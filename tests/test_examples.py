@@ -1,0 +1,109 @@
+"""The examples as a user runs them: they import `sagesplat` alone, work, and fail in one line."""
+
+import ast
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from sagesplat import read_ply
+from sagesplat.demo.capture import make_capture
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+SCRIPTS = sorted(EXAMPLES.glob("*.py"))
+
+
+def run(name: str, *words: object, code: int = 0, **env: str) -> subprocess.CompletedProcess[str]:
+    (script,) = EXAMPLES.glob(f"{name}_*.py")
+    command = [sys.executable, str(script), *map(str, words)]
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, env={**os.environ, **env}, timeout=300
+    )
+    assert done.returncode == code, done.stderr
+    return done
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("demo") / "capture"
+    make_capture(folder, views=10, width=64, height=48)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def finished(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    folder = tmp_path_factory.mktemp("run") / "run"
+    words = ("--target-ssim", 0.4, "--max-steps", 60, "--nest-steps", 20)
+    return folder, run("01", capture, folder, *words).stdout
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
+def test_examples_import_nothing_deeper_than_sagesplat(script):
+    names = [
+        name
+        for node in ast.walk(ast.parse(script.read_text()))
+        for name in (
+            [node.module or ""]
+            if isinstance(node, ast.ImportFrom)
+            else [alias.name for alias in node.names]
+            if isinstance(node, ast.Import)
+            else []
+        )
+        if name.startswith("sagesplat")
+    ]
+    assert names == ["sagesplat"]
+
+
+def test_a_run_from_python_shows_its_stages_and_plans(capture, finished):
+    folder, text = finished
+    assert "train: " in text
+    assert "SSIM 0.4: " in text
+    again = run("01", capture, folder, "--target-ssim", 0.4, "--max-steps", 60, "--nest-steps", 20).stdout
+    assert "train: up to date" in again
+    assert again[again.index("\n\nSSIM") :] == text[text.index("\n\nSSIM") :]
+
+
+def test_a_plan_for_a_viewer_is_written_and_grows_with_the_target(finished, tmp_path):
+    folder, _ = finished
+    counts = []
+    for target in (0.2, 0.4):
+        ply = tmp_path / f"{target}.ply"
+        text = run("02", folder, "view_001.png", ply, "--target-ssim", target, "--back", 1).stdout
+        counts.append(int(text.splitlines()[-1].split()[1].replace(",", "")))
+        assert len(read_ply(ply)) == counts[-1]
+    assert 0 < counts[0] < counts[1]
+
+
+def test_a_render_has_the_size_that_was_asked_for(capture, finished, tmp_path):
+    ply, png = finished[0] / "nested" / "composed.ply", tmp_path / "out.png"
+    run("03", ply, capture, "view_001.png", png, "--width", 32)
+    image = Image.open(png)
+    assert image.size == (32, 24)
+    assert any(low < high for low, high in image.convert("RGB").getextrema())
+
+
+def test_without_a_network_a_label_image_costs_one_line(tmp_path):
+    Image.new("RGB", (32, 24)).save(tmp_path / "a.jpg")
+    env = {"HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "hub")}
+    error = run("04", tmp_path / "out", tmp_path / "a.jpg", code=1, **env).stderr
+    assert error.count("\n") == 1
+    assert error.startswith("04_label_photos.py: ")
+    assert "hf download" in error or "pip install" in error
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("01", ("absent", "run")),
+        ("02", ("absent", "a.png", "out.ply")),
+        ("03", ("absent.ply", "absent", "a.png", "out.png")),
+    ],
+)
+def test_what_is_not_there_is_one_line(name, words, tmp_path):
+    paths = [tmp_path / word if word != "a.png" else word for word in words]
+    error = run(name, *paths, code=1).stderr
+    assert error.count("\n") == 1
+    assert str(tmp_path) in error

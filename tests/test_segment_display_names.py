@@ -1,0 +1,25 @@
+"""Names of categories, for people."""
+
+import pytest
+
+from sagesplat.segment.display_names import title_of, titles
+
+
+@pytest.mark.parametrize(
+    ("name", "title"),
+    [
+        ("grass-merged", "grass"), ("building-other-merged", "building"), ("sky-other-merged", "sky"),
+        ("door-stuff", "door"), ("wall-brick", "wall brick"), ("dining table", "dining table"),
+    ],
+)  # fmt: skip
+def test_titles(name: str, title: str) -> None:
+    assert title_of(name) == title
+
+
+def test_names_that_become_the_same_stay_as_they_are() -> None:
+    names = {1: "wall-other-merged", 2: "wall", 3: "grass-merged", -1: "unlabelled"}
+    assert titles(names) == {1: "wall-other-merged", 2: "wall", 3: "grass", -1: "unlabelled"}
+
+
+def test_categories_of_blocks_keep_their_block() -> None:
+    assert titles({1: "grass-merged@0", 2: "grass-merged@1"}) == {1: "grass@0", 2: "grass@1"}

@@ -1,0 +1,83 @@
+"""What scripts call gives what the commands give."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from sagesplat import (
+    FinishedRun,
+    NestConfig,
+    PlanConfig,
+    RunConfig,
+    SageError,
+    StageDone,
+    TrainConfig,
+    open_run,
+    read_ply,
+    run_scene,
+)
+from sagesplat.adapt.plan import Plan, read_plans
+from sagesplat.core.errors import RunError
+from sagesplat.demo.capture import make_capture
+
+CONFIG = RunConfig(
+    train=TrainConfig(max_steps=60, level_every=20),
+    nest=NestConfig(steps=20, levels=4, base_steps=20),
+    plan=PlanConfig(target_ssim=0.4),
+)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, FinishedRun]:
+    folder = tmp_path_factory.mktemp("runs")
+    make_capture(folder / "capture", views=9, width=64, height=48)
+    events = []
+    found = {
+        ladder: run_scene(folder / "capture", folder / "run", config, on_event=events.append, threads=1)
+        for ladder, config in (("nested", CONFIG), ("snapshots", replace(CONFIG, ladder="snapshots")))
+    }
+    stages = [event.name for event in events if isinstance(event, StageDone)]
+    assert stages.count("train") == 1  # both ladders are of one training
+    assert stages.count("plan") == 2
+    return found
+
+
+@pytest.mark.parametrize("ladder", ["nested", "snapshots"])
+def test_a_plan_for_the_camera_of_a_view_is_the_plan_of_that_view(runs, ladder):
+    run = runs[ladder]
+    _, view_plans = read_plans(run.job.run.plan)
+    for row in (0, 4):
+        plan = run.plan_camera(run.scene.views[row].camera, 0.4)
+        assert plan.levels == view_plans[row].levels
+        assert plan.view is None
+        assert plan.status == view_plans[row].status
+
+
+@pytest.mark.parametrize("ladder", ["nested", "snapshots"])
+def test_a_composition_is_what_the_run_wrote(runs, ladder):
+    run = runs[ladder]
+    (plan,) = (plan for plan in run.plans if plan.target == 0.4)
+    g, written = run.compose(plan), read_ply(run.job.run.composed)
+    assert torch.equal(g.means, written.means)
+    assert torch.equal(run.compose(plan.levels).label_ids, written.label_ids)
+    assert set(run.names) >= set(plan.levels)
+
+
+def test_a_run_is_opened_again(runs):
+    run = open_run(runs["nested"].job.run.path)
+    assert [plan.target for plan in run.plans] == [0.3, 0.4, 0.5]
+    assert isinstance(run.plans[0], Plan)
+    assert set(run.promises) <= set(run.names)
+    assert run.costs.count.shape[1] == 4
+
+
+def test_what_is_no_run_folder_is_said(tmp_path: Path):
+    with pytest.raises(RunError, match="not a run folder"):
+        open_run(tmp_path)
+
+
+def test_an_impossible_backend_is_said(tmp_path: Path):
+    with pytest.raises(SageError, match="--backend"):
+        run_scene(tmp_path, tmp_path / "run", device="cpu", backend="cuda")
