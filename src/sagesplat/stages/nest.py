@@ -1,4 +1,4 @@
-"""Make the nested levels of a run: order its Gaussians, train their prefixes, write the increments."""
+"""Makes the nested levels and their increments, from the trained Gaussians: orders them, trains prefixes."""
 
 from dataclasses import asdict
 

@@ -1,4 +1,4 @@
-"""Train 3DGS from the labelled points and record the levels."""
+"""Makes the levels: trains 3DGS from the labelled points and records snapshots."""
 
 import shutil
 from dataclasses import asdict
