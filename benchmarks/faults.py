@@ -29,7 +29,7 @@ NODES = 3
 FULL = re.compile(
     r"sagesplat: [^\n]*no space left, the disk is full; free [\d,]+ MB and run the same command[^\n]*\n"
 )
-_BEFORE = {"train": "blocks", "nest": "parts"}  # the stage that ends before another begins
+_BEFORE = {"train": "blocks", "nest": "block_categories"}  # the stage that ends before another begins
 
 
 @dataclass

@@ -1,5 +1,6 @@
 """The command line: errors are one line and exit code 2, and help answers at once."""
 
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from sagesplat import cli
+from sagesplat.cli import help
 
 
 def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str]:
@@ -106,3 +108,94 @@ def test_help_lists_every_command(
             cli.main()
         assert end.value.code == 0
         assert f"sagesplat {name}" in capsys.readouterr().out
+
+
+def printed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    monkeypatch.setattr(sys, "argv", ["sagesplat", *words])
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit):
+        cli.main()
+    return capsys.readouterr().out
+
+
+def test_help_of_run_shows_first_what_most_people_need(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    short, full = (printed(monkeypatch, capsys, "run", flag) for flag in ("--help", "--help-all"))
+    shown = [line.split()[0] for line in short.splitlines() if line.startswith("  --")]
+    assert set(shown) == help._COMMON
+    assert "--help-all" in short
+    everything = {flag.name for flag in help.flags_of(cli.COMMANDS["run"]) if flag.name.startswith("--")}
+    assert {line.split()[0] for line in full.splitlines() if line.startswith("  --")} == everything
+    for text in (short, full):
+        assert "SCENE" in text
+        assert max(len(line) for line in text.splitlines() if "{" not in line) <= 80
+
+
+def test_every_argument_of_every_command_has_help() -> None:
+    for name, function in cli.COMMANDS.items():
+        flags = list(help.flags_of(function))
+        assert len({flag.name for flag in flags}) == len(flags), name
+        assert [f.name for f in flags if not f.help] == [], name
+        assert not [f.name for f in flags if "worth" in f.help or "put together" in f.help.lower()]
+
+
+@pytest.mark.parametrize(
+    ("command", "absent"),
+    [
+        ("plan", ["--processes", "--memory-limit", "--executor", "--device", "--threads"]),
+        ("bundle", ["--processes", "--memory-limit", "--executor", "--force"]),
+        ("compose", ["--processes", "--memory-limit", "--executor"]),
+        ("lift", ["--processes", "--backend"]),
+    ],
+)
+def test_a_command_has_the_flags_that_it_uses(command: str, absent: list[str]) -> None:
+    names = {flag.name for flag in help.flags_of(cli.COMMANDS[command])}
+    assert not names & set(absent)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["run", "a"], "Missing from sagesplat run: RUN"),
+        (["run", "a", "b", "--train.max-steps", "x"], "Error parsing --train.max-steps"),
+        (
+            ["run", "a", "b", "--trian.max-steps", "3"],
+            "no option --trian.max-steps; did you mean --train.max",
+        ),
+        (["run", "a", "b", "--max-steps", "3"], "no option --max-steps; did you mean --train.max-steps?"),
+        (["demo", "a", "b"], "'b' is one argument too many"),
+        (["run", "a", "b", "--device", "gpu"], "invalid choice 'gpu' for argument '--device'"),
+        (["export", "a", "b", "--level"], "Missing value for argument '--level'"),
+    ],
+)
+def test_words_that_cannot_be_parsed_are_one_line(
+    words: list[str], says: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, error = call(monkeypatch, capsys, *words)
+    assert code == 2
+    assert error.startswith(f"sagesplat: {says}")
+    assert error.endswith(f"see `sagesplat {words[0]} --help`\n")
+    assert error.count("\n") == 1
+
+
+def test_demo_takes_its_folder_with_and_without_the_flag(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from sagesplat.stages import pipeline
+
+    seen = []
+    monkeypatch.setattr(pipeline, "run_demo", lambda job, places: seen.append(job.run.path.name))
+    for words in ([], ["x"], ["--run", "y"], ["--run=z"]):
+        assert call(monkeypatch, capsys, "demo", *words)[0] == 0
+    assert seen == ["demo", "x", "y", "z"]
+
+
+def test_an_example_without_its_network_ends_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    example = Path(__file__).parents[1] / "examples" / "04_label_photos.py"
+    monkeypatch.setattr(sys, "argv", ["04", str(tmp_path), "a.jpg", "--model", "no/such/network/here"])
+    with pytest.raises(SystemExit, match="no such folder") as end:
+        runpy.run_path(str(example), run_name="__main__")
+    assert str(end.value).count("\n") == 0

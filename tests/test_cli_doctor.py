@@ -158,3 +158,17 @@ def test_programs_that_are_not_there_or_fail_say_nothing() -> None:
 def test_lines_are_not_wrapped_where_they_are_piped() -> None:
     long = Finding("part", "gap", "word " * 40, "cure " * 40)
     assert len(printed([long, Finding("a longer part", "fine", "yes")]).splitlines()) == 3
+
+
+def test_building_without_a_gpu_is_an_error(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(sys, "argv", ["sagesplat", "doctor", "--build"])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code == 2
+    error = capsys.readouterr().err
+    assert error.startswith("sagesplat: --build: nothing was built: ")
+    assert error.count("\n") == 1
+    assert doctor.unbuilt([Finding("cuda kernels", "fine", "agree")]) == ""

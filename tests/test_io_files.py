@@ -1,12 +1,16 @@
 """Files are replaced whole or not at all."""
 
 import errno
+import os
 import stat
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
 from sagesplat.core.errors import RunError
-from sagesplat.io.files import atomic_path, read_json, write_json, write_text
+from sagesplat.io.files import atomic_folder, atomic_path, read_json, write_json, write_text
 
 
 def test_json_round_trip_in_the_order_given(tmp_path):
@@ -54,3 +58,62 @@ def test_json_that_cannot_be_read_is_one_line(tmp_path, content):
     with pytest.raises(RunError, match=r"a\.json: (no such file|not readable as JSON)") as caught:
         read_json(path)
     assert "\n" not in str(caught.value)
+
+
+def replaced(folder: Path, name: str) -> None:
+    """Replace a folder by one with a file of this name."""
+    with atomic_folder(folder) as fresh:
+        (fresh / name).write_text(name)
+
+
+@pytest.mark.parametrize("failing", [1, 2])
+def test_a_folder_that_cannot_be_swapped_stays_as_it_was(tmp_path: Path, monkeypatch, failing: int) -> None:
+    """The first rename takes the earlier folder aside, the second brings the new one in."""
+    folder, rename, times = tmp_path / "a", Path.rename, 0
+    replaced(folder, "old")
+
+    def fails(self: Path, target: Path) -> Path:
+        nonlocal times
+        times += 1
+        if times == failing:
+            raise PermissionError(errno.EACCES, "held by another program")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", fails)
+    with pytest.raises(PermissionError):
+        replaced(folder, "new")
+    assert [path.name for path in folder.iterdir()] == ["old"]
+    assert list(tmp_path.iterdir()) == [folder]
+
+
+KILLED_IN_A_SWAP = """
+import os, signal, sys
+from pathlib import Path
+from sagesplat.io.files import atomic_folder
+rename = Path.rename
+def dies_after(self, target):
+    rename(self, target)
+    os.kill(os.getpid(), signal.SIGKILL)
+with atomic_folder(Path(sys.argv[1])) as fresh:
+    (fresh / "new").write_text("new")
+    Path.rename = dies_after
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="kills are POSIX only")
+@pytest.mark.parametrize("then", ["fails", "works"])
+def test_a_kill_in_the_middle_of_a_swap_loses_nothing(tmp_path: Path, then: str) -> None:
+    folder = tmp_path / "a"
+    replaced(folder, "old")
+    here = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, sys.path))}
+    ended = subprocess.run([sys.executable, "-c", KILLED_IN_A_SWAP, str(folder)], env=here)
+    assert ended.returncode == -9
+    assert not folder.exists()
+    assert [path.name for path in tmp_path.rglob("old")] == ["old"]  # beside it
+    if then == "fails":
+        with pytest.raises(ZeroDivisionError), atomic_folder(folder):
+            _ = 1 / 0
+    else:
+        replaced(folder, "newer")
+    assert [path.name for path in folder.iterdir()] == [{"fails": "old", "works": "newer"}[then]]
+    assert list(tmp_path.iterdir()) == [folder]

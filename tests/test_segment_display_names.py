@@ -1,23 +1,29 @@
-"""Names of categories for people."""
+"""Names of categories, for people."""
 
 import pytest
 
 from sagesplat.segment.coco import NAMES
-from sagesplat.segment.display_names import titles
+from sagesplat.segment.display_names import title_of, titles
 
 
 @pytest.mark.parametrize(
-    ("names", "expected"),
+    ("name", "title"),
     [
-        (["grass-merged", "building-other-merged", "vase"], ["grass", "building", "vase"]),
-        (["grass-merged", "grass", "vase"], ["grass-merged", "grass", "vase"]),
-        (["grass-merged@0", "grass-merged@12", "unlabelled@0"], ["grass@0", "grass@12", "unlabelled@0"]),
-        (["grass-merged@0", "grass@0", "grass@1"], ["grass-merged@0", "grass@0", "grass@1"]),
-        ([], []),
+        ("grass-merged", "grass"), ("building-other-merged", "building"), ("sky-other-merged", "sky"),
+        ("door-stuff", "door"), ("wall-brick", "wall brick"), ("dining table", "dining table"),
     ],
-)
-def test_titles_are_short_unless_two_would_be_equal(names: list[str], expected: list[str]) -> None:
-    assert titles(dict(enumerate(names))) == dict(enumerate(expected))
+)  # fmt: skip
+def test_titles(name: str, title: str) -> None:
+    assert title_of(name) == title
+
+
+def test_names_that_become_the_same_stay_as_they_are() -> None:
+    names = {1: "wall-other-merged", 2: "wall", 3: "grass-merged", -1: "unlabelled"}
+    assert titles(names) == {1: "wall-other-merged", 2: "wall", 3: "grass", -1: "unlabelled"}
+
+
+def test_categories_of_blocks_keep_their_block() -> None:
+    assert titles({1: "grass-merged@0", 2: "grass-merged@1"}) == {1: "grass@0", 2: "grass@1"}
 
 
 def test_no_two_of_cocos_share_a_title() -> None:

@@ -19,9 +19,8 @@ from sagesplat.formats.spz import read_spz
 from sagesplat.io.files import read_json, write_json
 from sagesplat.raster import rasterize
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import RunDir
-from sagesplat.segment.display_names import title_of
-from sagesplat.stages.bundle import bundle, live_bundle
+from sagesplat.run.run_dir import FORMAT, RunDir, checkpoint_key
+from sagesplat.stages.bundle import _antialiased, bundle, live_bundle
 from sagesplat.stages.fit import fit_ladder
 from sagesplat.stages.label import lift_labels, make_masks
 from sagesplat.stages.nest import nest_levels
@@ -29,6 +28,8 @@ from sagesplat.stages.observe import observe_levels
 from sagesplat.stages.scene import open_scene
 from sagesplat.stages.shared import distances
 from sagesplat.stages.train import train_levels
+from sagesplat.train.checkpoint import write_checkpoint
+from sagesplat.train.state import initial_state
 from sagesplat.viewer.bundle import is_bundle
 from sagesplat.viewer.display_names import colors_of
 from sagesplat.viewer.frames import camera_at
@@ -185,8 +186,17 @@ def test_bad_input_is_one_line(run: Path, tmp_path: Path, viewer: Path) -> None:
 def test_promises_of_other_chunks(run: Path, tmp_path: Path, viewer: Path) -> None:
     index = run / "nested" / "increments" / "index.json"
     index.write_text(index.read_text() + "\n")
-    with pytest.raises(RunError, match="promises of other chunks; run `sagesplat fit`"):
+    with pytest.raises(RunError, match="fitted to other increments; run `sagesplat fit`"):
         bundle(job_of(run), tmp_path / "out", viewer=viewer)
+
+
+def test_a_training_that_goes_on_says_how_its_gaussians_are_drawn(tmp_path: Path) -> None:
+    job = job_of(tmp_path)
+    assert not _antialiased(job)  # no checkpoint yet
+    for antialiased in (True, False):
+        key = checkpoint_key(job.run, {"antialiased": antialiased}, [])
+        write_checkpoint(job.run.checkpoint, initial_state(random_gaussians(9), 0), key)
+        assert _antialiased(job) is antialiased
 
 
 def test_a_live_bundle_follows_the_training(run: Path, tmp_path: Path, viewer: Path) -> None:
@@ -217,7 +227,9 @@ def test_a_live_bundle_follows_the_training(run: Path, tmp_path: Path, viewer: P
             assert len(read_spz(folder / label["levels"][0]["uri"])) == label["levels"][0]["count"]
             assert label["quality"] is None
             assert label["boxes"]
-    write_json(run / "provenance" / "train.json", {"settings": {"antialiased": True}})
+    write_json(
+        run / "provenance" / "train.json", {"format": FORMAT, "settings": {"antialiased": True}, "inputs": {}}
+    )
     later[-1].touch()
     (viewer / "index.html").write_text("<!doctype html>of a newer package")
     assert live_bundle(job, folder, viewer)  # rewritten: a training that began again
@@ -238,17 +250,6 @@ def test_a_live_bundle_leaves_other_folders_alone(run: Path, tmp_path: Path, vie
     (other / "a.jpg").write_text("x")
     with pytest.raises(RunError, match="neither empty nor a bundle"):
         live_bundle(job_of(run), other, viewer)
-
-
-@pytest.mark.parametrize(
-    ("name", "title"),
-    [
-        ("grass-merged", "grass"), ("building-other-merged", "building"), ("sky-other-merged", "sky"),
-        ("door-stuff", "door"), ("wall-brick", "wall brick"), ("dining table", "dining table"),
-    ],
-)  # fmt: skip
-def test_titles(name: str, title: str) -> None:
-    assert title_of(name) == title
 
 
 def test_colours_are_distinct_and_stay() -> None:

@@ -10,15 +10,18 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from test_stages_label import Halves
 
 from sagesplat.adapt.plan import read_plans
 from sagesplat.core.config import LiftConfig, MasksConfig, PlanConfig, RunConfig, SceneConfig, TrainConfig
 from sagesplat.core.errors import DataError, RunError
 from sagesplat.core.events import Event, StageDone, TableMade, Training, Warned
 from sagesplat.demo.capture import make_capture
-from sagesplat.io.files import write_text
-from sagesplat.run.run_dir import RunDir
+from sagesplat.io.files import link, write_text
+from sagesplat.run.run_dir import RunDir, settings_of
+from sagesplat.segment import hf
 from sagesplat.stages import report
+from sagesplat.studies.sweep import run
 from sagesplat.studies.sweep.file import read_sweep
 from sagesplat.studies.sweep.report import MEASURES, Row, readable, summarise
 from sagesplat.studies.sweep.run import _share_training, _trained_alike, run_sweep
@@ -134,6 +137,56 @@ def test_what_is_trained_alike_is_trained_once(copy: Path) -> None:
         like, minimum = (rows[variant, "5", target] for variant in ("track", "minimum"))
         assert like["full PSNR"] == minimum["full PSNR"]
     assert done(sweep_in(copy, text)) == [*CELLS, "plot-minimum-seed0", "plot-minimum-seed5"]
+
+
+def test_cells_that_share_a_training_share_what_later_stages_read(finished, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(hf, "HfSegmenter", Halves)
+    (tmp_path / "capture").symlink_to(finished / "capture")
+    text = """
+        targets = [0.4]
+        seeds = [0]
+        [settings]
+        ladder = "snapshots"
+        fuse = true
+        masks = { segmenter = "hf", model = "some/network", soft = true }
+        train = { max_steps = 20, level_every = 20 }
+        [scenes]
+        plot = "capture"
+        [variants]
+        first = {}
+        second.fit.distance = "minimum"
+    """
+    events = sweep_in(tmp_path, text)
+    assert [name for name in done(events) if name.endswith("/train")] == ["plot-first-seed0/train"]
+    first, second = (RunDir(tmp_path / "out" / "runs" / f"plot-{name}-seed0") for name in ("first", "second"))
+    assert len(list(second.soft.iterdir())) == 12
+    assert settings_of(first, "fuse") == settings_of(second, "fuse") == {"soft": True}
+    for path in sorted(p for p in first.fused.rglob("*") if p.is_file()):
+        assert (second.path / path.relative_to(first.path)).read_bytes() == path.read_bytes(), path.name
+    # all that was there after training is there again
+    later = {"fused", "snapshots", ".lock"}
+    assert {p.name for p in first.path.iterdir()} - later == {p.name for p in second.path.iterdir()} - later
+
+
+def test_a_shared_training_is_there_as_a_whole_or_not_at_all(copy: Path, monkeypatch) -> None:
+    text = TEXT + "variants.minimum.fit.distance = 'minimum'\n"
+    cells = read_sweep(write(copy, text))
+    like, new = cells[0], cells[-1]
+    runs, times = copy / "out" / "runs", 0
+
+    def fails(path: Path, target: Path) -> None:
+        nonlocal times
+        times += 1
+        if times == 20:
+            raise KeyboardInterrupt
+        link(path, target)
+
+    monkeypatch.setattr(run, "link", fails)
+    with pytest.raises(KeyboardInterrupt):
+        _share_training(runs, like, new)
+    assert not (runs / new.name).exists()
+    _share_training(runs, like, new)
+    assert RunDir(runs / new.name).provenance("train").exists()
 
 
 def test_blocks_are_trained_by_each_cell(tmp_path: Path) -> None:
@@ -365,3 +418,21 @@ def test_spread_is_that_of_the_known_values(values: list[float]) -> None:
     assert sums["SSIM"] == pytest.approx(expected, nan_ok=True)
     expected = known.std(ddof=1) if len(known) > 1 else math.nan
     assert sums["SSIM sd"] == pytest.approx(expected, nan_ok=True)
+
+
+def test_settings_by_their_old_names_are_read_and_told(tmp_path: Path) -> None:
+    text = (
+        TEXT
+        + """
+variants.old.train = { pace = "published", rest_share = 0.5 }
+variants.old.nest = { seed_share = 0.1, seed_steps = 7, gain = 2.0 }
+variants.old.blocks = { seam_steps = 9 }
+"""
+    )
+    told: list[str] = []
+    config = read_sweep(write(tmp_path, text), told.append)[-1].config
+    assert (config.train.lr_schedule, config.train.gradient_freeze_share) == ("published", 0.5)
+    assert (config.nest.base_share, config.nest.base_steps, config.nest.lr_multiplier) == (0.1, 7, 2.0)
+    assert config.blocks.boundary_steps == 9
+    assert len(told) == 6
+    assert "variants.old.train.pace is called lr_schedule now" in told[0]

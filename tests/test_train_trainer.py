@@ -18,8 +18,9 @@ from sagesplat.raster import rasterize
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.train import stepper, trainer
+from sagesplat.train.events import Event, LevelSaved, Resumed, Step, Trained
 from sagesplat.train.state import from_points, initial_state
-from sagesplat.train.trainer import Event, LevelSaved, Resumed, Step, Trained, train
+from sagesplat.train.trainer import train
 
 LABEL_IDS = np.array([-1, 3, 184], np.int16)[np.arange(60) % 3]
 # 8 views, of which 7 train; densification from step 12 to 29, a reset after step 20, levels every 12 steps

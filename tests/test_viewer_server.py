@@ -490,11 +490,14 @@ def test_without_the_extra(bundle: Path, monkeypatch: pytest.MonkeyPatch):
         ({"manifest.json": b"[]"}, r"manifest.json: not of a sagesplat bundle"),
         ({"manifest.json": b'{"format": "other"}'}, r"manifest.json: not of a sagesplat bundle"),
         ({"manifest.json": FILES["manifest.json"]}, r"a bundle without a viewer"),
-        ({"scene.json": b"{}"}, r"a run folder of format None, this sagesplat reads"),
+        (
+            {"scene.json": b"{}"},
+            r"a run folder of format None, this sagesplat \(.*\) reads 3; run again into a new",
+        ),
         ({"scene.json": b"{}", "provenance/scene.json": b'{"format": 1}'}, r"a run folder of format 1, this"),
         (
             {"scene.json": b"{}", "provenance/scene.json": json.dumps({"format": FORMAT}).encode()},
-            r"not finished; do `sagesplat run`, or add --follow",
+            r"not finished; run `sagesplat run` again, or add --follow",
         ),
     ],
 )

@@ -111,6 +111,7 @@ def open_job(run: Path, options: Redo | Device, ladder: LadderKind = "nested") -
 
 def _approval(run: "RunDir", console: "Console", yes: bool) -> Callable[[str, str], None]:
     """Says once what --force redoes, and how long that took; on a terminal it is asked whether to."""
+    from sagesplat.cli.layout import duration
     from sagesplat.run.recorded import stage_seconds
     from sagesplat.run.stage import following
 
@@ -132,13 +133,6 @@ def _approval(run: "RunDir", console: "Console", yes: bool) -> Callable[[str, st
             raise RunError(f"{run.path}: nothing was redone; leave out --force to keep what is there")
 
     return approve
-
-
-def duration(seconds: float) -> str:
-    """Seconds as people say them: 40 s, 12 min, 3.2 h."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 @contextmanager

@@ -6,16 +6,10 @@ from pathlib import Path
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console as RichConsole
-from rich.progress import (
-    BarColumn,
-    Progress,
-    SpinnerColumn,
-    TaskProgressColumn,
-    TextColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn, TextColumn
 from rich.table import Table
 
+from sagesplat.cli.layout import duration, fitted
 from sagesplat.core.events import (
     Event,
     RunDone,
@@ -30,7 +24,30 @@ from sagesplat.core.events import Progress as ProgressEvent
 
 LABELS_SHOWN = 4  # categories whose counts the training bar shows
 _REFRESH = 0.2  # seconds between two updates of the bar
-_LINES = 10  # progress lines a stage prints where there is no terminal
+_SILENT = 60.0  # seconds at least between two progress lines where there is no terminal
+_LATEST = 600.0  # seconds after which there is a line though no mark was passed
+_MARKS = (10, 25, 50, 75, 100)  # percent
+_SURE = 0.02  # share of a stage after which its remaining time is told
+
+
+class Remaining:
+    """Seconds that are left of a stage, by its mean speed since its first report.
+
+    What came before that report (compiling, loading) is not part of the speed, and a stage that resumes does
+    not count what was done before.
+    """
+
+    def __init__(self) -> None:
+        self._first: tuple[float, int] | None = None
+
+    def __call__(self, now: float, done: int, total: int) -> float | None:
+        """The estimate at a time in seconds; None as long as too little is done."""
+        if self._first is None or done < self._first[1]:  # some stages report several rounds
+            self._first = now, done
+        since, before = now - self._first[0], done - self._first[1]
+        if before <= 0 or before < _SURE * (total - self._first[1]):
+            return None
+        return since * (total - done) / before
 
 
 class Console:
@@ -43,7 +60,7 @@ class Console:
             TextColumn("{task.description:9}"),
             BarColumn(bar_width=24),
             TaskProgressColumn(),
-            TimeRemainingColumn(),
+            TextColumn("{task.fields[left]}"),
             TextColumn("{task.fields[text]}"),
             console=self.out,
             transient=True,
@@ -51,8 +68,8 @@ class Console:
         )
         self._task = None
         self._shown = 0.0
-        self._began = 0.0
-        self._tenth = 0
+        self._mark = 0
+        self._remaining = Remaining()
 
     def __enter__(self) -> "Console":
         self._bar.start()
@@ -67,8 +84,9 @@ class Console:
             case StageStarted(name):
                 if self._task is not None:  # of a stage that failed
                     self._bar.remove_task(self._task)
-                self._task = self._bar.add_task(name, total=None, text="")
-                self._began, self._shown, self._tenth = time.monotonic(), 0.0, 0
+                self._task = self._bar.add_task(name, total=None, text="", left="")
+                self._shown, self._mark = time.monotonic(), 0
+                self._remaining = Remaining()
             case StageSkipped(name):
                 self.out.print(f"[dim]· {name:9} up to date[/]")
             case ProgressEvent(name, done, total, text):
@@ -90,36 +108,55 @@ class Console:
                 for line in lines[1:]:
                     self.out.print(f"{'':21}{line}", soft_wrap=True)
             case TableMade(title, header, rows):
-                table = Table(
-                    title=title,
-                    title_justify="left",
-                    title_style="bold",
-                    box=SIMPLE_HEAD,
-                    padding=(0, 1, 0, 0),
-                )
-                for index, column in enumerate(header):
-                    table.add_column(column, justify="left" if index == 0 else "right", no_wrap=True)
-                for row in rows:
-                    table.add_row(*row)
-                self.out.print(table)
+                self._show_table(title, header, rows)
             case RunDone(report, run):
                 self.out.print(f"Report: {report.resolve()}", soft_wrap=True)
                 if run:
                     self.out.print(f"Walk through it: {_program()} view {run}", soft_wrap=True)
 
+    def say(self, text: str) -> None:
+        """Print a line."""
+        self.out.print(text, soft_wrap=True, markup=False)
+
+    def ask(self, question: str) -> bool:
+        """Ask on the terminal; anything but yes is no."""
+        self._bar.stop()
+        try:
+            return self.out.input(f"{question} [y/N] ", markup=False).strip().lower() in ("y", "yes")
+        except EOFError:
+            return False
+        finally:
+            self._bar.start()
+
+    def _show_table(self, title: str, header: tuple[str, ...], rows: tuple[tuple[str, ...], ...]) -> None:
+        """Print a table, in parts if it is wider than the terminal."""
+        self.out.print(title, style="bold", markup=False)
+        for heads, cells in fitted(header, rows, self.out.width):
+            table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
+            for index, column in enumerate(heads):
+                table.add_column(column, justify="left" if index == 0 else "right", no_wrap=True)
+            for row in cells:
+                table.add_row(*row)
+            self.out.print(table, markup=False)
+            self.out.print()
+
     def _advance(self, name: str, done: int, total: int, text: str) -> None:
-        """Move the bar; without a terminal, a line at every tenth."""
+        """Move the bar; without a terminal, a line now and then."""
         now = time.monotonic()
+        left = self._remaining(now, done, total)
         if self.out.is_terminal:
             if self._task is not None and (now - self._shown > _REFRESH or done == total):
                 self._shown = now
-                self._bar.update(self._task, completed=done, total=total, text=text)
-        elif done * _LINES // total > self._tenth:
-            self._tenth = done * _LINES // total
-            left = (now - self._began) * (total - done) / done
-            self.out.print(
-                f"  {name:9} {100 * done // total:3d} %  {left:5.0f} s left  {text}", soft_wrap=True
-            )
+                shown = "" if left is None else f"{duration(left)} left"
+                self._bar.update(self._task, completed=done, total=total, text=text, left=shown)
+            return
+        share = 100 * done // total
+        mark = max((m for m in _MARKS if m <= share), default=0)
+        silent = now - self._shown
+        if done < total and ((mark > self._mark and silent >= _SILENT) or silent >= _LATEST):
+            self._shown, self._mark = now, mark
+            ahead = "" if left is None else f", {duration(left)} left"
+            self.say(f"  {name:9} {share:3d} %{ahead}  {text}")
 
 
 def _program() -> str:

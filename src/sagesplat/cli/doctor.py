@@ -1,4 +1,4 @@
-"""What this machine can do: looked up here, said by `sagesplat doctor`."""
+"""Checks of this machine, printed by `sagesplat doctor`."""
 
 import importlib.metadata
 import json
@@ -38,7 +38,7 @@ _MARKS = {"fine": "[green]✓[/]", "gap": "[yellow]·[/]", "broken": "[red]✗[/
 
 @dataclass(frozen=True)
 class Finding:
-    """One line about the machine. `gap`: something is not there, and `cure` says how to get it."""
+    """The result of one check. state "gap": something optional is missing, and `cure` says how to get it."""
 
     part: str
     state: Literal["fine", "gap", "broken"]
@@ -47,7 +47,7 @@ class Finding:
 
 
 def examine(build: bool = False) -> list[Finding]:
-    """Look at everything. gsplat's kernels are compiled only where `build` says so."""
+    """Run all checks; with `build`, gsplat's kernels are compiled first."""
     return [
         Finding("python", "fine", f"{platform.python_version()} on {platform.system()} {platform.machine()}"),
         Finding("sagesplat", "fine", f"{__version__} in {Path(__file__).parent}"),
@@ -65,7 +65,7 @@ def examine(build: bool = False) -> list[Finding]:
 
 
 def is_well(findings: Sequence[Finding]) -> bool:
-    """Whether what is there works; gaps do not count."""
+    """Whether everything that is installed works; missing optional parts do not count."""
     return all(finding.state != "broken" for finding in findings)
 
 
@@ -76,7 +76,7 @@ def unbuilt(findings: Sequence[Finding]) -> str:
 
 
 def processor() -> Finding:
-    """Its name, cores and vectors, as numba's kernels see them."""
+    """Name, cores and vector width of the CPU, as numba sees them."""
     import llvmlite.binding as llvm
     from numba.core import config
 
@@ -89,7 +89,7 @@ def processor() -> Finding:
 
 
 def memory() -> Finding:
-    """The machine's memory, and what is free where the system tells."""
+    """Memory of the machine, and what of it is unused."""
     try:
         total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
         free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
@@ -99,7 +99,7 @@ def memory() -> Finding:
 
 
 def kernels(backend: Literal["cpu", "cuda"]) -> Finding:
-    """Whether a backend's kernels compile and draw what the reference draws."""
+    """Whether the kernels of a backend compile and render what the reference renders."""
     part, began = f"{backend} kernels", time.monotonic()
     try:
         error = _error(backend)
@@ -115,7 +115,7 @@ def kernels(backend: Literal["cpu", "cuda"]) -> Finding:
 
 
 def _error(backend: Literal["cpu", "cuda"]) -> float:
-    """Largest difference of a small picture and of its gradients from the reference's."""
+    """Largest difference from the reference, over a small render and its normalised gradients."""
     generator = torch.Generator().manual_seed(0)
     w2c = np.eye(4, dtype=np.float32)
     K = np.array([[40, 0, 20], [0, 40, 12], [0, 0, 1]], np.float32)
@@ -160,7 +160,7 @@ def _driver() -> str:
 
 
 def _output(*words: str) -> str:
-    """What a program prints; nothing where it is not there or fails."""
+    """Standard output of a program; empty if it is not installed or fails."""
     if shutil.which(words[0]) is None:
         return ""
     try:
@@ -170,7 +170,7 @@ def _output(*words: str) -> str:
 
 
 def compiler() -> Finding:
-    """The CUDA compiler, which gsplat needs once."""
+    """The CUDA compiler, which gsplat needs to compile its kernels."""
     nvcc = cuda.nvcc()
     if nvcc is None:
         if cuda.compiled() is not None:
@@ -187,7 +187,7 @@ def compiler() -> Finding:
 
 
 def gsplat() -> Finding:
-    """The package."""
+    """The gsplat package."""
     gap = cuda.version_gap()
     if gap is not None:
         text, _, cure = gap.partition("; ")
@@ -196,7 +196,7 @@ def gsplat() -> Finding:
 
 
 def gsplat_kernels(build: bool) -> Finding:
-    """Whether they can be used, are compiled, and draw what the reference draws."""
+    """Whether gsplat's kernels can be used, are compiled, and render what the reference renders."""
     gap = cuda.missing()
     if gap is not None:
         text, _, cure = gap.partition("; ")
@@ -231,12 +231,12 @@ def lpips() -> Finding:
 
 
 def as_json(findings: Sequence[Finding]) -> str:
-    """For machines: whether all is well, and every finding."""
+    """All findings as JSON, with whether everything works."""
     return json.dumps({"well": is_well(findings), "findings": [asdict(f) for f in findings]}, indent=1)
 
 
 def print_findings(findings: Sequence[Finding], out: Console | None = None) -> None:
-    """A line for each, and one with the cure where something is missing."""
+    """Print a line per finding, and its cure below where something is missing."""
     out = out or Console(highlight=False, file=sys.stdout)
     width = max(len(finding.part) for finding in findings)
     for finding in findings:

@@ -37,7 +37,9 @@ def arguments(name: str, function: Callable[..., None], words: Sequence[str]) ->
 
     Raises UsageError.
     """
-    words = _renamed([word for word in words if name != "demo" or word != "--run"])  # it is positional now
+    if name == "demo":  # whose folder is positional now
+        words = [word.removeprefix("--run=") for word in words if word != "--run"]
+    words = _renamed(words)
     values = _parse(name, function, words)
     known = _recorded(name, function, values, words)
     return _parse(name, _with_defaults(function, known), words) if known else values

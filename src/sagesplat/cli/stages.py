@@ -256,8 +256,10 @@ def report(
 
     with open_job(run, machine, "snapshots" if paper else ladder) as job:
         if paper:
+            from sagesplat.studies.lpips import warn_of_lpips
             from sagesplat.studies.paper.run import paper_report
 
+            warn_of_lpips(job, settings.lpips)
             pipeline.adapt_snapshots(job)
             paper_report(job, settings)
         else:

@@ -97,8 +97,10 @@ def compare(
         json: file to write every measurement to, as JSON
     """
     from sagesplat.studies.compare.run import compare as compare_methods
+    from sagesplat.studies.lpips import warn_of_lpips
 
     with open_job(run, machine) as job:
+        warn_of_lpips(job, compare.lpips)
         compare_methods(job, compare, json)
 
 

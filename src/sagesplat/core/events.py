@@ -1,4 +1,4 @@
-"""What a run tells whoever watches it. The engine emits these and prints nothing."""
+"""Events of a run. The engine emits them and prints nothing; the console, the tests and the viewer listen."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -14,14 +14,14 @@ class StageStarted:
 
 @dataclass(frozen=True)
 class StageSkipped:
-    """A stage's result is there already, made from the same inputs with the same settings."""
+    """A stage is skipped: its result was made from the same inputs with the same settings."""
 
     name: str
 
 
 @dataclass(frozen=True)
 class Progress:
-    """A stage has done so much of its work."""
+    """Progress of a stage: `done` of `total` units of work, and a short text."""
 
     name: str
     done: int
@@ -31,25 +31,25 @@ class Progress:
 
 @dataclass(frozen=True)
 class Training:
-    """Progress of the training stage: once a step."""
+    """Progress of training, emitted at every step."""
 
     step: int
     total: int
     loss: float
-    counts: dict[str, int]  # Gaussians by category name, as of the last level
+    counts: dict[str, int]  # Gaussians by category name, at the last snapshot
     num_gaussians: int
 
 
 @dataclass(frozen=True)
 class Warned:
-    """Something that the user should know, but that does not stop the run."""
+    """A warning that does not stop the run."""
 
     text: str
 
 
 @dataclass(frozen=True)
 class StageDone:
-    """A stage has ended; `lines` sum up its result."""
+    """A stage ended; `lines` summarise its result."""
 
     name: str
     seconds: float
@@ -58,7 +58,7 @@ class StageDone:
 
 @dataclass(frozen=True)
 class TableMade:
-    """A table worth showing."""
+    """A table for the console."""
 
     title: str
     header: tuple[str, ...]
@@ -67,10 +67,10 @@ class TableMade:
 
 @dataclass(frozen=True)
 class RunDone:
-    """The end of a run."""
+    """The run ended, with a report."""
 
     report: Path
-    run: Path | None = None  # where there is something to walk through (`sagesplat view`)
+    run: Path | None = None  # run folder, if `sagesplat view` can show it
 
 
 Event = StageStarted | StageSkipped | Progress | Training | Warned | StageDone | TableMade | RunDone
@@ -78,7 +78,7 @@ Emit = Callable[[Event], None]
 
 
 def named(emit: Emit, name: str) -> Emit:
-    """Passes on what a part of a larger work does, under its name; not its tables, nor what is up to date."""
+    """An `Emit` for one of several tasks: events get its name as a prefix; tables and skips are dropped."""
 
     def tell(event: Event) -> None:
         match event:

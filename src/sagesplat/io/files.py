@@ -121,10 +121,10 @@ def _changed(path: Path) -> float:
 def remove_temporary(folder: Path, but: str = "") -> None:
     """Remove what a killed process began to write below `folder`, where nobody else may be writing.
 
-    `but`: leave alone folders of `folder` whose names begin with this.
+    `but`: leave alone folders of `folder` whose names begin with this, and what is to take their place.
     """
     for path in list(folder.rglob(f".*.{_TEMPORARY}*")):
-        if but and path.relative_to(folder).parts[0].startswith(but):
+        if but and path.relative_to(folder).parts[0].removeprefix(".").startswith(but):
             continue
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
@@ -147,20 +147,41 @@ def link(path: Path, target: Path) -> None:
 def atomic_folder(path: Path) -> Iterator[Path]:
     """A new folder beside `path` that takes its place when the block ends without an error.
 
-    Its files are on the disk then: they wait for it once, together. Raises RunError where the disk is full.
+    Its files are on the disk then: they wait for it once, together. The earlier folder is removed only after
+    that: where the block or the swap fails, it is at `path`; where the process is killed in the middle of the
+    swap, it lies beside `path` and the next writer puts it back. One writer at a time. Raises RunError where
+    the disk is full.
     """
+    fresh, earlier = (path.with_name(f".{path.name}.{end}") for end in (f"{_TEMPORARY}new", "earlier"))
     with named_full_disk(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        fresh = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.{_TEMPORARY}"))
+        if earlier.exists() and not path.exists():  # a writer was killed in the middle of the swap
+            earlier.rename(path)
+        for left in (fresh, earlier):
+            shutil.rmtree(left, ignore_errors=True)
         try:
+            fresh.mkdir()
             fresh.chmod(0o755)
             yield fresh
             sync_changed(fresh, 0)
-            shutil.rmtree(path, ignore_errors=True)
-            fresh.rename(path)
-            _sync_folder(path.parent)
+            _swap(fresh, path, earlier)
         finally:
             shutil.rmtree(fresh, ignore_errors=True)
+
+
+def _swap(fresh: Path, path: Path, earlier: Path) -> None:
+    """Put `fresh` in the place of `path`, which is `earlier` meanwhile and comes back if that fails."""
+    replaces = path.exists()
+    if replaces:
+        path.rename(earlier)
+    try:
+        fresh.rename(path)
+    except BaseException:
+        if replaces:
+            earlier.rename(path)
+        raise
+    _sync_folder(path.parent)
+    shutil.rmtree(earlier, ignore_errors=True)
 
 
 def write_text(path: Path, text: str) -> None:

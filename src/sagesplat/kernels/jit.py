@@ -35,7 +35,7 @@ def njit(function: Callable[..., Any] | None = None, *, cache: bool = False, **o
     kernel = numba.njit(**options)(function)
     if cache:
         with suppress(RuntimeError):  # numba finds no folder that it can write
-            kernel._cache = _KernelCache(function)
+            setattr(kernel, "_cache", _KernelCache(function))  # noqa: B010 - of numba's dispatcher
     return kernel
 
 

@@ -41,7 +41,8 @@ def recorded_settings(run: RunDir, of: str = "run") -> dict[str, Any]:
     train = _made(run, "train") or _begun(run)
     nest = _made(run, "nest")
     observed = {**_made(run, "observe"), **_made(run, "fit")}
-    boundary = {key: nest[key] for key in ("boundary_steps",) if key in nest}
+    tuned = nest.get("boundary_steps", nest.get("seam_steps"))
+    boundary = {} if tuned is None else {"boundary_steps": tuned}
     known: dict[str, Any] = {
         "scene_config": _config(SceneConfig, _read(run.scene).get("settings")),
         "poses": _config(PosesConfig, _made(run, "poses")),

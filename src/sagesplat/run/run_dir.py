@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -221,39 +222,78 @@ def file_hash(path: Path) -> str:
     return digest.hexdigest()
 
 
-def _hashes(path: Path) -> list[str]:
-    """What an input is known by: of a stage's record first without its seconds, which differ each time."""
-    plain = file_hash(path)
+def input_hashes(run: RunDir, inputs: Sequence[Path]) -> dict[str, str]:
+    """SHA-256 of each input, by its path relative to the run folder: a run may be moved as a whole.
+
+    Of a stage's record all but its seconds counts: they differ each time that a stage is done.
+    """
+    return {Path(os.path.relpath(path, run.path)).as_posix(): _input_hash(path) for path in inputs}
+
+
+def _input_hash(path: Path) -> str:
     if path.parent.name != "provenance":
-        return [plain]
-    kept = {key: value for key, value in read_json(path).items() if key != "seconds"}
-    return [hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest(), plain]
+        return file_hash(path)
+    kept = {key: value for key, value in _read_record(path).items() if key != "seconds"}
+    return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
+
+
+def checkpoint_key(run: RunDir, settings: Mapping[str, Any], inputs: Sequence[Path]) -> str:
+    """What a stage's checkpoint is kept with: training resumes only with these settings and inputs."""
+    return json.dumps({"settings": dict(settings), "inputs": input_hashes(run, inputs)})
+
+
+class _NoRecord(RunError):
+    """A file that is not the record of a stage."""
+
+
+def _read_record(path: Path) -> dict[str, Any]:
+    """A stage's record; RunError for anything else, and for a run folder of another format."""
+    wrong = _NoRecord(f"{path}: not the record of a stage; run that stage again with --force")
+    try:
+        made = read_json(path)
+    except RunError:
+        raise wrong from None
+    if not isinstance(made, dict):
+        raise wrong
+    check_format(path, made)
+    if not all(isinstance(made.get(part), dict) for part in ("settings", "inputs")):
+        raise wrong
+    return made
+
+
+def check_format(path: Path, made: Mapping[str, Any]) -> None:
+    """RunError unless a record, which was read from `path`, is of the format that is read here."""
+    if made.get("format") != FORMAT:
+        raise RunError(
+            f"{path}: from a run folder of format {made.get('format')}, this sagesplat ({__version__}) reads "
+            f"{FORMAT}; run again into a new folder"
+        )
 
 
 def is_done(
     run: RunDir,
     stage: str,
     settings: Mapping[str, Any],
-    inputs: Sequence[Path],
+    inputs: Sequence[Path] | None,
     outputs: Sequence[Path],
     force: bool,
 ) -> bool:
-    """Whether a stage's result is there, made with these settings from these inputs.
+    """Whether a stage's result is there, made with exactly these settings from exactly these inputs.
 
-    A result made otherwise is never overwritten without `force`: RunError says what differs.
+    Without `inputs` only the settings are compared: for a look ahead, before the inputs are made. A result
+    made otherwise is never overwritten without `force`: RunError says what differs.
     """
-    record = run.provenance(stage)
-    if not record.exists() or not all(p.exists() for p in outputs):
+    if not run.provenance(stage).exists():
         return False
-    made = read_json(record)
-    if not isinstance(made, dict):
-        raise RunError(f"{record}: not the record of a stage; run it again with --force")
-    if made.get("format") != FORMAT:
-        raise RunError(
-            f"{run.path}: a run folder of format {made.get('format')}, this sagesplat ({__version__}) reads "
-            f"{FORMAT}; choose another run folder"
-        )
-    differs = _differences(made, settings, {p.name: _hashes(p) for p in inputs})
+    try:
+        made = _read_record(run.provenance(stage))
+    except _NoRecord:
+        if force:
+            return False
+        raise
+    if not all(p.exists() for p in outputs):
+        return False
+    differs = _differences(made, settings, made["inputs"] if inputs is None else input_hashes(run, inputs))
     if not differs:
         return True
     if not force:
@@ -265,23 +305,33 @@ def is_done(
 
 def settings_of(run: RunDir, stage: str) -> dict[str, Any]:
     """The settings that a finished stage was made with."""
+    return _record_of(run, stage)["settings"]
+
+
+def is_made_from(run: RunDir, stage: str, path: Path) -> bool:
+    """Whether a finished stage's result was made from a file as it is now."""
+    name, digest = next(iter(input_hashes(run, [path]).items()))
+    return _record_of(run, stage)["inputs"].get(name) == digest
+
+
+def _record_of(run: RunDir, stage: str) -> dict[str, Any]:
     if not run.provenance(stage).exists():
         raise RunError(f"{run.path}: stage {stage} is not done; run `sagesplat {stage}` or `sagesplat run`")
-    made = read_json(run.provenance(stage))
-    if not isinstance(made, dict) or not isinstance(made.get("settings"), dict):
-        raise RunError(f"{run.provenance(stage)}: not the record of a stage; run it again with --force")
-    return made["settings"]
+    return _read_record(run.provenance(stage))
 
 
-def _differences(made: dict[str, Any], settings: Mapping[str, Any], inputs: Mapping[str, list[str]]) -> str:
+def _differences(made: Mapping[str, Any], settings: Mapping[str, Any], inputs: Mapping[str, str]) -> str:
     """A few words on what changed since a result was made; empty = nothing."""
-    old = made.get("settings", {})
-    changed = [f"{k} ({old.get(k)} then, {v} now)" for k, v in settings.items() if old.get(k) != v]
-    changed += [
-        f"{name} (its content changed)"
-        for name, hashes in inputs.items()
-        if made.get("inputs", {}).get(name) not in hashes
+    old, new = made["settings"], settings
+    changed = [
+        f"{k} ({old.get(k, 'not set')} then, {new.get(k, 'not set')} now)"
+        for k in [*new, *(k for k in old if k not in new)]
+        if k not in old or k not in new or old[k] != new[k]
     ]
+    old, new = made["inputs"], inputs
+    changed += [f"{name} (its content changed)" for name in new if name in old and old[name] != new[name]]
+    changed += [f"{name} (not used then)" for name in new if name not in old]
+    changed += [f"{name} (not used any more)" for name in old if name not in new]
     return ", ".join(changed[:3])
 
 
@@ -297,6 +347,6 @@ def record(
             "version": __version__,
             "seconds": round(seconds, 2),
             "settings": dict(settings),
-            "inputs": {p.name: _hashes(p)[0] for p in inputs},
+            "inputs": input_hashes(run, inputs),
         },
     )

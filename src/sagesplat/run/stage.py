@@ -18,11 +18,11 @@ from sagesplat.run.run_dir import is_done, record
 _CLOCK_STEP = 2.0  # seconds: some disks keep no finer time
 # Stages that are made of earlier results within minutes: they follow those without --force, as long as
 # their own settings are the same. The settings of the second ones are the plan's.
-_DERIVED = {"observe", "fit", "plan", "crossview", "occupancy", "paper"}
+_DERIVED = {"observe", "fit", "plan", "crossview", "same_size", "paper"}
 _OF_PLAN = {"compose", "evaluate", "report"}
 _ORDER = (
-    "poses", "scene", "segment", "masks", "lift", "blocks", "train", "fuse", "block_categories", "parts",
-    "base", "nest", "observe", "fit", "plan", "compose", "evaluate", "report", "crossview", "occupancy",
+    "poses", "scene", "segment", "masks", "lift", "blocks", "train", "fuse", "block_categories",
+    "base", "nest", "observe", "fit", "plan", "compose", "evaluate", "report", "crossview", "same_size",
     "paper",
 )  # fmt: skip
 
@@ -59,6 +59,7 @@ def run_stage(
         inputs: Files and folders that it is made from; their hashes are recorded.
         outputs: Files and folders that it makes.
         make: Does the work and returns lines that sum up the result.
+        swaps: The old result and its record stay until `make` removes them.
 
     Raises:
         RunError: If an input is missing, the result was made with other settings (without `job.force`),
@@ -103,9 +104,8 @@ def _is_done(job: Job, stage: Stage) -> bool:
         raise RunError(f"{job.run.path}: {NO_RUN}")
     for path in stage.inputs:
         if not path.exists():
-            raise RunError(
-                f"{path}: missing; run the stage before `sagesplat {stage.name}`, or `sagesplat run`"
-            )
+            command = stage.name.replace("_", "-")
+            raise RunError(f"{path}: missing; run the stage before `sagesplat {command}`, or `sagesplat run`")
     what = job.run, stage.name, stage.settings, stage.inputs, stage.outputs
     if is_done(*what, job.force or _follows(job, stage)):
         job.emit(StageSkipped(stage.name))

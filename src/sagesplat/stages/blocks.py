@@ -1,8 +1,8 @@
-"""Large scenes: blocks of the ground plane are trained by themselves and put together.
+"""Makes the levels and nested levels of a large scene, from blocks trained independently and merged.
 
-A block is a run folder of its own, RUN/blocks/NNN, whose capture is a part of the scene: it is trained and
-nested like any other, on whatever node, and goes on where it was killed. Put together, each category in each
-block is a category of its own (`segment.block_categories`), and all later stages take it like any other.
+A block has its own run folder, RUN/blocks/NNN, whose capture is a part of the scene. It is trained and nested
+like any other run, on any node, and resumes after a kill. In the merged scene every (block, category) pair is
+a category of its own (`segment.block_categories`), and later stages treat it as any other category.
 """
 
 import shutil
@@ -22,15 +22,15 @@ from sagesplat.formats.levels import read_level, read_more, read_sizes, write_le
 from sagesplat.io.files import link, read_json, write_json
 from sagesplat.run.executor import Task, results
 from sagesplat.run.job import Job, JobSpec, fingerprint
-from sagesplat.run.run_dir import RunDir, file_hash
+from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
 from sagesplat.scene.blocks import (
     Blocks,
-    colours,
-    part_of,
+    assigned_views,
+    graph_colouring,
     read_blocks,
     split,
-    views_of,
+    training_scene,
     visible_shares,
     write_blocks,
 )
@@ -40,17 +40,17 @@ from sagesplat.segment.block_categories import BlockCategories
 from sagesplat.segment.lift import LiftedLabels
 from sagesplat.segment.masks import mask_path, prepare_folder, write_labels, write_mask
 from sagesplat.stages.nest import nest_levels, write_ladder
-from sagesplat.stages.shared import train_config
-from sagesplat.stages.train import train_levels
+from sagesplat.stages.shared import label_image_inputs, train_config
+from sagesplat.stages.train import train_inputs, train_levels
 from sagesplat.train import memory, nested
 from sagesplat.train.boundaries import around, boundary_views, interior, interior_sizes, together
 from sagesplat.train.nested import Nested, NestStep
 
-_SEEN = 0.01  # of the points in a photo: then it sees the block
+_SEEN = 0.01  # share of a photo's visible points from which on it sees a block
 
 
 def check(config: BlocksConfig) -> None:
-    """RunError for settings that cannot be."""
+    """RunError for settings out of range."""
     wrong = (
         ("count", config.count, config.count >= 1, "1 or more"),
         ("margin", config.margin, 0 <= config.margin <= 2, "a share such as 0.2"),
@@ -65,11 +65,11 @@ def check(config: BlocksConfig) -> None:
 
 def _division(config: BlocksConfig) -> dict[str, float]:
     """The settings that decide what a block is trained on."""
-    return {name: value for name, value in asdict(config).items() if name != "seam_steps"}
+    return {name: value for name, value in asdict(config).items() if name != "boundary_steps"}
 
 
 def divide(job: Job, config: BlocksConfig, seed: int) -> Blocks:
-    """Divide the scene, and make a run folder for each block with its part of the capture."""
+    """Split the scene, and create a run folder for each block with its part of the capture."""
     run, file = job.run, job.run.blocks / "blocks.json"
     settings = {**_division(config), "seed": seed}
 
@@ -78,14 +78,14 @@ def divide(job: Job, config: BlocksConfig, seed: int) -> Blocks:
         blocks = split(scene, config.count, config.margin)
         of_points = blocks.of(scene.points.xyz)
         shares = visible_shares(scene, of_points, len(blocks))
-        assigned = views_of(scene, blocks, shares, config.min_share)
+        assigned = assigned_views(scene, blocks, shares, config.min_share)
         training = np.isin(np.arange(len(scene.views)), scene.train_ids)
         labels = LiftedLabels.read(run.labels, len(scene.points.xyz))
         sees: list[list[int]] = []
         for number in range(len(blocks)):
             rows = np.flatnonzero(assigned[:, number] & training).tolist()
             sees.append(np.flatnonzero((shares[rows] >= _SEEN).any(0)).tolist())
-            part, kept = part_of(scene, blocks, number, rows, config.far_share, seed)
+            part, kept = training_scene(scene, blocks, number, rows, config.far_share, seed)
             _begin(run.block(number), part, labels, kept)
         for old in run.blocks.glob("[0-9]*"):
             if int(old.name) >= len(blocks):
@@ -104,7 +104,7 @@ def divide(job: Job, config: BlocksConfig, seed: int) -> Blocks:
 
 
 def _begin(run: RunDir, scene: Scene, labels: LiftedLabels, rows: np.ndarray) -> None:
-    """A run folder with everything that training needs."""
+    """Create a block's run folder with the inputs of training."""
     run.path.mkdir(parents=True, exist_ok=True)
     capture = run.path / "capture.npz"
     write_scene(capture, scene)
@@ -115,16 +115,19 @@ def _begin(run: RunDir, scene: Scene, labels: LiftedLabels, rows: np.ndarray) ->
 
 
 def _share_masks(job: Job, block: Job) -> None:
-    """Give a block the label images of its views, and what they were made from, as links."""
-    run, source = block.run, job.whole_masks.folder
-    fused = source == job.run.fused
-    target = run.fused if fused else run.masks
-    files = [mask_path(source, view).relative_to(source) for view in block.scene.views]
-    for name in [*files, Path("labels.json")]:
-        link(source / name, target / name)
-    if fused:
-        link(job.run.provenance("fuse"), run.provenance("fuse"))
-        link(job.run.masks / "labels.json", run.masks / "labels.json")
+    """Give a block the label images of its views, and the records of who made them, as links.
+
+    Links of what the run has no more are removed: the block would take fused label images that were deleted.
+    """
+    of, run = job.run, block.run
+    for stage, source, target in (("masks", of.masks, run.masks), ("fuse", of.fused, run.fused)):
+        shutil.rmtree(target, ignore_errors=True)
+        run.provenance(stage).unlink(missing_ok=True)
+        if not (source / "labels.json").exists() or not of.provenance(stage).exists():
+            continue
+        for path in [*(mask_path(source, view) for view in block.scene.views), source / "labels.json"]:
+            link(path, target / path.relative_to(source))
+        link(of.provenance(stage), run.provenance(stage))
 
 
 def _spec(job: Job, number: int) -> JobSpec:
@@ -136,14 +139,14 @@ def _job_of(job: Job, number: int) -> Job:
 
 
 def _needed(block: Job, config: TrainConfig) -> int:
-    """Bytes that the training of a block is expected to need (0 on a GPU, whose memory is its own)."""
+    """Predicted host memory of a block's training, bytes (0 on a GPU)."""
     if block.gpus:
         return 0
     return memory.fit(block.scene, config, block.memory_limit, processes=block.processes).needed
 
 
 def train_blocks(job: Job, config: BlocksConfig, train: TrainConfig, seed: int) -> None:
-    """Divide the scene, train its blocks as tasks, and put their levels together."""
+    """Split the scene, train its blocks as tasks, and merge their levels."""
     run = job.run
     settings = {**asdict(train), "batch": max(train.batch, job.processes), "seed": seed}
     settings["blocks"] = _division(config)
@@ -162,30 +165,30 @@ def train_blocks(job: Job, config: BlocksConfig, train: TrainConfig, seed: int) 
         merged = _merge_levels(run, blocks, parts)
         return [f"{merged:,} Gaussians of {len(blocks)} blocks"]
 
-    inputs = [run.scene, run.labels, run.blocks / "blocks.json"]
+    inputs = [*train_inputs(run, train), run.blocks / "blocks.json", run.provenance("blocks")]
     run_stage(job, "train", settings, inputs, [run.levels], make, swaps=True)
 
 
 def train_block(spec: JobSpec, number: int, config: TrainConfig, seed: int, emit: Emit) -> None:
-    """Train one block, in its run folder."""
+    """Train one block in its run folder."""
     train_levels(spec.open(named(emit, f"block {number}")), config, seed)
 
 
 def _merge_levels(run: RunDir, blocks: Blocks, parts: BlockCategories) -> int:
-    """Record the levels of all blocks together, each inside its border; the size of the last one."""
+    """Write merged levels from the interiors of all blocks; the number of Gaussians in the last one."""
     ladders = [read_ladder(run.block(number).levels) for number in range(len(blocks))]
     shutil.rmtree(run.levels, ignore_errors=True)
     count = 0
     for step in sorted({level for ladder in ladders for level in ladder.levels}):
-        # blocks in which all categories stopped have ended before
+        # blocks in which all categories stopped early have fewer levels
         files = [[f for f in ladder.files if f.step <= step][-1:] for ladder in ladders]
-        cores = [
+        interiors = [
             interior(read_level(f.path), blocks, parts, number)[0]
-            for number, found in enumerate(files)
-            for f in found
+            for number, newest in enumerate(files)
+            for f in newest
         ]
-        flat = [f for found in files for f in found]
-        g = concat(cores)
+        flat = [f for newest in files for f in newest]
+        g = concat(interiors)
         write_level(
             run.levels, step, g, recovering=any(f.recovering for f in flat),
             sh_degree=max(f.sh_degree for f in flat),
@@ -200,7 +203,10 @@ def _merge_levels(run: RunDir, blocks: Blocks, parts: BlockCategories) -> int:
 
 
 def label_block_categories(job: Job) -> None:
-    """Draw which part each pixel shows: its category, in the block whose Gaussians paint most of it."""
+    """Render label images for a scene split into blocks; every (block, category) pair is its own category.
+
+    A pixel keeps its category and gets the block whose Gaussians contribute most to it.
+    """
     run = job.run
     blocks, masks = read_blocks(run.blocks / "blocks.json"), job.whole_masks
     parts = BlockCategories(masks.taxonomy, len(blocks))
@@ -219,27 +225,29 @@ def label_block_categories(job: Job) -> None:
             part_ids = parts.ids(masks[view], np.where(shown < 0, own, shown))
             write_mask(path, part_ids, names)
             occurring |= set(np.unique(part_ids).tolist())
-            job.emit(Progress("parts", row + 1, len(scene.views)))
+            job.emit(Progress("block_categories", row + 1, len(scene.views)))
         lifted = LiftedLabels.read(run.labels, len(scene.points.xyz))
         ids = parts.ids(lifted.label_ids, blocks.of(scene.points.xyz))
         replace(lifted, label_ids=ids).write(run.block_category_labels)
         write_labels(run.block_categories, names, occurring | set(np.unique(ids).tolist()))
-        return [f"{len(occurring)} parts of {len(masks.taxonomy.names)} categories in {len(blocks)} blocks"]
+        return [
+            f"{len(occurring)} per-block categories of {len(masks.taxonomy.names)} in {len(blocks)} blocks"
+        ]
 
-    inputs = [run.provenance("masks"), run.labels, run.levels, run.blocks / "blocks.json"]
+    made = [run.provenance(stage) for stage in ("train", "masks")]
+    inputs = [run.scene, run.labels, run.levels, run.blocks / "blocks.json", run.masks / "labels.json", *made]
     if masks.folder == run.fused:
         inputs.append(run.provenance("fuse"))
-    run_stage(
-        job, "parts", {}, inputs, [run.block_categories / "labels.json", run.block_category_labels], make
-    )
+    outputs = [run.block_categories / "labels.json", run.block_category_labels]
+    run_stage(job, "block_categories", {}, inputs, outputs, make)
 
 
 def nest_blocks(job: Job, config: BlocksConfig, nest: NestConfig, seed: int) -> None:
-    """Make the nested ladders of the blocks, tune them along their borders, and put them together."""
+    """Make the nested levels of the blocks, tune them along the boundaries, and merge them."""
     run, file = job.run, job.run.blocks / "blocks.json"
     nested.check(nest)
     blocks = read_blocks(file)
-    settings = {**asdict(nest), "seed": seed, "seam_steps": config.boundary_steps}
+    settings = {**asdict(nest), "seed": seed, "boundary_steps": config.boundary_steps}
 
     def make() -> list[str]:
         every = range(len(blocks))
@@ -254,16 +262,16 @@ def nest_blocks(job: Job, config: BlocksConfig, nest: NestConfig, seed: int) -> 
             files = _tune(job, blocks, config, nest, seed)
         g, sizes, purity = together(files)
         lines = write_ladder(job, g, sizes, nest, purity)
-        return [*lines, f"{len(blocks)} blocks, {config.boundary_steps} steps along the borders of each"]
+        return [*lines, f"{len(blocks)} blocks, {config.boundary_steps} steps of boundary tuning each"]
 
-    inputs = [run.scene, run.labels, run.levels, run.provenance("parts"), file]
+    inputs = [run.scene, run.labels, run.levels, run.provenance("train"), *label_image_inputs(run), file]
     run_stage(job, "nest", settings, inputs, [run.prefixes, run.increments], make, swaps=True)
 
 
 def nest_block(
     spec: JobSpec, partition: Path, number: int, config: NestConfig, seed: int, emit: Emit
 ) -> None:
-    """Make the nested ladder of one block, and what of it is inside the block's border."""
+    """Make the nested levels of one block, and its interior: the Gaussians inside the block's border."""
     job = spec.open(named(emit, f"block {number}"))
     run = job.run
     nest_levels(job, config, seed)
@@ -271,23 +279,24 @@ def nest_block(
     def make() -> list[str]:
         blocks = read_blocks(partition)
         parts = BlockCategories(job.masks.taxonomy, len(blocks))
-        whole = read_prefixes(run.prefixes)
-        g, inside = interior(whole.gaussians, blocks, parts, number)
+        full = read_prefixes(run.prefixes)
+        g, inside = interior(full.gaussians, blocks, parts, number)
         if not len(g):
             raise RunError(f"{run.path}: no Gaussians inside the block; choose fewer with --blocks.count")
-        labels, purity = whole.gaussians.label_ids.numpy(), read_more(run.prefixes, "purity")
-        sizes = interior_sizes(labels, inside, whole.sizes, parts, number)
+        labels, purity = full.gaussians.label_ids.numpy(), read_more(run.prefixes, "purity")
+        sizes = interior_sizes(labels, inside, full.sizes, parts, number)
         write_set(run.interior, g, config.steps, sizes, purity=purity[inside])
-        return [f"{len(g):,} of {len(whole.gaussians):,} Gaussians are inside the block"]
+        return [f"{len(g):,} of {len(full.gaussians):,} Gaussians are inside the block"]
 
-    run_stage(job, "core", {}, [run.prefixes, partition], [run.interior], make)
+    inputs = [run.prefixes, run.masks / "labels.json", partition]
+    run_stage(job, "interior", {}, inputs, [run.interior], make)
 
 
 def _tune(job: Job, blocks: Blocks, config: BlocksConfig, nest: NestConfig, seed: int) -> list[Path]:
-    """Tune the blocks along their borders: neighbours one after the other, others at once."""
+    """Tune the blocks along their boundaries, neighbours one after the other; the files with the results."""
     run, every = job.run, range(len(blocks))
     files = [run.block(number).interior for number in every]
-    colour, sees = colours(blocks.neighbours()), read_json(run.blocks / "blocks.json")["sees"]
+    colour, sees = graph_colouring(blocks.neighbours()), read_json(run.blocks / "blocks.json")["sees"]
     steps = replace(nest, steps=config.boundary_steps)
     for now in range(int(colour.max()) + 1):
         mine = [number for number in every if colour[number] == now]
@@ -295,7 +304,7 @@ def _tune(job: Job, blocks: Blocks, config: BlocksConfig, nest: NestConfig, seed
         for number in mine:
             others = [files[other] for other in sees[number] if other != number]
             what = (_spec(job, number), run.blocks / "blocks.json", number, others, steps, seed)
-            tasks.append(Task(f"seams of block {number}", tune_boundaries, what, job.gpus))
+            tasks.append(Task(f"boundaries of block {number}", tune_boundaries, what, job.gpus))
         results(job.executor, tasks, job.emit)
         for number in mine:
             files[number] = run.block(number).tuned_interior
@@ -305,10 +314,10 @@ def _tune(job: Job, blocks: Blocks, config: BlocksConfig, nest: NestConfig, seed
 def tune_boundaries(
     spec: JobSpec, partition: Path, number: int, others: list[Path], config: NestConfig, seed: int, emit: Emit
 ) -> None:
-    """Train a block's Gaussians near its border on compositions with what its views see of other blocks."""
+    """Train a block's Gaussians near its border on compositions with visible Gaussians of other blocks."""
     job = spec.open(named(emit, f"block {number}"))
     run = job.run
-    settings = {**asdict(config), "seed": seed, "others": [file_hash(path) for path in others]}
+    settings = {**asdict(config), "seed": seed}
 
     def make() -> list[str]:
         blocks, own = read_blocks(partition), read_level(run.interior)
@@ -321,7 +330,8 @@ def tune_boundaries(
         write_set(run.tuned_interior, tuned, config.steps, read_sizes(run.interior), purity=purity)
         return [f"{int(near.sum()):,} of {len(own):,} Gaussians, {len(views)} views of several blocks"]
 
-    run_stage(job, "seams", settings, [run.interior, partition], [run.tuned_interior], make)
+    inputs = [run.scene, run.provenance("train"), run.interior, partition, *others]
+    run_stage(job, "boundaries", settings, inputs, [run.tuned_interior], make)
 
 
 def _tuned(
@@ -345,8 +355,8 @@ def _tuned(
         seed=seed, backend=job.backend, movable=movable,
     ):  # fmt: skip
         if isinstance(event, NestStep):
-            job.emit(Progress("seams", event.step, config.steps, f"loss {event.loss:.3f}"))
+            job.emit(Progress("boundaries", event.step, config.steps, f"loss {event.loss:.3f}"))
         elif isinstance(event, Nested):
             mine = torch.isin(event.gaussians.label_ids, torch.unique(own.label_ids))
             return event.gaussians.select(mine)
-    raise AssertionError("a training ends with what it trained")
+    raise AssertionError("training ends with a Nested event")

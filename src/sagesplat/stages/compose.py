@@ -1,4 +1,6 @@
-"""Compose the chosen levels, and write the composed scene."""
+"""Makes the composed scene, from the levels that the plan chose."""
+
+from pathlib import Path
 
 from sagesplat.adapt.plan import Plan
 from sagesplat.core.gaussians import Gaussians
@@ -8,7 +10,7 @@ from sagesplat.run.run_dir import settings_of
 from sagesplat.run.stage import run_stage
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.plan import main_plan
-from sagesplat.stages.shared import train_config
+from sagesplat.stages.shared import label_image_inputs, train_config
 from sagesplat.train.stepper import tune
 
 
@@ -40,4 +42,11 @@ def compose_plan(job: Job) -> None:
         return [f"{len(g):,} Gaussians, {plan.nbytes / 1e6:.1f} MB at 248 bytes each{transfer_bytes}"]
 
     settings = {"tune_steps": settings_of(run, "plan").get("tune_steps", 0)}
-    run_stage(job, "compose", settings, [run.plan, method_of(job).level_files[0]], [run.composed], make)
+    run_stage(job, "compose", settings, compose_inputs(job), [run.composed], make)
+
+
+def compose_inputs(job: Job) -> list[Path]:
+    """What a plan's composition is made from."""
+    run = job.run
+    made = [run.provenance("plan"), run.provenance("train"), *label_image_inputs(run)]
+    return [run.scene, run.plan, method_of(job).level_files[0], *made]

@@ -1,4 +1,4 @@
-"""Measure the plans on the test views."""
+"""Makes the evaluation: the plans measured on the test views."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from sagesplat.run.job import Job
 from sagesplat.run.run_dir import settings_of
 from sagesplat.run.stage import run_stage
 from sagesplat.segment.display_names import titles
-from sagesplat.stages.compose import compose
+from sagesplat.stages.compose import compose, compose_inputs
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.plan import main_target, scene_plan
 from sagesplat.stages.shared import _show, label_images
@@ -46,6 +46,7 @@ def evaluate_plans(job: Job) -> None:
             )
         return lines
 
-    inputs = [run.scene, run.labels, *method.files, run.plan]
+    fitted = [run.provenance("observe"), run.provenance("fit")]
+    inputs = [run.labels, *method.files, *fitted, *compose_inputs(job)]
     settings = {"tune_steps": settings_of(run, "plan").get("tune_steps", 0)}
     run_stage(job, "evaluate", settings, inputs, [run.evaluation], make)

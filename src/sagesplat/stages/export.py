@@ -1,4 +1,4 @@
-"""Write levels, compositions and increments as files of their own."""
+"""Makes PLY or SPZ files, from levels, compositions and increments of a run."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,7 +17,7 @@ from sagesplat.stages.shared import label_named
 def export_increments(job: Job, folder: Path, kind: Format) -> int:
     """Write what each level of each category adds as files of their own; returns how many."""
     if job.run.ladder != "nested":
-        raise RunError(f"{job.run.path}: snapshots have no chunks; leave out --ladder snapshots")
+        raise RunError(f"{job.run.path}: snapshots have no chunks; use --ladder nested")
     if folder.exists() and not (job.force and (folder / INDEX).exists()):
         raise RunError(f"{folder}: exists; choose a new folder (--force replaces one of chunks)")
     ladder, made = read_prefixes(job.run.prefixes), settings_of(job.run, "nest")

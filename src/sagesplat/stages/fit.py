@@ -1,16 +1,18 @@
-"""Fit the quality models: Eq. 3 over distance, and what else the run's method fits."""
+"""Makes the quality models, from the observations: Eq. 3, and what else the run's method fits."""
 
 from collections.abc import Sequence
 
 from sagesplat.adapt.eq3 import Samples, SsimModel, fit_model, samples, write_models
 from sagesplat.adapt.observe import Observations
 from sagesplat.core.config import FitConfig
+from sagesplat.core.errors import RunError
 from sagesplat.run.executor import split
 from sagesplat.run.job import Job
 from sagesplat.run.remote import work_all
+from sagesplat.run.run_dir import RunDir, settings_of
 from sagesplat.run.stage import run_stage
 from sagesplat.stages.methods import method_of
-from sagesplat.stages.shared import observed
+from sagesplat.stages.shared import label_image_inputs, observed
 
 
 def fit_curves(job: Job, table: Observations) -> dict[tuple[int, int], SsimModel]:
@@ -37,5 +39,18 @@ def fit_ladder(job: Job, config: FitConfig) -> None:
         return lines + method.fit(table, config, models)
 
     settings = {name: getattr(config, name) for name in method.fit_settings}
-    inputs = [run.scene, run.observations, *method.level_files]
+    _check_observed(run, config)
+    inputs = [run.scene, run.provenance("observe"), run.observations, *method.level_files]
+    inputs += [run.labels, run.provenance("train"), *label_image_inputs(run)]
     run_stage(job, "fit", settings, inputs, method.model_files, make)
+
+
+def _check_observed(run: RunDir, config: FitConfig) -> None:
+    """RunError where the levels were observed with other distances or label images than `config` names."""
+    made = settings_of(run, "observe")
+    for name, wanted in (("distance", config.distance), ("masks", config.masks)):
+        if made[name] != wanted:
+            raise RunError(
+                f"{run.observations}: observed with {name} {made[name]}; add --fit.{name} {made[name]}, or "
+                f"observe again: `sagesplat observe {run.path} --fit.{name} {wanted} --force`"
+            )

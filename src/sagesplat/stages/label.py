@@ -1,4 +1,4 @@
-"""The stages that label: label images of the views, labels of the points, and what all views agree on."""
+"""Makes label images from the photos, point labels from these, and fused label images from both."""
 
 import shutil
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ _EDIT = "edit.json"
 
 def make_masks(job: Job, config: MasksConfig, labels: LabelsConfig = LabelsConfig()) -> None:
     """Import label images or segment the photos, then merge and drop categories."""
-    run, kind = job.run, _kind(job, config)
+    run, kind = job.run, segmenter_kind(job.scene.path, config)
     merge, keep = parse_merge(labels.merge), parse_keep(labels.keep)
     if kind == "masks":
         _import(job, config)
@@ -59,11 +59,11 @@ def _lines(edited: Edited) -> list[str]:
     return lines
 
 
-def _kind(job: Job, config: MasksConfig) -> str:
-    """The segmenter that was asked for, or with "auto" the one that the settings and the scene imply."""
+def segmenter_kind(capture: Path, config: MasksConfig) -> str:
+    """The segmenter that was asked for, or with "auto" the one that the settings and the capture imply."""
     if config.segmenter != "auto":
         return config.segmenter
-    if not config.model and (config.masks or (job.scene.path / "masks").is_dir()):
+    if not config.model and (config.masks or (capture / "masks").is_dir()):
         return "masks"
     return segmenter_for(config.model)
 
@@ -170,7 +170,8 @@ def fuse_masks(job: Job) -> None:
             f"in {after:.1%} of what they see ({before:.1%} before)"
         ]
 
-    inputs = [run.provenance("masks"), run.masks / "labels.json", run.levels]
+    made = [run.provenance(stage) for stage in ("masks", "train")]
+    inputs = [run.scene, run.masks / "labels.json", run.levels, *made]
     run_stage(job, "fuse", {"soft": soft is not None}, inputs, [run.fused / "labels.json"], make)
 
 

@@ -122,7 +122,7 @@ class Snapshots(Method):
 
     def plan_budget(self, config: PlanConfig) -> Plan:
         """See `Method`."""
-        raise RunError("--budget needs the nested ladder; leave out --ladder snapshots")
+        raise RunError("--budget needs the nested ladder; use --ladder nested")
 
     def amount(self, plan: Plan) -> str:
         """See `Method`."""

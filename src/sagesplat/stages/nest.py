@@ -1,29 +1,26 @@
-"""Make the nested levels of a run: order its Gaussians, train their prefixes, write the increments."""
+"""Makes the nested levels and their increments, from the trained Gaussians: orders them, trains prefixes."""
 
-import json
 from dataclasses import asdict
-from pathlib import Path
 
 import numpy as np
 import torch
 
 from sagesplat.adapt.observe import as_unit, render_rgb
 from sagesplat.core.config import NestConfig
-from sagesplat.core.errors import RunError
 from sagesplat.core.events import Progress, Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.increments import packed, read_increments, write_increments
 from sagesplat.formats.levels import read_level, write_set
 from sagesplat.metrics.image import ssim_map
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import file_hash
+from sagesplat.run.run_dir import checkpoint_key
 from sagesplat.run.stage import run_stage
-from sagesplat.stages.shared import fusion, train_config
+from sagesplat.stages.shared import label_image_inputs, train_config
 from sagesplat.train import nested
-from sagesplat.train.checkpoint import latest_checkpoint, remove_checkpoints
+from sagesplat.train.checkpoint import can_resume, remove_checkpoints
 from sagesplat.train.early_stopping import VIEWS, spread
+from sagesplat.train.events import Resumed, Step, Trained
 from sagesplat.train.nested import NestStep
-from sagesplat.train.trainer import Resumed, Step, Trained
 
 
 def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
@@ -37,15 +34,13 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
         base = read_level(run.base_model) if config.base_share else None
         masks = job.best_masks
         ordered = nested.order(full, job.scene, masks, config, base=base, antialiased=job.antialiased)
-        checkpoint_key = json.dumps(
-            {**settings, "scene": file_hash(run.scene), "levels": file_hash(run.levels)}
-        )
-        if job.force and not _continues(run.nest_checkpoint, checkpoint_key):
+        key = checkpoint_key(run, settings, inputs)
+        if job.force and not can_resume(run.nest_checkpoint, key):
             remove_checkpoints(run.nest_checkpoint)
         trained = ordered
         for event in nested.nest(
             ordered, job.scene, job.photos, train_config(job), config,
-            seed=seed, backend=job.backend, checkpoint=run.nest_checkpoint, settings=checkpoint_key,
+            seed=seed, backend=job.backend, checkpoint=run.nest_checkpoint, settings=key,
         ):  # fmt: skip
             if isinstance(event, NestStep):
                 job.emit(Progress("nest", event.step, config.steps, f"loss {event.loss:.3f}"))
@@ -61,20 +56,11 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
         remove_checkpoints(run.nest_checkpoint)
         return lines
 
-    inputs = [run.scene, run.labels, run.levels, *fusion(run)]
+    inputs = [run.scene, run.labels, run.levels, run.provenance("train"), *label_image_inputs(run)]
     if config.base_share:
         _make_base_model(job, config, seed)
         inputs.append(run.base_model)
     run_stage(job, "nest", settings, inputs, [run.prefixes, run.increments], make, swaps=True)
-
-
-def _continues(checkpoint: Path, checkpoint_key: str) -> bool:
-    """Whether a checkpoint belongs to these settings and can be read."""
-    try:
-        latest_checkpoint(checkpoint, checkpoint_key)
-    except (RunError, OSError):
-        return False
-    return True
 
 
 def _make_base_model(job: Job, config: NestConfig, seed: int) -> None:

@@ -1,4 +1,4 @@
-"""Measure every category at every level in every view."""
+"""Makes the observations: the quality of every category at every level in every view, from renders."""
 
 from collections.abc import Sequence
 
@@ -14,7 +14,7 @@ from sagesplat.run.remote import work_all
 from sagesplat.run.stage import run_stage
 from sagesplat.segment.display_names import titles
 from sagesplat.stages.methods import method_of
-from sagesplat.stages.shared import _show, distances, fusion, label_images
+from sagesplat.stages.shared import _show, distances, label_image_inputs, label_images
 
 
 def observe_levels(job: Job, config: FitConfig) -> None:
@@ -32,7 +32,8 @@ def observe_levels(job: Job, config: FitConfig) -> None:
             f"{len(table):,} observations of {len(job.ladder.levels)} levels in {len(job.scene.views)} views"
         ]
 
-    inputs = [run.scene, run.labels, method_of(job).level_files[0], *fusion(run)]
+    levels = method_of(job).level_files[0]
+    inputs = [run.scene, run.labels, run.provenance("train"), levels, *label_image_inputs(run)]
     settings = {"distance": config.distance, "masks": config.masks}
     run_stage(job, "observe", settings, inputs, [run.observations], make)
 

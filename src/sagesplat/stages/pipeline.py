@@ -1,4 +1,4 @@
-"""The whole flow, from photos and label images to the report."""
+"""Runs all stages in order, from a capture to the report."""
 
 import math
 import time
@@ -23,6 +23,7 @@ from sagesplat.stages.label import fuse_masks, lift_labels, make_masks
 from sagesplat.stages.nest import nest_levels
 from sagesplat.stages.observe import observe_levels
 from sagesplat.stages.plan import make_plan
+from sagesplat.stages.preflight import check_segmenter, check_training
 from sagesplat.stages.report import make_report
 from sagesplat.stages.scene import open_scene
 from sagesplat.stages.train import train_levels
@@ -56,7 +57,10 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
         check_target(target)
     nested.check(config.nest)
     blocks.check(config.blocks)
+    check_segmenter(job, scene, config.masks)
     open_scene(job, scene, config.scene, config.poses)
+    if config.blocks.count == 1:
+        check_training(job, config.train)
     make_masks(job, config.masks, config.labels)
     lift_labels(job, config.lift)
     train(job, config.train, config.blocks, config.seed)

@@ -1,4 +1,4 @@
-"""Choose the levels: for the scene, for single views, within a budget."""
+"""Makes plans from the quality models: a level per category, for the scene, for views, within a budget."""
 
 from dataclasses import asdict
 
@@ -9,6 +9,7 @@ from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir, settings_of
 from sagesplat.run.stage import run_stage
 from sagesplat.stages.methods import method_of
+from sagesplat.stages.shared import label_image_inputs
 
 
 def make_plan(job: Job, config: PlanConfig) -> None:
@@ -27,8 +28,10 @@ def make_plan(job: Job, config: PlanConfig) -> None:
             lines.append(f"{asked}: {method.amount(within)}, {within.status}")
         return lines
 
+    inputs = [run.scene, run.labels, *label_image_inputs(run), *method.files, run.observations]
+    inputs += [run.provenance("observe"), run.provenance("fit")]
     settings = asdict(config) | {"targets": config.targets}
-    run_stage(job, "plan", settings, [run.scene, *method.files, run.observations], [run.plan], make)
+    run_stage(job, "plan", settings, inputs, [run.plan], make)
 
 
 def main_target(run: RunDir) -> float:

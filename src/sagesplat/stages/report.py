@@ -1,4 +1,4 @@
-"""Write the report."""
+"""Makes the HTML report, from a finished run."""
 
 from sagesplat.adapt.plan import read_budget_plan
 from sagesplat.core.events import RunDone
@@ -9,7 +9,7 @@ from sagesplat.run.stage import run_stage
 from sagesplat.stages.compose import compose
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.plan import main_target, scene_plan
-from sagesplat.stages.report_data import report_data
+from sagesplat.stages.report_data import report_data, stage_records
 
 
 def make_report(job: Job) -> None:
@@ -26,12 +26,6 @@ def make_report(job: Job) -> None:
         write_report(run.report, data)
         return []
 
-    run_stage(
-        job,
-        "report",
-        {},
-        [run.observations, run.models, run.plan, run.evaluation],
-        [run.report / "index.html"],
-        make,
-    )
+    inputs = [run.observations, run.models, run.plan, run.evaluation, *stage_records(run)]
+    run_stage(job, "report", {}, inputs, [run.report / "index.html"], make)
     job.emit(RunDone(run.report / "index.html", run.path if method_of(job).streams else None))

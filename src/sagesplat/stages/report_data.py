@@ -1,7 +1,8 @@
-"""Gathers what the report shows from a finished run."""
+"""Reads the data of the report from a finished run."""
 
 import json
 import platform
+from pathlib import Path
 
 import numpy as np
 
@@ -45,7 +46,7 @@ def report_data(
     names = {**masks.taxonomy.names, UNLABELLED: masks.taxonomy.name(UNLABELLED)}
     categories, colours = _parts(run, names)
     plans = read_plans(run.plan)[0]
-    records = {stage: read_json(run.provenance(stage)) for stage in STAGES if run.provenance(stage).exists()}
+    records = {path.stem: read_json(path) for path in stage_records(run)}
     antialiased = bool(records["train"]["settings"]["antialiased"])
     return ReportData(
         title=scene.name,
@@ -68,6 +69,12 @@ def report_data(
         provenance=_provenance(records),
         categories=categories,
     )
+
+
+def stage_records(run: RunDir) -> list[Path]:
+    """The records of the stages that a run's results were made by: not of one whose result was deleted."""
+    stages = [stage for stage in STAGES if stage != "fuse" or (run.fused / "labels.json").exists()]
+    return [path for path in map(run.provenance, stages) if path.exists()]
 
 
 def _parts(run: RunDir, names: dict[int, str]) -> tuple[dict[int, int], Colours]:

@@ -1,4 +1,4 @@
-"""What several stages ask of a run."""
+"""Helpers that several stages share: settings, label images and distances of a run."""
 
 from dataclasses import fields, replace
 from pathlib import Path
@@ -28,9 +28,9 @@ def train_config(job: Job) -> TrainConfig:
     return TrainConfig(**{f.name: made[f.name] for f in fields(TrainConfig) if f.name in made})
 
 
-def fusion(run: RunDir) -> list[Path]:
-    """What results change with that look at label images after training."""
-    made = [("fuse", run.fused), ("parts", run.block_categories)]
+def label_image_inputs(run: RunDir) -> list[Path]:
+    """What decides the label images that stages after training look at: the records of who made them."""
+    made = [("masks", run.masks), ("fuse", run.fused), ("block_categories", run.block_categories)]
     return [run.provenance(stage) for stage, folder in made if (folder / "labels.json").exists()]
 
 

@@ -1,21 +1,22 @@
-"""Train 3DGS from the labelled points and record the levels."""
+"""Makes the levels: trains 3DGS from the labelled points and records snapshots."""
 
-import json
 import shutil
 from dataclasses import asdict
 from functools import partial
+from pathlib import Path
 
 from sagesplat.core.config import TrainConfig
-from sagesplat.core.errors import RunError
 from sagesplat.core.events import Training, Warned
 from sagesplat.io.files import read_json, write_json
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import RunDir, file_hash
+from sagesplat.run.run_dir import RunDir, checkpoint_key
 from sagesplat.run.stage import run_stage
+from sagesplat.segment.display_names import titles
 from sagesplat.train import memory
-from sagesplat.train.checkpoint import latest_checkpoint, remove_checkpoints
+from sagesplat.train.checkpoint import can_resume, remove_checkpoints
+from sagesplat.train.events import LabelFrozen, LevelSaved, Resumed, Step, Trained
 from sagesplat.train.parallel import train_together
-from sagesplat.train.trainer import LabelFrozen, LevelSaved, Resumed, Step, Trained, train
+from sagesplat.train.trainer import train
 
 
 def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
@@ -23,13 +24,12 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
     run = job.run
     # the photos of a step decide the result, not the processes that compute it
     settings = {**asdict(config), "batch": max(config.batch, job.processes), "seed": seed}
+    inputs = train_inputs(run, config)
 
     def make() -> list[str]:
-        checkpoint_key = json.dumps(
-            {**settings, "scene": file_hash(run.scene), "labels": file_hash(run.labels)}
-        )
-        place = _place(job, checkpoint_key)
-        resuming = place.checkpoint.exists() and (not job.force or _continues(place, checkpoint_key))
+        key = checkpoint_key(run, settings, inputs)
+        place = _place(job, key)
+        resuming = place.checkpoint.exists() and (not job.force or can_resume(place.checkpoint, key))
         fitted, cap = _fit_memory(job, place, config, resuming)  # before anything is given up
         if not resuming:
             remove_checkpoints(place.checkpoint)
@@ -37,12 +37,12 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
         place.path.mkdir(exist_ok=True)
         write_json(place.cap, {"cap": cap, "settings": settings})
         counts: dict[str, int] = {}
-        names = job.names()
+        names = titles(job.names())
         start = partial(train_together, job.processes, job.threads) if job.processes > 1 else train
         events = start(
             job.scene, job.photos, job.point_labels, fitted,
             masks=job.masks if config.freeze_at is not None else None,
-            seed=seed, backend=job.backend, folder=place.path, settings=checkpoint_key,
+            seed=seed, backend=job.backend, folder=place.path, settings=key,
         )  # fmt: skip
         lines = []
         for event in events:
@@ -66,14 +66,19 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
             _swap(run, place)
         return lines
 
-    inputs, outputs = [run.scene, run.labels], [run.levels, run.checkpoint]
+    outputs = [run.levels, run.checkpoint]
     run_stage(job, "train", settings, inputs, outputs, make, swaps=True)
 
 
-def _place(job: Job, checkpoint_key: str) -> RunDir:
+def train_inputs(run: RunDir, config: TrainConfig) -> list[Path]:
+    """What a training reads besides photos: label images only where categories may stop early."""
+    return [run.scene, run.labels, *([run.provenance("masks")] if config.freeze_at is not None else [])]
+
+
+def _place(job: Job, key: str) -> RunDir:
     """Where to train: in the run folder, or beside a finished training, which stays until this one ends."""
     run, aside = job.run, job.run.replacement
-    if aside.checkpoint.exists() and _continues(aside, checkpoint_key):
+    if can_resume(aside.checkpoint, key):
         return aside
     shutil.rmtree(aside.path, ignore_errors=True)
     finished = run.provenance("train").exists() and run.levels.exists()
@@ -110,12 +115,3 @@ def _fit_memory(job: Job, place: RunDir, config: TrainConfig, resuming: bool) ->
     fitted = memory.fit(job.scene, config, job.memory_limit, processes=job.processes, began=began)
     job.emit(Warned(str(fitted)))
     return fitted.config, fitted.lowered
-
-
-def _continues(run: RunDir, checkpoint_key: str) -> bool:
-    """Whether the checkpoint of a training belongs to these settings and can be read."""
-    try:
-        latest_checkpoint(run.checkpoint, checkpoint_key)
-    except RunError:
-        return False
-    return True

@@ -1,4 +1,4 @@
-"""Show a bundle, or a run, in the browser of this machine or of a headset."""
+"""Shows a bundle, or makes one from a run and shows it, in a browser here or in a headset."""
 
 import threading
 from collections.abc import Callable
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from sagesplat.core.errors import BackendUnavailable, RunError, SageError
 from sagesplat.core.events import Emit, Warned
 from sagesplat.io.files import read_json
-from sagesplat.run.run_dir import FORMAT, RunDir
+from sagesplat.run.run_dir import RunDir, check_format
 
 if TYPE_CHECKING:
     from sagesplat.run.job import Job
@@ -90,9 +90,7 @@ def run_bundle(job: "Job") -> Path:
 
     folder = job.run.path / "bundle"
     if not _is_finished(job.run):
-        raise RunError(
-            f"{job.run.path}: not finished; do `sagesplat run`, or add --follow to see its training"
-        )
+        raise RunError(f"{job.run.path}: not finished; run `sagesplat run` again, or add --follow")
     if not _is_current(job.run, folder):
         bundle(job, folder)
     return folder
@@ -106,9 +104,7 @@ def _open_run(path: Path, emit: Emit) -> "Job":
     if not run.scene.exists():
         raise RunError(f"{path}: neither a bundle (no {MANIFEST}) nor a run folder (no scene.json)")
     made = read_json(run.provenance("scene")) if run.provenance("scene").exists() else {}
-    found = made.get("format") if isinstance(made, dict) else None
-    if found != FORMAT:
-        raise RunError(f"{path}: a run folder of format {found}, this sagesplat reads {FORMAT}")
+    check_format(path, made if isinstance(made, dict) else {})
     return Job(run, emit)
 
 

@@ -27,3 +27,15 @@ def load_metrics(job: Job, folder: Path | None, nets: Sequence[Net] = NETS) -> d
         except SageError as error:
             job.emit(Warned(f"no LPIPS ({net}): {error}"))
     return found
+
+
+def warn_of_lpips(job: Job, folder: Path | None) -> None:
+    """Say before a study takes its time that its tables will have no LPIPS, where weights are missing."""
+    missing = [net for net, found in lpips_hashes(folder).items() if found is None]
+    if missing:
+        names = ", ".join(missing)
+        job.emit(
+            Warned(
+                f"tables will be without LPIPS ({names}): no weights; run `sagesplat download lpips` first"
+            )
+        )

@@ -19,7 +19,7 @@ def _update(
     parameter, grad, exp_avg, exp_avg_sq, trainable, count, rate, correction,
     WIDTH: tl.constexpr, COLUMNS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """`count` values: the exp_avg COLUMNS of every row of WIDTH."""
+    """`count` values: the first COLUMNS of every row of WIDTH."""
     at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = at < count
     row = at // COLUMNS
@@ -43,7 +43,7 @@ def adam_step(
     exp_avg_sq: Tensor,
     *,
     lr: float,
-    step: int,  # 1 for the exp_avg
+    step: int,  # 1 for the first
     trainable: Tensor | None,  # bool [N]; None: all rows
     columns: int | None = None,
 ) -> None:

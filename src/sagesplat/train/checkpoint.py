@@ -41,6 +41,15 @@ def remove_checkpoints(path: Path) -> None:
         each.unlink(missing_ok=True)
 
 
+def can_resume(path: Path, settings: str) -> bool:
+    """Whether a checkpoint is there, belongs to these settings and can be read."""
+    try:
+        latest_checkpoint(path, settings)
+    except RunError:
+        return False
+    return True
+
+
 def write_checkpoint(path: Path, state: TrainState, settings: str) -> None:
     """Save a state; `settings` says what run it belongs to and is checked on reading.
 
@@ -122,8 +131,8 @@ def latest_checkpoint(path: Path, settings: str) -> tuple[TrainState, str]:
             raise
         try:
             return read_checkpoint(kept, settings), damage
-        except _Damaged as exp_avg_sq:
-            reason = str(exp_avg_sq).partition("; ")[0]
+        except _Damaged as older:
+            reason = str(older).partition("; ")[0]
             raise RunError(
                 f"{damage}, and {reason}; delete both (or add --force) to train from the start"
             ) from None

@@ -50,8 +50,8 @@ class ActiveTiles:
     masks: Masks | None  # needed once a category has stopped
     frozen: frozenset[int] = frozenset()  # label ids
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
-    _kept: dict[tuple[int, int], np.ndarray] = field(default_factory=dict)
-    _there: dict[tuple[int, int], torch.Tensor] = field(default_factory=dict)
+    _kept: dict[tuple[int, int], np.ndarray] = field(default_factory=dict, init=False)
+    _there: dict[tuple[int, int], torch.Tensor] = field(default_factory=dict, init=False)
 
     def tiles(self, row: int, factor: int = 1) -> Bool[np.ndarray, "h w"] | None:
         """The tiles of a view, drawn `factor` times smaller, that are left; None: all."""

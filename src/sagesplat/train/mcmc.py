@@ -18,6 +18,7 @@ from sagesplat.raster.reference import rotation_matrices
 from sagesplat.train import densify
 from sagesplat.train.state import TrainState
 
+REFINE_STOP = 25_000  # step of 30,000 at which refinement ends, as published
 MOST = 51  # Gaussians that may share a place; more are treated as so many
 _GROWTH = 0.05  # of the present count, at each refinement, as published
 _GROWN_BY = 0.5  # share of the refinements after which even a short run has reached its cap

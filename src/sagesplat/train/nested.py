@@ -19,12 +19,13 @@ from sagesplat.scene.scene import Points, Scene
 from sagesplat.segment.masks import Masks
 from sagesplat.train.checkpoint import latest_checkpoint, write_checkpoint
 from sagesplat.train.early_stopping import ActiveTiles, trainable_rows
+from sagesplat.train.events import Event, Resumed
 from sagesplat.train.importance import importance
 from sagesplat.train.lr_schedule import LrSchedule
 from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.state import initial_state
 from sagesplat.train.stepper import Stepper
-from sagesplat.train.trainer import LOOK_EVERY, Event, Resumed, finite, named_failures, train
+from sagesplat.train.trainer import LOOK_EVERY, finite, named_failures, train
 from sagesplat.train.votes import label_weights, winners
 
 CLEAR = 0.8  # share of its blending weight that a Gaussian needs in one category, else it straddles a border
@@ -199,9 +200,10 @@ def nest(
     column = torch.from_numpy(column).to(device)
     views = scene.train_ids.tolist()
     sort_at = {round(part * config.steps) for part in _SORT_AT} if movable is None else {}
-    config_of_steps = replace(train_config, strategy="default", batch=1)
-    stepper = Stepper(PhotoLoader(scene, photos, device), config_of_steps, ActiveTiles(scene, None), backend)
-    stepper.sh_bits = config.sh_bits
+    stepper = Stepper(
+        PhotoLoader(scene, photos, device), replace(train_config, batch=1), ActiveTiles(scene, None), backend,
+        sh_bits=config.sh_bits,
+    )  # fmt: skip
     rates = _rates(train_config, config, scene)
     trainable = trainable_rows(state.gaussians, {})
     if movable is not None:

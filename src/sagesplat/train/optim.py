@@ -56,7 +56,7 @@ def adam_step(
     exp_avg_sq: np.ndarray,
     *,
     lr: float,
-    step: int,  # 1 for the exp_avg
+    step: int,  # 1 for the first
     trainable: np.ndarray,  # bool [N]
     columns: int | None = None,
 ) -> None:

@@ -12,7 +12,6 @@ from sagesplat.core.sh import num_bases, rgb_to_sh0
 from sagesplat.scene.scene import Points
 
 INITIAL_OPACITY = 0.1
-MCMC_OPACITY, MCMC_SCALE = 0.5, 0.1  # what 3DGS-MCMC begins with; scales times those of 3DGS
 
 
 @dataclass(eq=False)

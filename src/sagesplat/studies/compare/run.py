@@ -91,7 +91,7 @@ def compare(job: Job, config: CompareConfig, copy: Path | None = None) -> list[P
     lpips = lpips_hashes(config.lpips)
     targets = list(config.targets) or sorted({*PAPER_TARGETS, *settings_of(job.run, "plan")["targets"]})
     settings = json.loads(json.dumps(asdict(config) | {"targets": targets, "lpips": lpips}))
-    is_done(job.run, "compare", settings, [], [file], job.force)  # refused before hours of training
+    is_done(job.run, "compare", settings, None, [file], job.force)  # refused before hours of training
     snapshots = _snapshots(job)
     trained = _trained(job, [*_pruned(job, config, folder), *_mcmc(job, config, folder)])
 

@@ -114,7 +114,9 @@ def _rename(table: dict[str, Any], where: str, tell: Callable[[str], None]) -> N
     for prefix, of_run in tables:
         for stage in ("train", "nest", "blocks"):
             inner = of_run.get(stage) if isinstance(of_run, dict) else None
-            for old in [key for key in inner if key in _RENAMED] if isinstance(inner, dict) else []:
+            if not isinstance(inner, dict):
+                continue
+            for old in [key for key in inner if key in _RENAMED]:
                 tell(f"{where}{prefix}{stage}.{old} is called {_RENAMED[old]} now; the old name will go")
                 inner[_RENAMED[old]] = inner.pop(old)
 

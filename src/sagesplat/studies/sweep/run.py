@@ -1,7 +1,6 @@
 """A sweep: every scene, variant of the settings and seed of one small file, summed up as mean and spread."""
 
 import math
-import shutil
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -14,7 +13,7 @@ from sagesplat.adapt.observe import TOTAL
 from sagesplat.adapt.plan import read_plans
 from sagesplat.core.errors import RunError, SageError
 from sagesplat.core.events import Emit, Progress, StageDone, StageStarted, TableMade, Warned, named
-from sagesplat.io.files import link, read_json
+from sagesplat.io.files import atomic_folder, link, read_json
 from sagesplat.output.tables import MB, Table, mean, promise_kept
 from sagesplat.raster import Backend
 from sagesplat.run.executor import LOCAL, Executor, Local, Task
@@ -133,19 +132,21 @@ def _trained_alike(earlier: Sequence[Cell], cell: Cell) -> Cell | None:
 
 
 def _share_training(runs: Path, like: Cell | None, cell: Cell) -> None:
-    """Begin with what an earlier cell has trained."""
+    """Begin with all that an earlier cell has made up to its training: later stages read any of it."""
     new = RunDir(runs / cell.name)
     if like is None or new.path.exists() or not RunDir(runs / like.name).provenance("train").exists():
         return
     old = RunDir(runs / like.name)
     if old.capture.exists() or old.blocks.exists():  # these are named in there
         return
-    # links take no room; nothing in a run is changed in place
-    for path in (old.segmented, old.masks, old.levels):
-        shutil.copytree(path, new.path / path.name, copy_function=lambda a, b: link(Path(a), Path(b)))
     stages = [old.provenance(stage) for stage in ("scene", "segment", "masks", "lift", "train")]
-    for path in (old.scene, old.labels, old.checkpoint, old.frozen, *stages):
-        link(path, new.path / path.relative_to(old.path))
+    made = [old.scene, old.segmented, old.soft, old.masks, old.labels]
+    made += [old.levels, old.checkpoint, old.cap, old.frozen, *stages]
+    with atomic_folder(new.path) as fresh:
+        # links take no room; nothing in a run is changed in place
+        for path in (p for p in made if p.exists()):
+            for file in [p for p in path.rglob("*") if p.is_file()] if path.is_dir() else [path]:
+                link(file, fresh / file.relative_to(old.path))
 
 
 def _measure(cell: Cell, job: Job) -> Iterator[Row]:

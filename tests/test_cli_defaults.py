@@ -1,0 +1,346 @@
+"""A run's own settings as defaults, and --force, which keeps earlier results until new ones are whole."""
+
+import shutil
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from test_cli import call
+
+from sagesplat.adapt.plan import read_plans
+from sagesplat.cli import parse
+from sagesplat.cli.console import Console
+from sagesplat.core.config import FitConfig, NestConfig, PlanConfig, TrainConfig
+from sagesplat.core.errors import RunError
+from sagesplat.core.events import Event, Progress, StageDone, StageSkipped, Training, Warned
+from sagesplat.demo.capture import make_capture
+from sagesplat.formats.levels import read_level
+from sagesplat.io.files import read_json
+from sagesplat.run.job import Job
+from sagesplat.run.recorded import recorded_settings
+from sagesplat.run.run_dir import RunDir
+from sagesplat.stages import pipeline, preflight, train
+from sagesplat.stages.nest import nest_levels
+from sagesplat.stages.train import train_levels
+
+SETTINGS = "--train.max-steps 60 --train.level-every 30 --ladder snapshots --target-ssim 0.4 --test-every 6"
+Call = Callable[..., tuple[int, str]]
+
+
+class Killed(Exception):
+    """What a test kills a stage with."""
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("demo") / "capture"
+    make_capture(folder, views=12, width=64, height=48)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def finished(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from sagesplat import cli
+
+    run = tmp_path_factory.mktemp("run") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["sagesplat", "run", str(capture), str(run), *SETTINGS.split()])
+        cli.main()
+    return run
+
+
+@pytest.fixture
+def run(finished: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(finished, tmp_path / "run"))
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Call:
+    def typed(*words: str | Path) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["sagesplat", *map(str, words)])
+        code, text = 0, ""
+        try:
+            from sagesplat import cli
+
+            cli.main()
+        except SystemExit as end:
+            code = int(end.code or 0)
+        out = capsys.readouterr()
+        return code, text + out.out + out.err
+
+    return typed
+
+
+def test_flags_of_earlier_commands_are_the_defaults(run: Path, capture: Path, command: Call) -> None:
+    before = RunDir(run).provenance("train").read_bytes()
+    code, said = command("run", capture, run)
+    assert code == 0
+    assert "✓" not in said  # nothing is redone
+    for flag in SETTINGS.split("--")[1:]:
+        assert f"--{flag.strip()}" in said
+    code, said = command("run", capture, run, "--target-ssim", "0.5", "--force")
+    assert code == 0
+    assert [line.split()[1] for line in said.splitlines() if line.startswith("✓")] == [
+        "plan", "compose", "evaluate", "report",
+    ]  # fmt: skip
+    assert RunDir(run).provenance("train").read_bytes() == before
+    assert read_json(RunDir(run).scene)["settings"]["test_every"] == 6
+    assert read_plans(RunDir(run, "snapshots").plan)[0][1].target == 0.5
+
+
+def test_a_refusal_says_what_differs_and_its_cure_works(run: Path, command: Call) -> None:
+    code, said = command("plan", run, "--target-ssim", "0.5")
+    assert code == 2
+    assert "target_ssim (0.4 then, 0.5 now)" in said
+    assert "add --force" in said
+    code, said = command("plan", run, "--target-ssim", "0.5", "--force")
+    assert code == 0
+    assert "--force: " in said
+    assert "made with other target_ssim (0.4 then, 0.5 now)" in said
+    assert "plan is redone (it took 0 s)" in said
+    assert "compose, evaluate, report" in said
+    assert command("compose", run)[0] == 0  # it follows the plan without --force
+    assert command("evaluate", run)[0] == 0
+
+
+def test_settings_of_a_run_reach_every_command(run: Path) -> None:
+    known = recorded_settings(RunDir(run, "snapshots"))
+    assert known["train"] == TrainConfig(max_steps=60, level_every=30)
+    assert known["plan"] == PlanConfig(target_ssim=0.4)
+    assert known["fit"] == FitConfig()
+    assert known["masks"].segmenter == "auto"
+    assert known["seed"] == 0
+    assert "nest" not in known
+    assert "poses" not in known
+    for record in (run / "provenance").glob("*.json"):
+        record.write_text("[1")  # what cannot be read is no default
+    (run / "cap.json").write_text("{}")
+    assert {"train", "masks", "seed"} & set(recorded_settings(RunDir(run))) == {"masks"}
+
+
+def test_given_flags_win_and_another_source_of_label_images_drops_the_recorded_one(
+    run: Path, capture: Path, monkeypatch: pytest.MonkeyPatch, command: Call
+) -> None:
+    seen = {}
+    monkeypatch.setattr(
+        pipeline, "run_all", lambda job, scene, config: seen.update(config=config, run=job.run)
+    )
+    (run / "segmented" / "options.json").write_text('{"segmenter": "hf", "model": "a/b", "batch": 3}')
+    assert command("run", capture, run, "--train.max-steps=70", "--seed", "4")[0] == 0
+    config = seen["config"]
+    assert (config.train.max_steps, config.train.level_every, config.seed) == (70, 30, 4)
+    assert (config.masks.model, config.masks.batch, seen["run"].ladder) == ("a/b", 3, "snapshots")
+    assert command("run", capture, run, "--masks", capture / "masks")[0] == 0
+    assert (seen["config"].masks.segmenter, seen["config"].masks.model) == ("auto", None)
+
+
+@pytest.mark.parametrize("answer", ["n", "y"])
+def test_force_asks_on_a_terminal(
+    answer: str, run: Path, monkeypatch: pytest.MonkeyPatch, command: Call
+) -> None:
+    asked = []
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr("rich.console.Console.is_terminal", property(lambda self: True))
+    monkeypatch.setattr(Console, "ask", lambda self, question: asked.append(question) or answer == "y")
+    words = ("plan", run, "--target-ssim", "0.5", "--force")
+    code, said = command(*words)
+    assert asked == ["Redo?"]
+    assert code == (0 if answer == "y" else 2)
+    assert ("nothing was redone" in said) == (answer == "n")
+    target = read_plans(RunDir(run, "snapshots").plan)[0][1].target
+    assert target == (0.5 if answer == "y" else 0.4)
+    if answer == "n":
+        assert command(*words, "--yes")[0] == 0
+        assert len(asked) == 1
+
+
+def job(run: Path, emit: Callable[[Event], None], *, force: bool = True) -> Job:
+    return Job(RunDir(run, "nested"), emit, "cpu", force=force)
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {p.name: p.read_bytes() for p in sorted(folder.iterdir())}
+
+
+def test_a_killed_forced_training_resumes_and_the_earlier_levels_stay_until_then(run: Path) -> None:
+    paths, other = RunDir(run), TrainConfig(max_steps=80, level_every=20)
+    levels, record = files(paths.levels), paths.provenance("train").read_bytes()
+
+    def kill(event: Event) -> None:
+        if isinstance(event, Training) and event.step == 45:
+            raise Killed
+
+    with pytest.raises(Killed):
+        train_levels(job(run, kill), other, 0)
+    assert files(paths.levels) == levels
+    assert paths.provenance("train").read_bytes() == record
+    train_levels(job(run, print, force=False), TrainConfig(max_steps=60, level_every=30), 0)  # up to date
+    events: list[Event] = []
+    train_levels(job(run, events.append), other, 0)
+    assert min(e.step for e in events if isinstance(e, Training)) == 41
+    assert sorted(files(paths.levels)) == ["000020.npz", "000040.npz", "000060.npz", "000080.npz"]
+    assert read_json(paths.provenance("train"))["settings"]["max_steps"] == 80
+    assert not paths.replacement.path.exists()
+    assert recorded_settings(paths)["train"] == other
+
+
+@pytest.mark.parametrize("at", [0, 1, 2, 3, 4])
+def test_a_swap_that_is_killed_is_finished_by_the_same_command(
+    at: int, run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    paths, other, moves = RunDir(run), TrainConfig(max_steps=40, level_every=20), []
+
+    def dying(move: Callable[..., object]) -> Callable[..., object]:
+        def moved(self: Path, *args: object) -> object:
+            if len(moves) == at:
+                raise Killed
+            moves.append(self)
+            return move(self, *args)
+
+        return moved
+
+    def swap(run: RunDir, made: RunDir, swap: Callable[[RunDir, RunDir], None] = train._swap) -> None:
+        for name in ("rename", "replace"):
+            monkeypatch.setattr(Path, name, dying(getattr(Path, name)))
+        swap(run, made)
+
+    monkeypatch.setattr(train, "_swap", swap)
+    with pytest.raises(Killed):
+        train_levels(job(run, print), other, 0)
+    monkeypatch.undo()
+    events: list[Event] = []
+    train_levels(job(run, events.append, force=False), recorded_settings(paths)["train"], 0)
+    assert not [e for e in events if isinstance(e, Training)]
+    assert sorted(files(paths.levels)) == ["000020.npz", "000040.npz"]
+    assert len(read_level(paths.levels / "000040.npz"))
+    assert not paths.replacement.path.exists()
+
+
+def test_a_killed_training_gives_its_settings_to_the_next_command(capture: Path, tmp_path: Path) -> None:
+    def kill(event: Event) -> None:
+        if isinstance(event, Training) and event.step == 25:
+            raise Killed
+
+    config = replace(pipeline.DEMO, train=TrainConfig(max_steps=50, level_every=10))
+    with pytest.raises(Killed):
+        pipeline.run_all(Job(RunDir(tmp_path / "run"), kill, "cpu"), capture, config)
+    assert recorded_settings(RunDir(tmp_path / "run"))["train"] == config.train
+
+
+def test_a_killed_forced_nest_resumes_and_the_earlier_ladder_stays(run: Path) -> None:
+    paths = RunDir(run)
+    first = NestConfig(steps=20, base_steps=20, levels=3)
+    nest_levels(job(run, print), first, 0)
+    ladder, record = paths.prefixes.read_bytes(), paths.provenance("nest").read_bytes()
+    other, saves = replace(first, steps=24), []
+
+    def kill(event: Event) -> None:
+        if isinstance(event, Progress) and event.name == "nest" and event.done == 15:
+            raise Killed
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sagesplat.train.nested._SAVE_EVERY", 10)
+        with pytest.raises(Killed):
+            nest_levels(job(run, kill), other, 0)
+        assert (paths.prefixes.read_bytes(), paths.provenance("nest").read_bytes()) == (ladder, record)
+        nest_levels(job(run, saves.append), other, 0)
+    steps = [e.done for e in saves if isinstance(e, Progress) and e.name == "nest"]
+    assert min(steps) == 11
+    assert read_json(paths.provenance("nest"))["settings"]["steps"] == 24
+    (done,) = [e for e in saves if isinstance(e, StageDone)]
+    assert "SSIM 0." in done.lines[1]
+    assert "before rounding" in done.lines[1]
+    assert "costs" not in "".join(done.lines)
+
+
+def test_snapshots_are_adapted_with_the_settings_of_the_nested_levels(run: Path) -> None:
+    """What `report --paper` and `transfer` need after a plain run."""
+    shutil.move(run / "snapshots", run / "nested")
+    record = RunDir(run).provenance("plan")
+    record.write_text(record.read_text().replace('"budget": 0.0', '"budget": 5000.0'))
+    events: list[Event] = []
+    snapshots = Job(RunDir(run, "snapshots"), events.append, "cpu")
+    pipeline.adapt_snapshots(snapshots)
+    assert [e.name for e in events if isinstance(e, StageDone)] == ["observe", "fit", "plan"]
+    plans = read_plans(snapshots.run.plan)[0]
+    assert [plan.target for plan in plans] == [0.3, 0.4, 0.5]
+    events.clear()
+    pipeline.adapt_snapshots(snapshots)
+    assert [e.name for e in events if isinstance(e, StageSkipped)] == ["observe", "fit", "plan"]
+
+
+def test_a_missing_network_is_told_before_structure_from_motion(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Call
+) -> None:
+    monkeypatch.setattr("sagesplat.scene.photos.reconstruct", lambda *args: pytest.fail("hours were spent"))
+    photos = Path(shutil.copytree(capture / "images", tmp_path / "photos"))
+    for words, says in (
+        (["--segmenter", "onnx"], "--model"),
+        (["--model", "no/such/network/here"], "no such folder"),
+    ):
+        code, said = command("run", photos, tmp_path / "out", *words)
+        assert code == 2
+        assert says in said.splitlines()[-1]
+        assert not said.strip().count("Traceback")
+
+
+def test_a_training_that_does_not_fit_is_told_before_label_images(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from sagesplat.core.config import SceneConfig
+    from sagesplat.stages.scene import open_scene
+
+    events: list[Event] = []
+    work = Job(RunDir(tmp_path / "run"), events.append, "cpu", memory_limit=2**20)
+    open_scene(work, capture, SceneConfig())
+    with pytest.raises(RunError, match="raise --memory-limit"):
+        preflight.check_training(work, TrainConfig())
+    usage = shutil.disk_usage(tmp_path)
+    roomy = replace(work, memory_limit=0)
+    for free, error in ((2**20, True), (30_000_000, False)):
+        monkeypatch.setattr(shutil, "disk_usage", lambda path, free=free: usage._replace(free=free))
+        if error:
+            with pytest.raises(RunError, match=r"GiB, 0\.0 are free; free some"):
+                preflight.check_training(roomy, TrainConfig())
+        else:
+            events.clear()
+            preflight.check_training(roomy, TrainConfig())
+            assert [type(e) for e in events] == [Warned]
+
+
+def test_old_names_of_commands_and_flags(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seen = {}
+    monkeypatch.setattr(pipeline, "run_all", lambda job, scene, config: seen.update(config=config))
+    old = {
+        "--train.pace=published": ("train", "lr_schedule", "published"),
+        "--train.rest_share 0.5": ("train", "gradient_freeze_share", 0.5),
+        "--nest.seed-share 0.1": ("nest", "base_share", 0.1),
+        "--nest.seed-steps 7": ("nest", "base_steps", 7),
+        "--nest.gain 2": ("nest", "lr_multiplier", 2.0),
+        "--blocks.seam-steps 9": ("blocks", "boundary_steps", 9),
+    }
+    code, said = call(monkeypatch, capsys, "run", "a", "b", *" ".join(old).split())
+    assert code == 0
+    for part, name, value in old.values():
+        assert getattr(getattr(seen["config"], part), name) == value
+        assert f"--{part}.{name.replace('_', '-')} now" in said
+    assert said.count("\n") == len(old)
+    for name, now in parse.OLD_COMMANDS.items():
+        code, said = call(monkeypatch, capsys, name, "nowhere", *(["x"] if name == "online" else []))
+        assert code == 2
+        assert f"the command {name} is called {now} now" in said
+
+
+def test_no_old_name_is_one_of_today() -> None:
+    from sagesplat.cli import COMMANDS
+    from sagesplat.cli.help import flags_of
+
+    flags = {flag.name for flag in flags_of(COMMANDS["run"])}
+    assert not flags & set(parse.OLD_FLAGS)
+    assert set(parse.OLD_FLAGS.values()) <= flags
+    assert not set(COMMANDS) & set(parse.OLD_COMMANDS)
+    assert set(parse.OLD_COMMANDS.values()) <= set(COMMANDS)

@@ -1,0 +1,420 @@
+"""What a result was made from: every file that a stage reads is among its inputs, and all inputs count."""
+
+import os
+import shutil
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from sagesplat.core.config import (
+    BlocksConfig,
+    FitConfig,
+    LabelsConfig,
+    NestConfig,
+    PlanConfig,
+    RunConfig,
+    SceneConfig,
+    TrainConfig,
+)
+from sagesplat.core.errors import RunError
+from sagesplat.core.events import Event, Progress, StageDone
+from sagesplat.demo.capture import make_capture
+from sagesplat.io.files import read_json, write_json, write_text
+from sagesplat.run import stage
+from sagesplat.run.job import Job
+from sagesplat.run.run_dir import FORMAT, RunDir, input_hashes, is_done, is_made_from, record, settings_of
+from sagesplat.stages import report
+from sagesplat.stages.fit import fit_ladder
+from sagesplat.stages.label import fuse_masks, make_masks
+from sagesplat.stages.nest import nest_levels
+from sagesplat.stages.observe import observe_levels
+from sagesplat.stages.pipeline import run_all
+from sagesplat.stages.train import train_levels
+from sagesplat.train import nested
+
+CONFIG = RunConfig(
+    scene=SceneConfig(calibrate_every=4),
+    train=TrainConfig(max_steps=20, level_every=10),
+    nest=NestConfig(steps=12, levels=3, smallest=0.1, base_steps=10),
+    plan=PlanConfig(target_ssim=0.4),
+)
+BLOCKS = BlocksConfig(count=2, boundary_steps=5)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def plain_report() -> Iterator[None]:
+    """Figures take most of the time of so small a run, and have their own tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(report, "write_report", lambda folder, _: write_text(folder / "index.html", "report"))
+        yield
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("demo") / "capture"
+    make_capture(folder, views=12, width=64, height=48)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def finished(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = tmp_path_factory.mktemp("run") / "run"
+    work(run, capture)
+    return run
+
+
+@pytest.fixture
+def copy(finished: Path, tmp_path: Path) -> Path:
+    """The finished run, moved to where it may be changed."""
+    shutil.copytree(finished, tmp_path / "moved")
+    return tmp_path / "moved"
+
+
+def work(run: Path, capture: Path, config: RunConfig = CONFIG, **options) -> list[Event]:
+    events: list[Event] = []
+    run_all(Job(RunDir(run, config.ladder), events.append, "cpu", **options), capture, config)
+    return events
+
+
+def done(events: list[Event]) -> list[str]:
+    return [e.name for e in events if isinstance(e, StageDone)]
+
+
+def quiet(run: Path, **options) -> Job:
+    return Job(RunDir(run), lambda event: None, "cpu", **options)
+
+
+# every file that a stage reads
+
+_reading: list[set[str]] = []  # paths opened for reading, of the stages at work; nothing is watched if empty
+
+
+def _hear(event: str, arguments: tuple) -> None:
+    if event == "open" and _reading and isinstance(arguments[0], str | bytes | os.PathLike):
+        path, mode, flags = arguments
+        writes = set(mode) & set("wax+") if mode else flags & (os.O_WRONLY | os.O_RDWR)
+        if not writes:
+            _reading[-1].add(os.path.abspath(os.fsdecode(path)))
+
+
+sys.addaudithook(_hear)
+
+# read, and yet no input: a stage's name, and the file's or its folder's
+_NO_INPUTS = {
+    ("train", "labels.json"),  # names that are shown on the way
+    ("base", "train.json"),  # its settings are among those of the small model
+    ("base", "levels"),  # their number of Gaussians is in the settings
+}
+_CAPTURE = "capture.npz"  # of a block: its scene.json, which is an input, has the fingerprint
+
+
+def _id(path: Path) -> tuple[int, int]:
+    """The same for all links of a file."""
+    found = path.stat()
+    return found.st_dev, found.st_ino
+
+
+def _files(path: Path) -> list[Path]:
+    return [p for p in path.rglob("*") if p.is_file()] if path.is_dir() else [path]
+
+
+class Watch:
+    """Stands for `run_stages`, and notes what stages read that earlier ones wrote and that is no input."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.run_stages = stage.run_stages
+        self.owners: dict[tuple[int, int], set[Path]] = {}  # records of the stages that wrote a file
+        self.at_work = 0
+        self.read = 0
+        self.missed: list[str] = []
+
+    def __call__(self, job, stages, make) -> None:
+        (one,) = stages
+        mine = job.run.provenance(one.name)
+        before = self._state()
+        if self.at_work:
+            _reading.append(set())
+        self.at_work += 1
+        self.run_stages(job, stages, make)
+        self.at_work -= 1
+        read, others = _reading.pop(), _reading[:]
+        _reading.clear()  # what we read ourselves is nobody's
+        for file, written in self._state().items():
+            if before.get(file) != written:
+                self.owners.setdefault(file, set()).add(mine)
+        self._check(one, mine, read)
+        if not self.at_work:
+            others = [set()]  # of the next one: it reads before it is a stage
+            for name in ("scene", "photos", "masks", "snapshots", "ladder", "antialiased"):
+                vars(job).pop(name, None)  # else only the first stage would read them
+        _reading.extend(others)
+
+    def _state(self) -> dict[tuple[int, int], int]:
+        return {_id(path): path.stat().st_mtime_ns for path in _files(self.root)}
+
+    def _check(self, one: stage.Stage, mine: Path, read: set[str]) -> None:
+        known = self._known([*one.inputs, mine])
+        for path in map(Path, sorted(read)):
+            if not path.is_relative_to(self.root) or not path.is_file() or _id(path) not in self.owners:
+                continue
+            self.read += 1
+            makers = self.owners[_id(path)]
+            fine = _id(path) in known or any(p == mine or (p.exists() and _id(p) in known) for p in makers)
+            spared = {(one.name, path.name), (one.name, path.parent.name)} & _NO_INPUTS
+            if not (fine or spared or path.name == _CAPTURE):
+                self.missed.append(f"{one.name} reads {path.relative_to(self.root)}")
+
+    def _known(self, inputs: list[Path]) -> set[tuple[int, int]]:
+        """Files that inputs stand for: a stage's record stands for all that the stage was made from."""
+        known: set[tuple[int, int]] = set()
+        while inputs:
+            path = inputs.pop()
+            new = {_id(file) for file in _files(path)} - known if path.exists() else set()
+            known |= new
+            if new and path.parent.name == "provenance":
+                run = next(folder for folder in path.parents[1:] if (folder / "scene.json").exists())
+                inputs += [run / name for name in read_json(path)["inputs"]]
+        return known
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"fuse": True, "plan": PlanConfig(target_ssim=0.4, tune_steps=2, budget=1e4)},
+        {"ladder": "snapshots", "train": replace(CONFIG.train, freeze_at=0.5)},
+        {"fuse": True, "blocks": BLOCKS, "train": replace(CONFIG.train, freeze_at=0.5)},
+        {"fit": FitConfig(masks="rendered")},
+    ],
+    ids=["nested", "snapshots", "blocks", "rendered"],
+)
+def test_all_that_a_stage_reads_is_among_its_inputs(
+    capture: Path, tmp_path: Path, monkeypatch, changes: dict
+) -> None:
+    watch = Watch(tmp_path.resolve())
+    monkeypatch.setattr(stage, "run_stages", watch)
+    monkeypatch.setattr(stage, "sync_changed", lambda *args: None)  # it opens all that is new
+    _reading[:] = [set()]
+    try:
+        work(tmp_path.resolve() / "run", capture, replace(CONFIG, **changes))
+    finally:
+        _reading.clear()
+    assert watch.missed == [], "\n".join(watch.missed)
+    assert watch.read > 50
+
+
+# records
+
+
+def test_inputs_of_one_name_are_told_apart(tmp_path: Path) -> None:
+    run = RunDir(tmp_path / "run")
+    files = [run.segmented / "labels.json", run.masks / "labels.json"]
+    for path in files:
+        write_text(path, path.parent.name)
+    write_text(tmp_path / "blocks.json", "{}")
+    assert list(input_hashes(run, [*files, tmp_path / "blocks.json"])) == [
+        "segmented/labels.json",
+        "masks/labels.json",
+        "../blocks.json",
+    ]
+    record(run, "lift", {}, files, 1.0)
+    assert is_done(run, "lift", {}, files, files, force=False)
+    write_text(files[0], "changed")
+    with pytest.raises(RunError, match=r"other segmented/labels\.json \(its content changed\); choose"):
+        is_done(run, "lift", {}, files, files, force=False)
+    assert not is_made_from(run, "lift", files[0])
+    assert is_made_from(run, "lift", files[1])
+
+
+@pytest.mark.parametrize(
+    ("settings", "inputs", "says"),
+    [
+        ({"a": 1, "b": 2}, "xy", None),
+        ({"a": 1}, "xy", r"b \(2 then, not set now\)"),
+        ({"a": 1, "b": 2, "c": None}, "xy", r"c \(not set then, None now\)"),
+        ({"a": 1, "b": 2}, "x", r"y \(not used any more\)"),
+        ({"a": 1, "b": 2}, "xyz", r"z \(not used then\)"),
+    ],
+)
+def test_settings_and_inputs_that_are_dropped_or_new_count(tmp_path: Path, settings, inputs, says) -> None:
+    run = RunDir(tmp_path)
+    for name in "xyz":
+        write_text(tmp_path / name, name)
+    record(run, "lift", {"a": 1, "b": 2}, [tmp_path / "x", tmp_path / "y"], 1.0)
+
+    def found(force: bool) -> bool:
+        given = [tmp_path / name for name in inputs]
+        return is_done(run, "lift", settings, given, [tmp_path / "x"], force)
+
+    if says is None:
+        assert found(force=False)
+    else:
+        with pytest.raises(RunError, match=says):
+            found(force=False)
+        assert not found(force=True)
+
+
+def test_a_moved_run_has_nothing_to_do(copy: Path, capture: Path) -> None:
+    assert done(work(copy, capture)) == []
+
+
+def test_a_run_folder_of_an_older_format_is_refused_by_every_stage(copy: Path, capture: Path) -> None:
+    for path in copy.rglob("provenance/*.json"):
+        write_json(path, read_json(path) | {"format": FORMAT - 1})
+    job = quiet(copy, force=True)
+    shutil.rmtree(job.run.increments)  # their names were others
+    older = rf"of format {FORMAT - 1}, this sagesplat \(.*\) reads {FORMAT}; run again into a new folder$"
+    for act in (
+        lambda: work(copy, capture),
+        lambda: nest_levels(job, CONFIG.nest, 0),
+        lambda: fit_ladder(job, CONFIG.fit),
+        lambda: settings_of(job.run, "train"),
+    ):
+        with pytest.raises(RunError, match=older):
+            act()
+    assert done(work(copy.with_name("new"), capture, replace(CONFIG, ladder="snapshots")))[-1] == "report"
+
+
+@pytest.mark.parametrize("content", ["", "[]", f'{{"format": {FORMAT}}}'])
+def test_a_broken_record_is_one_line_and_force_redoes_the_stage(copy: Path, capture: Path, content) -> None:
+    write_text(RunDir(copy).provenance("plan"), content)
+    with pytest.raises(RunError, match=r"plan\.json: not the record of a stage; run that stage again with"):
+        work(copy, capture)
+    assert "plan" in done(work(copy, capture, force=True))
+
+
+# results that label images decide
+
+
+def test_deleting_fused_label_images_is_noticed(copy: Path, capture: Path) -> None:
+    fused = replace(CONFIG, fuse=True)
+    with pytest.raises(RunError, match=r"ladder\.npz: made with other provenance/fuse\.json \(not used then"):
+        work(copy, capture, fused)
+    work(copy, capture, fused, force=True)
+    shutil.rmtree(copy / "fused")
+    with pytest.raises(
+        RunError, match=r"ladder\.npz: made with other provenance/fuse\.json \(not used any mo"
+    ):
+        work(copy, capture)
+    again = done(work(copy, capture, force=True))
+    assert {"nest", "observe", "fit", "report"} <= set(again)
+    assert "fuse" not in (path.stem for path in report.stage_records(RunDir(copy)))
+
+
+def test_other_label_images_are_noticed_though_points_keep_their_labels(copy: Path) -> None:
+    job = quiet(copy, force=True)
+    before = job.run.labels.read_bytes()
+    make_masks(job, CONFIG.masks, LabelsConfig(min_share=1e-9))
+    assert job.run.labels.read_bytes() == before
+    job = quiet(copy)
+    with pytest.raises(RunError, match=r"provenance/masks\.json \(its content changed\)"):
+        nest_levels(job, CONFIG.nest, 0)
+    with pytest.raises(RunError, match=r"provenance/masks\.json \(its content changed\)"):
+        observe_levels(job, CONFIG.fit)
+
+
+def test_early_stopping_depends_on_label_images_and_other_training_does_not(copy: Path) -> None:
+    early = replace(CONFIG.train, freeze_at=0.5)
+    job = quiet(copy, force=True)
+    assert "provenance/masks.json" not in read_json(job.run.provenance("train"))["inputs"]
+    train_levels(job, early, 0)
+    assert "provenance/masks.json" in read_json(job.run.provenance("train"))["inputs"]
+    make_masks(job, CONFIG.masks, LabelsConfig(min_share=1e-9))
+    with pytest.raises(RunError, match=r"provenance/masks\.json \(its content changed\)"):
+        train_levels(quiet(copy), early, 0)
+
+
+def test_blocks_lose_fused_label_images_that_the_run_lost(capture: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    config = replace(CONFIG, blocks=BLOCKS, fuse=True)
+    work(run, capture, config)
+    block = RunDir(run).block(1)
+    assert (block.fused / "labels.json").exists()
+    assert (block.masks / "labels.json").exists()
+    fused = (RunDir(run).prefixes).read_bytes()
+    shutil.rmtree(run / "fused")
+    with pytest.raises(RunError, match=r"fuse\.json \(not used any more\)"):
+        work(run, capture, replace(config, fuse=False))
+    work(run, capture, replace(config, fuse=False), force=True)
+    assert not block.fused.exists()
+    assert not block.provenance("fuse").exists()
+    assert (RunDir(run).prefixes).read_bytes() != fused
+    # the same as if nothing had ever been fused
+    work(tmp_path / "plain", capture, replace(config, fuse=False))
+    assert RunDir(run).prefixes.read_bytes() == RunDir(tmp_path / "plain").prefixes.read_bytes()
+
+
+def test_the_ladders_of_a_run_in_blocks_share_its_categories_and_its_training(capture, tmp_path) -> None:
+    config = replace(CONFIG, blocks=BLOCKS, ladder="snapshots")
+    work(tmp_path / "run", capture, config)
+    more = replace(config, ladder="nested", blocks=replace(BLOCKS, boundary_steps=6))
+    again = done(work(tmp_path / "run", capture, more))
+    assert "block_categories" not in again
+    assert "train" not in again
+    assert again[-1] == "report"
+
+
+# checkpoints
+
+
+class Killed(Exception):
+    """In the place of a signal."""
+
+
+def killed_in_nest(run: Path, config: NestConfig) -> None:
+    def emit(event: Event) -> None:
+        if isinstance(event, Progress) and event.name == "nest" and event.done == 8:
+            raise Killed
+
+    with pytest.raises(Killed):
+        nest_levels(Job(RunDir(run), emit, "cpu"), config, 0)
+
+
+@pytest.mark.parametrize("change", ["fuse", "base"])
+def test_a_killed_nest_does_not_resume_with_other_labels_or_another_base_model(
+    copy: Path, monkeypatch, change: str
+) -> None:
+    monkeypatch.setattr(nested, "_SAVE_EVERY", 5)
+    run = RunDir(copy)
+    shutil.rmtree(run.adapted)
+    killed_in_nest(copy, CONFIG.nest)
+    assert run.nest_checkpoint.exists()
+    if change == "fuse":
+        fuse_masks(quiet(copy))
+    else:
+        shutil.copy(copy / "levels" / "000010.npz", run.base_model)
+    with pytest.raises(RunError, match=r"checkpoint\.npz: made with other settings or inputs; delete .*"):
+        nest_levels(quiet(copy), CONFIG.nest, 0)
+    nest_levels(quiet(copy, force=True), CONFIG.nest, 0)
+    assert not run.nest_checkpoint.exists()
+
+
+def test_a_killed_nest_resumes_with_the_same_inputs(copy: Path, finished: Path, monkeypatch) -> None:
+    monkeypatch.setattr(nested, "_SAVE_EVERY", 5)
+    shutil.rmtree(copy / "nested")
+    killed_in_nest(copy, CONFIG.nest)
+    steps: list[int] = []
+
+    def emit(event: Event) -> None:
+        if isinstance(event, Progress) and event.name == "nest":
+            steps.append(event.done)
+
+    nest_levels(Job(RunDir(copy), emit, "cpu"), CONFIG.nest, 0)
+    assert steps == list(range(6, 13))
+    assert RunDir(copy).prefixes.read_bytes() == RunDir(finished).prefixes.read_bytes()
+
+
+# models of other observations
+
+
+@pytest.mark.parametrize(("name", "value"), [("distance", "minimum"), ("masks", "rendered")])
+def test_models_are_fitted_to_what_was_observed(copy: Path, name: str, value: str) -> None:
+    other = replace(CONFIG.fit, **{name: value})
+    observe_levels(quiet(copy, force=True), other)
+    with pytest.raises(RunError, match=rf"observed with {name} {value}; add --fit\.{name} {value}, or obs"):
+        fit_ladder(quiet(copy, force=True), CONFIG.fit)
+    fit_ladder(quiet(copy, force=True), other)
+    assert getattr(quiet(copy).fit_config, name) == value
