@@ -19,7 +19,7 @@ def _update(
     parameter, grad, exp_avg, exp_avg_sq, trainable, count, rate, correction,
     WIDTH: tl.constexpr, COLUMNS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """`count` values: the exp_avg COLUMNS of every row of WIDTH."""
+    """`count` values: the first COLUMNS of every row of WIDTH."""
     at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = at < count
     row = at // COLUMNS
@@ -43,13 +43,13 @@ def adam_step(
     exp_avg_sq: Tensor,
     *,
     lr: float,
-    step: int,  # 1 for the exp_avg
+    step: int,  # 1 for the first
     trainable: Tensor | None,  # bool [N]; None: all rows
     columns: int | None = None,
 ) -> None:
     """One Adam step (Kingma and Ba, betas 0.9 and 0.999, eps 1e-15 as 3DGS); other rows keep every bit.
 
-    `columns`: only so many values at the start of each row; what never had a gradient would not move anyway.
+    `columns`: update only this many values at the start of each row; the others never had a gradient.
     """
     width = parameter[:1].numel()
     columns = width if columns is None else columns

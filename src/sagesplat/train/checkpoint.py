@@ -1,6 +1,6 @@
-"""Checkpoints: the whole training state in one file, so that a killed run goes on where it was.
+"""Checkpoints: the full training state in one file, from which a killed run resumes.
 
-The one before is kept beside it (checkpoint-1.npz) for a file that got damaged.
+The previous one is kept beside it (checkpoint-1.npz), in case the newest file is damaged.
 """
 
 import json
@@ -22,7 +22,7 @@ from sagesplat.io.npz import Npz
 from sagesplat.train.state import TrainState
 
 _VERSION = 3
-# what files raise that are cut off or changed
+# what truncated or changed files raise
 _DAMAGED = (OSError, KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError)
 
 
@@ -42,7 +42,7 @@ def remove_checkpoints(path: Path) -> None:
 
 
 def write_checkpoint(path: Path, state: TrainState, settings: str) -> None:
-    """Save a state; `settings` says what run it belongs to and is checked on reading.
+    """Save a state; `settings` identifies its run and is checked on reading.
 
     The file at `path` becomes the previous one, once the new one is on the disk and reads back as it was
     written; at no time is there none. RunError where the disk is full: then both stay as they were.
@@ -122,8 +122,8 @@ def latest_checkpoint(path: Path, settings: str) -> tuple[TrainState, str]:
             raise
         try:
             return read_checkpoint(kept, settings), damage
-        except _Damaged as exp_avg_sq:
-            reason = str(exp_avg_sq).partition("; ")[0]
+        except _Damaged as second:
+            reason = str(second).partition("; ")[0]
             raise RunError(
                 f"{damage}, and {reason}; delete both (or add --force) to train from the start"
             ) from None
@@ -153,7 +153,7 @@ def read_checkpoint(path: Path, settings: str) -> TrainState:
         raise RunError(f"{path}: made with other settings or inputs; {cure}")
     try:
         return _state(found, meta)
-    except _DAMAGED as error:  # a checksum keeps nobody from writing nonsense
+    except _DAMAGED as error:  # a checksum does not prove that the content is valid
         raise _Damaged(f"{path}: not a whole checkpoint ({short(repr(error))}); {cure}") from None
 
 
