@@ -302,7 +302,9 @@ def test_opaque_photos_keep_the_black_background(tmp_path):
 def test_explicit_split_of_a_scene():
     camera = Camera(np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32), 4, 4)
     views = tuple(View(f"{i}", camera, Path()) for i in range(10))
-    points = Points(*(np.zeros((0, 3)), np.zeros((0, 3), np.uint8)), *(np.zeros(0),) * 3)
+    none = np.zeros(0, np.int64)
+    empty = np.zeros((0, 3), np.float32)
+    points = Points(empty, empty.astype(np.uint8), none, none.astype(np.int32), empty[:, :2])
     scene = Scene("s", Path(), views, points, test_every=5, calibrate_every=4)
     assert scene.test_ids.tolist() == [0, 5]
     listed = replace(scene, test_names=frozenset({"1", "2", "9", "gone"}))

@@ -30,7 +30,7 @@ class Fitted:
     needed: int  # at that cap, predicted
     lowered: int  # Gaussians at most, as fits; the same where all fits
     limit: int
-    began: bool = False  # the cap is that of a training that goes on
+    began: bool = False  # the cap is that of a training that resumes
 
     def __str__(self) -> str:
         """One line for the user."""
@@ -44,8 +44,8 @@ class Fitted:
 def fit(scene: Scene, config: TrainConfig, limit: int = 0, *, processes: int = 1, began: int = 0) -> Fitted:
     """The settings with a cap that fits into `limit` bytes (0: what the machine has, but for a tenth).
 
-    `began`: the cap of a training that goes on; another one would give another result. RunError where not
-    even that fits, or the points to begin with do not.
+    `began`: the cap of a training that resumes, which is kept: another one would change the result. RunError
+    where that cap, or the initial points, do not fit.
     """
     limit = limit or default_limit()
     camera, points = scene.views[0].camera, len(scene.points.xyz)

@@ -1,4 +1,4 @@
-"""Several processes that train one model, one per GPU; on a CPU they serve to try it."""
+"""Data-parallel training: several processes train one model, one per GPU (on a CPU for tests)."""
 
 import multiprocessing
 import tempfile

@@ -294,7 +294,8 @@ def _check(config: TrainConfig, masks: Masks | None) -> None:
         raise RunError(f"--train.freeze-at {target} is no SSIM to reach; choose a number such as 0.8")
     if not 0 <= config.gradient_freeze_share < 1:
         raise RunError(
-            f"--train.rest-share {config.gradient_freeze_share} is no share; choose a number such as 0.5"
+            f"--train.gradient-freeze-share {config.gradient_freeze_share} is impossible; "
+            "choose a share below 1, such as 0.5"
         )
     if target is not None and masks is None:
         raise RunError("--train.freeze-at needs label images to measure categories on; bring masks")
