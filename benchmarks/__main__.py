@@ -29,7 +29,8 @@ from sagesplat.scene import load_scene
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene
 from sagesplat.segment.masks import Masks, Taxonomy, import_masks
-from sagesplat.train.trainer import Step, train
+from sagesplat.train.events import Step
+from sagesplat.train.trainer import train
 
 RESULTS = Path(__file__).parent / "results" / "cpu"
 OPENSPLAT_STEP_MS = 1830  # its CPU path (1.1.5) on garden at 512 px from 42,599 points, on a two-core machine

@@ -14,7 +14,8 @@ from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.segment.lift import lift
 from sagesplat.segment.masks import Masks, Taxonomy, import_masks
-from sagesplat.train.trainer import LabelFrozen, Step, Trained, train
+from sagesplat.train.events import LabelFrozen, Step, Trained
+from sagesplat.train.trainer import train
 
 _PARTS = 10  # stretches of a run that are timed apart
 

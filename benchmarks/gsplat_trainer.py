@@ -22,7 +22,7 @@ from sagesplat.core.config import TrainConfig
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.metrics.image import photometric_loss
 from sagesplat.scene.scene import Camera
-from sagesplat.train import densify
+from sagesplat.train.strategy import schedule_of
 
 NAMES = {  # gsplat's name: ours
     "means": "means", "scales": "log_scales", "quats": "quats", "opacities": "logit_opacities",
@@ -77,7 +77,7 @@ def train(
     import gsplat
     from gsplat.strategy import DefaultStrategy
 
-    device, plan = initial.means.device, densify.schedule(config)
+    device, plan = initial.means.device, schedule_of(config)
     params: dict[str, Any] = {
         name: torch.nn.Parameter(getattr(initial, ours).detach().clone()) for name, ours in NAMES.items()
     }

@@ -9,8 +9,9 @@ from sagesplat.core.config import TrainConfig
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene
+from sagesplat.train.events import Trained
 from sagesplat.train.state import from_points
-from sagesplat.train.trainer import Trained, train
+from sagesplat.train.trainer import train
 
 GARDEN = Path(__file__).parents[2] / "shared" / "scenes" / "garden"
 # standard deviation on the image in pixels, and opacity

@@ -35,7 +35,7 @@ def test_benchmarks_use_public_names_only():
             ):
                 names = [node.attr]
             private += [
-                f"{path.relative_to(ROOT)}:{node.lineno} {name}"
+                f"{path.relative_to(ROOT)}:{getattr(node, 'lineno', 0)} {name}"
                 for name in names
                 if name.startswith("_") and not name.startswith("__") and name not in allowed
             ]

@@ -4,6 +4,7 @@ import doctest
 import importlib
 import inspect
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -30,9 +31,9 @@ CALLED_BY_MANY = (
 )  # fmt: skip
 
 
-def named(name: str):
+def named(name: str) -> Any:
     module, _, path = name.partition(":")
-    found = importlib.import_module(f"sagesplat.{module}")
+    found: Any = importlib.import_module(f"sagesplat.{module}")
     for part in path.split("."):
         found = getattr(found, part)
     return found

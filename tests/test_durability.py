@@ -52,8 +52,9 @@ from sagesplat.stages.scene import open_scene
 from sagesplat.stages.train import train_levels
 from sagesplat.train import checkpoint as checkpoint_module
 from sagesplat.train.checkpoint import latest_checkpoint, previous, remove_checkpoints, write_checkpoint
+from sagesplat.train.events import Event, Resumed, Trained
 from sagesplat.train.state import TrainState, initial_state
-from sagesplat.train.trainer import Event, Resumed, Trained, train
+from sagesplat.train.trainer import train
 
 CONFIG = RunConfig(train=TrainConfig(max_steps=40, level_every=10), plan=PlanConfig(target_ssim=0.4))
 TRAINING = TrainConfig(max_steps=24, level_every=4, sh_degree=1)
@@ -467,7 +468,7 @@ def test_training_does_not_go_on_with_a_damaged_level(scene: Scene, trained: Pat
     stopped_at(scene, tmp_path, 18)
     level = tmp_path / "levels" / "000008.npz"
     damaged(level, "bit")
-    message = r"000008\.npz: a damaged level .*; delete it to go on without that level, or .*checkpoint\.npz"
+    message = r"000008\.npz: a damaged level .*; delete it to resume without that level, or .*checkpoint\.npz"
     with pytest.raises(RunError, match=message) as caught:
         list(training(scene, tmp_path))
     assert "\n" not in str(caught.value)

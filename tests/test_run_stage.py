@@ -1,5 +1,6 @@
 """What a result was made from: every file that a stage reads is among its inputs, and all inputs count."""
 
+import csv
 import os
 import shutil
 import sys
@@ -81,6 +82,11 @@ def work(run: Path, capture: Path, config: RunConfig = CONFIG, **options) -> lis
 
 def done(events: list[Event]) -> list[str]:
     return [e.name for e in events if isinstance(e, StageDone)]
+
+
+def rows_of(table: Path) -> list[dict[str, str]]:
+    with table.open(newline="") as file:
+        return list(csv.DictReader(file))
 
 
 def quiet(run: Path, **options) -> Job:
@@ -356,6 +362,10 @@ def test_the_ladders_of_a_run_in_blocks_share_its_categories_and_its_training(ca
     assert "block_categories" not in again
     assert "train" not in again
     assert again[-1] == "report"
+    table = RunDir(tmp_path / "run").adapted / "blocks.csv"
+    assert "" not in [row["boundaries s"] for row in rows_of(table)]
+    work(tmp_path / "run", capture, replace(more, blocks=replace(BLOCKS, boundary_steps=0)), force=True)
+    assert [row["boundaries s"] for row in rows_of(table)] == ["", ""]
 
 
 # checkpoints

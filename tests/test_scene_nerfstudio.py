@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
-from scipy.spatial.transform import Rotation
+from test_scene_colmap import poses
 
 from sagesplat.core.errors import SceneError
 from sagesplat.core.geometry import project, to_camera
@@ -38,17 +38,6 @@ def few_points():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(nerfstudio, "random_points", partial(random_points, count=300))
         yield
-
-
-def poses(count: int) -> list[np.ndarray]:
-    """World to camera, OpenCV axes: cameras on an arc that look at points near the origin."""
-    w2c = []
-    for angle in np.linspace(-0.4, 0.4, count):
-        pose = np.eye(4)
-        pose[:3, :3] = Rotation.from_euler("xyz", [0.1, angle, 0.2]).as_matrix()
-        pose[:3, 3] = [0.05, -0.1, 4 + angle]
-        w2c.append(pose)
-    return w2c
 
 
 def opengl(w2c: np.ndarray) -> list[list[float]]:
@@ -313,7 +302,9 @@ def test_opaque_photos_keep_the_black_background(tmp_path):
 def test_explicit_split_of_a_scene():
     camera = Camera(np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32), 4, 4)
     views = tuple(View(f"{i}", camera, Path()) for i in range(10))
-    points = Points(*(np.zeros((0, 3)), np.zeros((0, 3), np.uint8)), *(np.zeros(0),) * 3)
+    none = np.zeros(0, np.int64)
+    empty = np.zeros((0, 3), np.float32)
+    points = Points(empty, empty.astype(np.uint8), none, none.astype(np.int32), empty[:, :2])
     scene = Scene("s", Path(), views, points, test_every=5, calibrate_every=4)
     assert scene.test_ids.tolist() == [0, 5]
     listed = replace(scene, test_names=frozenset({"1", "2", "9", "gone"}))

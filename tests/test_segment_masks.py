@@ -21,7 +21,11 @@ def scene_of(*names, width=4, height=2, lens=None, K=None):
     )
     none = np.zeros(0, np.int64)
     points = Points(
-        np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), none, none.astype(np.int32), none[:, None]
+        np.zeros((0, 3), np.float32),
+        np.zeros((0, 3), np.uint8),
+        none,
+        none.astype(np.int32),
+        np.zeros((0, 2), np.float32),
     )
     return Scene("s", Path(), tuple(View(n, camera, Path(n), lens) for n in names), points)
 

@@ -86,7 +86,11 @@ def scene_of(*names, width=64, height=32):
     camera = Camera(np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32), width, height)
     none = np.zeros(0, np.int64)
     points = Points(
-        np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), none, none.astype(np.int32), none[:, None]
+        np.zeros((0, 3), np.float32),
+        np.zeros((0, 3), np.uint8),
+        none,
+        none.astype(np.int32),
+        np.zeros((0, 2), np.float32),
     )
     return Scene("s", Path(), tuple(View(n, camera, Path(n)) for n in names), points)
 

@@ -49,7 +49,11 @@ def scene_of(sizes: dict[str, tuple[int, int]], path: Path = Path("scene")) -> S
     views = tuple(View(name, Camera(eye4, eye3, w, h), path / name) for name, (h, w) in sizes.items())
     none = np.zeros(0, np.int64)
     points = Points(
-        np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), none, none.astype(np.int32), none[:, None]
+        np.zeros((0, 3), np.float32),
+        np.zeros((0, 3), np.uint8),
+        none,
+        none.astype(np.int32),
+        np.zeros((0, 2), np.float32),
     )
     return Scene("s", path, views, points)
 

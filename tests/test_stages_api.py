@@ -1,7 +1,9 @@
 """What scripts call gives what the commands give."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -71,6 +73,15 @@ def test_a_run_is_opened_again(runs):
     assert isinstance(run.plans[0], Plan)
     assert set(run.promises) <= set(run.names)
     assert run.costs.count.shape[1] == 4
+
+
+def test_the_example_of_the_readme_runs(runs):
+    text = (Path(__file__).parents[1] / "README.md").read_text()
+    (code,) = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    names: dict[str, Any] = {}
+    exec(code.replace("runs/capture", str(runs["nested"].job.run.path)), names)
+    assert names["image"].shape == (48, 64, 3)
+    assert len(names["gaussians"]) == names["plan"].count
 
 
 def test_what_is_no_run_folder_is_said(tmp_path: Path):

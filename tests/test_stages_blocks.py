@@ -1,4 +1,4 @@
-"""Large scenes: the partition, what a block is given, what is put together, and a whole run in blocks."""
+"""Large scenes: the partition, the scene of a block, merging, and a full run in blocks."""
 
 import json
 from collections.abc import Iterator
@@ -31,11 +31,11 @@ from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.scene import load_scene
 from sagesplat.scene.blocks import (
-    colours,
-    part_of,
+    assigned_views,
+    graph_colouring,
     read_blocks,
     split,
-    views_of,
+    training_scene,
     visible_shares,
     write_blocks,
 )
@@ -97,7 +97,7 @@ def test_blocks_tile_the_plane_and_share_the_work(count: int, seed: int, margin:
     near = blocks.neighbours()
     assert (near == near.T).all()
     assert not near.diagonal().any()
-    shades = colours(near)
+    shades = graph_colouring(near)
     assert all(shades[a] != shades[b] for a, b in zip(*near.nonzero(), strict=True))
 
 
@@ -117,7 +117,7 @@ def test_views_are_for_the_blocks_that_they_see() -> None:
     of_points = blocks.of(scene.points.xyz)
     shares = visible_shares(scene, of_points, 2)
     np.testing.assert_allclose(shares.sum(1), 1)
-    assigned = views_of(scene, blocks, shares, 0.25)
+    assigned = assigned_views(scene, blocks, shares, 0.25)
     assert assigned.any(1).all()
     own = np.array([of_points[0] if v.name.startswith("p0") else of_points[-1] for v in scene.views])
     assert assigned[np.arange(20), own].all()
@@ -141,7 +141,7 @@ def test_a_part_keeps_its_points_and_some_of_the_background() -> None:
     blocks = split(scene, 2)
     mine = int(blocks.of(scene.points.xyz[:1])[0])
     views = [0, 1, 2, 3, 9]
-    part, kept = part_of(scene, blocks, mine, views, 0.1, seed=0)
+    part, kept = training_scene(scene, blocks, mine, views, 0.1, seed=0)
     near = blocks.within(scene.points.xyz, mine, blocks.margin)
     assert near[kept].sum() == near.sum()
     assert 0 < (~near[kept]).sum() <= 0.1 * near.sum()
@@ -153,10 +153,10 @@ def test_a_part_keeps_its_points_and_some_of_the_background() -> None:
     ):
         was = (scene.points.track_points == kept[point]) & (scene.points.track_views == views[view])
         assert (scene.points.track_uv[was] == uv).all(1).any()
-    same, _ = part_of(scene, blocks, mine, views, 0.1, seed=0)
+    same, _ = training_scene(scene, blocks, mine, views, 0.1, seed=0)
     np.testing.assert_array_equal(same.points.xyz, part.points.xyz)
     with pytest.raises(RunError, match="has 0 views and"):
-        part_of(scene, blocks, mine, [], 0.1, seed=0)
+        training_scene(scene, blocks, mine, [], 0.1, seed=0)
 
 
 @pytest.mark.parametrize("count", [0, 1, 500])

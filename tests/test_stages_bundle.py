@@ -186,7 +186,7 @@ def test_bad_input_is_one_line(run: Path, tmp_path: Path, viewer: Path) -> None:
 def test_promises_of_other_chunks(run: Path, tmp_path: Path, viewer: Path) -> None:
     index = run / "nested" / "increments" / "index.json"
     index.write_text(index.read_text() + "\n")
-    with pytest.raises(RunError, match="promises of other chunks; run `sagesplat fit`"):
+    with pytest.raises(RunError, match="fitted to other increments; run `sagesplat fit`"):
         bundle(job_of(run), tmp_path / "out", viewer=viewer)
 
 

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -139,8 +140,9 @@ def test_photos_without_poses_become_a_capture(
     monkeypatch.setattr(photos_module, "reconstruct", reconstruct)
     events: list[Event] = []
     job = Job(RunDir(tmp_path / "run"), events.append)
-    for _ in range(2):
-        open_scene(job, capture / "images", SceneConfig(), PosesConfig(matching="sequential"))
+    monkeypatch.chdir(capture)
+    for path in (capture / "images", Path("images"), Path("..") / capture.name / "images"):
+        open_scene(replace(job), path, SceneConfig(), PosesConfig(matching="sequential"))
     assert asked == [(capture / "images", PosesConfig(matching="sequential"))]
     warned = [event.text for event in events if isinstance(event, Warned)]
     assert warned[0] == "a.jpg: too few features"

@@ -37,6 +37,7 @@ from sagesplat.stages.methods import NestedLevels
 from sagesplat.stages.observe import observe_levels
 from sagesplat.stages.pipeline import run_all
 from sagesplat.stages.plan import make_plan
+from sagesplat.stages.shared import observed
 from sagesplat.studies.paper.cross_view import read_cross_view
 from sagesplat.studies.paper.run import cross_views
 from sagesplat.train import nested
@@ -428,6 +429,31 @@ def test_each_view_is_planned_by_its_bound(finished: Path, tmp_path: Path) -> No
     }
     assert set(by) == {"eq3", "mean", "bound", "oracle"}
     assert float(by["oracle"]["kept"]) == 1
+
+
+def test_coverage_is_tested_on_the_plans_that_are_made_and_costs_are_bytes(finished: Path) -> None:
+    job, target = quiet(finished), 0.4
+    nested = NestedLevels(job)
+    scores = nested.coverage([target])
+    assert scores is not None
+    bound = scores.select(scores.predictor == "bound")
+    table = observed(job, job.fit_config)
+    table = table.select(np.isin(table.view, job.scene.test_ids))
+    plans = {row: nested.plan_view(row, target) for row in job.scene.test_ids.tolist()}
+    for i, label in enumerate(bound.label_id.tolist()):
+        sent = nested.costs.transfer_bytes[nested.costs.labels.index(label)]
+        accepted, regrets = 0, []
+        for row in np.unique(table.view[table.label_id == label]).tolist():
+            here = table.select((table.label_id == label) & (table.view == row))
+            measured = dict(zip(here.level.tolist(), here.ssim.tolist(), strict=True))
+            choice = next(c for c in plans[row].choices if c.label_id == label)
+            accepted += choice.status == "ok"
+            if choice.status == "ok" and measured[choice.level] >= target:
+                enough = [sent[level - 1] for level, ssim in measured.items() if ssim >= target]
+                regrets.append(sent[choice.level - 1] - min(enough))
+        assert bound.accepted[i] == accepted
+        assert bound.regret[i] == pytest.approx(np.mean(regrets) if regrets else np.nan, nan_ok=True)
+    assert bound.accepted.sum() > 0
 
 
 def test_without_calibration_views_a_run_still_promises(capture: Path, tmp_path: Path) -> None:

@@ -27,6 +27,7 @@ from sagesplat.io.files import read_json, write_json
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import LadderKind, RunDir
 from sagesplat.stages.bundle import bundle
+from sagesplat.stages.methods import method_of
 from sagesplat.stages.pipeline import run_all
 from sagesplat.studies.compare.run import compare
 from sagesplat.studies.paper.cross_view import read_cross_view
@@ -117,6 +118,12 @@ def _check_what_is_missing(job: Job) -> None:
     assert not {201, 202, 203} & drawn
     scene_plans, view_plans = read_plans(job.run.plan)
     assert all(set(plan.levels) == drawn for plan in (*scene_plans, *view_plans))
+    method = method_of(job)
+    for plan in view_plans:  # what is evaluated is what was planned with, without SfM points as well
+        assert plan.view is not None
+        for c in plan.choices:
+            found = method.predicted(c.label_id, c.level, plan.view)
+            assert found == pytest.approx(c.predicted_ssim, nan_ok=True)
     evaluation = read_evaluation(job.run.evaluation)
     assert set(evaluation.view) == set(TESTS)
     assert np.isnan(evaluation.predicted[evaluation.label_id == 202]).all()

@@ -11,7 +11,9 @@ from sagesplat.core.config import TrainConfig
 from sagesplat.core.gaussians import PARAMETERS
 from sagesplat.raster.render import Render
 from sagesplat.train import densify
+from sagesplat.train.schedule import Schedule
 from sagesplat.train.state import TrainState, initial_state
+from sagesplat.train.strategy import schedule_of
 
 CONFIG = TrainConfig()
 EXTENT = 10.0  # so that 0.1 divides clones from splits, and more than 1 is huge
@@ -165,8 +167,8 @@ def test_gradients_are_observed_in_half_images():
 
 
 def test_schedule_is_the_published_one_at_full_length():
-    plan = densify.schedule(TrainConfig(max_steps=30_000))
-    published = densify.Schedule(
+    plan = schedule_of(TrainConfig(max_steps=30_000))
+    published = Schedule(
         level_every=1000,
         refine_start=500,
         refine_stop=15_000,
@@ -179,18 +181,18 @@ def test_schedule_is_the_published_one_at_full_length():
 
 @pytest.mark.parametrize("steps", [1, 30, 300, 3000, 7000, 60_000])
 def test_schedule_scales_with_the_length(steps):
-    plan = densify.schedule(TrainConfig(max_steps=steps, lr_schedule="published"))
+    plan = schedule_of(TrainConfig(max_steps=steps, lr_schedule="published"))
     assert plan.level_every == -(-steps // 30)
     assert plan.refine_stop == max(1, steps // 2)
     assert plan.reset_every == max(1500, steps // 10)  # a model needs time to come back
     assert plan.recovery <= plan.reset_every // 2
-    assert densify.schedule(TrainConfig(max_steps=steps, level_every=17)).level_every == 17
+    assert schedule_of(TrainConfig(max_steps=steps, level_every=17)).level_every == 17
 
 
 @pytest.mark.parametrize(("steps", "stop"), [(900, 630), (2000, 1200), (3000, 1500), (30_000, 15_000)])
 def test_short_runs_of_the_fast_pace_grow_for_longer(steps, stop):
     fast, published = (
-        densify.schedule(TrainConfig(max_steps=steps, lr_schedule=pace)) for pace in ("fast", "published")
+        schedule_of(TrainConfig(max_steps=steps, lr_schedule=pace)) for pace in ("fast", "published")
     )
     assert fast.refine_stop == stop
     assert replace(fast, refine_stop=published.refine_stop) == published

@@ -27,11 +27,13 @@ from sagesplat.train.early_stopping import (
     measured_views,
     trainable_rows,
 )
+from sagesplat.train.events import LabelFrozen, LevelSaved, Resumed, Step, Trained
 from sagesplat.train.lr_schedule import smaller
 from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.state import initial_state
 from sagesplat.train.stepper import Stepper, tune
-from sagesplat.train.trainer import LabelFrozen, LevelSaved, Resumed, Step, Trained, train
+from sagesplat.train.strategy import schedule_of
+from sagesplat.train.trainer import train
 
 CPU = torch.device("cpu")
 # densification from step 24 to 60 every 6, resets at 40, the SH degree rises every 4 steps
@@ -147,7 +149,7 @@ def test_levels_right_after_a_reset_are_faint(capture, levels, tmp_path):
     scene, photos, _, labels = capture
     config = replace(CONFIG, max_steps=60, reset_every=30, refine_stop=15_000)
     config = replace(config, refine_stop=30_000)  # densification until the end
-    plan = trainer.densify.schedule(config)
+    plan = schedule_of(config)
     assert plan.refine_stop > 30
     saved: dict[bool, LevelSaved] = {}
     faint = {}

@@ -26,8 +26,9 @@ from sagesplat.scene.images import Photos
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.train import stepper, trainer
 from sagesplat.train.early_stopping import ActiveTiles, label_quality, measured_views
+from sagesplat.train.events import LabelFrozen, LevelSaved, Resumed, Step, Trained
 from sagesplat.train.stepper import Stepper
-from sagesplat.train.trainer import LabelFrozen, LevelSaved, Resumed, Step, Trained, train
+from sagesplat.train.trainer import train
 
 CPU = torch.device("cpu")
 SHORT = replace(BUSY, max_steps=26, level_every=12, refine_every=4, refine_start=4, reset_every=9)

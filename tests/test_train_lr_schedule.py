@@ -9,6 +9,7 @@ from sagesplat.core.gaussians import PARAMETERS
 from sagesplat.scene.scene import Camera
 from sagesplat.train import densify
 from sagesplat.train.lr_schedule import LrSchedule, detail, lr_schedule, smaller
+from sagesplat.train.strategy import schedule_of
 
 
 def noise(height: int, width: int, cells: int = 1) -> np.ndarray:
@@ -85,7 +86,7 @@ def test_a_smaller_photo_has_a_smaller_camera():
 
 def test_small_photos_ask_for_few_gaussians():
     config = TrainConfig(max_steps=30_000)
-    plan = densify.schedule(config)
+    plan = schedule_of(config)
     full = densify.budget(config, plan, plan.refine_stop, 100_000, 100_000, 1000)
     assert full == 150_000
     assert densify.budget(config, plan, plan.refine_stop, 100_000, 25_000, 1000) == 37_500

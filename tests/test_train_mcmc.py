@@ -22,6 +22,7 @@ from sagesplat.train.lr_schedule import LrSchedule
 from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.state import TrainState, from_points, initial_state
 from sagesplat.train.stepper import Stepper
+from sagesplat.train.strategy import make_strategy
 
 CONFIG = TrainConfig()
 DEAD = -9.0  # a logit
@@ -338,7 +339,9 @@ def test_a_chain_learns(tmp_path):
     labels = np.array([-1, 3, 184], np.int16)[np.arange(60) % 3]
     state = initial_state(from_points(scene.points, labels, 0), seed=0)
     feed = PhotoLoader(scene, Photos(scene.views), torch.device("cpu"))
-    stepper, lr_schedule = Stepper(feed, config, ActiveTiles(scene, None)), LrSchedule(config, scene.extent)
+    rates = LrSchedule(config, scene.extent)
+    strategy = make_strategy(config, scene, rates)
+    stepper = Stepper(feed, config, ActiveTiles(scene, None), strategy=strategy)
     losses, kept = [], torch.empty(0)
     trainable = all_of(state)
     for step in range(1, 106):
@@ -346,17 +349,7 @@ def test_a_chain_learns(tmp_path):
             state.frozen = {3: step}
             trainable = trainable_rows(state.gaussians, state.frozen)
             kept = state.gaussians.of_labels([3]).means.sort(0).values
-        losses.append(
-            float(
-                stepper(
-                    state,
-                    0,
-                    lr_schedule.learning_rates(step),
-                    trainable,
-                    sgld_noise=lr_schedule.sgld_noise(step),
-                )
-            )
-        )
+        losses.append(float(stepper(state, 0, rates.learning_rates(step), trainable)))
         if 14 <= step < 90 and step % 7 == 0:
             mcmc.relocate(state, config, trainable)
             mcmc.add(state, config, 90, trainable)

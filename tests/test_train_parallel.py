@@ -10,8 +10,9 @@ from sagesplat.core.config import TrainConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import PARAMETERS
 from sagesplat.train import parallel
+from sagesplat.train.events import LabelFrozen, LevelSaved, Resumed, Step, Trained
 from sagesplat.train.parallel import train_together
-from sagesplat.train.trainer import LabelFrozen, LevelSaved, Resumed, Step, Trained, train
+from sagesplat.train.trainer import train
 
 SHORT = replace(CONFIG, max_steps=40, level_every=10, refine_start=8, refine_every=6)
 

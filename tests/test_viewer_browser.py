@@ -21,7 +21,8 @@ from sagesplat.formats.increments import read_increments, write_increments
 from sagesplat.raster import rasterize
 from sagesplat.scene.scene import Camera
 from sagesplat.stages.bundle import package_viewer
-from sagesplat.viewer.bundle import CameraEntry, Category, Contents, write_bundle
+from sagesplat.viewer.bundle import write_bundle
+from sagesplat.viewer.manifest import CameraEntry, Category, Contents
 
 pytestmark = [
     pytest.mark.skipif(chromium.missing() is not None, reason=chromium.missing() or ""),
@@ -112,9 +113,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
                  np.concatenate([places[i].min(0), places[i].max(0)])[None])
         for i, name in names.items()
     ]  # fmt: skip
-    shots = [CameraEntry(f"photo{k}.jpg", "train", camera(0.2 * k)) for k in range(3)]
+    entries = [CameraEntry(f"photo{k}.jpg", "train", camera(0.2 * k)) for k in range(3)]
     contents = Contents(
-        "three walls", 1.0, shots, categories, chunks, folder / "chunks", 3, meters_per_unit=1.0
+        "three walls", 1.0, entries, categories, chunks, folder / "chunks", 3, meters_per_unit=1.0
     )
     write_bundle(folder / "bundle", contents, package_viewer())
     return folder / "bundle"
@@ -462,7 +463,7 @@ def test_a_lost_context_is_said(site: str, browser: Any) -> None:
         ready(opened)
         lose = "document.getElementById('view').getContext('webgl2').getExtension('WEBGL_lose_context')"
         opened.page.evaluate(f"{lose}.loseContext()")
-        assert "graphics card" in message(opened)
+        assert "GPU context was lost" in message(opened)
 
 
 def test_a_window_without_area_waits(site: str, browser: Any) -> None:

@@ -22,17 +22,9 @@ from sagesplat.formats.increments import write_increments
 from sagesplat.formats.spz import read_spz
 from sagesplat.scene.scene import Camera
 from sagesplat.viewer import boxes, frames
-from sagesplat.viewer.bundle import (
-    SCHEMA,
-    CameraEntry,
-    Category,
-    Contents,
-    documents,
-    is_bundle,
-    write_bundle,
-    write_documents,
-)
+from sagesplat.viewer.bundle import SCHEMA, is_bundle, write_bundle, write_documents
 from sagesplat.viewer.frames import FLIP
+from sagesplat.viewer.manifest import CameraEntry, Category, Contents, documents
 from sagesplat.viewer.pack import NEARBY, Ladder, gains_of, order_of
 from sagesplat.viewer.quality import (
     MOVES,
@@ -265,7 +257,7 @@ def contents(tmp_path: Path) -> Contents:
         tmp_path / "chunks", replace(g, label_ids=labels), SIZES, {3: "car", 184: "tree"}
     )
     made = replace(model(3, 6, [1, 2, 3]), label_id=3)
-    shots = []
+    entries = []
     for i, row in enumerate(made.inputs):  # the model's own views
         at = camera(at=tuple((row[:3] * made.extent).tolist()))
         z = row[3:6]
@@ -274,15 +266,15 @@ def contents(tmp_path: Path) -> Contents:
         w2c[:3, :3] = np.stack([x / np.linalg.norm(x), np.cross(z, x / np.linalg.norm(x)), z])
         w2c[:3, 3] = -w2c[:3, :3] @ (row[:3] * made.extent)
         split = "calibration" if made.heldout_inputs[i] else "train"
-        shots.append(CameraEntry(f"{i}.jpg", split, replace(at, w2c=w2c)))
-    shots.append(CameraEntry("none.jpg", "test", camera()))
+        entries.append(CameraEntry(f"{i}.jpg", split, replace(at, w2c=w2c)))
+    entries.append(CameraEntry("none.jpg", "test", camera()))
     points = np.random.default_rng(0).normal(size=(50, 3))
     categories = [
         Category(-1, "unlabelled", "everything else", "#808080", boxes.split_boxes(points)),
         Category(3, "car", "car", "#112233", boxes.split_boxes(points), 2.0, True, made, np.full(7, 0.25)),
         Category(184, "tree", "tree", "#445566", boxes.split_boxes(points[:3])),
     ]
-    return Contents("tiny", made.extent, shots, categories, chunks, tmp_path / "chunks", 1, points=points)
+    return Contents("tiny", made.extent, entries, categories, chunks, tmp_path / "chunks", 1, points=points)
 
 
 def manifest_of(folder: Path) -> dict[str, Any]:
@@ -339,7 +331,7 @@ def test_promises_of_a_bundle_are_those_of_the_model(tmp_path, contents, viewer)
     read = model_of(entry, [curve_of(c) for c in quality["curves"]], views, promises["extent"])
     made = contents.categories[1].model
     assert made is not None
-    cameras = [shot.camera for shot in contents.shots]
+    cameras = [entry.camera for entry in contents.cameras]
     at = (
         np.full(7, np.nan),
         np.stack([c.position for c in cameras]),

@@ -25,6 +25,7 @@ from sagesplat.train.lr_schedule import LrSchedule
 from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.state import TrainState, from_points, initial_state
 from sagesplat.train.stepper import Stepper
+from sagesplat.train.strategy import make_strategy
 
 TESTS = ("test_raster_cuda", "test_raster_cpu", "test_ssim_triton", "test_train_adam_triton")
 TOLERANCES = {"cuda": (1e-4, 1e-3), "cpu": (3e-6, 1e-5)}  # of images, of gradients: those of the tests
@@ -124,8 +125,13 @@ def frozen_kept(bench: Bench, steps: int) -> dict[str, Any]:
     """Train beside a frozen category, with densification and a reset: do its rows keep every bit?"""
     every = steps // 5
     config = TrainConfig(
-        max_steps=steps, lr_schedule="published", refine_every=every, refine_start=1, grow_grad=0
-    )
+        max_steps=steps,
+        lr_schedule="published",
+        refine_every=every,
+        refine_start=1,
+        refine_stop=60_000,
+        grow_grad=0,
+    )  # fmt: skip
     scene, labels = bench.scene, bench.labels
     if len(np.unique(labels)) < 2:
         labels = (scene.points.xyz[:, 0] > np.median(scene.points.xyz[:, 0])).astype(np.int16)
@@ -133,22 +139,18 @@ def frozen_kept(bench: Bench, steps: int) -> dict[str, Any]:
     state = initial_state(from_points(scene.points, labels, 3), 0).to(bench.device)
     state.frozen = {label: 0}
     work = ActiveTiles(scene, bench.masks, frozenset(state.frozen), bench.device)
-    stepper = Stepper(PhotoLoader(scene, bench.photos, bench.device), config, work, bench.backend)
-    rates, before, begun = (
-        LrSchedule(config, scene.extent).learning_rates,
-        rows_of(state, label),
-        len(state.gaussians),
-    )
+    schedule = LrSchedule(config, scene.extent)
+    strategy = make_strategy(config, scene, schedule)
+    feed = PhotoLoader(scene, bench.photos, bench.device)
+    stepper = Stepper(feed, config, work, bench.backend, strategy=strategy)
+    rates, before, begun = schedule.learning_rates, rows_of(state, label), len(state.gaussians)
     trainable = trainable_rows(state.gaussians, state.frozen)
-    plan, camera = densify.schedule(config), scene.views[0].camera
-    num_pixels = camera.width * camera.height
     for step in range(1, steps + 1):
-        stepper(state, min(3, step // every), rates(step), trainable, observing=True)
+        stepper(state, min(3, step // every), rates(step), trainable)
         if step == 3 * every:
             densify.reset_opacities(state, config, trainable)
         if step % every == 0:
-            most = densify.budget(config, plan, step, num_pixels, num_pixels, len(scene.points.xyz))
-            densify.refine(state, config, scene.extent, densify.room(state, most, trainable), trainable)
+            strategy.refine(state, trainable)
             state.sort()
             trainable = trainable_rows(state.gaussians, state.frozen)
     after = rows_of(state, label)

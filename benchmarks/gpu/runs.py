@@ -20,10 +20,12 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.metrics.image import photometric_loss, psnr, ssim_map
 from sagesplat.metrics.lpips import Net, load_lpips
 from sagesplat.raster import rasterize
-from sagesplat.train import densify, trainer
+from sagesplat.train import trainer
 from sagesplat.train.early_stopping import ActiveTiles, label_quality, measured_views
+from sagesplat.train.events import LevelSaved, Step, Trained
 from sagesplat.train.parallel import train_together
 from sagesplat.train.photo_loader import PhotoLoader
+from sagesplat.train.strategy import schedule_of
 
 KEPT_BACK = 0.1  # of the time, for what comes after the long runs
 WEIGHTS = {"ours": 1.0, "gsplat": 1.3, "third": 0.8, "two_thirds": 0.7, "all": 0.5}  # time of a run, guessed
@@ -156,7 +158,7 @@ def multi(bench: Bench) -> Outcome:
     }.items():
         begin, first = time.perf_counter(), True
         for event in events:
-            if first and isinstance(event, trainer.Step):  # processes start, kernels compile
+            if first and isinstance(event, Step):  # processes start, kernels compile
                 begin, first = time.perf_counter(), False
         wait(bench.device)
         seconds[name] = time.perf_counter() - begin
@@ -218,16 +220,13 @@ def steps_of(bench: Bench) -> int:
 def ours(bench: Bench, config: TrainConfig) -> Iterator[Moment]:
     """Our trainer, at its levels and at its end."""
     masks = bench.masks if config.freeze_at is not None else None
-    events = trainer.train(
+    training = trainer.begin(
         bench.scene, bench.photos, bench.labels, config, masks=masks, backend=bench.backend
     )
-    frozen: dict[int, int] = {}
-    for event in events:
-        match event:
-            case trainer.LabelFrozen(step, label_id):
-                frozen[label_id] = step
-            case trainer.LevelSaved(step) | trainer.Trained(step=step):
-                yield Moment(step, event.gaussians.to(bench.device), dict(frozen))
+    for event in training.run():
+        if isinstance(event, LevelSaved | Trained):
+            state = training.state
+            yield Moment(state.step, state.gaussians, dict(state.frozen))
 
 
 def gsplats(bench: Bench, config: TrainConfig) -> Iterator[Moment]:
@@ -241,7 +240,7 @@ def gsplats(bench: Bench, config: TrainConfig) -> Iterator[Moment]:
 
 def watch(bench: Bench, name: str, config: TrainConfig, moments: Iterator[Moment]) -> Run:
     """Train and, with the clock stopped, look at the model from time to time."""
-    plan, limit = densify.schedule(config), bench.end - KEPT_BACK * 60 * bench.asked.minutes
+    plan, limit = schedule_of(config), bench.end - KEPT_BACK * 60 * bench.asked.minutes
     clock, curve, label_ssim, stopped, last = Clock(bench.device), [], {}, None, None
     if bench.device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(bench.device)

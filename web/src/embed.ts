@@ -4,18 +4,18 @@ import type { Pose } from "./view/frame";
 /** One drawn frame. */
 export interface Sample {
   readonly time: number; // ms, of performance.now
-  readonly frameMs: number; // since the frame before
-  readonly drawn: number; // splats that the last sort put on the canvas
-  readonly settled: boolean; // nothing waits to be sorted: the next frame would be the same
-  readonly textures: number; // that three holds
+  readonly frameMs: number; // since the previous frame
+  readonly drawn: number; // splats drawn by the last sort
+  readonly settled: boolean; // no sort is pending: the next frame would be the same
+  readonly textures: number; // held by three
   readonly presenting: boolean; // in a headset
   readonly cap: number; // splats allowed in a headset
   readonly state: State;
 }
 
-/** What a page that embeds the viewer may use: `window.sagesplat`. Poses are in the bundle's frame. */
+/** The interface for pages that embed the viewer: `window.sagesplat`. Poses are in the bundle's frame. */
 export interface Embed {
-  /** The manifest is read and everything else can be used; rejects with the message on the page. */
+  /** Resolves when the manifest is read and all else is usable; rejects with the message on the page. */
   readonly ready: Promise<void>;
   readonly version: string;
   readonly cameras: readonly Camera[];
@@ -24,13 +24,13 @@ export interface Embed {
   set(partial: Partial<Settings>): void;
   pose(): Pose;
   setPose(pose: Pose): void;
-  /** Goes to a photo's pose and lens, by name or index; RangeError where there is none. */
+  /** Goes to a photo's pose and lens, by name or index; RangeError for an unknown photo. */
   goTo(photo: string | number): void;
-  /** Calls back after every drawn frame, the next one soon, while the canvas can be read. Returns how to stop it. */
+  /** Requests a frame, and calls back after every drawn one, while the canvas is readable. Returns how to stop. */
   onSample(callback: (sample: Sample) => void): () => void;
 }
 
-/** What the address says. */
+/** The options in the page's address. */
 export interface Options {
   readonly view: string | null;
   readonly target: number | null; // SSIM
@@ -61,7 +61,7 @@ function numeric(given: URLSearchParams, name: string, low: number, high: number
   return value;
 }
 
-/** A folder below the page's own, with a slash at its end. */
+/** A folder below the page's own, with a trailing slash. */
 function bundlePath(path: string): string {
   let decoded = path;
   try {

@@ -16,14 +16,14 @@ window.sagesplat = { ready };
 ready.catch((error: unknown) => fail(messageOf(error)));
 
 async function begin(): Promise<void> {
-  await Promise.resolve(); // so that `window.sagesplat` is there before anything can go wrong
+  await Promise.resolve(); // `window.sagesplat` exists before any error
   const options = parseOptions(location.search, location.hash);
   const base = new URL(`./${options.bundle}`, location.href.replace(/[?#].*/, ""));
   const canvas = document.getElementById("view");
   if (!(canvas instanceof HTMLCanvasElement))
     throw new Error("This page is incomplete; copy the bundle again.");
   if (!document.createElement("canvas").getContext("webgl2")) {
-    throw new Error("This browser has no WebGL 2; switch on hardware acceleration or use another browser.");
+    throw new Error("This browser has no WebGL 2; enable hardware acceleration or use another browser.");
   }
   const manifest = await loadManifest(base, (url, init) => fetch(url, init));
   open(canvas, new Viewer(canvas, manifest, base, options), options);
@@ -37,18 +37,16 @@ function open(canvas: HTMLCanvasElement, viewer: Viewer, options: Options): void
   if (app && options.ui) buildPage(app, viewer);
   window.sagesplat = Object.assign(window.sagesplat, embed(viewer, ready));
   canvas.addEventListener("webglcontextlost", () => {
-    fail(
-      "The graphics card dropped this page, usually for lack of memory; load it again with a smaller budget.",
-    );
+    fail("The GPU context was lost, usually for lack of memory; reload the page with a smaller budget.");
   });
   window.addEventListener("online", () => viewer.streamer.retry());
   followTraining(viewer);
   viewer.start();
-  takeDownPoster(viewer, canvas);
+  removePosterWhenDrawn(viewer, canvas);
 }
 
-/** The picture in the page's HTML stays until the scene is drawn, or somebody wants to move. */
-function takeDownPoster(viewer: Viewer, canvas: HTMLCanvasElement): void {
+/** Removes the poster when the scene is drawn, or at the first input. */
+function removePosterWhenDrawn(viewer: Viewer, canvas: HTMLCanvasElement): void {
   const poster = document.getElementById("poster");
   if (!poster) return;
   canvas.after(poster); // above the scene, below the panel
@@ -62,10 +60,10 @@ function takeDownPoster(viewer: Viewer, canvas: HTMLCanvasElement): void {
   for (const event of ["pointerdown", "wheel", "keydown"] as const) {
     canvas.addEventListener(event, down, { once: true });
   }
-  if (viewer.photo >= 0) down(); // it shows another view
+  if (viewer.photo >= 0) down(); // the poster shows another view
 }
 
-/** A live bundle is loaded anew once training is done, as it has levels then. */
+/** Reloads a live bundle when training is finished: it then has levels. */
 function followTraining(viewer: Viewer): void {
   if (!viewer.manifest.live) return;
   viewer.streamer.onChange(() => {

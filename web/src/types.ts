@@ -1,10 +1,10 @@
-/** What the parts of the viewer say to each other. Everything is in the bundle's frame unless said otherwise. */
+/** Types shared by the parts of the viewer. Geometry is in the bundle's frame unless noted. */
 
 export type Vec3 = readonly [number, number, number];
 export type Quat = readonly [number, number, number, number]; // x y z w
 export type Box = readonly [number, number, number, number, number, number]; // min x y z, max x y z
 
-/** One increment: what a level adds to the one below it. */
+/** One increment: the splats that a level adds to the level below. */
 export interface Level {
   readonly uri: string;
   readonly format: "spz";
@@ -19,29 +19,29 @@ export interface Curve {
   readonly level: number; // 1-based
   readonly params: readonly [number, number, number, number, number, number, number, number, number];
   readonly range: readonly [number, number]; // of the fitted distances
-  readonly median: number; // where the distance is unknown
+  readonly median: number; // used for an unknown distance
   readonly rmse: number;
 }
 
-/** What is known of a category's SSIM from its distance alone. */
+/** A category's quality model by distance alone. */
 export interface LabelQuality {
   readonly status: "calibrated" | "pooled" | "uncalibrated";
   readonly confidence: number;
-  readonly margin: readonly number[]; // by curve: from what the curve says to what can be promised, SSIM
+  readonly margin: readonly number[]; // by curve: offset to a lower confidence bound, SSIM
   readonly curves: readonly Curve[];
 }
 
 export interface Label {
   readonly id: number;
-  readonly name: string; // in the taxonomy: grass-merged; of a part of a scene in blocks: grass-merged@3
-  readonly category?: string; // of a part: grass-merged
-  readonly block?: number; // of a part: 3
-  readonly title: string; // for people: grass
+  readonly name: string; // in the taxonomy: grass-merged; in a scene in blocks: grass-merged@3
+  readonly category?: string; // in a scene in blocks: grass-merged
+  readonly block?: number; // in a scene in blocks: 3
+  readonly title: string; // display name: grass
   readonly color: string; // #rrggbb
   readonly weight: number;
   readonly always: boolean; // shipped in full whatever the plan says
   readonly boxes: readonly Box[];
-  readonly levels: readonly Level[]; // level k is what increments 1..k show together
+  readonly levels: readonly Level[]; // level k consists of increments 1..k
   readonly quality: LabelQuality | null;
 }
 
@@ -61,9 +61,9 @@ export interface Manifest {
   readonly version: number;
   readonly generator: string;
   readonly name: string;
-  readonly live: boolean; // training goes on: the manifest will change
+  readonly live: boolean; // training still runs: the manifest will change
   readonly frame: {
-    readonly axes: "rub"; // the capture's world with y and z negated, as SPZ has it
+    readonly axes: "rub"; // the capture's world with y and z negated, as in SPZ
     readonly up: Vec3;
     readonly floor: number; // height of the ground along `up`
     readonly extent: number; // of the cameras
@@ -82,22 +82,22 @@ export interface Manifest {
   readonly licenses: readonly { readonly what: string; readonly license: string; readonly url?: string }[];
 }
 
-/** Increments in one file, one after the other, best first: as a stream it is quicker than many files. */
+/** All increments concatenated in one file, best first: one stream is faster than many files. */
 export interface Pack {
   readonly uri: string;
-  readonly bytes: number; // the sum of those of its increments
+  readonly bytes: number; // sum over its increments
   readonly sha256: string;
   readonly order: readonly (readonly [number, number])[]; // index of the label, level (1-based)
 }
 
-/** The viewpoint models of all categories: src/sagesplat/adapt/promise.py says how they are evaluated. */
+/** The viewpoint models of all categories, as evaluated by src/sagesplat/adapt/viewpoint.py. */
 export interface Promises {
   readonly version: number;
   readonly extent: number;
   readonly views: readonly (readonly [number, number, number, number, number, number])[]; // position, direction
   readonly labels: readonly {
     readonly id: number;
-    readonly levels: readonly number[]; // 1-based, that have a promise
+    readonly levels: readonly number[]; // 1-based levels with a bound
     readonly usual: number;
     readonly lengths: Vec3;
     readonly unseen: number;
@@ -111,16 +111,16 @@ export interface Promises {
     readonly unseenViews: readonly number[]; // 0 or 1 for each of them
     readonly logDistances: readonly number[];
     readonly weights: readonly (readonly number[])[]; // [n][K]
-    readonly corrections: readonly number[]; // log of each one's distance over what the boxes tell; 0: unknown
-    readonly shares: readonly number[]; // of the pixels of each shared view, 0..1
+    readonly corrections: readonly number[]; // log of distance over distance by boxes; 0: unknown
+    readonly shares: readonly number[]; // pixel share in each shared view, 0..1
   }[];
 }
 
-/** Where the viewer stands, in the bundle's frame. */
+/** The viewer's position and view, in the bundle's frame. */
 export interface Viewpoint {
   readonly position: Vec3;
   readonly direction: Vec3; // unit
-  /** Six half spaces [nx, ny, nz, d] with n x + d >= 0 inside; empty: look everywhere. */
+  /** Six half spaces [nx, ny, nz, d] with n x + d >= 0 inside; empty: unlimited view. */
   readonly frustum: readonly (readonly [number, number, number, number])[];
 }
 
@@ -138,11 +138,11 @@ export interface Settings {
   readonly cacheBytes: number; // of decoded increments that are not shown
 }
 
-/** Draws increments. Nothing of it knows of plans or networks. */
+/** Draws increments; independent of plans and networks. */
 export interface Renderer {
-  /** Decodes; the handle is drawn only once shown. Rejects for a file that cannot be decoded. */
+  /** Decodes an increment, which is drawn after `swap` shows it. Rejects for an invalid file. */
   decode(label: number, level: number, bytes: Uint8Array): Promise<Handle>;
-  /** In one tick: show some, hide others; what is hidden stays drawn until the next sort has landed. */
+  /** Shows some increments and hides others in one tick; hidden ones stay drawn until the next sort is done. */
   swap(show: readonly Handle[], hide: readonly Handle[]): void;
   dispose(handle: Handle): void;
 }
@@ -156,14 +156,14 @@ export interface Handle {
 export interface LabelState {
   readonly label: Label;
   readonly wanted: number; // level of the plan, 0 = none
-  readonly shown: number; // level drawn now
+  readonly shown: number; // drawn level
   readonly loading: boolean;
   readonly error: string | null;
   readonly visible: boolean; // in the frustum
   readonly distance: number; // NaN: unknown
-  readonly promised: number; // SSIM bound of the shown level; NaN: no promise
-  readonly expected: number; // SSIM mean of the shown level
-  readonly count: number; // of what is shown
+  readonly promised: number; // the promise: lower confidence bound of SSIM at the shown level; NaN: unknown
+  readonly expected: number; // mean SSIM at the shown level
+  readonly count: number; // splats shown
   readonly bytes: number;
   readonly gpuBytes: number;
 }
@@ -171,11 +171,11 @@ export interface LabelState {
 export interface State {
   readonly labels: readonly LabelState[];
   readonly status: "loading" | "ok" | "infeasible" | "over budget";
-  readonly bytesLoaded: number; // over the network, in all
+  readonly bytesLoaded: number; // total downloaded
   readonly bytesShown: number;
   readonly gpuBytes: number; // of all decoded increments, shown or not
   readonly count: number; // shown
-  readonly bandwidth: number; // bytes a second, measured; NaN: not yet
+  readonly bandwidth: number; // bytes per second, measured; NaN: unknown
   readonly pending: number; // downloads
-  readonly message: string | null; // something that the user should know
+  readonly message: string | null; // for the user
 }

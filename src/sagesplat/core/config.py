@@ -209,7 +209,7 @@ class NestConfig:
     """Bits per SH coefficient in the increments: of degree 1, and of higher degrees. Training uses the
     rounded values."""
     criterion: Literal["weight", "weight-volume", "peak", "sensitivity", "opacity"] = "sensitivity"
-    """Importance that orders the Gaussians of a category; docs/nested.md compares them."""
+    """Importance that orders the Gaussians of a category; docs/developers/nested.md compares them."""
     lr_multiplier: float = 4.0
     """Initial learning rates as a multiple of 3DGS's late learning rates; they decay to 5 %."""
 

@@ -1,4 +1,4 @@
-"""Reads members of a zip archive on a web server by HTTP range requests, without the rest of it."""
+"""Reads single members of a remote zip archive by HTTP range requests."""
 
 import http.client
 import re
@@ -16,12 +16,12 @@ from zipfile import ZIP_DEFLATED, BadZipFile, ZipFile, ZipInfo
 
 from sagesplat.core.errors import DataError, short
 
-TIMEOUT = 30  # seconds without a byte
+TIMEOUT = 30  # seconds without data
 PAUSES = (1.0, 5.0)  # seconds before the second and the third try
 BLOCK = 1 << 16  # bytes
-TAIL = 1 << 20  # bytes at an archive's end that hold its directory, or most of it
+TAIL = 1 << 20  # bytes at the end of an archive that usually contain its directory
 MAX_DIRECTORY = 1 << 24  # bytes
-HEADER = 30  # bytes of a member's own header, before its name and extra field
+HEADER = 30  # bytes of a member's local header, before name and extra field
 AGAIN = "run it again: finished files are kept"
 
 
@@ -30,31 +30,32 @@ class Member:
     """A file in an archive."""
 
     info: ZipInfo
-    stop: int  # where in the archive the bytes that belong to it end
+    stop: int  # end of its bytes in the archive
 
 
 class RemoteZip:
-    """An archive whose server answers range requests; every failure is a DataError of one line.
+    """A zip archive on a server that answers range requests.
 
-    What can be a passing fault is tried three times in all, with pauses by `sleep`.
+    Every failure is a DataError. Requests with a possibly temporary fault are tried three times in all, with
+    pauses by `sleep`.
     """
 
     def __init__(self, url: str, sleep: Callable[[float], None] = time.sleep):
         self.url, self._sleep = url, sleep
         self.size = 0  # bytes
-        list(self._blocks(0, 1))  # the answer tells the size
-        # zipfile reads many small pieces of it.
+        list(self._blocks(0, 1))  # the response contains the size
+        # Read in one request: zipfile reads many small pieces.
         self._tail = b"".join(self._blocks(max(0, self.size - TAIL), self.size))
         self._position = 0
 
     def members(self) -> list[Member]:
-        """All members, by their place in the archive."""
+        """All members, in the order of their position in the archive."""
         try:
             with ZipFile(self) as file:
                 infos = sorted(file.infolist(), key=lambda info: info.header_offset)
                 stops = [*(info.header_offset for info in infos), file.start_dir][1:]
             if infos and infos[0].header_offset < 0:
-                raise BadZipFile("a member before its begin")
+                raise BadZipFile("a member before its start")
         except (BadZipFile, NotImplementedError, ValueError, EOFError, struct.error) as error:
             raise DataError(f"{self.url}: not readable as a zip archive ({short(error)}); {AGAIN}") from None
         most = HEADER + 2 * 0xFFFF
@@ -64,7 +65,7 @@ class RemoteZip:
         ]
 
     def content(self, member: Member) -> Generator[bytes]:
-        """A member's content in blocks, from one request. Its size and CRC-32 are checked at the end."""
+        """A member's content in blocks, by one request. Size and CRC-32 are checked at the end."""
         info, crc, size = member.info, 0, 0
         with closing(self._blocks(info.header_offset, member.stop)) as blocks:
             try:
@@ -80,7 +81,7 @@ class RemoteZip:
             )
 
     def _blocks(self, start: int, stop: int) -> Generator[bytes]:
-        """The archive's bytes from `start` to `stop`. After a passing fault it goes on where it was."""
+        """The archive's bytes from `start` to `stop`; resumes after a temporary fault."""
         for pause in (*PAUSES, None):
             if start >= stop:
                 return
@@ -95,7 +96,7 @@ class RemoteZip:
             except (OSError, http.client.HTTPException) as error:
                 if isinstance(error, HTTPError):
                     error.close()
-                if pause is None or not _passes(error):
+                if pause is None or not _is_temporary(error):
                     reason = " ".join(str(error).split()) or type(error).__name__
                     raise DataError(f"{self.url}: cannot be downloaded ({reason}); {AGAIN}") from None
                 self._sleep(pause)
@@ -111,16 +112,16 @@ class RemoteZip:
         self.size = size
 
     def seek(self, offset: int, whence: int = 0) -> int:
-        """As of a file, for zipfile."""
+        """The method of a binary file, for zipfile."""
         self._position = max(0, offset + (0, self._position, self.size)[whence])
         return self._position
 
     def tell(self) -> int:
-        """As of a file, for zipfile."""
+        """The method of a binary file, for zipfile."""
         return self._position
 
     def read(self, count: int = -1) -> bytes:
-        """As of a file, for zipfile."""
+        """The method of a binary file, for zipfile."""
         start = min(self._position, self.size)
         stop = self.size if count < 0 else min(self.size, start + count)
         if stop - start > MAX_DIRECTORY:
@@ -135,36 +136,36 @@ class RemoteZip:
 
 
 def _get(url: str, start: int, stop: int) -> http.client.HTTPResponse:
-    """The answer to a range request. Raises OSError, HTTPException, and DataError if it is the whole file."""
-    # Some servers refuse Python's own name.
+    """The response to a range request. Raises OSError, HTTPException, and DataError if ranges are ignored."""
+    # Some servers refuse Python's default user agent.
     headers = {"User-Agent": "sagesplat", "Range": f"bytes={start}-{stop - 1}"}
     response = urlopen(Request(url, headers=headers), timeout=TIMEOUT)
     if response.status == 206:
         return response
     with response:
         size = response.headers["Content-Length"] or ""
-    whole = f"all of its {int(size) / 1e9:.3g} GB" if re.fullmatch(r"\d{1,18}", size) else "the whole file"
+    full = f"all of its {int(size) / 1e9:.3g} GB" if re.fullmatch(r"\d{1,18}", size) else "the full file"
     raise DataError(
-        f"{url}: the server does not send parts of the archive (no range requests), and {whole} is more than "
-        "was asked for; try without a proxy, or download and unpack it by hand"
+        f"{url}: the server does not send parts of the archive (no range requests), and {full} is more than "
+        "needed; try without a proxy, or download and unpack it by hand"
     )
 
 
-def _passes(error: Exception) -> bool:
-    """Whether it is worth another try."""
+def _is_temporary(error: Exception) -> bool:
+    """Whether a retry may succeed."""
     if isinstance(error, HTTPError):
         return error.code in (408, 425, 429, 500, 502, 503, 504)
     return not (isinstance(error, URLError) and isinstance(error.reason, ssl.SSLCertVerificationError))
 
 
 def _unpack(blocks: Iterable[bytes], info: ZipInfo) -> Generator[bytes]:
-    """A member's content from the bytes that begin with its header; at most one byte more than listed."""
+    """A member's content, from its bytes including the header; at most one byte more than listed."""
     head, begin = b"", HEADER
     blocks = iter(blocks)
     for block in blocks:
         head += block
         if len(head) >= HEADER:
-            # The name and the extra field may be longer here than in the directory.
+            # Name and extra field may have other lengths here than in the directory.
             begin = HEADER + sum(struct.unpack("<HH", head[26:HEADER]))
             if len(head) >= begin:
                 break

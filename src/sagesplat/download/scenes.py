@@ -1,4 +1,4 @@
-"""Downloads scenes of the field: of an official archive, only the members that are needed."""
+"""Downloads scenes of public data sets: only the needed members of the official archives."""
 
 import re
 import stat
@@ -19,7 +19,7 @@ from sagesplat.io.files import atomic_path
 
 REGISTRY = Path(__file__).with_name("scenes.toml")
 THREADS = 4
-MAX_RATIO = 1000  # of a file to its compressed size; photos and models stay far below
+MAX_RATIO = 1000  # of size to compressed size; photos and models are far below
 OnProgress = Callable[[str, int, int], None]  # name of a file, bytes done, all bytes of the scene
 
 
@@ -31,9 +31,9 @@ class RemoteScene:
     url: str  # of the archive
     folder: str  # of the scene, inside the archive
     scales: tuple[int, ...]  # 1 = images/, N = images_N/
-    scale: int  # the one that papers evaluate on
+    scale: int  # the scale at which papers evaluate
     photos: int
-    limit: int  # bytes; more than the files of one scale can take
+    limit: int  # bytes; an upper limit for the files of one scale
     archive_gb: float | None  # size of the whole archive, 10^9 bytes; None = unknown
     page: str  # URL of the data set's own page
     licence: str  # one line
@@ -43,7 +43,7 @@ Registry = Mapping[str, RemoteScene]
 
 
 def read_registry(path: Path = REGISTRY) -> dict[str, RemoteScene]:
-    """The scenes of a registry (scenes.toml says what it holds) by name."""
+    """The scenes of a registry file by name; scenes.toml documents the format."""
     scenes = {}
     for collection, shared in tomllib.loads(path.read_text(encoding="utf-8")).items():
         for archive in shared["archives"]:
@@ -65,12 +65,12 @@ def read_registry(path: Path = REGISTRY) -> dict[str, RemoteScene]:
 
 
 def list_scenes(registry: Registry | None = None) -> list[RemoteScene]:
-    """The scenes that can be downloaded, in the registry's order."""
+    """All scenes of the registry, in its order."""
     return list((read_registry() if registry is None else registry).values())
 
 
 def find_scene(name: str, registry: Registry | None = None) -> RemoteScene:
-    """The scene of this name; its `licence` is what a user should read. Raises DataError."""
+    """The scene with this name. DataError if there is none."""
     scenes = {scene.name: scene for scene in list_scenes(registry)}
     if name not in scenes:
         raise DataError(f"{name}: no such scene; take one of {', '.join(scenes)}")
@@ -86,14 +86,14 @@ def download_scene(
     registry: Registry | None = None,
     sleep: Callable[[float], None] = time.sleep,
 ) -> Path:
-    """Fetch `mipnerf360/garden` into `folder`/garden, which is returned: one size of photos and sparse/0.
+    """Download e.g. `mipnerf360/garden` to `folder`/garden: photos of one scale, and sparse/0; the folder.
 
-    `scale` 1 fetches images/, N images_N/ (default: the one that papers evaluate on), to be loaded with
-    downscale N. Only these members of the archive are transferred, by HTTP range requests. Size and CRC-32 of
-    each are checked; files that have both already are kept, so a second call goes on where one was cut.
-    `on_progress` is called from several threads, one at a time. Raises DataError for a name or scale that
-    there is not, a server that fails (after three tries with pauses by `sleep`) and an archive that is not
-    what it should be; RunError where `folder` cannot be written.
+    `scale` 1 downloads images/, N images_N/, for loading with downscale N (default: the scale at which papers
+    evaluate). Only these members of the archive are transferred, by HTTP range requests. Their size and
+    CRC-32 are checked. Complete files are kept, so that a second call resumes an interrupted one.
+    `on_progress` is called from several threads, one at a time. Raises DataError for an unknown name or
+    scale, a failing server (after three tries with pauses by `sleep`) and an unexpected archive. Raises
+    RunError if `folder` cannot be written.
     """
     scene = find_scene(name, registry)
     scale = scene.scale if scale is None else scale
@@ -108,7 +108,7 @@ def download_scene(
 
 
 def _choose(scene: RemoteScene, scale: int, members: Iterable[Member]) -> dict[str, Member]:
-    """The photos of a scale and the sparse model, by their path below the scene's folder, all checked."""
+    """The members with the photos of a scale and the sparse model, by path in the scene's folder; checked."""
     photos = "images/" if scale == 1 else f"images_{scale}/"
     chosen: dict[str, Member] = {}
     for member in members:
@@ -134,7 +134,7 @@ def _choose(scene: RemoteScene, scale: int, members: Iterable[Member]) -> dict[s
 
 
 def _check(url: str, inside: str, info: ZipInfo) -> None:
-    """Refuse a member that could write outside its folder or fill the disk."""
+    """DataError for a member that could write outside its folder or fill the disk."""
     kind = stat.S_IFMT(info.external_attr >> 16)
     parts = inside.split("/")
     if any(part in ("", ".", "..") for part in parts) or re.search(r"[\\:\x00-\x1f]", inside):
@@ -151,7 +151,7 @@ def _check(url: str, inside: str, info: ZipInfo) -> None:
 
 
 def _fetch_all(archive: RemoteZip, members: Mapping[Path, Member], on_progress: OnProgress | None) -> None:
-    """Make each path, some at a time. The first error stops the others between two blocks."""
+    """Download several members at a time. The first error stops the others after their current block."""
     total = sum(member.info.file_size for member in members.values())
     lock, stop, done = threading.Lock(), threading.Event(), 0
 

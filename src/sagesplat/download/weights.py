@@ -17,19 +17,19 @@ from sagesplat.core.errors import BackendUnavailable, DataError, RunError
 from sagesplat.io.files import atomic_path
 from sagesplat.metrics.lpips import Net, checked, load_lpips, shapes, weights_path
 
-TIMEOUT = 30  # seconds without a byte
+TIMEOUT = 30  # seconds without data
 
 OnProgress = Callable[[str, int, int], None]  # name of a file, bytes done, all bytes (0 = unknown)
 
 
 @dataclass(frozen=True)
 class Source:
-    """Where the weights of a net are published: state dicts as torch saves them."""
+    """Where the weights of a network are published, as PyTorch state dicts."""
 
     backbone: str  # URL: torchvision's network
-    sha256: str  # its first digits
-    convolutions: tuple[int, ...]  # their numbers among the network's features
-    heads: str  # URL: the weights of the channels
+    sha256: str  # first digits of its hash
+    convolutions: tuple[int, ...]  # their indices in the network's `features`
+    heads: str  # URL: LPIPS's weights of the channels
 
 
 _TORCHVISION = "https://download.pytorch.org/models"
@@ -54,11 +54,11 @@ def download_lpips(
     *,
     sources: Mapping[Net, Source] = SOURCES,
 ) -> list[Path]:
-    """Make lpips_{net}.npz in `folder` (default: the cache) where `load_lpips` finds none; their paths.
+    """Download the weights that `load_lpips` does not find in `folder` (default: the cache); their paths.
 
-    Fetches 233 MB (alex) and 528 MB (vgg), of which the convolutions are kept: 10 and 59 MB. A file appears
-    when it is complete and checked. `on_progress` is called after each MB. Raises DataError for a download
-    that fails or is not what it should be, RunError where `folder` cannot be written.
+    Downloads 233 MB (alex) and 528 MB (vgg) and keeps the convolutions: 10 and 59 MB, as lpips_{net}.npz.
+    Files are checked and written atomically. `on_progress` is called after each MB. Raises DataError for a
+    failed or unexpected download, and RunError if `folder` cannot be written.
     """
     paths = [weights_path(net, folder) for net in nets]
     for net, path in zip(nets, paths, strict=True):
@@ -86,7 +86,7 @@ def _usable(net: Net, path: Path) -> bool:
 def _fetch_weights(
     net: Net, path: Path, source: Source, on_progress: OnProgress | None
 ) -> dict[str, np.ndarray]:
-    """The arrays of `path`. What is downloaded lies beside it meanwhile, in files without a name."""
+    """The arrays of `path`. Downloads are kept in unnamed temporary files beside it."""
     layers = [(k, n, part) for k, n in enumerate(source.convolutions) for part in ("weight", "bias")]
     backbone = {f"conv{k}.{part}": f"features.{n}.{part}" for k, n, part in layers}
     heads = {f"lin{k}": f"lin{k}.model.1.weight" for k in range(5)}  # [1, C, 1, 1]
@@ -95,13 +95,13 @@ def _fetch_weights(
     for url, sha256, keys in (source.heads, "", heads), (source.backbone, source.sha256, backbone):
         with tempfile.TemporaryFile(dir=path.parent) as file:
             try:
-                found = _fetch(url, file, on_progress)
+                digest = _fetch(url, file, on_progress)
             except (OSError, http.client.HTTPException) as error:
                 if getattr(error, "errno", None) == errno.ENOSPC:
                     raise
                 raise DataError(f"{url}: cannot be downloaded ({error}); {cure}") from None
-            if not found.startswith(sha256):
-                raise DataError(f"{url}: SHA-256 {found[:8]}, not {sha256}; {cure}")
+            if not digest.startswith(sha256):
+                raise DataError(f"{url}: SHA-256 {digest[:8]}, not {sha256}; {cure}")
             try:
                 state = torch.load(file, map_location="cpu", weights_only=True)
                 for name, key in keys.items():
@@ -113,9 +113,9 @@ def _fetch_weights(
 
 
 def _fetch(url: str, file: IO[bytes], on_progress: OnProgress | None) -> str:
-    """Copy what `url` gives into `file`; its SHA-256. Raises OSError or HTTPException."""
+    """Download `url` into `file`; the SHA-256 of the content. Raises OSError or HTTPException."""
     digest, done = hashlib.sha256(), 0
-    request = Request(url, headers={"User-Agent": "sagesplat"})  # some servers refuse Python's own
+    request = Request(url, headers={"User-Agent": "sagesplat"})  # some servers refuse Python's default
     with urlopen(request, timeout=TIMEOUT) as response:
         total = int(response.headers["Content-Length"] or 0)
         while block := response.read(1 << 20):

@@ -8,9 +8,8 @@ per Gaussian:
     1    opacity times 255
     3    (0.15 sh0 + 0.5) 255
     3    (log scale + 10) 16
-    4    rotation, uint32: 2 bits for the index of the largest of x y z w, which is positive and omitted, then
-         a sign and 9 bits of each other, in order: magnitude times 511 sqrt(2). Version 2: 3 bytes, x y z
-         with w >= 0
+    4    rotation, uint32: 2 bits: index of the largest of x y z w, which is positive and omitted. A sign
+         and 9 bits of each other: magnitude times 511 sqrt(2). Version 2: 3 bytes, x y z with w >= 0
     3 K  128 + 128 times the SH coefficients, RGB last
 
 In `coarse` files values are multiples of larger steps than the format allows: they compress better.

@@ -32,10 +32,10 @@ def njit(function: Callable[..., Any] | None = None, *, cache: bool = False, **o
     """
     if function is None:
         return partial(njit, cache=cache, **options)
-    kernel = numba.njit(**options)(function)
+    kernel: Any = numba.njit(**options)(function)
     if cache:
         with suppress(RuntimeError):  # numba finds no folder that it can write
-            kernel._cache = _KernelCache(function)
+            setattr(kernel, "_cache", _KernelCache(function))  # noqa: B010 - of numba's dispatcher
     return kernel
 
 
@@ -78,7 +78,7 @@ def _used(function: Any, seen: set[Any]) -> Iterator[str]:
             yield f"{name} {value.dtype} {value.shape} {hashlib.sha256(value.tobytes()).hexdigest()}"
         elif isinstance(value, _CONSTANTS):
             yield f"{name} {value!r}"
-        elif ours and (path := getattr(sys.modules.get(module), "__file__", None)):
+        elif ours and (path := getattr(sys.modules.get(str(module)), "__file__", None)):
             yield _file_hash(path)
 
 

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -44,7 +44,7 @@ class Features:
     """What a network sees in an image; 122 (vgg) or 11 (alex) floats per pixel."""
 
     shape: tuple[int, ...]  # of the image
-    blocks: tuple[Float32[Tensor, "C h w"], ...]  # of unit length over the channels; none: image too small
+    blocks: tuple[Float32[Tensor, "_ _ _"], ...]  # [C, h, w] of unit length over C; none: image too small
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,12 +61,12 @@ class Lpips:
     weights: dict[str, Float32[Tensor, "..."]]  # names and shapes: `shapes`
     as_3dgs: bool = False  # leave out the map from [0, 1] to [-1, 1]
 
-    def __call__(self, x: Float32[np.ndarray, "H W 3"], y: Float32[np.ndarray, "H W 3"]) -> float:
+    def __call__(self, x: Float[np.ndarray, "H W 3"], y: Float[np.ndarray, "H W 3"]) -> float:
         """The `distance` of two images of one size."""
         return self.distance(self.features(x), self.features(y))
 
     @torch.inference_mode()
-    def features(self, image: Float32[np.ndarray, "H W 3"]) -> Features:
+    def features(self, image: Float[np.ndarray, "H W 3"]) -> Features:
         """What `distance` compares: the network's features after each block, scaled to unit length."""
         layout, k, blocks = _LAYOUTS[self.net], 0, []
         if image.ndim != 3 or image.shape[2] != 3:

@@ -173,8 +173,8 @@ class Splats:
 
 
 def _take(g: Gaussians, rows: Tensor) -> Gaussians:
-    """Rows of the parameters. Unlike `select`, the gradient of this needs no sort."""
-    return replace(g, **{name: getattr(g, name).index_select(0, rows) for name in PARAMETERS})
+    """Rows of the Gaussians. Unlike `select`, the gradient of this needs no sort."""
+    return replace(g, **{name: getattr(g, name).index_select(0, rows) for name in (*PARAMETERS, "label_ids")})
 
 
 def splat(g: Gaussians, camera: Camera, degree: int, antialiased: bool) -> Splats:

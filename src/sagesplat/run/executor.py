@@ -1,4 +1,4 @@
-"""Where the independent pieces of a stage are computed: here, or on the nodes of a cluster."""
+"""Where independent tasks of a stage run: in this process, or on the nodes of a cluster."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -13,11 +13,11 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True)
 class Task:
-    """A piece of work that another process can do, and do again: what it writes is the same each time.
+    """A unit of work that another process can run, and repeat: its output is the same each time.
 
     `function` is one of a module, called as `function(*arguments, emit)`; its arguments and result can be
     pickled. It reads and writes files of the run folder and the capture, which all nodes see. Tasks of one
-    name are parts of one work: their progress is shown as one.
+    name belong together: their progress is shown as one.
     """
 
     name: str  # for messages
@@ -28,11 +28,11 @@ class Task:
 
 
 class Executor(Protocol):
-    """Does tasks."""
+    """Runs tasks."""
 
     @property
     def parallel(self) -> int:
-        """How many tasks it can do at once: what a stage divides its work by."""
+        """How many tasks run at once; a stage divides its work by it."""
         ...
 
     @property
@@ -70,7 +70,7 @@ LOCAL: Executor = Local()
 
 
 def results(executor: Executor, tasks: Sequence[Task], emit: Emit) -> list[Any]:
-    """The results of all tasks, in their order."""
+    """The results of all tasks, in the order of the tasks."""
     found = dict(executor.run(tasks, emit))
     return [found[number] for number in range(len(tasks))]
 
@@ -83,22 +83,22 @@ def split(items: Sequence[Item], parts: int) -> list[Sequence[Item]]:
 
 
 class ProgressAggregator:
-    """Passes on what tasks tell; those of one name as if they were one.
+    """Forwards the events of tasks; tasks of one name appear as one.
 
-    Their progress is summed (who has not told any yet counts as the mean of the others), and what several of
-    them warn of is said once.
+    Their progress is summed (a task without any yet counts as the mean of the others), and a warning of
+    several of them is forwarded once.
     """
 
     def __init__(self, tasks: Sequence[Task], emit: Emit):
         self._names = [task.name for task in tasks]
         self._parts = Counter(self._names)
         self._emit = emit
-        self._told: dict[str, dict[int, tuple[int, int]]] = {}  # (done, total) by number, by name
+        self._reported: dict[str, dict[int, tuple[int, int]]] = {}  # (done, total) by number, by name
         self._ended: dict[str, set[int]] = {}
         self._warned: set[tuple[str, str]] = set()
 
     def tell(self, number: int, event: Event) -> None:
-        """Pass on an event of a task."""
+        """Forward an event of a task."""
         name = self._names[number]
         if self._parts[name] == 1:
             self._emit(event)
@@ -117,27 +117,27 @@ class ProgressAggregator:
                 self._emit(event)
 
     def end(self, number: int) -> None:
-        """A task is done, whatever it told last."""
+        """Count a task as complete, whatever it reported last."""
         name = self._names[number]
         self._ended.setdefault(name, set()).add(number)
-        told = self._told.get(name, {})
-        if self._parts[name] > 1 and number in told:
-            total = told[number][1]
+        reported = self._reported.get(name, {})
+        if self._parts[name] > 1 and number in reported:
+            total = reported[number][1]
             self._add(name, number, total, total, "")
 
     def _add(self, name: str, number: int, done: int, total: int, text: str) -> None:
-        told = self._told.setdefault(name, {})
-        told[number] = done, total
-        known = sum(of for _, of in told.values())
-        each = known / len(told)
-        silent = self._ended.get(name, set()) - told.keys()
-        reached = sum(done for done, _ in told.values()) + each * len(silent)
-        whole = known + each * (self._parts[name] - len(told))
+        reported = self._reported.setdefault(name, {})
+        reported[number] = done, total
+        known = sum(of for _, of in reported.values())
+        each = known / len(reported)
+        silent = self._ended.get(name, set()) - reported.keys()
+        reached = sum(done for done, _ in reported.values()) + each * len(silent)
+        whole = known + each * (self._parts[name] - len(reported))
         self._emit(Progress(name, round(reached), round(whole), text))
 
 
 class EventBuffer:
-    """Keeps what tasks tell until it is fetched: an actor, which may be lost with what it holds."""
+    """Buffers the events of tasks until they are fetched: an actor, which may be lost with its content."""
 
     def __init__(self) -> None:
         self._events: list[tuple[str, int, Event | str]] = []
@@ -147,6 +147,6 @@ class EventBuffer:
         self._events.append((run, number, event))
 
     def take(self) -> list[tuple[str, int, Event | str]]:
-        """What was told since the last time."""
+        """The events since the last call."""
         taken, self._events = self._events, []
         return taken

@@ -22,8 +22,8 @@ from sagesplat.run.executor import EventBuffer, ProgressAggregator, Task
 from sagesplat.run.ray_task import ANSWER, Failed, WorkerEnvironment, run_task
 
 _TRIES = 3  # of a task, after the first
-_POLL = 0.1  # seconds between two looks at what happened
-_STALLED = 30.0  # seconds without any task at work until we say so
+_POLL = 0.1  # seconds between two checks of the tasks
+_STALLED = 30.0  # seconds without any task at work until a warning
 _STORE = 256 * 2**20  # bytes of shared memory of a cluster of our own: results are small
 
 
@@ -170,7 +170,7 @@ class RayExecutor:
         return int(min(most, node.get("GPU", 0) // self._gpus) if self._gpus else most)
 
     def _cpus(self, gpus: float) -> int:
-        """CPUs of a task: with GPUs no more than their share of their node's, so that all GPUs are used."""
+        """CPUs of a task; with GPUs at most their share of the node's, so that all GPUs can be used."""
         if not gpus:
             return self._threads
         shares = [node.get("CPU", 0) * gpus / node["GPU"] for node in self._nodes() if node.get("GPU")]

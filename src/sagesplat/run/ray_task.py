@@ -1,4 +1,4 @@
-"""A task of a Ray cluster, as it is done in a process of its node."""
+"""A task of a Ray cluster, as it runs in a process of a node."""
 
 import os
 import socket
@@ -18,21 +18,21 @@ from sagesplat.core.events import Event, Progress, Training
 from sagesplat.run.executor import Task
 
 ANSWER = 5.0  # seconds that an actor may take to answer
-_POLL = 0.1  # seconds between two looks for a file
+_POLL = 0.1  # seconds between two checks for a file
 _OFTEN = 0.2  # seconds between two reports of progress of a task
 _VISIBLE = 10.0  # seconds until a file that was written here is seen on another node
 
 
 @dataclass(frozen=True)
 class Failed:
-    """A task that ended with an error which is the user's to mend."""
+    """A task that ended with an error that the user can fix."""
 
     error: SageError
 
 
 @dataclass(frozen=True)
 class WorkerEnvironment:
-    """What a task has to find on its node."""
+    """What a task needs on its node."""
 
     marker: Path  # a file of ours in the folder that all nodes share
     cwd: Path  # what relative paths are relative to
@@ -42,7 +42,7 @@ class WorkerEnvironment:
 def run_task(
     task: Task, environment: WorkerEnvironment, post: Any, run: str, number: int, threads: int
 ) -> Any:
-    """A task, in a process of its node; `Failed` where the user has to mend something."""
+    """A task, in a process of its node; `Failed` for an error that the user can fix."""
     tell = _Tell(post, run, number)
     try:
         _check(environment)

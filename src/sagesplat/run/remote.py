@@ -1,4 +1,4 @@
-"""Pieces of a stage's work, done here or by other processes."""
+"""Parts of a stage, computed in this process or by those of an executor."""
 
 import json
 import socket
@@ -20,9 +20,9 @@ Result = TypeVar("Result")
 def work(
     job: Job, name: str, function: Callable[[Job, Part], Result], parts: Sequence[Part]
 ) -> Iterator[tuple[int, Result]]:
-    """`function(job, part)` of each part, with the part's number, as they come (see `Executor.run`).
+    """Yield (number of the part, `function(job, part)`) as results arrive (see `Executor.run`).
 
-    `function` is one of a module. Where the executor is another process's, it gets a job opened there.
+    `function` must be a module's, so that it can be pickled. In another process it gets a job opened there.
     """
     if isinstance(job.executor, Local):
         for number, part in enumerate(parts):
@@ -36,20 +36,20 @@ def work(
 def work_all(
     job: Job, name: str, function: Callable[[Job, Part], Result], parts: Sequence[Part]
 ) -> list[Result]:
-    """What `work` finds, in the order of the parts."""
-    found = dict(work(job, name, function, parts))
-    return [found[number] for number in range(len(parts))]
+    """The results of `work`, in the order of the parts."""
+    results = dict(work(job, name, function, parts))
+    return [results[number] for number in range(len(parts))]
 
 
 def _piece(spec: JobSpec, function: Callable[[Job, Any], Any], part: Any, emit: Emit) -> Any:
-    """A task: one part, in a process that may have had others of the same scene."""
+    """A task: one part, in a process that may have computed others of the same scene."""
     kept = _kept(replace(spec, force=False), spec.run.scene.read_bytes())
     return function(spec.open(emit, kept), part)
 
 
 @lru_cache(maxsize=1)
 def _kept(spec: JobSpec, scene: bytes) -> Job:
-    """A job whose scene and photos serve one task after the other; `scene`: content of scene.json."""
+    """A job whose scene and photos successive tasks share; `scene`: content of scene.json."""
     capture = Path(json.loads(scene)["path"])
     if not capture.exists():
         raise RunError(

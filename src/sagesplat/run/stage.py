@@ -18,11 +18,11 @@ from sagesplat.run.run_dir import is_done, record
 _CLOCK_STEP = 2.0  # seconds: some disks keep no finer time
 # Stages that are made of earlier results within minutes: they follow those without --force, as long as
 # their own settings are the same. The settings of the second ones are the plan's.
-_DERIVED = {"observe", "fit", "plan", "crossview", "occupancy", "paper"}
+_DERIVED = {"observe", "fit", "plan", "crossview", "same_size", "paper"}
 _OF_PLAN = {"compose", "evaluate", "report"}
 _ORDER = (
-    "poses", "scene", "segment", "masks", "lift", "blocks", "train", "fuse", "block_categories", "parts",
-    "base", "nest", "observe", "fit", "plan", "compose", "evaluate", "report", "crossview", "occupancy",
+    "poses", "scene", "segment", "masks", "lift", "blocks", "train", "fuse", "block_categories",
+    "base", "nest", "observe", "fit", "plan", "compose", "evaluate", "report", "crossview", "same_size",
     "paper",
 )  # fmt: skip
 
@@ -59,7 +59,7 @@ def run_stage(
         inputs: Files and folders that it is made from; their hashes are recorded.
         outputs: Files and folders that it makes.
         make: Does the work and returns lines that sum up the result.
-        swaps: Whether the old result and its record stay until `make` takes them away.
+        swaps: The old result and its record stay until `make` removes them.
 
     Raises:
         RunError: If an input is missing, the result was made with other settings (without `job.force`),

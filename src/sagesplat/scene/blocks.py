@@ -149,7 +149,7 @@ def visible_shares(scene: Scene, of_points: Int[np.ndarray, " P"], count: int) -
     return seen / np.maximum(seen.sum(1, keepdims=True), 1)
 
 
-def views_of(
+def assigned_views(
     scene: Scene, blocks: Blocks, shares: Float64[np.ndarray, "V B"], min_share: float
 ) -> Bool[np.ndarray, "V B"]:
     """The blocks that each view is assigned to.
@@ -164,7 +164,7 @@ def views_of(
     return assigned
 
 
-def part_of(
+def training_scene(
     scene: Scene, blocks: Blocks, block: int, views: Sequence[int], far_share: float, seed: int
 ) -> tuple[Scene, Int64[np.ndarray, " Q"]]:
     """The scene that a block is trained on, with only these views, and the rows of its points.
@@ -221,7 +221,7 @@ def _seen(scene: Scene, rows: np.ndarray) -> np.ndarray:
     return seen
 
 
-def colours(adjacent: Bool[np.ndarray, "B B"]) -> Int64[np.ndarray, " B"]:
+def graph_colouring(adjacent: Bool[np.ndarray, "B B"]) -> Int64[np.ndarray, " B"]:
     """A greedy graph colouring: adjacent blocks differ. Blocks of one colour can be changed concurrently."""
     chosen = np.full(len(adjacent), -1)
     for block in np.argsort(-adjacent.sum(1), kind="stable"):

@@ -51,21 +51,21 @@ def reconstruct(
     """Estimate the poses of a folder of photos or of a video; make `workspace` a capture for `load_scene`.
 
     Writes undistorted photos to images/, their COLMAP model to sparse/0, with gravity along +y, and
-    poses.json. Intermediate results are kept in sfm/: a killed run resumes, unless
-    photos or settings changed. The stages of `on_progress` are prepare, features, matches, mapping and
-    undistortion. Raises SceneError, and BackendUnavailable without pycolmap.
+    poses.json. Intermediate results are kept in sfm/: a killed run resumes, unless photos or settings
+    changed. The stages of `on_progress` are prepare, features, matches, mapping and undistortion. Raises
+    SceneError, and BackendUnavailable without pycolmap.
     """
     _check(source, workspace, config)
     work, started = workspace / "sfm", time.perf_counter()
     folder = source
+
+    def on_prepared(done: int, total: int) -> None:
+        on_progress("prepare", done, total)
+
     if source.is_file():
         folder = work / "frames"
-        extract_frames(
-            source, folder, max_frames=config.max_frames, on_frame=lambda i, n: on_progress("prepare", i, n)
-        )
-    photos, unreadable = prepare_photos(
-        folder, work / "photos", workspace, lambda i, n: on_progress("prepare", i, n)
-    )
+        extract_frames(source, folder, max_frames=config.max_frames, on_frame=on_prepared)
+    photos, unreadable = prepare_photos(folder, work / "photos", workspace, on_prepared)
     if len(photos) < MIN_PHOTOS:
         raise SceneError(_too_few(source, photos, unreadable))
     request = _request(source, photos, config)
@@ -76,29 +76,15 @@ def reconstruct(
     write_json(work / "request.json", request | {"min_photos": least, "threads": config.threads})
     seconds = {"prepare": round(time.perf_counter() - started, 2)}
     result = _run(work, on_progress)
-    names = {photo.prepared: photo.name for photo in photos}
-    reasons = {names[prepared]: reason for prepared, reason in result["reasons"].items()}
-    reconstruction = Reconstruction(
-        workspace=workspace,
-        num_photos=len(photos),
-        num_registered=len(result["registered"]),
-        unregistered=reasons | unreadable,
-        num_points=result["num_points"],
-        reprojection_error=result["reprojection_error"],
-        seconds=seconds | result["seconds"],
-    )
+    reconstruction = _reconstruction(workspace, photos, unreadable, seconds, result)
     complete = reconstruction.num_registered >= least
     if complete:
         _publish(workspace)
     renamed = {photo.name: photo.final for photo in photos if photo.name != photo.final}
     resolved = {"matching": request["matching"], "cameras": len(request["cameras"])}
-    report = asdict(reconstruction) | {"workspace": str(workspace)}
-    write_json(
-        workspace / "poses.json",
-        {"complete": complete, "settings": asdict(config), "resolved": resolved}
-        | report
-        | {"renamed": renamed},
-    )
+    report = {"complete": complete, "settings": asdict(config), "resolved": resolved}
+    report |= asdict(reconstruction) | {"workspace": str(workspace), "renamed": renamed}
+    write_json(workspace / "poses.json", report)
     if not complete:
         registered, total = reconstruction.num_registered, reconstruction.num_photos
         raise SceneError(
@@ -107,6 +93,27 @@ def reconstruct(
             f"another camera, a larger max_size; reasons in {workspace / 'poses.json'}"
         )
     return reconstruction
+
+
+def _reconstruction(
+    workspace: Path,
+    photos: list[PreparedPhoto],
+    unreadable: dict[str, str],
+    seconds: dict[str, float],
+    result: dict[str, Any],
+) -> Reconstruction:
+    """The result of _sfm.py, with the photos under their own names."""
+    names = {photo.prepared: photo.name for photo in photos}
+    reasons = {names[prepared]: reason for prepared, reason in result["reasons"].items()}
+    return Reconstruction(
+        workspace=workspace,
+        num_photos=len(photos),
+        num_registered=len(result["registered"]),
+        unregistered=reasons | unreadable,
+        num_points=result["num_points"],
+        reprojection_error=result["reprojection_error"],
+        seconds=seconds | result["seconds"],
+    )
 
 
 def _check(source: Path, workspace: Path, config: PosesConfig) -> None:

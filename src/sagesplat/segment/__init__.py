@@ -1,1 +1,1 @@
-"""Semantics: label images of the views, and the labels of points that follow from them."""
+"""Semantics: label images of the views, and 2D-to-3D label transfer to the points."""

@@ -1,4 +1,4 @@
-"""Parts of a large scene: each category in each block is one, with an id and a name of its own."""
+"""Per-block categories: each (block, category) pair has an id and a name of its own."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -8,12 +8,12 @@ import numpy as np
 from sagesplat.core.errors import LabelError
 from sagesplat.segment.masks import MAX_LABEL_ID, UNLABELLED, Taxonomy
 
-_MARK = "@"  # between category and block in a part's name
+_MARK = "@"  # between category and block in a name
 
 
 @dataclass(frozen=True)
 class BlockCategories:
-    """Numbers the parts: the categories of block 0, then those of block 1, ...; the unlabelled one first."""
+    """Numbers per-block categories: those of block 0, of block 1, ...; in each, unlabelled comes first."""
 
     taxonomy: Taxonomy  # of the categories
     blocks: int
@@ -31,17 +31,17 @@ class BlockCategories:
         return np.array([UNLABELLED, *sorted(self.taxonomy.names)], np.int16)
 
     def ids(self, label_ids: np.ndarray, block: np.ndarray | int) -> np.ndarray:
-        """Parts (int16) of category ids in blocks; arrays of one shape."""
+        """Per-block ids (int16) of category ids and blocks; arrays of one shape."""
         column = np.searchsorted(self.categories, label_ids)
         return (column + np.asarray(block) * len(self.categories)).astype(np.int16)
 
     def block_of(self, part_ids: np.ndarray) -> np.ndarray:
-        """Blocks of parts."""
+        """Blocks of per-block ids."""
         return (part_ids // len(self.categories)).astype(np.int16)
 
     @property
     def names(self) -> Taxonomy:
-        """The parts as a taxonomy."""
+        """The per-block categories as a taxonomy."""
         found = {}
         for block in range(self.blocks):
             for column, label in enumerate(self.categories.tolist()):
@@ -51,11 +51,11 @@ class BlockCategories:
 
 
 def category_of(name: str) -> str:
-    """The category in a part's name; of another name, that name."""
+    """The category in a per-block name; any other name unchanged."""
     return split_name(name)[0]
 
 
 def split_name(name: str) -> tuple[str, int | None]:
-    """Category and block of a part's name; no block for a category that is in none."""
+    """Category and block of a per-block name; (name, None) for any other name."""
     category, mark, block = name.rpartition(_MARK)
     return (category, int(block)) if mark and category and block.isdecimal() else (name, None)

@@ -75,7 +75,7 @@ class Bottleneck(nn.Module):
             shortcut = nn.Conv2d(inputs, 4 * width, 1, stride, bias=False)
             self.downsample = nn.Sequential(shortcut, nn.BatchNorm2d(4 * width))
 
-    def forward(self, x: Float32[Tensor, "B I h w"]) -> Float32[Tensor, "B O h2 w2"]:
+    def forward(self, x: Float[Tensor, "B I h w"]) -> Float[Tensor, "B O h2 w2"]:
         """The block's features."""
         shortcut = x if self.downsample is None else self.downsample(x)
         x = F.relu(self.bn1(self.conv1(x)))
@@ -112,7 +112,7 @@ class DeepLabV2(nn.Module):
         """How many logits a pixel has."""
         return int(self.aspp[0].bias.shape[0])  # type: ignore[union-attr, index]
 
-    def forward(self, x: Float32[Tensor, "B 3 H W"]) -> Float32[Tensor, "B C h w"]:
+    def forward(self, x: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B C h w"]:
         """Logits of each class at output stride 8."""
         x = self.pool(F.relu(self.bn1(self.conv1(x))))
         x = self.layer4(self.layer3(self.layer2(self.layer1(x))))
@@ -126,8 +126,8 @@ def _stage(inputs: int, width: int, blocks: int, *, stride: int, dilation: int) 
 
 
 def fuse_scales(
-    model: nn.Module, x: Float32[Tensor, "B 3 H W"], scales: Sequence[float] = SCALES
-) -> Float32[Tensor, "B C h w"]:
+    model: nn.Module, x: Float[Tensor, "B 3 H W"], scales: Sequence[float] = SCALES
+) -> Float[Tensor, "B C h w"]:
     """The largest logit over the input at several scales (Sec. 4.1.2), at the size of the first one's.
 
     Bilinear with align_corners=False, to which the PyTorch port trained its checkpoints.

@@ -1,4 +1,4 @@
-"""Labels of the structure-from-motion points, by vote over the label images."""
+"""2D-to-3D label transfer: labels of the SfM points, by vote over the label images."""
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, fields

@@ -1,4 +1,4 @@
-"""Segmenters: what they are asked and answer, and the loop that takes one over the views of a scene."""
+"""Segmenters: their interface, and the loop that applies one to the views of a scene."""
 
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -25,7 +25,7 @@ NEGLIGIBLE = 0.5 / 255  # no 8-bit image of probabilities shows less
 
 @dataclass(frozen=True, eq=False)
 class Segmented:
-    """What a segmenter says about a photo."""
+    """A segmenter's answer for a photo."""
 
     label_ids: Int16[np.ndarray, "H W"]  # category id of each pixel, -1 where it has none
     probabilities: Float32[np.ndarray, "C h w"] | None  # 0 ... 1, at most 1 in sum; covers the whole photo
@@ -33,7 +33,7 @@ class Segmented:
 
 
 class Segmenter(Protocol):
-    """A network, or whatever else, that knows the categories of pixels."""
+    """A network, or anything else, that labels pixels."""
 
     taxonomy: Taxonomy  # all categories that it can answer with
 
@@ -117,8 +117,8 @@ def segment_some(
     Several processes may do so with other views and the same network: the first one begins the folder.
 
     Up to `batch` photos of equal size are given to the segmenter at once. With `soft`, the probabilities of
-    each view are kept there too (`soft.read_soft`). A finished label image in `target` is kept, so that a
-    killed run goes on where it was, unless it is of other categories: empty the folder before using another
+    each view are kept there too (`soft.read_soft`). A finished label image in `target` is kept, and a
+    killed run resumes, unless it is of other categories: empty the folder before using another
     model of the same ones. `on_view(done, total)` is called after each view, `total` being that of `rows`.
     Raises LabelError.
     """

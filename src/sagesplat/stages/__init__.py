@@ -1,1 +1,1 @@
-"""What each stage of a run does: its settings, inputs and outputs, and the call that makes them."""
+"""The stages of a run, one file each: settings, inputs, outputs, and the function that makes them."""

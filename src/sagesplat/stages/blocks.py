@@ -1,8 +1,8 @@
-"""Large scenes: blocks of the ground plane are trained by themselves and put together.
+"""Makes the levels and nested levels of a large scene, from blocks trained independently and merged.
 
-A block is a run folder of its own, RUN/blocks/NNN, whose capture is a part of the scene: it is trained and
-nested like any other, on whatever node, and goes on where it was killed. Put together, each category in each
-block is a category of its own (`segment.block_categories`), and all later stages take it like any other.
+A block has its own run folder, RUN/blocks/NNN, whose capture is a part of the scene. It is trained and nested
+like any other run, on any node, and resumes after a kill. In the merged scene every (block, category) pair is
+a category of its own (`segment.block_categories`), and later stages treat it as any other category.
 """
 
 import shutil
@@ -26,11 +26,11 @@ from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
 from sagesplat.scene.blocks import (
     Blocks,
-    colours,
-    part_of,
+    assigned_views,
+    graph_colouring,
     read_blocks,
     split,
-    views_of,
+    training_scene,
     visible_shares,
     write_blocks,
 )
@@ -46,11 +46,11 @@ from sagesplat.train import memory, nested
 from sagesplat.train.boundaries import around, boundary_views, interior, interior_sizes, together
 from sagesplat.train.nested import Nested, NestStep
 
-_SEEN = 0.01  # of the points in a photo: then it sees the block
+_SEEN = 0.01  # share of a photo's visible points from which on it sees a block
 
 
 def check(config: BlocksConfig) -> None:
-    """RunError for settings that cannot be."""
+    """RunError for settings out of range."""
     wrong = (
         ("count", config.count, config.count >= 1, "1 or more"),
         ("margin", config.margin, 0 <= config.margin <= 2, "a share such as 0.2"),
@@ -69,7 +69,7 @@ def _division(config: BlocksConfig) -> dict[str, float]:
 
 
 def divide(job: Job, config: BlocksConfig, seed: int) -> Blocks:
-    """Divide the scene, and make a run folder for each block with its part of the capture."""
+    """Split the scene, and create a run folder for each block with its part of the capture."""
     run, file = job.run, job.run.blocks / "blocks.json"
     settings = {**_division(config), "seed": seed}
 
@@ -78,14 +78,14 @@ def divide(job: Job, config: BlocksConfig, seed: int) -> Blocks:
         blocks = split(scene, config.count, config.margin)
         of_points = blocks.of(scene.points.xyz)
         shares = visible_shares(scene, of_points, len(blocks))
-        assigned = views_of(scene, blocks, shares, config.min_share)
+        assigned = assigned_views(scene, blocks, shares, config.min_share)
         training = np.isin(np.arange(len(scene.views)), scene.train_ids)
         labels = LiftedLabels.read(run.labels, len(scene.points.xyz))
         sees: list[list[int]] = []
         for number in range(len(blocks)):
             rows = np.flatnonzero(assigned[:, number] & training).tolist()
             sees.append(np.flatnonzero((shares[rows] >= _SEEN).any(0)).tolist())
-            part, kept = part_of(scene, blocks, number, rows, config.far_share, seed)
+            part, kept = training_scene(scene, blocks, number, rows, config.far_share, seed)
             _begin(run.block(number), part, labels, kept)
         for old in run.blocks.glob("[0-9]*"):
             if int(old.name) >= len(blocks):
@@ -104,7 +104,7 @@ def divide(job: Job, config: BlocksConfig, seed: int) -> Blocks:
 
 
 def _begin(run: RunDir, scene: Scene, labels: LiftedLabels, rows: np.ndarray) -> None:
-    """A run folder with everything that training needs."""
+    """Create a block's run folder with the inputs of training."""
     run.path.mkdir(parents=True, exist_ok=True)
     capture = run.path / "capture.npz"
     write_scene(capture, scene)
@@ -139,14 +139,14 @@ def _job_of(job: Job, number: int) -> Job:
 
 
 def _needed(block: Job, config: TrainConfig) -> int:
-    """Bytes that the training of a block is expected to need (0 on a GPU, whose memory is its own)."""
+    """Predicted host memory of a block's training, bytes (0 on a GPU)."""
     if block.gpus:
         return 0
     return memory.fit(block.scene, config, block.memory_limit, processes=block.processes).needed
 
 
 def train_blocks(job: Job, config: BlocksConfig, train: TrainConfig, seed: int) -> None:
-    """Divide the scene, train its blocks as tasks, and put their levels together."""
+    """Split the scene, train its blocks as tasks, and merge their levels."""
     run = job.run
     settings = {**asdict(train), "batch": max(train.batch, job.processes), "seed": seed}
     settings["blocks"] = _division(config)
@@ -170,25 +170,25 @@ def train_blocks(job: Job, config: BlocksConfig, train: TrainConfig, seed: int) 
 
 
 def train_block(spec: JobSpec, number: int, config: TrainConfig, seed: int, emit: Emit) -> None:
-    """Train one block, in its run folder."""
+    """Train one block in its run folder."""
     train_levels(spec.open(named(emit, f"block {number}")), config, seed)
 
 
 def _merge_levels(run: RunDir, blocks: Blocks, parts: BlockCategories) -> int:
-    """Record the levels of all blocks together, each inside its border; the size of the last one."""
+    """Write merged levels from the interiors of all blocks; the number of Gaussians in the last one."""
     ladders = [read_ladder(run.block(number).levels) for number in range(len(blocks))]
     shutil.rmtree(run.levels, ignore_errors=True)
     count = 0
     for step in sorted({level for ladder in ladders for level in ladder.levels}):
-        # blocks in which all categories stopped have ended before
+        # blocks in which all categories stopped early have fewer levels
         files = [[f for f in ladder.files if f.step <= step][-1:] for ladder in ladders]
-        cores = [
+        interiors = [
             interior(read_level(f.path), blocks, parts, number)[0]
-            for number, found in enumerate(files)
-            for f in found
+            for number, newest in enumerate(files)
+            for f in newest
         ]
-        flat = [f for found in files for f in found]
-        g = concat(cores)
+        flat = [f for newest in files for f in newest]
+        g = concat(interiors)
         write_level(
             run.levels, step, g, recovering=any(f.recovering for f in flat),
             sh_degree=max(f.sh_degree for f in flat),
@@ -203,7 +203,10 @@ def _merge_levels(run: RunDir, blocks: Blocks, parts: BlockCategories) -> int:
 
 
 def label_block_categories(job: Job) -> None:
-    """Draw which part each pixel shows: its category, in the block whose Gaussians paint most of it."""
+    """Render label images for a scene split into blocks; every (block, category) pair is its own category.
+
+    A pixel keeps its category and gets the block whose Gaussians contribute most to it.
+    """
     run = job.run
     blocks, masks = read_blocks(run.blocks / "blocks.json"), job.whole_masks
     parts = BlockCategories(masks.taxonomy, len(blocks))
@@ -227,7 +230,9 @@ def label_block_categories(job: Job) -> None:
         ids = parts.ids(lifted.label_ids, blocks.of(scene.points.xyz))
         replace(lifted, label_ids=ids).write(run.block_category_labels)
         write_labels(run.block_categories, names, occurring | set(np.unique(ids).tolist()))
-        return [f"{len(occurring)} parts of {len(masks.taxonomy.names)} categories in {len(blocks)} blocks"]
+        return [
+            f"{len(occurring)} per-block categories of {len(masks.taxonomy.names)} in {len(blocks)} blocks"
+        ]
 
     made = [run.provenance(stage) for stage in ("train", "masks")]
     inputs = [run.scene, run.labels, run.levels, run.blocks / "blocks.json", run.masks / "labels.json", *made]
@@ -238,7 +243,7 @@ def label_block_categories(job: Job) -> None:
 
 
 def nest_blocks(job: Job, config: BlocksConfig, nest: NestConfig, seed: int) -> None:
-    """Make the nested ladders of the blocks, tune them along their borders, and put them together."""
+    """Make the nested levels of the blocks, tune them along the boundaries, and merge them."""
     run, file = job.run, job.run.blocks / "blocks.json"
     nested.check(nest)
     blocks = read_blocks(file)
@@ -255,9 +260,12 @@ def nest_blocks(job: Job, config: BlocksConfig, nest: NestConfig, seed: int) -> 
         files = [run.block(number).interior for number in every]
         if config.boundary_steps:
             files = _tune(job, blocks, config, nest, seed)
+        else:  # the table of blocks would show the seconds of an earlier tuning
+            for number in every:
+                run.block(number).provenance("boundaries").unlink(missing_ok=True)
         g, sizes, purity = together(files)
         lines = write_ladder(job, g, sizes, nest, purity)
-        return [*lines, f"{len(blocks)} blocks, {config.boundary_steps} steps along the borders of each"]
+        return [*lines, f"{len(blocks)} blocks, {config.boundary_steps} steps of boundary tuning each"]
 
     inputs = [run.scene, run.labels, run.levels, run.provenance("train"), *label_image_inputs(run), file]
     run_stage(job, "nest", settings, inputs, [run.prefixes, run.increments], make, swaps=True)
@@ -266,7 +274,7 @@ def nest_blocks(job: Job, config: BlocksConfig, nest: NestConfig, seed: int) -> 
 def nest_block(
     spec: JobSpec, partition: Path, number: int, config: NestConfig, seed: int, emit: Emit
 ) -> None:
-    """Make the nested ladder of one block, and what of it is inside the block's border."""
+    """Make the nested levels of one block, and its interior: the Gaussians inside the block's border."""
     job = spec.open(named(emit, f"block {number}"))
     run = job.run
     nest_levels(job, config, seed)
@@ -274,24 +282,24 @@ def nest_block(
     def make() -> list[str]:
         blocks = read_blocks(partition)
         parts = BlockCategories(job.masks.taxonomy, len(blocks))
-        whole = read_prefixes(run.prefixes)
-        g, inside = interior(whole.gaussians, blocks, parts, number)
+        full = read_prefixes(run.prefixes)
+        g, inside = interior(full.gaussians, blocks, parts, number)
         if not len(g):
             raise RunError(f"{run.path}: no Gaussians inside the block; choose fewer with --blocks.count")
-        labels, purity = whole.gaussians.label_ids.numpy(), read_more(run.prefixes, "purity")
-        sizes = interior_sizes(labels, inside, whole.sizes, parts, number)
+        labels, purity = full.gaussians.label_ids.numpy(), read_more(run.prefixes, "purity")
+        sizes = interior_sizes(labels, inside, full.sizes, parts, number)
         write_set(run.interior, g, config.steps, sizes, purity=purity[inside])
-        return [f"{len(g):,} of {len(whole.gaussians):,} Gaussians are inside the block"]
+        return [f"{len(g):,} of {len(full.gaussians):,} Gaussians are inside the block"]
 
     inputs = [run.prefixes, run.masks / "labels.json", partition]
     run_stage(job, "interior", {}, inputs, [run.interior], make)
 
 
 def _tune(job: Job, blocks: Blocks, config: BlocksConfig, nest: NestConfig, seed: int) -> list[Path]:
-    """Tune the blocks along their borders: neighbours one after the other, others at once."""
+    """Tune the blocks along their boundaries, neighbours one after the other; the files with the results."""
     run, every = job.run, range(len(blocks))
     files = [run.block(number).interior for number in every]
-    colour, sees = colours(blocks.neighbours()), read_json(run.blocks / "blocks.json")["sees"]
+    colour, sees = graph_colouring(blocks.neighbours()), read_json(run.blocks / "blocks.json")["sees"]
     steps = replace(nest, steps=config.boundary_steps)
     for now in range(int(colour.max()) + 1):
         mine = [number for number in every if colour[number] == now]
@@ -309,7 +317,7 @@ def _tune(job: Job, blocks: Blocks, config: BlocksConfig, nest: NestConfig, seed
 def tune_boundaries(
     spec: JobSpec, partition: Path, number: int, others: list[Path], config: NestConfig, seed: int, emit: Emit
 ) -> None:
-    """Train a block's Gaussians near its border on compositions with what its views see of other blocks."""
+    """Train a block's Gaussians near its border on compositions with visible Gaussians of other blocks."""
     job = spec.open(named(emit, f"block {number}"))
     run = job.run
     settings = {**asdict(config), "seed": seed}
@@ -354,4 +362,4 @@ def _tuned(
         elif isinstance(event, Nested):
             mine = torch.isin(event.gaussians.label_ids, torch.unique(own.label_ids))
             return event.gaussians.select(mine)
-    raise AssertionError("a training ends with what it trained")
+    raise AssertionError("training ends with a Nested event")

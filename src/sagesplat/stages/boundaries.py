@@ -1,4 +1,4 @@
-"""How even the blocks of a large scene are, and what it looks like where they meet."""
+"""Makes the tables of a scene in blocks: balance of the blocks, and quality along their borders."""
 
 import numpy as np
 import torch
@@ -20,18 +20,18 @@ from sagesplat.train.boundaries import bands, together
 from sagesplat.train.early_stopping import spread
 
 _TIMED = ("train", "base", "nest", "boundaries")  # stages of a block whose seconds are shown
-_VIEWS = 32  # training views that are looked at where there are no test views
+_VIEWS = 32  # training views that are measured if there are no test views
 
 
 def measure_borders(job: Job) -> None:
-    """Measure the whole scene near the borders of its blocks and away from them, and how even they are."""
+    """Measure the quality near the borders of the blocks and elsewhere, and the balance of the blocks."""
     run, file = job.run, job.run.blocks / "blocks.json"
     table_file = run.adapted / "blocks.csv"
 
     def make() -> list[str]:
         blocks = read_blocks(file)
         files = [run.block(number).interior for number in range(len(blocks))]
-        sets = {"put together": together(files)[0], "tuned": job.ladder.load(job.ladder.levels[-1])}
+        sets = {"merged": together(files)[0], "tuned": job.ladder.load(job.ladder.levels[-1])}
         tables = [balance_table(job, blocks), border_table(job, blocks, sets)]
         for table in tables:
             job.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
@@ -47,7 +47,7 @@ def measure_borders(job: Job) -> None:
 
 
 def balance_table(job: Job, blocks: Blocks) -> Table:
-    """Points, views, Gaussians and seconds of each block."""
+    """Points, views, Gaussians and seconds of each block, one row each."""
     made = read_json(job.run.blocks / "blocks.json")
     rows: list[tuple[str | int | float, ...]] = []
     for number in range(len(blocks)):
@@ -66,9 +66,10 @@ def _seconds(run: RunDir, stage: str) -> float:
 
 
 def border_table(job: Job, blocks: Blocks, sets: dict[str, Gaussians]) -> Table:
-    """PSNR and SSIM of whole scenes on the test views, in bands along the borders and away from them.
+    """PSNR and SSIM of full scenes on the test views, in bands along the borders and elsewhere.
 
-    A pixel is in a band where Gaussians of the first set within half the margin of a border paint most of it.
+    A pixel is in a band if Gaussians of the first set that are within half the margin of a border contribute
+    most of it.
     """
     scene = job.scene
     rows = scene.test_ids.tolist() or spread(scene.train_ids.tolist(), _VIEWS)
@@ -89,8 +90,8 @@ def border_table(job: Job, blocks: Blocks, sets: dict[str, Gaussians]) -> Table:
             photo = as_unit(job.photos[row])
             errors.append(squared_error_map(image, photo))
             quality.append(ssim_map(image, photo))
-        found = bands(in_band, errors, quality)
-        body.append((name, len(g), found.share, found.psnr, found.psnr_inside, found.ssim, found.ssim_inside))
+        b = bands(in_band, errors, quality)
+        body.append((name, len(g), b.share, b.psnr, b.psnr_inside, b.ssim, b.ssim_inside))
         job.emit(Progress("borders", done, len(sets)))
     header = (
         "scene",
@@ -106,7 +107,7 @@ def border_table(job: Job, blocks: Blocks, sets: dict[str, Gaussians]) -> Table:
 
 
 def _shows(job: Job, g: Gaussians, which: torch.Tensor, row: int) -> np.ndarray:
-    """Pixels (bool [H, W]) of a view that some Gaussians paint most of."""
+    """Pixels (bool [H, W]) of a view to which the Gaussians `which` contribute most."""
     device = device_of(job.backend)
     with torch.no_grad():
         render = rasterize(

@@ -1,4 +1,4 @@
-"""Bundles of a run: everything that a viewer needs, in one static folder."""
+"""Makes bundles for the web viewer, from a finished run or from the newest level of a running training."""
 
 import io
 import json
@@ -33,38 +33,36 @@ from sagesplat.viewer import boxes
 from sagesplat.viewer.bundle import (
     MANIFEST,
     BundleSizes,
-    CameraEntry,
-    Category,
-    Contents,
     check_target,
     check_viewer,
     has_viewer,
-    start_of,
     write_bundle,
     write_documents,
 )
+from sagesplat.viewer.corrections import distance_error, with_corrections
 from sagesplat.viewer.display_names import colors_of
-from sagesplat.viewer.frames import FLIP, camera_at, fov_y, position, quaternion
+from sagesplat.viewer.frames import FLIP, camera_at
+from sagesplat.viewer.manifest import CameraEntry, Category, Contents, start_of
 from sagesplat.viewer.pack import ASPECT, FOV_Y
 
 _GROUND = {"dirt", "floor", "grass", "gravel", "ground", "pavement", "platform", "playingfield", "railroad"}
 _GROUND |= {"path", "road", "sand", "sidewalk", "snow", "soil", "street", "terrain"}
-_FEW = boxes.FEW  # SfM points below which a category's Gaussians say where it is
-_OPAQUE = 0.1  # from which a Gaussian does
+_FEW = boxes.FEW  # SfM points; with fewer a category's boxes also take its Gaussians
+_OPAQUE = 0.1  # least opacity of such Gaussians
 _POSTER_HEIGHT = 360  # px
-_LIVE = ".live.json"  # what a live bundle was made of
+_LIVE = ".live.json"  # the level that a live bundle was made from, and its files
 
 
 @dataclass(frozen=True)
 class BundleMade:
-    """What is in a bundle, and how well its boxes tell distances."""
+    """The content of a bundle, and the accuracy of the distances by its boxes."""
 
     path: Path
     labels: int
-    chunks: int
+    chunks: int  # increments
     count: int  # Gaussians
     sizes: BundleSizes  # bytes
-    agreement: dict[int, tuple[float, float]]  # by label id: median and 95th percentile of the relative error
+    agreement: dict[int, tuple[float, float]]  # by label id: median, 95th percentile of the relative error
     error: tuple[float, float]  # the same over all labels
 
 
@@ -79,11 +77,11 @@ def bundle(
 ) -> BundleMade:
     """Write a finished run as a bundle into `out`: a new or empty folder, or an earlier bundle.
 
-    `meters_per_unit`: the scene's scale, guessed from the cameras' height if left out. `always`: categories
-    shipped in full. `weights`: of categories by name, 1 for the others. A category's name means all its
-    parts in a scene in blocks, `name@block` one of them. `viewer`: the built viewer, the package's own if
-    left out. RunError: a run without nested ladder or promises, another folder, unknown
-    names or an impossible number; DataError: a damaged chunk; SageError: no viewer.
+    `meters_per_unit`: scale of the scene; by default guessed from the cameras' height. `always`: categories
+    shipped in full. `weights`: by category, 1 for the others. In a scene in blocks, a category's name stands
+    for all its per-block categories, and `name@block` for one of them. `viewer`: the built viewer; by default
+    the package's own. RunError for a run without nested levels or bounds, another folder, unknown names or an
+    impossible number; DataError for a damaged increment; SageError without a viewer.
     """
     weights = weights or {}
     job = replace(job, run=replace(job.run, ladder="nested"))
@@ -109,7 +107,7 @@ def bundle(
 
 
 def _poster(g: Gaussians, contents: Contents) -> bytes:
-    """A JPEG of the first view: the scene is seen while the viewer and the first chunks are loading."""
+    """A JPEG of the start view, shown while the viewer and the first increments are loading."""
     first = start_of(contents)
     width = round(ASPECT * _POSTER_HEIGHT)
     camera = camera_at(first["position"], first["quaternion"], FOV_Y, width, _POSTER_HEIGHT)
@@ -122,29 +120,29 @@ def _poster(g: Gaussians, contents: Contents) -> bytes:
 
 
 def package_viewer() -> Path:
-    """Where the built viewer is, if it is."""
+    """The folder of the package's built viewer, which may be missing."""
     return Path(str(files("sagesplat"))) / "viewer" / "static"
 
 
 def live_bundle(job: Job, folder: Path, viewer: Path | None = None) -> bool:
-    """Write the newest snapshot of a training that may go on into `folder`; False if it is there already.
+    """Write the newest level of a training, which may still run, to `folder`; False if it is there already.
 
-    One level a category and no promises. Files appear whole; those that a page may still be loading stay
-    until two newer snapshots are there. RunError while there is no snapshot.
+    The bundle has one level per category and no bounds. Files are written atomically. Those that a page may
+    still be loading are kept until two newer levels are written. RunError if there is no level yet.
     """
     steps = sorted(p for p in job.run.levels.glob("*.npz") if not p.name.startswith("."))
     if not steps:
         raise RunError(f"{job.run.levels}: no level yet; wait, or run `sagesplat train`")
     newest = {"level": steps[-1].name, "written": steps[-1].stat().st_mtime_ns}
-    before: dict[str, Any] = {}
+    previous: dict[str, Any] = {}
     with suppress(RunError):
-        before = read_json(folder / _LIVE)
-    if before.get("of") == newest and (folder / MANIFEST).exists():
+        previous = read_json(folder / _LIVE)
+    if previous.get("of") == newest and (folder / MANIFEST).exists():
         return False
-    if not before:
+    if not previous:
         check_target(folder)
     viewer = viewer or package_viewer()
-    if not has_viewer(folder, viewer):  # none yet, or an older package's
+    if not has_viewer(folder, viewer):  # none yet, or that of an older version
         check_viewer(viewer)
         shutil.copytree(viewer, folder, dirs_exist_ok=True)
     g = read_level(steps[-1])
@@ -159,51 +157,12 @@ def live_bundle(job: Job, folder: Path, viewer: Path | None = None) -> bool:
     shutil.rmtree(work)
     write_documents(folder, replace(_contents(job, g, antialiased), chunks=chunks, live=True))
     uris = [chunk.uri for chunk in chunks]
-    kept = [uris, *(version for version in before.get("kept", []) if version != uris)][:3]
+    kept = [uris, *(version for version in previous.get("kept", []) if version != uris)][:3]
     write_json(folder / _LIVE, {"of": newest, "kept": kept})
     for path in target.iterdir():
         if path.name not in {uri for version in kept for uri in version}:
             path.unlink()
     return True
-
-
-def with_corrections(contents: Contents) -> Contents:
-    """The contents with what the boxes of each category miss of its distance in each view."""
-    views = []
-    for shot in contents.shots:
-        camera = shot.camera
-        where = position(camera)
-        sees = boxes.frustum(where, quaternion(camera), fov_y(camera), camera.width / camera.height)
-        views.append((where, sees))
-
-    def missed(category: Category) -> np.ndarray:
-        told = np.array([boxes.distance(category.boxes, *view) for view in views])
-        known = np.full(len(views), np.nan) if category.distance is None else category.distance
-        right = np.where((known > 0) & (told > 0), known / np.where(told > 0, told, 1), np.nan)
-        return np.log(right)
-
-    return replace(contents, categories=[replace(c, corrections=missed(c)) for c in contents.categories])
-
-
-def distance_error(contents: Contents) -> tuple[dict[int, tuple[float, float]], tuple[float, float]]:
-    """Median and 95th percentile of the relative error of distances by boxes, by label and over all.
-
-    Against d_min, in the views that show enough of a category.
-    """
-    found = {
-        c.label_id: np.abs(np.expm1(-c.corrections[c.shares > 0]))
-        for c in contents.categories
-        if c.shares is not None and c.corrections is not None
-    }
-    by_label = {label: _median_and_95th(errors) for label, errors in found.items()}
-    return by_label, _median_and_95th(np.concatenate([*found.values(), np.zeros(0)]))
-
-
-def _median_and_95th(errors: np.ndarray) -> tuple[float, float]:
-    if not np.isfinite(errors).any():
-        return float("nan"), float("nan")
-    median, high = np.nanpercentile(errors, [50, 95])
-    return float(median), float(high)
 
 
 def _check(
@@ -221,7 +180,7 @@ def _check(
                 f"run `sagesplat {stage}`, or `sagesplat run`"
             )
     if not is_made_from(run, "fit", run.increments / INDEX):
-        raise RunError(f"{run.promises}: promises of other chunks; run `sagesplat fit` again with --force")
+        raise RunError(f"{run.promises}: fitted to other increments; run `sagesplat fit` again with --force")
     if meters_per_unit is not None and not 1e-6 <= meters_per_unit <= 1e6:
         raise RunError(f"{meters_per_unit} metres per unit are impossible; give a number such as 0.5")
     names = set(job.names().values())
@@ -237,17 +196,19 @@ def _check(
 
 
 def _contents(job: Job, g: Gaussians, antialiased: bool) -> Contents:
-    """All but the chunks and what is promised of them."""
+    """The contents of a bundle without increments and bounds."""
     scene, names = job.scene, job.names()
     labels = sorted(g.counts())
-    found = {i: category_and_block(job, names[i]) for i in labels}
-    colors = _colors(job, {category for category, _ in found.values()})
-    ground = [i for i in labels if _GROUND & set(_title(job, found[i][0]).split())]
+    split_names = {i: category_and_block(job, names[i]) for i in labels}
+    colors = _colors(job, {category for category, _ in split_names.values()})
+    ground = [i for i in labels if _GROUND & set(_title(job, split_names[i][0]).split())]
     places = _places(job, g)
     return Contents(
         name=scene.name,
         extent=scene.extent,
-        shots=[CameraEntry(view.name, scene.split(row), view.camera) for row, view in enumerate(scene.views)],
+        cameras=[
+            CameraEntry(view.name, scene.split(row), view.camera) for row, view in enumerate(scene.views)
+        ],
         categories=[
             Category(
                 i,
@@ -257,7 +218,7 @@ def _contents(job: Job, g: Gaussians, antialiased: bool) -> Contents:
                 boxes.split_boxes(places[i] * FLIP),
                 block=block,
             )
-            for i, (category, block) in found.items()
+            for i, (category, block) in split_names.items()
         ],
         chunks=[],
         folder=job.run.increments,
@@ -269,7 +230,7 @@ def _contents(job: Job, g: Gaussians, antialiased: bool) -> Contents:
 
 
 def category_and_block(job: Job, name: str) -> tuple[str, int | None]:
-    """Of a label by name; without a block unless the scene is in blocks."""
+    """The category and block of a label's name; block None unless the scene is in blocks."""
     return split_name(name) if job.has_block_categories else (name, None)
 
 
@@ -285,18 +246,18 @@ def _colors(job: Job, categories: Collection[str]) -> dict[str, str]:
 
 
 def _places(job: Job, g: Gaussians) -> dict[int, np.ndarray]:
-    """By label its SfM points [N, 3]; where they are few, the centres of what is seen of it as well."""
+    """By label id its SfM points [N, 3]; where they are few, also the means of its opaque Gaussians."""
     points, rows = job.scene.points.xyz, _rows_by_label(job.point_labels)
     means, mine = g.means.numpy(), _rows_by_label(g.label_ids.numpy())
     opaque = g.logit_opacities.numpy() >= np.log(_OPAQUE / (1 - _OPAQUE))
-    found = {}
+    places = {}
     for label, own in mine.items():
         known = points[rows.get(label, [])]
         if len(known) < _FEW:
             seen = own[opaque[own]]
             known = np.concatenate([known, means[seen if len(seen) else own]])
-        found[label] = known
-    return found
+        places[label] = known
+    return places
 
 
 def _rows_by_label(label_ids: np.ndarray) -> dict[int, np.ndarray]:
@@ -325,18 +286,18 @@ def _with_quality(
 
 
 def _shares(job: Job) -> dict[int, np.ndarray]:
-    """Of the pixels of each view, by label id; 0 for small ones."""
+    """By label id, the pixel share in each view [V]; 0 where it is too small."""
     table = large_enough(read_observations(job.run.observations), job.scene, job.fit_config.min_share)
     table = table.select(table.level == table.level.max(initial=0))
     sizes = np.array([view.camera.width * view.camera.height for view in job.scene.views])
-    found = {label: np.zeros(len(sizes)) for label in set(table.label_id.tolist())}
+    shares = {label: np.zeros(len(sizes)) for label in set(table.label_id.tolist())}
     for label, view, pixels in zip(table.label_id, table.view, table.num_pixels, strict=True):
-        found[int(label)][view] = pixels / sizes[view]
-    return found
+        shares[int(label)][view] = pixels / sizes[view]
+    return shares
 
 
 def _antialiased(job: Job) -> bool:
-    """Whether the Gaussians are trained so; the checkpoint knows before training is done."""
+    """Whether the run trains with antialiasing; read from the checkpoint while training runs."""
     try:
         return bool(settings_of(job.run, "train")["antialiased"])
     except RunError:

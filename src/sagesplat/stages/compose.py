@@ -1,4 +1,4 @@
-"""Compose the chosen levels, and write the composed scene."""
+"""Makes the composed scene, from the levels that the plan chose."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Measure the plans on the test views."""
+"""Makes the evaluation: the plans measured on the test views."""
 
 import numpy as np
 

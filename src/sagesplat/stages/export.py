@@ -1,4 +1,4 @@
-"""Write levels, compositions and increments as files of their own."""
+"""Makes PLY or SPZ files, from levels, compositions and increments of a run."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Fit the quality models: Eq. 3 over distance, and what else the run's method fits."""
+"""Makes the quality models, from the observations: Eq. 3, and what else the run's method fits."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""The stages that label: label images of the views, labels of the points, and what all views agree on."""
+"""Makes label images from the photos, point labels from these, and fused label images from both."""
 
 import shutil
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Make the nested levels of a run: order its Gaussians, train their prefixes, write the increments."""
+"""Makes the nested levels and their increments, from the trained Gaussians: orders them, trains prefixes."""
 
 from dataclasses import asdict
 
@@ -19,8 +19,8 @@ from sagesplat.stages.shared import label_image_inputs, train_config
 from sagesplat.train import nested
 from sagesplat.train.checkpoint import can_resume, remove_checkpoints
 from sagesplat.train.early_stopping import VIEWS, spread
+from sagesplat.train.events import Resumed, Step, Trained
 from sagesplat.train.nested import NestStep
-from sagesplat.train.trainer import Resumed, Step, Trained
 
 
 def nest_levels(job: Job, config: NestConfig, seed: int) -> None:

@@ -1,4 +1,4 @@
-"""Measure every category at every level in every view."""
+"""Makes the observations: the quality of every category at every level in every view, from renders."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""The whole flow, from photos and label images to the report."""
+"""Runs all stages in order, from a capture to the report."""
 
 import math
 import time

@@ -1,4 +1,4 @@
-"""Choose the levels: for the scene, for single views, within a budget."""
+"""Makes plans from the quality models: a level per category, for the scene, for views, within a budget."""
 
 from dataclasses import asdict
 

@@ -11,7 +11,8 @@ from sagesplat.run.job import Job
 from sagesplat.scene.detect import detect
 from sagesplat.segment.registry import SEGMENTERS
 from sagesplat.stages.label import segmenter_kind
-from sagesplat.train import densify, memory
+from sagesplat.train import memory
+from sagesplat.train.strategy import schedule_of
 
 _GIB = 2**30
 _FLOATS = 59  # of a Gaussian with harmonics of degree 3
@@ -44,7 +45,7 @@ def check_training(job: Job, config: TrainConfig) -> None:
     if run.provenance("train").exists() or job.backend == "cuda":
         return
     fitted = memory.fit(job.scene, config, job.memory_limit, processes=job.processes)
-    points, levels = len(job.scene.points.xyz), config.max_steps // densify.schedule(config).level_every
+    points, levels = len(job.scene.points.xyz), config.max_steps // schedule_of(config).level_every
     free = shutil.disk_usage(run.path).free
     least, most = (4 * _FLOATS * n * (levels + _STATES) for n in (points, fitted.lowered))
     needs = f"training writes about {least / _GIB:.1f} to {most / _GIB:.1f} GiB, {free / _GIB:.1f} are free"

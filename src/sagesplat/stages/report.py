@@ -1,4 +1,4 @@
-"""Write the report."""
+"""Makes the HTML report, from a finished run."""
 
 from sagesplat.adapt.plan import read_budget_plan
 from sagesplat.core.events import RunDone

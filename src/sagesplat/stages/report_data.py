@@ -1,4 +1,4 @@
-"""Gathers what the report shows from a finished run."""
+"""Reads the data of the report from a finished run."""
 
 import json
 import platform

@@ -1,4 +1,4 @@
-"""Read a capture, and find the poses of photos that come without."""
+"""Makes scene.json from a capture, and a capture from photos or a video without poses."""
 
 import hashlib
 from dataclasses import asdict
@@ -15,7 +15,7 @@ from sagesplat.scene.detect import detect
 
 
 def open_scene(job: Job, path: Path, config: SceneConfig, poses: PosesConfig | None = None) -> None:
-    """Read a capture and write scene.json; of photos without poses, or a video, a capture is made first."""
+    """Read a capture and write scene.json. For photos without poses, or a video, estimate the poses first."""
     run = job.run
     ours = run.scene.exists() or run.capture.exists()
     if run.path.exists() and not ours and any(not p.name.startswith(".") for p in run.path.iterdir()):
@@ -58,17 +58,17 @@ def open_scene(job: Job, path: Path, config: SceneConfig, poses: PosesConfig | N
     run_stage(job, "scene", settings, [], [run.scene], make)
 
 
-HIGH_ERROR = 0.8  # px; what one camera leaves where each photo has its own (dinosaur: 0.97, then 0.42)
+HIGH_ERROR = 0.8  # px; `dinosaur` has 0.97 with one shared camera, 0.42 with a camera per photo
 _POSES = ("prepare", "features", "matches", "mapping", "undistortion")
 
 
 def _poses_progress(stage: str, done: float) -> Progress:
-    """One bar for all parts of structure from motion; mapping may go back where a model grows anew."""
+    """One progress bar for all stages of structure from motion; mapping may restart with another model."""
     return Progress("poses", round(100 * (_POSES.index(stage) + done)), 100 * len(_POSES), stage)
 
 
 def _find_poses(job: Job, source: Path, capture: Path, config: PosesConfig) -> None:
-    """Make a capture of photos or a video: cameras and points by structure from motion."""
+    """Make a capture from photos or a video by structure from motion."""
     from sagesplat.scene.photos import reconstruct
 
     if job.run.path.resolve().is_relative_to(source.resolve()):
@@ -79,21 +79,21 @@ def _find_poses(job: Job, source: Path, capture: Path, config: PosesConfig) -> N
     settings = {"source": str(source.resolve()), **asdict(config), "files": digest}
 
     def make() -> list[str]:
-        found = reconstruct(
+        result = reconstruct(
             source, capture, config,
             lambda stage, done, total: job.emit(_poses_progress(stage, done / max(total, 1))),
         )  # fmt: skip
-        for name, reason in list(found.unregistered.items())[:5]:
+        for name, reason in list(result.unregistered.items())[:5]:
             job.emit(Warned(f"{name}: {reason}"))
-        if len(found.unregistered) > 5:
-            job.emit(Warned(f"{len(found.unregistered)} photos in all left out; see {capture}/poses.json"))
-        if found.reprojection_error > HIGH_ERROR and not config.refine_principal_point:
+        if len(result.unregistered) > 5:
+            job.emit(Warned(f"{len(result.unregistered)} photos in all left out; see {capture}/poses.json"))
+        if result.reprojection_error > HIGH_ERROR and not config.refine_principal_point:
             cure = "--poses.camera per-image --poses.refine-principal-point"
-            high = f"reprojection error {found.reprojection_error:.2f} px is high"
+            high = f"reprojection error {result.reprojection_error:.2f} px is high"
             job.emit(Warned(f"{high}; if the photos were cropped or zoomed one by one, try {cure}"))
         return [
-            f"poses of {found.num_registered} of {found.num_photos} photos, {found.num_points:,} points, "
-            f"reprojection error {found.reprojection_error:.2f} px"
+            f"poses of {result.num_registered} of {result.num_photos} photos, {result.num_points:,} points, "
+            f"reprojection error {result.reprojection_error:.2f} px"
         ]
 
     run_stage(job, "poses", settings, [], [capture / "poses.json"], make)

@@ -1,4 +1,4 @@
-"""What several stages ask of a run."""
+"""Helpers that several stages share: settings, label images and distances of a run."""
 
 from dataclasses import fields, replace
 from pathlib import Path

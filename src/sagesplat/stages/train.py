@@ -1,4 +1,4 @@
-"""Train 3DGS from the labelled points and record the levels."""
+"""Makes the levels: trains 3DGS from the labelled points and records snapshots."""
 
 import shutil
 from dataclasses import asdict
@@ -14,8 +14,9 @@ from sagesplat.run.stage import run_stage
 from sagesplat.segment.display_names import titles
 from sagesplat.train import memory
 from sagesplat.train.checkpoint import can_resume, remove_checkpoints
+from sagesplat.train.events import LabelFrozen, LevelSaved, Resumed, Step, Trained
 from sagesplat.train.parallel import train_together
-from sagesplat.train.trainer import LabelFrozen, LevelSaved, Resumed, Step, Trained, train
+from sagesplat.train.trainer import train
 
 
 def train_levels(job: Job, config: TrainConfig, seed: int) -> None:

@@ -1,4 +1,4 @@
-"""Show a bundle, or a run, in the browser of this machine or of a headset."""
+"""Shows a bundle, or makes one from a run and shows it, in a browser here or in a headset."""
 
 import threading
 from collections.abc import Callable

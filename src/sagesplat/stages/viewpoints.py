@@ -1,4 +1,4 @@
-"""Fit the viewpoint models of the nested levels, and measure what compositions change."""
+"""Makes the viewpoint models of nested levels, from the observations and from random compositions."""
 
 from collections.abc import Mapping, Sequence
 

@@ -49,7 +49,7 @@ def adam_step(
 ) -> None:
     """One Adam step (Kingma and Ba, betas 0.9 and 0.999, eps 1e-15 as 3DGS); other rows keep every bit.
 
-    `columns`: only so many values at the start of each row; what never had a gradient would not move anyway.
+    `columns`: update only this many values at the start of each row; the others never had a gradient.
     """
     width = parameter[:1].numel()
     columns = width if columns is None else columns

@@ -1,4 +1,4 @@
-"""Where blocks that were trained by themselves meet: cut, put together, tuned, measured."""
+"""Boundaries of blocks that were trained independently: cut, merge, and measure."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,14 +16,14 @@ from sagesplat.scene.blocks import Blocks, visible_shares
 from sagesplat.scene.scene import Scene
 from sagesplat.segment.block_categories import BlockCategories
 
-SEVERAL = 0.1  # share of what a view sees that is of other blocks, from which on it tells of seams
-_PAD = 0.25  # of the image beyond its edges: Gaussians that begin there may reach into it
+SEVERAL = 0.1  # share of what a view sees that is of other blocks, from which on it is a boundary view
+_PAD = 0.25  # of the image beyond its edges: Gaussians with their centre there may reach into it
 
 
 def interior(
     g: Gaussians, blocks: Blocks, parts: BlockCategories, block: int
 ) -> tuple[Gaussians, Bool[np.ndarray, " N"]]:
-    """What a block adds to the whole: its Gaussians inside its border, as parts; and which ones they are."""
+    """Gaussians in the interior of a block, with per-block categories; and which rows (bool) they are."""
     inside = blocks.of(g.means.numpy()) == block
     kept = g.select(torch.from_numpy(inside))
     part_ids = parts.ids(kept.label_ids.numpy(), block)
@@ -37,7 +37,7 @@ def interior_sizes(
     parts: BlockCategories,
     block: int,
 ) -> dict[int, tuple[int, ...]]:
-    """Level sizes, by part, of what is inside (bool [N]) of a ladder in its order: at least one of any."""
+    """Level sizes, by per-block category, of the interior (bool [N]) of an ordered model: at least one."""
     found = {}
     for label, levels in sizes.items():
         summed = np.concatenate([[0], inside[labels == label].cumsum()])
@@ -47,14 +47,14 @@ def interior_sizes(
 
 
 def together(files: Sequence[Path]) -> tuple[Gaussians, dict[int, tuple[int, ...]], np.ndarray]:
-    """The ladders of all blocks as one: Gaussians, sizes of levels by label id, clarity."""
+    """The nested models of all blocks, merged: Gaussians, level sizes by label id, label purity."""
     sizes = {label: n for path in files for label, n in read_sizes(path).items()}
     purity = np.concatenate([read_more(path, "purity") for path in files])
     return concat([read_level(path) for path in files]), sizes, purity
 
 
 def boundary_views(scene: Scene, blocks: Blocks, block: int) -> list[int]:
-    """Training views of a block (rows) that see enough of others."""
+    """Training views of a block (rows) that see enough of other blocks."""
     shares = visible_shares(scene, blocks.of(scene.points.xyz), len(blocks))
     return [row for row in scene.train_ids.tolist() if shares[row, block] < 1 - SEVERAL]
 
@@ -71,14 +71,14 @@ def in_sight(g: Gaussians, scene: Scene, views: Sequence[int]) -> Bool[np.ndarra
 
 
 def around(own: Gaussians, others: Iterable[Gaussians], scene: Scene, views: Sequence[int]) -> Gaussians:
-    """A block's Gaussians, then what its views see of the others', which are looked at one by one."""
+    """A block's Gaussians, then those of other blocks that its views see; `others` is read one by one."""
     seen = [g.select(torch.from_numpy(in_sight(g, scene, views))) for g in others]
     return concat([own, *seen])
 
 
 @dataclass(frozen=True)
 class Bands:
-    """Quality of a composition near the borders of blocks and away from them, over some views."""
+    """Quality of a composition near the boundaries of blocks and away from them, over some views."""
 
     share: float  # of the pixels that are in a band
     psnr: float  # dB over all pixels in bands

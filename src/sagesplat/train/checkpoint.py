@@ -1,6 +1,6 @@
-"""Checkpoints: the whole training state in one file, so that a killed run goes on where it was.
+"""Checkpoints: the full training state in one file, from which a killed run resumes.
 
-The one before is kept beside it (checkpoint-1.npz) for a file that got damaged.
+The previous one is kept beside it (checkpoint-1.npz), in case the newest file is damaged.
 """
 
 import json
@@ -22,7 +22,7 @@ from sagesplat.io.npz import Npz
 from sagesplat.train.state import TrainState
 
 _VERSION = 3
-# what files raise that are cut off or changed
+# what truncated or changed files raise
 _DAMAGED = (OSError, KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError)
 
 
@@ -51,7 +51,7 @@ def can_resume(path: Path, settings: str) -> bool:
 
 
 def write_checkpoint(path: Path, state: TrainState, settings: str) -> None:
-    """Save a state; `settings` says what run it belongs to and is checked on reading.
+    """Save a state; `settings` identifies its run and is checked on reading.
 
     The file at `path` becomes the previous one, once the new one is on the disk and reads back as it was
     written; at no time is there none. RunError where the disk is full: then both stay as they were.
@@ -162,7 +162,7 @@ def read_checkpoint(path: Path, settings: str) -> TrainState:
         raise RunError(f"{path}: made with other settings or inputs; {cure}")
     try:
         return _state(found, meta)
-    except _DAMAGED as error:  # a checksum keeps nobody from writing nonsense
+    except _DAMAGED as error:  # a checksum does not prove that the content is valid
         raise _Damaged(f"{path}: not a whole checkpoint ({short(repr(error))}); {cure}") from None
 
 

@@ -1,7 +1,6 @@
 """Adaptive density control of 3DGS (Kerbl et al. 2023, section 5): clone, split, prune, reset."""
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -13,48 +12,10 @@ from sagesplat.core.gaussians import PARAMETERS, Gaussians, concat
 from sagesplat.kernels.jit import njit
 from sagesplat.raster.reference import rotation_matrices
 from sagesplat.raster.render import Render
+from sagesplat.train.schedule import Schedule
 from sagesplat.train.state import TrainState
 
 _SPLIT_SHRINK = 1.6
-_REFERENCE_STEPS = 30_000
-_ENOUGH_REFINEMENTS, _LATEST_STOP = 8, 0.7  # share of the run
-_MCMC_STOP = 25_000  # step at which MCMC ends its refinement, as published
-_RESET_FLOOR = 1500  # steps that a model needs between two resets, however short the run
-
-
-@dataclass(frozen=True)
-class Schedule:
-    """When what happens, for one length of run."""
-
-    level_every: int
-    refine_start: int
-    refine_stop: int
-    reset_every: int
-    raise_sh_every: int
-    recovery: int  # steps after a reset up to which a level counts as recovering
-
-
-def schedule(config: TrainConfig) -> Schedule:
-    """The published step numbers scaled to `max_steps`."""
-    share = config.max_steps / _REFERENCE_STEPS
-
-    def scaled(step: int) -> int:
-        return max(1, round(step * share))
-
-    reset_every = max(scaled(config.reset_every), min(config.reset_every, _RESET_FLOOR))
-    stop = config.refine_stop if config.strategy == "default" else max(config.refine_stop, _MCMC_STOP)
-    refine_start, refine_stop = min(config.refine_start, config.max_steps // 5), scaled(stop)
-    if config.lr_schedule == "fast":  # short runs too must have the time to grow
-        enough = refine_start + _ENOUGH_REFINEMENTS * config.refine_every
-        refine_stop = max(refine_stop, min(enough, int(_LATEST_STOP * config.max_steps)))
-    return Schedule(
-        level_every=config.level_every or math.ceil(config.max_steps / 30),
-        refine_start=refine_start,
-        refine_stop=refine_stop,
-        reset_every=reset_every,
-        raise_sh_every=scaled(config.raise_sh_every),
-        recovery=min(1000, reset_every // 2),
-    )
 
 
 def observe_gradients(state: TrainState, render: Render, width: int, height: int, trainable: Tensor) -> None:

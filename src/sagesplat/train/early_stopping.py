@@ -1,4 +1,4 @@
-"""Selective optimisation (Fig. 1 of the paper): a category that has reached its quality stops changing."""
+"""Per-category early stopping (Fig. 1 of the paper): a category at its target quality stops training."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -38,23 +38,23 @@ def measured_views(scene: Scene, masks: Masks) -> dict[int, list[int]]:
 
 
 def spread(rows: list[int], count: int) -> list[int]:
-    """So many of the rows, evenly spread; all, if there are not more."""
+    """At most `count` of the rows, evenly spread."""
     return [rows[i] for i in np.linspace(0, len(rows) - 1, min(count, len(rows))).round().astype(int)]
 
 
 @dataclass(frozen=True, eq=False)
 class ActiveTiles:
-    """What the categories that have stopped leave to learn: tiles of 16 px that show another one."""
+    """Tiles of 16 px that show a category which has not stopped; the others are not rendered."""
 
     scene: Scene
     masks: Masks | None  # needed once a category has stopped
     frozen: frozenset[int] = frozenset()  # label ids
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
-    _kept: dict[tuple[int, int], np.ndarray] = field(default_factory=dict)
-    _there: dict[tuple[int, int], torch.Tensor] = field(default_factory=dict)
+    _kept: dict[tuple[int, int], np.ndarray] = field(default_factory=dict, init=False)
+    _there: dict[tuple[int, int], torch.Tensor] = field(default_factory=dict, init=False)
 
     def tiles(self, row: int, factor: int = 1) -> Bool[np.ndarray, "h w"] | None:
-        """The tiles of a view, drawn `factor` times smaller, that are left; None: all."""
+        """The active tiles of a view that is rendered `factor` times smaller; None: all."""
         if not self.frozen or self.masks is None:
             return None
         if (row, factor) not in self._kept:
@@ -71,7 +71,7 @@ class ActiveTiles:
         return self._there[row, factor]
 
     def finished(self, row: int) -> bool:
-        """Whether a view shows nothing but stopped categories."""
+        """Whether a view shows only stopped categories."""
         tiles = self.tiles(row)
         return tiles is not None and not tiles.any()
 
@@ -93,8 +93,8 @@ def active_tiles(
 
 def label_quality(
     gaussians: Gaussians,
-    work: ActiveTiles,
-    feed: PhotoLoader,
+    active_tiles: ActiveTiles,
+    photo_loader: PhotoLoader,
     views: Mapping[int, Sequence[int]],
     config: TrainConfig,
     sh_degree: int,
@@ -107,11 +107,11 @@ def label_quality(
 
     The processes of a `group` measure some views each.
     """
-    assert work.masks is not None
+    assert active_tiles.masks is not None
     found: dict[int, dict[int, float]] = {}
-    left = {label: set(rows) for label, rows in views.items() if label not in work.frozen}
+    left = {label: set(rows) for label, rows in views.items() if label not in active_tiles.frozen}
     for row in group.share(sorted(set().union(*left.values()))):
-        view, tiles = work.scene.views[row], work.tiles(row)
+        view, tiles = active_tiles.scene.views[row], active_tiles.tiles(row)
         if tiles is not None:  # windows reach into the tiles around
             tiles = binary_dilation(tiles, np.ones((3, 3)))
         with torch.no_grad():
@@ -119,14 +119,14 @@ def label_quality(
                 gaussians, view.camera, sh_degree=sh_degree, antialiased=config.antialiased,
                 tile_mask=tiles, backend=backend, workspace=workspace,
             )  # fmt: skip
-        image, (photo, _) = render.rgb.clamp(0, 1).float(), feed(row)
+        image, (photo, _) = render.rgb.clamp(0, 1).float(), photo_loader(row)
         if image.is_cuda:
             from sagesplat.metrics import ssim_triton
 
             quality = ssim_triton.ssim_map(image, photo).cpu().numpy()
         else:
             quality = ssim_map(image.numpy(), photo.numpy(), tiles)
-        for label, (mean, _) in means_by_label(quality, work.masks[view]).items():
+        for label, (mean, _) in means_by_label(quality, active_tiles.masks[view]).items():
             if row in left.get(label, ()):
                 found.setdefault(label, {})[row] = mean
     values: dict[int, dict[int, float]] = {}  # by label and view, whoever measured it

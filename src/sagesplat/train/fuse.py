@@ -1,4 +1,4 @@
-"""View-consistent label images: all views vote on the Gaussians, which are drawn back into each view."""
+"""Multi-view label fusion: all views vote on the Gaussians, whose votes are rendered into each view."""
 
 from collections.abc import Callable, Collection
 from dataclasses import asdict, dataclass
@@ -28,14 +28,14 @@ class FuseOptions:
     """When the other views overrule a view."""
 
     weight: float = 2.0  # exponent of the fused probabilities beside the view's own
-    confidence: float = 0.9  # probability of a hard label; any other category has the rest
+    confidence: float = 0.9  # probability of a hard label; the other categories share what remains
     min_share: float = 0.5  # of a pixel: what the voters have to cover of it, and the winner of their votes
     keep_thin: float = 3.0  # exponent of the view's own probabilities at thin parts; 1 = as elsewhere
 
 
 @dataclass(frozen=True, eq=False)
 class Votes:
-    """What each Gaussian is, by all views that it paints."""
+    """Category votes of each Gaussian, over all views that it contributes to."""
 
     ids: Int16[np.ndarray, " C"]  # category ids in rising order, the first one -1
     shares: Float32[
@@ -61,7 +61,7 @@ def gather(
     antialiased: bool = False,
     on_view: Callable[[int], None] | None = None,
 ) -> Votes:
-    """Let the pixels of `views` (rows of `Scene.views`) vote on the Gaussians that paint them.
+    """Let the pixels of `views` (rows of `Scene.views`) vote on the Gaussians that contribute to them.
 
     A pixel's vote is its category in `masks`, or its distribution with `soft`, times the blending weight
     (alpha times transmittance) of the Gaussian. Unlabelled is a candidate too, but views without any label

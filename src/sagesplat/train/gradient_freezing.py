@@ -1,4 +1,4 @@
-"""Gaussians that rest by themselves (GSta, Armagan et al. 2025), to compare the freeze of categories with."""
+"""Gradient-based freezing of Gaussians (GSta, Armagan et al. 2025), the baseline of early stopping."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -11,29 +11,32 @@ _WATCHED = ("means", "sh0")  # position and base colour, as GSta
 
 @dataclass(eq=False)
 class GradientFreezing:
-    """Every other stretch of steps, Gaussians whose gradients were among the smallest in the one before rest.
+    """Freezes the Gaussians with the smallest gradients in alternate windows of steps.
 
-    `share`: those rest whose summed gradient norms lie in this lowest share for position and for colour too.
+    `share`: frozen are those whose summed gradient norms of the window before are in this lowest fraction,
+    for position and for colour.
     """
 
     share: float
-    sums: dict[str, Tensor] = field(default_factory=dict)  # gradient norms [N]; empty while some rest
+    sums: dict[str, Tensor] = field(
+        default_factory=dict
+    )  # gradient norms [N]; empty in a window with frozen Gaussians
 
     def watch(self, grads: Mapping[str, Tensor]) -> None:
-        """Add a step's gradients, unless some Gaussians rest."""
+        """Add the gradient norms of a step, in windows without frozen Gaussians."""
         for name in self.sums:
             self.sums[name] += grads[name].flatten(1).norm(dim=1)
 
     def turn(self, trainable: Tensor) -> Tensor:
-        """Bool [N]: who trains in the stretch that begins, of those who may."""
+        """Begin a window; the `trainable` rows (bool [N]) that are not frozen in it."""
         if not self.sums:
             self.sums = {name: trainable.new_zeros(len(trainable), dtype=torch.float32) for name in _WATCHED}
             return trainable
         norms, self.sums = self.sums, {}
-        resting = torch.ones_like(trainable)
+        frozen = torch.ones_like(trainable)
         for norm in norms.values():
-            if len(norm) != len(trainable) or not trainable.any():  # Gaussians came or went
+            if len(norm) != len(trainable) or not trainable.any():  # rows were added or removed
                 return trainable
             known = norm[trainable]
-            resting &= norm <= known.kthvalue(max(1, int(self.share * len(known)))).values
-        return trainable & ~resting
+            frozen &= norm <= known.kthvalue(max(1, int(self.share * len(known)))).values
+        return trainable & ~frozen

@@ -1,4 +1,4 @@
-"""Processes that train one model together, a view each: what they add up and agree on."""
+"""Processes that train one model together, a view each: sums and gathers over all of them."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -9,7 +9,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Group:
-    """One of `size` processes; alone, it has nobody to ask. torch.distributed must be initialised."""
+    """One of `size` processes. With more than one, torch.distributed must be initialised."""
 
     rank: int = 0
     size: int = 1

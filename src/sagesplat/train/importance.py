@@ -1,4 +1,4 @@
-"""How much each Gaussian matters to the pictures: the order in which a ladder of prefixes ships them."""
+"""Importance of each Gaussian for the rendered views: the order of the nested levels."""
 
 from collections.abc import Collection
 from dataclasses import replace
@@ -25,7 +25,7 @@ def importance(
     antialiased: bool = False,
     seed: int = 0,
 ) -> Float32[np.ndarray, " N"]:
-    """What each Gaussian is worth to `views` (rows of Scene.views), in no unit: larger is more.
+    """Importance of each Gaussian for `views` (rows of Scene.views), without unit; larger is more important.
 
     weight: blending weight (alpha times transmittance) summed over all pixels; weight-volume: times the
     volume to the power 0.1, as LightGaussian (arXiv:2311.17245, eq. 3); peak: the largest sum of one view;

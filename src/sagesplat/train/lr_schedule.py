@@ -1,8 +1,8 @@
-"""How fast training goes ahead: step sizes, and the resolution that a step is worth.
+"""Learning-rate and resolution schedule.
 
-`published` is 3DGS's pace. `fast` reaches the same quality in a fraction of the steps: larger steps at first,
-and photos no larger than what a young model can learn from them (the idea of DashGaussian, Chen et al. 2025:
-the frequency content of the photos tells for how long).
+`published` is that of 3DGS. `fast` reaches the same quality in a fraction of the steps: higher learning rates
+at first, and smaller photos while the model is coarse (as DashGaussian, Chen et al. 2025: the frequency
+content of the photos decides for how long).
 """
 
 from dataclasses import dataclass
@@ -20,20 +20,20 @@ from sagesplat.scene.scene import Camera
 _GAIN, _MEANS_GAIN, _SHRINK_FROM, _SHRINK_TO = 4.0, 4.0, 0.3, 0.1
 _MEANS_SHRINK_TO = 0.01  # of the published schedule too
 _FACTORS = (4, 2)  # how many times smaller photos may be
-_SMALLEST = 200  # pixels of the shorter side: what is smaller costs less than the Gaussians do
-_LEARNT_BY = 0.5  # share of the run in which everything up to full resolution has had its turn
+_SMALLEST = 200  # pixels of the shorter side: below, the Gaussians cost more than the pixels
+_LEARNT_BY = 0.5  # share of the run after which all photos have full resolution
 
 
 @dataclass(frozen=True)
 class LrSchedule:
-    """Rates and resolutions of one run."""
+    """Learning rates, SGLD noise and photo resolution of one run, by step."""
 
     config: TrainConfig
     extent: float
     coarse: tuple[tuple[int, int], ...] = ()  # (last step, how many times smaller), ascending
 
     def learning_rates(self, step: int) -> dict[str, float]:
-        """Adam's rate for each parameter at a step."""
+        """Adam's learning rate at a step, by parameter name."""
         config, share = self.config, step / self.config.max_steps
         learning_rates = {name: getattr(config, f"{name}_lr") for name in PARAMETERS}
         learning_rates["means"] *= self.extent * _MEANS_SHRINK_TO**share
@@ -61,10 +61,10 @@ class LrSchedule:
 
 
 def lr_schedule(config: TrainConfig, extent: float, photos: list[UInt8[np.ndarray, "H W 3"]]) -> LrSchedule:
-    """The pace of a run, from the frequency content of some of its photos.
+    """The schedule of a run, from the frequency content of some of its photos.
 
-    Photos `factor` times smaller show the share `detail` of what the photos hold, and that share of the first
-    half of the run is over when the next larger ones come.
+    Photos `factor` times smaller show the share `detail` of what the photos hold, and are used until
+    that share of the first half of the run is over.
     """
     coarse, last = [], 0
     if config.lr_schedule == "fast":

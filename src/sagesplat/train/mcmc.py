@@ -1,7 +1,8 @@
 """Densification of "3D Gaussian Splatting as Markov Chain Monte Carlo" (Kheradmand et al., NeurIPS 2024).
 
-Gaussians are samples: they wander, most where they are faint; dead ones move onto living ones, and new ones
-come the same way. Nothing is cloned, split, pruned or reset. All chance comes from `state.rng`.
+Gaussians are samples of a Markov chain: SGLD noise moves them, transparent ones most; dead ones are relocated
+to living ones, and new ones are added in the same way. Nothing is cloned, split, pruned or reset. All random
+numbers come from `state.rng`.
 """
 
 import math
@@ -18,11 +19,12 @@ from sagesplat.raster.reference import rotation_matrices
 from sagesplat.train import densify
 from sagesplat.train.state import TrainState
 
-MOST = 51  # Gaussians that may share a place; more are treated as so many
+REFINE_STOP = 25_000  # step of 30,000 at which refinement ends, as published
+MOST = 51  # Gaussians that may share a place; larger counts are treated as 51
 _GROWTH = 0.05  # of the present count, at each refinement, as published
 _GROWN_BY = 0.5  # share of the refinements after which even a short run has reached its cap
 _SHARPNESS, _FAINT = 100.0, 0.005  # k and 1 - t of equation 8: the noise fades around this opacity
-_QUIET = 0.2  # from this opacity on the noise is below 1e-8 of what it is for faint ones: none is drawn
+_QUIET = 0.2  # above this opacity the noise is below 1e-8 of that of transparent ones: it is skipped
 
 # row N, column k - 1: binomial(N, k) (-1)^(k - 1) / sqrt(k). The sum over i of equation 9 is done:
 # sum_{i=k}^{N} binomial(i - 1, k - 1) = binomial(N, k).
@@ -49,9 +51,9 @@ def shares(logits: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
 def relocate(state: TrainState, config: TrainConfig, trainable: Tensor) -> int:
     """Move dead Gaussians, opacity at most `prune_opacity`, onto living ones; returns how many.
 
-    Hosts are drawn by opacity. A moved Gaussian takes everything from its host, the label too, and both start
-    with fresh moments. Rows that are not `trainable` (bool [N]) neither move nor host: a stopped category
-    keeps its dead ones. Where nobody lives, nobody moves. Changes tensors in place.
+    Hosts are drawn by opacity. A relocated Gaussian copies its host, label included, and the
+    moments of both are reset. Rows that are not `trainable` (bool [N]) are neither moved nor hosts: a stopped
+    category keeps its dead ones. Without a living Gaussian nothing moves. Changes tensors in place.
     """
     alive = state.gaussians.logit_opacities.sigmoid() > config.prune_opacity
     dead = (trainable & ~alive).nonzero().squeeze(1)
@@ -110,7 +112,7 @@ def _land(state: TrainState, config: TrainConfig, living: Tensor, count: int) ->
 
 
 def perturb(state: TrainState, rate: float, trainable: Tensor) -> None:
-    """Let Gaussians wander (equation 8): mean += rate * sigmoid(100 (0.005 - opacity)) * covariance @ normal.
+    """Add SGLD noise (equation 8): mean += rate * sigmoid(100 (0.005 - opacity)) * covariance @ normal.
 
     `rate` is the step's learning rate of the means times `mcmc_noise`, in 1 / world units, since a covariance
     is in square ones. Only rows that are `trainable` (bool [N]) move. Draws one number from `state.rng`; on a
@@ -154,10 +156,12 @@ def _mix(x):
 
 @njit(cache=True)
 def _normal(seed, count):
-    """Nearly a standard normal number, the same whoever asks: the set ones of 64 random bits, and a fraction.
+    """An approximately standard normal number that depends on its arguments alone.
+
+    It is the number of set bits among 64 random ones, plus a fraction.
 
     Mean and variance are exact, the fourth moment is 2.97; Langevin noise needs no more, and logarithms and
-    sines would take longer than all the rest.
+    sines would take longer than everything else in the kernel.
     """
     x = _mix(seed + count * np.uint64(0x9E3779B97F4A7C15))
     fraction = np.float32(_mix(x) >> np.uint64(40)) * np.float32(2.0**-24)

@@ -10,7 +10,7 @@ from sagesplat.core.config import TrainConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.sh import num_bases
 from sagesplat.scene.scene import Scene
-from sagesplat.train import densify
+from sagesplat.train.strategy import max_count
 
 GIB = 2**30
 _MARGIN = 0.1  # of what a machine has, left for others
@@ -30,7 +30,7 @@ class Fitted:
     needed: int  # at that cap, predicted
     lowered: int  # Gaussians at most, as fits; the same where all fits
     limit: int
-    began: bool = False  # the cap is that of a training that goes on
+    began: bool = False  # the cap is that of a training that resumes
 
     def __str__(self) -> str:
         """One line for the user."""
@@ -44,17 +44,13 @@ class Fitted:
 def fit(scene: Scene, config: TrainConfig, limit: int = 0, *, processes: int = 1, began: int = 0) -> Fitted:
     """The settings with a cap that fits into `limit` bytes (0: what the machine has, but for a tenth).
 
-    `began`: the cap of a training that goes on; another one would give another result. RunError where not
-    even that fits, or the points to begin with do not.
+    `began`: the cap of a training that resumes, which is kept: another one would change the result. RunError
+    where that cap, or the initial points, do not fit.
     """
     limit = limit or default_limit()
     camera, points = scene.views[0].camera, len(scene.points.xyz)
     pixels = camera.width * camera.height
-    plan = densify.schedule(config)
-    most = densify.cap(config, pixels, points)
-    if config.strategy == "default":  # photos set a cap too
-        most = densify.budget(config, plan, plan.refine_stop, pixels, pixels, points)
-    most = max(most, points)
+    most = max(max_count(config, pixels, points), points)
     photos = min(photo_cache(limit), 3 * pixels * len(scene.train_ids))
     fixed = processes * (_BASE + _PIXEL * pixels + photos)
     each = processes * _COPIES * 4 * (11 + 3 * num_bases(config.sh_degree))

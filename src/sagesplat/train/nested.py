@@ -1,4 +1,4 @@
-"""The nested ladder: one ordered set of Gaussians per category, trained so that its prefixes are levels."""
+"""Nested levels (prefix LOD): a category is one ordered set of Gaussians, its prefixes are its levels."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -19,32 +19,33 @@ from sagesplat.scene.scene import Points, Scene
 from sagesplat.segment.masks import Masks
 from sagesplat.train.checkpoint import latest_checkpoint, write_checkpoint
 from sagesplat.train.early_stopping import ActiveTiles, trainable_rows
+from sagesplat.train.events import Event, Resumed
 from sagesplat.train.importance import importance
 from sagesplat.train.lr_schedule import LrSchedule
 from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.state import initial_state
 from sagesplat.train.stepper import Stepper
-from sagesplat.train.trainer import LOOK_EVERY, Event, Resumed, finite, named_failures, train
+from sagesplat.train.trainer import LOOK_EVERY, finite, named_failures, train
 from sagesplat.train.votes import label_weights, winners
 
-CLEAR = 0.8  # share of its blending weight that a Gaussian needs in one category, else it straddles a border
-_VISIBLE = 0.5  # pixels a view that it must paint of the others, on average, for that to matter
-_SHRINK_TO = 0.05  # of the rates, at the end
+CLEAR = 0.8  # share of its blending weight in one category below which a Gaussian is a boundary Gaussian
+_VISIBLE = 0.5  # blending weight in the other categories, in pixels per view, below which that is ignored
+_SHRINK_TO = 0.05  # of the learning rates, at the end
 _SAVE_EVERY = 500
 _SORT_AT = 1 / 12, 1 / 6, 1 / 3, 1 / 2, 2 / 3  # of the steps
 
 
 @dataclass(frozen=True, eq=False)
 class Nested:
-    """Gaussians in the order in which they are shipped: by category, the worthiest first."""
+    """Gaussians in the order in which they are sent: by category, the most important first."""
 
     gaussians: Gaussians
     purity: Float32[np.ndarray, " N"]  # share of a Gaussian's blending weight in its own category; 1 unseen
-    ranks: Int8[np.ndarray, " N"]  # in each category: 0 those across two categories, then 1 seeds, 2 the rest
+    ranks: Int8[np.ndarray, " N"]  # order in a category: 0 boundary Gaussians, 1 base model, 2 others
 
     @property
     def boundary(self) -> dict[int, int]:
-        """By label id, how many lie across two categories."""
+        """Number of boundary Gaussians by label id."""
         labels = self.gaussians.label_ids.numpy()
         return {label: int((self.ranks[labels == label] == 0).sum()) for label in self.gaussians.counts()}
 
@@ -58,9 +59,9 @@ class NestStep:
 
 
 def level_sizes(count: int, config: NestConfig, boundary: int = 0) -> tuple[int, ...]:
-    """Gaussians of a category of `count` at each level, ascending and geometric; at least one of any.
+    """Gaussians at each level of a category of `count`: ascending, geometric, at least one.
 
-    The lowest level has all `boundary` ones. A category with few Gaussians has levels of the same size.
+    The lowest level holds all `boundary` Gaussians. In a small category several levels have the same size.
     """
     smallest = max(config.smallest, min(boundary, count) / max(count, 1))
     shares = smallest ** np.linspace(0, 1, config.levels)[::-1]
@@ -76,21 +77,21 @@ def order(
     base: Gaussians | None = None,
     antialiased: bool = False,
 ) -> Nested:
-    """Vote on labels by what each Gaussian paints, and order each category by worth.
+    """Label Gaussians by the pixels that they contribute to, and order each category by importance.
 
-    `seeds`, a small model of the same scene, take the place of as many Gaussians of the least worth and come
-    before all others: what is best placed alone makes better low levels than the worthiest of many.
-    Gaussians that straddle a border come first in theirs, so that every composition has them. Splitting them
-    in two does not help: nine in ten of the halves straddle as well.
+    `base`, a small model of the same scene, replaces as many of the least important Gaussians and is ordered
+    before the others: a model trained small makes better low levels than the most important part of a large
+    one. Boundary Gaussians come first in their category, so that every composition has them. Splitting them
+    does not help: nine in ten of the halves are boundary Gaussians too.
     """
     views = scene.train_ids.tolist()
-    worth = importance(g, scene, views, config.criterion, antialiased=antialiased)
+    importances = importance(g, scene, views, config.criterion, antialiased=antialiased)
     ranks = np.full(len(g), 2, np.int8)
     if base is not None and len(base):
-        kept = np.sort(np.argsort(-worth, kind="stable")[: max(len(g) - len(base), 0)])
+        kept = np.sort(np.argsort(-importances, kind="stable")[: max(len(g) - len(base), 0)])
         of_base = importance(base, scene, views, config.criterion, antialiased=antialiased)
         g = concat([base, g.select(torch.from_numpy(kept))])
-        worth = np.concatenate([of_base, worth[kept]])
+        importances = np.concatenate([of_base, importances[kept]])
         ranks = np.repeat(np.array([1, 2], np.int8), [len(base), len(kept)])
     ids, weights = label_weights(g, scene, masks, views, antialiased=antialiased)
     g = replace(g, label_ids=winners(g, ids, weights))
@@ -100,12 +101,12 @@ def order(
     mine = weights[np.arange(len(g)), column] if len(ids) else total
     purity = np.where(total > 0, mine / np.maximum(total, 1e-12), 1).astype(np.float32)
     ranks[is_boundary(weights, len(views))] = 0  # whichever side is there needs them
-    rows = np.lexsort((-worth, ranks, labels))  # the last key decides first
+    rows = np.lexsort((-importances, ranks, labels))  # the last key decides first
     return Nested(g.select(torch.from_numpy(rows)), purity[rows], ranks[rows])
 
 
 def with_at_most(scene: Scene, labels: np.ndarray, count: int, seed: int) -> tuple[Scene, np.ndarray]:
-    """The scene with at most `count` of its points, drawn at random, and their labels (int16 [P])."""
+    """The scene with at most `count` of its points, chosen at random, and their labels (int16 [P])."""
     points = scene.points
     if len(points.xyz) <= count:
         return scene, labels
@@ -118,7 +119,7 @@ def with_at_most(scene: Scene, labels: np.ndarray, count: int, seed: int) -> tup
 
 
 def capped_config(config: TrainConfig, cap: int, steps: int) -> TrainConfig:
-    """3DGS-MCMC with at most `cap` Gaussians, otherwise as `config`; nothing is recorded on the way."""
+    """3DGS-MCMC with at most `cap` Gaussians, otherwise as `config`; only the last level is recorded."""
     mcmc = replace(config, strategy="mcmc", max_gaussians=cap, max_steps=steps, level_every=steps)
     return replace(mcmc, freeze_at=None, gradient_freeze_share=0.0)
 
@@ -140,7 +141,7 @@ def train_capped(
 
 
 def is_boundary(weights: Float32[np.ndarray, "N L"], num_views: int) -> np.ndarray:
-    """Gaussians (bool [N]) of which no category has 80 % of the weight, and which show on both sides."""
+    """Boundary Gaussians (bool [N]): no category has 80 % of their weight, the others a visible part."""
     total, top = weights.sum(1), weights.max(1, initial=0)
     return (top < CLEAR * total) & (total - top > _VISIBLE * num_views)
 
@@ -186,7 +187,7 @@ def nest(
     """
     check(config)
     device = device_of(backend)
-    near = geometry.morton_order(nested.gaussians.means.numpy())  # neighbours in space are drawn together
+    near = geometry.morton_order(nested.gaussians.means.numpy())  # neighbours in space are rendered together
     labels, ranks = nested.gaussians.label_ids.numpy()[near], nested.ranks[near]
     state = initial_state(nested.gaussians.select(torch.from_numpy(near)), seed)
     state.order_share = order_shares(labels, ranks, -near)
@@ -199,9 +200,10 @@ def nest(
     column = torch.from_numpy(column).to(device)
     views = scene.train_ids.tolist()
     sort_at = {round(part * config.steps) for part in _SORT_AT} if movable is None else {}
-    config_of_steps = replace(train_config, strategy="default", batch=1)
-    stepper = Stepper(PhotoLoader(scene, photos, device), config_of_steps, ActiveTiles(scene, None), backend)
-    stepper.sh_bits = config.sh_bits
+    stepper = Stepper(
+        PhotoLoader(scene, photos, device), replace(train_config, batch=1), ActiveTiles(scene, None), backend,
+        sh_bits=config.sh_bits,
+    )  # fmt: skip
     rates = _rates(train_config, config, scene)
     trainable = trainable_rows(state.gaussians, {})
     if movable is not None:
@@ -210,10 +212,10 @@ def nest(
     with named_failures(lambda: f"training on compositions stopped at step {state.step}"):
         while state.step < config.steps:
             if state.step in sort_at:
-                worth = importance(
+                importances = importance(
                     state.gaussians, scene, views, config.criterion, antialiased=train_config.antialiased
                 )
-                state.order_share = order_shares(labels, ranks, worth).to(device)
+                state.order_share = order_shares(labels, ranks, importances).to(device)
             prefix = draw_shares(state.rng, len(categories), config, state.step / config.steps)
             rows = None
             if (prefix < 1).any():
@@ -235,9 +237,9 @@ def nest(
     )
 
 
-def order_shares(labels: np.ndarray, ranks: np.ndarray, worth: np.ndarray) -> Tensor:
-    """Share of its category that comes before each Gaussian (float32 [N]): by rank, then by worth."""
-    rows = np.lexsort((-worth, ranks, labels))
+def order_shares(labels: np.ndarray, ranks: np.ndarray, importances: np.ndarray) -> Tensor:
+    """Share of its category ordered before each Gaussian (float32 [N]): by rank, then by importance."""
+    rows = np.lexsort((-importances, ranks, labels))
     _, first, counts = np.unique(labels[rows], return_index=True, return_counts=True)
     found = np.empty(len(rows), np.float32)
     found[rows] = (np.arange(len(rows)) - np.repeat(first, counts)) / np.repeat(counts, counts)
@@ -247,9 +249,9 @@ def order_shares(labels: np.ndarray, ranks: np.ndarray, worth: np.ndarray) -> Te
 def draw_shares(
     rng: np.random.Generator, num_labels: int, config: NestConfig, done: float
 ) -> Float32[np.ndarray, " L"]:
-    """Prefix of each category, as a share of it, that a step looks at when `done` of the steps are."""
-    everything = config.full_share + (config.full_share_end - config.full_share) * done
-    if rng.random() < everything:
+    """Prefix of each category that a step renders, as a share of it; `done`: share of the steps taken."""
+    full = config.full_share + (config.full_share_end - config.full_share) * done
+    if rng.random() < full:
         return np.ones(num_labels, np.float32)
     return np.exp(rng.uniform(np.log(config.drawn_from), 0, num_labels)).astype(np.float32)
 
@@ -257,7 +259,7 @@ def draw_shares(
 def _rates(
     train_config: TrainConfig, config: NestConfig, scene: Scene
 ) -> Callable[[int], Mapping[str, float]]:
-    """Adam's rates by step."""
+    """Learning rates by parameter name, for each step."""
     third = LrSchedule(
         replace(train_config, max_steps=3, lr_schedule="published"), scene.extent
     ).learning_rates(2)
@@ -270,7 +272,7 @@ def _rates(
 
 
 def check(config: NestConfig) -> None:
-    """RunError for settings that cannot be."""
+    """RunError for impossible settings."""
     wrong = (
         ("levels", config.levels, 1 <= config.levels <= 64, "1 to 64"),
         ("steps", config.steps, config.steps >= 0, "0 or more"),

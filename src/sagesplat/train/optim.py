@@ -62,7 +62,7 @@ def adam_step(
 ) -> None:
     """One Adam step (Kingma and Ba, betas 0.9 and 0.999, eps 1e-15 as 3DGS).
 
-    `columns`: only so many values at the start of each row; what never had a gradient would not move anyway.
+    `columns`: update only this many values at the start of each row; the others never had a gradient.
     """
     if parameter.size and columns != 0:
         rate = np.float32(lr / (1 - _BETA1**step))

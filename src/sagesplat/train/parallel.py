@@ -1,4 +1,4 @@
-"""Several processes that train one model, one per GPU; on a CPU they serve to try it."""
+"""Data-parallel training: several processes train one model, one per GPU (on a CPU for tests)."""
 
 import multiprocessing
 import tempfile
@@ -14,8 +14,9 @@ import torch.distributed as dist
 
 from sagesplat.core.errors import RunError, SageError
 from sagesplat.raster import set_threads
+from sagesplat.train.events import Event
 from sagesplat.train.group import Group
-from sagesplat.train.trainer import Event, train
+from sagesplat.train.trainer import train
 
 
 def train_together(processes: int, threads: int, *args: Any, **options: Any) -> Iterator[Event]:

@@ -1,4 +1,4 @@
-"""What a training step looks at: photos and cameras, near the device that trains."""
+"""Photos and cameras for the training steps, on the device that trains."""
 
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field

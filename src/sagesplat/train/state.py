@@ -1,4 +1,4 @@
-"""Everything that training changes, in one place."""
+"""The training state: all that training changes."""
 
 from dataclasses import dataclass, field, replace
 
@@ -12,7 +12,6 @@ from sagesplat.core.sh import num_bases, rgb_to_sh0
 from sagesplat.scene.scene import Points
 
 INITIAL_OPACITY = 0.1
-MCMC_OPACITY, MCMC_SCALE = 0.5, 0.1  # what 3DGS-MCMC begins with; scales times those of 3DGS
 
 
 @dataclass(eq=False)
@@ -29,7 +28,7 @@ class TrainState:
     step: int = 0
     last_reset: int = -1  # step of the last opacity reset, -1 = none yet
     frozen: dict[int, int] = field(default_factory=dict)  # label id -> step from which on it stays as it is
-    withheld: int = 0  # Gaussians that categories would have got, had they not stopped
+    withheld: int = 0  # Gaussians that stopped categories did not get
     order_share: Tensor | None = None  # [N] of a nested model: share of its category that comes before it
 
     def replace_rows(self, keep: Tensor, new: Gaussians) -> None:
@@ -44,7 +43,7 @@ class TrainState:
         self.clear_statistics()
 
     def sort(self) -> None:
-        """Put neighbours in space next to each other: then a CPU draws them, or not, together."""
+        """Sort rows by Morton code, so that the CPU kernels find neighbours together; nothing on a GPU."""
         if self.gaussians.means.is_cuda:
             return
         order = torch.from_numpy(geometry.morton_order(self.gaussians.means.numpy()))
@@ -57,7 +56,7 @@ class TrainState:
             self.order_share = self.order_share[order]
 
     def clear_statistics(self) -> None:
-        """Start the densification statistics again."""
+        """Reset the densification statistics to zero."""
         self.grad_sum = self.gaussians.means.new_zeros(len(self.gaussians))
         self.grad_count = self.grad_sum.clone()
 
@@ -80,7 +79,7 @@ def from_points(
     opacity: float = INITIAL_OPACITY,
     scale: float = 1.0,
 ) -> Gaussians:
-    """Gaussians at the SfM points: isotropic, `scale` times as wide as their three neighbours are far."""
+    """Gaussians at the SfM points: isotropic, scale `scale` times the mean distance to three neighbours."""
     n = len(points.xyz)
     scales = scale * geometry.mean_neighbour_distance(points.xyz)
     quats = torch.zeros(n, 4)

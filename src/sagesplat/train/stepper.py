@@ -1,7 +1,7 @@
 """Single training steps, and short trainings of a fixed set of Gaussians."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -14,28 +14,30 @@ from sagesplat.metrics.image import photometric_loss
 from sagesplat.raster import Backend, Render, Workspace, device_of, rasterize
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
-from sagesplat.train import densify, mcmc, optim
+from sagesplat.train import optim
 from sagesplat.train.early_stopping import ActiveTiles, trainable_rows
 from sagesplat.train.gradient_freezing import GradientFreezing
 from sagesplat.train.group import ALONE, Group
 from sagesplat.train.lr_schedule import LrSchedule
 from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.state import TrainState, initial_state
+from sagesplat.train.strategy import Strategy
 
-FINISHED_SHARE = 1 / 8  # of the rounds have a view in which nothing is left to learn: it is drawn whole then
+FINISHED_SHARE = 1 / 8  # of the rounds include a view whose categories have all stopped; it is drawn in full
 
 
 @dataclass(eq=False)
 class Stepper:
-    """Takes training steps on a state: render views, compare them with their photos, move the Gaussians."""
+    """Takes training steps on a state: render views, compare them with their photos, update the Gaussians."""
 
     photo_loader: PhotoLoader
     config: TrainConfig
     active_tiles: ActiveTiles
     backend: Backend = "auto"
     group: Group = ALONE
+    strategy: Strategy = field(default_factory=Strategy)  # without one the set of Gaussians is fixed
     gradient_freezing: GradientFreezing | None = None
-    sh_bits: tuple[int, int] | None = None  # draw Gaussians rounded as SPZ files will hold them
+    sh_bits: tuple[int, int] | None = None  # render Gaussians rounded as SPZ files will store them
     drawn: float = 1.0  # share of the tiles that the last step drew
     workspace: Workspace = field(default_factory=Workspace)
 
@@ -46,14 +48,17 @@ class Stepper:
         learning_rates: Mapping[str, float],
         trainable: Tensor,
         factor: int = 1,
-        observing: bool = False,
-        sgld_noise: float = 0.0,
         drawn_rows: Tensor | None = None,
     ) -> Tensor:
-        """One step on photos `factor` times smaller; the loss, on the device.
+        """Take one step; returns its loss (a scalar on the device, mean over the batch).
 
-        `observing`: add to the statistics that densification asks for. `wander`: MCMC's noise (see `Pace`).
-        `drawn_rows` (indices): only these Gaussians are there in this step, the others stay as they are.
+        Args:
+            state: Changed in place; its `step` is one more afterwards.
+            degree: Degree of the harmonics in use.
+            learning_rates: Adam's, by parameter name.
+            trainable: Bool [N]; the other rows keep every bit.
+            factor: Train on photos this many times smaller.
+            drawn_rows: Indices of the Gaussians to render; the others take no part in this step.
         """
         batch = max(self.config.batch, self.group.size)
         views = self.group.share([self._next_view(state) for _ in range(batch)])
@@ -71,9 +76,7 @@ class Stepper:
             loss, render = self._draw(moving, view, degree, trainable, factor)
             loss.backward()
             losses.append(loss.detach())
-            if observing:
-                height, width, _ = render.rgb.shape
-                densify.observe_gradients(state, render, width, height, trainable)
+            self.strategy.step_post_backward(state, render, trainable)
             for name, leaf in leaves.items():
                 assert leaf.grad is not None
                 if name in grads:
@@ -91,14 +94,16 @@ class Stepper:
         if self.gradient_freezing:
             self.gradient_freezing.watch(grads)
         state.step += 1
-        if self.config.strategy == "mcmc":
-            weights = self.config.mcmc_opacity, self.config.mcmc_scale / self.photo_loader.scene.extent
-            mcmc.add_regularisation_gradients(state, grads, *weights, trainable)
+        self.strategy.step_pre_update(state, grads, trainable)
         scaled = {name: rate * math.sqrt(batch) for name, rate in learning_rates.items()}
         optim.update(state, grads, scaled, degree, trainable)
-        if sgld_noise:
-            mcmc.perturb(state, sgld_noise, trainable)
+        self.strategy.step_post_update(state, trainable)
         return total / batch
+
+    def stop(self, frozen: Collection[int]) -> None:
+        """From now on, skip tiles that show nothing but the categories `frozen` (label ids)."""
+        if len(frozen) > len(self.active_tiles.frozen):
+            self.active_tiles = replace(self.active_tiles, frozen=frozenset(frozen))
 
     def _draw(
         self, moving: Gaussians, view: int, degree: int, trainable: Tensor, factor: int
@@ -153,11 +158,11 @@ def tune(
     seed: int = 0,
     backend: Backend = "auto",
 ) -> Gaussians:
-    """The same Gaussians, trained a little further: none comes, none goes, no reset.
+    """Train a fixed set of Gaussians for `steps` more steps; returns the result on the CPU.
 
-    The rates are those of the last third of a published run of three times `steps`.
+    Learning rates are those of the last third of a published run of three times `steps`.
     """
-    config = replace(config, strategy="default", batch=1)
+    config = replace(config, batch=1)
     learning_rates = LrSchedule(
         replace(config, max_steps=3 * steps, lr_schedule="published"), scene.extent
     ).learning_rates
@@ -166,7 +171,7 @@ def tune(
     state = initial_state(replace(gaussians, **copies).to(device), seed)
     state.sort()
     stepper = Stepper(PhotoLoader(scene, photos, device), config, ActiveTiles(scene, None), backend)
-    everything = trainable_rows(state.gaussians, {})
+    trainable = trainable_rows(state.gaussians, {})
     for step in range(1, steps + 1):
-        stepper(state, gaussians.sh_degree, learning_rates(2 * steps + step), everything)
+        stepper(state, gaussians.sh_degree, learning_rates(2 * steps + step), trainable)
     return state.gaussians.to("cpu")

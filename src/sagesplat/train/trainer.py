@@ -1,4 +1,4 @@
-"""Training: a generator of events over a state; it prints nothing and draws nothing."""
+"""Training: an iterator of events over a state; it prints nothing."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -12,76 +12,25 @@ from torch import Tensor
 
 from sagesplat.core.config import TrainConfig
 from sagesplat.core.errors import DataError, OutOfMemory, RunError
-from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.levels import check_level, write_level
 from sagesplat.raster import Backend, device_of
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.segment.masks import Masks
-from sagesplat.train import densify, mcmc
 from sagesplat.train.checkpoint import latest_checkpoint, previous, write_checkpoint
 from sagesplat.train.early_stopping import ActiveTiles, label_quality, measured_views, trainable_rows
+from sagesplat.train.events import Event, LabelFrozen, LevelSaved, Resumed, Step, Trained
 from sagesplat.train.gradient_freezing import GradientFreezing
 from sagesplat.train.group import ALONE, Group
-from sagesplat.train.lr_schedule import lr_schedule
+from sagesplat.train.lr_schedule import LrSchedule, lr_schedule
 from sagesplat.train.photo_loader import PhotoLoader
-from sagesplat.train.state import MCMC_OPACITY, MCMC_SCALE, TrainState, from_points, initial_state
+from sagesplat.train.state import TrainState, from_points, initial_state
 from sagesplat.train.stepper import Stepper
+from sagesplat.train.strategy import Densification, make_strategy
 
 CHECKPOINT = "checkpoint.npz"
 _LESS = "lower --train.max-gaussians, or begin a run with --downscale 2"
-LOOK_EVERY = 100  # steps between two looks at the loss on a GPU
-
-
-@dataclass(frozen=True)
-class Resumed:
-    """Training goes on from a checkpoint."""
-
-    step: int
-    damage: str = ""  # what was wrong with the newest one, if this is the one before
-
-
-@dataclass(frozen=True)
-class Step:
-    """One optimiser step was taken."""
-
-    step: int
-    loss: float
-    num_gaussians: int
-    drawn: float = 1.0  # share of the tiles that this process drew
-
-
-@dataclass(frozen=True)
-class LevelSaved:
-    """A level was recorded (`path` is None where nothing is written)."""
-
-    step: int
-    path: Path | None
-    counts: dict[int, int]
-    recovering: bool
-    gaussians: Gaussians  # on the training device; the next step changes them in place
-
-
-@dataclass(frozen=True)
-class LabelFrozen:
-    """A category has reached the quality asked for and stays as it is."""
-
-    step: int
-    label_id: int
-    ssim: float  # mean over the training views measured
-    count: int  # its Gaussians
-
-
-@dataclass(frozen=True)
-class Trained:
-    """The end."""
-
-    gaussians: Gaussians
-    step: int
-    frozen: dict[int, int]  # step from which on a category stayed as it was, by label id
-
-
-Event = Resumed | Step | LevelSaved | LabelFrozen | Trained
+LOOK_EVERY = 100  # steps between two checks of the loss on a GPU
 
 
 def train(
@@ -134,12 +83,13 @@ def train(
         ...     print(event)
     """
     _check(config, masks)
-    state: TrainState | None = None
-    with named_failures(lambda: _where(state, folder)):
-        for event, state in _train(  # noqa: B007 - the last state is asked for where training fails
-            scene, photos, label_ids, config, masks, seed, backend, folder, settings, group
-        ):
-            yield event
+    training: Training | None = None
+    with named_failures(lambda: _where(training and training.state, folder)):
+        training = begin(
+            scene, photos, label_ids, config,
+            masks=masks, seed=seed, backend=backend, folder=folder, settings=settings, group=group,
+        )  # fmt: skip
+        yield from training.run()
 
 
 @contextmanager
@@ -165,105 +115,160 @@ def finite(loss: Tensor, step: int) -> float:
 
 
 def _where(state: TrainState | None, folder: Path | None) -> str:
-    """How far training came, and where the next one begins."""
-    if state is None:
+    """How far training came, and what is kept of it."""
+    if state is None or not state.step:
         return "training did not begin"
     kept = f", {folder / CHECKPOINT} is kept" if folder and (folder / CHECKPOINT).exists() else ""
     return f"training stopped at step {state.step} with {len(state.gaussians):,} Gaussians{kept}"
 
 
-def _train(
+@dataclass(eq=False)
+class Training:
+    """A training in progress: the state, and what changes it in each step."""
+
+    config: TrainConfig
+    state: TrainState
+    stepper: Stepper
+    strategy: Densification
+    rates: LrSchedule
+    measured: dict[int, list[int]]  # rows of the views on which each category is measured, for early stopping
+    gradient_freezing: GradientFreezing | None
+    folder: Path | None  # None: this process writes nothing
+    settings: str
+    resumed: Resumed | None
+    loss: float = 0.0  # when it was last looked at
+
+    def __post_init__(self) -> None:
+        self.trainable = trainable_rows(self.state.gaussians, self.state.frozen)
+        self.active = self.trainable  # of those, the ones whose gradients are not frozen
+        self.unfinished = bool(self.trainable.any())
+
+    def run(self) -> Iterator[Event]:
+        """Train to the end; the events of `train`."""
+        if self.resumed:
+            yield self.resumed
+        while self.state.step < self.config.max_steps and self.unfinished:
+            yield self._step()
+            yield from self._after_step()
+        if self.folder:
+            previous(self.folder / CHECKPOINT).unlink(missing_ok=True)  # nobody resumes from here
+        yield Trained(self.state.gaussians.to("cpu"), self.state.step, self.state.frozen)
+
+    def _step(self) -> Step:
+        """One optimiser step."""
+        step = self.state.step + 1
+        loss = self.stepper(
+            self.state, self._sh_degree(step - 1), self.rates.learning_rates(step), self.active,
+            self.rates.factor(step),
+        )  # fmt: skip
+        on_cpu = not loss.is_cuda
+        if on_cpu or self._records(step) or step % LOOK_EVERY == 0:  # reading it waits for a GPU
+            self.loss = finite(loss, step)
+        return Step(step, self.loss, len(self.state.gaussians), self.stepper.drawn)
+
+    def _after_step(self) -> Iterator[Event]:
+        """Record a level, stop categories, densify, freeze by gradients, and save a checkpoint, as is due."""
+        step = self.state.step
+        records = self._records(step)
+        late = self.config.levels_after_reset and self.strategy.resets(step)
+        if records and not late:
+            yield self._save_level()
+        if records and self.config.freeze_at is not None:
+            yield from self._stop_categories(self.config.freeze_at)
+        if self.strategy.step_post(self.state):
+            self._update_trainable()
+        if self.gradient_freezing and step % self.config.refine_every == 0:
+            self.active = self.gradient_freezing.turn(self.trainable)
+        if records and late:
+            yield self._save_level()
+        if records:
+            self.stepper.group.collect(self.state.grad_sum, self.state.grad_count)
+            if self.folder:
+                write_checkpoint(self.folder / CHECKPOINT, self.state, self.settings)
+
+    def _records(self, step: int) -> bool:
+        """Whether a level is recorded after a step."""
+        return step % self.strategy.schedule.level_every == 0 or step == self.config.max_steps
+
+    def _sh_degree(self, step: int) -> int:
+        """The degree of the harmonics in use after a step."""
+        return min(self.config.sh_degree, step // self.strategy.schedule.raise_sh_every)
+
+    def _update_trainable(self) -> None:
+        self.active = self.trainable = trainable_rows(self.state.gaussians, self.state.frozen)
+
+    def _save_level(self) -> LevelSaved:
+        state, path = self.state, None
+        since_reset = state.step - state.last_reset
+        recovering = state.last_reset >= 0 and since_reset <= self.strategy.schedule.recovery
+        if self.folder:
+            path = write_level(
+                self.folder / "levels", state.step, state.gaussians.to("cpu"),
+                recovering=recovering, sh_degree=self._sh_degree(state.step),
+            )  # fmt: skip
+        return LevelSaved(state.step, path, state.gaussians.counts(), recovering)
+
+    def _stop_categories(self, target: float) -> Iterator[LabelFrozen]:
+        """Early stopping: measure the categories and stop those that have reached the target SSIM."""
+        state, stepper = self.state, self.stepper
+        quality = label_quality(
+            state.gaussians, stepper.active_tiles, stepper.photo_loader, self.measured, self.config,
+            self._sh_degree(state.step),
+            backend=stepper.backend, workspace=stepper.workspace, group=stepper.group,
+        )  # fmt: skip
+        counts = state.gaussians.counts()
+        for label, ssim in quality.items():
+            if label not in state.frozen and ssim >= target:
+                state.frozen[label] = state.step
+                yield LabelFrozen(state.step, label, ssim, counts.get(label, 0))
+        stepper.stop(state.frozen)
+        self._update_trainable()
+        self.unfinished = bool(self.trainable.any())
+
+
+def begin(
     scene: Scene,
     photos: Photos,
-    label_ids: np.ndarray,
+    label_ids: np.ndarray,  # int16 [P]
     config: TrainConfig,
-    masks: Masks | None,
-    seed: int,
-    backend: Backend,
-    folder: Path | None,
-    settings: str,
-    group: Group,
-) -> Iterator[tuple[Event, TrainState]]:
-    """The events of `train`, each with the state that it comes from."""
-    plan = densify.schedule(config)
-    some = scene.train_ids[:: max(1, len(scene.train_ids) // 8)]
-    schedule_of_run = lr_schedule(
-        config, scene.extent, [photos[i] for i in some] if config.lr_schedule == "fast" else []
+    *,
+    masks: Masks | None = None,
+    seed: int = 0,
+    backend: Backend = "auto",
+    folder: Path | None = None,
+    settings: str = "",
+    group: Group = ALONE,
+) -> Training:
+    """A training at its start, or at the checkpoint in `folder`; the arguments are those of `train`."""
+    rows = scene.train_ids[:: max(1, len(scene.train_ids) // 8)]
+    rates = lr_schedule(
+        config, scene.extent, [photos[i] for i in rows] if config.lr_schedule == "fast" else []
     )
     device = device_of(backend, group.rank)
-    begin = (MCMC_OPACITY, MCMC_SCALE) if config.strategy == "mcmc" else ()
-    state = initial_state(from_points(scene.points, label_ids, config.sh_degree, *begin), seed).to(device)
+    strategy = make_strategy(config, scene, rates, group)
+    g = from_points(
+        scene.points, label_ids, config.sh_degree, strategy.initial_opacity, strategy.initial_scale
+    )
+    state, resumed = initial_state(g, seed).to(device), None
     state.sort()
-    checkpoint = folder / CHECKPOINT if folder else None
-    if checkpoint and checkpoint.exists():
-        state, damage = latest_checkpoint(checkpoint, settings)
-        state = state.to(device)
-        if not group.leads:  # the first has what all had seen
-            state.clear_statistics()
+    if folder and (folder / CHECKPOINT).exists():
+        state, damage = latest_checkpoint(folder / CHECKPOINT, settings)
+        state, resumed = state.to(device), Resumed(state.step, damage)
+        if group.leads:
+            _check_levels(folder / CHECKPOINT, state.step)
         else:
-            _check_levels(checkpoint, state.step)
-        yield Resumed(state.step, damage), state
+            state.clear_statistics()  # the first process has those of all
+    share = config.gradient_freeze_share
+    freezing = GradientFreezing(share) if share else None
+    tiles = ActiveTiles(scene, masks, frozenset(state.frozen), device)
+    stepper = Stepper(PhotoLoader(scene, photos, device), config, tiles, backend, group, strategy, freezing)
+    measured = measured_views(scene, masks) if config.freeze_at is not None and masks is not None else {}
     folder = folder if group.leads else None
-    active_tiles = ActiveTiles(scene, masks, frozenset(state.frozen), device)
-    gradient_freezing = (
-        GradientFreezing(config.gradient_freeze_share) if config.gradient_freeze_share else None
-    )
-    stepper = Stepper(
-        PhotoLoader(scene, photos, device), config, active_tiles, backend, group, gradient_freezing
-    )
-    trainable = trainable_rows(state.gaussians, state.frozen)
-    looked_at = measured_views(scene, masks) if config.freeze_at is not None and masks is not None else {}
-    awake, learning, value = trainable, bool(trainable.any()), 0.0
-    while state.step < config.max_steps and learning:
-        step = state.step + 1
-        last = step == config.max_steps
-        records = step % plan.level_every == 0 or last
-        refining = plan.refine_start < step < plan.refine_stop
-        degree, factor = _sh_degree(step - 1, config, plan), schedule_of_run.factor(step)
-        observing = config.strategy == "default" and step < plan.refine_stop
-        sgld_noise = schedule_of_run.sgld_noise(step) if config.strategy == "mcmc" else 0.0
-        loss = stepper(
-            state, degree, schedule_of_run.learning_rates(step), awake, factor, observing, sgld_noise
-        )
-        if device.type == "cpu" or records or step % LOOK_EVERY == 0:  # looking waits for a GPU
-            value = finite(loss, step)
-        yield Step(step, value, len(state.gaussians), stepper.drawn), state
-        resets = refining and config.strategy == "default" and step % plan.reset_every == 0
-        late = resets and config.levels_after_reset
-        if records and not late:
-            yield _save_level(state, config, plan, folder), state
-        if records and config.freeze_at is not None and masks is not None:
-            degree = _sh_degree(step, config, plan)
-            quality = label_quality(
-                state.gaussians, stepper.active_tiles, stepper.photo_loader, looked_at, config, degree,
-                backend=backend, workspace=stepper.workspace, group=group,
-            )  # fmt: skip
-            for event in _freeze(state, quality, config.freeze_at):
-                yield event, state
-            if len(state.frozen) > len(stepper.active_tiles.frozen):
-                stepper.active_tiles = ActiveTiles(scene, masks, frozenset(state.frozen), device)
-            awake = trainable = trainable_rows(state.gaussians, state.frozen)
-            learning = bool(trainable.any())
-        if refining and step % config.refine_every == 0:
-            _refine(state, config, plan, scene, trainable, group, schedule_of_run.factor(step))
-            awake = trainable = trainable_rows(state.gaussians, state.frozen)
-        if gradient_freezing and step % config.refine_every == 0:
-            awake = gradient_freezing.turn(trainable)
-        if resets:
-            densify.reset_opacities(state, config, trainable)
-        if records and late:
-            yield _save_level(state, config, plan, folder), state
-        if records:
-            group.collect(state.grad_sum, state.grad_count)
-        if folder and records:
-            write_checkpoint(folder / CHECKPOINT, state, settings)
-    if folder:
-        previous(folder / CHECKPOINT).unlink(missing_ok=True)  # nobody goes on from here
-    yield Trained(state.gaussians.to("cpu"), state.step, state.frozen), state
+    return Training(config, state, stepper, strategy, rates, measured, freezing, folder, settings, resumed)
 
 
 def _check_levels(checkpoint: Path, step: int) -> None:
-    """RunError where a level up to a step is damaged: training goes on after it and records it no more."""
+    """RunError where a level up to a step is damaged: a resumed training does not record it again."""
     for path in sorted((checkpoint.parent / "levels").glob("[0-9]*.npz")):
         if int(path.stem) > step:
             continue
@@ -272,32 +277,8 @@ def _check_levels(checkpoint: Path, step: int) -> None:
         except DataError as error:
             reason = str(error).partition("; ")[0]
             raise RunError(
-                f"{reason}; delete it to go on without that level, or {checkpoint} to train from the start"
+                f"{reason}; delete it to resume without that level, or {checkpoint} to train from the start"
             ) from None
-
-
-def _refine(
-    state: TrainState,
-    config: TrainConfig,
-    plan: densify.Schedule,
-    scene: Scene,
-    trainable: Tensor,
-    group: Group,
-    factor: int,
-) -> None:
-    """Let Gaussians come and go, as the strategy has it; photos of the moment are `factor` times smaller."""
-    camera, num_points = scene.views[0].camera, len(scene.points.xyz)
-    num_pixels = camera.width * camera.height
-    if config.strategy == "mcmc":
-        most = densify.cap(config, num_pixels, num_points)
-        refinements = (plan.refine_stop - plan.refine_start) // config.refine_every
-        mcmc.relocate(state, config, trainable)
-        mcmc.add(state, config, most, trainable, mcmc.growth(most, num_points, refinements))
-    else:
-        most = densify.budget(config, plan, state.step, num_pixels, num_pixels // factor**2, num_points)
-        group.add(state.grad_sum, state.grad_count)
-        densify.refine(state, config, scene.extent, densify.room(state, most, trainable), trainable)
-    state.sort()
 
 
 def _check(config: TrainConfig, masks: Masks | None) -> None:
@@ -313,34 +294,8 @@ def _check(config: TrainConfig, masks: Masks | None) -> None:
         raise RunError(f"--train.freeze-at {target} is no SSIM to reach; choose a number such as 0.8")
     if not 0 <= config.gradient_freeze_share < 1:
         raise RunError(
-            f"--train.rest-share {config.gradient_freeze_share} is no share; choose a number such as 0.5"
+            f"--train.gradient-freeze-share {config.gradient_freeze_share} is impossible; "
+            "choose a share below 1, such as 0.5"
         )
     if target is not None and masks is None:
         raise RunError("--train.freeze-at needs label images to measure categories on; bring masks")
-
-
-def _freeze(state: TrainState, quality: dict[int, float], target: float) -> Iterator[LabelFrozen]:
-    """Stop the categories that have reached the target."""
-    counts = state.gaussians.counts()
-    for label, ssim in quality.items():
-        if label not in state.frozen and ssim >= target:
-            state.frozen[label] = state.step
-            yield LabelFrozen(state.step, label, ssim, counts.get(label, 0))
-
-
-def _save_level(
-    state: TrainState, config: TrainConfig, plan: densify.Schedule, folder: Path | None
-) -> LevelSaved:
-    recovering = state.last_reset >= 0 and state.step - state.last_reset <= plan.recovery
-    path = None
-    if folder:
-        degree = _sh_degree(state.step, config, plan)
-        path = write_level(
-            folder / "levels", state.step, state.gaussians.to("cpu"), recovering=recovering, sh_degree=degree
-        )
-    return LevelSaved(state.step, path, state.gaussians.counts(), recovering, state.gaussians)
-
-
-def _sh_degree(step: int, config: TrainConfig, plan: densify.Schedule) -> int:
-    """The degree of the harmonics in use after a step."""
-    return min(config.sh_degree, step // plan.raise_sh_every)

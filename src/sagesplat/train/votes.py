@@ -1,4 +1,4 @@
-"""Labels of trained Gaussians, by what each of them paints."""
+"""Labels of trained Gaussians, by the pixels that each contributes to."""
 
 from collections.abc import Collection
 

@@ -1,1 +1,4 @@
-"""The built web viewer, in `static/`: made from web/ by `npm run build`, copied into every bundle."""
+"""Bundles for the web viewer, and the server that shows them.
+
+`static/` is the built viewer: made from web/ by `npm run build`, and copied into every bundle.
+"""

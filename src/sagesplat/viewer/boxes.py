@@ -1,14 +1,14 @@
-"""Where a category is, in a few boxes, and how far from a camera: what a viewer knows instead of points.
+"""Bounding boxes of a category, and its distance from a camera by them: the viewer has no points.
 
-Split: points whose 8th nearest neighbour is more than FAR times as far away as is usual are left out; the
-rest is halved at the median of its longest axis, again and again, into up to MOST parts of equal counts. A
-part's box reaches from the 5th to the 95th percentile of its points on each axis.
+Splitting: outliers are removed, that is, points whose 8th nearest neighbour is more than FAR times the median
+of that distance away. The rest is halved at the median of its longest axis, recursively, into at most MOST
+parts of equal counts. A part's box extends from the 5th to the 95th percentile of its points on each axis.
 
-Distance, from a camera's position and the half spaces of what it sees: each box stands for 27 points, at
-1/6, 1/2 and 5/6 of each of its axes. Of those that lie in all half spaces, over all boxes, the 5th percentile
-of their distances (numpy's: linear between neighbours). If there are none, but boxes that touch the frustum,
-the distance of the nearest centre of those. Else NaN: out of sight. A box touches if for each half space the
-corner that lies deepest in it is inside.
+Distance, from a camera's position and the half spaces of its frustum: each box is sampled at 27 points, at
+1/6, 1/2 and 5/6 of each axis. The distance is the 5th percentile (numpy's, linear) over the samples of all
+boxes that lie in all half spaces. If there are none, but boxes touch the frustum, it is the distance of the
+nearest centre of those boxes. Else it is NaN: out of sight. A box touches the frustum if in each half space
+its deepest corner is inside.
 """
 
 import math
@@ -20,16 +20,16 @@ from scipy.spatial import KDTree
 
 MOST = 32  # boxes of a category, a power of two
 PERCENTILE = 5.0  # of distances, as in adapt.observe
-TRIM = (5.0, 95.0)  # percentiles that a box reaches to
-FAR = 5.0  # times the median distance of the NEIGHBOURS-th neighbour
+TRIM = (5.0, 95.0)  # percentiles of the points at a box's faces
+FAR = 5.0  # times the median distance of the NEIGHBOURS-th neighbour: outliers are beyond
 NEIGHBOURS = 8
-FEW = 20  # points of which none is left out
+FEW = 20  # points; outliers of fewer are kept
 _AT = np.array([1 / 6, 1 / 2, 5 / 6])
 _GRID = np.stack(np.meshgrid(_AT, _AT, _AT, indexing="ij"), -1).reshape(-1, 3)
 
 
 def split_boxes(points: Float[np.ndarray, "N 3"], most: int = MOST) -> Float[np.ndarray, "B 6"]:
-    """At most `most` boxes (smallest x y z, largest x y z) around N points, each around about as many."""
+    """At most `most` boxes (smallest x y z, largest x y z) around N points, with about equal counts."""
     if not len(points):
         return np.zeros((0, 6))
     parts = _halved(_without_outliers(np.asarray(points, np.float64)), most)
@@ -39,10 +39,10 @@ def split_boxes(points: Float[np.ndarray, "N 3"], most: int = MOST) -> Float[np.
 def frustum(
     position: ArrayLike, quaternion: ArrayLike, fov_y: float, aspect: float
 ) -> Float[np.ndarray, "5 4"]:
-    """Half spaces (nx, ny, nz, d), n x + d >= 0 inside, of what is seen: left, right, bottom, top, front.
+    """Half spaces (nx, ny, nz, d) of a view frustum, n x + d >= 0 inside: left, right, bottom, top, front.
 
-    `quaternion`: x y z w from a camera that looks along -z, y up, to the world; `fov_y`: radians; `aspect`:
-    width over height. It begins at the camera and has no end.
+    `quaternion`: x y z w, camera to world, for a camera that looks along -z with y up. `fov_y`: radians.
+    `aspect`: width over height. The near plane is at the camera; there is no far plane.
     """
     high = math.tan(fov_y / 2)
     wide = high * aspect
@@ -53,14 +53,14 @@ def frustum(
 
 
 def touching(boxes: Float[np.ndarray, "B 6"], planes: Float[np.ndarray, "P 4"]) -> Bool[np.ndarray, " B"]:
-    """Which boxes may reach into all half spaces; without any, all do."""
+    """Which boxes touch the frustum of the half spaces; all do if there are no half spaces."""
     normals, offsets = planes[:, None, :3], planes[:, None, 3]
     deepest = np.where(normals >= 0, boxes[None, :, 3:], boxes[None, :, :3])
     return ((deepest * normals).sum(-1) + offsets >= 0).all(0)
 
 
 def distance(boxes: Float[np.ndarray, "B 6"], position: ArrayLike, planes: Float[np.ndarray, "P 4"]) -> float:
-    """How far the closest of what is in sight is (see the module's text); NaN: nothing is."""
+    """Distance of the visible boxes (see the module's docstring), world units; NaN: out of sight."""
     near, position = boxes[touching(boxes, planes)], np.asarray(position, np.float64)
     if not len(near):
         return math.nan
@@ -89,7 +89,7 @@ def _halved(points: np.ndarray, most: int) -> list[np.ndarray]:
 
 
 def _rotation(quaternion: ArrayLike) -> np.ndarray:
-    """Of x y z w, of any length."""
+    """Rotation matrix [3, 3] of a quaternion x y z w of any length."""
     x, y, z, w = np.asarray(quaternion, np.float64) / np.linalg.norm(np.asarray(quaternion))
     return np.array(
         [

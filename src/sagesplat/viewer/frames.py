@@ -1,4 +1,4 @@
-"""Where cameras stand and which way is up, in a bundle's axes: right, up, back (y and z turned round)."""
+"""Cameras, up direction, floor and scale in a bundle's axes: right, up, back (y and z negated)."""
 
 import math
 from collections.abc import Sequence
@@ -12,18 +12,18 @@ from sagesplat.core import geometry
 from sagesplat.scene.scene import Camera
 
 FLIP = np.array([1.0, -1.0, -1.0])  # between COLMAP's axes and the bundle's
-EYES = 1.5  # metres above the floor that photos are taken from, where nobody says better
-SCALES = (1e-3, 1e3)  # metres a unit that are believed
-_LEVEL = 10.0  # times further that cameras must lean sideways than up, for their horizons to tell
+EYES = 1.5  # assumed height of cameras above the floor, metres
+SCALES = (1e-3, 1e3)  # limits of the guessed scale, metres per unit
+_LEVEL = 10.0  # least ratio of eigenvalues at which the horizons determine the up direction
 
 
 def position(camera: Camera) -> Float[np.ndarray, "3"]:
-    """Where a camera stands."""
+    """A camera's position."""
     return camera.position.astype(np.float64) * FLIP
 
 
 def rotation(camera: Camera) -> Float[np.ndarray, "3 3"]:
-    """Camera to world; the camera looks along its -z, y is up."""
+    """Camera-to-world rotation; the camera looks along -z, y is up."""
     return FLIP[:, None] * camera.w2c[:3, :3].T.astype(np.float64) * FLIP
 
 
@@ -38,10 +38,10 @@ def fov_y(camera: Camera) -> float:
 
 
 def upward(cameras: Sequence[Camera]) -> Float[np.ndarray, "3"]:
-    """Unit vector up: square to the horizons of all photos; the cameras' mean up if those are parallel.
+    """Unit up vector: perpendicular to the photos' horizons, or the cameras' mean up if those are parallel.
 
-    Photos are held level more often than straight ahead: on `garden` and `dinosaur` this is within 0.2 and
-    0.9 degrees of the ground's plane, the mean within 0.7 and 4.
+    Photos are rolled less often than tilted. On `garden` and `dinosaur` the result is within 0.2 and 0.9
+    degrees of the ground's normal; the mean up is within 0.7 and 4 degrees.
     """
     turned = np.stack([rotation(camera) for camera in cameras])
     mean = turned[:, :, 1].mean(0)
@@ -60,9 +60,9 @@ def floor(
     up: Float[np.ndarray, "3"],
     extent: float,
 ) -> float:
-    """Height of the ground along `up`: the median of the ground's points around the cameras.
+    """Height of the ground along `up`: the median over the ground's points around the cameras.
 
-    Of all points, the 5th percentile; without any, `extent` below the cameras.
+    With too few of these, the 5th percentile over all points; without points, `extent` below the cameras.
     """
     where = np.stack([position(camera) for camera in cameras])
     around = np.linalg.norm(points - np.median(where, axis=0), axis=1) < 1.5 * extent
@@ -74,7 +74,7 @@ def floor(
 
 
 def guessed_scale(cameras: Sequence[Camera], up: Float[np.ndarray, "3"], height: float) -> float:
-    """Metres a unit if the cameras stand at eye level above the floor; 1 if they do not stand above it."""
+    """Metres per unit if the cameras are EYES metres above the floor; 1 if they are below it."""
     above = float(np.median([position(camera) @ up for camera in cameras])) - height
     return float(np.clip(EYES / above, *SCALES)) if above > 0 else 1.0
 
@@ -82,9 +82,9 @@ def guessed_scale(cameras: Sequence[Camera], up: Float[np.ndarray, "3"], height:
 def start(
     cameras: Sequence[Camera], points: Float[np.ndarray, "P 3"], extent: float, up: Float[np.ndarray, "3"]
 ) -> dict[str, Any]:
-    """Where the photo that shows most points was taken, held level, and the point that it looks at.
+    """The start view: position, quaternion (without roll) and target of the photo with most points.
 
-    `points`: in COLMAP's axes; `up` in the bundle's.
+    `points` in COLMAP's axes, `up` in the bundle's.
     """
     seen = [_depths(camera, points) for camera in cameras]
     best = max(range(len(cameras)), key=lambda i: len(seen[i][0]))
@@ -103,7 +103,7 @@ def start(
 def camera_at(
     where: Float[np.ndarray, "3"], q: Float[np.ndarray, "4"], fov_y: float, width: int, height: int
 ) -> Camera:
-    """The camera of a pose in the bundle's axes (`position`, `quaternion`), centred, in COLMAP's."""
+    """A camera in COLMAP's axes, with a centred principal point, of a pose in the bundle's axes."""
     w2c = np.eye(4, dtype=np.float32)
     w2c[:3, :3] = (FLIP[:, None] * Rotation.from_quat(q).as_matrix() * FLIP).T
     w2c[:3, 3] = -w2c[:3, :3] @ (where * FLIP)
@@ -113,7 +113,7 @@ def camera_at(
 
 
 def _depths(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of the points in the picture, and of those in its middle."""
+    """Depths of the points in the image, and of those in its central part."""
     pixels, depth = geometry.project(points, camera.w2c, camera.K)
     away = np.abs(pixels / [camera.width, camera.height] - 0.5).max(1)
     return depth[away <= 0.5], depth[away <= 0.2]

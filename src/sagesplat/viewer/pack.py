@@ -1,9 +1,9 @@
-"""All chunks of a bundle in one file, for the first load: one stream instead of a round trip a chunk.
+"""The pack: all increments of a bundle in one file, for the first load without a round trip per increment.
 
-The chunks' bytes one after the other, in the order in which they gain most for the first view: level 1 of
-every label in sight and of those nearby, then what gains most expected SSIM x share of the pixels a byte. As
-levels come in order, one is worth as much as the best way that begins with it: the concave hull of SSIM over
-bytes. The rules are the viewer's (web/src/core/order.ts).
+It is a concatenation of the files, in the order of their benefit for the first view: level 1 of all
+visible and nearby labels, then increments by their gain of expected SSIM x pixel share per byte.
+Levels of a label must come in order. So an increment counts with the slope of the concave hull of SSIM over
+bytes. The viewer has the same rules (web/src/core/order.ts).
 """
 
 import hashlib
@@ -21,22 +21,22 @@ from sagesplat.scene.scene import Camera
 from sagesplat.viewer import boxes
 from sagesplat.viewer.frames import camera_at
 
-FOV_Y, ASPECT = math.radians(60), 16 / 9  # of the first view: the viewer's own on a usual screen
-_LEAST_SHARE = 1e-4  # so that nothing in sight is worth nothing
-_LEAST = 1e-6  # what is out of sight, or gains nothing, against the rest
-NEARBY = 2**18  # bytes of lowest levels out of sight that come before anything finer
-_TURN = 0.25  # how likely it is that one turns to what is out of sight soon
+FOV_Y, ASPECT = math.radians(60), 16 / 9  # of the first view, as in the viewer on a usual screen
+_LEAST_SHARE = 1e-4  # least pixel share, so that every visible label counts
+_LEAST = 1e-6  # weight of labels out of sight, and least gain
+NEARBY = 2**18  # bytes of first levels out of sight that precede all finer levels
+_TURN = 0.25  # assumed probability that the viewer soon turns to a label out of sight
 
 
 @dataclass(frozen=True, eq=False)
 class Ladder:
-    """What tells where a label's files belong."""
+    """The data of a label that decides where its files are placed."""
 
     sizes: Sequence[int]  # bytes of its files, by level
     weight: float
     boxes: Float[np.ndarray, "B 6"]  # in the bundle's axes
-    model: ViewModel | None  # with the files' levels; None: nothing is promised
-    shares: Float[np.ndarray, " V"] | None  # of the pixels of each camera
+    model: ViewModel | None  # with the files' levels; None: no quality model
+    shares: Float[np.ndarray, " V"] | None  # share of each camera's pixels
 
 
 def order_of(
@@ -45,18 +45,18 @@ def order_of(
     position: Float[np.ndarray, "3"],
     quaternion: Float[np.ndarray, "4"],
 ) -> list[tuple[int, int]]:
-    """(index of a ladder, level) of all files for the view from a pose in the bundle's axes."""
+    """(index of the ladder, level) of all files, ordered for the view from a pose in the bundle's axes."""
     planes = boxes.frustum(position, quaternion, FOV_Y, ASPECT)
     camera = camera_at(position, quaternion, FOV_Y, 16, 9)
     ranked, behind = [], []
     for index, ladder in enumerate(ladders):
-        sees = not len(ladder.boxes) or boxes.touching(ladder.boxes, planes).any()
+        visible = not len(ladder.boxes) or boxes.touching(ladder.boxes, planes).any()
         weight = ladder.weight * max(_share(ladder, cameras, camera, position, planes), _LEAST_SHARE)
-        weight = max(weight * (1 if sees else _LEAST), _LEAST**2)
+        weight = max(weight * (1 if visible else _LEAST), _LEAST**2)
         total = np.cumsum(ladder.sizes, dtype=np.float64)
         distance = boxes.distance(ladder.boxes, position, planes)
         ssim, limit = _expected(ladder, camera, distance, total), math.inf
-        if sees:
+        if visible:
             ranked.append((0, -weight / total[0], index, 1))
         else:
             around = ladder.weight * max(_apparent_size(ladder.boxes, position, planes[:0]), _LEAST_SHARE)
@@ -73,9 +73,9 @@ def order_of(
 
 
 def gains_of(ssim: Float[np.ndarray, " K"], total: Float[np.ndarray, " K"]) -> Float[np.ndarray, " K-1"]:
-    """SSIM gained a byte by each level from the second on, never rising; `ssim` NaN: unknown.
+    """SSIM gain per byte of each level from the second on: slopes of the concave hull, never rising.
 
-    `total`: bytes of a level with all below it.
+    `ssim` may be NaN: unknown. `total`: bytes of a level including all levels below.
     """
     gains, have, last = np.zeros(len(ssim) - 1), 0, math.inf
     while have < len(gains):
@@ -92,7 +92,7 @@ def gains_of(ssim: Float[np.ndarray, " K"], total: Float[np.ndarray, " K"]) -> F
 def write_pack(
     folder: Path, labels: Sequence[dict[str, Any]], order: Sequence[tuple[int, int]]
 ) -> dict[str, Any]:
-    """Write the chunks of a manifest's labels, which lie in `folder`, as one file; the manifest's entry."""
+    """Write the files of a manifest's labels, which are in `folder`, as one pack; its manifest entry."""
     unnamed, digest, size = folder / "scene.pack", hashlib.sha256(), 0
     with unnamed.open("wb") as file:
         for index, level in order:
@@ -105,7 +105,7 @@ def write_pack(
 
 
 def _expected(ladder: Ladder, camera: Camera, distance: float, total: np.ndarray) -> np.ndarray:
-    """SSIM by level; without promises it grows with the root of the bytes, as the planner has it."""
+    """Expected SSIM by level; without a model the square root of the share of bytes, as in the planner."""
     if ladder.model is None:
         return np.sqrt(total / total[-1])
     at = np.array([distance]), camera.position[None].astype(np.float64), camera.direction[None].astype(float)
@@ -117,7 +117,7 @@ def _expected(ladder: Ladder, camera: Camera, distance: float, total: np.ndarray
 def _share(
     ladder: Ladder, cameras: Sequence[Camera], camera: Camera, position: np.ndarray, planes: np.ndarray
 ) -> float:
-    """Of the pixels: what views close by have, by the model's kernel; without promises the apparent size."""
+    """Pixel share: kernel-weighted mean over the known views; without a model the apparent size."""
     if ladder.model is None or ladder.shares is None:
         return _apparent_size(ladder.boxes, position, planes)
     extent = ladder.model.extent
@@ -129,11 +129,11 @@ def _share(
     return float(near @ ladder.shares / near.sum()) if near.sum() > 1e-12 else float(ladder.shares.mean())
 
 
-def _apparent_size(found: np.ndarray, position: np.ndarray, planes: np.ndarray) -> float:
-    """How large boxes look: the mean square of half their diagonal over their distance, 0 out of sight."""
-    near = found[boxes.touching(found, planes)]
+def _apparent_size(category: np.ndarray, position: np.ndarray, planes: np.ndarray) -> float:
+    """Apparent size of boxes: mean of (half diagonal / distance)^2, each at most 1; 0 out of sight."""
+    near = category[boxes.touching(category, planes)]
     if not len(near):
         return 0.0
     away = np.linalg.norm((near[:, :3] + near[:, 3:]) / 2 - position, axis=1)
     half = np.linalg.norm(near[:, 3:] - near[:, :3], axis=1) / 2
-    return float((np.minimum(1, half / np.maximum(away, 1e-9)) ** 2).sum() / len(found))
+    return float((np.minimum(1, half / np.maximum(away, 1e-9)) ** 2).sum() / len(category))

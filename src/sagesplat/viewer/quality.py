@@ -1,4 +1,4 @@
-"""What a bundle's documents say of quality: Eq. 3 by level, and the viewpoint models; plain data, rounded."""
+"""Quality entries of a bundle's documents: Eq. 3 by level, and viewpoint models, as rounded plain data."""
 
 import json
 import math
@@ -15,21 +15,21 @@ from sagesplat.adapt.eq3 import Eq3, SsimModel
 from sagesplat.adapt.viewpoint import ViewModel, matern32
 from sagesplat.viewer.frames import FLIP
 
-MOVES = 5e-4  # SSIM that rounding may move a bound by in any of the scene's views
-CURVE_MOVES = 1e-4  # SSIM that rounding may move a curve by
-LIKE = 16  # power of the kernel that known views speak of a distance with: only those close by count
-_ENOUGH = 1e-3  # of such weight; below it the boxes alone tell
-_WIRE = {  # names in promises-*.json, which viewers read, of what `ViewModel` has
+MOVES = 5e-4  # largest change of a bound by rounding, SSIM, in any of the scene's views
+CURVE_MOVES = 1e-4  # largest change of a curve by rounding, SSIM
+LIKE = 16  # exponent of the kernel weights in `corrected`: only close views count
+_ENOUGH = 1e-3  # weight at which a correction counts by half
+_WIRE = {  # keys in promises-*.json -> fields of `ViewModel`
     "usual": "median_log_distance", "unseen": "heldout_variance", "noise": "noise", "factor": "multiplier",
     "confidence": "confidence", "shift": "composition_bias", "mixing": "composition_std",
 }  # fmt: skip
 
 
 def of_files(model: ViewModel, files: Sequence[int], last: int) -> ViewModel:
-    """The model with the levels renumbered 1, 2, ... as a label has files; `files`: their levels.
+    """The model with levels renumbered 1, 2, ... by the label's files; `files`: the levels of the files.
 
-    A level that adds nothing has no file. Of the levels that show the same, the last one's promise holds,
-    which is what a plan takes. `last`: the ladder's last level.
+    A level that adds nothing has no file. Of levels with equal content the bound of the last one is kept, as
+    in plans. `last`: the last of the nested levels.
     """
     known, columns, curves = list(model.levels), [], []
     for number, (first, after) in enumerate(pairwise([*files, last + 1]), 1):
@@ -45,7 +45,7 @@ def of_files(model: ViewModel, files: Sequence[int], last: int) -> ViewModel:
 
 
 def quality_entry(model: ViewModel) -> dict[str, Any]:
-    """What a manifest says of a label's quality."""
+    """The manifest's quality entry of a label."""
     return {
         "status": model.status,
         "confidence": model.confidence,
@@ -55,13 +55,13 @@ def quality_entry(model: ViewModel) -> dict[str, Any]:
 
 
 def curve_entry(curve: SsimModel, exact: bool = False) -> dict[str, Any]:
-    """Eq. 3 of a level, with as few digits as change it by at most CURVE_MOVES, or all of them.
+    """Eq. 3 of a level, with the fewest digits that change it by at most CURVE_MOVES; all with `exact`.
 
-    Where both regimes are the same, only the far one is told, from distance 0 on.
+    If both regimes are equal, only the far one is written, from distance 0 on.
     """
     near, far, beta = curve.params[:4], curve.params[4:8], curve.params.beta
     if far[1] == 0:
-        far = (far[0], 0.0, 0.0, 1.0)  # a constant, whatever the rest says
+        far = (far[0], 0.0, 0.0, 1.0)  # a constant; the other parameters have no effect
     if curve.params[:4] == curve.params[4:8]:
         near, beta = (0.0, 0.0, 0.0, 1.0), 0.0
     entry = {
@@ -73,9 +73,9 @@ def curve_entry(curve: SsimModel, exact: bool = False) -> dict[str, Any]:
     }
     if exact:
         return entry
-    below = 10.0 ** decimals_of(beta, 6)  # views stand exactly at beta, where the far regime begins
+    below = 10.0 ** decimals_of(beta, 6)  # rounds down: some views are exactly at beta, where far begins
     short: dict[str, Any] = {**entry, "median": round(curve.median, 4), "rmse": round(curve.rmse, 4)}
-    away = np.array([*np.linspace(*curve.d_range, 200), curve.params.mu1, curve.params.mu2])  # with its cusps
+    away = np.array([*np.linspace(*curve.d_range, 200), curve.params.mu1, curve.params.mu2])  # with the cusps
     for digits in range(3, 16):
         params = [*significant(entry["params"][:8], digits), math.floor(beta * below) / below]
         short |= {"params": params, "range": significant(entry["range"], max(digits, 6))}
@@ -85,7 +85,7 @@ def curve_entry(curve: SsimModel, exact: bool = False) -> dict[str, Any]:
 
 
 def curve_of(entry: dict[str, Any], label_id: int = -1) -> SsimModel:
-    """What `curve_entry` wrote."""
+    """The model that `curve_entry` wrote."""
     low, high = entry["range"]
     return SsimModel(
         label_id, entry["level"], Eq3(*entry["params"]), (low, high), entry["median"], entry["rmse"], 0, ""
@@ -93,15 +93,15 @@ def curve_of(entry: dict[str, Any], label_id: int = -1) -> SsimModel:
 
 
 def margins(model: ViewModel) -> Float[np.ndarray, " K"]:
-    """By level, from what the curve says to what can be promised without a model of the viewpoint.
+    """By level, the offset from the curve to a lower bound that needs no viewpoint model.
 
-    Chosen so that the curve stays below the model's bound in as many of its views as its confidence asks. On
-    unseen views of `garden` and `dinosaur` 96 % of the measurements are above it (0.95 asked).
+    With it the curve is below the model's bound in a share of the model's views equal to its confidence. On
+    held-out views of `garden` and `dinosaur` 96 % of the measurements are above it (for 0.95).
     """
     away = np.exp(model.inputs[:, 6])
-    told = model.predict(away, model.inputs[:, :3] * model.extent, model.inputs[:, 3:6])
-    room = told.bound - np.stack([curve(away) for curve in model.curves], 1)
-    return np.quantile(room, 1 - model.confidence, axis=0, method="lower")
+    predicted = model.predict(away, model.inputs[:, :3] * model.extent, model.inputs[:, 3:6])
+    difference = predicted.bound - np.stack([curve(away) for curve in model.curves], 1)
+    return np.quantile(difference, 1 - model.confidence, axis=0, method="lower")
 
 
 def promise_entry(
@@ -111,9 +111,10 @@ def promise_entry(
     corrections: Float[np.ndarray, " V"],
     decimals: int | None = None,
 ) -> dict[str, Any]:
-    """A model as in promises-*.json; `rows` of the shared views are its own; `decimals` of its weights.
+    """The entry of a model in promises-*.json, rounded to `decimals` (None: exact).
 
-    `corrections`: of each view, log of its distance over what the boxes tell; NaN: unknown.
+    `rows`: of the shared views, those that the model was fitted on. `shares`: pixel share in each view.
+    `corrections`: in each view, the log of the true distance over the distance by boxes; NaN: unknown.
     """
 
     def short(values: Any, digits: int = 6) -> Any:
@@ -145,7 +146,7 @@ def promise_entry(
 def model_of(
     entry: dict[str, Any], curves: Sequence[SsimModel], views: Float[np.ndarray, "V 6"], extent: float
 ) -> ViewModel:
-    """What `promise_entry` wrote, with the label's curves; views in the bundle's axes."""
+    """The model that `promise_entry` wrote, with the label's curves; `views` in the bundle's axes."""
     mine = views[entry["views"]] * np.tile(FLIP, 2)
     x, y, z = entry["lengths"]
     return ViewModel(
@@ -170,10 +171,10 @@ def corrected(
     position: Float[np.ndarray, "V 3"],
     direction: Float[np.ndarray, "V 3"],
 ) -> Float[np.ndarray, " V"]:
-    """Distances by boxes, corrected by what they miss at the model's own views close by.
+    """Distances by boxes, corrected by their errors in the model's views nearby.
 
-    d exp(sum_i a_i^16 c_i / (sum_i a_i^16 + 0.001)), a_i the model's kernel without the distance. Without
-    the view itself this halves the error of the bounds on `garden` and `dinosaur`.
+    d exp(sum_i a_i^16 c_i / (sum_i a_i^16 + 0.001)), where a_i is the model's kernel without the distance
+    input. In leave-one-out tests on `garden` and `dinosaur` this halves the error of the bounds.
     """
     here = np.column_stack([position / model.extent, direction, np.zeros(len(position))])
     known = np.column_stack([model.inputs[:, :6], np.zeros(model.num_views)])
@@ -189,7 +190,7 @@ def rounded_entry(
     views: np.ndarray,
     at: tuple[np.ndarray, ...],
 ) -> dict[str, Any]:
-    """The shortest entry of a model that moves no bound by more than MOVES at any of the viewpoints `at`."""
+    """The shortest entry of a model that changes no bound by more than MOVES at the viewpoints `at`."""
     curves = [curve_of(curve_entry(curve)) for curve in model.curves]
     bound = model.predict(*at).bound
     entry = {}
@@ -202,13 +203,13 @@ def rounded_entry(
 
 
 def rows_of(model: ViewModel, position: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Which cameras a model has learnt from."""
-    shots = np.column_stack([position / model.extent, direction])
-    return cdist(model.inputs[:, :6], shots, "sqeuclidean").argmin(1)
+    """Rows of the cameras that a model was fitted on."""
+    cameras = np.column_stack([position / model.extent, direction])
+    return cdist(model.inputs[:, :6], cameras, "sqeuclidean").argmin(1)
 
 
 def significant(values: Any, digits: int = 6) -> Any:
-    """Numbers, or lists of them, with at most so many significant digits."""
+    """A number, or nested lists of numbers, rounded to `digits` significant digits."""
     if isinstance(values, (int, np.integer)):
         return int(values)
     if isinstance(values, (list, tuple, np.ndarray)):
@@ -217,18 +218,18 @@ def significant(values: Any, digits: int = 6) -> Any:
 
 
 def decimals_of(extent: float, digits: int) -> int:
-    """Decimals of a length that are worth their bytes in a scene of this size."""
+    """Decimals that give a length `digits` significant digits relative to the scene's extent."""
     return digits - math.floor(math.log10(extent)) if extent > 0 else digits
 
 
 def dumped(document: Any) -> bytes:
-    """JSON without spaces; whole numbers without a point, to be shorter."""
-    return json.dumps(_whole(document), separators=(",", ":"), allow_nan=False).encode() + b"\n"
+    """Compact JSON: no spaces, and integral floats without a decimal point."""
+    return json.dumps(_integral(document), separators=(",", ":"), allow_nan=False).encode() + b"\n"
 
 
-def _whole(value: Any) -> Any:
+def _integral(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _whole(item) for key, item in value.items()}
+        return {key: _integral(item) for key, item in value.items()}
     if isinstance(value, list):
-        return [_whole(item) for item in value]
+        return [_integral(item) for item in value]
     return int(value) if isinstance(value, float) and value.is_integer() else value

@@ -1,4 +1,4 @@
-"""A server for bundles that holds its port, with or without TLS."""
+"""The server for bundles: port, TLS, and how a headset connects."""
 
 import errno
 import os
@@ -21,22 +21,22 @@ if TYPE_CHECKING:
 
 MANIFEST = "manifest.json"
 PORT = 8000
-_TRIED = 100  # ports from PORT on, where none is asked for
+_TRIED = 100  # ports from PORT on, if none is given
 _NO_SERVER = "showing a bundle needs starlette and uvicorn; pip install 'sagesplat[view]'"
 
 
 @dataclass(frozen=True)
 class View:
-    """A server that holds its port and answers once it runs; a context manager that gives the port back."""
+    """A server with a bound port, which answers after `run`; a context manager that releases the port."""
 
     urls: tuple[str, ...]
-    hint: str  # what a headset needs
+    hint: str  # one line: how a headset connects
     _server: "uvicorn.Server"
     _listener: socket.socket
-    _keep: Callable[[threading.Event], None] | None  # the site up to date
+    _keep: Callable[[threading.Event], None] | None  # keeps the site up to date until the event
 
     def run(self, browser: bool = True) -> None:
-        """Serve until Ctrl-C or `stop`, quietly; opens the browser where there is a display."""
+        """Serve until Ctrl-C or `stop`; opens a browser if there is a display."""
         stop = threading.Event()
         if self._keep:
             threading.Thread(target=self._keep, args=(stop,), daemon=True).start()
@@ -58,7 +58,7 @@ class View:
 
 
 def bind(host: str, port: int | None) -> socket.socket:
-    """A socket on a port (0: any), or on the first free one from 8000 on; RunError where that cannot be."""
+    """A listening socket on `port` (0: any free one; None: the first free one from 8000). Raises RunError."""
     if port is not None and not 0 <= port < 2**16:
         raise RunError(f"--port {port} is impossible; choose 1024 to 65535")
     ports = range(PORT, PORT + _TRIED) if port is None else [port]
@@ -67,7 +67,7 @@ def bind(host: str, port: int | None) -> socket.socket:
         try:
             family, *_, address = socket.getaddrinfo(host, number, type=socket.SOCK_STREAM)[0]
             listener = socket.socket(family, socket.SOCK_STREAM)
-            if os.name == "posix":  # elsewhere it would share a port in use
+            if os.name == "posix":  # on Windows it would share a port in use
                 listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listener.bind(address)
             listener.listen(1024)
@@ -98,7 +98,7 @@ def _check_certificate(certificate: Path | None, key: Path | None) -> None:
         if not path.is_file():
             raise RunError(f"{path}: no such file; give a certificate and its key in PEM")
     try:
-        # a password would be asked for on the terminal otherwise
+        # else OpenSSL would ask for a password on the terminal
         ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key, password=lambda: "")
     except (ssl.SSLError, OSError, ValueError) as error:
         why = getattr(error, "reason", None) or error
@@ -106,7 +106,7 @@ def _check_certificate(certificate: Path | None, key: Path | None) -> None:
 
 
 def _urls(listener: socket.socket, secure: bool) -> tuple[str, ...]:
-    """Where a bound socket is found: the first for this machine."""
+    """URLs of a bound socket; the first is for this machine."""
     host, port = listener.getsockname()[:2]
     hosts = [f"[{host}]" if ":" in host else host]
     if host in ("0.0.0.0", "::"):
@@ -115,7 +115,7 @@ def _urls(listener: socket.socket, secure: bool) -> tuple[str, ...]:
 
 
 def _network_address() -> str | None:
-    """This machine's address in its network. Nothing is sent: a datagram socket only looks up the route."""
+    """This machine's network address. Nothing is sent: connecting a UDP socket only looks up the route."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(("192.0.2.1", 9))
@@ -125,7 +125,7 @@ def _network_address() -> str | None:
 
 
 def _hint(urls: tuple[str, ...], secure: bool, host: str | None) -> str:
-    """One line: how a headset gets there, as browsers offer XR on localhost and https only."""
+    """One line: how a headset connects. Browsers offer WebXR on localhost and https only."""
     if secure and host is not None:
         return f"headset: open {urls[-1]} there and accept the certificate"
     port = urls[0].rstrip("/").rpartition(":")[2]

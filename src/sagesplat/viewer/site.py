@@ -1,4 +1,4 @@
-"""One folder over HTTP: for a browser on this machine, and closed to other people's pages."""
+"""Serves a folder over HTTP to a browser on this machine; other web pages cannot read it."""
 
 import asyncio
 import gzip
@@ -21,8 +21,8 @@ from starlette.staticfiles import NotModifiedResponse
 from starlette.types import Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-MOST_CONNECTIONS = 400  # two files each stay below the usual 1024 of a process
-PATIENCE = 30.0  # seconds for a connection on which nothing moves
+MOST_CONNECTIONS = 400  # two file handles each stay below the usual limit of 1024
+PATIENCE = 30.0  # seconds until an idle connection is closed
 HEADERS = {
     "content-security-policy": (
         "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; style-src 'self'; "
@@ -43,7 +43,7 @@ _FOREVER = "public, max-age=31536000, immutable"
 _HASHED = re.compile(
     r"chunks/.+-[0-9a-f]{12}\.(spz|ply)|scene-[0-9a-f]{12}\.pack|promises-[0-9a-f]{12}\.json|assets/.+-[\w-]{8}\.\w+"
 )
-# said here: what the system's own table has differs between machines; no type is registered for splats
+# set here, as the system's table differs between machines
 _TYPES = {
     ".css": "text/css; charset=utf-8",
     ".html": "text/html; charset=utf-8",
@@ -61,15 +61,15 @@ _TYPES = {
     ".webp": "image/webp",
     ".woff2": "font/woff2",
 }
-_PACKED = (".css", ".html", ".js", ".json", ".svg", ".txt", ".wasm")  # chunks are small already
+_PACKED = (".css", ".html", ".js", ".json", ".svg", ".txt", ".wasm")  # sent with gzip
 _WAITING = "<!doctype html><title>sagesplat</title><p>{}</p><p>This page tries again by itself.</p>"
 
 
 class Site:
-    """The folder that is served now, as an ASGI application.
+    """An ASGI application that serves a folder.
 
-    `folder` may change at any time; without one every path answers 503 with `note`. With `local` only
-    requests to this machine's own names are answered, so that no page can reach in by DNS rebinding.
+    `folder` may change at any time. Without a folder every path answers 503 with `note`. With `local` only
+    requests to local host names are answered, which prevents DNS rebinding.
     """
 
     def __init__(self, folder: Path | None = None, *, local: bool = True, note: str = ""):
@@ -101,13 +101,13 @@ class Site:
         try:
             if path := find(self.folder, name):
                 return _file(path, name, headers, scope["method"] == "HEAD")
-        except OSError:  # replaced just now
+        except OSError:  # replaced meanwhile
             pass
         return PlainTextResponse("no such file", 404)
 
 
 def find(folder: Path, name: str) -> Path | None:
-    """A file inside a folder by its relative name with slashes; None for anything else."""
+    """The readable file inside a folder with this relative name; None if there is none."""
     parts = name.split("/")
     if any(part == "" or part.startswith(".") for part in parts) or re.search(r"[\\:\x00-\x1f]", name):
         return None
@@ -116,7 +116,7 @@ def find(folder: Path, name: str) -> Path | None:
         path = root.joinpath(*parts).resolve()  # also follows links, which may lead outside
         inside = path.is_relative_to(root) and stat.S_ISREG(path.stat().st_mode)
         return path if inside and os.access(path, os.R_OK) else None
-    except (OSError, ValueError, RuntimeError):  # missing, too long a name, not a name, links in a circle
+    except (OSError, ValueError, RuntimeError):  # missing file, name too long or invalid, circular links
         return None
 
 
@@ -130,7 +130,7 @@ def is_local(host: str) -> bool:
 
 
 def _file(path: Path, name: str, request: Headers, head: bool) -> Response:
-    """A file, whole, in part, packed, or the answer that the client has it already."""
+    """The response with a file: full, a range, gzipped, or 304 if the client has it."""
     status = path.stat()
     suffix = path.suffix.lower()
     headers = {
@@ -164,7 +164,7 @@ def _gzipped(path: Path, _changed: int) -> bytes:
 
 
 class _Connection(H11Protocol):
-    """Ends where nothing moves: half a request, a reader that stopped; uvicorn itself waits for ever."""
+    """A connection that is closed when idle, e.g. after half a request; uvicorn itself waits for ever."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
@@ -188,7 +188,7 @@ class _Connection(H11Protocol):
 
 
 def make_server(site: Site, certificate: Path | None = None, key: Path | None = None) -> uvicorn.Server:
-    """A server for `site`, silent and ready to `run` on sockets; https with a certificate."""
+    """A silent server for `site`, to be `run` on sockets; https with a certificate."""
     settings: MutableMapping[str, Any] = {"ssl_certfile": certificate, "ssl_keyfile": key}
     config = uvicorn.Config(
         site, http=_Connection, ws="none", lifespan="off", log_config=None, log_level="critical",

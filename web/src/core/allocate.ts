@@ -1,11 +1,11 @@
 /**
- * Which level each label gets: the cheapest that keeps a target, or the most quality within a budget.
- * The rules are those of src/sagesplat/adapt/allocate.py; tests/data/plans.json holds both to them.
+ * Chooses a level per label: the cheapest that reaches a target, or the highest quality within a budget.
+ * Same rules as src/sagesplat/adapt/allocate.py; tests/data/plans.json checks both.
  */
 
 import { mostWithin, UNITS } from "./knapsack";
 
-/** A row of numbers per label, a number per level. */
+/** A matrix: a row per label, a column per level. */
 export type Table = readonly (readonly number[])[];
 
 /** A level (from 0) per label. */
@@ -14,29 +14,29 @@ export interface Allocation {
   readonly status: "ok" | "infeasible" | "over budget";
   readonly cost: number; // of the composition, in the unit of the costs
   readonly value: number; // sum of weight x quality
-  readonly bound: number; // no composition within the budget has more
+  readonly bound: number; // upper bound on the value of any composition within the budget
   readonly optimal: boolean;
-  readonly missed: boolean[]; // labels with promises of which none reaches the target
+  readonly missed: boolean[]; // labels with known bounds, none of which reaches the target
 }
 
 export interface Options {
   readonly weight?: readonly number[]; // per label
   readonly previous?: readonly number[]; // levels, -1: none
-  readonly slack?: number; // SSIM that a change of level must be worth
-  readonly states?: number; // partial compositions to keep before a plan is left unproven
+  readonly slack?: number; // hysteresis, SSIM: least gain of a change of level
+  readonly states?: number; // limit of partial compositions; beyond it the plan may not be optimal
 }
 
 const SLACK = 0.01;
 const STATES = 4096;
 
-/** Quality without NaN, cost with Infinity for what is passed over, which labels promise anything. */
+/** Quality without NaN, cost with Infinity for excluded levels, and which labels have known bounds. */
 export interface Known {
   readonly q: number[][];
   readonly c: number[][];
   readonly promised: boolean[];
 }
 
-/** What the rules make of unknown qualities (NaN) and of levels that cannot be had (cost Infinity). */
+/** Resolves unknown qualities (NaN) and unavailable levels (cost Infinity). */
 export function known(quality: Table, cost: Table): Known {
   const out: Known = { q: [], c: [], promised: [] };
   cost.forEach((row, label) => {
@@ -53,10 +53,10 @@ export function known(quality: Table, cost: Table): Known {
 }
 
 /**
- * Per label the cheapest level whose promised SSIM reaches `target`, else the best one ("infeasible").
+ * Per label the cheapest level whose SSIM bound reaches `target`, else the best one ("infeasible").
  *
- * @param quality - SSIM by label and level, NaN where nothing is promised
- * @param cost - whole numbers, Infinity for a level that cannot be had; each label has one that can
+ * @param quality - SSIM by label and level, NaN: unknown
+ * @param cost - integers, Infinity for an unavailable level; each label has an available one
  * @param target - SSIM of all labels or of each
  */
 export function cheapest(
@@ -81,8 +81,8 @@ export function cheapest(
 }
 
 /**
- * The levels of most weight x SSIM whose cost is at most `budget`; the smallest composition, "over budget",
- * where nothing fits.
+ * The levels with the largest sum of weight x SSIM whose cost is at most `budget`. If nothing fits, the
+ * smallest composition, "over budget".
  *
  * @param budget - from 0 on, in the unit of the costs
  */
@@ -96,16 +96,16 @@ export function bestWithin(
   const { q, c } = known(quality, cost);
   const previous = options.previous ?? q.map(() => -1);
   const { slack = SLACK, states = STATES } = options;
-  const found = mostWithin(q, c, weight, Math.floor(budget), previous, slack, states);
-  const { cost: total, value } = totals(found.levels, q, c, weight);
+  const best = mostWithin(q, c, weight, Math.floor(budget), previous, slack, states);
+  const { cost: total, value } = totals(best.levels, q, c, weight);
   const all = weight.reduce((sum, w) => sum + w, 0);
   return {
-    levels: found.levels,
-    status: found.fits ? "ok" : "over budget",
+    levels: best.levels,
+    status: best.fits ? "ok" : "over budget",
     cost: total,
     value,
-    bound: Math.max((found.bound / UNITS) * all, value),
-    optimal: found.optimal,
+    bound: Math.max((best.bound / UNITS) * all, value),
+    optimal: best.optimal,
     missed: q.map(() => false),
   };
 }
@@ -113,8 +113,8 @@ export function bestWithin(
 interface Reaching {
   readonly wanted: number; // level without hysteresis
   readonly met: boolean; // whether it reaches the target
-  readonly lower: number; // level to come down to, or -1
-  readonly highest: number; // of those that can be had
+  readonly lower: number; // level to go down to, or -1
+  readonly highest: number; // of the available levels
 }
 
 function reaching(q: readonly number[], c: readonly number[], target: number, slack: number): Reaching {

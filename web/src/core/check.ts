@@ -1,11 +1,11 @@
-/** Checks of foreign JSON: each names everything that is wrong by its path. */
+/** Checks of untrusted JSON: each reports all defects with their paths. */
 
-/** Something about a bundle that a user has to know, in one line. */
+/** A defect of a bundle, as one line for the user. */
 export class BundleError extends Error {
   override name = "BundleError";
 }
 
-/** Adds to `wrong` what is wrong with a value at a path. */
+/** Appends the defects of a value at a path to `wrong`. */
 export type Check = (value: unknown, path: string, wrong: string[]) => void;
 
 type Fields = Readonly<Record<string, unknown>>;
@@ -13,7 +13,7 @@ type Fields = Readonly<Record<string, unknown>>;
 const isObject = (value: unknown): value is Fields =>
   typeof value === "object" && value !== null && !Array.isArray(value);
 
-/** What a value must be, for messages: "labels[2].weight must be a number from 0 on". */
+/** A check with a description for messages: "labels[2].weight must be a number from 0 on". */
 function must(be: string, holds: (value: unknown) => boolean): Check {
   return (value, path, wrong) => {
     if (value === undefined) wrong.push(`${path} is missing`);
@@ -36,18 +36,18 @@ export const level = must("a whole number from 1 on", (v) => Number.isSafeIntege
 export const hash = must("a sha-256 in hexadecimal", (v) => /^[0-9a-f]{64}$/.test(String(v)));
 export const color = must("a colour as #rrggbb", (v) => /^#[0-9a-f]{6}$/i.test(String(v)));
 
-const PLAIN = /^\w[\w.-]*(\/\w[\w.-]*)*$/; // no scheme, no `..` in any spelling, nothing absolute
-/** A path that cannot leave the bundle's folder. */
+const PLAIN = /^\w[\w.-]*(\/\w[\w.-]*)*$/; // relative, without scheme and without `..`
+/** A path inside the bundle's folder. */
 export const relative = must(
   "a path below the bundle's folder",
   (v) => typeof v === "string" && PLAIN.test(v),
 );
 
-/** One of some texts or numbers. */
+/** One of the given strings or numbers. */
 export const oneOf = (...allowed: readonly unknown[]): Check =>
   must(allowed.map((a) => JSON.stringify(a)).join(" or "), (v) => allowed.includes(v));
 
-/** A list of what `item` accepts, of a length if one is given. */
+/** A list whose items pass `item`, optionally of a given length. */
 export function list(item: Check, length?: number): Check {
   const shape = must(length === undefined ? "a list" : `a list of ${length}`, (v) => {
     return Array.isArray(v) && (length === undefined || v.length === length);
@@ -62,7 +62,7 @@ export function list(item: Check, length?: number): Check {
   };
 }
 
-/** An object that has these fields; others are left alone, as a later version may add some. */
+/** An object with these fields; further fields are ignored, since later versions may add some. */
 export function object(fields: Readonly<Record<string, Check>>): Check {
   const shape = must("an object", isObject);
   return (value, path, wrong) => {
@@ -78,7 +78,7 @@ export const orNull =
     if (value !== null) check(value, path, wrong);
   };
 
-/** The value, if a check finds nothing wrong; else a BundleError that names the first few things. */
+/** The value if it passes the check; else throws a BundleError with the first few defects. */
 export function checked<T>(value: unknown, check: Check, file: string): T {
   const wrong: string[] = [];
   check(value, "", wrong);
@@ -86,7 +86,7 @@ export function checked<T>(value: unknown, check: Check, file: string): T {
   return value as T;
 }
 
-/** BundleError if anything is wrong. */
+/** Throws a BundleError if there are defects. */
 export function refuse(wrong: readonly string[], file: string): void {
   if (!wrong.length) return;
   const named = wrong.slice(0, 8).map((line) => line.replace(/^ /, "the file "));

@@ -1,39 +1,39 @@
-/** The state of a streamer in words and numbers, for people and tests. */
+/** The state of a streamer as numbers and messages, for the UI and tests. */
 
 import type { LabelState, State } from "../types";
 import type { Entry } from "./residency";
 import { type Failure, PATIENCE } from "./supply";
 
-/** What the whole is described from. */
-export interface Whole {
+/** The data that a state is described from. */
+export interface Overview {
   readonly planned: "ok" | "infeasible" | "over budget";
   readonly bytesLoaded: number;
   readonly bandwidth: number;
   readonly pending: number;
-  readonly leavingBytes: number; // GPU bytes of labels that go
+  readonly leavingBytes: number; // GPU bytes of removed labels that are still drawn
   readonly notes: readonly (string | null | undefined)[]; // most important first
   failure(entry: Entry, level: number): Failure | undefined;
 }
 
-export function describe(entries: readonly Entry[], whole: Whole): State {
-  const labels = entries.map((entry) => labelState(entry, whole));
+export function describe(entries: readonly Entry[], overview: Overview): State {
+  const labels = entries.map((entry) => labelState(entry, overview));
   const sum = (of: (label: LabelState) => number) => labels.reduce((total, label) => total + of(label), 0);
   const first = entries.some((e) => e.sight.visible && e.wanted > 0 && !e.shown && !e.former);
   const errors = labels.map((label) => label.error);
   return {
     labels,
-    status: first ? "loading" : whole.planned,
-    bytesLoaded: whole.bytesLoaded,
+    status: first ? "loading" : overview.planned,
+    bytesLoaded: overview.bytesLoaded,
     bytesShown: sum((label) => label.bytes),
-    gpuBytes: entries.reduce((total, e) => total + e.gpuBytes, whole.leavingBytes),
+    gpuBytes: entries.reduce((total, e) => total + e.gpuBytes, overview.leavingBytes),
     count: sum((label) => label.count),
-    bandwidth: whole.bandwidth,
-    pending: whole.pending,
-    message: [...errors, ...whole.notes].find((note) => note) ?? null,
+    bandwidth: overview.bandwidth,
+    pending: overview.pending,
+    message: [...errors, ...overview.notes].find((note) => note) ?? null,
   };
 }
 
-function labelState(entry: Entry, whole: Whole): LabelState {
+function labelState(entry: Entry, overview: Overview): LabelState {
   const { label, wanted, sight, prediction } = entry;
   const { level, ladder } = entry.former ?? { level: entry.shown, ladder: entry.ladder };
   return {
@@ -41,7 +41,7 @@ function labelState(entry: Entry, whole: Whole): LabelState {
     wanted,
     shown: level,
     loading: entry.shown < wanted,
-    error: errorOf(entry, whole),
+    error: errorOf(entry, overview),
     visible: sight.visible,
     distance: sight.distance,
     promised: prediction.bound[level - 1] ?? Number.NaN,
@@ -52,10 +52,10 @@ function labelState(entry: Entry, whole: Whole): LabelState {
   };
 }
 
-function errorOf(entry: Entry, whole: Whole): string | null {
+function errorOf(entry: Entry, overview: Overview): string | null {
   const { title, levels } = entry.label;
   for (let level = 1; level <= levels.length; level++) {
-    const failure = whole.failure(entry, level);
+    const failure = overview.failure(entry, level);
     if (failure?.lasting) {
       const rest = level > 1 ? `stays at level ${level - 1}` : "cannot be shown";
       return `${failure.message}; ${title} ${rest}. Make the bundle again or check the server.`;

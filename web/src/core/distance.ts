@@ -1,23 +1,23 @@
 /**
- * How far a label is and whether it is in sight, from its boxes. The rules are those of
- * src/sagesplat/output/boxes.py; tests/data/distances.json holds both to them.
+ * Distance and visibility of a label, by its bounding boxes. Same rules as src/sagesplat/viewer/boxes.py;
+ * tests/data/distances.json checks both.
  */
 
 import type { Box, Quat, Vec3, Viewpoint } from "../types";
 
-/** A label from a viewpoint. */
+/** A label as seen from a viewpoint. */
 export interface Sight {
   readonly visible: boolean;
   readonly distance: number; // the bundle's units; NaN: unknown
-  readonly size: number; // how large its boxes look, out of sight as well: about its share of the pixels
+  readonly size: number; // apparent size of its boxes, also out of sight: about its pixel share
 }
 
 type Plane = Viewpoint["frustum"][number];
 
 const PERCENTILE = 0.05;
-const AT = [1 / 6, 1 / 2, 5 / 6]; // of a box's axes: it stands for the 27 points there
+const AT = [1 / 6, 1 / 2, 5 / 6]; // sample positions along each axis of a box
 
-/** Half spaces of what a camera sees: left, right, bottom, top, front. It begins at the camera, without end. */
+/** Half spaces of a camera's frustum: left, right, bottom, top, front; the near plane is at the camera. */
 export function frustumOf(position: Vec3, quaternion: Quat, fovY: number, aspect: number): Plane[] {
   const high = Math.tan(fovY / 2);
   const wide = high * aspect;
@@ -36,7 +36,7 @@ export function frustumOf(position: Vec3, quaternion: Quat, fovY: number, aspect
   });
 }
 
-/** A vector turned by a quaternion x y z w of any length. */
+/** A vector rotated by a quaternion x y z w of any length. */
 export function rotate(q: Quat, v: Vec3): Vec3 {
   const length = Math.hypot(...q);
   const [x, y, z, w] = q.map((part) => part / length) as unknown as Quat;
@@ -50,7 +50,7 @@ export function rotate(q: Quat, v: Vec3): Vec3 {
   ];
 }
 
-/** How far the closest of what is in sight is: near the 5th percentile over a label's points. */
+/** Distance of the visible boxes: approximates the 5th percentile over a label's points. */
 export function look(boxes: readonly Box[], { position, frustum }: Viewpoint): Sight {
   const near = boxes.filter((box) => touches(box, frustum));
   const visible = near.length > 0;
@@ -68,15 +68,15 @@ export function look(boxes: readonly Box[], { position, frustum }: Viewpoint): S
   return { visible, distance: found ? percentile(sampled.subarray(0, found)) : nearest, size };
 }
 
-/** Whether the corner of a box that lies deepest in each half space is inside. */
+/** Whether in each half space the deepest corner of a box is inside. */
 export const touches = (box: Box, frustum: readonly Plane[]): boolean =>
   frustum.every((plane) => corner(box, plane, 3) >= 0);
 
-/** The half spaces that do not hold all of a box. */
+/** The half spaces that do not contain the full box. */
 const crossing = (box: Box, frustum: readonly Plane[]): Plane[] =>
   frustum.filter((plane) => corner(box, plane, 0) < 0);
 
-/** Height over a plane of a box's corner that is highest (`of` 3) or lowest (0) over it. */
+/** Signed height over a plane of a box's highest (`of` 3) or lowest (0) corner. */
 function corner(b: Box, plane: Plane, of: 0 | 3): number {
   let height = plane[3];
   for (let axis = 0; axis < 3; axis++) {
@@ -86,7 +86,7 @@ function corner(b: Box, plane: Plane, of: 0 | 3): number {
   return height;
 }
 
-/** Writes the squared distances of those of a box's points that lie in all half spaces; the new end. */
+/** Appends the squared distances of a box's samples in all half spaces; returns the new end. */
 function sample(b: Box, from: Vec3, planes: readonly Plane[], into: Float64Array, start: number): number {
   let end = start;
   for (const i of AT) {
@@ -114,7 +114,7 @@ const middle = (b: Box, axis: number): number => ((b[axis] as number) + (b[axis 
 
 const halfDiagonal = (b: Box): number => Math.sqrt(squareTo([b[0], b[1], b[2]], b[3], b[4], b[5])) / 2;
 
-/** Of distances, from their squares, linear between neighbours. */
+/** Percentile of distances, given their squares, with linear interpolation. */
 function percentile(squares: Float64Array): number {
   squares.sort();
   const rank = PERCENTILE * (squares.length - 1);

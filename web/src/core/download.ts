@@ -1,9 +1,9 @@
-/** One file of a bundle over the network: its bytes, checked; how fast the link is; what is kept. */
+/** Downloads single files of a bundle: verified content, bandwidth, and a cache. */
 
-/** What of `fetch` is used here. */
+/** The subset of `fetch` that is used here. */
 export type Fetch = (url: string, init?: RequestInit) => Promise<Reply>;
 
-/** What of `Response` is used here. */
+/** The subset of `Response` that is used here. */
 export interface Reply {
   readonly ok: boolean;
   readonly status: number;
@@ -16,14 +16,14 @@ export interface Reader {
   read(): Promise<{ readonly done: boolean; readonly value?: Uint8Array | undefined }>;
 }
 
-/** Time, so that tests can bring their own. */
+/** The clock, which tests replace. */
 export interface Clock {
   now(): number; // ms
-  /** Runs something in some ms, unless the returned function is called before. */
+  /** Runs a callback after some ms; the returned function cancels it. */
   after(ms: number, run: () => void): () => void;
 }
 
-/** Lower-case hexadecimal sha-256; null where the page may not compute one (plain http). */
+/** Lower-case hexadecimal SHA-256; null if the page cannot compute it (plain http). */
 export type Digest = ((bytes: Uint8Array) => Promise<string>) | null;
 
 export interface File {
@@ -32,7 +32,7 @@ export interface File {
   readonly sha256: string;
 }
 
-/** Why a file did not come: `lasting` is no use to try again. */
+/** Why a download failed; with `lasting`, a retry is useless. */
 export class DownloadError extends Error {
   override name = "DownloadError";
   constructor(
@@ -43,25 +43,25 @@ export class DownloadError extends Error {
   }
 }
 
-const SILENCE = 10_000; // ms without a byte, after which a download counts as lost
+const SILENCE = 10_000; // ms without data after which a download counts as failed
 
-/** How to get files; `received` hears of every piece. */
+/** How to download; `received` is called for every chunk of data. */
 export interface Link {
   readonly base: URL;
   readonly fetch: Fetch;
   readonly clock: Clock;
   readonly digest: Digest;
   received(bytes: number): void;
-  /** How long a server took to answer, ms. */
+  /** Called with a server's response time, ms. */
   answered(ms: number): void;
 }
 
 /**
- * Gets a file once and checks it. Rejects with a DownloadError in one line.
+ * Downloads and verifies a file, once. Rejects with a DownloadError in one line.
  *
  * @param signal - aborts it
- * @param again - past the browser's cache, which may hold what was found damaged
- * @param progress - hears how many bytes are there
+ * @param again - bypasses the browser's cache, which may hold a damaged copy
+ * @param progress - called with the number of bytes received
  */
 export async function download(
   link: Link,
@@ -81,14 +81,14 @@ export async function download(
   return await intact(link, file, joined(parts, size));
 }
 
-/** How to receive a file. */
+/** Options of `receive`. */
 export interface Manner {
-  readonly again?: boolean; // past the browser's cache
-  readonly silence?: number; // ms without a byte, after which the file counts as lost
-  readonly check?: (reply: Reply) => void; // throws for an answer that is of no use
+  readonly again?: boolean; // bypasses the browser's cache
+  readonly silence?: number; // ms without data after which the download counts as failed
+  readonly check?: (reply: Reply) => void; // throws for an unusable response
 }
 
-/** Hands over a file's body piece by piece until `take` says false. Rejects with a DownloadError in one line. */
+/** Passes a file's body to `take` in chunks until it returns false. Rejects with a DownloadError. */
 export async function receive(
   link: Link,
   file: File,
@@ -96,7 +96,7 @@ export async function receive(
   { again = false, silence = SILENCE, check }: Manner,
   take: (part: Uint8Array) => boolean,
 ): Promise<void> {
-  const { fetch, clock } = link; // the browser's own must not be called as a method
+  const { fetch, clock } = link; // the browser's fetch must not be called as a method
   let silent = false;
   const watch = () =>
     clock.after(silence, () => {
@@ -125,11 +125,11 @@ export async function receive(
     );
   } finally {
     stop();
-    signal.abort(); // of what is left, if it was too much or an error's page
+    signal.abort(); // stops the rest of an unexpected body
   }
 }
 
-/** Calls `take` for each piece of the body until it says false. */
+/** Calls `take` for each chunk of the body until it returns false. */
 async function each(reply: Reply, take: (part: Uint8Array) => boolean): Promise<void> {
   const reader = reply.body?.getReader();
   for (;;) {
@@ -144,7 +144,7 @@ function refused(file: File, status: number): DownloadError {
   return new DownloadError(`${file.uri}: the server said ${status}`, !passes);
 }
 
-/** The content if it is what the manifest says. It may be damaged on the way, so it is worth a second try. */
+/** The content if it has the size and hash in the manifest; damage may be temporary, so a retry is allowed. */
 export async function intact(link: Link, file: File, content: Uint8Array): Promise<Uint8Array> {
   if (content.length !== file.bytes) {
     const is = content.length < file.bytes ? `only ${content.length}` : `more than`;
@@ -156,7 +156,7 @@ export async function intact(link: Link, file: File, content: Uint8Array): Promi
   return content;
 }
 
-/** The file came, but is not what the manifest says. */
+/** The file does not have the size or hash in the manifest. */
 export class DamagedError extends DownloadError {}
 
 function joined(parts: readonly Uint8Array[], size: number): Uint8Array {
@@ -169,7 +169,7 @@ function joined(parts: readonly Uint8Array[], size: number): Uint8Array {
   return out;
 }
 
-/** sha-256 by the browser, where it offers that: on https and on localhost. */
+/** SHA-256 by the browser, which offers it on https and localhost only. */
 export const digestOfBrowser: Digest = globalThis.crypto?.subtle
   ? async (bytes) => {
       const hash = await crypto.subtle.digest("SHA-256", bytes as Uint8Array<ArrayBuffer>);
@@ -185,11 +185,11 @@ export const clockOfBrowser: Clock = {
   },
 };
 
-const SAMPLE = 100; // ms of downloading behind a sample
-const MEMORY = 2000; // ms after which a sample counts for 1/e
-const QUICK = 200; // the same where the link turns out faster: it is slow only until enough is asked for
+const SAMPLE = 100; // ms of downloading per sample
+const MEMORY = 2000; // ms: time constant of the bandwidth average
+const QUICK = 200; // ms, for samples above the average: a link seems slow while little is requested
 
-/** Bytes a second over all downloads together, while there are any. */
+/** Bandwidth over all downloads, bytes per second, measured while there are any. */
 export class Bandwidth {
   rate = Number.NaN;
   private bytes = 0;
@@ -198,7 +198,7 @@ export class Bandwidth {
 
   constructor(private readonly clock: Clock) {}
 
-  /** Downloads begin (after none), or the last one has ended. */
+  /** To be called when the first download starts, and when the last one has ended. */
   running(any: boolean): void {
     this.count(0);
     this.since = any ? this.clock.now() : Number.NaN;
@@ -220,7 +220,7 @@ export class Bandwidth {
   }
 }
 
-/** Contents by sha-256, the latest used ones up to a number of bytes. */
+/** An LRU cache of file contents by SHA-256, limited in bytes. */
 export class Shelf {
   private readonly kept = new Map<string, Uint8Array>();
   private size = 0;

@@ -1,8 +1,8 @@
-/** What the page hands over, frame by frame and slider by slider. */
+/** Normalises the page's inputs: settings and viewpoints. */
 
 import type { Settings, Viewpoint } from "../types";
 
-/** A slider without a number is no limit; one below zero is zero. */
+/** A budget without a number means no limit; a negative one means zero. */
 export function sane(settings: Settings): Settings {
   const limit = (value: number) => (Number.isNaN(value) ? Infinity : Math.max(value, 0));
   const { bytes, gpuBytes, count } = settings.budget;
@@ -13,7 +13,7 @@ export function sane(settings: Settings): Settings {
   };
 }
 
-/** Whether nothing moved. */
+/** Whether two viewpoints are equal. */
 export function same(a: Viewpoint, b: Viewpoint): boolean {
   const numbers = (v: Viewpoint) => [...v.position, ...v.direction, ...v.frustum.flat()];
   const [x, y] = [numbers(a), numbers(b)];

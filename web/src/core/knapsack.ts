@@ -1,34 +1,34 @@
 /**
- * The multiple-choice knapsack: one level per label, of most value, within a budget. What is done and why is
- * said in src/sagesplat/adapt/knapsack.py; results are equal to the last bit.
+ * The multiple-choice knapsack: one level per label, with the largest value within a budget. The method is
+ * documented in src/sagesplat/adapt/knapsack.py; results are equal bit for bit.
  */
 
 import type { Table } from "./allocate";
 
-/** Of value in the total weight. */
+/** Units of value in the total weight. */
 export const UNITS = 2 ** 40;
 
 export interface Most {
   readonly levels: number[];
   readonly fits: boolean;
   readonly bound: number; // on the value, in units
-  readonly optimal: boolean; // proven
+  readonly optimal: boolean; // proven optimal
 }
 
-/** What levels cost and gain above the cheapest ones, label by label. */
+/** Cost and gain of levels relative to the label's cheapest one. */
 interface Above {
   readonly floor: number[];
-  readonly extra: number[][]; // Infinity: cannot take part
+  readonly extra: number[][]; // Infinity: unavailable
   readonly gain: number[][];
-  readonly room: number; // budget left beside the cheapest
-  readonly base: number; // value of the cheapest
+  readonly room: number; // budget left after the cheapest levels
+  readonly base: number; // value of the cheapest levels
 }
 
 /**
- * The best levels within a budget; rows of `q` and `c` (Infinity: cannot be had) are labels.
+ * The best levels within a budget; rows of `q` and `c` (Infinity: unavailable) are labels.
  *
- * @param previous - levels that count `slack` better, -1: none
- * @param states - partial compositions to keep, 0: greedy only
+ * @param previous - levels that count as `slack` better, -1: none
+ * @param states - limit of partial compositions, 0: greedy only
  */
 export function mostWithin(
   q: Table,
@@ -94,7 +94,7 @@ function aboveFloor(
   return { floor, extra, gain, room, base };
 }
 
-/** The cheapest level; of equals the one of more gain, then of higher quality, then the lower. */
+/** The cheapest level; ties by larger gain, then higher quality, then lower index. */
 function cheapestOf(values: readonly number[], costs: readonly number[], gains: readonly number[]): number {
   let best = -1;
   costs.forEach((cost, k) => {
@@ -114,7 +114,7 @@ interface Step {
 
 const NONE: Step = { to: -1, slope: 0, more: 0 };
 
-/** Of the levels above one of a label that of most gain per cost, the cheaper of equals. */
+/** The level above a given one with the largest gain per cost; ties by lower cost. */
 function step(extra: readonly number[], gain: readonly number[], from: number, limit: number): Step {
   let best = NONE;
   for (let k = 0; k < extra.length; k++) {
@@ -126,7 +126,7 @@ function step(extra: readonly number[], gain: readonly number[], from: number, l
   return best;
 }
 
-/** Levels by gain per cost until nothing fits; gain per cost of the first step that did not, else 0. */
+/** Greedy levels by gain per cost; also the gain per cost of the first step that does not fit, else 0. */
 function greedy({ floor, extra, gain, room }: Above): { levels: number[]; critical: number } {
   const levels = [...floor];
   const steps = floor.map((from, label) => step(row(extra, label), row(gain, label), from, room));
@@ -148,13 +148,13 @@ function greedy({ floor, extra, gain, room }: Above): { levels: number[]; critic
     } else if (critical === 0) {
       critical = next.slope;
     }
-    const limit = critical > 0 ? left : Infinity; // before that the steps are those of the convex hull
+    const limit = critical > 0 ? left : Infinity; // until then the steps follow the convex hull
     steps[best] = step(row(extra, best), row(gain, best), num(levels, best), limit);
   }
   return { levels, critical };
 }
 
-/** Partial compositions as a tree: each names its parent and its level of one more label. */
+/** Partial compositions as a tree: each has a parent, and the level of one more label. */
 interface States {
   readonly parent: Int32Array;
   readonly choice: Int32Array;
@@ -162,7 +162,7 @@ interface States {
   readonly gain: Float64Array;
 }
 
-/** Whether a partial composition has the lower level at the first label where it differs from another. */
+/** Whether a partial composition has the lower level at the first label where two differ. */
 function before({ parent, choice }: States, a: number, b: number): boolean {
   let lower = false;
   let [x, y] = [a, b];
@@ -174,7 +174,7 @@ function before({ parent, choice }: States, a: number, b: number): boolean {
   return lower;
 }
 
-/** The best levels of all, null if that takes more states, and the Lagrangian bound on their gain. */
+/** The optimal levels, null beyond the limit of states; and the Lagrangian bound on their gain. */
 function front(
   { extra, gain, room }: Above,
   slope: number,
@@ -182,10 +182,10 @@ function front(
   limit: number,
 ): { exact: number[] | null; bound: number } {
   const L = extra.length;
-  const rest = new Array<number>(L + 1).fill(0); // most that the labels from here on can add at that price
+  const rest = new Array<number>(L + 1).fill(0); // largest contribution of the labels from here on at that price
   for (let label = L - 1; label >= 0; label--) {
-    const worth = row(gain, label).map((g, k) => g - slope * num(row(extra, label), k));
-    rest[label] = num(rest, label + 1) + Math.max(...worth);
+    const reduced = row(gain, label).map((g, k) => g - slope * num(row(extra, label), k));
+    rest[label] = num(rest, label + 1) + Math.max(...reduced);
   }
   const bound = num(rest, 0) + slope * room;
   const states: States = {
@@ -197,7 +197,7 @@ function front(
   let begin = 0;
   let end = 1;
   for (let label = 0; label < L; label++) {
-    // whole numbers against a sum of rounded ones: a unit per label is far more than the rounding
+    // tolerance of rounding: one unit per label is ample
     const needed = least - L - slope * room - num(rest, label + 1);
     const allowed = Math.floor((limit * (label + 1)) / L);
     const to = merge(states, row(extra, label), row(gain, label), {
@@ -222,15 +222,15 @@ function front(
 }
 
 interface Merge {
-  readonly begin: number; // of the front so far
+  readonly begin: number; // of the current front
   readonly end: number;
   readonly room: number;
   readonly slope: number;
   readonly needed: number;
-  readonly allowed: number; // states in all
+  readonly allowed: number; // limit of states
 }
 
-/** Appends the front with one more label, ascending in cost and gain; its end, -1 if it takes too many states. */
+/** Appends the Pareto front with one more label, ascending in cost and gain; its end, -1 beyond the limit. */
 function merge(s: States, extra: readonly number[], gain: readonly number[], m: Merge): number {
   const heads = new Int32Array(extra.length).fill(m.begin);
   let n = m.end;

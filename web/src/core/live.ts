@@ -1,4 +1,4 @@
-/** A bundle whose training goes on: its manifest is asked for again and again. */
+/** Polls the manifest of a bundle whose training still runs. */
 
 import type { Manifest } from "../types";
 import { BundleError } from "./check";
@@ -11,16 +11,16 @@ export interface Following {
   readonly url: string;
   readonly fetch: Fetch;
   readonly clock: Clock;
-  goesOn(): boolean;
-  /** Whether the manifest before is drawn; on a slow link none would ever be, if newer ones came between. */
+  isActive(): boolean;
+  /** Whether the previous manifest is drawn; else a slow link would never finish one. */
   isFree(): boolean;
-  found(manifest: Manifest): void;
+  changed(manifest: Manifest): void;
   failed(message: string): void;
 }
 
-/** Asks every two seconds, and hands over each manifest that differs from the one before. */
+/** Polls every two seconds, and passes on each manifest that differs from the previous one. */
 export function poll(following: Following): void {
-  const { url, fetch, clock, goesOn, isFree, found, failed } = following;
+  const { url, fetch, clock, isActive, isFree, changed, failed } = following;
   let tag: string | null = null;
   let last = "";
   const ask = async () => {
@@ -28,14 +28,14 @@ export function poll(following: Following): void {
     if (reply.status === 304) return;
     if (!reply.ok) throw new BundleError(`${url}: the server said ${reply.status}`);
     const text = await reply.text();
-    if (!goesOn()) return;
+    if (!isActive()) return;
     tag = reply.headers.get("ETag");
-    if (text !== last) found(parseManifest(text));
+    if (text !== last) changed(parseManifest(text));
     last = text;
   };
   const next = () => {
     clock.after(EVERY, async () => {
-      if (!goesOn()) return;
+      if (!isActive()) return;
       try {
         if (isFree()) await ask();
       } catch (error) {

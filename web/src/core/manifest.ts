@@ -1,4 +1,4 @@
-/** Reads manifest.json and promises-*.json: nothing of a bundle is used before it has been checked. */
+/** Reads and validates manifest.json and promises-*.json. */
 
 import type { Label, Manifest, Promises } from "../types";
 import {
@@ -25,12 +25,12 @@ import {
 } from "./check";
 import type { Fetch } from "./download";
 
-/** The newest version of the format that this viewer reads. */
+/** The newest version of the format that this viewer supports. */
 export const VERSION = 1;
 
 const vec3 = list(number, 3);
 const increment: Check = (value, path, wrong) => {
-  // a level may add nothing to the one below it; then there is no file
+  // a level that adds nothing has no file
   const empty = typeof value === "object" && value !== null && "count" in value && value.count === 0;
   const file = empty ? {} : { uri: relative, sha256: hash };
   object({ ...file, format: oneOf("spz"), bytes: amount, gpuBytes: amount, count: amount })(
@@ -99,7 +99,7 @@ const manifest = object({
   licenses: list(object({ what: text, license: text })),
 });
 
-/** The manifest in a JSON text. BundleError in one line for what cannot be used. */
+/** Parses a manifest. Throws a BundleError in one line if it is invalid. */
 export function parseManifest(json: string, file = "manifest.json"): Manifest {
   const value = parse(json, file);
   const head = checked<Manifest>(value, object({ format: oneOf("sagesplat-bundle"), version: level }), file);
@@ -165,7 +165,7 @@ const model = object({
 });
 const promises = object({ version: level, extent: positive, views: list(view), labels: list(model) });
 
-/** The viewpoint models in a JSON text. BundleError in one line for what cannot be used. */
+/** Parses the viewpoint models. Throws a BundleError in one line if they are invalid. */
 export function parsePromises(json: string, file: string): Promises {
   const found = checked<Promises>(parse(json, file), promises, file);
   const wrong = found.labels.flatMap((one, i) => {

@@ -1,29 +1,29 @@
-/** In which order increments are worth their bytes. */
+/** The order in which increments are downloaded: by gain per byte. */
 
 import { known } from "./allocate";
 import type { File } from "./download";
-import { around, type Candidate, worth } from "./planner";
+import { type Candidate, potentialWeight, visibleWeight } from "./planner";
 import type { Entry } from "./residency";
 import type { Supply } from "./supply";
 
-/** What a label shows less of counts a little less, but is not forgotten. */
+/** Least weight: out of sight, or without gain. */
 const LEAST = 1e-6;
 
-/** Bytes of lowest levels out of sight that come before anything finer: whoever turns finds no holes. */
+/** Bytes of first levels out of sight that precede all finer levels, so that turning shows no holes. */
 const NEARBY = 2 ** 18;
 
-/** How likely it is that one turns to what is out of sight soon. */
+/** Assumed probability that the viewer soon turns to a label out of sight. */
 const TURN = 0.25;
 
-/** An increment and what it is worth: SSIM, weighted by pixels, per byte of the way to where it leads. */
+/** An increment with its value: pixel-weighted SSIM gain per byte, along the concave hull. */
 export interface Step {
   readonly level: number; // 1-based
   readonly value: number;
 }
 
 /**
- * The increments from `have` to `wanted` with their values. As they must come in order, a step is worth as
- * much as the best way that begins with it: the concave hull of SSIM over bytes.
+ * The increments from `have` to `wanted` with their values. Since they must come in order, an increment
+ * counts with the slope of the concave hull of SSIM over bytes.
  *
  * @param weight - of the label in the picture
  */
@@ -59,8 +59,8 @@ interface Wanted {
 }
 
 /**
- * Files that are missing for the plan: the lowest levels in sight first, with those nearby out of sight, then
- * the promises, then what gains most per byte. The promises come last where nothing depends on them.
+ * The missing files of the plan, in order: first levels in sight and of nearby labels, the viewpoint models,
+ * then increments by gain per byte. The viewpoint models come last if the plan does not depend on them.
  */
 export function inOrder(
   entries: readonly Entry[],
@@ -79,10 +79,10 @@ export function inOrder(
     const have = files.findIndex((one) => !isHere(one));
     const lowest = files[0];
     if (!candidate || !lowest) continue;
-    const weight = worth(candidate);
-    let most = Infinity; // so that no level comes before the lowest
+    const weight = visibleWeight(candidate);
+    let most = Infinity; // keeps the levels of a label in order
     if (!candidate.visible) {
-      most = (TURN * around(candidate) * (candidate.mean[0] || 1)) / Math.max(lowest.file.bytes, 1);
+      most = (TURN * potentialWeight(candidate) * (candidate.mean[0] || 1)) / Math.max(lowest.file.bytes, 1);
       behind.push({ file: lowest.file, value: most, missing: have === 0 && !supply.rests(lowest.file) });
     }
     if (have < 0) continue;
@@ -91,7 +91,7 @@ export function inOrder(
     }
     for (const { level, value } of entry.steps.found) {
       const one = files[level - 1];
-      if (!one || supply.rests(one.file)) break; // what follows would have to wait for it
+      if (!one || supply.rests(one.file)) break; // later increments depend on it
       if (isHere(one)) continue;
       if (level > 1) rest.push({ file: one.file, value: Math.min(value, most), missing: true });
       else if (candidate.visible)
@@ -110,7 +110,7 @@ const best = (list: readonly Wanted[]): File[] =>
     .sort((a, b) => b.value - a.value)
     .map(({ file }) => file);
 
-/** The best up to `NEARBY` bytes, with those that are here already, and the others. */
+/** Splits labels into the best up to `NEARBY` bytes, with those already loaded, and the others. */
 function divided(list: readonly Wanted[]): [Wanted[], Wanted[]] {
   const sorted = [...list].sort((a, b) => b.value - a.value);
   let bytes = 0;

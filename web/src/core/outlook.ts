@@ -1,4 +1,4 @@
-/** What each label looks like from where the viewer stands: its distance, quality and share of the pixels. */
+/** Each label from the current viewpoint: distance, quality and pixel share. */
 
 import type { Label, Promises, Settings, Viewpoint } from "../types";
 import { look } from "./distance";
@@ -6,9 +6,9 @@ import type { Candidate } from "./planner";
 import { byDistance, ViewModel, Views } from "./quality";
 import type { Entry } from "./residency";
 
-/** Without promises levels are judged by the distance, shares of pixels by the size of the boxes. */
+/** Without viewpoint models, quality depends on the distance and pixel share on the size of the boxes. */
 export class Outlook {
-  readonly complete: boolean; // whether it has the promises
+  readonly complete: boolean; // whether it has the viewpoint models
   private readonly models = new Map<number, ViewModel>();
 
   constructor(labels: readonly Label[] = [], promises: Promises | null = null) {
@@ -22,14 +22,14 @@ export class Outlook {
     }
   }
 
-  /** Brings what is known of a label to a viewpoint. */
+  /** Evaluates a label at the viewpoint. */
   see(entry: Entry, viewpoint: Viewpoint): void {
     const { label } = entry;
     const { position, direction } = viewpoint;
     const model = this.models.get(label.id);
     const seen = look(label.boxes, viewpoint);
     if (!seen.visible && label.boxes.length) {
-      // no plan depends on what nobody sees: that it is not computed keeps scenes of many parts fast
+      // plans do not depend on labels out of sight; skipping them keeps scenes in blocks fast
       entry.sight = seen;
       entry.prediction = entry.unseen;
       entry.share = seen.size;
@@ -37,13 +37,13 @@ export class Outlook {
     }
     const distance = model?.corrected(seen.distance, position, direction) ?? seen.distance;
     const sight = { ...seen, distance };
-    // a label of which nobody knows where it is may be anywhere
+    // a label without boxes may be anywhere
     entry.sight = label.boxes.length ? sight : { ...sight, visible: true };
     entry.prediction = model?.predict(distance, position, direction) ?? byDistance(label, distance);
     entry.share = model ? model.share(position, direction) : this.complete ? 0 : sight.size;
   }
 
-  /** What a label is to be planned with. */
+  /** The planner's input for a label. */
   candidate(entry: Entry, weights: Settings["weights"], highest: number): Candidate {
     const { label, ladder, prediction, sight, share, wanted } = entry;
     return {

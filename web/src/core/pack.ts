@@ -1,9 +1,9 @@
-/** The pack of a bundle: its increments as one stream, each of use as soon as its last byte is there. */
+/** The pack of a bundle: its increments as one stream, each usable as soon as it is complete. */
 
 import type { Manifest } from "../types";
 import { DamagedError, DownloadError, type File, type Link, type Reply, receive } from "./download";
 
-/** ms without a byte, after which the files are rather fetched one by one. */
+/** ms without data after which the files are downloaded one by one instead. */
 const SILENCE = 3000;
 
 /** The increments in a manifest's pack, in their order. */
@@ -12,12 +12,12 @@ export const filesOf = ({ pack, labels }: Manifest): File[] =>
     .flatMap(([label, level]) => labels[label]?.levels[level - 1] ?? [])
     .filter((file) => file.bytes);
 
-/** Requests that a browser has on their way at once, without HTTP/2. */
+/** Concurrent requests of a browser without HTTP/2. */
 const CONNECTIONS = 6;
 
 export class Pack {
-  private at = 0; // bytes that have come
-  private readonly ends = new Map<string, number>(); // offsets of what has not been handed over
+  private at = 0; // bytes received
+  private readonly ends = new Map<string, number>(); // end offsets of the files not yet passed on
   private readonly all: ReadonlySet<string>;
   private readonly abort = new AbortController();
   private stopped = false;
@@ -34,18 +34,18 @@ export class Pack {
     this.all = new Set(this.ends.keys());
   }
 
-  /** Whether a file is in the pack, to come or not. */
+  /** Whether a file is in the pack, received or not. */
   holds(file: File): boolean {
     return this.all.has(file.sha256);
   }
 
-  /** Bytes until a file is whole, 0: it is being checked; NaN: it will not come (any more). */
+  /** Bytes until a file is complete, 0: being verified; NaN: it will not arrive (any more). */
   until(file: File): number {
     const left = Math.max(0, (this.ends.get(file.sha256) ?? Number.NaN) - this.at);
     return this.stopped && left > 0 ? Number.NaN : left;
   }
 
-  /** Whether all its bytes have come; a browser keeps it only if it is read to its end. */
+  /** Whether it is received completely: the browser caches it only then. */
   get isHere(): boolean {
     return this.at >= this.file.bytes;
   }
@@ -56,8 +56,8 @@ export class Pack {
   }
 
   /**
-   * Hands over each file as it comes, to be checked; ends when all of them are. Rejects with a DownloadError, a
-   * DamagedError for a pack that is shorter or longer than promised.
+   * Passes on each file when it is complete, to be verified. Resolves when all are. Rejects with a
+   * DownloadError, or a DamagedError for a pack that is shorter or longer than its manifest entry.
    */
   async read(link: Link, take: (file: File, content: Uint8Array) => Promise<void>): Promise<void> {
     const checks: Promise<void>[] = [];
@@ -111,11 +111,11 @@ export class Pack {
 }
 
 /**
- * Of files that a pack is to bring those that are here sooner by requests of their own: behind more that nobody
- * wants than round trips for the rest cost, or more than a round trip later than in the order of worth.
+ * Files of the pack that arrive earlier by their own requests: those behind more unwanted bytes than round
+ * trips for the rest cost, or more than a round trip later than in the order of value.
  *
- * @param files - in the order of their worth
- * @param trip - bytes that the link carries in a round trip; NaN: not known yet
+ * @param files - in the order of their value
+ * @param trip - bytes per round trip of the link; NaN: unknown
  */
 export function lateIn(pack: Pack, files: readonly File[], trip: number): Set<File> {
   const late = new Set<File>();

@@ -1,22 +1,22 @@
-/** From settings and a viewpoint to the level that each label should have. Levels are 1-based, 0 is nothing. */
+/** Plans the level of each label from settings and a viewpoint. Levels are 1-based, 0 is nothing. */
 
 import type { Budget, Label, Settings } from "../types";
 import { type Allocation, bestWithin, cheapest } from "./allocate";
 
-/** What one label is to be planned with. */
+/** The planner's input for one label. */
 export interface Candidate {
   readonly label: Label;
   readonly ladder: Ladder;
-  readonly highest: number; // level that can be had; less than all where an increment is broken
+  readonly highest: number; // highest available level; lower if an increment is damaged
   readonly mean: readonly number[]; // by level, SSIM; NaN: unknown
   readonly bound: readonly number[];
-  readonly weight: number; // of the label, given by people
-  readonly share: number; // of the pixels; out of sight what it might have
+  readonly weight: number; // of the label, set by the user
+  readonly share: number; // pixel share; out of sight the one that it would have
   readonly visible: boolean;
-  readonly previous: number; // level of the plan before, 0: none
+  readonly previous: number; // level in the previous plan, 0: none
 }
 
-/** What the levels of a label cost in full, by level. */
+/** Total costs of a label's levels. */
 export interface Ladder {
   readonly bytes: readonly number[];
   readonly gpuBytes: readonly number[];
@@ -30,10 +30,10 @@ export interface Plan {
 
 const UNITS = ["bytes", "gpuBytes", "count"] as const;
 type Unit = (typeof UNITS)[number];
-const FINE = 2 ** 20; // steps of a budget where several units are solved as one
-const LEAST_SHARE = 1e-4; // so that nothing in sight is worth nothing
+const FINE = 2 ** 20; // steps of a budget when several units are combined
+const LEAST_SHARE = 1e-4; // least pixel share, so that every visible label counts
 
-/** Costs of levels as sums of their increments. */
+/** Costs of levels as sums over their increments. */
 export function ladderOf(label: Label): Ladder {
   const sums = (unit: Unit) => {
     let sum = 0;
@@ -45,13 +45,13 @@ export function ladderOf(label: Label): Ladder {
   return { bytes: sums("bytes"), gpuBytes: sums("gpuBytes"), count: sums("count") };
 }
 
-/** What a label at this viewpoint is worth against the others. */
-export const worth = (c: Candidate): number => (c.visible ? around(c) : 0);
+/** Weight of a label at this viewpoint. */
+export const visibleWeight = (c: Candidate): number => (c.visible ? potentialWeight(c) : 0);
 
-/** The same, as if it were in sight. */
-export const around = (c: Candidate): number => c.weight * Math.max(c.share, LEAST_SHARE);
+/** The same, as if the label were in sight. */
+export const potentialWeight = (c: Candidate): number => c.weight * Math.max(c.share, LEAST_SHARE);
 
-/** The levels to have, within the budget in all its units; the smallest composition where nothing fits. */
+/** The planned levels, within the budget in all units; the smallest composition if nothing fits. */
 export function makePlan(candidates: readonly Candidate[], settings: Settings): Plan {
   const there = withoutFar(
     candidates.filter((c) => c.highest > 0),
@@ -67,8 +67,8 @@ export function makePlan(candidates: readonly Candidate[], settings: Settings): 
 }
 
 /**
- * Without the parts of blocks out of sight that have no room even at their lowest level: those worth least go
- * first. What is in sight stays, as does everything in a scene without blocks.
+ * Removes per-block categories out of sight that do not fit even at their first level, least weight first.
+ * Labels in sight stay, as do all labels of a scene without blocks.
  */
 function withoutFar(all: readonly Candidate[], budget: Budget): readonly Candidate[] {
   const least = (c: Candidate) => (c.label.always ? c.highest : 1) - 1;
@@ -78,7 +78,7 @@ function withoutFar(all: readonly Candidate[], budget: Budget): readonly Candida
   if (!lacks()) return all;
   const far = all.filter((c) => c.label.block !== undefined && !c.visible && !c.label.always);
   const out = new Set<Candidate>();
-  for (const c of far.sort((a, b) => around(a) - around(b))) {
+  for (const c of far.sort((a, b) => potentialWeight(a) - potentialWeight(b))) {
     if (!lacks()) break;
     out.add(c);
     for (const unit of UNITS) over[unit] += c.ladder[unit][0] ?? 0;
@@ -103,7 +103,7 @@ function same(free: readonly Candidate[], mode: "full" | "base"): Chosen {
   return { levels: free.map((c) => (mode === "full" ? c.highest - 1 : 0)), status: "ok" };
 }
 
-/** The cheapest levels that keep a target; the lowest where nobody looks. */
+/** The cheapest levels that reach a target; the first level out of sight. */
 function reach(free: readonly Candidate[], target: number): Chosen {
   const levels = free.map(() => 0);
   const seen = free.flatMap((c, i) => (c.visible && c.weight > 0 ? [{ c, i }] : []));
@@ -117,14 +117,14 @@ function reach(free: readonly Candidate[], target: number): Chosen {
   return { levels, status: found.status };
 }
 
-/** The levels of most expected SSIM within the budget in every unit. */
+/** The levels with the largest expected SSIM within the budget in every unit. */
 function within(free: readonly Candidate[], budget: Budget): Chosen {
   const [tightest, ...others] = [...UNITS].sort((a, b) => room(free, budget, a) - room(free, budget, b));
   const first = best(free, (c) => costOf(c, tightest as Unit), budget[tightest as Unit]);
   if (first.status === "over budget" || others.every((unit) => fitsIn(free, first.levels, budget, unit))) {
     return first;
   }
-  // the largest of the shares of all budgets is a cost that keeps each of them
+  // the largest share over all budgets, as the cost, respects each of them
   const largest = (c: Candidate, k: number) =>
     Math.max(...UNITS.map((unit) => (costOf(c, unit)[k] as number) / budget[unit] || 0));
   const joint = best(free, (c) => c.label.levels.map((_, k) => Math.ceil(FINE * largest(c, k))), FINE);
@@ -139,7 +139,7 @@ function best(
   return bestWithin(
     free.map((c) => c.mean),
     free.map(cost),
-    free.map(worth),
+    free.map(visibleWeight),
     Math.max(budget, 0),
     { previous: free.map(before) },
   );
@@ -147,11 +147,11 @@ function best(
 
 const before = (c: Candidate): number => (c.previous <= c.highest ? c.previous - 1 : -1);
 
-/** Cost by level; what cannot be had costs Infinity. */
+/** Cost by level; Infinity for unavailable levels. */
 const costOf = (c: Candidate, unit: Unit): readonly number[] =>
   c.ladder[unit].map((cost, k) => (k < c.highest ? cost : Infinity));
 
-/** Budget over what everything costs. */
+/** Budget as a share of the full model's cost. */
 function room(free: readonly Candidate[], budget: Budget, unit: Unit): number {
   const full = free.reduce((sum, c) => sum + (c.ladder[unit][c.highest - 1] ?? 0), 0);
   return full > 0 ? budget[unit] / full : Infinity;

@@ -1,18 +1,18 @@
 /**
- * SSIM of a label at each level from any viewpoint. The formulas are those of src/sagesplat/adapt/promise.py;
- * tests/data/promises.json holds both to them.
+ * SSIM of a label at each level from any viewpoint. Same formulas as src/sagesplat/adapt/viewpoint.py;
+ * tests/data/promises.json checks both.
  */
 
 import type { Curve, Label, Promises, Vec3 } from "../types";
 
-/** What is known of one label at one viewpoint. */
+/** The prediction for one label at one viewpoint. */
 export interface Prediction {
   readonly mean: readonly number[]; // by level, expected SSIM, never falls; NaN: unknown
-  readonly bound: readonly number[]; // by level, SSIM that can be promised, never falls
-  readonly support: number; // 1 at a known viewpoint, 0 far from all; NaN: no model
+  readonly bound: readonly number[]; // by level, lower confidence bound of SSIM, never falls
+  readonly support: number; // 1 at a known viewpoint, 0 far from all of them; NaN: no model
 }
 
-/** Eq. 3 at a distance: beyond the fitted range the value at its end, the median where it is unknown (NaN). */
+/** Eq. 3 at a distance, clamped to the fitted range; the median for an unknown distance (NaN). */
 export function curveAt(curve: Curve, distance: number): number {
   if (Number.isNaN(distance)) return clip(curve.median);
   const [K1, g1, mu1, a1, K2, g2, mu2, a2, beta] = curve.params;
@@ -22,7 +22,7 @@ export function curveAt(curve: Curve, distance: number): number {
   return clip(K * Math.exp(-g * Math.abs(d - mu) ** a));
 }
 
-/** What the distance alone says of a label, as long as its viewpoint model is not there. */
+/** The prediction from the distance alone, until the viewpoint model is loaded. */
 export function byDistance(label: Label, distance: number): Prediction {
   const unknown = label.levels.map(() => Number.NaN);
   const quality = label.quality;
@@ -37,13 +37,13 @@ export function byDistance(label: Label, distance: number): Prediction {
   };
 }
 
-/** Power of the kernel that known views speak of a distance with, and the least weight that counts. */
+/** Exponent of the kernel weights in `corrected`, and the weight at which a correction counts by half. */
 const LIKE = 16;
 const ENOUGH = 1e-3;
 
 type LabelPromises = Promises["labels"][number];
 
-/** The views that the models of all labels share, and how far they are from where the viewer stands. */
+/** The views that the models of all labels share, and their scaled distances from the current viewpoint. */
 export class Views {
   readonly away: Float64Array; // [V] square of the distance over the extent
   readonly turned: Float64Array; // [V] square of the difference of the directions
@@ -61,7 +61,7 @@ export class Views {
     this.turned = new Float64Array(views.length);
   }
 
-  /** Brings `away` and `turned` to a viewpoint: once for all labels. */
+  /** Computes `away` and `turned` for a viewpoint, once for all labels. */
   from(position: Vec3, direction: Vec3): void {
     if (position === this.position && direction === this.direction) return;
     [this.position, this.direction] = [position, direction];
@@ -74,7 +74,7 @@ export class Views {
     }
   }
 
-  /** The same squares between two of the views. */
+  /** The same squares between two views. */
   between(i: number, j: number): [number, number] {
     const { rows } = this;
     const [a, b] = [6 * i, 6 * i + 3];
@@ -92,11 +92,11 @@ function square(x: number, y: number, z: number, rows: Float64Array, at: number)
   return dx * dx + dy * dy + dz * dz;
 }
 
-/** A label's viewpoint model; its Cholesky factor is made when the label is first in sight. */
+/** A label's viewpoint model; its Cholesky factor is computed when the label is first in sight. */
 export class ViewModel {
   private factor: Float64Array | null = null; // [n, n] lower
   private readonly weights: Float64Array; // [K, n]
-  private readonly unseen: Float64Array; // [n] its variance at unseen views
+  private readonly unseen: Float64Array; // [n] variance at held-out views
   private readonly scale: Vec3; // of squares: of positions, directions, log distances
   private readonly n: number;
   private readonly curves: readonly Curve[];
@@ -119,7 +119,7 @@ export class ViewModel {
     this.meanShare = own.shares.reduce((sum, s) => sum + s, 0) / Math.max(own.shares.length, 1);
   }
 
-  /** Whether the label has a curve for each level that its model speaks of. */
+  /** Whether the label has a curve for each level of its model. */
   static fits(label: Label, own: LabelPromises): boolean {
     const known = (label.quality?.curves ?? []).map((curve) => curve.level);
     return own.levels.every((level) => known.includes(level) && level <= label.levels.length);
@@ -152,7 +152,7 @@ export class ViewModel {
     return this.promise(mean, Math.sqrt(variance), support);
   }
 
-  /** A distance by the boxes, corrected by what they miss at the label's own views close by; NaN stays. */
+  /** A distance by boxes, corrected by their errors in the label's views nearby; NaN stays NaN. */
   corrected(distance: number, position: Vec3, direction: Vec3): number {
     const { views, corrections } = this.own;
     this.views.from(position, direction);
@@ -165,7 +165,7 @@ export class ViewModel {
     return distance * Math.exp(sum / (total + ENOUGH));
   }
 
-  /** Share of the pixels that the label has around a viewpoint, from the known views near it, 0..1. */
+  /** The label's pixel share at a viewpoint, from the known views near it, 0..1. */
   share(position: Vec3, direction: Vec3): number {
     const { shares } = this.own;
     this.views.from(position, direction);
@@ -178,7 +178,7 @@ export class ViewModel {
     return total > 1e-12 ? sum / total : this.meanShare;
   }
 
-  /** Square of the scaled difference between where the viewer stands and a view. */
+  /** Square of the scaled difference between the current viewpoint and a view. */
   private square(view: number): number {
     return (
       (this.views.away[view] as number) * this.scale[0] + (this.views.turned[view] as number) * this.scale[1]
@@ -224,7 +224,7 @@ function matern(square: number): number {
 const STEPS = 256; // of a table of it, in a unit of the scaled difference
 const TABLE = Float64Array.from({ length: 32 * STEPS }, (_, i) => matern((i / STEPS) ** 2 / 3));
 
-/** The same to 2e-6, without an exponential: shares of pixels take all views of a scene for each of its labels. */
+/** The same by a table, accurate to 2e-6: pixel shares sum over all views for each label. */
 function maternTable(square: number): number {
   const at = Math.sqrt(3 * square) * STEPS;
   const i = Math.floor(at);
@@ -239,7 +239,7 @@ function cholesky(S: Float64Array, n: number): Float64Array {
     for (let i = j; i < n; i++) {
       let sum = S[i * n + j] as number;
       for (let k = 0; k < j; k++) sum -= (S[i * n + k] as number) * (S[j * n + k] as number);
-      // rounded inputs can take the least bit of what the noise adds
+      // rounding can make the pivot vanish
       S[i * n + j] = i === j ? Math.sqrt(Math.max(sum, 1e-12)) : sum / (S[j * n + j] as number);
     }
   }
@@ -261,7 +261,7 @@ function explained(factor: Float64Array, k: Float64Array): number {
   return square;
 }
 
-/** Halfway between the largest so far and the smallest to come, kept in [-1, 1]: never falls. */
+/** Monotone values: the mean of the running maximum and the running minimum from the end, in [-1, 1]. */
 function rising(values: readonly number[]): number[] {
   const up = running(values, Math.max);
   const down = running([...values].reverse(), Math.min).reverse();
@@ -276,7 +276,7 @@ function running(values: readonly number[], pick: (a: number, b: number) => numb
   });
 }
 
-/** Values of some levels (1-based) among all. */
+/** Values of given levels (1-based) as an array over all levels. */
 function spread(values: readonly number[], levels: readonly number[], among: readonly number[]): number[] {
   const out = [...among];
   levels.forEach((level, i) => {

@@ -1,4 +1,4 @@
-/** What of each label is decoded and what of that is drawn. */
+/** Tracks which increments of each label are decoded, and which of these are drawn. */
 
 import type { Handle, Label, Level, Renderer } from "../types";
 import type { Sight } from "./distance";
@@ -6,20 +6,20 @@ import type { Step } from "./order";
 import { type Candidate, type Ladder, ladderOf } from "./planner";
 import { byDistance, type Prediction } from "./quality";
 
-/** One label of the manifest. What is drawn are increments 1..shown, or `former` until those are there. */
+/** A label of the manifest. Drawn are increments 1..shown, or `former` until those are decoded. */
 export class Entry {
   readonly ladder: Ladder;
-  readonly decoded: (Handle | null | undefined)[]; // by increment; null: it adds nothing
+  readonly decoded: (Handle | null | undefined)[]; // by increment; null: an empty one
   wanted = 0;
   shown = 0;
-  decoding = 0; // level that is being decoded, 0: none
+  decoding = 0; // level being decoded, 0: none
   former: Drawn | null = null;
   sight: Sight = { visible: true, distance: Number.NaN, size: 0 };
-  share = 0; // of the pixels
-  candidate: Candidate | null = null; // that the plan was made with
-  steps: { candidate: Candidate; have: number; found: Step[] } | null = null; // to the plan from what is here
+  share = 0; // pixel share
+  candidate: Candidate | null = null; // input of the current plan
+  steps: { candidate: Candidate; have: number; found: Step[] } | null = null; // from the loaded to the planned level
   prediction: Prediction = { mean: [], bound: [], support: Number.NaN };
-  readonly unseen: Prediction; // what is known while it is out of sight
+  readonly unseen: Prediction; // prediction while it is out of sight
 
   constructor(public label: Label) {
     this.ladder = ladderOf(label);
@@ -27,13 +27,13 @@ export class Entry {
     this.decoded = label.levels.map((file) => (file.count ? undefined : null));
   }
 
-  /** Level up to which all is decoded. */
+  /** Level up to which all increments are decoded. */
   get ready(): number {
     const missing = this.decoded.indexOf(undefined);
     return missing < 0 ? this.decoded.length : missing;
   }
 
-  /** The files of increments, with their levels. */
+  /** The files of the increments, with their levels. */
   files(from: number, to: number): { file: Level; level: number }[] {
     return this.label.levels.slice(from, to).map((file, i) => ({ file, level: from + i + 1 }));
   }
@@ -42,14 +42,14 @@ export class Entry {
     return this.decoded.slice(from, to).filter((handle) => handle !== undefined && handle !== null);
   }
 
-  /** Of all that is decoded, and of what it is to replace. */
+  /** GPU bytes of all decoded increments, including replaced ones that are still drawn. */
   get gpuBytes(): number {
     const own = this.label.levels.reduce((sum, file, i) => sum + (this.decoded[i] ? file.gpuBytes : 0), 0);
     return own + (this.former ? gpuBytesOf(this.former) : 0);
   }
 }
 
-/** Drawn content that is to be replaced. */
+/** Drawn content that will be replaced. */
 export interface Drawn {
   readonly label: Label;
   readonly handles: readonly Handle[];
@@ -59,7 +59,7 @@ export interface Drawn {
 
 export const gpuBytesOf = (drawn: Drawn): number => drawn.ladder.gpuBytes[drawn.level - 1] ?? 0;
 
-/** What is drawn of a label that goes; what else is decoded of it is disposed of. */
+/** The drawn increments of a removed label; disposes of its other decoded increments. */
 function retire(entry: Entry, hidden: Hidden, renderer: Renderer): Drawn | null {
   for (const handle of entry.handles(entry.shown, entry.decoded.length)) {
     hidden.remove(handle);
@@ -69,7 +69,7 @@ function retire(entry: Entry, hidden: Hidden, renderer: Renderer): Drawn | null 
   return shown ? { label, handles: entry.handles(0, shown), level: shown, ladder } : entry.former;
 }
 
-/** Entries for the labels of a new manifest, and what is drawn of labels that it has no more. */
+/** Entries for the labels of a new manifest, and the drawn increments of removed labels. */
 export function exchange(
   entries: readonly Entry[],
   labels: readonly Label[],
@@ -98,7 +98,7 @@ function renewed(old: Entry, label: Label, hidden: Hidden, renderer: Renderer): 
   return entry;
 }
 
-/** Decoded increments that are not drawn, the longest hidden first. */
+/** Decoded increments that are not drawn, least recently drawn first. */
 export class Hidden {
   private readonly kept = new Map<Handle, { entry: Entry; bytes: number }>();
   bytes = 0;
@@ -117,7 +117,7 @@ export class Hidden {
     this.kept.delete(handle);
   }
 
-  /** Disposes of the longest hidden until the rest is within a limit of GPU bytes. */
+  /** Disposes of the least recently drawn increments until the rest is within a limit of GPU bytes. */
   shrink(limit: number): void {
     for (const [handle, { entry }] of this.kept) {
       if (this.bytes <= limit) return;
@@ -128,7 +128,7 @@ export class Hidden {
   }
 }
 
-/** Brings what is drawn to what is wanted, as far as it is decoded, in one tick. */
+/** Draws the wanted levels as far as they are decoded, in one tick. */
 export function settle(
   entries: readonly Entry[],
   leaving: Drawn[],
@@ -138,7 +138,7 @@ export function settle(
   const show: Handle[] = [];
   const hide: Handle[] = [];
   const gone: Handle[] = [];
-  // new content of a scene in training goes with all of itself, or neighbours would not fit together
+  // new content of a live scene is swapped in completely, or neighbouring labels would not match
   const renewed = entries.every((e) => !isChanging(e) || e.ready >= e.wanted);
   for (const e of entries) {
     if (isChanging(e) ? !renewed : e.former) continue;
@@ -148,7 +148,7 @@ export function settle(
       show.push(handle);
     }
     hide.push(...e.handles(level, e.shown));
-    // the top first, so that it goes first
+    // the top level first, so that it is disposed of first
     for (const handle of e.handles(level, e.former ? e.decoded.length : e.shown).reverse())
       hidden.add(e, handle);
     e.shown = level;
@@ -161,5 +161,5 @@ export function settle(
   for (const handle of gone) renderer.dispose(handle);
 }
 
-/** Whether a label waits for new content that it can have. */
+/** Whether a label waits for new content that is available. */
 const isChanging = (e: Entry): boolean => e.former !== null && e.wanted > 0;

@@ -1,4 +1,4 @@
-/** Streams a bundle: from where the viewer stands to what is drawn. The only part of the core with a state. */
+/** Streams a bundle: plans, downloads, decodes and draws increments. The only stateful part of the core. */
 
 import type { Handle, Manifest, Renderer, Settings, State, Viewpoint } from "../types";
 import { describe } from "./describe";
@@ -23,16 +23,16 @@ export interface StreamerOptions {
   readonly clock?: Clock;
   readonly now?: () => number; // ms, instead of the clock's
   readonly digest?: Digest;
-  readonly keepBytes?: number; // of files that have come
-  readonly downloads?: number; // at once, at most
+  readonly keepBytes?: number; // cache of downloaded files
+  readonly downloads?: number; // concurrent downloads, at most
 }
 
-const PLAN_EVERY = 125; // ms, at least
-const REST = 4; // times as long as a plan took before the next: scenes of many parts leave time to draw
-const QUICK = 4; // ms of work that needs no rest
+const PLAN_EVERY = 125; // ms between plans, at least
+const REST = 4; // least pause after a plan, as a multiple of its duration, so that large scenes leave time to draw
+const QUICK = 4; // ms; plans that are faster need no pause
 const KEEP = 64 * 2 ** 20;
-const DECODES = 4; // at once
-const HOLDS_UP = 0.05; // of a pack's bytes
+const DECODES = 4; // concurrent
+const HOLDS_UP = 0.05; // size of the viewpoint models, relative to a pack, from which on they delay it
 const BY_DISTANCE = "levels are planned by distance alone.";
 const UNCHECKED = "Served without https: files are checked by their size only.";
 
@@ -48,19 +48,19 @@ export class Streamer {
   private viewpoint: Viewpoint;
   private content: Manifest;
   private entries: Entry[];
-  private leaving: Drawn[] = []; // labels that a new manifest has no more
+  private leaving: Drawn[] = []; // drawn increments of labels that a new manifest removed
   private outlook = new Outlook();
   private planned: Plan["status"] = "ok";
-  private nextPlan = -Infinity; // ms, not before
+  private nextPlan = -Infinity; // ms of the clock: earliest time
   private nextWork = -Infinity;
-  private postponed = false; // work
+  private postponed = false; // an update is scheduled
   private wantedKeys = new Set<string>(); // of all files of the plan
   private dirty = false;
   private decodes = 0;
   private pending = 0;
   private trouble: string | null = null;
   private known: State | null = null;
-  private told = true;
+  private notified = true;
   private phase: "new" | "running" | "disposed" = "new";
 
   constructor(private readonly options: StreamerOptions) {
@@ -97,7 +97,7 @@ export class Streamer {
     return this.known;
   }
 
-  /** Begins to load, for the bundle's own start until `update` is called. */
+  /** Starts loading, for the bundle's start view until `update` is called. */
   start(): void {
     if (this.phase !== "new") return;
     this.phase = "running";
@@ -107,7 +107,7 @@ export class Streamer {
     if (this.content.live) this.follow();
   }
 
-  /** Where the viewer is now. Cheap: plans at most 8 times a second, and only if something moved. */
+  /** Sets the viewpoint. Cheap: plans at most 8 times a second, and only if something moved. */
   update(viewpoint: Viewpoint): void {
     if (same(viewpoint, this.viewpoint)) return;
     this.viewpoint = viewpoint;
@@ -120,13 +120,13 @@ export class Streamer {
     this.replan();
   }
 
-  /** Calls back, at most once in a task, when the state has changed. Returns how to stop that. */
+  /** Calls back, at most once per task, when the state has changed. Returns a function that unsubscribes. */
   onChange(callback: () => void): () => void {
     this.listeners.add(callback);
     return () => this.listeners.delete(callback);
   }
 
-  /** Resolves when all that the plan wants is drawn, or cannot be had for now. */
+  /** Resolves when everything planned is drawn, or currently unavailable. */
   idle(): Promise<void> {
     return new Promise((resolve) => {
       this.waiting.push(resolve);
@@ -134,7 +134,7 @@ export class Streamer {
     });
   }
 
-  /** Tries at once what failed, say when the browser is online again. */
+  /** Retries failed downloads immediately, e.g. when the browser is online again. */
   retry(): void {
     this.supply.forgive();
     this.trouble = null;
@@ -186,13 +186,13 @@ export class Streamer {
     this.work();
   }
 
-  /** Level that a label can have: below the first increment that is broken. */
+  /** Highest available level of a label: below its first damaged increment. */
   private highest(entry: Entry): number {
     const broken = entry.label.levels.findIndex((file) => this.supply.failure(file)?.lasting);
     return broken < 0 ? entry.label.levels.length : broken;
   }
 
-  /** Draws what is there, decodes what has come, fetches what is missing. */
+  /** Draws decoded increments, decodes downloaded ones, downloads missing ones. */
   private work(): void {
     if (this.phase !== "running" || this.postponed) return;
     const begun = this.clock.now();
@@ -227,7 +227,7 @@ export class Streamer {
     }
   }
 
-  /** Whether the plan does not depend on promises, which would hold up a pack that is hardly larger. */
+  /** Whether viewpoint models can wait: the plan does not depend on them, and they would delay a small pack. */
   private promisesCanWait(): boolean {
     const { mode } = this.settings;
     const { pack, promises } = this.content;
@@ -240,7 +240,7 @@ export class Streamer {
     return promises && !this.outlook.complete ? [promises] : [];
   }
 
-  /** Files of all increments of the plan that are not decoded. */
+  /** Files of all planned increments that are not decoded. */
   private wantedFiles(): File[] {
     return this.entries.flatMap((entry) => {
       const files = entry.files(0, entry.wanted);
@@ -248,7 +248,7 @@ export class Streamer {
     });
   }
 
-  /** Decodes in the order in which files have come, which is that of their worth. */
+  /** Decodes in the order of arrival, which is that of value. */
   private decodeMore(): void {
     const came = this.supply.waiting;
     const place = (entry: Entry) => came.get(entry.label.levels[entry.ready]?.sha256 ?? "") ?? -1;
@@ -285,7 +285,7 @@ export class Streamer {
     else this.arrived();
   }
 
-  /** A file has come or failed, or may be tried again. */
+  /** Called when a file has arrived, has failed, or may be retried. */
   private arrived(): void {
     if (this.phase !== "running") return;
     this.takePromises();
@@ -310,16 +310,16 @@ export class Streamer {
     }
   }
 
-  /** Takes over the manifest of a live bundle each time it has changed and the one before is drawn. */
+  /** Adopts the manifest of a live bundle whenever it has changed and the previous one is drawn. */
   private follow(): void {
     const { base, fetch = (url, init) => globalThis.fetch(url, init) } = this.options;
     poll({
       url: new URL("manifest.json", base).href,
       fetch,
       clock: this.clock,
-      goesOn: () => this.phase === "running" && this.content.live,
+      isActive: () => this.phase === "running" && this.content.live,
       isFree: () => this.isIdle(),
-      found: (manifest) => this.adopt(manifest),
+      changed: (manifest) => this.adopt(manifest),
       failed: (message) => {
         this.trouble = message;
         this.changed();
@@ -352,7 +352,7 @@ export class Streamer {
     );
   }
 
-  /** Whether something failed that will soon be tried again. */
+  /** Whether a failed download will soon be retried. */
   private retrying(): boolean {
     return [...this.wantedFiles(), ...this.missingPromises()].some((file) => {
       const failure = this.supply.failure(file);
@@ -367,10 +367,10 @@ export class Streamer {
 
   private changed(): void {
     this.known = null;
-    if (!this.told) return;
-    this.told = false;
+    if (!this.notified) return;
+    this.notified = false;
     queueMicrotask(() => {
-      this.told = true;
+      this.notified = true;
       for (const callback of this.listeners) callback();
     });
   }

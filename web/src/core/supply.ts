@@ -1,4 +1,4 @@
-/** Which files are on their way, have come or have failed. It is told what is wanted, best first. */
+/** Schedules the downloads of the wanted files, best first; knows what has arrived or failed. */
 
 import {
   Bandwidth,
@@ -12,47 +12,47 @@ import {
 } from "./download";
 import { lateIn, Pack } from "./pack";
 
-/** A file that did not come. */
+/** A failed download. */
 export interface Failure {
   readonly message: string;
-  readonly lasting: boolean; // of no use to try again
+  readonly lasting: boolean; // a retry is useless
   readonly tries: number;
-  readonly until: number; // ms of the clock, before which it is not tried again
+  readonly until: number; // ms of the clock: earliest time of a retry
 }
 
 interface Load {
   readonly file: File;
   readonly abort: AbortController;
-  got: number; // bytes
+  got: number; // bytes received
   dropped: boolean;
 }
 
-/** Tries after which a failure is told of; it is still tried again, but seldom. */
+/** Tries after which a failure is shown to the user; it is still retried, but rarely. */
 export const PATIENCE = 5;
-const FIRST_WAIT = 500; // ms, doubled from try to try
+const FIRST_WAIT = 500; // ms, doubled with each try
 const LONGEST_WAIT = 15_000;
-const AT_ONCE = 16; // downloads; a browser has no more than 6 on a server without HTTP/2
-const AHEAD = 0.25; // seconds of the link's speed to keep in flight: a round trip and some
-const UNKNOWN = 32_768; // bytes in flight as long as the speed is not known
-const TINY = 16_384; // bytes left that are not worth an abort
+const AT_ONCE = 16; // concurrent downloads; browsers allow only 6 without HTTP/2
+const AHEAD = 0.25; // seconds of bandwidth to keep in flight: more than a round trip
+const UNKNOWN = 32_768; // bytes in flight while the bandwidth is unknown
+const TINY = 16_384; // remaining bytes below which a download is not aborted
 
 export interface SupplyOptions extends Omit<Link, "received" | "answered"> {
-  readonly keepBytes: number; // of files that have come, for when they are wanted again
-  readonly changed: () => void; // something came, failed or may be tried again
+  readonly keepBytes: number; // cache of downloaded files
+  readonly changed: () => void; // called when a file arrived, failed or may be retried
   readonly atOnce?: number;
 }
 
 export class Supply {
   readonly bandwidth: Bandwidth;
   received = 0; // bytes in all
-  /** Why the pack is of no use, if it is not what the manifest says. */
+  /** Why the pack is unusable, if it does not match the manifest. */
   note: string | null = null;
   private pack: Pack | null = null;
-  private damaged = 0; // files of the pack
+  private damaged = 0; // damaged files of the pack
   private roundTrip = Infinity; // ms
-  private readonly unproven = new Set<string>(); // files of a pack that could not be checked
+  private readonly unverified = new Set<string>(); // files of a pack whose hash could not be checked
   private readonly loads = new Map<string, Load>();
-  private readonly come = new Map<string, Uint8Array>(); // until they are taken
+  private readonly come = new Map<string, Uint8Array>(); // arrived files, until they are taken
   private readonly failures = new Map<string, Failure>();
   private readonly shelf: Shelf;
   private readonly link: Link;
@@ -66,7 +66,7 @@ export class Supply {
       this.bandwidth.count(bytes);
     };
     const answered = (ms: number) => {
-      this.roundTrip = Math.min(ms, 1.25 * this.roundTrip); // a browser's own queue is no round trip
+      this.roundTrip = Math.min(ms, 1.25 * this.roundTrip); // waiting in the browser's queue does not count
     };
     this.link = { ...options, received, answered };
   }
@@ -75,19 +75,19 @@ export class Supply {
     return this.loads.size + (this.pack ? 1 : 0);
   }
 
-  /** Whether a pack is coming. */
+  /** Whether a pack is loading. */
   get streams(): boolean {
     return this.pack !== null;
   }
 
-  /** Begins to receive a pack: what it brings in time is not fetched one by one. */
+  /** Starts loading a pack; files that it brings in time are not downloaded separately. */
   open(file: File, files: readonly File[]): void {
     this.begin();
     this.pack = new Pack(file, files);
     void this.receive(this.pack);
   }
 
-  /** Bytes of files kept for later. */
+  /** Bytes of cached files. */
   get keptBytes(): number {
     return this.shelf.bytes;
   }
@@ -100,12 +100,12 @@ export class Supply {
     return this.come.has(file.sha256) || this.shelf.has(file.sha256);
   }
 
-  /** Of files that have come and were not taken: their place in the order in which they came. */
+  /** Arrived files that were not taken, with their rank in the order of arrival. */
   get waiting(): Map<string, number> {
     return new Map([...this.come.keys()].map((key, i) => [key, i]));
   }
 
-  /** The content, if it is here; it stays on the shelf as long as there is room. */
+  /** The content, if it has arrived; it stays in the cache while there is room. */
   take(file: File): Uint8Array | undefined {
     const content = this.come.get(file.sha256) ?? this.shelf.get(file.sha256);
     this.come.delete(file.sha256);
@@ -116,15 +116,15 @@ export class Supply {
     return this.failures.get(file.sha256);
   }
 
-  /** Whether a file is not to be tried now. */
+  /** Whether a file must not be retried yet. */
   rests(file: File): boolean {
     const failure = this.failures.get(file.sha256);
     return failure !== undefined && (failure.lasting || failure.until > this.link.clock.now());
   }
 
-  /** A file that came in order, but is of no use. */
+  /** Reports a file that arrived intact but is unusable. */
   spoil(file: File, message: string): void {
-    if (this.unproven.delete(file.sha256)) {
+    if (this.unverified.delete(file.sha256)) {
       this.shelf.drop(file.sha256);
       this.fail(file, new DamagedError(message, false));
       return;
@@ -133,9 +133,9 @@ export class Supply {
   }
 
   /**
-   * Starts the best of what is wanted, as many as the link can use, and stops the pack where it is no more use.
+   * Starts the best of the wanted downloads, as many as the link can use; stops the pack when it is useless.
    *
-   * @param undecided - more may be wanted soon, and what is worth more is not known well
+   * @param undecided - more files may be wanted soon, and values are still estimates
    */
   fill(wanted: readonly File[], undecided = false): void {
     const single = this.pack ? this.besides(this.pack, wanted, undecided) : wanted;
@@ -145,7 +145,7 @@ export class Supply {
     }
   }
 
-  /** Of what is wanted that which a pack does not bring, or brings late. */
+  /** The wanted files that the pack does not bring, or brings late. */
   private besides(pack: Pack, wanted: readonly File[], undecided: boolean): File[] {
     const brought = wanted.filter((file) => !this.loads.has(file.sha256) && pack.until(file) >= 0);
     const late = undecided ? new Set() : lateIn(pack, brought, (this.roundTrip * this.bandwidth.rate) / 1000);
@@ -153,13 +153,13 @@ export class Supply {
     const single = wanted.filter((file) => {
       const mine = pack.until(file) >= 0 && !this.loads.has(file.sha256) && !late.has(file);
       brings ||= mine;
-      return !mine && (!brings || pack.holds(file)); // what else there is waits for what is worth more
+      return !mine && (!brings || pack.holds(file)); // other files wait for those of larger value
     });
     if (!brings && !undecided && !pack.isHere) pack.stop();
     return single;
   }
 
-  /** Aborts what is no longer wanted, unless it is nearly there. */
+  /** Aborts downloads that are no longer wanted, unless they are nearly complete. */
   keepOnly(wanted: ReadonlySet<string>): void {
     for (const [key, load] of this.loads) {
       const left = load.file.bytes - load.got;
@@ -169,7 +169,7 @@ export class Supply {
     for (const key of this.come.keys()) if (!wanted.has(key)) this.come.delete(key);
   }
 
-  /** Forgets failures: all may be tried again at once. */
+  /** Forgets failures, so that all files may be retried immediately. */
   forgive(): void {
     this.failures.clear();
   }
@@ -182,7 +182,7 @@ export class Supply {
     this.shelf.clear();
   }
 
-  /** Small files need many requests in flight to fill a link; more than that would only spoil the order. */
+  /** Number of concurrent downloads: many for small files, to fill the link; more would only weaken the order. */
   private hasRoom(): boolean {
     if (this.closed || this.loads.size >= (this.options.atOnce ?? AT_ONCE)) return false;
     if (this.loads.size < 2) return true;
@@ -218,19 +218,19 @@ export class Supply {
     if (!this.closed) this.options.changed();
   }
 
-  /** A file of the pack; damaged ones are fetched once more by themselves. */
+  /** Verifies a file of the pack; a damaged one is downloaded again separately. */
   private async accept(file: File, content: Uint8Array): Promise<void> {
     if (this.closed || this.isHere(file)) return;
     try {
       await intact(this.link, file, content);
       if (this.closed) return;
-      if (!this.link.digest) this.unproven.add(file.sha256);
+      if (!this.link.digest) this.unverified.add(file.sha256);
       const load = this.loads.get(file.sha256);
       if (load) this.drop(file.sha256, load);
       this.arrive(file, content);
     } catch (error) {
       this.damaged += 1;
-      if (this.damaged > 1) this.pack?.stop(); // then the rest is no better
+      if (this.damaged > 1) this.pack?.stop(); // the rest is likely damaged too
       this.fail(file, error);
     }
     this.options.changed();
@@ -253,7 +253,7 @@ export class Supply {
         load.got = got;
       });
       if (load.dropped) return;
-      this.unproven.delete(key);
+      this.unverified.delete(key);
       this.arrive(file, content);
     } catch (error) {
       if (load.dropped) return;

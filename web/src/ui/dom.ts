@@ -46,7 +46,7 @@ export function setIcon(button: HTMLElement, name: IconName): void {
   button.querySelector("svg")?.replaceWith(icon(name));
 }
 
-/** A button with an icon; its name is read out and shown as a tooltip. */
+/** A button with an icon; its title is the tooltip and the accessible name. */
 export function iconButton(
   name: IconName,
   title: string,
@@ -60,7 +60,7 @@ export function iconButton(
   );
 }
 
-/** Sets text only where it changed, so that nothing is laid out anew. */
+/** Sets text only if it changed, to avoid a new layout. */
 export function setText(element: Element, text: string): void {
   if (element.textContent !== text) element.textContent = text;
 }

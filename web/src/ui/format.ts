@@ -1,4 +1,4 @@
-/** "1.2 MB", with two figures or more; bytes are counted by thousands, as networks do. */
+/** "1.2 MB", with at least two digits; decimal units. */
 export function formatBytes(bytes: number): string {
   if (!Number.isFinite(bytes)) return "no limit";
   if (bytes < 1000) return `${Math.round(bytes)} B`;
@@ -17,7 +17,7 @@ export function formatCount(count: number): string {
   return `${(kilo / 1000).toFixed(2)} M`;
 }
 
-/** Metres; "–" where nothing is in sight. */
+/** Metres; "–" for an unknown distance. */
 export function formatDistance(metres: number): string {
   if (!Number.isFinite(metres)) return "–";
   return `${metres < 10 ? metres.toFixed(1) : Math.round(metres)} m`;

@@ -1,38 +1,38 @@
 import type { LabelState } from "../types";
 
-/** The labels that are one category: a label by itself, or all its parts in a scene in blocks. */
+/** The labels of one category: a single label, or its per-block categories in a scene in blocks. */
 export interface Group {
   readonly key: string;
-  readonly states: readonly LabelState[]; // the parts by block
+  readonly states: readonly LabelState[]; // sorted by block
   readonly splats: number; // of all levels
 }
 
-/** What a group's row says. */
+/** The content of a group's row. */
 export interface Summary {
   readonly shown: number; // share of its levels
   readonly wanted: number;
-  readonly level: string; // "2/6", "1–4/6" where its parts differ
-  readonly promised: number; // the least of what is in sight
+  readonly level: string; // "2/6", or "1–4/6" if the blocks differ
+  readonly promised: number; // minimum over visible labels
   readonly expected: number;
   readonly count: number;
   readonly bytes: number;
-  readonly distance: number; // of the nearest
+  readonly distance: number; // of the nearest label
   readonly visible: boolean;
   readonly loading: boolean;
   readonly error: string | null;
 }
 
-/** By category, the largest first. */
+/** The labels grouped by category, largest first. */
 export function grouped(states: readonly LabelState[]): Group[] {
-  const found = new Map<string, LabelState[]>();
+  const byCategory = new Map<string, LabelState[]>();
   for (const state of states) {
     const { label } = state;
     const key = label.block === undefined ? `#${label.id}` : (label.category ?? label.name);
-    const known = found.get(key);
+    const known = byCategory.get(key);
     if (known) known.push(state);
-    else found.set(key, [state]);
+    else byCategory.set(key, [state]);
   }
-  const groups = [...found].map(([key, parts]) => ({
+  const groups = [...byCategory].map(([key, parts]) => ({
     key,
     states: parts.sort((a, b) => (a.label.block ?? 0) - (b.label.block ?? 0)),
     splats: parts.reduce(
@@ -69,7 +69,7 @@ export function summary(states: readonly LabelState[]): Summary {
   };
 }
 
-/** A colour for a block, as far from those before it as hues go. */
+/** A colour for a block, with hues spread by the golden angle. */
 export const blockColor = (block: number): string => {
   const hue = (block * 137.508) % 360;
   const channel = (at: number) => {

@@ -5,13 +5,14 @@ import { formatBytes, formatCount, formatDistance, formatSsim } from "./format";
 import { blockColor, grouped, summary } from "./groups";
 
 const WEIGHTS = [0.25, 0.5, 1, 2, 4];
+const PROMISE = "a promise is a lower confidence bound of SSIM, calibrated on held-out views";
 
 interface Row {
   readonly element: HTMLElement;
   update(states: readonly LabelState[]): void;
 }
 
-/** The labels: colour, level, promised SSIM, size, distance, weight, and whether they are drawn. */
+/** The list of categories: colour, level, promised SSIM, size, distance, weight, and visibility. */
 export class LabelTable {
   readonly element = h("ul", { class: "labels", "aria-label": "Labels" });
   readonly #rows = new Map<string, Row>();
@@ -36,7 +37,7 @@ export class LabelTable {
   }
 }
 
-/** A label by itself, or a category in blocks: then its parts are below it once somebody wants to see them. */
+/** The row of a category; in a scene in blocks it can be expanded to one row per block. */
 function labelRow(viewer: Viewer, states: readonly LabelState[]): Row {
   const label = states[0]?.label;
   const title = label?.title ?? "";
@@ -58,7 +59,7 @@ function labelRow(viewer: Viewer, states: readonly LabelState[]): Row {
   };
 }
 
-/** The parts of a category, by block. */
+/** The expandable list of a category's blocks. */
 function partList(viewer: Viewer, parent: HTMLElement, title: string): Pick<Row, "update"> {
   const rows = new Map<number, Row>();
   const list = h("ul", { class: "parts", "aria-label": `${title} by block`, hidden: true });
@@ -116,11 +117,11 @@ function factsRow(viewer: Viewer, title: string, name: string, color: string): R
     bar.style.setProperty("--wanted", String(now.wanted));
     bar.setAttribute(
       "aria-label",
-      `level ${now.level}, ${Math.round(100 * now.wanted)} % of the levels wanted`,
+      `level ${now.level}, ${Math.round(100 * now.wanted)} % of the levels planned`,
     );
     setText(level, now.level);
     setText(ssim, formatSsim(now.promised));
-    ssim.title = `promised SSIM ${formatSsim(now.promised)}, expected ${formatSsim(now.expected)}`;
+    ssim.title = `promised SSIM ${formatSsim(now.promised)}, expected ${formatSsim(now.expected)}; ${PROMISE}`;
     const place = now.visible ? formatDistance(now.distance * metres) : "out of sight";
     setText(facts, now.error ?? `${formatCount(now.count)} · ${formatBytes(now.bytes)} · ${place}`);
     element.classList.toggle("error", now.error !== null);
@@ -140,7 +141,7 @@ function setEye(eye: HTMLButtonElement, title: string, hidden: boolean): void {
   setIcon(eye, hidden ? "closed" : "eye");
 }
 
-/** One weight for all labels of a row; where they differ, none is chosen. */
+/** The weight of all labels of a row; if they differ, none is selected. */
 function weightSelect(viewer: Viewer, ids: () => number[], title: string): HTMLSelectElement {
   const set = () => {
     const weights = new Map(viewer.settings.weights);
@@ -161,9 +162,9 @@ function weightSelect(viewer: Viewer, ids: () => number[], title: string): HTMLS
   return select;
 }
 
-/** A level change is seen for a moment. */
+/** Highlights a change of level briefly. */
 function flash(element: HTMLElement, up: boolean): void {
   element.classList.remove("up", "down");
-  void element.offsetWidth; // so that the animation begins anew
+  void element.offsetWidth; // forces a layout, which restarts the animation
   element.classList.add(up ? "up" : "down");
 }

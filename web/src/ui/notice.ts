@@ -1,6 +1,6 @@
 import { h } from "./dom";
 
-/** A message in place of the scene, with a way out. */
+/** Shows an error in place of the scene, with a button to reload. */
 export function fail(message: string): void {
   const again = h(
     "button",

@@ -7,9 +7,9 @@ import { splitSlider } from "./split";
 import { toolbar } from "./toolbar";
 import "./theme";
 
-const REFRESH = 250; // ms: numbers that change all the time
+const REFRESH = 250; // ms between updates of the numbers
 
-/** The page around the canvas. `app` holds the canvas already. */
+/** Builds the UI around the canvas, which is already in `app`. */
 export function buildPage(app: HTMLElement, viewer: Viewer): void {
   const { manifest } = viewer;
   const panel = new Panel(viewer);
@@ -60,18 +60,18 @@ function sentence(viewer: Viewer, done: boolean): string {
   const { state, compare } = viewer;
   if (compare.on && compare.progress < 1)
     return `Loading the full scene, ${Math.floor(compare.progress * 100)} %`;
-  if (state.status === "over budget") return "The smallest picture is over the budget";
+  if (state.status === "over budget") return "The lowest levels exceed the budget";
   if (state.status === "infeasible") return shortfall(state, viewer.settings);
-  if (done) return viewer.manifest.live ? "Training goes on" : "";
+  if (done) return viewer.manifest.live ? "Training is running" : "";
   return state.count ? "Refining…" : "Loading…";
 }
 
-/** Which labels miss the target, or that the budget is too small for what was asked. */
+/** Names the categories that miss the target, or says that the budget is the limit. */
 function shortfall(state: State, { mode, target }: Settings): string {
   const short = state.labels.filter(
     (l) => l.visible && l.wanted === l.label.levels.length && l.promised < target,
   );
-  if (mode !== "target" || !short.length) return "The best that the budget allows";
+  if (mode !== "target" || !short.length) return "Best quality within the budget";
   const names = [...new Set(short.map((l) => l.label.title))];
   const named =
     names.length > 2 ? `${names.slice(0, 2).join(", ")} and ${names.length - 2} more` : names.join(" and ");

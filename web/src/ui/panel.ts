@@ -11,7 +11,7 @@ const MODES: readonly (readonly [Settings["mode"], string])[] = [
 ];
 const NARROW = "(max-width: 640px)";
 
-/** Mode, sliders, meters and the labels; on a phone a sheet at the bottom. */
+/** The panel with mode, sliders, meters and categories; on a phone a sheet at the bottom. */
 export class Panel {
   readonly element: HTMLElement;
   readonly #table: LabelTable;
@@ -45,7 +45,7 @@ export class Panel {
           {
             class: "modes",
             role: "radiogroup",
-            "aria-label": "What decides",
+            "aria-label": "Planning mode",
             keydown: (event) => this.#step(event),
           },
           ...this.#modes,
@@ -70,7 +70,7 @@ export class Panel {
 
   update(): void {
     const { state, settings, streamer, frameMs } = this.viewer;
-    const { totals } = streamer.manifest; // it grows while a training is followed
+    const { totals } = streamer.manifest; // grows while training runs
     const bytes = `${formatBytes(state.bytesShown)} of ${formatBytes(totals.bytes)}`;
     setText(this.#summary, bytes);
     this.#meter.style.setProperty("--value", String(state.bytesShown / Math.max(totals.bytes, 1)));
@@ -84,12 +84,12 @@ export class Panel {
       ["Splats", `${formatCount(state.count)} of ${formatCount(totals.count)}`],
       ["GPU", `${formatBytes(state.gpuBytes)} of ${formatBytes(totals.gpuBytes)}`],
       ["Network", `${formatBytes(state.bytesLoaded)}${rate(state.bandwidth)}`],
-      ["Frame", Number.isNaN(frameMs) ? "at rest" : `${frameMs.toFixed(frameMs < 10 ? 1 : 0)} ms`],
+      ["Frame", Number.isNaN(frameMs) ? "idle" : `${frameMs.toFixed(frameMs < 10 ? 1 : 0)} ms`],
     ]);
     this.#table.update(state.labels);
   }
 
-  /** Arrow keys choose among the modes, as in every group of radio buttons. */
+  /** Arrow keys change the mode, as in any radio group. */
   #step(event: Event): void {
     const by = { ArrowLeft: -1, ArrowUp: -1, ArrowRight: 1, ArrowDown: 1 }[(event as KeyboardEvent).key];
     if (!by) return;
@@ -162,7 +162,7 @@ function qualitySlider(viewer: Viewer): Slider {
   );
 }
 
-/** One slider a unit, as a share of the full scene; its right end is no limit. */
+/** One slider per unit, as a share of the full scene; the right end means no limit. */
 function budgetSliders(viewer: Viewer): Slider[] {
   const { totals } = viewer.manifest;
   const units = [

@@ -7,7 +7,7 @@ export interface Split {
   update(): void;
 }
 
-/** The line between the full scene and the adapted one; a range input, so that keys move it too. */
+/** The divider between the full and the adapted scene; a range input, so that keys can move it. */
 export function splitSlider(viewer: Viewer): Split {
   const range = h("input", {
     type: "range",

@@ -6,7 +6,7 @@ function stored(): string | null {
   try {
     return localStorage.getItem(KEY);
   } catch {
-    return null; // storage may be forbidden; then the theme lasts as long as the page
+    return null; // storage may be blocked; the theme is then not remembered
   }
 }
 
@@ -17,7 +17,7 @@ function show(): void {
   document.documentElement.dataset.theme = theme;
 }
 
-/** Light, dark, or as the system has it; returns the new one. */
+/** Switches between light, dark and the system's theme; returns the new one. */
 export function nextTheme(): Theme {
   const dark = matchMedia("(prefers-color-scheme: dark)").matches;
   const order: readonly Theme[] = dark ? ["auto", "light", "dark"] : ["auto", "dark", "light"];

@@ -6,7 +6,7 @@ import { messageOf } from "./notice";
 import type { Split } from "./split";
 import { nextTheme } from "./theme";
 
-const TINT = 0.75; // how much of a label's own colour
+const TINT = 0.75; // share of the label colour
 
 interface Parts {
   readonly split: Split;
@@ -14,7 +14,7 @@ interface Parts {
   readonly say: (message: string) => void;
 }
 
-/** Camera, photos, comparison, colours, help and headset, with a key for each. */
+/** The toolbar: camera, photos, comparison, colours, help and headset, with keyboard shortcuts. */
 export function toolbar(viewer: Viewer, parts: Parts): { element: HTMLElement; update(): void } {
   const blocks = viewer.manifest.labels.some(({ block }) => block !== undefined);
   const tints = blocks ? 3 : 2; // none, by label, by block
@@ -23,15 +23,14 @@ export function toolbar(viewer: Viewer, parts: Parts): { element: HTMLElement; u
     viewer.controls.mode = viewer.controls.mode === "orbit" ? "walk" : "orbit";
     setIcon(mode, viewer.controls.mode);
     parts.say(
-      viewer.controls.mode === "orbit" ? "Drag turns around the scene" : "Drag looks around, W A S D walk",
+      viewer.controls.mode === "orbit" ? "Drag to orbit the scene" : "Drag to look around, W A S D to walk",
     );
   });
   const compare = iconButton("compare", "Compare with the full scene (C)", () => parts.split.toggle());
-  const tint = iconButton("tint", "Colour the labels (T)", () => {
+  const tint = iconButton("tint", "Colour by category (T)", () => {
     tinted = (tinted + 1) % tints;
     viewer.setTint(tinted ? TINT : 0, tinted === 2 ? blockColors(viewer) : undefined);
-    if (blocks)
-      parts.say(["Colours of the photos", "Coloured by category", "Coloured by block"][tinted] ?? "");
+    if (blocks) parts.say(["Original colours", "Coloured by category", "Coloured by block"][tinted] ?? "");
   });
   const help = iconButton("help", "Help (?)", () => parts.help.showModal());
   const theme = iconButton("theme", "Light or dark", () => parts.say(`Theme: ${nextTheme()}`));
@@ -84,9 +83,9 @@ function photoPicker(viewer: Viewer): { elements: HTMLElement[]; step(by: number
           h(
             "span",
             { class: "photos" },
-            iconButton("previous", "Photo before ([)", () => step(-1)),
+            iconButton("previous", "Previous photo ([)", () => step(-1)),
             select,
-            iconButton("next", "Photo after (])", () => step(1)),
+            iconButton("next", "Next photo (])", () => step(1)),
           ),
         ]
       : [],
@@ -114,7 +113,11 @@ async function addHeadsets(
     element.append(h("button", { type: "button", class: "text", title, click: enter }, names[mode]));
   }
   if (!modes.length) return;
-  const turning = h("button", { type: "button", class: "text", title: "Turning in the headset" }, "Snap");
+  const turning = h(
+    "button",
+    { type: "button", class: "text", title: "Turning in the headset: snap or smooth" },
+    "Snap",
+  );
   turning.addEventListener("click", () => {
     headset.turning = headset.turning === "snap" ? "smooth" : "snap";
     turning.textContent = headset.turning === "snap" ? "Snap" : "Smooth";

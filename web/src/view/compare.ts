@@ -3,7 +3,7 @@ import type { Manifest, Settings } from "../types";
 import type { SparkLayer } from "./spark";
 import type { Stage } from "./stage";
 
-/** The full scene beside the adapted one: a layer and a stream of its own, only while it is wanted. */
+/** The full scene beside the adapted one, with its own layer and streamer while the comparison is on. */
 export class Compare {
   #streamer: Streamer | null = null;
   #layer: SparkLayer | null = null;
@@ -19,7 +19,7 @@ export class Compare {
     return this.#layer !== null;
   }
 
-  /** Of the full scene's bytes, what has come: 0 to 1. */
+  /** Loaded share of the full scene's bytes, 0 to 1. */
   get progress(): number {
     const shown = this.#streamer?.state.bytesShown ?? 0;
     return shown / Math.max(this.manifest.totals.bytes, 1);

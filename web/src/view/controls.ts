@@ -2,14 +2,14 @@ import { between, dolly, look, orbit, pan, type Rig, walk } from "./motion";
 
 export type Mode = "orbit" | "walk";
 
-const SPEED = 1.4; // metres a second: a walking pace
-const FAST = 3.5; // times that with shift
-const TURN = 1.6; // radians a second by keyboard and gamepad
-const DRAG = 0.005; // radians a pixel
+const SPEED = 1.4; // metres per second: walking speed
+const FAST = 3.5; // factor with Shift
+const TURN = 1.6; // radians per second, by keyboard and gamepad
+const DRAG = 0.005; // radians per pixel
 const TRAVEL = 700; // ms from one photo to the next
-const DEAD = 0.15; // of a gamepad's stick
+const DEAD = 0.15; // dead zone of a gamepad's stick
 
-/** Keys that move: right, up, ahead (1 or -1), and those that turn: yaw, pitch. By `KeyboardEvent.code`. */
+/** Keys by `KeyboardEvent.code`: translation (right, up, forward) or rotation (yaw, pitch). */
 const MOVES: Readonly<Record<string, readonly [number, number, number]>> = {
   KeyW: [0, 0, 1],
   KeyS: [0, 0, -1],
@@ -32,7 +32,7 @@ export class Controls {
   readonly #pointers = new Map<number, { x: number; y: number; button: number }>();
   #travel: { from: Rig; to: Rig; start: number } | null = null;
 
-  /** @param onMove - the user, or a journey, moved the camera */
+  /** @param onMove - called when the user or an animation moved the camera */
   constructor(
     readonly canvas: HTMLElement,
     public rig: Rig,
@@ -50,7 +50,7 @@ export class Controls {
     window.addEventListener("blur", () => this.#keys.clear());
   }
 
-  /** Goes somewhere: at once, or in a smooth journey unless the user asked for less motion. */
+  /** Moves the camera: immediately, or animated unless the user prefers reduced motion. */
   go(to: Rig, smooth: boolean): void {
     const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
     if (smooth && !still) {
@@ -61,7 +61,7 @@ export class Controls {
     this.#set(to, false);
   }
 
-  /** Once a frame. `seconds` since the last one. */
+  /** To be called once per frame; `seconds` since the previous one. */
   update(seconds: number): void {
     if (this.#travel) {
       const { from, to, start } = this.#travel;
@@ -178,7 +178,7 @@ function heldPad(): Held {
   };
 }
 
-/** A stick's value without the wobble around its centre. */
+/** A stick's value with a dead zone around its centre. */
 export function dead(value: number): number {
   return Math.abs(value) < DEAD ? 0 : (value - Math.sign(value) * DEAD) / (1 - DEAD);
 }

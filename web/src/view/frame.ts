@@ -1,7 +1,7 @@
 import { Euler, Matrix4, Quaternion, Vector3 } from "three";
 import type { Camera, Manifest, Quat, Vec3, Viewpoint } from "../types";
 
-/** Where a camera stands and how much it sees. Position in units of its frame, `fovY` in radians. */
+/** A camera's pose and field of view. Position in units of its frame, `fovY` in radians. */
 export interface Pose {
   readonly position: Vec3;
   readonly quaternion: Quat; // camera to frame; the camera looks along its -z, y is up
@@ -25,7 +25,7 @@ export function rootMatrix(frame: Manifest["frame"]): Matrix4 {
   );
 }
 
-/** A pose through a similarity. */
+/** A pose transformed by a similarity. */
 export function transformPose(pose: Pose, matrix: Matrix4): Pose {
   const rotation = new Quaternion().setFromRotationMatrix(new Matrix4().extractRotation(matrix));
   const position = new Vector3(...pose.position).applyMatrix4(matrix);
@@ -34,10 +34,10 @@ export function transformPose(pose: Pose, matrix: Matrix4): Pose {
 }
 
 /**
- * What the planner asks for, in the bundle's frame.
+ * The planner's viewpoint, in the bundle's frame.
  * @param root - the bundle's frame to world
  * @param camera - camera to world
- * @param projection - camera to clip space; its near plane is left out, as what is near is in sight
+ * @param projection - camera to clip space; its near plane is ignored, since near content is visible
  */
 export function viewpoint(root: Matrix4, camera: Matrix4, projection: Matrix4): Viewpoint {
   const inverse = root.clone().invert();
@@ -64,7 +64,7 @@ function plane(axis: number[], w: number[], sign: number): [number, number, numb
   return [x / length, y / length, z / length, d / length];
 }
 
-/** Everything in front of the camera. */
+/** The half space in front of the camera. */
 function behind(camera: Matrix4, direction: Vector3): [number, number, number, number] {
   const position = new Vector3().setFromMatrixPosition(camera);
   return [direction.x, direction.y, direction.z, -direction.dot(position)];

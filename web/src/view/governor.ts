@@ -1,29 +1,29 @@
-/** How many splats a headset takes: lowered when frames come late, raised slowly while they are on time. */
+/** The splat limit of a headset: lowered when frames are late, raised slowly while they are on time. */
 export interface Governor {
   readonly cap: number; // splats
-  readonly late: number; // mean frame time over what the headset asks for
-  readonly changed: number; // ms, when `cap` changed last
-  readonly patience: number; // ms on time before it is raised again
+  readonly late: number; // mean frame time, relative to the headset's
+  readonly changed: number; // ms: time of the last change of `cap`
+  readonly patience: number; // ms of timely frames before it is raised
 }
 
-export const XR_SPLATS = 500_000; // what headsets of today hold at 72 frames a second
+export const XR_SPLATS = 500_000; // current headsets render these at 72 frames per second
 const FEWEST = 20_000;
-const LATE = 1.2; // times the headset's frame time
+const LATE = 1.2; // relative to the headset's frame time
 const ON_TIME = 1.08;
 const SETTLE = 600; // ms that a lower count needs to take effect
 const PATIENCE = 4_000;
 
-/** @param cap - splats to begin with */
+/** @param cap - initial limit, splats */
 export function governor(cap: number, now: number): Governor {
   return { cap: Math.min(cap, XR_SPLATS), late: 1, changed: now, patience: PATIENCE };
 }
 
 /**
- * One frame later.
- * @param frame - ms since the frame before
- * @param wanted - ms that the headset asks for
- * @param most - splats that the user allows
- * @param count - splats that are shown: raising a limit that is not reached would mean nothing
+ * The governor after one frame.
+ * @param frame - ms since the previous frame
+ * @param wanted - frame time of the headset, ms
+ * @param most - the user's limit, splats
+ * @param count - splats shown: a limit that is not reached is not raised
  */
 export function next(
   g: Governor,

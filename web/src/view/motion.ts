@@ -7,12 +7,12 @@ export interface Rig {
   readonly position: Vec3;
   readonly yaw: number; // radians
   readonly pitch: number;
-  readonly roll: number; // of a photo's pose; the first turn levels the camera
+  readonly roll: number; // of a photo's pose; the first rotation levels the camera
   readonly reach: number;
 }
 
-const STEEPEST = 1.55; // just short of straight up, where yaw would lose its meaning
-const NEAREST = 0.1; // metres to what is orbited
+const STEEPEST = 1.55; // just below vertical, where yaw is undefined
+const NEAREST = 0.1; // metres to the orbited point
 const FARTHEST = 500;
 
 const clamp = (value: number, low: number, high: number) => Math.min(Math.max(value, low), high);
@@ -25,7 +25,7 @@ export function rigAt(position: Vec3, quaternion: Quat, reach: number): Rig {
   return { position, ...angles(quaternion), reach: clamp(reach, NEAREST, FARTHEST) };
 }
 
-/** Turns the head. Angles in radians. */
+/** Rotates the camera in place. Angles in radians. */
 export function look(rig: Rig, yaw: number, pitch: number): Rig {
   const level = Math.max(0, 1 - 4 * (Math.abs(yaw) + Math.abs(pitch)));
   return {
@@ -36,7 +36,7 @@ export function look(rig: Rig, yaw: number, pitch: number): Rig {
   };
 }
 
-/** Turns about what is looked at. */
+/** Rotates the camera about the point that it looks at. */
 export function orbit(rig: Rig, yaw: number, pitch: number): Rig {
   const target = ahead(rig);
   const turned = look(rig, yaw, pitch);
@@ -44,24 +44,24 @@ export function orbit(rig: Rig, yaw: number, pitch: number): Rig {
   return { ...turned, position: vec3(position) };
 }
 
-/** Moves along the camera's right, the world's up, and ahead on the level. Metres. */
+/** Moves along the camera's right, the world's up, and horizontally forward. Metres. */
 export function walk(rig: Rig, right: number, up: number, ahead: number): Rig {
   const heading = new Quaternion().setFromEuler(new Euler(0, rig.yaw, 0));
   return shift(rig, new Vector3(right, up, -ahead).applyQuaternion(heading));
 }
 
-/** Moves in the plane of the picture. Metres. */
+/** Moves in the image plane. Metres. */
 export function pan(rig: Rig, right: number, up: number): Rig {
   return shift(rig, new Vector3(right, up, 0).applyQuaternion(new Quaternion(...orientation(rig))));
 }
 
-/** Moves to or from what is looked at: the distance is multiplied by `factor`. */
+/** Multiplies the distance to the point that the camera looks at by `factor`. */
 export function dolly(rig: Rig, factor: number): Rig {
   const reach = clamp(rig.reach * factor, NEAREST, FARTHEST);
   return { ...shift(rig, forward(rig).multiplyScalar(rig.reach - reach)), reach };
 }
 
-/** Between two poses, t from 0 to 1; turns the short way round. */
+/** Interpolates between two poses, t from 0 to 1, along the shorter rotation. */
 export function between(from: Rig, to: Rig, t: number): Rig {
   const s = t * t * (3 - 2 * t);
   const mix = (a: number, b: number) => a + (b - a) * s;

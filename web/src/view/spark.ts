@@ -12,8 +12,8 @@ interface Increment extends Handle {
 }
 
 /**
- * A label's increments as one mesh: first what is shown, by level, then what has been hidden since.
- * One mesh a label, as Spark pads every mesh to 2048 splats and draws each with a call of its own.
+ * A label's increments as one mesh: first the shown ones, by level, then those hidden since. There is one mesh
+ * per label, since Spark pads every mesh to 2048 splats and draws each with its own call.
  */
 interface Column {
   readonly mesh: SplatMesh;
@@ -23,7 +23,7 @@ interface Column {
   stored: readonly Increment[];
 }
 
-/** As many of the stored splats as are shown: going down a level needs no upload. */
+/** A view of the shown prefix of the stored splats: going down a level needs no upload. */
 class Source {
   count = 0;
   constructor(public splats: PackedSplats) {}
@@ -37,7 +37,7 @@ class Source {
   forEachSplat: PackedSplats["forEachSplat"] = (callback) => this.splats.forEachSplat(callback);
 }
 
-/** All labels of a scene, drawn by Spark: increments come and go, the picture never has a hole. */
+/** Draws all labels of a scene with Spark; increments can be added and removed without visible gaps. */
 export class SparkLayer implements Renderer {
   readonly scene = new Scene();
   readonly root = new Group();
@@ -47,17 +47,17 @@ export class SparkLayer implements Renderer {
   readonly #tint = new dyno.DynoFloat({ value: 0 });
   readonly #dirty: () => void;
 
-  /** @param onDirty - a new frame is worth drawing: something was shown, hidden or sorted */
+  /** @param onDirty - called when a new frame is needed: something was shown, hidden or sorted */
   constructor(renderer: WebGLRenderer, manifest: Manifest, onDirty: () => void) {
     this.#dirty = onDirty;
     this.spark = new SparkRenderer({
       renderer,
       onDirty,
       enableLod: false,
-      sortRadial: false, // as it was trained
-      accumExtSplats: true, // colours above 1 are kept until they are blended
-      maxStdDev: 3.33, // where an opaque splat falls below 1/255
-      clipXY: 2, // large splats reach into the picture from outside
+      sortRadial: false, // as in training
+      accumExtSplats: true, // keeps colours above 1 until blending
+      maxStdDev: 3.33, // where an opaque splat's alpha falls below 1/255
+      clipXY: 2, // large splats can extend into the image from outside
       maxPixelRadius: 2048,
       preBlurAmount: manifest.antialiased ? 0 : 0.3,
       blurAmount: manifest.antialiased ? 0.3 : 0,
@@ -65,17 +65,17 @@ export class SparkLayer implements Renderer {
     this.place(rootMatrix(manifest.frame));
     this.scene.add(this.spark, this.root);
     this.setColors(colorsOf(manifest));
-    // now and not as they come: splats of equal depth are drawn in the order of their meshes
+    // in advance, in a fixed order: splats of equal depth are drawn in the order of their meshes
     for (const { id } of manifest.labels) this.#column(id);
   }
 
-  /** Whether the last frame showed what it should, sorted for where the camera is. */
+  /** Whether the last frame was complete, and sorted for the camera's position. */
   get settled(): boolean {
     const { sorting, sortDirty, display, current } = this.spark;
     return !sorting && !sortDirty && display === current;
   }
 
-  /** Places the bundle's frame in the scene: a similarity. */
+  /** Sets the similarity from the bundle's frame to the scene. */
   place(matrix: Matrix4): void {
     matrix.decompose(this.root.position, this.root.quaternion, this.root.scale);
   }
@@ -114,20 +114,20 @@ export class SparkLayer implements Renderer {
     this.#dirty();
   }
 
-  /** Draws a label or leaves it out; what it holds stays. */
+  /** Shows or hides a label without releasing its content. */
   setVisible(label: number, visible: boolean): void {
     this.#column(label).mesh.visible = visible;
     this.#dirty();
   }
 
-  /** How much of a label's own colour is mixed in, 0 to 1. */
+  /** Sets the share of the label colours that is mixed in, 0 to 1. */
   setTint(amount: number): void {
     this.#tint.value = amount;
     for (const { mesh } of this.#columns.values()) mesh.updateVersion();
     this.#dirty();
   }
 
-  /** Frees all that is on the GPU. The layer draws nothing after that. */
+  /** Frees all GPU memory. The layer draws nothing afterwards. */
   free(): void {
     for (const { mesh, source } of this.#columns.values()) {
       this.root.remove(mesh);
@@ -163,13 +163,13 @@ export class SparkLayer implements Renderer {
     source.count = total(shown);
     column.stored = shown;
     mesh.updateGenerator();
-    mesh.updateMappingVersion(); // the old picture stays until the new one is sorted
+    mesh.updateMappingVersion(); // the previous image stays until the new one is sorted
   }
 }
 
 const total = (parts: readonly Handle[]) => parts.reduce((sum, part) => sum + part.count, 0);
 
-/** The labels' own colours. */
+/** The label colours by id. */
 export const colorsOf = ({ labels }: Manifest): Map<number, string> =>
   new Map(labels.map(({ id, color }) => [id, color]));
 
@@ -178,7 +178,7 @@ const rgbOf = (color: string): Vector3 => {
   return new Vector3(r, g, b);
 };
 
-/** Mixes a label's colour in, as light or dark as the scene is there. */
+/** Mixes in a label's colour at the brightness of the scene. */
 function tinted(color: Color, amount: InstanceType<typeof dyno.DynoFloat>) {
   const vec3 = (x: number, y: number, z: number) => dyno.dynoConst("vec3", [x, y, z]);
   return dyno.dynoBlock({ gsplat: dyno.Gsplat }, { gsplat: dyno.Gsplat }, ({ gsplat }) => {

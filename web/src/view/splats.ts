@@ -1,10 +1,10 @@
 import { PackedSplats } from "@sparkjsdev/spark";
 
-const ROW = 2048; // splats in a row of Spark's textures: arrays hold whole rows
+const ROW = 2048; // splats per row of Spark's textures: arrays hold complete rows
 const HARMONICS = ["sh1", "sh2", "sh3"] as const;
-const WORDS = { sh1: 2, sh2: 4, sh3: 4 } as const; // of a splat, uint32
+const WORDS = { sh1: 2, sh2: 4, sh3: 4 } as const; // uint32 words per splat
 
-// SPZ's whole range: colours below 0 and above 1 become visible ones once harmonics are added
+// the full range of SPZ: colours below 0 and above 1 can become visible with the harmonics
 const ENCODING = {
   rgbMin: -0.45,
   rgbMax: 1.45,
@@ -23,7 +23,7 @@ export interface Part {
   readonly harmonics: ReadonlyMap<(typeof HARMONICS)[number], Uint32Array>;
 }
 
-/** Decodes an SPZ file in Spark's worker; rejects for one that cannot be read. */
+/** Decodes an SPZ file in Spark's worker; rejects for an invalid file. */
 export async function decodePart(bytes: Uint8Array): Promise<Part> {
   const packed = new PackedSplats({ fileBytes: bytes, splatEncoding: ENCODING });
   await packed.initialized;
@@ -43,7 +43,7 @@ export async function decodePart(bytes: Uint8Array): Promise<Part> {
   return part;
 }
 
-/** Parts one after the other as one set of splats. A part without harmonics gets zeros. */
+/** Concatenates parts into one set of splats. A part without harmonics gets zeros. */
 export function joined(parts: readonly Part[]): PackedSplats {
   const count = parts.reduce((sum, part) => sum + part.count, 0);
   const rows = Math.max(1, Math.ceil(count / ROW)) * ROW;

@@ -4,23 +4,23 @@ import { lens, type Pose, quat, rootMatrix, transformPose, vec3, viewpoint } fro
 import { orientation, type Rig } from "./motion";
 import { SparkLayer } from "./spark";
 
-const FOV = 60; // degrees of the window's shorter side, where no photo says otherwise
+const FOV = 60; // degrees, of the window's shorter side, unless a photo's lens is set
 const NEAR = 0.03; // metres
 const FAR = 2000;
 
-/** The canvas: one camera, the adapted scene, and beside it the full one while the two are compared. */
+/** The canvas: one camera and the adapted scene, beside the full scene while they are compared. */
 export class Stage {
   readonly renderer: WebGLRenderer;
   readonly camera = new PerspectiveCamera(FOV, 1, NEAR, FAR);
   readonly layer: SparkLayer;
-  readonly root: Matrix4; // from the bundle's frame to what the camera is placed in
+  readonly root: Matrix4; // from the bundle's frame to the camera's world
   full: SparkLayer | null = null;
-  split = 0.5; // of the width that shows the full scene
+  split = 0.5; // share of the width that shows the full scene
   needsFrame = true;
   #photo: Camera | null = null;
   #fovY: number | null = null;
 
-  /** Throws where there is no WebGL 2. */
+  /** Throws without WebGL 2. */
   constructor(
     readonly canvas: HTMLCanvasElement,
     readonly manifest: Manifest,
@@ -39,28 +39,28 @@ export class Stage {
     this.needsFrame = true;
   }
 
-  /** Moves the world, for a headset that cannot be moved itself; `matrix` from the world to its room. */
+  /** Moves the world, since a headset's camera cannot be moved; `matrix` from the world to its room. */
   setRoom(matrix: Matrix4): void {
     this.root.multiplyMatrices(matrix, rootMatrix(this.manifest.frame));
     this.layer.place(this.root);
     this.invalidate();
   }
 
-  /** Places the camera. A photo's lens is kept until `setLens` says otherwise. */
+  /** Sets the camera's pose. A photo's lens is kept until `setLens` is called. */
   place(rig: Rig): void {
     this.camera.position.set(...rig.position);
     this.camera.quaternion.set(...orientation(rig));
     this.invalidate();
   }
 
-  /** The lens of a photo, a vertical field of view in radians, or the usual one. */
+  /** Sets the lens: a photo's, a vertical field of view in radians, or the default. */
   setLens(photo: Camera | null, fovY: number | null = null): void {
     this.#photo = photo;
     this.#fovY = fovY;
     this.project();
   }
 
-  /** Fits the canvas to the window; a window without area is left alone, and so is a headset. */
+  /** Fits the canvas to the window, unless the window has no area or a headset is on. */
   resize(width: number, height: number, ratio: number): void {
     if (width < 1 || height < 1 || this.renderer.xr.isPresenting) return;
     const before = this.renderer.getSize(new Vector2());
@@ -68,10 +68,10 @@ export class Stage {
     this.renderer.setPixelRatio(ratio);
     this.renderer.setSize(width, height, false);
     this.project();
-    this.draw(); // a new size clears the canvas
+    this.draw(); // resizing clears the canvas
   }
 
-  /** Where the camera is, in the bundle's frame. */
+  /** The camera's viewpoint in the bundle's frame. */
   pose(): Pose {
     const { position, quaternion, projectionMatrix } = this.camera; // in a headset, three keeps it at the head
     const fovY = 2 * Math.atan(1 / (projectionMatrix.elements[5] || 1));
@@ -101,7 +101,7 @@ export class Stage {
     renderer.setScissorTest(false);
   }
 
-  /** Sets the projection anew: after another size, lens, or a headset. */
+  /** Updates the projection after a change of size or lens, or a headset session. */
   project(): void {
     const { x, y } = this.renderer.getSize(new Vector2());
     const { camera } = this;

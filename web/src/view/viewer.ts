@@ -12,9 +12,9 @@ import { Headset } from "./xr";
 
 const CACHE = 128e6; // bytes of decoded increments that are not shown
 const UNLIMITED: Budget = { bytes: Infinity, gpuBytes: Infinity, count: Infinity };
-const SHARPEST = 2; // device pixels a CSS pixel: more costs fill rate and shows nothing
+const SHARPEST = 2; // device pixels per CSS pixel: more costs fill rate without a visible gain
 
-/** The whole viewer without its panel: a bundle, a camera, and settings. */
+/** The viewer without its UI: a bundle, a camera, and settings. */
 export class Viewer {
   readonly stage: Stage;
   readonly controls: Controls;
@@ -23,15 +23,15 @@ export class Viewer {
   readonly compare: Compare;
   settings: Settings;
   frameMs = Number.NaN; // smoothed; NaN while nothing moves
-  photo = -1; // index of the photo that is shown, -1: none
+  photo = -1; // index of the current photo, -1: none
   readonly #hidden = new Set<number>();
   readonly #samples = new Set<(sample: Sample) => void>();
-  #cap: number | null = null; // splats that the headset bears
+  #cap: number | null = null; // splat limit of the headset
   #tint = 0;
   #colors: ReadonlyMap<number, string> = new Map();
   #last = 0;
 
-  /** Throws where there is no WebGL 2. */
+  /** Throws without WebGL 2. */
   constructor(
     canvas: HTMLCanvasElement,
     readonly manifest: Manifest,
@@ -76,7 +76,7 @@ export class Viewer {
     return this.#hidden.has(label);
   }
 
-  /** Leaves labels out, or draws them again; while they are out they claim nothing of the budget but their base. */
+  /** Hides or shows labels; hidden labels use only their first level of the budget. */
   setHidden(labels: readonly number[], hidden: boolean): void {
     for (const label of labels) {
       if (hidden) this.#hidden.add(label);
@@ -86,7 +86,7 @@ export class Viewer {
     this.#apply();
   }
 
-  /** Shows the full scene beside the adapted one, dressed like it. */
+  /** Shows the full scene beside the adapted one, with the same tint and hidden labels. */
   startCompare(): void {
     this.compare.start(() => this.stage.invalidate());
     for (const label of this.#hidden) this.stage.full?.setVisible(label, false);
@@ -94,7 +94,7 @@ export class Viewer {
     this.stage.full?.setTint(this.#tint);
   }
 
-  /** How much of the labels' own colours is mixed in, 0 to 1, or of others by label. */
+  /** Sets the share of the label colours that is mixed in, 0 to 1; optionally other colours by label. */
   setTint(amount: number, colors?: ReadonlyMap<number, string>): void {
     this.#tint = amount;
     this.#colors = colors ?? colorsOf(this.streamer.manifest);
@@ -114,7 +114,7 @@ export class Viewer {
     this.controls.go(this.#rig(pose), false);
   }
 
-  /** A photo's pose and lens; RangeError where there is none of that name or index. */
+  /** Goes to a photo's pose and lens; RangeError for an unknown name or index. */
   goTo(photo: string | number, smooth = false): void {
     const { cameras } = this.manifest;
     const index = typeof photo === "number" ? photo : cameras.findIndex(({ name }) => name === photo);
@@ -161,7 +161,7 @@ export class Viewer {
     if (cap === null) this.#landed();
   }
 
-  /** Back from the headset: the camera stays where the head was. */
+  /** Ends a headset session; the camera stays at the head's pose. */
   #landed(): void {
     const { position, quaternion } = this.stage.camera;
     this.controls.go(rigAt(vec3(position), quat(quaternion), this.controls.rig.reach), false);
@@ -214,7 +214,7 @@ function startSettings(manifest: Manifest, options: Options): Settings {
   };
 }
 
-/** The viewer as other scripts on the page see it. */
+/** The viewer's interface for other scripts on the page. */
 export function embed(viewer: Viewer, ready: Promise<void>): Embed {
   return {
     ready,

@@ -7,12 +7,12 @@ export type XrMode = "immersive-vr" | "immersive-ar";
 export type Turning = "snap" | "smooth";
 
 const HEAD = 1.6; // metres: eyes above the floor
-const WALK = 2; // metres a second
-const SMOOTH = 1.8; // radians a second
+const WALK = 2; // metres per second
+const SMOOTH = 1.8; // radians per second
 const SNAP = Math.PI / 6;
-const RATE = 72; // frames a second where the session does not say
+const RATE = 72; // frames per second, if the session does not report it
 
-/** Which sessions this browser offers, of VR and AR passthrough. */
+/** The session modes that this browser supports, of VR and AR passthrough. */
 export async function offered(): Promise<XrMode[]> {
   const modes: XrMode[] = ["immersive-vr", "immersive-ar"];
   const asked = modes.map((mode) => navigator.xr?.isSessionSupported(mode).catch(() => false) ?? false);
@@ -20,7 +20,7 @@ export async function offered(): Promise<XrMode[]> {
   return modes.filter((_, i) => answers[i]);
 }
 
-/** A headset: session, locomotion by the controllers, and a count that its frame rate can bear. */
+/** A headset: session, locomotion by the controllers, and a splat limit by its frame rate. */
 export class Headset {
   turning: Turning = "snap";
   session: XRSession | null = null;
@@ -28,7 +28,7 @@ export class Headset {
   #turned = false;
   readonly #room = new Matrix4(); // from the room to the world
 
-  /** @param onCap - splats allowed from now on; null: the headset is off */
+  /** @param onCap - called with a new splat limit; null: the headset is off */
   constructor(
     readonly stage: Stage,
     readonly most: () => number,
@@ -38,7 +38,7 @@ export class Headset {
     stage.renderer.xr.setReferenceSpaceType("local-floor");
   }
 
-  /** Starts a session; it must be called from a click. Rejects where the browser refuses. */
+  /** Starts a session; must be called from a click. Rejects if the browser refuses. */
   async enter(mode: XrMode): Promise<void> {
     if (this.session || !navigator.xr) return;
     const { xr } = this.stage.renderer;
@@ -47,7 +47,7 @@ export class Headset {
     session.addEventListener("end", () => this.#ended());
     this.#stand();
     this.stage.renderer.setClearAlpha(mode === "immersive-ar" ? 0 : 1);
-    this.stage.layer.spark.sortRadial = true; // steady while the head turns
+    this.stage.layer.spark.sortRadial = true; // stable while the head turns
     await xr.setSession(session);
     this.#place();
     this.governor = governor(this.most(), performance.now());
@@ -58,7 +58,7 @@ export class Headset {
     await this.session?.end();
   }
 
-  /** Once a frame of the session. `seconds` since the last one, `count` splats shown. */
+  /** To be called once per frame of the session; `seconds` since the previous one, `count` splats shown. */
   update(seconds: number, count: number): void {
     if (!this.session) return;
     this.#move(seconds);
@@ -69,7 +69,7 @@ export class Headset {
     this.governor = after;
   }
 
-  /** The room's floor goes below the camera, and ahead is where it looked. */
+  /** Places the room with its floor below the camera, facing the camera's direction. */
   #stand(): void {
     const { camera } = this.stage;
     this.#room.makeRotationY(headingOf(camera.quaternion));
@@ -83,7 +83,7 @@ export class Headset {
   #ended(): void {
     const { renderer, layer, camera } = this.stage;
     this.session = null;
-    camera.applyMatrix4(this.#room); // the page goes on where the head was
+    camera.applyMatrix4(this.#room); // the page's camera takes over the head's pose
     this.stage.setRoom(new Matrix4());
     renderer.setClearAlpha(1);
     layer.spark.sortRadial = false;
@@ -103,7 +103,7 @@ export class Headset {
     this.#turn(turn, seconds);
   }
 
-  /** Along where the head looks, on the level. */
+  /** Moves horizontally along the head's direction. */
   #walk(right: number, back: number): void {
     if (!right && !back) return;
     const heading = headingOf(this.stage.camera.quaternion);
@@ -121,7 +121,7 @@ export class Headset {
     }
   }
 
-  /** Turns the room about the head, so that the user stays where they stand. */
+  /** Rotates the room about the head, so that the user's position does not change. */
   #rotate(angle: number): void {
     if (!angle) return;
     const head = this.stage.camera.position;

@@ -102,7 +102,7 @@ def equal_size(job: Job, config: PaperConfig) -> None:
         def advance(by: int) -> None:
             nonlocal done
             done += by
-            job.emit(Progress("same-size", done, total))
+            job.emit(Progress("same_size", done, total))
 
         def tuned(g: Gaussians) -> Gaussians:
             result = tune_composition(job, g, config.tune_steps)
@@ -121,7 +121,7 @@ def equal_size(job: Job, config: PaperConfig) -> None:
         return [f"{len(rows)} images measured"]
 
     inputs = [run.scene, run.levels, run.models, run.observations, run.plan]
-    run_stage(job, "same-size", settings, inputs, [run.same_size], make)
+    run_stage(job, "same_size", settings, inputs, [run.same_size], make)
 
 
 def tables_and_figures(job: Job, config: PaperConfig) -> None:

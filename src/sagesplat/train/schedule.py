@@ -1,0 +1,48 @@
+"""The step numbers of a training: the published ones of 3DGS, scaled to the length of the run."""
+
+import math
+from dataclasses import dataclass
+
+from sagesplat.core.config import TrainConfig
+
+_REFERENCE_STEPS = 30_000
+_MIN_REFINEMENTS, _LATEST_STOP = 8, 0.7  # refinements of a short fast run; share of the run
+_MIN_RESET_INTERVAL = 1500  # steps that a model needs between two resets, however short the run
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Steps and intervals of one training, in steps."""
+
+    level_every: int
+    refine_start: int
+    refine_stop: int
+    reset_every: int
+    raise_sh_every: int
+    recovery: int  # steps after a reset during which a level counts as recovering
+
+    def refines(self, step: int) -> bool:
+        """Whether densification is active at a step."""
+        return self.refine_start < step < self.refine_stop
+
+
+def scaled_schedule(config: TrainConfig, refine_stop: int) -> Schedule:
+    """The published step numbers scaled to `max_steps`; `refine_stop` is that of a run of 30,000 steps."""
+    share = config.max_steps / _REFERENCE_STEPS
+
+    def scaled(step: int) -> int:
+        return max(1, round(step * share))
+
+    reset_every = max(scaled(config.reset_every), min(config.reset_every, _MIN_RESET_INTERVAL))
+    start, stop = min(config.refine_start, config.max_steps // 5), scaled(refine_stop)
+    if config.lr_schedule == "fast":  # short runs need time to grow too
+        enough = start + _MIN_REFINEMENTS * config.refine_every
+        stop = max(stop, min(enough, int(_LATEST_STOP * config.max_steps)))
+    return Schedule(
+        level_every=config.level_every or math.ceil(config.max_steps / 30),
+        refine_start=start,
+        refine_stop=stop,
+        reset_every=reset_every,
+        raise_sh_every=scaled(config.raise_sh_every),
+        recovery=min(1000, reset_every // 2),
+    )

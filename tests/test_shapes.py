@@ -1,0 +1,37 @@
+"""The checker of shapes that `CHECK_SHAPES=1` turns on."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from jaxtyping import Float32, Int64, TypeCheckError, jaxtyped
+from shapes import check, checked_modules
+
+
+@jaxtyped(typechecker=check)
+def _sums(
+    x: Float32[np.ndarray, "N C"], rows: Int64[np.ndarray, " N"] | None = None, other: Any = 0
+) -> tuple[Float32[np.ndarray, " N"], dict[str, Float32[np.ndarray, " C"]]]:
+    return x.sum(1), {"columns": x.sum(0)[: 2 if other else None]}
+
+
+X = np.zeros((4, 3), np.float32)
+
+
+def test_what_fits_passes() -> None:
+    assert _sums(X, np.arange(4))[0].shape == (4,)
+    assert _sums(X, None, other="")[0].shape == (4,)
+
+
+@pytest.mark.parametrize(
+    "arguments", [(X.astype(float),), (X[0],), (X, np.arange(3)), (X, np.arange(4.0)), (X, None, 1)]
+)
+def test_other_shapes_and_dtypes_do_not(arguments: tuple[Any, ...]) -> None:
+    with pytest.raises(TypeCheckError):
+        _sums(*arguments)
+
+
+def test_modules_with_kernels_are_left_out() -> None:
+    modules = checked_modules()
+    assert {"sagesplat.core.gaussians", "sagesplat.raster", "sagesplat.segment.masks"} <= modules
+    assert not modules & {"sagesplat.segment.crf", "sagesplat.raster.project", "sagesplat.demo.noise"}
