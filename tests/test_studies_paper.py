@@ -191,7 +191,7 @@ def test_a_second_report_has_nothing_to_do_and_another_view_needs_force(finished
     events: list[Event] = []
     again = Job(job.run, events.append)
     paper_report(again, replace(PAPER, lpips=job.run.path / "nowhere"))
-    assert [e.name for e in events if isinstance(e, StageSkipped)] == ["crossview", "same-size", "paper"]
+    assert [e.name for e in events if isinstance(e, StageSkipped)] == ["crossview", "same_size", "paper"]
     with pytest.raises(RunError, match=r"no photo 'nothing'; there are view_000"):
         paper_report(again, replace(PAPER, view="nothing"))
     with pytest.raises(RunError, match=r"same_size\.csv: made with other .*--force"):
