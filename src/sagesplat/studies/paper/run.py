@@ -1,4 +1,4 @@
-"""The paper's evaluation of a finished run, in three stages: crossview, same-size, tables and figures."""
+"""The paper's evaluation of a finished run, in three stages: crossview, same_size, tables and figures."""
 
 from collections.abc import Sequence
 
