@@ -27,12 +27,13 @@ CORPUS = Path(__file__).parents[1] / "tests" / "data" / "hostile"
 MEMORY = 16 * 2**30  # bytes of address space; torch takes some of them for itself
 # What is measured; compiled kernels cannot be
 MODULES = [
-    "errors", "files", "npz", "gaussians", "ply_header", "remote_zip", "sweep",
-    "scene.blocks", "scene.stored", "scene.colmap", "scene.colmap_read",
-    "scene.nerfstudio", "scene.points", "scene.undistort",
-    "output.ply", "output.spz", "output.chunks", "adapt.columns", "adapt.ladder", "adapt.model", "adapt.plan",
-    "adapt.promise", "segment.coco", "segment.masks", "segment.onnx", "segment.soft", "segment.lift",
-    "segment.taxonomies", "train.checkpoint", "train.levels",
+    "core.errors", "core.gaussians", "io.files", "io.npz", "io.columns", "io.ply_header",
+    "download.remote_zip", "formats.ply", "formats.spz", "formats.increments", "formats.levels",
+    "scene.blocks", "scene.stored",
+    "scene.colmap", "scene.colmap_read", "scene.loading", "scene.nerfstudio", "scene.points",
+    "scene.undistort", "segment.coco", "segment.masks", "segment.onnx", "segment.soft", "segment.lift",
+    "segment.taxonomies", "train.checkpoint", "adapt.ladder", "adapt.eq3", "adapt.plan", "adapt.viewpoint",
+    "studies.sweep.file",
 ]  # fmt: skip
 
 

@@ -10,13 +10,14 @@ import time
 import tracemalloc
 import zipfile
 from collections.abc import Callable, Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from random import Random
 
 import numpy as np
 import pytest
 
-from benchmarks.fuzz import CORPUS
+from benchmarks.fuzz import CORPUS, MODULES
 from benchmarks.hostile import MIB, Finding, Reader, check
 from benchmarks.hostile_readers import READERS
 from benchmarks.mutate import mutate
@@ -215,3 +216,7 @@ def test_nothing_unpickles():
         for call, wanted in calls.items():
             for match in re.finditer(call, text):
                 assert wanted in text[match.start() : match.start() + 120], path
+
+
+def test_the_modules_that_the_fuzzer_instruments_are_there() -> None:
+    assert [name for name in MODULES if find_spec(f"sagesplat.{name}") is None] == []

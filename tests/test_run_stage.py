@@ -15,6 +15,7 @@ from sagesplat.core.config import (
     FitConfig,
     LabelsConfig,
     NestConfig,
+    PaperConfig,
     PlanConfig,
     RunConfig,
     SceneConfig,
@@ -34,6 +35,7 @@ from sagesplat.stages.nest import nest_levels
 from sagesplat.stages.observe import observe_levels
 from sagesplat.stages.pipeline import run_all
 from sagesplat.stages.train import train_levels
+from sagesplat.studies.paper.run import paper_report
 from sagesplat.train import nested
 
 CONFIG = RunConfig(
@@ -205,7 +207,11 @@ def test_all_that_a_stage_reads_is_among_its_inputs(
     monkeypatch.setattr(stage, "sync_changed", lambda *args: None)  # it opens all that is new
     _reading[:] = [set()]
     try:
-        work(tmp_path.resolve() / "run", capture, replace(CONFIG, **changes))
+        config = replace(CONFIG, **changes)
+        work(tmp_path.resolve() / "run", capture, config)
+        if config.ladder == "snapshots":
+            job = Job(RunDir(tmp_path.resolve() / "run", "snapshots"), lambda event: None, "cpu")
+            paper_report(job, PaperConfig(tune_steps=2))
     finally:
         _reading.clear()
     assert watch.missed == [], "\n".join(watch.missed)

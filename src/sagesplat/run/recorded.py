@@ -41,7 +41,7 @@ def recorded_settings(run: RunDir, of: str = "run") -> dict[str, Any]:
     train = _made(run, "train") or _begun(run)
     nest = _made(run, "nest")
     observed = {**_made(run, "observe"), **_made(run, "fit")}
-    tuned = nest.get("boundary_steps", nest.get("seam_steps"))
+    tuned = nest.get("boundary_steps")
     boundary = {} if tuned is None else {"boundary_steps": tuned}
     known: dict[str, Any] = {
         "scene_config": _config(SceneConfig, _read(run.scene).get("settings")),

@@ -30,7 +30,7 @@ from sagesplat.run.remote import work
 from sagesplat.run.run_dir import RunDir, is_done, settings_of
 from sagesplat.run.stage import Stage, run_stage, run_stages
 from sagesplat.segment.display_names import titles
-from sagesplat.stages.compose import tune_composition
+from sagesplat.stages.compose import compose_inputs, tune_composition
 from sagesplat.stages.fit import fit_ladder
 from sagesplat.stages.methods import NestedLevels, Snapshots, method_of
 from sagesplat.stages.nest import train_capped
@@ -110,7 +110,8 @@ def compare(job: Job, config: CompareConfig, copy: Path | None = None) -> list[P
         return [f"{len(points)} sets in {len(job.scene.test_ids)} test views"]
 
     run = job.run
-    inputs = [run.scene, *method_of(job).files, run.observations, run.plan, snapshots.run.models, *trained]
+    inputs = [run.labels, *method_of(job).files, run.observations, *compose_inputs(job)]
+    inputs += [snapshots.run.models, *trained]
     run_stage(job, "compare", settings, inputs, [file], make)
     points, walks = read_comparison(file)
     tables = make_tables(points, walks, main_target(run))

@@ -1,6 +1,7 @@
 """The paper's evaluation of a finished run, in three stages: crossview, same_size, tables and figures."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from sagesplat.run.job import Job
 from sagesplat.run.run_dir import settings_of
 from sagesplat.run.stage import run_stage
 from sagesplat.segment.display_names import titles
-from sagesplat.stages.compose import tune_composition
+from sagesplat.stages.compose import compose_inputs, tune_composition
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.shared import distances, observed
 from sagesplat.studies.lpips import load_metrics, lpips_hashes
@@ -59,7 +60,7 @@ def cross_views(job: Job) -> None:
             lines.append(f"SSIM {target:g}: {fared.kept} of {fared.promised} promises kept on unseen views")
         return lines
 
-    inputs = [run.scene, run.labels, *method.files, run.plan]
+    inputs = [*method.files, run.observations, *_made_of(job)]
     run_stage(job, "crossview", {"targets": targets}, inputs, [run.cross_view], make)
 
 
@@ -120,7 +121,7 @@ def equal_size(job: Job, config: PaperConfig) -> None:
         write_columns(run.same_size, from_rows(SameSize, rows))
         return [f"{len(rows)} images measured"]
 
-    inputs = [run.scene, run.levels, run.models, run.observations, run.plan]
+    inputs = [run.levels, run.models, run.observations, *_made_of(job)]
     run_stage(job, "same_size", settings, inputs, [run.same_size], make)
 
 
@@ -160,9 +161,15 @@ def tables_and_figures(job: Job, config: PaperConfig) -> None:
         write_paper(run.paper, data)
         return []
 
-    inputs = [run.observations, run.models, run.plan, run.cross_view, run.same_size]
+    inputs = [run.levels, run.observations, run.models, run.cross_view, run.same_size, *_made_of(job)]
     run_stage(job, "paper", {"view": view}, inputs, [run.paper / "index.html"], make)
     job.emit(RunDone(run.paper / "index.html"))
+
+
+def _made_of(job: Job) -> list[Path]:
+    """What each of these stages reads besides its own inputs: labels, plan and the records behind them."""
+    run = job.run
+    return [run.labels, run.provenance("observe"), run.provenance("fit"), *compose_inputs(job)]
 
 
 def _targets(job: Job) -> list[float]:
