@@ -1,4 +1,4 @@
-"""With CHECK_SHAPES=1, checks jaxtyping's shapes and dtypes while tests run; import it before sagesplat.
+"""Unless CHECK_SHAPES=0, checks jaxtyping's shapes and dtypes while tests run; import it before sagesplat.
 
 Checked are all modules that use jaxtyping, but for `EXCEPT` and those with kernels: a wrapper would change
 what is compiled. Only arrays are checked: what tests pass instead of other classes is their affair.
@@ -80,6 +80,6 @@ def checked_modules() -> set[str]:
     return found - EXCEPT
 
 
-if os.environ.get("CHECK_SHAPES"):
+if os.environ.get("CHECK_SHAPES", "1") != "0":
     _finder: Any = install_import_hook("sagesplat", "shapes.check").hook
     _finder.should_instrument = checked_modules().__contains__  # by whole name; its own rule goes by prefix

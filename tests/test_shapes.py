@@ -1,4 +1,4 @@
-"""The checker of shapes that `CHECK_SHAPES=1` turns on."""
+"""The checker of shapes, which `CHECK_SHAPES=0` turns off."""
 
 from typing import Any
 

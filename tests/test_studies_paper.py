@@ -157,13 +157,15 @@ def test_cross_view_rows_hold_together(finished):
 
 
 def test_regret_by_hand():
-    columns = {f: np.zeros(4, np.float32) for f in CrossView.__dataclass_fields__}
+    whole = {"view", "label_id", "level", "count", "oracle_level", "oracle_count", "num_pixels"}
+    fields = CrossView.__dataclass_fields__
+    columns = {f: np.zeros(4, np.int32 if f in whole else np.float32) for f in fields}
     columns |= {
         "target": np.full(4, 0.5, np.float32),
         "level_ssim": np.array([0.6, 0.4, 0.6, 0.5], np.float32),
-        "count": np.array([30, 10, 30, 20]),
-        "oracle_level": np.array([100, 200, -1, 100]),
-        "oracle_count": np.array([20, 20, -1, 20]),
+        "count": np.array([30, 10, 30, 20], np.int32),
+        "oracle_level": np.array([100, 200, -1, 100], np.int32),
+        "oracle_count": np.array([20, 20, -1, 20], np.int32),
     }
     np.testing.assert_array_equal(CrossView(**columns).regret, [10, np.nan, np.nan, 0])
 

@@ -49,6 +49,9 @@ def truth(label_id: int, level: int, scale: float) -> SsimModel:
     return SsimModel(label_id, level, params, (scale, 5.0 * scale), peak, 0.0, VIEWS, "one regime")
 
 
+WHOLE = dict.fromkeys(("label_id", "level", "view", "num_pixels"), np.int32)  # columns of whole numbers
+
+
 def synthetic(
     name: str, names: Mapping[int, str], *, unit: float = 1.0, focal: float = 100.0, levels=LEVELS
 ) -> FittedRun:
@@ -71,7 +74,7 @@ def synthetic(
     return FittedRun(
         name,
         names,
-        Observations(**{n: np.array(c) for n, c in (columns | others).items()}),
+        Observations(**{n: np.array(c, WHOLE.get(n, np.float32)) for n, c in (columns | others).items()}),
         models,
         counts={(i, j): j * i for i in names for j in levels},
         recovering=frozenset(),
@@ -111,7 +114,7 @@ def test_another_lens_transfers_by_footprint_only():
     assert min(error["raw"], error["extent"]) > 0.05
     b = synthetic("b", A.names)  # twice as far, half of the views through twice the lens
     focals = np.where(np.arange(VIEWS) % 2, 200.0, 100.0)
-    distance = b.observations.distance * focals[b.observations.view] / 100
+    distance = (b.observations.distance * focals[b.observations.view] / 100).astype(np.float32)
     error = errors(
         transfer(A, replace(b, focals=focals, observations=replace(b.observations, distance=distance)), [0.7])
     )

@@ -221,7 +221,7 @@ def choose_snapshot(
 ) -> tuple[Int[np.ndarray, "..."], Bool[np.ndarray, "..."]]:
     """`allocate.choose` for K snapshots in order of their steps: of equal ones the latest."""
     found, met = choose(ssim[..., ::-1], counts[::-1], target, [key[..., ::-1] for key in otherwise])
-    return len(counts) - 1 - found, met
+    return np.asarray(len(counts) - 1 - found), met  # [] too: numpy makes a number of that
 
 
 def check_target(target: float) -> None:

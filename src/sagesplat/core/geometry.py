@@ -1,7 +1,7 @@
 """Geometry on plain arrays: projection, nearest neighbours, Morton order."""
 
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Float, Float32, Int64
 from scipy.spatial import KDTree
 
 
@@ -14,14 +14,14 @@ def mean_neighbour_distance(xyz: Float32[np.ndarray, "P 3"], k: int = 3) -> Floa
     return np.sqrt(np.maximum(np.square(distances).mean(1), 1e-14)).astype(np.float32)
 
 
-def to_camera(xyz: Float32[np.ndarray, "P 3"], w2c: Float32[np.ndarray, "4 4"]) -> Float32[np.ndarray, "P 3"]:
+def to_camera(xyz: Float[np.ndarray, "P 3"], w2c: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "P 3"]:
     """World points in camera coordinates."""
     return xyz @ w2c[:3, :3].T + w2c[:3, 3]
 
 
 def project(
-    xyz: Float32[np.ndarray, "P 3"], w2c: Float32[np.ndarray, "4 4"], K: Float32[np.ndarray, "3 3"]
-) -> tuple[Float32[np.ndarray, "P 2"], Float32[np.ndarray, " P"]]:
+    xyz: Float[np.ndarray, "P 3"], w2c: Float[np.ndarray, "4 4"], K: Float[np.ndarray, "3 3"]
+) -> tuple[Float[np.ndarray, "P 2"], Float[np.ndarray, " P"]]:
     """Pixels and depths (camera z, world units) of world points; pixels behind the camera are NaN."""
     points = to_camera(xyz, w2c)
     depths = points[:, 2]
