@@ -165,6 +165,7 @@ def test_a_command_has_the_flags_that_it_uses(command: str, absent: list[str]) -
         ),
         (["run", "a", "b", "--max-steps", "3"], "no option --max-steps; did you mean --train.max-steps?"),
         (["demo", "a", "b"], "'b' is one argument too many"),
+        (["demo", "--devce", "cpu"], "no option --devce; did you mean --device?"),
         (["run", "a", "b", "--device", "gpu"], "invalid choice 'gpu' for argument '--device'"),
         (["export", "a", "b", "--level"], "Missing value for argument '--level'"),
     ],

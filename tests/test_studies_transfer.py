@@ -49,7 +49,9 @@ def truth(label_id: int, level: int, scale: float) -> SsimModel:
     return SsimModel(label_id, level, params, (scale, 5.0 * scale), peak, 0.0, VIEWS, "one regime")
 
 
-WHOLE = dict.fromkeys(("label_id", "level", "view", "num_pixels"), np.int32)  # columns of whole numbers
+WHOLE: dict[str, type] = dict.fromkeys(
+    ("label_id", "level", "view", "num_pixels"), np.int32
+)  # columns of whole numbers
 
 
 def synthetic(

@@ -86,7 +86,12 @@ def _parse(name: str, function: Callable[..., None], words: Sequence[str]) -> di
         if not end.code:  # what tyro prints for shells
             print(printed.getvalue(), end="")
             raise
-        raise UsageError(f"{_flat(printed.getvalue())}; see `{prog} --help`") from None
+        # an unknown option can make tyro complain of the positional argument beside it
+        known = {flag.name.replace("--no-", "--", 1) for flag in flags_of(function)}
+        flags = [word.partition("=")[0] for word in words if word.startswith("--")]
+        strange = [flag for flag in flags if flag.replace("_", "-").replace("--no-", "--", 1) not in known]
+        reason = _unknown(function, strange) if strange else _flat(printed.getvalue())
+        raise UsageError(f"{reason}; see `{prog} --help`") from None
     if unknown:
         raise UsageError(f"{_unknown(function, unknown)}; see `{prog} --help`")
     return values
