@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 PROGRAM = Path(sys.executable).with_name("sagesplat")
-AGAIN = re.compile(r"^! (.*(?:; done again |going on from step ).*)$", re.MULTILINE)
+AGAIN = re.compile(r"^! (.*(?:; done again |resuming from step ).*)$", re.MULTILINE)
 _DONE = re.compile(r"^✓ (.+?) +(\d+\.\d) s  ", re.MULTILINE)
 _SKIPPED = re.compile(r"^· (.+?) +up to date$", re.MULTILINE)
 _POLL = 0.1  # seconds between two looks at what a run printed

@@ -17,7 +17,7 @@ SAID = """✓ scene        0.5 s  46 training, 8 test views
 ! block 1 (2 of 3): its process on vm was lost; done again (1 of 3)
 ! block 0: needs about 0.6 GiB
 ✓ block 0/train    2.0 s  13,039 Gaussians after 300 steps
-! block 1: going on from step 60
+! block 1: resuming from step 60
 ✓ block 1/train    3.0 s  16,999 Gaussians after 300 steps
 ✓ train        5.5 s  18,000 Gaussians of 2 blocks
 """
@@ -77,7 +77,7 @@ def test_what_a_run_prints_is_understood() -> None:
     assert ends(found) == {"scene": 0.5, "block 0/train": 2.5, "block 1/train": 5.5, "train": 6.0}
     assert AGAIN.findall(SAID) == [
         "block 1 (2 of 3): its process on vm was lost; done again (1 of 3)",
-        "block 1: going on from step 60",
+        "block 1: resuming from step 60",
     ]
 
 

@@ -46,7 +46,7 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
                 job.emit(Progress("nest", event.step, config.steps, f"loss {event.loss:.3f}"))
             elif isinstance(event, Resumed):
                 before = f"the checkpoint before the newest: {event.damage}"
-                job.emit(Warned(f"going on from step {event.step}, {before}"))
+                job.emit(Warned(f"resuming from step {event.step}, {before}"))
             else:
                 trained = event
         counts, across = trained.gaussians.counts(), trained.boundary

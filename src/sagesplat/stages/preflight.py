@@ -15,7 +15,7 @@ from sagesplat.train import memory
 from sagesplat.train.strategy import schedule_of
 
 _GIB = 2**30
-_FLOATS = 59  # of a Gaussian with harmonics of degree 3
+_LEVEL_BYTES = 34, 79  # of a Gaussian in a level file, with harmonics of degree 0 and 3
 _STATES = 6  # copies of the Gaussians in the two checkpoints: parameters and two moments each
 
 
@@ -47,7 +47,9 @@ def check_training(job: Job, config: TrainConfig) -> None:
     fitted = memory.fit(job.scene, config, job.memory_limit, processes=job.processes)
     points, levels = len(job.scene.points.xyz), config.max_steps // schedule_of(config).level_every
     free = shutil.disk_usage(run.path).free
-    least, most = (4 * _FLOATS * n * (levels + _STATES) for n in (points, fitted.lowered))
+    state = 4 * (11 + 3 * (config.sh_degree + 1) ** 2) * _STATES  # bytes a Gaussian in the checkpoints
+    counts = points, fitted.lowered
+    least, most = (n * (level * levels + state) for n, level in zip(counts, _LEVEL_BYTES, strict=True))
     needs = f"training writes about {least / _GIB:.1f} to {most / _GIB:.1f} GiB, {free / _GIB:.1f} are free"
     if least > free:
         raise RunError(f"{run.path}: {needs}; free some, or choose another disk")

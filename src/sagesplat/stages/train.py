@@ -49,7 +49,7 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
             match event:
                 case Resumed(step, damage):
                     before = f", the checkpoint before the newest: {damage}" if damage else ""
-                    job.emit(Warned(f"going on from step {step}{before}"))
+                    job.emit(Warned(f"resuming from step {step}{before}"))
                 case Step(step, loss, num, _):
                     job.emit(Training(step, config.max_steps, loss, counts, num))
                 case LevelSaved():
