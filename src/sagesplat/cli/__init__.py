@@ -11,11 +11,13 @@ from sagesplat.cli import stages, studies, tools  # noqa: F401  (their commands 
 from sagesplat.cli.base import COMMANDS
 from sagesplat.cli.help import help_of
 from sagesplat.cli.parse import arguments, current_command
+from sagesplat.cli.say import print_any_character, say
 from sagesplat.core.errors import SageError
 
 
 def main() -> None:
     """Run a command; errors that a user can cause are one line and exit code 2."""
+    print_any_character()
     name, *words = sys.argv[1:] or ["--help"]
     if name in ("-h", "--help", "--version"):
         print(f"sagesplat {__version__}" if name == "--version" else _overview())
@@ -51,5 +53,5 @@ def _overview() -> str:
 
 
 def _fail(message: str) -> NoReturn:
-    print(f"sagesplat: {' '.join(message.split())}", file=sys.stderr)
+    say(f"sagesplat: {' '.join(message.split())}", file=sys.stderr)
     raise SystemExit(2)

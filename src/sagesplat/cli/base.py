@@ -99,9 +99,9 @@ def open_job(run: Path, options: Redo | Device, ladder: LadderKind = "nested") -
     limit = int(machine.memory_limit * 2**30)
     with computing(machine, run) as (backend, threads, executor), Console() as console, ExitStack() as locks:
         if backend == "cuda":
-            console.out.print("[dim]· computing on the GPU[/]")
+            console.note("computing on the GPU")
         if machine.executor != "local":
-            console.out.print(f"[dim]· on a Ray cluster, {executor.parallel} tasks at once[/]")
+            console.note(f"on a Ray cluster, {executor.parallel} tasks at once")
         folder = RunDir(run, ladder)
         yield Job(
             folder, console, backend, threads, machine.force, machine.processes, machine.device,

@@ -14,6 +14,7 @@ from typing import Any
 import tyro
 
 from sagesplat.cli.help import Flag, flags_of
+from sagesplat.cli.say import say
 from sagesplat.core.errors import SageError
 
 OLD_COMMANDS = {"online": "early-stopping", "parts": "block-categories"}
@@ -65,7 +66,7 @@ def _renamed(words: Sequence[str]) -> list[str]:
 
 
 def _say(text: str) -> None:
-    print(f"sagesplat: {text}", file=sys.stderr)
+    say(f"sagesplat: {text}", file=sys.stderr)
 
 
 def _parse(name: str, function: Callable[..., None], words: Sequence[str]) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from jaxtyping import Int64
 
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians, concat
+from sagesplat.core.names import slugs
 from sagesplat.formats.ply import write_ply
 from sagesplat.formats.spz import SH_BITS, encode_spz, packing_order, read_spz
 from sagesplat.io.files import atomic_folder, read_json, write_json
@@ -78,6 +79,7 @@ def write_increments(
     `antialiased` as in `encode_spz`.
     """
     written = []
+    stems = slugs({label: names.get(label, str(label)) for label in sizes})
     with atomic_folder(folder) as fresh:
         for label, level, rows in increments(g, sizes):
             part = g.select(torch.from_numpy(rows))
@@ -88,8 +90,7 @@ def write_increments(
                 write_ply(temporary, part, names)
             content = temporary.read_bytes()
             digest = hashlib.sha256(content).hexdigest()
-            slug = re.sub(r"[^a-z0-9]+", "-", names.get(label, str(label)).lower()).strip("-")
-            uri = f"{slug}-{level:02d}-{digest[:12]}.{kind}"
+            uri = f"{stems[label]}-{level:02d}-{digest[:12]}.{kind}"
             temporary.rename(fresh / uri)
             gpu = len(part) * _GPU_BYTES[part.sh_degree]
             written.append(Increment(label, level, uri, len(part), len(content), gpu, digest))

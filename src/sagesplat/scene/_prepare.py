@@ -11,10 +11,12 @@ from typing import Any
 
 from PIL import Image, ImageOps
 
+from sagesplat.core.names import cleaned, clipped, collision_key
 from sagesplat.io.files import atomic_path, link
 from sagesplat.scene.detect import PHOTOS
 from sagesplat.scene.images import _rgb
 
+_LONGEST, _ROOM = 250, 30  # bytes of a name, and what is left of them for suffixes
 _ORIENTATION, _MAKER, _MODEL, _DETAILS, _FOCAL, _FOCAL_35 = 0x0112, 0x010F, 0x0110, 0x8769, 0x920A, 0xA405
 
 
@@ -82,19 +84,27 @@ def _by_number(path: Path) -> list[tuple[int, str]]:
 
 
 def _clean(name: str) -> str:
-    """The name without control characters and invalid Unicode, which COLMAP and JSON cannot hold."""
-    return re.sub(r"[\x00-\x1f\x7f\ud800-\udfff]", "_", name)
+    """The path as COLMAP, JSON and `check_photo` take it: without control characters and invalid Unicode.
+
+    A long name is cut, and told from others by a hash, so that something can be added to it.
+    """
+    *folders, file = cleaned(name).split("/")
+    stem, dot, suffix = file.rpartition(".")
+    if len(stem.encode()) > _LONGEST - _ROOM:
+        digest = hashlib.sha256(os.fsencode(name)).hexdigest()[:8]
+        file = f"{clipped(stem, _LONGEST - 2 * _ROOM)}_{digest}{dot}{suffix}"
+    return "/".join([*(clipped(folder, _LONGEST) for folder in folders), file])
 
 
 def _free(name: str, suffix: str, taken: set[str]) -> str:
     """The name with `suffix` and a stem that is not in `taken`: label images are named by stems."""
     stem, _, old = name.rpartition(".")
     fits = old.lower() in (("png",) if suffix == ".png" else ("jpg", "jpeg"))
-    if stem.casefold() in taken:
+    if collision_key(stem) in taken:
         stem = f"{stem}_{old.lower()}"
-    while stem.casefold() in taken:
+    while collision_key(stem) in taken:
         stem += "_"
-    taken.add(stem.casefold())
+    taken.add(collision_key(stem))
     return f"{stem}.{old}" if fits else stem + suffix
 
 

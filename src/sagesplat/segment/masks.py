@@ -12,6 +12,7 @@ from jaxtyping import Int16, Int32
 from PIL import Image
 
 from sagesplat.core.errors import LabelError, RunError, short
+from sagesplat.core.names import LENGTH, RULE, checked, collision_key
 from sagesplat.io.files import atomic_path, read_json, write_json
 from sagesplat.scene.scene import Scene, View
 from sagesplat.scene.undistort import undistort
@@ -22,6 +23,7 @@ UNLABELLED_NAME = "unlabelled"
 UNLABELLED_COLOR = (128, 128, 128)
 MAX_LABEL_ID = np.iinfo(np.int16).max
 _UNKNOWN = -2  # never leaves this file
+_BLOCK = len("@4095")  # what a per-block category adds to the name of its category
 _DEFLATE = 1032  # times its size is all that a deflate stream can hold
 VOID_8, VOID_16 = 255, 65535  # what unlabelled pixels hold in 8- and 16-bit files, unless stated otherwise
 
@@ -62,7 +64,7 @@ class Taxonomy:
     @classmethod
     def read(cls, path: Path) -> "Taxonomy":
         """Read labels.json; LabelError where it is missing or its content cannot be used."""
-        return _read_labels(path)[0]
+        return _read_labels(path, LENGTH + _BLOCK)[0]
 
 
 class Masks:
@@ -107,14 +109,16 @@ def prepare_folder(folder: Path, views: Sequence[View]) -> list[Path]:
 
     Removes its labels.json, which is written last and says that the folder is complete.
     """
-    taken: dict[Path, str] = {}
-    for view in views:
-        path = mask_path(folder, view)
-        if path in taken:
-            raise LabelError(f"{view.name}: {taken[path]} has the same name but for the suffix; rename one")
-        taken[path] = view.name
+    paths = [mask_path(folder, view) for view in views]
+    taken: dict[str, str] = {}
+    for view, path in zip(views, paths, strict=True):
+        other = taken.setdefault(collision_key(path.as_posix()), view.name)
+        if other != view.name:
+            raise LabelError(
+                f"{view.name}: {other} has the same name but for the suffix or capitals; rename one"
+            )
     (folder / "labels.json").unlink(missing_ok=True)
-    return list(taken)
+    return paths
 
 
 def read_mask(path: Path, taxonomy: Taxonomy) -> Int16[np.ndarray, "H W"]:
@@ -237,8 +241,11 @@ def _panoptic_source(folder: Path) -> tuple[Taxonomy, _Find]:
     return taxonomy, find
 
 
-def _read_labels(path: Path) -> tuple[Taxonomy, int | None]:
-    """The taxonomy of a labels.json, and the value of unlabelled pixels if it is stated."""
+def _read_labels(path: Path, length: int = LENGTH) -> tuple[Taxonomy, int | None]:
+    """The taxonomy of a labels.json, and the value of unlabelled pixels if it is stated.
+
+    `length`: characters of a name, at most.
+    """
     try:
         content = read_json(path)
     except RunError as error:
@@ -256,11 +263,14 @@ def _read_labels(path: Path) -> tuple[Taxonomy, int | None]:
         raise LabelError(f'{path}: "unlabelled" is {short(unlabelled)}; give a pixel value, 0 ... {VOID_16}')
     if unlabelled in names:
         raise LabelError(f'{path}: {unlabelled} is "unlabelled" and has a name too; remove one of them')
-    return taxonomy_of(names, path), unlabelled
+    return taxonomy_of(names, path, length), unlabelled
 
 
-def taxonomy_of(names: dict[int, Any], path: Path) -> Taxonomy:
-    """A taxonomy whose ids fit and whose names are distinct: results are listed by name."""
+def taxonomy_of(names: dict[int, Any], path: Path, length: int = LENGTH) -> Taxonomy:
+    """A taxonomy whose ids fit and whose names may be; they are distinct, as results are listed by name.
+
+    `path`: the file that the names are from; `length`: characters of a name, at most. LabelError for others.
+    """
     wrong = [label_id for label_id in names if not 0 <= label_id <= MAX_LABEL_ID]
     if wrong:
         raise LabelError(
@@ -268,15 +278,20 @@ def taxonomy_of(names: dict[int, Any], path: Path) -> Taxonomy:
         )
     if not names:
         raise LabelError(f"{path}: names no label; list the ids of the label images")
-    seen = {UNLABELLED_NAME}
+    found: dict[str, int] = {}
     for label_id, name in names.items():
-        if not isinstance(name, str) or not name.strip() or name in seen:
+        named = f"{path}: label {label_id} is named {short(repr(name))}"
+        try:
+            name = checked(name, length)
+        except ValueError as error:
+            raise LabelError(f"{named}, but {error}; rename it ({RULE})") from None
+        if name in found or name == UNLABELLED_NAME:
             raise LabelError(
-                f"{path}: label {label_id} is named {short(repr(name))}; give each id a name of its own "
+                f"{named}; give each id a name of its own "
                 f'(unlabelled pixels: "{UNLABELLED_NAME}": {label_id} beside "labels")'
             )
-        seen.add(name)
-    return Taxonomy(dict(sorted(names.items())))
+        found[name] = label_id
+    return Taxonomy({label_id: name for name, label_id in sorted(found.items(), key=lambda of: of[1])})
 
 
 def _read_png(path: Path, segments: bool = False) -> Int32[np.ndarray, "h w"]:

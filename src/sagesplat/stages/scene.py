@@ -7,6 +7,7 @@ from pathlib import Path
 from sagesplat.core.config import PosesConfig, SceneConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Progress, Warned
+from sagesplat.core.names import repaired
 from sagesplat.io.files import write_json
 from sagesplat.run.job import Job, fingerprint
 from sagesplat.run.stage import run_stage
@@ -21,7 +22,7 @@ def open_scene(job: Job, path: Path, config: SceneConfig, poses: PosesConfig | N
     if run.path.exists() and not ours and any(not p.name.startswith(".") for p in run.path.iterdir()):
         raise RunError(f"{run.path}: not empty and not a run folder; choose a new folder")
     if detect(path) in ("photos", "video"):
-        capture = run.capture / path.resolve().stem  # the scene will have that name
+        capture = run.capture / repaired(path.resolve().stem)  # the scene will have that name
         _find_poses(job, path, capture, poses or PosesConfig())
         path = capture
     scene = load_scene(path, **asdict(config))
