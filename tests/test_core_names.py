@@ -50,7 +50,9 @@ def test_both_ways_of_writing_an_accent_are_one_name() -> None:
     assert checked("e\u0301" * LENGTH) == "\u00e9" * LENGTH
 
 
-@pytest.mark.parametrize("name", ["a.jpg", "sub dir/Screenshot 10.00.00\u202fAM.png", " a.jpg", "e\u0301.png"])
+@pytest.mark.parametrize(
+    "name", ["a.jpg", "sub dir/Screenshot 10.00.00\u202fAM.png", " a.jpg", "e\u0301.png"]
+)
 def test_names_of_photos_are_those_of_the_disk(name: str) -> None:
     check_photo(name)
 

@@ -117,3 +117,10 @@ def test_a_kill_in_the_middle_of_a_swap_loses_nothing(tmp_path: Path, then: str)
         replaced(folder, "newer")
     assert [path.name for path in folder.iterdir()] == [{"fails": "old", "works": "newer"}[then]]
     assert list(tmp_path.iterdir()) == [folder]
+
+
+def test_files_of_long_names_and_texts_of_any_path(tmp_path: Path) -> None:
+    path = tmp_path / ("日" * 83 + ".txt")
+    write_text(path, "caf\udce9")
+    assert path.read_text(encoding="utf-8") == "caf\\udce9"
+    assert list(tmp_path.iterdir()) == [path]

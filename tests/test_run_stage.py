@@ -27,7 +27,16 @@ from sagesplat.demo.capture import make_capture
 from sagesplat.io.files import read_json, write_json, write_text
 from sagesplat.run import stage
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import FORMAT, RunDir, input_hashes, is_done, is_made_from, record, settings_of
+from sagesplat.run.run_dir import (
+    FORMAT,
+    RunDir,
+    file_hash,
+    input_hashes,
+    is_done,
+    is_made_from,
+    record,
+    settings_of,
+)
 from sagesplat.stages import report
 from sagesplat.stages.fit import fit_ladder
 from sagesplat.stages.label import fuse_masks, make_masks
@@ -435,3 +444,10 @@ def test_models_are_fitted_to_what_was_observed(copy: Path, name: str, value: st
         fit_ladder(quiet(copy, force=True), CONFIG.fit)
     fit_ladder(quiet(copy, force=True), other)
     assert getattr(quiet(copy).fit_config, name) == value
+
+
+def test_a_folder_of_any_names_has_a_hash(tmp_path: Path) -> None:
+    (tmp_path / os.fsdecode(b"caf\xe9.png")).write_bytes(b"1")
+    first = file_hash(tmp_path)
+    (tmp_path / os.fsdecode(b"caf\xe9.png")).rename(tmp_path / os.fsdecode(b"caf\xe8.png"))
+    assert file_hash(tmp_path) != first

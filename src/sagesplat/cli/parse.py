@@ -152,7 +152,8 @@ def _recorded(
     known = recorded_settings(RunDir(path, ladder or "nested"), of=name) | {"ladder": ladder}
     if given & _SOURCES:
         known.pop("masks", None)
-    known = {key: value for key, value in known.items() if key in values}
+    # `labels` are settings of one command, and names of categories in another
+    known = {key: value for key, value in known.items() if isinstance(value, type(values.get(key, ...)))}
     changed = [
         _typed(flag, now)
         for flag in flags_of(function)

@@ -27,7 +27,7 @@ def checked(name: object, length: int = LENGTH) -> str:
         raise ValueError("it is no text")
     if len(name) > 4 * length:  # composing never makes it so much shorter
         raise ValueError(f"it has {len(name)} characters")
-    name = unicodedata.normalize("NFC", name)
+    name = composed(name)
     _check_characters(name)
     if not any(unicodedata.category(c)[0] in "LNPS" and c not in _FILLERS for c in name):
         raise ValueError("it is blank")
@@ -36,6 +36,11 @@ def checked(name: object, length: int = LENGTH) -> str:
     if len(name) > length:
         raise ValueError(f"it has {len(name)} characters")
     return name
+
+
+def composed(name: str) -> str:
+    """A name as `checked` has it: what is typed may hold an accent as a character of its own."""
+    return unicodedata.normalize("NFC", name)
 
 
 def check_photo(name: str) -> None:
@@ -63,8 +68,9 @@ def _check_characters(name: str) -> None:
 
 def repaired(name: str, otherwise: str = "scene") -> str:
     """A name that may be, for what is only shown or for a file of our own: `_` for what is wrong in it."""
-    name = cleaned(unicodedata.normalize("NFC", name[: 4 * LENGTH]))
-    return clipped(name[:LENGTH], _PART_BYTES).strip() or otherwise
+    name = cleaned(composed(name[: 4 * LENGTH]))
+    name = clipped(name[:LENGTH], _PART_BYTES).strip()
+    return name if name.strip(".") else otherwise
 
 
 def cleaned(text: str) -> str:
@@ -79,7 +85,7 @@ def clipped(text: str, nbytes: int) -> str:
 
 def collision_key(name: str) -> str:
     """The same for names that some disk takes for one: those that differ in case or in composition."""
-    return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())
+    return composed(composed(name).casefold())
 
 
 def slugs(names: Mapping[int, str]) -> dict[int, str]:

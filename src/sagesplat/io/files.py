@@ -15,6 +15,7 @@ from sagesplat.core.errors import RunError, short
 
 _FULL = {errno.ENOSPC: "the disk is full", errno.EDQUOT: "the quota is used up"}
 _TEMPORARY = "tmp-"  # in the names of incomplete files and folders
+_STEM = 50  # characters of a file's name in that of the incomplete one, which is longer
 _MB = 10**6
 
 
@@ -36,7 +37,7 @@ def atomic_path(path: Path, *, nbytes: int = 0, sync: bool = True) -> Iterator[P
     with named_full_disk(path, nbytes):
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(
-            dir=path.parent, prefix=f".{path.stem}.{_TEMPORARY}", suffix=path.suffix
+            dir=path.parent, prefix=f".{path.stem[:_STEM]}.{_TEMPORARY}", suffix=path.suffix
         )
         os.close(handle)
         temporary = Path(name)
@@ -185,8 +186,8 @@ def _swap(fresh: Path, path: Path, earlier: Path) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Replace a text file atomically."""
-    content = text.encode()
+    """Replace a text file atomically; escapes are written for what is not UTF-8, as in some paths."""
+    content = text.encode("utf-8", "backslashreplace")
     with atomic_path(path, nbytes=len(content)) as temporary:
         temporary.write_bytes(content)
 

@@ -18,6 +18,7 @@ from sagesplat.adapt.observe import large_enough, read_observations
 from sagesplat.adapt.viewpoint import ViewModel, read_promises
 from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import Gaussians
+from sagesplat.core.names import composed
 from sagesplat.formats.increments import INDEX, read_increments, read_index, write_increments
 from sagesplat.formats.levels import read_level
 from sagesplat.io.files import read_json, write_json
@@ -83,7 +84,8 @@ def bundle(
     the package's own. RunError for a run without nested levels or bounds, another folder, unknown names or an
     impossible number; DataError for a damaged increment; SageError without a viewer.
     """
-    weights = weights or {}
+    always = [composed(name) for name in always]
+    weights = {composed(name): weight for name, weight in (weights or {}).items()}
     job = replace(job, run=replace(job.run, ladder="nested"))
     _check(job, meters_per_unit, always, weights)
     viewer = viewer or package_viewer()

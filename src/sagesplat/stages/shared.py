@@ -17,6 +17,7 @@ from sagesplat.adapt.observe import (
 from sagesplat.core.config import FitConfig, TrainConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import TableMade
+from sagesplat.core.names import composed
 from sagesplat.output.tables import Table
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir, settings_of
@@ -60,6 +61,6 @@ def _show(job: Job, table: Table) -> None:
 def label_named(job: Job, name: str) -> int:
     """The id of a category of the run; RunError for a name that it does not have."""
     ids = {name: label for label, name in job.names().items()}
-    if name not in ids:
+    if composed(name) not in ids:
         raise RunError(f"{job.run.path}: no category {name!r}; there are {', '.join(ids)}")
-    return ids[name]
+    return ids[composed(name)]
