@@ -396,7 +396,10 @@ def all_corrupt(folder: Path) -> None:
     [
         (lambda folder: None, "0 readable photos, but it takes 3; add overlapping photos"),
         (one_photo, "1 readable photos, but it takes 3; add"),
-        (all_corrupt, r"0 readable photos, but it takes 3 \(0\.jpg unreadable: .*\.\.\.\); replace"),
+        (
+            all_corrupt,
+            r"it takes 3; 0\.jpg \(the first of 3\) is unreadable: .*; replace or",
+        ),
     ],
 )
 def test_too_few_photos(

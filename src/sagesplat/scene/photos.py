@@ -151,8 +151,8 @@ def _too_few(source: Path, photos: list[PreparedPhoto], unreadable: dict[str, st
     problem = f"{source}: {len(photos)} readable photos, but it takes {MIN_PHOTOS}"
     if unreadable:
         name, reason = next(iter(unreadable.items()))
-        more = ", ..." if len(unreadable) > 1 else ""
-        return f"{problem} ({name} {reason}{more}); replace the damaged files"
+        count = f" (the first of {len(unreadable)})" if len(unreadable) > 1 else ""
+        return f"{problem}; {name}{count} is {reason}"
     if photos and source.is_file():
         return f"{problem} frames that differ; move the camera, or take a longer video"
     kinds = ", ".join(sorted(suffix[1:] for suffix in PHOTOS))

@@ -8,12 +8,13 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int16, Int32
+from jaxtyping import Int16, Integer
 from PIL import Image
 
 from sagesplat.core.errors import LabelError, RunError, short
 from sagesplat.core.names import LENGTH, RULE, checked, collision_key
 from sagesplat.io.files import atomic_path, read_json, write_json
+from sagesplat.io.pictures import FREE_PIXELS, PictureError, open_picture
 from sagesplat.scene.scene import Scene, View
 from sagesplat.scene.undistort import undistort
 from sagesplat.segment import coco
@@ -24,7 +25,6 @@ UNLABELLED_COLOR = (128, 128, 128)
 MAX_LABEL_ID = np.iinfo(np.int16).max
 _UNKNOWN = -2  # never leaves this file
 _BLOCK = len("@4095")  # what a per-block category adds to the name of its category
-_DEFLATE = 1032  # times its size is all that a deflate stream can hold
 VOID_8, VOID_16 = 255, 65535  # what unlabelled pixels hold in 8- and 16-bit files, unless stated otherwise
 
 
@@ -83,7 +83,7 @@ class Masks:
         """A view's category ids at the size of its camera, -1 = unlabelled; shared, so not to be changed."""
         label_ids = self._cache.get(view.name)
         if label_ids is None:
-            label_ids = read_mask(mask_path(self.folder, view), self.taxonomy)
+            label_ids = read_mask(mask_path(self.folder, view), self.taxonomy, _pixels(view))
             if self._used + label_ids.nbytes <= self.cache_bytes:
                 self._cache[view.name] = label_ids
                 self._used += label_ids.nbytes
@@ -121,10 +121,19 @@ def prepare_folder(folder: Path, views: Sequence[View]) -> list[Path]:
     return paths
 
 
-def read_mask(path: Path, taxonomy: Taxonomy) -> Int16[np.ndarray, "H W"]:
-    """A normalised label image; LabelError where it is missing, damaged or holds ids without a name."""
+def read_mask(path: Path, taxonomy: Taxonomy, free: int = FREE_PIXELS) -> Int16[np.ndarray, "H W"]:
+    """A normalised label image; LabelError where it is missing, damaged or holds ids without a name.
+
+    Label images with more than `free` pixels are refused where their files are too small for photos of that
+    size. Memory: up to 20 bytes per pixel.
+    """
     ids = {VOID_8: UNLABELLED, VOID_16: UNLABELLED} | {i: i for i in taxonomy.names}
-    return _translate(_read_png(path), ids, path, "make the masks again")
+    return _translate(_read_png(path, free), ids, path, "make the masks again")
+
+
+def _pixels(view: View) -> int:
+    """Number of pixels that any label image of a view may have: four times its photo's, at least."""
+    return max(FREE_PIXELS, 4 * view.camera.width * view.camera.height)
 
 
 def write_mask(path: Path, label_ids: Int16[np.ndarray, "H W"], taxonomy: Taxonomy) -> None:
@@ -173,7 +182,7 @@ def import_masks(scene: Scene, source: Path, target: Path) -> list[str]:
     for view, path in zip(scene.views, prepare_folder(target, scene.views), strict=True):
         label_ids = np.full((view.camera.height, view.camera.width), UNLABELLED, np.int16)
         if (file := found[view.name]) is not None:
-            label_ids = _fit(file.read(), view, file.path)
+            label_ids = _fit(file.read(_pixels(view)), view, file.path)
         write_mask(path, label_ids, taxonomy)
         occurring.update(np.unique(label_ids).tolist())
     write_labels(target, taxonomy, occurring)
@@ -197,9 +206,9 @@ class _File:
     segments: bool  # RGB-coded segment ids instead of category ids
     cure: str  # what helps where the file holds other values
 
-    def read(self) -> Int16[np.ndarray, "h w"]:
-        """Category ids at the file's own size."""
-        return _translate(_read_png(self.path, self.segments), self.ids, self.path, self.cure)
+    def read(self, free: int) -> Int16[np.ndarray, "h w"]:
+        """Category ids at the file's own size; `free` as in `read_mask`."""
+        return _translate(_read_png(self.path, free, self.segments), self.ids, self.path, self.cure)
 
 
 _Find = Callable[[View], _File | None]
@@ -294,35 +303,39 @@ def taxonomy_of(names: dict[int, Any], path: Path, length: int = LENGTH) -> Taxo
     return Taxonomy({label_id: name for name, label_id in sorted(found.items(), key=lambda of: of[1])})
 
 
-def _read_png(path: Path, segments: bool = False) -> Int32[np.ndarray, "h w"]:
-    """The ids in a PNG: grey values or palette indices, or R + 256 G + 65536 B with `segments`.
-
-    Memory: up to 16 bytes for each pixel, which are no more than a file of this size can hold.
-    """
+def _read_png(path: Path, free: int, segments: bool = False) -> Integer[np.ndarray, "h w"]:
+    """The ids in a PNG: grey values or palette indices, or R + 256 G + 65536 B with `segments`."""
+    modes = ("RGB", "RGBA") if segments else ("1", "L", "P", "I;16", "I")
     try:
-        with Image.open(path, formats=["PNG"]) as image:
-            mode, bits = image.mode, 24 if segments else 1
-            if image.width * image.height * bits > 8 * _DEFLATE * path.stat().st_size:
-                raise ValueError(f"{image.width} x {image.height} pixels promised, more than fit")
-            fits = mode in (("RGB", "RGBA") if segments else ("1", "L", "P", "I;16", "I"))
-            pixels = np.asarray(image).astype(np.int32) if fits else np.zeros((0, 0), np.int32)
-    except FileNotFoundError:
-        raise LabelError(f"{path}: no such file; make the masks again") from None
-    except Exception as error:  # Pillow raises errors of many kinds for damaged files
-        raise LabelError(f"{path}: not a readable PNG ({short(error)}); export it again") from None
-    if not fits:
+        with open_picture(path, ("PNG",), free=free) as image:
+            mode = image.mode
+            pixels = np.asarray(image) if mode in modes else None
+    except PictureError as error:
+        if not path.exists():
+            raise LabelError(f"{path}: no such file; make the masks again") from None
+        cure = error.cure or "export it again"
+        raise LabelError(f"{path}: not a readable PNG ({error.reason}); {cure}") from None
+    if pixels is None:
         wanted = "an RGB image of segments" if segments else "one channel of 8- or 16-bit ids"
         raise LabelError(f"{path}: a PNG of mode {mode} where {wanted} is needed; convert it")
-    return pixels[..., 0] + 256 * pixels[..., 1] + 65536 * pixels[..., 2] if segments else pixels
+    if not segments:
+        return pixels.astype(np.uint8) if mode == "1" else pixels
+    ids = pixels[..., 2].astype(np.int32)
+    for channel in (1, 0):
+        ids *= 256
+        ids += pixels[..., channel]
+    return ids
 
 
 def _translate(
-    raw: Int32[np.ndarray, "h w"], ids: dict[int, int], path: Path, cure: str
+    raw: Integer[np.ndarray, "h w"], ids: dict[int, int], path: Path, cure: str
 ) -> Int16[np.ndarray, "h w"]:
     """Replace each value by what `ids` says; LabelError for values that it does not know."""
-    table = np.full(max(ids) + 2, _UNKNOWN, np.int16)  # its last entry is for all larger values
+    small = raw.dtype.itemsize <= 2
+    size = max(ids) + 2  # the last entry is for all larger values
+    table = np.full(max(size, np.iinfo(raw.dtype).max + 1) if small else size, _UNKNOWN, np.int16)
     table[list(ids)] = list(ids.values())
-    label_ids = table[np.minimum(raw, len(table) - 1)]
+    label_ids = table[raw if small else np.minimum(raw, len(table) - 1)]
     unknown = raw[label_ids == _UNKNOWN]
     if len(unknown):
         unknown = np.unique(unknown[:10_000])  # of a large image some will do
