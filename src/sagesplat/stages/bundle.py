@@ -6,7 +6,6 @@ import shutil
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -31,11 +30,11 @@ from sagesplat.segment.display_names import title_of
 from sagesplat.segment.masks import UNLABELLED
 from sagesplat.stages.shared import distances
 from sagesplat.viewer import boxes
+from sagesplat.viewer.built import check_viewer, package_viewer
 from sagesplat.viewer.bundle import (
     MANIFEST,
     BundleSizes,
     check_target,
-    check_viewer,
     has_viewer,
     write_bundle,
     write_documents,
@@ -119,11 +118,6 @@ def _poster(g: Gaussians, contents: Contents) -> bytes:
     file = io.BytesIO()
     Image.fromarray(pixels).save(file, "JPEG", quality=72, optimize=True)
     return file.getvalue()
-
-
-def package_viewer() -> Path:
-    """The folder of the package's built viewer, which may be missing."""
-    return Path(str(files("sagesplat"))) / "viewer" / "static"
 
 
 def live_bundle(job: Job, folder: Path, viewer: Path | None = None) -> bool:
