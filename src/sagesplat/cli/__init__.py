@@ -11,6 +11,7 @@ from sagesplat.cli import stages, studies, tools  # noqa: F401  (their commands 
 from sagesplat.cli.base import COMMANDS
 from sagesplat.cli.help import help_of
 from sagesplat.cli.parse import arguments, current_command
+from sagesplat.core import signals
 from sagesplat.core.errors import SageError
 
 
@@ -31,8 +32,8 @@ def main() -> None:
         function(**arguments(name, function, words))
     except SageError as error:
         _fail(str(error))
-    except KeyboardInterrupt:
-        _fail("interrupted; finished stages and checkpoints are kept: run the same command again to resume")
+    except KeyboardInterrupt as error:
+        signals.leave(error)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except OSError as error:
