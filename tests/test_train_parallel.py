@@ -125,7 +125,7 @@ def test_more_processes_than_gpus(capture, monkeypatch):  # noqa: F811
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signal masks")
 def test_the_others_do_not_hear_ctrl_c() -> None:
-    """A terminal sends it to all: the first process cleans up and ends the others, which would print traces."""
+    """A terminal sends it to all: the first ends the others, which would only print tracebacks."""
     code = "import signal; print(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, []))"
     with parallel._without_ctrl_c():
         assert subprocess.check_output([sys.executable, "-c", code]) == b"True\n"

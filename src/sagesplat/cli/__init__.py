@@ -13,6 +13,10 @@ from sagesplat.cli.help import help_of
 from sagesplat.cli.parse import arguments, current_command
 from sagesplat.core import signals
 from sagesplat.core.errors import SageError
+from sagesplat.core.memory import named_memory
+from sagesplat.io.files import CURES
+
+_CHECK = "check the path, its rights and the disk"
 
 
 def main() -> None:
@@ -29,7 +33,8 @@ def main() -> None:
         print(help_of(name, function, everything="--help-all" in words))
         raise SystemExit(0)
     try:
-        function(**arguments(name, function, words))
+        with named_memory(f"sagesplat {name}"):
+            function(**arguments(name, function, words))
     except SageError as error:
         _fail(str(error))
     except KeyboardInterrupt as error:
@@ -38,7 +43,7 @@ def main() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except OSError as error:
         where = error.filename or "input/output"
-        _fail(f"{where}: {error.strerror or error}; check the path, its rights and the disk")
+        _fail(f"{where}: {error.strerror or error}; {CURES.get(error.errno or 0, _CHECK)}")
 
 
 def _overview() -> str:
