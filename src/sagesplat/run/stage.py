@@ -10,6 +10,7 @@ from typing import Any
 
 from sagesplat.core.errors import RunError, SageError
 from sagesplat.core.events import StageDone, StageSkipped, StageStarted
+from sagesplat.core.memory import named_memory
 from sagesplat.io.files import named_full_disk, read_json, remove_temporary, sync_changed
 from sagesplat.io.lock import locked
 from sagesplat.run.job import NO_RUN, Job
@@ -65,6 +66,7 @@ def run_stage(
         RunError: If an input is missing, the result was made with other settings (without `job.force`),
             another process works on the folder, or the disk is full. What was finished stays: the same
             command resumes.
+        OutOfMemory: If memory runs out; the same holds.
     """
     run_stages(job, [Stage(name, settings, inputs, outputs, swaps)], lambda _: iter([(0, make())]))
 
@@ -82,7 +84,8 @@ def run_stages(
     missing = [number for number, stage in enumerate(stages) if not _is_done(job, stage)]
     if not missing:
         return
-    with ExitStack() as own, named_full_disk(job.run.path):
+    where = f"{job.run.path}: {stages[missing[0]].name}"
+    with ExitStack() as own, named_full_disk(job.run.path), named_memory(where):
         (job.locks or own).enter_context(locked(job.run.path, job.lock_wait))
         remove_temporary(job.run.path, but="bundle")  # a viewer writes those, without the lock
         for number in missing:

@@ -11,6 +11,7 @@ from PIL import Image
 
 from sagesplat.core.config import MasksConfig
 from sagesplat.core.errors import BackendUnavailable, LabelError, RunError, short
+from sagesplat.core.memory import ran_out
 from sagesplat.io.files import read_json
 from sagesplat.segment import coco
 from sagesplat.segment.masks import UNLABELLED, Taxonomy, taxonomy_of
@@ -120,6 +121,8 @@ class OnnxSegmenter:
         try:
             return np.asarray(self._session.run(None, {self._input: np.ascontiguousarray(x[None])})[0])
         except Exception as error:  # onnxruntime has a class of its own for each kind of failure
+            if ran_out(error):
+                raise
             raise LabelError(f"{self._model}: does not run ({_first_line(error)}); export it again") from None
 
     def _grouped(
@@ -181,6 +184,8 @@ def open_session(model: Path, threads: int, device: str = "cpu") -> Any:
     try:
         session = onnxruntime.InferenceSession(str(model), options, providers=[*gpu, "CPUExecutionProvider"])
     except Exception as error:  # onnxruntime has a class of its own for each kind of failure
+        if ran_out(error):
+            raise
         raise LabelError(
             f"{model}: no model that onnxruntime can load ({_first_line(error)}); export it again"
         ) from None

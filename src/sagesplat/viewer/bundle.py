@@ -12,7 +12,7 @@ from pathlib import Path
 
 from sagesplat.core.errors import DataError, RunError
 from sagesplat.formats.increments import Increment
-from sagesplat.io.files import atomic_folder, read_json, write_text
+from sagesplat.io.files import atomic_folder, read_json, unwritable, write_text
 from sagesplat.viewer.built import PAGE, POSTER, check_viewer, with_poster
 from sagesplat.viewer.manifest import FORMAT, THIRD_PARTY, Contents, documents, pack_order
 from sagesplat.viewer.pack import write_pack
@@ -45,7 +45,8 @@ def write_bundle(out: Path, contents: Contents, viewer: Path, poster: bytes | No
 
     `viewer`: the folder with the built viewer. `poster`: a JPEG of the first view, shown until the scene is
     drawn. RunError for another folder; SageError without a viewer;
-    DataError for a chunk that is missing or not what the index says.
+    DataError for a chunk that is missing or not what the index says; RunError too where another process
+    writes there.
     """
     check_target(out)
     check_viewer(viewer)
@@ -60,9 +61,7 @@ def write_bundle(out: Path, contents: Contents, viewer: Path, poster: bytes | No
                 _put_up(fresh, poster)
             return write_documents(fresh, contents)
     except OSError as error:
-        raise RunError(
-            f"{out}: cannot be written ({error.strerror}); free some space or name another folder"
-        ) from error
+        raise RunError(unwritable(out, error)) from error
 
 
 def _put_up(folder: Path, poster: bytes) -> None:
