@@ -19,7 +19,8 @@ from sagesplat.formats.spz import read_spz
 from sagesplat.io.files import read_json, write_json
 from sagesplat.raster import rasterize
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import FORMAT, RunDir, checkpoint_key
+from sagesplat.run.records import FORMAT, checkpoint_key
+from sagesplat.run.run_dir import RunDir
 from sagesplat.stages.bundle import _antialiased, bundle, live_bundle
 from sagesplat.stages.fit import fit_ladder
 from sagesplat.stages.label import lift_labels, make_masks

@@ -1,11 +1,9 @@
 """A run folder being worked on, and what its stages share."""
 
-import hashlib
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 
@@ -13,10 +11,11 @@ from sagesplat.adapt.ladder import Ladder, SnapshotLadder, read_ladder, read_pre
 from sagesplat.core.config import FitConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit
-from sagesplat.io.files import read_json
 from sagesplat.raster import Backend
+from sagesplat.run.capture import check_photos, fingerprint, photo_hashes, read_capture
 from sagesplat.run.executor import LOCAL, Executor, Local
-from sagesplat.run.run_dir import RunDir, settings_of
+from sagesplat.run.records import settings_of
+from sagesplat.run.run_dir import RunDir
 from sagesplat.scene import load_scene
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
@@ -75,12 +74,16 @@ class Job:
             return self.source.scene
         if not self.run.scene.exists():
             raise RunError(f"{self.run.path}: {NO_RUN}")
-        made = read_json(self.run.scene)
-        scene = load_scene(Path(made["path"]), **made["settings"])
-        if fingerprint(scene) != made["fingerprint"]:
+        made = read_capture(self.run.scene)
+        scene = load_scene(made.path, **made.settings)
+        if fingerprint(scene) != made.fingerprint:
             raise RunError(
-                f"{made['path']}: the capture changed since this run began; choose another run folder"
+                f"{made.path}: the capture changed since this run began; choose another run folder"
             )
+        if made.photos is not None:
+            now = photo_hashes(self.run.photo_hashes, scene)
+            check_photos(scene, made.photos, now.sha256)
+            now.keep()
         return scene
 
     @cached_property
@@ -173,20 +176,3 @@ class JobSpec:
         """The job, in this process; it shares the scene and the photos of `source`."""
         made = {f.name: getattr(self, f.name) for f in fields(self)}
         return Job(emit=emit, lock_wait=_LOCK_WAIT, source=source, **made)
-
-
-def fingerprint(scene: Scene) -> str:
-    """Changes when the poses, the points or the set of photos do."""
-    digest = hashlib.sha256()
-    for view in scene.views:
-        size = view.image_path.stat().st_size
-        digest.update(f"{view.name} {size} {view.camera.width} {view.camera.height}".encode())
-        digest.update(view.camera.w2c.tobytes() + view.camera.K.tobytes())
-        if any(view.camera.background):
-            digest.update(bytes(view.camera.background))
-    digest.update(scene.points.xyz.tobytes())
-    if scene.test_names is not None:
-        digest.update("\n".join(sorted(scene.test_names)).encode())
-    if scene.calibration_names is not None:
-        digest.update("\n".join(["", *sorted(scene.calibration_names)]).encode())
-    return digest.hexdigest()

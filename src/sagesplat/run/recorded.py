@@ -18,7 +18,8 @@ from sagesplat.core.config import (
     SceneConfig,
     TrainConfig,
 )
-from sagesplat.run.run_dir import FORMAT, LadderKind, RunDir
+from sagesplat.run.records import FORMAT
+from sagesplat.run.run_dir import LadderKind, RunDir
 
 Config = TypeVar("Config")
 _PATHS = {"masks", "classes"}  # fields of MasksConfig that are paths

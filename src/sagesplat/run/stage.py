@@ -13,7 +13,7 @@ from sagesplat.core.events import StageDone, StageSkipped, StageStarted
 from sagesplat.io.files import named_full_disk, read_json, remove_temporary, sync_changed
 from sagesplat.io.lock import locked
 from sagesplat.run.job import NO_RUN, Job
-from sagesplat.run.run_dir import is_done, record
+from sagesplat.run.records import is_done, record
 
 _CLOCK_STEP = 2.0  # seconds: some disks keep no finer time
 # Stages that are made of earlier results within minutes: they follow those without --force, as long as

@@ -20,8 +20,9 @@ from sagesplat.core.events import Emit, Progress, named
 from sagesplat.core.gaussians import Gaussians, concat
 from sagesplat.formats.levels import read_level, read_more, read_sizes, write_level, write_set
 from sagesplat.io.files import link, read_json, write_json
+from sagesplat.run.capture import Hashes, fingerprint, photo_hashes
 from sagesplat.run.executor import Task, results
-from sagesplat.run.job import Job, JobSpec, fingerprint
+from sagesplat.run.job import Job, JobSpec
 from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
 from sagesplat.scene.blocks import (
@@ -81,12 +82,13 @@ def divide(job: Job, config: BlocksConfig, seed: int) -> Blocks:
         assigned = assigned_views(scene, blocks, shares, config.min_share)
         training = np.isin(np.arange(len(scene.views)), scene.train_ids)
         labels = LiftedLabels.read(run.labels, len(scene.points.xyz))
+        photos = photo_hashes(run.photo_hashes, scene)
         sees: list[list[int]] = []
         for number in range(len(blocks)):
             rows = np.flatnonzero(assigned[:, number] & training).tolist()
             sees.append(np.flatnonzero((shares[rows] >= _SEEN).any(0)).tolist())
             part, kept = training_scene(scene, blocks, number, rows, config.far_share, seed)
-            _begin(run.block(number), part, labels, kept)
+            _begin(run.block(number), part, labels, kept, photos)
         for old in run.blocks.glob("[0-9]*"):
             if int(old.name) >= len(blocks):
                 shutil.rmtree(old)
@@ -103,15 +105,17 @@ def divide(job: Job, config: BlocksConfig, seed: int) -> Blocks:
     return read_blocks(file)
 
 
-def _begin(run: RunDir, scene: Scene, labels: LiftedLabels, rows: np.ndarray) -> None:
+def _begin(run: RunDir, scene: Scene, labels: LiftedLabels, rows: np.ndarray, photos: Hashes) -> None:
     """Create a block's run folder with the inputs of training."""
     run.path.mkdir(parents=True, exist_ok=True)
     capture = run.path / "capture.npz"
     write_scene(capture, scene)
-    mine = LiftedLabels(labels.label_ids[rows], labels.num_votes[rows], labels.num_agreeing[rows])
-    mine.write(run.labels)
+    LiftedLabels(labels.label_ids[rows], labels.num_votes[rows], labels.num_agreeing[rows]).write(run.labels)
+    mine = photos.of({view.name for view in scene.views})
     stored = {"path": str(capture.resolve()), "settings": {}, "fingerprint": fingerprint(scene)}
-    write_json(run.scene, {**stored, "extent": scene.extent, "points": len(rows), "views": []})
+    stored |= {"photos": mine.sha256, "extent": scene.extent, "points": len(rows), "views": []}
+    write_json(run.scene, stored)
+    mine.keep(run.photo_hashes)
 
 
 def _share_masks(job: Job, block: Job) -> None:

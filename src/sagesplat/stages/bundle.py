@@ -24,7 +24,7 @@ from sagesplat.io.files import read_json, write_json
 from sagesplat.io.npz import Npz
 from sagesplat.raster import rasterize
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import is_made_from, settings_of
+from sagesplat.run.records import is_made_from, settings_of
 from sagesplat.segment.block_categories import split_name
 from sagesplat.segment.display_names import title_of
 from sagesplat.segment.masks import UNLABELLED

@@ -8,7 +8,7 @@ from sagesplat.adapt.plan import read_budget_plan, read_plans
 from sagesplat.core.events import Progress
 from sagesplat.output import tables
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import settings_of
+from sagesplat.run.records import settings_of
 from sagesplat.run.stage import run_stage
 from sagesplat.segment.display_names import titles
 from sagesplat.stages.compose import compose, compose_inputs

@@ -8,7 +8,7 @@ from sagesplat.core.errors import RunError
 from sagesplat.formats.increments import INDEX, Format, write_increments
 from sagesplat.formats.ply import write_ply
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import settings_of
+from sagesplat.run.records import settings_of
 from sagesplat.stages.compose import compose
 from sagesplat.stages.plan import main_plan, scene_plan
 from sagesplat.stages.shared import label_named

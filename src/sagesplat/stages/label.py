@@ -1,20 +1,22 @@
 """Makes label images from the photos, point labels from these, and fused label images from both."""
 
+import json
 import shutil
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from sagesplat.core.config import LabelsConfig, LiftConfig, MasksConfig
-from sagesplat.core.errors import LabelError
+from sagesplat.core.errors import LabelError, RunError
 from sagesplat.core.events import Progress, Warned
 from sagesplat.io.files import read_json, write_json
 from sagesplat.run.executor import split
 from sagesplat.run.job import Job
+from sagesplat.run.records import file_hash
 from sagesplat.run.remote import work_all
-from sagesplat.run.run_dir import file_hash
 from sagesplat.run.stage import run_stage
 from sagesplat.segment.edit import Edited, edit_labels, parse_keep, parse_merge
 from sagesplat.segment.lift import agreement_in, lift
@@ -103,11 +105,11 @@ def _segment(job: Job, config: MasksConfig, kind: str) -> None:
     settings = {"segmenter": kind, "soft": config.soft, **hashed}
 
     def make() -> list[str]:
-        marker = run.segmented / _MARKER
-        if not marker.exists() or read_json(marker) != settings:
+        marker, key = run.segmented / _MARKER, {**settings, "scene": file_hash(run.scene)}
+        if not _is(marker, key):
             shutil.rmtree(run.segmented, ignore_errors=True)
             shutil.rmtree(run.soft, ignore_errors=True)
-        write_json(marker, settings)
+        write_json(marker, key)
         some = split(range(len(job.scene.views)), job.executor.parallel)  # each loads the network
         found = work_all(job, "segment", _segment_some, [(rows, config, kind) for rows in some])
         taxonomy = found[0][0]
@@ -118,6 +120,14 @@ def _segment(job: Job, config: MasksConfig, kind: str) -> None:
         return []
 
     run_stage(job, "segment", settings, [run.scene], [run.segmented / "labels.json"], make)
+
+
+def _is(marker: Path, key: dict[str, Any]) -> bool:
+    """Whether a folder of label images was begun with this network and these photos."""
+    try:
+        return read_json(marker) == json.loads(json.dumps(key))
+    except RunError:
+        return False
 
 
 def _segment_some(job: Job, part: tuple[Sequence[int], MasksConfig, str]) -> tuple[Taxonomy, set[int]]:

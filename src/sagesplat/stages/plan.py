@@ -6,7 +6,8 @@ from sagesplat.adapt.plan import Plan, read_budget_plan, read_plans, write_plans
 from sagesplat.core.config import PlanConfig
 from sagesplat.core.errors import RunError
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import RunDir, settings_of
+from sagesplat.run.records import settings_of
+from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.shared import label_image_inputs

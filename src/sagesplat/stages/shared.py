@@ -19,7 +19,8 @@ from sagesplat.core.errors import RunError
 from sagesplat.core.events import TableMade
 from sagesplat.output.tables import Table
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import RunDir, settings_of
+from sagesplat.run.records import settings_of
+from sagesplat.run.run_dir import RunDir
 
 
 def train_config(job: Job) -> TrainConfig:

@@ -9,7 +9,8 @@ from sagesplat.core.config import TrainConfig
 from sagesplat.core.events import Training, Warned
 from sagesplat.io.files import read_json, write_json
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import RunDir, checkpoint_key
+from sagesplat.run.records import checkpoint_key
+from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
 from sagesplat.segment.display_names import titles
 from sagesplat.train import memory

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 from sagesplat.core.errors import BackendUnavailable, RunError, SageError
 from sagesplat.core.events import Emit, Warned
 from sagesplat.io.files import read_json
-from sagesplat.run.run_dir import RunDir, check_format
+from sagesplat.run.records import check_format
+from sagesplat.run.run_dir import RunDir
 
 if TYPE_CHECKING:
     from sagesplat.run.job import Job

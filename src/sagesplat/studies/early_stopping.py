@@ -22,7 +22,7 @@ from sagesplat.metrics.image import psnr, squared_error_map
 from sagesplat.output.tables import Table, by_size, mean, name_of
 from sagesplat.raster import Workspace
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import settings_of
+from sagesplat.run.records import settings_of
 from sagesplat.segment.display_names import titles
 from sagesplat.train.early_stopping import measured_views
 

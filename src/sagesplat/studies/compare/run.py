@@ -26,8 +26,9 @@ from sagesplat.metrics.lpips import Lpips
 from sagesplat.raster import Workspace
 from sagesplat.run.executor import Local
 from sagesplat.run.job import Job
+from sagesplat.run.records import is_done, settings_of
 from sagesplat.run.remote import work
-from sagesplat.run.run_dir import RunDir, is_done, settings_of
+from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import Stage, run_stage, run_stages
 from sagesplat.segment.display_names import titles
 from sagesplat.stages.compose import compose_inputs, tune_composition

@@ -16,7 +16,7 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.columns import from_rows, write_columns
 from sagesplat.output.tables import Table, promise_kept
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import settings_of
+from sagesplat.run.records import settings_of
 from sagesplat.run.stage import run_stage
 from sagesplat.segment.display_names import titles
 from sagesplat.stages.compose import compose_inputs, tune_composition

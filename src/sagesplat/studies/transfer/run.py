@@ -14,7 +14,7 @@ from sagesplat.metrics.lpips import load_lpips
 from sagesplat.output.figures import save_figure
 from sagesplat.output.tables import Table
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import settings_of
+from sagesplat.run.records import settings_of
 from sagesplat.stages.shared import distances, observed
 from sagesplat.studies.paper.report import Picture, panel, take_pictures
 from sagesplat.studies.transfer import score
