@@ -15,6 +15,7 @@ from sagesplat.io.files import read_json, write_json
 from sagesplat.run.records import file_hash
 from sagesplat.scene.scene import Scene
 
+_CURE = "delete it, and run `sagesplat run SCENE RUN` again with the same settings"
 _TYPES = {"path": Path, "fingerprint": str}
 _STATE = tuple[
     int, int, int, str
@@ -33,7 +34,7 @@ class Capture:
 
 def read_capture(path: Path) -> Capture:
     """The capture that a scene.json names; RunError for anything else."""
-    made = read_json(path)
+    made = read_json(path, _CURE)
     try:
         if not isinstance(made, dict) or not isinstance(made.get("settings"), dict):
             raise ValueError("no settings")
@@ -45,9 +46,7 @@ def read_capture(path: Path) -> Capture:
         if not (photos is None or fits(photos, dict[str, str])):
             raise ValueError("photos without hashes")
     except ValueError as error:
-        raise RunError(
-            f"{path}: not the scene of a run ({error}); write it anew with `sagesplat run SCENE RUN --force`"
-        ) from None
+        raise RunError(f"{path}: not the scene of a run ({short(error)}); {_CURE}") from None
     return Capture(Path(made["path"]), made["settings"], made["fingerprint"], photos)
 
 

@@ -1,9 +1,10 @@
 """A run folder being worked on, and what its stages share."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 
@@ -106,9 +107,11 @@ class Job:
     @property
     def taxonomy(self) -> Taxonomy:
         """The names of the run's categories."""
-        return Taxonomy.read(
-            (self.run.block_categories if self.has_block_categories else self.run.masks) / "labels.json"
-        )
+        return Taxonomy.read(self._labels)
+
+    @property
+    def _labels(self) -> Path:
+        return (self.run.block_categories if self.has_block_categories else self.run.masks) / "labels.json"
 
     @cached_property
     def masks(self) -> Masks:
@@ -132,7 +135,9 @@ class Job:
     def point_labels(self) -> np.ndarray:
         """Category of each SfM point."""
         path = self.run.block_category_labels if self.has_block_categories else self.run.labels
-        return LiftedLabels.read(path, len(self.scene.points.xyz)).label_ids
+        ids = LiftedLabels.read(path, len(self.scene.points.xyz)).label_ids
+        self._check_named(path, np.flatnonzero(np.bincount(ids.astype(np.int64) + 1)) - 1)
+        return ids
 
     @cached_property
     def snapshots(self) -> SnapshotLadder:
@@ -142,7 +147,21 @@ class Job:
     @cached_property
     def ladder(self) -> Ladder:
         """The levels to choose from: prefixes of the nested model, or the snapshots."""
-        return read_prefixes(self.run.prefixes) if self.run.ladder == "nested" else self.snapshots
+        nested = self.run.ladder == "nested"
+        ladder = read_prefixes(self.run.prefixes) if nested else self.snapshots
+        path = self.run.prefixes if nested else self.run.levels
+        self._check_named(path, sorted({label for label, _ in ladder.counts}))
+        return ladder
+
+    def _check_named(self, path: Path, label_ids: Iterable[int]) -> None:
+        """RunError for an id that the run's labels.json does not name."""
+        names = self.names()
+        for label in label_ids:
+            if label not in names:
+                raise RunError(
+                    f"{path}: of category {label}, which {self._labels} does not name; put back the "
+                    "labels.json that belongs to it, or run again into a new folder"
+                )
 
     @cached_property
     def antialiased(self) -> bool:

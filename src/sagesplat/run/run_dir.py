@@ -1,8 +1,11 @@
 """The names of everything in a run folder."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
+
+from sagesplat.core.errors import RunError
 
 LadderKind = Literal["nested", "snapshots"]
 # stages that all ladders of a run share
@@ -17,6 +20,27 @@ _BEFORE_LADDERS = (
     "fuse",
     "block_categories",
 )
+
+
+def check_links(folder: Path) -> None:
+    """RunError for a link below a run folder that leads out of it.
+
+    Run folders come from other people too: through such a link they would name files to read and to replace.
+    What is meant to lie elsewhere is named by an absolute path: the capture, in scene.json.
+    """
+    root, todo = os.path.join(os.path.realpath(folder), ""), [str(folder)]
+    while todo:
+        try:
+            with os.scandir(todo.pop()) as entries:
+                for entry in entries:
+                    if entry.is_symlink() and not os.path.realpath(entry.path).startswith(root):
+                        raise RunError(
+                            f"{entry.path}: a link out of the run folder; put the file or folder itself there"
+                        )
+                    if entry.is_dir(follow_symlinks=False):
+                        todo.append(entry.path)
+        except (FileNotFoundError, NotADirectoryError):  # not made yet, or removed by a run at work
+            continue
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Extracts frames from a video: the sharpest of each interval, without duplicates."""
 
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,8 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from PIL import Image
 
-from sagesplat.core.errors import BackendUnavailable, SceneError
+from sagesplat.core.errors import BackendUnavailable, RunError, SceneError
+from sagesplat.core.typed import fits
 from sagesplat.io.files import atomic_path, read_json, write_json
 
 _GREY_WIDTH = 640  # px, of the copies that sharpness is measured on
@@ -62,9 +64,17 @@ def _finished(folder: Path, source: dict[str, int]) -> list[Path] | None:
     """The frames of an earlier, finished run on the same file, if all are there."""
     if not (folder / "video.json").is_file():
         return None
-    listed = read_json(folder / "video.json")
-    paths = [folder / name for name in listed.pop("frames", [])]
-    return paths if listed == source and all(p.is_file() for p in paths) else None
+    try:
+        listed = read_json(folder / "video.json")
+    except RunError:
+        return None
+    if not isinstance(listed, dict) or {k: v for k, v in listed.items() if k != "frames"} != source:
+        return None
+    frames: Any = listed.get("frames")
+    if not fits(frames, list[str]) or not all(re.fullmatch(r"frame_\d+\.jpg", name) for name in frames):
+        return None
+    paths = [folder / name for name in frames]
+    return paths if all(path.is_file() for path in paths) else None
 
 
 def _sharpest(

@@ -19,7 +19,7 @@ from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit, Progress, named
 from sagesplat.core.gaussians import Gaussians, concat
 from sagesplat.formats.levels import read_level, read_more, read_sizes, write_level, write_set
-from sagesplat.io.files import link, read_json, write_json
+from sagesplat.io.files import link, write_json
 from sagesplat.run.capture import Hashes, fingerprint, photo_hashes
 from sagesplat.run.executor import Task, results
 from sagesplat.run.job import Job, JobSpec
@@ -30,6 +30,7 @@ from sagesplat.scene.blocks import (
     assigned_views,
     graph_colouring,
     read_blocks,
+    read_division,
     split,
     training_scene,
     visible_shares,
@@ -42,7 +43,7 @@ from sagesplat.segment.lift import LiftedLabels
 from sagesplat.segment.masks import mask_path, prepare_folder, write_labels, write_mask
 from sagesplat.stages.nest import nest_levels, write_ladder
 from sagesplat.stages.shared import label_image_inputs, train_config
-from sagesplat.stages.train import train_inputs, train_levels
+from sagesplat.stages.train import read_frozen, train_inputs, train_levels, write_frozen
 from sagesplat.train import memory, nested
 from sagesplat.train.boundaries import around, boundary_views, interior, interior_sizes, together
 from sagesplat.train.nested import Nested, NestStep
@@ -200,9 +201,9 @@ def _merge_levels(run: RunDir, blocks: Blocks, parts: BlockCategories) -> int:
         count = len(g)
     frozen = {}
     for number in range(len(blocks)):
-        for label, step in read_json(run.block(number).frozen).items():
-            frozen[str(int(parts.ids(np.array(int(label)), number)))] = step
-    write_json(run.frozen, frozen)
+        for label, step in read_frozen(run.block(number).frozen).items():
+            frozen[int(parts.ids(np.array(label), number))] = step
+    write_frozen(run.frozen, frozen)
     return count
 
 
@@ -303,7 +304,7 @@ def _tune(job: Job, blocks: Blocks, config: BlocksConfig, nest: NestConfig, seed
     """Tune the blocks along their boundaries, neighbours one after the other; the files with the results."""
     run, every = job.run, range(len(blocks))
     files = [run.block(number).interior for number in every]
-    colour, sees = graph_colouring(blocks.neighbours()), read_json(run.blocks / "blocks.json")["sees"]
+    colour, sees = graph_colouring(blocks.neighbours()), read_division(run.blocks / "blocks.json").sees
     steps = replace(nest, steps=config.boundary_steps)
     for now in range(int(colour.max()) + 1):
         mine = [number for number in every if colour[number] == now]

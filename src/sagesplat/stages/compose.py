@@ -33,7 +33,7 @@ def compose_plan(job: Job) -> None:
     run = job.run
 
     def make() -> list[str]:
-        plan = main_plan(run)
+        plan = main_plan(job)
         g = compose(job, plan)
         write_ply(run.composed, g, job.names())
         transfer_bytes = (

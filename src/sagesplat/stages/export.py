@@ -38,7 +38,7 @@ def export_ply(
     if level is not None:
         g = job.ladder.load(level, wanted)
     else:
-        plan = main_plan(job.run) if target is None else scene_plan(job.run, target)
+        plan = main_plan(job) if target is None else scene_plan(job, target)
         g = compose(job, plan).of_labels(wanted)
     write_ply(path, g, job.names())
     return len(g)

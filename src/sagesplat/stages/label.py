@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Int16
 
 from sagesplat.core.config import LabelsConfig, LiftConfig, MasksConfig
 from sagesplat.core.errors import LabelError, RunError
 from sagesplat.core.events import Progress, Warned
+from sagesplat.core.typed import fits
 from sagesplat.io.files import read_json, write_json
 from sagesplat.run.executor import split
 from sagesplat.run.job import Job
@@ -185,6 +187,20 @@ def fuse_masks(job: Job) -> None:
     run_stage(job, "fuse", {"soft": soft is not None}, inputs, [run.fused / "labels.json"], make)
 
 
+def read_edit_table(path: Path, before: Taxonomy) -> Int16[np.ndarray, " T"]:
+    """What became of each id of the categories `before`: its new id, or -1. RunError for another file."""
+    cure = f"delete {path.parent} and run `sagesplat masks` again"
+    made = read_json(path, cure)
+    table: Any = made.get("table") if isinstance(made, dict) else None
+    if (
+        not fits(table, list[int])
+        or len(table) <= max(before.names)
+        or not all(UNLABELLED <= new <= MAX_LABEL_ID for new in table)
+    ):
+        raise RunError(f"{path}: not of these categories; {cure}")
+    return np.array(table, np.int16)
+
+
 def _agreement(job: Job, masks: Masks) -> float:
     """Share of what views without a vote show of the points that is the points' label; NaN without any."""
     voters = set(job.scene.train_ids.tolist())
@@ -196,7 +212,7 @@ def _agreement(job: Job, masks: Masks) -> float:
 def _soft(job: Job) -> Soft:
     """The network's probabilities, of the categories that are left."""
     before = Taxonomy.read(job.run.segmented / "labels.json")
-    edited = np.array(read_json(job.run.masks / _EDIT)["table"], np.int16)
+    edited = read_edit_table(job.run.masks / _EDIT, before)
     table = np.full(MAX_LABEL_ID + 2, UNLABELLED, np.int16)  # what never was likeliest has no label
     table[list(before.names)] = edited[list(before.names)]
 

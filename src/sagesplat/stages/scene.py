@@ -26,7 +26,7 @@ from sagesplat.scene.detect import detect
 def open_scene(job: Job, path: Path, config: SceneConfig, poses: PosesConfig | None = None) -> None:
     """Read a capture and write scene.json. For photos without poses, or a video, estimate the poses first."""
     run = job.run
-    ours = run.scene.exists() or run.capture.exists()
+    ours = run.scene.exists() or run.capture.exists() or run.provenance("scene").exists()
     if run.path.exists() and not ours and any(not p.name.startswith(".") for p in run.path.iterdir()):
         raise RunError(f"{run.path}: not empty and not a run folder; choose a new folder")
     if detect(path) in ("photos", "video"):
@@ -79,12 +79,7 @@ def _begun(job: Job) -> Capture | None:
     """What the run folder says of its capture; None where it says nothing, or nothing of use."""
     if not job.run.provenance("scene").exists():
         return None
-    try:
-        return read_capture(job.run.scene)
-    except RunError:
-        if job.force or not job.run.scene.exists():
-            return None
-        raise
+    return read_capture(job.run.scene) if job.run.scene.exists() else None
 
 
 HIGH_ERROR = 0.8  # px; `dinosaur` has 0.97 with one shared camera, 0.42 with a camera per photo

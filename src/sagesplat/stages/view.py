@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 from sagesplat.core.errors import BackendUnavailable, RunError, SageError
 from sagesplat.core.events import Emit, Warned
+from sagesplat.formats.increments import read_index
 from sagesplat.io.files import read_json
-from sagesplat.run.records import check_format
-from sagesplat.run.run_dir import RunDir
+from sagesplat.run.records import settings_of
+from sagesplat.run.run_dir import RunDir, check_links
 
 if TYPE_CHECKING:
     from sagesplat.run.job import Job
@@ -104,8 +105,8 @@ def _open_run(path: Path, emit: Emit) -> "Job":
     run = RunDir(path)
     if not run.scene.exists():
         raise RunError(f"{path}: neither a bundle (no {MANIFEST}) nor a run folder (no scene.json)")
-    made = read_json(run.provenance("scene")) if run.provenance("scene").exists() else {}
-    check_format(path, made if isinstance(made, dict) else {})
+    check_links(path)
+    settings_of(run, "scene")  # of a format that is read here
     return Job(run, emit)
 
 
@@ -120,12 +121,12 @@ def _is_current(run: RunDir, folder: Path) -> bool:
 
     if not (folder / MANIFEST).exists():
         return False
-    manifest: Any = read_json(folder / MANIFEST)
     try:
+        manifest: Any = read_json(folder / MANIFEST)
         held = {level["sha256"] for label in manifest["labels"] for level in label["levels"]}
-    except (KeyError, TypeError):
+    except (RunError, KeyError, TypeError):
         return False
-    chunks = {chunk["sha256"] for chunk in read_json(run.increments / "index.json")["chunks"]}
+    chunks = {chunk.sha256 for chunk in read_index(run.increments)}
     older = (folder / MANIFEST).stat().st_mtime < run.promises.stat().st_mtime
     return held == chunks and not older and has_viewer(folder, package_viewer())
 
