@@ -27,16 +27,8 @@ from sagesplat.demo.capture import make_capture
 from sagesplat.io.files import read_json, write_json, write_text
 from sagesplat.run import stage
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import (
-    FORMAT,
-    RunDir,
-    file_hash,
-    input_hashes,
-    is_done,
-    is_made_from,
-    record,
-    settings_of,
-)
+from sagesplat.run.records import FORMAT, file_hash, input_hashes, is_done, is_made_from, record, settings_of
+from sagesplat.run.run_dir import RunDir
 from sagesplat.stages import report
 from sagesplat.stages.fit import fit_ladder
 from sagesplat.stages.label import fuse_masks, make_masks
@@ -125,7 +117,8 @@ _NO_INPUTS = {
     ("base", "train.json"),  # its settings are among those of the small model
     ("base", "levels"),  # their number of Gaussians is in the settings
 }
-_CAPTURE = "capture.npz"  # of a block: its scene.json, which is an input, has the fingerprint
+# of a block: its scene.json, which is an input, has the fingerprint and the hashes of the photos
+_CAPTURE = {"capture.npz", "photos.json"}
 
 
 def _id(path: Path) -> tuple[int, int]:
@@ -182,7 +175,7 @@ class Watch:
             makers = self.owners[_id(path)]
             fine = _id(path) in known or any(p == mine or (p.exists() and _id(p) in known) for p in makers)
             spared = {(one.name, path.name), (one.name, path.parent.name)} & _NO_INPUTS
-            if not (fine or spared or path.name == _CAPTURE):
+            if not (fine or spared or path.name in _CAPTURE):
                 self.missed.append(f"{one.name} reads {path.relative_to(self.root)}")
 
     def _known(self, inputs: list[Path]) -> set[tuple[int, int]]:

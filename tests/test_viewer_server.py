@@ -21,7 +21,7 @@ import browser
 import pytest
 
 from sagesplat.core.errors import BackendUnavailable, RunError, SageError
-from sagesplat.run.run_dir import FORMAT
+from sagesplat.run.records import FORMAT
 from sagesplat.stages import view as stages_view
 from sagesplat.stages.view import show
 from sagesplat.viewer import server

@@ -91,8 +91,9 @@ def open_job(run: Path, options: Redo | Device, ladder: LadderKind = "nested") -
     """A job on a run folder, shown on the console; options that a command does not have are the defaults."""
     from sagesplat.cli.console import Console
     from sagesplat.run.job import Job
-    from sagesplat.run.run_dir import RunDir
+    from sagesplat.run.run_dir import RunDir, check_links
 
+    check_links(run)
     machine = Machine(**vars(options))
     if not machine.memory_limit >= 0:
         raise RunError(f"--memory-limit {machine.memory_limit} is impossible; choose GiB, such as 8")

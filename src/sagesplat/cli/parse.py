@@ -145,7 +145,9 @@ def _recorded(
     if not isinstance(path, Path) or not (path / "provenance").is_dir():
         return {}
     from sagesplat.run.recorded import recorded_ladder, recorded_settings
-    from sagesplat.run.run_dir import RunDir
+    from sagesplat.run.run_dir import RunDir, check_links
+
+    check_links(path)
 
     given = {word.partition("=")[0].replace("_", "-").replace("--no-", "--") for word in words}
     ladder = values.get("ladder") if "--ladder" in given else recorded_ladder(path)

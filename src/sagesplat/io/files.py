@@ -227,13 +227,14 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=1) + "\n")
 
 
-def read_json(path: Path) -> Any:
-    """The content of a JSON file. RunError if it is unreadable. Memory: up to 64 bytes per byte."""
+def read_json(path: Path, cure: str = "") -> Any:
+    """The content of a JSON file. RunError if it is unreadable, with a `cure`. Memory: 64 bytes per byte."""
+    cure = cure and f"; {cure}"
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise RunError(f"{path}: no such file") from None
+        raise RunError(f"{path}: no such file{cure}") from None
     except RecursionError:
-        raise RunError(f"{path}: not readable as JSON (nested too deeply)") from None
+        raise RunError(f"{path}: not readable as JSON (nested too deeply){cure}") from None
     except (OSError, ValueError) as error:
-        raise RunError(f"{path}: not readable as JSON ({short(error)})") from error
+        raise RunError(f"{path}: not readable as JSON ({short(error)}){cure}") from error

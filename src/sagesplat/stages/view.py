@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 from sagesplat.core.errors import BackendUnavailable, RunError, SageError
 from sagesplat.core.events import Emit, Warned
+from sagesplat.formats.increments import read_index
 from sagesplat.io.files import read_json
-from sagesplat.run.run_dir import RunDir, check_format
+from sagesplat.run.records import settings_of
+from sagesplat.run.run_dir import RunDir, check_links
 from sagesplat.viewer.built import check_viewer, package_viewer
 from sagesplat.viewer.hosts import Hosts
 from sagesplat.viewer.server import _NO_SERVER, MANIFEST, View, _check_certificate, _hint, _urls, bind
@@ -106,8 +108,8 @@ def _open_run(path: Path, emit: Emit) -> "Job":
     run = RunDir(path)
     if not run.scene.exists():
         raise RunError(f"{path}: neither a bundle (no {MANIFEST}) nor a run folder (no scene.json)")
-    made = read_json(run.provenance("scene")) if run.provenance("scene").exists() else {}
-    check_format(path, made if isinstance(made, dict) else {})
+    check_links(path)
+    settings_of(run, "scene")  # of a format that is read here
     return Job(run, emit)
 
 
@@ -119,12 +121,12 @@ def _is_current(run: RunDir, folder: Path) -> bool:
     """Whether a bundle has the run's chunks, and promises no older than the run's."""
     if not (folder / MANIFEST).exists():
         return False
-    manifest: Any = read_json(folder / MANIFEST)
     try:
+        manifest: Any = read_json(folder / MANIFEST)
         held = {level["sha256"] for label in manifest["labels"] for level in label["levels"]}
-    except (KeyError, TypeError):
+    except (RunError, KeyError, TypeError):
         return False
-    chunks = {chunk["sha256"] for chunk in read_json(run.increments / "index.json")["chunks"]}
+    chunks = {chunk.sha256 for chunk in read_index(run.increments)}
     older = (folder / MANIFEST).stat().st_mtime < run.promises.stat().st_mtime
     return held == chunks and not older
 

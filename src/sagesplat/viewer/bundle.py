@@ -116,10 +116,12 @@ def _verified(folder: Path, chunk: Increment) -> bytes:
         content = (folder / chunk.uri).read_bytes()
     except OSError as error:
         raise DataError(
-            f"{folder / chunk.uri}: cannot be read ({error.strerror}); run `sagesplat nest --force` again"
+            f"{folder / chunk.uri}: cannot be read ({error.strerror}); delete that folder and run "
+            "`sagesplat nest` again"
         ) from None
     if hashlib.sha256(content).hexdigest() != chunk.sha256:
         raise DataError(
-            f"{folder / chunk.uri}: not the chunk that was written; run `sagesplat nest --force` again"
+            f"{folder / chunk.uri}: not the chunk that was written; delete that folder and run "
+            "`sagesplat nest` again"
         )
     return content
