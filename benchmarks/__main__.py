@@ -371,19 +371,38 @@ def viewer(bundle: Path, write: bool = False) -> None:
 
 @app.command
 def fuzz(
-    seconds: float = 720, only: tuple[str, ...] = (), out: Path = Path("fuzz-findings"), seed: int = 0
+    readers: tyro.conf.Positional[tuple[str, ...]] = (),
+    *,
+    seconds: float = 720,
+    out: Path = Path("fuzz-findings"),
+    seed: int = 0,
+    jobs: int = 2,
+    write: bool = False,
 ) -> None:
-    """Damaged files for every reader, guided by coverage where atheris is installed; fails on findings."""
+    """Damaged files for every reader, guided by coverage where atheris is installed; fails on findings.
+
+    Args:
+        readers: names (none: all; benchmarks/readers lists them).
+        seconds: of all readers together, in `jobs` processes.
+        out: folder for the files that a reader fails on.
+        seed: of the random numbers.
+        jobs: processes.
+        write: keep the figures in benchmarks/results/fuzz.json.
+    """
     rows = []
-    for row in fuzzing.run(seconds, only, out, seed):
+    for row in fuzzing.run(seconds, readers, out, seed, jobs):
         branches = "" if row["branches"] is None else f", {row['branches']} branches"
-        print(f"{row['reader']:20} {row['executions']:>8,} executions{branches}", flush=True)
+        print(f"{row['reader']:20} {row['executions']:>10,} in {row['seconds']:>6} s{branches}", flush=True)
         for text in row["findings"].values():
             print(f"    {text}")
         rows.append(row)
     found = sum(len(row["findings"]) for row in rows)
     executions = sum(row["executions"] for row in rows)
-    _finish("fuzz", {"executions": executions, "findings": found, "readers": len(rows)}, False)
+    result = {"executions": executions, "findings": found, "readers": len(rows)}
+    result |= {"guided": any(row["guided"] for row in rows), "seconds": seconds, "jobs": jobs}
+    if write:
+        fuzzing.write(RESULTS.parent / "fuzz.json", result, rows)
+    _finish("fuzz", result, False)
     if found:
         raise SystemExit(f"{found} findings; the files are in {out}")
 

@@ -12,6 +12,7 @@ import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Sequence
+from functools import cache
 from random import Random
 from typing import Any
 
@@ -44,14 +45,15 @@ NODES: tuple[Any, ...] = (
 SHAPES = ("()", "(0,)", "(1000000000,)", "(-1,)", "(2, 2)", "(9223372036854775807, 2)", "(1e9,)")
 DTYPES = ("<f4", "<f8", ">i2", "|O", "|S0", "<U9", "|b1", "<c16", "<i8", "<M8[s]", "|V8")
 MAGIC = {b"PK\x03\x04": "zip", b"\x1f\x8b": "gzip", b"\x89PNG": "png"}
+_WORD = re.compile(rb"[-+.\w]+")
 MOST = 20_000  # bytes that files grow to
 
 
-def mutate(content: bytes, others: Sequence[bytes], rng: Random) -> bytes:
-    """A damaged copy of a file; `others` are files of its kind that parts may come from."""
+def mutate(content: bytes, others: Sequence[bytes], rng: Random, most: int = MOST) -> bytes:
+    """A damaged copy of a file, of at most `most` bytes; `others` are files that parts may come from."""
     for _ in range(rng.choice((1, 1, 1, 2, 3, 8))):
         content = _once(content, others, rng)
-    return content[:MOST]
+    return content[:most]
 
 
 def _once(content: bytes, others: Sequence[bytes], rng: Random) -> bytes:
@@ -110,10 +112,9 @@ def _number(content: bytes, rng: Random) -> bytes:
 
 def _word(content: bytes, rng: Random) -> bytes:
     """Another word or number in a text."""
-    words = list(re.finditer(rb"[-+.\w]+", content))
-    if not words:
+    word = _WORD.search(content, rng.randrange(len(content) + 1)) or _WORD.search(content)
+    if word is None:
         return content + rng.choice(WORDS)
-    word = rng.choice(words)
     return content[: word.start()] + rng.choice(WORDS) + content[word.end() :]
 
 
@@ -148,9 +149,14 @@ def _range(content: bytes, rng: Random) -> tuple[int, int]:
 
 
 def _gzip(content: bytes, rng: Random) -> bytes:
-    if rng.random() < 0.05:
-        return gzip.compress(gzip.decompress(content) + bytes(rng.choice((10**4, 10**6))), mtime=0)
-    return gzip.compress(rng.choice(BYTES)(gzip.decompress(content), rng), 6, mtime=0)
+    if rng.random() < 0.01:
+        return gzip.compress(gzip.decompress(content) + bytes(rng.choice((10**4, 10**6))), 1, mtime=0)
+    return gzip.compress(rng.choice(BYTES)(gzip.decompress(content), rng), 1, mtime=0)
+
+
+@cache
+def _zeros(count: int) -> bytes:
+    return zlib.compress(bytes(count))
 
 
 def _png(content: bytes, rng: Random) -> bytes:
@@ -168,11 +174,11 @@ def _png(content: bytes, rng: Random) -> bytes:
         case 1:
             chunks.insert(rng.randrange(len(chunks) + 1), (name, body))
         case 2:  # another picture in the same chunk
-            packed = zlib.compress(bytes(rng.choice((0, 5, 9, 10**6))))
+            packed = _zeros(rng.choice((0, 5, 9, 10**6)))
             chunks[row] = (name, packed if name == b"IDAT" else rng.choice(BYTES)(body, rng))
         case 3:
             extra = rng.choice((b"tEXt", b"zTXt", b"iCCP", b"PLTE", b"tRNS", b"acTL", b"fdAT", b"eXIf"))
-            chunks.insert(1, (extra, b"k\0\0" + zlib.compress(bytes(10**5))))
+            chunks.insert(1, (extra, b"k\0\0" + _zeros(10**5)))
         case _:
             chunks[row] = (name, _number(body, rng))
     parts = [struct.pack(">I", len(b)) + n + b + struct.pack(">I", zlib.crc32(n + b)) for n, b in chunks]
@@ -239,8 +245,7 @@ def _array(body: bytes, rng: Random) -> bytes:
 def _json(content: bytes, rng: Random) -> bytes:
     """Another value, type or length somewhere in a document."""
     document = [json.loads(content)]
-    places = list(_places(document))
-    holder, key = rng.choice(places)
+    holder, key = _place(document, rng)
     match rng.randrange(6):
         case 0 if isinstance(holder, dict):
             del holder[key]
@@ -255,9 +260,11 @@ def _json(content: bytes, rng: Random) -> bytes:
     return json.dumps(document[0]).encode()
 
 
-def _places(node: Any) -> Any:
-    """(holder, key) of every value below a node."""
-    for key in list(node) if isinstance(node, dict) else range(len(node)):
-        yield node, key
-        if isinstance(node[key], dict | list):
-            yield from _places(node[key])
+def _place(holder: Any, rng: Random) -> tuple[Any, Any]:
+    """A list or an object below a node that holds something, and a key of it."""
+    while True:
+        key = rng.choice(list(holder)) if isinstance(holder, dict) else rng.randrange(len(holder))
+        below = holder[key]
+        if not isinstance(below, dict | list) or not below or rng.random() < 0.2:
+            return holder, key
+        holder = below

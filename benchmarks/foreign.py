@@ -1,0 +1,112 @@
+"""Which functions of the package read bytes, and which of them need no reader in benchmarks/readers.
+
+A function reads bytes where it calls one of `CALLS`: the ways of Python and of our libraries to open, parse
+or fetch, and those functions of io/ through which the rest of the package reads.
+tests/test_benchmarks_foreign.py runs every reader on a valid file, and fails where a function that reads is
+neither run by one of them nor listed in `EXCEPTIONS`.
+"""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+PACKAGE = Path(__file__).parents[1] / "src" / "sagesplat"
+CALLS = {
+    # files
+    "open", "read_bytes", "read_text", "fromfile", "memmap", "loadtxt", "genfromtxt", "mmap",
+    # what is in them
+    "loads", "frombuffer", "unpack", "unpack_from", "iter_unpack", "decompress", "decompressobj", "reader",
+    "DictReader", "ZipFile", "TarFile", "read_array", "fromstring", "literal_eval", "safe_load",
+    # what others sent
+    "urlopen", "urlretrieve", "snapshot_download", "hf_hub_download", "recv", "Headers",
+    # networks and weights
+    "InferenceSession", "from_pretrained", "load_file", "safe_open",
+    # our own
+    "read_json", "Npz", "read_columns", "read_header", "parse_header",
+}  # fmt: skip
+LOADERS = {"np", "numpy", "torch", "json", "tomllib", "pickle", "image"}  # whose `load` reads a file
+WRITING = set("wxa")
+
+OURS = "what this version of the package installed"
+_WROTE = "what this process wrote a moment ago"
+_STAGE = "a record in the middle of a stage that takes minutes; tests of the stage damage it by hand"
+MACHINE = "what the operating system says"
+_COLMAP = "what COLMAP's process of ours wrote; it ends alone, and its error is one line"
+_NETWORK = "a network that the user names, by its authors' library, told to run no code and read no pickles"
+_HASHED = "bytes that are only hashed, copied or sent"
+EXCEPTIONS: dict[str, str] = {
+    "cli.__init__:main": MACHINE,
+    "demo.capture:cached_capture": OURS,
+    "download.scenes:read_registry": OURS,
+    "formats.increments:write_increments": _WROTE,
+    "io.lock:_open": _HASHED,
+    "kernels.jit:_file_hash": OURS,
+    "output.report:template": OURS,
+    "run.remote:_piece": _HASHED,
+    "run.stage:run_stages": _WROTE,
+    "scene._sfm:Stages._reasons": _COLMAP,
+    "scene._sfm:Stages.features": _COLMAP,
+    "scene._sfm:Stages.matches": _COLMAP,
+    "scene._sfm:_result": _COLMAP,
+    "scene._sfm:run": _COLMAP,
+    "scene.photos:_ending": _COLMAP,
+    "scene.photos:_run": _COLMAP,
+    "segment.coco:": OURS,
+    "segment.hf:_config": _NETWORK,
+    "segment.hf:_folder": _NETWORK,
+    "segment.hf:_load": _NETWORK,
+    "segment.hf:_task_tokens": _NETWORK,
+    "segment.taxonomies:_vocabularies": OURS,
+    "stages.blocks:_merge_levels": _STAGE,
+    "stages.blocks:_tune": _STAGE,
+    "stages.boundaries:balance_table": _STAGE,
+    "stages.bundle:live_bundle": _STAGE,
+    "stages.label:_segment.make": _STAGE,
+    "stages.label:_soft": _STAGE,
+    "stages.report_data:report_data": _STAGE,
+    "studies.compare.run:compare": _STAGE,
+    "studies.early_stopping:_check": _STAGE,
+    "studies.early_stopping:compare_early_stopping": _STAGE,
+    "studies.sweep.run:_measure": _STAGE,
+    "train.checkpoint:_verify": _WROTE,
+    "train.memory:_cgroup_limits": MACHINE,
+    "viewer.bundle:_put_up": OURS,
+    "viewer.bundle:_verified": _HASHED,
+    "viewer.bundle:has_viewer": OURS,
+    "viewer.bundle:write_documents": OURS,
+    "viewer.pack:write_pack": _WROTE,
+}
+
+
+def readers_in(package: Path = PACKAGE) -> Iterator[tuple[str, str, int]]:
+    """Every (function, call, line) that reads, e.g. ("io.files:read_json", "json.loads", 202)."""
+    for path in sorted(package.rglob("*.py")):
+        module = ".".join(path.relative_to(package).with_suffix("").parts)
+        yield from _calls(ast.parse(path.read_text(encoding="utf-8")), module, [])
+
+
+def _calls(node: ast.AST, module: str, names: list[str]) -> Iterator[tuple[str, str, int]]:
+    for child in ast.iter_child_nodes(node):
+        inside = names
+        if isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            inside = [*names, child.name]
+        elif isinstance(child, ast.Call) and _reads(child):
+            yield f"{module}:{'.'.join(names)}", ast.unparse(child.func), child.lineno
+        yield from _calls(child, module, inside)
+
+
+def _reads(call: ast.Call) -> bool:
+    owner = call.func.value if isinstance(call.func, ast.Attribute) else None
+    name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
+    if name == "load":
+        return isinstance(owner, ast.Name) and owner.id in LOADERS
+    return name in CALLS and not (name == "open" and _no_reading(call, owner))
+
+
+def _no_reading(call: ast.Call, owner: ast.expr | None) -> bool:
+    """Whether what is called `open` writes, or opens a run's job or a browser."""
+    modes = [a.value for a in call.args if isinstance(a, ast.Constant) and isinstance(a.value, str)]
+    if any(set(mode) & WRITING and len(mode) <= 3 for mode in modes):
+        return True
+    owner_name = ast.unparse(owner) if owner is not None else ""
+    return owner_name.endswith(("spec", "webbrowser")) or owner_name.startswith("_spec(")

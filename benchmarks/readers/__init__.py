@@ -1,0 +1,17 @@
+"""Every reader of bytes that may come from somebody else, by subject: the one list of them.
+
+`benchmarks/foreign.py` finds the functions of the package that read, and a test fails where one of them is
+neither reached by a reader of this list nor an exception with a reason.
+"""
+
+from benchmarks.hostile import Reader
+from benchmarks.readers import captures, downloads, networks, records, requests, splats
+
+READERS: tuple[Reader, ...] = (
+    *captures.READERS,
+    *splats.READERS,
+    *records.READERS,
+    *networks.READERS,
+    *downloads.READERS,
+    *requests.READERS,
+)

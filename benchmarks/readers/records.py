@@ -1,0 +1,264 @@
+"""Readers of what lies in a run folder, a bundle or a study: JSON, CSV and TOML."""
+
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.hostile import MIB, Reader
+from benchmarks.readers.captures import points
+from benchmarks.readers.making import PHOTOS, as_json, file, put, put_photos, written
+from benchmarks.readers.splats import CHUNK
+from sagesplat.adapt import eq3, plan, viewpoint
+from sagesplat.adapt.evaluate import Evaluation, read_evaluation
+from sagesplat.adapt.observe import Observations, read_observations
+from sagesplat.core.config import TrainConfig
+from sagesplat.core.events import Event
+from sagesplat.io import lock
+from sagesplat.io.columns import write_columns
+from sagesplat.io.files import read_json
+from sagesplat.run import remote
+from sagesplat.run.job import Job, fingerprint
+from sagesplat.run.recorded import recorded_settings, stage_seconds
+from sagesplat.run.run_dir import FORMAT, RunDir, input_hashes, is_done, is_made_from, settings_of
+from sagesplat.run.stage import Stage, _follows
+from sagesplat.scene import load_scene
+from sagesplat.scene.blocks import Blocks, read_blocks, write_blocks
+from sagesplat.segment import segmenters
+from sagesplat.segment.masks import Taxonomy
+from sagesplat.stages import bundle, view
+from sagesplat.stages.boundaries import _seconds
+from sagesplat.stages.train import _fit_memory
+from sagesplat.studies.compare.report import OfLabel, Point, Walk, read_comparison, write_comparison
+from sagesplat.studies.paper.cross_view import CrossView, read_cross_view
+from sagesplat.studies.paper.same_size import SameSize, read_same_size
+from sagesplat.studies.sweep.file import read_sweep
+from sagesplat.viewer.bundle import is_bundle
+
+CURVE = {
+    "label_id": 2,
+    "level": 1,
+    "d_range": [1, 9.5],
+    "median": 0.8,
+    "rmse": 0.01,
+    "num_observations": 7,
+    "status": "",
+}
+CHOICE = {"label_id": 2, "level": 1, "predicted_ssim": 0.8, "distance": None, "count": 3, "status": ""}
+TRAINED = {"antialiased": True, "max_steps": 9, "seed": 3}
+SWEEP = """targets = [0.4, 0.3]
+seeds = [0, 5]
+settings.ladder = "snapshots"
+settings.train = { max_steps = 60, level_every = 20 }
+scenes.plot = "demo"
+variants.track = {}
+variants.projection.lift.votes = "projection"
+"""
+
+
+def _ignore(event: Event) -> None:
+    pass
+
+
+def _json(folder: Path, size: int) -> list[bytes]:
+    return as_json({"a": [1, "x", None, 1.5] * size}, [[], {}])
+
+
+def _models(folder: Path, size: int) -> list[bytes]:
+    curve = CURVE | {"params": dict.fromkeys(eq3.Eq3._fields, 0.5), "status": sorted(eq3.STATUSES)[0]}
+    return as_json({"models": [curve | {"level": 1 + i} for i in range(size)]})
+
+
+def _promises(folder: Path, size: int) -> list[bytes]:
+    curve = json.loads(_models(folder, 1)[0])["models"][0]
+    entry = dict.fromkeys(viewpoint.NUMBERS, 0.5) | {"curves": [curve], "lengths": [1, 2, 0.5]}
+    entry |= {"inputs": [[0.1] * 7, [0.2] * 7], "heldout_inputs": [False, True], "weights": [[0.1], [0.2]]}
+    entry |= {"amplitudes": [0.1], "status": sorted(viewpoint.STATUSES)[0]}
+    return as_json({"promises": [entry | {"label_id": 2 + i} for i in range(size)]})
+
+
+def _plans(folder: Path, size: int) -> list[bytes]:
+    choice = CHOICE | {"status": sorted(plan.STATUSES)[0], "transfer_bytes": 9}
+    scene = {"target": 0.8, "view": None, "share": 0.9, "choices": [choice]}
+    budget = scene | {"target": None, "budget": 1e6, "unit": "bytes", "fits": True}
+    views = [scene | {"view": 1 + i} for i in range(size)]
+    return as_json({"targets": [0.8], "scene": [scene], "views": views, "budget": budget})
+
+
+def _read_plans(path: Path) -> None:
+    plan.read_plans(path)
+    plan.read_budget_plan(path)
+
+
+def _table(kind: Any) -> Any:
+    """Makers of the CSV files of a kind of table."""
+
+    def make(folder: Path, size: int) -> list[bytes]:
+        rows = {name: np.full(2 * size, 1, dtype) for name, dtype in _types(kind).items()}
+        return [written(folder / "t.csv", lambda path: write_columns(path, kind(**rows)))]
+
+    return make
+
+
+def _types(kind: Any) -> dict[str, Any]:
+    from sagesplat.io.columns import _types as types
+
+    return types(kind)
+
+
+def _partition(folder: Path, size: int) -> list[bytes]:
+    low, high = np.array([[-np.inf, 0], [1, -np.inf]]), np.array([[1, np.inf], [np.inf, 2.5]])
+    blocks = Blocks(np.eye(3)[:2], low, high, 0.5)
+    return [written(folder / "b.json", lambda path: write_blocks(path, blocks, views=[3, 4] * size))]
+
+
+def _sweep(folder: Path, size: int) -> list[bytes]:
+    return [(SWEEP + "".join(f'scenes.s{i} = "demo"\n' for i in range(size - 1))).encode()]
+
+
+def _comparison(folder: Path, size: int) -> list[bytes]:
+    fields: Any = [dict.fromkeys(kind.__dataclass_fields__, 1) for kind in (OfLabel, Point, Walk)]
+    point, walk = Point(**fields[1] | {"labels": {2: OfLabel(**fields[0])}}), Walk(**fields[2])
+    return [written(folder / "c.json", lambda path: write_comparison(path, [point] * size, [walk]))]
+
+
+@cache
+def _capture(folder: Path) -> dict[str, Any]:
+    """A capture with three photos, and the scene.json of its run."""
+    capture = folder / "capture"
+    put_photos(capture / "images")
+    (capture / "points.ply").write_bytes(points(capture, 1)[0])
+    pose = np.eye(4).tolist()
+    frames = [{"file_path": f"images/{name}", "transform_matrix": pose} for name in PHOTOS]
+    shared = {"w": 16, "h": 12, "fl_x": 14.0, "ply_file_path": "points.ply", "frames": frames}
+    (capture / "transforms.json").write_text(json.dumps(shared))
+    settings = {"downscale": 1, "test_every": 8}
+    scene = load_scene(capture, **settings)
+    return {"path": str(capture), "settings": settings, "fingerprint": fingerprint(scene)}
+
+
+def _scenes(folder: Path, size: int) -> list[bytes]:
+    return as_json(_capture(folder) | {f"note{i}": [i, 0.5] for i in range(size - 1)})
+
+
+def _read_scene(path: Path) -> None:
+    run = RunDir(path.parent)
+    len(Job(run, _ignore).scene.views)
+    recorded_settings(run)
+
+
+def _read_elsewhere(path: Path) -> None:
+    """As a process of another machine reads it."""
+    job = Job(RunDir(path.parent), _ignore)
+    remote._kept.__wrapped__(job.spec, path.read_bytes())
+
+
+def _provenance(folder: Path, size: int) -> list[bytes]:
+    put(folder / "scene.json", b"{}")
+    put(folder / "labels.npz", b"x")
+    inputs = {"scene.json": "0" * 64} | {f"levels/{i:06d}.npz": "1" * 64 for i in range(size - 1)}
+    made = {"format": FORMAT, "stage": "train", "version": "1", "seconds": 3.5, "settings": TRAINED}
+    return as_json(made | {"inputs": inputs})
+
+
+def _read_provenance(path: Path) -> None:
+    run = RunDir(path.parents[1])
+    stage_seconds(run)
+    recorded_settings(run)
+    _seconds(run, "train")
+    _follows(Job(run, _ignore), Stage("train", TRAINED, [], []))
+    is_done(run, "train", TRAINED, None, [run.scene], False)
+    settings_of(run, "train")
+    is_made_from(run, "train", run.scene)
+
+
+def _read_shown(path: Path) -> None:
+    """As a viewer looks at it, and as the hash of an input that others were made from."""
+    run = RunDir(path.parents[1])
+    view._open_run(run.path, _ignore)
+    input_hashes(run, [path])
+
+
+def _taxonomies(folder: Path, size: int) -> list[bytes]:
+    return as_json({str(i): f"thing {i}" for i in range(size)})
+
+
+def _read_taxonomy(path: Path) -> None:
+    segmenters._begin(path.parent, Taxonomy({0: "thing 0"}), [])
+
+
+def _caps(folder: Path, size: int) -> list[bytes]:
+    put(folder / "scene.json", _scenes(folder, 1)[0])
+    return as_json({"cap": 900, "settings": TRAINED | {f"note{i}": i for i in range(size - 1)}})
+
+
+def _read_cap(path: Path) -> None:
+    run = RunDir(path.parent)
+    recorded_settings(run)
+    _fit_memory(Job(run, _ignore, "cpu"), run, TrainConfig(max_steps=9), True)
+
+
+def _options(folder: Path, size: int) -> list[bytes]:
+    more = {f"note{i}": i for i in range(size - 1)}
+    return as_json({"masks": "/p", "classes": None, "segmenter": "onnx", "keep": ["sky"], **more})
+
+
+def _read_options(path: Path) -> None:
+    recorded_settings(RunDir(path.parents[1]))
+
+
+def _manifest(folder: Path, size: int) -> list[bytes]:
+    (folder / "index.html").write_text("<title>x</title>")
+    put(folder / "run/nested/increments/index.json", json.dumps({"chunks": [CHUNK]}).encode())
+    put(folder / "run/nested/promises.json", b"{}")
+    levels = [{"uri": "chunks/2-1.spz", "sha256": "0" * 64, "nbytes": 9}]
+    labels = [{"id": 2 + i, "name": "sky", "levels": levels} for i in range(size)]
+    return as_json({"format": "sagesplat-bundle", "version": 1, "labels": labels})
+
+
+def _read_manifest(path: Path) -> None:
+    is_bundle(path.parent)
+    view.is_bundle(path.parent)
+    view._is_current(RunDir(path.parent / "run"), path.parent)
+
+
+def _begun(folder: Path, size: int) -> list[bytes]:
+    """A checkpoint from which a bundle of a training reads one setting."""
+    from benchmarks.readers.splats import _checkpoints
+
+    return _checkpoints(folder, size)
+
+
+def _read_begun(path: Path) -> None:
+    bundle._antialiased(Job(RunDir(path.parent), _ignore))
+
+
+def _lock(folder: Path, size: int) -> list[bytes]:
+    return as_json({"pid": 9, "host": "h", "command": "sagesplat run" * size, "since": "2026"})
+
+
+READERS = (
+    Reader("json", ".json", _json, file("m.json", read_json)),
+    Reader("models", ".json", _models, file("models.json", eq3.read_models)),
+    Reader("promises", ".json", _promises, file("promises.json", viewpoint.read_promises)),
+    Reader("plans", ".json", _plans, file("plan.json", _read_plans)),
+    Reader("observations", ".csv", _table(Observations), file("o.csv", read_observations), 3000),
+    Reader("evaluation", ".csv", _table(Evaluation), file("e.csv", read_evaluation), 3000),
+    Reader("cross-view", ".csv", _table(CrossView), file("c.csv", read_cross_view), 3000),
+    Reader("same-size", ".csv", _table(SameSize), file("s.csv", read_same_size), 3000),
+    Reader("partition", ".json", _partition, file("b.json", read_blocks), 10_000),
+    Reader("sweep", ".toml", _sweep, file("s.toml", read_sweep), 300, 16 * MIB),
+    Reader("comparison", ".json", _comparison, file("compare.json", read_comparison)),
+    Reader("scene", ".json", _scenes, file("scene.json", _read_scene), 3000),
+    Reader("scene-elsewhere", ".json", _scenes, file("scene.json", _read_elsewhere), 3000),
+    Reader("provenance", ".json", _provenance, file("provenance/train.json", _read_provenance), 1000),
+    Reader("provenance-shown", ".json", _provenance, file("provenance/scene.json", _read_shown), 1000),
+    Reader("cap", ".json", _caps, file("cap.json", _read_cap), 3000),
+    Reader("options", ".json", _options, file("segmented/options.json", _read_options), 3000),
+    Reader("manifest", ".json", _manifest, file("manifest.json", _read_manifest)),
+    Reader("begun", ".npz", _begun, file("checkpoint.npz", _read_begun)),
+    Reader("segmented", ".json", _taxonomies, file(".taxonomy.json", _read_taxonomy), 1000),
+    Reader("lock", ".json", _lock, file("lock", lock._holder), 3000),
+)

@@ -1,0 +1,86 @@
+"""What browsers ask of the server for bundles, and what is typed at the command line."""
+
+import asyncio
+from functools import cache
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import h11
+
+from benchmarks.hostile import Reader
+from sagesplat.cli import parse
+from sagesplat.cli.base import COMMANDS
+from sagesplat.viewer.site import Site
+
+SECRET = b"not in the folder that is served"
+
+
+def _requests(folder: Path, size: int) -> list[bytes]:
+    site = folder / "site"
+    (site / "chunks").mkdir(parents=True, exist_ok=True)
+    (folder / "secret.txt").write_bytes(SECRET)
+    (site / "index.html").write_text("<title>x</title>")
+    (site / "chunks/a.spz").write_bytes(b"abc" * 99)
+    (site / ".hidden").write_bytes(SECRET)
+    if not (site / "link").exists():
+        (site / "link").symlink_to(folder)
+    head = "Host: localhost:8000\r\nAccept-Encoding: gzip, br;q=0.5\r\n" + "X-Y: z\r\n" * (size - 1)
+    return [
+        f'GET /index.html HTTP/1.1\r\n{head}If-None-Match: W/"a"\r\n\r\n'.encode(),
+        f'GET /chunks/a.spz HTTP/1.1\r\n{head}Range: bytes=1-4,7-\r\nIf-Range: "x"\r\n\r\n'.encode(),
+        f"HEAD /../link/%2e%2e/secret.txt?x=/.hidden HTTP/1.1\r\n{head}\r\n".encode(),
+    ]
+
+
+@cache
+def _loop() -> asyncio.AbstractEventLoop:
+    return asyncio.new_event_loop()
+
+
+def _answer(folder: Path, content: bytes) -> None:
+    """Answer a request as uvicorn hands it over; AssertionError where what is outside the folder gets out."""
+    connection = h11.Connection(h11.SERVER)
+    try:
+        connection.receive_data(content)
+        asked = connection.next_event()
+    except h11.RemoteProtocolError:
+        return  # uvicorn answers 400 itself
+    if not isinstance(asked, h11.Request):
+        return
+    path, _, query = asked.target.partition(b"?")
+    scope = {
+        "type": "http", "method": asked.method.decode(), "path": unquote(path.decode("ascii")),
+        "raw_path": path, "query_string": query, "headers": list(asked.headers), "http_version": "1.1",
+        "scheme": "http", "root_path": "", "client": ("127.0.0.1", 9), "server": ("127.0.0.1", 8000),
+    }  # fmt: skip
+    sent: list[Any] = []
+
+    async def receive() -> Any:
+        return {"type": "http.disconnect"}
+
+    async def send(message: Any) -> None:
+        sent.append(message)
+
+    _loop().run_until_complete(Site(folder / "site")(scope, receive, send))
+    assert sent[0]["status"] in (200, 206, 304, 400, 403, 404, 405, 416), sent[0]
+    assert not any(SECRET[:9] in message.get("body", b"") for message in sent)
+
+
+def _words(folder: Path, size: int) -> list[bytes]:
+    return ["\n".join(["run", "SCENE", "RUN", *["--target-ssim", "0.5"] * size]).encode(),
+            b"plan\nRUN\n--target-ssim\n0.9\n--ladder\nsnapshots"]  # fmt: skip
+
+
+def _parse(folder: Path, content: bytes) -> None:
+    """Words of a command line, one on each line, as `main` reads them."""
+    name, *words = content.decode("utf-8", "surrogateescape").replace("\0", "").split("\n")
+    name = parse.current_command(name)
+    if name in COMMANDS and not {"-h", "--help", "--help-all"} & set(words):
+        parse.arguments(name, COMMANDS[name], words)
+
+
+READERS = (
+    Reader("request", ".http", _requests, _answer, 300),
+    Reader("command-line", ".txt", _words, _parse, 300),
+)
