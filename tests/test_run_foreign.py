@@ -76,7 +76,7 @@ def resume(run: Path) -> None:
 
 COMMAND = {
     "settings": settings,
-    "view": lambda run: view._fill(Site(local=True), run, lambda event: None, follow=False),
+    "view": lambda run: view._fill(Site(), run, lambda event: None, follow=False),
     "bundle": lambda run: bundle(job_of(run), run.parent / "bundle"),
     "live": lambda run: redone("train", run, lambda job: live_bundle(job, run / "bundle-live")),
     "open": lambda run: (lambda opened: (opened.scene, opened.plans, opened.promises))(open_run(run)),
