@@ -112,11 +112,12 @@ def prepare_folder(folder: Path, views: Sequence[View]) -> list[Path]:
     paths = [mask_path(folder, view) for view in views]
     taken: dict[str, str] = {}
     for view, path in zip(views, paths, strict=True):
-        other = taken.setdefault(collision_key(path.as_posix()), view.name)
-        if other != view.name:
+        key = collision_key(path.as_posix())
+        if key in taken:
             raise LabelError(
-                f"{view.name}: {other} has the same name but for the suffix or capitals; rename one"
+                f"{view.name}: {taken[key]} has the same name but for the suffix or capitals; rename one"
             )
+        taken[key] = view.name
     (folder / "labels.json").unlink(missing_ok=True)
     return paths
 
