@@ -220,6 +220,8 @@ class Server(uvicorn.Server):
         loop = asyncio.get_running_loop()
         try:
             with suppress(OSError):  # of TLS too
+                if self.config.ssl:
+                    await _first_byte(sock)
                 await loop.connect_accepted_socket(lambda: connection, sock, ssl=self.config.ssl, **options)
         finally:
             if connection.transport is None:
@@ -231,6 +233,26 @@ class Server(uvicorn.Server):
             now = asyncio.get_running_loop().time()
             for connection in self.room:
                 connection.look(now)
+
+
+async def _first_byte(sock: socket.socket) -> None:
+    """Wait until a handshake begins: who says nothing does not get the 50 kB that TLS needs.
+
+    TimeoutError after `HANDSHAKE`; then the socket is closed.
+    """
+    loop = asyncio.get_running_loop()
+    begun = asyncio.Event()
+    try:
+        loop.add_reader(sock, begun.set)
+    except NotImplementedError:  # Windows
+        return
+    try:
+        await asyncio.wait_for(begun.wait(), HANDSHAKE)
+        loop.remove_reader(sock)
+    except BaseException:
+        loop.remove_reader(sock)
+        sock.close()
+        raise
 
 
 def _peer(address: str) -> str:
