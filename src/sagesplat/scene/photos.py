@@ -14,10 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from sagesplat.core.config import PosesConfig
-from sagesplat.core.errors import BackendUnavailable, SceneError
+from sagesplat.core.errors import BackendUnavailable, RunError, SceneError
 from sagesplat.io.files import read_json, write_json
 from sagesplat.scene._prepare import PreparedPhoto, prepare_photos
 from sagesplat.scene.detect import PHOTOS
+from sagesplat.scene.raw_photos import REPORT, describe_raw
 from sagesplat.scene.video import extract_frames
 
 
@@ -84,7 +85,10 @@ def reconstruct(
     resolved = {"matching": request["matching"], "cameras": len(request["cameras"])}
     report = {"complete": complete, "settings": asdict(config), "resolved": resolved}
     report |= asdict(reconstruction) | {"workspace": str(workspace), "renamed": renamed}
-    write_json(workspace / "poses.json", report)
+    if complete:
+        taken = {photo.prepared: (photo.final, photo.orientation) for photo in photos}
+        report |= {"raw": describe_raw(work / "model", taken)}
+    write_json(workspace / REPORT, report)
     if not complete:
         registered, total = reconstruction.num_registered, reconstruction.num_photos
         raise SceneError(
@@ -196,23 +200,30 @@ def _request(source: Path, photos: list[PreparedPhoto], config: PosesConfig) -> 
 
 def _resume(workspace: Path, request: dict[str, Any]) -> Reconstruction | None:
     """The finished result of the same request, if any; results of another request are removed."""
-    work, report = workspace / "sfm", workspace / "poses.json"
+    work, report = workspace / "sfm", workspace / REPORT
     request = json.loads(json.dumps(request))
-    path = work / "request.json"
-    old = read_json(path) if path.is_file() else {}
+    old = _read(work / "request.json")
     if {k: v for k, v in old.items() if k not in ("min_photos", "threads")} != request:
         for name in ("database.db", "database.db-wal", "database.db-shm", "models.json", "seconds.json"):
             (work / name).unlink(missing_ok=True)
         report.unlink(missing_ok=True)
         return None
-    if not (report.is_file() and (workspace / "sparse" / "0").is_dir()):
+    content = _read(report)
+    if not (content.get("complete") is True and (workspace / "sparse" / "0").is_dir()):
         return None
-    content = read_json(report)
-    if not content["complete"]:
-        return None
-    fields: dict[str, Any] = {name: content[name] for name in Reconstruction.__dataclass_fields__}
+    fields: dict[str, Any] = {name: content.get(name) for name in Reconstruction.__dataclass_fields__}
     fields["workspace"] = workspace
-    return Reconstruction(**fields)
+    whole = isinstance(fields["unregistered"], dict) and None not in fields.values()
+    return Reconstruction(**fields) if whole else None
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """The JSON object in a file of the workspace; empty if there is none, or something else."""
+    try:
+        content = read_json(path)
+    except RunError:
+        return {}
+    return content if isinstance(content, dict) else {}
 
 
 def _run(work: Path, on_progress: OnProgress) -> dict[str, Any]:
