@@ -80,8 +80,14 @@ def test_an_error_of_writing_names_its_file(tmp_path: Path) -> None:
     [
         (OSError(errno.ENOSPC, "No space"), r"\(the disk is full\); free some space"),
         (OSError(errno.EDQUOT, "Quota"), r"\(the quota is used up\); free some space"),
-        (OSError(errno.EROFS, "Read-only file system"), r"\(Read-only file system\); choose a place that can"),
-        (OSError(errno.EFBIG, "File too large"), r"\(File too large\); raise the limit of files \(ulimit -f\)"),
+        (
+            OSError(errno.EROFS, "Read-only file system"),
+            r"\(Read-only file system\); choose a place that can",
+        ),
+        (
+            OSError(errno.EFBIG, "File too large"),
+            r"\(File too large\); raise the limit of files \(ulimit -f\)",
+        ),
         (OSError(errno.ENAMETOOLONG, "File name too long"), r"\(File name too long\); choose a shorter path"),
         (PermissionError(errno.EACCES, "Permission denied"), r"\(Permission denied\); check its rights"),
         (shutil.Error([("a", "b", "no")]), r"\(\[\('a', 'b', 'no'\)\]\); choose another place"),
@@ -89,7 +95,9 @@ def test_an_error_of_writing_names_its_file(tmp_path: Path) -> None:
     ],
 )
 def test_what_cannot_be_written_is_one_true_line(tmp_path: Path, error: OSError, says: str) -> None:
-    assert re.fullmatch(rf"{re.escape(str(tmp_path))}: cannot be written {says}.*", unwritable(tmp_path, error))
+    assert re.fullmatch(
+        rf"{re.escape(str(tmp_path))}: cannot be written {says}.*", unwritable(tmp_path, error)
+    )
 
 
 WRITES = """
@@ -118,7 +126,9 @@ def test_one_of_three_writers_of_a_folder_has_it(tmp_path: Path) -> None:
         writers.append(subprocess.Popen(command, **pipes))  # pyright: ignore
         said.append(writers[-1].stdout.readline())
     assert said[0] == "writing\n"
-    who = rf"{re.escape(str(folder))}: process {writers[0].pid} on .* \(`-c .*`, since .*\) writes there; wait"
+    who = (
+        rf"{re.escape(str(folder))}: process {writers[0].pid} on .* \(`-c .*`, since .*\) writes there; wait"
+    )
     assert all(re.match(who, line) for line in said[1:])
     with pytest.raises(RunError, match=f"process {writers[0].pid} "):
         replaced(folder, "mine")
