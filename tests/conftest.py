@@ -14,14 +14,26 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from sagesplat.adapt.observe import RenderedLabels
+from sagesplat.core.config import NestConfig, PlanConfig, RunConfig, SceneConfig, TrainConfig
 from sagesplat.core.gaussians import PARAMETERS, Gaussians
 from sagesplat.core.sh import num_bases, sh0_to_rgb
+from sagesplat.io.files import write_json
 from sagesplat.raster import Backend, Render, rasterize, set_threads
+from sagesplat.run.job import Job
+from sagesplat.run.run_dir import RunDir
 from sagesplat.scene import load_scene
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage, write_model
 from sagesplat.scene.scene import Camera, Scene
+from sagesplat.stages.pipeline import run_all
 
 LABELS = (-1, 3, 184)
+SMALL_RUN = RunConfig(  # of `finished_run`
+    scene=SceneConfig(test_every=4, calibrate_every=3),
+    train=TrainConfig(max_steps=6, level_every=2),
+    nest=NestConfig(steps=2, levels=4, smallest=0.1, base_share=0),
+    plan=PlanConfig(target_ssim=0.4, other_targets=()),
+)
 
 
 @pytest.fixture
@@ -123,6 +135,23 @@ def write_capture(folder: Path, truth: Gaussians, *, views: int = 8, noise: floa
         images.append(ModelImage(i + 1, f"{i:02d}.png", 1, camera.w2c.astype(float), uv, np.arange(len(xyz))))
     write_model(folder / "sparse" / "0", [model], images, xyz, rgb, np.full(len(xyz), 0.5))
     return load_scene(folder)
+
+
+@pytest.fixture(scope="session")
+def finished_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run on nested levels, in two seconds; its capture is beside it. Copy it before a change."""
+    folder = tmp_path_factory.mktemp("finished")
+    set_threads(1)
+    truth = random_gaussians(120, degree=1, logit=2.0)
+    images = RenderedLabels(truth, "cpu")
+    scene, masks = write_capture(folder / "capture", truth, noise=0.02), folder / "capture" / "masks"
+    masks.mkdir()
+    for view in scene.views:
+        ids = np.where(images[view] < 0, 255, images[view]).astype(np.uint8)
+        Image.fromarray(ids).save(masks / view.name)
+    write_json(masks / "labels.json", {"labels": {"3": "car", "184": "tree-merged"}})
+    run_all(Job(RunDir(folder / "run"), lambda event: None, "cpu"), folder / "capture", SMALL_RUN)
+    return folder / "run"
 
 
 def damage(content: bytes, data: st.DataObject) -> bytes:

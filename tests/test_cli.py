@@ -1,14 +1,17 @@
 """The command line: errors are one line and exit code 2, and help answers at once."""
 
+import os
 import runpy
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from conftest import random_gaussians, write_capture
 
 from sagesplat import cli
 from sagesplat.cli import help
+from sagesplat.core.names import visible
 
 
 def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str]:
@@ -200,3 +203,30 @@ def test_an_example_without_its_network_ends_in_one_line(
     with pytest.raises(SystemExit, match="no such folder") as end:
         runpy.run_path(str(example), run_name="__main__")
     assert str(end.value).count("\n") == 0
+
+
+@pytest.mark.parametrize(
+    "name", ["a[old]b", "[/red]", "\x1b[31mred", "caf\udce9", "\x9b2J", ":car:", "a\u202eb"]
+)
+def test_errors_repeat_what_was_typed_and_obey_none_of_it(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for words in (["info", name], [name], ["info", ".", name], ["plan", "x", "--ladder", name],
+                  ["run", "a", "b", f"--{name}"], ["run", "a", "b", "--train.max-steps", name]):  # fmt: skip
+        code, error = call(monkeypatch, capsys, *words)
+        assert code == 2
+        assert error.count("\n") == 1
+        assert error[:-1].isprintable()
+    assert visible("a[old]b") in call(monkeypatch, capsys, "info", "a[old]b")[1]
+
+
+def test_a_path_that_is_not_utf8_is_printed(tmp_path: Path) -> None:
+    run = tmp_path / os.fsdecode(b"caf\xe9 [/red]")
+    write_capture(run, random_gaussians(12))
+    code = "import sys; from sagesplat.cli import main; main()"
+    for encoding in ("utf-8", "ascii"):
+        environment = {**os.environ, "PYTHONIOENCODING": encoding}
+        done = subprocess.run(
+            [sys.executable, "-c", code, "info", run], env=environment, capture_output=True, check=True
+        )
+        assert b"caf\\xe9 [/red]" in done.stdout

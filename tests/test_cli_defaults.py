@@ -21,7 +21,7 @@ from sagesplat.io.files import read_json
 from sagesplat.run.job import Job
 from sagesplat.run.recorded import recorded_settings
 from sagesplat.run.run_dir import RunDir
-from sagesplat.stages import pipeline, preflight, train
+from sagesplat.stages import export, pipeline, preflight, train
 from sagesplat.stages.nest import nest_levels
 from sagesplat.stages.train import train_levels
 
@@ -346,3 +346,12 @@ def test_no_old_name_is_one_of_today() -> None:
     assert set(parse.OLD_FLAGS.values()) <= flags
     assert not set(COMMANDS) & set(parse.OLD_COMMANDS)
     assert set(parse.OLD_COMMANDS.values()) <= set(COMMANDS)
+
+
+def test_names_of_categories_are_no_settings_of_label_images(
+    run: Path, command: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = []
+    monkeypatch.setattr(export, "export_ply", lambda job, out, **options: seen.append(options["labels"]) or 3)
+    assert command("export", run, "a.ply")[0] == command("export", run, "a.ply", "--labels", "tree")[0] == 0
+    assert seen == [(), ("tree",)]

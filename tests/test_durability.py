@@ -38,7 +38,8 @@ from sagesplat.io.files import (
 )
 from sagesplat.run import stage
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import RunDir, is_done, record
+from sagesplat.run.records import is_done, record
+from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene

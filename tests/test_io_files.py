@@ -2,6 +2,8 @@
 
 import errno
 import os
+import re
+import shutil
 import stat
 import subprocess
 import sys
@@ -10,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from sagesplat.core.errors import RunError
-from sagesplat.io.files import atomic_folder, atomic_path, read_json, write_json, write_text
+from sagesplat.io import lock
+from sagesplat.io.files import atomic_folder, atomic_path, read_json, unwritable, write_json, write_text
 
 
 def test_json_round_trip_in_the_order_given(tmp_path):
@@ -50,6 +53,116 @@ def test_a_full_disk_is_one_line(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def full_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: shutil._ntuple_diskusage(9, 9, 0))  # type: ignore[attr-defined]
+
+
+def test_a_full_disk_is_seen_where_the_error_has_no_number(tmp_path: Path, monkeypatch) -> None:
+    """numpy's `tofile`, and shutil's list of what it could not copy."""
+    full_disk(monkeypatch)
+    with pytest.raises(RunError, match=r"a\.npy: no space left, the disk is full; free \d+ MB"):  # noqa: SIM117
+        with atomic_path(tmp_path / "a.npy"):
+            raise OSError("1920000 requested and 307072 written")
+    with pytest.raises(RunError, match=r"a: no space left, the disk is full"), atomic_folder(tmp_path / "a"):
+        raise shutil.Error([("from", "to", "[Errno 28] No space left on device: 'from' -> 'to'")])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_error_of_writing_names_its_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    with pytest.raises(OSError, match="File too large") as caught, atomic_path(path):
+        raise OSError(errno.EFBIG, "File too large")
+    assert caught.value.filename == str(path)
+
+
+@pytest.mark.parametrize(
+    ("error", "says"),
+    [
+        (OSError(errno.ENOSPC, "No space"), r"\(the disk is full\); free some space"),
+        (OSError(errno.EDQUOT, "Quota"), r"\(the quota is used up\); free some space"),
+        (
+            OSError(errno.EROFS, "Read-only file system"),
+            r"\(Read-only file system\); choose a place that can",
+        ),
+        (
+            OSError(errno.EFBIG, "File too large"),
+            r"\(File too large\); raise the limit of files \(ulimit -f\)",
+        ),
+        (OSError(errno.ENAMETOOLONG, "File name too long"), r"\(File name too long\); choose a shorter path"),
+        (PermissionError(errno.EACCES, "Permission denied"), r"\(Permission denied\); check its rights"),
+        (shutil.Error([("a", "b", "no")]), r"\(\[\('a', 'b', 'no'\)\]\); choose another place"),
+        (OSError(), r"\(OSError\); choose another place"),
+    ],
+)
+def test_what_cannot_be_written_is_one_true_line(tmp_path: Path, error: OSError, says: str) -> None:
+    assert re.fullmatch(
+        rf"{re.escape(str(tmp_path))}: cannot be written {says}.*", unwritable(tmp_path, error)
+    )
+
+
+WRITES = """
+import sys
+from pathlib import Path
+from sagesplat.core.errors import RunError
+from sagesplat.io.files import atomic_folder
+try:
+    with atomic_folder(Path(sys.argv[1])) as fresh:
+        for name in "abc":
+            (fresh / name).write_text(sys.argv[2])
+        print("writing", flush=True)
+        sys.stdin.read()
+except RunError as error:
+    print(error, flush=True)
+"""
+
+
+def test_one_of_three_writers_of_a_folder_has_it(tmp_path: Path) -> None:
+    """The others are told who; the folder is whole, and the first one's."""
+    folder, here = tmp_path / "out", os.environ | {"PYTHONPATH": os.pathsep.join(map(str, sys.path))}
+    writers, said = [], []
+    for number in "123":
+        command = [sys.executable, "-c", WRITES, str(folder), number]
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "env": here}
+        writers.append(subprocess.Popen(command, **pipes))  # pyright: ignore
+        said.append(writers[-1].stdout.readline())
+    assert said[0] == "writing\n"
+    who = (
+        rf"{re.escape(str(folder))}: process {writers[0].pid} on .* \(`-c .*`, since .*\) writes there; wait"
+    )
+    assert all(re.match(who, line) for line in said[1:])
+    with pytest.raises(RunError, match=f"process {writers[0].pid} "):
+        replaced(folder, "mine")
+    for writer in writers:
+        writer.communicate()
+        assert writer.returncode == 0
+    assert {path.name: path.read_text() for path in folder.iterdir()} == dict.fromkeys("abc", "1")
+    assert list(tmp_path.iterdir()) == [folder]
+    replaced(folder, "mine")
+    assert [path.name for path in folder.iterdir()] == ["mine"]
+
+
+def test_threads_take_turns_too(tmp_path: Path) -> None:
+    with atomic_folder(tmp_path / "a"), pytest.raises(RunError, match=f"process {os.getpid()} "):
+        replaced(tmp_path / "a", "inner")
+
+
+def test_a_lock_that_was_removed_meanwhile_counts_for_nothing(tmp_path: Path, monkeypatch) -> None:
+    """Its holder was about to leave when it was opened; the one that is there then is the other's."""
+    taken, take, file = [], lock._take, tmp_path / ".a.lock"
+
+    def late(handle: int) -> None:
+        if not taken:
+            file.unlink()
+        taken.append(handle)
+        take(handle)
+
+    monkeypatch.setattr(lock, "_take", late)
+    with lock.alone(tmp_path / "a"):
+        assert len(taken) == 2
+        assert file.exists()
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("content", [None, b"", b"{", b"\xff\xfe", b'{"a": }'])
 def test_json_that_cannot_be_read_is_one_line(tmp_path, content):
     path = tmp_path / "a.json"
@@ -64,6 +177,23 @@ def replaced(folder: Path, name: str) -> None:
     """Replace a folder by one with a file of this name."""
     with atomic_folder(folder) as fresh:
         (fresh / name).write_text(name)
+
+
+def test_a_swap_that_is_interrupted_leaves_the_earlier_folder(tmp_path: Path, monkeypatch) -> None:
+    """Right after it was taken aside."""
+    folder, rename = tmp_path / "a", Path.rename
+    replaced(folder, "old")
+
+    def interrupted(self: Path, target: Path) -> Path:
+        monkeypatch.setattr(Path, "rename", rename)
+        rename(self, target)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Path, "rename", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        replaced(folder, "new")
+    assert [path.name for path in folder.iterdir()] == ["old"]
+    assert list(tmp_path.iterdir()) == [folder]
 
 
 @pytest.mark.parametrize("failing", [1, 2])
@@ -117,3 +247,10 @@ def test_a_kill_in_the_middle_of_a_swap_loses_nothing(tmp_path: Path, then: str)
         replaced(folder, "newer")
     assert [path.name for path in folder.iterdir()] == [{"fails": "old", "works": "newer"}[then]]
     assert list(tmp_path.iterdir()) == [folder]
+
+
+def test_files_of_long_names_and_texts_of_any_path(tmp_path: Path) -> None:
+    path = tmp_path / ("日" * 83 + ".txt")
+    write_text(path, "caf\udce9")
+    assert path.read_text(encoding="utf-8") == "caf\\udce9"
+    assert list(tmp_path.iterdir()) == [path]

@@ -4,6 +4,7 @@ import re
 from dataclasses import dataclass
 from html.parser import HTMLParser
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from sagesplat.adapt.eq3 import fit_models
 from sagesplat.adapt.evaluate import Evaluation, read_evaluation
 from sagesplat.adapt.observe import TOTAL, Observations, read_observations
 from sagesplat.adapt.plan import plan_scene
+from sagesplat.io.columns import cell_text
 from sagesplat.output import figures
 from sagesplat.output.by_category import merged
 from sagesplat.output.report import Panel, ReportData, write_report
@@ -226,3 +228,24 @@ def test_parts_are_averaged_over_their_pixels() -> None:
     assert one.ssim[0] == pytest.approx(0.725)
     assert one.ssim_eroded[0] == pytest.approx(0.5)
     assert one.psnr[0] == pytest.approx(-10 * np.log10((1e-2 + 3 * 1e-3) / 4))
+
+
+AWKWARD = (
+    *("[/red]", '=HYPERLINK("x")', "$x^2$", "_grass", "a|b & c_%", "日本語", "é", "🚗", "x" * 100, "W" * 99),
+    *("a--b-->", "</svg>", "{{ 1 }}", "🚗" * 100, "\\frac{", "__", "%s %d {0}"),
+)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("first", range(0, len(AWKWARD), 4))
+def test_awkward_names_are_drawn_and_listed_as_they_are(tmp_path: Path, first: int) -> None:
+    some = (AWKWARD * 2)[first : first + 4]
+    data = dataclasses.replace(make(), names=dict(zip(LABELS, some, strict=True)), title=some[0])
+    path = write_report(tmp_path / "report", data)
+    for name in some[1:]:  # of the first, unlabelled, the name is ours
+        assert name in Page(path).text
+    with (tmp_path / "report" / "tables" / "plan.csv").open(newline="", encoding="utf-8") as file:
+        cells = [row[0] for row in csv.reader(file)]
+    assert {cell_text(cell) for cell in cells} > set(some[1:])
+    for drawing in (tmp_path / "report" / "figures").glob("*.svg"):
+        ElementTree.parse(drawing)

@@ -3,11 +3,14 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from sagesplat.adapt.eq3 import fit_model
 from sagesplat.adapt.evaluate import Evaluation
 from sagesplat.adapt.observe import TOTAL, Observations
 from sagesplat.adapt.plan import Choice, Plan
+from sagesplat.io.columns import cell_text, text_cell
 from sagesplat.output import tables
 
 NAMES = {3: "vase", 7: "dining, table"}
@@ -122,3 +125,58 @@ def test_models_table(tmp_path):
     assert float(row["K1"]) == model.params.K1
     assert (float(row["d min"]), float(row["d max"])) == (1, 5)
     assert tables.models_table({}, NAMES).rows == []
+
+
+AWKWARD = (
+    '=HYPERLINK("x")',
+    "+1",
+    "-1+2",
+    "@SUM(A1)",
+    "'=1",
+    "''@x",
+    "'tis",
+    "＝1",
+    "a|b",
+    "a\\",
+    "[a](b)",
+    "_a_",
+    "*a",
+)
+
+
+def test_no_cell_is_a_formula_and_names_come_back(tmp_path):
+    header = ("category", "=1+1", "count")
+    rows = [(name, "x", -3) for name in AWKWARD]
+    table = tables.Table("t", header, ("", "", ",d"), rows, marks={(0, 1): "m"})
+    table.write_csv(tmp_path / "t.csv")
+    with (tmp_path / "t.csv").open(newline="", encoding="utf-8") as file:
+        first, *lines = csv.reader(file)
+    assert tuple(cell_text(cell) for cell in first[:3]) == header
+    assert tuple(cell_text(line[0]) for line in lines) == AWKWARD
+    assert {line[2] for line in lines} == {"-3"}
+    assert lines[0][3] == "'=1+1: m"
+    text = [cell for line in (first, *lines) for cell in line if cell != "-3"]
+    assert not [cell for cell in text if cell.startswith(tuple("=+-@＝"))]
+
+
+@given(st.text())
+def test_text_cells_come_back(text):
+    cell = text_cell(text)
+    assert cell[:1] not in tuple("=+-@\t\r\n")
+    assert cell_text(cell) == text
+
+
+def test_markdown_and_latex_take_names_as_they_are():
+    table = tables.Table("t", ("a|b",), ("",), [(name,) for name in (*AWKWARD, "<b>&amp;", "c_%")])
+    lines = table.markdown().splitlines()
+    assert lines[0] == "| a\\|b |"
+    assert {
+        "| a\\\\ |",
+        "| \\[a\\](b) |",
+        "| \\_a\\_ |",
+        "| \\*a |",
+        "| &lt;b>&amp;amp; |",
+        "| c\\_% |",
+    } < set(lines)
+    latex = table.latex().splitlines()
+    assert {r"{[}a](b) \\", r"{*}a \\", r"\_a\_ \\", r"c\_\% \\", r"a\textbackslash{} \\"} < set(latex)

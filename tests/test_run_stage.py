@@ -27,7 +27,8 @@ from sagesplat.demo.capture import make_capture
 from sagesplat.io.files import read_json, write_json, write_text
 from sagesplat.run import stage
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import FORMAT, RunDir, input_hashes, is_done, is_made_from, record, settings_of
+from sagesplat.run.records import FORMAT, file_hash, input_hashes, is_done, is_made_from, record, settings_of
+from sagesplat.run.run_dir import RunDir
 from sagesplat.stages import report
 from sagesplat.stages.fit import fit_ladder
 from sagesplat.stages.label import fuse_masks, make_masks
@@ -116,7 +117,8 @@ _NO_INPUTS = {
     ("base", "train.json"),  # its settings are among those of the small model
     ("base", "levels"),  # their number of Gaussians is in the settings
 }
-_CAPTURE = "capture.npz"  # of a block: its scene.json, which is an input, has the fingerprint
+# of a block: its scene.json, which is an input, has the fingerprint and the hashes of the photos
+_CAPTURE = {"capture.npz", "photos.json"}
 
 
 def _id(path: Path) -> tuple[int, int]:
@@ -173,7 +175,7 @@ class Watch:
             makers = self.owners[_id(path)]
             fine = _id(path) in known or any(p == mine or (p.exists() and _id(p) in known) for p in makers)
             spared = {(one.name, path.name), (one.name, path.parent.name)} & _NO_INPUTS
-            if not (fine or spared or path.name == _CAPTURE):
+            if not (fine or spared or path.name in _CAPTURE):
                 self.missed.append(f"{one.name} reads {path.relative_to(self.root)}")
 
     def _known(self, inputs: list[Path]) -> set[tuple[int, int]]:
@@ -435,3 +437,10 @@ def test_models_are_fitted_to_what_was_observed(copy: Path, name: str, value: st
         fit_ladder(quiet(copy, force=True), CONFIG.fit)
     fit_ladder(quiet(copy, force=True), other)
     assert getattr(quiet(copy).fit_config, name) == value
+
+
+def test_a_folder_of_any_names_has_a_hash(tmp_path: Path) -> None:
+    (tmp_path / os.fsdecode(b"caf\xe9.png")).write_bytes(b"1")
+    first = file_hash(tmp_path)
+    (tmp_path / os.fsdecode(b"caf\xe9.png")).rename(tmp_path / os.fsdecode(b"caf\xe8.png"))
+    assert file_hash(tmp_path) != first

@@ -1,5 +1,6 @@
 """COLMAP workspaces: what is read back, what is refused, and the real scenes."""
 
+import os
 import shutil
 from pathlib import Path
 
@@ -275,3 +276,32 @@ def test_real_scenes(name, views, points, error):
     assert rows["distortion"] == "none"
     assert float(rows["reprojection error"].split()[0]) < 0.4
     assert rows["cameras"].split()[0] == {"garden": "1", "dinosaur": "116"}[name]
+
+
+BAD_NAMES = {
+    b"caf\xe9.png": r"photo 'caf\\udce9\.png': it is not UTF-8; rename the photo",
+    b"\x1b[31m.png": r"U\+001B; rename the photo",
+    b"../a.png": "names nothing in the folder of the photos",
+    b"/a.png": "names nothing in the folder of the photos",
+    b"x" * 251: "251 bytes, more than 250",
+}
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("name", BAD_NAMES)
+def test_photos_that_cannot_be_named_are_one_line(tmp_path, name, text):
+    capture(tmp_path, [PINHOLE], text=text)
+    model = tmp_path / "sparse" / "0" / ("images.txt" if text else "images.bin")
+    content = model.read_bytes()
+    assert content.count(b"part 1/02.png") == 1
+    model.write_bytes(content.replace(b"part 1/02.png", name))
+    with pytest.raises(SceneError, match=BAD_NAMES[name]) as raised:
+        load_scene(tmp_path)
+    assert str(raised.value).isprintable()
+
+
+def test_the_folder_names_the_scene(tmp_path):
+    for name, shown in ((b"[old] caf\xe9", "[old] caf_"), (b"\x1b[31mx", "_[31mx"), ("é" * 120, "é" * 100)):
+        folder = tmp_path / os.fsdecode(name)
+        capture(folder, [PINHOLE])
+        assert load_scene(folder).name == shown

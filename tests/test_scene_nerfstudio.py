@@ -371,7 +371,9 @@ def breakages() -> dict[str, Callable[[Path, dict], Any]]:
         r"images: 1 of the 5 photos of transforms.json are missing, first 'none.png'": frame(
             file_path="images/none.png"
         ),
-        r"images: 1 of the 5 photos .* are missing": frame(file_path="images/" + 300 * "a"),
+        r"file_path 'images/aaa.*: a part of it has 300 bytes": frame(file_path="images/" + 300 * "a"),
+        r"file_path .*: it is not UTF-8; rename the file": frame(file_path="images/caf\udce9.png"),
+        r"file_path .*: it holds a control .*, U\+001B; rename": frame(file_path="images/\x1b[31m.png"),
         r"images: 2 of the 5 photos of transforms.json are missing, first 'frame_00004.png'": gone,
         r"the frames name 'frame_00001.png' twice": frame(file_path="images/frame_00001.png"),
         r"frame 'frame_00003.png': no transform_matrix": frame(transform_matrix=None),

@@ -24,6 +24,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 
 from sagesplat.core.errors import BackendUnavailable, SceneError
+from sagesplat.core.names import check_photo, collision_key
 from sagesplat.scene import load_scene, photos
 from sagesplat.scene._prepare import prepare_photos
 from sagesplat.scene.photos import PosesConfig, reconstruct
@@ -395,7 +396,10 @@ def all_corrupt(folder: Path) -> None:
     [
         (lambda folder: None, "0 readable photos, but it takes 3; add overlapping photos"),
         (one_photo, "1 readable photos, but it takes 3; add"),
-        (all_corrupt, r"0 readable photos, but it takes 3 \(0\.jpg unreadable: .*\.\.\.\); replace"),
+        (
+            all_corrupt,
+            r"it takes 3; 0\.jpg \(the first of 3\) is unreadable: .*; replace or",
+        ),
     ],
 )
 def test_too_few_photos(
@@ -559,3 +563,26 @@ def test_upright_finds_gravity(seed: int, facade: bool) -> None:
 def test_cuda_where_there_is_none(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(BackendUnavailable, match="no CUDA; install pycolmap-cuda12 or take device cpu"):
         reconstruct(folder, tmp_path / "out", replace(CONFIG, device="cuda"))
+
+
+def test_awkward_names_of_photos_are_mended(tmp_path: Path) -> None:
+    source = tmp_path / os.fsdecode(b"photos \xff [old]")
+    source.mkdir()
+    names = (
+        b"caf\xe9.png",
+        b"caf\xe8.png",
+        b"\x1b[31m.png",
+        b"x" * 251 + b".png",
+        b"x" * 250 + b"y.png",
+        b"A.png",
+        b"a.PNG",
+    )
+    for name in (*names, "e\u0301.png".encode(), "\u00e9.png".encode()):
+        Image.new("RGB", (8, 8)).save(source / os.fsdecode(name))
+    photos, unreadable = prepare_photos(source, tmp_path / "work", tmp_path / "none", lambda *_: None)
+    assert not unreadable
+    finals = [photo.final for photo in photos]
+    assert len(photos) == len({collision_key(name) for name in finals}) == 9
+    for name in finals:
+        check_photo(name)
+        assert name.lower().endswith(".png")

@@ -1,6 +1,8 @@
 """Frames of a video: upright, sharp, evenly spread, none twice, and one line for files that are none."""
 
 import builtins
+import json
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from sagesplat.core.errors import BackendUnavailable, SceneError
+from sagesplat.scene import video
 from sagesplat.scene.video import extract_frames, sharpness
 
 av = pytest.importorskip("av", reason="needs PyAV (the extra `video`)")
@@ -159,6 +162,87 @@ def test_a_file_that_is_no_video_is_one_line(tmp_path: Path, name: str, fill: An
         extract_frames(tmp_path / name, tmp_path / "f")
     assert "\n" not in str(raised.value)
     assert str(raised.value).startswith(str(tmp_path / name))
+
+
+def hls(path: Path) -> None:
+    """A playlist in the format of HLS that names another file, in a segment that FFmpeg would read."""
+    write_video(path.with_name("secret.ts"), pan(6))
+    path.write_text("#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:9,\nsecret.ts\n#EXT-X-ENDLIST\n")
+
+
+def concat(path: Path) -> None:
+    write_video(path.with_name("secret.mp4"), pan(6))
+    path.write_text("ffconcat version 1.0\nfile secret.mp4\n")
+
+
+@pytest.mark.parametrize("fill", [hls, concat])
+@pytest.mark.parametrize("name", ["a.mp4", "a.m3u8", "a.mkv"])
+def test_scripts_that_read_other_files_are_refused(tmp_path: Path, fill: Any, name: str) -> None:
+    fill(tmp_path / name)
+    with pytest.raises(SceneError, match=r"holds no video stream in MP4|not readable as a video"):
+        extract_frames(tmp_path / name, tmp_path / "f")
+    assert not list((tmp_path / "f").glob("*.jpg"))
+
+
+def test_a_name_is_no_protocol(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_video(tmp_path / "secret.mp4", pan(6)).rename(tmp_path / "concat:secret.mp4")
+    assert len(extract_frames(Path("concat:secret.mp4"), tmp_path / "f")) == 6
+
+
+def frames_of(path: Path, pixels: np.ndarray, count: int = 3) -> Path:
+    """A video whose first frame is small; the others are PNG files that a decoder takes as they are."""
+    file = path.with_suffix(".png")
+    with av.open(str(path), "w") as container:
+        stream: Any = container.add_stream("png", rate=25)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "rgb24"
+        for i in range(count):
+            Image.fromarray(pixels if i else pan(1)[0]).save(file, compress_level=1)
+            packet = av.Packet(file.read_bytes())
+            packet.stream, packet.pts, packet.dts, packet.time_base = stream, i, i, Fraction(1, 25)
+            container.mux(packet)
+    return path
+
+
+def test_frames_of_too_many_pixels_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    large = frames_of(tmp_path / "a.mov", np.zeros((600, 800, 3), np.uint8))
+    assert len(extract_frames(large, tmp_path / "f")) == 2
+    monkeypatch.setattr(video, "MAX_PIXELS", 100_000)
+    (kept,) = extract_frames(large, tmp_path / "g")
+    assert read(kept).shape == (HEIGHT, WIDTH, 3)
+    monkeypatch.setattr(video, "MAX_PIXELS", 1000)
+    with pytest.raises(SceneError, match="no frame of up to"):
+        extract_frames(large, tmp_path / "h")
+
+
+def test_a_video_of_too_many_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    film = write_video(tmp_path / "a.mp4", pan(12))
+    monkeypatch.setattr(video, "MAX_FRAMES", 11)
+    with pytest.raises(SceneError, match=r"a\.mp4: 12 frames of .* too many; cut or convert"):
+        extract_frames(film, tmp_path / "f")
+
+
+def test_packets_that_hold_more_than_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where an index names the same bytes again and again."""
+    film = write_video(tmp_path / "a.mp4", pan(12))
+    monkeypatch.setattr(video, "_PACKED", 0.5)
+    with pytest.raises(SceneError, match="bytes or more are too many"):
+        extract_frames(film, tmp_path / "f")
+
+
+@pytest.mark.parametrize(
+    "content",
+    ["{", "[1]", "{}", '{"frames": 3}', '{"frames": [1]}', '{"frames": ["../../etc/passwd"]}', "OWN"],
+)
+def test_a_list_of_frames_from_elsewhere_is_not_believed(tmp_path: Path, content: str) -> None:
+    film = write_video(tmp_path / "a.mp4", pan(6))
+    first = extract_frames(film, tmp_path / "f")
+    listed = json.loads((tmp_path / "f" / "video.json").read_text())
+    if content == "OWN":
+        content = json.dumps(listed | {"frames": ["../a.mp4"]})
+    (tmp_path / "f" / "video.json").write_text(content)
+    assert extract_frames(film, tmp_path / "f") == first
+    assert json.loads((tmp_path / "f" / "video.json").read_text()) == listed
 
 
 def test_max_frames_of_none(tmp_path: Path) -> None:

@@ -30,3 +30,7 @@ def test_no_two_of_cocos_share_a_title() -> None:
     shown = titles(NAMES).values()
     assert len(set(shown)) == len(NAMES)
     assert not [title for title in shown if "-" in title]
+
+
+def test_a_name_of_suffixes_alone_is_its_own_title() -> None:
+    assert [title_of(name) for name in ("-merged", "-", "a-stuff")] == ["-merged", "-", "a"]

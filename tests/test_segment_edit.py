@@ -243,3 +243,18 @@ def test_an_edit_done_twice_is_an_edit_done_once(pixels: list[int]) -> None:
     once = apply(label_ids, table)
     assert (apply(once, table) == once).all()
     assert ((once == -1) == np.isin(label_ids, [-1, TREE])).all()
+
+
+@pytest.mark.parametrize("name", ["x" * 101, "a\x1b", "\u202ea", "a\udce9"])
+def test_typed_names_that_may_not_be(name):
+    for said in (lambda: parse_merge(f"vase={name}"), lambda: parse_keep(f"vase,{name}")):
+        with pytest.raises(LabelError, match=r"^(merge|keep) .*: it .*; a name has 1 to 100 printable"):
+            said()
+    with pytest.raises(LabelError, match=r"^merge"):
+        edit_table(Taxonomy({1: "vase"}), merge={"vase": name})
+
+
+def test_typed_accents_are_those_of_the_file():
+    taxonomy = Taxonomy({1: "caf\u00e9", 2: "vase"})
+    left, _ = edit_table(taxonomy, keep=parse_keep("cafe\u0301"), merge=parse_merge("vase=cafe\u0301"))
+    assert left.names == {1: "caf\u00e9"}

@@ -1,4 +1,5 @@
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,16 @@ from PIL import Image
 from sagesplat.core.errors import LabelError
 from sagesplat.scene.scene import Camera, Lens, Points, Scene, View
 from sagesplat.scene.undistort import pinhole
-from sagesplat.segment.masks import Masks, Taxonomy, import_masks, mask_path, read_mask, write_mask
+from sagesplat.segment.block_categories import BlockCategories
+from sagesplat.segment.masks import (
+    Masks,
+    Taxonomy,
+    import_masks,
+    mask_path,
+    prepare_folder,
+    read_mask,
+    write_mask,
+)
 
 LABELS = {"unlabelled": 255, "labels": {"3": "car", "184": "tree-merged"}}
 
@@ -260,3 +270,49 @@ def test_names_and_colors():
     assert len(set(colors)) == 4
     assert all(0 <= c <= 255 for color in colors for c in color)
     assert Taxonomy({9: "statue"}).color(9) == taxonomy.color(201)
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("x" * 101, "101 characters"), ("a\x1b[31m", r"U\+001B"), ("a\ud800", "not UTF-8"), (" ", "blank"),
+        ("a\u202eb", r"U\+202E"), (" a", "begins or ends with a space"), (7, "no text"),
+    ],
+)  # fmt: skip
+def test_names_that_may_not_be_are_refused_where_they_are_read(tmp_path, name, why):
+    save(tmp_path / "a.png", IDS, {"labels": {"3": name, "184": "tree"}})
+    with pytest.raises(LabelError, match=f"{why}; rename it") as raised:
+        imported(scene_of("a.jpg"), tmp_path)
+    said = str(raised.value)
+    assert said.startswith(f"{tmp_path / 'labels.json'}: label 3 is named ")
+    assert said.isprintable()
+    assert len(said) < 600
+
+
+def test_an_accent_in_two_ways_is_one_name(tmp_path):
+    save(tmp_path / "a.png", IDS, {"labels": {"3": "caf\u00e9", "184": "cafe\u0301"}})
+    with pytest.raises(LabelError, match="name of its own"):
+        imported(scene_of("a.jpg"), tmp_path)
+    save(tmp_path / "a.png", IDS, {"labels": {"3": "cafe\u0301", "184": "Tree"}})
+    assert imported(scene_of("a.jpg"), tmp_path)[0].taxonomy.names == {3: "caf\u00e9", 184: "Tree"}
+
+
+def test_the_longest_names_have_room_for_a_block(tmp_path):
+    names = BlockCategories(Taxonomy({3: "x" * 100}), 300).names
+    names.write(tmp_path / "labels.json")
+    assert Taxonomy.read(tmp_path / "labels.json") == names
+
+
+def test_photos_that_some_disks_take_for_one(tmp_path):
+    prepare_folder(tmp_path, scene_of("a.jpg", "sub/a.jpg", "b.jpg").views)
+    for one, other in (("a.jpg", "A.png"), ("caf\u00e9.jpg", "cafe\u0301.jpg"), ("a.jpg", "a.png")):
+        with pytest.raises(LabelError, match="has the same name but for the suffix or capitals; rename one"):
+            prepare_folder(tmp_path, scene_of(one, other).views)
+
+
+def test_a_photo_of_the_longest_name_has_a_label_image(tmp_path):
+    view = scene_of("日" * 83 + ".j").views[0]
+    path = mask_path(tmp_path, view)
+    write_mask(path, WANTED.astype(np.int16), Taxonomy({3: "car", 184: "tree"}))
+    assert len(os.fsencode(path.name)) == 253
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]

@@ -1,6 +1,7 @@
 import json
 import struct
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -286,6 +287,129 @@ def test_unusable_models(tmp_path, files):
     write_model(model, [[0, 0, 0], [0, 0, 0], [9, 9, 9]])
     with pytest.raises(LabelError, match="every pixel is unlabelled"):
         segment_onnx(scene, [np.full((32, 64, 3), 255, np.uint8)], model, classes, tmp_path / "out")
+
+
+def attribute(name, number, value, kind):
+    return field(5, field(1, name) + field(number, value) + field(20, kind))
+
+
+def model_of(path, nodes, inputs=(("photo", (1, 3, 16, 32), FLOAT),), outputs=(), tensors=b""):
+    """A model of nodes, with inputs and outputs of (name, shape, kind)."""
+    graph = nodes + field(2, "graph") + tensors
+    graph += b"".join(field(11, value_info(*entry)) for entry in inputs)
+    graph += b"".join(field(12, value_info(*entry)) for entry in outputs)
+    path.write_bytes(field(1, 8) + field(7, graph) + field(8, field(2, 13)))
+    return path
+
+
+LOGITS = ("logits", (1, 3, 16, 32), FLOAT)
+
+
+@pytest.mark.parametrize(
+    ("shape", "kind"),
+    [
+        ((), FLOAT),
+        ((3,), FLOAT),
+        ((1, 3, 16), FLOAT),
+        ((1, 3, 16, 32, 1), FLOAT),
+        ((1, 3, 0, 32), FLOAT),
+        ((1, 3, "height", 32), FLOAT),
+        ((1, 3, 10**9, 10**9), FLOAT),
+        ((1, 3, 2**40, 1), FLOAT),
+        ((1, 3, 16, 32), INT64),
+        ((1, 3, 16, 32), 8),  # strings
+        ((1, 4, 16, 32), FLOAT),
+    ],
+)
+def test_inputs_that_are_no_photo(tmp_path, files, shape, kind):
+    nodes = node("Identity", ["photo"], "logits")
+    model = model_of(tmp_path / "m.onnx", nodes, [("photo", shape, kind)], [("logits", shape, kind)])
+    with pytest.raises(LabelError, match=r"m\.onnx: .*export it") as caught:
+        OnnxSegmenter(model, files[1])
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 1000
+
+
+def test_models_without_inputs_or_with_two(tmp_path, files):
+    one = field(5, field(1, 1) + field(2, FLOAT) + field(8, "one") + field(9, struct.pack("<f", 1)))
+    two = [("photo", (1, 3, 16, 32), FLOAT), ("other", (1, 3, 16, 32), FLOAT)]
+    cases = [
+        ("0 inputs", node("Identity", ["one"], "logits"), (), [("logits", (1,), FLOAT)], one),
+        ("2 inputs", node("Add", ["photo", "other"], "logits"), two, [LOGITS], b""),
+    ]
+    for complaint, nodes, inputs, outputs, tensors in cases:
+        model = model_of(tmp_path / "m.onnx", nodes, inputs, outputs, tensors)
+        with pytest.raises(LabelError, match=complaint):
+            OnnxSegmenter(model, files[1])
+
+
+@pytest.mark.parametrize(
+    ("nodes", "output"),
+    [
+        (b"", None),
+        (node("Flatten", ["photo"], "logits"), ("logits", (1, 1536), FLOAT)),
+        (node("ReduceMax", ["photo"], "logits"), ("logits", (1, 1, 1, 1), FLOAT)),
+        (node("Shape", ["photo"], "logits"), ("logits", (4,), INT64)),
+        (node("Size", ["photo"], "logits"), ("logits", (), INT64)),
+        (node("IsNaN", ["photo"], "logits"), ("logits", (1, 3, 16, 32), 9)),  # of truth values
+        (node("Transpose", ["photo"], "logits", perm=(2, 1, 0, 3)), ("logits", (16, 3, 1, 32), FLOAT)),
+        (node("Sqrt", ["photo"], "logits"), LOGITS),  # NaN
+        (node("Unheard", ["photo"], "logits"), LOGITS),  # an operator of somebody's own
+    ],
+)
+def test_outputs_that_are_no_label_scores(tmp_path, files, nodes, output):
+    model = model_of(tmp_path / "m.onnx", nodes, outputs=[output] if output else [])
+    with pytest.raises(LabelError, match=r"m\.onnx: ") as caught:
+        OnnxSegmenter(model, files[1])([red_and_blue()])
+    assert "\n" not in str(caught.value)
+
+
+def test_an_output_too_large_is_refused_before_it_is_made(tmp_path, files):
+    sizes = field(
+        5,
+        field(1, 4) + field(2, INT64) + field(8, "sizes") + field(9, struct.pack("<4q", 1, 3, 2**20, 2**20)),
+    )
+    nodes = node("Expand", ["photo", "sizes"], "logits")
+    inputs = [("photo", (1, 3, 1, 1), FLOAT)]
+    model = model_of(tmp_path / "m.onnx", nodes, inputs, [("logits", (1, 3, 2**20, 2**20), FLOAT)], sizes)
+    with pytest.raises(LabelError, match="up to 536,870,912 of them"):
+        OnnxSegmenter(model, files[1])
+
+
+def test_a_loop_that_never_ends_is_stopped(tmp_path, files, capfd):
+    body = node("Identity", ["go"], "go_on") + node("Relu", ["x"], "y") + field(2, "body")
+    for name, shape, kind in (("i", (), INT64), ("go", (), 9), ("x", LOGITS[1], FLOAT)):
+        body += field(11, value_info(name, shape, kind))
+    body += field(12, value_info("go_on", (), 9)) + field(12, value_info("y", LOGITS[1]))
+    loop = b"".join(field(1, name) for name in ("", "yes", "photo")) + field(2, "logits") + field(4, "Loop")
+    yes = field(5, field(2, 9) + field(8, "yes") + field(9, b"\x01"))
+    nodes = field(1, loop + attribute("body", 6, body, 5))
+    model = model_of(tmp_path / "m.onnx", nodes, outputs=[LOGITS], tensors=yes)
+    begin = time.perf_counter()
+    with pytest.raises(LabelError, match=r"m\.onnx: no answer within 0\.3 s; raise --time-limit"):
+        OnnxSegmenter(model, files[1], time_limit=0.3)([red_and_blue()])
+    assert time.perf_counter() - begin < 5
+    assert capfd.readouterr() == ("", "")
+    assert OnnxSegmenter(*files, time_limit=30)([red_and_blue()])  # one that ends
+
+
+@pytest.mark.parametrize("location", ["../w.bin", "/etc/passwd", "link.bin", "w.bin"])
+def test_weights_outside_of_the_models_folder_are_not_read(tmp_path, files, location):
+    folder = tmp_path / "model"
+    folder.mkdir()
+    (tmp_path / "w.bin").write_bytes(np.eye(3, dtype=np.float32).tobytes())
+    (folder / "link.bin").symlink_to(tmp_path / "w.bin")
+    tensor = b"".join(field(1, d) for d in (3, 3, 1, 1)) + field(2, FLOAT) + field(8, "weights")
+    tensor += field(13, field(1, "location") + field(2, location)) + field(14, 1)
+    nodes = node("Conv", ["photo", "weights"], "logits", kernel_shape=(1, 1))
+    model = model_of(folder / "m.onnx", nodes, outputs=[LOGITS], tensors=field(5, tensor))
+    if location == "w.bin":  # beside the model
+        (folder / "w.bin").write_bytes((tmp_path / "w.bin").read_bytes())
+        assert OnnxSegmenter(model, files[1])([red_and_blue()])
+        return
+    with pytest.raises(LabelError, match=r"m\.onnx: no model that onnxruntime can load") as caught:
+        OnnxSegmenter(model, files[1])
+    assert "\n" not in str(caught.value)
 
 
 def test_without_onnxruntime(tmp_path, monkeypatch):

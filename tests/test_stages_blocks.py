@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import random_gaussians
+from conftest import random_gaussians, write_capture
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_run_executor import Shuffled
@@ -396,3 +396,13 @@ def test_snapshots_of_blocks(capture: Path, tmp_path: Path) -> None:
     events = run_in_blocks(capture, tmp_path / "run", config)
     assert any(isinstance(e, StageDone) and e.name == "report" for e in events)
     assert read_json(RunDir(tmp_path / "run", "snapshots").plan)["scene"]
+
+
+def test_stored_scenes_name_photos_that_may_be(tmp_path: Path) -> None:
+    scene = write_capture(tmp_path / "capture", random_gaussians(12))
+    views = (replace(scene.views[0], name="caf\udce9.png"), *scene.views[1:])
+    write_scene(tmp_path / "a.npz", replace(scene, views=views))
+    with pytest.raises(SceneError, match=r"not a stored scene \(it is not UTF-8"):
+        read_scene(tmp_path / "a.npz")
+    write_scene(tmp_path / "b.npz", replace(scene, name="\x1b[31m"))
+    assert read_scene(tmp_path / "b.npz").name == "_[31m"

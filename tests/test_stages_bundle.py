@@ -6,28 +6,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import random_gaussians, write_capture
+from conftest import random_gaussians
 from PIL import Image
 from test_viewer_bundle import manifest_of
 
-from sagesplat.adapt.observe import RenderedLabels
 from sagesplat.adapt.viewpoint import read_promises
-from sagesplat.core.config import FitConfig, LiftConfig, MasksConfig, NestConfig, SceneConfig, TrainConfig
+from sagesplat.core.config import FitConfig
 from sagesplat.core.errors import DataError, RunError, SageError
 from sagesplat.formats.increments import read_increments, read_index
 from sagesplat.formats.spz import read_spz
 from sagesplat.io.files import read_json, write_json
 from sagesplat.raster import rasterize
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import FORMAT, RunDir, checkpoint_key
+from sagesplat.run.records import FORMAT, checkpoint_key
+from sagesplat.run.run_dir import RunDir
 from sagesplat.stages.bundle import _antialiased, bundle, live_bundle
-from sagesplat.stages.fit import fit_ladder
-from sagesplat.stages.label import lift_labels, make_masks
-from sagesplat.stages.nest import nest_levels
-from sagesplat.stages.observe import observe_levels
-from sagesplat.stages.scene import open_scene
 from sagesplat.stages.shared import distances
-from sagesplat.stages.train import train_levels
 from sagesplat.train.checkpoint import write_checkpoint
 from sagesplat.train.state import initial_state
 from sagesplat.viewer.bundle import is_bundle
@@ -43,27 +37,10 @@ def job_of(run: Path) -> Job:
     return Job(RunDir(run), lambda event: None)
 
 
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture
+def trained(finished_run: Path) -> Path:
     """A run with all that a bundle needs."""
-    folder = tmp_path_factory.mktemp("bundling")
-    truth = random_gaussians(120, degree=1, logit=2.0)
-    images = RenderedLabels(truth, "cpu")
-    scene, masks = write_capture(folder / "capture", truth, noise=0.02), folder / "capture" / "masks"
-    masks.mkdir()
-    for view in scene.views:
-        ids = np.where(images[view] < 0, 255, images[view]).astype(np.uint8)
-        Image.fromarray(ids).save(masks / view.name)
-    write_json(masks / "labels.json", {"labels": {"3": "car", "184": "tree-merged"}})
-    job = job_of(folder / "run")
-    open_scene(job, folder / "capture", SceneConfig(test_every=4, calibrate_every=3))
-    make_masks(job, MasksConfig())
-    lift_labels(job, LiftConfig())
-    train_levels(job, TrainConfig(max_steps=6, level_every=2), 0)
-    nest_levels(job, NestConfig(steps=2, levels=4, smallest=0.1, base_share=0), 0)
-    observe_levels(job, FIT)
-    fit_ladder(job, FIT)
-    return job.run.path
+    return finished_run
 
 
 @pytest.fixture

@@ -18,7 +18,8 @@ from sagesplat.core.errors import DataError, RunError
 from sagesplat.core.events import Event, StageDone, TableMade, Training, Warned
 from sagesplat.demo.capture import make_capture
 from sagesplat.io.files import link, write_text
-from sagesplat.run.run_dir import RunDir, settings_of
+from sagesplat.run.records import settings_of
+from sagesplat.run.run_dir import RunDir
 from sagesplat.segment import hf
 from sagesplat.stages import report
 from sagesplat.studies.sweep import run

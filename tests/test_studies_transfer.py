@@ -19,7 +19,8 @@ from sagesplat.core.config import SceneConfig
 from sagesplat.core.errors import RunError
 from sagesplat.formats.levels import write_level
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import RunDir, record
+from sagesplat.run.records import record
+from sagesplat.run.run_dir import RunDir
 from sagesplat.segment.lift import LiftedLabels
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.stages.scene import open_scene

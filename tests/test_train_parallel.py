@@ -1,5 +1,8 @@
 """Processes that train together: the result of one process with as many photos a step."""
 
+import signal
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -118,3 +121,12 @@ def test_more_processes_than_gpus(capture, monkeypatch):  # noqa: F811
     monkeypatch.setattr(parallel.torch.cuda, "device_count", lambda: 1)
     with pytest.raises(RunError, match="--processes 2: this machine has 1 GPUs; lower it"):
         next(train_together(2, 2, *capture, backend="cuda"))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signal masks")
+def test_the_others_do_not_hear_ctrl_c() -> None:
+    """A terminal sends it to all: the first ends the others, which would only print tracebacks."""
+    code = "import signal; print(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, []))"
+    with parallel._without_ctrl_c():
+        assert subprocess.check_output([sys.executable, "-c", code]) == b"True\n"
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])

@@ -20,7 +20,7 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.increments import read_increments, write_increments
 from sagesplat.raster import rasterize
 from sagesplat.scene.scene import Camera
-from sagesplat.stages.bundle import package_viewer
+from sagesplat.viewer.built import package_viewer
 from sagesplat.viewer.bundle import write_bundle
 from sagesplat.viewer.manifest import CameraEntry, Category, Contents
 

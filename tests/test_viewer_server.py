@@ -12,23 +12,24 @@ import sys
 import threading
 import time
 import types
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import browser
 import pytest
 
 from sagesplat.core.errors import BackendUnavailable, RunError, SageError
-from sagesplat.run.run_dir import FORMAT
+from sagesplat.run.records import FORMAT
 from sagesplat.stages import view as stages_view
 from sagesplat.stages.view import show
 from sagesplat.viewer import server
 
 pytest.importorskip("starlette", reason="needs the extra `view`")
 pytest.importorskip("uvicorn", reason="needs the extra `view`")
-from sagesplat.viewer import site
+from sagesplat.viewer import connections, site
+from sagesplat.viewer.hosts import Hosts
 
 CHUNK = "chunks/grass-01-0123456789ab.spz"
 PROMISES = "promises-0123456789ab.json"
@@ -44,6 +45,7 @@ FILES = {
     "assets/sort-1a2b3c4d.wasm": b"\0asm",
     "LICENSES.txt": b"Apache-2.0",
 }
+OF_VIEWER = [name for name in FILES if name.startswith(("index.html", "assets/"))]
 Answer = tuple[int, dict[str, str], bytes]
 
 
@@ -58,7 +60,7 @@ def write_bundle(folder: Path, contents: dict[str, bytes] = FILES) -> Path:
 @contextmanager
 def running(served: site.Site, **certificate: Path) -> Iterator[int]:
     listener = server.bind("127.0.0.1", 0)
-    serving = site.make_server(served, **certificate)
+    serving = connections.make_server(served, **certificate)
     thread = threading.Thread(target=serving.run, args=([listener],))
     port = listener.getsockname()[1]
     thread.start()
@@ -113,7 +115,8 @@ def ask(port: int, target: str, method: str = "GET", **headers: str) -> Answer:
 
 @pytest.fixture(scope="module")
 def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = write_bundle(tmp_path_factory.mktemp("served") / "bundle")
+    folder = tmp_path_factory.mktemp("served") / "bundle"
+    write_bundle(folder, {name: FILES[name] for name in FILES if name not in OF_VIEWER})
     secret = folder.parent / "secret.txt"
     secret.write_text("secret")
     (folder.parent / "bundle-other").mkdir()
@@ -127,8 +130,14 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def port(bundle: Path) -> Iterator[int]:
-    with running(site.Site(bundle)) as port:
+def viewer(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A built viewer."""
+    return write_bundle(tmp_path_factory.mktemp("viewer"), {name: FILES[name] for name in OF_VIEWER})
+
+
+@pytest.fixture(scope="module")
+def port(bundle: Path, viewer: Path) -> Iterator[int]:
+    with running(site.Site(bundle, viewer=viewer)) as port:
         yield port
 
 
@@ -304,7 +313,9 @@ def test_a_link_that_stays_inside_is_followed(port: int):
     assert ask(port, "/inside.spz")[2] == FILES[CHUNK]
 
 
-@pytest.mark.parametrize("host", ["localhost", "LOCALHOST:80", "127.0.0.1:8000", "[::1]:8000", "a.localhost"])
+@pytest.mark.parametrize(
+    "host", ["localhost", "LOCALHOST:80", "127.0.0.1:8000", "[::1]:8000", "a.localhost."]
+)
 def test_this_machine_s_names_are_answered(port: int, host: str):
     assert ask(port, "/", host=host)[0] == 200
 
@@ -319,9 +330,70 @@ def test_other_names_are_not(port: int, host: str):
     assert headers["cache-control"] == "no-cache"
 
 
-def test_any_name_is_answered_where_others_were_let_in(bundle: Path):
-    with running(site.Site(bundle, local=False)) as port:
-        assert ask(port, "/", host="splats.example")[0] == 200
+@pytest.mark.parametrize("listening", ["127.0.0.1", "localhost", "::1", "127.8.9.1"])
+def test_a_host_that_is_this_machine_lets_no_other_name_in(listening: str, bundle: Path):
+    names = Hosts(listening)
+    assert ("localhost:80" in names, "127.0.0.1" in names) == (True, True)
+    assert not [name for name in ("evil.example", "192.168.1.7", socket.gethostname()) if name in names]
+    if listening == "127.0.0.1":
+        with viewing(show(bundle, print, port=0, host=listening)) as port:
+            assert ask(port, "/manifest.json", host="evil.example")[0] == 403
+            assert ask(port, "/manifest.json")[0] == 200
+
+
+def test_names_that_are_answered_where_others_were_let_in(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(socket, "gethostname", lambda: "Desk.lan")
+    everybody, one = Hosts("0.0.0.0"), Hosts("splats.example")
+    for name in ("192.168.1.7:8000", "[2001:db8::1]:8000", "desk.lan", "desk.local:8000", "localhost"):
+        assert name in everybody
+        assert name in one
+    assert ("splats.example:80" in one, "splats.example" in everybody) == (True, False)
+    for name in ("evil.example", "192.168.1.7.nip.io", "evil.local", "", "a@b"):
+        assert name not in everybody
+        assert name not in one
+    assert "evil.example" in Hosts("0.0.0.0", certificate=True)  # its name is in the certificate
+    assert "evil.example" not in Hosts("127.0.0.1", certificate=True)
+
+
+ACTS = ("evil.html", "evil.js", "sw.js", "evil.mjs", "evil.svg", "evil.wasm", "evil.xhtml", "evil.css")
+ACTS += ("chunks/evil.html", "assets/index-CmV_C-3Q.mjs", "evil.webmanifest", "evil.xml", "evil.pdf", "evil")
+
+
+def test_of_a_bundle_nothing_that_acts_is_served(bundle: Path, tmp_path: Path):
+    folder = Path(shutil.copytree(bundle, tmp_path / "bundle", symlinks=True))
+    write_bundle(
+        folder, dict.fromkeys(ACTS, b"evil") | {"index.html": b"evil", "assets/a-12345678.js": b"evil"}
+    )
+    write_bundle(
+        folder, {"manifest.json.txt": b"<script>1</script>", "chunks/page.JSON": b"<script>1</script>"}
+    )
+    with viewing(show(folder, print, port=0)) as port:
+        for name in ACTS:
+            assert ask(port, "/" + name)[0] == 404
+        assert ask(port, "/assets/a-12345678.js")[0] == 404
+        assert b"evil" not in ask(port, "/")[2]
+        for name, kind in (
+            ("manifest.json.txt", "text/plain; charset=utf-8"),
+            ("chunks/page.JSON", "application/json"),
+        ):
+            status, headers, _ = ask(port, "/" + name)
+            assert (status, headers["content-type"]) == (200, kind)
+            assert headers["x-content-type-options"] == "nosniff"
+
+
+def test_the_page_shows_the_bundle_s_poster(bundle: Path, viewer: Path, tmp_path: Path):
+    page = b"<!doctype html><body><!-- poster --></body>"
+    own = write_bundle(tmp_path / "viewer", {"index.html": page})
+    folder = write_bundle(tmp_path / "bundle", {"manifest.json": FILES["manifest.json"]})
+    with running(site.Site(folder, viewer=own)) as port:
+        _, headers, body = ask(port, "/")
+        assert body == page
+        (folder / "poster.jpg").write_bytes(b"jpeg")
+        status, again, body = ask(port, "/", if_none_match=headers["etag"])
+        assert (status, b'src="poster.jpg"' in body, int(again["content-length"])) == (200, True, len(body))
+        assert ask(port, "/", if_none_match=again["etag"])[0] == 304
+        assert gzip.decompress(ask(port, "/", accept_encoding="gzip")[2]) == body
+        assert ask(port, "/poster.jpg")[1]["content-type"] == "image/jpeg"
 
 
 def test_two_hundred_at_once(port: int):
@@ -333,10 +405,13 @@ def test_two_hundred_at_once(port: int):
         assert all(pool.map(fetch, range(200)))
 
 
-def test_what_does_not_move_is_dropped_and_blocks_nobody(bundle: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(site, "PATIENCE", 0.4)
+def test_what_does_not_move_is_dropped_and_blocks_nobody(
+    bundle: Path, viewer: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(connections, "PATIENCE", 0.4)
+    monkeypatch.setattr(connections, "_EVERY", 0.1)
     (bundle / "large.spz").write_bytes(bytes(30_000_000))
-    with running(site.Site(bundle)) as port:
+    with running(site.Site(bundle, viewer=viewer)) as port:
         half, stopped, silent = (socket.create_connection(("127.0.0.1", port)) for _ in range(3))
         half.sendall(b"GET / HTTP/1.1\r\nHost: local")
         stopped.sendall(b"GET /large.spz HTTP/1.1\r\nHost: localhost\r\n\r\n")
@@ -350,17 +425,116 @@ def test_what_does_not_move_is_dropped_and_blocks_nobody(bundle: Path, monkeypat
             connection.close()
 
 
-def test_no_more_connections_than_files_can_be_open(bundle: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(site, "MOST_CONNECTIONS", 2)
-    with running(site.Site(bundle)) as port:
-        idle = [socket.create_connection(("127.0.0.1", port)) for _ in range(2)]
+def slow(port: int, window: int) -> socket.socket:
+    """A connection of small buffers that asked for large.spz."""
+    connection = socket.socket()
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, window)
+    connection.connect(("127.0.0.1", port))
+    connection.sendall(b"GET /large.spz HTTP/1.1\r\nHost: localhost\r\n\r\n")
+    return connection
+
+
+@pytest.mark.parametrize("tell", [True, False])
+def test_a_download_that_moves_is_never_cut(
+    tell: bool, bundle: Path, viewer: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """At full speed its buffer is as full as before at every look; slowly read, it moves in lumps."""
+    monkeypatch.setattr(connections, "PATIENCE", 0.5)
+    monkeypatch.setattr(connections, "_EVERY", 0.1)
+    if not tell:  # as on systems that do not say what has arrived
+        monkeypatch.setattr(connections, "_acknowledged", lambda sock: 0)
+    size = 2_500_000
+    (bundle / "large.spz").write_bytes(bytes(size))
+    with running(site.Site(bundle, viewer=viewer)) as port, slow(port, 4096) as connection:
+        connection.settimeout(5)
+        got, begin = 0, time.monotonic()
+        while time.monotonic() - begin < 2.0:
+            got += len(connection.recv(2048 if tell else 65536))
+            time.sleep(0.02)
+        assert 0 < got < size
+        while got < size + 200:
+            piece = connection.recv(1 << 20)
+            if not piece:
+                break
+            got += len(piece)
+        assert got > size
+
+
+def test_a_request_has_its_time_however_it_trickles(
+    bundle: Path, viewer: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(connections, "PATIENCE", 0.5)
+    monkeypatch.setattr(connections, "_EVERY", 0.1)
+    with (
+        running(site.Site(bundle, viewer=viewer)) as port,
+        socket.create_connection(("127.0.0.1", port)) as connection,
+    ):
+        begin = time.monotonic()
+        with suppress(ConnectionError):
+            while time.monotonic() - begin < 5:
+                connection.sendall(b"G")
+                time.sleep(0.02)
+        assert time.monotonic() - begin < 2
+
+
+def test_who_leaves_stops_the_reading_of_the_file(bundle: Path, viewer: Path):
+    with (bundle / "endless.spz").open("wb") as file:
+        file.truncate(2**40)
+    listener = server.bind("127.0.0.1", 0)
+    serving = connections.make_server(site.Site(bundle, viewer=viewer))
+    thread = threading.Thread(target=serving.run, args=([listener],))
+    thread.start()
+    try:
+        with socket.create_connection(listener.getsockname()) as connection:
+            connection.sendall(b"GET /endless.spz HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            assert connection.recv(1000)
+            wait_for(lambda: len(serving.server_state.tasks) == 1)
+        wait_for(lambda: not serving.server_state.tasks, 2)
+        wait_for(lambda: not len(serving.room), 2)
+    finally:
+        serving.should_exit = True
+        thread.join(10)
+        listener.close()
+        (bundle / "endless.spz").unlink()
+
+
+def test_when_it_is_full_the_longest_idle_of_the_largest_crowd_goes(
+    bundle: Path, viewer: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(connections, "MOST", 40)
+    with running(site.Site(bundle, viewer=viewer)) as port:
+        other = socket.create_connection(("127.0.0.1", port), source_address=("127.0.0.77", 0))
+        idle = [socket.create_connection(("127.0.0.1", port)) for _ in range(120)]
+        assert ask(port, "/" + CHUNK)[2] == FILES[CHUNK]
         time.sleep(0.1)
-        with pytest.raises((ConnectionError, http.client.HTTPException)):
-            ask(port, "/")
-        for connection in idle:
+        for connection in idle[:60]:
+            assert received(connection) == 0  # closed, the oldest first
+        for connection in (other, idle[-1]):
+            connection.sendall(b"GET /LICENSES.txt HTTP/1.0\r\nHost: localhost\r\n\r\n")
+            assert received(connection) > 100
+        for connection in (other, *idle):
             connection.close()
-        time.sleep(0.1)
-        assert ask(port, "/")[0] == 200
+
+
+def test_connections_are_as_many_as_files_can_be_open(monkeypatch: pytest.MonkeyPatch):
+    resource = pytest.importorskip("resource")
+    infinite = resource.RLIM_INFINITY
+    limits = [(1024, 4096), (1024, 1024), (256, 256), (infinite, infinite), (64, 64)]
+    monkeypatch.setattr(connections, "MOST", 512)
+    found = []
+    for limit in limits:
+        now = [limit]
+        monkeypatch.setattr(resource, "getrlimit", lambda _, now=now: now[-1])
+        monkeypatch.setattr(resource, "setrlimit", lambda _, new, now=now: now.append(new))
+        found.append((connections.capacity(), now[-1]))
+    raised = [(1088, 4096), *limits[1:]]
+    assert found == list(zip((512, 480, 96, 512, 8), raised, strict=True))
+
+
+def test_addresses_that_count_as_one():
+    peer = connections._peer
+    assert peer("::ffff:10.0.0.1") == peer("10.0.0.1") != peer("10.0.0.2")
+    assert peer("2001:db8:1:2::1") == peer("2001:db8:1:2:ffff::9%eth0") != peer("2001:db8:1:3::1")
 
 
 def test_rubbish_is_refused_and_the_server_goes_on(port: int):
@@ -375,10 +549,13 @@ def test_rubbish_is_refused_and_the_server_goes_on(port: int):
     assert ask(port, "/")[0] == 200
 
 
-def test_a_certificate_makes_it_https(bundle: Path, tmp_path: Path):
+@pytest.fixture(scope="module")
+def pem(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A certificate for localhost, and its key."""
     if not shutil.which("openssl"):
         pytest.skip("needs openssl to make a certificate")
-    certificate, key = tmp_path / "cert.pem", tmp_path / "key.pem"
+    folder = tmp_path_factory.mktemp("certificate")
+    certificate, key = folder / "cert.pem", folder / "key.pem"
     subprocess.run(
         [
             "openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2",
@@ -387,6 +564,34 @@ def test_a_certificate_makes_it_https(bundle: Path, tmp_path: Path):
         ],
         check=True, capture_output=True,
     )  # fmt: skip
+    return certificate, key
+
+
+def test_a_handshake_that_does_not_come_is_cut_and_nothing_is_printed(
+    bundle: Path, viewer: Path, pem: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, capfd
+):
+    monkeypatch.setattr(connections, "HANDSHAKE", 0.5)
+    monkeypatch.setattr(connections, "MOST", 40)
+    context = ssl.create_default_context(cafile=str(pem[0]))
+    with running(site.Site(bundle, viewer=viewer), certificate=pem[0], key=pem[1]) as port:
+        silent = [socket.create_connection(("127.0.0.1", port)) for _ in range(100)]
+        for number, connection in enumerate(silent):
+            with suppress(OSError):  # dropped for later ones
+                connection.sendall((b"", b"GET / HTTP/1.1\r\n\r\n", b"\x16\x03\x01\x02\x00\x01")[number % 3])
+        connection = http.client.HTTPSConnection("localhost", port, context=context, timeout=10)
+        connection.request("GET", "/" + CHUNK)
+        assert connection.getresponse().read() == FILES[CHUNK]
+        connection.close()
+        begin = time.monotonic()
+        for connection in silent:
+            received(connection)  # ends
+            connection.close()
+        assert time.monotonic() - begin < 3
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_certificate_makes_it_https(bundle: Path, tmp_path: Path, pem: tuple[Path, Path]):
+    certificate, key = pem
     context = ssl.create_default_context(cafile=str(certificate))
     view = show(bundle, print, port=0, ssl_certfile=certificate, ssl_keyfile=key)
     assert view.urls[0].startswith("https://127.0.0.1:")
@@ -489,7 +694,6 @@ def test_without_the_extra(bundle: Path, monkeypatch: pytest.MonkeyPatch):
         ({"manifest.json": b"{"}, r"manifest.json: not readable as JSON"),
         ({"manifest.json": b"[]"}, r"manifest.json: not of a sagesplat bundle"),
         ({"manifest.json": b'{"format": "other"}'}, r"manifest.json: not of a sagesplat bundle"),
-        ({"manifest.json": FILES["manifest.json"]}, r"a bundle without a viewer"),
         (
             {"scene.json": b"{}"},
             r"a run folder of format None, this sagesplat \(.*\) reads 3; run again into a new",
@@ -530,7 +734,6 @@ class Bundling(types.ModuleType):
         self.live: bytes | None = None
         self.trouble = ""
         self.viewer: dict[str, bytes] = {}
-        self.package_viewer: Callable[[], Path] = Path
 
     def bundle(self, job, out: Path) -> None:
         self.made += 1
@@ -559,7 +762,9 @@ def bundling(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Bundling:
     fake.viewer = {"index.html": b"one <!-- poster -->"}
     write_bundle(package / "viewer" / "static", fake.viewer)
     monkeypatch.setitem(sys.modules, "sagesplat.stages.bundle", fake)
-    fake.package_viewer = lambda: package / "viewer" / "static"
+    built = package / "viewer" / "static"
+    monkeypatch.setattr(stages_view, "package_viewer", lambda: built)
+    monkeypatch.setattr(site, "package_viewer", lambda: built)
     monkeypatch.setattr(stages_view, "_EVERY", 0.05)
     return fake
 
@@ -580,7 +785,17 @@ def test_a_run_s_bundle_is_made_once(tmp_path: Path, bundling: Bundling):
         assert bundling.made == 1
 
 
-@pytest.mark.parametrize("change", ["chunks", "promises", "viewer", "manifest"])
+def test_a_newer_viewer_needs_no_new_bundle(tmp_path: Path, bundling: Bundling):
+    run = write_run(tmp_path / "run")
+    with show(run, print, port=0):
+        pass
+    write_bundle(tmp_path / "package" / "viewer" / "static", {"index.html": b"two <!-- poster -->"})
+    with viewing(show(run, print, port=0)) as port:
+        assert ask(port, "/")[2].startswith(b"two")
+    assert bundling.made == 1
+
+
+@pytest.mark.parametrize("change", ["chunks", "promises", "manifest"])
 def test_and_again_when_it_is_out_of_date(tmp_path: Path, bundling: Bundling, change: str):
     run = write_run(tmp_path / "run")
     with show(run, print, port=0):
@@ -590,9 +805,6 @@ def test_and_again_when_it_is_out_of_date(tmp_path: Path, bundling: Bundling, ch
     elif change == "promises":
         time.sleep(0.02)
         (run / "nested/promises.json").write_text("{ }")
-    elif change == "viewer":
-        bundling.viewer = {"index.html": b"two <!-- poster -->"}
-        write_bundle(tmp_path / "package" / "viewer" / "static", bundling.viewer)
     else:
         (run / "bundle/manifest.json").write_text('{"format": "sagesplat-bundle", "labels": [1]}')
     for _ in range(2):
@@ -649,8 +861,11 @@ window.found = found
 
 
 @pytest.mark.skipif(browser.missing() is not None, reason=str(browser.missing()))
-def test_a_browser_lets_the_viewer_do_what_it_needs_and_no_more(tmp_path: Path):
+def test_a_browser_lets_the_viewer_do_what_it_needs_and_no_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     folder = write_bundle(tmp_path, {**FILES, "index.html": PAGE, "assets/page.js": SCRIPT})
+    monkeypatch.setattr(site, "package_viewer", lambda: folder)
     with (
         viewing(show(folder, print, port=0)) as port,
         browser.open_page(f"http://127.0.0.1:{port}/") as opened,

@@ -269,13 +269,12 @@ def write_models(path: Path, models: dict[tuple[int, int], SsimModel]) -> None:
 
 def read_models(path: Path) -> dict[tuple[int, int], SsimModel]:
     """What `write_models` wrote; DataError where the content cannot be used."""
-    document = read_json(path)
+    cure = "delete it and run `sagesplat fit` again"
+    document = read_json(path, cure)
     try:
         models = [model_from_json(entry) for entry in document["models"]]
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise DataError(
-            f"{path}: not a file of quality models ({short(repr(error))}); fit the models again"
-        ) from None
+        raise DataError(f"{path}: not a file of quality models ({short(repr(error))}); {cure}") from None
     return {(model.label_id, model.level): model for model in models}
 
 

@@ -47,7 +47,7 @@ class Evaluation:
 
 def read_evaluation(path: Path) -> Evaluation:
     """The table that `write_csv` wrote. DataError where it is not one."""
-    return read_columns(path, Evaluation, "run `sagesplat evaluate` again")
+    return read_columns(path, Evaluation, "delete it and run `sagesplat evaluate` again")
 
 
 def evaluate(

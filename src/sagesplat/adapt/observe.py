@@ -50,7 +50,7 @@ class Observations:
 
 def read_observations(path: Path) -> Observations:
     """The table that `write_csv` wrote. DataError where it is not one."""
-    return read_columns(path, Observations, "run `sagesplat observe` again")
+    return read_columns(path, Observations, "delete it and run `sagesplat observe` again")
 
 
 def large_enough(observations: Observations, scene: Scene, min_share: float) -> Observations:

@@ -19,6 +19,7 @@ from sagesplat.io.files import read_json, write_json
 Models = Mapping[tuple[int, int], SsimModel]  # by (label id, level)
 Counts = Mapping[tuple[int, int], int]  # Gaussians of each (label id, level)
 
+_CURE = "delete it and run `sagesplat plan` again"
 STATUSES = ("ok", "infeasible", "no model")
 
 
@@ -255,7 +256,7 @@ def write_plans(
 
 def read_plans(path: Path) -> tuple[tuple[Plan, ...], tuple[Plan, ...]]:
     """The scene's plans and the single views' that `write_plans` wrote; DataError for unusable content."""
-    document = read_json(path)
+    document = read_json(path, _CURE)
     with _usable(path):
         scene_plans = tuple(_from_json(entry) for entry in document["scene"])
         view_plans = tuple(_from_json(entry) for entry in document["views"])
@@ -264,7 +265,7 @@ def read_plans(path: Path) -> tuple[tuple[Plan, ...], tuple[Plan, ...]]:
 
 def read_budget_plan(path: Path) -> Plan | None:
     """The plan for a budget, if there is one; DataError for unusable content."""
-    document = read_json(path)
+    document = read_json(path, _CURE)
     with _usable(path):
         return _from_json(document["budget"]) if "budget" in document else None
 
@@ -274,7 +275,7 @@ def _usable(path: Path) -> Iterator[None]:
     try:
         yield
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise DataError(f"{path}: not a file of plans ({short(repr(error))}); plan again") from None
+        raise DataError(f"{path}: not a file of plans ({short(repr(error))}); {_CURE}") from None
 
 
 def _to_json(plan: Plan) -> dict[str, Any]:

@@ -452,11 +452,12 @@ def write_promises(path: Path, models: Mapping[int, ViewModel]) -> None:
 
 def read_promises(path: Path) -> dict[int, ViewModel]:
     """What `write_promises` wrote; DataError where the content cannot be used."""
-    document = read_json(path)
+    cure = "delete it and run `sagesplat fit` again"
+    document = read_json(path, cure)
     try:
         models = [_from_json(entry) for entry in document["promises"]]
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise DataError(f"{path}: not a file of promises ({short(repr(error))}); fit them again") from None
+        raise DataError(f"{path}: not a file of promises ({short(repr(error))}); {cure}") from None
     return {model.label_id: model for model in models}
 
 

@@ -11,11 +11,18 @@ from sagesplat.cli import stages, studies, tools  # noqa: F401  (their commands 
 from sagesplat.cli.base import COMMANDS
 from sagesplat.cli.help import help_of
 from sagesplat.cli.parse import arguments, current_command
+from sagesplat.cli.say import print_any_character, say
+from sagesplat.core import signals
 from sagesplat.core.errors import SageError
+from sagesplat.core.memory import named_memory
+from sagesplat.io.files import CURES
+
+_CHECK = "check the path, its rights and the disk"
 
 
 def main() -> None:
     """Run a command; errors that a user can cause are one line and exit code 2."""
+    print_any_character()
     name, *words = sys.argv[1:] or ["--help"]
     if name in ("-h", "--help", "--version"):
         print(f"sagesplat {__version__}" if name == "--version" else _overview())
@@ -28,16 +35,17 @@ def main() -> None:
         print(help_of(name, function, everything="--help-all" in words))
         raise SystemExit(0)
     try:
-        function(**arguments(name, function, words))
+        with named_memory(f"sagesplat {name}"):
+            function(**arguments(name, function, words))
     except SageError as error:
         _fail(str(error))
-    except KeyboardInterrupt:
-        _fail("interrupted; finished stages and checkpoints are kept: run the same command again to resume")
+    except KeyboardInterrupt as error:
+        signals.leave(error)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except OSError as error:
         where = error.filename or "input/output"
-        _fail(f"{where}: {error.strerror or error}; check the path, its rights and the disk")
+        _fail(f"{where}: {error.strerror or error}; {CURES.get(error.errno or 0, _CHECK)}")
 
 
 def _overview() -> str:
@@ -51,5 +59,5 @@ def _overview() -> str:
 
 
 def _fail(message: str) -> NoReturn:
-    print(f"sagesplat: {' '.join(message.split())}", file=sys.stderr)
+    say(f"sagesplat: {' '.join(message.split())}", file=sys.stderr)
     raise SystemExit(2)

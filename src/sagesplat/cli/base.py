@@ -91,17 +91,18 @@ def open_job(run: Path, options: Redo | Device, ladder: LadderKind = "nested") -
     """A job on a run folder, shown on the console; options that a command does not have are the defaults."""
     from sagesplat.cli.console import Console
     from sagesplat.run.job import Job
-    from sagesplat.run.run_dir import RunDir
+    from sagesplat.run.run_dir import RunDir, check_links
 
+    check_links(run)
     machine = Machine(**vars(options))
     if not machine.memory_limit >= 0:
         raise RunError(f"--memory-limit {machine.memory_limit} is impossible; choose GiB, such as 8")
     limit = int(machine.memory_limit * 2**30)
     with computing(machine, run) as (backend, threads, executor), Console() as console, ExitStack() as locks:
         if backend == "cuda":
-            console.out.print("[dim]· computing on the GPU[/]")
+            console.note("computing on the GPU")
         if machine.executor != "local":
-            console.out.print(f"[dim]· on a Ray cluster, {executor.parallel} tasks at once[/]")
+            console.note(f"on a Ray cluster, {executor.parallel} tasks at once")
         folder = RunDir(run, ladder)
         yield Job(
             folder, console, backend, threads, machine.force, machine.processes, machine.device,

@@ -8,6 +8,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console as RichConsole
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn, TextColumn
 from rich.table import Table
+from rich.text import Text
 
 from sagesplat.cli.layout import duration, fitted
 from sagesplat.core.events import (
@@ -21,6 +22,7 @@ from sagesplat.core.events import (
     Warned,
 )
 from sagesplat.core.events import Progress as ProgressEvent
+from sagesplat.core.names import visible
 
 LABELS_SHOWN = 4  # categories whose counts the training bar shows
 _REFRESH = 0.2  # seconds between two updates of the bar
@@ -51,17 +53,21 @@ class Remaining:
 
 
 class Console:
-    """Shows a run; used as a context manager and called with each event."""
+    """Shows a run; used as a context manager and called with each event.
+
+    What events hold is printed as it is: rich's markup and emoji codes mean nothing in names and paths, and
+    what a terminal would obey is shown (`names.visible`).
+    """
 
     def __init__(self, output: RichConsole | None = None):
         self.out = output or RichConsole(highlight=False)
         self._bar = Progress(
             SpinnerColumn(),
-            TextColumn("{task.description:9}"),
+            TextColumn("{task.description:9}", markup=False),
             BarColumn(bar_width=24),
             TaskProgressColumn(),
-            TextColumn("{task.fields[left]}"),
-            TextColumn("{task.fields[text]}"),
+            TextColumn("{task.fields[left]}", markup=False),
+            TextColumn("{task.fields[text]}", markup=False),
             console=self.out,
             transient=True,
             disable=not self.out.is_terminal,
@@ -84,11 +90,11 @@ class Console:
             case StageStarted(name):
                 if self._task is not None:  # of a stage that failed
                     self._bar.remove_task(self._task)
-                self._task = self._bar.add_task(name, total=None, text="", left="")
+                self._task = self._bar.add_task(visible(name), total=None, text="", left="")
                 self._shown, self._mark = time.monotonic(), 0
                 self._remaining = Remaining()
             case StageSkipped(name):
-                self.out.print(f"[dim]· {name:9} up to date[/]")
+                self.note(f"{name:9} up to date")
             case ProgressEvent(name, done, total, text):
                 self._advance(name, done, total, text)
             case Training(step, total, loss, counts, num):
@@ -97,32 +103,34 @@ class Console:
                 text = f"step {step} loss {loss:.3f} · {num / 1000:.1f}k Gaussians {by_label}"
                 self._advance("train", step, total, text)
             case Warned(text):
-                self.out.print(f"[yellow]! {text}[/]", soft_wrap=True)
+                self.say(f"! {text}", style="yellow")
             case StageDone(name, seconds, lines):
                 if self._task is not None:
                     self._bar.remove_task(self._task)
                     self._task = None
-                self.out.print(
-                    f"[green]✓[/] {name:9} {seconds:6.1f} s  {lines[0] if lines else ''}", soft_wrap=True
-                )
+                self.say(f" {name:9} {seconds:6.1f} s  {lines[0] if lines else ''}", mark=("✓", "green"))
                 for line in lines[1:]:
-                    self.out.print(f"{'':21}{line}", soft_wrap=True)
+                    self.say(f"{'':21}{line}")
             case TableMade(title, header, rows):
                 self._show_table(title, header, rows)
             case RunDone(report, run):
-                self.out.print(f"Report: {report.resolve()}", soft_wrap=True)
+                self.say(f"Report: {report.resolve()}")
                 if run:
-                    self.out.print(f"Walk through it: {_program()} view {run}", soft_wrap=True)
+                    self.say(f"Walk through it: {_program()} view {run}")
 
-    def say(self, text: str) -> None:
-        """Print a line."""
-        self.out.print(text, soft_wrap=True, markup=False)
+    def say(self, text: str, style: str = "", mark: tuple[str, str] = ("", "")) -> None:
+        """Print a line in a style, after a mark (text, style) of another."""
+        self.out.print(Text.assemble(mark, (visible(text), style)), soft_wrap=True)
+
+    def note(self, text: str) -> None:
+        """Print a line that matters little."""
+        self.say(f"· {text}", style="dim")
 
     def ask(self, question: str) -> bool:
         """Ask on the terminal; anything but yes is no."""
         self._bar.stop()
         try:
-            return self.out.input(f"{question} [y/N] ", markup=False).strip().lower() in ("y", "yes")
+            return self.out.input(Text(f"{visible(question)} [y/N] ")).strip().lower() in ("y", "yes")
         except EOFError:
             return False
         finally:
@@ -130,14 +138,15 @@ class Console:
 
     def _show_table(self, title: str, header: tuple[str, ...], rows: tuple[tuple[str, ...], ...]) -> None:
         """Print a table, in parts if it is wider than the terminal."""
-        self.out.print(title, style="bold", markup=False)
-        for heads, cells in fitted(header, rows, self.out.width):
+        self.out.print(Text(visible(title), "bold"))
+        shown = [[visible(cell) for cell in row] for row in (header, *rows)]
+        for heads, cells in fitted(shown[0], shown[1:], self.out.width):
             table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
             for index, column in enumerate(heads):
-                table.add_column(column, justify="left" if index == 0 else "right", no_wrap=True)
+                table.add_column(Text(column), justify="left" if index == 0 else "right", no_wrap=True)
             for row in cells:
-                table.add_row(*row)
-            self.out.print(table, markup=False)
+                table.add_row(*map(Text, row))
+            self.out.print(table)
             self.out.print()
 
     def _advance(self, name: str, done: int, total: int, text: str) -> None:
@@ -148,7 +157,7 @@ class Console:
             if self._task is not None and (now - self._shown > _REFRESH or done == total):
                 self._shown = now
                 shown = "" if left is None else f"{duration(left)} left"
-                self._bar.update(self._task, completed=done, total=total, text=text, left=shown)
+                self._bar.update(self._task, completed=done, total=total, text=visible(text), left=shown)
             return
         share = 100 * done // total
         mark = max((m for m in _MARKS if m <= share), default=0)

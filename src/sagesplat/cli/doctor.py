@@ -17,11 +17,13 @@ from typing import Literal
 import numpy as np
 import torch
 from rich.console import Console
-from rich.markup import escape
+from rich.text import Text
 
 from sagesplat import __version__
+from sagesplat.cli.say import say
 from sagesplat.core.errors import SageError
 from sagesplat.core.gaussians import Gaussians
+from sagesplat.core.names import visible
 from sagesplat.metrics.lpips import weights_path
 from sagesplat.raster import Backend, cuda, rasterize
 from sagesplat.scene.scene import Camera
@@ -33,7 +35,7 @@ _REPAIRS = {
     "cuda": "delete gsplat_cuda in ~/.cache/torch_extensions, then sagesplat doctor --build",
 }
 
-_MARKS = {"fine": "[green]✓[/]", "gap": "[yellow]·[/]", "broken": "[red]✗[/]"}
+_MARKS = {"fine": ("✓", "green"), "gap": ("·", "yellow"), "broken": ("✗", "red")}
 
 
 @dataclass(frozen=True)
@@ -209,7 +211,7 @@ def gsplat_kernels(build: bool) -> Finding:
             with redirect_stdout(sys.stderr):  # gsplat tells how it goes; standard output may be JSON
                 cuda.kernels()
         except SageError as problem:
-            print(problem.__cause__ or "", file=sys.stderr)
+            say(*str(problem.__cause__ or "").splitlines(), file=sys.stderr)
             return Finding("cuda kernels", "gap", str(problem), "read what the compiler printed above")
     return kernels("cuda")
 
@@ -240,7 +242,7 @@ def print_findings(findings: Sequence[Finding], out: Console | None = None) -> N
     out = out or Console(highlight=False, file=sys.stdout)
     width = max(len(finding.part) for finding in findings)
     for finding in findings:
-        mark = _MARKS[finding.state]
-        out.print(f"{mark} {finding.part:{width}}  {escape(finding.text)}", soft_wrap=True)
+        text = visible(f" {finding.part:{width}}  {finding.text}")
+        out.print(Text.assemble(_MARKS[finding.state], text), soft_wrap=True)
         if finding.cure:
-            out.print(f"  {'':{width}}  [dim]→ {escape(finding.cure)}[/]", soft_wrap=True)
+            out.print(Text(f"  {'':{width}}  ").append(visible(f"→ {finding.cure}"), "dim"), soft_wrap=True)

@@ -3,6 +3,8 @@
 import textwrap
 from collections.abc import Sequence
 
+from rich.cells import cell_len
+
 _FIRST = 14  # characters that names are wrapped to, rather than splitting the table
 _PAD = 2  # characters between two columns
 
@@ -16,7 +18,7 @@ def fitted(header: Sequence[str], rows: Rows, width: int) -> list[tuple[list[str
     Every part begins with the first column (the names). Cells of the others are never cut.
     """
     names = [header[0], *(row[0] for row in rows)]
-    longest = max(map(len, names))
+    longest = max(map(cell_len, names))
     needed = [_needed(name, [row[i] for row in rows]) for i, name in enumerate(header)]
     first = max(min(longest, width - 2 - sum(n + _PAD for n in needed[1:])), min(longest, _FIRST))
     parts: list[list[int]] = [[]]
@@ -32,7 +34,7 @@ def fitted(header: Sequence[str], rows: Rows, width: int) -> list[tuple[list[str
 
 def _needed(name: str, cells: Sequence[str]) -> int:
     """Width of a column: that of its cells, and of the longest word of its header."""
-    return max([len(word) for word in name.split()] + [len(cell) for cell in cells], default=0)
+    return max(map(cell_len, [*name.split(), *cells]), default=0)
 
 
 def _part(
@@ -43,7 +45,10 @@ def _part(
 
 
 def _wrapped(text: str, width: int) -> str:
-    return "\n".join(textwrap.wrap(text, max(1, width))) if len(text) > width else text
+    if cell_len(text) <= width:
+        return text
+    letters = width if cell_len(text) == len(text) else width // 2  # of double width
+    return "\n".join(textwrap.wrap(text, max(1, letters)))
 
 
 def duration(seconds: float) -> str:

@@ -14,6 +14,7 @@ from typing import Any
 import tyro
 
 from sagesplat.cli.help import Flag, flags_of
+from sagesplat.cli.say import say
 from sagesplat.core.errors import SageError
 
 OLD_COMMANDS = {"online": "early-stopping", "parts": "block-categories"}
@@ -65,7 +66,7 @@ def _renamed(words: Sequence[str]) -> list[str]:
 
 
 def _say(text: str) -> None:
-    print(f"sagesplat: {text}", file=sys.stderr)
+    say(f"sagesplat: {text}", file=sys.stderr)
 
 
 def _parse(name: str, function: Callable[..., None], words: Sequence[str]) -> dict[str, Any]:
@@ -144,14 +145,17 @@ def _recorded(
     if not isinstance(path, Path) or not (path / "provenance").is_dir():
         return {}
     from sagesplat.run.recorded import recorded_ladder, recorded_settings
-    from sagesplat.run.run_dir import RunDir
+    from sagesplat.run.run_dir import RunDir, check_links
+
+    check_links(path)
 
     given = {word.partition("=")[0].replace("_", "-").replace("--no-", "--") for word in words}
     ladder = values.get("ladder") if "--ladder" in given else recorded_ladder(path)
     known = recorded_settings(RunDir(path, ladder or "nested"), of=name) | {"ladder": ladder}
     if given & _SOURCES:
         known.pop("masks", None)
-    known = {key: value for key, value in known.items() if key in values}
+    # `labels` are settings of one command, and names of categories in another
+    known = {key: value for key, value in known.items() if isinstance(value, type(values.get(key, ...)))}
     changed = [
         _typed(flag, now)
         for flag in flags_of(function)

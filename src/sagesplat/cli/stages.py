@@ -19,6 +19,7 @@ from sagesplat.cli.base import (
     command,
     open_job,
 )
+from sagesplat.cli.say import say
 from sagesplat.core.config import (
     BlocksConfig,
     FitConfig,
@@ -45,7 +46,7 @@ def info(scene: Scene, scene_config: Annotated[SceneConfig, Flat] = SceneConfig(
     rows = describe(load_scene(scene, **asdict(scene_config)))
     width = max(len(name) for name, _ in rows)
     for name, value in rows:
-        print(f"{name:{width}}  {value}")
+        say(f"{name:{width}}  {value}")
 
 
 @command

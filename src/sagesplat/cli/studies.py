@@ -7,6 +7,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from sagesplat.cli.base import Compute, Flat, Ladder, Machine, Parallel, Run, command, computing, open_job
+from sagesplat.cli.say import say
 from sagesplat.core.config import CompareConfig
 
 
@@ -50,7 +51,7 @@ def transfer(
         table, line = evaluate_transfer(job_a, job_b, out, targets, lpips)
         table = table.only("split", "predictor", "ssim error", "iteration error", "hit", "regret share")
         job_b.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
-    print(f"{line}\n{out}")
+    say(line, out)
 
 
 @command
@@ -80,7 +81,7 @@ def early_stopping(
         pipeline.observe_snapshots(job_full)
         table, _ = compare_early_stopping(job_stopped, job_full, out)
         job_stopped.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
-    print(out)
+    say(out)
 
 
 @command
@@ -120,7 +121,7 @@ def sweep(
     from sagesplat.studies.sweep.file import read_sweep
     from sagesplat.studies.sweep.run import run_sweep
 
-    cells = read_sweep(file, lambda text: print(f"sagesplat: {text}", file=sys.stderr))
+    cells = read_sweep(file, lambda text: say(f"sagesplat: {text}", file=sys.stderr))
     with computing(machine, out / "runs") as (backend, threads, executor), Console() as console:
         run_sweep(cells, out, console, backend, threads, machine.force, executor)
-    print(out / "summary.md")
+    say(out / "summary.md")

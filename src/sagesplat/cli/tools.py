@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from sagesplat.cli.base import Compute, Device, Flat, Ladder, Run, command, open_job
+from sagesplat.cli.say import say
 from sagesplat.core.config import BundleConfig
 from sagesplat.core.errors import BackendUnavailable, RunError
 
@@ -40,7 +41,7 @@ def export(
             count = export_increments(job, out, chunks)
         else:
             count = export_ply(job, out, level=level, labels=labels, target=target_ssim)
-    print(f"{out}: {count:,} {'chunks' if chunks else 'Gaussians'}")
+    say(f"{out}: {count:,} {'chunks' if chunks else 'Gaussians'}")
 
 
 @command
@@ -84,9 +85,9 @@ def download(
         if what == "lpips":
             found = download_lpips(folder, on_progress=progress)
         else:
-            print(find_scene(what).licence, file=sys.stderr)
+            say(find_scene(what).licence, file=sys.stderr)
             found = [download_scene(what, folder or Path(), scale=scale, on_progress=progress)]
-    print("\n".join(map(str, found)))
+    say(*found)
     if what != "lpips" and (factor := scale or find_scene(what).scale) > 1:
         print(f"train with --downscale {factor}", file=sys.stderr)
 
@@ -130,7 +131,7 @@ def bundle(
     with open_job(run, machine) as job:
         made = write(job, out, **asdict(config))
     megabytes = f"{made.sizes.chunks / 1e6:.1f} MB of {made.sizes.total / 1e6:.1f} MB"
-    print(f"{out}: {made.labels} categories, {made.chunks} chunks, {made.count:,} Gaussians, {megabytes}")
+    say(f"{out}: {made.labels} categories, {made.chunks} chunks, {made.count:,} Gaussians, {megabytes}")
 
 
 @command
@@ -162,5 +163,5 @@ def view(
         Console() as console,
         show(path, console, port=port, host=host, follow=follow, **certificate) as shown,
     ):
-        print(*shown.urls, shown.hint, "Ctrl-C ends it", sep="\n", flush=True)
+        say(*shown.urls, shown.hint, "Ctrl-C ends it")
         shown.run(browser)

@@ -67,6 +67,8 @@ class MasksConfig:
     """Photos per forward pass of the network."""
     soft: bool = False
     """Store the class probabilities too; label fusion then uses them."""
+    time_limit: float = 300.0
+    """Time limit for an ONNX network on a photo, seconds (0: none)."""
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ class BackendUnavailable(SageError):
 
 
 class OutOfMemory(SageError):
-    """Too little GPU memory for the requested operation."""
+    """Too little memory, of the machine or its GPU, for the requested operation."""
 
 
 def _shown(c: str) -> str:

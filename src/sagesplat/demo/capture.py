@@ -15,7 +15,7 @@ from sagesplat.demo.cameras import demo_cameras, grid_cameras
 from sagesplat.demo.points import write_points
 from sagesplat.demo.render import lit_world, render_view, threads_map
 from sagesplat.demo.world import LABELS
-from sagesplat.io.files import cache_folder, write_json
+from sagesplat.io.files import cache_folder, unwritable, write_json
 from sagesplat.scene.scene import Camera
 
 
@@ -56,7 +56,7 @@ def make_capture(
         temporary.chmod(0o755)
         temporary.rename(folder)
     except OSError as error:
-        raise SceneError(f"{folder}: cannot be written ({error.strerror}); name another folder") from error
+        raise SceneError(unwritable(folder, error)) from error
     finally:
         if temporary:
             shutil.rmtree(temporary, ignore_errors=True)

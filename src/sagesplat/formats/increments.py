@@ -14,12 +14,14 @@ from jaxtyping import Int64
 
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians, concat
+from sagesplat.core.names import slugs
 from sagesplat.formats.ply import write_ply
 from sagesplat.formats.spz import SH_BITS, encode_spz, packing_order, read_spz
 from sagesplat.io.files import atomic_folder, read_json, write_json
 
 Format = Literal["spz", "ply"]
 INDEX = "index.json"
+_CURE = "delete that folder and run `sagesplat nest` again"
 _URI = r"(?!\.)[A-Za-z0-9_.-]{1,200}"  # a plain file name
 _GPU_BYTES = (16, 24, 40, 56)  # per Gaussian in Spark 2.2, by SH degree
 
@@ -78,6 +80,7 @@ def write_increments(
     `antialiased` as in `encode_spz`.
     """
     written = []
+    stems = slugs({label: names.get(label, str(label)) for label in sizes})
     with atomic_folder(folder) as fresh:
         for label, level, rows in increments(g, sizes):
             part = g.select(torch.from_numpy(rows))
@@ -88,8 +91,7 @@ def write_increments(
                 write_ply(temporary, part, names)
             content = temporary.read_bytes()
             digest = hashlib.sha256(content).hexdigest()
-            slug = re.sub(r"[^a-z0-9]+", "-", names.get(label, str(label)).lower()).strip("-")
-            uri = f"{slug}-{level:02d}-{digest[:12]}.{kind}"
+            uri = f"{stems[label]}-{level:02d}-{digest[:12]}.{kind}"
             temporary.rename(fresh / uri)
             gpu = len(part) * _GPU_BYTES[part.sh_degree]
             written.append(Increment(label, level, uri, len(part), len(content), gpu, digest))
@@ -99,14 +101,14 @@ def write_increments(
 
 def read_index(folder: Path) -> list[Increment]:
     """The increments that `write_increments` listed; DataError for an invalid index."""
-    document: Any = read_json(folder / INDEX)
+    document: Any = read_json(folder / INDEX, _CURE)
     try:
         listed = [Increment(**entry) for entry in document["chunks"]]
         for increment in listed:
             _check(increment)
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(
-            f"{folder / INDEX}: not an index of increments ({short(repr(error))}); run `sagesplat nest` again"
+            f"{folder / INDEX}: not an index of increments ({short(repr(error))}); {_CURE}"
         ) from None
     return listed
 
@@ -127,7 +129,7 @@ def _check(increment: Increment) -> None:
 def read_increments(folder: Path, listed: Sequence[Increment]) -> Gaussians:
     """The Gaussians of SPZ increments, concatenated; DataError for a missing or damaged file."""
     if not listed:
-        raise DataError(f"{folder}: no increments; run `sagesplat nest` again")
+        raise DataError(f"{folder}: no increments; {_CURE}")
     return concat([read_spz(folder / increment.uri, increment.label_id) for increment in listed])
 
 
@@ -143,7 +145,7 @@ def totals(listed: Sequence[Increment], labels: Sequence[int], levels: int, what
         if increment.label_id not in row or increment.level > levels:
             raise DataError(
                 f"{increment.uri}: this run has no category {increment.label_id}, level {increment.level}; "
-                "run `sagesplat nest` again"
+                f"{_CURE}"
             )
         table[row[increment.label_id], increment.level - 1] += getattr(increment, what)
     return table.cumsum(1)

@@ -80,16 +80,14 @@ def read_sizes(path: Path) -> dict[int, tuple[int, ...]]:
         try:
             sizes = {label: tuple(map(int, file[f"{label}/sizes"])) for label in counts}
         except _DAMAGED as error:
-            raise DataError(
-                f"{path}: not nested levels ({short(error)}); run `sagesplat nest` again"
-            ) from None
+            raise DataError(f"{path}: not nested levels ({short(error)}); {_again(path)}") from None
     lengths = {len(s) for s in sizes.values()}
     if (
         len(lengths) != 1
         or any(s != tuple(sorted(s)) or s[0] < 0 or s[-1] != counts[i] for i, s in sizes.items() if s)
         or 0 in lengths
     ):
-        raise DataError(f"{path}: level sizes that do not fit its Gaussians; run `sagesplat nest` again")
+        raise DataError(f"{path}: level sizes that do not fit its Gaussians; {_again(path)}")
     return sizes
 
 
@@ -99,16 +97,21 @@ def read_more(path: Path, name: str) -> np.ndarray[Any, Any]:
         try:
             return file[f"more/{name}"]
         except _DAMAGED as error:
-            raise DataError(f"{path}: no {name} in it ({short(error)}); run `sagesplat nest` again") from None
+            raise DataError(f"{path}: no {name} in it ({short(error)}); {_again(path)}") from None
+
+
+def _again(path: Path) -> str:
+    """How a damaged file is made again: one that is there counts as done."""
+    if path.parent.name != "levels":
+        return "delete it and run `sagesplat nest` again"
+    return f"delete {path.parent} and the checkpoint*.npz beside it, and run `sagesplat train` again"
 
 
 def _open(path: Path) -> Npz:
     try:
         return Npz(path)
     except _DAMAGED as error:
-        raise DataError(
-            f"{path}: not a readable level ({short(error)}); run `sagesplat train` again"
-        ) from None
+        raise DataError(f"{path}: not a readable level ({short(error)}); {_again(path)}") from None
 
 
 def read_header(path: Path) -> LevelFile:
@@ -123,7 +126,7 @@ def read_header(path: Path) -> LevelFile:
             if step < 0 or not 0 <= degree <= 3 or not all(-1 <= label < 2**15 for label in labels):
                 raise ValueError(f"step {step}, degree {degree}, categories {labels}")
         except _DAMAGED as error:
-            raise DataError(f"{path}: not a level ({short(error)}); run `sagesplat train` again") from None
+            raise DataError(f"{path}: not a level ({short(error)}); {_again(path)}") from None
     return LevelFile(path, step, bool(recovering), degree, counts)
 
 
@@ -152,13 +155,13 @@ def read_level(path: Path, label_ids: Sequence[int] | None = None) -> Gaussians:
         try:
             parts = [_decode(file, label) for label in wanted]
         except _DAMAGED as error:
-            raise DataError(f"{path}: a broken level ({short(error)}); run `sagesplat train` again") from None
+            raise DataError(f"{path}: a broken level ({short(error)}); {_again(path)}") from None
     if not parts:
         return _empty(header.sh_degree)
     g = concat(parts)
     for name, parameter in g.parameters().items():
         if not torch.isfinite(parameter).all():
-            raise DataError(f"{path}: {name} holds NaN or Inf; run `sagesplat train` again")
+            raise DataError(f"{path}: {name} holds NaN or Inf; {_again(path)}")
     return g
 
 
@@ -170,7 +173,7 @@ def check_level(path: Path) -> None:
     except Exception as error:  # zipfile and zlib have a class for each kind of damage
         broken = short(error)
     if broken is not None:
-        raise DataError(f"{path}: a damaged level ({broken}); run `sagesplat train` again")
+        raise DataError(f"{path}: a damaged level ({broken}); {_again(path)}")
 
 
 def _decode(file: Npz, label: int) -> Gaussians:

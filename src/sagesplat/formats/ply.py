@@ -13,6 +13,7 @@ import torch
 from sagesplat import __version__
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians
+from sagesplat.core.names import repaired
 from sagesplat.io.files import atomic_path
 from sagesplat.io.ply_header import read_header
 
@@ -50,7 +51,9 @@ def write_ply(path: Path, gaussians: Gaussians, names: dict[int, str] | None = N
     labels = gaussians.label_ids.cpu().numpy()
     dtype = np.dtype([("values", "<f4", len(properties)), ("label", "<i2")])
     comments = [f"sagesplat {__version__}"]
-    comments += [f"label {i} {' '.join(name.split())}" for i, name in sorted((names or {}).items())]
+    comments += [
+        f"label {i} {' '.join(repaired(name, '?').split())}" for i, name in sorted((names or {}).items())
+    ]
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
     header += [f"element vertex {len(gaussians)}", *(f"property float {name}" for name in properties)]
     header += ["property short label", "end_header", ""]

@@ -1,6 +1,7 @@
-"""Tables as frozen dataclasses of equal-length numpy columns, stored as CSV."""
+"""Tables as frozen dataclasses of equal-length numpy columns, stored as CSV; cells of text in any CSV."""
 
 import csv
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -12,7 +13,19 @@ from sagesplat.core.errors import DataError, short
 from sagesplat.io.files import atomic_path
 
 _CELL = 40  # characters of a number, at most: numpy pads all cells of a column to the widest
+# what spreadsheets begin a formula with (OWASP, "CSV Injection"), and those characters in full width
+_FORMULA = re.compile("'*[=+\\-@\t\r\n\uff1d\uff0b\uff0d\uff20]")
 Columns = TypeVar("Columns")  # a dataclass whose fields are annotated with jaxtyping arrays [R]
+
+
+def text_cell(text: str) -> str:
+    """A text as a cell that no spreadsheet takes for a formula: after a ' where it begins like one."""
+    return f"'{text}" if _FORMULA.match(text) else text
+
+
+def cell_text(cell: str) -> str:
+    """The text that `text_cell` made a cell of."""
+    return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
 
 
 def write_columns(path: Path, table: Any) -> None:

@@ -12,9 +12,20 @@ from pathlib import Path
 from typing import Any
 
 from sagesplat.core.errors import RunError, short
+from sagesplat.io.lock import alone
 
 _FULL = {errno.ENOSPC: "the disk is full", errno.EDQUOT: "the quota is used up"}
+_LEFT = 2**16  # bytes; a disk with less is full, where an error has no number of its own
+CURES = {
+    errno.EROFS: "choose a place that can be written",
+    errno.EACCES: "check its rights, or choose another place",
+    errno.EPERM: "check its rights, or choose another place",
+    errno.EFBIG: "raise the limit of files (ulimit -f), or choose another disk",
+    errno.ENAMETOOLONG: "choose a shorter path",
+    errno.EMFILE: "raise the limit of open files (ulimit -n)",
+}
 _TEMPORARY = "tmp-"  # in the names of incomplete files and folders
+_STEM = 50  # characters of a file's name in that of the incomplete one, which is longer
 _MB = 10**6
 
 
@@ -36,7 +47,7 @@ def atomic_path(path: Path, *, nbytes: int = 0, sync: bool = True) -> Iterator[P
     with named_full_disk(path, nbytes):
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(
-            dir=path.parent, prefix=f".{path.stem}.{_TEMPORARY}", suffix=path.suffix
+            dir=path.parent, prefix=f".{path.stem[:_STEM]}.{_TEMPORARY}", suffix=path.suffix
         )
         os.close(handle)
         temporary = Path(name)
@@ -49,10 +60,12 @@ def atomic_path(path: Path, *, nbytes: int = 0, sync: bool = True) -> Iterator[P
             if sync:
                 _sync_folder(path.parent)
         except OSError as error:
-            if error.errno in _FULL:
+            if _number(error, path.parent) in _FULL:
                 nbytes = max(nbytes, _size(path), _size(temporary) + _MB)
                 temporary.unlink(missing_ok=True)
                 raise _full(path, error, nbytes) from error
+            if error.filename is None and error.errno is not None:
+                error.filename = str(path)  # writing says what is wrong, but not with which file
             raise
         finally:
             temporary.unlink(missing_ok=True)
@@ -64,21 +77,38 @@ def named_full_disk(path: Path, nbytes: int = 0) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno in _FULL:
+        if _number(error, path.parent) in _FULL:
             raise _full(path, error, nbytes) from error
         raise
 
 
+def _number(error: OSError, folder: Path) -> int | None:
+    """The number of an error while `folder` was written to; of one without a number, that of a full disk."""
+    if error.errno is None:
+        with suppress(OSError):
+            if shutil.disk_usage(folder).free < _LEFT:
+                return errno.ENOSPC
+    return error.errno
+
+
 def _full(path: Path, error: OSError, nbytes: int) -> RunError:
-    free = 0
+    free, number = 0, _number(error, path.parent) or errno.ENOSPC
     with suppress(OSError):
-        if error.errno == errno.ENOSPC:  # what a quota leaves cannot be queried portably
+        if number == errno.ENOSPC:  # what a quota leaves cannot be queried portably
             free = shutil.disk_usage(path.parent).free
     megabytes = max(1, math.ceil((nbytes - free) / _MB))
     return RunError(
-        f"{path}: no space left, {_FULL[error.errno or 0]}; free {megabytes:,} MB and run the same command "
+        f"{path}: no space left, {_FULL[number]}; free {megabytes:,} MB and run the same command "
         "again (nothing was lost)"
     )
+
+
+def unwritable(path: Path, error: OSError) -> str:
+    """The line for a file or folder that cannot be written: the path, why, and what to do."""
+    number = _number(error, path.parent)
+    reason = _FULL.get(number or 0) or error.strerror or short(error) or type(error).__name__
+    cure = "free some space" if number in _FULL else CURES.get(number or 0, "choose another place")
+    return f"{path}: cannot be written ({reason}); {cure}"
 
 
 def _size(path: Path) -> int:
@@ -149,35 +179,36 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 
     Its files are on the disk then: they wait for it once, together. The earlier folder is removed only after
     that: where the block or the swap fails, it is at `path`; where the process is killed in the middle of the
-    swap, it lies beside `path` and the next writer puts it back. One writer at a time. Raises RunError where
-    the disk is full.
+    swap, it lies beside `path` and the next writer puts it back. Raises RunError where the disk is full, or
+    another process or thread writes to `path` this way.
     """
     fresh, earlier = (path.with_name(f".{path.name}.{end}") for end in (f"{_TEMPORARY}new", "earlier"))
     with named_full_disk(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        if earlier.exists() and not path.exists():  # a writer was killed in the middle of the swap
-            earlier.rename(path)
-        for left in (fresh, earlier):
-            shutil.rmtree(left, ignore_errors=True)
-        try:
-            fresh.mkdir()
-            fresh.chmod(0o755)
-            yield fresh
-            sync_changed(fresh, 0)
-            _swap(fresh, path, earlier)
-        finally:
-            shutil.rmtree(fresh, ignore_errors=True)
+        with alone(path):
+            if earlier.exists() and not path.exists():  # a writer was killed in the middle of the swap
+                earlier.rename(path)
+            for left in (fresh, earlier):
+                shutil.rmtree(left, ignore_errors=True)
+            try:
+                with named_full_disk(path):  # before what was written is removed
+                    fresh.mkdir()
+                    fresh.chmod(0o755)
+                    yield fresh
+                    sync_changed(fresh, 0)
+                    _swap(fresh, path, earlier)
+            finally:
+                shutil.rmtree(fresh, ignore_errors=True)
 
 
 def _swap(fresh: Path, path: Path, earlier: Path) -> None:
     """Put `fresh` in the place of `path`, which is `earlier` meanwhile and comes back if that fails."""
-    replaces = path.exists()
-    if replaces:
-        path.rename(earlier)
     try:
+        if path.exists():
+            path.rename(earlier)
         fresh.rename(path)
     except BaseException:
-        if replaces:
+        if earlier.exists() and not path.exists():
             earlier.rename(path)
         raise
     _sync_folder(path.parent)
@@ -185,8 +216,8 @@ def _swap(fresh: Path, path: Path, earlier: Path) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Replace a text file atomically."""
-    content = text.encode()
+    """Replace a text file atomically; escapes are written for what is not UTF-8, as in some paths."""
+    content = text.encode("utf-8", "backslashreplace")
     with atomic_path(path, nbytes=len(content)) as temporary:
         temporary.write_bytes(content)
 
@@ -196,13 +227,14 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=1) + "\n")
 
 
-def read_json(path: Path) -> Any:
-    """The content of a JSON file. RunError if it is unreadable. Memory: up to 64 bytes per byte."""
+def read_json(path: Path, cure: str = "") -> Any:
+    """The content of a JSON file. RunError if it is unreadable, with a `cure`. Memory: 64 bytes per byte."""
+    cure = cure and f"; {cure}"
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise RunError(f"{path}: no such file") from None
+        raise RunError(f"{path}: no such file{cure}") from None
     except RecursionError:
-        raise RunError(f"{path}: not readable as JSON (nested too deeply)") from None
+        raise RunError(f"{path}: not readable as JSON (nested too deeply){cure}") from None
     except (OSError, ValueError) as error:
-        raise RunError(f"{path}: not readable as JSON ({short(error)})") from error
+        raise RunError(f"{path}: not readable as JSON ({short(error)}){cure}") from error

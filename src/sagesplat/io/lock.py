@@ -1,4 +1,4 @@
-"""A lock per run folder, so that only one process writes into it; released when the process ends."""
+"""Locks, so that only one process writes into a run folder or a bundle; released when the process ends."""
 
 import errno
 import json
@@ -40,6 +40,47 @@ def locked(folder: Path, wait: float = 0.0) -> Iterator[None]:
                 os.close(_held.pop(key)[0])
 
 
+@contextmanager
+def alone(path: Path, wait: float = 0.0) -> Iterator[None]:
+    """Be the only one, process or thread, that replaces `path` this way, whose folder exists.
+
+    RunError, with the name of who does, if that is another one for more than `wait` seconds. The lock is
+    a file beside `path` and is removed afterwards. On disks without locks nothing is checked.
+    """
+    file, end = path.with_name(f".{path.name}{FILE}"), time.monotonic() + wait
+    handle = None
+    while handle is None:
+        try:
+            handle = _exclusive(file)
+        except BlockingIOError:
+            if time.monotonic() >= end:
+                raise RunError(f"{path}: {_holder(file)} writes there; wait for it or stop it") from None
+            time.sleep(_AGAIN)
+    try:
+        yield
+    finally:
+        with suppress(OSError):  # Windows removes no open files
+            file.unlink()  # while it is locked: who opened it meanwhile sees that it is gone (`_exclusive`)
+        os.close(handle)
+
+
+def _exclusive(file: Path) -> int | None:
+    """The open and locked file; None where it was removed meanwhile. BlockingIOError where it is locked."""
+    handle = os.open(file, os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        _take(handle)
+    except OSError as error:
+        if error.errno in _BUSY:
+            os.close(handle)
+            raise BlockingIOError from None
+    with suppress(OSError):
+        if os.path.samestat(os.fstat(handle), file.stat()):
+            _describe(handle)
+            return handle
+    os.close(handle)
+    return None
+
+
 def _entered(folder: Path, key: Path, last: bool) -> bool:
     """Whether this process holds the lock now; RunError if it does not and this was the `last` try."""
     with _guard:
@@ -68,10 +109,15 @@ def _open(folder: Path) -> int:
         raise RunError(
             f"{path}: cannot be locked ({error.strerror}); choose a run folder on another disk"
         ) from None
+    _describe(handle)
+    return handle
+
+
+def _describe(handle: int) -> None:
+    """Write into a lock's file who holds it."""
     with suppress(OSError):  # e.g. a full disk: the lock holds without the description
         os.ftruncate(handle, 0)
         os.write(handle, json.dumps(_ourselves()).encode())
-    return handle
 
 
 def _take(handle: int) -> None:

@@ -2,6 +2,7 @@
 
 import io
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,7 @@ Colours = Mapping[int, tuple[int, int, int]]  # label id -> RGB, 0..255
 
 INK, FAINT, ACCENT = "#1d2530", "#8a94a3", "#c2410c"
 PAIR = (5.4, 4.9)  # inches, of two figures side by side
+_LONGEST = 32  # characters of a name
 STYLE: dict[Any, Any] = {
     "font.size": 9,
     "axes.titlesize": 10,
@@ -67,6 +69,16 @@ def ink(label_id: int, colours: Colours) -> tuple[float, float, float]:
     luminance = float(rgb**2.2 @ [0.2126, 0.7152, 0.0722])
     r, g, b = rgb * min(1.0, (0.32 / max(luminance, 1e-6)) ** (1 / 2.2))
     return r, g, b
+
+
+def caption(label_id: int, names: Mapping[int, str]) -> str:
+    """A category's name, cut where the figure would have no room left beside it."""
+    return shortened(name_of(label_id, names))
+
+
+def shortened(text: str) -> str:
+    """A text cut to the length that a legend or a title has room for."""
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
 
 
 def label_image(label_ids: Int[np.ndarray, "H W"], colours: Colours) -> UInt8[np.ndarray, "H W 3"]:
@@ -121,8 +133,8 @@ def ssim_over_levels(
     ordered = sorted(
         labels, key=lambda i: -last[i]
     )  # the legend from top to bottom, like the ends of the lines
-    handles = [Line2D([], [], color=INK, lw=2.4, label=name_of(TOTAL, names))]
-    handles += [Line2D([], [], color=ink(i, colours), label=name_of(i, names)) for i in ordered]
+    handles = [Line2D([], [], color=INK, lw=2.4, label=caption(TOTAL, names))]
+    handles += [Line2D([], [], color=ink(i, colours), label=caption(i, names)) for i in ordered]
     handles += [Line2D([], [], color=FAINT, label="training views")]
     handles += [Line2D([], [], color=FAINT, ls="--", label="test views (unseen)")]
     if recovering & set(levels.tolist()):
@@ -158,7 +170,7 @@ def ssim_over_distance(
             if model := models.get((label_id, level)):
                 distance = np.linspace(*model.d_range, 200)
                 axes.plot(distance, model(distance), color=shade, lw=1.6)
-        axes.set_title(name_of(label_id, names), color=ink(label_id, colours), loc="left", fontweight="bold")
+        axes.set_title(caption(label_id, names), color=ink(label_id, colours), loc="left", fontweight="bold")
     for axes in grid[len(shown) :]:
         axes.set_axis_off()
     figure.supxlabel("distance to the category (world units)", fontsize=9)
@@ -195,7 +207,7 @@ def size_by_target(
     axes.invert_yaxis()
     axes.grid(axis="y", visible=False)
     axes.set(xlabel="model size (MB, 248 bytes a Gaussian)", xlim=(0, 1.16 * whole / MB))
-    handles = [Patch(color=ink(i, colours), label=name_of(i, names)) for i in labels]
+    handles = [Patch(color=ink(i, colours), label=caption(i, names)) for i in labels]
     if any(bar[2] for bar in bars):
         handles.append(
             Patch(facecolor="#cccccc", hatch="////", edgecolor="white", label="target out of reach")
@@ -221,7 +233,7 @@ def promised_and_measured(
         axes.plot(mine.predicted[reached], mine.ssim[reached], "o", color=colour, ms=5, alpha=0.75, mew=0)
         axes.plot(mine.predicted[~reached], mine.ssim[~reached], "o", mfc="none", mec=colour, ms=5)
         if len(mine):
-            handles.append(Line2D([], [], marker="o", ls="", color=colour, label=name_of(label_id, names)))
+            handles.append(Line2D([], [], marker="o", ls="", color=colour, label=caption(label_id, names)))
     values = np.concatenate([rows.ssim, rows.predicted, np.array([0.5])])
     ends = np.array([values.min() - 0.03, min(1.0, values.max() + 0.03)])
     axes.plot(ends, ends, color=FAINT, lw=1)
@@ -294,7 +306,9 @@ def panel_strip(panel: Panel, colours: Colours) -> Figure:
 def save_figure(figure: Figure, path: Path) -> bytes:
     """Write `path` with the suffixes .png and .svg; the SVG is also returned."""
     buffer = io.BytesIO()
-    with rc_context(STYLE):
+    with rc_context(STYLE), warnings.catch_warnings():
+        # the font has no Chinese and no emoji: names in these are boxes here, and text in the tables
+        warnings.filterwarnings("ignore", message="Glyph .* missing from font")
         with atomic_path(path.with_suffix(".png")) as temporary:
             figure.savefig(temporary, format="png", dpi=160)
         figure.set_layout_engine("none")  # the layout just found also holds for the SVG

@@ -2,6 +2,7 @@
 
 import csv
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +15,7 @@ from sagesplat.adapt.evaluate import Evaluation
 from sagesplat.adapt.observe import TOTAL, Observations
 from sagesplat.adapt.plan import Counts, Plan
 from sagesplat.core.gaussians import BYTES_PER_GAUSSIAN
+from sagesplat.io.columns import text_cell
 from sagesplat.io.files import atomic_path, write_text
 from sagesplat.segment.masks import UNLABELLED, UNLABELLED_NAME
 
@@ -52,29 +54,38 @@ class Table:
         return [f"{group} {name}".strip() for group, name in zip(groups, self.header, strict=True)]
 
     def write_csv(self, path: Path) -> None:
-        """A header, then one line per row; NaN is an empty cell, marks are a last column."""
+        """A header, then one line per row; NaN is an empty cell, marks are a last column.
+
+        Text that a spreadsheet would take for a formula begins with a ' (`io.columns.cell_text` removes it).
+        """
         notes = [""] * len(self.rows)
         for (row, column), mark in sorted(self.marks.items()):
             notes[row] += f"{'; ' if notes[row] else ''}{self.columns()[column]}: {mark}"
-        with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow([*self.columns(), "marks"] if self.marks else self.columns())
-            for row, note in zip(self.rows, notes, strict=True):
-                values = ["" if _is_nan(value) else value for value in row]
-                writer.writerow([*values, note] if self.marks else values)
+        lines: list[list[str | int | float]] = [[*self.columns(), *(["marks"] if self.marks else [])]]
+        for row, note in zip(self.rows, notes, strict=True):
+            lines.append([*("" if _is_nan(v) else v for v in row), *([note] if self.marks else [])])
+        with (
+            atomic_path(path) as temporary,
+            # of a path that is not UTF-8, in an error that a table holds, escapes are written
+            temporary.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file,
+        ):
+            cells = ([text_cell(v) if isinstance(v, str) else v for v in line] for line in lines)
+            csv.writer(file).writerows(cells)
 
     def markdown(self) -> str:
         """The table in Markdown; marked cells are bold and carry their mark."""
-        columns = [name.replace("|", "\\|") for name in self.columns()]
+        columns = [markdown_text(name) for name in self.columns()]
         rules = ["---:" if spec else "---" for spec in self.formats]
         lines = [f"| {' | '.join(columns)} |", f"|{'|'.join(rules)}|"]
         for r, cells in enumerate(self.cells()):
             shown = [
-                f"**{cell}** ({self.marks[r, c]})" if (r, c) in self.marks else cell.replace("|", "\\|")
+                f"**{markdown_text(cell)}** ({markdown_text(self.marks[r, c])})"
+                if (r, c) in self.marks
+                else markdown_text(cell)
                 for c, cell in enumerate(cells)
             ]
             lines.append(f"| {' | '.join(shown)} |")
-        return "\n".join([*lines, "", *self.notes]).rstrip() + "\n"
+        return "\n".join([*lines, "", *map(markdown_text, self.notes)]).rstrip() + "\n"
 
     def latex(self) -> str:
         """The table in LaTeX (packages booktabs and, where cells are marked, xcolor with option `table`)."""
@@ -105,7 +116,7 @@ class Table:
     def write(self, stem: Path) -> None:
         """The table as `stem`.csv, .md and .tex."""
         self.write_csv(stem.with_name(stem.name + ".csv"))
-        write_text(stem.with_name(stem.name + ".md"), f"**{self.title}**\n\n{self.markdown()}")
+        write_text(stem.with_name(stem.name + ".md"), f"**{markdown_text(self.title)}**\n\n{self.markdown()}")
         write_text(stem.with_name(stem.name + ".tex"), self.latex())
 
 
@@ -360,4 +371,12 @@ _TEX |= {"^": r"\textasciicircum{}", "–": "--", "≥": r"$\geq$", "<": r"$<$",
 
 def _tex(text: str) -> str:
     """Text with LaTeX's own characters taken as they are."""
-    return "".join(_TEX.get(character, character) for character in text)
+    shown = "".join(_TEX.get(character, character) for character in text)
+    # the end of a row and a rule take a star or brackets after them for themselves
+    return f"{{{shown[0]}}}{shown[1:]}" if shown[:1] in ("[", "*") else shown
+
+
+def markdown_text(text: str) -> str:
+    """Text for Markdown, in which its own characters and those of HTML are taken as they are."""
+    text = text.replace("&", "&amp;").replace("<", "&lt;")
+    return re.sub(r"[\\|`*\[\]~$]|(?<!\w)_|_(?!\w)", r"\\\g<0>", text)

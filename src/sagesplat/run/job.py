@@ -1,7 +1,6 @@
 """A run folder being worked on, and what its stages share."""
 
-import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -13,10 +12,11 @@ from sagesplat.adapt.ladder import Ladder, SnapshotLadder, read_ladder, read_pre
 from sagesplat.core.config import FitConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit
-from sagesplat.io.files import read_json
 from sagesplat.raster import Backend
+from sagesplat.run.capture import check_photos, fingerprint, photo_hashes, read_capture
 from sagesplat.run.executor import LOCAL, Executor, Local
-from sagesplat.run.run_dir import RunDir, settings_of
+from sagesplat.run.records import settings_of
+from sagesplat.run.run_dir import RunDir
 from sagesplat.scene import load_scene
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
@@ -75,12 +75,16 @@ class Job:
             return self.source.scene
         if not self.run.scene.exists():
             raise RunError(f"{self.run.path}: {NO_RUN}")
-        made = read_json(self.run.scene)
-        scene = load_scene(Path(made["path"]), **made["settings"])
-        if fingerprint(scene) != made["fingerprint"]:
+        made = read_capture(self.run.scene)
+        scene = load_scene(made.path, **made.settings)
+        if fingerprint(scene) != made.fingerprint:
             raise RunError(
-                f"{made['path']}: the capture changed since this run began; choose another run folder"
+                f"{made.path}: the capture changed since this run began; choose another run folder"
             )
+        if made.photos is not None:
+            now = photo_hashes(self.run.photo_hashes, scene)
+            check_photos(scene, made.photos, now.sha256)
+            now.keep()
         return scene
 
     @cached_property
@@ -103,9 +107,11 @@ class Job:
     @property
     def taxonomy(self) -> Taxonomy:
         """The names of the run's categories."""
-        return Taxonomy.read(
-            (self.run.block_categories if self.has_block_categories else self.run.masks) / "labels.json"
-        )
+        return Taxonomy.read(self._labels)
+
+    @property
+    def _labels(self) -> Path:
+        return (self.run.block_categories if self.has_block_categories else self.run.masks) / "labels.json"
 
     @cached_property
     def masks(self) -> Masks:
@@ -129,7 +135,9 @@ class Job:
     def point_labels(self) -> np.ndarray:
         """Category of each SfM point."""
         path = self.run.block_category_labels if self.has_block_categories else self.run.labels
-        return LiftedLabels.read(path, len(self.scene.points.xyz)).label_ids
+        ids = LiftedLabels.read(path, len(self.scene.points.xyz)).label_ids
+        self._check_named(path, np.flatnonzero(np.bincount(ids.astype(np.int64) + 1)) - 1)
+        return ids
 
     @cached_property
     def snapshots(self) -> SnapshotLadder:
@@ -139,7 +147,21 @@ class Job:
     @cached_property
     def ladder(self) -> Ladder:
         """The levels to choose from: prefixes of the nested model, or the snapshots."""
-        return read_prefixes(self.run.prefixes) if self.run.ladder == "nested" else self.snapshots
+        nested = self.run.ladder == "nested"
+        ladder = read_prefixes(self.run.prefixes) if nested else self.snapshots
+        path = self.run.prefixes if nested else self.run.levels
+        self._check_named(path, sorted({label for label, _ in ladder.counts}))
+        return ladder
+
+    def _check_named(self, path: Path, label_ids: Iterable[int]) -> None:
+        """RunError for an id that the run's labels.json does not name."""
+        names = self.names()
+        for label in label_ids:
+            if label not in names:
+                raise RunError(
+                    f"{path}: of category {label}, which {self._labels} does not name; put back the "
+                    "labels.json that belongs to it, or run again into a new folder"
+                )
 
     @cached_property
     def antialiased(self) -> bool:
@@ -173,20 +195,3 @@ class JobSpec:
         """The job, in this process; it shares the scene and the photos of `source`."""
         made = {f.name: getattr(self, f.name) for f in fields(self)}
         return Job(emit=emit, lock_wait=_LOCK_WAIT, source=source, **made)
-
-
-def fingerprint(scene: Scene) -> str:
-    """Changes when the poses, the points or the set of photos do."""
-    digest = hashlib.sha256()
-    for view in scene.views:
-        size = view.image_path.stat().st_size
-        digest.update(f"{view.name} {size} {view.camera.width} {view.camera.height}".encode())
-        digest.update(view.camera.w2c.tobytes() + view.camera.K.tobytes())
-        if any(view.camera.background):
-            digest.update(bytes(view.camera.background))
-    digest.update(scene.points.xyz.tobytes())
-    if scene.test_names is not None:
-        digest.update("\n".join(sorted(scene.test_names)).encode())
-    if scene.calibration_names is not None:
-        digest.update("\n".join(["", *sorted(scene.calibration_names)]).encode())
-    return digest.hexdigest()

@@ -15,6 +15,7 @@ from ray.exceptions import RayError, RayTaskError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from sagesplat import __version__
+from sagesplat.core import signals
 from sagesplat.core.errors import RunError, short
 from sagesplat.core.events import Emit, Event, Warned
 from sagesplat.io.files import write_text
@@ -207,7 +208,8 @@ def connected(address: str = "") -> Iterator[Mapping[str, float]]:
     if ray.is_initialized():
         yield ray.cluster_resources()
         return
-    _connect(address or os.environ.get("RAY_ADDRESS", ""))
+    with signals.deferred():  # processes of a cluster that is half begun would stay
+        _connect(address or os.environ.get("RAY_ADDRESS", ""))
     try:
         yield ray.cluster_resources()
     finally:
@@ -218,6 +220,7 @@ def _connect(address: str) -> None:
     quiet = {"log_to_driver": False, "logging_level": logging.ERROR}
     # what happens to nodes it prints all the same, and has no setting for it; we say what matters
     ray._private.worker.print_to_stdstream = lambda *_, **__: None  # pyright: ignore
+    ray._private.utils.set_sigterm_handler = lambda _: None  # pyright: ignore  # it would leave without a line
     own = {"address": "local", "include_dashboard": False, "object_store_memory": _STORE}
     try:
         if address and address not in ("auto", "local"):

@@ -1,10 +1,7 @@
 """The settings that a run folder knows: defaults of the next command on it."""
 
-import json
-from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 from sagesplat.core.config import (
     BlocksConfig,
@@ -18,10 +15,13 @@ from sagesplat.core.config import (
     SceneConfig,
     TrainConfig,
 )
-from sagesplat.run.run_dir import FORMAT, LadderKind, RunDir
+from sagesplat.core.errors import RunError
+from sagesplat.core.typed import check_fields, fits, types_of
+from sagesplat.io.files import read_json
+from sagesplat.run.records import FORMAT
+from sagesplat.run.run_dir import LadderKind, RunDir
 
 Config = TypeVar("Config")
-_PATHS = {"masks", "classes"}  # fields of MasksConfig that are paths
 
 
 def recorded_ladder(path: Path) -> LadderKind:
@@ -46,7 +46,7 @@ def recorded_settings(run: RunDir, of: str = "run") -> dict[str, Any]:
     known: dict[str, Any] = {
         "scene_config": _config(SceneConfig, _read(run.scene).get("settings")),
         "poses": _config(PosesConfig, _made(run, "poses")),
-        "masks": _config(MasksConfig, _paths(_read(run.segmentation))),
+        "masks": _config(MasksConfig, _read(run.segmentation)),
         "labels": _config(LabelsConfig, _made(run, "masks")),
         "lift": _config(LiftConfig, _made(run, "lift")),
         "train": _config(TrainConfig, train),
@@ -54,7 +54,7 @@ def recorded_settings(run: RunDir, of: str = "run") -> dict[str, Any]:
         "nest": _config(NestConfig, nest),
         "fit": _config(FitConfig, observed),
         "plan": _config(PlanConfig, _made(run, "plan")),
-        "seed": (nest if of == "nest" and nest else train).get("seed"),
+        "seed": _seed((nest if of == "nest" and nest else train).get("seed")),
         "fuse": True if run.provenance("fuse").exists() else None,
     }
     return {name: value for name, value in known.items() if value is not None}
@@ -66,8 +66,8 @@ def stage_seconds(run: RunDir) -> dict[str, float]:
     found = {}
     for folder in folders:
         for path in sorted(folder.glob("*.json")):
-            seconds = _read(path).get("seconds")
-            if isinstance(seconds, int | float):
+            seconds: Any = _read(path).get("seconds")
+            if fits(seconds, float):
                 found[path.stem] = float(seconds)
     return found
 
@@ -75,8 +75,8 @@ def stage_seconds(run: RunDir) -> dict[str, float]:
 def _read(path: Path) -> dict[str, Any]:
     """A JSON object, empty where there is none that can be read."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        content = read_json(path)
+    except RunError:
         return {}
     return content if isinstance(content, dict) else {}
 
@@ -97,14 +97,24 @@ def _begun(run: RunDir) -> dict[str, Any]:
     return {}
 
 
-def _paths(settings: Mapping[str, Any]) -> dict[str, Any]:
-    return {k: Path(v) if k in _PATHS and v is not None else v for k, v in settings.items()}
+def _seed(value: Any) -> int | None:
+    return value if fits(value, int) else None
 
 
 def _config(kind: type[Config], settings: Any) -> Config | None:
-    """Settings of a kind from a JSON object; None where it holds none of them."""
-    if not isinstance(settings, Mapping):
+    """Settings of a kind from a JSON object; None where it holds none of them, or one of a wrong type."""
+    types = types_of(kind)
+    try:
+        values = {name: settings[name] for name in types if name in settings}
+        check_fields(values, types)
+    except (TypeError, ValueError):
         return None
-    names = [field.name for field in fields(kind)]  # pyright: ignore[reportArgumentType]
-    values = {k: tuple(v) if isinstance(v, list) else v for k, v in settings.items() if k in names}
-    return kind(**values) if values else None
+    made = {name: _plain(value, types[name]) for name, value in values.items()}
+    return kind(**made) if made else None
+
+
+def _plain(value: Any, kind: Any) -> Any:
+    """A value of a JSON file as settings have it: JSON has neither tuples nor paths."""
+    if isinstance(value, list):
+        return tuple(value)
+    return Path(value) if isinstance(value, str) and Path in get_args(kind) else value

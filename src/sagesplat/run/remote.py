@@ -1,15 +1,14 @@
 """Parts of a stage, computed in this process or by those of an executor."""
 
-import json
 import socket
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from pathlib import Path
 from typing import Any, TypeVar
 
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit
+from sagesplat.run.capture import read_capture
 from sagesplat.run.executor import Local, Task
 from sagesplat.run.job import Job, JobSpec
 
@@ -50,7 +49,7 @@ def _piece(spec: JobSpec, function: Callable[[Job, Any], Any], part: Any, emit: 
 @lru_cache(maxsize=1)
 def _kept(spec: JobSpec, scene: bytes) -> Job:
     """A job whose scene and photos successive tasks share; `scene`: content of scene.json."""
-    capture = Path(json.loads(scene)["path"])
+    capture = read_capture(spec.run.scene).path
     if not capture.exists():
         raise RunError(
             f"{capture}: {socket.gethostname()} does not see the capture; all nodes need it under this path, "

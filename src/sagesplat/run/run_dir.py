@@ -1,18 +1,11 @@
-"""A run folder: the names of everything in it, and what each result was made from."""
+"""The names of everything in a run folder."""
 
-import hashlib
-import json
 import os
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-from sagesplat import __version__
 from sagesplat.core.errors import RunError
-from sagesplat.io.files import read_json, write_json
-
-FORMAT = 3  # of the run folder; raised when older folders can no longer be read
 
 LadderKind = Literal["nested", "snapshots"]
 # stages that all ladders of a run share
@@ -27,6 +20,27 @@ _BEFORE_LADDERS = (
     "fuse",
     "block_categories",
 )
+
+
+def check_links(folder: Path) -> None:
+    """RunError for a link below a run folder that leads out of it.
+
+    Run folders come from other people too: through such a link they would name files to read and to replace.
+    What is meant to lie elsewhere is named by an absolute path: the capture, in scene.json.
+    """
+    root, todo = os.path.join(os.path.realpath(folder), ""), [str(folder)]
+    while todo:
+        try:
+            with os.scandir(todo.pop()) as entries:
+                for entry in entries:
+                    if entry.is_symlink() and not os.path.realpath(entry.path).startswith(root):
+                        raise RunError(
+                            f"{entry.path}: a link out of the run folder; put the file or folder itself there"
+                        )
+                    if entry.is_dir(follow_symlinks=False):
+                        todo.append(entry.path)
+        except (FileNotFoundError, NotADirectoryError):  # not made yet, or removed by a run at work
+            continue
 
 
 @dataclass(frozen=True)
@@ -45,6 +59,16 @@ class RunDir:
     def scene(self) -> Path:
         """Where the capture is and how it is read."""
         return self.path / "scene.json"
+
+    @property
+    def photo_hashes(self) -> Path:
+        """Sizes, times and hashes of the photos, when they were last looked at."""
+        return self.path / "photos.json"
+
+    @property
+    def source_hashes(self) -> Path:
+        """The same of the photos, or the video, that the poses were estimated from."""
+        return self.path / "source.json"
 
     @property
     def masks(self) -> Path:
@@ -209,144 +233,3 @@ class RunDir:
         """What a stage's result was made from."""
         folder = self.path if stage in _BEFORE_LADDERS else self.adapted
         return folder / "provenance" / f"{stage}.json"
-
-
-def file_hash(path: Path) -> str:
-    """SHA-256 of a file, or of all files of a folder with their names."""
-    digest = hashlib.sha256()
-    for file in sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]:
-        if path.is_dir():
-            digest.update(str(file.relative_to(path)).encode())
-        with file.open("rb") as stream:
-            digest.update(hashlib.file_digest(stream, "sha256").digest())
-    return digest.hexdigest()
-
-
-def input_hashes(run: RunDir, inputs: Sequence[Path]) -> dict[str, str]:
-    """SHA-256 of each input, by its path relative to the run folder: a run may be moved as a whole.
-
-    Of a stage's record all but its seconds counts: they differ each time that a stage is done.
-    """
-    return {Path(os.path.relpath(path, run.path)).as_posix(): _input_hash(path) for path in inputs}
-
-
-def _input_hash(path: Path) -> str:
-    if path.parent.name != "provenance":
-        return file_hash(path)
-    kept = {key: value for key, value in _read_record(path).items() if key != "seconds"}
-    return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
-
-
-def checkpoint_key(run: RunDir, settings: Mapping[str, Any], inputs: Sequence[Path]) -> str:
-    """What a stage's checkpoint is kept with: training resumes only with these settings and inputs."""
-    return json.dumps({"settings": dict(settings), "inputs": input_hashes(run, inputs)})
-
-
-class _NoRecord(RunError):
-    """A file that is not the record of a stage."""
-
-
-def _read_record(path: Path) -> dict[str, Any]:
-    """A stage's record; RunError for anything else, and for a run folder of another format."""
-    wrong = _NoRecord(f"{path}: not the record of a stage; run that stage again with --force")
-    try:
-        made = read_json(path)
-    except RunError:
-        raise wrong from None
-    if not isinstance(made, dict):
-        raise wrong
-    check_format(path, made)
-    if not all(isinstance(made.get(part), dict) for part in ("settings", "inputs")):
-        raise wrong
-    return made
-
-
-def check_format(path: Path, made: Mapping[str, Any]) -> None:
-    """RunError unless a record, which was read from `path`, is of the format that is read here."""
-    if made.get("format") != FORMAT:
-        raise RunError(
-            f"{path}: from a run folder of format {made.get('format')}, this sagesplat ({__version__}) reads "
-            f"{FORMAT}; run again into a new folder"
-        )
-
-
-def is_done(
-    run: RunDir,
-    stage: str,
-    settings: Mapping[str, Any],
-    inputs: Sequence[Path] | None,
-    outputs: Sequence[Path],
-    force: bool,
-) -> bool:
-    """Whether a stage's result is there, made with exactly these settings from exactly these inputs.
-
-    Without `inputs` only the settings are compared: for a look ahead, before the inputs are made. A result
-    made otherwise is never overwritten without `force`: RunError says what differs.
-    """
-    if not run.provenance(stage).exists():
-        return False
-    try:
-        made = _read_record(run.provenance(stage))
-    except _NoRecord:
-        if force:
-            return False
-        raise
-    if not all(p.exists() for p in outputs):
-        return False
-    differs = _differences(made, settings, made["inputs"] if inputs is None else input_hashes(run, inputs))
-    if not differs:
-        return True
-    if not force:
-        raise RunError(
-            f"{outputs[0]}: made with other {differs}; choose another run folder, or add --force to redo it"
-        )
-    return False
-
-
-def settings_of(run: RunDir, stage: str) -> dict[str, Any]:
-    """The settings that a finished stage was made with."""
-    return _record_of(run, stage)["settings"]
-
-
-def is_made_from(run: RunDir, stage: str, path: Path) -> bool:
-    """Whether a finished stage's result was made from a file as it is now."""
-    name, digest = next(iter(input_hashes(run, [path]).items()))
-    return _record_of(run, stage)["inputs"].get(name) == digest
-
-
-def _record_of(run: RunDir, stage: str) -> dict[str, Any]:
-    if not run.provenance(stage).exists():
-        raise RunError(f"{run.path}: stage {stage} is not done; run `sagesplat {stage}` or `sagesplat run`")
-    return _read_record(run.provenance(stage))
-
-
-def _differences(made: Mapping[str, Any], settings: Mapping[str, Any], inputs: Mapping[str, str]) -> str:
-    """A few words on what changed since a result was made; empty = nothing."""
-    old, new = made["settings"], settings
-    changed = [
-        f"{k} ({old.get(k, 'not set')} then, {new.get(k, 'not set')} now)"
-        for k in [*new, *(k for k in old if k not in new)]
-        if k not in old or k not in new or old[k] != new[k]
-    ]
-    old, new = made["inputs"], inputs
-    changed += [f"{name} (its content changed)" for name in new if name in old and old[name] != new[name]]
-    changed += [f"{name} (not used then)" for name in new if name not in old]
-    changed += [f"{name} (not used any more)" for name in old if name not in new]
-    return ", ".join(changed[:3])
-
-
-def record(
-    run: RunDir, stage: str, settings: Mapping[str, Any], inputs: Sequence[Path], seconds: float
-) -> None:
-    """Write down what a finished stage's result was made from."""
-    write_json(
-        run.provenance(stage),
-        {
-            "format": FORMAT,
-            "stage": stage,
-            "version": __version__,
-            "seconds": round(seconds, 2),
-            "settings": dict(settings),
-            "inputs": input_hashes(run, inputs),
-        },
-    )

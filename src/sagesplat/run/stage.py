@@ -8,12 +8,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from sagesplat.core.errors import RunError, SageError
+from sagesplat.core.errors import RunError
 from sagesplat.core.events import StageDone, StageSkipped, StageStarted
-from sagesplat.io.files import named_full_disk, read_json, remove_temporary, sync_changed
+from sagesplat.core.memory import named_memory
+from sagesplat.io.files import named_full_disk, remove_temporary, sync_changed
 from sagesplat.io.lock import locked
 from sagesplat.run.job import NO_RUN, Job
-from sagesplat.run.run_dir import is_done, record
+from sagesplat.run.records import is_done, read_record, record
 
 _CLOCK_STEP = 2.0  # seconds: some disks keep no finer time
 # Stages that are made of earlier results within minutes: they follow those without --force, as long as
@@ -65,6 +66,7 @@ def run_stage(
         RunError: If an input is missing, the result was made with other settings (without `job.force`),
             another process works on the folder, or the disk is full. What was finished stays: the same
             command resumes.
+        OutOfMemory: If memory runs out; the same holds.
     """
     run_stages(job, [Stage(name, settings, inputs, outputs, swaps)], lambda _: iter([(0, make())]))
 
@@ -82,7 +84,8 @@ def run_stages(
     missing = [number for number, stage in enumerate(stages) if not _is_done(job, stage)]
     if not missing:
         return
-    with ExitStack() as own, named_full_disk(job.run.path):
+    where = f"{job.run.path}: {stages[missing[0]].name}"
+    with ExitStack() as own, named_full_disk(job.run.path), named_memory(where):
         (job.locks or own).enter_context(locked(job.run.path, job.lock_wait))
         remove_temporary(job.run.path, but="bundle")  # a viewer writes those, without the lock
         for number in missing:
@@ -126,7 +129,6 @@ def _follows(job: Job, stage: Stage) -> bool:
     if stage.name not in _DERIVED or not record.exists():
         return False
     try:
-        made = read_json(record)
-    except SageError:  # a broken record is told where it is compared
+        return read_record(record)["settings"] == stage.settings
+    except RunError:  # a broken record is told where it is compared
         return False
-    return isinstance(made, dict) and made.get("settings") == stage.settings

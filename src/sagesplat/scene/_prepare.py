@@ -3,7 +3,6 @@
 import hashlib
 import os
 import re
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,11 +10,15 @@ from typing import Any
 
 from PIL import Image, ImageOps
 
+from sagesplat.core.names import cleaned, clipped, collision_key
 from sagesplat.io.files import atomic_path, link
+from sagesplat.io.pictures import PictureError, open_picture
 from sagesplat.scene.detect import PHOTOS
-from sagesplat.scene.images import _rgb
+from sagesplat.scene.images import as_rgb
 
+_LONGEST, _ROOM = 250, 30  # bytes of a name, and what is left of them for suffixes
 _ORIENTATION, _MAKER, _MODEL, _DETAILS, _FOCAL, _FOCAL_35 = 0x0112, 0x010F, 0x0110, 0x8769, 0x920A, 0xA405
+_LARGEST_EXIF = 2**20  # bytes
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,6 @@ def prepare_photos(
     """
     paths = _list(source, skipped)
     target.mkdir(parents=True, exist_ok=True)
-    _register_heif()
     photos: list[PreparedPhoto] = []
     unreadable: dict[str, str] = {}
     taken: set[str] = set()
@@ -50,8 +52,8 @@ def prepare_photos(
         key = hashlib.sha256(os.fsencode(path.relative_to(source))).hexdigest()[:16]
         try:
             prepared, camera, state = _prepare_photo(path, target, key)
-        except _Unreadable as error:
-            unreadable[name] = f"unreadable: {error}"
+        except PictureError as error:
+            unreadable[name] = f"unreadable: {error.reason}; {error.cure or 'replace or remove it'}"
         else:
             final = _free(name, prepared.suffix, taken)
             photos.append(PreparedPhoto(name, prepared.name, final, camera, state))
@@ -82,43 +84,43 @@ def _by_number(path: Path) -> list[tuple[int, str]]:
 
 
 def _clean(name: str) -> str:
-    """The name without control characters and invalid Unicode, which COLMAP and JSON cannot hold."""
-    return re.sub(r"[\x00-\x1f\x7f\ud800-\udfff]", "_", name)
+    """The path as COLMAP, JSON and `check_photo` take it: without control characters and invalid Unicode.
+
+    A long name is cut, and told from others by a hash, so that something can be added to it.
+    """
+    *folders, file = cleaned(name).split("/")
+    stem, dot, suffix = file.rpartition(".")
+    if len(stem.encode()) > _LONGEST - _ROOM:
+        digest = hashlib.sha256(os.fsencode(name)).hexdigest()[:8]
+        file = f"{clipped(stem, _LONGEST - 2 * _ROOM)}_{digest}{dot}{suffix}"
+    return "/".join([*(clipped(folder, _LONGEST) for folder in folders), file])
 
 
 def _free(name: str, suffix: str, taken: set[str]) -> str:
     """The name with `suffix` and a stem that is not in `taken`: label images are named by stems."""
     stem, _, old = name.rpartition(".")
     fits = old.lower() in (("png",) if suffix == ".png" else ("jpg", "jpeg"))
-    if stem.casefold() in taken:
+    if collision_key(stem) in taken:
         stem = f"{stem}_{old.lower()}"
-    while stem.casefold() in taken:
+    while collision_key(stem) in taken:
         stem += "_"
-    taken.add(stem.casefold())
+    taken.add(collision_key(stem))
     return f"{stem}.{old}" if fits else stem + suffix
 
 
-class _Unreadable(Exception):
-    """A photo that cannot be decoded."""
-
-
 def _prepare_photo(path: Path, folder: Path, key: str) -> tuple[Path, tuple[Any, ...], tuple[int, int]]:
-    """Write one photo as upright 8-bit RGB, or hard-link it if it is one. Raises _Unreadable.
+    """Write one photo as upright 8-bit RGB, or hard-link it if it is one. Raises PictureError.
 
     Returns the file, the camera key and the source's size and time.
     """
     changed = None
-    try:
-        with warnings.catch_warnings(), Image.open(path) as image:
-            warnings.simplefilter("ignore")  # about large photos and invalid EXIF
-            stat, exif = path.stat(), _exif(image)
-            target = folder / (key + (".png" if image.format in ("PNG", "TIFF", "BMP") else ".jpg"))
-            camera = _camera(image.size, exif)
-            done = target.is_file() and target.stat().st_mtime_ns == stat.st_mtime_ns
-            if not done:
-                changed = _changed(path, image, exif)
-    except Exception as error:  # Pillow raises errors of many kinds for damaged files
-        raise _Unreadable(" ".join(str(error).split()) or type(error).__name__) from None
+    with open_picture(path) as image:
+        stat, exif = path.stat(), _exif(image)
+        target = folder / (key + (".png" if image.format in ("PNG", "TIFF", "BMP") else ".jpg"))
+        camera = _camera(image.size, exif)
+        done = target.is_file() and target.stat().st_mtime_ns == stat.st_mtime_ns
+        if not done:
+            changed = _changed(path, image, exif)
     if changed is not None:
         with atomic_path(target) as temporary:
             _save(changed, exif, temporary)
@@ -129,7 +131,9 @@ def _prepare_photo(path: Path, folder: Path, key: str) -> tuple[Path, tuple[Any,
 
 
 def _exif(image: Image.Image) -> Image.Exif:
-    """The photo's EXIF; empty if it is damaged."""
+    """The photo's EXIF; empty if it is damaged, or larger than photos have it."""
+    if len(image.info.get("exif") or b"") > _LARGEST_EXIF:
+        return Image.Exif()
     try:
         exif = image.getexif()
         exif.get_ifd(_DETAILS)
@@ -149,7 +153,7 @@ def _changed(path: Path, image: Image.Image, exif: Image.Exif) -> Image.Image | 
         image.draft("RGB", (image.width // 8, image.height // 8))  # finds damage at an eighth of the size
         image.load()
         return None
-    return _rgb(ImageOps.exif_transpose(image) if turned else image, (0, 0, 0))
+    return as_rgb(ImageOps.exif_transpose(image) if turned else image, (0, 0, 0))
 
 
 def _save(image: Image.Image, exif: Image.Exif, path: Path) -> None:
@@ -169,14 +173,6 @@ def _save(image: Image.Image, exif: Image.Exif, path: Path) -> None:
 def _camera(size: tuple[int, int], exif: Image.Exif) -> tuple[Any, ...]:
     """Key of photos with one camera and zoom: upright size, maker, model, focal lengths."""
     details = exif.get_ifd(_DETAILS)
-    focal = [str(details.get(tag, "")) for tag in (_FOCAL, _FOCAL_35)]  # in mm, and 35 mm equivalent
+    focal = [details.get(tag, "") for tag in (_FOCAL, _FOCAL_35)]  # in mm, and 35 mm equivalent
     upright = size[::-1] if exif.get(_ORIENTATION, 1) in range(5, 9) else size
-    return (*upright, str(exif.get(_MAKER, "")), str(exif.get(_MODEL, "")), *focal)
-
-
-def _register_heif() -> None:
-    try:
-        import pi_heif
-    except ImportError:
-        return  # HEIF photos are then listed as unreadable
-    pi_heif.register_heif_opener()
+    return (*upright, *(str(value)[:200] for value in (exif.get(_MAKER, ""), exif.get(_MODEL, ""), *focal)))

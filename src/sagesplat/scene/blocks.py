@@ -10,10 +10,12 @@ from jaxtyping import Bool, Float, Float64, Int, Int64
 
 from sagesplat.core import geometry
 from sagesplat.core.errors import RunError, SceneError, short
+from sagesplat.core.typed import check_fields, types_of
 from sagesplat.io.files import read_json, write_json
 from sagesplat.scene.scene import Points, Scene
 
 MOST = 4096  # blocks
+_CURE = "delete it and run `sagesplat run` again"
 _ANGLES = np.radians(np.arange(0, 90, 7.5))  # orientations of the split; the one of least cost is taken
 _SLACK = 0.08  # of the weight by which a cut may be unbalanced, to run through a sparse region
 _TRIES = 33  # positions that are tried for a cut
@@ -238,16 +240,44 @@ def write_blocks(path: Path, blocks: Blocks, **more: Any) -> None:
 
 def read_blocks(path: Path) -> Blocks:
     """The partition that `write_blocks` wrote; SceneError for any other content."""
-    content = read_json(path)
+    content = read_json(path, _CURE)
     try:
         low = np.array([[-np.inf if v is None else float(v) for v in row] for row in content["low"]])
         high = np.array([[np.inf if v is None else float(v) for v in row] for row in content["high"]])
         axes, margin = np.array(content["axes"], np.float64), float(content["margin"])
-        if low.shape != high.shape or low.shape[1:] != (2,) or axes.shape != (2, 3) or len(low) < 1:
+        if low.shape != high.shape or low.shape[1:] != (2,) or axes.shape != (2, 3):
             raise ValueError(f"boxes of shape {low.shape}")
+        if not 1 <= len(low) <= MOST or np.isnan([low, high]).any():
+            raise ValueError(f"{len(low)} boxes")
+        if not np.isfinite([*axes.flat, margin]).all() or margin < 0:
+            raise ValueError("axes or a margin that are none")
     except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
-        raise SceneError(f"{path}: not a partition ({short(error)}); run with --force") from None
+        raise SceneError(f"{path}: not a partition ({short(error)}); {_CURE}") from None
     return Blocks(axes, low, high, margin)
+
+
+@dataclass(frozen=True)
+class Division:
+    """What each of B blocks is made of."""
+
+    points: list[int]  # SfM points in its box
+    views: list[int]  # training views
+    sees: list[list[int]]  # blocks that its training views see
+
+
+def read_division(path: Path) -> Division:
+    """What `write_blocks` wrote of the content of the blocks; SceneError for anything else."""
+    content, count = read_json(path, _CURE), len(read_blocks(path))
+    try:
+        made = Division(content["points"], content["views"], content["sees"])
+        check_fields(vars(made), types_of(Division))
+        if {len(made.points), len(made.views), len(made.sees)} != {count}:
+            raise ValueError(f"not of {count} blocks")
+        if not all(0 <= other < count for each in made.sees for other in each):
+            raise ValueError("a block that sees one that is not there")
+    except (KeyError, TypeError, ValueError) as error:
+        raise SceneError(f"{path}: not a partition ({short(error)}); {_CURE}") from None
+    return made
 
 
 def _finite(corners: np.ndarray) -> list[list[float | None]]:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from sagesplat.core.errors import SceneError, short
+from sagesplat.core.names import check_photo, repaired
 from sagesplat.scene.colmap_read import ModelPoints, read_model
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage
 from sagesplat.scene.loading import MIN_VIEWS, camera_of, check_settings
@@ -31,12 +32,13 @@ def load_colmap(path: Path, *, downscale: int = 1, test_every: int = 8, images: 
             )
         if not len(points.xyz):
             raise SceneError(f"{model}: no 3D points; run COLMAP's mapper or point_triangulator again")
+        _check_names(model, listed)
         listed = sorted(listed, key=lambda image: image.name)
         folder, divisor = _find_photos(path, images, downscale)
         _check_photos(folder, listed)
         views = _views(model, folder, cameras, listed, divisor)
         tracked = _scene_points(cameras, listed, views, points)
-    return Scene(path.resolve().name, path, views, tracked, test_every)
+    return Scene(repaired(path.resolve().name), path, views, tracked, test_every)
 
 
 def _find_model(path: Path) -> Path:
@@ -59,6 +61,16 @@ def _find_photos(path: Path, images: str | None, downscale: int) -> tuple[Path, 
     if not folder.is_dir():
         raise SceneError(f"{folder}: no such folder; put the photos that COLMAP was run on there")
     return folder, downscale
+
+
+def _check_names(model: Path, listed: Sequence[ModelImage]) -> None:
+    for image in listed:
+        try:
+            check_photo(image.name)
+        except ValueError as error:
+            raise SceneError(
+                f"{model}: photo {short(repr(image.name))}: {error}; rename the photo and run COLMAP again"
+            ) from None
 
 
 def _check_photos(folder: Path, listed: Sequence[ModelImage]) -> None:

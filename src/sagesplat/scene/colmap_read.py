@@ -62,7 +62,9 @@ def _read(path: Path, binary: Callable, text: Callable) -> Any:
             if data.at != len(data.data):
                 raise ValueError(f"{len(data.data) - data.at} bytes more than expected")
             return value
-        return text(path, [line.strip() for line in path.read_text(encoding="utf-8").split("\n")])
+        # bytes that are not UTF-8 stay what they are in paths: a photo may be named so
+        content = path.read_text(encoding="utf-8", errors="surrogateescape")
+        return text(path, [line.strip() for line in content.split("\n")])
     except FileNotFoundError:
         raise SceneError(f"{path}: no such file; copy the whole model (cameras, images, points3D)") from None
     except (OSError, ValueError, IndexError, OverflowError) as error:
@@ -94,7 +96,7 @@ class _Bytes:
     def name(self) -> str:
         start, end = self.at, self.data.index(b"\0", self.at)
         self.at = end + 1
-        return self.data[start:end].decode()
+        return self.data[start:end].decode("utf-8", "surrogateescape")
 
 
 def _binary_cameras(path: Path, data: _Bytes) -> dict[int, ModelCamera]:

@@ -1,6 +1,6 @@
 """Reads photos as 8-bit RGB, at the size of their view's camera."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -8,28 +8,29 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from sagesplat.core.errors import SceneError
+from sagesplat.io.pictures import PictureError, open_picture
 from sagesplat.scene.scene import View
 from sagesplat.scene.undistort import undistort
 
-# What Pillow raises for files that are damaged, not images, or too large.
-_UNREADABLE = (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError)
+_STRIP = 2**20  # pixels that are converted at a time
+_HUGE = 180 * 10**6  # pixels
 
 
 def photo_size(path: Path) -> tuple[int, int]:
     """Width and height in pixels, before EXIF rotation, from the file's header. Raises SceneError."""
     try:
-        with Image.open(path) as image:
+        with open_picture(path, decodes=False) as image:
             return image.size
-    except _UNREADABLE as error:
+    except PictureError as error:
         raise _unreadable(path, error) from None
 
 
 def has_alpha(path: Path) -> bool:
     """Whether a photo has an alpha channel, from the file's header. Raises SceneError."""
     try:
-        with Image.open(path) as image:
+        with open_picture(path, decodes=False) as image:
             return image.has_transparency_data
-    except _UNREADABLE as error:
+    except PictureError as error:
         raise _unreadable(path, error) from None
 
 
@@ -38,13 +39,16 @@ def load_photo(view: View) -> UInt8[np.ndarray, "H W 3"]:
 
     EXIF orientation is not applied, because COLMAP's poses refer to the stored pixels. Grey photos
     become RGB, 16 bits become 8, and alpha is composited over the camera's background. Raises SceneError.
+    Memory: up to 16 bytes for each pixel of the file, whose number `open_picture` limits.
     """
-    try:
-        with Image.open(view.image_path) as file:
-            image = _rgb(file, view.camera.background)
-    except _UNREADABLE as error:
-        raise _unreadable(view.image_path, error) from None
     size = (view.camera.width, view.camera.height)
+    try:
+        with open_picture(view.image_path) as file:
+            if file.width * file.height > _HUGE:
+                file.draft(None, size)  # JPEG: decodes at a half, a quarter or an eighth of the size
+            image = as_rgb(file, view.camera.background)
+    except PictureError as error:
+        raise _unreadable(view.image_path, error) from None
     if image.size != size:
         image = image.resize(size, Image.Resampling.BOX)  # first, as undistortion costs more per pixel
     return undistort(np.array(image), view.lens, view.camera, order=1)
@@ -76,21 +80,46 @@ class Photos:
         return photo
 
 
-def _rgb(image: Image.Image, background: tuple[int, int, int]) -> Image.Image:
-    """The image, of any Pillow mode, as 8-bit RGB; alpha is composited over `background`."""
+def as_rgb(image: Image.Image, background: tuple[int, int, int]) -> Image.Image:
+    """The image, of any Pillow mode, as 8-bit RGB; alpha is composited over `background`.
+
+    Decodes it. Returns `image` itself where it is RGB already.
+    """
+    image.load()
     if image.mode.startswith("I") or image.mode == "F":
-        values = np.asarray(image, np.float64)
-        # Pillow's own conversion clips 16-bit greys instead of scaling them.
-        scale = 257 if image.mode.startswith("I") and values.max() > 255 else 1
-        return Image.fromarray((values / scale).round().clip(0, 255).astype(np.uint8)).convert("RGB")
+        return _grey(image).convert("RGB")
     if image.has_transparency_data:
-        image = image.convert("RGBA")
-        return Image.alpha_composite(Image.new("RGBA", image.size, (*background, 255)), image).convert("RGB")
-    return image.convert("RGB")
+        return _composited(image, background)
+    return image if image.mode == "RGB" else image.convert("RGB")
 
 
-def _unreadable(path: Path, error: BaseException) -> SceneError:
-    reason = " ".join(str(error).split())
-    return SceneError(
-        f"{path}: not readable as a photo ({reason}); replace the file, or remove it from the model"
-    )
+def _grey(image: Image.Image) -> Image.Image:
+    """The image, of 16 or 32 bits, in 8 bits."""
+    deep = image.mode.startswith("I")
+    # Pillow's own conversion clips 16-bit greys instead of scaling them.
+    scale = 257 if deep and any(np.asarray(strip).max() > 255 for _, strip in _strips(image)) else 1
+    grey = Image.new("L", image.size)
+    for top, strip in _strips(image):
+        values = np.nan_to_num(np.asarray(strip, np.float64), nan=0)
+        grey.paste(Image.fromarray((values / scale).round().clip(0, 255).astype(np.uint8)), (0, top))
+    return grey
+
+
+def _composited(image: Image.Image, background: tuple[int, int, int]) -> Image.Image:
+    rgb = Image.new("RGB", image.size)
+    for top, strip in _strips(image):
+        below = Image.new("RGBA", strip.size, (*background, 255))
+        rgb.paste(Image.alpha_composite(below, strip.convert("RGBA")).convert("RGB"), (0, top))
+    return rgb
+
+
+def _strips(image: Image.Image) -> Iterator[tuple[int, Image.Image]]:
+    """The first row and the content of each strip: copies of the whole image would take much memory."""
+    rows = max(1, _STRIP // image.width)
+    for top in range(0, image.height, rows):
+        yield top, image.crop((0, top, image.width, min(top + rows, image.height)))
+
+
+def _unreadable(path: Path, error: PictureError) -> SceneError:
+    cure = error.cure or "replace the file, or remove it from the model"
+    return SceneError(f"{path}: not readable as a photo ({error.reason}); {cure}")

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from sagesplat.core.errors import RunError, SceneError, short
+from sagesplat.core.names import check_photo, repaired
 from sagesplat.io.files import read_json
 from sagesplat.scene.images import has_alpha, photo_size
 from sagesplat.scene.loading import MAX_SIDE, MIN_VIEWS, camera_of, check_settings
@@ -56,7 +57,7 @@ def load_transforms(path: Path, *, downscale: int = 1, test_every: int = 8) -> S
     else:
         points = read_points(file.parent / _inside(file, "ply_file_path", listed))
     folder = file.parent
-    return Scene(folder.resolve().name, folder, views, points, test_every, test_names=test_names)
+    return Scene(repaired(folder.resolve().name), folder, views, points, test_every, test_names=test_names)
 
 
 def load_blender(path: Path, *, downscale: int = 1, test_every: int = 8) -> Scene:
@@ -79,7 +80,7 @@ def load_blender(path: Path, *, downscale: int = 1, test_every: int = 8) -> Scen
     if has_alpha(views[0].image_path):
         views = tuple(replace(view, camera=replace(view.camera, background=WHITE)) for view in views)
     points = random_points(views, cube=BLENDER_CUBE)
-    return Scene(folder.resolve().name, folder, views, points, test_every, test_names=test_names)
+    return Scene(repaired(folder.resolve().name), folder, views, points, test_every, test_names=test_names)
 
 
 def _read(file: Path) -> tuple[dict[str, Any], list[Mapping[str, Any]]]:
@@ -104,6 +105,10 @@ def _inside(file: Path, key: str, value: Any) -> PurePosixPath:
         raise SceneError(
             f"{file}: {key} {value[:80]!r} is outside the folder; move it there and name it relative to it"
         )
+    try:
+        check_photo(path.as_posix())
+    except ValueError as error:
+        raise SceneError(f"{file}: {key} {short(repr(value))}: {error}; rename the file, and here") from None
     return path
 
 

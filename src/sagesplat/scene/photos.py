@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from sagesplat.core.config import PosesConfig
-from sagesplat.core.errors import BackendUnavailable, SceneError
+from sagesplat.core.errors import BackendUnavailable, RunError, SceneError
+from sagesplat.core.typed import check_fields, types_of
 from sagesplat.io.files import read_json, write_json
 from sagesplat.scene._prepare import PreparedPhoto, prepare_photos
 from sagesplat.scene.detect import PHOTOS
@@ -151,8 +152,8 @@ def _too_few(source: Path, photos: list[PreparedPhoto], unreadable: dict[str, st
     problem = f"{source}: {len(photos)} readable photos, but it takes {MIN_PHOTOS}"
     if unreadable:
         name, reason = next(iter(unreadable.items()))
-        more = ", ..." if len(unreadable) > 1 else ""
-        return f"{problem} ({name} {reason}{more}); replace the damaged files"
+        count = f" (the first of {len(unreadable)})" if len(unreadable) > 1 else ""
+        return f"{problem}; {name}{count} is {reason}"
     if photos and source.is_file():
         return f"{problem} frames that differ; move the camera, or take a longer video"
     kinds = ", ".join(sorted(suffix[1:] for suffix in PHOTOS))
@@ -199,7 +200,7 @@ def _resume(workspace: Path, request: dict[str, Any]) -> Reconstruction | None:
     work, report = workspace / "sfm", workspace / "poses.json"
     request = json.loads(json.dumps(request))
     path = work / "request.json"
-    old = read_json(path) if path.is_file() else {}
+    old = _read_object(path)
     if {k: v for k, v in old.items() if k not in ("min_photos", "threads")} != request:
         for name in ("database.db", "database.db-wal", "database.db-shm", "models.json", "seconds.json"):
             (work / name).unlink(missing_ok=True)
@@ -207,12 +208,23 @@ def _resume(workspace: Path, request: dict[str, Any]) -> Reconstruction | None:
         return None
     if not (report.is_file() and (workspace / "sparse" / "0").is_dir()):
         return None
-    content = read_json(report)
-    if not content["complete"]:
+    content = _read_object(report)
+    types = {name: kind for name, kind in types_of(Reconstruction).items() if name != "workspace"}
+    try:
+        fields: dict[str, Any] = {name: content[name] for name in types}
+        check_fields(fields, types)
+    except (KeyError, ValueError):
         return None
-    fields: dict[str, Any] = {name: content[name] for name in Reconstruction.__dataclass_fields__}
-    fields["workspace"] = workspace
-    return Reconstruction(**fields)
+    return Reconstruction(workspace=workspace, **fields) if content.get("complete") is True else None
+
+
+def _read_object(path: Path) -> dict[str, Any]:
+    """A JSON object, empty where there is none that can be read."""
+    try:
+        content = read_json(path)
+    except RunError:
+        return {}
+    return content if isinstance(content, dict) else {}
 
 
 def _run(work: Path, on_progress: OnProgress) -> dict[str, Any]:

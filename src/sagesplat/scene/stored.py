@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from sagesplat.core.errors import SceneError, short
+from sagesplat.core.names import check_photo, repaired
 from sagesplat.io.files import atomic_path
 from sagesplat.io.npz import Npz
 from sagesplat.scene.scene import Camera, Lens, Points, Scene, View
@@ -60,7 +61,8 @@ def read_scene(path: Path) -> Scene:
         points = Points(**columns)
         _check(points, len(views))
         test, calibration = frozenset(about["test"]), frozenset(about["calibration"])
-        return Scene(str(about["name"]), path, views, points, test_names=test, calibration_names=calibration)
+        name = repaired(str(about["name"]))
+        return Scene(name, path, views, points, test_names=test, calibration_names=calibration)
     except FileNotFoundError:
         raise SceneError(f"{path}: no such file; give the path of a capture") from None
     except (OSError, KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
@@ -73,6 +75,7 @@ def _view(about: dict, w2c: np.ndarray, K: np.ndarray) -> View:
         raise ValueError(f"a view of {width!r} x {height!r} pixels")
     if w2c.shape != (4, 4) or K.shape != (3, 3) or not (np.isfinite(w2c).all() and np.isfinite(K).all()):
         raise ValueError(f"no camera for {about['name']}")
+    check_photo(str(about["name"]))
     r, g, b = map(int, about["background"])
     lens = about["lens"]
     if lens:

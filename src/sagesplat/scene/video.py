@@ -1,5 +1,6 @@
 """Extracts frames from a video: the sharpest of each interval, without duplicates."""
 
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -8,12 +9,17 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from PIL import Image
 
-from sagesplat.core.errors import BackendUnavailable, SceneError
+from sagesplat.core.errors import BackendUnavailable, RunError, SceneError
 from sagesplat.io.files import atomic_path, read_json, write_json
 
 _GREY_WIDTH = 640  # px, of the copies that sharpness is measured on
 _THUMB_WIDTH = 64  # px, of the copies that are compared for motion
 _SAME = 1.0  # mean absolute difference, grey levels, below which the camera has not moved
+MAX_PIXELS = 2**26  # of a frame; 8K video has half as many
+MAX_FRAMES = 10**6  # four hours
+_PACKED = 4  # times its size is what a video's packets may hold: those of a forged index overlap
+# FFmpeg also knows playlists and scripts, which name other files and addresses for it to read.
+_DEMUXERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,mpegvideo"
 _TURNS = {90: Image.Transpose.ROTATE_90, 180: Image.Transpose.ROTATE_180, 270: Image.Transpose.ROTATE_270}
 
 
@@ -53,18 +59,25 @@ def extract_frames(
         reason = getattr(error, "strerror", None) or error
         raise SceneError(f"{path}: not readable as a video ({reason}); convert it to MP4") from None
     if not paths:
-        raise SceneError(f"{path}: no frame can be decoded; copy or convert the video again")
+        raise SceneError(
+            f"{path}: no frame of up to {MAX_PIXELS // 10**6} million pixels can be decoded; copy or convert "
+            "the video again"
+        )
     write_json(folder / "video.json", source | {"frames": [p.name for p in paths]})
     return paths
 
 
 def _finished(folder: Path, source: dict[str, int]) -> list[Path] | None:
     """The frames of an earlier, finished run on the same file, if all are there."""
-    if not (folder / "video.json").is_file():
+    try:
+        listed = read_json(folder / "video.json")
+        names = listed.pop("frames")
+        if listed != source or not names or not all(re.fullmatch(r"frame_[0-9]+\.jpg", n) for n in names):
+            return None
+    except (RunError, AttributeError, KeyError, TypeError):  # none, or not ours
         return None
-    listed = read_json(folder / "video.json")
-    paths = [folder / name for name in listed.pop("frames", [])]
-    return paths if listed == source and all(p.is_file() for p in paths) else None
+    paths = [folder / name for name in names]
+    return paths if all(path.is_file() for path in paths) else None
 
 
 def _sharpest(
@@ -99,28 +112,50 @@ def _moving(frames: Iterator[tuple[int, Any, UInt8[np.ndarray, "h w"]]]) -> Iter
             yield i, frame
 
 
+def _open(path: Path) -> Any:
+    """The video's container, of one that is meant, which reads no other file. Raises SceneError."""
+    import av
+    from av.error import ArgumentError
+
+    options = {"format_whitelist": _DEMUXERS, "protocol_whitelist": "file", "max_pixels": str(MAX_PIXELS)}
+    try:
+        container = av.open(str(path.absolute()), options=options)  # "a:b" would name a protocol
+    except ArgumentError:
+        container = None
+    if container is None or not container.streams.video:
+        raise SceneError(
+            f"{path}: holds no video stream in MP4, MOV, MKV, WebM, AVI or MPEG; convert it to MP4, or name "
+            "a folder of photos"
+        )
+    container.streams.video[0].codec_context.options = {"max_pixels": str(MAX_PIXELS)}
+    return container
+
+
 def _count(path: Path) -> int:
     """Number of frames, counted by packets: the header's count is often missing or wrong."""
-    import av
-
-    with av.open(str(path)) as container:
-        if not container.streams.video:
-            raise SceneError(f"{path}: holds no video stream; name a video or a folder of photos")
-        return sum(1 for packet in container.demux(container.streams.video[0]) if packet.size)
+    frames = nbytes = 0
+    most = _PACKED * path.stat().st_size
+    with _open(path) as container:
+        for packet in container.demux(container.streams.video[0]):
+            frames += packet.size > 0
+            nbytes += packet.size
+            if frames > MAX_FRAMES or nbytes > most:
+                held = f"{frames:,} frames of {nbytes:,} bytes"
+                raise SceneError(f"{path}: {held} or more are too many; cut or convert the video")
+    return frames
 
 
 def _decode(path: Path) -> Iterator[Any]:
-    """The frames that can be decoded; damaged packets are skipped."""
-    import av
-    from av.error import InvalidDataError
+    """The frames that can be decoded; damaged packets, and frames of too many pixels, are skipped."""
+    from av.error import ArgumentError, InvalidDataError
 
-    with av.open(str(path)) as container:
+    with _open(path) as container:
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
         for packet in container.demux(stream):
             try:
                 frames = packet.decode()
-            except InvalidDataError:
+            except (InvalidDataError, ArgumentError):
                 continue
             yield from frames
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sagesplat.core.errors import LabelError, RunError, short
+from sagesplat.core.names import check_photo
 from sagesplat.io.files import read_json
 
 _ROWS = [
@@ -50,11 +51,10 @@ def read_panoptic(folder: Path) -> Panoptic | None:
     beside = path.with_suffix("")
     pngs, segments = {}, {}
     try:
-        names = {int(c["id"]): str(c["name"]) for c in content.get("categories", [])} or NAMES
+        names = {int(c["id"]): c["name"] for c in content.get("categories", [])} or NAMES
         for annotation in content["annotations"]:
             file = Path(annotation["file_name"])
-            if file.is_absolute() or ".." in file.parts:
-                raise ValueError(f"{str(file)!r} is outside the folder")
+            check_photo(file.as_posix())
             key = str(file.with_suffix(""))
             pngs[key] = (beside if beside.is_dir() else folder) / file
             segments[key] = {int(s["id"]): int(s["category_id"]) for s in annotation["segments_info"]}

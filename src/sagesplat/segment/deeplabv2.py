@@ -26,6 +26,7 @@ from torch.nn import functional as F
 
 from sagesplat.core.config import MasksConfig
 from sagesplat.core.errors import BackendUnavailable, LabelError
+from sagesplat.core.memory import ran_out
 from sagesplat.io.tensors import read_tensors
 from sagesplat.segment import coco
 from sagesplat.segment.crf import refine
@@ -223,6 +224,8 @@ def _read_weights(path: Path) -> dict[str, Tensor]:
     except BackendUnavailable:
         raise
     except Exception as error:  # pickle, zip and safetensors have a class for each kind of damage
+        if ran_out(error):
+            raise
         reason = str(error).strip().partition("\n")[0][:120]
         raise LabelError(f"{path}: not a file of tensors ({reason}); save the bare state dict") from None
     for key in ("state_dict", "model"):

@@ -9,10 +9,11 @@ _SUFFIXES = ("-merged", "-other", "-stuff")  # of COCO's panoptic names
 
 
 def title_of(name: str) -> str:
-    """A category's name for people: grass for grass-merged."""
+    """A category's name for people: grass for grass-merged; the name itself where nothing else is left."""
+    title = name
     for suffix in _SUFFIXES:
-        name = name.removesuffix(suffix)
-    return name.replace("-", " ")
+        title = title.removesuffix(suffix)
+    return title.replace("-", " ").strip() or name
 
 
 def titles(names: Mapping[int, str]) -> dict[int, str]:

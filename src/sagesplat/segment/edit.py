@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int16, Int64
 
-from sagesplat.core.errors import LabelError
+from sagesplat.core.errors import LabelError, short
+from sagesplat.core.names import RULE, checked
 from sagesplat.scene.scene import View
 from sagesplat.segment import coco
 from sagesplat.segment.masks import (
@@ -48,11 +49,11 @@ class Edited:
 
 
 def parse_keep(text: str) -> tuple[str, ...]:
-    """The categories in "grass-merged,tree-merged"; LabelError for an empty name."""
+    """The categories in "grass-merged,tree-merged"; LabelError for what is no name."""
     names = tuple(name.strip() for name in text.split(",")) if text.strip() else ()
     if "" in names:
-        raise LabelError(f"keep {text!r}: a name is empty; write NAME,NAME")
-    return tuple(dict.fromkeys(names))
+        raise LabelError(f"keep {short(repr(text))}: a name is empty; write NAME,NAME")
+    return tuple(dict.fromkeys(_named(name, "keep") for name in names))
 
 
 def parse_merge(text: str) -> dict[str, str]:
@@ -64,14 +65,25 @@ def parse_merge(text: str) -> dict[str, str]:
     for pair in text.split(",") if text.strip() else ():
         old, _, new = (part.strip() for part in pair.partition("="))
         if not old or not new or "=" in new:
-            raise LabelError(f"merge {pair.strip()!r}: not of the form FROM=INTO; write FROM=INTO,FROM=INTO")
+            raise LabelError(
+                f"merge {short(repr(pair.strip()))}: not of the form FROM=INTO; write FROM=INTO,FROM=INTO"
+            )
         if merge.setdefault(old, new) != new:
             raise LabelError(f"merge: {old} goes into {merge[old]} and into {new}; leave one of them")
     return resolve(merge)
 
 
+def _named(name: str, option: str) -> str:
+    """A name that was typed, as it may be; LabelError where it may not."""
+    try:
+        return checked(name)
+    except ValueError as error:
+        raise LabelError(f"{option} {short(repr(name))}: {error}; {RULE}") from None
+
+
 def resolve(merge: Mapping[str, str]) -> dict[str, str]:
-    """The same with chains followed to their end; LabelError for a circle."""
+    """The same with chains followed to their end; LabelError for a circle, and for what is no name."""
+    merge = {_named(old, "merge"): _named(new, "merge") for old, new in merge.items()}
     ends = {}
     for old in merge:
         chain = [old]

@@ -21,6 +21,7 @@ from torch.nn.functional import interpolate
 
 from sagesplat.core.config import MasksConfig
 from sagesplat.core.errors import BackendUnavailable, LabelError, OutOfMemory
+from sagesplat.core.memory import ran_out
 from sagesplat.segment import coco
 from sagesplat.segment.masks import UNLABELLED, Taxonomy
 from sagesplat.segment.segmenters import (
@@ -76,10 +77,12 @@ class HfSegmenter:
             return [found for photo in photos for found in self([photo])]
         try:
             return self._segment(photos) if photos else []
-        except torch.cuda.OutOfMemoryError:
+        except (RuntimeError, MemoryError) as error:  # of a GPU's too
+            if not (isinstance(error, torch.cuda.OutOfMemoryError) or ran_out(error)):
+                raise
             raise OutOfMemory(
                 f"{self._name}: no memory on {self._device} for {len(photos)} photos at once; "
-                "take fewer, smaller photos or --device cpu"
+                f"take fewer, smaller photos{'' if self._device.type == 'cpu' else ' or --device cpu'}"
             ) from None
 
     @torch.inference_mode()
@@ -251,6 +254,8 @@ def _config(folder: Path, name: str) -> Any:
     try:
         config = transformers.AutoConfig.from_pretrained(folder, trust_remote_code=False)
     except Exception as error:  # many kinds for what may be in the file
+        if ran_out(error):
+            raise
         raise LabelError(
             f"{name}: no network of transformers ({_first_line(error)}); name one for universal segmentation"
         ) from None
@@ -281,6 +286,8 @@ def _load(folder: Path, name: str, config: Any) -> tuple[Any, Int64[Tensor, "1 T
             f"{name}: needs another package ({_first_line(error)}); install it"
         ) from None
     except Exception as error:  # of many kinds for files that are missing, damaged or do not fit
+        if ran_out(error):
+            raise
         raise LabelError(
             f"{name}: cannot be loaded ({_first_line(error)}); it needs config.json, "
             "preprocessor_config.json and model.safetensors that belong together"

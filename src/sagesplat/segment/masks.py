@@ -8,11 +8,13 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int16, Int32
+from jaxtyping import Int16, Integer
 from PIL import Image
 
 from sagesplat.core.errors import LabelError, RunError, short
+from sagesplat.core.names import LENGTH, RULE, checked, collision_key
 from sagesplat.io.files import atomic_path, read_json, write_json
+from sagesplat.io.pictures import FREE_PIXELS, PictureError, open_picture
 from sagesplat.scene.scene import Scene, View
 from sagesplat.scene.undistort import undistort
 from sagesplat.segment import coco
@@ -22,7 +24,7 @@ UNLABELLED_NAME = "unlabelled"
 UNLABELLED_COLOR = (128, 128, 128)
 MAX_LABEL_ID = np.iinfo(np.int16).max
 _UNKNOWN = -2  # never leaves this file
-_DEFLATE = 1032  # times its size is all that a deflate stream can hold
+_BLOCK = len("@4095")  # what a per-block category adds to the name of its category
 VOID_8, VOID_16 = 255, 65535  # what unlabelled pixels hold in 8- and 16-bit files, unless stated otherwise
 
 
@@ -62,7 +64,7 @@ class Taxonomy:
     @classmethod
     def read(cls, path: Path) -> "Taxonomy":
         """Read labels.json; LabelError where it is missing or its content cannot be used."""
-        return _read_labels(path)[0]
+        return _read_labels(path, LENGTH + _BLOCK)[0]
 
 
 class Masks:
@@ -81,7 +83,7 @@ class Masks:
         """A view's category ids at the size of its camera, -1 = unlabelled; shared, so not to be changed."""
         label_ids = self._cache.get(view.name)
         if label_ids is None:
-            label_ids = read_mask(mask_path(self.folder, view), self.taxonomy)
+            label_ids = read_mask(mask_path(self.folder, view), self.taxonomy, _pixels(view))
             if self._used + label_ids.nbytes <= self.cache_bytes:
                 self._cache[view.name] = label_ids
                 self._used += label_ids.nbytes
@@ -107,20 +109,31 @@ def prepare_folder(folder: Path, views: Sequence[View]) -> list[Path]:
 
     Removes its labels.json, which is written last and says that the folder is complete.
     """
-    taken: dict[Path, str] = {}
-    for view in views:
-        path = mask_path(folder, view)
-        if path in taken:
-            raise LabelError(f"{view.name}: {taken[path]} has the same name but for the suffix; rename one")
-        taken[path] = view.name
+    paths = [mask_path(folder, view) for view in views]
+    taken: dict[str, str] = {}
+    for view, path in zip(views, paths, strict=True):
+        other = taken.setdefault(collision_key(path.as_posix()), view.name)
+        if other != view.name:
+            raise LabelError(
+                f"{view.name}: {other} has the same name but for the suffix or capitals; rename one"
+            )
     (folder / "labels.json").unlink(missing_ok=True)
-    return list(taken)
+    return paths
 
 
-def read_mask(path: Path, taxonomy: Taxonomy) -> Int16[np.ndarray, "H W"]:
-    """A normalised label image; LabelError where it is missing, damaged or holds ids without a name."""
+def read_mask(path: Path, taxonomy: Taxonomy, free: int = FREE_PIXELS) -> Int16[np.ndarray, "H W"]:
+    """A normalised label image; LabelError where it is missing, damaged or holds ids without a name.
+
+    Label images with more than `free` pixels are refused where their files are too small for photos of that
+    size. Memory: up to 20 bytes per pixel.
+    """
     ids = {VOID_8: UNLABELLED, VOID_16: UNLABELLED} | {i: i for i in taxonomy.names}
-    return _translate(_read_png(path), ids, path, "make the masks again")
+    return _translate(_read_png(path, free), ids, path, "make the masks again")
+
+
+def _pixels(view: View) -> int:
+    """Number of pixels that any label image of a view may have: four times its photo's, at least."""
+    return max(FREE_PIXELS, 4 * view.camera.width * view.camera.height)
 
 
 def write_mask(path: Path, label_ids: Int16[np.ndarray, "H W"], taxonomy: Taxonomy) -> None:
@@ -169,7 +182,7 @@ def import_masks(scene: Scene, source: Path, target: Path) -> list[str]:
     for view, path in zip(scene.views, prepare_folder(target, scene.views), strict=True):
         label_ids = np.full((view.camera.height, view.camera.width), UNLABELLED, np.int16)
         if (file := found[view.name]) is not None:
-            label_ids = _fit(file.read(), view, file.path)
+            label_ids = _fit(file.read(_pixels(view)), view, file.path)
         write_mask(path, label_ids, taxonomy)
         occurring.update(np.unique(label_ids).tolist())
     write_labels(target, taxonomy, occurring)
@@ -193,9 +206,9 @@ class _File:
     segments: bool  # RGB-coded segment ids instead of category ids
     cure: str  # what helps where the file holds other values
 
-    def read(self) -> Int16[np.ndarray, "h w"]:
-        """Category ids at the file's own size."""
-        return _translate(_read_png(self.path, self.segments), self.ids, self.path, self.cure)
+    def read(self, free: int) -> Int16[np.ndarray, "h w"]:
+        """Category ids at the file's own size; `free` as in `read_mask`."""
+        return _translate(_read_png(self.path, free, self.segments), self.ids, self.path, self.cure)
 
 
 _Find = Callable[[View], _File | None]
@@ -237,8 +250,11 @@ def _panoptic_source(folder: Path) -> tuple[Taxonomy, _Find]:
     return taxonomy, find
 
 
-def _read_labels(path: Path) -> tuple[Taxonomy, int | None]:
-    """The taxonomy of a labels.json, and the value of unlabelled pixels if it is stated."""
+def _read_labels(path: Path, length: int = LENGTH) -> tuple[Taxonomy, int | None]:
+    """The taxonomy of a labels.json, and the value of unlabelled pixels if it is stated.
+
+    `length`: characters of a name, at most.
+    """
     try:
         content = read_json(path)
     except RunError as error:
@@ -256,11 +272,14 @@ def _read_labels(path: Path) -> tuple[Taxonomy, int | None]:
         raise LabelError(f'{path}: "unlabelled" is {short(unlabelled)}; give a pixel value, 0 ... {VOID_16}')
     if unlabelled in names:
         raise LabelError(f'{path}: {unlabelled} is "unlabelled" and has a name too; remove one of them')
-    return taxonomy_of(names, path), unlabelled
+    return taxonomy_of(names, path, length), unlabelled
 
 
-def taxonomy_of(names: dict[int, Any], path: Path) -> Taxonomy:
-    """A taxonomy whose ids fit and whose names are distinct: results are listed by name."""
+def taxonomy_of(names: dict[int, Any], path: Path, length: int = LENGTH) -> Taxonomy:
+    """A taxonomy whose ids fit and whose names may be; they are distinct, as results are listed by name.
+
+    `path`: the file that the names are from; `length`: characters of a name, at most. LabelError for others.
+    """
     wrong = [label_id for label_id in names if not 0 <= label_id <= MAX_LABEL_ID]
     if wrong:
         raise LabelError(
@@ -268,46 +287,55 @@ def taxonomy_of(names: dict[int, Any], path: Path) -> Taxonomy:
         )
     if not names:
         raise LabelError(f"{path}: names no label; list the ids of the label images")
-    seen = {UNLABELLED_NAME}
+    found: dict[str, int] = {}
     for label_id, name in names.items():
-        if not isinstance(name, str) or not name.strip() or name in seen:
+        named = f"{path}: label {label_id} is named {short(repr(name))}"
+        try:
+            name = checked(name, length)
+        except ValueError as error:
+            raise LabelError(f"{named}, but {error}; rename it ({RULE})") from None
+        if name in found or name == UNLABELLED_NAME:
             raise LabelError(
-                f"{path}: label {label_id} is named {short(repr(name))}; give each id a name of its own "
+                f"{named}; give each id a name of its own "
                 f'(unlabelled pixels: "{UNLABELLED_NAME}": {label_id} beside "labels")'
             )
-        seen.add(name)
-    return Taxonomy(dict(sorted(names.items())))
+        found[name] = label_id
+    return Taxonomy({label_id: name for name, label_id in sorted(found.items(), key=lambda of: of[1])})
 
 
-def _read_png(path: Path, segments: bool = False) -> Int32[np.ndarray, "h w"]:
-    """The ids in a PNG: grey values or palette indices, or R + 256 G + 65536 B with `segments`.
-
-    Memory: up to 16 bytes for each pixel, which are no more than a file of this size can hold.
-    """
+def _read_png(path: Path, free: int, segments: bool = False) -> Integer[np.ndarray, "h w"]:
+    """The ids in a PNG: grey values or palette indices, or R + 256 G + 65536 B with `segments`."""
+    modes = ("RGB", "RGBA") if segments else ("1", "L", "P", "I;16", "I")
     try:
-        with Image.open(path, formats=["PNG"]) as image:
-            mode, bits = image.mode, 24 if segments else 1
-            if image.width * image.height * bits > 8 * _DEFLATE * path.stat().st_size:
-                raise ValueError(f"{image.width} x {image.height} pixels promised, more than fit")
-            fits = mode in (("RGB", "RGBA") if segments else ("1", "L", "P", "I;16", "I"))
-            pixels = np.asarray(image).astype(np.int32) if fits else np.zeros((0, 0), np.int32)
-    except FileNotFoundError:
-        raise LabelError(f"{path}: no such file; make the masks again") from None
-    except Exception as error:  # Pillow raises errors of many kinds for damaged files
-        raise LabelError(f"{path}: not a readable PNG ({short(error)}); export it again") from None
-    if not fits:
+        with open_picture(path, ("PNG",), free=free) as image:
+            mode = image.mode
+            pixels = np.asarray(image) if mode in modes else None
+    except PictureError as error:
+        if not path.exists():
+            raise LabelError(f"{path}: no such file; make the masks again") from None
+        cure = error.cure or "export it again"
+        raise LabelError(f"{path}: not a readable PNG ({error.reason}); {cure}") from None
+    if pixels is None:
         wanted = "an RGB image of segments" if segments else "one channel of 8- or 16-bit ids"
         raise LabelError(f"{path}: a PNG of mode {mode} where {wanted} is needed; convert it")
-    return pixels[..., 0] + 256 * pixels[..., 1] + 65536 * pixels[..., 2] if segments else pixels
+    if not segments:
+        return pixels.astype(np.uint8) if mode == "1" else pixels
+    ids = pixels[..., 2].astype(np.int32)
+    for channel in (1, 0):
+        ids *= 256
+        ids += pixels[..., channel]
+    return ids
 
 
 def _translate(
-    raw: Int32[np.ndarray, "h w"], ids: dict[int, int], path: Path, cure: str
+    raw: Integer[np.ndarray, "h w"], ids: dict[int, int], path: Path, cure: str
 ) -> Int16[np.ndarray, "h w"]:
     """Replace each value by what `ids` says; LabelError for values that it does not know."""
-    table = np.full(max(ids) + 2, _UNKNOWN, np.int16)  # its last entry is for all larger values
+    small = raw.dtype.itemsize <= 2
+    size = max(ids) + 2  # the last entry is for all larger values
+    table = np.full(max(size, np.iinfo(raw.dtype).max + 1) if small else size, _UNKNOWN, np.int16)
     table[list(ids)] = list(ids.values())
-    label_ids = table[np.minimum(raw, len(table) - 1)]
+    label_ids = table[raw if small else np.minimum(raw, len(table) - 1)]
     unknown = raw[label_ids == _UNKNOWN]
     if len(unknown):
         unknown = np.unique(unknown[:10_000])  # of a large image some will do

@@ -1,5 +1,7 @@
 """Segmentation networks in ONNX format."""
 
+import math
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +13,7 @@ from PIL import Image
 
 from sagesplat.core.config import MasksConfig
 from sagesplat.core.errors import BackendUnavailable, LabelError, RunError, short
+from sagesplat.core.memory import ran_out
 from sagesplat.io.files import read_json
 from sagesplat.segment import coco
 from sagesplat.segment.masks import UNLABELLED, Taxonomy, taxonomy_of
@@ -22,6 +25,10 @@ from sagesplat.segment.segmenters import (
     group_classes,
     parse_device,
 )
+
+_PIXELS = 2**24  # of a network's input: 200 MB
+_VALUES = 2**29  # of its output: 2 GB
+_OUTPUTS = {f"tensor({kind})" for kind in ("float", "float16", "double", "int64", "int32", "uint8")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,23 +88,45 @@ def _categories(content: dict[str, Any], path: Path) -> dict[str, int | None]:
 class OnnxSegmenter:
     """A semantic segmentation network: RGB in, a logit per class and (coarser) pixel out, or class ids."""
 
-    def __init__(self, model: Path, classes: Path, *, device: str = "auto", threads: int = 1):
+    def __init__(
+        self, model: Path, classes: Path, *, device: str = "auto", threads: int = 1, time_limit: float = 0
+    ):
+        """`time_limit`: seconds for a photo, 0: none. LabelError for a model or classes of no use."""
         self.classes = read_classes(classes)
         self.taxonomy = self.classes.taxonomy
         self._ids, self._group = group_classes(self.classes.label_ids.tolist())
         self._session = open_session(model, threads, device)
-        self._model = model
-        entry = self._session.get_inputs()[0]
-        self._input, shape = entry.name, entry.shape
+        self._model, self._time_limit = model, time_limit
+        self._check_output()
+        self._input, self._channels, (self._height, self._width) = self._read_input()
+
+    def _read_input(self) -> tuple[str, int, tuple[int, int]]:
+        """Name of the input, the axis of its channels, its height and width."""
+        inputs = self._session.get_inputs()
+        kind, shape = (inputs[0].type, list(inputs[0].shape)) if len(inputs) == 1 else ("", [])
         channels = next((axis for axis in (1, 3) if len(shape) == 4 and shape[axis] == 3), None)
         size = [length for axis, length in enumerate(shape) if axis not in (0, channels)]
-        fixed = all(isinstance(length, int) for length in size)  # a size left open is None or a name
-        if channels is None or not fixed or entry.type != "tensor(float)":
+        # a size left open is None or a name
+        fixed = len(size) == 2 and all(type(n) is int and n > 0 for n in size)
+        if channels is None or not fixed or math.prod(size) > _PIXELS or kind != "tensor(float)":
+            what = f"input {kind} of shape {shape}" if kind else f"{len(inputs)} inputs"
             raise LabelError(
-                f"{model}: input {entry.type} of shape {shape}, but [1, 3, height, width] or "
-                "[1, height, width, 3] of floats in fixed size is needed; export it so"
+                f"{self._model}: {short(what)}, but [1, 3, height, width] or [1, height, width, 3] of floats "
+                f"in fixed size is needed (up to {_PIXELS:,} pixels); export it so"
             )
-        self._channels, (self._height, self._width) = channels, size
+        return inputs[0].name, channels, (size[0], size[1])
+
+    def _check_output(self) -> None:
+        """LabelError where the first output, as far as the model says its shape, cannot be label scores."""
+        outputs = self._session.get_outputs()
+        kind, shape = (outputs[0].type, list(outputs[0].shape)) if outputs else ("nothing", [])
+        self._output = outputs[0].name if outputs else ""
+        known = [n for n in shape if type(n) is int]
+        if kind not in _OUTPUTS or math.prod(known) > _VALUES:
+            raise LabelError(
+                f"{self._model}: answers with {short(f'{kind} of shape {shape}')}, but numbers by class or "
+                f"class numbers, up to {_VALUES:,} of them, are needed; export it so"
+            )
 
     def __call__(self, photos: Sequence[UInt8[np.ndarray, "H W 3"]], /) -> list[Segmented]:
         """Label images and probabilities (softmax of the logits), one photo after the other."""
@@ -115,12 +144,34 @@ class OnnxSegmenter:
         return answer(*self._grouped(logits), self._ids, height, width)
 
     def _run(self, photo: UInt8[np.ndarray, "H W 3"]) -> np.ndarray:
-        """The network's first output."""
+        """The network's first output, [1, ...]."""
+        from onnxruntime import RunOptions
+
         x = np.moveaxis(to_input(photo, self._height, self._width, self.classes), 2, self._channels - 1)
+        options = RunOptions()
+        options.log_severity_level = 4  # what goes wrong is in the exception
+        # a network may hold a loop that never ends; onnxruntime looks at this before each node
+        timer = threading.Timer(self._time_limit, setattr, (options, "terminate", True))
+        timer.daemon = True
+        if self._time_limit > 0:
+            timer.start()
         try:
-            return np.asarray(self._session.run(None, {self._input: np.ascontiguousarray(x[None])})[0])
+            feeds = {self._input: np.ascontiguousarray(x[None])}
+            output = np.asarray(self._session.run([self._output], feeds, options)[0])
         except Exception as error:  # onnxruntime has a class of its own for each kind of failure
+            if ran_out(error):
+                raise
+            if options.terminate:
+                raise LabelError(
+                    f"{self._model}: no answer within {self._time_limit:g} s; raise --time-limit, or take "
+                    "another network"
+                ) from None
             raise LabelError(f"{self._model}: does not run ({_first_line(error)}); export it again") from None
+        finally:
+            timer.cancel()
+        if not output.ndim or output.shape[0] != 1 or not output.size or output.size > _VALUES:
+            raise self._unfit(output)
+        return output
 
     def _grouped(
         self, logits: Float32[np.ndarray, "C h w"]
@@ -176,11 +227,13 @@ def open_session(model: Path, threads: int, device: str = "cpu") -> Any:
         raise unavailable
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
-    options.log_severity_level = 3  # errors only
+    options.log_severity_level = 4  # errors are raised too
     gpu = [("CUDAExecutionProvider", {"device_id": index})] if on_gpu else []
     try:
         session = onnxruntime.InferenceSession(str(model), options, providers=[*gpu, "CPUExecutionProvider"])
     except Exception as error:  # onnxruntime has a class of its own for each kind of failure
+        if ran_out(error):
+            raise
         raise LabelError(
             f"{model}: no model that onnxruntime can load ({_first_line(error)}); export it again"
         ) from None
@@ -203,7 +256,7 @@ def class_axis(shape: Sequence[int], num_classes: int, likely: int) -> int | Non
 
 
 def _first_line(error: Exception) -> str:
-    return str(error).strip().partition("\n")[0]
+    return short(str(error).strip().partition("\n")[0])
 
 
 _NEEDS = "--segmenter onnx needs --model NETWORK.onnx and --classes CLASSES.json"
@@ -217,7 +270,7 @@ def _settings(config: MasksConfig) -> dict[str, Any]:
 
 
 def _load(config: MasksConfig, device: str, threads: int, warn: Callable[[str], None]) -> OnnxSegmenter:
-    return OnnxSegmenter(**_settings(config), device=device, threads=threads)
+    return OnnxSegmenter(**_settings(config), device=device, threads=threads, time_limit=config.time_limit)
 
 
 FACTORY = SegmenterFactory(_settings, _load, (".onnx",))

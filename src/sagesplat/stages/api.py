@@ -12,20 +12,20 @@ from pathlib import Path
 import numpy as np
 
 from sagesplat.adapt.bound_plans import Costs, plan_for_view, quality_at
-from sagesplat.adapt.eq3 import read_models
 from sagesplat.adapt.observe import PERCENTILE, distances_in_views
-from sagesplat.adapt.plan import Plan, plan_view, read_plans
-from sagesplat.adapt.viewpoint import ViewModel, read_promises
+from sagesplat.adapt.plan import Plan, plan_view
+from sagesplat.adapt.viewpoint import ViewModel
 from sagesplat.core.config import RunConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit, Event
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.raster import Backend, cuda, resolve_backend, set_threads
 from sagesplat.run.job import NO_RUN, Job
-from sagesplat.run.run_dir import LadderKind, RunDir
+from sagesplat.run.run_dir import LadderKind, RunDir, check_links
 from sagesplat.scene.scene import Camera, Scene, View
 from sagesplat.stages import pipeline
 from sagesplat.stages.methods import NestedLevels
+from sagesplat.stages.results import models_of, plans_of, promises_of
 
 
 def ignore(event: Event) -> None:
@@ -76,6 +76,7 @@ def run_scene(
         device = "cuda"
     backend, threads = resolve_backend(backend, device), set_threads(threads)
     run = RunDir(Path(folder), config.ladder)
+    check_links(run.path)
     with ExitStack() as locks:  # nobody else writes into the folder between two stages
         job = Job(run, on_event, backend, threads, force, device=device, locks=locks)
         pipeline.run_all(job, Path(scene), config)
@@ -102,6 +103,7 @@ def open_run(folder: Path | str, ladder: LadderKind = "nested") -> "FinishedRun"
         >>> gaussians = run.compose(plan)  # doctest: +SKIP
     """
     run = RunDir(Path(folder), ladder)
+    check_links(run.path)
     if not run.scene.exists():
         raise RunError(f"{run.path}: {NO_RUN}")
     return FinishedRun(Job(run, ignore))
@@ -126,12 +128,12 @@ class FinishedRun:
     @cached_property
     def plans(self) -> tuple[Plan, ...]:
         """The scene's plans, one per target SSIM, ascending. RunError before `sagesplat plan`."""
-        return read_plans(self.job.run.plan)[0]
+        return plans_of(self.job)
 
     @cached_property
     def promises(self) -> dict[int, ViewModel]:
         """The SSIM model of each category, by label id (nested ladder). RunError before `sagesplat fit`."""
-        return read_promises(self.job.run.promises)
+        return promises_of(self.job)
 
     @cached_property
     def costs(self) -> Costs:
@@ -162,7 +164,7 @@ class FinishedRun:
         if self.job.run.ladder == "nested":
             quality = quality_at(self.costs, self.promises, distances, [camera])
             return replace(plan_for_view(quality, self.costs, target_ssim, 0), view=None)
-        ladder, models = self.job.ladder, read_models(self.job.run.models)
+        ladder, models = self.job.ladder, models_of(self.job)
         near = {label: float(np.float64(d[0])) for label, d in distances.items()}
         return plan_view(models, ladder.counts, near, target_ssim, None, recovering=ladder.recovering)
 

@@ -19,9 +19,10 @@ from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit, Progress, named
 from sagesplat.core.gaussians import Gaussians, concat
 from sagesplat.formats.levels import read_level, read_more, read_sizes, write_level, write_set
-from sagesplat.io.files import link, read_json, write_json
+from sagesplat.io.files import link, write_json
+from sagesplat.run.capture import Hashes, fingerprint, photo_hashes
 from sagesplat.run.executor import Task, results
-from sagesplat.run.job import Job, JobSpec, fingerprint
+from sagesplat.run.job import Job, JobSpec
 from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
 from sagesplat.scene.blocks import (
@@ -29,6 +30,7 @@ from sagesplat.scene.blocks import (
     assigned_views,
     graph_colouring,
     read_blocks,
+    read_division,
     split,
     training_scene,
     visible_shares,
@@ -41,7 +43,7 @@ from sagesplat.segment.lift import LiftedLabels
 from sagesplat.segment.masks import mask_path, prepare_folder, write_labels, write_mask
 from sagesplat.stages.nest import nest_levels, write_ladder
 from sagesplat.stages.shared import label_image_inputs, train_config
-from sagesplat.stages.train import train_inputs, train_levels
+from sagesplat.stages.train import read_frozen, train_inputs, train_levels, write_frozen
 from sagesplat.train import memory, nested
 from sagesplat.train.boundaries import around, boundary_views, interior, interior_sizes, together
 from sagesplat.train.nested import Nested, NestStep
@@ -81,12 +83,13 @@ def divide(job: Job, config: BlocksConfig, seed: int) -> Blocks:
         assigned = assigned_views(scene, blocks, shares, config.min_share)
         training = np.isin(np.arange(len(scene.views)), scene.train_ids)
         labels = LiftedLabels.read(run.labels, len(scene.points.xyz))
+        photos = photo_hashes(run.photo_hashes, scene)
         sees: list[list[int]] = []
         for number in range(len(blocks)):
             rows = np.flatnonzero(assigned[:, number] & training).tolist()
             sees.append(np.flatnonzero((shares[rows] >= _SEEN).any(0)).tolist())
             part, kept = training_scene(scene, blocks, number, rows, config.far_share, seed)
-            _begin(run.block(number), part, labels, kept)
+            _begin(run.block(number), part, labels, kept, photos)
         for old in run.blocks.glob("[0-9]*"):
             if int(old.name) >= len(blocks):
                 shutil.rmtree(old)
@@ -103,15 +106,17 @@ def divide(job: Job, config: BlocksConfig, seed: int) -> Blocks:
     return read_blocks(file)
 
 
-def _begin(run: RunDir, scene: Scene, labels: LiftedLabels, rows: np.ndarray) -> None:
+def _begin(run: RunDir, scene: Scene, labels: LiftedLabels, rows: np.ndarray, photos: Hashes) -> None:
     """Create a block's run folder with the inputs of training."""
     run.path.mkdir(parents=True, exist_ok=True)
     capture = run.path / "capture.npz"
     write_scene(capture, scene)
-    mine = LiftedLabels(labels.label_ids[rows], labels.num_votes[rows], labels.num_agreeing[rows])
-    mine.write(run.labels)
+    LiftedLabels(labels.label_ids[rows], labels.num_votes[rows], labels.num_agreeing[rows]).write(run.labels)
+    mine = photos.of({view.name for view in scene.views})
     stored = {"path": str(capture.resolve()), "settings": {}, "fingerprint": fingerprint(scene)}
-    write_json(run.scene, {**stored, "extent": scene.extent, "points": len(rows), "views": []})
+    stored |= {"photos": mine.sha256, "extent": scene.extent, "points": len(rows), "views": []}
+    write_json(run.scene, stored)
+    mine.keep(run.photo_hashes)
 
 
 def _share_masks(job: Job, block: Job) -> None:
@@ -196,9 +201,9 @@ def _merge_levels(run: RunDir, blocks: Blocks, parts: BlockCategories) -> int:
         count = len(g)
     frozen = {}
     for number in range(len(blocks)):
-        for label, step in read_json(run.block(number).frozen).items():
-            frozen[str(int(parts.ids(np.array(int(label)), number)))] = step
-    write_json(run.frozen, frozen)
+        for label, step in read_frozen(run.block(number).frozen).items():
+            frozen[int(parts.ids(np.array(label), number))] = step
+    write_frozen(run.frozen, frozen)
     return count
 
 
@@ -299,7 +304,7 @@ def _tune(job: Job, blocks: Blocks, config: BlocksConfig, nest: NestConfig, seed
     """Tune the blocks along their boundaries, neighbours one after the other; the files with the results."""
     run, every = job.run, range(len(blocks))
     files = [run.block(number).interior for number in every]
-    colour, sees = graph_colouring(blocks.neighbours()), read_json(run.blocks / "blocks.json")["sees"]
+    colour, sees = graph_colouring(blocks.neighbours()), read_division(run.blocks / "blocks.json").sees
     steps = replace(nest, steps=config.boundary_steps)
     for now in range(int(colour.max()) + 1):
         mine = [number for number in every if colour[number] == now]

@@ -8,14 +8,15 @@ from sagesplat.adapt.observe import as_unit, render_rgb
 from sagesplat.core.events import Progress, TableMade
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.levels import read_sizes
-from sagesplat.io.files import read_json, write_text
+from sagesplat.io.files import write_text
 from sagesplat.metrics.image import squared_error_map, ssim_map
 from sagesplat.output.tables import Table
 from sagesplat.raster import Workspace, device_of, rasterize
 from sagesplat.run.job import Job
+from sagesplat.run.records import seconds_of
 from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
-from sagesplat.scene.blocks import Blocks, read_blocks
+from sagesplat.scene.blocks import Blocks, read_blocks, read_division
 from sagesplat.train.boundaries import bands, together
 from sagesplat.train.early_stopping import spread
 
@@ -48,21 +49,20 @@ def measure_borders(job: Job) -> None:
 
 def balance_table(job: Job, blocks: Blocks) -> Table:
     """Points, views, Gaussians and seconds of each block, one row each."""
-    made = read_json(job.run.blocks / "blocks.json")
+    made = read_division(job.run.blocks / "blocks.json")
     rows: list[tuple[str | int | float, ...]] = []
     for number in range(len(blocks)):
         run = job.run.block(number)
         seconds = [_seconds(run, stage) for stage in _TIMED]
         trained = sum(read_ladder(run.levels).files[-1].counts.values())
         kept = sum(n[-1] for n in read_sizes(run.interior).values())
-        rows.append((number, made["points"][number], made["views"][number], trained, kept, *seconds))
+        rows.append((number, made.points[number], made.views[number], trained, kept, *seconds))
     header = ("block", "points", "views", "Gaussians", "inside", *(f"{stage} s" for stage in _TIMED))
     return Table("Blocks", header, ("d", ",d", "d", ",d", ",d", ".1f", ".1f", ".1f", ".1f"), rows)
 
 
 def _seconds(run: RunDir, stage: str) -> float:
-    record = run.provenance(stage)
-    return float(read_json(record)["seconds"]) if record.exists() else float("nan")
+    return seconds_of(run, stage) if run.provenance(stage).exists() else float("nan")
 
 
 def border_table(job: Job, blocks: Blocks, sets: dict[str, Gaussians]) -> Table:

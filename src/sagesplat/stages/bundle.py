@@ -4,9 +4,7 @@ import io
 import json
 import shutil
 from collections.abc import Collection, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -14,27 +12,30 @@ import numpy as np
 import torch
 from PIL import Image
 
-from sagesplat.adapt.observe import large_enough, read_observations
-from sagesplat.adapt.viewpoint import ViewModel, read_promises
+from sagesplat.adapt.observe import large_enough
+from sagesplat.adapt.viewpoint import ViewModel
 from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.formats.increments import INDEX, read_increments, read_index, write_increments
+from sagesplat.core.names import composed
+from sagesplat.core.typed import fits
+from sagesplat.formats.increments import INDEX, read_increments, write_increments
 from sagesplat.formats.levels import read_level
 from sagesplat.io.files import read_json, write_json
 from sagesplat.io.npz import Npz
 from sagesplat.raster import rasterize
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import is_made_from, settings_of
+from sagesplat.run.records import is_made_from, settings_of
 from sagesplat.segment.block_categories import split_name
 from sagesplat.segment.display_names import title_of
 from sagesplat.segment.masks import UNLABELLED
+from sagesplat.stages.results import increments_of, observations_of, promises_of
 from sagesplat.stages.shared import distances
 from sagesplat.viewer import boxes
+from sagesplat.viewer.built import check_viewer, package_viewer
 from sagesplat.viewer.bundle import (
     MANIFEST,
     BundleSizes,
     check_target,
-    check_viewer,
     has_viewer,
     write_bundle,
     write_documents,
@@ -83,13 +84,14 @@ def bundle(
     the package's own. RunError for a run without nested levels or bounds, another folder, unknown names or an
     impossible number; DataError for a damaged increment; SageError without a viewer.
     """
-    weights = weights or {}
+    always = [composed(name) for name in always]
+    weights = {composed(name): weight for name, weight in (weights or {}).items()}
     job = replace(job, run=replace(job.run, ladder="nested"))
     _check(job, meters_per_unit, always, weights)
     viewer = viewer or package_viewer()
     check_target(out)
     check_viewer(viewer)
-    chunks = read_index(job.run.increments)
+    chunks = increments_of(job)
     if any(not chunk.uri.endswith(".spz") for chunk in chunks):
         raise RunError(f"{job.run.increments}: not SPZ files; run `sagesplat nest` again with --force")
     g = read_increments(job.run.increments, chunks)
@@ -119,11 +121,6 @@ def _poster(g: Gaussians, contents: Contents) -> bytes:
     return file.getvalue()
 
 
-def package_viewer() -> Path:
-    """The folder of the package's built viewer, which may be missing."""
-    return Path(str(files("sagesplat"))) / "viewer" / "static"
-
-
 def live_bundle(job: Job, folder: Path, viewer: Path | None = None) -> bool:
     """Write the newest level of a training, which may still run, to `folder`; False if it is there already.
 
@@ -134,9 +131,7 @@ def live_bundle(job: Job, folder: Path, viewer: Path | None = None) -> bool:
     if not steps:
         raise RunError(f"{job.run.levels}: no level yet; wait, or run `sagesplat train`")
     newest = {"level": steps[-1].name, "written": steps[-1].stat().st_mtime_ns}
-    previous: dict[str, Any] = {}
-    with suppress(RunError):
-        previous = read_json(folder / _LIVE)
+    previous = _read_live(folder / _LIVE)
     if previous.get("of") == newest and (folder / MANIFEST).exists():
         return False
     if not previous:
@@ -163,6 +158,16 @@ def live_bundle(job: Job, folder: Path, viewer: Path | None = None) -> bool:
         if path.name not in {uri for version in kept for uri in version}:
             path.unlink()
     return True
+
+
+def _read_live(path: Path) -> dict[str, Any]:
+    """What the last call of `live_bundle` wrote down; empty where there is nothing of use."""
+    try:
+        made = read_json(path)
+    except RunError:
+        return {}
+    usable = isinstance(made, dict) and fits(made.get("kept"), list[list[str]])
+    return made if usable else {}
 
 
 def _check(
@@ -269,7 +274,7 @@ def _rows_by_label(label_ids: np.ndarray) -> dict[int, np.ndarray]:
 def _with_quality(
     job: Job, categories: Sequence[Category], always: Collection[str], weights: Mapping[str, float]
 ) -> list[Category]:
-    promises: dict[int, ViewModel] = read_promises(job.run.promises)
+    promises: dict[int, ViewModel] = promises_of(job)
     far = distances(job, job.fit_config.distance)
     shares = _shares(job)
     return [
@@ -287,7 +292,7 @@ def _with_quality(
 
 def _shares(job: Job) -> dict[int, np.ndarray]:
     """By label id, the pixel share in each view [V]; 0 where it is too small."""
-    table = large_enough(read_observations(job.run.observations), job.scene, job.fit_config.min_share)
+    table = large_enough(observations_of(job), job.scene, job.fit_config.min_share)
     table = table.select(table.level == table.level.max(initial=0))
     sizes = np.array([view.camera.width * view.camera.height for view in job.scene.views])
     shares = {label: np.zeros(len(sizes)) for label in set(table.label_id.tolist())}

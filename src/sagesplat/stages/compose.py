@@ -6,7 +6,7 @@ from sagesplat.adapt.plan import Plan
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.ply import write_ply
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import settings_of
+from sagesplat.run.records import settings_of
 from sagesplat.run.stage import run_stage
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.plan import main_plan
@@ -33,7 +33,7 @@ def compose_plan(job: Job) -> None:
     run = job.run
 
     def make() -> list[str]:
-        plan = main_plan(run)
+        plan = main_plan(job)
         g = compose(job, plan)
         write_ply(run.composed, g, job.names())
         transfer_bytes = (

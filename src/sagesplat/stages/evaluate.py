@@ -4,16 +4,16 @@ import numpy as np
 
 from sagesplat.adapt.evaluate import evaluate
 from sagesplat.adapt.observe import TOTAL
-from sagesplat.adapt.plan import read_budget_plan, read_plans
 from sagesplat.core.events import Progress
 from sagesplat.output import tables
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import settings_of
+from sagesplat.run.records import settings_of
 from sagesplat.run.stage import run_stage
 from sagesplat.segment.display_names import titles
 from sagesplat.stages.compose import compose, compose_inputs
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.plan import main_target, scene_plan
+from sagesplat.stages.results import budget_plan_of, plans_of
 from sagesplat.stages.shared import _show, label_images
 
 
@@ -22,8 +22,8 @@ def evaluate_plans(job: Job) -> None:
     run, method = job.run, method_of(job)
 
     def make() -> list[str]:
-        fitted, within = job.fit_config, read_budget_plan(run.plan)
-        plans = [*read_plans(run.plan)[0], *([within] if within else [])]
+        fitted, within = job.fit_config, budget_plan_of(job)
+        plans = [*plans_of(job), *([within] if within else [])]
         table = evaluate(
             job.scene, job.photos, label_images(job, fitted.masks), job.ladder, plans, method.predicted,
             region=fitted.region, compose=lambda plan: compose(job, plan),
@@ -32,7 +32,7 @@ def evaluate_plans(job: Job) -> None:
         )  # fmt: skip
         table.write_csv(run.evaluation)
         if len(table):
-            plan = scene_plan(run, main_target(run))
+            plan = scene_plan(job, main_target(run))
             _show(job, tables.outcome_table(plan, job.ladder.counts, table, titles(job.names())))
         whole = table.select(table.label_id == TOTAL)
         lines = []

@@ -8,7 +8,7 @@ from sagesplat.core.errors import RunError
 from sagesplat.formats.increments import INDEX, Format, write_increments
 from sagesplat.formats.ply import write_ply
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import settings_of
+from sagesplat.run.records import settings_of
 from sagesplat.stages.compose import compose
 from sagesplat.stages.plan import main_plan, scene_plan
 from sagesplat.stages.shared import label_named
@@ -38,7 +38,7 @@ def export_ply(
     if level is not None:
         g = job.ladder.load(level, wanted)
     else:
-        plan = main_plan(job.run) if target is None else scene_plan(job.run, target)
+        plan = main_plan(job) if target is None else scene_plan(job, target)
         g = compose(job, plan).of_labels(wanted)
     write_ply(path, g, job.names())
     return len(g)

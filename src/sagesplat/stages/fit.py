@@ -8,8 +8,9 @@ from sagesplat.core.config import FitConfig
 from sagesplat.core.errors import RunError
 from sagesplat.run.executor import split
 from sagesplat.run.job import Job
+from sagesplat.run.records import settings_of
 from sagesplat.run.remote import work_all
-from sagesplat.run.run_dir import RunDir, settings_of
+from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.shared import label_image_inputs, observed

@@ -1,20 +1,24 @@
 """Makes label images from the photos, point labels from these, and fused label images from both."""
 
+import json
 import shutil
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from jaxtyping import Int16
 
 from sagesplat.core.config import LabelsConfig, LiftConfig, MasksConfig
-from sagesplat.core.errors import LabelError
+from sagesplat.core.errors import LabelError, RunError
 from sagesplat.core.events import Progress, Warned
+from sagesplat.core.typed import fits
 from sagesplat.io.files import read_json, write_json
 from sagesplat.run.executor import split
 from sagesplat.run.job import Job
+from sagesplat.run.records import file_hash
 from sagesplat.run.remote import work_all
-from sagesplat.run.run_dir import file_hash
 from sagesplat.run.stage import run_stage
 from sagesplat.segment.edit import Edited, edit_labels, parse_keep, parse_merge
 from sagesplat.segment.lift import agreement_in, lift
@@ -103,11 +107,11 @@ def _segment(job: Job, config: MasksConfig, kind: str) -> None:
     settings = {"segmenter": kind, "soft": config.soft, **hashed}
 
     def make() -> list[str]:
-        marker = run.segmented / _MARKER
-        if not marker.exists() or read_json(marker) != settings:
+        marker, key = run.segmented / _MARKER, {**settings, "scene": file_hash(run.scene)}
+        if not _is(marker, key):
             shutil.rmtree(run.segmented, ignore_errors=True)
             shutil.rmtree(run.soft, ignore_errors=True)
-        write_json(marker, settings)
+        write_json(marker, key)
         some = split(range(len(job.scene.views)), job.executor.parallel)  # each loads the network
         found = work_all(job, "segment", _segment_some, [(rows, config, kind) for rows in some])
         taxonomy = found[0][0]
@@ -118,6 +122,14 @@ def _segment(job: Job, config: MasksConfig, kind: str) -> None:
         return []
 
     run_stage(job, "segment", settings, [run.scene], [run.segmented / "labels.json"], make)
+
+
+def _is(marker: Path, key: dict[str, Any]) -> bool:
+    """Whether a folder of label images was begun with this network and these photos."""
+    try:
+        return read_json(marker) == json.loads(json.dumps(key))
+    except RunError:
+        return False
 
 
 def _segment_some(job: Job, part: tuple[Sequence[int], MasksConfig, str]) -> tuple[Taxonomy, set[int]]:
@@ -175,6 +187,20 @@ def fuse_masks(job: Job) -> None:
     run_stage(job, "fuse", {"soft": soft is not None}, inputs, [run.fused / "labels.json"], make)
 
 
+def read_edit_table(path: Path, before: Taxonomy) -> Int16[np.ndarray, " T"]:
+    """What became of each id of the categories `before`: its new id, or -1. RunError for another file."""
+    cure = f"delete {path.parent} and run `sagesplat masks` again"
+    made = read_json(path, cure)
+    table: Any = made.get("table") if isinstance(made, dict) else None
+    if (
+        not fits(table, list[int])
+        or len(table) <= max(before.names)
+        or not all(UNLABELLED <= new <= MAX_LABEL_ID for new in table)
+    ):
+        raise RunError(f"{path}: not of these categories; {cure}")
+    return np.array(table, np.int16)
+
+
 def _agreement(job: Job, masks: Masks) -> float:
     """Share of what views without a vote show of the points that is the points' label; NaN without any."""
     voters = set(job.scene.train_ids.tolist())
@@ -186,7 +212,7 @@ def _agreement(job: Job, masks: Masks) -> float:
 def _soft(job: Job) -> Soft:
     """The network's probabilities, of the categories that are left."""
     before = Taxonomy.read(job.run.segmented / "labels.json")
-    edited = np.array(read_json(job.run.masks / _EDIT)["table"], np.int16)
+    edited = read_edit_table(job.run.masks / _EDIT, before)
     table = np.full(MAX_LABEL_ID + 2, UNLABELLED, np.int16)  # what never was likeliest has no label
     table[list(before.names)] = edited[list(before.names)]
 

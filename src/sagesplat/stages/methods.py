@@ -12,14 +12,15 @@ import numpy as np
 
 from sagesplat.adapt.bound_plans import Costs, Quality, plan_for_scene, plan_for_view, plan_within, quality_at
 from sagesplat.adapt.coverage import Decisions, score
-from sagesplat.adapt.eq3 import SsimModel, read_models
+from sagesplat.adapt.eq3 import SsimModel
 from sagesplat.adapt.observe import LabelImages, Observations
 from sagesplat.adapt.plan import Plan, plan_scene, plan_view
-from sagesplat.adapt.viewpoint import read_promises, write_promises
+from sagesplat.adapt.viewpoint import write_promises
 from sagesplat.core.config import FitConfig, PlanConfig
 from sagesplat.core.errors import RunError
-from sagesplat.formats.increments import INDEX, read_index, totals
+from sagesplat.formats.increments import INDEX, totals
 from sagesplat.run.job import Job
+from sagesplat.stages.results import increments_of, models_of, promises_of
 from sagesplat.stages.shared import distances, label_images, label_named, observed
 from sagesplat.stages.viewpoints import fit_viewpoints
 
@@ -84,7 +85,7 @@ class Snapshots(Method):
 
     @cached_property
     def _models(self) -> Curves:
-        return read_models(self.job.run.models)
+        return models_of(self.job)
 
     @cached_property
     def _distances(self) -> dict[int, np.ndarray]:
@@ -147,7 +148,7 @@ class NestedLevels(Method):
     def costs(self) -> Costs:
         """What the levels cost."""
         labels = sorted({label for label, _ in self.job.ladder.counts})
-        increments, levels = read_index(self.job.run.increments), len(self.job.ladder.levels)
+        increments, levels = increments_of(self.job), len(self.job.ladder.levels)
         columns = (totals(increments, labels, levels, name) for name in ("count", "nbytes", "gpu_bytes"))
         return Costs(tuple(labels), *columns)
 
@@ -157,7 +158,7 @@ class NestedLevels(Method):
         job = self.job
         far = distances(job, job.fit_config.distance)
         cameras = [view.camera for view in job.scene.views]
-        return quality_at(self.costs, read_promises(job.run.promises), far, cameras)
+        return quality_at(self.costs, promises_of(job), far, cameras)
 
     @cached_property
     def shown(self) -> np.ndarray:
@@ -206,9 +207,7 @@ class NestedLevels(Method):
         job = self.job
         sent = zip(self.costs.labels, self.costs.transfer_bytes.tolist(), strict=True)
         costs = {(label, level): n for label, row in sent for level, n in enumerate(row, 1)}
-        return score(
-            observed(job, job.fit_config), job.scene, read_promises(job.run.promises), costs, targets
-        )
+        return score(observed(job, job.fit_config), job.scene, promises_of(job), costs, targets)
 
 
 def _training_rows(job: Job) -> Observations:

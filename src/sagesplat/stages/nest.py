@@ -13,7 +13,7 @@ from sagesplat.formats.increments import packed, read_increments, write_incremen
 from sagesplat.formats.levels import read_level, write_set
 from sagesplat.metrics.image import ssim_map
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import checkpoint_key
+from sagesplat.run.records import checkpoint_key
 from sagesplat.run.stage import run_stage
 from sagesplat.stages.shared import label_image_inputs, train_config
 from sagesplat.train import nested

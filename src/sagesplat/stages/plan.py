@@ -2,13 +2,15 @@
 
 from dataclasses import asdict
 
-from sagesplat.adapt.plan import Plan, read_budget_plan, read_plans, write_plans
+from sagesplat.adapt.plan import Plan, write_plans
 from sagesplat.core.config import PlanConfig
 from sagesplat.core.errors import RunError
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import RunDir, settings_of
+from sagesplat.run.records import settings_of
+from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
 from sagesplat.stages.methods import method_of
+from sagesplat.stages.results import budget_plan_of, plans_of
 from sagesplat.stages.shared import label_image_inputs
 
 
@@ -39,15 +41,18 @@ def main_target(run: RunDir) -> float:
     return float(settings_of(run, "plan")["target_ssim"])
 
 
-def scene_plan(run: RunDir, target: float) -> Plan:
+def scene_plan(job: Job, target: float) -> Plan:
     """The scene's plan for one of the run's targets."""
-    plans = {plan.target: plan for plan in read_plans(run.plan)[0]}
+    plans = {plan.target: plan for plan in plans_of(job)}
     if target not in plans:
         known = ", ".join(f"{t:g}" for t in plans)
-        raise RunError(f"{run.plan}: no plan for SSIM {target:g}, only for {known}; run `sagesplat plan`")
+        raise RunError(
+            f"{job.run.plan}: no plan for SSIM {target:g}, only for {known}; "
+            "run `sagesplat plan` with --force"
+        )
     return plans[target]
 
 
-def main_plan(run: RunDir) -> Plan:
+def main_plan(job: Job) -> Plan:
     """What the run composes: the plan for its budget, if it has one, else for its main target."""
-    return read_budget_plan(run.plan) or scene_plan(run, main_target(run))
+    return budget_plan_of(job) or scene_plan(job, main_target(job.run))

@@ -1,6 +1,5 @@
 """Makes the HTML report, from a finished run."""
 
-from sagesplat.adapt.plan import read_budget_plan
 from sagesplat.core.events import RunDone
 from sagesplat.formats.ply import read_ply
 from sagesplat.output.report import write_report
@@ -10,6 +9,7 @@ from sagesplat.stages.compose import compose
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.plan import main_target, scene_plan
 from sagesplat.stages.report_data import report_data, stage_records
+from sagesplat.stages.results import budget_plan_of
 
 
 def make_report(job: Job) -> None:
@@ -19,11 +19,9 @@ def make_report(job: Job) -> None:
     def make() -> list[str]:
         target = main_target(run)
         # the page leads with a target: what was composed for a budget is not what it is about
-        within_budget = read_budget_plan(run.plan) is not None
-        composed = compose(job, scene_plan(run, target)) if within_budget else read_ply(run.composed)
-        masks = job.best_masks
-        data = report_data(run, job.scene, job.photos, masks, job.ladder, composed, target, job.backend)
-        write_report(run.report, data)
+        within_budget = budget_plan_of(job) is not None
+        composed = compose(job, scene_plan(job, target)) if within_budget else read_ply(run.composed)
+        write_report(run.report, report_data(job, composed, target))
         return []
 
     inputs = [run.observations, run.models, run.plan, run.evaluation, *stage_records(run)]

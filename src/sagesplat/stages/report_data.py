@@ -1,29 +1,25 @@
 """Reads the data of the report from a finished run."""
 
 import json
+import math
 import platform
 from pathlib import Path
 
 import numpy as np
 
 from sagesplat import __version__
-from sagesplat.adapt.eq3 import read_models
-from sagesplat.adapt.evaluate import read_evaluation
-from sagesplat.adapt.ladder import Ladder
-from sagesplat.adapt.observe import TOTAL, as_unit, measure, read_observations, render_rgb
-from sagesplat.adapt.plan import read_plans
+from sagesplat.adapt.observe import TOTAL, as_unit, measure, render_rgb
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.io.files import read_json
 from sagesplat.output.figures import Colours, Panel
 from sagesplat.output.report import ReportData
-from sagesplat.raster import Backend
+from sagesplat.run.job import Job
+from sagesplat.run.records import read_record
 from sagesplat.run.run_dir import RunDir
 from sagesplat.scene import describe
-from sagesplat.scene.images import Photos
-from sagesplat.scene.scene import Scene
 from sagesplat.segment.block_categories import category_of
 from sagesplat.segment.display_names import titles
-from sagesplat.segment.masks import UNLABELLED, UNLABELLED_COLOR, Masks, Taxonomy
+from sagesplat.segment.masks import UNLABELLED, UNLABELLED_COLOR, Taxonomy
+from sagesplat.stages.results import evaluation_of, models_of, observations_of, plans_of
 
 PANELS = 3  # views shown in pictures
 STAGES = (
@@ -32,40 +28,30 @@ STAGES = (
 )
 
 
-def report_data(
-    run: RunDir,
-    scene: Scene,
-    photos: Photos,
-    masks: Masks,
-    ladder: Ladder,
-    composed: Gaussians,
-    target: float,
-    backend: Backend,
-) -> ReportData:
+def report_data(job: Job, composed: Gaussians, target: float) -> ReportData:
     """Everything the report of a run shows; `target` is the SSIM that it leads with, `composed` its scene."""
+    run, scene, masks, ladder = job.run, job.scene, job.best_masks, job.ladder
     names = {**masks.taxonomy.names, UNLABELLED: masks.taxonomy.name(UNLABELLED)}
     categories, colours = _parts(run, names)
-    plans = read_plans(run.plan)[0]
-    records = {path.stem: read_json(path) for path in stage_records(run)}
-    antialiased = bool(records["train"]["settings"]["antialiased"])
+    records = {path.stem: read_record(path) for path in stage_records(run)}
     return ReportData(
         title=scene.name,
         target=target,
         names=titles(names),
         colours=colours or {label: masks.taxonomy.color(label) for label in names},
-        observations=read_observations(run.observations),
+        observations=observations_of(job),
         train_views=scene.train_ids,
         test_views=scene.test_ids,
         view_names=[view.name for view in scene.views],
         counts=ladder.counts,
         recovering=ladder.recovering,
-        models=read_models(run.models),
-        plans=plans,
-        evaluation=read_evaluation(run.evaluation),
-        panels=_panels(scene, photos, masks, ladder, composed, backend, antialiased),
+        models=models_of(job),
+        plans=list(plans_of(job)),
+        evaluation=evaluation_of(job),
+        panels=_panels(job, composed),
         scene_facts=describe(scene),
         settings=_settings(records),
-        timings=[(stage, float(made["seconds"])) for stage, made in records.items()],
+        timings=[(stage, float(made.get("seconds", math.nan))) for stage, made in records.items()],
         provenance=_provenance(records),
         categories=categories,
     )
@@ -91,16 +77,9 @@ def _parts(run: RunDir, names: dict[int, str]) -> tuple[dict[int, int], Colours]
     return {label: stands[category] for label, category in of.items() if label != UNLABELLED}, colours
 
 
-def _panels(
-    scene: Scene,
-    photos: Photos,
-    masks: Masks,
-    ladder: Ladder,
-    composed: Gaussians,
-    backend: Backend,
-    antialiased: bool,
-) -> list[Panel]:
+def _panels(job: Job, composed: Gaussians) -> list[Panel]:
     """A few test views, spread over the capture, in pictures."""
+    scene, photos, masks, ladder = job.scene, job.photos, job.best_masks, job.ladder
     if not len(scene.test_ids):
         return []
     rows = scene.test_ids[
@@ -114,7 +93,8 @@ def _panels(
         view = scene.views[row]
         photo = photos[row]
         images = [
-            render_rgb(g, view.camera, backend=backend, antialiased=antialiased) for g in (full, composed)
+            render_rgb(g, view.camera, backend=job.backend, antialiased=job.antialiased)
+            for g in (full, composed)
         ]
         of_full, of_composed = (measure(image, as_unit(photo), masks[view])[TOTAL] for image in images)
         eight_bit = [np.round(image * 255).astype(np.uint8) for image in images]

@@ -7,8 +7,18 @@ from pathlib import Path
 from sagesplat.core.config import PosesConfig, SceneConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Progress, Warned
+from sagesplat.core.names import repaired
 from sagesplat.io.files import write_json
-from sagesplat.run.job import Job, fingerprint
+from sagesplat.run.capture import (
+    Capture,
+    Hashes,
+    check_photos,
+    fingerprint,
+    photo_hashes,
+    read_capture,
+)
+from sagesplat.run.job import Job
+from sagesplat.run.records import settings_of
 from sagesplat.run.stage import run_stage
 from sagesplat.scene import load_scene
 from sagesplat.scene.detect import detect
@@ -17,15 +27,21 @@ from sagesplat.scene.detect import detect
 def open_scene(job: Job, path: Path, config: SceneConfig, poses: PosesConfig | None = None) -> None:
     """Read a capture and write scene.json. For photos without poses, or a video, estimate the poses first."""
     run = job.run
-    ours = run.scene.exists() or run.capture.exists()
+    ours = run.scene.exists() or run.capture.exists() or run.provenance("scene").exists()
     if run.path.exists() and not ours and any(not p.name.startswith(".") for p in run.path.iterdir()):
         raise RunError(f"{run.path}: not empty and not a run folder; choose a new folder")
     if detect(path) in ("photos", "video"):
-        capture = run.capture / path.resolve().stem  # the scene will have that name
+        capture = run.capture / repaired(path.resolve().stem)  # the scene will have that name
         _find_poses(job, path, capture, poses or PosesConfig())
         path = capture
     scene = load_scene(path, **asdict(config))
+    photos = photo_hashes(run.photo_hashes, scene)
     settings = {"path": str(path.resolve()), **asdict(config), "fingerprint": fingerprint(scene)}
+    begun = _begun(job)
+    if begun is None or begun.photos is not None or begun.fingerprint != settings["fingerprint"]:
+        settings["photos"] = photos.digest
+    if begun and begun.photos is not None and not job.force and begun.settings == asdict(config):
+        check_photos(scene, begun.photos, photos.sha256)
 
     def make() -> list[str]:
         write_json(
@@ -34,6 +50,7 @@ def open_scene(job: Job, path: Path, config: SceneConfig, poses: PosesConfig | N
                 "path": str(path.resolve()),
                 "settings": asdict(config),
                 "fingerprint": settings["fingerprint"],
+                "photos": photos.sha256,
                 "extent": scene.extent,
                 "points": len(scene.points.xyz),
                 "views": [
@@ -56,6 +73,14 @@ def open_scene(job: Job, path: Path, config: SceneConfig, poses: PosesConfig | N
         ]
 
     run_stage(job, "scene", settings, [], [run.scene], make)
+    photos.keep()
+
+
+def _begun(job: Job) -> Capture | None:
+    """What the run folder says of its capture; None where it says nothing, or nothing of use."""
+    if not job.run.provenance("scene").exists():
+        return None
+    return read_capture(job.run.scene) if job.run.scene.exists() else None
 
 
 HIGH_ERROR = 0.8  # px; `dinosaur` has 0.97 with one shared camera, 0.42 with a camera per photo
@@ -73,9 +98,7 @@ def _find_poses(job: Job, source: Path, capture: Path, config: PosesConfig) -> N
 
     if job.run.path.resolve().is_relative_to(source.resolve()):
         raise RunError(f"{job.run.path}: lies among the photos; name a run folder outside of {source}")
-    files = sorted(p for p in source.rglob("*") if p.is_file()) if source.is_dir() else [source]
-    state = [(str(p.relative_to(source)), p.stat().st_size, p.stat().st_mtime_ns) for p in files]
-    digest = hashlib.sha256(repr(state).encode()).hexdigest()
+    digest, hashes = _hashes(job, source)
     settings = {"source": str(source.resolve()), **asdict(config), "files": digest}
 
     def make() -> list[str]:
@@ -97,3 +120,19 @@ def _find_poses(job: Job, source: Path, capture: Path, config: PosesConfig) -> N
         ]
 
     run_stage(job, "poses", settings, [], [capture / "poses.json"], make)
+    if hashes:
+        hashes.keep()
+
+
+def _hashes(job: Job, source: Path) -> tuple[str, Hashes | None]:
+    """What changes when the content of the photos, or of the video, does; and what is to be kept of it."""
+    files = sorted(p for p in source.rglob("*") if p.is_file()) if source.is_dir() else [source]
+    state = [(str(p.relative_to(source)), p.stat().st_size, p.stat().st_mtime_ns) for p in files]
+    of_times = hashlib.sha256(repr(state).encode()).hexdigest()  # what older run folders recorded
+    try:
+        if settings_of(job.run, "poses").get("files") == of_times:
+            return of_times, None
+    except RunError:
+        pass
+    hashes = Hashes(job.run.source_hashes, {str(path.relative_to(source)): path for path in files})
+    return hashes.digest, hashes

@@ -12,14 +12,16 @@ from sagesplat.adapt.observe import (
     RenderedLabels,
     distances_in_views,
     large_enough,
-    read_observations,
 )
 from sagesplat.core.config import FitConfig, TrainConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import TableMade
+from sagesplat.core.names import composed
 from sagesplat.output.tables import Table
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import RunDir, settings_of
+from sagesplat.run.records import settings_of
+from sagesplat.run.run_dir import RunDir
+from sagesplat.stages.results import observations_of
 
 
 def train_config(job: Job) -> TrainConfig:
@@ -49,7 +51,7 @@ def distances(job: Job, distance: str) -> dict[int, np.ndarray]:
 
 def observed(job: Job, config: FitConfig) -> Observations:
     """The rows of views that show enough of a category, with SSIM of the region that models are fitted to."""
-    table = large_enough(read_observations(job.run.observations), job.scene, config.min_share)
+    table = large_enough(observations_of(job), job.scene, config.min_share)
     return replace(table, ssim=table.ssim_eroded) if config.region == "eroded" else table
 
 
@@ -60,6 +62,6 @@ def _show(job: Job, table: Table) -> None:
 def label_named(job: Job, name: str) -> int:
     """The id of a category of the run; RunError for a name that it does not have."""
     ids = {name: label for label, name in job.names().items()}
-    if name not in ids:
+    if composed(name) not in ids:
         raise RunError(f"{job.run.path}: no category {name!r}; there are {', '.join(ids)}")
-    return ids[name]
+    return ids[composed(name)]

@@ -1,17 +1,23 @@
 """Makes the levels: trains 3DGS from the labelled points and records snapshots."""
 
 import shutil
+from collections.abc import Mapping
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from sagesplat.core.config import TrainConfig
+from sagesplat.core.errors import RunError
 from sagesplat.core.events import Training, Warned
+from sagesplat.core.typed import fits
 from sagesplat.io.files import read_json, write_json
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import RunDir, checkpoint_key
+from sagesplat.run.records import checkpoint_key
+from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
 from sagesplat.segment.display_names import titles
+from sagesplat.segment.masks import MAX_LABEL_ID
 from sagesplat.train import memory
 from sagesplat.train.checkpoint import can_resume, remove_checkpoints
 from sagesplat.train.events import LabelFrozen, LevelSaved, Resumed, Step, Trained
@@ -35,7 +41,7 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
             remove_checkpoints(place.checkpoint)
             shutil.rmtree(place.levels, ignore_errors=True)
         place.path.mkdir(exist_ok=True)
-        write_json(place.cap, {"cap": cap, "settings": settings})
+        write_cap(place.cap, cap, settings)
         counts: dict[str, int] = {}
         names = titles(job.names())
         start = partial(train_together, job.processes, job.threads) if job.processes > 1 else train
@@ -60,7 +66,7 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
                         Warned(f"{name} stops at step {step} with SSIM {ssim:.3f} and {count:,} Gaussians")
                     )
                 case Trained(gaussians, step, frozen):
-                    write_json(place.frozen, {str(label): at for label, at in frozen.items()})
+                    write_frozen(place.frozen, frozen)
                     lines = [f"{len(gaussians):,} Gaussians after {step} steps"]
         if place != run:
             _swap(run, place)
@@ -68,6 +74,40 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
 
     outputs = [run.levels, run.checkpoint]
     run_stage(job, "train", settings, inputs, outputs, make, swaps=True)
+
+
+def write_cap(path: Path, cap: int, settings: Mapping[str, Any]) -> None:
+    """Write down what a training begins with: its cap of Gaussians (0: none needed) and its settings."""
+    write_json(path, {"cap": cap, "settings": dict(settings)})
+
+
+def read_cap(path: Path) -> int:
+    """The cap that `write_cap` wrote; RunError for anything else."""
+    made = read_json(path, "delete it, and run the same command again")
+    cap = made.get("cap") if isinstance(made, dict) else None
+    if type(cap) is not int or not 0 <= cap < 2**31:
+        raise RunError(f"{path}: no cap of Gaussians in it; delete it, and run the same command again")
+    return cap
+
+
+def write_frozen(path: Path, steps: Mapping[int, int]) -> None:
+    """Write the steps at which categories stopped, by label id."""
+    write_json(path, {str(label): step for label, step in steps.items()})
+
+
+def read_frozen(path: Path) -> dict[int, int]:
+    """The steps that `write_frozen` wrote; RunError for anything else."""
+    cure = "write {} into it if no category stopped early"
+    made = read_json(path, cure)
+    try:
+        if not fits(made, dict[str, int]):
+            raise ValueError
+        steps = {int(label): step for label, step in made.items()}
+        if not all(-1 <= label <= MAX_LABEL_ID and 0 <= step < 2**31 for label, step in steps.items()):
+            raise ValueError
+    except ValueError:
+        raise RunError(f"{path}: not the steps at which categories stopped; {cure}") from None
+    return steps
 
 
 def train_inputs(run: RunDir, config: TrainConfig) -> list[Path]:
@@ -111,7 +151,7 @@ def _fit_memory(job: Job, place: RunDir, config: TrainConfig, resuming: bool) ->
     """
     if job.backend == "cuda":  # Gaussians are not in the machine's memory
         return config, 0
-    began = int(read_json(place.cap)["cap"]) if resuming and place.cap.exists() else 0
+    began = read_cap(place.cap) if resuming and place.cap.exists() else 0
     fitted = memory.fit(job.scene, config, job.memory_limit, processes=job.processes, began=began)
     job.emit(Warned(str(fitted)))
     return fitted.config, fitted.lowered

@@ -8,13 +8,17 @@ from typing import TYPE_CHECKING, Any
 
 from sagesplat.core.errors import BackendUnavailable, RunError, SageError
 from sagesplat.core.events import Emit, Warned
+from sagesplat.formats.increments import read_index
 from sagesplat.io.files import read_json
-from sagesplat.run.run_dir import RunDir, check_format
+from sagesplat.run.records import settings_of
+from sagesplat.run.run_dir import RunDir, check_links
+from sagesplat.viewer.built import check_viewer, package_viewer
+from sagesplat.viewer.hosts import Hosts
+from sagesplat.viewer.server import _NO_SERVER, MANIFEST, View, _check_certificate, _hint, _urls, bind
 
 if TYPE_CHECKING:
     from sagesplat.run.job import Job
     from sagesplat.viewer.site import Site
-from sagesplat.viewer.server import _NO_SERVER, MANIFEST, View, _check_certificate, _hint, _urls, bind
 
 _EVERY = 2.0  # seconds between two looks at a training
 _MAKE_IT = "make one by `sagesplat bundle RUN OUT`"
@@ -33,16 +37,19 @@ def show(
 ) -> View:
     """A server for a bundle, or for a run folder, whose bundle is made if it is missing or out of date.
 
-    Without a host only this machine gets in, under its own names; without a port the first free one from
-    8000 on is taken. With `follow` the run's training is shown as it goes on, then its bundle. SageError: a
-    folder that is neither, a run that is not ready, a port or certificate of no use, no extra `view`.
+    The viewer is this package's; of a bundle only the data is served. Without a host only this machine gets
+    in; without a port the first free one from 8000 on is taken. With `follow` the run's training is shown as
+    it goes on, then its bundle. SageError: a folder that is neither, a run that is not ready, a port or
+    certificate of no use, no extra `view`, no built viewer.
     """
     try:
-        from sagesplat.viewer.site import Site, make_server
+        from sagesplat.viewer.connections import make_server
+        from sagesplat.viewer.site import Site
     except ImportError:
         raise BackendUnavailable(_NO_SERVER) from None
     _check_certificate(ssl_certfile, ssl_keyfile)
-    site = Site(local=host is None)
+    check_viewer(package_viewer())
+    site = Site(hosts=Hosts(host, certificate=ssl_certfile is not None))
     listener = bind(host or "127.0.0.1", port)  # first: making a bundle takes its time
     try:
         keep = _fill(site, path, emit, follow)
@@ -79,8 +86,6 @@ def is_bundle(path: Path) -> bool:
     manifest = read_json(path / MANIFEST)
     if not isinstance(manifest, dict) or manifest.get("format") != "sagesplat-bundle":
         raise RunError(f"{path / MANIFEST}: not of a sagesplat bundle; {_MAKE_IT}")
-    if not (path / "index.html").exists():
-        raise RunError(f"{path}: a bundle without a viewer (no index.html); {_MAKE_IT}")
     return True
 
 
@@ -103,8 +108,8 @@ def _open_run(path: Path, emit: Emit) -> "Job":
     run = RunDir(path)
     if not run.scene.exists():
         raise RunError(f"{path}: neither a bundle (no {MANIFEST}) nor a run folder (no scene.json)")
-    made = read_json(run.provenance("scene")) if run.provenance("scene").exists() else {}
-    check_format(path, made if isinstance(made, dict) else {})
+    check_links(path)
+    settings_of(run, "scene")  # of a format that is read here
     return Job(run, emit)
 
 
@@ -113,20 +118,17 @@ def _is_finished(run: RunDir) -> bool:
 
 
 def _is_current(run: RunDir, folder: Path) -> bool:
-    """Whether a bundle has the run's chunks, promises no older than the run's, and this package's viewer."""
-    from sagesplat.stages.bundle import package_viewer
-    from sagesplat.viewer.bundle import has_viewer
-
+    """Whether a bundle has the run's chunks, and promises no older than the run's."""
     if not (folder / MANIFEST).exists():
         return False
-    manifest: Any = read_json(folder / MANIFEST)
     try:
+        manifest: Any = read_json(folder / MANIFEST)
         held = {level["sha256"] for label in manifest["labels"] for level in label["levels"]}
-    except (KeyError, TypeError):
+    except (RunError, KeyError, TypeError):
         return False
-    chunks = {chunk["sha256"] for chunk in read_json(run.increments / "index.json")["chunks"]}
+    chunks = {chunk.sha256 for chunk in read_index(run.increments)}
     older = (folder / MANIFEST).stat().st_mtime < run.promises.stat().st_mtime
-    return held == chunks and not older and has_viewer(folder, package_viewer())
+    return held == chunks and not older
 
 
 def _follow(job: "Job", site: "Site", stop: threading.Event) -> None:

@@ -12,18 +12,19 @@ from sagesplat.adapt.observe import (
     as_unit,
     measure,
     near_border,
-    read_observations,
     render_rgb,
 )
 from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.io.files import read_json
 from sagesplat.metrics.image import psnr, squared_error_map
 from sagesplat.output.tables import Table, by_size, mean, name_of
 from sagesplat.raster import Workspace
+from sagesplat.run.capture import read_capture
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import settings_of
+from sagesplat.run.records import seconds_of, settings_of
 from sagesplat.segment.display_names import titles
+from sagesplat.stages.results import observations_of
+from sagesplat.stages.train import read_frozen
 from sagesplat.train.early_stopping import measured_views
 
 BAND = 10  # px around the borders of categories
@@ -38,16 +39,16 @@ def compare_early_stopping(stopped: Job, full: Job, out: Path) -> tuple[Table, T
     `out`/early_stopping.* and early_stopping_categories.*; RunError where the runs differ in more than that.
     """
     target = _check(stopped, full)
-    stops = {int(label): step for label, step in read_json(stopped.run.frozen).items()}
+    stops = read_frozen(stopped.run.frozen)
     ladder = full.ladder
     views = measured_views(full.scene, full.masks)
-    reached = first_levels(ladder, read_observations(full.run.observations), views, target)
+    reached = first_levels(ladder, observations_of(full), views, target)
     sets = {
         "early stopping": stopped.ladder.load(stopped.ladder.levels[-1]),
         "composed": ladder.compose(reached),
         "full run": ladder.load(ladder.levels[-1]),
     }
-    seconds = {job: read_json(job.run.provenance("train"))["seconds"] for job in (stopped, full)}
+    seconds = {job: seconds_of(job.run, "train") for job in (stopped, full)}
     times = {"early stopping": seconds[stopped], "composed": seconds[full], "full run": seconds[full]}
     measured = {name: _measure(full, g) for name, g in sets.items()}
     labels = by_size(ladder.counts)
@@ -107,9 +108,9 @@ def _check(stopped: Job, full: Job) -> float:
             f"{stopped.run.path}: this run needs --train.freeze-at and {full.run.path} must not have it; "
             "swap them, or train one of them so"
         )
-    scenes = [read_json(job.run.scene)["fingerprint"] for job in (stopped, full)]
+    scenes = [read_capture(job.run.scene) for job in (stopped, full)]
     names = {name for name in {*made, *other} - _FREE if made.get(name) != other.get(name)}
-    if scenes[0] != scenes[1] or names:
+    if (scenes[0].fingerprint, scenes[0].photos) != (scenes[1].fingerprint, scenes[1].photos) or names:
         what = f"settings ({', '.join(sorted(names))})" if names else "captures"
         raise RunError(
             f"{full.run.path}: other {what} than {stopped.run.path}; train one of them like the other"

@@ -7,7 +7,7 @@ from sagesplat.core.errors import SageError
 from sagesplat.core.events import Warned
 from sagesplat.metrics.lpips import Lpips, Net, load_lpips, weights_path
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import file_hash
+from sagesplat.run.records import file_hash
 
 NETS: tuple[Net, ...] = ("alex", "vgg")
 

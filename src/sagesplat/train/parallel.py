@@ -1,6 +1,7 @@
 """Data-parallel training: several processes train one model, one per GPU (on a CPU for tests)."""
 
 import multiprocessing
+import signal
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -38,8 +39,9 @@ def train_together(processes: int, threads: int, *args: Any, **options: Any) -> 
         workers = [
             context.Process(target=_work, args=(rank, *shared), daemon=True) for rank in range(1, processes)
         ]
-        for worker in workers:
-            worker.start()
+        with _without_ctrl_c():
+            for worker in workers:
+                worker.start()
         before = torch.get_num_threads()
         set_threads(each)
         try:
@@ -58,6 +60,19 @@ def train_together(processes: int, threads: int, *args: Any, **options: Any) -> 
             for worker in workers:
                 worker.terminate()
                 worker.join()
+
+
+@contextmanager
+def _without_ctrl_c() -> Iterator[None]:
+    """Processes that begin in the block never get SIGINT, which terminals send to all: this one ends them."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _lost(workers: Sequence[BaseProcess]) -> str | None:

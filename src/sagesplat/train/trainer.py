@@ -12,6 +12,7 @@ from torch import Tensor
 
 from sagesplat.core.config import TrainConfig
 from sagesplat.core.errors import DataError, OutOfMemory, RunError
+from sagesplat.core.memory import ran_out
 from sagesplat.formats.levels import check_level, write_level
 from sagesplat.raster import Backend, device_of
 from sagesplat.scene.images import Photos
@@ -100,6 +101,8 @@ def named_failures(where: Callable[[], str]) -> Iterator[None]:
     except (torch.OutOfMemoryError, OutOfMemory, MemoryError) as error:
         raise RunError(f"{where()}: out of memory; {_LESS}") from error
     except RuntimeError as error:
+        if ran_out(error):
+            raise RunError(f"{where()}: out of memory; {_LESS}") from error
         if "CUDA error" not in str(error):
             raise
         reason = str(error).splitlines()[0]

@@ -10,14 +10,15 @@ from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
-from sagesplat.core.errors import DataError, RunError, SageError
+from sagesplat.core.errors import DataError, RunError
 from sagesplat.formats.increments import Increment
-from sagesplat.io.files import atomic_folder, read_json, write_text
+from sagesplat.io.files import atomic_folder, read_json, unwritable, write_text
+from sagesplat.viewer.built import PAGE, POSTER, check_viewer, with_poster
 from sagesplat.viewer.manifest import FORMAT, THIRD_PARTY, Contents, documents, pack_order
 from sagesplat.viewer.pack import write_pack
 from sagesplat.viewer.quality import dumped
 
-MANIFEST, SCHEMA, POSTER = "manifest.json", "manifest.schema.json", "poster.jpg"
+MANIFEST, SCHEMA = "manifest.json", "manifest.schema.json"
 _LICENSES = """\
 The viewer in this folder is part of sagesplat, licensed under the Apache License, Version 2.0
 (SPDX: Apache-2.0). It contains other people's software: see THIRD_PARTY_LICENSES.txt.
@@ -44,7 +45,8 @@ def write_bundle(out: Path, contents: Contents, viewer: Path, poster: bytes | No
 
     `viewer`: the folder with the built viewer. `poster`: a JPEG of the first view, shown until the scene is
     drawn. RunError for another folder; SageError without a viewer;
-    DataError for a chunk that is missing or not what the index says.
+    DataError for a chunk that is missing or not what the index says; RunError too where another process
+    writes there.
     """
     check_target(out)
     check_viewer(viewer)
@@ -59,29 +61,23 @@ def write_bundle(out: Path, contents: Contents, viewer: Path, poster: bytes | No
                 _put_up(fresh, poster)
             return write_documents(fresh, contents)
     except OSError as error:
-        raise RunError(
-            f"{out}: cannot be written ({error.strerror}); free some space or name another folder"
-        ) from error
+        raise RunError(unwritable(out, error)) from error
 
 
 def _put_up(folder: Path, poster: bytes) -> None:
     """Show the poster in the page until its scripts are loaded."""
-    page = folder / "index.html"
+    page = folder / PAGE
     (folder / POSTER).write_bytes(poster)
-    write_text(page, _with_poster(page.read_text(encoding="utf-8")))
-
-
-def _with_poster(page: str) -> str:
-    return page.replace("<!-- poster -->", f'<img id="poster" src="{POSTER}" alt="" />')
+    write_text(page, with_poster(page.read_text(encoding="utf-8")))
 
 
 def has_viewer(folder: Path, viewer: Path) -> bool:
     """Whether a bundle has this viewer, by its page, which names all scripts by content hash."""
-    pages = [path / "index.html" for path in (folder, viewer)]
+    pages = [path / PAGE for path in (folder, viewer)]
     if not all(page.is_file() for page in pages):
         return False
     mine, page = (page.read_text(encoding="utf-8") for page in pages)
-    return mine in (page, _with_poster(page))
+    return mine in (page, with_poster(page))
 
 
 def write_documents(folder: Path, contents: Contents) -> BundleSizes:
@@ -115,21 +111,17 @@ def is_bundle(folder: Path) -> bool:
         return False
 
 
-def check_viewer(viewer: Path) -> None:
-    """SageError unless the viewer is built."""
-    if not (viewer / "index.html").is_file():
-        raise SageError(f"{viewer}: viewer not built: run `make web` (installed packages have it)")
-
-
 def _verified(folder: Path, chunk: Increment) -> bytes:
     try:
         content = (folder / chunk.uri).read_bytes()
     except OSError as error:
         raise DataError(
-            f"{folder / chunk.uri}: cannot be read ({error.strerror}); run `sagesplat nest --force` again"
+            f"{folder / chunk.uri}: cannot be read ({error.strerror}); delete that folder and run "
+            "`sagesplat nest` again"
         ) from None
     if hashlib.sha256(content).hexdigest() != chunk.sha256:
         raise DataError(
-            f"{folder / chunk.uri}: not the chunk that was written; run `sagesplat nest --force` again"
+            f"{folder / chunk.uri}: not the chunk that was written; delete that folder and run "
+            "`sagesplat nest` again"
         )
     return content

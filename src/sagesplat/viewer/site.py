@@ -1,28 +1,24 @@
-"""Serves a folder over HTTP to a browser on this machine; other web pages cannot read it."""
+"""Serves a bundle over HTTP to a browser on this machine; other web pages cannot read it."""
 
-import asyncio
 import gzip
 import os
 import re
 import stat
-from collections.abc import MutableMapping
+import threading
+from collections.abc import Container
 from functools import lru_cache
 from html import escape
-from ipaddress import ip_address
-from pathlib import Path
-from typing import Any
-from urllib.parse import urlsplit
+from pathlib import Path, PurePosixPath
 
-import uvicorn
-from anyio import to_thread
+from anyio import create_task_group, to_thread
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import FileResponse, HTMLResponse, PlainTextResponse, Response
 from starlette.staticfiles import NotModifiedResponse
 from starlette.types import Message, Receive, Scope, Send
-from uvicorn.protocols.http.h11_impl import H11Protocol
 
-MOST_CONNECTIONS = 400  # two file handles each stay below the usual limit of 1024
-PATIENCE = 30.0  # seconds until an idle connection is closed
+from sagesplat.viewer.built import PAGE, POSTER, package_viewer, with_poster
+from sagesplat.viewer.hosts import Hosts
+
 HEADERS = {
     "content-security-policy": (
         "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; style-src 'self'; "
@@ -48,6 +44,7 @@ _TYPES = {
     ".css": "text/css; charset=utf-8",
     ".html": "text/html; charset=utf-8",
     ".ico": "image/x-icon",
+    ".jpeg": "image/jpeg",
     ".jpg": "image/jpeg",
     ".js": "text/javascript; charset=utf-8",
     ".json": "application/json",
@@ -62,21 +59,36 @@ _TYPES = {
     ".woff2": "font/woff2",
 }
 _PACKED = (".css", ".html", ".js", ".json", ".svg", ".txt", ".wasm")  # sent with gzip
+_MOST_PACKED = 16 * 2**20  # bytes of a file that is packed in memory
+_packing = threading.Lock()
+_PIECE = 64 * 1024  # bytes that are sent at once
+# of a bundle: what no browser runs, whatever is in it
+_DATA = {".jpeg", ".jpg", ".json", ".md", ".pack", ".ply", ".png", ".spz", ".txt", ".webp"}
 _WAITING = "<!doctype html><title>sagesplat</title><p>{}</p><p>This page tries again by itself.</p>"
 
 
 class Site:
-    """An ASGI application that serves a folder.
+    """An ASGI application that serves the viewer of this package with the data of a bundle.
 
-    `folder` may change at any time. Without a folder every path answers 503 with `note`. With `local` only
-    requests to local host names are answered, which prevents DNS rebinding.
+    `folder`: the bundle, which may change at any time. Of it only files are sent that no browser runs: a page
+    or a script of its own would act in the name of this machine. Without a folder every path answers 503 with
+    `note`. Requests to names that are not in `hosts` are refused, which prevents DNS rebinding. `viewer`: the
+    folder of the built viewer.
     """
 
-    def __init__(self, folder: Path | None = None, *, local: bool = True, note: str = ""):
-        self.folder, self.local, self.note = folder, local, note
+    def __init__(
+        self,
+        folder: Path | None = None,
+        *,
+        hosts: Container[str] | None = None,
+        note: str = "",
+        viewer: Path | None = None,
+    ):
+        self.folder, self.note = folder, note
+        self._hosts, self._viewer = hosts or Hosts(), viewer or package_viewer()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer one request."""
+        """Answer one request; stops when the other side is gone."""
 
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -85,25 +97,39 @@ class Site:
                     headers.setdefault(name, value)
             await send(message)
 
-        response = await to_thread.run_sync(self._answer, scope)
-        await response(scope, receive, send_with_headers)
+        async def respond() -> None:
+            response = await to_thread.run_sync(self._answer, scope)
+            await response(scope, receive, send_with_headers)
+            group.cancel_scope.cancel()
+
+        async with create_task_group() as group:
+            group.start_soon(respond)
+            while (await receive())["type"] != "http.disconnect":  # uvicorn itself would read on to the end
+                pass
+            group.cancel_scope.cancel()
 
     def _answer(self, scope: Scope) -> Response:
         headers = Headers(scope=scope)
-        if self.local and not is_local(headers.get("host", "")):
-            text = "this server answers to localhost only; start it with --host to change that"
+        if headers.get("host", "") not in self._hosts:
+            text = "this server does not answer to this name; start it with --host to change that"
             return PlainTextResponse(text, 403)
         if scope["method"] not in ("GET", "HEAD"):
             return PlainTextResponse("only GET and HEAD", 405, {"allow": "GET, HEAD"})
         if self.folder is None:
             return HTMLResponse(_WAITING.format(escape(self.note)), 503, {"refresh": "2", "retry-after": "2"})
-        name = scope["path"].removeprefix("/") or "index.html"
+        name = scope["path"].removeprefix("/") or PAGE
         try:
-            if path := find(self.folder, name):
-                return _file(path, name, headers, scope["method"] == "HEAD")
+            if path := self._find(self.folder, name):
+                poster = name == PAGE and find(self.folder, POSTER) is not None
+                return _file(path, name, headers, scope["method"] == "HEAD", poster)
         except OSError:  # replaced meanwhile
             pass
         return PlainTextResponse("no such file", 404)
+
+    def _find(self, folder: Path, name: str) -> Path | None:
+        """A file of the viewer, or else one of the data."""
+        is_data = PurePosixPath(name).suffix.lower() in _DATA
+        return find(self._viewer, name) or (find(folder, name) if is_data else None)
 
 
 def find(folder: Path, name: str) -> Path | None:
@@ -120,25 +146,17 @@ def find(folder: Path, name: str) -> Path | None:
         return None
 
 
-def is_local(host: str) -> bool:
-    """Whether a Host header names this machine: localhost or a loopback address, with or without a port."""
-    try:
-        name = urlsplit(f"//{host}").hostname or ""
-        return name == "localhost" or name.endswith(".localhost") or ip_address(name).is_loopback
-    except ValueError:
-        return False
-
-
-def _file(path: Path, name: str, request: Headers, head: bool) -> Response:
+def _file(path: Path, name: str, request: Headers, head: bool, poster: bool) -> Response:
     """The response with a file: full, a range, gzipped, or 304 if the client has it."""
     status = path.stat()
     suffix = path.suffix.lower()
     headers = {
         "cache-control": _FOREVER if _HASHED.fullmatch(name) else "no-cache",
-        "etag": f'"{status.st_mtime_ns:x}-{status.st_size:x}"',
+        "etag": f'"{status.st_mtime_ns:x}-{status.st_size:x}{"-poster" if poster else ""}"',
     }
-    packed = suffix in _PACKED and "range" not in request and _takes_gzip(request)
-    if suffix in _PACKED:
+    may_pack = suffix in _PACKED and status.st_size <= _MOST_PACKED
+    packed = may_pack and "range" not in request and _takes_gzip(request)
+    if may_pack:
         headers["vary"] = "accept-encoding"
     if packed:
         headers["etag"] = headers["etag"][:-1] + '-gz"'
@@ -146,11 +164,28 @@ def _file(path: Path, name: str, request: Headers, head: bool) -> Response:
     if headers["etag"] in tags or "*" in tags:
         return NotModifiedResponse(Headers(headers))
     kind = _TYPES.get(suffix, "application/octet-stream")
-    if not packed:
+    if not packed and not poster:
         return FileResponse(path, headers=headers, media_type=kind, stat_result=status)
-    body = _gzipped(path, status.st_mtime_ns)
-    headers |= {"content-encoding": "gzip", "content-length": str(len(body))}
-    return Response(b"" if head else body, headers=headers, media_type=kind)
+    with _packing:  # one at a time: those who wait find it packed
+        body = _content(path, status.st_mtime_ns, packed, poster)
+    headers |= {"content-encoding": "gzip"} if packed else {}
+    return _Pieces(b"" if head else body, headers, kind, len(body))
+
+
+class _Pieces(Response):
+    """Bytes that many may be sent at once: each connection holds a copy of one piece only."""
+
+    def __init__(self, body: bytes, headers: dict[str, str], kind: str, length: int):
+        super().__init__(None, headers=headers | {"content-length": str(length)}, media_type=kind)
+        self._content = memoryview(body)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer one request."""
+        await send({"type": "http.response.start", "status": 200, "headers": self.raw_headers})
+        for at in range(0, len(self._content), _PIECE):
+            piece = bytes(self._content[at : at + _PIECE])
+            await send({"type": "http.response.body", "body": piece, "more_body": True})
+        await send({"type": "http.response.body", "body": b"", "more_body": False})
 
 
 def _takes_gzip(request: Headers) -> bool:
@@ -158,40 +193,10 @@ def _takes_gzip(request: Headers) -> bool:
     return any(name.strip() == "gzip" and q.strip() not in ("q=0", "q=0.0") for name, _, q in accepted)
 
 
-@lru_cache(maxsize=32)
-def _gzipped(path: Path, _changed: int) -> bytes:
-    return gzip.compress(path.read_bytes(), 6, mtime=0)
-
-
-class _Connection(H11Protocol):
-    """A connection that is closed when idle, e.g. after half a request; uvicorn itself waits for ever."""
-
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        super().connection_made(transport)
-        if len(self.connections) > MOST_CONNECTIONS:
-            transport.abort()
-        self._watch = self.loop.call_later(PATIENCE, self._check, self._moved())
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        self._watch.cancel()
-        super().connection_lost(exc)
-
-    def _moved(self) -> tuple[object, int]:
-        return self.cycle, self.transport.get_write_buffer_size()
-
-    def _check(self, before: tuple[object, int]) -> None:
-        now = self._moved()
-        if now == before:
-            self.transport.abort()
-        else:
-            self._watch = self.loop.call_later(PATIENCE, self._check, now)
-
-
-def make_server(site: Site, certificate: Path | None = None, key: Path | None = None) -> uvicorn.Server:
-    """A silent server for `site`, to be `run` on sockets; https with a certificate."""
-    settings: MutableMapping[str, Any] = {"ssl_certfile": certificate, "ssl_keyfile": key}
-    config = uvicorn.Config(
-        site, http=_Connection, ws="none", lifespan="off", log_config=None, log_level="critical",
-        access_log=False, server_header=False, proxy_headers=False, timeout_graceful_shutdown=1, **settings,
-    )  # fmt: skip
-    return uvicorn.Server(config)
+@lru_cache(maxsize=16)
+def _content(path: Path, _changed: int, packed: bool, poster: bool) -> bytes:
+    """A file's bytes, as a page with a poster, with gzip."""
+    body = path.read_bytes()
+    if poster:
+        body = with_poster(body.decode()).encode()
+    return gzip.compress(body, 6, mtime=0) if packed else body

@@ -15,8 +15,8 @@ from matplotlib.ticker import LogLocator, NullLocator
 from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import BYTES_PER_GAUSSIAN
 from sagesplat.io.files import read_json, write_json, write_text
-from sagesplat.output.figures import ACCENT, FAINT, INK, STYLE, save_figure
-from sagesplat.output.tables import MB, Table, name_of
+from sagesplat.output.figures import ACCENT, FAINT, INK, STYLE, caption, save_figure
+from sagesplat.output.tables import MB, Table
 
 SNAPSHOTS, SAGE, PRUNED, MCMC = "3DGS, snapshots", "SAGE", "3DGS, pruned and tuned", "3DGS-MCMC"
 SAME_SHARE, PLANNED = "nested, same share", "nested, planned"
@@ -331,7 +331,7 @@ def label_curves(points: Sequence[Point], names: Mapping[int, str]) -> Figure:
             own = [(p, p.labels[label]) for p in _of(points, method) if label in p.labels]
             _line(axes, method, [(p, of.encoded / MB, of.ssim) for p, of in own])
         _sizes(axes)
-        axes.set_title(name_of(label, names), loc="left", fontweight="bold")
+        axes.set_title(caption(label, names), loc="left", fontweight="bold")
     for axes in grid[len(labels) :]:
         axes.set_axis_off()
     figure.supxlabel("MB of the category, encoded", fontsize=9)

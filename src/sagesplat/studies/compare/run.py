@@ -17,7 +17,7 @@ from sagesplat.core.config import CompareConfig, PlanConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Progress, RunDone, TableMade
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.formats.increments import INDEX, read_increments, read_index, write_increments
+from sagesplat.formats.increments import INDEX, read_increments, write_increments
 from sagesplat.formats.levels import read_level, write_set
 from sagesplat.formats.spz import SH_BITS
 from sagesplat.io.files import read_json, write_json
@@ -26,8 +26,9 @@ from sagesplat.metrics.lpips import Lpips
 from sagesplat.raster import Workspace
 from sagesplat.run.executor import Local
 from sagesplat.run.job import Job
+from sagesplat.run.records import is_done, settings_of
 from sagesplat.run.remote import work
-from sagesplat.run.run_dir import RunDir, is_done, settings_of
+from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import Stage, run_stage, run_stages
 from sagesplat.segment.display_names import titles
 from sagesplat.stages.compose import compose_inputs, tune_composition
@@ -36,6 +37,7 @@ from sagesplat.stages.methods import NestedLevels, Snapshots, method_of
 from sagesplat.stages.nest import train_capped
 from sagesplat.stages.observe import observe_levels
 from sagesplat.stages.plan import main_target
+from sagesplat.stages.results import increments_of
 from sagesplat.stages.shared import label_images, train_config
 from sagesplat.studies.compare.report import (
     CONSOLE,
@@ -393,7 +395,7 @@ def _walks(nested: NestedLevels, sage: Snapshots) -> list[Walk]:
     target, views = main_target(job.run), range(len(job.scene.views))
     chosen = along(nested.quality.bound, costs.transfer_bytes, target=target) + 1
     ours = [dict(zip(costs.labels, levels.tolist(), strict=True)) for levels in chosen]
-    increments = read_index(job.run.increments)
+    increments = increments_of(job)
     increment_files = {
         (label, k + 1): {c.uri: c.nbytes for c in increments if c.label_id == label and c.level <= k + 1}
         for label in costs.labels

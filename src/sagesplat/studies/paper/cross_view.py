@@ -59,7 +59,7 @@ class CrossView:
 
 def read_cross_view(path: Path) -> CrossView:
     """The table that `write_csv` wrote. DataError where it is not one."""
-    return read_columns(path, CrossView, "run `sagesplat crossview` again")
+    return read_columns(path, CrossView, "delete it and run `sagesplat crossview` again")
 
 
 def cross_view(

@@ -19,7 +19,17 @@ from sagesplat.metrics.lpips import Lpips
 from sagesplat.output import figures
 from sagesplat.output.figures import STYLE, Colours
 from sagesplat.output.report import template
-from sagesplat.output.tables import MB, Table, by_size, last_counts, mean, name_of, promise_kept, view_mean
+from sagesplat.output.tables import (
+    MB,
+    Table,
+    by_size,
+    last_counts,
+    markdown_text,
+    mean,
+    name_of,
+    promise_kept,
+    view_mean,
+)
 from sagesplat.raster import Backend
 from sagesplat.scene.scene import Camera
 from sagesplat.studies.paper.cross_view import NONE, CrossView
@@ -80,8 +90,10 @@ def write_paper(folder: Path, data: PaperData) -> Path:
         figures.save_figure(figure, folder / name)
         pictures.append((name, title))
     title = f"{data.title}: tables and figures of the paper"
-    parts = [f"# {title}\n", *(f"## {table.title}\n\n{table.markdown()}" for _, table in tables)]
-    parts += [f"## {caption}\n\n![{caption}]({name}.png)\n" for name, caption in pictures]
+    shown = [(markdown_text(table.title), table) for _, table in tables]
+    parts = [f"# {markdown_text(title)}\n", *(f"## {title}\n\n{table.markdown()}" for title, table in shown)]
+    captions = [(name, markdown_text(caption)) for name, caption in pictures]
+    parts += [f"## {caption}\n\n![{caption}]({name}.png)\n" for name, caption in captions]
     write_text(folder / "paper.md", "\n".join(parts))
     page = template(Path(__file__).with_name("paper.html.j2")).render(
         title=title, tables=tables, pictures=pictures

@@ -6,9 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from sagesplat.adapt.coverage import PREDICTORS, Decisions
-from sagesplat.adapt.eq3 import read_models
-from sagesplat.adapt.observe import distances_in_views, read_observations
-from sagesplat.adapt.plan import Plan, plan_view, read_plans
+from sagesplat.adapt.observe import distances_in_views
+from sagesplat.adapt.plan import Plan, plan_view
 from sagesplat.core.config import PaperConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Progress, RunDone, TableMade
@@ -16,11 +15,12 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.columns import from_rows, write_columns
 from sagesplat.output.tables import Table, promise_kept
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import settings_of
+from sagesplat.run.records import settings_of
 from sagesplat.run.stage import run_stage
 from sagesplat.segment.display_names import titles
 from sagesplat.stages.compose import compose_inputs, tune_composition
 from sagesplat.stages.methods import method_of
+from sagesplat.stages.results import models_of, observations_of, plans_of
 from sagesplat.stages.shared import distances, observed
 from sagesplat.studies.lpips import load_metrics, lpips_hashes
 from sagesplat.studies.paper.cross_view import NONE, cross_view, read_cross_view
@@ -94,7 +94,7 @@ def equal_size(job: Job, config: PaperConfig) -> None:
 
     def make() -> list[str]:
         tests = job.scene.test_ids.tolist()
-        comparisons = [(NONE, read_plans(run.plan)[0], tests), (view, _view_plans(job, view), [view])]
+        comparisons = [(NONE, plans_of(job), tests), (view, _view_plans(job, view), [view])]
         comparisons = [c for c in comparisons if c[2]]
         images = sum(len(views) * (4 * len(plans) + 1) for _, plans, views in comparisons)
         trainings = sum(2 * len(plans) for _, plans, _ in comparisons)
@@ -142,14 +142,14 @@ def tables_and_figures(job: Job, config: PaperConfig) -> None:
             title=job.scene.name,
             names=titles(job.names()),
             colours={label: taxonomy.color(label) for label in job.names()},
-            observations=read_observations(run.observations),
+            observations=observations_of(job),
             fitted=observed(job, job.fit_config),
             train_views=job.scene.train_ids,
             test_views=job.scene.test_ids,
             view_names=[v.name for v in job.scene.views],
             counts=ladder.counts,
             recovering=ladder.recovering,
-            models=read_models(run.models),
+            models=models_of(job),
             iterations=four_levels(ladder.levels),
             view=view,
             distances={n: {i: float(d[view]) for i, d in table.items()} for n, table in by_statistic.items()},
@@ -182,7 +182,7 @@ def _view_plans(job: Job, view: int) -> list[Plan]:
     counts = {key: n for key, n in job.ladder.counts.items() if key[1] in levels}
     seen = distances(job, job.fit_config.distance)
     here = {label: float(d[view]) for label, d in seen.items()}
-    models = read_models(job.run.models)
+    models = models_of(job)
     return [plan_view(models, counts, here, target, view) for target in _targets(job)]
 
 

@@ -54,7 +54,7 @@ class SameSize:
 
 def read_same_size(path: Path) -> SameSize:
     """The table that `columns.write_columns` wrote. DataError where it is not one."""
-    return read_columns(path, SameSize, "run `sagesplat report --paper` again")
+    return read_columns(path, SameSize, "delete it and run `sagesplat report --paper` again")
 
 
 def prune_to(g: Gaussians, count: int, weights: np.ndarray) -> Gaussians:

@@ -8,18 +8,18 @@ from pathlib import Path
 
 import numpy as np
 
-from sagesplat.adapt.evaluate import read_evaluation
 from sagesplat.adapt.observe import TOTAL
-from sagesplat.adapt.plan import read_plans
 from sagesplat.core.errors import RunError, SageError
 from sagesplat.core.events import Emit, Progress, StageDone, StageStarted, TableMade, Warned, named
-from sagesplat.io.files import atomic_folder, link, read_json
+from sagesplat.io.files import atomic_folder, link
 from sagesplat.output.tables import MB, Table, mean, promise_kept
 from sagesplat.raster import Backend
 from sagesplat.run.executor import LOCAL, Executor, Local, Task
 from sagesplat.run.job import Job, JobSpec
+from sagesplat.run.records import seconds_of
 from sagesplat.run.run_dir import RunDir
 from sagesplat.stages.pipeline import demo_capture, run_all
+from sagesplat.stages.results import evaluation_of, plans_of
 from sagesplat.studies.sweep.file import Cell, Sweep
 from sagesplat.studies.sweep.report import MEASURES, SHOWN, Row, _write, readable, summarise
 
@@ -152,9 +152,9 @@ def _share_training(runs: Path, like: Cell | None, cell: Cell) -> None:
 def _measure(cell: Cell, job: Job) -> Iterator[Row]:
     """What a finished run says of each target, as a row of cells.csv."""
     full = job.ladder.size(job.ladder.levels[-1])
-    evaluation = read_evaluation(job.run.evaluation)
-    seconds = float(read_json(job.run.provenance("train"))["seconds"])
-    for plan in read_plans(job.run.plan)[0]:
+    evaluation = evaluation_of(job)
+    seconds = seconds_of(job.run, "train")
+    for plan in plans_of(job):
         here = evaluation.select(evaluation.target == np.float32(plan.target))
         whole = here.select(here.label_id == TOTAL)
         kept = promise_kept(here)

@@ -10,7 +10,8 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from sagesplat.output.figures import FAINT, INK, STYLE
+from sagesplat.core.names import repaired
+from sagesplat.output.figures import FAINT, INK, STYLE, shortened
 from sagesplat.output.tables import Table, mean
 from sagesplat.segment.display_names import titles
 from sagesplat.studies.transfer.score import (
@@ -90,7 +91,7 @@ def transfer_figure(a: FittedRun, b: FittedRun) -> Figure:
         test = np.isin(mine.view, b.test_views)
         axes.plot(mine.distance[~test], mine.ssim[~test], ".", color=FAINT, ms=4, alpha=0.6, mew=0)
         axes.plot(mine.distance[test], mine.ssim[test], "o", mfc="none", mec=FAINT, ms=4, mew=0.8)
-        axes.set_title(shown[shared.name], loc="left", fontweight="bold")
+        axes.set_title(shortened(shown[shared.name]), loc="left", fontweight="bold")
         if not len(mine):
             continue
         distance = np.linspace(mine.distance.min(), mine.distance.max(), 300)
@@ -106,7 +107,7 @@ def transfer_figure(a: FittedRun, b: FittedRun) -> Figure:
                 axes.plot(distance, ssim, color=colour, lw=width, alpha=alpha, solid_capstyle="butt")
     for axes in grid[len(found) :]:
         axes.set_axis_off()
-    of_a, of_b = (Path(run.name).resolve().name for run in (a, b))
+    of_a, of_b = (shortened(repaired(Path(run.name).resolve().name, "run")) for run in (a, b))
     figure.supxlabel(f"distance to the category in {of_b} (world units)", fontsize=9)
     figure.supylabel("SSIM", fontsize=9)
     says = {"own": f"model of {of_b}", **{n: f"model of {of_a}, {n}" for n in NORMALISATIONS}}

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from sagesplat.adapt.eq3 import read_models
 from sagesplat.adapt.plan import check_target, plan_view
 from sagesplat.core.errors import RunError, SageError
 from sagesplat.core.events import Warned
@@ -14,7 +13,8 @@ from sagesplat.metrics.lpips import load_lpips
 from sagesplat.output.figures import save_figure
 from sagesplat.output.tables import Table
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import settings_of
+from sagesplat.run.records import settings_of
+from sagesplat.stages.results import models_of
 from sagesplat.stages.shared import distances, observed
 from sagesplat.studies.paper.report import Picture, panel, take_pictures
 from sagesplat.studies.transfer import score
@@ -90,7 +90,7 @@ def load_fitted(job: Job) -> FittedRun:
         name=str(run.path),
         names=job.names(),
         observations=observed(job, job.fit_config),
-        models=read_models(run.models),
+        models=models_of(job),
         counts=job.ladder.counts,
         recovering=job.ladder.recovering,
         train_views=scene.train_ids,

@@ -1,0 +1,23 @@
+"""The program `sagesplat`, also as `python -m sagesplat`."""
+
+import os
+import sys
+
+from sagesplat.core import signals
+
+
+def program() -> None:
+    """Run the command line. Signals end it in order from the first moment on, imports included."""
+    if os.path.basename(sys.argv[0]) == "__main__.py":
+        sys.argv[0] = "sagesplat"  # in messages and in locks
+    with signals.handled():
+        try:
+            from sagesplat.cli import main
+
+            main()
+        except KeyboardInterrupt as error:
+            signals.leave(error)
+
+
+if __name__ == "__main__":
+    program()

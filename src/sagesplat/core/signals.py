@@ -1,0 +1,137 @@
+"""Ctrl-C, SIGTERM and SIGHUP: each ends the program in order, with one line, however often it comes.
+
+A signal becomes an exception in the main thread, so that `finally` and `with` blocks release locks, remove
+temporary files and end child processes. Standard library only: it is imported before everything else.
+"""
+
+import atexit
+import os
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType
+from typing import Any, NoReturn
+
+_NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # Windows has no SIGHUP
+_HANDLED = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
+_SAME = 3.0  # seconds in which further signals are the same wish: they must not cut off the cleaning up
+_RETRY = 0.05  # seconds until an exception that went astray is raised again
+_KEPT = "finished stages and checkpoints are kept: run the same command again to resume"
+
+
+class Stopped(KeyboardInterrupt):
+    """A signal asks this process to end.
+
+    A class of our own for Ctrl-C too: after a plain KeyboardInterrupt that passed through an `exec`, as in
+    imports, Python kills itself at the end, though it was caught.
+    """
+
+    def __init__(self, number: int):
+        self.number = number
+        super().__init__(signal.Signals(number).name)
+
+
+class _Stop:
+    """The handler of all signals."""
+
+    def __init__(self) -> None:
+        self.number: int = signal.SIGINT  # of the newest that was not ignored
+        self.ending = False  # the outcome is known: nothing is left to interrupt
+        self.deferring = self.waiting = False  # see `deferred`
+        self._since = -_SAME
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        now = time.monotonic()
+        if now - self._since < _SAME:
+            return
+        self._since = now
+        if self.ending:  # and something hangs
+            os._exit(_exit_code(number))
+        self.number = number
+        if self.deferring and not self.waiting:
+            self.waiting = True
+            return
+        self.throw()
+
+    def throw(self, *_: object) -> NoReturn:
+        raise Stopped(self.number)
+
+    def end(self) -> None:
+        """From now on signals change nothing, unless the process still hangs after some seconds."""
+        self.ending, self._since = True, time.monotonic()
+        atexit.register(_ignore)  # the interpreter's own end would restore the defaults
+
+
+_stop = _Stop()
+
+
+@contextmanager
+def handled() -> Iterator[None]:
+    """Raise `Stopped` for signals in the block; after it they change nothing.
+
+    For the main thread of a program whose last block this is. Signals that are ignored stay so, as those
+    of a process that `nohup` or a shell in the background started.
+    """
+    for number in _HANDLED:
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, _stop)
+    sys.unraisablehook = _raising_again(sys.unraisablehook)
+    try:
+        yield
+    finally:
+        _stop.end()
+
+
+def _raising_again(before: Any) -> Any:
+    """A hook that raises signals again which came in a destructor or callback, where Python drops them."""
+
+    def hook(dropped: "sys.UnraisableHookArgs") -> None:
+        if not isinstance(dropped.exc_value, KeyboardInterrupt):
+            before(dropped)
+        elif hasattr(signal, "setitimer") and not _stop.ending:
+            signal.signal(signal.SIGALRM, _stop.throw)
+            signal.setitimer(signal.ITIMER_REAL, _RETRY)
+
+    return hook
+
+
+def _ignore() -> None:
+    for number in _HANDLED:
+        signal.signal(number, signal.SIG_IGN)
+
+
+@contextmanager
+def deferred() -> Iterator[None]:
+    """Raise signals of the block at its end, or where another comes seconds later.
+
+    For what leaves processes behind where its start is cut off. Handlers that a library brings are undone.
+    """
+    handlers = {number: signal.getsignal(number) for number in _HANDLED}
+    _stop.deferring = True
+    try:
+        yield
+    finally:
+        _stop.deferring = False
+        for number, handler in handlers.items():
+            with suppress(ValueError):  # not the main thread, where nobody else could set them either
+                signal.signal(number, handler)
+    if _stop.waiting:
+        _stop.throw()
+
+
+def leave(error: KeyboardInterrupt) -> NoReturn:
+    """End the program with the line and the exit code of a signal."""
+    number = error.number if isinstance(error, Stopped) else signal.SIGINT
+    line = "interrupted" if number == signal.SIGINT else f"ended by {error}"
+    if str(error) == "SIGHUP":
+        line += " (its terminal was closed; nohup or tmux keeps a run)"
+    with suppress(OSError):  # the terminal that was closed
+        print(f"sagesplat: {line}; {_KEPT}", file=sys.stderr, flush=True)
+    raise SystemExit(_exit_code(number))
+
+
+def _exit_code(number: int) -> int:
+    """What shells report of a program that a signal ended, but 2 for Ctrl-C, as for all that users do."""
+    return 2 if number == signal.SIGINT else 128 + number

@@ -1,0 +1,130 @@
+"""The capture of a run: what scene.json says of it, and whether its photos are still the same."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sagesplat.core.config import SceneConfig
+from sagesplat.core.errors import RunError, short
+from sagesplat.core.typed import check_fields, fits, types_of
+from sagesplat.io.files import read_json, write_json
+from sagesplat.run.records import file_hash
+from sagesplat.scene.scene import Scene
+
+_CURE = "delete it, and run `sagesplat run SCENE RUN` again with the same settings"
+_TYPES = {"path": Path, "fingerprint": str}
+_STATE = tuple[
+    int, int, int, str
+]  # of a photo: bytes, times of its last change (content, status; ns), SHA-256
+
+
+@dataclass(frozen=True)
+class Capture:
+    """What scene.json says of the capture that a run is made from."""
+
+    path: Path
+    settings: dict[str, Any]  # how it is read; none for a stored scene
+    fingerprint: str
+    photos: dict[str, str] | None  # SHA-256 by name; None in run folders made before it was kept
+
+
+def read_capture(path: Path) -> Capture:
+    """The capture that a scene.json names; RunError for anything else."""
+    made = read_json(path, _CURE)
+    try:
+        if not isinstance(made, dict) or not isinstance(made.get("settings"), dict):
+            raise ValueError("no settings")
+        check_fields({name: made.get(name) for name in _TYPES}, _TYPES)
+        check_fields(made["settings"], types_of(SceneConfig))
+        if unknown := sorted(made["settings"].keys() - types_of(SceneConfig).keys()):
+            raise ValueError(f"setting {short(unknown[0])} is not known")
+        photos = made.get("photos")
+        if not (photos is None or fits(photos, dict[str, str])):
+            raise ValueError("photos without hashes")
+    except ValueError as error:
+        raise RunError(f"{path}: not the scene of a run ({short(error)}); {_CURE}") from None
+    return Capture(Path(made["path"]), made["settings"], made["fingerprint"], photos)
+
+
+def fingerprint(scene: Scene) -> str:
+    """Changes when the poses, the points or the set of photos do."""
+    digest = hashlib.sha256()
+    for view in scene.views:
+        size = view.image_path.stat().st_size
+        digest.update(f"{view.name} {size} {view.camera.width} {view.camera.height}".encode())
+        digest.update(view.camera.w2c.tobytes() + view.camera.K.tobytes())
+        if any(view.camera.background):
+            digest.update(bytes(view.camera.background))
+    digest.update(scene.points.xyz.tobytes())
+    if scene.test_names is not None:
+        digest.update("\n".join(sorted(scene.test_names)).encode())
+    if scene.calibration_names is not None:
+        digest.update("\n".join(["", *sorted(scene.calibration_names)]).encode())
+    return digest.hexdigest()
+
+
+class Hashes:
+    """SHA-256 of files by name. Those that changed neither in size nor in time are not read again.
+
+    A file that was copied or touched has the same hash, one that was replaced has another, whatever its size.
+    """
+
+    def __init__(self, kept: Path, files: Mapping[str, Path]) -> None:
+        """`kept`: where `keep` wrote what was known of the files before; it may be missing."""
+        self._path, self._known = kept, _read_known(kept)
+        self._found = {name: _state_of(path, self._known.get(name)) for name, path in files.items()}
+
+    @property
+    def sha256(self) -> dict[str, str]:
+        """By name."""
+        return {name: state[3] for name, state in self._found.items()}
+
+    @property
+    def digest(self) -> str:
+        """One SHA-256 of all names and hashes."""
+        return hashlib.sha256(json.dumps(sorted(self.sha256.items())).encode()).hexdigest()
+
+    def keep(self, path: Path | None = None) -> None:
+        """Write what is known now, if it is news; where that cannot be, files are read again next time."""
+        if path is not None or self._found != self._known:
+            with suppress(RunError, OSError):
+                write_json(path or self._path, self._found)
+
+    def of(self, names: set[str]) -> "Hashes":
+        """Those of some of the files."""
+        part = Hashes(self._path, {})
+        part._found = {name: state for name, state in self._found.items() if name in names}
+        return part
+
+
+def photo_hashes(kept: Path, scene: Scene) -> Hashes:
+    """The hashes of a scene's photos."""
+    return Hashes(kept, {view.name: view.image_path for view in scene.views})
+
+
+def check_photos(scene: Scene, begun: Mapping[str, str], now: Mapping[str, str]) -> None:
+    """RunError, naming a photo, where the photos are not those that a run began with."""
+    for view in scene.views:
+        if begun.get(view.name) != now[view.name]:
+            raise RunError(
+                f"{view.image_path}: not the photo that this run began with; put that one back, or choose "
+                "another run folder"
+            )
+
+
+def _read_known(path: Path) -> dict[str, list[Any]]:
+    try:
+        known = read_json(path)
+    except RunError:
+        return {}
+    return {k: v for k, v in known.items() if fits(v, _STATE)} if isinstance(known, dict) else {}
+
+
+def _state_of(path: Path, known: list[Any] | None) -> list[Any]:
+    status = path.stat()
+    now = [status.st_size, status.st_mtime_ns, status.st_ctime_ns]
+    return known if known and known[:3] == now else [*now, file_hash(path)]

@@ -1,0 +1,102 @@
+"""Results of a run, each checked against the levels, the categories and the views that the run has.
+
+The readers of the files check a file by itself. A file that was edited, or comes from another run, can be
+sound and still not belong to the others.
+"""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from sagesplat.adapt.eq3 import SsimModel, read_models
+from sagesplat.adapt.evaluate import Evaluation, read_evaluation
+from sagesplat.adapt.observe import TOTAL, Observations, read_observations
+from sagesplat.adapt.plan import Plan, read_budget_plan, read_plans
+from sagesplat.adapt.viewpoint import ViewModel, read_promises
+from sagesplat.core.errors import DataError
+from sagesplat.formats.increments import INDEX, Increment, read_index
+from sagesplat.run.job import Job
+
+_WHOLE = -1  # level of the rows of the whole image in an evaluation
+
+
+def observations_of(job: Job) -> Observations:
+    """The run's observations; DataError where they are of other categories, levels or views."""
+    path, table = job.run.observations, read_observations(job.run.observations)
+    _check(path, "observe", "category", table.label_id.tolist(), {*job.names(), TOTAL})
+    _check(path, "observe", "level", table.level.tolist(), set(job.ladder.levels))
+    _check(path, "observe", "view", table.view.tolist(), range(len(job.scene.views)))
+    return table
+
+
+def evaluation_of(job: Job) -> Evaluation:
+    """The run's evaluation; DataError like `observations_of`."""
+    path, table = job.run.evaluation, read_evaluation(job.run.evaluation)
+    _check(path, "evaluate", "category", table.label_id.tolist(), {*job.names(), TOTAL})
+    _check(path, "evaluate", "level", table.level.tolist(), {*job.ladder.levels, _WHOLE})
+    _check(path, "evaluate", "view", table.view.tolist(), range(len(job.scene.views)))
+    return table
+
+
+def plans_of(job: Job) -> tuple[Plan, ...]:
+    """The scene's plans, of levels that the run has."""
+    plans, _ = read_plans(job.run.plan)
+    _check_plans(job, plans)
+    return plans
+
+
+def budget_plan_of(job: Job) -> Plan | None:
+    """The plan for a budget, if there is one, of levels that the run has."""
+    plan = read_budget_plan(job.run.plan)
+    _check_plans(job, [plan] if plan else [])
+    return plan
+
+
+def models_of(job: Job) -> dict[tuple[int, int], SsimModel]:
+    """Eq. 3 by (label id, level), of categories and levels that the run has."""
+    models = read_models(job.run.models)
+    _check(job.run.models, "fit", "category", (label for label, _ in models), {*job.names(), TOTAL})
+    _check(job.run.models, "fit", "level", (level for _, level in models), set(job.ladder.levels))
+    return models
+
+
+def promises_of(job: Job) -> dict[int, ViewModel]:
+    """The SSIM model of each category with its bound, by label id, of levels that the run has."""
+    models = read_promises(job.run.promises)
+    _check(job.run.promises, "fit", "category", models, job.names())
+    levels = (level for model in models.values() for level in model.levels)
+    _check(job.run.promises, "fit", "level", levels, set(job.ladder.levels))
+    return models
+
+
+def increments_of(job: Job) -> list[Increment]:
+    """The increments of the nested levels, of categories and levels that the run has."""
+    path, listed = job.run.increments / INDEX, read_index(job.run.increments)
+    _check(path, "nest", "category", (one.label_id for one in listed), {i for i, _ in job.ladder.counts})
+    _check(path, "nest", "level", (one.level for one in listed), set(job.ladder.levels))
+    counts = dict.fromkeys((label for label, _ in job.ladder.counts), 0)
+    for one in listed:
+        counts[one.label_id] += one.count
+    last = job.ladder.levels[-1]
+    for label, count in counts.items():
+        if count != job.ladder.counts[label, last]:
+            raise _foreign(path, "nest", f"{count:,} Gaussians of category {label}")
+    return listed
+
+
+def _check_plans(job: Job, plans: Iterable[Plan]) -> None:
+    for plan in plans:
+        for choice in plan.choices:
+            if (choice.label_id, choice.level) not in job.ladder.counts:
+                what = f"level {choice.level} of category {choice.label_id}"
+                raise _foreign(job.run.plan, "plan", what)
+
+
+def _check(path: Path, stage: str, what: str, values: Iterable[int], known: Iterable[int]) -> None:
+    """DataError for the first of `values` that is not known."""
+    if unknown := sorted(set(values) - set(known)):
+        raise _foreign(path, stage, f"{what} {unknown[0]}")
+
+
+def _foreign(path: Path, stage: str, what: str) -> DataError:
+    which = "that folder" if path.name == INDEX else "it"
+    return DataError(f"{path}: {what} is not this run's; delete {which} and run `sagesplat {stage}` again")

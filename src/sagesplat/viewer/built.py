@@ -1,0 +1,24 @@
+"""The built viewer of this package: its folder and its page."""
+
+from importlib.resources import files
+from pathlib import Path
+
+from sagesplat.core.errors import SageError
+
+PAGE, POSTER = "index.html", "poster.jpg"
+
+
+def package_viewer() -> Path:
+    """The folder of the package's built viewer, which may be missing."""
+    return Path(str(files("sagesplat"))) / "viewer" / "static"
+
+
+def check_viewer(viewer: Path) -> None:
+    """SageError unless the viewer is built."""
+    if not (viewer / PAGE).is_file():
+        raise SageError(f"{viewer}: viewer not built: run `make web` (installed packages have it)")
+
+
+def with_poster(page: str) -> str:
+    """The page with a picture that is shown until its scripts are loaded."""
+    return page.replace("<!-- poster -->", f'<img id="poster" src="{POSTER}" alt="" />')

@@ -1,0 +1,93 @@
+"""What events hold is printed as it is, and never obeyed by rich or by the terminal."""
+
+import io
+import re
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rich.console import Console as RichConsole
+
+from sagesplat.cli.console import Console
+from sagesplat.cli.doctor import Finding, print_findings
+from sagesplat.cli.layout import fitted
+from sagesplat.core.events import (
+    Event,
+    Progress,
+    RunDone,
+    StageDone,
+    StageSkipped,
+    StageStarted,
+    TableMade,
+    Training,
+    Warned,
+)
+from sagesplat.core.names import visible
+
+ANY = st.text(st.characters(), max_size=40) | st.sampled_from(["[/red]", "[old]", ":car:", "\x1b[31m", "\\["])
+
+
+def printed(*events: Event, terminal: bool = False) -> str:
+    output = io.StringIO()
+    kept = RichConsole(file=output, width=400, force_terminal=terminal, color_system=None)
+    with Console(kept) as console:
+        for event in events:
+            console(event)
+    return output.getvalue()
+
+
+def events_of(text: str) -> dict[str, Event]:
+    return {
+        "skipped": StageSkipped(text),
+        "warned": Warned(text),
+        "done": StageDone(text, 1.0, (text, text)),
+        "table": TableMade(text, ("category", text), ((text, "1"), ("b", text))),
+        "report": RunDone(Path("/runs") / visible(text).replace("/", "_"), Path("/runs")),
+    }
+
+
+@settings(max_examples=60, deadline=None)
+@given(ANY)
+def test_whatever_events_hold_is_shown(text: str) -> None:
+    for event in events_of(text).values():
+        shown = printed(event)
+        assert re.fullmatch(r"[^\x00-\x09\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]*", shown)
+        shown.encode()
+
+
+@pytest.mark.parametrize("text", ["[/red]", "/runs/[old]/x", ":car:", "[bold]a[/]", "\\[a]", "日本語"])
+@pytest.mark.parametrize("kind", ["skipped", "warned", "done", "table"])
+def test_brackets_and_codes_are_kept(kind: str, text: str) -> None:
+    assert text in printed(events_of(text)[kind])
+
+
+def test_a_path_is_printed_whole() -> None:
+    shown = printed(RunDone(Path("/runs/[old]/caf\udce9/report"), Path("/runs/[/red]")))
+    assert "/runs/[old]/caf\\xe9/report" in shown
+    assert "view /runs/[/red]\n" in shown
+
+
+def test_the_bar_shows_names_as_they_are() -> None:
+    began, counts = StageStarted("[/red]\x07"), {"[/b]": 3, "\x1b[2J": 4}
+    shown = printed(began, Progress("[/red]", 2, 2, "[old] \x1b[31m"), terminal=True)
+    assert "[/red]\\x07" in shown
+    assert "[old] \\x1b[31m" in shown
+    shown = printed(began, Training(1, 1, 0.5, counts, 7), terminal=True)
+    assert "[/b] 0.0k" in shown
+    assert "\x1b[2J" not in shown
+
+
+def test_findings_are_shown_as_they_are() -> None:
+    output = io.StringIO()
+    findings = [Finding("[/red]", "gap", "at /opt/[old]\x1b[31m\\", "see :car: [/]")]
+    print_findings(findings, RichConsole(file=output, width=200, color_system=None))
+    assert output.getvalue() == "· [/red]  at /opt/[old]\\x1b[31m\\\n          → see :car: [/]\n"
+
+
+def test_wide_letters_are_counted_as_two() -> None:
+    (heads, cells), *more = fitted(("category", "SSIM"), [("日本語" * 8, "日本")], 24)
+    assert not more
+    assert heads == ["category", "SSIM"]
+    assert cells[0][1] == "日本"
+    assert all(len(line) <= 10 for line in cells[0][0].splitlines())

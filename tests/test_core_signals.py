@@ -1,0 +1,171 @@
+"""Signals end a program in order, with one line, whenever and however often they come."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from sagesplat.core.signals import _exit_code
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such signals")
+KEPT = "finished stages and checkpoints are kept: run the same command again to resume"
+LINES = {
+    signal.SIGINT: f"sagesplat: interrupted; {KEPT}\n",
+    signal.SIGTERM: f"sagesplat: ended by SIGTERM; {KEPT}\n",
+    signal.SIGHUP: "sagesplat: ended by SIGHUP (its terminal was closed; nohup or tmux keeps a run); "
+    f"{KEPT}\n",
+}
+# A command in the place of sagesplat's: what it does is the program's first argument.
+PROGRAM = """
+import sys, types, weakref, time
+from pathlib import Path
+from sagesplat.__main__ import program
+
+def main():
+    def ready():
+        print("ready", flush=True)
+    exec(sys.argv[1], {"ready": ready, "folder": Path(sys.argv[2])})
+
+sys.modules["sagesplat.cli"] = types.SimpleNamespace(main=main)
+program()
+"""
+WRITES = """
+import time
+from sagesplat.io.files import atomic_path
+from sagesplat.io.lock import locked
+with locked(folder), atomic_path(folder / "a.txt") as path:
+    path.write_text("half")
+    try:
+        ready()
+        time.sleep(60)
+    finally:
+        time.sleep(0.3)
+        print("cleaned", flush=True)
+"""
+
+
+def started(code: str, folder: Path, **options) -> subprocess.Popen[str]:
+    """A program that does this, after it said that it is ready."""
+    here = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, sys.path))}
+    process = subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, code, str(folder)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=here, **options,
+    )  # fmt: skip
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    return process
+
+
+def ended(process: subprocess.Popen[str]) -> tuple[int, str, str]:
+    out, errors = process.communicate(timeout=20)
+    return process.returncode, out, errors
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_five_quick_signals_are_one_line_and_cleaning_up_is_not_cut_off(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    process = started(WRITES, tmp_path)
+    for _ in range(5):
+        process.send_signal(number)
+        time.sleep(0.05)
+    assert ended(process) == (_exit_code(number), "cleaned\n", LINES[number])
+    assert [path.name for path in tmp_path.iterdir()] == [".lock"]
+
+
+def test_exit_codes_are_what_shells_report() -> None:
+    assert [_exit_code(number) for number in LINES] == [2, 143, 129]
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import atexit, time; atexit.register(lambda: (ready(), time.sleep(0.5)))",
+        "import threading, time\n"
+        "threading.Thread(target=lambda: (ready(), time.sleep(0.5))).start()",  # waited for at the end
+    ],
+)
+def test_a_signal_after_the_work_changes_nothing(tmp_path: Path, code: str) -> None:
+    process = started(code, tmp_path)
+    for number in LINES:
+        time.sleep(0.1)
+        process.send_signal(number)
+    assert ended(process) == (0, "", "")
+
+
+def test_a_program_that_hangs_at_its_end_can_still_be_ended(tmp_path: Path) -> None:
+    code = "import threading, time; threading.Thread(target=lambda: (ready(), time.sleep(60))).start()"
+    process = started(f"import sagesplat.core.signals as s; s._SAME = 0.2\n{code}", tmp_path)
+    time.sleep(0.5)
+    process.send_signal(signal.SIGTERM)
+    assert ended(process) == (143, "", "")
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        # a callback of the garbage collector, which drops exceptions
+        "class Slow:\n    def __del__(self):\n        ready()\n        time.sleep(0.3)\n"
+        "import time\nSlow()\ntime.sleep(60)",
+        # Python ends itself by SIGINT where a plain KeyboardInterrupt passed through an `exec`
+        "exec('ready(); import time; time.sleep(60)', globals())",
+    ],
+)
+def test_no_signal_goes_astray(tmp_path: Path, code: str) -> None:
+    process = started(code, tmp_path)
+    process.send_signal(signal.SIGINT)
+    assert ended(process) == (2, "", LINES[signal.SIGINT])
+
+
+STARTS = """
+import signal, time
+from sagesplat.core.signals import deferred
+import sagesplat.core.signals as s; s._SAME = 0.2
+with deferred():
+    ready()
+    time.sleep(SECONDS)
+    print("begun", flush=True)
+    signal.signal(signal.SIGTERM, lambda *_: exit(9))  # as libraries do
+time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize(("seconds", "times", "said"), [(0.5, 1, "begun\n"), (60, 2, "")])
+def test_what_must_not_be_half_begun_is_finished_first(
+    tmp_path: Path, seconds: float, times: int, said: str
+) -> None:
+    """Unless the wish is repeated after a while."""
+    process = started(STARTS.replace("SECONDS", str(seconds)), tmp_path)
+    for _ in range(times):
+        process.send_signal(signal.SIGTERM)
+        time.sleep(0.3)
+    assert ended(process) == (143, said, LINES[signal.SIGTERM])
+
+
+def test_what_nohup_and_shells_ignore_stays_ignored(tmp_path: Path) -> None:
+    def ignore() -> None:
+        for number in (signal.SIGHUP, signal.SIGINT):
+            signal.signal(number, signal.SIG_IGN)
+
+    process = started("ready(); import time; time.sleep(0.5)", tmp_path, preexec_fn=ignore)
+    process.send_signal(signal.SIGHUP)
+    process.send_signal(signal.SIGINT)
+    assert ended(process) == (0, "", "")
+
+
+def test_imports_are_interrupted_in_one_line_too(tmp_path: Path) -> None:
+    """The first module that the command line imports says when."""
+    (tmp_path / "tyro.py").write_text("import time; print('ready', flush=True); time.sleep(60)")
+    here = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *map(str, sys.path)])}
+    with subprocess.Popen(
+        [sys.executable, "-m", "sagesplat", "info", "."],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=here,
+    ) as process:  # fmt: skip
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(signal.SIGINT)
+        assert ended(process) == (2, "", LINES[signal.SIGINT])

@@ -1,0 +1,149 @@
+"""Whether a run notices that its photos changed, and only then."""
+
+import os
+import shutil
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import random_gaussians, write_capture
+from PIL import Image
+
+from sagesplat.core.config import SceneConfig
+from sagesplat.core.errors import RunError
+from sagesplat.core.events import Event, StageDone, StageSkipped
+from sagesplat.io.files import read_json, write_json
+from sagesplat.run import capture as run_capture
+from sagesplat.run.capture import Hashes, read_capture
+from sagesplat.run.job import Job
+from sagesplat.run.records import FORMAT, file_hash
+from sagesplat.run.run_dir import RunDir
+from sagesplat.stages import scene as scene_stage
+from sagesplat.stages.scene import open_scene
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("capture")
+    write_capture(folder / "capture", random_gaussians(30, degree=0), views=4)
+    for path in (folder / "capture" / "images").iterdir():  # equal sizes, whatever they show
+        Image.open(path).save(path.with_suffix(".bmp"))
+        path.with_suffix(".bmp").replace(path)
+    return folder
+
+
+@pytest.fixture
+def capture(made: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made / "capture", tmp_path / "capture"))
+
+
+def begin(run: Path, capture: Path, force: bool = False) -> list[Event]:
+    events: list[Event] = []
+    open_scene(Job(RunDir(run), events.append, "cpu", force=force), capture, SceneConfig())
+    return events
+
+
+def replace_photo(path: Path) -> None:
+    """By another one of the same size in bytes, and from the same second as far as it can be said."""
+    before = path.stat()
+    pixels = np.asarray(Image.open(path)).copy()
+    Image.fromarray(255 - pixels).save(path, "BMP")
+    assert path.stat().st_size == before.st_size
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+
+
+def test_a_photo_of_the_same_size_and_time_is_noticed(tmp_path: Path, capture: Path) -> None:
+    begin(tmp_path / "run", capture)
+    time.sleep(0.02)  # clocks of file systems are no finer
+    replace_photo(capture / "images" / "01.png")
+    for act in (
+        lambda: begin(tmp_path / "run", capture),
+        lambda: Job(RunDir(tmp_path / "run"), lambda event: None).scene,
+    ):
+        with pytest.raises(
+            RunError, match=r"images/01\.png: not the photo that this run began with"
+        ) as caught:
+            act()
+        assert "\n" not in str(caught.value)
+    assert any(isinstance(event, StageDone) for event in begin(tmp_path / "run", capture, force=True))
+    assert Job(RunDir(tmp_path / "run"), lambda event: None).scene.views
+    assert isinstance(begin(tmp_path / "run", capture)[-1], StageSkipped)
+
+
+def test_photos_that_were_touched_or_copied_are_the_same(tmp_path: Path, capture: Path) -> None:
+    begin(tmp_path / "run", capture)
+    (capture / "images" / "00.png").touch()
+    aside = capture.rename(tmp_path / "aside")
+    shutil.copytree(aside, capture, copy_function=shutil.copyfile)
+    before = RunDir(tmp_path / "run").scene.read_bytes()
+    assert isinstance(begin(tmp_path / "run", capture)[-1], StageSkipped)
+    assert RunDir(tmp_path / "run").scene.read_bytes() == before
+    RunDir(tmp_path / "run").photo_hashes.unlink()
+    assert isinstance(begin(tmp_path / "run", capture)[-1], StageSkipped)
+
+
+def test_photos_are_read_once_unless_they_changed(tmp_path: Path, capture: Path, monkeypatch) -> None:
+    read: list[str] = []
+
+    def watched(path: Path) -> str:
+        read.append(path.name)
+        return file_hash(path)
+
+    monkeypatch.setattr(run_capture, "file_hash", watched)
+    begin(tmp_path / "run", capture)
+    assert sorted(read) == ["00.png", "01.png", "02.png", "03.png"]
+    begin(tmp_path / "run", capture)
+    assert Job(RunDir(tmp_path / "run"), lambda event: None).scene.views
+    assert len(read) == 4
+    (capture / "images" / "02.png").touch()
+    begin(tmp_path / "run", capture)
+    begin(tmp_path / "run", capture)
+    assert read[4:] == ["02.png"]
+
+
+def test_a_run_folder_from_before_hashes_works(tmp_path: Path, capture: Path) -> None:
+    run = RunDir(tmp_path / "run")
+    begin(run.path, capture)
+    scene = read_json(run.scene)
+    del scene["photos"]
+    write_json(run.scene, scene)
+    record = read_json(run.provenance("scene"))
+    del record["settings"]["photos"]
+    write_json(run.provenance("scene"), record)
+    run.photo_hashes.unlink()
+    assert isinstance(begin(run.path, capture)[-1], StageSkipped)
+    assert read_capture(run.scene).photos is None
+    assert Job(run, lambda event: None).scene.views
+
+
+@pytest.mark.parametrize("content", ["[]", '{"00.png": 7}', '{"00.png": [1, 2, 3, "x"]}', "\0", "{"])
+def test_a_damaged_list_of_hashes_is_made_anew(tmp_path: Path, capture: Path, content: str) -> None:
+    begin(tmp_path / "run", capture)
+    RunDir(tmp_path / "run").photo_hashes.write_text(content)
+    assert isinstance(begin(tmp_path / "run", capture)[-1], StageSkipped)
+
+
+def test_photos_without_poses_are_known_by_their_content(tmp_path: Path) -> None:
+    photos, job = tmp_path / "photos", Job(RunDir(tmp_path / "run"), lambda event: None)
+    photos.mkdir()
+    (photos / "a.jpg").write_bytes(b"one")
+    digest, hashes = scene_stage._hashes(job, photos)
+    assert hashes is not None
+    hashes.keep()
+    (photos / "a.jpg").touch()
+    assert scene_stage._hashes(job, photos)[0] == digest
+    (photos / "a.jpg").write_bytes(b"two")
+    assert scene_stage._hashes(job, photos)[0] != digest
+    # an older run recorded sizes and times
+    state = (photos / "a.jpg").stat()
+    old = scene_stage.hashlib.sha256(repr([("a.jpg", state.st_size, state.st_mtime_ns)]).encode()).hexdigest()
+    record = {"format": FORMAT, "stage": "poses", "settings": {"files": old}, "inputs": {}}
+    write_json(job.run.provenance("poses"), record)
+    assert scene_stage._hashes(job, photos) == (old, None)
+
+
+def test_hashes_of_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"a")
+    (tmp_path / "file").touch()
+    Hashes(tmp_path / "file" / "kept.json", {"a": tmp_path / "a"}).keep()

@@ -1,0 +1,233 @@
+"""Run folders from elsewhere: whatever their documents hold, a command works or says one line.
+
+Documents are changed so that the records of the stages agree with them, as in a folder made on purpose.
+"""
+
+import json
+import os
+import random
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import redirect_stderr
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import SMALL_RUN
+
+from sagesplat.cli import parse
+from sagesplat.cli.base import COMMANDS
+from sagesplat.core.config import FitConfig
+from sagesplat.core.errors import SageError
+from sagesplat.io.files import read_json, write_json
+from sagesplat.run import records
+from sagesplat.run.job import Job
+from sagesplat.run.recorded import stage_seconds
+from sagesplat.run.run_dir import RunDir
+from sagesplat.run.stage import _ORDER
+from sagesplat.stages import report, view
+from sagesplat.stages.api import open_run
+from sagesplat.stages.bundle import bundle, live_bundle
+from sagesplat.stages.compose import compose_plan
+from sagesplat.stages.evaluate import evaluate_plans
+from sagesplat.stages.fit import fit_ladder
+from sagesplat.stages.nest import nest_levels
+from sagesplat.stages.pipeline import run_all
+from sagesplat.stages.plan import make_plan
+from sagesplat.viewer.site import Site
+
+VALUES = [
+    None, True, -1, 0, 7, 2**70, 10**400, 1e308, float("nan"), float("inf"), "x", "\0", "a" * 5000, "\ud800",
+    [], {}, [[]], "../../etc", "/etc/passwd",
+]  # fmt: skip
+NUMBERS = ["-1", "-2", "-5", "99", "1e9", "nan", "inf", "", "x", "2147483647", "99999999999", "0", "\0"]
+WHOLE = [
+    b"", b"[]", b"7", b"null", b'"x"', b"{}", b"[" * 100_000, b"\xff\xfe", bytes(30), b"[[]]", b'{"a":',
+]  # fmt: skip
+VARIANTS = 6  # of the values in a document, besides those of the whole
+
+
+def job_of(run: Path, force: bool = False) -> Job:
+    return Job(RunDir(run), lambda event: None, "cpu", force=force)
+
+
+def redone(stage: str, run: Path, act: Callable[[Job], Any]) -> None:
+    """A command whose stage is not done yet."""
+    RunDir(run).provenance(stage).unlink(missing_ok=True)
+    act(job_of(run))
+
+
+def settings(run: Path) -> None:
+    """What every command does first."""
+    with redirect_stderr(StringIO()):
+        for name in ("fit", "plan", "nest", "train", "lift"):
+            parse.arguments(name, COMMANDS[name], [str(run)])
+    stage_seconds(RunDir(run))
+
+
+def resume(run: Path) -> None:
+    """`sagesplat run --force`, with training, labels and nested levels to be made again."""
+    for stage in ("train", "lift", "masks", "nest"):
+        RunDir(run).provenance(stage).unlink(missing_ok=True)
+    run_all(job_of(run, force=True), run.parent / "capture", SMALL_RUN)
+
+
+COMMAND = {
+    "settings": settings,
+    "view": lambda run: view._fill(Site(), run, lambda event: None, follow=False),
+    "bundle": lambda run: bundle(job_of(run), run.parent / "bundle"),
+    "live": lambda run: redone("train", run, lambda job: live_bundle(job, run / "bundle-live")),
+    "open": lambda run: (lambda opened: (opened.scene, opened.plans, opened.promises))(open_run(run)),
+    "plan": lambda run: redone("plan", run, lambda job: make_plan(job, SMALL_RUN.plan)),
+    "compose": lambda run: redone("compose", run, compose_plan),
+    "evaluate": lambda run: redone("evaluate", run, evaluate_plans),
+    "report": lambda run: redone("report", run, report.make_report),
+    "fit": lambda run: redone("fit", run, lambda job: fit_ladder(job, FitConfig())),
+    "run": lambda run: run_all(job_of(run), run.parent / "capture", SMALL_RUN),
+    "nest": lambda run: redone("nest", run, lambda job: nest_levels(job, SMALL_RUN.nest, 0)),
+    "resume": resume,
+}
+READERS = {  # the commands that read a document
+    "scene.json": ("settings", "view", "plan", "run"),
+    "photos.json": ("plan", "run"),
+    "cap.json": ("settings", "resume"),
+    "segmented/options.json": ("settings",),
+    "segmented/labels.json": ("resume",),
+    "masks/labels.json": ("bundle", "compose", "plan", "report", "live"),
+    "masks/edit.json": ("run",),
+    "provenance/scene.json": ("settings", "view", "report", "run"),
+    "provenance/masks.json": ("settings", "report", "run"),
+    "provenance/train.json": ("settings", "bundle", "evaluate", "report", "nest", "live"),
+    "nested/provenance/observe.json": ("settings", "fit", "plan", "report"),
+    "nested/provenance/fit.json": ("settings", "bundle", "plan", "evaluate"),
+    "nested/provenance/plan.json": ("settings", "compose", "evaluate", "report"),
+    "nested/provenance/nest.json": ("settings", "run", "report"),
+    "nested/observations.csv": ("bundle", "fit", "plan", "report"),
+    "nested/evaluation.csv": ("report",),
+    "nested/models.json": ("report",),
+    "nested/promises.json": ("open", "bundle", "plan", "evaluate"),
+    "nested/plan.json": ("open", "compose", "evaluate", "report"),
+    "nested/increments/index.json": ("view", "bundle", "plan", "evaluate"),
+    "labels.npz": ("plan", "bundle", "fit", "resume"),
+    "nested/ladder.npz": ("compose", "plan", "bundle", "evaluate"),
+    "levels/000006.npz": ("nest", "live"),
+    "checkpoint.npz": ("resume",),
+}
+
+
+@pytest.fixture
+def run(finished_run: Path, tmp_path: Path) -> Path:
+    (tmp_path / "capture").symlink_to(finished_run.parent / "capture")
+    return Path(shutil.copytree(finished_run, tmp_path / "run"))
+
+
+def nodes(document: Any, path: tuple = ()) -> Iterator[tuple]:
+    """Where values are in a JSON document: of lists the first few."""
+    entries = document.items() if isinstance(document, dict) else []
+    entries = list(enumerate(document))[:4] if isinstance(document, list) else entries
+    for key, value in entries:
+        yield (*path, key)
+        yield from nodes(value, (*path, key))
+
+
+def json_variants(content: bytes, draw: random.Random) -> Iterator[bytes]:
+    yield from WHOLE
+    places = list(nodes(json.loads(content)))
+    for _ in range(VARIANTS if places else 0):
+        document = json.loads(content)
+        *above, last = draw.choice(places)
+        at = document
+        for key in above:
+            at = at[key]
+        at[last] = draw.choice(VALUES)
+        if draw.random() < 0.15:
+            del at[last]
+        yield json.dumps(document).encode()
+
+
+def csv_variants(content: bytes, draw: random.Random) -> Iterator[bytes]:
+    header, *rows = content.decode().splitlines()
+    yield from (b"", f"{header}\n".encode(), bytes(9), b"\xff\xfe,", "\n".join(rows).encode())
+    for _ in range(2 * VARIANTS):
+        cells, column, value = (
+            [row.split(",") for row in rows],
+            draw.randrange(header.count(",") + 1),
+            draw.choice(NUMBERS),
+        )
+        for row in cells if draw.random() < 0.3 else [draw.choice(cells)]:
+            row[column] = value
+        yield "\n".join([header, *map(",".join, cells)]).encode()
+
+
+def npz_variants(content: bytes, draw: random.Random, folder: Path) -> Iterator[bytes]:
+    yield from (b"", content[: len(content) // 2], bytes(len(content)))
+    path = folder / "variant.npz"
+    path.write_bytes(content)
+    with np.load(path) as file:
+        arrays = dict(file)
+    for _ in range(VARIANTS):
+        name = draw.choice(sorted(arrays))
+        array = arrays[name]
+        other = draw.choice(
+            [
+                array[:0] if array.ndim else array,
+                array[..., None],
+                array * 0 if array.dtype.kind in "iuf" else array,
+            ]
+        )
+        np.savez(path, **{**arrays, name: other})
+        yield path.read_bytes()
+    np.savez(path, **{name.replace("184", "185"): array for name, array in arrays.items()})
+    yield path.read_bytes()
+
+
+def agree(run: Path) -> None:
+    """Let the records of all stages say that their inputs are as they are."""
+    for stage in _ORDER:
+        path = RunDir(run).provenance(stage)
+        try:
+            record = read_json(path)
+            names = [name for name in record["inputs"] if (run / name).exists()]
+            record["inputs"] |= records.input_hashes(RunDir(run), [run / name for name in names])
+            write_json(path, record)
+        except (SageError, TypeError, KeyError, UnicodeError):
+            continue
+
+
+def works_or_says_one_line(command: str, run: Path) -> None:
+    try:
+        COMMAND[command](run)
+    except SageError as error:
+        text = str(error)
+    else:
+        text = ""
+    assert "\n" not in text, text[:500]
+    assert len(text) < 1500, text[:500]
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_any_document(run: Path, tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        report,
+        "write_report",
+        lambda folder, data: (folder.mkdir(exist_ok=True), (folder / "index.html").touch()),
+    )
+    monkeypatch.setattr("sagesplat.stages.bundle._poster", lambda *_: b"")
+    draw, content = random.Random(name), (run / name).read_bytes()
+    if name.endswith(".npz"):
+        variants = npz_variants(content, draw, tmp_path)
+    else:
+        variants = (csv_variants if name.endswith(".csv") else json_variants)(content, draw)
+    for number, variant in enumerate(variants):
+        for command in READERS[name]:
+            other = tmp_path / "copy" / "run"
+            shutil.copytree(run, other, copy_function=os.link)
+            (other.parent / "capture").symlink_to(tmp_path / "capture")
+            (other / name).unlink()
+            (other / name).write_bytes(variant)
+            if number >= len(WHOLE) or number % 2:
+                agree(other)
+            works_or_says_one_line(command, other)
+            shutil.rmtree(other.parent)
