@@ -13,6 +13,7 @@ from PIL import Image
 from benchmarks.hostile import MIB, Reader
 from benchmarks.readers.making import PHOTOS, as_json, file, put, put_photos, written
 from sagesplat.core.errors import SceneError
+from sagesplat.io.pictures import PictureError
 from sagesplat.scene import _prepare, photos, video
 from sagesplat.scene.colmap import load_colmap
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage, write_model
@@ -113,7 +114,7 @@ def _prepare_photo(path: Path) -> None:
     (path.parent / "prepared").mkdir(exist_ok=True)
     try:
         _prepare._prepare_photo(path, path.parent / "prepared", "p")
-    except _prepare._Unreadable as error:
+    except PictureError as error:
         raise SceneError(str(error)) from None
 
 

@@ -22,7 +22,8 @@ from sagesplat.io.files import read_json
 from sagesplat.run import remote
 from sagesplat.run.job import Job, fingerprint
 from sagesplat.run.recorded import recorded_settings, stage_seconds
-from sagesplat.run.run_dir import FORMAT, RunDir, input_hashes, is_done, is_made_from, settings_of
+from sagesplat.run.records import FORMAT, input_hashes, is_done, is_made_from, settings_of
+from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import Stage, _follows
 from sagesplat.scene import load_scene
 from sagesplat.scene.blocks import Blocks, read_blocks, write_blocks
