@@ -18,6 +18,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType, TracebackType
+from unicodedata import category
 
 from sagesplat.core.errors import SageError
 
@@ -169,15 +170,11 @@ def _read(reader: Reader, folder: Path, content: bytes) -> tuple[Finding | None,
 
 
 def _message(text: str) -> Finding | None:
-    if text.isprintable() and len(text) <= LONGEST:
+    plain = text.isprintable() or all(c.isprintable() or category(c) == "Zs" for c in text)
+    if plain and text and len(text) <= LONGEST:
         return None
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        return Finding("message", f"cannot be printed: {text[:200]!r}")
-    if len(text.splitlines()) != 1 or len(text) > LONGEST:
-        return Finding("message", f"{len(text)} characters, not one line: {text[:200]!r}")
-    return Finding("message", f"characters that are not to be printed: {text[:200]!r}")
+    what = f"{len(text)} characters" if plain else "characters that are not to be printed"
+    return Finding("message", f"{what}, not one line: {text[:200]!r}")
 
 
 def _place(traceback: TracebackType | None) -> str:

@@ -195,3 +195,10 @@ def test_a_server_that_falls_silent(sources, served, tmp_path, monkeypatch):
         with pytest.raises(DataError, match="timed out"):
             download_lpips(tmp_path, ["alex"], sources=quiet)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_no_more_is_downloaded_than_weights_can_have(sources, tmp_path, monkeypatch):
+    monkeypatch.setattr("sagesplat.download.weights.MAX_HEADS", 100)
+    with pytest.raises(DataError, match=r"cannot be downloaded \(more than 0\.0001 MB\)"):
+        download_lpips(tmp_path, ["alex"], sources=sources)
+    assert list(tmp_path.iterdir()) == []

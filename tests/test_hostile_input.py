@@ -30,7 +30,8 @@ from sagesplat.io.npz import Npz
 ROOT = Path(__file__).parents[1]
 BUDGET = 0.1  # seconds for each reader
 ALL = pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
-ACCEPTED = {"observations/overflow.csv"}  # infinite numbers, which are values
+# infinite numbers, which are values; an archive whose member is zeros alone
+ACCEPTED = {"observations/overflow.csv", "zip/bomb.zip"}
 Prepare = Callable[[Reader], "Prepared"]
 
 
@@ -96,6 +97,13 @@ def test_every_reader_has_a_corpus_or_none_of_its_files_failed():
     assert sum(path.stat().st_size for path in CORPUS.glob("*/*")) < MIB
 
 
+class Unchecked(DataError):
+    """An error whose text is what it was made of."""
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
 def finding_of(read: Callable[[Path, bytes], object], honest: float = 0.25) -> Finding | None:
     reader = Reader("x", ".x", lambda *_: [], read, base=0)
     with watchdog():
@@ -111,10 +119,8 @@ def test_the_oracle_sees_what_it_is_for():
 
     assert finding_of(lambda _, content: len(content)) is None
     assert finding_of(fail(DataError("x: wrong; do this")), 2) is None
-    assert "not one line" in (finding_of(fail(DataError("x\ny"))) or Finding("", "")).text
-    assert "not one line" in (finding_of(fail(DataError("x" * 9999))) or Finding("", "")).text
-    assert "printed" in (finding_of(fail(DataError("\ud800"))) or Finding("", "")).text
-    assert "not to be printed" in (finding_of(fail(DataError("x\x1b[1m"))) or Finding("", "")).text
+    for text in ("x\ny", "x" * 9999, "", "\ud800", "x\x1b[1m"):
+        assert "not one line" in (finding_of(fail(Unchecked(text))) or Finding("", "")).text
     assert "KeyError" in (finding_of(fail(KeyError("x"))) or Finding("", "")).kind
     assert (finding_of(lambda _, content: np.zeros(len(content))) or Finding("", "")).kind == "memory"
     assert finding_of(lambda _, content: np.zeros(len(content)), 2.25) is None

@@ -1,8 +1,21 @@
 """Errors that a user can cause. Each message is one line: the path, what is wrong, what to do."""
 
+import unicodedata
+
+_LONGEST = 2500  # characters of a message
+
 
 class SageError(Exception):
-    """Base class of the errors that the CLI prints as one line, with exit code 2."""
+    """Base class of the errors that the CLI prints as one line, with exit code 2.
+
+    Its text is one printable line, whatever it was made of: files and servers decide on parts of many.
+    """
+
+    def __str__(self) -> str:
+        text = super().__str__()
+        if not text.isprintable():
+            text = "".join(_shown(c) for c in text)
+        return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 520]}...{text[-500:]}"
 
 
 class SceneError(SageError):
@@ -27,6 +40,13 @@ class BackendUnavailable(SageError):
 
 class OutOfMemory(SageError):
     """Too little memory, of the machine or its GPU, for the requested operation."""
+
+
+def _shown(c: str) -> str:
+    """A character as it may be printed. Spaces stay what they are: macOS has narrow ones in names."""
+    if c.isprintable() or unicodedata.category(c) == "Zs":
+        return c
+    return " " if c.isspace() else c.encode("unicode_escape").decode()
 
 
 def short(value: object) -> str:

@@ -19,6 +19,7 @@ from sagesplat.core.errors import DataError, short
 TIMEOUT = 30  # seconds without data
 PAUSES = (1.0, 5.0)  # seconds before the second and the third try
 BLOCK = 1 << 16  # bytes
+PIECE = 1 << 18  # bytes that are unpacked at once
 TAIL = 1 << 20  # bytes at the end of an archive that usually contain its directory
 MAX_DIRECTORY = 1 << 24  # bytes
 HEADER = 30  # bytes of a member's local header, before name and extra field
@@ -93,11 +94,11 @@ class RemoteZip:
                         yield block
                 if start < stop:
                     raise ConnectionError(f"the connection ended {stop - start} bytes early")
-            except (OSError, http.client.HTTPException) as error:
+            except (OSError, ValueError, http.client.HTTPException) as error:  # ValueError: of redirects
                 if isinstance(error, HTTPError):
                     error.close()
                 if pause is None or not _is_temporary(error):
-                    reason = " ".join(str(error).split()) or type(error).__name__
+                    reason = short(error) or type(error).__name__
                     raise DataError(f"{self.url}: cannot be downloaded ({reason}); {AGAIN}") from None
                 self._sleep(pause)
 
@@ -155,6 +156,8 @@ def _is_temporary(error: Exception) -> bool:
     """Whether a retry may succeed."""
     if isinstance(error, HTTPError):
         return error.code in (408, 425, 429, 500, 502, 503, 504)
+    if isinstance(error, ValueError):  # an address that is none
+        return False
     return not (isinstance(error, URLError) and isinstance(error.reason, ssl.SSLCertVerificationError))
 
 
@@ -174,9 +177,11 @@ def _unpack(blocks: Iterable[bytes], info: ZipInfo) -> Generator[bytes]:
     for block in chain([head[begin:]], blocks):
         block = block[:packed]
         packed -= len(block)
-        content = inflate.decompress(block, room) if inflate else block[:room]
-        room -= len(content)
-        if content:
-            yield content
+        while block and room:  # in pieces: a block can unpack to a thousand times its size
+            content = inflate.decompress(block, min(room, PIECE)) if inflate else block[:room]
+            block = inflate.unconsumed_tail if inflate else b""
+            room -= len(content)
+            if content:
+                yield content
         if not packed or not room:
             return

@@ -3,6 +3,7 @@
 import errno
 import hashlib
 import http.client
+import re
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,13 +12,14 @@ from typing import IO
 from urllib.request import Request, urlopen
 
 import numpy as np
-import torch
 
-from sagesplat.core.errors import BackendUnavailable, DataError, RunError
+from sagesplat.core.errors import BackendUnavailable, DataError, RunError, short
 from sagesplat.io.files import atomic_path
+from sagesplat.io.tensors import read_tensors
 from sagesplat.metrics.lpips import Net, checked, load_lpips, shapes, weights_path
 
 TIMEOUT = 30  # seconds without data
+MAX_HEADS, MAX_BACKBONE = 10**6, 10**9  # bytes of what is downloaded; 6 KB and 528 MB are published
 
 OnProgress = Callable[[str, int, int], None]  # name of a file, bytes done, all bytes (0 = unknown)
 
@@ -98,40 +100,50 @@ def _fetch_weights(
     heads = {f"lin{k}": f"lin{k}.model.1.weight" for k in range(5)}  # [1, C, 1, 1]
     cure = f"try again, or copy {path.name} from another machine to {path.parent}, or give --lpips FOLDER"
     expected, weights = shapes(net), {}
-    files = (source.heads, source.heads_sha256, heads), (source.backbone, source.sha256, backbone)
-    for url, sha256, keys in files:
+    files = (
+        (source.heads, source.heads_sha256, heads, MAX_HEADS),
+        (source.backbone, source.sha256, backbone, MAX_BACKBONE),
+    )
+    for url, sha256, keys, most in files:
         with tempfile.TemporaryFile(dir=path.parent) as file:
             try:
-                digest = _fetch(url, file, on_progress)
-            except (OSError, http.client.HTTPException) as error:
+                digest = _fetch(url, file, most, on_progress)
+            except (OSError, ValueError, http.client.HTTPException) as error:  # ValueError: of redirects
                 if getattr(error, "errno", None) == errno.ENOSPC:
                     raise
-                raise DataError(f"{url}: cannot be downloaded ({error}); {cure}") from None
+                raise DataError(f"{url}: cannot be downloaded ({short(error)}); {cure}") from None
             if digest != sha256:  # before anything of the file is read
                 raise DataError(f"{url}: not the file that was published (its SHA-256 is another); {cure}")
             try:
-                state = torch.load(file, map_location="cpu", weights_only=True)
+                state = read_tensors(file)
                 for name, key in keys.items():
-                    weights[name] = checked(name, state[key].squeeze().numpy(), expected[name])
+                    weights[name] = checked(name, state[key].detach().squeeze().numpy(), expected[name])
             except Exception as error:  # torch has a class of its own for each kind of failure
                 reason = str(error).partition("\n")[0].partition(". ")[0]
                 raise DataError(f"{url}: not the weights of LPIPS {net} ({reason}); {cure}") from None
     return weights
 
 
-def _fetch(url: str, file: IO[bytes], on_progress: OnProgress | None) -> str:
-    """Download `url` into `file`; the SHA-256 of the content. Raises OSError or HTTPException."""
+def _fetch(url: str, file: IO[bytes], most: int, on_progress: OnProgress | None) -> str:
+    """Download `url`, at most `most` bytes, into `file`; the SHA-256 of the content.
+
+    Raises OSError, HTTPException or ValueError.
+    """
     digest, done = hashlib.sha256(), 0
     request = Request(url, headers={"User-Agent": "sagesplat"})  # some servers refuse Python's default
     with urlopen(request, timeout=TIMEOUT) as response:
-        total = int(response.headers["Content-Length"] or 0)
+        length = response.headers["Content-Length"] or ""
+        total = int(length) if re.fullmatch(r"[0-9]{1,18}", length) else 0
         while block := response.read(1 << 20):
             file.write(block)
             digest.update(block)
             done += len(block)
+            if done > most:
+                raise OSError(f"more than {most / 1e6:g} MB")
             if on_progress is not None:
                 on_progress(url.rpartition("/")[2], done, total)
     if done < total:
         raise OSError(f"ends after {done} of {total} bytes")
+    file.flush()  # it is read through a memory map
     file.seek(0)
     return digest.hexdigest()

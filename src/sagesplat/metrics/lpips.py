@@ -10,8 +10,9 @@ from jaxtyping import Float, Float32
 from torch import Tensor
 from torch.nn import functional as F
 
-from sagesplat.core.errors import BackendUnavailable, DataError
+from sagesplat.core.errors import BackendUnavailable, DataError, short
 from sagesplat.io.files import cache_folder
+from sagesplat.io.npz import Npz
 
 Net = Literal["alex", "vgg"]
 
@@ -114,13 +115,12 @@ def load_lpips(net: Net, folder: Path | None = None, *, as_3dgs: bool = False) -
     path = folder if folder and folder.suffix == ".npz" else weights_path(net, folder)
     cure = "run `sagesplat download lpips` or give --lpips FOLDER"
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+        with Npz(path) as arrays:
             weights = {name: checked(name, arrays[name], shape) for name, shape in shapes(net).items()}
     except (FileNotFoundError, NotADirectoryError):
         raise BackendUnavailable(f"{path}: no such file, but LPIPS needs it; {cure}") from None
-    except Exception as error:  # zipfile and numpy have a class for each kind of damage
-        reason = str(error).partition("\n")[0]
-        raise DataError(f"{path}: not the weights of LPIPS {net} ({reason}); {cure}") from None
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise DataError(f"{path}: not the weights of LPIPS {net} ({short(error)}); {cure}") from None
     return Lpips(net, {name: torch.from_numpy(array) for name, array in weights.items()}, as_3dgs)
 
 
@@ -143,9 +143,10 @@ def shapes(net: Net) -> dict[str, tuple[int, ...]]:
 
 def checked(name: str, array: Any, shape: tuple[int, ...]) -> Float32[np.ndarray, "..."]:
     """`array` as float32. Raises ValueError where it is of another shape or not finite."""
-    array = np.asarray(array, np.float32)
-    if array.shape != shape:
+    if tuple(array.shape) != shape:  # first: a few bytes can stand for an array of any size
         raise ValueError(f"{name} is of shape {list(array.shape)}, not {list(shape)}")
+    with np.errstate(all="ignore"):  # infinite then
+        array = np.asarray(array, np.float32)
     if not np.isfinite(array).all():
         raise ValueError(f"{name} has values that are not finite")
     return array

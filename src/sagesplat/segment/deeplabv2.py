@@ -27,6 +27,7 @@ from torch.nn import functional as F
 from sagesplat.core.config import MasksConfig
 from sagesplat.core.errors import BackendUnavailable, LabelError
 from sagesplat.core.memory import ran_out
+from sagesplat.io.tensors import read_tensors
 from sagesplat.segment import coco
 from sagesplat.segment.crf import refine
 from sagesplat.segment.masks import Taxonomy
@@ -216,7 +217,8 @@ def _read_weights(path: Path) -> dict[str, Tensor]:
         if path.suffix == ".safetensors":
             content = _read_safetensors(path)
         else:
-            content = torch.load(path, map_location="cpu", weights_only=True)
+            with path.open("rb") as file:
+                content = read_tensors(file)
     except FileNotFoundError:
         raise LabelError(f"{path}: no such file; name a checkpoint of DeepLabV2") from None
     except BackendUnavailable:
