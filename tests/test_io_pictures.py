@@ -430,6 +430,20 @@ def test_only_jpeg_and_png_reach_colmap_as_they_are(tmp_path: Path) -> None:
     assert kinds == {"a.jpg": ("PNG", ".png"), "b.jpg": ("PNG", ".png"), "c.png": ("JPEG", ".jpg")}
 
 
+@pytest.mark.parametrize("planted", [b"%!PS", png(9, 9), jpeg_of(60, 40, 99)])
+def test_a_prepared_photo_from_elsewhere_is_made_again(tmp_path: Path, planted: bytes) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    Image.fromarray(NOISE).convert("L").save(photos / "a.png")
+    (first,), _ = prepare_photos(photos, tmp_path / "t", tmp_path / "t", lambda done, total: None)
+    prepared = tmp_path / "t" / first.prepared
+    expected, mtime = prepared.read_bytes(), prepared.stat().st_mtime_ns
+    prepared.write_bytes(planted)
+    os.utime(prepared, ns=(mtime, mtime))
+    prepare_photos(photos, tmp_path / "t", tmp_path / "t", lambda done, total: None)
+    assert prepared.read_bytes() == expected
+
+
 def test_a_missing_file(tmp_path: Path) -> None:
     with pytest.raises(PictureError, match="No such file or directory"), open_picture(tmp_path / "a.png"):
         pass

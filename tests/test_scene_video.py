@@ -184,6 +184,25 @@ def test_scripts_that_read_other_files_are_refused(tmp_path: Path, fill: Any, na
     assert not list((tmp_path / "f").glob("*.jpg"))
 
 
+def test_an_unknown_codec_is_one_line(tmp_path: Path) -> None:
+    film = write_video(tmp_path / "a.mkv", pan(6))
+    film.write_bytes(film.read_bytes().replace(b"V_MPEG4/ISO/ASP", b"V_ZZZZZ/ISO/ASP"))
+    with pytest.raises(SceneError, match="holds no video stream in MP4"):
+        extract_frames(film, tmp_path / "f")
+
+
+def test_an_error_of_pyav_itself_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a transport stream that turns out to have one stream more than its header said."""
+    film = write_video(tmp_path / "a.mp4", pan(6))
+
+    def fail(path: Path) -> int:
+        raise IndexError("list index out of range")
+
+    monkeypatch.setattr(video, "_count", fail)
+    with pytest.raises(SceneError, match=r"not readable as a video \(list index out of range\); convert"):
+        extract_frames(film, tmp_path / "f")
+
+
 def test_a_name_is_no_protocol(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     write_video(tmp_path / "secret.mp4", pan(6)).rename(tmp_path / "concat:secret.mp4")

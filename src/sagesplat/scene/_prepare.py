@@ -119,7 +119,7 @@ def _prepare_photo(path: Path, folder: Path, key: str) -> tuple[Path, tuple[Any,
         stat, exif = path.stat(), _exif(image)
         target = folder / (key + (".png" if image.format in ("PNG", "TIFF", "BMP") else ".jpg"))
         camera = _camera(image.size, exif)
-        done = target.is_file() and target.stat().st_mtime_ns == stat.st_mtime_ns
+        done = _is_prepared(target, camera[:2], stat.st_mtime_ns)
         if not done:
             changed = _changed(path, image, exif)
     if changed is not None:
@@ -129,6 +129,16 @@ def _prepare_photo(path: Path, folder: Path, key: str) -> tuple[Path, tuple[Any,
     elif not done:
         link(path.resolve(), target)
     return target, camera, (stat.st_size, stat.st_mtime_ns), _orientation(exif)
+
+
+def _is_prepared(target: Path, size: tuple[int, ...], mtime_ns: int) -> bool:
+    """Whether a photo was prepared before: COLMAP opens what is there by itself, so it has to be a photo."""
+    try:
+        with open_picture(target, ("JPEG", "PNG"), decodes=False) as image:
+            suffix = ".png" if image.format == "PNG" else ".jpg"
+            return (image.size, suffix) == (size, target.suffix) and target.stat().st_mtime_ns == mtime_ns
+    except PictureError:
+        return False
 
 
 def _exif(image: Image.Image) -> Image.Exif:

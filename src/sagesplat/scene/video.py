@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from PIL import Image
 
-from sagesplat.core.errors import BackendUnavailable, RunError, SceneError
+from sagesplat.core.errors import BackendUnavailable, RunError, SceneError, short
 from sagesplat.io.files import atomic_path, read_json, write_json
 
 _GREY_WIDTH = 640  # px, of the copies that sharpness is measured on
@@ -55,8 +55,8 @@ def extract_frames(
         old.unlink()
     try:
         paths = [_write(frame, folder, i) for i, frame in _moving(_sharpest(path, max_frames, on_frame))]
-    except (FFmpegError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
+    except (FFmpegError, ValueError, IndexError, MemoryError) as error:  # PyAV's own for a late stream
+        reason = short(getattr(error, "strerror", None) or str(error) or "too little memory is free for it")
         raise SceneError(f"{path}: not readable as a video ({reason}); convert it to MP4") from None
     if not paths:
         raise SceneError(
@@ -122,12 +122,13 @@ def _open(path: Path) -> Any:
         container = av.open(str(path.absolute()), options=options)  # "a:b" would name a protocol
     except ArgumentError:
         container = None
-    if container is None or not container.streams.video:
+    context = container.streams.video[0].codec_context if container and container.streams.video else None
+    if container is None or context is None:  # there is none for an unknown codec
         raise SceneError(
             f"{path}: holds no video stream in MP4, MOV, MKV, WebM, AVI or MPEG; convert it to MP4, or name "
             "a folder of photos"
         )
-    container.streams.video[0].codec_context.options = {"max_pixels": str(MAX_PIXELS)}
+    context.options = {"max_pixels": str(MAX_PIXELS)}
     return container
 
 
