@@ -19,7 +19,7 @@ from sagesplat import cli
 ROOT = Path(__file__).parents[1]
 DOCS = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
 FOREIGN = {  # flags of other tools
-    "--fix", "--address", "--no-index", "--find-links", "--revision", "--extra", "--upgrade",
+    "--fix", "--address", "--generate", "--no-index", "--find-links", "--revision", "--extra", "--upgrade",
 }  # fmt: skip
 
 FOREIGN_FILES = {"stages/NAME.py", "simple_trainer.py"}  # a placeholder; gsplat's

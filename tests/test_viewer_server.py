@@ -753,6 +753,9 @@ class Bundling(types.ModuleType):
             raise RunError(self.trouble)
         if self.live is None:
             return False
+        written = folder / "manifest.json"
+        if written.exists() and written.read_bytes() == self.live:  # as the real one
+            return False
         write_bundle(folder, {"manifest.json": self.live})
         return True
 
