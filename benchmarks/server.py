@@ -2,8 +2,6 @@
 
 import asyncio
 import hashlib
-import json
-import os
 import random
 import resource
 import ssl
@@ -209,11 +207,9 @@ class _Clients:
         return await reader.readexactly(int(length.partition(b":")[2]))
 
 
-def main() -> None:
-    """One measurement in a process of its own; arguments as JSON."""
-    print(json.dumps(measure(**json.loads(sys.argv[1]))))
-
-
-if __name__ == "__main__":
-    os.environ.setdefault("PYTHONWARNINGS", "ignore")
-    main()
+def commit() -> str:
+    """The commit that is checked out."""
+    done = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False
+    )
+    return done.stdout.strip()

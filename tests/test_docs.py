@@ -18,10 +18,9 @@ from sagesplat import cli
 
 ROOT = Path(__file__).parents[1]
 DOCS = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
-FOREIGN = {
+FOREIGN = {  # flags of other tools
     *("--only-binary", "--constraint", "--dest", "--require-hashes"),  # pip
-     # flags of other tools
-    "--fix", "--address", "--no-index", "--find-links", "--revision", "--extra", "--upgrade",
+    "--fix", "--address", "--generate", "--no-index", "--find-links", "--revision", "--extra", "--upgrade",
 }  # fmt: skip
 
 FOREIGN_FILES = {"stages/NAME.py", "simple_trainer.py"}  # a placeholder; gsplat's

@@ -124,6 +124,31 @@ def test_the_same_run_gives_the_same_bytes(run: Path, tmp_path: Path, viewer: Pa
     assert len(list(a.rglob("*"))) == len(list(b.rglob("*")))
 
 
+def test_a_finished_run_is_shown_without_its_capture(run: Path, tmp_path: Path, viewer: Path) -> None:
+    """The run keeps the cameras and points; the photos are needed by nothing that a bundle shows."""
+    made = bundle(job_of(run), tmp_path / "before", viewer=viewer)
+    scene = read_json(run / "scene.json")
+    write_json(run / "scene.json", {**scene, "path": str(tmp_path / "gone")})
+    again = bundle(job_of(run), tmp_path / "after", viewer=viewer)
+    assert made.agreement == again.agreement
+    before, after = (
+        {path.name: path.read_bytes() for path in (tmp_path / name).rglob("*") if path.is_file()}
+        for name in ("before", "after")
+    )
+    assert before == after
+
+    (run / "geometry.npz").unlink()  # a run of an earlier version
+    with pytest.raises(SageError, match=f"^{tmp_path / 'gone'}: ") as raised:
+        bundle(job_of(run), tmp_path / "other", viewer=viewer)
+    assert "\n" not in str(raised.value)
+
+
+def test_an_earlier_run_gets_its_geometry(run: Path, trained: Path) -> None:
+    (run / "geometry.npz").unlink()
+    open_scene(job_of(run), trained.parent / "capture", SceneConfig(test_every=4, calibrate_every=3))
+    assert (run / "geometry.npz").read_bytes() == (trained / "geometry.npz").read_bytes()
+
+
 @pytest.mark.parametrize(
     ("missing", "command"),
     [("nested/increments", "nest"), ("nested/observations.csv", "observe"), ("nested/promises.json", "fit")],

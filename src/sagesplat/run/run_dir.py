@@ -71,6 +71,11 @@ class RunDir:
         return self.path / "source.json"
 
     @property
+    def geometry(self) -> Path:
+        """Cameras and points of the capture, so that results can be shown without it."""
+        return self.path / "geometry.npz"
+
+    @property
     def masks(self) -> Path:
         """Label images at training size, with labels.json."""
         return self.path / "masks"

@@ -25,6 +25,7 @@ from sagesplat.io.npz import Npz
 from sagesplat.raster import rasterize
 from sagesplat.run.job import Job
 from sagesplat.run.records import is_made_from, settings_of
+from sagesplat.scene import read_scene
 from sagesplat.segment.block_categories import split_name
 from sagesplat.segment.display_names import title_of
 from sagesplat.segment.masks import UNLABELLED
@@ -86,7 +87,7 @@ def bundle(
     """
     always = [composed(name) for name in always]
     weights = {composed(name): weight for name, weight in (weights or {}).items()}
-    job = replace(job, run=replace(job.run, ladder="nested"))
+    job = _without_capture(replace(job, run=replace(job.run, ladder="nested")))
     _check(job, meters_per_unit, always, weights)
     viewer = viewer or package_viewer()
     check_target(out)
@@ -106,6 +107,15 @@ def bundle(
     agreement, error = distance_error(contents)
     count = sum(chunk.count for chunk in chunks)
     return BundleMade(out, len(contents.categories), len(chunks), count, written, agreement, error)
+
+
+def _without_capture(job: Job) -> Job:
+    """The job with the cameras and points that the run kept: its capture may be gone or changed since."""
+    if not job.run.geometry.exists():  # of an earlier version
+        return job
+    source = replace(job)
+    vars(source)["scene"] = read_scene(job.run.geometry)
+    return replace(job, source=source)
 
 
 def _poster(g: Gaussians, contents: Contents) -> bytes:

@@ -1,7 +1,7 @@
 """Makes scene.json from a capture, and a capture from photos or a video without poses."""
 
 import hashlib
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from sagesplat.core.config import PosesConfig, SceneConfig
@@ -22,6 +22,8 @@ from sagesplat.run.records import settings_of
 from sagesplat.run.stage import run_stage
 from sagesplat.scene import load_scene
 from sagesplat.scene.detect import detect
+from sagesplat.scene.scene import Scene
+from sagesplat.scene.stored import write_scene
 
 
 def open_scene(job: Job, path: Path, config: SceneConfig, poses: PosesConfig | None = None) -> None:
@@ -44,6 +46,7 @@ def open_scene(job: Job, path: Path, config: SceneConfig, poses: PosesConfig | N
         check_photos(scene, begun.photos, photos.sha256)
 
     def make() -> list[str]:
+        _write_geometry(run.geometry, scene)
         write_json(
             run.scene,
             {
@@ -74,6 +77,8 @@ def open_scene(job: Job, path: Path, config: SceneConfig, poses: PosesConfig | N
 
     run_stage(job, "scene", settings, [], [run.scene], make)
     photos.keep()
+    if not run.geometry.exists():  # the run began before it was kept
+        _write_geometry(run.geometry, scene)
 
 
 def _begun(job: Job) -> Capture | None:
@@ -81,6 +86,12 @@ def _begun(job: Job) -> Capture | None:
     if not job.run.provenance("scene").exists():
         return None
     return read_capture(job.run.scene) if job.run.scene.exists() else None
+
+
+def _write_geometry(path: Path, scene: Scene) -> None:
+    """Write cameras and points without their tracks, which are long and which only training needs."""
+    nothing = {name: getattr(scene.points, name)[:0] for name in ("track_points", "track_views", "track_uv")}
+    write_scene(path, replace(scene, points=replace(scene.points, **nothing)))
 
 
 HIGH_ERROR = 0.8  # px; `dinosaur` has 0.97 with one shared camera, 0.42 with a camera per photo

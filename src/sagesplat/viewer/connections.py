@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import uvicorn
+from anyio import to_thread
 from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
@@ -29,6 +30,7 @@ _RATE = 16 * 1024  # bytes a second of a download that counts as busy when someb
 _EVERY = 1.0  # seconds between two looks at all connections
 _BUFFER = 16 * 1024  # bytes that a connection holds of an answer before the next piece is read
 _TLS_BUFFER = 8 * 1024  # bytes that asyncio reads at once from each connection, and keeps for it
+_THREADS = 8  # that read files; each keeps memory of its own
 _FILES = 64  # file handles for all else
 _BATCH = 16  # connections that are accepted before the others' turn
 
@@ -97,7 +99,9 @@ class Connection(H11Protocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """See `asyncio.Protocol`."""
-        transport.set_write_buffer_limits(high=_BUFFER)
+        below = getattr(getattr(transport, "_ssl_protocol", None), "_transport", None)  # of TLS
+        for each in (transport, below) if below else (transport,):
+            each.set_write_buffer_limits(high=_BUFFER)
         self._counted = _Counted(transport)
         super().connection_made(self._counted)  # type: ignore[arg-type]
 
@@ -187,6 +191,7 @@ class Server(uvicorn.Server):
         """See `uvicorn.Server`; the sockets are accepted from here."""
         loop = asyncio.get_running_loop()
         loop.set_exception_handler(_ignore)
+        to_thread.current_default_thread_limiter().total_tokens = _THREADS
         await super().startup([])
         self._own = [loop.create_task(self._accept(each)) for each in sockets or []]
         self._own.append(loop.create_task(self._watch()))

@@ -62,6 +62,7 @@ _PACKED = (".css", ".html", ".js", ".json", ".svg", ".txt", ".wasm")  # sent wit
 _MOST_PACKED = 16 * 2**20  # bytes of a file that is packed in memory
 _packing = threading.Lock()
 _PIECE = 64 * 1024  # bytes that are sent at once
+_TLS_PIECE = 32 * 1024  # the same of a file over TLS, which keeps three copies for a slow reader
 # of a bundle: what no browser runs, whatever is in it
 _DATA = {".jpeg", ".jpg", ".json", ".md", ".pack", ".ply", ".png", ".spz", ".txt", ".webp"}
 _WAITING = "<!doctype html><title>sagesplat</title><p>{}</p><p>This page tries again by itself.</p>"
@@ -99,6 +100,8 @@ class Site:
 
         async def respond() -> None:
             response = await to_thread.run_sync(self._answer, scope)
+            if isinstance(response, FileResponse) and scope["scheme"] == "https":
+                response.chunk_size = _TLS_PIECE
             await response(scope, receive, send_with_headers)
             group.cancel_scope.cancel()
 
