@@ -10,16 +10,13 @@ from typing import Any
 
 from sagesplat.core.config import SceneConfig
 from sagesplat.core.errors import RunError, short
-from sagesplat.core.typed import check_fields, fits, types_of
+from sagesplat.core.typed import check_fields, types_of
 from sagesplat.io.files import read_json, write_json
 from sagesplat.run.records import file_hash
 from sagesplat.scene.scene import Scene
 
 _CURE = "delete it, and run `sagesplat run SCENE RUN` again with the same settings"
 _TYPES = {"path": Path, "fingerprint": str}
-_STATE = tuple[
-    int, int, int, str
-]  # of a photo: bytes, times of its last change (content, status; ns), SHA-256
 
 
 @dataclass(frozen=True)
@@ -43,7 +40,7 @@ def read_capture(path: Path) -> Capture:
         if unknown := sorted(made["settings"].keys() - types_of(SceneConfig).keys()):
             raise ValueError(f"setting {short(unknown[0])} is not known")
         photos = made.get("photos")
-        if not (photos is None or fits(photos, dict[str, str])):
+        if photos is not None and not (isinstance(photos, dict) and set(map(type, photos.values())) <= {str}):
             raise ValueError("photos without hashes")
     except ValueError as error:
         raise RunError(f"{path}: not the scene of a run ({short(error)}); {_CURE}") from None
@@ -116,15 +113,17 @@ def check_photos(scene: Scene, begun: Mapping[str, str], now: Mapping[str, str])
             )
 
 
-def _read_known(path: Path) -> dict[str, list[Any]]:
+def _read_known(path: Path) -> dict[str, Any]:
     try:
         known = read_json(path)
     except RunError:
         return {}
-    return {k: v for k, v in known.items() if fits(v, _STATE)} if isinstance(known, dict) else {}
+    return known if isinstance(known, dict) else {}
 
 
-def _state_of(path: Path, known: list[Any] | None) -> list[Any]:
+def _state_of(path: Path, known: Any) -> list[Any]:
+    """Bytes of a file, when its content and its status changed (ns), and its SHA-256."""
     status = path.stat()
     now = [status.st_size, status.st_mtime_ns, status.st_ctime_ns]
-    return known if known and known[:3] == now else [*now, file_hash(path)]
+    usable = isinstance(known, list) and known[:3] == now and len(known) == 4 and isinstance(known[3], str)
+    return known if usable else [*now, file_hash(path)]

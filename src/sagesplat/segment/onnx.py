@@ -145,10 +145,10 @@ class OnnxSegmenter:
 
     def _run(self, photo: UInt8[np.ndarray, "H W 3"]) -> np.ndarray:
         """The network's first output, [1, ...]."""
-        from onnxruntime import RunOptions  # pyright: ignore[reportAttributeAccessIssue]
+        import onnxruntime
 
         x = np.moveaxis(to_input(photo, self._height, self._width, self.classes), 2, self._channels - 1)
-        options = RunOptions()
+        options = onnxruntime.RunOptions()
         options.log_severity_level = 4  # what goes wrong is in the exception
         # a network may hold a loop that never ends; onnxruntime looks at this before each node
         timer = threading.Timer(self._time_limit, setattr, (options, "terminate", True))

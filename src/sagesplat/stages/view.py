@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 from sagesplat.core.errors import BackendUnavailable, RunError, SageError
 from sagesplat.core.events import Emit, Warned
 from sagesplat.core.names import visible
-from sagesplat.formats.increments import read_index
+from sagesplat.formats.increments import INDEX
 from sagesplat.io.files import read_json
-from sagesplat.run.records import settings_of
+from sagesplat.run.records import check_format
 from sagesplat.run.run_dir import RunDir, check_links
 from sagesplat.viewer.built import check_viewer, package_viewer
 from sagesplat.viewer.hosts import Hosts
@@ -110,7 +110,9 @@ def _open_run(path: Path, emit: Emit) -> "Job":
     if not run.scene.exists():
         raise RunError(f"{path}: neither a bundle (no {MANIFEST}) nor a run folder (no scene.json)")
     check_links(path)
-    settings_of(run, "scene")  # of a format that is read here
+    record = run.provenance("scene")
+    made = read_json(record, "run `sagesplat run` with --force") if record.exists() else {}
+    check_format(path, made if isinstance(made, dict) else {})
     return Job(run, emit)
 
 
@@ -125,9 +127,9 @@ def _is_current(run: RunDir, folder: Path) -> bool:
     try:
         manifest: Any = read_json(folder / MANIFEST)
         held = {level["sha256"] for label in manifest["labels"] for level in label["levels"]}
-    except (RunError, KeyError, TypeError):
+        chunks = {chunk["sha256"] for chunk in read_json(run.increments / INDEX)["chunks"]}
+    except (RunError, KeyError, TypeError):  # `bundle` says what is wrong with the run
         return False
-    chunks = {chunk.sha256 for chunk in read_index(run.increments)}
     older = (folder / MANIFEST).stat().st_mtime < run.promises.stat().st_mtime
     return held == chunks and not older
 
