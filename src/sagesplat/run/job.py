@@ -81,14 +81,17 @@ class Job:
             raise RunError(
                 f"{made['path']}: the capture changed since this run began; choose another run folder"
             )
+        # together with the scene: photos that change from now on are noticed
+        self.__dict__["photos"] = Photos(scene.views, memory.photo_cache(self.memory_limit))
         return scene
 
     @cached_property
     def photos(self) -> Photos:
-        """The photos, loaded when asked for."""
+        """The photos, loaded when asked for; those of the scene when it was opened."""
         if self.source is not None:
             return self.source.photos
-        return Photos(self.scene.views, memory.photo_cache(self.memory_limit))
+        _ = self.scene
+        return self.__dict__["photos"]
 
     @property
     def has_blocks(self) -> bool:
