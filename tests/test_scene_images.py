@@ -118,6 +118,8 @@ def test_a_photo_that_changes_while_a_command_works_is_noticed(tmp_path: Path) -
     assert photos[0] is first  # what was read counts
     with pytest.raises(SceneError, match=rf"^{paths[1]}: changed since this command began; put the earlier"):
         _ = photos[1]
+    with pytest.raises(SceneError, match=rf"^{paths[0]}: changed"):
+        photos.check()
     (tmp_path / "capture").rename(tmp_path / "away")
     with pytest.raises(SceneError, match=rf"^{paths[2]}: gone since this command began; put it back, then"):
         _ = photos[2]

@@ -78,22 +78,32 @@ class Photos:
             self._used += photo.nbytes
         return photo
 
+    def check(self) -> None:
+        """SceneError if a photo was changed or removed since this was made."""
+        for index in range(len(self.views)):
+            self._check(index)
+
     def _unchanged(self, index: int) -> UInt8[np.ndarray, "H W 3"]:
-        path, found = self.views[index].image_path, self._found[index]
         try:
             photo = load_photo(self.views[index])
         except SceneError:
-            if found and _version(path) is None:
-                raise SceneError(
-                    f"{path}: gone since this command began; put it back, then give the command again"
-                ) from None
+            self._check(index)  # has the better reason, if it has one
             raise
-        if _version(path) != found:
+        self._check(index)
+        return photo
+
+    def _check(self, index: int) -> None:
+        path, found = self.views[index].image_path, self._found[index]
+        now = _version(path)
+        if found and now is None:
+            raise SceneError(
+                f"{path}: gone since this command began; put it back, then give the command again"
+            )
+        if now != found:
             raise SceneError(
                 f"{path}: changed since this command began; put the earlier photo back, then give the "
                 "command again, or choose another run folder"
             )
-        return photo
 
 
 def _version(path: Path) -> tuple[int, int] | None:
