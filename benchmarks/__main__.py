@@ -1,6 +1,7 @@
 """`python -m benchmarks NAME`: each prints a table and ends with one line of JSON (docs/performance.md)."""
 
 import json
+import shutil
 import tempfile
 import time
 from dataclasses import replace
@@ -489,8 +490,9 @@ def blocks(
 @app.command
 def faults(
     scene: tyro.conf.Positional[str], *, out: Path,
-    only: tuple[Literal["a", "b", "c", "d", "e", "f"], ...] = (), downscale: int = 1, steps: int = 300,
-    nest_steps: int = 100, levels: int = 4, kills: int = 20, seed: int = 0, write: bool = False,
+    only: tuple[Literal["a", "b", "c", "d", "e", "f", "g", "h", "i", "j"], ...] = (),
+    downscale: int = 1, steps: int = 300, nest_steps: int = 100, levels: int = 4, kills: int = 20,
+    seed: int = 0, write: bool = False,
 ) -> None:  # fmt: skip
     """Nodes, drivers and runs killed at random, a full disk: the same result, and what it costs.
 
@@ -498,12 +500,13 @@ def faults(
         scene: a capture, or demo for the built-in one.
         out: folder for the runs, what they print, faults.json and faults.md.
         only: cases: undisturbed (a), on three nodes (b), nodes killed (c), driver killed (d), disk full (e),
-            run killed again and again (f).
+            run killed again and again (f), SIGTERM and five quick Ctrl-C (g), no memory left (h), capture
+            moved and changed (i), three bundlers at once (j).
         downscale: times smaller photos.
         steps: of the training of each block.
         nest_steps: of its nested ladder, and of the small model that this begins with.
         levels: of the ladder.
-        kills: of case f.
+        kills: of case f; case g has half as many.
         seed: of the random moments.
         write: also put the result into benchmarks/results.
     """
@@ -513,7 +516,10 @@ def faults(
 
     capture = cached_capture() if scene == "demo" else Path(scene).absolute()
     words = settings(downscale, steps, nest_steps, levels)
-    asked = Asked(capture, out.absolute(), words, kills, seed)
+    own = out.absolute() / "capture"  # one case moves it
+    if not own.exists():
+        shutil.copytree(capture, own)
+    asked = Asked(own, out.absolute(), words, kills, seed)
     try:
         cases = disturbing.measure(asked, only, lambda line: print(line, flush=True))
     except SageError as error:

@@ -10,6 +10,7 @@ import random
 import re
 import shutil
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -24,7 +25,7 @@ from sagesplat.output.tables import Table
 
 RESULTS = Path(__file__).parent / "results"
 NODE = {"num_cpus": 1, "object_store_memory": 80 * 2**20, "include_dashboard": False}
-CASES = ("a", "b", "c", "d", "e", "f")
+CASES = ("a", "b", "c", "d", "e", "f", "g", "h", "i", "j")
 NODES = 3
 FULL = re.compile(
     r"sagesplat: [^\n]*no space left, the disk is full; free [\d,]+ MB and run the same command[^\n]*\n"
@@ -279,9 +280,36 @@ def measure(asked: Asked, only: tuple[str, ...], tell: Callable[[str], None]) ->
             keep(disk_full(asked, nbytes, judge, ray))
     if "f" in wanted:
         keep(killed(asked, known("1 thread"), judge))
+    from benchmarks import faults_process as process  # which takes its types from here
+
+    if "g" in wanted:
+        keep(process.signalled(asked, known("1 thread"), max(2, asked.kills // 2)))
+    if "h" in wanted:
+        keep(process.without_memory(asked))
+    if "i" in wanted:
+        keep(process.capture_changed(asked))
+    if "j" in wanted:
+        keep(process.bundlers(asked, asked.out / "undisturbed"))
     if "a" in wanted:
         keep(undisturbed(asked, 2))
     return cases
+
+
+def _origin(asked: Asked) -> dict[str, Any]:
+    """What a case was measured with and when."""
+    git = ["git", "-C", str(RESULTS), "rev-parse", "--short", "HEAD"]
+    commit = subprocess.run(git, capture_output=True, text=True).stdout.strip()
+    command = " ".join(["python -m benchmarks", *sys.argv[1:]])
+    return {
+        "command": command, "commit": commit, "date": time.strftime("%Y-%m-%d"), "settings": asked.words,
+    }  # fmt: skip
+
+
+def _kept(file: Path, cases: Mapping[str, Outcome]) -> list[dict[str, Any]]:
+    """What an earlier run measured of other cases."""
+    before = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {"cases": []}
+    of = {"settings": before.get("settings")}
+    return [{"of": of} | row for row in before["cases"] if row["case"] not in cases]
 
 
 def result(found: Outcome) -> str:
@@ -325,8 +353,11 @@ def report(scene: str, asked: Asked, cases: Mapping[str, Outcome], write: bool) 
     text = "\n\n".join(f"**{t.title}**\n\n{t.markdown()}" for t in tables(scene, cases))
     (asked.out / "faults.md").write_text(text, encoding="utf-8")
     if write:
-        made = {"scene": scene, "settings": asked.words, "seed": asked.seed, "not_compared": TIMES}
-        made["cases"] = [asdict(found) | {"result": result(found)} for found in cases.values()]
+        file = RESULTS / f"faults-{scene}.json"
+        made = {"scene": scene, "seed": asked.seed, "not_compared": TIMES}
+        made["cases"] = _kept(file, cases) + [
+            asdict(found) | {"result": result(found), "of": _origin(asked)} for found in cases.values()
+        ]
         line = json.dumps(made, indent=1).replace(str(asked.out), "OUT")
-        (RESULTS / f"faults-{scene}.json").write_text(line + "\n", encoding="utf-8")
+        file.write_text(line + "\n", encoding="utf-8")
     return text

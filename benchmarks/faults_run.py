@@ -11,11 +11,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-PROGRAM = Path(sys.executable).with_name("sagesplat")
+PROGRAM = (sys.executable, "-m", "sagesplat")
 AGAIN = re.compile(r"^! (.*(?:; done again |resuming from step ).*)$", re.MULTILINE)
 _DONE = re.compile(r"^✓ (.+?) +(\d+\.\d) s  ", re.MULTILINE)
 _SKIPPED = re.compile(r"^· (.+?) +up to date$", re.MULTILINE)
 _POLL = 0.1  # seconds between two looks at what a run printed
+_QUICK = 0.05  # seconds between two signals
 _BLOCK = 4096  # bytes: what a tmpfs gives out
 # What tells seconds, and so differs between any two runs. All else has to be the same
 TIMES = {
@@ -106,7 +107,7 @@ class Command:
         logs.mkdir(parents=True, exist_ok=True)
         number = len(list(logs.glob(f"{name}-*.txt")))
         self.log, self._errors = logs / f"{name}-{number:02d}.txt", logs / f"{name}-{number:02d}.err"
-        words = [PROGRAM, "run", asked.scene, asked.run, *asked.words, *more]
+        words = [*PROGRAM, "run", asked.scene, asked.run, *asked.words, *more]
         environment = os.environ | {"RAY_USAGE_STATS_ENABLED": "0", "PYTHONUNBUFFERED": "1"}
         with self.log.open("wb") as out, self._errors.open("wb") as errors:
             self._process = subprocess.Popen(
@@ -125,6 +126,25 @@ class Command:
         self._process.kill()
         self._process.wait()
         return working
+
+    def signal(self, number: int, times: int = 1) -> bool:
+        """Send it a signal, several times in quick succession; whether it was still at work."""
+        working = self._process.poll() is None
+        for _ in range(times):
+            self._process.send_signal(number)  # nothing where it has ended
+            time.sleep(_QUICK)
+        return working
+
+    def limit_memory(self, more: int) -> bool:
+        """Let its address space grow by so many bytes at most; whether it was still at work."""
+        import resource
+
+        if self._process.poll() is not None:
+            return False
+        pages = int(Path(f"/proc/{self._process.pid}/statm").read_text().split()[0])
+        limit = pages * resource.getpagesize() + more
+        resource.prlimit(self._process.pid, resource.RLIMIT_AS, (limit, limit))
+        return True
 
     def end(self, seconds: float | None = None) -> int | None:
         """Its exit code; None where it still works after so many seconds."""

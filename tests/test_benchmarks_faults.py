@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import faults, faults_run
+from benchmarks import faults, faults_process, faults_run
 from benchmarks.faults import Outcome, tables
 from benchmarks.faults_run import AGAIN, Asked, Command, differing, digests, ends, stages, used
 from sagesplat.core.errors import RunError
@@ -21,6 +21,9 @@ SAID = """✓ scene        0.5 s  46 training, 8 test views
 ✓ block 1/train    3.0 s  16,999 Gaussians after 300 steps
 ✓ train        5.5 s  18,000 Gaussians of 2 blocks
 """
+
+
+REFUSES = 'echo "sagesplat: $3: process 1 on a writes there; wait for it or stop it" >&2; exit 2'
 
 
 def record(seconds: float, levels: str = "1", masks: str = "1") -> str:
@@ -115,7 +118,7 @@ def program(folder: Path, monkeypatch: pytest.MonkeyPatch, does: str) -> Asked:
     script = folder / "program"
     script.write_text(f"#!/bin/sh\n{does}\n")
     script.chmod(0o755)
-    monkeypatch.setattr(faults_run, "PROGRAM", script)
+    monkeypatch.setattr(faults_run, "PROGRAM", (str(script),))
     return Asked(folder / "scene", folder / "out", ("--downscale=4",))
 
 
@@ -143,3 +146,54 @@ def test_a_full_disk_is_skipped_where_nothing_can_be_mounted(tmp_path: Path, mon
     found = faults.disk_full(Asked(tmp_path, tmp_path, ()), 10**6, lambda found: None, ray=False)
     assert faults.result(found).startswith("skipped: ")
     assert "mounting a tmpfs takes root" in found.skipped
+
+
+def test_what_a_disturbed_process_has_to_say(tmp_path: Path, monkeypatch) -> None:
+    """Nothing and code 0, or one line and the code of what was done to it."""
+    for does, problems in (
+        ('echo "sagesplat: ended" >&2; exit 2', 0),
+        ("exit 0", 0),
+        ('echo "sagesplat: ended" >&2; exit 3', 1),
+        ('echo "sagesplat: ended" >&2; echo "and more" >&2; exit 2', 1),
+        ("exit 2", 1),
+    ):
+        asked = program(tmp_path, monkeypatch, does)
+        found = Outcome("x")
+        with Command(asked, "x") as command:
+            faults_process._refused(found, command, 2)
+        assert len(found.problems) == problems, does
+
+
+def test_several_bundlers_are_one_writer_and_others_that_are_told(tmp_path: Path, monkeypatch) -> None:
+    takes = 'mkdir "$3" 2>/dev/null && echo whole > "$3/manifest.json" && exit 0\n'
+    monkeypatch.setattr(faults_process, "PROGRAM", ("sh", "-c", takes + REFUSES, "sh"))
+    asked = Asked(tmp_path / "scene", tmp_path, ())
+    found = faults_process.bundlers(asked, tmp_path / "run")
+    assert (found.problems, found.differing, len(found.disturbances)) == ([], [], 2)
+    monkeypatch.setattr(faults_process, "PROGRAM", ("sh", "-c", takes + "echo Traceback >&2; exit 1", "sh"))
+    assert faults_process.bundlers(asked, tmp_path / "run").problems == ["bundling: Traceback"] * 2
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of another process are Linux's")
+def test_a_process_gets_no_more_memory(tmp_path: Path, monkeypatch) -> None:
+    asked = program(tmp_path, monkeypatch, "exec sleep 60")
+    with Command(asked, "x") as command:
+        assert command.limit_memory(2**20)
+        limits = Path(f"/proc/{command._process.pid}/limits").read_text()
+        assert "unlimited" not in next(line for line in limits.splitlines() if "address space" in line)
+        command.kill()
+        assert not command.limit_memory(2**20)
+
+
+def test_earlier_cases_stay_in_the_results(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(faults, "RESULTS", tmp_path)
+    file = tmp_path / "faults-demo.json"
+    old = [{"case": "3 nodes", "seconds": 1.0}, {"case": "1 thread", "seconds": 1.0}]
+    file.write_text(json.dumps({"settings": ["--old"], "cases": old}))
+    asked = Asked(tmp_path / "scene", tmp_path, ("--new",))
+    faults.report("demo", asked, {"1 thread": Outcome("1 thread", seconds=2.0)}, write=True)
+    cases = json.loads(file.read_text())["cases"]
+    assert [(case["case"], case["seconds"], case["of"]["settings"]) for case in cases] == [
+        ("3 nodes", 1.0, ["--old"]),
+        ("1 thread", 2.0, ["--new"]),
+    ]

@@ -29,6 +29,7 @@ OUT = [
     RuntimeError("can't start new thread"),
     Exception("[ONNXRuntimeError] : 6 : RUNTIME_EXCEPTION : std::bad_alloc"),
     Exception("Failed to allocate memory for requested buffer of size 4294967296"),
+    SystemError("error return without exception set"),
     caused(MemoryError()),
 ]
 

@@ -1,7 +1,10 @@
 """Photos of every kind become 8-bit RGB at the size of their view."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from conftest import random_gaussians, write_capture
 from PIL import Image
 
 from sagesplat.core.errors import SceneError
@@ -103,3 +106,22 @@ def test_photos_cache_within_the_limit(tmp_path, monkeypatch):
     assert int(photos[-1].mean()) == 2
     with pytest.raises(IndexError):
         photos[3]
+
+
+def test_a_photo_that_changes_while_a_command_works_is_noticed(tmp_path: Path) -> None:
+    """Else a result would be of two captures."""
+    scene = write_capture(tmp_path / "capture", random_gaussians(20, degree=0), views=3)
+    photos, paths = Photos(scene.views), [view.image_path for view in scene.views]
+    first = photos[0]
+    for path in paths[:2]:
+        path.write_bytes(paths[2].read_bytes())
+    assert photos[0] is first  # what was read counts
+    with pytest.raises(SceneError, match=rf"^{paths[1]}: changed since this command began; put the earlier"):
+        _ = photos[1]
+    with pytest.raises(SceneError, match=rf"^{paths[0]}: changed"):
+        photos.check()
+    (tmp_path / "capture").rename(tmp_path / "away")
+    with pytest.raises(SceneError, match=rf"^{paths[2]}: gone since this command began; put it back, then"):
+        _ = photos[2]
+    (tmp_path / "away").rename(tmp_path / "capture")
+    assert photos[2].shape == first.shape

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from sagesplat.adapt.viewpoint import ViewModel
 from sagesplat.core.errors import DataError, RunError, SageError
 from sagesplat.formats.increments import write_increments
 from sagesplat.formats.spz import read_spz
+from sagesplat.io.lock import alone
 from sagesplat.scene.scene import Camera
 from sagesplat.viewer import boxes, frames
 from sagesplat.viewer.bundle import SCHEMA, is_bundle, write_bundle, write_documents
@@ -520,6 +522,30 @@ def test_a_place_that_cannot_be_written(tmp_path, contents, viewer) -> None:
     (tmp_path / "file").write_text("x")
     with pytest.raises(RunError, match="cannot be written"):
         write_bundle(tmp_path / "file" / "out", contents, viewer)
+
+
+def test_a_full_disk_while_the_viewer_is_copied(tmp_path, contents, viewer, monkeypatch) -> None:
+    """Copying a folder fails with a list of files and no number; the line was "cannot be written (None)"."""
+
+    def full(*_: object, **__: object) -> None:
+        raise shutil.Error([("a", "b", "[Errno 28] No space left on device: 'a' -> 'b'")])
+
+    monkeypatch.setattr(shutil, "copytree", full)
+    with pytest.raises(RunError, match=r"out: cannot be written \(\[\('a', .*No space left on device"):
+        write_bundle(tmp_path / "out", contents, viewer)
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: shutil._ntuple_diskusage(9, 9, 0))  # type: ignore[attr-defined]
+    with pytest.raises(RunError, match="out: no space left, the disk is full; free 1 MB"):
+        write_bundle(tmp_path / "out", contents, viewer)
+    assert list(tmp_path.glob("*out*")) == []
+
+
+def test_a_second_bundler_is_told_of_the_first(tmp_path, contents, viewer) -> None:
+    with (
+        alone(tmp_path / "out"),
+        pytest.raises(RunError, match=r"out: process \d+ on .* writes there; wait for it or stop it$"),
+    ):
+        write_bundle(tmp_path / "out", contents, viewer)
+    write_bundle(tmp_path / "out", contents, viewer)
 
 
 def test_the_pack_brings_far_parts_out_of_sight_late() -> None:

@@ -14,6 +14,7 @@ _SAYS = (
     "failed to map segment from shared object",  # of a library that is imported
     "can't start new thread",
     "Cannot allocate memory",
+    "error return without exception set",  # of an import that had no memory for its error
 )
 MORE = (
     "close other programs, or let this one have more (ulimit -v, the container), then run the same command "

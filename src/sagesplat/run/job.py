@@ -85,14 +85,17 @@ class Job:
             now = photo_hashes(self.run.photo_hashes, scene)
             check_photos(scene, made.photos, now.sha256)
             now.keep()
+        # together with the scene: photos that change from now on are noticed
+        self.__dict__["photos"] = Photos(scene.views, memory.photo_cache(self.memory_limit))
         return scene
 
     @cached_property
     def photos(self) -> Photos:
-        """The photos, loaded when asked for."""
+        """The photos, loaded when asked for; those of the scene when it was opened."""
         if self.source is not None:
             return self.source.photos
-        return Photos(self.scene.views, memory.photo_cache(self.memory_limit))
+        _ = self.scene
+        return self.__dict__["photos"]
 
     @property
     def has_blocks(self) -> bool:

@@ -59,10 +59,13 @@ class Photos:
 
     Photos are cached until the cache holds `cache_bytes`; the others are read again on each access. Nothing
     is evicted: training cycles through all views, where an LRU cache would never hit.
+
+    A file that is changed or removed after this was made is a SceneError: results would be of two captures.
     """
 
     def __init__(self, views: Sequence[View], cache_bytes: int = 2**30):
         self.views, self.cache_bytes = views, cache_bytes
+        self._found = [_version(view.image_path) for view in views]
         self._cache: dict[int, np.ndarray] = {}
         self._used = 0
 
@@ -73,11 +76,47 @@ class Photos:
         index = range(len(self.views))[index]
         if index in self._cache:
             return self._cache[index]
-        photo = load_photo(self.views[index])
+        photo = self._unchanged(index)
         if self._used + photo.nbytes <= self.cache_bytes:
             self._cache[index] = photo
             self._used += photo.nbytes
         return photo
+
+    def check(self) -> None:
+        """SceneError if a photo was changed or removed since this was made."""
+        for index in range(len(self.views)):
+            self._check(index)
+
+    def _unchanged(self, index: int) -> UInt8[np.ndarray, "H W 3"]:
+        try:
+            photo = load_photo(self.views[index])
+        except SceneError:
+            self._check(index)  # has the better reason, if it has one
+            raise
+        self._check(index)
+        return photo
+
+    def _check(self, index: int) -> None:
+        path, found = self.views[index].image_path, self._found[index]
+        now = _version(path)
+        if found and now is None:
+            raise SceneError(
+                f"{path}: gone since this command began; put it back, then give the command again"
+            )
+        if now != found:
+            raise SceneError(
+                f"{path}: changed since this command began; put the earlier photo back, then give the "
+                "command again, or choose another run folder"
+            )
+
+
+def _version(path: Path) -> tuple[int, int] | None:
+    """Changes when a file does: its size and the time of its last change; None where it is not there."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_size, status.st_mtime_ns
 
 
 def as_rgb(image: Image.Image, background: tuple[int, int, int]) -> Image.Image:

@@ -93,6 +93,7 @@ def divide(job: Job, config: BlocksConfig, seed: int) -> Blocks:
         for old in run.blocks.glob("[0-9]*"):
             if int(old.name) >= len(blocks):
                 shutil.rmtree(old)
+        job.photos.check()  # blocks record the photos that are there now
         views = (assigned & training[:, None]).sum(0)
         points = np.bincount(of_points, minlength=len(blocks))
         write_blocks(file, blocks, views=views.tolist(), points=points.tolist(), sees=sees)

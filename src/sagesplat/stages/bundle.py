@@ -21,6 +21,7 @@ from sagesplat.core.typed import fits
 from sagesplat.formats.increments import INDEX, read_increments, write_increments
 from sagesplat.formats.levels import read_level
 from sagesplat.io.files import read_json, write_json
+from sagesplat.io.lock import alone
 from sagesplat.io.npz import Npz
 from sagesplat.raster import rasterize
 from sagesplat.run.job import Job
@@ -52,6 +53,7 @@ _GROUND |= {"path", "road", "sand", "sidewalk", "snow", "soil", "street", "terra
 _FEW = boxes.FEW  # SfM points; with fewer a category's boxes also take its Gaussians
 _OPAQUE = 0.1  # least opacity of such Gaussians
 _POSTER_HEIGHT = 360  # px
+_OTHERS = 10.0  # seconds to wait for another process that writes the same live bundle
 _LIVE = ".live.json"  # the level that a live bundle was made from, and its files
 
 
@@ -135,8 +137,14 @@ def live_bundle(job: Job, folder: Path, viewer: Path | None = None) -> bool:
     """Write the newest level of a training, which may still run, to `folder`; False if it is there already.
 
     The bundle has one level per category and no bounds. Files are written atomically. Those that a page may
-    still be loading are kept until two newer levels are written. RunError if there is no level yet.
+    still be loading are kept until two newer levels are written. RunError if there is no level yet, or where
+    another process writes there for seconds.
     """
+    with alone(folder, _OTHERS):
+        return _live_bundle(job, folder, viewer or package_viewer())
+
+
+def _live_bundle(job: Job, folder: Path, viewer: Path) -> bool:
     steps = sorted(p for p in job.run.levels.glob("*.npz") if not p.name.startswith("."))
     if not steps:
         raise RunError(f"{job.run.levels}: no level yet; wait, or run `sagesplat train`")
@@ -146,7 +154,6 @@ def live_bundle(job: Job, folder: Path, viewer: Path | None = None) -> bool:
         return False
     if not previous:
         check_target(folder)
-    viewer = viewer or package_viewer()
     if not has_viewer(folder, viewer):  # none yet, or that of an older version
         check_viewer(viewer)
         shutil.copytree(viewer, folder, dirs_exist_ok=True)
