@@ -18,7 +18,9 @@ from sagesplat import cli
 
 ROOT = Path(__file__).parents[1]
 DOCS = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
-FOREIGN = {  # flags of other tools
+FOREIGN = {
+    *("--only-binary", "--constraint", "--dest", "--require-hashes"),  # pip
+     # flags of other tools
     "--fix", "--address", "--no-index", "--find-links", "--revision", "--extra", "--upgrade",
 }  # fmt: skip
 

@@ -65,12 +65,17 @@ def sources(served, monkeypatch) -> dict[Net, Source]:
     return {
         net: Source(
             f"{base}/{net}_backbone.pth",
-            hashlib.sha256((folder / f"{net}_backbone.pth").read_bytes()).hexdigest()[:8],
+            sha256_of(folder / f"{net}_backbone.pth"),
             source.convolutions,
             f"{base}/{net}.pth",
+            sha256_of(folder / f"{net}.pth"),
         )
         for net, source in SOURCES.items()
     }
+
+
+def sha256_of(path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def changed(sources, **fields) -> dict[Net, Source]:
@@ -112,7 +117,8 @@ def test_the_published_layers_are_convolutions():
     for net, source in SOURCES.items():
         layers = enumerate(rows[net].replace(" ", ""))
         assert source.convolutions == tuple(i for i, layer in layers if layer == "c")
-        assert source.backbone.endswith(f"-{source.sha256}.pth")
+        assert source.backbone.endswith(f"-{source.sha256[:8]}.pth")  # as torchvision names its files
+        assert len(source.sha256) == len(source.heads_sha256) == 64
 
 
 def test_failures_are_one_line_and_leave_nothing(sources, served, tmp_path):
@@ -139,14 +145,21 @@ def test_failures_are_one_line_and_leave_nothing(sources, served, tmp_path):
         **{f"{base}/bad_{name}.pth": "not the weights" for name in (*bad_files, "text", "empty")},
     }
     for url, reason in cases.items():
+        file = folder / url.rpartition("/")[2]
+        sha256 = sha256_of(file) if file.exists() else ""
+        bad = changed(sources, heads=url, heads_sha256=sha256)
         with pytest.raises(DataError) as caught:
-            download_lpips(tmp_path / "cache", ["alex"], sources=changed(sources, heads=url))
+            download_lpips(tmp_path / "cache", ["alex"], sources=bad)
         assert_one_line(caught.value, url, reason)
         assert list((tmp_path / "cache").iterdir()) == []
-    with pytest.raises(DataError) as caught:
-        download_lpips(tmp_path / "cache", ["alex"], sources=changed(sources, sha256="7be5be79"))
-    assert_one_line(caught.value, sources["alex"].backbone, "not 7be5be79")
-    assert list((tmp_path / "cache").iterdir()) == []
+    for url, other in [
+        (sources["alex"].backbone, {"sha256": SOURCES["alex"].sha256}),
+        (sources["alex"].heads, {"heads_sha256": SOURCES["alex"].heads_sha256}),
+    ]:
+        with pytest.raises(DataError) as caught:
+            download_lpips(tmp_path / "cache", ["alex"], sources=changed(sources, **other))
+        assert_one_line(caught.value, url, "not the file that was published")
+        assert list((tmp_path / "cache").iterdir()) == []
 
 
 def assert_one_line(error, url, reason):

@@ -78,7 +78,9 @@ def test_other_categories_are_not_touched(tmp_path):
     data[info.header_offset + 500] ^= 0xFF
     path.write_bytes(data)
     assert len(read_level(path, [-1, 3])) == 200
-    with pytest.raises(DataError, match=r"000001\.npz: a broken level .*; run `sagesplat train` again"):
+    with pytest.raises(
+        DataError, match=r"000001\.npz: a broken level .*; delete it and run `sagesplat nest`"
+    ):
         read_level(path, [184])
 
 
@@ -104,7 +106,7 @@ def test_not_finite_is_refused(tmp_path, name, value):
     parameter = getattr(g, name).clone()
     parameter.view(30, -1)[7, 0] = value
     path = write_level(tmp_path, 3, replace(g, **{name: parameter}), recovering=False, sh_degree=3)
-    with pytest.raises(DataError, match=rf"000003\.npz: {name} holds NaN or Inf; run") as caught:
+    with pytest.raises(DataError, match=rf"000003\.npz: {name} holds NaN or Inf; delete") as caught:
         read_level(path)
     assert "\n" not in str(caught.value)
 

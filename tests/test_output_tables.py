@@ -146,7 +146,7 @@ AWKWARD = (
 
 def test_no_cell_is_a_formula_and_names_come_back(tmp_path):
     header = ("category", "=1+1", "count")
-    rows = [(name, "x", -3) for name in AWKWARD]
+    rows: list[tuple[str | int | float, ...]] = [(name, "x", -3) for name in AWKWARD]
     table = tables.Table("t", header, ("", "", ",d"), rows, marks={(0, 1): "m"})
     table.write_csv(tmp_path / "t.csv")
     with (tmp_path / "t.csv").open(newline="", encoding="utf-8") as file:

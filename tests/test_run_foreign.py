@@ -9,6 +9,7 @@ import random
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -20,22 +21,26 @@ from conftest import SMALL_RUN
 from sagesplat.cli import parse
 from sagesplat.cli.base import COMMANDS
 from sagesplat.core.config import FitConfig
-from sagesplat.core.errors import SageError
+from sagesplat.core.errors import RunError, SageError
 from sagesplat.io.files import read_json, write_json
 from sagesplat.run import records
 from sagesplat.run.job import Job
 from sagesplat.run.recorded import stage_seconds
-from sagesplat.run.run_dir import RunDir
+from sagesplat.run.run_dir import RunDir, check_links
 from sagesplat.run.stage import _ORDER
+from sagesplat.scene.blocks import Blocks, read_blocks, read_division, write_blocks
+from sagesplat.segment.masks import Taxonomy
 from sagesplat.stages import report, view
 from sagesplat.stages.api import open_run
 from sagesplat.stages.bundle import bundle, live_bundle
 from sagesplat.stages.compose import compose_plan
 from sagesplat.stages.evaluate import evaluate_plans
 from sagesplat.stages.fit import fit_ladder
+from sagesplat.stages.label import read_edit_table
 from sagesplat.stages.nest import nest_levels
 from sagesplat.stages.pipeline import run_all
 from sagesplat.stages.plan import make_plan
+from sagesplat.stages.train import read_cap, read_frozen
 from sagesplat.viewer.site import Site
 
 VALUES = [
@@ -46,7 +51,7 @@ NUMBERS = ["-1", "-2", "-5", "99", "1e9", "nan", "inf", "", "x", "2147483647", "
 WHOLE = [
     b"", b"[]", b"7", b"null", b'"x"', b"{}", b"[" * 100_000, b"\xff\xfe", bytes(30), b"[[]]", b'{"a":',
 ]  # fmt: skip
-VARIANTS = 6  # of the values in a document, besides those of the whole
+VARIANTS = 5  # of the values in a document, besides those of the whole
 
 
 def job_of(run: Path, force: bool = False) -> Job:
@@ -209,6 +214,22 @@ def works_or_says_one_line(command: str, run: Path) -> None:
 
 @pytest.mark.parametrize("name", READERS)
 def test_any_document(run: Path, tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each variant is read by one command, in turn."""
+    check_variants(run, tmp_path, name, monkeypatch, every=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", READERS)
+def test_any_document_and_command(
+    run: Path, tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("test_run_foreign.VARIANTS", 40)
+    check_variants(run, tmp_path, name, monkeypatch, every=True)
+
+
+def check_variants(
+    run: Path, tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch, every: bool
+) -> None:
     monkeypatch.setattr(
         report,
         "write_report",
@@ -221,7 +242,8 @@ def test_any_document(run: Path, tmp_path: Path, name: str, monkeypatch: pytest.
     else:
         variants = (csv_variants if name.endswith(".csv") else json_variants)(content, draw)
     for number, variant in enumerate(variants):
-        for command in READERS[name]:
+        commands = READERS[name]
+        for command in commands if every else [commands[number % len(commands)]]:
             other = tmp_path / "copy" / "run"
             shutil.copytree(run, other, copy_function=os.link)
             (other.parent / "capture").symlink_to(tmp_path / "capture")
@@ -231,3 +253,154 @@ def test_any_document(run: Path, tmp_path: Path, name: str, monkeypatch: pytest.
                 agree(other)
             works_or_says_one_line(command, other)
             shutil.rmtree(other.parent)
+
+
+# what belongs together
+
+
+@pytest.mark.parametrize(
+    ("command", "name", "old", "new", "complaint"),
+    [
+        ("fit", "nested/observations.csv", "\n3,", "\n77,", "category 77 is not this run's"),
+        ("plan", "nested/observations.csv", "\n3,1,", "\n3,9,", "level 9 is not this run's"),
+        ("bundle", "nested/observations.csv", "\n3,1,0,", "\n3,1,99,", "view 99 is not this run's"),
+        ("report", "nested/evaluation.csv", "\n0.4,0,", "\n0.4,-9,", "view -9 is not this run's"),
+        ("compose", "nested/plan.json", '"label_id": 3', '"label_id": 4', "of category 4 is not this run's"),
+        ("plan", "nested/promises.json", '"label_id": 3', '"label_id": 4', "category 4 is not this run's"),
+        ("plan", "nested/increments/index.json", '"level": 4', '"level": 5', "level 5 is not this run's"),
+        ("bundle", "nested/increments/index.json", '"count": 1', '"count": 2', "Gaussians of category"),
+        ("compose", "masks/labels.json", '"3"', '"5"', r"of category 3, which .*labels\.json does not name"),
+    ],
+)
+def test_documents_that_do_not_belong_to_the_others(
+    run: Path, command: str, name: str, old: str, new: str, complaint: str
+) -> None:
+    text = (run / name).read_text()
+    assert old in text
+    (run / name).write_text(text.replace(old, new))
+    agree(run)
+    with pytest.raises(SageError, match=complaint) as caught:
+        COMMAND[command](run)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("reader", "name", "gone", "again"),
+    [
+        ("plan", "scene.json", "scene.json", "run"),
+        ("fit", "nested/observations.csv", "nested/observations.csv", "observe"),
+        ("report", "nested/models.json", "nested/models.json", "fit"),
+        ("plan", "nested/promises.json", "nested/promises.json", "fit"),
+        ("compose", "nested/plan.json", "nested/plan.json", "plan"),
+        ("report", "nested/evaluation.csv", "nested/evaluation.csv", "evaluate"),
+        ("plan", "nested/increments/index.json", "nested/increments", "nest"),
+        ("compose", "nested/ladder.npz", "nested/ladder.npz", "nest"),
+        ("nest", "levels/000006.npz", "levels", "train"),
+    ],
+)
+def test_a_damaged_document_is_made_again_as_its_error_says(
+    run: Path, tmp_path: Path, reader: str, name: str, gone: str, again: str
+) -> None:
+    """The cures as they are typed: what the error names is deleted, and the run goes on."""
+    (run / name).write_bytes(b"[]")
+    with pytest.raises(SageError, match=rf"delete .*run `sagesplat {again}") as caught:
+        COMMAND[reader](run)
+    assert str(run / name) in str(caught.value)
+    if (run / gone).is_dir():
+        shutil.rmtree(run / gone)
+    else:
+        (run / gone).unlink()
+    for checkpoint in run.glob("checkpoint*.npz") if again == "train" else ():
+        checkpoint.unlink()
+    for _ in range(2):
+        run_all(job_of(run), tmp_path / "capture", SMALL_RUN)
+    assert (run / name).stat().st_size > 100
+
+
+def test_links_out_of_a_run_folder_are_refused(run: Path, tmp_path: Path) -> None:
+    check_links(run)
+    (run / "inside").symlink_to(run / "levels")
+    check_links(run)
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    for name, target in (("a", elsewhere), ("nested/b", "../../elsewhere"), ("masks/c", "/etc/passwd")):
+        (run / name).symlink_to(target)
+        for act in (lambda: check_links(run), lambda: open_run(run), lambda: COMMAND["view"](run)):
+            with pytest.raises(RunError, match=rf"{name}: a link out of the run folder"):
+                act()
+        with pytest.raises(RunError, match="a link out of the run folder"):
+            parse.arguments("plan", COMMANDS["plan"], [str(run)])
+        (run / name).unlink()
+    link = tmp_path / "link"
+    link.symlink_to(run)  # the folder itself may be named by a link
+    check_links(link)
+    assert not any(elsewhere.iterdir())
+
+
+def test_names_in_a_run_folder_lead_nowhere_else(run: Path, tmp_path: Path) -> None:
+    """Of all names in a run folder, only the capture's may be outside of it."""
+    secret = tmp_path / "secret.spz"
+    secret.write_bytes(b"x")
+    index = read_json(run / "nested/increments/index.json")
+    for uri in ("../../../secret.spz", str(secret), ".hidden", "a/b.spz", "x\0.spz"):
+        index["chunks"][0]["uri"] = uri
+        write_json(run / "nested/increments/index.json", index)
+        agree(run)
+        with pytest.raises(SageError, match="is not a file name of an increment"):
+            COMMAND["bundle"](run)
+
+
+# readers
+
+
+@pytest.mark.parametrize("content", [*WHOLE, b'{"cap": 1e9}', b'{"cap": -1}', b'{"cap": true}'])
+def test_caps_of_a_training(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "cap.json").write_bytes(content)
+    with pytest.raises(RunError, match=r"cap\.json: .*delete it, and run the same command again"):
+        read_cap(tmp_path / "cap.json")
+
+
+@pytest.mark.parametrize("content", [b"", b"[]", b'{"x": 1}', b'{"99999": 1}', b'{"3": "x"}', b'{"3": -1}'])
+def test_steps_at_which_categories_stopped(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "frozen.json").write_bytes(content)
+    with pytest.raises(RunError, match=r"frozen\.json: .*write \{\} into it"):
+        read_frozen(tmp_path / "frozen.json")
+    (tmp_path / "frozen.json").write_bytes(b"{}")
+    assert read_frozen(tmp_path / "frozen.json") == {}
+
+
+@pytest.mark.parametrize("content", [b"", b"[]", b'{"table": [1]}', b'{"table": [1, 2, 3, 99999]}'])
+def test_tables_of_merged_categories(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "edit.json").write_bytes(content)
+    with pytest.raises(RunError, match=r"edit\.json: .*`sagesplat masks` again"):
+        read_edit_table(tmp_path / "edit.json", Taxonomy({3: "car"}))
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {},
+        {"points": [1], "views": [1, 1], "sees": [[0], [1]]},
+        {"points": [1, 1], "views": [1, 1], "sees": [[0], [2]]},
+        {"points": [1, 1], "views": [1, "x"], "sees": [[0], [1]]},
+    ],
+)
+def test_what_blocks_are_made_of(tmp_path: Path, more: dict[str, Any]) -> None:
+    path, corners = tmp_path / "blocks.json", np.zeros((2, 2))
+    write_blocks(path, Blocks(np.eye(3)[:2], corners, corners + 1, 0.5), **more)
+    assert len(read_blocks(path)) == 2
+    with pytest.raises(SageError, match=r"blocks\.json: not a partition .*delete it and run"):
+        read_division(path)
+
+
+def test_settings_of_a_wrong_type_are_no_record(run: Path) -> None:
+    path = RunDir(run).provenance("train")
+    record = read_json(path)
+    for name, value in [("max_steps", "6"), ("antialiased", 1), ("means_lr", None), ("seed", 10**30)]:
+        write_json(path, record | {"settings": record["settings"] | {name: value}})
+        with pytest.raises(RunError, match=rf"not the record of a stage; .*--force \({name} is"):
+            records.read_record(path)
+    del record["settings"]["antialiased"]
+    write_json(path, record)
+    with pytest.raises(RunError, match="no setting antialiased in it"):
+        assert replace(job_of(run)).antialiased

@@ -1,5 +1,6 @@
 """Tasks on a Ray cluster of a few nodes on this machine: spread, lost, failed, and from the command line."""
 
+import logging
 import os
 import shutil
 import subprocess
@@ -7,7 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import closing, nullcontext
+from contextlib import closing, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +25,11 @@ from sagesplat.core.config import FitConfig, LiftConfig, MasksConfig, SceneConfi
 from sagesplat.core.errors import BackendUnavailable, RunError
 from sagesplat.core.events import Event, Progress, Warned
 from sagesplat.demo.capture import make_capture
-from sagesplat.run import ray_executor, ray_task
+from sagesplat.run import ray_cluster, ray_executor, ray_task
 from sagesplat.run.executor import LOCAL, Task, results
 from sagesplat.run.job import Job
-from sagesplat.run.ray_executor import RayExecutor, connected
+from sagesplat.run.ray_cluster import connected
+from sagesplat.run.ray_executor import RayExecutor
 from sagesplat.run.ray_task import Failed, WorkerEnvironment, run_task
 from sagesplat.run.run_dir import RunDir
 from sagesplat.stages.label import lift_labels, make_masks
@@ -47,6 +49,7 @@ def cluster() -> Iterator[Any]:
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
         patch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
         patch.delenv("RAY_ADDRESS", raising=False)
+        patch.setenv("RAY_AUTH_MODE", "disabled")  # as somebody else may have started it
         made = Cluster(initialize_head=True, head_node_args=NODE)
         made.add_node(**NODE)
         try:
@@ -196,7 +199,7 @@ def test_gpus_of_the_cluster_are_used_unless_told_otherwise(
     options: dict[str, Any], gpus: int, found: str | None, cluster: Any, tmp_path: Path, monkeypatch
 ) -> None:
     monkeypatch.setattr("sagesplat.raster.cuda.missing", lambda: "no GPU here")
-    monkeypatch.setattr(ray_executor, "connected", lambda _: nullcontext({"CPU": 2, "GPU": gpus}))
+    monkeypatch.setattr(ray_cluster, "connected", lambda _: nullcontext({"CPU": 2, "GPU": gpus}))
     with computing(Machine(executor="ray", threads=1, **options), tmp_path) as (backend, _, executor):
         job = Job(RunDir(tmp_path), lambda event: None, backend, executor=executor)
         assert (backend, executor.backend) == ("cpu", found)
@@ -302,7 +305,9 @@ def test_the_command_line_on_a_cluster(cluster: Any, trained: Path, tmp_path: Pa
     observe_levels(Job(RunDir(trained, "snapshots"), lambda event: None), FitConfig())
     words = ("observe", tmp_path / "other", "--ladder", "snapshots", "--threads", 1)
     made = command(*words, "--executor", f"ray:{cluster.address}")
-    assert (made.returncode, made.stderr) == (0, "")  # nothing of Ray's
+    assert made.returncode == 0
+    (line,) = made.stderr.splitlines()  # nothing else of Ray's
+    assert line.startswith("! ray: this Ray cluster does not check tokens: whoever reaches its port can run")
     assert "✓ observe" in made.stdout
     assert (tmp_path / "other" / OBSERVED).read_bytes() == (trained / OBSERVED).read_bytes()
 
@@ -315,13 +320,118 @@ def test_a_cluster_of_this_machine_is_started_and_ended(tmp_path: Path) -> None:
     assert (tmp_path / "run" / "snapshots" / "report" / "index.html").exists()
 
 
+OWN = """
+import os, sys
+import ray
+from sagesplat.run.ray_cluster import connected
+with connected("local"):
+    print(ray.get_runtime_context().gcs_address, os.environ["RAY_AUTH_TOKEN_PATH"], flush=True)
+    assert ray.get(ray.remote(lambda: os.getpid()).remote()) != os.getpid()
+    print("ready", flush=True)
+    sys.stdin.readline()
+assert not [name for name in os.environ if name.startswith("RAY_AUTH")]
+"""
+STRANGER = """
+import os, sys
+import ray
+ray.init(address=sys.argv[1], log_to_driver=False)
+print("got in:", ray.get(ray.remote(lambda: os.getpid()).remote()))
+"""
+
+
+def listening(processes: set[int]) -> set[str]:
+    """Addresses that processes listen on, as /proc/net has them."""
+    inodes = set()
+    for process in processes:
+        for handle in Path(f"/proc/{process}/fd").iterdir():
+            with suppress(OSError):
+                inodes.add(os.readlink(handle))
+    rows = [
+        line.split()
+        for table in ("tcp", "tcp6")
+        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]
+    ]
+    return {row[1].partition(":")[0] for row in rows if row[3] == "0A" and f"socket:[{row[9]}]" in inodes}
+
+
+def members(of: str, driver: int) -> dict[int, str]:
+    """Command lines of the processes of a cluster, whose environment names its folder."""
+    found = {driver: Path(f"/proc/{driver}/cmdline").read_text()}
+    for folder in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            if of.encode() in (folder / "environ").read_bytes():
+                found[int(folder.name)] = (folder / "cmdline").read_text()
+    return found
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks at /proc")
+def test_nobody_else_gets_into_a_cluster_of_our_own() -> None:
+    """All of it listens on the loopback, and who has no token is sent away there too."""
+    clean = {name: value for name, value in os.environ.items() if not name.startswith("RAY")}
+    clean |= {"RAY_USAGE_STATS_ENABLED": "0"}
+    with subprocess.Popen(
+        [sys.executable, "-c", OWN], env=clean, text=True,
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    ) as driver:  # fmt: skip
+        assert driver.stdin is not None
+        assert driver.stdout is not None
+        assert driver.stderr is not None
+        address, file = driver.stdout.readline().split()
+        assert driver.stdout.readline() == "ready\n"
+        token = Path(file)
+        assert len(token.read_text()) == 64
+        assert (token.stat().st_mode & 0o777, token.parent.stat().st_mode & 0o777) == (0o600, 0o700)
+
+        processes = members(str(token.parent), driver.pid)
+        assert len(processes) > 3
+        assert not [line for line in processes.values() if token.read_text() in line]
+        assert listening(set(processes)) == {"0100007F", "0000000000000000FFFF00000100007F"}
+
+        other = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "0" * 64}
+        for stranger in ({"RAY_AUTH_MODE": "disabled"}, other):
+            # as loopback as the cluster itself: else the address alone would keep it out
+            env = clean | stranger | {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
+            with subprocess.Popen(
+                [sys.executable, "-c", STRANGER, address], env=env, text=True,
+                stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+            ) as attempt:  # fmt: skip
+                assert attempt.stdout is not None
+                heard = []
+                for line in attempt.stdout:
+                    heard.append(line)
+                    if "Unauthenticated" in line or "got in" in line:
+                        break
+                attempt.kill()
+            assert "InvalidAuthToken" in heard[-1], heard
+        driver.stdin.write("\n")
+        driver.stdin.close()
+        assert driver.wait(60) == 0
+        assert driver.stderr.read() == ""
+    assert not token.parent.exists()
+
+
+def test_a_cluster_without_tokens_is_said_and_ray_s_warnings_once_each(cluster: Any, capsys) -> None:
+    assert ray_cluster._tells_that_it_is_open()
+    with ray_cluster._heard(ray_cluster._Warnings()):
+        for _ in range(3):
+            logging.getLogger("ray.anything").warning("a node is\nshort of %s", "memory")
+        ray._private.worker.print_to_stdstream(  # type: ignore[attr-defined]
+            {"lines": ["a node died", "a node died"], "pid": "raylet", "is_err": False}, ignore_prefix=False
+        )
+        ray._private.worker.print_to_stdstream(  # type: ignore[attr-defined]
+            {"lines": ["output of a task"], "pid": 7, "is_err": True}, ignore_prefix=False
+        )
+    assert capsys.readouterr() == ("", "! ray: a node is short of memory\n! ray: a node died\n")
+
+
 DRIVER = """
 import sys
 from pathlib import Path
 from ray_tasks import hold
 from sagesplat.run.executor import LOCAL, Task, results
 from sagesplat.run.job import Job
-from sagesplat.run.ray_executor import RayExecutor, connected
+from sagesplat.run.ray_cluster import connected
+from sagesplat.run.ray_executor import RayExecutor
 with connected(sys.argv[1]):
     folder = Path(sys.argv[2])
     results(RayExecutor(folder / "shared"), [Task("hold", hold, (folder,))], lambda event: None)

@@ -21,7 +21,7 @@ from sagesplat.core.config import (
     SceneConfig,
     TrainConfig,
 )
-from sagesplat.core.errors import RunError
+from sagesplat.core.errors import OutOfMemory, RunError
 from sagesplat.core.events import Event, Progress, StageDone
 from sagesplat.demo.capture import make_capture
 from sagesplat.io.files import read_json, write_json, write_text
@@ -444,3 +444,15 @@ def test_a_folder_of_any_names_has_a_hash(tmp_path: Path) -> None:
     first = file_hash(tmp_path)
     (tmp_path / os.fsdecode(b"caf\xe9.png")).rename(tmp_path / os.fsdecode(b"caf\xe8.png"))
     assert file_hash(tmp_path) != first
+
+
+def test_memory_that_runs_out_names_the_stage(tmp_path: Path) -> None:
+    run = RunDir(tmp_path)
+    run.scene.write_text("{}")
+
+    def make() -> list[str]:
+        raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 8 bytes")
+
+    with pytest.raises(OutOfMemory, match=f"{tmp_path}: lift: out of memory; close other programs"):
+        stage.run_stage(Job(run, lambda event: None), "lift", {}, [run.scene], [run.labels], make)
+    assert not run.provenance("lift").exists()

@@ -27,7 +27,9 @@ from sagesplat.core.errors import BackendUnavailable, SceneError
 from sagesplat.core.names import check_photo, collision_key
 from sagesplat.scene import load_scene, photos
 from sagesplat.scene._prepare import prepare_photos
+from sagesplat.scene.images import load_photo
 from sagesplat.scene.photos import PosesConfig, reconstruct
+from sagesplat.segment.masks import import_masks
 
 WIDTH, HEIGHT, FOCAL = 240, 180, 210.0
 VIEWS = 6
@@ -160,6 +162,42 @@ def test_what_was_left_out_is_said(solved: tuple[Path, Path, list]) -> None:
     assert report["settings"]["model"] == "SIMPLE_RADIAL"
     assert 0 < report["reprojection_error"] < 1
     assert list(report["seconds"]) == ["prepare", "features", "matches", "mapping", "undistortion"]
+
+
+def test_label_images_of_the_photos_land_on_their_pixels(
+    solved: tuple[Path, Path, list], rendered: list[Image.Image], tmp_path: Path
+) -> None:
+    """As they were taken, one of them on its side: bright pixels of the photos are those labelled bright."""
+    scene = load_scene(solved[1], test_every=0)
+    (tmp_path / "labels.json").write_text('{"labels": {"0": "dark", "1": "bright"}}')
+    names = [view.name for view in scene.views]
+    for name in names:
+        number = int(name.split()[2][0])
+        stored = (
+            rendered[-1].transpose(Image.Transpose.ROTATE_90) if name.endswith("jpg") else rendered[number]
+        )
+        label = (np.asarray(stored.convert("L")) > 128).astype(np.uint8)
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        Image.fromarray(label).save((tmp_path / name).with_suffix(".png"))
+    assert import_masks(scene, tmp_path, tmp_path / "out") == []
+    for view in scene.views:
+        bright = read(tmp_path / "out" / Path(view.name).with_suffix(".png"))
+        grey = load_photo(view).mean(axis=2)
+        clear = np.abs(grey - 128) > 25
+        assert (bright[clear] == (grey[clear] > 128)).mean() > 0.97
+
+
+@pytest.mark.parametrize(
+    "damage", ["{", "[]", "{}", '{"complete": true}', '{"complete": true, "seconds": 3}']
+)
+def test_a_damaged_report_is_made_again(tmp_path: Path, damage: str) -> None:
+    (tmp_path / "sfm").mkdir()
+    (tmp_path / "sparse" / "0").mkdir(parents=True)
+    (tmp_path / "sfm" / "request.json").write_text(json.dumps({"a": 1, "threads": 2}))
+    (tmp_path / "poses.json").write_text(damage)
+    assert photos._resume(tmp_path, {"a": 1}) is None
+    (tmp_path / "sfm" / "request.json").write_text(damage)
+    assert photos._resume(tmp_path, {"a": 1}) is None
 
 
 def test_progress_by_stage(solved: tuple[Path, Path, list]) -> None:

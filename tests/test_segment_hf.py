@@ -377,3 +377,10 @@ def test_devices(folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> N
     segmenter._model = full
     with pytest.raises(OutOfMemory, match="2 photos at once"):
         segmenter([noise(8, 8)] * 2)
+
+    def full_machine(**_: Any) -> Any:
+        raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 8 bytes")
+
+    segmenter._model = full_machine
+    with pytest.raises(OutOfMemory, match=r"on cpu for 1 photos at once; take fewer, smaller photos$"):
+        segmenter([noise(8, 8)])

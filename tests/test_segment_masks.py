@@ -1,5 +1,6 @@
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from sagesplat.core.errors import LabelError
+from sagesplat.core.errors import LabelError, SceneError
 from sagesplat.scene.scene import Camera, Lens, Points, Scene, View
 from sagesplat.scene.undistort import pinhole
 from sagesplat.segment.block_categories import BlockCategories
@@ -150,6 +151,115 @@ def test_label_images_are_undistorted_like_photos(tmp_path):
         np.testing.assert_array_equal(
             found[:, sure], np.where(columns > 0.3, 3, 184)[sure][None].repeat(96, 0)
         )
+
+
+LENS = Lens("SIMPLE_RADIAL", (100.0, 64.0, 48.0, -0.15), 128, 96)
+FLAT = (120, 94)  # px, of the undistorted photo: another aspect ratio
+
+
+def taken(lens: Lens = LENS) -> np.ndarray:
+    """Labels of the photo that a lens takes of an upright edge at x = 0.3 and a level one at y = -0.2."""
+    f, cx, cy, k = lens.params
+    v, u = np.mgrid[: lens.height, : lens.width] + 0.5
+    distorted_x, distorted_y = (u - cx) / f, (v - cy) / f
+    x, y = distorted_x, distorted_y
+    for _ in range(50):  # the ray that each pixel of the lens sees, by fixed-point iteration
+        radial = 1 + k * (x**2 + y**2)
+        x, y = distorted_x / radial, distorted_y / radial
+    return np.where(x > 0.3, 3, np.where(y > -0.2, 184, 255)).astype(np.uint8)
+
+
+def undistorted_capture(folder, size=FLAT, orientation=1, lens=LENS):
+    """A capture of one photo that structure from motion undistorted and cropped, and what it should show."""
+    (folder / "images").mkdir(parents=True)
+    width, height = size
+    Image.new("RGB", size).save(folder / "images" / "a.jpg")
+    about = {"model": lens.model, "params": lens.params, "width": lens.width, "height": lens.height}
+    raw = {"lenses": [about], "photos": {"a.jpg": [0, orientation]}}
+    (folder / "poses.json").write_text(json.dumps({"raw": raw}))
+    K = np.array([[115.0, 0, width / 2], [0, 115.0, height / 2], [0, 0, 1]])
+    scene = scene_of("a.jpg", width=width, height=height, K=K)
+    view = replace(scene.views[0], image_path=folder / "images" / "a.jpg")
+    x = (np.arange(width) + 0.5 - width / 2) / 115
+    y = (np.arange(height) + 0.5 - height / 2) / 115
+    expected = np.where(x > 0.3, 3, np.where(y[:, None] > -0.2, 184, -1))
+    sure = (np.abs(x - 0.3) > 0.02) & (np.abs(y[:, None] + 0.2) > 0.02)
+    return replace(scene, path=folder, views=(view,)), expected, sure
+
+
+@pytest.mark.parametrize(
+    ("label", "orientation"),
+    [
+        (taken(), 1),
+        (taken(), 3),  # upright, as viewers show it
+        (taken().repeat(2, 0).repeat(2, 1), 1),
+        (taken(), 6),
+        (np.rot90(taken(), 1), 6),  # as its pixels are stored
+        (np.rot90(taken(), -1), 8),
+        (taken().T, 5),
+    ],
+    ids=["raw", "raw 180", "raw, twice as large", "upright", "stored 6", "stored 8", "stored 5"],
+)
+def test_label_images_of_raw_photos_follow_the_undistorted_ones(tmp_path, label, orientation):
+    """Until now they were taken for the undistorted photos' where their aspect ratios were alike."""
+    scene, expected, sure = undistorted_capture(tmp_path / "capture", orientation=orientation)
+    save(tmp_path / "m" / "a.png", np.ascontiguousarray(label))
+    masks, _ = imported(scene, tmp_path / "m")
+    np.testing.assert_array_equal(masks[scene.views[0]][sure], expected[sure])
+    assert sure.mean() > 0.8
+
+
+def test_of_two_photos_of_one_size_the_raw_one_is_meant(tmp_path):
+    scene, expected, sure = undistorted_capture(tmp_path / "capture", size=(128, 96))
+    save(tmp_path / "m" / "a.png", taken())
+    masks, _ = imported(scene, tmp_path / "m")
+    np.testing.assert_array_equal(masks[scene.views[0]][sure], expected[sure])
+
+
+def test_label_images_of_undistorted_photos_stay(tmp_path):
+    scene, expected, _ = undistorted_capture(tmp_path / "capture")
+    save(tmp_path / "m" / "a.png", np.where(expected == -1, 255, expected).astype(np.uint8))
+    np.testing.assert_array_equal(imported(scene, tmp_path / "m")[0][scene.views[0]], expected)
+
+
+def test_label_images_that_fit_both_or_none_are_refused(tmp_path):
+    scene, _, _ = undistorted_capture(tmp_path / "capture", size=(124, 93))  # the same aspect ratio
+    save(tmp_path / "m" / "a.png", taken()[::2, ::2])
+    with pytest.raises(
+        LabelError, match=r"64 x 48 pixels fit its photo, 128 x 96, and the .* 124 x 93; scale"
+    ):
+        imported(scene, tmp_path / "m")
+    save(tmp_path / "m" / "a.png", taken()[:80])
+    with pytest.raises(
+        LabelError, match="128 x 80 pixels, but its photo has 128 x 96, and 124 x 93 where it"
+    ):
+        imported(scene, tmp_path / "m")
+    save(tmp_path / "m" / "a.png", taken())
+    imported(scene, tmp_path / "m")
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda raw: [],
+        lambda raw: {"lenses": 3},
+        lambda raw: raw | {"photos": {"a.jpg": [1, 1]}},
+        lambda raw: raw | {"photos": {"a.jpg": [0, 9]}},
+        lambda raw: raw | {"photos": {"a.jpg": [0]}},
+        lambda raw: raw | {"lenses": [raw["lenses"][0] | {"model": "NONE"}]},
+        lambda raw: raw | {"lenses": [raw["lenses"][0] | {"params": [1e999, 1, 1, 1]}]},
+        lambda raw: raw | {"lenses": [raw["lenses"][0] | {"width": 1e999}]},
+    ],
+)
+def test_a_damaged_report_of_poses_is_one_line(tmp_path, damage):
+    scene, _, _ = undistorted_capture(tmp_path / "capture")
+    save(tmp_path / "m" / "a.png", taken())
+    path = tmp_path / "capture" / "poses.json"
+    raw = json.loads(path.read_text())["raw"]
+    path.write_text(json.dumps({"raw": damage(raw)}))
+    with pytest.raises(SceneError, match=r"poses\.json: not readable \(.*\); find the poses again") as raised:
+        imported(scene, tmp_path / "m")
+    assert "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize(

@@ -237,12 +237,13 @@ LESS = "out of memory; lower --train.max-gaussians"
         ),
         (OutOfMemory("the GPU is out of memory"), LESS),
         (MemoryError(), LESS),
+        (RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to ..."), LESS),
         (
             RuntimeError("CUDA error: unspecified launch failure\nmore"),
             "the GPU failed .CUDA error: un",
         ),
     ],
-    ids=["torch", "raster", "memory", "device"],
+    ids=["torch", "raster", "memory", "cpu", "device"],
 )
 def test_what_a_machine_cannot_do_is_one_line_and_costs_no_checkpoint(
     scene, tmp_path, monkeypatch, failure, says

@@ -10,6 +10,9 @@ interface Package {
   readonly dependencies?: Readonly<Record<string, string>>;
 }
 
+const SPARK = "@sparkjsdev/spark";
+/** Of the Rust crates in Spark's WebAssembly, which npm knows nothing of; tests/test_viewer_licenses.py checks it. */
+const notices = readFileSync(join(import.meta.dirname, "wasm-notices.txt"), "utf8");
 const modules = join(import.meta.dirname, "node_modules");
 
 function readPackage(name: string): Package {
@@ -46,7 +49,7 @@ function licenses(): Plugin {
       this.emitFile({
         type: "asset",
         fileName: "THIRD_PARTY_LICENSES.txt",
-        source: [...names].sort().map(licenseOf).join(rule),
+        source: [...[...names].sort().map(licenseOf), ...(names.has(SPARK) ? [notices] : [])].join(rule),
       });
     },
   };

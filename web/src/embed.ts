@@ -63,16 +63,48 @@ function numeric(given: URLSearchParams, name: string, low: number, high: number
 
 /** A folder below the page's own, with a trailing slash. */
 function bundlePath(path: string): string {
-  let decoded = path;
-  try {
-    decoded = decodeURIComponent(path);
-  } catch {
-    decoded = "..";
-  }
-  if (/^[\w.-]+:|^\/|\\|[?#\0]/.test(decoded) || decoded.split("/").includes("..")) {
+  const folder = path === "" || path.endsWith("/") ? path : `${path}/`;
+  if (folder !== "" && !isBelow(folder)) {
     throw new Error(
       `?bundle=${path} leaves this page's folder; give a folder below it, like ?bundle=garden/.`,
     );
   }
-  return path === "" || path.endsWith("/") ? path : `${path}/`;
+  return folder;
+}
+
+/** The URL of a bundle's folder, below that of the page; throws for any other. */
+export function bundleUrl(folder: string, page: string): URL {
+  const own = new URL("./", page.replace(/[?#].*/, ""));
+  const url = new URL(`./${folder}`, own);
+  if (url.origin !== own.origin || !url.pathname.startsWith(own.pathname)) {
+    throw new Error(`?bundle=${folder} leaves this page's folder; correct the address.`);
+  }
+  return url;
+}
+
+/**
+ * Whether a relative address stays below the folder that it is relative to, as browsers resolve it: they take
+ * backslashes for slashes and "%2e" for dots, and drop tabs and line breaks. Servers may decode once more.
+ */
+function isBelow(folder: string): boolean {
+  for (let text = folder, times = 0; times < 5; times += 1) {
+    if (/[\p{Cc}\\?#]/u.test(text) || !resolvesBelow(text)) return false;
+    let decoded: string;
+    try {
+      decoded = decodeURIComponent(text);
+    } catch {
+      return false;
+    }
+    if (decoded === text) return true;
+    text = decoded;
+  }
+  return false;
+}
+
+function resolvesBelow(text: string): boolean {
+  const page = new URL("https://page.invalid/a/b/");
+  const url = URL.canParse(text, page) ? new URL(text, page) : null;
+  const below = url?.origin === page.origin && url.pathname.startsWith(page.pathname);
+  // "a/../b" would do as well, but not where a link or a server takes it otherwise
+  return below && !text.split("/").includes("..") && !/^[\w.+-]*:|^\//.test(text);
 }

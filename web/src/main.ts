@@ -1,5 +1,5 @@
 import { loadManifest } from "./core/manifest";
-import { type Embed, type Options, parseOptions } from "./embed";
+import { bundleUrl, type Embed, type Options, parseOptions } from "./embed";
 import { fail, hideNotice, messageOf } from "./ui/notice";
 import { buildPage } from "./ui/page";
 import { colorsOf } from "./view/spark";
@@ -18,7 +18,7 @@ ready.catch((error: unknown) => fail(messageOf(error)));
 async function begin(): Promise<void> {
   await Promise.resolve(); // `window.sagesplat` exists before any error
   const options = parseOptions(location.search, location.hash);
-  const base = new URL(`./${options.bundle}`, location.href.replace(/[?#].*/, ""));
+  const base = bundleUrl(options.bundle, location.href);
   const canvas = document.getElementById("view");
   if (!(canvas instanceof HTMLCanvasElement))
     throw new Error("This page is incomplete; copy the bundle again.");

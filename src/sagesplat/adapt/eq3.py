@@ -19,6 +19,7 @@ NOISE = 0.05  # SSIM residual from which an observation counts as an outlier (sc
 FLOOR = 0.003  # SSIM residual below which a better fit does not justify a parameter
 REGIME_SIZE = 4  # parameters of one regime: K, gamma, mu, alpha
 SIDE = 6  # fewest observations on a side of beta
+LARGEST = 1e30  # numbers of a model that is read; those of fits are far smaller
 STATUSES = ("two regimes", "one regime", "constant", "not converged")
 
 # Bounds and starts of one regime, with distances mapped to [0, 1]. gamma = s**-alpha, where s is the distance
@@ -291,7 +292,7 @@ def model_from_json(entry: dict) -> SsimModel:
         num_observations=int(entry["num_observations"]),
         status=str(entry["status"]),
     )
-    finite = np.isfinite([*model.params, low, high, model.median, model.rmse]).all()
+    finite = (np.abs([*model.params, low, high, model.median, model.rmse]) < LARGEST).all()
     if not finite or low > high or min(model.params.g1, model.params.g2) < 0:
         raise ValueError(f"category {model.label_id}, level {model.level}: numbers out of range")
     if not (-2 <= model.label_id < 2**15 and 0 <= model.level < 2**31):

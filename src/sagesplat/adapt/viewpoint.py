@@ -46,7 +46,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
-from sagesplat.adapt.eq3 import SsimModel, fit_models, model_from_json
+from sagesplat.adapt.eq3 import LARGEST, SsimModel, fit_models, model_from_json
 from sagesplat.adapt.observe import TOTAL, Observations
 from sagesplat.core.errors import DataError, RunError, short
 from sagesplat.io.files import read_json, write_json
@@ -480,7 +480,7 @@ def _from_json(entry: dict[str, Any]) -> ViewModel:
     if not n or u.shape != (n,) or not curves or shapes != ((n, 7), (n, len(curves)), (len(curves),)):
         raise ValueError("lists of unequal length")
     finite = all(
-        np.isfinite(a).all() for a in (inputs, weights, amplitudes, (x, y, z), list(numbers.values()))
+        (np.abs(a) < LARGEST).all() for a in (inputs, weights, amplitudes, (x, y, z), list(numbers.values()))
     )
     if (
         not finite

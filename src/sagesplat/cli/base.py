@@ -154,7 +154,8 @@ def computing(machine: Machine, folder: Path) -> "Iterator[tuple[Backend, int, E
         return
     if find_spec("ray") is None:
         raise BackendUnavailable("--executor ray: Ray is missing; pip install 'sagesplat[ray]'")
-    from sagesplat.run.ray_executor import RayExecutor, connected
+    from sagesplat.run.ray_cluster import connected
+    from sagesplat.run.ray_executor import RayExecutor
 
     with connected(address) as resources:
         auto = (machine.device, machine.backend) == ("auto", "auto")

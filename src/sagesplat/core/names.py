@@ -59,7 +59,7 @@ def check_photo(name: str) -> None:
 
 
 def _check_characters(name: str) -> None:
-    wrong = next((c for c in name if not _is_shown(c)), None)
+    wrong = None if name.isprintable() else next((c for c in name if not _is_shown(c)), None)
     if wrong is not None and "\ud800" <= wrong <= "\udfff":
         raise ValueError("it is not UTF-8")
     if wrong is not None:

@@ -29,22 +29,28 @@ class Source:
     """Where the weights of a network are published, as PyTorch state dicts."""
 
     backbone: str  # URL: torchvision's network
-    sha256: str  # first digits of its hash
+    sha256: str  # of that file
     convolutions: tuple[int, ...]  # their indices in the network's `features`
     heads: str  # URL: LPIPS's weights of the channels
+    heads_sha256: str  # of that file, as in the package lpips 0.1.4
 
 
 _TORCHVISION = "https://download.pytorch.org/models"
 _LPIPS = "https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/master/lpips/weights/v0.1"
 SOURCES: Mapping[Net, Source] = {
     "alex": Source(
-        f"{_TORCHVISION}/alexnet-owt-7be5be79.pth", "7be5be79", (0, 3, 6, 8, 10), f"{_LPIPS}/alex.pth"
+        f"{_TORCHVISION}/alexnet-owt-7be5be79.pth",
+        "7be5be791159472b1fbf3c69796f7cb30dca7ad8466c2df70058c37116cdee02",
+        (0, 3, 6, 8, 10),
+        f"{_LPIPS}/alex.pth",
+        "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0",
     ),
     "vgg": Source(
         f"{_TORCHVISION}/vgg16-397923af.pth",
-        "397923af",
+        "397923af8e79cdbb6a7127f12361acd7a2f83e06b05044ddf496e83de57a5bf0",
         (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28),
         f"{_LPIPS}/vgg.pth",
+        "a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868",
     ),
 }
 
@@ -94,7 +100,10 @@ def _fetch_weights(
     heads = {f"lin{k}": f"lin{k}.model.1.weight" for k in range(5)}  # [1, C, 1, 1]
     cure = f"try again, or copy {path.name} from another machine to {path.parent}, or give --lpips FOLDER"
     expected, weights = shapes(net), {}
-    files = (source.heads, "", heads, MAX_HEADS), (source.backbone, source.sha256, backbone, MAX_BACKBONE)
+    files = (
+        (source.heads, source.heads_sha256, heads, MAX_HEADS),
+        (source.backbone, source.sha256, backbone, MAX_BACKBONE),
+    )
     for url, sha256, keys, most in files:
         with tempfile.TemporaryFile(dir=path.parent) as file:
             try:
@@ -103,8 +112,8 @@ def _fetch_weights(
                 if getattr(error, "errno", None) == errno.ENOSPC:
                     raise
                 raise DataError(f"{url}: cannot be downloaded ({short(error)}); {cure}") from None
-            if not digest.startswith(sha256):
-                raise DataError(f"{url}: SHA-256 {digest[:8]}, not {sha256}; {cure}")
+            if digest != sha256:  # before anything of the file is read
+                raise DataError(f"{url}: not the file that was published (its SHA-256 is another); {cure}")
             try:
                 state = read_tensors(file)
                 for name, key in keys.items():

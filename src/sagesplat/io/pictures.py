@@ -4,15 +4,17 @@ Pillow by itself opens some sixty formats, and starts Ghostscript for PostScript
 """
 
 import importlib
+import logging
 import stat
+import struct
 import threading
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from io import BufferedReader
 from pathlib import Path
-from typing import BinaryIO
 
-from PIL import Image, ImageFile
+from PIL import Image, ImageFile, UnidentifiedImageError
 
 from sagesplat.core.errors import short
 
@@ -24,8 +26,17 @@ PIXELS_PER_BYTE = 64
 _HEAD = 256  # bytes that tell formats apart
 _JUNK = 4096  # bytes between a JPEG's segments
 _SEGMENTS, _EXIF_SEGMENTS, _SCANS = 4096, 16, 100  # of a JPEG; photos have tens, 1 and 10
-_CHUNKS, _PACKED_CHUNKS = 4096, 16  # of a PNG before its pixels; each packed one may hold a megabyte
+_CHUNKS, _BYTES_PER_CHUNK = 4096, 256  # of a PNG: so many, and one more for each such part of the file
+_PACKED_CHUNKS = 16  # of a PNG; each may hold a megabyte
+_TAGS, _RATIONALS = 4096, 1024  # of a TIFF; Pillow takes 5 us for each rational number
+_EXIF_TAG = 34665
+# Of TIFFs that hold photos. Others are faxes, of whose every damaged row libtiff prints a line, or obsolete.
+_COMPRESSIONS = (
+    *("raw", "packbits", "tiff_lzw", "tiff_adobe_deflate", "tiff_deflate"),
+    *("jpeg", "lzma", "zstd", "webp"),
+)
 _LOCK = threading.Lock()
+logging.getLogger("PIL").addHandler(logging.NullHandler())  # or Pillow's errors reach the terminal
 
 _PLUGINS = {"JPEG": "Jpeg", "PNG": "Png", "TIFF": "Tiff", "WEBP": "WebP", "BMP": "Bmp", "AVIF": "Avif"}
 _MAGIC = (
@@ -88,14 +99,17 @@ def open_picture(
     try:
         with _without_warnings(), _regular(path).open("rb") as file:
             kind = _checked_format(file, formats)
-            _check_metadata(file, kind, decodes)
+            nbytes = path.stat().st_size
+            _check_metadata(file, kind, nbytes, decodes)
             with _opened(file, kind) as image:
-                _check_pixels(image.size, path.stat().st_size, free)
+                _check_pixels(image.size, nbytes, free)
                 yield image
     except PictureError:
         raise
     except MemoryError:
         raise PictureError("too little memory is free for it", "close other programs") from None
+    except UnidentifiedImageError:
+        raise PictureError("its header is damaged") from None
     except Exception as error:  # decoders raise errors of many kinds for damaged files
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         raise PictureError(short(reason.strip() or type(error).__name__)) from None
@@ -115,7 +129,7 @@ def _regular(path: Path) -> Path:
     return path
 
 
-def _checked_format(file: BinaryIO, formats: Sequence[str]) -> str:
+def _checked_format(file: BufferedReader, formats: Sequence[str]) -> str:
     """The format by the file's first bytes, ready to be opened. PictureError unless it is in `formats`."""
     head = file.read(_HEAD)
     kind = _format(head)
@@ -166,7 +180,7 @@ def _register_heif() -> None:
 
 
 @contextmanager
-def _opened(file: BinaryIO, kind: str) -> Iterator[ImageFile.ImageFile]:
+def _opened(file: BufferedReader, kind: str) -> Iterator[ImageFile.ImageFile]:
     with _LOCK:  # Pillow's own limit is one for all: 89 megapixels warn, twice as many fail
         usual = Image.MAX_IMAGE_PIXELS
         Image.MAX_IMAGE_PIXELS = None
@@ -175,6 +189,9 @@ def _opened(file: BinaryIO, kind: str) -> Iterator[ImageFile.ImageFile]:
         finally:
             Image.MAX_IMAGE_PIXELS = usual
     with image:
+        compression = image.info.get("compression", "raw")
+        if kind == "TIFF" and compression not in _COMPRESSIONS:
+            raise PictureError(f"a TIFF packed as {short(compression)}", "convert it to PNG")
         yield image
 
 
@@ -188,17 +205,19 @@ def _check_pixels(size: tuple[int, int], nbytes: int, free: int) -> None:
         raise PictureError(f"{said} in {nbytes:,} bytes, more than photos have", "make it smaller")
 
 
-def _check_metadata(file: BinaryIO, kind: str, decodes: bool) -> None:
+def _check_metadata(file: BufferedReader, kind: str, nbytes: int, decodes: bool) -> None:
     """PictureError for metadata over which Pillow would take long or much memory."""
     if kind == "PNG":
-        _check_png(file)
+        _check_png(file, nbytes, decodes)
+    if kind == "TIFF":
+        _check_tiff(file)
     if kind == "JPEG":
         in_one_pass = _check_jpeg(file)
         if decodes and not in_one_pass and file.read().count(b"\xff\xda\x00") >= _SCANS:
             raise PictureError("a JPEG of too many scans", "save it again")
 
 
-def _check_jpeg(file: BinaryIO) -> bool:
+def _check_jpeg(file: BufferedReader) -> bool:
     """Read segments up to the first scan; whether it is the only one. PictureError for too many segments."""
     file.seek(2)
     junk = exif = components = 0
@@ -226,16 +245,40 @@ def _check_jpeg(file: BinaryIO) -> bool:
     raise PictureError("its metadata has too many segments", "save it again")
 
 
-def _check_png(file: BinaryIO) -> None:
+def _check_png(file: BufferedReader, nbytes: int, to_the_end: bool) -> None:
     """PictureError for chunks without end, or for packed texts of many megabytes."""
-    file.seek(8)
-    packed = 0
-    for _ in range(_CHUNKS):
-        head = file.read(8)
-        if len(head) < 8 or head[4:] in (b"IDAT", b"fdAT", b"IEND"):
-            return  # the rest is Pillow's to judge
-        packed += head[4:] in (b"zTXt", b"iTXt")
-        if packed > _PACKED_CHUNKS:
-            break
-        file.seek(int.from_bytes(head[:4], "big") + 4, 1)
+    at, packed = 8, 0
+    with open(file.name, "rb", buffering=0) as chunks:  # most are thousands of bytes apart
+        for _ in range(_CHUNKS + nbytes // _BYTES_PER_CHUNK):
+            chunks.seek(at)
+            head = chunks.read(8)
+            kind = head[4:]
+            packed += kind in (b"zTXt", b"iTXt")
+            if packed > _PACKED_CHUNKS:
+                break
+            if len(head) < 8 or kind == b"IEND" or (kind == b"IDAT" and not to_the_end):
+                return
+            at += int.from_bytes(head[:4], "big") + 12
     raise PictureError("its metadata has too many chunks", "save it again")
+
+
+def _check_tiff(file: BufferedReader) -> None:
+    """PictureError for more tags, or rational numbers in one, than photos have."""
+    file.seek(0)
+    head = file.read(16)
+    big = head[2:4] in (b"+\0", b"\0+")
+    order, word, value, at = "<" if head[:1] == b"I" else ">", *("QQ" if big else "HI"), 8 if big else 4
+    number, entry = struct.Struct(order + word), struct.Struct(f"{order}HH{value}{value}")
+    directories = [struct.unpack_from(order + value, head, at)[0]]
+    for at in directories:
+        file.seek(min(at, 2**62))
+        count = number.unpack(file.read(number.size))[0]
+        if count > _TAGS:
+            raise PictureError("its metadata has too many tags", "save it again")
+        content = file.read(count * entry.size)
+        for start in range(0, len(content) - entry.size + 1, entry.size):
+            tag, kind, values, offset = entry.unpack_from(content, start)
+            if kind in (5, 10) and values > _RATIONALS:
+                raise PictureError("its metadata has too many numbers", "save it again")
+            if tag == _EXIF_TAG and len(directories) == 1:
+                directories.append(offset)

@@ -27,7 +27,8 @@ Colours = Mapping[int, tuple[int, int, int]]  # label id -> RGB, 0..255
 
 INK, FAINT, ACCENT = "#1d2530", "#8a94a3", "#c2410c"
 PAIR = (5.4, 4.9)  # inches, of two figures side by side
-_LONGEST = 32  # characters of a name
+_LONGEST = 28  # characters of a name
+_LONG = 20  # characters of a name, above which a legend has fewer columns
 STYLE: dict[Any, Any] = {
     "font.size": 9,
     "axes.titlesize": 10,
@@ -79,6 +80,12 @@ def caption(label_id: int, names: Mapping[int, str]) -> str:
 def shortened(text: str) -> str:
     """A text cut to the length that a legend or a title has room for."""
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
+
+
+def _columns(usual: int, of_long: int, labels: Sequence[int], names: Mapping[int, str]) -> int:
+    """Columns of a legend of these names: the usual number, or `of_long` where a name is long."""
+    longest = max((len(caption(label, names)) for label in labels), default=0)
+    return usual if longest <= _LONG else of_long
 
 
 def label_image(label_ids: Int[np.ndarray, "H W"], colours: Colours) -> UInt8[np.ndarray, "H W 3"]:
@@ -212,7 +219,7 @@ def size_by_target(
         handles.append(
             Patch(facecolor="#cccccc", hatch="////", edgecolor="white", label="target out of reach")
         )
-    figure.legend(handles=handles, loc="outside lower center", ncols=6)
+    figure.legend(handles=handles, loc="outside lower center", ncols=_columns(6, 3, labels, names))
     return figure
 
 
@@ -242,7 +249,8 @@ def promised_and_measured(
     axes.set(xlabel="promised SSIM", ylabel="measured SSIM", xlim=ends, ylim=ends)
     handles += [Line2D([], [], marker="o", ls="", color=FAINT, label="target reached")]
     handles += [Line2D([], [], marker="o", ls="", mfc="none", mec=FAINT, label="target missed")]
-    figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=7.5)
+    columns = _columns(3, 2, labels, names)
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=7.5)
     return figure
 
 

@@ -136,7 +136,7 @@ class Job:
         """Category of each SfM point."""
         path = self.run.block_category_labels if self.has_block_categories else self.run.labels
         ids = LiftedLabels.read(path, len(self.scene.points.xyz)).label_ids
-        self._check_named(path, np.flatnonzero(np.bincount(ids.astype(np.int64) + 1)) - 1)
+        self.check_named(path, np.flatnonzero(np.bincount(ids.astype(np.int64) + 1)) - 1)
         return ids
 
     @cached_property
@@ -150,10 +150,10 @@ class Job:
         nested = self.run.ladder == "nested"
         ladder = read_prefixes(self.run.prefixes) if nested else self.snapshots
         path = self.run.prefixes if nested else self.run.levels
-        self._check_named(path, sorted({label for label, _ in ladder.counts}))
+        self.check_named(path, sorted({label for label, _ in ladder.counts}))
         return ladder
 
-    def _check_named(self, path: Path, label_ids: Iterable[int]) -> None:
+    def check_named(self, path: Path, label_ids: Iterable[int]) -> None:
         """RunError for an id that the run's labels.json does not name."""
         names = self.names()
         for label in label_ids:

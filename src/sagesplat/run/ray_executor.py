@@ -1,12 +1,9 @@
 """Tasks on the nodes of a Ray cluster, which share the disk of the run folder and the capture."""
 
-import logging
-import os
-import socket
 import time
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,7 +12,6 @@ from ray.exceptions import RayError, RayTaskError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from sagesplat import __version__
-from sagesplat.core import signals
 from sagesplat.core.errors import RunError, short
 from sagesplat.core.events import Emit, Event, Warned
 from sagesplat.io.files import write_text
@@ -25,7 +21,6 @@ from sagesplat.run.ray_task import ANSWER, Failed, WorkerEnvironment, run_task
 _TRIES = 3  # of a task, after the first
 _POLL = 0.1  # seconds between two checks of the tasks
 _STALLED = 30.0  # seconds without any task at work until a warning
-_STORE = 256 * 2**20  # bytes of shared memory of a cluster of our own: results are small
 
 
 class RayExecutor:
@@ -193,60 +188,3 @@ class RayExecutor:
             raise RunError(
                 f"{task.name}: no node of the cluster has {self._asked(task)} (most CPUs: {most}); {cure}"
             )
-
-
-@contextmanager
-def connected(address: str = "") -> Iterator[Mapping[str, float]]:
-    """A connection to a cluster; what it has in all comes back: "CPU", "GPU", "memory" (bytes), ...
-
-    `address` is host:port; without one RAY_ADDRESS or the cluster that runs on this machine is taken, else
-    one of this machine is started, and ended again. RunError where the cluster does not answer. A connection
-    that this process has already is used.
-    """
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "1")  # else it prints a line about it
-    if ray.is_initialized():
-        yield ray.cluster_resources()
-        return
-    with signals.deferred():  # processes of a cluster that is half begun would stay
-        _connect(address or os.environ.get("RAY_ADDRESS", ""))
-    try:
-        yield ray.cluster_resources()
-    finally:
-        ray.shutdown()
-
-
-def _connect(address: str) -> None:
-    quiet = {"log_to_driver": False, "logging_level": logging.ERROR}
-    # what happens to nodes it prints all the same, and has no setting for it; we say what matters
-    ray._private.worker.print_to_stdstream = lambda *_, **__: None  # pyright: ignore
-    ray._private.utils.set_sigterm_handler = lambda _: None  # pyright: ignore  # it would leave without a line
-    own = {"address": "local", "include_dashboard": False, "object_store_memory": _STORE}
-    try:
-        if address and address not in ("auto", "local"):
-            _check_answers(address)
-            ray.init(address=address, **quiet)
-            return
-        try:
-            ray.init(address="auto", **quiet)
-        except ConnectionError:
-            ray.init(**own, **quiet)
-    except (OSError, RuntimeError, ValueError, AssertionError, TimeoutError) as error:
-        cause = short(" ".join(str(error).split()) or repr(error))
-        cure = (
-            "make this machine a node of it (`ray start --address=HOST:PORT`), with the same Ray and Python"
-        )
-        raise RunError(f"--executor ray: no connection to the cluster ({cause}); {cure}") from None
-
-
-def _check_answers(address: str) -> None:
-    """RunError where nobody listens: Ray itself would wait for minutes."""
-    host, _, port = address.rpartition(":")
-    try:
-        with socket.create_connection((host.strip("[]"), int(port)), timeout=ANSWER):
-            return
-    except (OSError, ValueError, OverflowError) as error:
-        raise RunError(
-            f"--executor ray:{address}: no answer ({short(error)}); name the cluster's head as HOST:PORT, "
-            "such as ray:10.0.0.1:6379, or start one with `ray start --head`"
-        ) from None

@@ -56,6 +56,13 @@ def run_task(
         tell.flush()
 
 
+def checks_tokens() -> bool:
+    """Whether the cluster that this process belongs to asks whoever connects for its token."""
+    from ray._raylet import AuthenticationMode, get_authentication_mode  # pyright: ignore
+
+    return get_authentication_mode() == AuthenticationMode.TOKEN
+
+
 def _check(environment: WorkerEnvironment) -> None:
     """RunError on a node that does not see the run folder, or has another version of this package."""
     host = socket.gethostname()

@@ -30,6 +30,7 @@ class PreparedPhoto:
     final: str  # path below images/
     camera: tuple[Any, ...]  # size, maker, model, focal lengths; photos with equal values share a camera
     state: tuple[int, int]  # size in bytes and modification time (ns) of the source
+    orientation: int  # of the source's pixels, by EXIF: 1 ... 8
 
 
 def prepare_photos(
@@ -51,12 +52,12 @@ def prepare_photos(
         name = _clean(path.relative_to(source).as_posix())
         key = hashlib.sha256(os.fsencode(path.relative_to(source))).hexdigest()[:16]
         try:
-            prepared, camera, state = _prepare_photo(path, target, key)
+            prepared, camera, state, turned = _prepare_photo(path, target, key)
         except PictureError as error:
             unreadable[name] = f"unreadable: {error.reason}; {error.cure or 'replace or remove it'}"
         else:
             final = _free(name, prepared.suffix, taken)
-            photos.append(PreparedPhoto(name, prepared.name, final, camera, state))
+            photos.append(PreparedPhoto(name, prepared.name, final, camera, state, turned))
     on_photo(len(paths), len(paths))
     for old in {p.name for p in target.iterdir()} - {photo.prepared for photo in photos}:
         (target / old).unlink()
@@ -108,10 +109,10 @@ def _free(name: str, suffix: str, taken: set[str]) -> str:
     return f"{stem}.{old}" if fits else stem + suffix
 
 
-def _prepare_photo(path: Path, folder: Path, key: str) -> tuple[Path, tuple[Any, ...], tuple[int, int]]:
+def _prepare_photo(path: Path, folder: Path, key: str) -> tuple[Path, tuple[Any, ...], tuple[int, int], int]:
     """Write one photo as upright 8-bit RGB, or hard-link it if it is one. Raises PictureError.
 
-    Returns the file, the camera key and the source's size and time.
+    Returns the file, the camera key, the source's size and time, and its orientation.
     """
     changed = None
     with open_picture(path) as image:
@@ -127,7 +128,7 @@ def _prepare_photo(path: Path, folder: Path, key: str) -> tuple[Path, tuple[Any,
             os.utime(temporary, ns=(stat.st_atime_ns, stat.st_mtime_ns))
     elif not done:
         link(path.resolve(), target)
-    return target, camera, (stat.st_size, stat.st_mtime_ns)
+    return target, camera, (stat.st_size, stat.st_mtime_ns), _orientation(exif)
 
 
 def _exif(image: Image.Image) -> Image.Exif:
@@ -144,7 +145,7 @@ def _exif(image: Image.Image) -> Image.Exif:
 
 def _changed(path: Path, image: Image.Image, exif: Image.Exif) -> Image.Image | None:
     """The photo as upright 8-bit RGB, or None if the file is that already; decodes it in both cases."""
-    turned = exif.get(_ORIENTATION, 1) in range(2, 9)
+    turned = _orientation(exif) > 1
     as_is = image.format in ("JPEG", "MPO", "PNG") and image.mode == "RGB" and not turned
     if as_is and image.format == "PNG":
         with path.open("rb") as file:
@@ -170,9 +171,14 @@ def _save(image: Image.Image, exif: Image.Exif, path: Path) -> None:
     image.save(path, exif=content, quality=97 if lossy else -1, subsampling=0 if lossy else -1)
 
 
+def _orientation(exif: Image.Exif) -> int:
+    stored = exif.get(_ORIENTATION, 1)
+    return int(stored) if stored in range(1, 9) else 1
+
+
 def _camera(size: tuple[int, int], exif: Image.Exif) -> tuple[Any, ...]:
     """Key of photos with one camera and zoom: upright size, maker, model, focal lengths."""
     details = exif.get_ifd(_DETAILS)
     focal = [details.get(tag, "") for tag in (_FOCAL, _FOCAL_35)]  # in mm, and 35 mm equivalent
-    upright = size[::-1] if exif.get(_ORIENTATION, 1) in range(5, 9) else size
+    upright = size[::-1] if _orientation(exif) >= 5 else size
     return (*upright, *(str(value)[:200] for value in (exif.get(_MAKER, ""), exif.get(_MODEL, ""), *focal)))

@@ -105,7 +105,7 @@ def _binary_cameras(path: Path, data: _Bytes) -> dict[int, ModelCamera]:
         id, model, width, height = data.take(CAMERA)[0].tolist()
         name = MODEL_NAMES.get(model) or _unknown_model(path, f"number {model}")
         params = data.take("<f8", CAMERA_MODELS[name].num_params)
-        cameras[id] = _camera(id, name, width, height, params.tolist())
+        cameras[id] = camera_of_model(id, name, width, height, params.tolist())
     return cameras
 
 
@@ -114,7 +114,7 @@ def _text_cameras(path: Path, lines: list[str]) -> dict[int, ModelCamera]:
     for line in _records(lines):
         id, model, width, height, *params = line.split()
         name = model if model in CAMERA_MODELS else _unknown_model(path, model)
-        cameras[int(id)] = _camera(int(id), name, int(width), int(height), [float(p) for p in params])
+        cameras[int(id)] = camera_of_model(int(id), name, int(width), int(height), [float(p) for p in params])
     return cameras
 
 
@@ -125,7 +125,8 @@ def _unknown_model(path: Path, model: str) -> str:
     )
 
 
-def _camera(id: int, name: str, width: int, height: int, params: list[float]) -> ModelCamera:
+def camera_of_model(id: int, name: str, width: int, height: int, params: list[float]) -> ModelCamera:
+    """A camera whose numbers are checked. KeyError for an unknown model, ValueError for other numbers."""
     model = CAMERA_MODELS[name]
     if len(params) != model.num_params or not np.isfinite(params).all():
         raise ValueError(f"camera {id}: {name} has {model.num_params} finite parameters, not {params[:13]}")

@@ -8,7 +8,8 @@ from sagesplat.core.errors import SceneError
 from sagesplat.scene import stored
 
 Kind = Literal["colmap", "transforms", "blender", "stored", "photos", "video"]
-PHOTOS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif"})
+# Their content decides how they are read (`io.pictures`).
+PHOTOS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".avif", ".heic", ".heif"})
 VIDEOS = frozenset(
     {".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".mts", ".m2ts", ".mpg", ".mpeg", ".3gp"}
 )

@@ -39,7 +39,7 @@ def load_photo(view: View) -> UInt8[np.ndarray, "H W 3"]:
 
     EXIF orientation is not applied, because COLMAP's poses refer to the stored pixels. Grey photos
     become RGB, 16 bits become 8, and alpha is composited over the camera's background. Raises SceneError.
-    Memory: up to 16 bytes for each pixel of the file, whose number `open_picture` limits.
+    Memory: up to 24 bytes for each pixel of the file, whose number `open_picture` limits.
     """
     size = (view.camera.width, view.camera.height)
     try:

@@ -19,6 +19,7 @@ from sagesplat.core.typed import check_fields, types_of
 from sagesplat.io.files import read_json, write_json
 from sagesplat.scene._prepare import PreparedPhoto, prepare_photos
 from sagesplat.scene.detect import PHOTOS
+from sagesplat.scene.raw_photos import REPORT, describe_raw
 from sagesplat.scene.video import extract_frames
 
 
@@ -85,7 +86,10 @@ def reconstruct(
     resolved = {"matching": request["matching"], "cameras": len(request["cameras"])}
     report = {"complete": complete, "settings": asdict(config), "resolved": resolved}
     report |= asdict(reconstruction) | {"workspace": str(workspace), "renamed": renamed}
-    write_json(workspace / "poses.json", report)
+    if complete:
+        taken = {photo.prepared: (photo.final, photo.orientation) for photo in photos}
+        report |= {"raw": describe_raw(work / "model", taken)}
+    write_json(workspace / REPORT, report)
     if not complete:
         registered, total = reconstruction.num_registered, reconstruction.num_photos
         raise SceneError(
@@ -197,25 +201,24 @@ def _request(source: Path, photos: list[PreparedPhoto], config: PosesConfig) -> 
 
 def _resume(workspace: Path, request: dict[str, Any]) -> Reconstruction | None:
     """The finished result of the same request, if any; results of another request are removed."""
-    work, report = workspace / "sfm", workspace / "poses.json"
+    work, report = workspace / "sfm", workspace / REPORT
     request = json.loads(json.dumps(request))
-    path = work / "request.json"
-    old = _read_object(path)
+    old = _read_object(work / "request.json")
     if {k: v for k, v in old.items() if k not in ("min_photos", "threads")} != request:
         for name in ("database.db", "database.db-wal", "database.db-shm", "models.json", "seconds.json"):
             (work / name).unlink(missing_ok=True)
         report.unlink(missing_ok=True)
         return None
-    if not (report.is_file() and (workspace / "sparse" / "0").is_dir()):
-        return None
     content = _read_object(report)
+    if not (content.get("complete") is True and (workspace / "sparse" / "0").is_dir()):
+        return None
     types = {name: kind for name, kind in types_of(Reconstruction).items() if name != "workspace"}
     try:
         fields: dict[str, Any] = {name: content[name] for name in types}
         check_fields(fields, types)
     except (KeyError, ValueError):
         return None
-    return Reconstruction(workspace=workspace, **fields) if content.get("complete") is True else None
+    return Reconstruction(workspace=workspace, **fields)
 
 
 def _read_object(path: Path) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from sagesplat.core.config import MasksConfig
-from sagesplat.core.errors import BackendUnavailable, LabelError, OutOfMemory
+from sagesplat.core.errors import BackendUnavailable, LabelError, OutOfMemory, short
 from sagesplat.core.memory import ran_out
 from sagesplat.segment import coco
 from sagesplat.segment.masks import UNLABELLED, Taxonomy
@@ -221,7 +221,7 @@ def class_ids(names: Sequence[str], family: str, model: str) -> tuple[list[int |
     ids = to_coco(names, None)
     if all(i is None for i in ids):
         raise LabelError(
-            f"{model}: no known names among its {len(names)} classes ({', '.join(names[:3])}, ...); "
+            f"{model}: no known names among its {len(names)} classes ({short(', '.join(names[:3]))}, ...); "
             'give it the names of COCO, ADE20K or Cityscapes as "id2label" in config.json'
         )
     return ids, None
@@ -260,7 +260,8 @@ def _config(folder: Path, name: str) -> Any:
             f"{name}: no network of transformers ({_first_line(error)}); name one for universal segmentation"
         ) from None
     if config.model_type not in FAMILIES:
-        raise LabelError(f"{name}: a network of kind {config.model_type}; take one of {', '.join(FAMILIES)}")
+        kind = short(config.model_type)
+        raise LabelError(f"{name}: a network of kind {kind}; take one of {', '.join(FAMILIES)}")
     return config
 
 

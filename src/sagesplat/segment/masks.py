@@ -15,9 +15,10 @@ from sagesplat.core.errors import LabelError, RunError, short
 from sagesplat.core.names import LENGTH, RULE, checked, collision_key
 from sagesplat.io.files import atomic_path, read_json, write_json
 from sagesplat.io.pictures import FREE_PIXELS, PictureError, open_picture
+from sagesplat.scene.raw_photos import raw_photos
 from sagesplat.scene.scene import Scene, View
-from sagesplat.scene.undistort import undistort
 from sagesplat.segment import coco
+from sagesplat.segment.fit import fit
 
 UNLABELLED = -1  # pixels, points and Gaussians without a category
 UNLABELLED_NAME = "unlabelled"
@@ -112,11 +113,12 @@ def prepare_folder(folder: Path, views: Sequence[View]) -> list[Path]:
     paths = [mask_path(folder, view) for view in views]
     taken: dict[str, str] = {}
     for view, path in zip(views, paths, strict=True):
-        other = taken.setdefault(collision_key(path.as_posix()), view.name)
-        if other != view.name:
+        key = collision_key(path.as_posix())
+        if key in taken:
             raise LabelError(
-                f"{view.name}: {other} has the same name but for the suffix or capitals; rename one"
+                f"{view.name}: {taken[key]} has the same name but for the suffix or capitals; rename one"
             )
+        taken[key] = view.name
     (folder / "labels.json").unlink(missing_ok=True)
     return paths
 
@@ -151,7 +153,8 @@ def write_mask(path: Path, label_ids: Int16[np.ndarray, "H W"], taxonomy: Taxono
 def import_masks(scene: Scene, source: Path, target: Path) -> list[str]:
     """Import label images: one per view at the size of its camera, with ids checked, and a labels.json.
 
-    Images are undistorted like the photos and resampled to the nearest pixel.
+    Images are undistorted like the photos and resampled to the nearest pixel. Where structure from motion
+    undistorted the photos of the capture, that goes for label images of the photos as they were taken.
 
     Args:
         scene: The capture.
@@ -178,11 +181,11 @@ def import_masks(scene: Scene, source: Path, target: Path) -> list[str]:
             f"{source}: no label image for any view; name them like the photos "
             f"({PurePosixPath(missing[0]).with_suffix('.png')}, ...)"
         )
-    occurring: set[int] = set()
+    occurring, raw = set[int](), raw_photos(scene.path)
     for view, path in zip(scene.views, prepare_folder(target, scene.views), strict=True):
         label_ids = np.full((view.camera.height, view.camera.width), UNLABELLED, np.int16)
         if (file := found[view.name]) is not None:
-            label_ids = _fit(file.read(_pixels(view)), view, file.path)
+            label_ids = fit(file.read(_pixels(view)), view, raw.get(view.name), file.path)
         write_mask(path, label_ids, taxonomy)
         occurring.update(np.unique(label_ids).tolist())
     write_labels(target, taxonomy, occurring)
@@ -342,19 +345,3 @@ def _translate(
         listed = ", ".join(map(str, unknown[:5])) + (", ..." if len(unknown) > 5 else "")
         raise LabelError(f"{path}: unknown ids {listed}; {cure}")
     return label_ids
-
-
-def _fit(label_ids: Int16[np.ndarray, "h w"], view: View, path: Path) -> Int16[np.ndarray, "H W"]:
-    """A label image as the view's camera sees it: undistorted, resampled to the nearest pixel."""
-    (h, w), full = label_ids.shape, view.lens or view.camera
-    # The smaller of the two may have been rounded to whole pixels: by up to one, in either direction.
-    if abs(w * full.height - h * full.width) > max(w, h, full.width, full.height):
-        raise LabelError(
-            f"{path}: {w} x {h} pixels, but its photo has {full.width} x {full.height}; "
-            "label images show the whole photo, at any resolution"
-        )
-    label_ids = undistort(label_ids, view.lens, view.camera, order=0)
-    h, w = label_ids.shape
-    rows = (np.arange(view.camera.height) + 0.5) * h / view.camera.height
-    columns = (np.arange(view.camera.width) + 0.5) * w / view.camera.width
-    return label_ids[rows.astype(int)[:, None], columns.astype(int)]

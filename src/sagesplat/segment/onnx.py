@@ -145,7 +145,7 @@ class OnnxSegmenter:
 
     def _run(self, photo: UInt8[np.ndarray, "H W 3"]) -> np.ndarray:
         """The network's first output, [1, ...]."""
-        from onnxruntime import RunOptions
+        from onnxruntime import RunOptions  # pyright: ignore[reportAttributeAccessIssue]
 
         x = np.moveaxis(to_input(photo, self._height, self._width, self.classes), 2, self._channels - 1)
         options = RunOptions()

@@ -204,6 +204,7 @@ def _contents(job: Job, g: Gaussians, antialiased: bool) -> Contents:
     """The contents of a bundle without increments and bounds."""
     scene, names = job.scene, job.names()
     labels = sorted(g.counts())
+    job.check_named(job.run.levels, labels)
     split_names = {i: category_and_block(job, names[i]) for i in labels}
     colors = _colors(job, {category for category, _ in split_names.values()})
     ground = [i for i in labels if _GROUND & set(_title(job, split_names[i][0]).split())]

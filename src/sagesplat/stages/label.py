@@ -26,6 +26,7 @@ from sagesplat.segment.masks import MAX_LABEL_ID, UNLABELLED, Masks, Taxonomy, i
 from sagesplat.segment.registry import SEGMENTERS, segmenter_for
 from sagesplat.segment.segmenters import segment_some
 from sagesplat.segment.soft import read_soft, soft_path
+from sagesplat.stages.memory import check_network
 from sagesplat.train.fuse import Soft, fuse
 
 _MARKER = ".network.json"
@@ -112,6 +113,7 @@ def _segment(job: Job, config: MasksConfig, kind: str) -> None:
             shutil.rmtree(run.segmented, ignore_errors=True)
             shutil.rmtree(run.soft, ignore_errors=True)
         write_json(marker, key)
+        check_network(job, kind, own, config.batch)
         some = split(range(len(job.scene.views)), job.executor.parallel)  # each loads the network
         found = work_all(job, "segment", _segment_some, [(rows, config, kind) for rows in some])
         taxonomy = found[0][0]

@@ -15,6 +15,7 @@ from sagesplat.metrics.image import ssim_map
 from sagesplat.run.job import Job
 from sagesplat.run.records import checkpoint_key
 from sagesplat.run.stage import run_stage
+from sagesplat.stages.memory import check_nest
 from sagesplat.stages.shared import label_image_inputs, train_config
 from sagesplat.train import nested
 from sagesplat.train.checkpoint import can_resume, remove_checkpoints
@@ -30,6 +31,7 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
     settings = {**asdict(config), "seed": seed}
 
     def make() -> list[str]:
+        check_nest(job, job.snapshots.size(job.snapshots.levels[-1]), train_config(job).sh_degree)
         full = job.snapshots.load(job.snapshots.levels[-1])
         base = read_level(run.base_model) if config.base_share else None
         masks = job.best_masks

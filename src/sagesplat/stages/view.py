@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from sagesplat.core.errors import BackendUnavailable, RunError, SageError
 from sagesplat.core.events import Emit, Warned
+from sagesplat.core.names import visible
 from sagesplat.formats.increments import read_index
 from sagesplat.io.files import read_json
 from sagesplat.run.records import settings_of
@@ -140,7 +141,8 @@ def _follow(job: "Job", site: "Site", stop: threading.Event) -> None:
                 return
         except (SageError, OSError, ValueError) as error:  # of a moment, most often: training goes on
             if str(error) != told and any(job.run.levels.glob("*.npz")):
-                told = site.note = str(error)
+                told = str(error)
+                site.note = visible(told)  # a page is UTF-8, and a path in an error need not be
                 job.emit(Warned(told))
         stop.wait(_EVERY)
 

@@ -51,9 +51,7 @@ def fit(scene: Scene, config: TrainConfig, limit: int = 0, *, processes: int = 1
     camera, points = scene.views[0].camera, len(scene.points.xyz)
     pixels = camera.width * camera.height
     most = max(max_count(config, pixels, points), points)
-    photos = min(photo_cache(limit), 3 * pixels * len(scene.train_ids))
-    fixed = processes * (_BASE + _PIXEL * pixels + photos)
-    each = processes * _COPIES * 4 * (11 + 3 * num_bases(config.sh_degree))
+    fixed, each = fixed_and_each(scene, config.sh_degree, limit, processes)
     needed = int(fixed + each * most)
     room = int((limit - fixed) / each)
     lowered = began or (most if room >= most else max(room // _STEP * _STEP, points))
@@ -66,6 +64,14 @@ def fit(scene: Scene, config: TrainConfig, limit: int = 0, *, processes: int = 1
     if lowered != most:
         config = replace(config, max_gaussians=lowered)
     return Fitted(config, most, needed, lowered, limit, began > 0)
+
+
+def fixed_and_each(scene: Scene, sh_degree: int, limit: int, processes: int = 1) -> tuple[float, int]:
+    """Bytes that training takes whatever it trains, and bytes for each Gaussian."""
+    pixels = scene.views[0].camera.width * scene.views[0].camera.height
+    photos = min(photo_cache(limit), 3 * pixels * len(scene.train_ids))
+    fixed = processes * (_BASE + _PIXEL * pixels + photos)
+    return fixed, processes * _COPIES * 4 * (11 + 3 * num_bases(sh_degree))
 
 
 def photo_cache(limit: int = 0) -> int:

@@ -6,9 +6,11 @@ there is no room for another, the address that holds most loses the one that has
 """
 
 import asyncio
+import heapq
 import logging
 import socket
 import sys
+from asyncio import sslproto
 from collections import defaultdict
 from collections.abc import Iterator, MutableMapping
 from contextlib import suppress
@@ -20,12 +22,13 @@ import uvicorn
 from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-MOST = 512  # connections
+MOST = 2500  # connections
 PATIENCE = 30.0  # seconds
 HANDSHAKE = 10.0  # seconds for TLS to begin
 _RATE = 16 * 1024  # bytes a second of a download that counts as busy when somebody must go
 _EVERY = 1.0  # seconds between two looks at all connections
-_BUFFER = 64 * 1024  # bytes that a connection holds of an answer, beside what the system does
+_BUFFER = 16 * 1024  # bytes that a connection holds of an answer before the next piece is read
+_TLS_BUFFER = 8 * 1024  # bytes that asyncio reads at once from each connection, and keeps for it
 _FILES = 64  # file handles for all else
 _BATCH = 16  # connections that are accepted before the others' turn
 
@@ -53,6 +56,7 @@ class Room:
 
     def __init__(self, most: int):
         self.most = most
+        self._at_once = max(1, most // 64)  # looking at all costs time, so room is made for a few
         self._by_peer: dict[str, set[Connection]] = defaultdict(set)
 
     def __iter__(self) -> "Iterator[Connection]":
@@ -62,11 +66,14 @@ class Room:
         return sum(map(len, self._by_peer.values()))
 
     def enter(self, connection: "Connection") -> None:
-        """Take one in; where there is no room, who has done nothing for longest goes."""
+        """Take one in; where there is no room, those go who have done nothing for longest."""
         if len(self) >= self.most:
             largest = max(map(len, self._by_peer.values()))
             crowds = [crowd for crowd in self._by_peer.values() if len(crowd) == largest]
-            min((one for crowd in crowds for one in crowd), key=lambda one: one.busy).drop()
+            now = asyncio.get_running_loop().time()
+            every = (one for crowd in crowds for one in crowd)
+            for one in heapq.nsmallest(self._at_once, every, key=lambda one: one.worth(now)):
+                one.drop()
         self._by_peer[connection.peer].add(connection)
 
     def leave(self, connection: "Connection") -> None:
@@ -113,6 +120,10 @@ class Connection(H11Protocol):
 
     def timeout_keep_alive_handler(self) -> None:
         """Nothing: uvicorn would cut what is on its way; `look` closes what stands still."""
+
+    def worth(self, now: float) -> tuple[bool, float]:
+        """Least for who goes first: without a request or too slow for a while, then by the last activity."""
+        return self.cycle is not None and now - self.busy < 2 * _EVERY, self.busy
 
     def look(self, now: float) -> None:
         """Close what stands still; called every second."""
@@ -209,6 +220,8 @@ class Server(uvicorn.Server):
         loop = asyncio.get_running_loop()
         try:
             with suppress(OSError):  # of TLS too
+                if self.config.ssl:
+                    await _first_byte(sock)
                 await loop.connect_accepted_socket(lambda: connection, sock, ssl=self.config.ssl, **options)
         finally:
             if connection.transport is None:
@@ -220,6 +233,26 @@ class Server(uvicorn.Server):
             now = asyncio.get_running_loop().time()
             for connection in self.room:
                 connection.look(now)
+
+
+async def _first_byte(sock: socket.socket) -> None:
+    """Wait until a handshake begins: who says nothing does not get the 50 kB that TLS needs.
+
+    TimeoutError after `HANDSHAKE`; then the socket is closed.
+    """
+    loop = asyncio.get_running_loop()
+    begun = asyncio.Event()
+    try:
+        loop.add_reader(sock, begun.set)
+    except NotImplementedError:  # Windows
+        return
+    try:
+        await asyncio.wait_for(begun.wait(), HANDSHAKE)
+        loop.remove_reader(sock)
+    except BaseException:
+        loop.remove_reader(sock)
+        sock.close()
+        raise
 
 
 def _peer(address: str) -> str:
@@ -237,6 +270,7 @@ def _ignore(_loop: asyncio.AbstractEventLoop, _context: dict[str, Any]) -> None:
 def make_server(site: ASGIApp, certificate: Path | None = None, key: Path | None = None) -> Server:
     """A silent server for `site`, to be `run` on sockets; https with a certificate."""
     logging.getLogger("asyncio").setLevel(logging.CRITICAL)
+    sslproto.SSLProtocol.max_size = _TLS_BUFFER  # of 256 kB each, a thousand would be too much
     settings: MutableMapping[str, Any] = {"ssl_certfile": certificate, "ssl_keyfile": key}
     config = uvicorn.Config(
         site, loop="asyncio", ws="none", lifespan="off", log_config=None, log_level="critical",

@@ -1,5 +1,5 @@
 import { expect, test } from "vitest";
-import { parseOptions } from "../../src/embed";
+import { bundleUrl, parseOptions } from "../../src/embed";
 import { formatBytes, formatCount, formatDistance, formatSsim } from "../../src/ui/format";
 import { dead } from "../../src/view/controls";
 
@@ -21,14 +21,48 @@ test.each([
   "%2e%2e/",
   "%252e%252e%2f..",
   "a?b",
+  "a#b",
   "%",
+  "%2e%2e%2f",
+  ".%2e/",
+  "%2E./",
+  "garden/%2e%2e/%2e%2e/",
+  "%25252e%25252e/",
+  "%252525252525252e/",
+  "%5c%5chost/",
+  "..%5c",
+  "\\\\host",
+  "/\\host",
+  "%2f%2fhost/",
+  "%252f%252fhost/",
+  "a/%00/",
+  "\t/host",
+  "/\n/host",
+  ".\t./",
+  "a%0a/../..",
+  "javascript:x",
+  "blob:x",
+  ":80/",
 ])("a bundle at %s is refused", (path) => {
   expect(() => parseOptions(`?bundle=${encodeURIComponent(path)}`, "")).toThrow(/below it/);
+});
+
+test("the address of a bundle is below the page's", () => {
+  const page = "https://host/site/page.html?bundle=x#y";
+  expect(bundleUrl("scenes/garden/", page).href).toBe("https://host/site/scenes/garden/");
+  expect(bundleUrl("", page).href).toBe("https://host/site/");
+  expect(bundleUrl("50% off".replace("%", "%25"), "https://host/").href).toBe("https://host/50%25%20off");
+  for (const folder of ["../", "%2e%2e/", "a/.%2e/%2E%2e/", "..\\", ".\t./"]) {
+    expect(() => bundleUrl(folder, page)).toThrow(/leaves this page's folder/);
+  }
 });
 
 test("a bundle below the page gets its slash", () => {
   expect(parseOptions("?bundle=scenes/garden", "").bundle).toBe("scenes/garden/");
   expect(parseOptions("?bundle=garden/", "").bundle).toBe("garden/");
+  for (const name of ["a..b", "...", "größe", "a b", ".hidden"]) {
+    expect(parseOptions(`?bundle=${encodeURIComponent(name)}`, "").bundle).toBe(`${name}/`);
+  }
 });
 
 test.each(["2", "-1", "", "x", "NaN"])("a target of %s is refused", (value) => {

@@ -1,0 +1,219 @@
+"""`sagesplat view` under load: idle, slow and honest clients at once, from another process."""
+
+import asyncio
+import hashlib
+import json
+import os
+import random
+import resource
+import ssl
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+FILES, SIZE, LARGE = (
+    10,
+    200_000,
+    20_000_000,
+)  # files of a bundle, bytes of each, bytes of one that is read slowly
+_AGAIN = 1.0  # seconds until a bad client that was cut comes back
+_TRICKLE = 0.2  # seconds between two bytes of a slow request, and between two reads of a slow reader
+_CODE = "from sagesplat.cli import main; main()"
+_PATIENCE = 60.0  # seconds that an honest client waits for a file
+
+
+def make_bundle(folder: Path) -> dict[str, str]:
+    """A bundle of random files; SHA-256 by name."""
+    rng, hashes = random.Random(0), {}
+    (folder / "chunks").mkdir(parents=True)
+    (folder / "manifest.json").write_text('{"format": "sagesplat-bundle", "labels": []}')
+    (folder / "large.spz").write_bytes(bytes(LARGE))
+    for number in range(FILES):
+        content = rng.randbytes(SIZE)
+        digest = hashlib.sha256(content).hexdigest()
+        name = f"chunks/some-{number:02d}-{digest[:12]}.spz"
+        (folder / name).write_bytes(content)
+        hashes[name] = digest
+    return hashes
+
+
+def make_certificate(folder: Path) -> tuple[Path, Path]:
+    """A certificate for localhost and its key; needs openssl."""
+    certificate, key = folder / "cert.pem", folder / "key.pem"
+    subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", "/CN=localhost",
+         "-addext", "subjectAltName=DNS:localhost", "-keyout", key, "-out", certificate],
+        check=True, capture_output=True,
+    )  # fmt: skip
+    return certificate, key
+
+
+def measure(idle: int, slow: int, honest: int, tls: bool, files: int = FILES) -> dict[str, Any]:
+    """Who finished, seconds, and the server's memory and lines; `files`: what each honest client loads."""
+    _allow_files(idle + slow + honest)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        hashes = make_bundle(folder / "bundle")
+        pem = make_certificate(folder) if tls else None
+        words = [sys.executable, "-c", _CODE, "view", str(folder / "bundle"), "--port", "0", "--no-browser"]
+        if pem:
+            words += ["--ssl-certfile", str(pem[0]), "--ssl-keyfile", str(pem[1])]
+        with (folder / "terminal").open("w+b") as terminal:
+            with subprocess.Popen(words, stdout=terminal, stderr=subprocess.STDOUT) as server:
+                try:
+                    port = _port(folder / "terminal")
+                    memory = _Memory(server.pid)
+                    context = ssl.create_default_context(cafile=str(pem[0])) if pem else None
+                    clients = _Clients(port, context, dict(list(hashes.items())[:files]))
+                    found = asyncio.run(clients.run(idle, slow, honest))
+                    found["server_rss_mb"] = memory.end()
+                finally:
+                    server.terminate()
+            terminal.seek(0)
+            found["terminal_lines"] = len(terminal.read().splitlines())
+    return {"tls": tls, "idle": idle, "slow": slow, "honest": honest, **found}
+
+
+def _allow_files(count: int) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft < count + 100:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (min(count + 100, hard), hard))
+
+
+def _port(terminal: Path) -> int:
+    end = time.monotonic() + 30
+    while time.monotonic() < end:
+        lines = terminal.read_text().splitlines()
+        if len(lines) >= 3:
+            return int(lines[0].rstrip("/").rpartition(":")[2])
+        time.sleep(0.05)
+    raise TimeoutError(terminal.read_text())
+
+
+class _Memory:
+    """Looks at a process's memory until the end."""
+
+    def __init__(self, process: int):
+        self._status, self._most, self._stop = Path(f"/proc/{process}/status"), 0, threading.Event()
+        self._thread = threading.Thread(target=self._look)
+        self._thread.start()
+
+    def _look(self) -> None:
+        while not self._stop.wait(0.05):
+            with suppress(OSError, StopIteration):
+                lines = self._status.read_text().splitlines()
+                line = next(line for line in lines if line.startswith("VmRSS"))
+                self._most = max(self._most, int(line.split()[1]))
+
+    def end(self) -> float:
+        """The most that it had, MB."""
+        self._stop.set()
+        self._thread.join()
+        return self._most * 1024 / 1e6
+
+
+class _Clients:
+    """All clients of one server, in this process."""
+
+    def __init__(self, port: int, context: ssl.SSLContext | None, hashes: dict[str, str]):
+        self._port, self._context, self._hashes = port, context, hashes
+        self._open = self._cut = 0
+        self._latencies: list[float] = []
+
+    async def run(self, idle: int, slow: int, honest: int) -> dict[str, Any]:
+        """Start the bad ones and, while they come, the honest ones."""
+        begin = time.perf_counter()
+        ways = [self._idle] * idle + [self._trickle, self._read_slowly] * (slow // 2)
+        random.Random(1).shuffle(ways)
+        bad = [asyncio.create_task(self._for_ever(way)) for way in ways]
+        if bad:
+            await asyncio.sleep(1.0)  # they are there first
+        done = await asyncio.gather(*(self._load(number) for number in range(honest)))
+        seconds = time.perf_counter() - begin
+        for task in bad:
+            task.cancel()
+        await asyncio.gather(*bad, return_exceptions=True)
+        waits = sorted(self._latencies)
+        return {
+            "finished": sum(done),
+            "seconds": seconds,
+            "file_median_s": waits[len(waits) // 2] if waits else None,
+            "file_longest_s": waits[-1] if waits else None,
+            "bad_connections": self._open,
+            "bad_cut": self._cut,
+        }
+
+    async def _for_ever(self, way: Any) -> None:
+        while True:
+            writer = None
+            try:
+                reader, writer = await self._connect(tls=way is not self._idle)
+                self._open += 1
+                await way(reader, writer)
+            except (OSError, asyncio.IncompleteReadError, ssl.SSLError):
+                pass
+            finally:
+                if writer:
+                    writer.transport.abort()
+            self._cut += 1
+            await asyncio.sleep(_AGAIN)
+
+    async def _connect(self, tls: bool = True) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        name = "localhost" if self._context and tls else None
+        options: dict[str, Any] = {"ssl": self._context, "server_hostname": name} if name else {}
+        return await asyncio.open_connection("127.0.0.1", self._port, limit=4096, **options)
+
+    async def _idle(self, reader: asyncio.StreamReader, _writer: asyncio.StreamWriter) -> None:
+        """Says nothing: with TLS not even a handshake."""
+        await reader.read(1)
+
+    async def _trickle(self, _reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        for byte in b"GET /manifest.json HTTP/1.1\r\nHost: localhost\r\nX: " + b"x" * 10_000:
+            writer.write(bytes([byte]))
+            await writer.drain()
+            await asyncio.sleep(_TRICKLE)
+
+    async def _read_slowly(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(b"GET /large.spz HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        while await reader.read(200):  # 1 kB/s
+            await asyncio.sleep(_TRICKLE)
+
+    async def _load(self, number: int) -> bool:
+        """All files with the right hashes, over one connection, as a browser would."""
+        names = list(self._hashes)
+        names = names[number % len(names) :] + names[: number % len(names)]
+        try:
+            reader, writer = await asyncio.wait_for(self._connect(), _PATIENCE)
+            for name in names:
+                begin = time.perf_counter()
+                content = await asyncio.wait_for(self._fetch(name, reader, writer), _PATIENCE)
+                self._latencies.append(time.perf_counter() - begin)
+                if hashlib.sha256(content).hexdigest() != self._hashes[name]:
+                    return False
+            writer.close()
+        except (OSError, EOFError, TimeoutError, ssl.SSLError):
+            return False
+        return True
+
+    async def _fetch(self, name: str, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bytes:
+        writer.write(f"GET /{name} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
+        head = await reader.readuntil(b"\r\n\r\n")
+        if not head.startswith(b"HTTP/1.1 200"):
+            return b""
+        length = next(line for line in head.lower().splitlines() if line.startswith(b"content-length:"))
+        return await reader.readexactly(int(length.partition(b":")[2]))
+
+
+def main() -> None:
+    """One measurement in a process of its own; arguments as JSON."""
+    print(json.dumps(measure(**json.loads(sys.argv[1]))))
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("PYTHONWARNINGS", "ignore")
+    main()

@@ -1,0 +1,203 @@
+"""The connection to a Ray cluster, or one of this machine alone, which nobody else can reach.
+
+Whoever can talk to a cluster runs code as its user. So one that we start listens on the loopback, wants a
+token that only its own processes know, and keeps its sockets and logs in a folder of the user's own.
+"""
+
+import logging
+import os
+import secrets
+import shutil
+import socket
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import ray
+from ray._private import ray_constants
+from ray._raylet import AuthenticationTokenLoader, Config  # pyright: ignore
+from ray.exceptions import RayError
+
+from sagesplat.core import signals
+from sagesplat.core.errors import RunError, short
+from sagesplat.run.ray_task import ANSWER, checks_tokens
+
+_STORE = 256 * 2**20  # bytes of shared memory of a cluster of our own: results are small
+_TOKENS = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
+_LOOPBACK = ray_constants.ENABLE_RAY_CLUSTERS_ENV_VAR  # 0: nodes have the address 127.0.0.1
+_OPEN = (
+    "this Ray cluster does not check tokens: whoever reaches its port can run programs as you; start it "
+    "with RAY_AUTH_MODE=token (docs/pipeline.md, clusters)"
+)
+# Ray's own word on tokens, which depends on its version; we say what matters
+_ABOUT_TOKENS = "authentication_token_setup"
+
+
+@contextmanager
+def connected(address: str = "") -> Iterator[Mapping[str, float]]:
+    """A connection to a cluster; what it has in all comes back: "CPU", "GPU", "memory" (bytes), ...
+
+    `address` is host:port; without one RAY_ADDRESS or the cluster that runs on this machine is taken, else
+    one of this machine is started, and ended again. RunError where the cluster does not answer. A connection
+    that this process has already is used. Ray's warnings are written to stderr, each once.
+    """
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "1")  # else it prints a line about it
+    if ray.is_initialized():
+        yield ray.cluster_resources()
+        return
+    warn = _Warnings()
+    address = address or os.environ.get("RAY_ADDRESS", "")
+    with _heard(warn):
+        if _join(address):
+            if _tells_that_it_is_open():
+                warn(_OPEN)
+            yield from _resources()
+        else:
+            with _own_cluster():
+                yield from _resources()
+
+
+def _resources() -> Iterator[Mapping[str, float]]:
+    try:
+        yield ray.cluster_resources()
+    finally:
+        ray.shutdown()
+
+
+def _join(address: str) -> bool:
+    """Connect to a cluster; False where none is named and none runs."""
+    if address == "local":
+        return False
+    named = address not in ("", "auto")
+    if named:
+        _check_answers(address)
+    try:
+        _init(address=address if named else "auto")
+    except ConnectionError as error:
+        if named or str(error).startswith("Failed to connect"):  # else it found none
+            raise _no_connection(error) from None
+        return False
+    return True
+
+
+def _init(**options: Any) -> None:
+    """`ray.init` without the output of tasks; RunError or ConnectionError where it fails."""
+    # it would end the process without a line
+    ray._private.utils.set_sigterm_handler = lambda _: None  # type: ignore[attr-defined]
+    try:
+        with signals.deferred():  # processes of a cluster that is half begun would stay
+            ray.init(log_to_driver=False, logging_level=logging.WARNING, **options)
+    except ConnectionError:
+        raise
+    except (OSError, RuntimeError, ValueError, AssertionError, TimeoutError, RayError) as error:
+        raise _no_connection(error) from None
+
+
+def _no_connection(error: Exception) -> RunError:
+    cause = short(" ".join(str(error).split()) or repr(error))
+    return RunError(
+        f"--executor ray: no connection to the cluster ({cause}); make this machine a node of it (`ray start "
+        "--address=HOST:PORT`), with the same Ray and Python; if it checks tokens, set RAY_AUTH_MODE=token "
+        "and RAY_AUTH_TOKEN_PATH to a file with its token"
+    )
+
+
+@contextmanager
+def _own_cluster() -> Iterator[None]:
+    """A cluster of this machine that only this process and those that it starts can use."""
+    folder = Path(tempfile.mkdtemp(prefix="sagesplat-ray-"))  # for this user only; Ray opens its own to all
+    token = folder / "token"
+    before = {name: os.environ.get(name) for name in (*_TOKENS, _LOOPBACK)}
+    clusters = ray_constants.ENABLE_RAY_CLUSTER
+    try:
+        token.touch(0o600)
+        token.write_text(secrets.token_hex(32))
+        os.environ.pop("RAY_AUTH_TOKEN", None)
+        os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(token), _LOOPBACK: "0"}
+        ray_constants.ENABLE_RAY_CLUSTER = False  # it has read the variable already
+        _reload_tokens()
+        _init(
+            address="local", include_dashboard=False, object_store_memory=_STORE,
+            _temp_dir=str(folder / "ray"),
+        )  # fmt: skip
+        yield
+    finally:
+        ray.shutdown()
+        shutil.rmtree(folder, ignore_errors=True)
+        for name, value in before.items():
+            os.environ.pop(name, None)
+            if value is not None:
+                os.environ[name] = value
+        ray_constants.ENABLE_RAY_CLUSTER = clusters
+        _reload_tokens()
+
+
+def _reload_tokens() -> None:
+    """Let Ray read its variables again; it does so itself where it makes tokens the default."""
+    Config.initialize("")
+    AuthenticationTokenLoader.instance().reset_cache()
+
+
+def _tells_that_it_is_open() -> bool:
+    """Whether a process of the cluster says that no token is asked for; False where none answers."""
+    asked = ray.remote(num_cpus=0)(checks_tokens).remote()
+    try:
+        return not ray.get(asked, timeout=ANSWER)
+    except (RayError, ModuleNotFoundError):  # busy, or without this package: the first task will say so
+        ray.cancel(asked)
+        return False
+
+
+class _Warnings(logging.Handler):
+    """Writes each warning once, as one line on stderr."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self._said = set[str]()
+
+    def __call__(self, text: str) -> None:
+        line = short(" ".join(text.split()))
+        if line and line not in self._said:
+            self._said.add(line)
+            print(f"! ray: {line}", file=sys.stderr)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """See `logging.Handler`."""
+        if record.module != _ABOUT_TOKENS:
+            self(record.getMessage())
+
+    def hear(self, data: Mapping[str, Any], **_: object) -> None:
+        """What Ray would print itself: news of nodes, and the output of tasks, which is left out."""
+        if data.get("pid") in ("raylet", "autoscaler"):
+            for line in data["lines"]:
+                self(line)
+
+
+@contextmanager
+def _heard(warn: _Warnings) -> Iterator[None]:
+    """Send Ray's warnings to `warn` instead of several lines each to the terminal."""
+    worker: Any = ray._private.worker  # type: ignore[attr-defined]
+    logger = logging.getLogger("ray")
+    printed, handlers = worker.print_to_stdstream, logger.handlers[:]
+    worker.print_to_stdstream, logger.handlers[:] = warn.hear, [warn]
+    try:
+        yield
+    finally:
+        worker.print_to_stdstream, logger.handlers[:] = printed, handlers
+
+
+def _check_answers(address: str) -> None:
+    """RunError where nobody listens: Ray itself would wait for minutes."""
+    host, _, port = address.rpartition(":")
+    try:
+        with socket.create_connection((host.strip("[]"), int(port)), timeout=ANSWER):
+            return
+    except (OSError, ValueError, OverflowError) as error:
+        raise RunError(
+            f"--executor ray:{address}: no answer ({short(error)}); name the cluster's head as HOST:PORT, "
+            "such as ray:10.0.0.1:6379, or start one with `ray start --head`"
+        ) from None

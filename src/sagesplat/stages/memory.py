@@ -1,0 +1,71 @@
+"""Whether nesting and segmentation fit into the memory limit: told before they begin."""
+
+from pathlib import Path
+from typing import Any
+
+from sagesplat.core.errors import RunError
+from sagesplat.core.events import Warned
+from sagesplat.run.job import Job
+from sagesplat.segment.hf import DEFAULT_MODEL
+from sagesplat.train import memory
+from sagesplat.train.memory import GIB
+
+# Of a CPU, measured (docs/performance.md). Limits are compared with what is needed at least: a run that
+# would do is not refused.
+_NEST = 250e6  # bytes of nesting besides those of training as many Gaussians
+_RUNTIME = 330e6  # the interpreter with torch and onnxruntime
+_PIXEL = 22  # bytes of a photo's pixel: the label image and what it is chosen from
+_DEFAULT_WEIGHTS = 96e6  # bytes of the default network's, which may not be on this machine yet
+_ONNX = 50e6  # bytes that a small network computes with
+_HF = 12, 1.1e9  # the same of transformers' networks: times the weights, at most
+
+
+def check_nest(job: Job, count: int, sh_degree: int) -> None:
+    """RunError where nesting `count` Gaussians needs more memory than the limit; a warning if it may."""
+    if job.backend == "cuda":
+        return
+    limit = job.memory_limit or memory.default_limit()
+    fixed, each = memory.fixed_and_each(job.scene, sh_degree, limit)
+    least = fixed + each * count
+    if least > limit:
+        fits = max(int((limit - fixed) / each) // 1000 * 1000, 1000)
+        raise RunError(
+            f"{job.run.path}: nesting {count:,} Gaussians needs about {least / GIB:.1f} GiB, the limit is "
+            f"{limit / GIB:.1f}; raise --memory-limit of `sagesplat run`, or train fewer: "
+            f"--train.max-gaussians {fits} --force"
+        )
+    if least + _NEST > limit:
+        needs = f"nesting needs about {(least + _NEST) / GIB:.1f} GiB, the limit is {limit / GIB:.1f}"
+        job.emit(Warned(f"{job.run.path}: {needs}"))
+
+
+def check_network(job: Job, kind: str, settings: dict[str, Any], batch: int) -> None:
+    """RunError where a network (of `SEGMENTERS`, with its settings) needs more memory than the limit."""
+    if job.backend == "cuda":
+        return
+    limit, model = job.memory_limit or memory.default_limit(), settings["model"]
+    largest = max(view.camera.width * view.camera.height for view in job.scene.views)
+    needed = network_memory(kind, weights(model), largest, batch)
+    if needed > limit:
+        raise RunError(
+            f"{model}: segmenting photos of {largest / 1e6:.1f} megapixels needs at least about "
+            f"{needed / GIB:.1f} GiB, the limit is {limit / GIB:.1f}; raise --memory-limit of `sagesplat "
+            "run`, take a smaller network, or begin a run with --downscale 2"
+        )
+
+
+def network_memory(kind: str, weights: float, pixels: int, batch: int = 1) -> float:
+    """Bytes that a network needs at least, by those of its weights and the pixels of a photo."""
+    computes = {"onnx": _ONNX, "hf": min(_HF[0] * weights, _HF[1])}.get(kind, 0.0)
+    # files are read into memory, and become parameters before they are released
+    return _RUNTIME + max(2 * weights, weights + computes) + pixels * (_PIXEL + 3 * batch)
+
+
+def weights(model: Path | str) -> float:
+    """Bytes of a network's weights; 0 where they are not here and not known."""
+    path = Path(model)
+    if path.is_dir():
+        return float(sum(file.stat().st_size for file in path.glob("model*.safetensors")))
+    if path.is_file():
+        return float(path.stat().st_size)
+    return _DEFAULT_WEIGHTS if model == DEFAULT_MODEL else 0.0
