@@ -122,7 +122,8 @@ def _open(path: Path) -> Any:
         container = av.open(str(path.absolute()), options=options)  # "a:b" would name a protocol
     except ArgumentError:
         container = None
-    if container is None or not container.streams.video:
+    # a stream of a codec that FFmpeg does not know has no context
+    if container is None or not container.streams.video or not container.streams.video[0].codec_context:
         raise SceneError(
             f"{path}: holds no video stream in MP4, MOV, MKV, WebM, AVI or MPEG; convert it to MP4, or name "
             "a folder of photos"
