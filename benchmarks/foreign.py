@@ -29,7 +29,6 @@ WRITING = set("wxa")
 
 OURS = "what this version of the package installed"
 _WROTE = "what this process wrote a moment ago"
-_STAGE = "a record in the middle of a stage that takes minutes; tests of the stage damage it by hand"
 MACHINE = "what the operating system says"
 _COLMAP = "what COLMAP's process of ours wrote; it ends alone, and its error is one line"
 _NETWORK = "a network that the user names, by its authors' library, told to run no code and read no pickles"
@@ -39,6 +38,7 @@ EXCEPTIONS: dict[str, str] = {
     "demo.capture:cached_capture": OURS,
     "download.scenes:read_registry": OURS,
     "formats.increments:write_increments": _WROTE,
+    "io.lock:_exclusive": _HASHED,
     "io.lock:_open": _HASHED,
     "kernels.jit:_file_hash": OURS,
     "output.report:template": OURS,
@@ -57,23 +57,13 @@ EXCEPTIONS: dict[str, str] = {
     "segment.hf:_load": _NETWORK,
     "segment.hf:_task_tokens": _NETWORK,
     "segment.taxonomies:_vocabularies": OURS,
-    "stages.blocks:_merge_levels": _STAGE,
-    "stages.blocks:_tune": _STAGE,
-    "stages.boundaries:balance_table": _STAGE,
-    "stages.bundle:live_bundle": _STAGE,
-    "stages.label:_segment.make": _STAGE,
-    "stages.label:_soft": _STAGE,
-    "stages.report_data:report_data": _STAGE,
-    "studies.compare.run:compare": _STAGE,
-    "studies.early_stopping:_check": _STAGE,
-    "studies.early_stopping:compare_early_stopping": _STAGE,
-    "studies.sweep.run:_measure": _STAGE,
-    "train.checkpoint:_verify": _WROTE,
+    "studies.compare.run:compare": _HASHED,
     "train.memory:_cgroup_limits": MACHINE,
     "viewer.bundle:_put_up": OURS,
     "viewer.bundle:_verified": _HASHED,
     "viewer.bundle:has_viewer": OURS,
     "viewer.bundle:write_documents": OURS,
+    "train.checkpoint:_verify": _WROTE,
     "viewer.pack:write_pack": _WROTE,
 }
 

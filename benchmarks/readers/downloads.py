@@ -155,7 +155,7 @@ def _read_weights(folder: Path, content: bytes) -> None:
 
 
 READERS = (
-    Reader("zip", ".zip", lambda _, size: [_zip(size)[0]], _read_archive, 10_000),
+    Reader("zip", ".zip", lambda _, size: [_zip(size)[0]], _read_archive, 1000),
     Reader("http-scene", ".http", _scene, _read_scene, 1000, 4 * MIB),
     Reader("http-weights", ".http", _weights, _read_weights, 1, 4 * MIB),
 )

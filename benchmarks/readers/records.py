@@ -20,18 +20,19 @@ from sagesplat.io import lock
 from sagesplat.io.columns import write_columns
 from sagesplat.io.files import read_json
 from sagesplat.run import remote
-from sagesplat.run.job import Job, fingerprint
+from sagesplat.run.capture import fingerprint, photo_hashes
+from sagesplat.run.job import Job
 from sagesplat.run.recorded import recorded_settings, stage_seconds
 from sagesplat.run.records import FORMAT, input_hashes, is_done, is_made_from, settings_of
 from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import Stage, _follows
 from sagesplat.scene import load_scene
-from sagesplat.scene.blocks import Blocks, read_blocks, write_blocks
+from sagesplat.scene.blocks import Blocks, read_blocks, read_division, write_blocks
 from sagesplat.segment import segmenters
 from sagesplat.segment.masks import Taxonomy
-from sagesplat.stages import bundle, view
+from sagesplat.stages import bundle, label, view
 from sagesplat.stages.boundaries import _seconds
-from sagesplat.stages.train import _fit_memory
+from sagesplat.stages.train import _fit_memory, read_frozen
 from sagesplat.studies.compare.report import OfLabel, Point, Walk, read_comparison, write_comparison
 from sagesplat.studies.paper.cross_view import CrossView, read_cross_view
 from sagesplat.studies.paper.same_size import SameSize, read_same_size
@@ -112,7 +113,13 @@ def _types(kind: Any) -> dict[str, Any]:
 def _partition(folder: Path, size: int) -> list[bytes]:
     low, high = np.array([[-np.inf, 0], [1, -np.inf]]), np.array([[1, np.inf], [np.inf, 2.5]])
     blocks = Blocks(np.eye(3)[:2], low, high, 0.5)
-    return [written(folder / "b.json", lambda path: write_blocks(path, blocks, views=[3, 4] * size))]
+    made = {"points": [3, 4], "views": [5, 6], "sees": [[1], [0]], "note": [3.5] * size}
+    return [written(folder / "b.json", lambda path: write_blocks(path, blocks, **made))]
+
+
+def _read_partition(path: Path) -> None:
+    read_blocks(path)
+    read_division(path)
 
 
 def _sweep(folder: Path, size: int) -> list[bytes]:
@@ -137,7 +144,8 @@ def _capture(folder: Path) -> dict[str, Any]:
     (capture / "transforms.json").write_text(json.dumps(shared))
     settings = {"downscale": 1, "test_every": 8}
     scene = load_scene(capture, **settings)
-    return {"path": str(capture), "settings": settings, "fingerprint": fingerprint(scene)}
+    photos = photo_hashes(folder / "none.json", scene).sha256
+    return {"path": str(capture), "settings": settings, "fingerprint": fingerprint(scene), "photos": photos}
 
 
 def _scenes(folder: Path, size: int) -> list[bytes]:
@@ -148,6 +156,17 @@ def _read_scene(path: Path) -> None:
     run = RunDir(path.parent)
     len(Job(run, _ignore).scene.views)
     recorded_settings(run)
+
+
+def _hashes(folder: Path, size: int) -> list[bytes]:
+    made = _capture(folder)
+    more = {f"{i}.png": [9, 9, 9, "0" * 64] for i in range(size - 1)}
+    return as_json({name: [9, 9, 9, sha256] for name, sha256 in made["photos"].items()} | more)
+
+
+def _read_hashes(path: Path) -> None:
+    scene = load_scene(Path(_capture(path.parent)["path"]))
+    assert photo_hashes(path, scene).sha256.keys() == {view.name for view in scene.views}
 
 
 def _read_elsewhere(path: Path) -> None:
@@ -212,7 +231,10 @@ def _read_options(path: Path) -> None:
 
 def _manifest(folder: Path, size: int) -> list[bytes]:
     (folder / "index.html").write_text("<title>x</title>")
-    put(folder / "run/nested/increments/index.json", json.dumps({"chunks": [CHUNK]}).encode())
+    put(
+        folder / "run/nested/increments/index.json",
+        json.dumps({"format": "spz", "chunks": [CHUNK | {"uri": "2-1.spz"}]}).encode(),
+    )
     put(folder / "run/nested/promises.json", b"{}")
     levels = [{"uri": "chunks/2-1.spz", "sha256": "0" * 64, "nbytes": 9}]
     labels = [{"id": 2 + i, "name": "sky", "levels": levels} for i in range(size)]
@@ -236,6 +258,33 @@ def _read_begun(path: Path) -> None:
     bundle._antialiased(Job(RunDir(path.parent), _ignore))
 
 
+def _frozen(folder: Path, size: int) -> list[bytes]:
+    return as_json({str(label): 500 for label in range(2 * size)})
+
+
+def _edits(folder: Path, size: int) -> list[bytes]:
+    return as_json({"table": [0, 7, -1, *range(size)], "labels": {"7": "sky"}})
+
+
+def _read_edits(path: Path) -> None:
+    label.read_edit_table(path, Taxonomy({0: "sky", 2: "tree"}))
+
+
+NETWORK = {"segmenter": "onnx", "soft": True, "model": "0" * 64}
+
+
+def _networks(folder: Path, size: int) -> list[bytes]:
+    return as_json(NETWORK | {f"note{i}": i for i in range(size - 1)})
+
+
+def _read_network(path: Path) -> None:
+    label._is(path, NETWORK)
+
+
+def _live(folder: Path, size: int) -> list[bytes]:
+    return as_json({"of": {"level": "1.npz", "written": 9}, "kept": [["chunks/a.spz"] * size]})
+
+
 def _lock(folder: Path, size: int) -> list[bytes]:
     return as_json({"pid": 9, "host": "h", "command": "sagesplat run" * size, "since": "2026"})
 
@@ -244,12 +293,12 @@ READERS = (
     Reader("json", ".json", _json, file("m.json", read_json)),
     Reader("models", ".json", _models, file("models.json", eq3.read_models)),
     Reader("promises", ".json", _promises, file("promises.json", viewpoint.read_promises)),
-    Reader("plans", ".json", _plans, file("plan.json", _read_plans)),
-    Reader("observations", ".csv", _table(Observations), file("o.csv", read_observations), 3000),
-    Reader("evaluation", ".csv", _table(Evaluation), file("e.csv", read_evaluation), 3000),
-    Reader("cross-view", ".csv", _table(CrossView), file("c.csv", read_cross_view), 3000),
-    Reader("same-size", ".csv", _table(SameSize), file("s.csv", read_same_size), 3000),
-    Reader("partition", ".json", _partition, file("b.json", read_blocks), 10_000),
+    Reader("plans", ".json", _plans, file("plan.json", _read_plans), 100),
+    Reader("observations", ".csv", _table(Observations), file("o.csv", read_observations), 1000),
+    Reader("evaluation", ".csv", _table(Evaluation), file("e.csv", read_evaluation), 1000),
+    Reader("cross-view", ".csv", _table(CrossView), file("c.csv", read_cross_view), 1000),
+    Reader("same-size", ".csv", _table(SameSize), file("s.csv", read_same_size), 1000),
+    Reader("partition", ".json", _partition, file("b.json", _read_partition), 10_000),
     Reader("sweep", ".toml", _sweep, file("s.toml", read_sweep), 300, 16 * MIB),
     Reader("comparison", ".json", _comparison, file("compare.json", read_comparison)),
     Reader("scene", ".json", _scenes, file("scene.json", _read_scene), 3000),
@@ -261,5 +310,10 @@ READERS = (
     Reader("manifest", ".json", _manifest, file("manifest.json", _read_manifest)),
     Reader("begun", ".npz", _begun, file("checkpoint.npz", _read_begun)),
     Reader("segmented", ".json", _taxonomies, file(".taxonomy.json", _read_taxonomy), 1000),
+    Reader("photo-hashes", ".json", _hashes, file("photos.json", _read_hashes), 1000),
+    Reader("frozen", ".json", _frozen, file("frozen.json", read_frozen), 3000),
+    Reader("edits", ".json", _edits, file("edit.json", _read_edits), 10_000),
+    Reader("segmenting", ".json", _networks, file(".network.json", _read_network), 3000),
+    Reader("live", ".json", _live, file("live.json", bundle._read_live), 3000),
     Reader("lock", ".json", _lock, file("lock", lock._holder), 3000),
 )

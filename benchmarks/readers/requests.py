@@ -20,7 +20,8 @@ def _requests(folder: Path, size: int) -> list[bytes]:
     site = folder / "site"
     (site / "chunks").mkdir(parents=True, exist_ok=True)
     (folder / "secret.txt").write_bytes(SECRET)
-    (site / "index.html").write_text("<title>x</title>")
+    (folder / "viewer").mkdir(exist_ok=True)
+    (folder / "viewer/index.html").write_text("<title>x</title>")
     (site / "chunks/a.spz").write_bytes(b"abc" * 99)
     (site / ".hidden").write_bytes(SECRET)
     if not (site / "link").exists():
@@ -57,12 +58,12 @@ def _answer(folder: Path, content: bytes) -> None:
     sent: list[Any] = []
 
     async def receive() -> Any:
-        return {"type": "http.disconnect"}
+        await asyncio.Event().wait()  # nothing comes after a request, and the other side stays
 
     async def send(message: Any) -> None:
         sent.append(message)
 
-    _loop().run_until_complete(Site(folder / "site")(scope, receive, send))
+    _loop().run_until_complete(Site(folder / "site", viewer=folder / "viewer")(scope, receive, send))
     assert sent[0]["status"] in (200, 206, 304, 400, 403, 404, 405, 416), sent[0]
     assert not any(SECRET[:9] in message.get("body", b"") for message in sent)
 

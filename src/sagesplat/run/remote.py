@@ -1,5 +1,6 @@
 """Parts of a stage, computed in this process or by those of an executor."""
 
+import os
 import socket
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -50,7 +51,7 @@ def _piece(spec: JobSpec, function: Callable[[Job, Any], Any], part: Any, emit: 
 def _kept(spec: JobSpec, scene: bytes) -> Job:
     """A job whose scene and photos successive tasks share; `scene`: content of scene.json."""
     capture = read_capture(spec.run.scene).path
-    if not capture.exists():
+    if not os.path.exists(capture):  # Path.exists fails for names that no disk can hold
         raise RunError(
             f"{capture}: {socket.gethostname()} does not see the capture; all nodes need it under this path, "
             "on a disk that they share"

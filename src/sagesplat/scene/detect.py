@@ -1,5 +1,6 @@
 """Detects the kind of capture at a path."""
 
+import os
 from pathlib import Path
 from typing import Literal
 
@@ -26,9 +27,9 @@ def detect(path: Path) -> Kind:
 
     Raises SceneError if none matches.
     """
-    if path.is_file():
+    if os.path.isfile(path):  # Path's own methods fail for names that no disk can hold
         return _of_file(path)
-    if not path.is_dir():
+    if not os.path.isdir(path):
         raise SceneError(f"{path}: no such file or folder; give a capture's folder or a video")
     models = (path / "sparse" / "0", path / "sparse")
     if any((model / name).is_file() for model in models for name in ("cameras.bin", "cameras.txt")):
