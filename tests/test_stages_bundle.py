@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import random_gaussians
+from conftest import SMALL_RUN, random_gaussians
 from PIL import Image
 from test_viewer_bundle import manifest_of
 
@@ -21,6 +21,7 @@ from sagesplat.run.job import Job
 from sagesplat.run.records import FORMAT, checkpoint_key
 from sagesplat.run.run_dir import RunDir
 from sagesplat.stages.bundle import _antialiased, bundle, live_bundle
+from sagesplat.stages.scene import open_scene
 from sagesplat.stages.shared import distances
 from sagesplat.train.checkpoint import write_checkpoint
 from sagesplat.train.state import initial_state
@@ -145,7 +146,7 @@ def test_a_finished_run_is_shown_without_its_capture(run: Path, tmp_path: Path, 
 
 def test_an_earlier_run_gets_its_geometry(run: Path, trained: Path) -> None:
     (run / "geometry.npz").unlink()
-    open_scene(job_of(run), trained.parent / "capture", SceneConfig(test_every=4, calibrate_every=3))
+    open_scene(job_of(run), trained.parent / "capture", SMALL_RUN.scene)
     assert (run / "geometry.npz").read_bytes() == (trained / "geometry.npz").read_bytes()
 
 
