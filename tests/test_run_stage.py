@@ -116,6 +116,8 @@ _NO_INPUTS = {
     ("train", "labels.json"),  # names that are shown on the way
     ("base", "train.json"),  # its settings are among those of the small model
     ("base", "levels"),  # their number of Gaussians is in the settings
+    ("base", "labels.json"),  # only looked at: ids without a name are refused
+    ("borders", "labels.json"),
 }
 # of a block: its scene.json, which is an input, has the fingerprint and the hashes of the photos
 _CAPTURE = {"capture.npz", "photos.json"}

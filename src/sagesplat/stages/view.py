@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 from sagesplat.core.errors import BackendUnavailable, RunError, SageError
 from sagesplat.core.events import Emit, Warned
 from sagesplat.core.names import visible
-from sagesplat.formats.increments import INDEX
 from sagesplat.io.files import read_json
 from sagesplat.run.records import check_format
 from sagesplat.run.run_dir import RunDir, check_links
@@ -122,6 +121,8 @@ def _is_finished(run: RunDir) -> bool:
 
 def _is_current(run: RunDir, folder: Path) -> bool:
     """Whether a bundle has the run's chunks, and promises no older than the run's."""
+    from sagesplat.formats.increments import INDEX
+
     if not (folder / MANIFEST).exists():
         return False
     try:
