@@ -9,7 +9,7 @@ from sagesplat.core.errors import DataError, short
         ("a.ply: wrong; do this", "a.ply: wrong; do this"),
         ("a\nb\tc\u2028d", "a b c d"),
         ("\x1b[31mred \x00\x9b \u202e", "\\x1b[31mred \\x00\\x9b \\u202e"),
-        ("\udcff and \ud800", "\\udcff and \\ud800"),
+        ("\udcff and \ud800", "\\xff and \\ud800"),
         ("Straße 東京, 3.41\u202fPM.png", "Straße 東京, 3.41\u202fPM.png"),
     ],
 )

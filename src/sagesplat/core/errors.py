@@ -1,7 +1,10 @@
 """Errors that a user can cause. Each message is one line: the path, what is wrong, what to do."""
 
-import unicodedata
+import re
 
+from sagesplat.core.names import visible
+
+_LINE_ENDS = re.compile(r"[\t-\r\x1c-\x1f\x85\u2028\u2029]")
 _LONGEST = 2500  # characters of a message
 
 
@@ -14,7 +17,7 @@ class SageError(Exception):
     def __str__(self) -> str:
         text = super().__str__()
         if not text.isprintable():
-            text = "".join(_shown(c) for c in text)
+            text = visible(_LINE_ENDS.sub(" ", text))
         return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 520]}...{text[-500:]}"
 
 
@@ -40,13 +43,6 @@ class BackendUnavailable(SageError):
 
 class OutOfMemory(SageError):
     """Too little memory, of the machine or its GPU, for the requested operation."""
-
-
-def _shown(c: str) -> str:
-    """A character as it may be printed. Spaces stay what they are: macOS has narrow ones in names."""
-    if c.isprintable() or unicodedata.category(c) == "Zs":
-        return c
-    return " " if c.isspace() else c.encode("unicode_escape").decode()
 
 
 def short(value: object) -> str:
