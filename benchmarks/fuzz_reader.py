@@ -141,7 +141,8 @@ def _by_coverage(target: _Target, corpus: Path, seconds: int, seed: int) -> None
         rng = Random(number)
         return mutate(data, target.seeds, rng)[:most] if rng.random() < 0.6 else atheris.Mutate(data, most)
 
-    options = [f"-max_total_time={seconds}", f"-seed={seed + 1}", f"-max_len={MOST}", "-rss_limit_mb=0"]
+    options = [f"-max_total_time={seconds}", f"-seed={seed + 1}", f"-max_len={MOST}", "-rss_limit_mb=0",
+        f"-artifact_prefix={corpus.parent}/"]  # fmt: skip
     atheris.Setup(["fuzz", *options, "-timeout=600", str(corpus)], target.execute, custom_mutator=mutated)
     signal.setitimer(signal.ITIMER_REAL, 0.25, 0.25)
     atheris.Fuzz()

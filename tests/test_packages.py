@@ -20,7 +20,7 @@ REQUIRED = [
 SAFE = {  # the first versions without a hole that strangers reach; pyproject.toml says which
     "torch": "2.10",
     "onnxruntime": "1.27",
-    "pillow": "12.3",
+    "pillow": "13",
     "jinja2": "3.1.6",
     "starlette": "1.3.1",
     "h11": "0.16",

@@ -1,6 +1,7 @@
 """What browsers ask of the server for bundles, and what is typed at the command line."""
 
 import asyncio
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -78,7 +79,8 @@ def _parse(folder: Path, content: bytes) -> None:
     name, *words = content.decode("utf-8", "surrogateescape").replace("\0", "").split("\n")
     name = parse.current_command(name)
     if name in COMMANDS and not {"-h", "--help", "--help-all"} & set(words):
-        parse.arguments(name, COMMANDS[name], words)
+        with suppress(OSError):  # `main` makes a line of what the system says
+            parse.arguments(name, COMMANDS[name], words)
 
 
 READERS = (

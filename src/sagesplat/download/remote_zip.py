@@ -183,5 +183,7 @@ def _unpack(blocks: Iterable[bytes], info: ZipInfo) -> Generator[bytes]:
             room -= len(content)
             if content:
                 yield content
+            if inflate and inflate.eof:  # it would not take what follows
+                return
         if not packed or not room:
             return

@@ -72,7 +72,7 @@ def _finished(folder: Path, source: dict[str, int]) -> list[Path] | None:
     try:
         listed = read_json(folder / "video.json")
         names = listed.pop("frames")
-        if listed != source or not names or not all(re.fullmatch(r"frame_[0-9]+\.jpg", n) for n in names):
+        if listed != source or not names or not all(re.fullmatch(r"frame_[0-9]{1,20}\.jpg", n) for n in names):
             return None
     except (RunError, AttributeError, KeyError, TypeError):  # none, or not ours
         return None
