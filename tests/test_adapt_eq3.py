@@ -211,7 +211,8 @@ def test_an_unusable_file_is_one_line(tmp_path, some_models, spoil):
     document = json.loads(path.read_text())
     spoil(document)
     path.write_text(json.dumps(document))
-    with pytest.raises(DataError, match=r"models\.json: not a file of quality models.*fit .* again") as error:
+    says = r"models\.json: not a file of quality models.*; delete it and run `sagesplat fit` again"
+    with pytest.raises(DataError, match=says) as error:
         read_models(path)
     assert "\n" not in str(error.value)
 

@@ -250,6 +250,8 @@ def test_plans_read_back_identical(tmp_path):
 def test_an_unusable_file_is_one_line(tmp_path, content):
     path = tmp_path / "plan.json"
     path.write_text(content)
-    with pytest.raises(DataError, match=r"plan\.json: not a file of plans.*plan again") as error:
+    with pytest.raises(
+        DataError, match=r"plan\.json: not a file of plans.*delete it and run `sagesplat plan` again"
+    ) as error:
         read_plans(path)
     assert "\n" not in str(error.value)

@@ -48,12 +48,19 @@ with locked(folder), atomic_path(folder / "a.txt") as path:
 """
 
 
+def hears_signals() -> None:
+    """In the child: tests that run in a shell's background begin with signals ignored."""
+    for number in LINES:
+        signal.signal(number, signal.SIG_DFL)
+
+
 def started(code: str, folder: Path, **options) -> subprocess.Popen[str]:
     """A program that does this, after it said that it is ready."""
     here = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, sys.path))}
     process = subprocess.Popen(
         [sys.executable, "-c", PROGRAM, code, str(folder)],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=here, **options,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=here,
+        **{"preexec_fn": hears_signals, **options},
     )  # fmt: skip
     assert process.stdout is not None
     assert process.stdout.readline() == "ready\n"
@@ -163,7 +170,7 @@ def test_imports_are_interrupted_in_one_line_too(tmp_path: Path) -> None:
     here = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *map(str, sys.path)])}
     with subprocess.Popen(
         [sys.executable, "-m", "sagesplat", "info", "."],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=here,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=here, preexec_fn=hears_signals,
     ) as process:  # fmt: skip
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"

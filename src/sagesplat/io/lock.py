@@ -146,5 +146,6 @@ def _holder(path: Path) -> str:
         holder = json.loads(path.read_text(encoding="utf-8"))
         who = f"process {holder['pid']} on {holder['host']}"
         return f"{who} (`{holder['command']}`, since {holder['since']})"
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):  # it has not written its description yet
+    # it has not written its description yet
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return "another process"

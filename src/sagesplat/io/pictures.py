@@ -35,6 +35,8 @@ _COMPRESSIONS = (
     *("raw", "packbits", "tiff_lzw", "tiff_adobe_deflate", "tiff_deflate"),
     *("jpeg", "lzma", "zstd", "webp"),
 )
+_PNG_CHANNELS = {2: 3, 4: 2, 6: 4}  # by the colour type; 1 otherwise
+_DEFLATE = 1032  # times its size is all that a deflate stream can hold
 _LOCK = threading.Lock()
 logging.getLogger("PIL").addHandler(logging.NullHandler())  # or Pillow's errors reach the terminal
 
@@ -246,9 +248,14 @@ def _check_jpeg(file: BufferedReader) -> bool:
 
 
 def _check_png(file: BufferedReader, nbytes: int, to_the_end: bool) -> None:
-    """PictureError for chunks without end, or for packed texts of many megabytes."""
+    """PictureError for chunks without end, many megabytes of packed texts, pixels that cannot be there."""
     at, packed = 8, 0
     with open(file.name, "rb", buffering=0) as chunks:  # most are thousands of bytes apart
+        head = chunks.read(26)
+        if head[12:16] == b"IHDR" and len(head) == 26:
+            width, height, depth, color = struct.unpack(">IIBB", head[16:])
+            if width * height * depth * _PNG_CHANNELS.get(color, 1) > 8 * _DEFLATE * nbytes:
+                raise PictureError(f"{width} x {height} pixels, more than fit into {nbytes:,} bytes")
         for _ in range(_CHUNKS + nbytes // _BYTES_PER_CHUNK):
             chunks.seek(at)
             head = chunks.read(8)

@@ -15,6 +15,7 @@ from sagesplat.io.files import atomic_path, read_json, write_json
 _GREY_WIDTH = 640  # px, of the copies that sharpness is measured on
 _THUMB_WIDTH = 64  # px, of the copies that are compared for motion
 _SAME = 1.0  # mean absolute difference, grey levels, below which the camera has not moved
+_FRAME = re.compile(r"frame_[0-9]{1,20}\.jpg")
 MAX_PIXELS = 2**26  # of a frame; 8K video has half as many
 MAX_FRAMES = 10**6  # four hours
 _PACKED = 4  # times its size is what a video's packets may hold: those of a forged index overlap
@@ -72,7 +73,7 @@ def _finished(folder: Path, source: dict[str, int]) -> list[Path] | None:
     try:
         listed = read_json(folder / "video.json")
         names = listed.pop("frames")
-        if listed != source or not names or not all(re.fullmatch(r"frame_[0-9]{1,20}\.jpg", n) for n in names):
+        if listed != source or not names or not all(map(_FRAME.fullmatch, names)):
             return None
     except (RunError, AttributeError, KeyError, TypeError):  # none, or not ours
         return None

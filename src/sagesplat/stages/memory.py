@@ -41,9 +41,10 @@ def check_nest(job: Job, count: int, sh_degree: int) -> None:
 
 def check_network(job: Job, kind: str, settings: dict[str, Any], batch: int) -> None:
     """RunError where a network (of `SEGMENTERS`, with its settings) needs more memory than the limit."""
-    if job.backend == "cuda":
+    model = settings.get("model")
+    if job.backend == "cuda" or model is None:  # segmenters of others may have no such file
         return
-    limit, model = job.memory_limit or memory.default_limit(), settings["model"]
+    limit = job.memory_limit or memory.default_limit()
     largest = max(view.camera.width * view.camera.height for view in job.scene.views)
     needed = network_memory(kind, weights(model), largest, batch)
     if needed > limit:
