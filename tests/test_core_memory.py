@@ -30,6 +30,7 @@ OUT = [
     Exception("[ONNXRuntimeError] : 6 : RUNTIME_EXCEPTION : std::bad_alloc"),
     Exception("Failed to allocate memory for requested buffer of size 4294967296"),
     SystemError("error return without exception set"),
+    SystemError("<function _find_and_load> returned NULL without setting an exception"),
     caused(MemoryError()),
 ]
 

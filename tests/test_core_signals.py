@@ -176,3 +176,8 @@ def test_imports_are_interrupted_in_one_line_too(tmp_path: Path) -> None:
         assert process.stdout.readline() == "ready\n"
         process.send_signal(signal.SIGINT)
         assert ended(process) == (2, "", LINES[signal.SIGINT])
+
+
+def test_memory_that_runs_out_at_the_very_end_is_not_told_again(tmp_path: Path) -> None:
+    code = "ready()\ndef end():\n    raise MemoryError\nimport atexit\natexit.register(end)"
+    assert ended(started(code, tmp_path)) == (0, "", "")

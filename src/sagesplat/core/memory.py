@@ -15,6 +15,7 @@ _SAYS = (
     "can't start new thread",
     "Cannot allocate memory",
     "error return without exception set",  # of an import that had no memory for its error
+    "returned NULL without setting an exception",  # the same
 )
 MORE = (
     "close other programs, or let this one have more (ulimit -v, the container), then run the same command "

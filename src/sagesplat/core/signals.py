@@ -88,6 +88,8 @@ def _raising_again(before: Any) -> Any:
     """A hook that raises signals again which came in a destructor or callback, where Python drops them."""
 
     def hook(dropped: "sys.UnraisableHookArgs") -> None:
+        if _stop.ending and issubclass(dropped.exc_type, MemoryError):
+            return  # the line that says so is printed already
         if not isinstance(dropped.exc_value, KeyboardInterrupt):
             before(dropped)
         elif hasattr(signal, "setitimer") and not _stop.ending:
