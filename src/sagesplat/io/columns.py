@@ -58,7 +58,7 @@ def read_columns(path: Path, table: type[Columns], cure: str) -> Columns:
     types = _types(table)
     try:
         with path.open(newline="", encoding="utf-8") as file:
-            header, *rows = csv.reader(file)
+            header, *rows = filter(None, csv.reader(file))  # without empty lines
         cells = dict(zip(header, zip(*rows, strict=True) if rows else [()] * len(header), strict=True))
         with np.errstate(all="ignore"):  # numbers too large for float32 become infinite
             columns = {name: _column(cells[name], dtype) for name, dtype in types.items()}
