@@ -22,7 +22,7 @@ CALLS = {
     # networks and weights
     "InferenceSession", "from_pretrained", "load_file", "safe_open",
     # our own
-    "read_json", "Npz", "read_columns", "read_header", "parse_header",
+    "read_json", "read_object", "Npz", "read_columns", "read_header", "parse_header",
 }  # fmt: skip
 LOADERS = {"np", "numpy", "torch", "json", "tomllib", "pickle", "image"}  # whose `load` reads a file
 WRITING = set("wxa")

@@ -238,3 +238,12 @@ def read_json(path: Path, cure: str = "") -> Any:
         raise RunError(f"{path}: not readable as JSON (nested too deeply){cure}") from None
     except (OSError, ValueError) as error:
         raise RunError(f"{path}: not readable as JSON ({short(error)}){cure}") from error
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """The JSON object in a file; empty where there is none that can be read."""
+    try:
+        content = read_json(path)
+    except RunError:
+        return {}
+    return content if isinstance(content, dict) else {}

@@ -11,7 +11,7 @@ from typing import Any
 from sagesplat.core.config import SceneConfig
 from sagesplat.core.errors import RunError, short
 from sagesplat.core.typed import check_fields, types_of
-from sagesplat.io.files import read_json, write_json
+from sagesplat.io.files import read_json, read_object, write_json
 from sagesplat.run.records import file_hash
 from sagesplat.scene.scene import Scene
 
@@ -72,7 +72,7 @@ class Hashes:
 
     def __init__(self, kept: Path, files: Mapping[str, Path]) -> None:
         """`kept`: where `keep` wrote what was known of the files before; it may be missing."""
-        self._path, self._known = kept, _read_known(kept)
+        self._path, self._known = kept, read_object(kept)
         self._found = {name: _state_of(path, self._known.get(name)) for name, path in files.items()}
 
     @property
@@ -111,14 +111,6 @@ def check_photos(scene: Scene, begun: Mapping[str, str], now: Mapping[str, str])
                 f"{view.image_path}: not the photo that this run began with; put that one back, or choose "
                 "another run folder"
             )
-
-
-def _read_known(path: Path) -> dict[str, Any]:
-    try:
-        known = read_json(path)
-    except RunError:
-        return {}
-    return known if isinstance(known, dict) else {}
 
 
 def _state_of(path: Path, known: Any) -> list[Any]:

@@ -15,9 +15,8 @@ from sagesplat.core.config import (
     SceneConfig,
     TrainConfig,
 )
-from sagesplat.core.errors import RunError
 from sagesplat.core.typed import check_fields, fits, types_of
-from sagesplat.io.files import read_json
+from sagesplat.io.files import read_object
 from sagesplat.run.records import FORMAT
 from sagesplat.run.run_dir import LadderKind, RunDir
 
@@ -44,9 +43,9 @@ def recorded_settings(run: RunDir, of: str = "run") -> dict[str, Any]:
     tuned = nest.get("boundary_steps")
     boundary = {} if tuned is None else {"boundary_steps": tuned}
     known: dict[str, Any] = {
-        "scene_config": _config(SceneConfig, _read(run.scene).get("settings")),
+        "scene_config": _config(SceneConfig, read_object(run.scene).get("settings")),
         "poses": _config(PosesConfig, _made(run, "poses")),
-        "masks": _config(MasksConfig, _read(run.segmentation)),
+        "masks": _config(MasksConfig, read_object(run.segmentation)),
         "labels": _config(LabelsConfig, _made(run, "masks")),
         "lift": _config(LiftConfig, _made(run, "lift")),
         "train": _config(TrainConfig, train),
@@ -66,24 +65,15 @@ def stage_seconds(run: RunDir) -> dict[str, float]:
     found = {}
     for folder in folders:
         for path in sorted(folder.glob("*.json")):
-            seconds: Any = _read(path).get("seconds")
+            seconds: Any = read_object(path).get("seconds")
             if fits(seconds, float):
                 found[path.stem] = float(seconds)
     return found
 
 
-def _read(path: Path) -> dict[str, Any]:
-    """A JSON object, empty where there is none that can be read."""
-    try:
-        content = read_json(path)
-    except RunError:
-        return {}
-    return content if isinstance(content, dict) else {}
-
-
 def _made(run: RunDir, stage: str) -> dict[str, Any]:
     """The settings of a finished stage, empty where it is not done or of another format."""
-    made = _read(run.provenance(stage))
+    made = read_object(run.provenance(stage))
     settings = made.get("settings")
     return settings if made.get("format") == FORMAT and isinstance(settings, dict) else {}
 
@@ -91,7 +81,7 @@ def _made(run: RunDir, stage: str) -> dict[str, Any]:
 def _begun(run: RunDir) -> dict[str, Any]:
     """The settings of a training that did not end: of the run, or of its first block."""
     for folder in (run.replacement, run, run.block(0)):
-        settings = _read(folder.cap).get("settings")
+        settings = read_object(folder.cap).get("settings")
         if isinstance(settings, dict):
             return settings
     return {}

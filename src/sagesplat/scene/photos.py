@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from sagesplat.core.config import PosesConfig
-from sagesplat.core.errors import BackendUnavailable, RunError, SceneError
+from sagesplat.core.errors import BackendUnavailable, SceneError
 from sagesplat.core.typed import check_fields, types_of
-from sagesplat.io.files import read_json, write_json
+from sagesplat.io.files import read_object, write_json
 from sagesplat.scene._prepare import PreparedPhoto, prepare_photos
 from sagesplat.scene.detect import PHOTOS
 from sagesplat.scene.raw_photos import REPORT, describe_raw
@@ -203,13 +203,13 @@ def _resume(workspace: Path, request: dict[str, Any]) -> Reconstruction | None:
     """The finished result of the same request, if any; results of another request are removed."""
     work, report = workspace / "sfm", workspace / REPORT
     request = json.loads(json.dumps(request))
-    old = _read_object(work / "request.json")
+    old = read_object(work / "request.json")
     if {k: v for k, v in old.items() if k not in ("min_photos", "threads")} != request:
         for name in ("database.db", "database.db-wal", "database.db-shm", "models.json", "seconds.json"):
             (work / name).unlink(missing_ok=True)
         report.unlink(missing_ok=True)
         return None
-    content = _read_object(report)
+    content = read_object(report)
     if not (content.get("complete") is True and (workspace / "sparse" / "0").is_dir()):
         return None
     types = {name: kind for name, kind in types_of(Reconstruction).items() if name != "workspace"}
@@ -219,15 +219,6 @@ def _resume(workspace: Path, request: dict[str, Any]) -> Reconstruction | None:
     except (KeyError, ValueError):
         return None
     return Reconstruction(workspace=workspace, **fields)
-
-
-def _read_object(path: Path) -> dict[str, Any]:
-    """A JSON object, empty where there is none that can be read."""
-    try:
-        content = read_json(path)
-    except RunError:
-        return {}
-    return content if isinstance(content, dict) else {}
 
 
 def _run(work: Path, on_progress: OnProgress) -> dict[str, Any]:
