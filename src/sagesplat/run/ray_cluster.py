@@ -30,7 +30,7 @@ _TOKENS = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 _LOOPBACK = ray_constants.ENABLE_RAY_CLUSTERS_ENV_VAR  # 0: nodes have the address 127.0.0.1
 _OPEN = (
     "this Ray cluster does not check tokens: whoever reaches its port can run programs as you; start it "
-    "with RAY_AUTH_MODE=token (docs/pipeline.md, clusters)"
+    "with RAY_AUTH_MODE=token (docs/pipeline.md, several machines)"
 )
 # Ray's own word on tokens, which depends on its version; we say what matters
 _ABOUT_TOKENS = "authentication_token_setup"
