@@ -1,0 +1,83 @@
+"""Thresholds that keep a target, from views that nothing was fitted to: conformal prediction of decisions.
+
+A plan takes the cheapest level whose expected quality reaches a threshold. For one view, a category and a
+target there is a critical threshold: above it the level that is taken keeps the target. So the critical
+thresholds of the calibration views say, by split conformal prediction (Vovk et al. 2005), which threshold
+keeps the target in a new view at a confidence: the ceil((n + 1) confidence)-th smallest of n. Unlike a bound on
+each number this counts what is decided only; where levels are far apart it costs almost nothing.
+
+Views are the unit: those of one capture are drawn independently, the categories of one view are not. A
+category has its own thresholds, and each target has its own. With fewer than 19 views (at 0.95) not even the
+largest is enough: "uncalibrated", widened to the largest of all categories.
+
+Quality depends on the neighbours' levels too. So compositions are measured: plans made for a range of nominal
+targets by preliminary thresholds. What is calibrated is the nominal target to ask for.
+"""
+
+import math
+
+import numpy as np
+from jaxtyping import Float, Int
+
+
+def fewest_views(confidence: float) -> int:
+    """Views needed to calibrate at a confidence: with fewer, even no violation at all is not enough."""
+    return math.ceil(confidence / (1 - confidence) - 1e-9)
+
+
+def conformal_quantile(values: Float[np.ndarray, " n"], confidence: float, extra: int = 0) -> float:
+    """The value that a new one does not exceed at a confidence; inf from too few values.
+
+    `extra`: ranks above the one of split conformal prediction.
+    """
+    rank = math.ceil((len(values) + 1) * confidence - 1e-9) + extra
+    return float(np.sort(values)[rank - 1]) if rank <= len(values) else math.inf
+
+
+def critical_thresholds(
+    mean: Float[np.ndarray, "n K"], measured: Float[np.ndarray, "n K"], target: float
+) -> Float[np.ndarray, " n"]:
+    """In each view, the largest threshold by which a level is taken that misses the target; -inf: none.
+
+    A threshold takes the first level whose mean reaches it; above all means nothing is taken.
+    """
+    taken = np.diff(mean, axis=1, prepend=-np.inf) > 0  # of equal means the first
+    missed = (measured < target) & taken
+    return np.where(missed, mean, -np.inf).max(1)
+
+
+def critical_nominals(
+    bound: Float[np.ndarray, "n K"],
+    nominal: Float[np.ndarray, " J"],
+    taken: Int[np.ndarray, "n J"],
+    measured: Float[np.ndarray, "n J"],
+    target: float,
+) -> Float[np.ndarray, " n"]:
+    """In each view, the largest nominal target by which a level is taken that misses the target.
+
+    Args:
+        bound: [n, K], preliminary bounds: a nominal target takes the first level whose bound reaches it.
+        nominal: [J], ascending: the targets that compositions were planned for.
+        taken: [n, J], columns of `bound` taken.
+        measured: [n, J], quality in the composition.
+        target: That is to be kept.
+
+    Returns:
+        [n]. Levels between those of two compositions are interpolated; those below the first count as missed.
+        1 where the last composition misses: nothing but the full model is known to keep the target.
+    """
+    n, J = taken.shape
+    missed = measured < target
+    last = J - 1 - missed[:, ::-1].argmax(1)  # the last composition that misses
+    rows, after = np.arange(n), np.minimum(last + 1, J - 1)
+    level, above = taken[rows, last], taken[rows, after]
+    low, high = measured[rows, last], measured[rows, after]
+    part = (target - low) / np.maximum(high - low, 1e-12)
+    between = level + np.floor(np.clip(part, 0, 1) * (above - level)).astype(int)
+    between = np.where(above > level, np.minimum(between, above - 1), level)
+    # the same level in both: its neighbours' levels made the difference
+    found = np.where(above > level, bound[rows, between], nominal[after])
+    found = np.where(last == J - 1, 1.0, found)
+    first = taken[:, 0]
+    below = np.where(first > 0, bound[rows, np.maximum(first - 1, 0)], -np.inf)
+    return np.where(missed.any(1), np.maximum(found, below), below)

@@ -1,0 +1,138 @@
+"""A Gaussian process over the viewpoint, with values at several levels (Rasmussen & Williams 2006, ch. 2, 5).
+
+One kernel serves all levels, only its amplitude differs:
+
+    x        = (position / extent, direction, log distance): 7 numbers, 3 groups with a length scale each
+    a(x, x') = sqrt(3 * sum over the groups of |x - x'|^2 / length^2)
+    c(x, x') = (1 + a) exp(-a)                                        Matern 3/2
+    S_ij     = c(x_i, x_j) + heldout_variance * u_i * u_j + noise * [i = j]
+               u: 1 at views that training never saw, else 0
+    k_i      = c(x, x_i) + heldout_variance * u_i                     at a viewpoint without a photo
+    mean_k   = sum_i k_i * weights_ik,  weights = S^-1 values         eq. 2.25
+
+`heldout_variance` is the variance of a constant by which views that training never saw differ. Length scales,
+`heldout_variance` and `noise` maximise the marginal likelihood, mean over the levels, times a prior (eq. 5.8);
+what each view would be predicted as without itself is eqs. 5.10 to 5.12.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.linalg import cho_factor, cho_solve
+from scipy.optimize import minimize
+from scipy.spatial.distance import cdist
+
+GROUPS = (slice(0, 3), slice(3, 6), slice(6, 7))  # of the inputs: position, direction, log distance
+# logs of the hyperparameters (lengths of GROUPS; heldout variance and noise over the amplitude's square):
+# where they are sought, one standard deviation of the prior, and the bounds in standard deviations
+PRIOR = np.log([0.3, 0.5, 0.5, 0.1, 0.1])
+PRIOR_WIDTH = np.array([0.7, 0.7, 0.7, 1.5, 1.5])
+PRIOR_REACH = 3.0
+FEW = 0.1  # what values are uncertain by if seen in one view; falls as 1 / views
+
+
+@dataclass(frozen=True, eq=False)
+class Process:
+    """A fitted process, and its views predicted without themselves."""
+
+    lengths: tuple[float, float, float]  # of the three groups of inputs
+    heldout_variance: float  # variances over that of the process
+    noise: float
+    weights: Float[np.ndarray, "n K"]
+    amplitudes: Float[np.ndarray, " K"]
+    left_out: Float[np.ndarray, "n K"]  # mean at each view, predicted without it
+    left_out_spread: Float[np.ndarray, "n K"]  # its standard deviation
+
+
+def inputs_of(
+    distance: Float[np.ndarray, " V"],
+    position: Float[np.ndarray, "V 3"],
+    direction: Float[np.ndarray, "V 3"],
+    extent: float,
+    median_log_distance: float,
+) -> Float[np.ndarray, "V 7"]:
+    """The inputs x of viewpoints; an unknown distance (NaN) counts as the median."""
+    known = np.isfinite(distance) & (distance > 0)
+    log_distance = np.where(known, np.log(np.where(known, distance, 1.0)), median_log_distance)
+    return np.column_stack([position / extent, direction, log_distance]).astype(np.float64)
+
+
+def matern32(
+    a: Float[np.ndarray, "A 7"], b: Float[np.ndarray, "B 7"], lengths: Sequence[float]
+) -> Float[np.ndarray, "A B"]:
+    """c(x, x') of the module's text, for all pairs of inputs."""
+    scale = np.repeat(lengths, [group.stop - group.start for group in GROUPS])
+    scaled_distance = np.sqrt(3) * cdist(a / scale, b / scale)
+    return (1 + scaled_distance) * np.exp(-scaled_distance)
+
+
+def fit_process(
+    x: Float[np.ndarray, "n 7"], heldout: Bool[np.ndarray, " n"], values: Float[np.ndarray, "n K"]
+) -> Process:
+    """Fit a process of zero mean to values at n >= 1 viewpoints and K levels.
+
+    Args:
+        x: [n, 7], inputs (`inputs_of`).
+        heldout: [n], whether training never saw the view.
+        values: [n, K], what the levels' means leave.
+
+    Returns:
+        The process, and for each view what is predicted without it.
+    """
+    squares = [cdist(x[:, group], x[:, group], "sqeuclidean") for group in GROUPS]
+    theta = _hyperparameters(squares, heldout, values)
+    inverse = _inverse(_terms(squares, heldout, theta)[0])
+    weights = inverse @ values
+    amplitudes = np.sqrt(_variances(values, weights))
+    own = np.diag(inverse)[:, None]
+    x_length, direction_length, distance_length, heldout_variance, noise = np.exp(theta).tolist()
+    return Process(
+        lengths=(x_length, direction_length, distance_length),
+        heldout_variance=heldout_variance,
+        noise=noise,
+        weights=weights,
+        amplitudes=amplitudes,
+        left_out=values - weights / own,
+        left_out_spread=amplitudes / np.sqrt(own),
+    )
+
+
+def _terms(
+    squares: list[np.ndarray], u: np.ndarray, theta: np.ndarray
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """S and its derivatives by the log hyperparameters, from squared distances in each group, [n, n] each."""
+    *lengths, heldout_variance, noise = np.exp(theta)
+    scaled = [3 * square / length**2 for square, length in zip(squares, lengths, strict=True)]
+    scaled_distance = np.sqrt(np.sum(scaled, 0))
+    exp_neg_r = np.exp(-scaled_distance)
+    offset, own = heldout_variance * np.outer(u, u), noise * np.eye(len(u))
+    return (1 + scaled_distance) * exp_neg_r + offset + own, [*(s * exp_neg_r for s in scaled), offset, own]
+
+
+def _inverse(S: np.ndarray) -> np.ndarray:
+    return cho_solve(cho_factor(S, lower=True), np.eye(len(S)))
+
+
+def _variances(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Squared amplitude of each level, the best for its values [K]."""
+    return (values * weights).mean(0) + (FEW / len(values)) ** 2
+
+
+def _hyperparameters(squares: list[np.ndarray], u: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Logs of lengths, heldout variance and noise: marginal likelihood, mean over levels, times the prior."""
+
+    def cost(theta: np.ndarray) -> tuple[float, np.ndarray]:
+        S, slopes = _terms(squares, u, theta)
+        inverse = _inverse(S)
+        weights = inverse @ values
+        variances = _variances(values, weights)
+        z = (theta - PRIOR) / PRIOR_WIDTH
+        value = (len(u) * np.log(variances).mean() - np.linalg.slogdet(inverse)[1] + z @ z) / 2
+        slope = (inverse - (weights / variances) @ weights.T / len(variances)) / 2
+        return value, np.array([(slope * s).sum() for s in slopes]) + z / PRIOR_WIDTH
+
+    reach = PRIOR_REACH * PRIOR_WIDTH
+    bounds = list(zip(PRIOR - reach, PRIOR + reach, strict=True))
+    return minimize(cost, PRIOR, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 50}).x
