@@ -1,4 +1,4 @@
-"""Empirical coverage of fidelity bounds at fresh viewpoints, and plans beside equal levels of the same bytes."""
+"""Coverage of fidelity bounds at fresh viewpoints, and plans beside equal levels of the same bytes."""
 
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -87,8 +87,8 @@ def measure_compositions(
 ) -> tuple[Float32[np.ndarray, "V J L+1"], Int32[np.ndarray, "V L"]]:
     """Measure the fidelity of each category in J compositions at each of V viewpoints.
 
-    `planned`: level (1 to K) of each label, ascending by id. The result's last column is the whole image; then
-    come the pixels of each category. The other arguments are those of `measure_levels`.
+    `planned`: level (1 to K) of each label, ascending by id. The result's last column is the whole image;
+    then come the pixels of each category. The other arguments are those of `measure_levels`.
     """
     labels = sorted({label for label, _ in ladder.counts})
     probe = _Probe(ladder.load(ladder.levels[-1]).to(device_of(backend)), labels, backend, antialiased)

@@ -40,7 +40,7 @@ TARGETS = np.unique(
 NOTHING_HELD = np.zeros(len(TARGETS), bool)
 _ABOVE = 1e-9  # a threshold lies above its critical value
 _HAIR = 1e-6  # between equal thresholds
-_CHANCE = 2.0  # standard deviations of a share of views that are no more than chance
+_CHANCE = 3.0  # standard deviations of a share of views that are no more than chance
 
 
 def fit_fidelity(
@@ -117,7 +117,7 @@ def _fit(
 def _calibration(
     thresholds: Float[np.ndarray, " G"], status: str, confidence: float, views: int, least: float
 ) -> Calibration:
-    """A calibration from the thresholds of TARGETS; the full model, where the mean is 1, keeps all targets."""
+    """A calibration from the thresholds of TARGETS; the full model (mean 1) keeps all targets."""
     targets = np.append(TARGETS, 1.0)
     up = np.append(np.clip(thresholds + _ABOVE, -1, 1), 1.0)
     # Equal thresholds stay apart by a hair: below the first of them not even its target is reached.
@@ -182,15 +182,15 @@ class Trial:
         return float(matern32(x, model.inputs, model.lengths).max(1).min())
 
 
-def recentred(
-    models: Mapping[int, ViewModel], trial: Trial, confidence: float
-) -> dict[int, ViewModel]:
+def recentred(models: Mapping[int, ViewModel], trial: Trial, confidence: float) -> dict[int, ViewModel]:
     """The models with thresholds that allow for the neighbours' levels; `trial` was planned with the models.
 
     This is no calibration: it brings what is calibrated close to what is asked.
     """
     return {
-        label: _asked(model, _empirical(trial.critical(model), confidence)) if len(trial.views(label)) else model
+        label: _asked(model, _empirical(trial.critical(model), confidence))
+        if len(trial.views(label))
+        else model
         for label, model in models.items()
     }
 
@@ -209,6 +209,8 @@ def settled(
         if not (views := len(trial.views(label))):
             continue
         asked[label] = _empirical(trial.critical(model), confidence)
+        if views < fewest_views(confidence):
+            continue
         chance = views * (1 - confidence) + _CHANCE * np.sqrt(views * confidence * (1 - confidence))
         spilled = np.interp(TARGETS, NOMINAL, (trial.missed(label) > chance).astype(float)) > 0
         floor = np.maximum(floor, np.where(spilled, asked[label], -np.inf))

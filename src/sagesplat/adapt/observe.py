@@ -125,6 +125,7 @@ class RenderedLabels:
         return self._kept[view.name]
 
     def render(self, camera: Camera) -> Int16[np.ndarray, "H W"]:
+        """The same at any camera."""
         ids = sorted({UNLABELLED, *self.gaussians.counts()})
         g = self.gaussians.to(device_of(self.backend))
         one_hot = (g.label_ids[:, None] == torch.tensor(ids, device=g.label_ids.device)).float()

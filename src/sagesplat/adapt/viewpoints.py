@@ -53,8 +53,8 @@ class Rule:
         """RunError for a rule that cannot be followed."""
         if self.neighbours < 0 or not 0 <= self.shift <= LARGEST_SHIFT or not 0 <= self.turn <= LARGEST_TURN:
             raise RunError(
-                f"neighbours {self.neighbours}, shift {self.shift} and turn {self.turn} cannot be used; choose "
-                f"neighbours >= 0, a shift of 0 to {LARGEST_SHIFT:g} and a turn of 0 to {LARGEST_TURN:.4g}"
+                f"neighbours {self.neighbours}, shift {self.shift} and turn {self.turn} cannot be used; "
+                f"choose neighbours >= 0, a shift of 0 to {LARGEST_SHIFT:g} and a turn of 0 to {LARGEST_TURN:.4g}"
             )
 
 

@@ -34,7 +34,9 @@ from sagesplat.stages.methods import method_of
 VIEWS = (60, 120, 240)  # to fit to: the next number is tried while the last step made the error smaller by
 _SHRINKS = 0.1  # at least this share
 BIAS_VIEWS, CALIBRATION_VIEWS = 60, 200
-_RENDERS = 2.5  # a training step; renders take about a fifth of a step, so this is half of the training's time
+_RENDERS = (
+    2.5  # a training step; renders take about a fifth of a step, so this is half of the training's time
+)
 _LABEL_IMAGE = 5  # renders that a viewpoint's label image takes
 _FEWEST = {"fit": 20, "bias": 6, "calibration": 30}
 
@@ -65,7 +67,8 @@ def sample_levels(job: Job, config: SampleConfig, fit: FitConfig) -> None:
         calibration = len(drawn.rows("calibration"))
         return [f"{used} viewpoints to fit to, {len(drawn.rows('bias'))} + {calibration} to calibrate on"]
 
-    inputs = [run.scene, run.labels, method_of(job).level_files[0]]
+    made_by = [run.provenance("train"), run.provenance("nest")]
+    inputs = [run.scene, run.labels, method_of(job).level_files[0], *made_by]
     if config.viewpoints:
         inputs.append(config.viewpoints)
     settings = asdict(config) | {"distance": fit.distance, "min_share": fit.min_share}
@@ -103,7 +106,7 @@ def _counts(job: Job, config: SampleConfig) -> dict[str, int]:
 def _until_it_stops_shrinking(
     job: Job, drawn: Viewpoints, fit: FitConfig, all_of_them: bool
 ) -> tuple[SampledFidelity, int]:
-    """Measure the viewpoints to fit to in growing numbers, as long as that makes the models' error smaller."""
+    """Measure viewpoints to fit to in growing numbers, as long as that makes the models' error smaller."""
     cameras = [drawn.cameras[row] for row in drawn.rows("fit")]
     stops = [len(cameras)] if all_of_them else [n for n in VIEWS if n < len(cameras)] + [len(cameras)]
     table, errors = None, []
@@ -120,8 +123,8 @@ def _until_it_stops_shrinking(
     assert table is not None
     if not (table.pixels > 0).any():
         raise RunError(
-            f"{job.run.path}: none of {len(table.pixels)} viewpoints shows any Gaussian of the scene; "
-            "draw them closer to its cameras (--sample.shift, --sample.turn), or leave out --sample.viewpoints"
+            f"{job.run.path}: none of {len(table.pixels)} viewpoints shows anything of the scene; draw them "
+            "closer to its cameras (--sample.shift, --sample.turn), or leave out --sample.viewpoints"
         )
     return table, len(table.fidelity)
 
