@@ -114,7 +114,8 @@ class _Probe:
     """Compares compositions with the full model."""
 
     def __init__(self, full: Gaussians, labels: Sequence[int], backend: Backend, antialiased: bool):
-        self.full, self.labels, self.backend, self.antialiased = full, labels, backend, antialiased
+        self.full, self.labels, self.antialiased = full, labels, antialiased
+        self.backend: Backend = backend
         self.painted = RenderedLabels(full, backend, antialiased)
         self.workspace = Workspace()
 

@@ -87,8 +87,14 @@ def _fit(
 ) -> ViewModel:
     mean = values.mean(0)
     photos = np.zeros(len(x), bool)
-    process = fit_process(x, photos, values[:, :-1] - mean[:-1])
-    left_out = monotone(np.column_stack([mean[:-1] + process.left_out, np.ones(len(x))]))
+    # the last level is the reference: known, and no part of the process (unless it is the only one)
+    learnt = slice(0, max(len(mean) - 1, 1))
+    process = fit_process(x, photos, (values - mean)[:, learnt])
+    weights = np.zeros(values.shape)
+    weights[:, learnt] = process.weights
+    left_out = values.copy()
+    left_out[:, learnt] = mean[learnt] + process.left_out
+    left_out = monotone(left_out)
     rmse = np.sqrt(((left_out - values) ** 2).mean(0))
     levels = range(1, len(mean) + 1)
     thresholds = [
@@ -108,7 +114,7 @@ def _fit(
         heldout_inputs=photos,
         lengths=process.lengths,
         heldout_variance=0.0,
-        weights=np.column_stack([process.weights, np.zeros(len(x))]),
+        weights=weights,
         rmse=float(rmse.mean()),
         calibration=_calibration(np.array(thresholds), "uncalibrated", confidence, 0, 0.0),
     )
