@@ -4,12 +4,13 @@ Three sets of drawn viewpoints are used, each for one thing:
 
 1. "fit": a Gaussian process per category learns the expected fidelity of each level, all categories at the
    same level. Each viewpoint predicted without itself gives preliminary thresholds.
-2. "bias": compositions planned by the thresholds for a range of nominal targets are measured, several times;
-   each time the thresholds are mended (`recentred`). They then allow for neighbours at other levels. Where a
+2. "bias": compositions planned by the thresholds for a range of nominal targets are measured;
+   then the thresholds are mended (`recentred`). They then allow for neighbours at other levels. Where a
    category misses a target at any level of its own, as its neighbours spill over it, all categories are held
    at the nominal target that keeps it (`settled`).
-3. "calibration": measured once; split conformal prediction says which nominal target to ask for, so that each
-   target is kept at the confidence, category by category (`adapt.calibrate`).
+3. "calibration": split conformal prediction says which nominal target to ask for, so that each target is kept
+   at the confidence, category by category (`adapt.calibrate`). Neighbours' levels move with that, so it is
+   done twice; the second time thresholds only rise.
 """
 
 from collections.abc import Mapping, Sequence
@@ -38,6 +39,7 @@ TARGETS = np.unique(
     ).round(4)
 )
 NOTHING_HELD = np.zeros(len(TARGETS), bool)
+EVERYTHING_HELD = ~NOTHING_HELD
 _ABOVE = 1e-9  # a threshold lies above its critical value
 _HAIR = 1e-6  # between equal thresholds
 _CHANCE = 3.0  # standard deviations of a share of views that are no more than chance

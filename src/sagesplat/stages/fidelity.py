@@ -6,6 +6,7 @@ import numpy as np
 
 from sagesplat.adapt.fidelity import distances_at, measure_compositions
 from sagesplat.adapt.fidelity_models import (
+    EVERYTHING_HELD,
     NOMINAL,
     Trial,
     calibrated,
@@ -24,8 +25,6 @@ from sagesplat.scene.scene import Camera
 from sagesplat.segment.masks import UNLABELLED
 from sagesplat.stages.results import sampled_of, viewpoints_of
 
-_ROUNDS = 2  # of mending thresholds before they are settled
-
 
 def fit_drawn(job: Job, config: FitConfig) -> dict[int, ViewModel]:
     """Models of fidelity by label id, calibrated at viewpoints that nothing was fitted to."""
@@ -36,11 +35,13 @@ def fit_drawn(job: Job, config: FitConfig) -> dict[int, ViewModel]:
     extent = job.scene.extent if job.scene.extent > 0 else 1.0
     models = fit_fidelity(sampled, fit, extent, config.min_share, confidence)
     models.pop(UNLABELLED, None)  # has no target and stays in full
-    for _ in range(_ROUNDS):
-        models = recentred(models, _trial(job, config, models, sampled.labels, bias), confidence)
+    models = recentred(models, _trial(job, config, models, sampled.labels, bias), confidence)
     models, held = settled(models, _trial(job, config, models, sampled.labels, bias), confidence)
-    trial = _trial(job, config, models, sampled.labels, calibration)
-    return calibrated(models, trial, confidence, held)
+    for lowered in (held, EVERYTHING_HELD):  # what calibration moved moves the neighbours: then only up
+        models = calibrated(
+            models, _trial(job, config, models, sampled.labels, calibration), confidence, lowered
+        )
+    return models
 
 
 def _trial(

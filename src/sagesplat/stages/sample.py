@@ -33,7 +33,7 @@ from sagesplat.stages.methods import method_of
 
 VIEWS = (60, 120, 240)  # to fit to: the next number is tried while the last step made the error smaller by
 _SHRINKS = 0.1  # at least this share
-BIAS_VIEWS, CALIBRATION_VIEWS = 60, 200
+BIAS_VIEWS, CALIBRATION_VIEWS = 60, 180
 _RENDERS = (
     2.5  # a training step; renders take about a fifth of a step, so this is half of the training's time
 )
