@@ -70,4 +70,3 @@ def measure(folder: Path, names: tuple[str, ...], views: int, redraws: int, say:
             say(line)
         results[name] = {"fidelity": fidelity, "photos": photos}
     return results
-
