@@ -114,25 +114,23 @@ class _Probe:
     """Compares compositions with the full model."""
 
     def __init__(self, full: Gaussians, labels: Sequence[int], backend: Backend, antialiased: bool):
-        self.full, self.labels, self.antialiased = full, labels, antialiased
+        self.labels, self.antialiased = labels, antialiased
         self.backend: Backend = backend
         self.painted = RenderedLabels(full, backend, antialiased)
         self.workspace = Workspace()
 
     def reference(self, camera: Camera) -> tuple[Float32[np.ndarray, "H W 3"], Int16[np.ndarray, "H W"]]:
         """The full model's image and label image."""
-        return self._render(self.full, camera).copy(), self.painted.render(camera)
-
-    def _render(self, g: Gaussians, camera: Camera) -> Float32[np.ndarray, "H W 3"]:
-        return render_rgb(
-            g, camera, backend=self.backend, antialiased=self.antialiased, workspace=self.workspace
-        )
+        return self.painted.paint(camera)
 
     def compare(
         self, g: Gaussians, camera: Camera, full: np.ndarray, label_ids: np.ndarray
     ) -> tuple[Float32[np.ndarray, " L"], float]:
         """Fidelity by label, NaN where one is not in sight, and of the whole image."""
-        quality = ssim_map(self._render(g, camera), full)
+        image = render_rgb(
+            g, camera, backend=self.backend, antialiased=self.antialiased, workspace=self.workspace
+        )
+        quality = ssim_map(image, full)
         means = means_by_label(quality, label_ids)
         by_label = [means[label][0] if label in means else np.nan for label in self.labels]
         return np.array(by_label, np.float32), float(quality.mean())
