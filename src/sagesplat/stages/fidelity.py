@@ -25,6 +25,8 @@ from sagesplat.scene.scene import Camera
 from sagesplat.segment.masks import UNLABELLED
 from sagesplat.stages.results import sampled_of, viewpoints_of
 
+_ROUNDS = 2  # after one, categories whose neighbours moved much would seem to be beyond help
+
 
 def fit_drawn(job: Job, config: FitConfig) -> dict[int, ViewModel]:
     """Models of fidelity by label id, calibrated at viewpoints that nothing was fitted to."""
@@ -35,7 +37,8 @@ def fit_drawn(job: Job, config: FitConfig) -> dict[int, ViewModel]:
     extent = job.scene.extent if job.scene.extent > 0 else 1.0
     models = fit_fidelity(sampled, fit, extent, config.min_share, confidence)
     models.pop(UNLABELLED, None)  # has no target and stays in full
-    models = recentred(models, _trial(job, config, models, sampled.labels, bias), confidence)
+    for _ in range(_ROUNDS):
+        models = recentred(models, _trial(job, config, models, sampled.labels, bias), confidence)
     models, held = settled(models, _trial(job, config, models, sampled.labels, bias), confidence)
     for lowered in (held, EVERYTHING_HELD):  # what calibration moved moves the neighbours: then only up
         models = calibrated(

@@ -35,9 +35,7 @@ VIEWS = (60, 120, 240)  # to fit to: the next number is tried while the last ste
 _SHRINKS = 0.1  # at least this share
 USUAL = {"fit": VIEWS[1], "bias": 60, "calibration": 180}  # as many as half of the training's time allows;
 MOST = {"fit": VIEWS[-1], "bias": 60, "calibration": 300}  # after a long training up to these
-_RENDERS = (
-    2.5  # a training step; renders take about a fifth of a step, so this is half of the training's time
-)
+_RENDERS = 2.5  # a training step: a render takes about a fifth of it, so this is half of the training's time
 _LABEL_IMAGE = 4  # renders that a viewpoint's label image takes
 _FEWEST = {"fit": 20, "bias": 6, "calibration": 30}
 
@@ -92,8 +90,12 @@ def _counts(job: Job, config: SampleConfig) -> dict[str, int]:
         )
     train, nest = settings_of(job.run, "train"), settings_of(job.run, "nest")
     renders = _RENDERS * (train["max_steps"] + nest["steps"] + nest["base_steps"])
-    compositions = 2 * (len(NOMINAL) + _LABEL_IMAGE)  # measured twice
-    cost = {"fit": len(job.ladder.levels) + _LABEL_IMAGE, "bias": compositions, "calibration": compositions}
+    compositions = 2 * (len(NOMINAL) + _LABEL_IMAGE)  # measured twice, for the bias three times
+    cost = {
+        "fit": len(job.ladder.levels) + _LABEL_IMAGE,
+        "bias": 1.5 * compositions,
+        "calibration": compositions,
+    }
     part = renders / sum(USUAL[name] * cost[name] for name in USUAL)
     counts = {name: max(int(min(part, 1) * USUAL[name]), _FEWEST[name]) for name in USUAL}
     left = renders - sum(counts[name] * cost[name] for name in counts)
