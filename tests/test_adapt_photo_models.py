@@ -45,9 +45,9 @@ def test_finds_the_field_and_the_drop_of_unseen_views(model):
 def test_bounds_hold_on_unseen_views_over_many_draws():
     """At every target, and no wider than needed: a bound that accepts nothing would hold too."""
     accepted, kept, excess, perfect, wrong = (np.zeros(len(GRID)) for _ in range(5))
-    for seed in range(6):
-        scene = orbit(176, seed)
-        observations = together(*(synthetic(scene, 100 * seed + i, label_id=i) for i in range(3)))
+    for seed in range(4):
+        scene = orbit(144, seed)
+        observations = together(*(synthetic(scene, 100 * seed + i, label_id=i) for i in range(2)))
         promises = fit_photo_models(observations, scene)
         costs = {(label, level): 1000 * 2**level for label in promises for level in LEVELS}
         scores = score(observations, scene, promises, costs, GRID)
@@ -61,10 +61,9 @@ def test_bounds_hold_on_unseen_views_over_many_draws():
             wrong[i] += (rows.reachable & ~rows.accepted).sum()
     some = accepted > 100
     assert some.sum() >= 6
-    assert (kept[some] / accepted[some] > 0.93).all()
-    assert kept.sum() / accepted.sum() > 0.95
-    assert ((excess - perfect)[some] / accepted[some]).max() < 0.06
-    assert wrong[some].sum() < 0.25 * accepted[some].sum()
+    assert (kept[some] / accepted[some] > 0.94).all()
+    assert ((excess - perfect)[some] / accepted[some]).max() < 0.03
+    assert wrong[some].sum() < 0.05 * accepted[some].sum()
 
 
 def test_a_category_whose_unseen_views_stray_has_the_higher_thresholds():
@@ -146,7 +145,7 @@ def test_scenes_of_a_few_views(count):
     assert len(models) == (count > 0)
     for model in models.values():
         assert model.status == "uncalibrated"
-        assert bool(len(model.calibration.targets)) == (count == 6)  # of one view nothing can be said
+        assert bool(len(model.calibration.targets)) == (count > 1)  # of one view nothing can be said
         where = viewpoints(scene, scene.train_ids[:1])
         assert np.isfinite(model.predict(*where).mean).all()
 
@@ -163,9 +162,11 @@ def test_what_is_lost_in_composition_raises_the_thresholds():
     alone = calibrated(fits, 0.95)[5].calibration
     loss = np.full(len(TARGETS), -0.03)
     loss[:5] = np.nan  # not measured at low targets
-    changes = {5: {row: loss for row in SCENE.calibration_ids.tolist()}, 9: {0: loss}}
+    changes = {5: dict.fromkeys(SCENE.calibration_ids.tolist(), loss), 9: {0: loss}}
     fits = in_composition(fits, changes)
-    np.testing.assert_allclose(fits[5].left_out.change, -0.03)  # of views and targets that were not measured too
+    np.testing.assert_allclose(
+        fits[5].left_out.change, -0.03
+    )  # of views and targets that were not measured too
     beside = calibrated(fits, 0.95)[5].calibration
     both = np.intersect1d(alone.targets, beside.targets)
     assert len(both) >= 5

@@ -88,7 +88,8 @@ def test_the_bound_of_a_mean_by_hand():
     plain = replace(CALIBRATION, discount=0.0)
     np.testing.assert_allclose(plain.bound(means, np.ones(1)), [[0.48, 0.6, 0.65, 0.8, 0.8]])
     # a discount counts where the support lacks
-    np.testing.assert_allclose(CALIBRATION.bound(means + 0.01, np.array([0.5])), plain.bound(means, np.ones(1)))
+    halfway = CALIBRATION.bound(means + 0.01, np.array([0.5]))
+    np.testing.assert_allclose(halfway, plain.bound(means, np.ones(1)))
     assert np.isnan(CALIBRATION.bound(means, np.array([0.05]))).all()
     assert np.isnan(NO_CALIBRATION.bound(means, np.ones(1))).all()
 

@@ -239,11 +239,15 @@ def _risks(
 def _envelope(
     multipliers: Float[np.ndarray, " G"], own: _Scored
 ) -> tuple[Float[np.ndarray, " H"], Float[np.ndarray, " H"]]:
-    """Targets and thresholds of a category, both rising; without targets that no score reaches."""
+    """Targets and thresholds of a category, both rising; without targets that no score reaches.
+
+    The first stays all the same: its margin is that of lower qualities, which are no targets.
+    """
     thresholds = TARGETS + multipliers * own.scale
     # what keeps a higher target keeps this one
     thresholds = np.minimum.accumulate(thresholds[::-1])[::-1]
     thresholds = thresholds + 1e-9 * np.arange(len(TARGETS))  # of equal ones
-    reached = thresholds <= min(own.score.max(), 1.0)
-    reached &= thresholds >= -1
+    reached = thresholds <= own.score.max()
+    reached[0] = True
+    reached &= np.abs(thresholds) <= 1
     return TARGETS[reached], thresholds[reached]
