@@ -32,14 +32,18 @@ def left_out(
     scale = np.where(u, std if heldout_std is None else heldout_std, std)
     mean = STEPS + 0.05 * rng.standard_normal((n, 1))
     ssim = mean + (scale * rng.standard_normal(n))[:, None]
-    return LeftOut(np.arange(n), u, mean, ssim, np.full(n, 0.9), np.zeros((n, len(TARGETS))))
+    return LeftOut.alone(np.arange(n), u, mean, ssim, np.full(n, 0.9))
 
 
 def test_decisions_and_risks_by_hand():
-    own = _Scored(np.array([[0.5, 0.7], [0.4, 0.6]]), np.array([[0.65, 0.7], [0.3, 0.55]]), 0.1, 0.0)
-    accepted, missed = _decisions(own, np.array([0.0, 0.2]), 0.6)
+    g = int(np.argmin(np.abs(TARGETS - 0.6)))
+    change, bias = np.zeros((2, len(TARGETS))), np.zeros(len(TARGETS))
+    change[1, g], bias[g] = 0.2, 0.03
+    score, measured = np.array([[0.5, 0.7], [0.4, 0.6]]), np.array([[0.65, 0.7], [0.3, 0.55]])
+    own = _Scored(score, measured, change, bias, 0.1, 0.0)
+    accepted, missed = _decisions(own, g)
     for column, multiplier in enumerate(MULTIPLIERS):
-        threshold = 0.6 + multiplier * 0.1
+        threshold = 0.6 + multiplier * 0.1 - 0.03
         for view in range(2):
             level = next((k for k in range(2) if own.score[view, k] >= threshold), None)
             got = np.nan if level is None else own.measured[view, level] + [0.0, 0.2][view]
@@ -101,14 +105,15 @@ def test_targets_that_few_views_accept_are_not_returned():
 
 def test_a_multiplier_is_at_least_that_of_the_targets_beside_it():
     views = {3: left_out(120, 30)}
-    scored = {3: _Scored(views[3].mean, views[3].ssim, 0.03, 0.0)}
+    none = views[3].change
+    scored = {3: _Scored(views[3].mean, views[3].ssim, none, none[0], 0.03, 0.0)}
     found = _multipliers(views, scored, 0.95)
     finite = np.flatnonzero(np.isfinite(found))
     assert len(finite) >= 5
     # what a target alone needs, by a grid of multipliers
     for g in finite[1:-1]:
         for beside in (g - 1, g, g + 1):
-            accepted, missed = _decisions(scored[3], np.zeros(120), float(TARGETS[beside]))
+            accepted, missed = _decisions(scored[3], int(beside))
             at = np.argmin(np.abs(MULTIPLIERS - found[g]))
             assert missed[:, at].sum() + 1 <= 0.05 * (accepted[:, at].sum() + 1) + 1e-9
 
@@ -139,7 +144,8 @@ def test_the_discount_follows_errors_that_grow_away_from_known_views():
 
 
 def test_a_higher_targets_threshold_keeps_a_lower_target_too():
-    own = _Scored(np.full((1, 1), 0.95), np.full((1, 1), 0.95), 0.1, 0.0)
+    none = np.zeros((1, len(TARGETS)))
+    own = _Scored(np.full((1, 1), 0.95), np.full((1, 1), 0.95), none, none[0], 0.1, 0.0)
     multipliers = np.where(TARGETS < 0.5, 4.0, 0.5)
     multipliers[-3:] = np.inf
     targets, thresholds = _envelope(multipliers, own)
@@ -159,6 +165,7 @@ def test_changes_of_views_that_were_not_measured_are_those_of_the_nearest():
     np.testing.assert_allclose(found.change[0], found.change[2])
     np.testing.assert_allclose(found.change[0][[0, 4, 5, 6, -1]], [-0.02, -0.02, -0.03, -0.04, -0.04])
     np.testing.assert_allclose(found.change[[1, 3]], 0.01)
+    np.testing.assert_allclose(found.bias[[4, 6]], [-0.01 / 10, -0.03 / 10])  # of two views
     assert with_changes(own, {}, near) is own
     assert with_changes(own, {2: np.full(len(TARGETS), np.nan)}, near) is own
 

@@ -12,9 +12,9 @@ from conftest import pinhole, random_gaussians, write_capture
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sagesplat.adapt.coverage import PREDICTORS
 from sagesplat.adapt.evaluate import read_evaluation
 from sagesplat.adapt.ladder import PrefixLadder, read_prefixes
-from sagesplat.adapt.coverage import PREDICTORS
 from sagesplat.adapt.observe import TOTAL, read_observations
 from sagesplat.adapt.plan import read_budget_plan, read_plans
 from sagesplat.core.config import FitConfig, NestConfig, PlanConfig, RunConfig, SceneConfig, TrainConfig

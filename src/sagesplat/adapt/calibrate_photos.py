@@ -6,7 +6,8 @@ itself. What training views cannot tell is how much larger the errors of new pho
 
     error_i  = measured - mean; of a training view times `_inflation`
     score_ik = mean_ik - discount * (1 - support_i)           errors grow away from known viewpoints
-    a level is taken where score >= target + multiplier * scale      scale: root mean square of the errors
+    a level is taken where score >= target + multiplier * scale - bias
+                                scale: root mean square of the errors; bias: what compositions add on average
     risk     = (sum over views of the share of accepted decisions missed + C) / (views that accept any + C)
 
 The multiplier of a target is the smallest one from which on the risk stays within 1 - confidence: conformal
@@ -51,6 +52,20 @@ class LeftOut:
     support: Float[np.ndarray, " n"]  # by the other views
     # what the category gains in composition, beside others at other levels, by target of TARGETS; 0: unknown
     change: Float[np.ndarray, "n G"]
+    bias: Float[np.ndarray, " G"]  # the part of it to expect in any view
+
+    @classmethod
+    def alone(
+        cls,
+        rows: Int[np.ndarray, " n"],
+        heldout: Bool[np.ndarray, " n"],
+        mean: Float[np.ndarray, "n K"],
+        ssim: Float[np.ndarray, "n K"],
+        support: Float[np.ndarray, " n"],
+    ) -> "LeftOut":
+        """Views of which no composition was measured."""
+        none = np.zeros(len(TARGETS))
+        return cls(rows, heldout, mean, ssim, support, np.tile(none, (len(rows), 1)), none)
 
     @property
     def error(self) -> Float[np.ndarray, " n"]:
@@ -64,6 +79,8 @@ class _Scored:
 
     score: Float[np.ndarray, "n K"]
     measured: Float[np.ndarray, "n K"]  # as a new photo would be
+    change: Float[np.ndarray, "n G"]
+    bias: Float[np.ndarray, " G"]
     scale: float
     discount: float
 
@@ -118,7 +135,7 @@ def with_changes(
         near: How alike the views are. One without a measurement gets that of the most alike.
 
     Returns:
-        The views with their changes.
+        The views with their changes. The bias is their mean, drawn to 0 where they are of few views.
     """
     known = np.array([np.isfinite(changes.get(row, np.nan)).any() for row in own.rows.tolist()])
     if not known.any():
@@ -126,7 +143,7 @@ def with_changes(
     table = np.array([_filled(changes[row]) for row in own.rows[known].tolist()])
     nearest = near[:, known].argmax(1)
     nearest[known] = np.arange(known.sum())
-    return replace(own, change=table[nearest])
+    return replace(own, change=table[nearest], bias=table.sum(0) / (len(table) + OWN_VIEWS))
 
 
 def _filled(change: Float[np.ndarray, " G"]) -> Float[np.ndarray, " G"]:
@@ -148,7 +165,9 @@ def _scored(views: Mapping[int, LeftOut], confidence: float) -> dict[int, _Score
         found[label] = _Scored(
             score=own.mean - discount * away[:, None],
             measured=own.mean + error,
-            scale=max(float(np.sqrt(np.mean(error**2))), LEAST_ERROR),
+            change=own.change,
+            bias=own.bias,
+            scale=max(float(np.sqrt(np.mean(error**2) + np.mean((own.change - own.bias) ** 2))), LEAST_ERROR),
             discount=discount,
         )
     return found
@@ -197,10 +216,10 @@ def _multipliers(
         wide = 2 * float(student.ppf(confidence, n - 1)) * np.sqrt(1 + 1 / n) if n > 1 else np.inf
         return np.full(len(TARGETS), max(wide, 0.0))
     found = np.full(len(TARGETS), np.inf)
-    for g, target in enumerate(TARGETS):
+    for g in range(len(TARGETS)):
         accepted, missed = (np.zeros((len(rows), len(MULTIPLIERS))) for _ in range(2))
         for label, own in views.items():
-            take = _decisions(scored[label], own.change[:, g], float(target))
+            take = _decisions(scored[label], g)
             at = np.searchsorted(rows, own.rows)
             accepted[at] += take[0]
             missed[at] += take[1]
@@ -213,14 +232,14 @@ def _multipliers(
     return np.max([beside[:-2], found, beside[2:]], 0)
 
 
-def _decisions(
-    own: _Scored, change: Float[np.ndarray, " n"], target: float
-) -> tuple[Bool[np.ndarray, "n M"], Bool[np.ndarray, "n M"]]:
-    """Whether a view accepts the target by each of MULTIPLIERS, and the level taken then misses it."""
+def _decisions(own: _Scored, g: int) -> tuple[Bool[np.ndarray, "n M"], Bool[np.ndarray, "n M"]]:
+    """Whether a view accepts target g by each of MULTIPLIERS, and the level taken then misses it."""
     n, K = own.score.shape
-    level = (own.score[:, None, :] < (target + MULTIPLIERS * own.scale)[:, None]).sum(2)
+    target = float(TARGETS[g])
+    threshold = target + MULTIPLIERS * own.scale - own.bias[g]
+    level = (own.score[:, None, :] < threshold[:, None]).sum(2)
     accepted = level < K
-    got = own.measured[np.arange(n)[:, None], np.minimum(level, K - 1)] + change[:, None]
+    got = own.measured[np.arange(n)[:, None], np.minimum(level, K - 1)] + own.change[:, g, None]
     return accepted, accepted & (got < target)
 
 
@@ -243,7 +262,7 @@ def _envelope(
 
     The first stays all the same: its margin is that of lower qualities, which are no targets.
     """
-    thresholds = TARGETS + multipliers * own.scale
+    thresholds = TARGETS + multipliers * own.scale - own.bias
     # what keeps a higher target keeps this one
     thresholds = np.minimum.accumulate(thresholds[::-1])[::-1]
     thresholds = thresholds + 1e-9 * np.arange(len(TARGETS))  # of equal ones

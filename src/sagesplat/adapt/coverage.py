@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sagesplat.adapt.allocate import choose
-from sagesplat.adapt.calibrate_photos import TARGETS, LeftOut, calibrate_photos
+from sagesplat.adapt.calibrate_photos import LeftOut, calibrate_photos
 from sagesplat.adapt.observe import Observations
 from sagesplat.adapt.photo_models import measured_at
 from sagesplat.adapt.plan import check_target
@@ -220,10 +220,10 @@ def _margins(
         constant, eq3 = _Constant(seen.mean(0)), _Eq3(model)
         others = np.maximum(len(seen) - 1, 1)
         without = np.where(heldout[:, None], seen.mean(0), (seen.sum(0) - ssim) / others)
-        n, no_change = len(rows), np.zeros((len(rows), len(TARGETS)))
+        certain = np.ones(len(rows))
         for name, of, mean in (("constant", constant, monotone(without)), ("eq3", eq3, eq3(distance))):
             means[name][label] = of
-            left_out[name][label] = LeftOut(rows, heldout, mean, ssim, np.ones(n), no_change)
+            left_out[name][label] = LeftOut.alone(rows, heldout, mean, ssim, certain)
     confidence = next((model.confidence for model in models.values()), 0.95)
     found = {name: calibrate_photos(views, confidence) for name, views in left_out.items()}
     return {label: {name: (means[name][label], found[name][label]) for name in means} for label in models}

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from sagesplat.adapt.calibrate_photos import TARGETS, LeftOut, calibrate_photos, with_changes
+from sagesplat.adapt.calibrate_photos import LeftOut, calibrate_photos, with_changes
 from sagesplat.adapt.eq3 import SsimModel, fit_models
 from sagesplat.adapt.observe import TOTAL, Observations
 from sagesplat.adapt.process import fit_process, inputs_of, matern32
@@ -151,5 +151,4 @@ def _fit(rows: Observations, scene: Scene, curves: tuple[SsimModel, ...]) -> Pho
         weights=process.weights,
         rmse=float(np.sqrt(np.mean((left_out - ssim) ** 2))),
     )
-    no_change = np.zeros((len(views), len(TARGETS)))
-    return PhotoFit(model, LeftOut(views, heldout, left_out, ssim, near.max(1), no_change))
+    return PhotoFit(model, LeftOut.alone(views, heldout, left_out, ssim, near.max(1)))
