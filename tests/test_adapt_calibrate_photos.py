@@ -74,12 +74,24 @@ def test_each_multiplier_keeps_the_risk_and_a_smaller_one_does_not():
     assert np.mean((own.mean + error)[np.arange(120), ok.argmax(1)] < 0.6) > 0.1
 
 
+def test_calibration_views_hold_by_themselves():
+    """Two hundred training views that are predicted exactly do not hide that new photos are not."""
+    own = left_out(220, 20, std=1e-4)
+    low = own.ssim - np.where(own.heldout & (np.arange(220) % 4 > 0), 0.1, 0.0)[:, None]
+    found = calibrate_photos({3: replace(own, ssim=low)}, 0.95)[3]
+    bound = found.bound(own.mean, own.support)
+    for target in found.targets:
+        ok = bound[own.heldout] >= target
+        got = low[own.heldout][np.arange(20), ok.argmax(1)]
+        assert (ok.any(1) & (got < target)).sum() <= 0.05 * ok.any(1).sum()
+
+
 @pytest.mark.parametrize(("n", "heldout", "status"), [(120, 19, "calibrated"), (120, 18, "uncalibrated")])
 def test_nineteen_views_calibrate_and_fewer_widen(n, heldout, status):
     """Views that training saw do not count; below 19 one failure more is counted in."""
-    found = calibrate_photos({3: left_out(n, heldout)}, 0.95)[3]
+    found = calibrate_photos({3: left_out(n, heldout, heldout_std=0.01)}, 0.95)[3]
     assert (found.status, found.num_views) == (status, heldout)
-    full = calibrate_photos({3: left_out(n, 19)}, 0.95)[3]
+    full = calibrate_photos({3: left_out(n, 19, heldout_std=0.01)}, 0.95)[3]
     at = np.interp(0.6, found.targets, found.thresholds) - np.interp(0.6, full.targets, full.thresholds)
     assert (at > 0) == (heldout < 19)
 

@@ -60,6 +60,13 @@ def fit_photo_models(
 
     Raises:
         RunError: For an impossible confidence.
+
+    Example:
+        >>> from sagesplat import open_run
+        >>> from sagesplat.adapt.observe import read_observations
+        >>> from sagesplat.adapt.photo_models import fit_photo_models
+        >>> run = open_run("runs/garden").job  # doctest: +SKIP
+        >>> models = fit_photo_models(read_observations(run.run.observations), run.scene)  # doctest: +SKIP
     """
     return calibrated(fit_photos(observations, scene, curves), confidence)
 
