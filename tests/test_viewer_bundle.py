@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from make_viewer_vectors import DATA, cameras_at, distance_cases, model, promise_cases
 from scipy.spatial.transform import Rotation
 
-from sagesplat.adapt.viewpoint import NO_CALIBRATION, Calibration, ViewModel
+from sagesplat.adapt.viewpoint import NO_CALIBRATION, Calibration, QualityKind, ViewModel
 from sagesplat.core.errors import DataError, RunError, SageError
 from sagesplat.formats.increments import write_increments
 from sagesplat.formats.spz import read_spz
@@ -306,7 +306,10 @@ def contents(tmp_path: Path) -> Contents:
         for i, (at, heldout) in enumerate(zip(cameras_at(made), made.heldout_inputs, strict=True))
     ]
     entries.append(CameraEntry("none.jpg", "test", camera()))
-    seen = {"fidelity": seen_by(cameras_at(fidelity), 0.5), "ssim": seen_by(entries, 0.25)}
+    seen: dict[QualityKind, Seen] = {
+        "fidelity": seen_by(cameras_at(fidelity), 0.5),
+        "ssim": seen_by(entries, 0.25),
+    }
     car = Category(3, "car", "car", "#112233", UNIT, 2.0, True, {"fidelity": fidelity, "ssim": made}, seen)
     points = np.random.default_rng(0).normal(size=(50, 3))
     categories = [

@@ -2,8 +2,8 @@
 
 It is a concatenation of the files, in the order of their benefit for the first view: level 1 of all
 visible and nearby labels, then increments by their gain of expected quality x pixel share per byte.
-Levels of a label must come in order. So an increment counts with the slope of the concave hull of quality over
-bytes. The viewer has the same rules (web/src/core/order.ts).
+Levels of a label must come in order. So an increment counts with the slope of the concave hull of quality
+over bytes. The viewer has the same rules (web/src/core/order.ts).
 """
 
 import hashlib

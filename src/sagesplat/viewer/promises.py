@@ -6,10 +6,10 @@ other and need many digits; a value that is rounded moves the mean by about as m
     (C + NUGGET I) weights = values,        C_ij = c(x_i, x_j), the kernel of `adapt.process`
     mean_k = curve_k(d) + offset_k + sum_i c(x, x_i) weights_ik
 
-and goes on as in `adapt.viewpoint`. An offset holds what does not depend on the viewpoint: the mean of fidelity,
-what views differ by that training never saw. Numbers are whole steps of a unit. The shared views are in the
-order of a path from each to the nearest one left, and lists over views hold differences to the view before:
-most are small. Values hold differences to the level below as well.
+and goes on as in `adapt.viewpoint`. An offset holds what does not depend on the viewpoint: the mean of
+fidelity, and what views differ by that training never saw. Numbers are whole steps of a unit. The shared views
+are in the order of a path from each to the nearest one left, and lists over views hold differences to the view
+before: most are small. Values hold differences to the level below as well.
 """
 
 import math
@@ -193,7 +193,7 @@ def _rounded(entry: dict[str, Any], model: ViewModel, shared: Int[np.ndarray, "U
 
 
 def _thresholds(calibration: Calibration, moved: float) -> dict[str, list[int]]:
-    """Targets and thresholds in whole steps. Rounding raises no bound: thresholds go up by what means moved."""
+    """Targets and thresholds in whole steps; thresholds go up by what means moved, so no bound is raised."""
     targets = np.floor(calibration.targets / STEP + 1e-6).astype(int)
     raised = np.ceil((calibration.thresholds + moved) / STEP - 1e-6).astype(int)
     rising = np.maximum.accumulate(raised - np.arange(len(raised))) + np.arange(len(raised))

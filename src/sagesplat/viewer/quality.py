@@ -36,8 +36,8 @@ def of_files(model: ViewModel, files: Sequence[int], last: int) -> ViewModel:
 def quality_entry(model: ViewModel) -> dict[str, Any]:
     """What a label's manifest entry says of one quality: by level, what holds whatever the viewpoint.
 
-    The mean is that over the model's views; the bound is below that of all but a share of them, which is one less the
-    confidence. null: no promise.
+    The mean is that over the model's views. The bound is below that of as many views as the confidence says;
+    null: no promise.
     """
     own = model.inputs
     told = model.predict(np.exp(own[:, 6]), own[:, :3] * model.extent, own[:, 3:6])
