@@ -16,10 +16,10 @@ from tests.browser import Opened, launch, open_page
 
 NETWORKS = (2.0, 10.0, 50.0)  # Mbit/s
 LATENCY = 100.0  # ms
-TARGETS = (0.7, 0.8, 0.9)
+TARGETS = (0.8, 0.9, 0.95)  # of fidelity
 WAYS = {
     "streamed": ("#2f6f56", "-"),
-    "target 0.8": ("#d6a10b", "-"),
+    "fidelity 0.95": ("#d6a10b", "-"),
     "file order": ("#8a94a3", "--"),
     "one file": ("#e5484d", ":"),
 }
@@ -112,7 +112,7 @@ def _complete(state: dict[str, Any], target: float | None) -> bool:
 
 
 def _ssim(state: dict[str, Any]) -> float | None:
-    """Expected SSIM of what is shown, mean over the categories in sight."""
+    """Expected quality of what is shown, mean over the categories in sight."""
     told = [s["expected"] for s in state["labels"] if s["visible"] and s["expected"] is not None]
     return sum(told) / len(told) if told else None
 

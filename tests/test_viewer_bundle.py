@@ -319,7 +319,7 @@ def contents(tmp_path: Path) -> Contents:
     ]
     return Contents(
         "tiny", made.extent, entries, categories, chunks, tmp_path / "chunks", 1, points=points,
-        drawn=cameras_at(fidelity),
+        drawn=drawn,
     )  # fmt: skip
 
 

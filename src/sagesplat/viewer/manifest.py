@@ -152,7 +152,8 @@ def pack_order(contents: Contents) -> list[tuple[int, int]]:
 
     By fidelity at the drawn viewpoints where the bundle has it, else by SSIM at the photos.
     """
-    quality = next(iter(contents.qualities), "ssim")
+    known = contents.qualities
+    quality: QualityKind = known[0] if known else "ssim"
     by_label, models = _chunks_by_label(contents.chunks), _models(contents, quality)
     first = start_of(contents)
     cameras = contents.viewpoints(quality)

@@ -7,9 +7,9 @@ other and need many digits; a value that is rounded moves the mean by about as m
     mean_k = curve_k(d) + offset_k + sum_i c(x, x_i) weights_ik
 
 and goes on as in `adapt.viewpoint`. An offset holds what does not depend on the viewpoint: the mean of
-fidelity, and what views differ by that training never saw. Numbers are whole steps of a unit. The shared views
-are in the order of a path from each to the nearest one left, and lists over views hold differences to the view
-before: most are small. Values hold differences to the level below as well.
+fidelity, and what views differ by that training never saw. Numbers are whole steps of a unit. The shared
+views are in the order of a path from each to the nearest one left, and lists over views hold differences to
+the view before: most are small. Values hold differences to the level below as well.
 """
 
 import math
