@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 import shutil
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -34,6 +35,7 @@ from sagesplat.stages.results import (
     fidelity_of,
     increments_of,
     observations_of,
+    plans_of,
     promises_of,
     sampled_of,
     viewpoints_of,
@@ -111,6 +113,7 @@ def bundle(
         chunks=chunks,
         meters_per_unit=meters_per_unit,
         drawn=[drawn.cameras[row] for row in drawn.rows("fit")],
+        target=_target(job),
     )
     contents = replace(contents, categories=_with_quality(job, contents.categories, always, weights))
     contents = with_corrections(contents)
@@ -321,6 +324,12 @@ def _with_quality(
         )
         for category in categories
     ]
+
+
+def _target(job: Job) -> tuple[QualityKind, float] | None:
+    """What the run's plan was made for; None without a plan, or for a budget alone."""
+    plans = plans_of(job) if job.run.plan.exists() else ()
+    return next(((plan.quality, plan.target) for plan in plans if not math.isnan(plan.target)), None)
 
 
 def _seen_in_photos(job: Job) -> dict[int, Seen]:

@@ -13,8 +13,8 @@ const MEANING: Readonly<Record<Trust, string>> = {
 };
 const REMARK: Readonly<Record<Trust, string>> = {
   calibrated: "",
-  uncalibrated: " · uncalibrated",
-  outside: " · no promise here",
+  uncalibrated: "uncalibrated · ",
+  outside: "no promise here · ",
   unknown: "",
 };
 
@@ -135,11 +135,9 @@ function factsRow(viewer: Viewer, title: string, name: string, color: string): R
     setText(quality, formatSsim(now.promised));
     quality.title = `promised ${name} ${formatSsim(now.promised)}, expected ${formatSsim(now.expected)}; ${MEANING[now.trust]}`;
     const place = now.visible ? formatDistance(now.distance * metres) : "out of sight";
-    setText(
-      facts,
-      now.error ??
-        `${formatCount(now.count)} · ${formatBytes(now.bytes)} · ${place}${now.visible ? REMARK[now.trust] : ""}`,
-    );
+    const remark = now.visible ? REMARK[now.trust] : "";
+    const size = `${formatCount(now.count)} · ${formatBytes(now.bytes)}`;
+    setText(facts, now.error ?? `${remark}${size} · ${place}`);
     element.classList.toggle("error", now.error !== null);
     element.classList.toggle("dim", !now.visible || states.every(({ label }) => viewer.isHidden(label.id)));
     element.classList.toggle("busy", now.loading);

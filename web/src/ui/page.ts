@@ -70,8 +70,12 @@ function sentence(viewer: Viewer, done: boolean): string {
 
 /** Names the categories without a promise at this viewpoint. */
 function outside(state: State): string {
-  const short = state.labels.filter((l) => l.visible && l.trust === "outside");
-  return short.length ? `No promise here for ${named(short)}` : "";
+  const known = state.labels.filter((l) => l.visible && l.trust !== "unknown");
+  const short = known.filter((l) => l.trust === "outside");
+  if (!short.length) return "";
+  return short.length < known.length
+    ? `No promise here for ${named(short)}`
+    : "No promise here: too far from the viewpoints that were tried";
 }
 
 /** Names the categories that miss the target, or says that the budget is the limit. */
