@@ -306,10 +306,8 @@ def contents(tmp_path: Path) -> Contents:
         for i, (at, heldout) in enumerate(zip(cameras_at(made), made.heldout_inputs, strict=True))
     ]
     entries.append(CameraEntry("none.jpg", "test", camera()))
-    seen: dict[QualityKind, Seen] = {
-        "fidelity": seen_by(cameras_at(fidelity), 0.5),
-        "ssim": seen_by(entries, 0.25),
-    }
+    drawn = cameras_at(fidelity)
+    seen: dict[QualityKind, Seen] = {"fidelity": seen_by(drawn, 0.5), "ssim": seen_by(entries, 0.25)}
     car = Category(3, "car", "car", "#112233", UNIT, 2.0, True, {"fidelity": fidelity, "ssim": made}, seen)
     points = np.random.default_rng(0).normal(size=(50, 3))
     categories = [

@@ -94,8 +94,12 @@ def documents(
 ) -> tuple[dict[str, Any], dict[QualityKind, bytes]]:
     """The manifest as plain data, and by quality the bytes of promises-*.json."""
     by_label = _chunks_by_label(contents.chunks)
-    models = {quality: _models(contents, quality) for quality in contents.qualities}
-    promises = {quality: _promises(contents, quality, some) for quality, some in models.items() if some}
+    models: dict[QualityKind, dict[int, ViewModel]] = {
+        quality: some for quality in contents.qualities if (some := _models(contents, quality))
+    }
+    promises: dict[QualityKind, bytes] = {
+        quality: _promises(contents, quality, some) for quality, some in models.items()
+    }
     manifest = {
         "format": FORMAT,
         "version": VERSION,
