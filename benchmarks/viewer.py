@@ -134,7 +134,7 @@ def table(result: dict[str, Any]) -> str:
 
 
 def figure(curves: Path, out: Path) -> None:
-    """SSIM over time of curve.csv, as `node web/test/network.report.mjs` writes it: a panel for each link."""
+    """Fidelity over time of curve.csv, as `node web/test/network.report.mjs` writes it: a panel for each link."""
     with curves.open() as file:
         rows = list(csv.DictReader(file))
     links = sorted({float(row["mbit"]) for row in rows})
@@ -147,6 +147,6 @@ def figure(curves: Path, out: Path) -> None:
                 axes.step(time, ssim, line, where="post", color=color, label=way)
             axes.set(title=f"{link:g} Mbit/s, 100 ms", xlabel="seconds", ylim=(0, None), xlim=(0, None))
             axes.grid(True, alpha=0.3)
-        picture.axes[0].set_ylabel("expected SSIM")
+        picture.axes[0].set_ylabel("expected fidelity")
         picture.axes[0].legend()
         picture.savefig(out, dpi=110)

@@ -50,7 +50,7 @@ for (const connections of [6, Infinity]) {
   }
 }
 
-const walk = await sim.walked(documents, { mbit: 10, connections: 6 }, { mode: "target", target: 0.8 });
+const walk = await sim.walked(documents, { mbit: 10, connections: 6 }, { mode: "target", target: 0.95 });
 const lines = walk.map((s) => [s.second, s.bytes, s.count, round(s.ssim, 4), round(s.full, 4)].join());
 const mean = (of) => round(walk.reduce((sum, step) => sum + of(step), 0) / walk.length, 4);
 const totals = JSON.parse(manifest).totals;
