@@ -29,7 +29,7 @@ from sagesplat.viewer.bundle import SCHEMA, is_bundle, write_bundle, write_docum
 from sagesplat.viewer.frames import FLIP
 from sagesplat.viewer.manifest import CameraEntry, Category, Contents, documents
 from sagesplat.viewer.pack import NEARBY, Ladder, gains_of, order_of
-from sagesplat.viewer.promises import MOVES, Seen, promises_document, read_model
+from sagesplat.viewer.promises import Seen, allowed, promises_document, read_model
 from sagesplat.viewer.quality import curve_entry, curve_of, of_files, quality_entry, significant
 
 UNIT = np.array([[-1.0, -1, -1, 1, 1, 1]])
@@ -184,15 +184,17 @@ def test_a_model_that_is_sent_predicts_the_same(quality, seed: int, views: int) 
     made = model(seed, views, [1, 2, 4], quality=quality)
     read = read_model(sent(made), made.label_id)
     before, after = made.predict(*own_views(made)), read.predict(*own_views(made))
-    np.testing.assert_allclose(after.mean, before.mean, atol=MOVES)
-    assert (after.bound <= before.bound + 1e-12).all()  # rounding promises nothing that was not promised
-    assert (after.bound >= before.bound - 0.03).all()  # the thresholds are 0.001 apart in one place
+    assert (np.abs(after.mean - before.mean) <= allowed(before.mean)).all()
+    asked = before.bound >= made.calibration.targets[0]
+    assert (after.bound <= before.bound + 1e-12)[asked].all()  # nothing is promised that was not before
+    np.testing.assert_allclose(after.bound, before.bound, atol=0.1)  # thresholds are 0.05 apart at 0.55
     np.testing.assert_allclose(after.support, before.support, atol=0.02)
     if quality == "fidelity":
         assert (after.bound[:, -1] == 1).all()
     nowhere = np.array([2.0, np.nan]), np.full((2, 3), 1e3), np.eye(3)[:2]
     assert np.isnan(read.predict(*nowhere).bound).all()
-    np.testing.assert_allclose(read.predict(*nowhere).mean, made.predict(*nowhere).mean, atol=MOVES)
+    known = made.predict(*nowhere).mean
+    assert (np.abs(read.predict(*nowhere).mean - known) <= allowed(known)).all()
 
 
 def test_two_photos_from_one_place_can_be_sent() -> None:
@@ -201,9 +203,8 @@ def test_two_photos_from_one_place_can_be_sent() -> None:
     inputs[1:4] = inputs[0]
     made = replace(made, inputs=inputs, weights=made.weights / 4)
     read = read_model(sent(made), made.label_id)
-    np.testing.assert_allclose(
-        read.predict(*own_views(made)).mean, made.predict(*own_views(made)).mean, atol=MOVES
-    )
+    known = made.predict(*own_views(made)).mean
+    assert (np.abs(read.predict(*own_views(made)).mean - known) <= allowed(known)).all()
 
 
 def test_thresholds_that_are_close_stay_apart_and_below_the_full_model() -> None:
@@ -258,7 +259,7 @@ def test_known_views_correct_the_boxes() -> None:
     _, position, direction = own_views(made)
     told = np.linspace(1, 3, 12)
     right = read.corrected(told, position, direction)
-    np.testing.assert_allclose(right, told * np.exp(missed), rtol=2e-3)
+    np.testing.assert_allclose(right, told * np.exp(missed), rtol=3e-3)
     np.testing.assert_allclose(read.corrected(told, position + 1e3, direction), told, rtol=1e-9)
     assert np.isnan(read.corrected(np.full(12, np.nan), position, direction)).all()
 
@@ -380,9 +381,8 @@ def test_promises_of_a_bundle_are_those_of_the_model(tmp_path, contents, viewer,
     assert len(views) == made.num_views  # the test photo taught nothing
     assert np.cumsum(entry["shares"]).tolist() == [share * 1e4] * len(views)
     read = read_model(promises, 3)
-    np.testing.assert_allclose(
-        read.predict(*own_views(made)).mean, made.predict(*own_views(made)).mean, atol=MOVES
-    )
+    known = made.predict(*own_views(made)).mean
+    assert (np.abs(read.predict(*own_views(made)).mean - known) <= allowed(known)).all()
     shown = sorted(map(tuple, (read.inputs[:, :6]).round(3).tolist()))
     np.testing.assert_allclose(shown, sorted(map(tuple, made.inputs[:, :6].round(3).tolist())), atol=2e-3)
     (label,) = (label for label in manifest["labels"] if label["id"] == 3)

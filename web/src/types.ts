@@ -105,12 +105,6 @@ export interface Pack {
   readonly order: readonly (readonly [number, number])[]; // index of the label, level (1-based)
 }
 
-/** Whole numbers times a unit: differences along each axis, so each number is the sum of those up to it. */
-export interface Steps<T> {
-  readonly unit: number;
-  readonly steps: T;
-}
-
 /** The viewpoint models of all categories for one quality, as in src/sagesplat/viewer/promises.py. */
 export interface Promises {
   readonly version: number;
@@ -133,10 +127,13 @@ export interface LabelPromises {
   readonly curves: readonly Curve[]; // by level; empty: 0
   readonly offsets: readonly number[]; // by level
   readonly views: readonly number[]; // rows of the shared views: differences
-  readonly logDistances: Steps<readonly number[]>; // by own view
-  readonly values: Steps<readonly (readonly number[])[]>; // by level and own view
+  readonly logDistances: { readonly unit: number; readonly steps: readonly number[] }; // by own view: differences
+  readonly values: {
+    readonly units: readonly number[]; // by level
+    readonly steps: readonly (readonly number[])[]; // by level and own view: differences along both
+  };
   readonly shares: readonly number[]; // of the pixels, by shared view: differences, 1/10000
-  readonly corrections: readonly number[]; // log of distance over that by boxes: differences, 1/1000
+  readonly corrections: readonly number[]; // log of distance over that by boxes: differences, 1/200
 }
 
 /** The viewer's position and view, in the bundle's frame. */

@@ -153,7 +153,10 @@ export function modelOf(label: Label, rows: readonly number[], random: () => num
     offsets: means,
     views: differences(rows),
     logDistances: { unit: 0.01, steps: differences(rows.map(() => 150 + 30 * random())) },
-    values: { unit: 1e-3, steps: means.map(() => differences(rows.map(() => 2 * (random() - 0.5)))) },
+    values: {
+      units: means.map(() => 1e-3),
+      steps: means.map(() => differences(rows.map(() => 2 * (random() - 0.5)))),
+    },
     shares: [],
     corrections: rows.map(() => 0),
   };

@@ -30,10 +30,12 @@ from sagesplat.viewer.frames import FLIP
 from sagesplat.viewer.quality import curve_entry, curve_of, significant
 
 VERSION = 2
-MOVES = 5e-4  # largest change of a mean by rounding, in any of the model's views and halfway to the next one
+# largest change of a mean by rounding, in any of the model's views and halfway to the next one: this much, or
+MOVES = 5e-4
+PART = 1e-2  # this part of what is missing to 1, if that is more
 NUGGET = 1e-3  # added to the kernel's diagonal: far below what a mean is uncertain by
 STEP = 1e-4  # of positions over the extent, directions, shares, targets and thresholds
-CORRECTION_STEP = 1e-3
+CORRECTION_STEP = 5e-3
 LIKE = 16  # exponent of the kernel weights in `corrected`: only close views count
 _ENOUGH = 1e-3  # weight at which a correction counts by half
 _WHOLE = round(1 / STEP)
@@ -177,25 +179,37 @@ def _rounded(entry: dict[str, Any], model: ViewModel, shared: Int[np.ndarray, "U
     expected = matern32(own, own, model.lengths) @ model.weights
     nothing = {"targets": [], "thresholds": []}
     moved, sent = math.inf, entry
+    coarser = significant(allowed(mean.mean(0)) / MOVES, 2)
     for distance_unit, unit in _UNITS:
-        logs = _steps(np.round(own[:, 6] / distance_unit), distance_unit)
-        none = np.zeros((len(model.levels), len(own)))
-        sent = {**entry, **nothing, "logDistances": logs, "values": _steps(none, unit)}
+        logs = {"unit": distance_unit, "steps": _differences(np.round(own[:, 6] / distance_unit))}
+        units = np.multiply(coarser, unit)
+        sent = {**entry, **nothing, "logDistances": logs}
         inputs = _inputs(sent, shared)
         # weights by which the rounded inputs predict the same
         weights = np.linalg.lstsq(matern32(own, inputs, model.lengths), expected, rcond=1e-9)[0]
         values = _covariance(inputs, model.lengths) @ weights
-        sent["values"] = _steps(np.round(values.T / unit), unit)
-        moved = float(np.abs(_model_of(sent, shared, model.extent).predict(*told).mean - mean).max())
-        if moved <= MOVES:
+        steps = _differences(np.round(values.T / units[:, None]))
+        sent["values"] = {"units": significant(units, 6), "steps": steps}
+        rounded = _model_of(sent, shared, model.extent).predict(*told).mean
+        moved = float((np.abs(rounded - mean) / allowed(mean)).max())
+        if moved <= 1:
             break
     return {**sent, **_thresholds(model.calibration, moved)}
 
 
+def allowed(mean: np.ndarray) -> np.ndarray:
+    """What rounding may change means by."""
+    return np.maximum(MOVES, PART * (1 - mean))
+
+
 def _thresholds(calibration: Calibration, moved: float) -> dict[str, list[int]]:
-    """Targets and thresholds in whole steps; thresholds go up by what means moved, so no bound is raised."""
+    """Targets and thresholds in whole steps; thresholds go up by what means moved, so no bound is raised.
+
+    `moved`: the largest change of a mean, over what is allowed.
+    """
     targets = np.floor(calibration.targets / STEP + 1e-6).astype(int)
-    raised = np.ceil((calibration.thresholds + moved) / STEP - 1e-6).astype(int)
+    raised = calibration.thresholds + moved * allowed(calibration.thresholds)
+    raised = np.ceil(raised / STEP - 1e-6).astype(int)
     rising = np.maximum.accumulate(raised - np.arange(len(raised))) + np.arange(len(raised))
     kept = (rising < _WHOLE) & (np.diff(targets, prepend=-2 * _WHOLE) > 0)
     if len(raised) and calibration.thresholds[-1] >= 1:  # the full model keeps every target
@@ -206,7 +220,8 @@ def _thresholds(calibration: Calibration, moved: float) -> dict[str, list[int]]:
 def _model_of(entry: dict[str, Any], shared: Int[np.ndarray, "U 6"], extent: float) -> SentModel:
     inputs = _inputs(entry, shared)
     x, y, z = entry["lengths"]
-    weights = cho_solve(cho_factor(_covariance(inputs, (x, y, z))), _summed(entry["values"]).T)
+    values = np.cumsum(np.cumsum(entry["values"]["steps"], 0), 1).T * entry["values"]["units"]
+    weights = cho_solve(cho_factor(_covariance(inputs, (x, y, z))), values)
     targets, thresholds = (np.array(entry[name], np.float64) / _WHOLE for name in ("targets", "thresholds"))
     calibration = Calibration(
         entry["status"], entry["confidence"], 0, targets, thresholds, entry["leastSupport"]
@@ -227,7 +242,8 @@ def _model_of(entry: dict[str, Any], shared: Int[np.ndarray, "U 6"], extent: flo
 
 def _inputs(entry: dict[str, Any], shared: Int[np.ndarray, "U 6"]) -> Float[np.ndarray, "n 7"]:
     own = shared[np.cumsum(entry["views"])] / _WHOLE * np.tile(FLIP, 2)
-    return np.column_stack([own, _summed(entry["logDistances"])])
+    logs = np.cumsum(entry["logDistances"]["steps"]) * entry["logDistances"]["unit"]
+    return np.column_stack([own, logs])
 
 
 def _covariance(inputs: Float[np.ndarray, "n 7"], lengths: Sequence[float]) -> Float[np.ndarray, "n n"]:
@@ -239,18 +255,6 @@ def _differences(whole: np.ndarray) -> list[Any]:
     for axis in range(whole.ndim):
         whole = np.diff(whole, axis=axis, prepend=0)
     return whole.astype(int).tolist()
-
-
-def _steps(whole: np.ndarray, unit: float) -> dict[str, Any]:
-    return {"unit": unit, "steps": _differences(whole)}
-
-
-def _summed(steps: dict[str, Any]) -> np.ndarray:
-    """What `_steps` wrote."""
-    whole = np.array(steps["steps"])
-    for axis in range(whole.ndim):
-        whole = np.cumsum(whole, axis=axis)
-    return whole * steps["unit"]
 
 
 def _nearest(a: Float[np.ndarray, "A D"], b: Float[np.ndarray, "B D"]) -> Int[np.ndarray, " A"]:

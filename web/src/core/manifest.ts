@@ -176,7 +176,7 @@ function oddPack({ pack, labels }: Manifest): string[] {
   return bytes === pack.bytes && once ? [] : ["pack.order must name levels that fill pack.bytes, each once"];
 }
 
-const steps = (check: Check): Check => object({ unit: between(1e-9, 1), steps: check });
+const unit = between(1e-9, 1);
 const curve = object({ params: list(number, 9), range: list(number, 2), median: number });
 const model = object({
   id: whole,
@@ -191,8 +191,8 @@ const model = object({
   curves: list(curve),
   offsets: list(between(-9, 9)),
   views: list(amount),
-  logDistances: steps(list(whole)),
-  values: steps(list(list(whole))),
+  logDistances: object({ unit, steps: list(whole) }),
+  values: object({ units: list(unit), steps: list(list(whole)) }),
   shares: list(whole),
   corrections: list(whole),
 });
@@ -225,7 +225,7 @@ function oddModel(one: LabelPromises, shared: number): string[] {
     n > 0 &&
     K > 0 &&
     lists.every((values) => values.length === n) &&
-    [one.offsets, one.values.steps].every((values) => values.length === K) &&
+    [one.offsets, one.values.units, one.values.steps].every((values) => values.length === K) &&
     (one.curves.length === K || !one.curves.length) &&
     one.shares.length === shared &&
     total(one.views) < shared &&

@@ -16,7 +16,7 @@ export interface Prediction {
 
 /** Steps in which promises hold positions over the extent, directions, shares, targets and thresholds. */
 const STEP = 1e-4;
-const CORRECTION_STEP = 1e-3;
+const CORRECTION_STEP = 5e-3;
 
 /** Eq. 3 at a distance, clamped to the fitted range; the median for an unknown distance (NaN). */
 export function curveAt(curve: Curve, distance: number): number {
@@ -228,7 +228,7 @@ function valuesOf({ values }: LabelPromises): Float64Array {
     for (let i = 0; i < n; i++) {
       along += steps[i] as number;
       level[i] = (level[i] as number) + along;
-      out[k * n + i] = (level[i] as number) * values.unit;
+      out[k * n + i] = (level[i] as number) * (values.units[k] as number);
     }
   });
   return out;

@@ -179,7 +179,8 @@ test.each([
   ["labels.0.values.steps", [], "labels[0] has lists"],
   ["labels.0.values.steps.0", [1], "labels[0] has lists"],
   ["labels.0.values.steps.0.0", 1e10, "labels[0] has values out of range"],
-  ["labels.0.values.unit", 0, "labels[0].values.unit must be a number from"],
+  ["labels.0.values.units.0", 0, "labels[0].values.units[0] must be a number from"],
+  ["labels.0.values.units", [1], "labels[0] has lists"],
   ["labels.0.offsets", [0], "labels[0] has lists"],
   [
     "labels.0.curves",
