@@ -109,7 +109,7 @@ def calibration(quality: QualityKind) -> Calibration:
     thresholds = np.array([0.32, 0.55, 0.601, 0.85, 0.92, 0.971])
     if quality == "fidelity":
         targets, thresholds = np.append(targets, 1.0), np.append(thresholds, 1.0)
-    return Calibration("calibrated", 0.95, 40, targets, thresholds, 0.3)
+    return Calibration("calibrated", 0.95, 40, targets, thresholds, 0.3, 0.04 if quality == "ssim" else 0.0)
 
 
 def _constants(levels: list[int]) -> tuple[SsimModel, ...]:

@@ -120,6 +120,7 @@ export interface LabelPromises {
   readonly status: Status;
   readonly confidence: number;
   readonly leastSupport: number; // below it there is no bound
+  readonly discount: number; // of the mean where the support is 0; none at a known viewpoint
   readonly targets: readonly number[]; // ascending, 1/10000
   readonly thresholds: readonly number[]; // of the mean, by target
   readonly medianLogDistance: number; // for an unknown distance

@@ -145,6 +145,7 @@ export function modelOf(label: Label, rows: readonly number[], random: () => num
     status: "calibrated",
     confidence: 0.95,
     leastSupport: 0,
+    discount: 0,
     targets: [3000, 6000, 8000, 9000, 9900],
     thresholds: [3200, 6200, 8200, 9200, 9990],
     medianLogDistance: 1.6,

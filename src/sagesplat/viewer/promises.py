@@ -158,6 +158,7 @@ def _entry(
         "status": model.status,
         "confidence": model.confidence,
         "leastSupport": math.ceil(model.calibration.least_support / STEP) / _WHOLE,
+        "discount": math.ceil(model.calibration.discount / STEP) / _WHOLE,
         "medianLogDistance": significant(model.median_log_distance),
         "lengths": significant(model.lengths),
         "curves": [] if flat else [curve_entry(curve) for curve in model.curves],
@@ -175,11 +176,11 @@ def _rounded(entry: dict[str, Any], model: ViewModel, shared: Int[np.ndarray, "U
     at = np.concatenate([own, middle])
     # a curve may jump exactly at the distance of a view: a little beyond it
     told = np.exp(at[:, 6]) * (1 + 1e-9), at[:, :3] * model.extent, at[:, 3:6]
-    mean = model.predict(*told).mean
+    before = model.predict(*told)
     expected = matern32(own, own, model.lengths) @ model.weights
     nothing = {"targets": [], "thresholds": []}
     moved, sent = math.inf, entry
-    coarser = significant(allowed(mean.mean(0)) / MOVES, 2)
+    coarser = significant(allowed(before.mean.mean(0)) / MOVES, 2)
     for distance_unit, unit in _UNITS:
         logs = {"unit": distance_unit, "steps": _differences(np.round(own[:, 6] / distance_unit))}
         units = np.multiply(coarser, unit)
@@ -190,11 +191,18 @@ def _rounded(entry: dict[str, Any], model: ViewModel, shared: Int[np.ndarray, "U
         values = _covariance(inputs, model.lengths) @ weights
         steps = _differences(np.round(values.T / units[:, None]))
         sent["values"] = {"units": significant(units, 6), "steps": steps}
-        rounded = _model_of(sent, shared, model.extent).predict(*told).mean
-        moved = float((np.abs(rounded - mean) / allowed(mean)).max())
+        moved = _moved(
+            before, _model_of(sent, shared, model.extent).predict(*told), model.calibration.discount
+        )
         if moved <= 1:
             break
     return {**sent, **_thresholds(model.calibration, moved)}
+
+
+def _moved(before: Prediction, after: Prediction, discount: float) -> float:
+    """The largest change of what bounds come from, over what is allowed."""
+    change = after.mean - before.mean + discount * (after.support - before.support)[:, None]
+    return float((np.abs(change) / allowed(before.mean)).max())
 
 
 def allowed(mean: np.ndarray) -> np.ndarray:
@@ -207,12 +215,18 @@ def _thresholds(calibration: Calibration, moved: float) -> dict[str, list[int]]:
 
     `moved`: the largest change of a mean, over what is allowed.
     """
-    targets = np.floor(calibration.targets / STEP + 1e-6).astype(int)
-    raised = calibration.thresholds + moved * allowed(calibration.thresholds)
+    targets, thresholds = calibration.targets, calibration.thresholds
+    full = len(targets) > 0 and thresholds[-1] >= 1  # the full model keeps every target: that is not raised
+    just_below = 1 - 1.5 * STEP - moved * MOVES
+    if full and just_below > max(thresholds[:-1], default=-1.0):
+        target = np.interp(just_below, thresholds, targets)
+        targets, thresholds = np.insert(targets, -1, target), np.insert(thresholds, -1, just_below)
+    targets = np.floor(targets / STEP + 1e-6).astype(int)
+    raised = thresholds + moved * allowed(thresholds)
     raised = np.ceil(raised / STEP - 1e-6).astype(int)
     rising = np.maximum.accumulate(raised - np.arange(len(raised))) + np.arange(len(raised))
     kept = (rising < _WHOLE) & (np.diff(targets, prepend=-2 * _WHOLE) > 0)
-    if len(raised) and calibration.thresholds[-1] >= 1:  # the full model keeps every target
+    if full:
         rising[-1], kept[-1] = _WHOLE, True
     return {"targets": targets[kept].tolist(), "thresholds": rising[kept].tolist()}
 
@@ -224,7 +238,7 @@ def _model_of(entry: dict[str, Any], shared: Int[np.ndarray, "U 6"], extent: flo
     weights = cho_solve(cho_factor(_covariance(inputs, (x, y, z))), values)
     targets, thresholds = (np.array(entry[name], np.float64) / _WHOLE for name in ("targets", "thresholds"))
     calibration = Calibration(
-        entry["status"], entry["confidence"], 0, targets, thresholds, entry["leastSupport"]
+        entry["status"], entry["confidence"], 0, targets, thresholds, entry["leastSupport"], entry["discount"]
     )
     return SentModel(
         levels=tuple(entry["levels"]),

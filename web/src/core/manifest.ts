@@ -184,6 +184,7 @@ const model = object({
   status: oneOf(...STATUSES),
   confidence: share,
   leastSupport: share,
+  discount: fromZero,
   targets: list(whole),
   thresholds: list(whole),
   medianLogDistance: number,

@@ -182,7 +182,8 @@ export class ViewModel {
     const unknown = label.levels.map(() => Number.NaN);
     const known = this.targets.length > 0;
     const outside = support < sent.leastSupport;
-    const bound = mean.map((m) => (outside || !known ? Number.NaN : this.bound(m)));
+    const less = sent.discount * (1 - support);
+    const bound = mean.map((m) => (outside || !known ? Number.NaN : this.bound(m - less)));
     return {
       mean: spread(mean, sent.levels, unknown),
       bound: spread(bound, sent.levels, unknown),
