@@ -83,7 +83,7 @@ def test_distance_decides():
     near, far = (plan_view(models, counts, {1: d}, 0.8, 3) for d in (0.5, 2.0))
     assert (near.levels, near.count, near.status, near.view) == ({1: 1000}, 10, "ok", 3)
     assert (far.levels, far.count, far.status) == ({1: 2000}, 20, "ok")
-    assert far.choices[0].predicted_ssim == pytest.approx(0.95 * math.exp(-0.1))
+    assert far.choices[0].predicted == pytest.approx(0.95 * math.exp(-0.1))
     nowhere: list[dict[int, float]] = [{}, {1: math.nan}]  # then the median, here the peak
     for unknown in nowhere:
         plan = plan_view(models, counts, unknown, 0.8, 3)
@@ -98,7 +98,7 @@ def test_a_scene_needs_its_share_of_views():
     assert plan_scene(models, counts, distances, 0.8, 0.95).levels == {1: 1000}
     strict = plan_scene(models, counts, distances, 0.8, 1.0)
     assert (strict.levels, strict.status, strict.share) == ({1: 2000}, "ok", 1.0)
-    assert strict.choices[0].predicted_ssim == pytest.approx(0.9 * math.exp(-0.09))
+    assert strict.choices[0].predicted == pytest.approx(0.9 * math.exp(-0.09))
     # Nobody reaches 0.85 at 9: the level that serves most views, here 19 of 20 both, then the better mean.
     hopeless = plan_scene(models, counts, distances, 0.85, 1.0)
     assert (hopeless.levels, hopeless.status) == ({1: 2000}, "infeasible")
@@ -110,7 +110,7 @@ def test_a_category_that_was_never_seen_is_shipped_whole():
     plan = plan_view(models, counts, {2: 1.0, 3: 1.0}, 0.8, None)
     unseen, _, half_seen = plan.choices
     assert (unseen.label_id, unseen.level, unseen.count, unseen.status) == (-1, 2000, 7, "no model")
-    assert math.isnan(unseen.predicted_ssim)
+    assert math.isnan(unseen.predicted)
     assert (half_seen.level, half_seen.status) == (
         2000,
         "infeasible",
@@ -167,15 +167,15 @@ def test_a_view_plan_is_the_cheapest_that_will_do(ladder, target, distance):
         options = {key: models[key](distance) for key in ladder if key[0] == choice.label_id}
         feasible = [counts[key] for key, ssim in options.items() if ssim >= target]
         assert choice.count == counts[choice.label_id, choice.level]
-        assert choice.predicted_ssim == options[choice.label_id, choice.level]
+        assert choice.predicted == options[choice.label_id, choice.level]
         if feasible:
             assert (choice.status, choice.count) == ("ok", min(feasible))
-            assert choice.predicted_ssim >= target
+            assert choice.predicted >= target
         else:
-            assert (choice.status, choice.predicted_ssim) == ("infeasible", max(options.values()))
+            assert (choice.status, choice.predicted) == ("infeasible", max(options.values()))
     assert plan.count == sum(c.count for c in plan.choices)
-    lowest = min(c.predicted_ssim for c in plan.choices)
-    assert plan.binding in {c.label_id for c in plan.choices if c.predicted_ssim == lowest}
+    lowest = min(c.predicted for c in plan.choices)
+    assert plan.binding in {c.label_id for c in plan.choices if c.predicted == lowest}
 
 
 @quick
@@ -206,8 +206,8 @@ def test_a_scene_plan_is_the_cheapest_that_will_do(ladder, target, distances, sh
         else:
             assert choice.status == "infeasible"
             assert reached[mine] == max(reached.values())
-        assert (choice.predicted_ssim >= target) == (choice.status == "ok")
-        assert (models[mine](views) >= choice.predicted_ssim).mean() >= share
+        assert (choice.predicted >= target) == (choice.status == "ok")
+        assert (models[mine](views) >= choice.predicted).mean() >= share
 
 
 @quick

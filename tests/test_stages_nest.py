@@ -384,7 +384,7 @@ def test_budgets_are_kept_and_more_bytes_promise_more(finished: Path, tmp_path: 
     quality, shown = nested.quality, nested.shown
     best = (quality.mean * shown[..., None]).sum(0) / shown.sum(0)[:, None]
     for row, choice in enumerate(plan.choices):  # all that money can buy
-        assert choice.status == "no model" or choice.predicted_ssim == pytest.approx(best[row].max())
+        assert choice.status == "no model" or choice.predicted == pytest.approx(best[row].max())
     evaluate_plans(job)
     assert np.isnan(read_evaluation(job.run.evaluation).target).any()
     make_plan(job, PlanConfig(target_ssim=0.4, budget=10.0))
