@@ -153,7 +153,7 @@ def plan_within(
 def pooled(
     values: Float[np.ndarray, "V L K"], pixels: Float[np.ndarray, "V L"]
 ) -> tuple[Float[np.ndarray, "L K"], Float[np.ndarray, " L"]]:
-    """Mean over the pixels of all views in which a value is known, and those pixels; NaN where there are none.
+    """Mean over the pixels of the views in which a value is known, and those pixels; NaN where none is.
 
     Summed over the categories it is the mean over the whole images.
     """

@@ -1,7 +1,7 @@
 """Evaluation: composed scenes measured on views that nothing was fitted to, beside the prediction.
 
-Each composition is compared with the photo, over the pixels of the photo's label image, and with the full model
-rendered from the same viewpoint, over the pixels of the label image of the full model's Gaussians.
+Each composition is compared with the photo, over the pixels of the photo's label image, and with the full
+model rendered from the same viewpoint, over the pixels that the full model's Gaussians paint.
 """
 
 from collections.abc import Callable, Sequence
@@ -38,7 +38,9 @@ class Evaluation:
     quality: Int32[np.ndarray, " R"]  # of the plan, a place in QUALITIES
     target: Float32[np.ndarray, " R"]  # NaN for a plan within a budget
     view: Int32[np.ndarray, " R"]  # row in Scene.views
-    label_id: Int32[np.ndarray, " R"]  # category id, -1 = unlabelled, -2 = the whole image, -3 = the same of a level
+    label_id: Int32[
+        np.ndarray, " R"
+    ]  # category id, -1 = unlabelled, -2 = the whole image, -3 = the same of a level
     level: Int32[np.ndarray, " R"]  # the level chosen; -1 for the whole image of a plan
     predicted: Float32[np.ndarray, " R"]  # that the plan counts on in this view; NaN for the whole image
     fidelity: Float32[np.ndarray, " R"]  # SSIM against the full model; NaN where it shows too little of it
@@ -70,7 +72,9 @@ class Evaluation:
 
     def of_own_quality(self) -> "Evaluation":
         """The same with what was measured of the plan's own quality as `ssim`."""
-        return replace(self, ssim=np.where(self.quality == QUALITIES.index("fidelity"), self.fidelity, self.ssim))
+        return replace(
+            self, ssim=np.where(self.quality == QUALITIES.index("fidelity"), self.fidelity, self.ssim)
+        )
 
     def write_csv(self, path: Path) -> None:
         """One line per row, a header first; floats so that they read back identical."""

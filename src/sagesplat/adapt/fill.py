@@ -56,7 +56,9 @@ def fill(
     weight = np.array(weight, np.float64, order="C")
     shape = quality.shape
     if quality.ndim != 2 or cost.shape != shape or (levels.shape, weight.shape) != (shape[:1], shape[:1]):
-        raise RunError(f"quality {shape}, cost {cost.shape} and levels {levels.shape} do not fit; give one each")
+        raise RunError(
+            f"quality {shape}, cost {cost.shape} and levels {levels.shape} do not fit; give one each"
+        )
     if not np.isfinite(cost).all() or (cost < 0).any():
         raise RunError("a cost is negative or not finite; give bytes")
     if levels.min(initial=0) < 0 or levels.max(initial=0) >= shape[1]:

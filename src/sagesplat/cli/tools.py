@@ -32,7 +32,8 @@ def export(
         out: PLY to write, or with --chunks a folder
         level: number of a level (of snapshots: its training step) to write instead of the planned scene
         labels: names of the categories to write (default: all)
-        target_fidelity: write the scene planned for this fidelity (default: for the budget, else the main target)
+        target_fidelity: write the scene planned for this fidelity (default: for the budget, else the main
+            target)
         target_ssim: write the scene planned for this SSIM against photos
         chunks: write the increment of each level of each category as a file of this format
     """

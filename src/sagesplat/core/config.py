@@ -263,7 +263,11 @@ class PlanConfig:
         """The same with the default target of the ladder, where none is given."""
         if self.target_fidelity is not None or self.target_ssim is not None:
             return self
-        return replace(self, target_fidelity=0.95) if ladder == "nested" else replace(self, target_ssim=0.8)
+        return (
+            replace(self, target_fidelity=self.target)
+            if ladder == "nested"
+            else replace(self, target_ssim=0.8)
+        )
 
     @property
     def quality(self) -> Literal["fidelity", "ssim"]:
@@ -272,11 +276,15 @@ class PlanConfig:
         return "ssim" if ssim_alone else "fidelity"
 
     @property
+    def target(self) -> float:
+        """Its main target."""
+        given = self.target_ssim if self.quality == "ssim" else self.target_fidelity
+        return 0.95 if given is None else given
+
+    @property
     def targets(self) -> list[float]:
         """All targets of the quality that leads, ascending."""
-        main = self.target_ssim if self.quality == "ssim" else self.target_fidelity
-        if main is None:
-            return []
+        main = self.target
         near = (main - 0.1, main + 0.1) if self.quality == "ssim" else (0.8, 0.9, 0.98)
         others = [t for t in near if 0 < t < 1] if self.other_targets is None else self.other_targets
         return sorted({round(t, 6) for t in (main, *others)})

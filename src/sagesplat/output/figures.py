@@ -241,7 +241,11 @@ def size_by_target(
 
 @rc_context(STYLE)
 def promised_and_measured(
-    evaluation: Evaluation, labels: Sequence[int], names: Mapping[int, str], colours: Colours, quality: QualityKind
+    evaluation: Evaluation,
+    labels: Sequence[int],
+    names: Mapping[int, str],
+    colours: Colours,
+    quality: QualityKind,
 ) -> Figure:
     """Measured against promised quality on unseen views, a dot per (label, view, target)."""
     figure = Figure(figsize=PAIR, layout="constrained")

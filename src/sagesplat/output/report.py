@@ -153,7 +153,10 @@ def _headline(data: ReportData, promises: Evaluation) -> dict:
     full = sum(tables.last_counts(data.counts).values())
     rows = data.evaluation.of(plan)
     whole = rows.select(rows.label_id == TOTAL)
-    mb, full_mb = sum(map(figures.bytes_of, plan.choices)) / MB, sum(tables.last_counts(_sizes(data)).values()) / MB
+    mb, full_mb = (
+        sum(map(figures.bytes_of, plan.choices)) / MB,
+        sum(tables.last_counts(_sizes(data)).values()) / MB,
+    )
     saved = 1 - mb / full_mb if full_mb else 0.0
     shares = [c.reached for c in plan.choices if c.reached]
     return {

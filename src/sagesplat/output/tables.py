@@ -236,14 +236,22 @@ def plan_table(plan: Plan, counts: Counts, names: Mapping[int, str]) -> Table:
     for choice in sorted(plan.choices, key=lambda c: -full.get(c.label_id, 0)):
         share = choice.count / full[choice.label_id] if full.get(choice.label_id) else math.nan
         sent = math.nan if choice.transfer_bytes is None else choice.transfer_bytes / MB
-        cells = (choice.level, choice.count, share, choice.nbytes / MB, sent, choice.distance, choice.predicted)
+        cells = (
+            choice.level,
+            choice.count,
+            share,
+            choice.nbytes / MB,
+            sent,
+            choice.distance,
+            choice.predicted,
+        )
         of = choice.reached
         views = (of.share, of.low, of.high, of.num_views) if of else (math.nan,) * 4
         body.append((name_of(choice.label_id, names), *cells, *views, choice.verdict))
     header = ("category", "level", "Gaussians", "of full model", "MB", "MB to send", "distance")
     header += (f"promised {quality_title(plan.quality)}", "reached in", "from", "to", "views", "status")
     formats = ("", ",d", ",d", ".1%", ".2f", ".3f", ".3f", ".3f", ".0%", ".0%", ".0%", ",d", "")
-    note = "reached in: share of the views that measure the target at this level or above, with its 95 % interval"
+    note = "reached in: share of the views that measure the target at this level or above, 95 % interval"
     return Table(f"Plan for {plan.asked}", header, formats, body, notes=(f"{note} from, to.",))
 
 
@@ -314,7 +322,9 @@ def evaluation_table(evaluation: Evaluation, labels: Sequence[int], names: Mappi
     A plan within a budget has no target and promises none: its rows come last.
     """
     body = []
-    asked = [(i, t) for i in range(len(QUALITIES)) for t in np.unique(evaluation.target[evaluation.quality == i])]
+    asked = [
+        (i, t) for i in range(len(QUALITIES)) for t in np.unique(evaluation.target[evaluation.quality == i])
+    ]
     for i, target in asked:
         within = np.isnan(evaluation.target) if np.isnan(target) else evaluation.target == target
         plan = evaluation.select(within & (evaluation.quality == i))

@@ -128,17 +128,17 @@ class FinishedRun:
 
     @cached_property
     def plans(self) -> tuple[Plan, ...]:
-        """The scene's plans, one per target, those of the quality that leads first. RunError before `plan`."""
+        """The scene's plans, those of the quality that leads first. RunError before `sagesplat plan`."""
         return plans_of(self.job)
 
     @cached_property
     def fidelity(self) -> dict[int, ViewModel]:
-        """The model of each category's fidelity, by label id (nested ladder). RunError before `sagesplat fit`."""
+        """Models of fidelity by label id (nested ladder). RunError before `sagesplat fit`."""
         return fidelity_of(self.job)
 
     @cached_property
     def promises(self) -> dict[int, ViewModel]:
-        """The model of each category's SSIM against photos, by label id (nested ladder); else as `fidelity`."""
+        """Models of SSIM against photos by label id; otherwise like `fidelity`."""
         return promises_of(self.job)
 
     @cached_property
@@ -177,8 +177,7 @@ class FinishedRun:
             raise RunError("a camera is planned for one target; give target_fidelity or target_ssim")
         config = PlanConfig(target_fidelity, target_ssim)
         config = check_targets(config, self.job.run.ladder)
-        kind, target = config.quality, config.target_ssim or config.target_fidelity
-        assert target is not None
+        kind, target = config.quality, config.target
         # Distances have to be measured as those that the models were fitted to.
         percentile = PERCENTILE if self.job.fit_config.distance == "percentile" else 0.0
         viewer = replace(self.scene, views=(View("viewer", camera, Path()),))

@@ -165,8 +165,10 @@ class NestedLevels(Method):
         job = self.job
         far = distances(job, job.fit_config.distance)
         cameras = [view.camera for view in job.scene.views]
-        models = {"fidelity": fidelity_of(job), "ssim": promises_of(job)}
-        return {kind: quality_at(self.costs, some, far, cameras, kind) for kind, some in models.items()}
+        return {
+            "fidelity": quality_at(self.costs, fidelity_of(job), far, cameras, "fidelity"),
+            "ssim": quality_at(self.costs, promises_of(job), far, cameras, "ssim"),
+        }
 
     @cached_property
     def shown(self) -> np.ndarray:
@@ -185,7 +187,7 @@ class NestedLevels(Method):
 
     @cached_property
     def measured(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """SSIM against the photos of training and calibration, pixels there, which of them were trained on."""
+        """SSIM against photos of training and calibration, pixels there, which of them training saw."""
         scene = self.job.scene
         rows = np.concatenate([scene.train_ids, scene.calibration_ids])
         ssim = self._table(lambda found: found.ssim, self.job.ladder.levels, np.nan)
@@ -230,9 +232,7 @@ class NestedLevels(Method):
         weights = {label_named(self.job, name): weight for name, weight in config.weights.items()}
         mean, pixels = pooled(*(self.sampled if config.quality == "fidelity" else self.measured[:2]))
         weight = pixels * [weights.get(label, 1.0) for label in self.costs.labels]
-        return plan_within(
-            mean, self.costs, config.budget, config.budget_unit, weight, config.quality
-        )
+        return plan_within(mean, self.costs, config.budget, config.budget_unit, weight, config.quality)
 
     def amount(self, plan: Plan) -> str:
         """See `Method`."""
@@ -240,7 +240,7 @@ class NestedLevels(Method):
         return f"{(plan.transfer_bytes or 0) / 1e6:.2f} of {full / 1e6:.2f} MB, {plan.count:,} Gaussians"
 
     @property
-    def bytes_to_send(self) -> dict[tuple[int, int], int] | None:
+    def bytes_to_send(self) -> dict[tuple[int, int], int]:
         """See `Method`."""
         sent = zip(self.costs.labels, self.costs.transfer_bytes.tolist(), strict=True)
         return {(label, level): n for label, row in sent for level, n in enumerate(row, 1)}

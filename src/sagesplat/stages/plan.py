@@ -34,12 +34,12 @@ def make_plan(job: Job, config: PlanConfig) -> None:
     run, method = job.run, method_of(job)
     config = check_targets(config, run.ladder)
     method.check(config)
-    main = config.target_fidelity if config.quality == "fidelity" else config.target_ssim
 
     def make() -> list[str]:
-        assert main is not None
         scene_plans = [method.plan_scene(target, config.share, kind) for kind, target in config.all_targets]
-        view_plans = [method.plan_view(row, main, config.quality) for row in range(len(job.scene.views))]
+        view_plans = [
+            method.plan_view(row, config.target, config.quality) for row in range(len(job.scene.views))
+        ]
         within = method.plan_budget(config) if config.budget else None
         write_plans(run.plan, scene_plans, view_plans, within)
         plans = [*scene_plans, *([within] if within else [])]
@@ -59,8 +59,18 @@ def show_plan(job: Job) -> None:
         plans.append(scene_plan(job, "ssim", ssim))
     for plan in plans:
         table = plan_table(plan, job.ladder.counts, titles(job.names()))
-        columns = ("category", "level", "Gaussians", "of full model", f"promised {quality_title(plan.quality)}")
-        reached = ("reached in", "from", "to", "views") if plan.budget is None and job.run.ladder == "nested" else ()
+        columns = (
+            "category",
+            "level",
+            "Gaussians",
+            "of full model",
+            f"promised {quality_title(plan.quality)}",
+        )
+        reached = (
+            ("reached in", "from", "to", "views")
+            if plan.budget is None and job.run.ladder == "nested"
+            else ()
+        )
         _show(job, table.only(*columns, *reached, "status"))
 
 
@@ -76,7 +86,9 @@ def ssim_targets(run: RunDir) -> list[float]:
     made = settings_of(run, "plan")
     if made.get("target_fidelity") is None:
         return list(made["targets"])
-    return list(PAPER_TARGETS if made["target_ssim"] is None else PlanConfig(target_ssim=made["target_ssim"]).targets)
+    return list(
+        PAPER_TARGETS if made["target_ssim"] is None else PlanConfig(target_ssim=made["target_ssim"]).targets
+    )
 
 
 def ssim_target(run: RunDir) -> float:

@@ -31,7 +31,7 @@ STAGES = (
 
 
 def report_data(job: Job, composed: Gaussians, quality: QualityKind, target: float) -> ReportData:
-    """Everything the report of a run shows; it leads with the plan for `target`, whose scene is `composed`."""
+    """Everything that the report shows; it leads with the plan for `target`, whose scene is `composed`."""
     run, scene, masks, ladder = job.run, job.scene, job.best_masks, job.ladder
     names = {**masks.taxonomy.names, UNLABELLED: masks.taxonomy.name(UNLABELLED)}
     categories, colours = _parts(run, names)

@@ -291,10 +291,11 @@ def _nested(nested: NestedLevels, config: CompareConfig) -> list[Contender]:
         load = partial(job.ladder.load, k + 1)
         found.append(Contender(SAME_SHARE, f"level {k + 1}", steps, load, bytes_of))
     budgets = np.ceil(np.geomspace(sent[0], sent[-1], config.budgets)).tolist()
+    main = ssim_target(job.run)
     plans: list[tuple[str, Plan]] = [
-        (f"{b / 1e6:.3g} MB", nested.plan_budget(PlanConfig(target_ssim=ssim_target(nested.job.run), budget=b))) for b in budgets
+        (f"{b / 1e6:.3g} MB", nested.plan_budget(PlanConfig(target_ssim=main, budget=b))) for b in budgets
     ]
-    for target in made["targets"]:
+    for target in ssim_targets(job.run):
         plan = nested.plan_scene(target, made["share"])
         plans.append((f"SSIM {target:g}, {plan.status}", plan))
     seen = []
