@@ -110,7 +110,9 @@ def test_what_it_guarantees(problem):
 
 def test_a_scene_that_is_hard_in_a_small_category():
     """What was wrong: bytes of a plan for a target went to what is hard, the whole image was worse."""
-    quality, cost, weight = (x[0] if x.ndim == 3 else x for x in make_plans.scene(np.random.default_rng(3), 1, 12, 16))
+    quality, cost, weight = (
+        x[0] if x.ndim == 3 else x for x in make_plans.scene(np.random.default_rng(3), 1, 12, 16)
+    )
     quality = np.maximum.accumulate(quality, 1)
     levels = cheapest(quality, cost, 0.6).levels
     rows, curve = np.arange(len(levels)), lambda at: uniform_curve(at, quality, cost, weight)

@@ -21,7 +21,7 @@ from benchmarks.audit import (
     sums_table,
 )
 from sagesplat.adapt.eq3 import Eq3, SsimModel
-from sagesplat.adapt.plan import plan_scene, plan_view, read_plans, write_plans
+from sagesplat.adapt.plan import Choice, Plan, Reached, plan_scene, plan_view, read_plans, write_plans
 from sagesplat.core.errors import DataError, RunError
 
 
@@ -236,6 +236,34 @@ def test_plans_read_back_identical(tmp_path):
     assert repr(views_back) == repr(tuple(views))
 
 
+def test_all_of_a_plan_for_fidelity_reads_back(tmp_path):
+    path = tmp_path / "plan.json"
+    choices = (
+        Choice(2, 3, 0.95, math.nan, 40, "ok", 900, True, Reached(0.97, 0.94, 0.99, 240)),
+        Choice(5, 9, math.nan, math.nan, 7, "no promise", 100, False, None),
+    )
+    plans = (Plan(0.95, None, choices, 0.95, quality="fidelity"), Plan(0.7, None, choices, 0.95))
+    write_plans(path, plans)
+    document = json.loads(path.read_text(), parse_constant=pytest.fail)
+    assert [entry["quality"] for entry in document["scene"]] == ["fidelity", "ssim"]
+    assert document["scene"][0]["status"] == "no promise"
+    assert document["scene"][0]["choices"][0]["reached"] == {
+        "share": 0.97, "low": 0.94, "high": 0.99, "num_views": 240,
+    }  # fmt: skip
+    assert repr(read_plans(path)[0]) == repr(plans)
+    assert (plans[0].verdict, plans[0].calibrated) == ("no promise, uncalibrated", False)
+
+
+def test_plans_of_older_runs_are_of_ssim(tmp_path):
+    """They had no other quality, and called the promise predicted_ssim."""
+    path = tmp_path / "plan.json"
+    choice = {"label_id": 1, "level": 2, "predicted_ssim": 0.5, "distance": None, "count": 1, "status": "ok"}
+    plan = {"target": 0.5, "view": None, "share": 0.95, "choices": [choice]}
+    path.write_text(json.dumps({"scene": [plan], "views": []}))
+    ((found,), _) = read_plans(path)
+    assert (found.quality, found.choices[0].predicted, found.choices[0].calibrated) == ("ssim", 0.5, None)
+
+
 @pytest.mark.parametrize(
     "content",
     [
@@ -245,6 +273,10 @@ def test_plans_read_back_identical(tmp_path):
         '{"scene": [], "views": [{"target": 0.5, "view": 1e999, "share": null, "choices": []}]}',
         '{"scene": [], "views": [{"target": 0.5, "view": 1, "share": null, "choices": [{"label_id": 1,'
         ' "level": 1, "predicted_ssim": 0.5, "distance": null, "count": 1, "status": "fine"}]}]}',
+        '{"views": [], "scene": [{"target": 1, "view": 1, "share": null, "choices": [], "quality": "psnr"}]}',
+        '{"views": [], "scene": [{"target": 0.5, "view": 1, "share": null, "choices": [{"label_id": 1,'
+        ' "level": 1, "predicted": 0.5, "distance": null, "count": 1, "status": "ok",'
+        ' "reached": {"share": 0.5, "low": 0.6, "high": 1, "num_views": 3}}]}]}',
     ],
 )
 def test_an_unusable_file_is_one_line(tmp_path, content):
