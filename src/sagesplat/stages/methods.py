@@ -230,7 +230,11 @@ class NestedLevels(Method):
     def plan_budget(self, config: PlanConfig) -> Plan:
         """See `Method`."""
         weights = {label_named(self.job, name): weight for name, weight in config.weights.items()}
-        mean, pixels = pooled(*(self.sampled if config.quality == "fidelity" else self.measured[:2]))
+        train = self.job.scene.train_ids
+        if config.quality == "fidelity":
+            mean, pixels = pooled(*self.sampled)
+        else:
+            mean, pixels = pooled(self.qualities["ssim"].mean[train], self.shown[train])
         weight = pixels * [weights.get(label, 1.0) for label in self.costs.labels]
         return plan_within(mean, self.costs, config.budget, config.budget_unit, weight, config.quality)
 
