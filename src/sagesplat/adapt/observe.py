@@ -121,10 +121,10 @@ class RenderedLabels:
     def __getitem__(self, view: View) -> Int16[np.ndarray, "H W"]:
         """Per pixel the category that paints most of it; -1 where more shines through than that."""
         if view.name not in self._kept:
-            self._kept[view.name] = self._render(view.camera)
+            self._kept[view.name] = self.render(view.camera)
         return self._kept[view.name]
 
-    def _render(self, camera: Camera) -> Int16[np.ndarray, "H W"]:
+    def render(self, camera: Camera) -> Int16[np.ndarray, "H W"]:
         ids = sorted({UNLABELLED, *self.gaussians.counts()})
         g = self.gaussians.to(device_of(self.backend))
         one_hot = (g.label_ids[:, None] == torch.tensor(ids, device=g.label_ids.device)).float()

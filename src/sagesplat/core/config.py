@@ -217,6 +217,28 @@ class NestConfig:
 
 
 @dataclass(frozen=True)
+class SampleConfig:
+    """Viewpoints at which the levels are measured against the full model."""
+
+    views: int = 0
+    """Viewpoints that the fidelity models are fitted to; 0: until their error stops shrinking, and for at most
+    about half of the training's time."""
+    calibration_views: int = 0
+    """Viewpoints that calibrate the bounds; 0: 200, or fewer after a short training."""
+    viewpoints: Path | None = None
+    """File with the cameras to draw from: a viewpoints.json, or a transforms.json (default: the cameras of the
+    training and calibration photos)."""
+    neighbours: int = 4
+    """Each viewpoint lies between a camera and one of this many nearest ones; 0: at a camera."""
+    shift: float = 0.03
+    """Largest random shift along each axis, as a fraction of the scene extent."""
+    turn: float = 0.05
+    """Largest random rotation about each axis, radians."""
+    seed: int = 0
+    """Seed of the draws."""
+
+
+@dataclass(frozen=True)
 class FitConfig:
     """Quality models and what they are measured on."""
 
@@ -355,6 +377,7 @@ class RunConfig:
     train: TrainConfig = field(default_factory=TrainConfig)
     blocks: BlocksConfig = field(default_factory=BlocksConfig)
     nest: NestConfig = field(default_factory=NestConfig)
+    sample: SampleConfig = field(default_factory=SampleConfig)
     fit: FitConfig = field(default_factory=FitConfig)
     plan: PlanConfig = field(default_factory=PlanConfig)
     fuse: bool = False

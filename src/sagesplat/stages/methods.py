@@ -181,8 +181,9 @@ class NestedLevels(Method):
         found = sampled_of(self.job)
         at = {label: i for i, label in enumerate(found.labels)}
         rows = [-1 if label == UNLABELLED else at.get(label, -1) for label in self.costs.labels]
-        known = np.array(rows) >= 0  # unlabelled pixels have no target, and stay in full
-        fidelity = np.where(known[:, None], found.fidelity[:, rows].astype(np.float64), np.nan)
+        # unlabelled pixels have no target, and stay in full
+        known = (np.array(rows) >= 0) & found.shown(self.job.fit_config.min_share)[:, rows]
+        fidelity = np.where(known[..., None], found.fidelity[:, rows].astype(np.float64), np.nan)
         return fidelity, np.where(known, found.pixels[:, rows], 0).astype(np.float64)
 
     @cached_property
