@@ -108,6 +108,24 @@ def test_what_it_guarantees(problem):
     assert fill(found, quality, cost, weight).tolist() == found.tolist()  # twice changes nothing
 
 
+@quick
+@given(problems(), st.sampled_from([0.0, 0.01]))
+def test_the_lowest_label_is_no_lower_than_with_equal_levels(problem, tolerance):
+    levels, quality, cost, weight = problem
+    found, rows = fill(*problem, lowest=tolerance), np.arange(len(levels))
+    counts = np.isfinite(quality).all(1) & (weight > 0)
+    assert (found >= levels).all()
+    assert (found[~counts] == levels[~counts]).all()
+    if counts.all():
+        sizes, first = np.unique(cost.sum(0), return_index=True)
+        nbytes = cost[rows, found].sum()
+        assert (
+            quality[rows, found].min() >= np.interp(nbytes, sizes, quality.min(0)[first]) - tolerance - 1e-9
+        )
+        uniform = np.interp(nbytes, sizes, (weight @ quality / weight.sum())[first])
+        assert mean_of(found, quality, weight) >= uniform - 1e-8
+
+
 def test_a_scene_that_is_hard_in_a_small_category():
     """What was wrong: bytes of a plan for a target went to what is hard, the whole image was worse."""
     quality, cost, weight = (

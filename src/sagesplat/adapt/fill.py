@@ -12,7 +12,11 @@ a second implementation must have it (tests/data/plans.json, mode "fill"):
   on. From a vertex the next one is the level above of the largest slope = gain / bytes; a gain without bytes
   has an infinite slope. Of equal slopes the one of fewer bytes, then of more gain, then the lower level.
 - All segments, by falling slope, then by label, are added one after another until W >= curve(B) - 1e-9.
+  Slopes fall along a label, so each step takes the steepest of the labels' next segments.
 - A label of weight 0, or with a mean that is NaN, stays; it has no part in W, its bytes count.
+
+Plans of a whole scene look at the lowest category too (`lowest`): while its mean lies further than that below
+the lowest of equal levels at the same bytes, it gets its own next segment first.
 """
 
 import numpy as np
@@ -29,6 +33,7 @@ def fill(
     quality: Float[np.ndarray, "L K"],
     cost: Float[np.ndarray, "L K"] | Int[np.ndarray, "L K"],
     weight: Float[np.ndarray, "L"],
+    lowest: float = np.inf,
 ) -> Int[np.ndarray, "L"]:
     """Add upgrades until the composition is no worse than equal levels of the same cost (the module's rule).
 
@@ -37,6 +42,7 @@ def fill(
         quality: [L, K], mean quality of each label and level, never falling along the levels; NaN: unknown.
         cost: [L, K], bytes, finite.
         weight: [L], pixels times what a pixel counts; 0: the label stays.
+        lowest: How far the lowest label may lie below the lowest of equal levels of the same cost.
 
     Returns:
         A level per label, none below `levels`.
@@ -67,7 +73,7 @@ def fill(
     if not np.isfinite(weight).all() or (weight < 0).any():
         raise RunError("a weight is negative or not finite; give 0 for a label that does not matter")
     value = weight[:, None] * np.where(weight[:, None] > 0, quality, 0)
-    return _fill(np.array(levels, np.int64), value, cost, float(weight.sum()))
+    return _fill(np.array(levels, np.int64), value, cost, weight, float(lowest))
 
 
 def uniform_curve(
@@ -83,31 +89,53 @@ def uniform_curve(
 
 
 @njit(cache=True, error_model="numpy")
-def _fill(levels, value, cost, total):
-    L, K = value.shape
-    nbytes, worth = 0.0, 0.0
+def _fill(levels, value, cost, weight, lowest):
+    L, total, nbytes, worth = len(levels), weight.sum(), 0.0, 0.0
+    tops, slopes = np.empty(L, np.int64), np.empty(L)
     for label in range(L):
         nbytes += cost[label, levels[label]]
         worth += value[label, levels[label]]
-    uniform_bytes, uniform = cost.sum(0), value.sum(0)
-    if total == 0 or _reached(worth, nbytes, uniform_bytes, uniform, total):
-        return levels
-    slopes, labels, tops = np.empty(L * K), np.empty(L * K, np.int64), np.empty(L * K, np.int64)
-    n = 0
-    for label in range(L):
-        at, slope = _next(cost[label], value[label], levels[label])
-        while at >= 0:
-            slopes[n], labels[n], tops[n] = slope, label, at
-            n += 1
-            at, slope = _next(cost[label], value[label], at)
-    for one in np.argsort(-slopes[:n], kind="mergesort"):  # stable: of equal slopes the lower label
-        label, at, before = labels[one], tops[one], levels[labels[one]]
+        tops[label], slopes[label] = _next(cost[label], value[label], levels[label])
+    uniform_bytes, uniform, uniform_lowest = cost.sum(0), value.sum(0), _lowest_of_levels(value, weight)
+    while total > 0:
+        label = -1
+        if lowest < np.inf:
+            low, least = _lowest(value, weight, levels)
+            if tops[low] >= 0 and least < _at(nbytes, uniform_bytes, uniform_lowest) - lowest:
+                label = low
+        if label < 0:
+            if worth / total >= _at(nbytes, uniform_bytes, uniform) / total - TOLERANCE:
+                break
+            label = int(slopes.argmax())  # of equal slopes the lower label
+            if tops[label] < 0:
+                break
+        before, at = levels[label], tops[label]
         nbytes += cost[label, at] - cost[label, before]
         worth += value[label, at] - value[label, before]
         levels[label] = at
-        if _reached(worth, nbytes, uniform_bytes, uniform, total):
-            break
+        tops[label], slopes[label] = _next(cost[label], value[label], at)
     return levels
+
+
+@njit(cache=True, error_model="numpy")
+def _lowest(value, weight, levels):
+    """The label of the lowest mean among those that count, and that mean."""
+    low, least = 0, np.inf
+    for label in range(len(levels)):
+        if weight[label] > 0 and value[label, levels[label]] / weight[label] < least:
+            low, least = label, value[label, levels[label]] / weight[label]
+    return low, least
+
+
+@njit(cache=True, error_model="numpy")
+def _lowest_of_levels(value, weight):
+    """The lowest mean of all labels at one level, by level."""
+    levels = np.empty(value.shape[0], np.int64)
+    found = np.empty(value.shape[1])
+    for k in range(value.shape[1]):
+        levels[:] = k
+        found[k] = _lowest(value, weight, levels)[1]
+    return found
 
 
 @njit(cache=True, error_model="numpy")
@@ -125,14 +153,14 @@ def _next(cost, value, at):
 
 
 @njit(cache=True, error_model="numpy")
-def _reached(worth, nbytes, uniform_bytes, uniform, total):
-    """Whether a composition is no worse than the uniform curve at its bytes."""
-    curve = uniform[-1]
-    for k in range(len(uniform)):
-        if nbytes <= uniform_bytes[k]:
-            curve = uniform[k]
-            if k > 0:  # and above the point before, so the two differ
-                part = (nbytes - uniform_bytes[k - 1]) / (uniform_bytes[k] - uniform_bytes[k - 1])
-                curve = uniform[k - 1] + part * (uniform[k] - uniform[k - 1])
-            break
-    return worth / total >= curve / total - TOLERANCE
+def _at(nbytes, sizes, values):
+    """What equal levels have at some bytes: linear between the levels, constant outside."""
+    for k in range(len(sizes)):
+        if nbytes <= sizes[k]:
+            if k == 0:
+                return values[0]
+            part = (nbytes - sizes[k - 1]) / (
+                sizes[k] - sizes[k - 1]
+            )  # above the point before, so the two differ
+            return values[k - 1] + part * (values[k] - values[k - 1])
+    return values[-1]

@@ -21,6 +21,8 @@ from sagesplat.adapt.fill import fill
 from sagesplat.adapt.plan import Plan, Reached, check_share, check_target
 from sagesplat.adapt.viewpoint import QualityKind
 
+LOWEST = 0.005  # fidelity by which the lowest category may lie below that of equal levels
+
 
 def plan_for_scene(
     measured: Float[np.ndarray, "V L K"],
@@ -34,7 +36,7 @@ def plan_for_scene(
     """Choose the cheapest level of each category that reaches a target in a share of the viewpoints.
 
     A plan for fidelity is then filled (`adapt.fill`), so that all images together are no worse than with all
-    categories at one level, at equal bytes.
+    categories at one level, at equal bytes, and so that the lowest category is not either (up to `LOWEST`).
 
     Args:
         measured: [V, L, K], quality of each category and level; NaN where the view shows too little of it.
@@ -62,7 +64,7 @@ def plan_for_scene(
     levels = np.array([one.level for one in found])
     if kind == "fidelity":
         mean, total = pooled(measured, pixels)
-        levels = fill(levels, np.maximum.accumulate(mean, 1), costs.transfer_bytes, total)
+        levels = fill(levels, np.maximum.accumulate(mean, 1), costs.transfer_bytes, total, LOWEST)
     choices = make_choices(
         costs, levels, np.stack([one.promised for one in found]), np.full(len(levels), np.nan),
         [one.status for one in found], [one.calibrated for one in found],
