@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sagesplat.adapt.bound_plans import Costs
-from sagesplat.adapt.scene_plans import plan_for_scene, reached
+from sagesplat.adapt.bound_plans import Costs, pooled
+from sagesplat.adapt.scene_plans import mended, plan_for_scene, reached
 from sagesplat.core.errors import RunError
 
 quick = settings(max_examples=80, deadline=None)
@@ -75,6 +75,40 @@ def test_the_scene_is_filled():
     assert plan_for_scene(measured, pixels * 0, of, 0.6, 0.95, "fidelity").levels == {0: 3, 1: 1}
     assert plan_for_scene(measured, pixels, of, 0.6, 0.95, "fidelity").levels == {0: 3, 1: 2}
     assert plan_for_scene(measured, pixels, of, 0.6, 0.95, "ssim").levels == {0: 3, 1: 1}
+
+
+def test_a_level_goes_up_where_its_composition_misses():
+    """Neighbours at lower levels cost fidelity: with equal levels the first category seemed fine."""
+    measured = np.tile(np.array([[0.6, 0.9, 0.95, 1.0], [0.9, 0.95, 0.97, 1.0]]), (40, 1, 1))
+    nbytes = np.array([[10, 20, 30, 60], [10, 20, 30, 90]])
+    of, pixels = Costs((0, 1), nbytes, nbytes, nbytes), np.tile([100.0, 0.0], (40, 1))
+    weights = pooled(measured, pixels)
+    plan = plan_for_scene(measured, pixels, of, 0.88, 0.95, "fidelity")
+    assert plan.levels == {0: 2, 1: 1}
+    composed = np.tile([0.85, 0.9], (39, 1))
+    up, settled = mended(plan, composed, of, *weights, last=False)
+    assert (up.levels, settled) == ({0: 3, 1: 1}, False)
+    assert (up.count, up.transfer_bytes) == (40, 40)
+    left, settled = mended(plan, composed, of, *weights, last=True)
+    assert (left.levels, settled, left.verdict) == (plan.levels, True, "ok, uncalibrated")
+    assert left.choices[0].reached is not None
+    assert (left.choices[0].predicted, left.choices[0].reached.share) == (0.85, 0)
+    one_in_39 = np.where(np.arange(39)[:, None] == 5, [0.85, 0.9], [0.89, 0.9])
+    fine, settled = mended(up, one_in_39, of, *weights, last=False)
+    assert (fine.levels, settled, fine.verdict) == (up.levels, True, "ok")
+    assert fine.choices[0].reached is not None
+    assert (fine.choices[0].predicted, fine.choices[0].reached.num_views) == (0.89, 39)
+    few = mended(plan, composed[:18], of, *weights, last=False)  # 18 views prove nothing
+    assert few == (plan, True)
+
+
+def test_what_misses_at_its_highest_level_lifts_its_neighbours():
+    measured = np.tile(np.array([[0.6, 1.0], [0.9, 1.0], [np.nan, np.nan]]), (40, 1, 1))
+    plan = plan_for_scene(measured, np.zeros((40, 3)), costs(3, 2), 0.8, 0.95, "fidelity")
+    assert plan.levels == {0: 2, 1: 1, 2: 2}
+    composed = np.tile([0.7, 0.9, np.nan], (40, 1))
+    up, settled = mended(plan, composed, costs(3, 2), *pooled(measured, np.zeros((40, 3))), last=False)
+    assert (up.levels, settled) == ({0: 2, 1: 2, 2: 2}, False)
 
 
 def test_few_views_take_the_full_model_or_prove_nothing():

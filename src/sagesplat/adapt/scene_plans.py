@@ -5,10 +5,14 @@ lower bounds of single views. Of each view let m_k be the least that it measures
 drawn like those to come, the ceil((n + 1) share)-th largest m_k is reached in a new view at least with
 probability `share` (split conformal prediction, Vovk et al. 2005). The cheapest level for which it is the
 target or more is taken.
+
+That is measured with all categories at the same level. In the composition the neighbours have other levels,
+so it is measured at further viewpoints; where too few of them keep the target the level goes up (`mended`).
 """
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -18,7 +22,7 @@ from sagesplat.adapt.allocate import choose
 from sagesplat.adapt.bound_plans import Costs, make_choices, pooled
 from sagesplat.adapt.calibrate import fewest_views
 from sagesplat.adapt.fill import fill
-from sagesplat.adapt.plan import Plan, Reached, check_share, check_target
+from sagesplat.adapt.plan import Choice, Plan, Reached, check_share, check_target
 from sagesplat.adapt.viewpoint import QualityKind
 
 LOWEST = 0.005  # fidelity by which the lowest category may lie below that of equal levels
@@ -74,6 +78,63 @@ def plan_for_scene(
         for choice, one in zip(choices, found, strict=True)
     )
     return Plan(float(target), None, choices, float(share), quality=kind)
+
+
+def mended(
+    plan: Plan,
+    measured: Float[np.ndarray, "V L"],
+    costs: Costs,
+    mean: Float[np.ndarray, "L K"],
+    pixels: Float[np.ndarray, " L"],
+    *,
+    last: bool,
+) -> tuple[Plan, bool]:
+    """A plan of a scene for fidelity with what its composition measures; levels go up where that is too low.
+
+    Args:
+        plan: Of `plan_for_scene`.
+        measured: [V, L], fidelity of each category in the plan's composition, at viewpoints that the plan was
+            not made from; NaN where one shows too little of the category.
+        costs: What the levels cost.
+        mean: [L, K], expected fidelity, for the fill (`pooled`).
+        pixels: [L], its weights.
+        last: Leave the levels as they are, and say what is not proven.
+
+    Returns:
+        The plan, and whether its levels are still the same.
+    """
+    assert plan.share is not None
+    choices, failing = [], []
+    for i, choice in enumerate(plan.choices):
+        values = measured[np.isfinite(measured[:, i]), i]
+        rank = math.ceil((len(values) + 1) * plan.share - 1e-9)
+        if choice.status == "ok" and 0 < rank <= len(values):  # else nothing is proven by them
+            least = float(np.sort(values)[len(values) - rank])
+            here = reached(values >= plan.target)
+            choice = replace(choice, predicted=least, reached=here, calibrated=least >= plan.target)
+            failing += [i] if least < plan.target else []
+        choices.append(choice)
+    levels = np.array([choice.level - 1 for choice in choices])
+    top = costs.count.shape[1] - 1
+    up = np.isin(np.arange(len(levels)), failing)
+    if (levels[up] == top).any():  # what is at its top already misses by its neighbours
+        up[:] = True
+    raised = np.where(up & (levels < top), levels + 1, levels)
+    if last or (raised == levels).all():
+        return replace(plan, choices=tuple(choices)), True
+    raised = fill(raised, np.maximum.accumulate(mean, 1), costs.transfer_bytes, pixels, LOWEST)
+    return replace(plan, choices=tuple(map(partial(_at_level, costs), choices, raised.tolist()))), False
+
+
+def _at_level(costs: Costs, choice: Choice, column: int) -> Choice:
+    """A choice at another level."""
+    row = costs.labels.index(choice.label_id)
+    return replace(
+        choice,
+        level=column + 1,
+        count=int(costs.count[row, column]),
+        transfer_bytes=int(costs.transfer_bytes[row, column]),
+    )
 
 
 def reached(held: Bool[np.ndarray, " n"]) -> Reached | None:

@@ -15,17 +15,27 @@ from sagesplat.adapt.coverage import Decisions, score
 from sagesplat.adapt.eq3 import SsimModel
 from sagesplat.adapt.observe import LabelImages, Observations
 from sagesplat.adapt.plan import Plan, plan_scene, plan_view
-from sagesplat.adapt.scene_plans import plan_for_scene
+from sagesplat.adapt.scene_plans import mended, plan_for_scene
 from sagesplat.adapt.viewpoint import QualityKind, write_promises
 from sagesplat.core.config import FitConfig, PlanConfig
 from sagesplat.core.errors import RunError
 from sagesplat.formats.increments import INDEX, totals
 from sagesplat.run.job import Job
+from sagesplat.scene.scene import Camera
 from sagesplat.segment.masks import UNLABELLED
-from sagesplat.stages.results import fidelity_of, increments_of, models_of, promises_of, sampled_of
+from sagesplat.stages.fidelity import compositions_at
+from sagesplat.stages.results import (
+    fidelity_of,
+    increments_of,
+    models_of,
+    promises_of,
+    sampled_of,
+    viewpoints_of,
+)
 from sagesplat.stages.shared import distances, label_images, label_named, observed
 from sagesplat.stages.viewpoints import fit_viewpoints
 
+_MENDINGS = 4  # times that a plan of a scene is measured in its composition and mended
 Curves = Mapping[tuple[int, int], SsimModel]  # Eq. 3 by (label id, level)
 
 
@@ -56,6 +66,10 @@ class Method(Protocol):
     def plan_scene(self, target: float, share: float, quality: QualityKind = "ssim") -> Plan:
         """The cheapest levels that reach `target` in a `share` of the viewpoints."""
         ...
+
+    def plan_scenes(self, targets: Sequence[tuple[QualityKind, float]], share: float) -> list[Plan]:
+        """Plans of the scene for several targets, checked in their compositions where that is possible."""
+        return [self.plan_scene(target, share, quality) for quality, target in targets]
 
     def plan_budget(self, config: PlanConfig) -> Plan:
         """The levels of most expected quality within the budget."""
@@ -149,7 +163,7 @@ class NestedLevels(Method):
         self.job = job
         self.level_files = [run.prefixes, run.increments / INDEX]
         self.model_files = [run.models, run.promises]
-        self.files = [*self.level_files, run.promises, run.fidelity, run.sampled]
+        self.files = [*self.level_files, run.promises, run.fidelity, run.sampled, run.viewpoints]
 
     @cached_property
     def costs(self) -> Costs:
@@ -227,6 +241,34 @@ class NestedLevels(Method):
             return plan_for_scene(*self.sampled, self.costs, target, share, quality)
         ssim, pixels, trained = self.measured
         return plan_for_scene(ssim, pixels, self.costs, target, share, quality, trained)
+
+    def plan_scenes(self, targets: Sequence[tuple[QualityKind, float]], share: float) -> list[Plan]:
+        """See `Method`: those for fidelity are measured at drawn viewpoints, and mended."""
+        plans = [self.plan_scene(target, share, quality) for quality, target in targets]
+        drawn, mean_and_pixels = viewpoints_of(self.job), pooled(*self.sampled)
+        cameras = [drawn.cameras[row] for row in drawn.rows("bias")]
+        open_ones = [i for i, plan in enumerate(plans) if plan.quality == "fidelity"]
+        for left in reversed(range(_MENDINGS + 1)):
+            if not open_ones or not cameras:
+                break
+            measured = self._in_composition([plans[i] for i in open_ones], cameras)
+            found = {
+                i: mended(plans[i], measured[:, j], self.costs, *mean_and_pixels, last=not left)
+                for j, i in enumerate(open_ones)
+            }
+            plans = [found[i][0] if i in found else plan for i, plan in enumerate(plans)]
+            open_ones = [i for i in open_ones if not found[i][1]]
+        return plans
+
+    def _in_composition(self, plans: Sequence[Plan], cameras: Sequence[Camera]) -> np.ndarray:
+        """Fidelity of each category in each plan's composition, [V, J, L]; NaN where it shows too little."""
+        levels = np.array([[plan.levels[label] for label in self.costs.labels] for plan in plans])
+        planned = np.broadcast_to(levels, (len(cameras), *levels.shape))
+        fidelity, pixels = compositions_at(self.job, cameras, planned, "plan")
+        image = np.array([camera.width * camera.height for camera in cameras])
+        shown = (pixels > 0) & (pixels >= self.job.fit_config.min_share * image[:, None])
+        shown &= np.array(self.costs.labels) != UNLABELLED
+        return np.where(shown[:, None], fidelity[..., :-1], np.nan).astype(np.float64)
 
     def plan_budget(self, config: PlanConfig) -> Plan:
         """See `Method`."""

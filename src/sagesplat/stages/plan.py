@@ -36,7 +36,7 @@ def make_plan(job: Job, config: PlanConfig) -> None:
     method.check(config)
 
     def make() -> list[str]:
-        scene_plans = [method.plan_scene(target, config.share, kind) for kind, target in config.all_targets]
+        scene_plans = method.plan_scenes(config.all_targets, config.share)
         view_plans = [
             method.plan_view(row, config.target, config.quality) for row in range(len(job.scene.views))
         ]
