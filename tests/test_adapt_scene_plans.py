@@ -98,7 +98,9 @@ def test_a_level_goes_up_where_its_composition_misses():
     assert (fine.levels, settled, fine.verdict) == (up.levels, True, "ok")
     assert fine.choices[0].reached is not None
     assert (fine.choices[0].predicted, fine.choices[0].reached.num_views) == (0.89, 39)
-    few = mended(plan, composed[:18], of, *weights, last=False)  # 18 views prove nothing
+    two_in_39 = np.where(np.isin(np.arange(39), [5, 9])[:, None], [0.85, 0.9], [0.89, 0.9])
+    assert mended(up, two_in_39, of, *weights, last=False)[1] is False  # 94.9 %
+    few = mended(plan, composed[:18], of, *weights, last=False)  # 18 views say too little
     assert few == (plan, True)
 
 

@@ -7,7 +7,7 @@ probability `share` (split conformal prediction, Vovk et al. 2005). The cheapest
 target or more is taken.
 
 That is measured with all categories at the same level. In the composition the neighbours have other levels,
-so it is measured at further viewpoints; where too few of them keep the target the level goes up (`mended`).
+so it is measured at further viewpoints; where fewer than the share keep the target, levels go up (`mended`).
 """
 
 import math
@@ -107,9 +107,9 @@ def mended(
     choices, failing = [], []
     for i, choice in enumerate(plan.choices):
         values = measured[np.isfinite(measured[:, i]), i]
-        rank = math.ceil((len(values) + 1) * plan.share - 1e-9)
-        if choice.status == "ok" and 0 < rank <= len(values):  # else nothing is proven by them
-            least = float(np.sort(values)[len(values) - rank])
+        if choice.status == "ok" and plan.share < 1 and len(values) >= fewest_views(plan.share):
+            needed = math.ceil(len(values) * plan.share - 1e-9)
+            least = float(np.sort(values)[len(values) - needed])
             here = reached(values >= plan.target)
             choice = replace(choice, predicted=least, reached=here, calibrated=least >= plan.target)
             failing += [i] if least < plan.target else []
