@@ -1,4 +1,4 @@
-"""Empirical coverage of fidelity bounds at fresh viewpoints, and plans beside equal levels of the same bytes."""
+"""Coverage of fidelity bounds at fresh viewpoints, and plans beside equal levels of the same bytes."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -119,3 +119,25 @@ def _curve(
         "lowest": lowest[:J].tolist(),
         "equal_levels_lowest": np.interp(size, level_bytes, lowest[J:]).tolist(),
     }
+
+
+def lines(name: str, result: dict[str, Any]) -> list[str]:
+    """The result for people."""
+    out = [f"{name}: fidelity at {result['views']} fresh viewpoints"]
+    for target, row in result["targets"].items():
+        if float(target) in TARGETS:
+            low, high = row["interval"]
+            worst = min(row["by_category"].items(), key=lambda item: item[1][0] / item[1][1])
+            out.append(
+                f"  {target:>5}: kept {row['kept']:.3f} [{low:.3f}, {high:.3f}] of {row['decisions']}, "
+                f"excess {row['excess']:.4f} (perfect {row['perfect']:.4f}, beyond the step "
+                f"{row['beyond_step']:.4f}); worst {worst[0]} {worst[1][0]} of {worst[1][1]}"
+            )
+    curve = result["curve"]
+    for i, target in enumerate(curve["targets"]):
+        out.append(
+            f"  {target:>5}: {curve['bytes'][i] / 1e6:.3f} MB, whole image {curve['whole'][i]:.3f} (equal levels "
+            f"{curve['equal_levels_whole'][i]:.3f}), lowest category {curve['lowest'][i]:.3f} "
+            f"({curve['equal_levels_lowest'][i]:.3f})"
+        )
+    return out

@@ -87,8 +87,8 @@ def measure_compositions(
 ) -> tuple[Float32[np.ndarray, "V J L+1"], Int32[np.ndarray, "V L"]]:
     """Measure the fidelity of each category in J compositions at each of V viewpoints.
 
-    `planned`: level (1 to K) of each label, ascending by id. The result's last column is the whole image; then
-    come the pixels of each category. The other arguments are those of `measure_levels`.
+    `planned`: level (1 to K) of each label, ascending by id. The result's last column is the whole image;
+    then come the pixels of each category. The other arguments are those of `measure_levels`.
     """
     labels = sorted({label for label, _ in ladder.counts})
     probe = _Probe(ladder.load(ladder.levels[-1]).to(device_of(backend)), labels, backend, antialiased)
@@ -114,24 +114,23 @@ class _Probe:
     """Compares compositions with the full model."""
 
     def __init__(self, full: Gaussians, labels: Sequence[int], backend: Backend, antialiased: bool):
-        self.full, self.labels, self.backend, self.antialiased = full, labels, backend, antialiased
+        self.labels, self.antialiased = labels, antialiased
+        self.backend: Backend = backend
         self.painted = RenderedLabels(full, backend, antialiased)
         self.workspace = Workspace()
 
     def reference(self, camera: Camera) -> tuple[Float32[np.ndarray, "H W 3"], Int16[np.ndarray, "H W"]]:
         """The full model's image and label image."""
-        return self._render(self.full, camera).copy(), self.painted.render(camera)
-
-    def _render(self, g: Gaussians, camera: Camera) -> Float32[np.ndarray, "H W 3"]:
-        return render_rgb(
-            g, camera, backend=self.backend, antialiased=self.antialiased, workspace=self.workspace
-        )
+        return self.painted.paint(camera)
 
     def compare(
         self, g: Gaussians, camera: Camera, full: np.ndarray, label_ids: np.ndarray
     ) -> tuple[Float32[np.ndarray, " L"], float]:
         """Fidelity by label, NaN where one is not in sight, and of the whole image."""
-        quality = ssim_map(self._render(g, camera), full)
+        image = render_rgb(
+            g, camera, backend=self.backend, antialiased=self.antialiased, workspace=self.workspace
+        )
+        quality = ssim_map(image, full)
         means = means_by_label(quality, label_ids)
         by_label = [means[label][0] if label in means else np.nan for label in self.labels]
         return np.array(by_label, np.float32), float(quality.mean())

@@ -4,12 +4,13 @@ Three sets of drawn viewpoints are used, each for one thing:
 
 1. "fit": a Gaussian process per category learns the expected fidelity of each level, all categories at the
    same level. Each viewpoint predicted without itself gives preliminary thresholds.
-2. "bias": compositions planned by the thresholds for a range of nominal targets are measured, several times;
-   each time the thresholds are mended (`recentred`). They then allow for neighbours at other levels. Where a
+2. "bias": compositions planned by the thresholds for a range of nominal targets are measured;
+   then the thresholds are mended (`recentred`). They then allow for neighbours at other levels. Where a
    category misses a target at any level of its own, as its neighbours spill over it, all categories are held
    at the nominal target that keeps it (`settled`).
-3. "calibration": measured once; split conformal prediction says which nominal target to ask for, so that each
-   target is kept at the confidence, category by category (`adapt.calibrate`).
+3. "calibration": split conformal prediction says which nominal target to ask for, so that each target is kept
+   at the confidence, category by category (`adapt.calibrate`). Neighbours' levels move with that, so it is
+   done twice; the second time thresholds only rise.
 """
 
 from collections.abc import Mapping, Sequence
@@ -38,9 +39,10 @@ TARGETS = np.unique(
     ).round(4)
 )
 NOTHING_HELD = np.zeros(len(TARGETS), bool)
+EVERYTHING_HELD = ~NOTHING_HELD
 _ABOVE = 1e-9  # a threshold lies above its critical value
 _HAIR = 1e-6  # between equal thresholds
-_CHANCE = 2.0  # standard deviations of a share of views that are no more than chance
+_CHANCE = 3.0  # standard deviations of a share of views that are no more than chance
 
 
 def fit_fidelity(
@@ -87,8 +89,14 @@ def _fit(
 ) -> ViewModel:
     mean = values.mean(0)
     photos = np.zeros(len(x), bool)
-    process = fit_process(x, photos, values[:, :-1] - mean[:-1])
-    left_out = monotone(np.column_stack([mean[:-1] + process.left_out, np.ones(len(x))]))
+    # the last level is the reference: known, and no part of the process (unless it is the only one)
+    learnt = slice(0, max(len(mean) - 1, 1))
+    process = fit_process(x, photos, (values - mean)[:, learnt])
+    weights = np.zeros(values.shape)
+    weights[:, learnt] = process.weights
+    left_out = values.copy()
+    left_out[:, learnt] = mean[learnt] + process.left_out
+    left_out = monotone(left_out)
     rmse = np.sqrt(((left_out - values) ** 2).mean(0))
     levels = range(1, len(mean) + 1)
     thresholds = [
@@ -108,7 +116,7 @@ def _fit(
         heldout_inputs=photos,
         lengths=process.lengths,
         heldout_variance=0.0,
-        weights=np.column_stack([process.weights, np.zeros(len(x))]),
+        weights=weights,
         rmse=float(rmse.mean()),
         calibration=_calibration(np.array(thresholds), "uncalibrated", confidence, 0, 0.0),
     )
@@ -117,7 +125,7 @@ def _fit(
 def _calibration(
     thresholds: Float[np.ndarray, " G"], status: str, confidence: float, views: int, least: float
 ) -> Calibration:
-    """A calibration from the thresholds of TARGETS; the full model, where the mean is 1, keeps all targets."""
+    """A calibration from the thresholds of TARGETS; the full model (mean 1) keeps all targets."""
     targets = np.append(TARGETS, 1.0)
     up = np.append(np.clip(thresholds + _ABOVE, -1, 1), 1.0)
     # Equal thresholds stay apart by a hair: below the first of them not even its target is reached.
@@ -182,15 +190,15 @@ class Trial:
         return float(matern32(x, model.inputs, model.lengths).max(1).min())
 
 
-def recentred(
-    models: Mapping[int, ViewModel], trial: Trial, confidence: float
-) -> dict[int, ViewModel]:
+def recentred(models: Mapping[int, ViewModel], trial: Trial, confidence: float) -> dict[int, ViewModel]:
     """The models with thresholds that allow for the neighbours' levels; `trial` was planned with the models.
 
     This is no calibration: it brings what is calibrated close to what is asked.
     """
     return {
-        label: _asked(model, _empirical(trial.critical(model), confidence)) if len(trial.views(label)) else model
+        label: _asked(model, _empirical(trial.critical(model), confidence))
+        if len(trial.views(label))
+        else model
         for label, model in models.items()
     }
 
@@ -209,6 +217,8 @@ def settled(
         if not (views := len(trial.views(label))):
             continue
         asked[label] = _empirical(trial.critical(model), confidence)
+        if views < fewest_views(confidence):
+            continue
         chance = views * (1 - confidence) + _CHANCE * np.sqrt(views * confidence * (1 - confidence))
         spilled = np.interp(TARGETS, NOMINAL, (trial.missed(label) > chance).astype(float)) > 0
         floor = np.maximum(floor, np.where(spilled, asked[label], -np.inf))

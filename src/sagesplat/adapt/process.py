@@ -10,9 +10,9 @@ One kernel serves all levels, only its amplitude differs:
     k_i      = c(x, x_i) + heldout_variance * u_i                     at a viewpoint without a photo
     mean_k   = sum_i k_i * weights_ik,  weights = S^-1 values         eq. 2.25
 
-`heldout_variance` is the variance of a constant by which views that training never saw differ. Length scales,
-`heldout_variance` and `noise` maximise the marginal likelihood, mean over the levels, times a prior (eq. 5.8);
-what each view would be predicted as without itself is eqs. 5.10 to 5.12.
+`heldout_variance` is the variance of a constant by which views that training never saw differ. Length
+scales, `heldout_variance` and `noise` maximise the marginal likelihood, mean over the levels, times a prior
+(eq. 5.8); what each view would be predicted as without itself is eqs. 5.10 to 5.12.
 """
 
 from collections.abc import Sequence

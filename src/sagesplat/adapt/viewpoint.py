@@ -1,4 +1,4 @@
-"""Quality models: what to expect of a category at each level from any viewpoint, and a lower confidence bound.
+"""Quality models: what to expect of a category at each level from any viewpoint, with a lower bound.
 
 There are two qualities. Fidelity is SSIM against the full model rendered from the same viewpoint; any
 viewpoint can tell it. SSIM against photos needs a photo. Both are predicted in the same way, and a viewer
@@ -42,7 +42,9 @@ class Prediction(NamedTuple):
     """Quality of one category at each of its levels from V viewpoints."""
 
     mean: Float[np.ndarray, "V K"]
-    bound: Float[np.ndarray, "V K"]  # lower confidence bound; like the mean, it never falls from level to level
+    bound: Float[
+        np.ndarray, "V K"
+    ]  # lower confidence bound; like the mean, it never falls from level to level
     support: Float[np.ndarray, " V"]  # 1 at a known viewpoint, 0 far from all
 
 
@@ -231,6 +233,4 @@ def _calibration_from_json(entry: dict[str, Any]) -> Calibration:
         raise ValueError("numbers out of range")
     if entry["status"] not in STATUSES:
         raise ValueError(f"unknown status {entry['status']!r}")
-    return Calibration(
-        str(entry["status"]), confidence, int(entry["num_views"]), targets, thresholds, least
-    )
+    return Calibration(str(entry["status"]), confidence, int(entry["num_views"]), targets, thresholds, least)

@@ -53,8 +53,8 @@ class Rule:
         """RunError for a rule that cannot be followed."""
         if self.neighbours < 0 or not 0 <= self.shift <= LARGEST_SHIFT or not 0 <= self.turn <= LARGEST_TURN:
             raise RunError(
-                f"neighbours {self.neighbours}, shift {self.shift} and turn {self.turn} cannot be used; choose "
-                f"neighbours >= 0, a shift of 0 to {LARGEST_SHIFT:g} and a turn of 0 to {LARGEST_TURN:.4g}"
+                f"neighbours {self.neighbours}, shift {self.shift} and turn {self.turn} cannot be used; "
+                f"choose neighbours >= 0, a shift up to {LARGEST_SHIFT:g} and a turn up to {LARGEST_TURN:.4g}"
             )
 
 
@@ -124,7 +124,7 @@ class _Sampler:
         points = scene.points.xyz
         self.points = KDTree(points) if len(points) else None
         self.free = self._free(self.position)
-        self.extent = scene.extent or float(np.median(self.free[np.isfinite(self.free)], initial=1.0))
+        self.extent = scene.extent if scene.extent > 0 else 1.0  # all cameras in one place
         apart = np.linalg.norm(self.position[:, None] - self.position, axis=2) / self.extent
         direction = self.rotation[:, :, 2]
         apart += np.linalg.norm(direction[:, None] - direction, axis=2)

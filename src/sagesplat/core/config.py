@@ -221,13 +221,13 @@ class SampleConfig:
     """Viewpoints at which the levels are measured against the full model."""
 
     views: int = 0
-    """Viewpoints that the fidelity models are fitted to; 0: until their error stops shrinking, and for at most
-    about half of the training's time."""
+    """Viewpoints that the fidelity models are fitted to; 0: until their error stops shrinking, within about
+    half of the training's time."""
     calibration_views: int = 0
     """Viewpoints that calibrate the bounds; 0: 200, or fewer after a short training."""
     viewpoints: Path | None = None
-    """File with the cameras to draw from: a viewpoints.json, or a transforms.json (default: the cameras of the
-    training and calibration photos)."""
+    """File with the cameras to draw from: a viewpoints.json, or a transforms.json (default: the cameras of
+    the training and calibration photos)."""
     neighbours: int = 4
     """Each viewpoint lies between a camera and one of this many nearest ones; 0: at a camera."""
     shift: float = 0.03

@@ -23,8 +23,8 @@ _DERIVED = {"observe", "sample", "fit", "plan", "crossview", "same_size", "paper
 _OF_PLAN = {"compose", "evaluate", "report"}
 _ORDER = (
     "poses", "scene", "segment", "masks", "lift", "blocks", "train", "fuse", "block_categories",
-    "base", "nest", "observe", "sample", "fit", "plan", "compose", "evaluate", "report", "crossview", "same_size",
-    "paper",
+    "base", "nest", "observe", "sample", "fit", "plan", "compose", "evaluate", "report", "crossview",
+    "same_size", "paper",
 )  # fmt: skip
 
 

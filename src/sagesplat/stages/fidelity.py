@@ -6,6 +6,7 @@ import numpy as np
 
 from sagesplat.adapt.fidelity import distances_at, measure_compositions
 from sagesplat.adapt.fidelity_models import (
+    EVERYTHING_HELD,
     NOMINAL,
     Trial,
     calibrated,
@@ -24,7 +25,7 @@ from sagesplat.scene.scene import Camera
 from sagesplat.segment.masks import UNLABELLED
 from sagesplat.stages.results import sampled_of, viewpoints_of
 
-_ROUNDS = 2  # of mending thresholds before they are settled
+_ROUNDS = 2  # after one, categories whose neighbours moved much would seem to be beyond help
 
 
 def fit_drawn(job: Job, config: FitConfig) -> dict[int, ViewModel]:
@@ -39,8 +40,11 @@ def fit_drawn(job: Job, config: FitConfig) -> dict[int, ViewModel]:
     for _ in range(_ROUNDS):
         models = recentred(models, _trial(job, config, models, sampled.labels, bias), confidence)
     models, held = settled(models, _trial(job, config, models, sampled.labels, bias), confidence)
-    trial = _trial(job, config, models, sampled.labels, calibration)
-    return calibrated(models, trial, confidence, held)
+    for lowered in (held, EVERYTHING_HELD):  # what calibration moved moves the neighbours: then only up
+        models = calibrated(
+            models, _trial(job, config, models, sampled.labels, calibration), confidence, lowered
+        )
+    return models
 
 
 def _trial(

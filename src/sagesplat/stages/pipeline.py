@@ -24,6 +24,7 @@ from sagesplat.stages.observe import observe_levels
 from sagesplat.stages.plan import check_targets, make_plan
 from sagesplat.stages.preflight import check_segmenter, check_training
 from sagesplat.stages.report import make_report
+from sagesplat.stages.sample import sample_levels
 from sagesplat.stages.scene import open_scene
 from sagesplat.stages.train import train_levels
 from sagesplat.train import nested
@@ -71,6 +72,7 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
     if job.run.ladder == "nested":
         nest(job, config.nest, config.blocks, config.seed)
     observe_levels(job, config.fit)
+    sample_levels(job, config.sample, config.fit)
     fit_ladder(job, config.fit)
     make_plan(job, config.plan)
     compose_plan(job)

@@ -91,9 +91,9 @@ def sampled_of(job: Job) -> SampledFidelity:
     path, sampled = job.run.sampled, read_sampled(job.run.sampled)
     _check(path, "sample", "category", sampled.labels, {label for label, _ in job.ladder.counts})
     V, _, K = sampled.fidelity.shape
-    if K != len(job.ladder.levels):
+    if len(job.ladder.levels) != K:
         raise _foreign(path, "sample", f"{K} levels")
-    if V != len(viewpoints_of(job).rows("fit")):
+    if len(viewpoints_of(job).rows("fit")) != V:
         raise _foreign(path, "sample", f"{V} viewpoints")
     return sampled
 

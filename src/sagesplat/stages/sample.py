@@ -33,9 +33,10 @@ from sagesplat.stages.methods import method_of
 
 VIEWS = (60, 120, 240)  # to fit to: the next number is tried while the last step made the error smaller by
 _SHRINKS = 0.1  # at least this share
-BIAS_VIEWS, CALIBRATION_VIEWS = 60, 200
-_RENDERS = 2.5  # a training step; renders take about a fifth of a step, so this is half of the training's time
-_LABEL_IMAGE = 5  # renders that a viewpoint's label image takes
+USUAL = {"fit": VIEWS[1], "bias": 60, "calibration": 180}  # as many as half of the training's time allows;
+MOST = {"fit": VIEWS[-1], "bias": 60, "calibration": 300}  # after a long training up to these
+_RENDERS = 2.5  # a training step: a render takes about a fifth of it, so this is half of the training's time
+_LABEL_IMAGE = 4  # renders that a viewpoint's label image takes
 _FEWEST = {"fit": 20, "bias": 6, "calibration": 30}
 
 
@@ -65,7 +66,8 @@ def sample_levels(job: Job, config: SampleConfig, fit: FitConfig) -> None:
         calibration = len(drawn.rows("calibration"))
         return [f"{used} viewpoints to fit to, {len(drawn.rows('bias'))} + {calibration} to calibrate on"]
 
-    inputs = [run.scene, run.labels, method_of(job).level_files[0]]
+    made_by = [run.provenance("train"), run.provenance("nest")]
+    inputs = [run.scene, run.labels, method_of(job).level_files[0], *made_by]
     if config.viewpoints:
         inputs.append(config.viewpoints)
     settings = asdict(config) | {"distance": fit.distance, "min_share": fit.min_share}
@@ -88,13 +90,18 @@ def _counts(job: Job, config: SampleConfig) -> dict[str, int]:
         )
     train, nest = settings_of(job.run, "train"), settings_of(job.run, "nest")
     renders = _RENDERS * (train["max_steps"] + nest["steps"] + nest["base_steps"])
-    composition = len(NOMINAL) + _LABEL_IMAGE
-    wanted = VIEWS[1] * (len(job.ladder.levels) + _LABEL_IMAGE)
-    wanted += (BIAS_VIEWS + CALIBRATION_VIEWS) * composition
-    part = min(1.0, renders / wanted)
-    most = {"fit": VIEWS[-1] if part == 1 else int(part * VIEWS[1])}
-    most |= {"bias": int(part * BIAS_VIEWS), "calibration": int(part * CALIBRATION_VIEWS)}
-    counts = {name: max(most[name], fewest) for name, fewest in _FEWEST.items()}
+    compositions = 2 * (len(NOMINAL) + _LABEL_IMAGE)  # measured twice, for the bias three times
+    cost = {
+        "fit": len(job.ladder.levels) + _LABEL_IMAGE,
+        "bias": 1.5 * compositions,
+        "calibration": compositions,
+    }
+    part = renders / sum(USUAL[name] * cost[name] for name in USUAL)
+    counts = {name: max(int(min(part, 1) * USUAL[name]), _FEWEST[name]) for name in USUAL}
+    left = renders - sum(counts[name] * cost[name] for name in counts)
+    for name in counts:
+        more = int(np.clip(left // cost[name], 0, MOST[name] - counts[name]))
+        counts[name], left = counts[name] + more, left - more * cost[name]
     counts["fit"] = config.views or counts["fit"]
     counts["calibration"] = config.calibration_views or counts["calibration"]
     return counts
@@ -103,7 +110,7 @@ def _counts(job: Job, config: SampleConfig) -> dict[str, int]:
 def _until_it_stops_shrinking(
     job: Job, drawn: Viewpoints, fit: FitConfig, all_of_them: bool
 ) -> tuple[SampledFidelity, int]:
-    """Measure the viewpoints to fit to in growing numbers, as long as that makes the models' error smaller."""
+    """Measure viewpoints to fit to in growing numbers, as long as that makes the models' error smaller."""
     cameras = [drawn.cameras[row] for row in drawn.rows("fit")]
     stops = [len(cameras)] if all_of_them else [n for n in VIEWS if n < len(cameras)] + [len(cameras)]
     table, errors = None, []
@@ -120,8 +127,8 @@ def _until_it_stops_shrinking(
     assert table is not None
     if not (table.pixels > 0).any():
         raise RunError(
-            f"{job.run.path}: none of {len(table.pixels)} viewpoints shows any Gaussian of the scene; "
-            "draw them closer to its cameras (--sample.shift, --sample.turn), or leave out --sample.viewpoints"
+            f"{job.run.path}: none of {len(table.pixels)} viewpoints shows anything of the scene; draw them "
+            "closer to its cameras (--sample.shift, --sample.turn), or leave out --sample.viewpoints"
         )
     return table, len(table.fidelity)
 
