@@ -49,7 +49,7 @@ CURVE = {
     "num_observations": 7,
     "status": "",
 }
-CHOICE = {"label_id": 2, "level": 1, "predicted_ssim": 0.8, "distance": None, "count": 3, "status": ""}
+CHOICE = {"label_id": 2, "level": 1, "predicted": 0.8, "distance": None, "count": 3, "status": ""}
 TRAINED = {"antialiased": True, "max_steps": 9, "seed": 3}
 SWEEP = """targets = [0.4, 0.3]
 seeds = [0, 5]

@@ -228,11 +228,15 @@ def plan(
     ladder: Ladder = "nested",
     machine: Annotated[Redo, Flat] = Redo(),
 ) -> None:
-    """Choose the cheapest level of each category that reaches a target SSIM, or the best within a budget."""
-    from sagesplat.stages.plan import make_plan
+    """Choose the cheapest level of each category that reaches a target, or the best within a budget.
+
+    A target is of fidelity (SSIM against the full model from the same viewpoint) or of SSIM against photos.
+    """
+    from sagesplat.stages.plan import make_plan, show_plan
 
     with open_job(run, machine, ladder) as job:
         make_plan(job, plan)
+        show_plan(job)
 
 
 @command

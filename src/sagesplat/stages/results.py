@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from sagesplat.adapt.eq3 import SsimModel, read_models
-from sagesplat.adapt.evaluate import Evaluation, read_evaluation
+from sagesplat.adapt.evaluate import UNIFORM, Evaluation, read_evaluation
 from sagesplat.adapt.fidelity import SampledFidelity, read_sampled
 from sagesplat.adapt.observe import TOTAL, Observations, read_observations
 from sagesplat.adapt.plan import Plan, read_budget_plan, read_plans
@@ -33,7 +33,7 @@ def observations_of(job: Job) -> Observations:
 def evaluation_of(job: Job) -> Evaluation:
     """The run's evaluation; DataError like `observations_of`."""
     path, table = job.run.evaluation, read_evaluation(job.run.evaluation)
-    _check(path, "evaluate", "category", table.label_id.tolist(), {*job.names(), TOTAL})
+    _check(path, "evaluate", "category", table.label_id.tolist(), {*job.names(), TOTAL, UNIFORM})
     _check(path, "evaluate", "level", table.level.tolist(), {*job.ladder.levels, _WHOLE})
     _check(path, "evaluate", "view", table.view.tolist(), range(len(job.scene.views)))
     return table
