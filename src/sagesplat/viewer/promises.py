@@ -173,7 +173,7 @@ def _entry(
 
 
 def _rounded(entry: dict[str, Any], model: ViewModel, shared: Int[np.ndarray, "U 6"]) -> dict[str, Any]:
-    """The entry with log distances, values and thresholds, in the coarsest units that keep means as allowed."""
+    """The entry with log distances, values and thresholds, in the coarsest units that are allowed."""
     own = model.inputs
     at = np.concatenate([own, (own + own[_neighbours(own)]) / 2])
     # a curve may jump exactly at the distance of a view: a little beyond it
@@ -197,7 +197,7 @@ def _with_values(
     log_unit: float,
     units: Sequence[float],
 ) -> dict[str, Any]:
-    """The entry with log distances and values, by which it predicts what the model does; without thresholds."""
+    """The entry with log distances and values, by which it predicts what the model does."""
     own = model.inputs
     logs = _differences(np.round(own[_every(len(own)), 6] / log_unit))
     sent = {**entry, "logDistances": {"unit": log_unit, "steps": logs}, "targets": [], "thresholds": []}
