@@ -134,7 +134,7 @@ def table(result: dict[str, Any]) -> str:
 
 
 def figure(curves: Path, out: Path) -> None:
-    """Fidelity over time of curve.csv, as `node web/test/network.report.mjs` writes it: a panel for each link."""
+    """Fidelity over time of curve.csv, as `node web/test/network.report.mjs` writes it, by link."""
     with curves.open() as file:
         rows = list(csv.DictReader(file))
     links = sorted({float(row["mbit"]) for row in rows})

@@ -24,7 +24,7 @@ from sagesplat.formats.increments import write_increments
 from sagesplat.formats.spz import read_spz
 from sagesplat.io.lock import alone
 from sagesplat.scene.scene import Camera
-from sagesplat.viewer import boxes, frames
+from sagesplat.viewer import boxes, frames, promises
 from sagesplat.viewer.bundle import SCHEMA, is_bundle, write_bundle, write_documents
 from sagesplat.viewer.frames import FLIP
 from sagesplat.viewer.manifest import CameraEntry, Category, Contents, documents
@@ -205,6 +205,18 @@ def test_two_photos_from_one_place_can_be_sent() -> None:
     read = read_model(sent(made), made.label_id)
     known = made.predict(*own_views(made)).mean
     assert (np.abs(read.predict(*own_views(made)).mean - known) <= allowed(known)).all()
+
+
+def test_of_very_many_views_some_are_sent_and_thresholds_allow_for_it(monkeypatch) -> None:
+    made = model(5, 40, [1, 2, 4])
+    monkeypatch.setattr(promises, "MOST_VIEWS", 16)
+    document = sent(made)
+    read = read_model(document, 7)
+    assert len(read.inputs) == 14
+    before, after = made.predict(*own_views(made)), read.predict(*own_views(made))
+    assert np.abs(after.mean - before.mean).max() > 0.01
+    asked = (before.bound >= made.calibration.targets[0]) & np.isfinite(after.bound)
+    assert (after.bound <= before.bound + 1e-12)[asked].all()
 
 
 def test_thresholds_that_are_close_stay_apart_and_below_the_full_model() -> None:

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_factor, cho_solve, lstsq
 from scipy.spatial.distance import cdist
 
 from sagesplat.adapt.eq3 import SsimModel
@@ -36,6 +36,7 @@ PART = 1e-2  # this part of what is missing to 1, if that is more
 NUGGET = 1e-3  # added to the kernel's diagonal: far below what a mean is uncertain by
 STEP = 1e-4  # of positions over the extent, directions, shares, targets and thresholds
 CORRECTION_STEP = 5e-3
+MOST_VIEWS = 1024  # of a model; of more every second, third, ... is sent: a browser solves for the weights
 LIKE = 16  # exponent of the kernel weights in `corrected`: only close views count
 _ENOUGH = 1e-3  # weight at which a correction counts by half
 _WHOLE = round(1 / STEP)
@@ -147,10 +148,11 @@ def _entry(
     offsets = model.heldout_variance * model.heldout_inputs @ model.weights
     offsets += np.array([curve.median if flat else 0.0 for curve in model.curves])
     order = np.argsort(places, kind="stable")
+    sent = order[_every(len(order))]
     ordered = {name: getattr(model, name)[order] for name in ("inputs", "heldout_inputs", "weights")}
     shares = np.zeros(len(used)) if seen is None else seen.shares[used]
     corrections = (
-        seen.corrections[rows[order]] if seen and seen.corrections is not None else np.zeros(len(rows))
+        seen.corrections[rows[sent]] if seen and seen.corrections is not None else np.zeros(len(sent))
     )
     entry = {
         "id": model.label_id,
@@ -163,7 +165,7 @@ def _entry(
         "lengths": significant(model.lengths),
         "curves": [] if flat else [curve_entry(curve) for curve in model.curves],
         "offsets": offsets.round(6).tolist(),
-        "views": _differences(places[order]),
+        "views": _differences(places[sent]),
         "shares": _differences(np.round(shares / STEP)),
         "corrections": _differences(np.round(np.nan_to_num(corrections) / CORRECTION_STEP)),
     }
@@ -171,32 +173,41 @@ def _entry(
 
 
 def _rounded(entry: dict[str, Any], model: ViewModel, shared: Int[np.ndarray, "U 6"]) -> dict[str, Any]:
-    """The entry with log distances, values and thresholds, in the coarsest units that keep within MOVES."""
-    own, middle = model.inputs, (model.inputs + model.inputs[_neighbours(model.inputs)]) / 2
-    at = np.concatenate([own, middle])
+    """The entry with log distances, values and thresholds, in the coarsest units that are allowed."""
+    own = model.inputs
+    at = np.concatenate([own, (own + own[_neighbours(own)]) / 2])
     # a curve may jump exactly at the distance of a view: a little beyond it
     told = np.exp(at[:, 6]) * (1 + 1e-9), at[:, :3] * model.extent, at[:, 3:6]
     before = model.predict(*told)
-    expected = matern32(own, own, model.lengths) @ model.weights
-    nothing = {"targets": [], "thresholds": []}
-    moved, sent = math.inf, entry
-    coarser = significant(allowed(before.mean.mean(0)) / MOVES, 2)
-    for distance_unit, unit in _UNITS:
-        logs = {"unit": distance_unit, "steps": _differences(np.round(own[:, 6] / distance_unit))}
-        units = np.multiply(coarser, unit)
-        sent = {**entry, **nothing, "logDistances": logs}
-        inputs = _inputs(sent, shared)
-        # weights by which the rounded inputs predict the same
-        weights = np.linalg.lstsq(matern32(own, inputs, model.lengths), expected, rcond=1e-9)[0]
-        values = _covariance(inputs, model.lengths) @ weights
-        steps = _differences(np.round(values.T / units[:, None]))
-        sent["values"] = {"units": significant(units, 6), "steps": steps}
-        moved = _moved(
-            before, _model_of(sent, shared, model.extent).predict(*told), model.calibration.discount
-        )
+    coarser = allowed(before.mean.mean(0)) / MOVES
+    sent, moved = entry, math.inf
+    for log_unit, unit in _UNITS if len(own) <= MOST_VIEWS else _UNITS[:1]:
+        sent = _with_values(entry, model, shared, log_unit, significant(unit * coarser, 4))
+        after = _model_of(sent, shared, model.extent).predict(*told)
+        moved = _moved(before, after, model.calibration.discount)
         if moved <= 1:
             break
     return {**sent, **_thresholds(model.calibration, moved)}
+
+
+def _with_values(
+    entry: dict[str, Any],
+    model: ViewModel,
+    shared: Int[np.ndarray, "U 6"],
+    log_unit: float,
+    units: Sequence[float],
+) -> dict[str, Any]:
+    """The entry with log distances and values, by which it predicts what the model does."""
+    own = model.inputs
+    logs = _differences(np.round(own[_every(len(own)), 6] / log_unit))
+    sent = {**entry, "logDistances": {"unit": log_unit, "steps": logs}, "targets": [], "thresholds": []}
+    inputs = _inputs(sent, shared)
+    expected = matern32(own, own, model.lengths) @ model.weights
+    found = lstsq(matern32(own, inputs, model.lengths), expected, cond=1e-9, lapack_driver="gelsy")
+    assert found is not None  # as its stub has it
+    values = _covariance(inputs, model.lengths) @ found[0]
+    sent["values"] = {"units": units, "steps": _differences(np.round((values / units).T))}
+    return sent
 
 
 def _moved(before: Prediction, after: Prediction, discount: float) -> float:
@@ -269,6 +280,11 @@ def _differences(whole: np.ndarray) -> list[Any]:
     for axis in range(whole.ndim):
         whole = np.diff(whole, axis=axis, prepend=0)
     return whole.astype(int).tolist()
+
+
+def _every(views: int) -> slice:
+    """Which of so many views are sent."""
+    return slice(None, None, math.ceil(views / MOST_VIEWS))
 
 
 def _nearest(a: Float[np.ndarray, "A D"], b: Float[np.ndarray, "B D"]) -> Int[np.ndarray, " A"]:

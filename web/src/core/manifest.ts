@@ -233,6 +233,7 @@ function oddModel(one: LabelPromises, shared: number): string[] {
     one.thresholds.length === one.targets.length;
   if (!fit) return [" has lists that do not fit together"];
   const wrong: string[] = [];
+  if (n > MOST_VIEWS) wrong.push(` has more than ${MOST_VIEWS} views`);
   if (!isRising(one.levels)) wrong.push(".levels must rise");
   for (const values of [one.targets, one.thresholds]) {
     if (!isRising(values) || values.some((v) => Math.abs(v) > WHOLE)) {
@@ -248,6 +249,7 @@ function oddModel(one: LabelPromises, shared: number): string[] {
   return wrong;
 }
 
+const MOST_VIEWS = 2048; // of a model: its weights are solved for
 const WHOLE = 10_000; // steps of shares, targets and thresholds in 1
 
 const isRising = (values: readonly number[]): boolean =>
