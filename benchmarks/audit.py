@@ -73,7 +73,7 @@ def choices_table() -> Table:
         for target, printed in zip(TARGETS, row.printed[1:], strict=True):
             choice = plans[target][label]
             best = "" if choice.status == "ok" else ", out of reach"
-            cells += [printed, choice.count, f"{choice.level:,}: {choice.predicted_ssim:.3f}{best}"]
+            cells += [printed, choice.count, f"{choice.level:,}: {choice.predicted:.3f}{best}"]
         body.append(tuple(cells))
     totals: list[str | int | float] = ["all"]
     for target, printed in zip(TARGETS, PRINTED_TOTALS[1:], strict=True):

@@ -1,7 +1,7 @@
 """Plan the levels for one camera of a finished run and write the scene that it should get.
 
 The camera is a view of the capture, moved back along its viewing direction by --back world units.
-python examples/02_plan_for_a_viewer.py RUN VIEW_NAME OUT.ply --target-ssim 0.7 --back 1.5
+python examples/02_plan_for_a_viewer.py RUN VIEW_NAME OUT.ply --target-fidelity 0.9 --back 1.5
 """
 
 import argparse
@@ -18,7 +18,8 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("view", help="name of a photo of the capture")
     parser.add_argument("ply", type=Path)
-    parser.add_argument("--target-ssim", type=float, default=0.7)
+    parser.add_argument("--target-fidelity", type=float, help="SSIM against the full model (default: 0.95)")
+    parser.add_argument("--target-ssim", type=float, help="SSIM against photos, instead")
     parser.add_argument("--back", type=float, default=0.0, help="world units")
     args = parser.parse_args()
 
@@ -30,11 +31,11 @@ def main() -> None:
     w2c[2, 3] += args.back  # the world moves away along the camera's z
     viewer = replace(views[args.view].camera, w2c=w2c)
 
-    plan = run.plan_camera(viewer, args.target_ssim)
+    plan = run.plan_camera(viewer, target_fidelity=args.target_fidelity, target_ssim=args.target_ssim)
     for choice in plan.choices:
         print(
             f"{run.names[choice.label_id]:24} level {choice.level:3}  {choice.count:9,} Gaussians  "
-            f"distance {choice.distance:6.2f}  SSIM at least {choice.predicted_ssim:.3f}, {choice.status}"
+            f"distance {choice.distance:6.2f}  at least {choice.predicted:.3f}, {choice.verdict}"
         )
     write_ply(args.ply, run.compose(plan), run.names)
     print(f"{args.ply}: {plan.count:,} Gaussians, {plan.transfer_bytes or 0:,} bytes to send")

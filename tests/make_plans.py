@@ -1,9 +1,9 @@
-"""Test vectors of `adapt.allocate` for every implementation: `python tests/make_plans.py` writes them.
+"""Test vectors of `adapt.allocate` and `adapt.fill`: `python tests/make_plans.py` writes them.
 
 A case of tests/data/plans.json has the arguments of a function (null: NaN in quality, inf in cost, an
 argument left out) and under "expected" what it returns. Modes: "target" is `cheapest`, "budget" is
-`best_within`, either is `along` where quality has positions. Levels, status, cost, missed and optimal are to
-be equal, value and bound to 1e-9 of themselves.
+`best_within`, either is `along` where quality has positions, "fill" is `fill` from "levels" on. Levels,
+status, cost, missed and optimal are to be equal, value and bound to 1e-9 of themselves.
 """
 
 import json
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from sagesplat.adapt.allocate import along, best_within, cheapest
+from sagesplat.adapt.fill import fill
 
 PATH = Path(__file__).parent / "data" / "plans.json"
 Case = dict[str, Any]
@@ -103,6 +104,40 @@ def _by_hand() -> list[Case]:
     ]
 
 
+def _fills() -> list[Case]:
+    rising = [[0.3, 0.4, 0.9], [0.5, 0.95, 1.0]], [[10, 20, 60], [10, 30, 90]]
+    free = [[0.2, 0.5, 0.9], [0.5, 0.8, 1.0]], [[10, 10, 60], [10, 30, 90]]
+    bumpy = [[0.4, 0.45, 0.7, 0.75], [0.5, 0.6, 0.65, 1.0]], [[5, 10, 12, 90], [20, 30, 60, 70]]
+    cases = [
+        ("a hard category that is small", *rising, [1, 9], [2, 0]),
+        ("nothing to add", *rising, [1, 9], [0, 1]),
+        ("equal levels", *rising, [1, 9], [1, 1]),
+        ("all at the top", *rising, [1, 9], [2, 2]),
+        ("weight 0 stays", *rising, [1, 0], [0, 2]),
+        ("all weights 0", *rising, [0, 0], [2, 0]),
+        ("an unknown mean stays, its bytes count", [[NAN, 0.4, 0.9], Q[0][:3]], rising[1], [5, 9], [2, 0]),
+        ("a gain without bytes comes first", *free, [3, 2], [0, 2]),
+        ("a gain without bytes where all is well", *free, [3, 2], [0, 0]),
+        ("levels below the hull are passed over", *bumpy, [2, 5], [3, 0]),
+        ("equal labels, the lower first", [rising[0][1]] * 3, [rising[1][1]] * 3, [1, 1, 1], [2, 0, 0]),
+        ("one level", [[0.5], [0.9]], [[3], [4]], [1, 1], [0, 0]),
+        ("one label", [[0.5, 0.6, 0.9]], [[3, 4, 9]], [2], [1]),
+        ("no cost at all", [[0.5, 0.7], [0.6, 0.6]], [[0, 0], [0, 0]], [1, 1], [0, 0]),
+    ]  # fmt: skip
+    names = "name", "quality", "cost", "weight", "levels"
+    found: list[Case] = [{"mode": "fill", **dict(zip(names, case, strict=True))} for case in cases]
+    rng = np.random.default_rng(3)
+    for labels, levels in ((2, 3), (3, 5), (5, 8), (12, 16), (40, 6), (128, 16)):
+        for target in (0.6, 0.8):
+            quality, cost, weight = scene(rng, 1, labels, levels)
+            quality = np.maximum.accumulate(quality[0], 1)
+            begin = cheapest(quality, cost, target).levels.tolist()
+            case = {"quality": quality.tolist(), "cost": cost.tolist(), "weight": weight.tolist()}
+            name = f"{labels} labels of {levels} levels, from {target}"
+            found.append({"name": name, "mode": "fill", **case, "levels": begin})
+    return found
+
+
 def scene(rng: np.random.Generator, *shape: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Quality [P, L, K] as on a walk, cost [L, K] and weight [L] as in a scene, of 4 digits."""
     _, labels, levels = shape
@@ -147,6 +182,9 @@ def arguments(case: Case) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
 def expected(case: Case) -> Case:
     """What the implementation here makes of a case."""
     quality, cost, rest = arguments(case)
+    if case["mode"] == "fill":
+        weight = np.array(case["weight"], np.float64)
+        return {"levels": fill(np.array(case["levels"]), quality, cost, weight).tolist()}
     if quality.ndim == 3:
         return {"levels": along(quality, cost, **rest).tolist()}
     plan = cheapest(quality, cost, **rest) if case["mode"] == "target" else best_within(quality, cost, **rest)
@@ -161,7 +199,7 @@ def cases() -> list[Case]:
             return [plain(v) for v in value]
         return None if isinstance(value, float) and not math.isfinite(value) else value
 
-    whole = [{key: plain(value) for key, value in case.items()} for case in _by_hand() + _random()]
+    whole = [{key: plain(value) for key, value in case.items()} for case in _by_hand() + _random() + _fills()]
     return [case | {"expected": expected(case)} for case in whole]
 
 

@@ -21,7 +21,7 @@ from benchmarks.audit import (
     sums_table,
 )
 from sagesplat.adapt.eq3 import Eq3, SsimModel
-from sagesplat.adapt.plan import plan_scene, plan_view, read_plans, write_plans
+from sagesplat.adapt.plan import Choice, Plan, Reached, plan_scene, plan_view, read_plans, write_plans
 from sagesplat.core.errors import DataError, RunError
 
 
@@ -83,7 +83,7 @@ def test_distance_decides():
     near, far = (plan_view(models, counts, {1: d}, 0.8, 3) for d in (0.5, 2.0))
     assert (near.levels, near.count, near.status, near.view) == ({1: 1000}, 10, "ok", 3)
     assert (far.levels, far.count, far.status) == ({1: 2000}, 20, "ok")
-    assert far.choices[0].predicted_ssim == pytest.approx(0.95 * math.exp(-0.1))
+    assert far.choices[0].predicted == pytest.approx(0.95 * math.exp(-0.1))
     nowhere: list[dict[int, float]] = [{}, {1: math.nan}]  # then the median, here the peak
     for unknown in nowhere:
         plan = plan_view(models, counts, unknown, 0.8, 3)
@@ -98,7 +98,7 @@ def test_a_scene_needs_its_share_of_views():
     assert plan_scene(models, counts, distances, 0.8, 0.95).levels == {1: 1000}
     strict = plan_scene(models, counts, distances, 0.8, 1.0)
     assert (strict.levels, strict.status, strict.share) == ({1: 2000}, "ok", 1.0)
-    assert strict.choices[0].predicted_ssim == pytest.approx(0.9 * math.exp(-0.09))
+    assert strict.choices[0].predicted == pytest.approx(0.9 * math.exp(-0.09))
     # Nobody reaches 0.85 at 9: the level that serves most views, here 19 of 20 both, then the better mean.
     hopeless = plan_scene(models, counts, distances, 0.85, 1.0)
     assert (hopeless.levels, hopeless.status) == ({1: 2000}, "infeasible")
@@ -110,7 +110,7 @@ def test_a_category_that_was_never_seen_is_shipped_whole():
     plan = plan_view(models, counts, {2: 1.0, 3: 1.0}, 0.8, None)
     unseen, _, half_seen = plan.choices
     assert (unseen.label_id, unseen.level, unseen.count, unseen.status) == (-1, 2000, 7, "no model")
-    assert math.isnan(unseen.predicted_ssim)
+    assert math.isnan(unseen.predicted)
     assert (half_seen.level, half_seen.status) == (
         2000,
         "infeasible",
@@ -167,15 +167,15 @@ def test_a_view_plan_is_the_cheapest_that_will_do(ladder, target, distance):
         options = {key: models[key](distance) for key in ladder if key[0] == choice.label_id}
         feasible = [counts[key] for key, ssim in options.items() if ssim >= target]
         assert choice.count == counts[choice.label_id, choice.level]
-        assert choice.predicted_ssim == options[choice.label_id, choice.level]
+        assert choice.predicted == options[choice.label_id, choice.level]
         if feasible:
             assert (choice.status, choice.count) == ("ok", min(feasible))
-            assert choice.predicted_ssim >= target
+            assert choice.predicted >= target
         else:
-            assert (choice.status, choice.predicted_ssim) == ("infeasible", max(options.values()))
+            assert (choice.status, choice.predicted) == ("infeasible", max(options.values()))
     assert plan.count == sum(c.count for c in plan.choices)
-    lowest = min(c.predicted_ssim for c in plan.choices)
-    assert plan.binding in {c.label_id for c in plan.choices if c.predicted_ssim == lowest}
+    lowest = min(c.predicted for c in plan.choices)
+    assert plan.binding in {c.label_id for c in plan.choices if c.predicted == lowest}
 
 
 @quick
@@ -206,8 +206,8 @@ def test_a_scene_plan_is_the_cheapest_that_will_do(ladder, target, distances, sh
         else:
             assert choice.status == "infeasible"
             assert reached[mine] == max(reached.values())
-        assert (choice.predicted_ssim >= target) == (choice.status == "ok")
-        assert (models[mine](views) >= choice.predicted_ssim).mean() >= share
+        assert (choice.predicted >= target) == (choice.status == "ok")
+        assert (models[mine](views) >= choice.predicted).mean() >= share
 
 
 @quick
@@ -236,6 +236,34 @@ def test_plans_read_back_identical(tmp_path):
     assert repr(views_back) == repr(tuple(views))
 
 
+def test_all_of_a_plan_for_fidelity_reads_back(tmp_path):
+    path = tmp_path / "plan.json"
+    choices = (
+        Choice(2, 3, 0.95, math.nan, 40, "ok", 900, True, Reached(0.97, 0.94, 0.99, 240)),
+        Choice(5, 9, math.nan, math.nan, 7, "no promise", 100, False, None),
+    )
+    plans = (Plan(0.95, None, choices, 0.95, quality="fidelity"), Plan(0.7, None, choices, 0.95))
+    write_plans(path, plans)
+    document = json.loads(path.read_text(), parse_constant=pytest.fail)
+    assert [entry["quality"] for entry in document["scene"]] == ["fidelity", "ssim"]
+    assert document["scene"][0]["status"] == "no promise"
+    assert document["scene"][0]["choices"][0]["reached"] == {
+        "share": 0.97, "low": 0.94, "high": 0.99, "num_views": 240,
+    }  # fmt: skip
+    assert repr(read_plans(path)[0]) == repr(plans)
+    assert (plans[0].verdict, plans[0].calibrated) == ("no promise, uncalibrated", False)
+
+
+def test_plans_of_older_runs_are_of_ssim(tmp_path):
+    """They had no other quality, and called the promise predicted_ssim."""
+    path = tmp_path / "plan.json"
+    choice = {"label_id": 1, "level": 2, "predicted_ssim": 0.5, "distance": None, "count": 1, "status": "ok"}
+    plan = {"target": 0.5, "view": None, "share": 0.95, "choices": [choice]}
+    path.write_text(json.dumps({"scene": [plan], "views": []}))
+    ((found,), _) = read_plans(path)
+    assert (found.quality, found.choices[0].predicted, found.choices[0].calibrated) == ("ssim", 0.5, None)
+
+
 @pytest.mark.parametrize(
     "content",
     [
@@ -245,6 +273,10 @@ def test_plans_read_back_identical(tmp_path):
         '{"scene": [], "views": [{"target": 0.5, "view": 1e999, "share": null, "choices": []}]}',
         '{"scene": [], "views": [{"target": 0.5, "view": 1, "share": null, "choices": [{"label_id": 1,'
         ' "level": 1, "predicted_ssim": 0.5, "distance": null, "count": 1, "status": "fine"}]}]}',
+        '{"views": [], "scene": [{"target": 1, "view": 1, "share": null, "choices": [], "quality": "psnr"}]}',
+        '{"views": [], "scene": [{"target": 0.5, "view": 1, "share": null, "choices": [{"label_id": 1,'
+        ' "level": 1, "predicted": 0.5, "distance": null, "count": 1, "status": "ok",'
+        ' "reached": {"share": 0.5, "low": 0.6, "high": 1, "num_views": 3}}]}]}',
     ],
 )
 def test_an_unusable_file_is_one_line(tmp_path, content):

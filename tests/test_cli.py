@@ -1,6 +1,7 @@
 """The command line: errors are one line and exit code 2, and help answers at once."""
 
 import os
+import re
 import runpy
 import subprocess
 import sys
@@ -85,6 +86,46 @@ def test_flags_reach_their_settings(
     config = seen["config"]
     assert (config.scene.downscale, config.plan.target_ssim, config.train.max_steps) == (2, 0.7, 70)
     assert (config.masks.segmenter, config.seed, seen["job"].threads) == ("onnx", 3, 1)
+
+
+@pytest.mark.parametrize(
+    ("words", "targets"),
+    [
+        ("", [("fidelity", t) for t in (0.8, 0.9, 0.95, 0.98)]),
+        ("--target-fidelity 0.9 --other-targets 0.5", [("fidelity", 0.5), ("fidelity", 0.9)]),
+        ("--target-fidelity 1", [("fidelity", t) for t in (0.8, 0.9, 0.98, 1)]),
+        ("--target-ssim 0.7", [("ssim", t) for t in (0.6, 0.7, 0.8)]),
+        (
+            "--target-ssim 0.7 --target-fidelity 0.98",
+            [*(("fidelity", t) for t in (0.8, 0.9, 0.98)), ("ssim", 0.7)],
+        ),
+        ("--ladder snapshots", [("ssim", t) for t in (0.7, 0.8, 0.9)]),
+    ],
+)
+def test_targets_of_both_qualities(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], words: str, targets: list
+) -> None:
+    from sagesplat.stages import pipeline
+    from sagesplat.stages.plan import check_targets
+
+    seen = {}
+    monkeypatch.setattr(pipeline, "run_all", lambda job, scene, config: seen.update(config=config))
+    assert call(monkeypatch, capsys, "run", "a", "b", *words.split())[0] == 0
+    config = check_targets(seen["config"].plan, seen["config"].ladder)
+    assert config.all_targets == targets
+    assert (config.quality, config.target) in config.all_targets
+
+
+@pytest.mark.parametrize("words", ["--target-fidelity 0", "--target-fidelity 1.5", "--target-fidelity nan",
+                                   "--target-ssim -0.1", "--target-fidelity 0.9 --target-ssim nan",
+                                   "--target-fidelity 0.9 --other-targets 0.5 2",
+                                   "--ladder snapshots --target-fidelity 0.9"])  # fmt: skip
+def test_impossible_targets_are_one_line_before_anything_is_read(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, words: str
+) -> None:
+    code, line = call(monkeypatch, capsys, "run", str(tmp_path), str(tmp_path / "run"), *words.split())
+    assert code == 2
+    assert re.search("target (SSIM|fidelity) .* is impossible; choose|needs the nested ladder; give", line)
 
 
 def test_processes_are_counted(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

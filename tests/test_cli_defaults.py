@@ -1,5 +1,6 @@
 """A run's own settings as defaults, and --force, which keeps earlier results until new ones are whole."""
 
+import json
 import shutil
 import sys
 from collections.abc import Callable
@@ -22,6 +23,7 @@ from sagesplat.run.job import Job
 from sagesplat.run.recorded import recorded_settings
 from sagesplat.run.run_dir import RunDir
 from sagesplat.stages import export, pipeline, preflight, train
+from sagesplat.stages import plan as plan_stage
 from sagesplat.stages.nest import nest_levels
 from sagesplat.stages.train import train_levels
 
@@ -88,6 +90,29 @@ def test_flags_of_earlier_commands_are_the_defaults(run: Path, capture: Path, co
     assert RunDir(run).provenance("train").read_bytes() == before
     assert read_json(RunDir(run).scene)["settings"]["test_every"] == 6
     assert read_plans(RunDir(run, "snapshots").plan)[0][1].target == 0.5
+
+
+def test_a_given_target_drops_the_recorded_ones(
+    run: Path, monkeypatch: pytest.MonkeyPatch, command: Call
+) -> None:
+    seen = {}
+    monkeypatch.setattr(plan_stage, "make_plan", lambda job, config: seen.update(config=config))
+    monkeypatch.setattr(plan_stage, "show_plan", lambda job: None)
+    record = RunDir(run, "snapshots").provenance("plan")
+    made = read_json(record)
+
+    def asked(recorded: dict[str, object], *words: str) -> PlanConfig:
+        made["settings"] |= {"target_fidelity": None, "target_ssim": None} | recorded
+        record.write_text(json.dumps(made))
+        assert command("plan", run, *words)[0] == 0
+        return seen["config"]
+
+    both = {"target_fidelity": 0.9, "target_ssim": 0.7, "other_targets": [0.5], "share": 0.8}
+    assert asked(both) == PlanConfig(0.9, 0.7, 0.8, other_targets=(0.5,))
+    assert asked(both, "--target-ssim", "0.6") == PlanConfig(None, 0.6, 0.8)
+    assert asked(both, "--target-fidelity=0.8") == PlanConfig(0.8, None, 0.8, other_targets=(0.5,))
+    assert asked(both, "--target-fidelity", "0.8", "--target-ssim", "0.5").target_ssim == 0.5
+    assert asked({"target_ssim": 0.4, "other_targets": None}, "--share", "0.7") == PlanConfig(None, 0.4, 0.7)
 
 
 def test_a_refusal_says_what_differs_and_its_cure_works(run: Path, command: Call) -> None:

@@ -16,15 +16,15 @@ def evaluation(rows: list[tuple[float, int, float, int]]) -> Evaluation:
     f, i = np.float32, np.int32
     zero, measured = np.zeros(len(rows), i), ssim.astype(f)
     return Evaluation(
-        target.astype(f), zero, label.astype(i), zero, measured, measured, 30 * measured, measured,
-        30 * measured, pixels.astype(i),
+        zero + 1, target.astype(f), zero, label.astype(i), zero, measured, measured, measured, 30 * measured,
+        measured, 30 * measured, pixels.astype(i),
     )  # fmt: skip
 
 
 def test_rows_of_a_budget_plan_are_merged_like_those_of_a_target() -> None:
     """A plan within a budget has no target: NaN, which differs from itself."""
     parts = [(target, label, ssim, 10) for target in (0.5, np.nan) for label, ssim in ((3, 0.4), (4, 0.8))]
-    found = merged(evaluation(parts), {4: 3}, ("target", "view"))
+    found = merged(evaluation(parts), {4: 3}, ("quality", "target", "view"))
     assert found.label_id.tolist() == [3, 3]
     np.testing.assert_array_equal(found.target, np.array([0.5, np.nan], np.float32))
     np.testing.assert_allclose(found.ssim, 0.6, rtol=1e-6)
@@ -34,4 +34,4 @@ def test_rows_of_a_budget_plan_are_merged_like_those_of_a_target() -> None:
 def test_the_budget_plan_is_in_the_table_of_the_evaluation() -> None:
     rows = evaluation([(0.5, 3, 0.6, 9), (np.nan, 3, 0.7, 9), (np.nan, TOTAL, 0.8, 9)])
     table = tables.evaluation_table(rows, [3], NAMES)
-    assert [row[:2] for row in table.cells()] == [["0.5", "vase"], ["–", "vase"], ["–", "whole image"]]
+    assert [row[1:3] for row in table.cells()] == [["0.5", "vase"], ["–", "vase"], ["–", "whole image"]]

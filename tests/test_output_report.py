@@ -11,9 +11,9 @@ import pytest
 from PIL import Image
 
 from sagesplat.adapt.eq3 import fit_models
-from sagesplat.adapt.evaluate import Evaluation, read_evaluation
+from sagesplat.adapt.evaluate import QUALITIES, UNIFORM, Evaluation, read_evaluation
 from sagesplat.adapt.observe import TOTAL, Observations, read_observations
-from sagesplat.adapt.plan import plan_scene
+from sagesplat.adapt.plan import Plan, Reached, plan_scene
 from sagesplat.io.columns import cell_text
 from sagesplat.output import figures
 from sagesplat.output.by_category import merged
@@ -51,12 +51,16 @@ def make(panels: int = 2) -> ReportData:
     plans = [plan_scene(models, counts, distances, target) for target in (0.5, 0.6)]
     measured = []
     for plan in plans:
+        kind = QUALITIES.index(plan.quality)
         for view in (*TEST, 1):  # view 1 is a training view and must not count
             for c in plan.choices:
                 ssim = quality(c.label_id, c.level, view) - (0.3 if view == 1 else 0.0)
                 promised = models[c.label_id, c.level](1 + view / 3)
-                measured.append((plan.target, view, c.label_id, c.level, promised, ssim, 24, 0.8, 26, 99))
-            measured.append((plan.target, view, TOTAL, -1, np.nan, 0.6 - 0.1 * (view == 1), 24, 0.8, 26, 400))
+                alike = 0.9 + 0.01 * LEVELS.index(c.level)
+                key = (kind, plan.target, view, c.label_id, c.level)
+                measured.append((*key, promised, alike, ssim, 24, 0.8, 26, 99))
+            whole = 0.6 - 0.1 * (view == 1)
+            measured.append((kind, plan.target, view, TOTAL, -1, np.nan, 0.93, whole, 24, 0.8, 26, 400))
     draw = np.random.default_rng(0)
     photo, full, composed = draw.integers(0, 255, (3, 24, 40, 3)).astype(np.uint8)
     ids = draw.choice(np.array(LABELS, np.int16), (24, 40))
@@ -178,10 +182,100 @@ def test_categories_out_of_reach_are_named(tmp_path):
     assert text.count("infeasible") > len(out)
 
 
+def led_by_fidelity(panels: int = 0) -> ReportData:
+    """The same capture with nested levels: plans for fidelity, one for SSIM beside them."""
+    data = make(panels)
+    sizes = {key: 30 * count for key, count in data.counts.items()}
+    reached = Reached(0.97, 0.94, 0.99, 240)
+    plans = []
+    for kind, target in (("fidelity", 0.9), ("fidelity", 0.95), ("ssim", 0.6)):
+        choices = [
+            dataclasses.replace(
+                c, transfer_bytes=sizes[c.label_id, c.level], predicted=target + 0.01, status="ok",
+                calibrated=kind == "fidelity", reached=reached,
+            )
+            for c in data.plans[0].choices
+        ]  # fmt: skip
+        choices[0] = dataclasses.replace(choices[0], status="no promise", predicted=np.nan)
+        choices[1] = dataclasses.replace(choices[1], status="infeasible" if kind == "ssim" else "ok")
+        plans.append(Plan(target, None, tuple(choices), 0.95, quality=kind))
+    rows = []
+    for plan in plans:
+        kind = QUALITIES.index(plan.quality)
+        for view in TEST:
+            for c in plan.choices:
+                alike = 0.96 if view else 0.94
+                rows.append((kind, plan.target, view, c.label_id, c.level, 0.9, alike, 0.62, 24, 0.8, 26, 99))
+            rows.append((kind, plan.target, view, TOTAL, -1, np.nan, 0.955, 0.7, 24, 0.8, 26, 400))
+    for level, view in ((1000, 0), (1000, 5), (2000, 0), (2000, 5)):
+        alike = 0.8 + level / 1e5 + view / 1e3
+        rows.append((0, np.nan, view, UNIFORM, level, np.nan, alike, 0.5, 20, 0.8, 26, 400))
+    evaluation = columns(Evaluation, rows)
+    return dataclasses.replace(
+        data,
+        plans=plans,
+        evaluation=evaluation,
+        quality="fidelity",
+        target=0.95,
+        ssim_target=0.6,
+        sizes=sizes,
+    )
+
+
+def test_the_first_page_leads_with_fidelity(tmp_path):
+    data = led_by_fidelity()
+    plan, full = data.plans[1], sum(n for (_, level), n in (data.sizes or {}).items() if level == LEVELS[-1])
+    words = " ".join(Page(write_report(tmp_path, data)).text.split())
+    first = words[: words.index("What each category gets")]
+    assert (
+        f"{(plan.transfer_bytes or 0) / 1e6:.2f} MB of {full / 1e6:.2f} MB looks like the full model" in first
+    )
+    assert "fidelity ≥ 0.95 in every category for 95 % of viewpoints" in first
+    assert "at least 97 % of the viewpoints" in first
+    assert "fidelity 0.955" in first
+    assert "3 of 6 measurements there" in first  # not of the category without a promise
+    for word in ("infeasible", "uncalibrated", "cannot reach"):
+        assert word not in first
+    table = words[words.index("What each category gets") : words.index("SSIM against photos")]
+    assert "97 % (94 to 99, n 240)" in table
+    assert table.count("no promise") == 1
+    assert table.count("infeasible") == 0
+    beside = words[words.index("A second plan, for SSIM ≥ 0.6") : words.index("Size and quality")]
+    assert "infeasible, uncalibrated" in beside
+    assert "ok, uncalibrated" in beside
+    assert "nan" not in words.lower().split()
+    assert (tmp_path / "tables" / "plan_ssim.csv").exists()
+    rows = list(csv.DictReader((tmp_path / "tables" / "evaluation.csv").read_text("utf-8").splitlines()))
+    assert {(row["quality"], row["target"]) for row in rows} == {
+        ("fidelity", "0.9"), ("fidelity", "0.95"), ("SSIM", "0.6"),
+    }  # fmt: skip
+
+
+def test_plans_for_fidelity_are_compared_with_equal_levels_at_the_same_views():
+    data = led_by_fidelity()
+    uniform = data.evaluation.uniform("fidelity")
+    assert uniform == pytest.approx({1000: 0.8125, 2000: 0.8225})
+    figure = figures.quality_over_size(uniform, data.sizes or {}, data.plans, data.evaluation, "fidelity")
+    equal, composed = (line.get_xydata() for line in figure.axes[0].lines)
+    sizes = [sum(n for (_, i), n in (data.sizes or {}).items() if i == level) / 1e6 for level in uniform]
+    assert equal == pytest.approx(np.column_stack([sizes, list(uniform.values())]))
+    assert composed[:, 1] == pytest.approx([0.955, 0.955])  # the plan for SSIM is not in it
+
+
+def test_blocks_are_merged_for_both_qualities(tmp_path):
+    names = {3: "grass@0", 7: "grass@1", 9: "vase@1"}
+    data = dataclasses.replace(led_by_fidelity(), names=names, categories={3: 3, 7: 3, 9: 9})
+    words = " ".join(Page(write_report(tmp_path, data)).text.split())
+    assert "MB looks like the full model" in words
+    rows = list(csv.DictReader((tmp_path / "tables" / "evaluation.csv").read_text("utf-8").splitlines()))
+    assert sum(row["category"] == "grass" for row in rows) == 3
+
+
 def test_same_data_same_figure(tmp_path):
     data = make(panels=0)
+    sizes = {key: 248 * count for key, count in data.counts.items()}
     for name in ("a", "b"):
-        figure = figures.size_by_target(data.plans, data.counts, LABELS, NAMES, COLOURS)
+        figure = figures.size_by_target(data.plans, sizes, LABELS, NAMES, COLOURS)
         figures.save_figure(figure, tmp_path / name)
     assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
 

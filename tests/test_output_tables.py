@@ -1,5 +1,6 @@
 import csv
 import math
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -7,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sagesplat.adapt.eq3 import fit_model
-from sagesplat.adapt.evaluate import Evaluation
+from sagesplat.adapt.evaluate import QUALITIES, Evaluation
 from sagesplat.adapt.observe import TOTAL, Observations
-from sagesplat.adapt.plan import Choice, Plan
+from sagesplat.adapt.plan import Choice, Plan, Reached
 from sagesplat.io.columns import cell_text, text_cell
 from sagesplat.output import tables
 
@@ -31,12 +32,13 @@ def observe() -> Observations:
 
 
 def evaluate(rows: list[tuple[float, int, float, float]]) -> Evaluation:
-    """Rows of (target, label, predicted, measured), one view."""
+    """Rows of (target, label, predicted, measured), one view, of a plan for SSIM."""
     target, label, predicted, ssim = (np.array(c) for c in zip(*rows, strict=True))
     zero, one = np.zeros(len(rows), np.int32), np.full(len(rows), 0.9, np.float32)
     f = np.float32
-    measured = (predicted.astype(f), ssim.astype(f), 30 * one, one, 33 * one)
-    return Evaluation(target.astype(f), zero, label.astype(np.int32), zero, *measured, zero)
+    measured = (predicted.astype(f), one, ssim.astype(f), 30 * one, one, 33 * one)
+    kind = zero + QUALITIES.index("ssim")
+    return Evaluation(kind, target.astype(f), zero, label.astype(np.int32), zero, *measured, zero)
 
 
 def as_text(table: tables.Table, path) -> list[dict[str, str]]:
@@ -84,8 +86,8 @@ def test_plan_and_targets(tmp_path):
     assert rows[2]["promised SSIM"] == ""
     rows = as_text(tables.targets_table([plan, plan], COUNTS, LABELS, NAMES), tmp_path / "t.csv")
     assert rows[-1]["full model Gaussians"] == "105"
-    assert rows[-1]["t=0.6 Gaussians"] == "75"
-    assert rows[-1]["t=0.6 status"] == "infeasible"
+    assert rows[-1]["SSIM 0.6 Gaussians"] == "75"
+    assert rows[-1]["SSIM 0.6 status"] == "infeasible"
 
 
 def test_promise_counts_only_what_was_promised():
@@ -112,9 +114,47 @@ def test_evaluation_table(tmp_path):
         ("0.5", "vase"), ("0.5", "whole image"), ("0.7", "vase"),
     ]  # fmt: skip
     assert (lines[0]["promised"], lines[0]["kept"], lines[0]["share kept"]) == ("2", "1", "0.5")
-    assert float(lines[0]["error of promise"]) == pytest.approx(0.15)
-    assert lines[1]["promised"] == lines[1]["promised SSIM"] == ""
+    assert float(lines[0]["error of bound"]) == pytest.approx(0.15)
+    assert lines[1]["promised"] == lines[1]["bound"] == ""
     assert lines[2]["promised"] == "0"
+
+
+def test_promises_are_counted_in_the_quality_of_the_plan(tmp_path):
+    """Measured fidelity is 0.9 in every row, SSIM is given."""
+    rows = evaluate([(0.8, 3, 0.85, 0.5), (0.95, 3, 0.96, 0.97), (0.8, TOTAL, np.nan, 0.6)])
+    rows = replace(rows, quality=np.zeros(3, np.int32))
+    lines = as_text(tables.evaluation_table(rows, LABELS, NAMES), tmp_path / "t.csv")
+    assert [(line["quality"], line["target"], line["kept"]) for line in lines] == [
+        ("fidelity", "0.8", "1"), ("fidelity", "0.8", ""), ("fidelity", "0.95", "0"),
+    ]  # fmt: skip
+    assert [float(line["fidelity"]) for line in lines] == pytest.approx([0.9] * 3)
+    assert [float(line["SSIM"]) for line in lines] == pytest.approx([0.5, 0.6, 0.97])
+
+
+def test_plans_of_both_qualities_side_by_side(tmp_path):
+    choices = (
+        Choice(3, 1000, 0.81, math.nan, 10, "ok", 300, False, Reached(0.97, 0.94, 0.99, 240)),
+        Choice(7, 2000, math.nan, math.nan, 60, "no promise", 900),
+    )
+    plan = Plan(0.8, None, choices, 0.95, quality="fidelity")
+    first, second = as_text(tables.plan_table(plan, COUNTS, NAMES), tmp_path / "t.csv")
+    assert (first["status"], first["promised fidelity"], first["reached in"]) == ("no promise", "", "")
+    assert [second[name] for name in ("status", "reached in", "from", "to", "views", "MB to send")] == [
+        "ok, uncalibrated", "0.97", "0.94", "0.99", "240", "0.0003",
+    ]  # fmt: skip
+    rows = evaluate([(0.8, 3, 0.85, 0.5), (0.8, TOTAL, np.nan, 0.6)])
+    both = Evaluation(
+        *(np.concatenate([getattr(r, f.name) for r in (rows, rows)]) for f in fields(Evaluation))
+    )
+    both.quality[:2] = 0  # the same target of both qualities
+    table = as_text(tables.outcome_table(plan, COUNTS, both, NAMES), tmp_path / "t.csv")
+    assert float(table[1]["fidelity"]) == pytest.approx(0.9)
+    assert float(table[1]["SSIM"]) == pytest.approx(0.5)
+    assert len(both.of(plan)) == len(both.of(replace(plan, quality="ssim"))) == 2
+    two = as_text(
+        tables.targets_table([plan, replace(plan, quality="ssim")], COUNTS, LABELS, NAMES), tmp_path / "t"
+    )
+    assert {"fidelity 0.8 status", "SSIM 0.8 status"} < set(two[0])
 
 
 def test_models_table(tmp_path):

@@ -155,7 +155,7 @@ def test_export_takes_levels_and_categories(finished: Path, tmp_path: Path) -> N
     with pytest.raises(RunError, match="no category 'cat'"):
         export_ply(job, tmp_path / "b.ply", level=None, labels=["cat"], target=None)
     with pytest.raises(RunError, match=r"no plan for SSIM 0\.77"):
-        export_ply(job, tmp_path / "b.ply", level=None, labels=[], target=0.77)
+        export_ply(job, tmp_path / "b.ply", level=None, labels=[], target=("ssim", 0.77))
 
 
 def test_a_broken_level_is_one_clear_error(finished: Path, capture: Path, tmp_path: Path) -> None:

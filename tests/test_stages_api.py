@@ -1,5 +1,6 @@
 """What scripts call gives what the commands give."""
 
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -51,10 +52,39 @@ def test_a_plan_for_the_camera_of_a_view_is_the_plan_of_that_view(runs, ladder):
     run = runs[ladder]
     _, view_plans = read_plans(run.job.run.plan)
     for row in (0, 4):
-        plan = run.plan_camera(run.scene.views[row].camera, 0.4)
+        plan = run.plan_camera(run.scene.views[row].camera, target_ssim=0.4)
         assert plan.levels == view_plans[row].levels
         assert plan.view is None
         assert plan.status == view_plans[row].status
+
+
+def test_a_camera_is_planned_for_fidelity_by_default(runs):
+    run = runs["nested"]
+    camera = run.scene.views[0].camera
+    plan = run.plan_camera(camera)
+    assert (plan.quality, plan.target, plan.view) == ("fidelity", 0.95, None)
+    assert {choice.status for choice in plan.choices} <= {"ok", "no promise", "no model"}
+    low, full = (run.plan_camera(camera, target_fidelity=target) for target in (0.3, 1.0))
+    assert low.count <= plan.count <= full.count == len(run.job.ladder.load(4))
+    w2c = camera.w2c.copy()
+    w2c[2, 3] += 100  # far from all that was sampled
+    lost = run.plan_camera(replace(camera, w2c=w2c), target_fidelity=0.3)
+    assert {choice.status for choice in lost.choices} <= {"no promise", "no model"}
+    assert (lost.status, lost.count) == ("no promise", full.count)
+
+
+def test_impossible_targets_of_a_camera_are_one_line(runs):
+    camera = runs["nested"].scene.views[0].camera
+    for target in (0.0, 1.5, math.nan):
+        with pytest.raises(RunError, match=r"target fidelity .* is impossible; choose"):
+            runs["nested"].plan_camera(camera, target_fidelity=target)
+        with pytest.raises(RunError, match=r"target SSIM .* is impossible; choose"):
+            runs["nested"].plan_camera(camera, target_ssim=target)
+    with pytest.raises(RunError, match="one target; give"):
+        runs["nested"].plan_camera(camera, target_fidelity=0.9, target_ssim=0.5)
+    with pytest.raises(RunError, match="needs the nested ladder; give --target-ssim"):
+        runs["snapshots"].plan_camera(camera, target_fidelity=0.9)
+    assert runs["snapshots"].plan_camera(camera).quality == "ssim"
 
 
 @pytest.mark.parametrize("ladder", ["nested", "snapshots"])

@@ -122,8 +122,8 @@ def _check_what_is_missing(job: Job) -> None:
     for plan in view_plans:  # what is evaluated is what was planned with, without SfM points as well
         assert plan.view is not None
         for c in plan.choices:
-            found = method.predicted(c.label_id, c.level, plan.view)
-            assert found == pytest.approx(c.predicted_ssim, nan_ok=True)
+            found = method.predicted("ssim", c.label_id, c.level, plan.view)
+            assert found == pytest.approx(c.predicted, nan_ok=True)
     evaluation = read_evaluation(job.run.evaluation)
     assert set(evaluation.view) == set(TESTS)
     assert np.isnan(evaluation.predicted[evaluation.label_id == 202]).all()

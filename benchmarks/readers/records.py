@@ -11,7 +11,7 @@ from benchmarks.hostile import MIB, Reader
 from benchmarks.readers.captures import points
 from benchmarks.readers.making import PHOTOS, as_json, file, put, put_photos, written
 from benchmarks.readers.splats import CHUNK
-from sagesplat.adapt import eq3, plan, viewpoint
+from sagesplat.adapt import eq3, fidelity, plan, viewpoint, viewpoints
 from sagesplat.adapt.evaluate import Evaluation, read_evaluation
 from sagesplat.adapt.observe import Observations, read_observations
 from sagesplat.core.config import TrainConfig
@@ -28,6 +28,7 @@ from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import Stage, _follows
 from sagesplat.scene import load_scene
 from sagesplat.scene.blocks import Blocks, read_blocks, read_division, write_blocks
+from sagesplat.scene.scene import Camera
 from sagesplat.segment import segmenters
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.stages import bundle, label, view
@@ -48,7 +49,7 @@ CURVE = {
     "num_observations": 7,
     "status": "",
 }
-CHOICE = {"label_id": 2, "level": 1, "predicted_ssim": 0.8, "distance": None, "count": 3, "status": ""}
+CHOICE = {"label_id": 2, "level": 1, "predicted": 0.8, "distance": None, "count": 3, "status": ""}
 TRAINED = {"antialiased": True, "max_steps": 9, "seed": 3}
 SWEEP = """targets = [0.4, 0.3]
 seeds = [0, 5]
@@ -77,8 +78,33 @@ def _promises(folder: Path, size: int) -> list[bytes]:
     curve = json.loads(_models(folder, 1)[0])["models"][0]
     entry = dict.fromkeys(viewpoint.NUMBERS, 0.5) | {"curves": [curve], "lengths": [1, 2, 0.5]}
     entry |= {"inputs": [[0.1] * 7, [0.2] * 7], "heldout_inputs": [False, True], "weights": [[0.1], [0.2]]}
-    entry |= {"amplitudes": [0.1], "status": sorted(viewpoint.STATUSES)[0]}
+    calibration = {"status": sorted(viewpoint.STATUSES)[0], "confidence": 0.95, "num_views": 20}
+    calibration |= {"targets": [0.5, 0.7], "thresholds": [0.52, 0.7], "least_support": 0.2}
+    entry |= {"quality": "fidelity", "calibration": calibration}
     return as_json({"promises": [entry | {"label_id": 2 + i} for i in range(size)]})
+
+
+def _viewpoints(folder: Path, size: int) -> list[bytes]:
+    camera = Camera(np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32), 4, 3)
+    drawn = viewpoints.Viewpoints(viewpoints.Rule(), "capture", (camera,) * size, ("fit",) * size)
+    return [written(folder / "v.json", lambda path: viewpoints.write_viewpoints(path, drawn))]
+
+
+def _read_cameras(path: Path) -> None:
+    viewpoints.read_cameras(path, Camera(np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32), 4, 3))
+
+
+def _cameras(folder: Path, size: int) -> list[bytes]:
+    frames = {"frames": [{"transform_matrix": np.eye(4).tolist()}] * size}
+    return [*as_json(frames), *_viewpoints(folder, size)]
+
+
+def _sampled(folder: Path, size: int) -> list[bytes]:
+    table = fidelity.SampledFidelity(
+        (3, 7), np.full((size, 2, 3), 0.5, np.float32), np.full((size, 2), 4, np.int32),
+        np.full(size, 9, np.int32), np.ones((size, 3), np.float32), np.ones((size, 2), np.float32),
+    )  # fmt: skip
+    return [written(folder / "f.npz", lambda path: fidelity.write_sampled(path, table))]
 
 
 def _plans(folder: Path, size: int) -> list[bytes]:
@@ -293,6 +319,9 @@ READERS = (
     Reader("json", ".json", _json, file("m.json", read_json)),
     Reader("models", ".json", _models, file("models.json", eq3.read_models)),
     Reader("promises", ".json", _promises, file("promises.json", viewpoint.read_promises)),
+    Reader("viewpoints", ".json", _viewpoints, file("viewpoints.json", viewpoints.read_viewpoints), 100),
+    Reader("cameras", ".json", _cameras, file("path.json", _read_cameras), 100),
+    Reader("sampled", ".npz", _sampled, file("fidelity.npz", fidelity.read_sampled), 1000),
     Reader("plans", ".json", _plans, file("plan.json", _read_plans), 100),
     Reader("observations", ".csv", _table(Observations), file("o.csv", read_observations), 1000),
     Reader("evaluation", ".csv", _table(Evaluation), file("e.csv", read_evaluation), 1000),

@@ -1,4 +1,4 @@
-"""Plans from promises: the cheapest levels that keep a target, or the best ones within a budget."""
+"""Plans for a viewpoint from lower bounds: the cheapest levels that keep a target. Plans within a budget."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
-from sagesplat.adapt.allocate import Allocation, best_within, cheapest
-from sagesplat.adapt.plan import Choice, Plan, check_share, check_target
-from sagesplat.adapt.viewpoint import ViewModel
+from sagesplat.adapt.allocate import best_within, cheapest
+from sagesplat.adapt.fill import fill
+from sagesplat.adapt.plan import Choice, Plan, check_target
+from sagesplat.adapt.viewpoint import QualityKind, ViewModel
 from sagesplat.scene.scene import Camera
 
 Unit = Literal["bytes", "gpu-bytes", "count"]
@@ -32,11 +33,13 @@ class Costs:
 
 @dataclass(frozen=True, eq=False)
 class Quality:
-    """What is promised of each category and level in each view; NaN where a category has no model."""
+    """What is predicted of each category and level in each view; NaN where a category has no model."""
 
-    mean: Float[np.ndarray, "V L K"]  # expected SSIM
-    bound: Float[np.ndarray, "V L K"]  # that it is not to fall below
+    kind: QualityKind
+    mean: Float[np.ndarray, "V L K"]  # expected
+    bound: Float[np.ndarray, "V L K"]  # that it is not to fall below; NaN too where nothing is promised
     distance: Float[np.ndarray, "V L"]  # of the closest points in sight, world units; NaN: none
+    calibrated: Bool[np.ndarray, " L"]  # whether the bound is proven
 
 
 def quality_at(
@@ -44,145 +47,143 @@ def quality_at(
     promises: Mapping[int, ViewModel],
     distances: Mapping[int, Float[np.ndarray, " V"]],
     cameras: Sequence[Camera],
+    kind: QualityKind | None = None,
 ) -> Quality:
     """Predict every category at every level from V viewpoints.
 
     Args:
         costs: The levels that there are.
-        promises: Models by label id.
+        promises: Models of one quality, by label id.
         distances: d_min by label id, [V] in world units (`observe.distances_in_views`); NaN: not in sight.
         cameras: V viewpoints; no photo has to be taken there.
+        kind: The quality; None: that of the models.
 
     Returns:
-        mean and bound [V, L, K] in SSIM, NaN for categories without a model; distance [V, L].
+        mean and bound [V, L, K], NaN for categories without a model; distance [V, L].
     """
     shape = len(cameras), *costs.count.shape
     position = np.stack([camera.position for camera in cameras])
     direction = np.stack([camera.direction for camera in cameras])
     mean, bound, far = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape[:2], np.nan)
+    calibrated = np.zeros(len(costs.labels), bool)
     for i, label in enumerate(costs.labels):
         far[:, i] = distances.get(label, far[:, i])
         if label in promises:
             predicted = promises[label].predict(far[:, i], position, direction)
             known = np.array(promises[label].levels) - 1
             mean[:, i, known], bound[:, i, known] = predicted.mean, predicted.bound
-    return Quality(mean, bound, far)
+            calibrated[i] = promises[label].status == "calibrated"
+    kind = kind or next((model.quality for model in promises.values()), "ssim")
+    return Quality(kind, mean, bound, far, calibrated)
 
 
-def plan_for_view(quality: Quality, costs: Costs, target: float, view: int) -> Plan:
+def plan_for_view(
+    quality: Quality,
+    costs: Costs,
+    target: float,
+    view: int,
+    pixels: Float[np.ndarray, " L"] | None = None,
+) -> Plan:
     """Choose the cheapest level of each category whose lower bound reaches a target in one view.
+
+    A plan for fidelity is then filled (`adapt.fill`), so that the image as a whole is no worse than with all
+    categories at one level, at equal bytes.
 
     Args:
         quality: Predictions of `quality_at`.
         costs: What the levels cost; bytes to send are minimised.
-        target: SSIM, above 0 and at most 1.
+        target: Above 0 and at most 1, of the quality's kind.
         view: Row of `quality`.
+        pixels: [L], that each category has in the view; None: unknown, nothing is filled.
 
     Returns:
-        One choice per category; "infeasible" where no level reaches the target.
+        One choice per category; "infeasible" where no level reaches the target, "no promise" where the view
+        is too far from all that was sampled: then the highest level.
 
     Raises:
         RunError: For an impossible target.
     """
-    check_target(target)
-    bound = quality.bound[view]
+    check_target(target, quality.kind)
+    bound, mean = quality.bound[view], quality.mean[view]
     found = cheapest(bound, costs.transfer_bytes, target)
-    return Plan(float(target), view, _choices(found, bound, quality.distance[view], costs))
-
-
-def plan_for_scene(
-    quality: Quality,
-    costs: Costs,
-    target: float,
-    share: float,
-    shown: Float[np.ndarray, "V L"],
-) -> Plan:
-    """Choose the cheapest level of each category whose lower bound reaches a target in a share of the views.
-
-    Args:
-        quality: Predictions of `quality_at`.
-        costs: What the levels cost; bytes to send are minimised.
-        target: SSIM, above 0 and at most 1.
-        share: Of the views that show the category, above 0 and at most 1.
-        shown: [V, L], pixels of each category in each view; 0: the view does not count for it.
-
-    Returns:
-        One choice per category; "infeasible" where no level reaches the target.
-
-    Raises:
-        RunError: For an impossible target or share.
-    """
-    check_target(target)
-    check_share(share)
-    bound = np.stack([_kept_in(quality.bound[shown[:, i] > 0, i], share) for i in range(len(costs.labels))])
-    found = cheapest(bound, costs.transfer_bytes, target)
-    nowhere = np.full(len(costs.labels), np.nan)
-    return Plan(float(target), None, _choices(found, bound, nowhere, costs), float(share))
+    levels = found.levels
+    if quality.kind == "fidelity" and pixels is not None:
+        levels = fill(levels, mean, costs.transfer_bytes, pixels)
+    known, promised = ~np.isnan(mean).all(1), ~np.isnan(bound).all(1)
+    statuses = np.select(
+        [~known, ~promised, found.missed], ["no model", "no promise", "infeasible"], "ok"
+    ).tolist()
+    calibrated = [bool(c) if p else None for c, p in zip(quality.calibrated, promised, strict=True)]
+    choices = make_choices(costs, levels, bound, quality.distance[view], statuses, calibrated)
+    return Plan(float(target), view, choices, quality=quality.kind)
 
 
 def plan_within(
-    quality: Quality,
+    mean: Float[np.ndarray, "L K"],
     costs: Costs,
     budget: float,
     unit: Unit,
-    shown: Float[np.ndarray, "V L"],
-    weights: Mapping[int, float] | None = None,
-    view: int | None = None,
+    weight: Float[np.ndarray, " L"],
+    kind: QualityKind = "ssim",
 ) -> Plan:
-    """Choose the levels of the highest expected SSIM within a budget.
+    """Choose the levels of the highest expected quality within a budget.
 
-    The sum over categories of weight x pixels x mean SSIM is maximised: a multiple-choice knapsack
+    The sum over categories of weight x mean quality is maximised: a multiple-choice knapsack
     (`allocate.best_within`).
 
     Args:
-        quality: Predictions of `quality_at`.
+        mean: [L, K], expected quality of each category and level (`pooled`); NaN: unknown.
         costs: What the levels cost.
         budget: Most that the composition may cost, in `unit`.
         unit: "bytes" to send, "gpu-bytes" on the viewer's GPU, or "count" of Gaussians.
-        shown: [V, L], pixels of each category in each view.
-        weights: Factors by label id (1 where none is given).
-        view: Row of `quality` to plan for; None: all views that `shown` has pixels of.
+        weight: [L], pixels of each category, times what they count.
+        kind: The quality.
 
     Returns:
         One choice per category. Status "over budget": the smallest composition, where even that does not fit.
     """
-    rows = [view] if view is not None else np.flatnonzero(shown.any(1)).tolist()
-    pixels = shown[rows]
-    total = pixels.sum(0)
-    mean = (quality.mean[rows] * pixels[..., None]).sum(0) / np.maximum(total, 1)[:, None]
-    mean[total == 0] = np.nan
-    weight = total * [(weights or {}).get(label, 1.0) for label in costs.labels]
     found = best_within(mean, costs.of(unit), weight, budget)
-    where = quality.distance[view] if view is not None else np.full(len(costs.labels), np.nan)
-    choices = _choices(found, mean, where, costs)
-    return Plan(math.nan, view, choices, budget=float(budget), unit=unit, fits=found.status == "ok")
+    statuses = np.where(np.isnan(mean).all(1), "no model", "ok").tolist()
+    nowhere = np.full(len(costs.labels), np.nan)
+    choices = make_choices(costs, found.levels, mean, nowhere, statuses)
+    fits = found.status == "ok"
+    return Plan(math.nan, None, choices, budget=float(budget), unit=unit, fits=fits, quality=kind)
 
 
-def _kept_in(bound: Float[np.ndarray, "v K"], share: float) -> Float[np.ndarray, " K"]:
-    """What at least a share of the views reach, per level; NaN without any view."""
-    if not len(bound):
-        return np.full(bound.shape[1], np.nan)
-    needed = max(1, math.ceil(share * len(bound) - 1e-9))
-    return np.sort(bound, axis=0)[len(bound) - needed]
+def pooled(
+    values: Float[np.ndarray, "V L K"], pixels: Float[np.ndarray, "V L"]
+) -> tuple[Float[np.ndarray, "L K"], Float[np.ndarray, " L"]]:
+    """Mean over the pixels of the views in which a value is known, and those pixels; NaN where none is.
+
+    Summed over the categories it is the mean over the whole images.
+    """
+    pixels = np.where(np.isfinite(values).all(2), pixels, 0)
+    total = pixels.sum(0)
+    mean = (np.where(pixels[..., None] > 0, values, 0) * pixels[..., None]).sum(0)
+    mean /= np.maximum(total, 1e-300)[:, None]
+    mean[total == 0] = np.nan
+    return mean, total
 
 
-def _choices(
-    found: Allocation, promised: Float[np.ndarray, "L K"], distance: np.ndarray, costs: Costs
+def make_choices(
+    costs: Costs,
+    levels: Int[np.ndarray, " L"],
+    predicted: Float[np.ndarray, "L K"],
+    distance: Float[np.ndarray, " L"],
+    statuses: Sequence[str],
+    calibrated: Sequence[bool | None] | None = None,
 ) -> tuple[Choice, ...]:
-    choices = []
-    for i, label in enumerate(costs.labels):
-        level = int(found.levels[i])
-        known = not np.isnan(promised[i]).all()
-        status = "infeasible" if found.missed[i] else "ok"
-        choices.append(
-            Choice(
-                label_id=label,
-                level=level + 1,
-                predicted_ssim=float(promised[i, level]),
-                distance=float(distance[i]),
-                count=int(costs.count[i, level]),
-                status=status if known else "no model",
-                transfer_bytes=int(costs.transfer_bytes[i, level]),
-            )
+    """A choice per category, from columns of `predicted`."""
+    return tuple(
+        Choice(
+            label_id=label,
+            level=int(levels[i]) + 1,
+            predicted=float(predicted[i, levels[i]]),
+            distance=float(distance[i]),
+            count=int(costs.count[i, levels[i]]),
+            status=statuses[i],
+            transfer_bytes=int(costs.transfer_bytes[i, levels[i]]),
+            calibrated=None if calibrated is None else calibrated[i],
         )
-    return tuple(choices)
+        for i, label in enumerate(costs.labels)
+    )

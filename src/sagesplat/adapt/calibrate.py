@@ -3,8 +3,8 @@
 A plan takes the cheapest level whose expected quality reaches a threshold. For one view, a category and a
 target there is a critical threshold: above it the level that is taken keeps the target. So the critical
 thresholds of the calibration views say, by split conformal prediction (Vovk et al. 2005), which threshold
-keeps the target in a new view at a confidence: the ceil((n + 1) confidence)-th smallest of n. Unlike a bound on
-each number this counts what is decided only; where levels are far apart it costs almost nothing.
+keeps the target in a new view at a confidence: the ceil((n + 1) confidence)-th smallest of n. Unlike a bound
+on each number this counts what is decided only; where levels are far apart it costs almost nothing.
 
 Views are the unit: those of one capture are drawn independently, the categories of one view are not. A
 category has its own thresholds, and each target has its own. With fewer than 19 views (at 0.95) not even the

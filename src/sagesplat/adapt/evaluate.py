@@ -1,33 +1,50 @@
-"""Evaluation: composed scenes measured on views that nothing was fitted to, beside the prediction."""
+"""Evaluation: composed scenes measured on views that nothing was fitted to, beside the prediction.
+
+Each composition is compared with the photo, over the pixels of the photo's label image, and with the full
+model rendered from the same viewpoint, over the pixels that the full model's Gaussians paint.
+"""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
-from jaxtyping import Float32, Int32
+from jaxtyping import Float32, Int16, Int32
 
 from sagesplat.adapt.ladder import Ladder
-from sagesplat.adapt.observe import LabelImages, as_unit, erode, measure, render_rgb
+from sagesplat.adapt.observe import TOTAL, LabelImages, RenderedLabels, as_unit, erode, measure, render_rgb
 from sagesplat.adapt.plan import Plan
+from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.columns import from_rows, read_columns, write_columns
+from sagesplat.metrics.image import means_by_label, ssim_map
 from sagesplat.raster import Backend, Workspace, device_of
 from sagesplat.scene.images import Photos
-from sagesplat.scene.scene import Scene
+from sagesplat.scene.scene import Camera, Scene
+
+QUALITIES: tuple[QualityKind, ...] = get_args(QualityKind)  # by the number in the table
+UNIFORM = -3  # label id of the whole image with all categories at one level
+KEPT = 512 * 2**20  # bytes of the full model's images to keep; of further views they are rendered again
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """One row per (target, view, category) and one per (target, view) for the whole image; equal lengths."""
+    """One row per (plan, view, category), one per (plan, view) for the whole image, one per (level, view).
 
-    target: Float32[np.ndarray, " R"]  # SSIM; NaN for a plan within a budget
+    The last are of all categories at one level, and have no target.
+    """
+
+    quality: Int32[np.ndarray, " R"]  # of the plan, a place in QUALITIES
+    target: Float32[np.ndarray, " R"]  # NaN for a plan within a budget
     view: Int32[np.ndarray, " R"]  # row in Scene.views
-    label_id: Int32[np.ndarray, " R"]  # category id, -1 = unlabelled, -2 = the whole image
-    level: Int32[np.ndarray, " R"]  # the level chosen; -1 for the whole image
-    predicted: Float32[np.ndarray, " R"]  # SSIM that the plan counts on; NaN for the whole image
-    ssim: Float32[np.ndarray, " R"]  # measured on the composed scene, over the category's pixels
+    label_id: Int32[
+        np.ndarray, " R"
+    ]  # category id, -1 = unlabelled, -2 = the whole image, -3 = the same of a level
+    level: Int32[np.ndarray, " R"]  # the level chosen; -1 for the whole image of a plan
+    predicted: Float32[np.ndarray, " R"]  # that the plan counts on in this view; NaN for the whole image
+    fidelity: Float32[np.ndarray, " R"]  # SSIM against the full model; NaN where it shows too little of it
+    ssim: Float32[np.ndarray, " R"]  # against the photo, over the category's pixels
     psnr: Float32[np.ndarray, " R"]  # dB, the same
     full_ssim: Float32[np.ndarray, " R"]  # of the full model: every category at its last level
     full_psnr: Float32[np.ndarray, " R"]  # dB, the same
@@ -39,6 +56,25 @@ class Evaluation:
     def select(self, keep: np.ndarray) -> "Evaluation":
         """The rows that a boolean mask or an index array names."""
         return Evaluation(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+
+    def of(self, plan: Plan) -> "Evaluation":
+        """The rows of a plan: for its target, or within the budget."""
+        within = np.isnan(self.target) if np.isnan(plan.target) else self.target == np.float32(plan.target)
+        return self.select(
+            within & (self.quality == QUALITIES.index(plan.quality)) & (self.label_id != UNIFORM)
+        )
+
+    def uniform(self, quality: QualityKind) -> dict[int, float]:
+        """Mean quality of the whole image by level, all categories at that level."""
+        rows = self.select(self.label_id == UNIFORM)
+        values = rows.fidelity if quality == "fidelity" else rows.ssim
+        return {level: float(values[rows.level == level].mean()) for level in np.unique(rows.level).tolist()}
+
+    def of_own_quality(self) -> "Evaluation":
+        """The same with what was measured of the plan's own quality as `ssim`."""
+        return replace(
+            self, ssim=np.where(self.quality == QUALITIES.index("fidelity"), self.fidelity, self.ssim)
+        )
 
     def write_csv(self, path: Path) -> None:
         """One line per row, a header first; floats so that they read back identical."""
@@ -56,9 +92,11 @@ def evaluate(
     masks: LabelImages,
     ladder: Ladder,
     plans: Sequence[Plan],
-    predicted: Callable[[int, int, int], float],
+    predicted: Callable[[QualityKind, int, int, int], float],
     *,
     region: Literal["mask", "eroded"] = "mask",
+    min_share: float = 0.0,
+    uniform: Sequence[int] = (),
     compose: Callable[[Plan], Gaussians] | None = None,
     backend: Backend = "auto",
     antialiased: bool = False,
@@ -72,43 +110,83 @@ def evaluate(
         masks: Label images, [H, W] of category ids; indexed by view.
         ladder: The levels.
         plans: What to compose.
-        predicted: SSIM expected of (label id, level, row of `Scene.views`); NaN: none.
+        predicted: What is expected of (quality, label id, level, row of `Scene.views`); NaN: none.
         region: Where a category's SSIM is measured: on its mask, or on the mask eroded by 5 px.
+        min_share: Fidelity is not measured where a category covers less than this fraction of the pixels.
+        uniform: Levels to measure with all categories at that level, to compare the plans with.
         compose: The Gaussians of a plan; None: its levels as they are.
         backend: Rasteriser; decides the device.
         antialiased: How the model was trained.
         progress: Called with (images measured, images in all).
 
     Returns:
-        One row per (plan, view, category), and one per (plan, view) for the full image.
+        One row per (plan, view, category), one per (plan, view) and one per (level, view) for the full image.
     """
     ssim = "ssim_eroded" if region == "eroded" else "ssim"
     rows: list[dict[str, float]] = []
     views = scene.test_ids.tolist()
     inner = {row: erode(masks[scene.views[row]]) for row in views}
-    done, total = 0, len(views) * (1 + len(plans))
+    done, total = 0, len(views) * (1 + len(plans) + len(uniform))
     workspace = Workspace()
+    last = ladder.load(ladder.levels[-1]).to(device_of(backend))
+    labels, kept, size = RenderedLabels(last, backend, antialiased), {}, 0
+
+    def render(g: Gaussians, camera: Camera) -> np.ndarray:
+        return render_rgb(g, camera, backend=backend, antialiased=antialiased, workspace=workspace)
 
     def measure_all(g: Gaussians):
-        nonlocal done
+        nonlocal done, size
         g = g.to(device_of(backend))
         for row in views:
             view = scene.views[row]
-            image = render_rgb(g, view.camera, backend=backend, antialiased=antialiased, workspace=workspace)
-            yield row, measure(image, as_unit(photos[row]), masks[view], inner[row])
+            if row not in kept:
+                reference = render(last, view.camera)
+                size += reference.nbytes
+                if size <= KEPT:
+                    kept[row] = reference
+            else:
+                reference = kept[row]
+            image = reference if g is last else render(g, view.camera)
+            least = min_share * image.shape[0] * image.shape[1]
+            alike = fidelity_by_label(image, reference, labels[view], least)
+            yield row, measure(image, as_unit(photos[row]), masks[view], inner[row]), alike
             done += 1
             if progress:
                 progress(done, total)
 
-    full = dict(measure_all(ladder.load(ladder.levels[-1])))
+    full = {row: measured for row, measured, _ in measure_all(last)}
+    for level in uniform:
+        for row, measured, alike in measure_all(ladder.load(level)):
+            rows.append({
+                "quality": QUALITIES.index("fidelity"), "target": np.nan,
+                "view": row, "label_id": UNIFORM, "level": level,
+                "predicted": np.nan, "fidelity": alike[TOTAL],
+                "ssim": measured[TOTAL][ssim], "psnr": measured[TOTAL]["psnr"],
+                "num_pixels": measured[TOTAL]["num_pixels"],
+                "full_ssim": full[row][TOTAL][ssim], "full_psnr": full[row][TOTAL]["psnr"],
+            })  # fmt: skip
     for plan in plans:
-        for row, measured in measure_all(compose(plan) if compose else ladder.compose(plan.levels)):
+        for row, measured, alike in measure_all(compose(plan) if compose else ladder.compose(plan.levels)):
             for label, values in measured.items():
-                level = plan.levels.get(label, -1)
+                level, known = plan.levels.get(label, -1), label in plan.levels
                 rows.append({
-                    "target": plan.target, "view": row, "label_id": label, "level": level,
-                    "predicted": predicted(label, level, row) if label in plan.levels else np.nan,
+                    "quality": QUALITIES.index(plan.quality), "target": plan.target,
+                    "view": row, "label_id": label, "level": level,
+                    "predicted": predicted(plan.quality, label, level, row) if known else np.nan,
+                    "fidelity": alike.get(label, np.nan),
                     "ssim": values[ssim], "psnr": values["psnr"], "num_pixels": values["num_pixels"],
                     "full_ssim": full[row][label][ssim], "full_psnr": full[row][label]["psnr"],
                 })  # fmt: skip
     return from_rows(Evaluation, rows)
+
+
+def fidelity_by_label(
+    image: Float32[np.ndarray, "H W 3"],
+    reference: Float32[np.ndarray, "H W 3"],
+    label_ids: Int16[np.ndarray, "H W"],
+    least: float = 0.0,
+) -> dict[int, float]:
+    """SSIM of an image against the full model's, by category of at least `least` pixels, and of the whole."""
+    quality = ssim_map(image, reference)
+    found = {i: mean for i, (mean, pixels) in means_by_label(quality, label_ids).items() if pixels >= least}
+    return {**found, TOTAL: float(quality.mean())}

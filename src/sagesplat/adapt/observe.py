@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Protocol
 
@@ -9,6 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Int16, Int32, UInt8
 from scipy.ndimage import maximum_filter, minimum_filter
+from torch import Tensor
 
 from sagesplat.adapt.ladder import Ladder
 from sagesplat.core import geometry
@@ -121,13 +123,17 @@ class RenderedLabels:
     def __getitem__(self, view: View) -> Int16[np.ndarray, "H W"]:
         """Per pixel the category that paints most of it; -1 where more shines through than that."""
         if view.name not in self._kept:
-            self._kept[view.name] = self._render(view.camera)
+            self._kept[view.name] = self.render(view.camera)
         return self._kept[view.name]
 
-    def _render(self, camera: Camera) -> Int16[np.ndarray, "H W"]:
-        ids = sorted({UNLABELLED, *self.gaussians.counts()})
+    def render(self, camera: Camera) -> Int16[np.ndarray, "H W"]:
+        """The same at any camera."""
+        return self.paint(camera)[1]
+
+    def paint(self, camera: Camera) -> tuple[Float32[np.ndarray, "H W 3"], Int16[np.ndarray, "H W"]]:
+        """An image as of `render_rgb`, and the label image, in one pass."""
+        ids, one_hot = self._one_hot
         g = self.gaussians.to(device_of(self.backend))
-        one_hot = (g.label_ids[:, None] == torch.tensor(ids, device=g.label_ids.device)).float()
         with torch.no_grad():
             render = rasterize(
                 g, camera, features=one_hot, backend=self.backend, antialiased=self.antialiased
@@ -135,7 +141,15 @@ class RenderedLabels:
         assert render.features is not None
         painted = render.features.float().cpu().numpy().copy()
         painted[..., 0] += 1 - render.alpha.float().cpu().numpy()
-        return np.array(ids, np.int16)[painted.argmax(-1)]
+        return render.rgb.clamp(0, 1).float().cpu().numpy(), ids[painted.argmax(-1)]
+
+    @cached_property
+    def _one_hot(self) -> tuple[Int16[np.ndarray, " L"], Tensor]:
+        """The labels, and which Gaussian has which [N, L]."""
+        ids = sorted({UNLABELLED, *self.gaussians.counts()})
+        g = self.gaussians.to(device_of(self.backend))
+        one_hot = (g.label_ids[:, None] == torch.tensor(ids, device=g.label_ids.device)).float()
+        return np.array(ids, np.int16), one_hot
 
 
 def as_unit(photo: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W 3"]:

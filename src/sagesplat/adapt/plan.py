@@ -1,17 +1,18 @@
-"""Which level of each category meets a target SSIM at the least Gaussians (Eq. 1 of the paper)."""
+"""Which level of each category meets a target at the least Gaussians (Eq. 1 of the paper); plan.json."""
 
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sagesplat.adapt.allocate import choose
 from sagesplat.adapt.eq3 import SsimModel
+from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.core.errors import DataError, RunError, short
 from sagesplat.core.gaussians import BYTES_PER_GAUSSIAN
 from sagesplat.io.files import read_json, write_json
@@ -20,7 +21,22 @@ Models = Mapping[tuple[int, int], SsimModel]  # by (label id, level)
 Counts = Mapping[tuple[int, int], int]  # Gaussians of each (label id, level)
 
 _CURE = "delete it and run `sagesplat plan` again"
-STATUSES = ("ok", "infeasible", "no model")
+STATUSES = (
+    "ok",  # the level is predicted, or measured, to reach the target
+    "infeasible",  # no level is; this is the best attainable
+    "no promise",  # too far from all that was sampled, or too little known: the highest level
+    "no model",  # nothing is known of the category: the highest level
+)
+
+
+@dataclass(frozen=True)
+class Reached:
+    """The share of viewpoints that measure a target, with its Clopper-Pearson interval at 95 %."""
+
+    share: float
+    low: float
+    high: float
+    num_views: int
 
 
 @dataclass(frozen=True)
@@ -29,29 +45,37 @@ class Choice:
 
     label_id: int
     level: int  # of snapshots the training step, of nested levels 1 to K
-    predicted_ssim: float  # in a scene: what at least `share` of the views reach; NaN without a model
+    predicted: float  # quality; in a scene what at least `share` of the views reach; NaN: nothing promised
     distance: float  # of the view, world units; NaN in a scene and where unknown
     count: int  # Gaussians
-    status: str  # one of STATUSES; "infeasible" is the best attainable, "no model" the highest level
+    status: str  # one of STATUSES
     transfer_bytes: int | None = None  # of its increments; None for snapshots
+    calibrated: bool | None = None  # whether the promise is proven; None: no bound, a mere prediction
+    reached: Reached | None = None  # of a scene's plan: views that measure the target at this level
 
     @property
     def nbytes(self) -> int:
         """Bytes as the paper counts model size: 248 a Gaussian."""
         return self.count * BYTES_PER_GAUSSIAN
 
+    @property
+    def verdict(self) -> str:
+        """The status for people, with what is missing to a proof."""
+        return f"{self.status}, uncalibrated" if self.calibrated is False else self.status
+
 
 @dataclass(frozen=True)
 class Plan:
     """One level per category, for one view or for a whole scene."""
 
-    target: float  # SSIM that every category is to reach; NaN for a plan within a budget
+    target: float  # quality that every category is to reach; NaN for a plan within a budget
     view: int | None  # row in Scene.views; None = the scene
     choices: tuple[Choice, ...]  # ordered by label id
     share: float | None = None  # of the views that must reach the target; None for one view
     budget: float | None = None  # what the composition may cost, in `unit`
     unit: str | None = None  # bytes, gpu-bytes or count
     fits: bool = True  # whether it keeps the budget
+    quality: QualityKind = "ssim"  # of which it is the target
 
     @property
     def levels(self) -> dict[int, int]:
@@ -76,10 +100,29 @@ class Plan:
 
     @property
     def status(self) -> str:
-        """ "ok", or "infeasible" where a category with a model misses the target, or "over budget"."""
+        """The worst of its choices: "infeasible", "no promise" or "ok"; or "over budget"."""
         if not self.fits:
             return "over budget"
-        return "infeasible" if self.infeasible else "ok"
+        if self.infeasible:
+            return "infeasible"
+        return "no promise" if any(c.status == "no promise" for c in self.choices) else "ok"
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether no promise in it lacks its proof."""
+        return all(choice.calibrated is not False for choice in self.choices)
+
+    @property
+    def verdict(self) -> str:
+        """The status for people, with what is missing to a proof."""
+        return self.status if self.calibrated else f"{self.status}, uncalibrated"
+
+    @property
+    def asked(self) -> str:
+        """What it was made for, for people: "fidelity 0.95"."""
+        if self.budget is not None:
+            return f"budget {self.budget:,g} {self.unit}"
+        return f"{quality_title(self.quality)} {self.target:g}"
 
     @property
     def infeasible(self) -> list[int]:
@@ -89,8 +132,13 @@ class Plan:
     @property
     def binding(self) -> int | None:
         """The category whose prediction is lowest against the target; None without any model."""
-        predicted = [c for c in self.choices if not math.isnan(c.predicted_ssim)]
-        return min(predicted, key=lambda c: c.predicted_ssim).label_id if predicted else None
+        predicted = [c for c in self.choices if not math.isnan(c.predicted)]
+        return min(predicted, key=lambda c: c.predicted).label_id if predicted else None
+
+
+def quality_title(quality: QualityKind) -> str:
+    """A quality as people call it."""
+    return {"fidelity": "fidelity", "ssim": "SSIM"}[quality]
 
 
 def plan_view(
@@ -225,9 +273,9 @@ def choose_snapshot(
     return np.asarray(len(counts) - 1 - found), met  # [] too: numpy makes a number of that
 
 
-def check_target(target: float) -> None:
-    """RunError for an SSIM that no plan can have as its target."""
-    _check("target SSIM", target)
+def check_target(target: float, quality: QualityKind = "ssim") -> None:
+    """RunError for a quality that no plan can have as its target."""
+    _check(f"target {quality_title(quality)}", target)
 
 
 def check_share(share: float) -> None:
@@ -281,7 +329,7 @@ def _usable(path: Path) -> Iterator[None]:
 def _to_json(plan: Plan) -> dict[str, Any]:
     """A plan with its totals; NaN becomes null, which JSON has."""
     choices = [
-        {name: None if value != value else value for name, value in vars(choice).items()}
+        {name: None if value != value else value for name, value in asdict(choice).items()}
         | {"nbytes": choice.nbytes}
         for choice in plan.choices
     ]
@@ -302,16 +350,21 @@ def _from_json(entry: dict[str, Any]) -> Plan:
         Choice(
             label_id=int(choice["label_id"]),
             level=int(choice["level"]),
-            predicted_ssim=number(choice["predicted_ssim"]),
+            predicted=number(choice["predicted" if "predicted" in choice else "predicted_ssim"]),
             distance=number(choice["distance"]),
             count=int(choice["count"]),
             status=str(choice["status"]),
             transfer_bytes=maybe(int, choice.get("transfer_bytes")),
+            calibrated=maybe(bool, choice.get("calibrated")),
+            reached=maybe(_reached, choice.get("reached")),
         )
         for choice in entry["choices"]
     )
     if unknown := {choice.status for choice in choices} - set(STATUSES):
         raise ValueError(f"unknown status {unknown.pop()!r}")
+    quality = entry.get("quality", "ssim")  # the only one of older runs
+    if quality not in get_args(QualityKind):
+        raise ValueError(f"unknown quality {quality!r}")
     return Plan(
         target=number(entry["target"]),
         view=maybe(int, entry["view"]),
@@ -320,4 +373,12 @@ def _from_json(entry: dict[str, Any]) -> Plan:
         budget=maybe(float, entry.get("budget")),
         unit=maybe(str, entry.get("unit")),
         fits=bool(entry.get("fits", True)),
+        quality=quality,
     )
+
+
+def _reached(entry: dict[str, Any]) -> Reached:
+    found = Reached(*(float(entry[name]) for name in ("share", "low", "high")), int(entry["num_views"]))
+    if not 0 <= found.low <= found.share <= found.high <= 1 or found.num_views < 0:
+        raise ValueError("an impossible share of views")
+    return found

@@ -18,7 +18,8 @@ _POSITIONAL = get_args(Positional[int])[1]
 _MANY = 25  # flags: a command with more shows only the common ones first
 _COMMON = {
     "--downscale", "--segmenter", "--model", "--labels.merge", "--train.max-steps", "--fuse",
-    "--blocks.count", "--ladder", "--target-ssim", "--budget", "--device", "--seed", "--force", "--yes",
+    "--blocks.count", "--ladder", "--target-fidelity", "--target-ssim", "--budget", "--device", "--seed",
+    "--force", "--yes",
 }  # fmt: skip
 _INDENT = " " * 6
 _WIDEST = 100  # characters of a line

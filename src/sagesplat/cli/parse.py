@@ -5,7 +5,7 @@ import io
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from difflib import get_close_matches
 from functools import wraps
 from pathlib import Path
@@ -15,6 +15,7 @@ import tyro
 
 from sagesplat.cli.help import Flag, flags_of
 from sagesplat.cli.say import say
+from sagesplat.core.config import PlanConfig
 from sagesplat.core.errors import SageError
 
 OLD_COMMANDS = {"online": "early-stopping", "parts": "block-categories"}
@@ -26,6 +27,7 @@ OLD_FLAGS = {
     "--nest.gain": "--nest.lr-multiplier",
     "--blocks.seam-steps": "--blocks.boundary-steps",
 }
+_TARGETS = {"--target-fidelity", "--target-ssim"}  # of a plan: one given, the recorded ones are gone
 _SOURCES = {"--segmenter", "--masks", "--model", "--classes"}  # of label images: one given, all are anew
 
 
@@ -154,6 +156,8 @@ def _recorded(
     known = recorded_settings(RunDir(path, ladder or "nested"), of=name) | {"ladder": ladder}
     if given & _SOURCES:
         known.pop("masks", None)
+    if asked := given & _TARGETS:
+        _forget_targets(known, "ssim" if asked == {"--target-ssim"} else "fidelity")
     # `labels` are settings of one command, and names of categories in another
     known = {key: value for key, value in known.items() if isinstance(value, type(values.get(key, ...)))}
     changed = [
@@ -164,6 +168,13 @@ def _recorded(
     if changed:
         _say(f"settings of {path}: {' '.join(changed)}")
     return known
+
+
+def _forget_targets(known: dict[str, Any], leads: str) -> None:
+    """Drop the recorded targets, as others are given; the other targets too where another quality leads."""
+    if isinstance(plan := known.get("plan"), PlanConfig):
+        others = plan.other_targets if plan.quality == leads else None
+        known["plan"] = replace(plan, target_fidelity=None, target_ssim=None, other_targets=others)
 
 
 def _now(flag: Flag, known: Mapping[str, Any], default: Any) -> Any:

@@ -31,6 +31,7 @@ from sagesplat.core.config import (
     PlanConfig,
     PosesConfig,
     RunConfig,
+    SampleConfig,
     SceneConfig,
     TrainConfig,
 )
@@ -61,6 +62,7 @@ def run(
     train: TrainConfig = TrainConfig(),
     blocks: BlocksConfig = BlocksConfig(),
     nest: NestConfig = NestConfig(),
+    sample: SampleConfig = SampleConfig(),
     fit: FitConfig = FitConfig(),
     plan: Annotated[PlanConfig, Flat] = PlanConfig(),
     fuse: Annotated[bool, arg(help=_FUSE)] = False,
@@ -77,7 +79,7 @@ def run(
     from sagesplat.stages import pipeline
 
     config = RunConfig(
-        scene_config, poses, masks, labels, lift, train, blocks, nest, fit, plan, fuse, ladder, seed
+        scene_config, poses, masks, labels, lift, train, blocks, nest, sample, fit, plan, fuse, ladder, seed
     )
     with open_job(run, machine, ladder) as job:
         pipeline.run_all(job, scene, config)
@@ -192,13 +194,27 @@ def observe(
 
 
 @command
+def sample(
+    run: Run,
+    sample: SampleConfig = SampleConfig(),
+    fit: FitConfig = FitConfig(),
+    machine: Annotated[Parallel, Flat] = Parallel(),
+) -> None:
+    """Draw viewpoints and measure every level there against the full model (fidelity)."""
+    from sagesplat.stages.sample import sample_levels
+
+    with open_job(run, machine, "nested") as job:
+        sample_levels(job, sample, fit)
+
+
+@command
 def fit(
     run: Run,
     fit: FitConfig = FitConfig(),
     ladder: Ladder = "nested",
     machine: Annotated[Parallel, Flat] = Parallel(),
 ) -> None:
-    """Fit the quality models: SSIM of every category and level, as a function of viewpoint."""
+    """Fit the quality models: fidelity and SSIM of every category and level, over the viewpoint."""
     from sagesplat.stages.fit import fit_ladder
 
     with open_job(run, machine, ladder) as job:
@@ -212,11 +228,15 @@ def plan(
     ladder: Ladder = "nested",
     machine: Annotated[Redo, Flat] = Redo(),
 ) -> None:
-    """Choose the cheapest level of each category that reaches a target SSIM, or the best within a budget."""
-    from sagesplat.stages.plan import make_plan
+    """Choose the cheapest level of each category that reaches a target, or the best within a budget.
+
+    A target is of fidelity (SSIM against the full model from the same viewpoint) or of SSIM against photos.
+    """
+    from sagesplat.stages.plan import make_plan, show_plan
 
     with open_job(run, machine, ladder) as job:
         make_plan(job, plan)
+        show_plan(job)
 
 
 @command

@@ -19,6 +19,7 @@ def export(
     out: Positional[Annotated[Path, arg(metavar="OUT")]],
     level: int | None = None,
     labels: tuple[str, ...] = (),
+    target_fidelity: float | None = None,
     target_ssim: float | None = None,
     chunks: Literal["spz", "ply"] | None = None,
     ladder: Ladder = "nested",
@@ -31,7 +32,9 @@ def export(
         out: PLY to write, or with --chunks a folder
         level: number of a level (of snapshots: its training step) to write instead of the planned scene
         labels: names of the categories to write (default: all)
-        target_ssim: write the scene planned for this SSIM (default: for the budget, else the main target)
+        target_fidelity: write the scene planned for this fidelity (default: for the budget, else the main
+            target)
+        target_ssim: write the scene planned for this SSIM against photos
         chunks: write the increment of each level of each category as a file of this format
     """
     from sagesplat.stages.export import export_increments, export_ply
@@ -40,7 +43,9 @@ def export(
         if chunks:
             count = export_increments(job, out, chunks)
         else:
-            count = export_ply(job, out, level=level, labels=labels, target=target_ssim)
+            target = None if target_ssim is None else ("ssim", target_ssim)
+            target = target if target_fidelity is None else ("fidelity", target_fidelity)
+            count = export_ply(job, out, level=level, labels=labels, target=target)
     say(f"{out}: {count:,} {'chunks' if chunks else 'Gaussians'}")
 
 

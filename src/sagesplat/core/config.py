@@ -1,6 +1,6 @@
 """Settings of every stage. Standard library only, so that the command line answers at once."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -217,6 +217,28 @@ class NestConfig:
 
 
 @dataclass(frozen=True)
+class SampleConfig:
+    """Viewpoints at which the levels are measured against the full model."""
+
+    views: int = 0
+    """Viewpoints that the fidelity models are fitted to; 0: until their error stops shrinking, within about
+    half of the training's time."""
+    calibration_views: int = 0
+    """Viewpoints that calibrate the bounds; 0: 200, or fewer after a short training."""
+    viewpoints: Path | None = None
+    """File with the cameras to draw from: a viewpoints.json, or a transforms.json (default: the cameras of
+    the training and calibration photos)."""
+    neighbours: int = 4
+    """Each viewpoint lies between a camera and one of this many nearest ones; 0: at a camera."""
+    shift: float = 0.03
+    """Largest random shift along each axis, as a fraction of the scene extent."""
+    turn: float = 0.05
+    """Largest random rotation about each axis, radians."""
+    seed: int = 0
+    """Seed of the draws."""
+
+
+@dataclass(frozen=True)
 class FitConfig:
     """Quality models and what they are measured on."""
 
@@ -239,27 +261,63 @@ class FitConfig:
 class PlanConfig:
     """Target quality or budget."""
 
-    target_ssim: float = 0.8
-    """SSIM that the planned scene must reach."""
+    target_fidelity: float | None = None
+    """Fidelity that the planned scene must reach: SSIM against the full model rendered from the same
+    viewpoint (default: 0.95, where --target-ssim is not given; 1: the full model)."""
+    target_ssim: float | None = None
+    """SSIM against photos that the planned scene must reach; with --target-fidelity a plan beside that one
+    (default: none, of snapshots 0.8)."""
     share: float = 0.95
-    """Fraction of the training views in which the level of a category must reach the target."""
+    """Fraction of the viewpoints in which the level of a category must reach the target."""
     tune_steps: int = 0
     """Training steps on the planned scene, which adapt its categories to each other."""
     other_targets: tuple[float, ...] | None = None
-    """Further SSIM targets to plan and measure (default: 0.1 below and above)."""
+    """Further targets to plan and measure, of the quality that leads (default: fidelity 0.8, 0.9 and 0.98;
+    SSIM 0.1 below and above)."""
     budget: float = 0.0
-    """Plan for the best quality within this budget instead of the target SSIM; 0: no budget."""
+    """Plan for the best quality within this budget instead of the target; 0: no budget."""
     budget_unit: Literal["bytes", "gpu-bytes", "count"] = "bytes"
     """Unit of the budget: bytes to transfer, bytes of GPU memory in the viewer, or Gaussians."""
     weights: dict[str, float] = field(default_factory=dict)
     """Weights of categories within the budget, by name (1 unless named)."""
 
+    def with_target(self, ladder: Literal["nested", "snapshots"]) -> "PlanConfig":
+        """The same with the default target of the ladder, where none is given."""
+        if self.target_fidelity is not None or self.target_ssim is not None:
+            return self
+        return (
+            replace(self, target_fidelity=self.target)
+            if ladder == "nested"
+            else replace(self, target_ssim=0.8)
+        )
+
+    @property
+    def quality(self) -> Literal["fidelity", "ssim"]:
+        """The quality that leads: fidelity where it has a target, or nothing has."""
+        ssim_alone = self.target_fidelity is None and self.target_ssim is not None
+        return "ssim" if ssim_alone else "fidelity"
+
+    @property
+    def target(self) -> float:
+        """Its main target."""
+        given = self.target_ssim if self.quality == "ssim" else self.target_fidelity
+        return 0.95 if given is None else given
+
     @property
     def targets(self) -> list[float]:
-        """All targets, ascending."""
-        near = (self.target_ssim - 0.1, self.target_ssim + 0.1)
+        """All targets of the quality that leads, ascending."""
+        main = self.target
+        near = (main - 0.1, main + 0.1) if self.quality == "ssim" else (0.8, 0.9, 0.98)
         others = [t for t in near if 0 < t < 1] if self.other_targets is None else self.other_targets
-        return sorted({round(t, 6) for t in (self.target_ssim, *others)})
+        return sorted({round(t, 6) for t in (main, *others)})
+
+    @property
+    def all_targets(self) -> list[tuple[Literal["fidelity", "ssim"], float]]:
+        """Every (quality, target) to plan for: those of the quality that leads, then SSIM beside fidelity."""
+        found = [(self.quality, target) for target in self.targets]
+        if self.quality == "fidelity" and self.target_ssim is not None:
+            found.append(("ssim", round(self.target_ssim, 6)))
+        return found
 
 
 @dataclass(frozen=True)
@@ -319,6 +377,7 @@ class RunConfig:
     train: TrainConfig = field(default_factory=TrainConfig)
     blocks: BlocksConfig = field(default_factory=BlocksConfig)
     nest: NestConfig = field(default_factory=NestConfig)
+    sample: SampleConfig = field(default_factory=SampleConfig)
     fit: FitConfig = field(default_factory=FitConfig)
     plan: PlanConfig = field(default_factory=PlanConfig)
     fuse: bool = False

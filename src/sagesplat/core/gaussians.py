@@ -50,6 +50,13 @@ class Gaussians:
         """The Gaussians that a boolean mask or an index tensor selects."""
         return Gaussians(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
+    def slices(self, parts: Sequence[slice]) -> "Gaussians":
+        """The Gaussians of some slices, in order: a copy."""
+        whole = [slice(0, 0), *parts]
+        return Gaussians(
+            **{f.name: torch.cat([getattr(self, f.name)[p] for p in whole]) for f in fields(self)}
+        )
+
     def of_labels(self, label_ids: Sequence[int]) -> "Gaussians":
         """The Gaussians of these categories."""
         wanted = torch.tensor(list(label_ids), dtype=self.label_ids.dtype, device=self.label_ids.device)

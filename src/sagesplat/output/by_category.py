@@ -83,14 +83,18 @@ def _together(label: int, choices: Sequence[Choice]) -> Choice:
         return replace(choices[0], label_id=label)
     states = {choice.status for choice in choices}
     transfer_bytes = [choice.transfer_bytes for choice in choices if choice.transfer_bytes is not None]
+    known = [choice.calibrated for choice in choices if choice.calibrated is not None]
+    reached = [choice.reached for choice in choices if choice.reached]
     return Choice(
         label,
         max(choice.level for choice in choices),
-        _least([choice.predicted_ssim for choice in choices]),
+        _least([choice.predicted for choice in choices]),
         _least([choice.distance for choice in choices]),
         sum(choice.count for choice in choices),
-        next(status for status in ("infeasible", "ok", "no model") if status in states),
+        next(status for status in ("infeasible", "no promise", "ok", "no model") if status in states),
         sum(transfer_bytes) if len(transfer_bytes) == len(choices) else None,
+        all(known) if known else None,
+        min(reached, key=lambda one: one.low) if reached else None,
     )
 
 

@@ -16,14 +16,16 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from sagesplat.adapt.eq3 import SsimModel
-from sagesplat.adapt.evaluate import Evaluation
+from sagesplat.adapt.evaluate import QUALITIES, Evaluation
 from sagesplat.adapt.observe import TOTAL, Observations
-from sagesplat.adapt.plan import Counts, Plan
-from sagesplat.core.gaussians import BYTES_PER_GAUSSIAN
+from sagesplat.adapt.plan import Choice, Plan, quality_title
+from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.io.files import atomic_path
 from sagesplat.output.tables import MB, last_counts, name_of, view_mean
 
 Colours = Mapping[int, tuple[int, int, int]]  # label id -> RGB, 0..255
+Sizes = Mapping[tuple[int, int], int]  # bytes of each (label id, level)
+RAW = "model size (MB, 248 bytes a Gaussian)"
 
 INK, FAINT, ACCENT = "#1d2530", "#8a94a3", "#c2410c"
 PAIR = (5.4, 4.9)  # inches, of two figures side by side
@@ -80,6 +82,11 @@ def caption(label_id: int, names: Mapping[int, str]) -> str:
 def shortened(text: str) -> str:
     """A text cut to the length that a legend or a title has room for."""
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
+
+
+def bytes_of(choice: Choice) -> int:
+    """What a choice costs: bytes to send, of snapshots 248 a Gaussian."""
+    return choice.nbytes if choice.transfer_bytes is None else choice.transfer_bytes
 
 
 def _columns(usual: int, of_long: int, labels: Sequence[int], names: Mapping[int, str]) -> int:
@@ -189,16 +196,25 @@ def ssim_over_distance(
 
 @rc_context(STYLE)
 def size_by_target(
-    plans: Sequence[Plan], counts: Counts, labels: Sequence[int], names: Mapping[int, str], colours: Colours
+    plans: Sequence[Plan],
+    sizes: Sizes,
+    labels: Sequence[int],
+    names: Mapping[int, str],
+    colours: Colours,
+    unit: str = RAW,
 ) -> Figure:
-    """Size of the full model and of each target's plan, stacked by label; hatched = target out of reach."""
+    """Size of the full model and of each target's plan, stacked by label; hatched = target out of reach.
+
+    `sizes`: bytes of each (label id, level), named by `unit`.
+    """
     figure = Figure(figsize=(9, 0.52 * (len(plans) + 1) + 1.6), layout="constrained")
     axes = figure.subplots()
-    full = {i: n * BYTES_PER_GAUSSIAN for i, n in last_counts(counts).items()}
+    full = last_counts(sizes)
     bars = [("full model", full, set())]
     for plan in plans:
         infeasible = {c.label_id for c in plan.choices if c.status == "infeasible"}
-        bars.append((f"SSIM ≥ {plan.target:g}", {c.label_id: c.nbytes for c in plan.choices}, infeasible))
+        asked = f"{quality_title(plan.quality)} ≥ {plan.target:g}"
+        bars.append((asked, {c.label_id: bytes_of(c) for c in plan.choices}, infeasible))
     whole = max(sum(full.values()), 1)
     for row, (_, nbytes, infeasible) in enumerate(bars):
         left = 0.0
@@ -213,7 +229,7 @@ def size_by_target(
     axes.set_yticks(range(len(bars)), [bar[0] for bar in bars])
     axes.invert_yaxis()
     axes.grid(axis="y", visible=False)
-    axes.set(xlabel="model size (MB, 248 bytes a Gaussian)", xlim=(0, 1.16 * whole / MB))
+    axes.set(xlabel=unit, xlim=(0, 1.16 * whole / MB))
     handles = [Patch(color=ink(i, colours), label=caption(i, names)) for i in labels]
     if any(bar[2] for bar in bars):
         handles.append(
@@ -225,11 +241,16 @@ def size_by_target(
 
 @rc_context(STYLE)
 def promised_and_measured(
-    evaluation: Evaluation, labels: Sequence[int], names: Mapping[int, str], colours: Colours
+    evaluation: Evaluation,
+    labels: Sequence[int],
+    names: Mapping[int, str],
+    colours: Colours,
+    quality: QualityKind,
 ) -> Figure:
-    """Measured against promised SSIM on unseen views, a dot per (label, view, target)."""
+    """Measured against promised quality on unseen views, a dot per (label, view, target)."""
     figure = Figure(figsize=PAIR, layout="constrained")
     axes = figure.subplots()
+    evaluation = evaluation.select(evaluation.quality == QUALITIES.index(quality)).of_own_quality()
     known = np.isfinite(evaluation.ssim + evaluation.predicted + evaluation.target)  # no target: a budget
     rows = evaluation.select((evaluation.label_id != TOTAL) & known)
     handles = []
@@ -241,12 +262,13 @@ def promised_and_measured(
         axes.plot(mine.predicted[~reached], mine.ssim[~reached], "o", mfc="none", mec=colour, ms=5)
         if len(mine):
             handles.append(Line2D([], [], marker="o", ls="", color=colour, label=caption(label_id, names)))
-    values = np.concatenate([rows.ssim, rows.predicted, np.array([0.5])])
+    values = np.concatenate([rows.ssim, rows.predicted, np.array([0.5 if quality == "ssim" else 0.9])])
     ends = np.array([values.min() - 0.03, min(1.0, values.max() + 0.03)])
     axes.plot(ends, ends, color=FAINT, lw=1)
     axes.fill_between(ends, ends, ends[0], color="#f7ecec", lw=0, zorder=0)
-    axes.text(ends[1], ends[0], "measured below the prediction ", ha="right", va="bottom", color=FAINT)
-    axes.set(xlabel="promised SSIM", ylabel="measured SSIM", xlim=ends, ylim=ends)
+    axes.text(ends[1], ends[0], "measured below the promise ", ha="right", va="bottom", color=FAINT)
+    named = quality_title(quality)
+    axes.set(xlabel=f"promised {named}", ylabel=f"measured {named}", xlim=ends, ylim=ends)
     handles += [Line2D([], [], marker="o", ls="", color=FAINT, label="target reached")]
     handles += [Line2D([], [], marker="o", ls="", mfc="none", mec=FAINT, label="target missed")]
     columns = _columns(3, 2, labels, names)
@@ -256,33 +278,32 @@ def promised_and_measured(
 
 @rc_context(STYLE)
 def quality_over_size(
-    observations: Observations,
-    test_views: np.ndarray,
-    counts: Counts,
+    uniform: Mapping[int, float],
+    sizes: Sizes,
     plans: Sequence[Plan],
     evaluation: Evaluation,
-    recovering: frozenset[int],
+    quality: QualityKind,
+    unit: str = RAW,
 ) -> Figure:
-    """Whole-image SSIM on unseen views over model size: one level for all, and each target's plan."""
+    """Quality of the whole image on unseen views over model size: one level for all, and each target's plan.
+
+    `uniform`: mean quality of the whole image by level; `sizes`: bytes of each (label id, level).
+    """
     figure = Figure(figsize=PAIR, layout="constrained")
     axes = figure.subplots()
-    rows = observations.select(np.isin(observations.view, test_views))
-    levels = np.array([i for i in np.unique(rows.level).tolist() if i not in recovering], np.int64)
-    size = [
-        sum(n for (_, i), n in counts.items() if i == level) * BYTES_PER_GAUSSIAN / MB
-        for level in levels.tolist()
-    ]
-    ssim = [view_mean(rows, TOTAL, level) for level in levels.tolist()]
-    axes.plot(size, ssim, "o-", color=FAINT, ms=4, label="all categories at one level")
+    size = [sum(n for (_, i), n in sizes.items() if i == level) / MB for level in uniform]
+    axes.plot(size, list(uniform.values()), "o-", color=FAINT, ms=4, label="all categories at one level")
     composed = []
     for plan in plans:
-        at = (evaluation.target == np.float32(plan.target)) & (evaluation.label_id == TOTAL)
-        if at.any():
-            composed.append((plan.nbytes / MB, float(np.nanmean(evaluation.ssim[at])), plan.target))
+        rows = evaluation.of(plan).of_own_quality()
+        whole = rows.ssim[rows.label_id == TOTAL]
+        if len(whole) and plan.quality == quality:
+            composed.append((sum(map(bytes_of, plan.choices)) / MB, float(np.nanmean(whole)), plan.target))
     axes.plot(*np.array(composed).reshape(-1, 3).T[:2], "o-", color=ACCENT, ms=6, label="composed by plan")
     for x, y, target in composed:
         axes.annotate(f"t = {target:g}", (x, y), (7, -11), textcoords="offset points", color=ACCENT)
-    axes.set(xlabel="model size (MB, 248 bytes a Gaussian)", ylabel="SSIM of the whole image")
+    of = "against the full model" if quality == "fidelity" else "against photos"
+    axes.set(xlabel=unit, ylabel=f"SSIM of the whole image {of}")
     axes.margins(0.08, 0.12)
     axes.legend(loc="lower right")
     return figure

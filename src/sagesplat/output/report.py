@@ -4,7 +4,7 @@ import base64
 import io
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +13,15 @@ from PIL import Image
 
 from sagesplat import __version__
 from sagesplat.adapt.eq3 import SsimModel
-from sagesplat.adapt.evaluate import Evaluation
+from sagesplat.adapt.evaluate import UNIFORM, Evaluation
 from sagesplat.adapt.observe import TOTAL, Observations
-from sagesplat.adapt.plan import Choice, Counts, Plan
+from sagesplat.adapt.plan import Choice, Counts, Plan, quality_title
+from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.core.gaussians import BYTES_PER_GAUSSIAN
 from sagesplat.io.files import write_text
 from sagesplat.output import figures, tables
 from sagesplat.output.by_category import Categories, merged, merged_counts, merged_plan, relabelled
-from sagesplat.output.figures import Colours, Panel
+from sagesplat.output.figures import Colours, Panel, Sizes
 from sagesplat.output.tables import MB, Table, name_of
 from sagesplat.segment.block_categories import category_of
 
@@ -37,7 +38,7 @@ class ReportData:
     """Everything the page shows, wherever it comes from. Views are rows of `view_names`."""
 
     title: str
-    target: float  # SSIM of the plan that the page leads with; one of `plans` has it
+    target: float  # of the plan that the page leads with; one of `plans` has it
     names: Mapping[int, str]  # label id -> name
     colours: Colours  # label id -> RGB, 0..255
     observations: Observations
@@ -47,8 +48,11 @@ class ReportData:
     counts: Counts  # (label id, level) -> Gaussians, every level of the ladder
     recovering: frozenset[int]  # levels taken shortly after an opacity reset
     models: Mapping[tuple[int, int], SsimModel]  # by (label id, level)
-    plans: Sequence[Plan]  # of the scene, one per target
+    plans: Sequence[Plan]  # of the scene, one per quality and target
     evaluation: Evaluation
+    quality: QualityKind = "ssim"  # of the plan that the page leads with
+    ssim_target: float | None = None  # of the plan for SSIM beside one for fidelity
+    sizes: Sizes | None = None  # bytes to send of each (label id, level); None: 248 a Gaussian
     panels: Sequence[Panel] = ()  # at the page's target
     scene_facts: Facts = ()
     settings: Facts = ()
@@ -68,6 +72,7 @@ def write_report(folder: Path, data: ReportData) -> Path:
     per_block = replace(data, evaluation=data.evaluation.select(unseen))
     data, promises = by_category(per_block), relabelled(per_block.evaluation, per_block.categories)
     labels = tables.by_size(data.counts)
+    beside = None if data.ssim_target is None else _nearest(data, "ssim", data.ssim_target)
     drawn = _figures(data, labels, per_block, promises)
     plots = [(name, title, _save(figure, folder, name)) for name, title, figure in drawn]
     sheets = dict(_tables(data, labels, per_block, promises))
@@ -82,7 +87,9 @@ def write_report(folder: Path, data: ReportData) -> Path:
         data=data,
         version=__version__,
         headline=_headline(data, promises),
-        categories=_categories(data, labels, promises),
+        categories=_categories(data, main_plan(data), labels, promises),
+        beside=beside,
+        beside_categories=_categories(data, beside, labels, promises) if beside else [],
         num_parts=len(per_block.categories),
         table_rows=TABLE_ROWS,
         plots={name: (title, image) for name, title, image in plots},
@@ -103,10 +110,19 @@ def by_category(data: ReportData) -> ReportData:
         data,
         observations=merged(data.observations, to, ("level", "view")),
         counts=merged_counts(data.counts, to),
+        sizes=None if data.sizes is None else merged_counts(data.sizes, to),
         plans=[merged_plan(plan, to) for plan in data.plans],
-        evaluation=merged(data.evaluation, to, ("target", "view")),
+        evaluation=_merged_evaluation(data.evaluation, to),
         names={label: category_of(name) if label in to else name for label, name in data.names.items()},
     )
+
+
+def _merged_evaluation(rows: Evaluation, to: Categories) -> Evaluation:
+    """The rows by category; those of whole images at one level stay as they are."""
+    uniform = rows.label_id == UNIFORM
+    parts = [merged(rows.select(~uniform), to, ("quality", "target", "view")), rows.select(uniform)]
+    columns = {f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Evaluation)}
+    return Evaluation(**columns)
 
 
 def template(path: Path) -> Template:
@@ -118,56 +134,85 @@ def template(path: Path) -> Template:
 
 
 def main_plan(data: ReportData) -> Plan:
-    """The plan that the page leads with: the one whose target is nearest to `data.target`."""
-    return min(data.plans, key=lambda plan: abs(plan.target - data.target))
+    """The plan that the page leads with: of its quality, the one whose target is nearest to `data.target`."""
+    return _nearest(data, data.quality, data.target)
+
+
+def _nearest(data: ReportData, quality: QualityKind, target: float) -> Plan:
+    return min(data.plans, key=lambda plan: (plan.quality != quality, abs(plan.target - target)))
+
+
+def _sizes(data: ReportData) -> Sizes:
+    """Bytes of each (label id, level), as the page counts them."""
+    return data.sizes or {key: count * BYTES_PER_GAUSSIAN for key, count in data.counts.items()}
 
 
 def _headline(data: ReportData, promises: Evaluation) -> dict:
     """The figures at the top of the page, all measured."""
     plan = main_plan(data)
     full = sum(tables.last_counts(data.counts).values())
-    rows = data.evaluation.select(data.evaluation.target == np.float32(plan.target))
+    rows = data.evaluation.of(plan)
     whole = rows.select(rows.label_id == TOTAL)
-    saved = 1 - plan.count / full if full else 0.0
+    mb, full_mb = (
+        sum(map(figures.bytes_of, plan.choices)) / MB,
+        sum(tables.last_counts(_sizes(data)).values()) / MB,
+    )
+    saved = 1 - mb / full_mb if full_mb else 0.0
+    shares = [c.reached for c in plan.choices if c.reached]
     return {
         "plan": plan,
+        "quality": quality_title(plan.quality),
         "saved": math.floor(100 * saved),  # percent, never rounded in our favour
         "full_count": full,
-        "full_mb": full * BYTES_PER_GAUSSIAN / MB,
-        "mb": plan.nbytes / MB,
+        "full_mb": full_mb,
+        "mb": mb,
+        "unit": "to send" if data.sizes else "at 248 bytes a Gaussian",
+        "fidelity": tables.mean(whole.fidelity),
         "ssim": tables.mean(whole.ssim),
         "psnr": tables.mean(whole.psnr),
         "full_ssim": tables.mean(whole.full_ssim),
         "full_psnr": tables.mean(whole.full_psnr),
         "num_views": len(np.unique(whole.view)),
-        "kept": tables.promise_kept(promises.select(promises.target == np.float32(plan.target))),
+        "kept": _kept(plan, promises.of(plan)),
+        "least": min(shares, key=lambda share: share.share) if shares else None,
+        "num_drawn": max((share.num_views for share in shares), default=0),
         "infeasible": [c for c in plan.choices if c.status == "infeasible"],
         "binding": None if plan.binding is None else name_of(plan.binding, data.names),
     }
 
 
-def _categories(data: ReportData, labels: Sequence[int], promises: Evaluation) -> list[dict]:
-    """A line of the page's main table per label, the largest first."""
-    plan = main_plan(data)
-    full = tables.last_counts(data.counts)
+def _kept(plan: Plan, rows: Evaluation) -> tables.Kept:
+    """Measurements at or above the target: of all views for fidelity, else of those whose bound is there.
+
+    A plan of a scene for fidelity promises a share of all viewpoints, whatever the bound of each.
+    """
+    if plan.quality == "fidelity":
+        known = np.isin(rows.label_id, [c.label_id for c in plan.choices if c.status == "ok"])
+        rows = replace(rows, predicted=np.where(known, np.float32(np.inf), np.float32(np.nan)))
+    return tables.promise_kept(rows.of_own_quality())
+
+
+def _categories(data: ReportData, plan: Plan, labels: Sequence[int], promises: Evaluation) -> list[dict]:
+    """A line of one of the page's tables of categories per label, the largest first."""
+    sizes = tables.last_counts(_sizes(data))
     chosen: dict[int, Choice] = {choice.label_id: choice for choice in plan.choices}
-    at_target = data.evaluation.target == np.float32(plan.target)
-    promised = promises.select(promises.target == np.float32(plan.target))
+    at_target, promised = data.evaluation.of(plan), promises.of(plan)
     lines = []
     for label_id in labels:
-        rows = data.evaluation.select(at_target & (data.evaluation.label_id == label_id))
-        choice = chosen.get(label_id)
+        rows = at_target.select(at_target.label_id == label_id)
+        choice, full = chosen.get(label_id), sizes.get(label_id, 0)
         lines.append(
             {
                 "name": name_of(label_id, data.names),
                 "colour": _css(data.colours.get(label_id, (128, 128, 128))),
                 "choice": choice,
-                "full": full[label_id],
-                "share": choice.count / full[label_id] if choice and full[label_id] else math.nan,
-                "of_scene": full[label_id] / max(1, *full.values()),
+                "mb": figures.bytes_of(choice) / MB if choice else math.nan,
+                "share": figures.bytes_of(choice) / full if choice and full else math.nan,
+                "of_scene": full / max(1, *sizes.values()),
+                "fidelity": tables.mean(rows.fidelity),
                 "measured": tables.mean(rows.ssim),
                 "full_ssim": tables.mean(rows.full_ssim),
-                "kept": tables.promise_kept(promised.select(promised.label_id == label_id)),
+                "kept": _kept(plan, promised.select(promised.label_id == label_id)),
             }
         )
     return lines
@@ -175,24 +220,25 @@ def _categories(data: ReportData, labels: Sequence[int], promises: Evaluation) -
 
 def _figures(data: ReportData, labels: Sequence[int], per_block: ReportData, promises: Evaluation):
     """(file name, title, Figure) of every plot that the data allow."""
-    names, colours, seen = data.names, data.colours, data.observations
+    names, colours, seen, quality = data.names, data.colours, data.observations, data.quality
+    unit = "bytes to send (MB)" if data.sizes else figures.RAW
     yield (
         "size_by_target",
         "Model size by target and category",
-        figures.size_by_target(data.plans, data.counts, labels, names, colours),
+        figures.size_by_target(data.plans, _sizes(data), labels, names, colours, unit),
     )
     if len(data.evaluation):
         yield (
             "quality_over_size",
             "Quality over size on unseen views",
             figures.quality_over_size(
-                seen, data.test_views, data.counts, data.plans, data.evaluation, data.recovering
+                _uniform(data), _sizes(data), data.plans, data.evaluation, quality, unit
             ),
         )
         yield (
             "promised_and_measured",
-            "Promised and measured SSIM on unseen views",
-            figures.promised_and_measured(promises, labels, names, colours),
+            f"Promised and measured {quality_title(quality)} on unseen views",
+            figures.promised_and_measured(promises, labels, names, colours, quality),
         )
     if len(seen):
         yield (
@@ -218,10 +264,22 @@ def _figures(data: ReportData, labels: Sequence[int], per_block: ReportData, pro
         )
 
 
+def _uniform(data: ReportData) -> dict[int, float]:
+    """Quality of the whole image on unseen views by level, all categories at one: what plans compare with."""
+    if data.quality == "fidelity":
+        return data.evaluation.uniform("fidelity")
+    rows = data.observations.select(np.isin(data.observations.view, data.test_views))
+    levels = [level for level in np.unique(rows.level).tolist() if level not in data.recovering]
+    return {level: tables.view_mean(rows, TOTAL, level) for level in levels}
+
+
 def _tables(data: ReportData, labels: Sequence[int], per_block: ReportData, promises: Evaluation):
     """(file name, Table) of every table that the data allow."""
     names = data.names
     yield "plan", tables.plan_table(main_plan(per_block), per_block.counts, per_block.names)
+    if data.ssim_target is not None:
+        beside = _nearest(per_block, "ssim", data.ssim_target)
+        yield "plan_ssim", tables.plan_table(beside, per_block.counts, per_block.names)
     yield "size_by_target", tables.targets_table(data.plans, data.counts, labels, names)
     if len(data.evaluation):
         yield "evaluation", tables.evaluation_table(promises, labels, names)

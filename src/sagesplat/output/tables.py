@@ -11,9 +11,9 @@ from typing import Protocol
 import numpy as np
 
 from sagesplat.adapt.eq3 import SsimModel
-from sagesplat.adapt.evaluate import Evaluation
+from sagesplat.adapt.evaluate import QUALITIES, Evaluation
 from sagesplat.adapt.observe import TOTAL, Observations
-from sagesplat.adapt.plan import Counts, Plan
+from sagesplat.adapt.plan import Counts, Plan, quality_title
 from sagesplat.core.gaussians import BYTES_PER_GAUSSIAN
 from sagesplat.io.columns import text_cell
 from sagesplat.io.files import atomic_path, write_text
@@ -207,27 +207,26 @@ def ladder_table(
 def outcome_table(plan: Plan, counts: Counts, evaluation: Evaluation, names: Mapping[int, str]) -> Table:
     """A plan in short: what each category takes, what was promised and what test views show."""
     full = last_counts(counts)
-    rows = evaluation.select(evaluation.target == np.float32(plan.target))
+    rows = evaluation.of(plan)
+    fidelity = plan.quality == "fidelity"
+
+    def measured(of: Evaluation) -> tuple[float, ...]:
+        return (*((mean(of.fidelity),) if fidelity else ()), mean(of.ssim), mean(of.full_ssim))
+
     body = []
     for choice in sorted(plan.choices, key=lambda c: -full.get(c.label_id, 0)):
-        here = rows.select(rows.label_id == choice.label_id)
+        here = measured(rows.select(rows.label_id == choice.label_id))
         share = choice.count / full[choice.label_id] if full.get(choice.label_id) else math.nan
-        body.append(
-            (name_of(choice.label_id, names), choice.level, choice.count, share, choice.predicted_ssim,
-             mean(here.ssim), mean(here.full_ssim), choice.status)
-        )  # fmt: skip
-    whole = rows.select(rows.label_id == TOTAL)
+        cells = (choice.level, choice.count, share, choice.predicted)
+        body.append((name_of(choice.label_id, names), *cells, *here, choice.verdict))
     share = plan.count / max(1, sum(full.values()))
-    measured = (mean(whole.ssim), mean(whole.full_ssim))
-    body.append((name_of(TOTAL, names), math.nan, plan.count, share, math.nan, *measured, plan.status))
-    header = ("category", "level", "Gaussians", "share", "promised", "test", "full", "status")
-    formats = ("", "d", ",d", ".0%", ".3f", ".3f", ".3f", "")
-    return Table(
-        f"Plan for SSIM {plan.target:g}: promised, and measured on test views beside the full model",
-        header,
-        formats,
-        body,
-    )
+    whole = measured(rows.select(rows.label_id == TOTAL))
+    body.append((name_of(TOTAL, names), math.nan, plan.count, share, math.nan, *whole, plan.verdict))
+    shown = ("fidelity", "SSIM", "full") if fidelity else ("test", "full")
+    header = ("category", "level", "Gaussians", "share", "promised", *shown, "status")
+    formats = ("", "d", ",d", ".0%", ".3f", *[".3f"] * len(shown), "")
+    beside = "and measured on test views beside the full model"
+    return Table(f"Plan for {plan.asked}: promised, {beside}", header, formats, body)
 
 
 def plan_table(plan: Plan, counts: Counts, names: Mapping[int, str]) -> Table:
@@ -236,12 +235,24 @@ def plan_table(plan: Plan, counts: Counts, names: Mapping[int, str]) -> Table:
     body = []
     for choice in sorted(plan.choices, key=lambda c: -full.get(c.label_id, 0)):
         share = choice.count / full[choice.label_id] if full.get(choice.label_id) else math.nan
-        cells = (choice.level, choice.count, share, choice.nbytes / MB)
-        name = name_of(choice.label_id, names)
-        body.append((name, *cells, choice.distance, choice.predicted_ssim, choice.status))
-    header = ("category", "level", "Gaussians", "of full model", "MB", "distance", "promised SSIM", "status")
-    formats = ("", ",d", ",d", ".1%", ".2f", ".3f", ".3f", "")
-    return Table(f"Plan for SSIM {plan.target:g}", header, formats, body)
+        sent = math.nan if choice.transfer_bytes is None else choice.transfer_bytes / MB
+        cells = (
+            choice.level,
+            choice.count,
+            share,
+            choice.nbytes / MB,
+            sent,
+            choice.distance,
+            choice.predicted,
+        )
+        of = choice.reached
+        views = (of.share, of.low, of.high, of.num_views) if of else (math.nan,) * 4
+        body.append((name_of(choice.label_id, names), *cells, *views, choice.verdict))
+    header = ("category", "level", "Gaussians", "of full model", "MB", "MB to send", "distance")
+    header += (f"promised {quality_title(plan.quality)}", "reached in", "from", "to", "views", "status")
+    formats = ("", ",d", ",d", ".1%", ".2f", ".3f", ".3f", ".3f", ".0%", ".0%", ".0%", ",d", "")
+    note = "reached in: share of the views that measure the target at this level or above, 95 % interval"
+    return Table(f"Plan for {plan.asked}", header, formats, body, notes=(f"{note} from, to.",))
 
 
 def targets_table(
@@ -251,7 +262,7 @@ def targets_table(
     full = last_counts(counts)
     header = ["category", "full model Gaussians", "full model MB"]
     for plan in plans:
-        header += [f"t={plan.target:g} {column}" for column in ("level", "Gaussians", "MB", "status")]
+        header += [f"{plan.asked} {column}" for column in ("level", "Gaussians", "MB", "status")]
     chosen = [{choice.label_id: choice for choice in plan.choices} for plan in plans]
     body = []
     for label_id in labels:
@@ -262,13 +273,13 @@ def targets_table(
         ]
         for choices in chosen:
             if choice := choices.get(label_id):
-                row += [choice.level, choice.count, choice.nbytes / MB, choice.status]
+                row += [choice.level, choice.count, choice.nbytes / MB, choice.verdict]
             else:
                 row += [math.nan, 0, 0.0, ""]
         body.append(tuple(row))
     total = ["all", sum(full.values()), sum(full.values()) * BYTES_PER_GAUSSIAN / MB]
     for plan in plans:
-        total += [math.nan, plan.count, plan.nbytes / MB, plan.status]
+        total += [math.nan, plan.count, plan.nbytes / MB, plan.verdict]
     formats = ("", ",d", ".2f", *(",d", ",d", ".2f", "") * len(plans))
     return Table("Size by target", tuple(header), formats, [*body, tuple(total)])
 
@@ -306,30 +317,34 @@ def promise_kept(rows: Decisions) -> Kept:
 
 
 def evaluation_table(evaluation: Evaluation, labels: Sequence[int], names: Mapping[int, str]) -> Table:
-    """Promise against measurement for every target and label, and for the whole image.
+    """Lower bound against measurement for every plan and label, and for the whole image.
 
     A plan within a budget has no target and promises none: its rows come last.
     """
     body = []
-    for target in np.unique(evaluation.target):
-        asked = np.isnan(evaluation.target) if np.isnan(target) else evaluation.target == target
+    asked = [
+        (i, t) for i in range(len(QUALITIES)) for t in np.unique(evaluation.target[evaluation.quality == i])
+    ]
+    for i, target in asked:
+        within = np.isnan(evaluation.target) if np.isnan(target) else evaluation.target == target
+        plan = evaluation.select(within & (evaluation.quality == i))
         for label_id in [*labels, TOTAL]:
-            rows = evaluation.select(asked & (evaluation.label_id == label_id))
-            rows = rows.select(np.isfinite(rows.ssim))
+            rows = plan.select(plan.label_id == label_id)
+            own = rows.of_own_quality()
+            rows, own = rows.select(np.isfinite(own.ssim)), own.select(np.isfinite(own.ssim))
             if not len(rows):
                 continue
-            kept = promise_kept(rows)
+            kept = promise_kept(own)
             none = label_id == TOTAL or np.isnan(target)
             share = (math.nan,) * 3 if none else (kept.promised, kept.kept, kept.share)
-            promise = (mean(rows.predicted), mean(rows.ssim), mean(np.abs(rows.predicted - rows.ssim)))
+            found = (mean(rows.predicted), mean(rows.fidelity), mean(rows.ssim))
             others = (mean(rows.full_ssim), mean(rows.psnr), mean(rows.full_psnr))
-            body.append(
-                (float(f"{target:g}"), name_of(label_id, names), len(rows), *share, *promise, *others)
-            )
-    header = ("target", "category", "views", "promised", "kept", "share kept", "promised SSIM", "SSIM")
-    header += ("error of promise", "full model SSIM", "PSNR", "full model PSNR")
-    formats = ("g", "", ",d", ",d", ",d", ".0%", ".3f", ".3f", ".3f", ".3f", ".2f", ".2f")
-    return Table("Promise against measurement, unseen views", header, formats, body)
+            named = (quality_title(QUALITIES[i]), float(f"{target:g}"), name_of(label_id, names), len(rows))
+            body.append((*named, *share, *found, mean(np.abs(own.predicted - own.ssim)), *others))
+    header = ("quality", "target", "category", "views", "promised", "kept", "share kept", "bound", "fidelity")
+    header += ("SSIM", "error of bound", "full model SSIM", "PSNR", "full model PSNR")
+    formats = ("", "g", "", ",d", ",d", ",d", ".0%", ".3f", ".3f", ".3f", ".3f", ".3f", ".2f", ".2f")
+    return Table("Bound against measurement, unseen views", header, formats, body)
 
 
 def models_table(models: Mapping[tuple[int, int], SsimModel], names: Mapping[int, str]) -> Table:

@@ -12,6 +12,7 @@ from sagesplat.core.config import (
     NestConfig,
     PlanConfig,
     PosesConfig,
+    SampleConfig,
     SceneConfig,
     TrainConfig,
 )
@@ -51,6 +52,7 @@ def recorded_settings(run: RunDir, of: str = "run") -> dict[str, Any]:
         "train": _config(TrainConfig, train),
         "blocks": _config(BlocksConfig, {**_made(run, "blocks"), **boundary}),
         "nest": _config(NestConfig, nest),
+        "sample": _config(SampleConfig, _made(run, "sample")),
         "fit": _config(FitConfig, observed),
         "plan": _config(PlanConfig, _made(run, "plan")),
         "seed": _seed((nest if of == "nest" and nest else train).get("seed")),

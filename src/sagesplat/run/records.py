@@ -26,6 +26,7 @@ _KINDS = {  # settings by stage; those of other stages are compared, and never u
     "blocks": config.BlocksConfig,
     "nest": config.NestConfig,
     "observe": config.FitConfig,
+    "sample": config.SampleConfig,
     "fit": config.FitConfig,
     "plan": config.PlanConfig,
 }

@@ -190,13 +190,28 @@ class RunDir:
         return self.adapted / "observations.csv"
 
     @property
+    def viewpoints(self) -> Path:
+        """Drawn viewpoints, and the rule that they were drawn by."""
+        return self.adapted / "viewpoints.json"
+
+    @property
+    def sampled(self) -> Path:
+        """Fidelity per category and level at drawn viewpoints."""
+        return self.adapted / "fidelity.npz"
+
+    @property
+    def fidelity(self) -> Path:
+        """Fidelity per category and level at any viewpoint, with its lower bound."""
+        return self.adapted / "fidelity.json"
+
+    @property
     def models(self) -> Path:
         """Eq. 3 per category and level."""
         return self.adapted / "models.json"
 
     @property
     def promises(self) -> Path:
-        """Quality per category and level at any viewpoint, with its lower bound."""
+        """SSIM against photos per category and level at any viewpoint, with its lower bound."""
         return self.adapted / "promises.json"
 
     @property

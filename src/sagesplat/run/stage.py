@@ -19,12 +19,12 @@ from sagesplat.run.records import is_done, read_record, record
 _CLOCK_STEP = 2.0  # seconds: some disks keep no finer time
 # Stages that are made of earlier results within minutes: they follow those without --force, as long as
 # their own settings are the same. The settings of the second ones are the plan's.
-_DERIVED = {"observe", "fit", "plan", "crossview", "same_size", "paper"}
+_DERIVED = {"observe", "sample", "fit", "plan", "crossview", "same_size", "paper"}
 _OF_PLAN = {"compose", "evaluate", "report"}
 _ORDER = (
     "poses", "scene", "segment", "masks", "lift", "blocks", "train", "fuse", "block_categories",
-    "base", "nest", "observe", "fit", "plan", "compose", "evaluate", "report", "crossview", "same_size",
-    "paper",
+    "base", "nest", "observe", "sample", "fit", "plan", "compose", "evaluate", "report", "crossview",
+    "same_size", "paper",
 )  # fmt: skip
 
 

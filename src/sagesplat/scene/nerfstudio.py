@@ -138,7 +138,7 @@ def _views(file: Path, frames: Sequence[Mapping[str, Any]], downscale: int) -> l
             key = (lens.model, lens.params, lens.width, lens.height)
             if key not in lenses:
                 lenses[key] = lens, intrinsics(lens) if is_pinhole(lens) else pinhole(lens)
-            w2c = _w2c(frame.get("transform_matrix"))
+            w2c = world_to_camera(frame.get("transform_matrix"))
         except (TypeError, ValueError, OverflowError) as error:
             reason = short(error)
             raise SceneError(f"{file}: frame {str(path)!r}: {reason}; export the transforms again") from None
@@ -218,7 +218,7 @@ def _number(frame: Mapping[str, Any], key: str, default: float | None = None) ->
     return float(value)
 
 
-def _w2c(matrix: Any) -> Float64[np.ndarray, "4 4"]:
+def world_to_camera(matrix: Any) -> Float64[np.ndarray, "4 4"]:
     """World to camera with OpenCV axes, from camera to world with OpenGL axes. Raises ValueError."""
     if matrix is None:
         raise ValueError("no transform_matrix")

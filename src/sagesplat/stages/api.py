@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from sagesplat.adapt.bound_plans import Costs, plan_for_view, quality_at
-from sagesplat.adapt.observe import PERCENTILE, distances_in_views
+from sagesplat.adapt.observe import PERCENTILE, RenderedLabels, distances_in_views
 from sagesplat.adapt.plan import Plan, plan_view
 from sagesplat.adapt.viewpoint import ViewModel
-from sagesplat.core.config import RunConfig
+from sagesplat.core.config import PlanConfig, RunConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit, Event
 from sagesplat.core.gaussians import Gaussians
@@ -25,7 +25,8 @@ from sagesplat.run.run_dir import LadderKind, RunDir, check_links
 from sagesplat.scene.scene import Camera, Scene, View
 from sagesplat.stages import pipeline
 from sagesplat.stages.methods import NestedLevels
-from sagesplat.stages.results import models_of, plans_of, promises_of
+from sagesplat.stages.plan import check_targets
+from sagesplat.stages.results import fidelity_of, models_of, plans_of, promises_of
 
 
 def ignore(event: Event) -> None:
@@ -99,7 +100,7 @@ def open_run(folder: Path | str, ladder: LadderKind = "nested") -> "FinishedRun"
     Example:
         >>> from sagesplat import open_run
         >>> run = open_run("runs/garden")  # doctest: +SKIP
-        >>> plan = run.plan_camera(run.scene.views[0].camera, target_ssim=0.8)  # doctest: +SKIP
+        >>> plan = run.plan_camera(run.scene.views[0].camera, target_fidelity=0.95)  # doctest: +SKIP
         >>> gaussians = run.compose(plan)  # doctest: +SKIP
     """
     run = RunDir(Path(folder), ladder)
@@ -127,46 +128,73 @@ class FinishedRun:
 
     @cached_property
     def plans(self) -> tuple[Plan, ...]:
-        """The scene's plans, one per target SSIM, ascending. RunError before `sagesplat plan`."""
+        """The scene's plans, those of the quality that leads first. RunError before `sagesplat plan`."""
         return plans_of(self.job)
 
     @cached_property
+    def fidelity(self) -> dict[int, ViewModel]:
+        """Models of fidelity by label id (nested ladder). RunError before `sagesplat fit`."""
+        return fidelity_of(self.job)
+
+    @cached_property
     def promises(self) -> dict[int, ViewModel]:
-        """The SSIM model of each category, by label id (nested ladder). RunError before `sagesplat fit`."""
+        """Models of SSIM against photos by label id; otherwise like `fidelity`."""
         return promises_of(self.job)
+
+    @cached_property
+    def _full(self) -> Gaussians:
+        ladder = self.job.ladder
+        return ladder.load(ladder.levels[-1])
 
     @cached_property
     def costs(self) -> Costs:
         """Gaussians and bytes of each category's levels; of a nested ladder."""
         return NestedLevels(self.job).costs
 
-    def plan_camera(self, camera: Camera, target_ssim: float) -> Plan:
-        """The cheapest level of each category whose predicted SSIM reaches a target from one camera (Eq. 1).
+    def plan_camera(
+        self, camera: Camera, *, target_fidelity: float | None = None, target_ssim: float | None = None
+    ) -> Plan:
+        """The cheapest level of each category that is promised to reach a target from one camera (Eq. 1).
 
-        The camera may be anywhere: no photo has to be taken there. For a nested ladder the prediction is the
-        calibrated lower bound of the promises, for snapshots it is Eq. 3 at the category's distance.
+        The camera may be anywhere: no photo has to be taken there. For a nested ladder the promise is a lower
+        confidence bound, for snapshots it is Eq. 3 at the category's distance. For fidelity, categories whose
+        pixels are worth their bytes then get more, until the image is no worse than with all at one level.
 
         Args:
             camera: The viewer's: pose in the world of `scene`, intrinsics and image size in pixels.
-            target_ssim: SSIM that every category is to reach, above 0 and at most 1.
+            target_fidelity: SSIM against the full model from the same camera, above 0 and at most 1; of a
+                nested ladder. Default: 0.95, where `target_ssim` is not given.
+            target_ssim: SSIM against photos instead.
 
         Returns:
-            One level per category; `status` is "infeasible" where a category cannot reach the target.
+            One level per category; `status` is "infeasible" where a category cannot reach the target, and "no
+            promise" where the camera is too far from all that was sampled: there it gets the highest level.
 
         Raises:
-            RunError: For an impossible target, or before the run has models.
+            RunError: For an impossible target, both targets, or before the run has models.
         """
-        view = View("viewer", camera, Path())
+        if target_fidelity is not None and target_ssim is not None:
+            raise RunError("a camera is planned for one target; give target_fidelity or target_ssim")
+        config = PlanConfig(target_fidelity, target_ssim)
+        config = check_targets(config, self.job.run.ladder)
+        kind, target = config.quality, config.target
         # Distances have to be measured as those that the models were fitted to.
         percentile = PERCENTILE if self.job.fit_config.distance == "percentile" else 0.0
-        viewer = replace(self.scene, views=(view,))
+        viewer = replace(self.scene, views=(View("viewer", camera, Path()),))
         distances = distances_in_views(viewer, self.job.point_labels, percentile)
         if self.job.run.ladder == "nested":
-            quality = quality_at(self.costs, self.promises, distances, [camera])
-            return replace(plan_for_view(quality, self.costs, target_ssim, 0), view=None)
+            models = self.fidelity if kind == "fidelity" else self.promises
+            quality = quality_at(self.costs, models, distances, [camera], kind)
+            pixels = self._pixels(camera) if kind == "fidelity" else None
+            return replace(plan_for_view(quality, self.costs, target, 0, pixels), view=None)
         ladder, models = self.job.ladder, models_of(self.job)
         near = {label: float(np.float64(d[0])) for label, d in distances.items()}
-        return plan_view(models, ladder.counts, near, target_ssim, None, recovering=ladder.recovering)
+        return plan_view(models, ladder.counts, near, target, None, recovering=ladder.recovering)
+
+    def _pixels(self, camera: Camera) -> np.ndarray:
+        """Pixels of each category that a camera sees, as the full model paints them; float64 [L]."""
+        image = RenderedLabels(self._full, self.job.backend, self.job.antialiased)[View("", camera, Path())]
+        return np.array([(image == label).sum() for label in self.costs.labels], np.float64)
 
     def compose(self, plan: Plan | Mapping[int, int]) -> Gaussians:
         """The Gaussians of a plan: each category at its level.

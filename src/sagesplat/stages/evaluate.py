@@ -1,9 +1,12 @@
 """Makes the evaluation: the plans measured on the test views."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from sagesplat.adapt.evaluate import evaluate
+from sagesplat.adapt.evaluate import Evaluation, evaluate
 from sagesplat.adapt.observe import TOTAL
+from sagesplat.adapt.plan import Plan
 from sagesplat.core.events import Progress
 from sagesplat.output import tables
 from sagesplat.run.job import Job
@@ -26,27 +29,39 @@ def evaluate_plans(job: Job) -> None:
         plans = [*plans_of(job), *([within] if within else [])]
         table = evaluate(
             job.scene, job.photos, label_images(job, fitted.masks), job.ladder, plans, method.predicted,
-            region=fitted.region, compose=lambda plan: compose(job, plan),
-            backend=job.backend, antialiased=job.antialiased,
+            region=fitted.region, min_share=fitted.min_share, uniform=_levels_beside(job, plans),
+            compose=lambda plan: compose(job, plan), backend=job.backend, antialiased=job.antialiased,
             progress=lambda done, total: job.emit(Progress("evaluate", done, total)),
         )  # fmt: skip
         table.write_csv(run.evaluation)
         if len(table):
-            plan = scene_plan(job, main_target(run))
+            plan = scene_plan(job, *main_target(run))
             _show(job, tables.outcome_table(plan, job.ladder.counts, table, titles(job.names())))
-        whole = table.select(table.label_id == TOTAL)
-        lines = []
-        for target in np.unique(whole.target):
-            within_budget = np.isnan(target)
-            at = whole.select(np.isnan(whole.target) if within_budget else whole.target == target)
-            asked = "within the budget" if within_budget else f"SSIM {target:g} asked"
-            lines.append(
-                f"{asked}: test views {at.ssim.mean():.3f} / {at.psnr.mean():.2f} dB "
-                f"(full model {at.full_ssim.mean():.3f} / {at.full_psnr.mean():.2f} dB)"
-            )
-        return lines
+        return [line for plan in plans for line in _lines(plan, table.of(plan))]
 
     fitted = [run.provenance("observe"), run.provenance("fit")]
     inputs = [run.labels, *method.files, *fitted, *compose_inputs(job)]
     settings = {"tune_steps": settings_of(run, "plan").get("tune_steps", 0)}
     run_stage(job, "evaluate", settings, inputs, [run.evaluation], make)
+
+
+def _levels_beside(job: Job, plans: Sequence[Plan]) -> list[int]:
+    """The levels whose sizes are next to those of plans for fidelity: what such plans are compared with."""
+    levels = job.ladder.levels
+    sizes = np.array([job.ladder.size(level) for level in levels])
+    above = [int(np.searchsorted(sizes, plan.count)) for plan in plans if plan.quality == "fidelity"]
+    near = {min(max(i, 0), len(levels) - 1) for at in above for i in (at - 1, at)}
+    return [levels[i] for i in sorted(near)]
+
+
+def _lines(plan: Plan, rows: Evaluation) -> list[str]:
+    """What test views measure of a plan, in words."""
+    at = rows.select(rows.label_id == TOTAL)
+    if not len(at):
+        return []
+    asked = "within the budget" if plan.budget is not None else f"{plan.asked} asked"
+    alike = f"fidelity {at.fidelity.mean():.3f}, " if plan.quality == "fidelity" else ""
+    return [
+        f"{asked}: test views {alike}{at.ssim.mean():.3f} / {at.psnr.mean():.2f} dB "
+        f"(full model {at.full_ssim.mean():.3f} / {at.full_psnr.mean():.2f} dB)"
+    ]

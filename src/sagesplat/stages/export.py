@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sagesplat.adapt.ladder import read_prefixes
+from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.core.errors import RunError
 from sagesplat.formats.increments import INDEX, Format, write_increments
 from sagesplat.formats.ply import write_ply
@@ -29,7 +30,12 @@ def export_increments(job: Job, folder: Path, kind: Format) -> int:
 
 
 def export_ply(
-    job: Job, path: Path, *, level: int | None, labels: Sequence[str], target: float | None
+    job: Job,
+    path: Path,
+    *,
+    level: int | None,
+    labels: Sequence[str],
+    target: tuple[QualityKind, float] | None,
 ) -> int:
     """Write a level or a composition, whole or some categories, as a PLY; returns the number of Gaussians."""
     if path.exists() and not job.force:
@@ -38,7 +44,7 @@ def export_ply(
     if level is not None:
         g = job.ladder.load(level, wanted)
     else:
-        plan = main_plan(job) if target is None else scene_plan(job, target)
+        plan = main_plan(job) if target is None else scene_plan(job, *target)
         g = compose(job, plan).of_labels(wanted)
     write_ply(path, g, job.names())
     return len(g)

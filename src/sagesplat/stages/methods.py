@@ -3,27 +3,39 @@
 Stages and studies ask `method_of` what they need and never which of the two it is.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
-from sagesplat.adapt.bound_plans import Costs, Quality, plan_for_scene, plan_for_view, plan_within, quality_at
+from sagesplat.adapt.bound_plans import Costs, Quality, plan_for_view, plan_within, pooled, quality_at
 from sagesplat.adapt.coverage import Decisions, score
 from sagesplat.adapt.eq3 import SsimModel
 from sagesplat.adapt.observe import LabelImages, Observations
 from sagesplat.adapt.plan import Plan, plan_scene, plan_view
-from sagesplat.adapt.viewpoint import write_promises
+from sagesplat.adapt.scene_plans import mended, plan_for_scene
+from sagesplat.adapt.viewpoint import QualityKind, write_promises
 from sagesplat.core.config import FitConfig, PlanConfig
 from sagesplat.core.errors import RunError
 from sagesplat.formats.increments import INDEX, totals
 from sagesplat.run.job import Job
-from sagesplat.stages.results import increments_of, models_of, promises_of
+from sagesplat.scene.scene import Camera
+from sagesplat.segment.masks import UNLABELLED
+from sagesplat.stages.fidelity import compositions_at
+from sagesplat.stages.results import (
+    fidelity_of,
+    increments_of,
+    models_of,
+    promises_of,
+    sampled_of,
+    viewpoints_of,
+)
 from sagesplat.stages.shared import distances, label_images, label_named, observed
 from sagesplat.stages.viewpoints import fit_viewpoints
 
+_MENDINGS = 4  # times that a plan of a scene is measured in its composition and mended
 Curves = Mapping[tuple[int, int], SsimModel]  # Eq. 3 by (label id, level)
 
 
@@ -43,25 +55,34 @@ class Method(Protocol):
     def check(self, config: PlanConfig) -> None:
         """RunError for a plan that cannot be made of these levels."""
 
-    def predicted(self, label_id: int, level: int, row: int) -> float:
-        """SSIM that plans count on in a view (row of Scene.views); NaN where nothing is known."""
+    def predicted(self, quality: QualityKind, label_id: int, level: int, row: int) -> float:
+        """Quality that plans count on in a view (row of Scene.views); NaN where nothing is promised."""
         ...
 
-    def plan_view(self, row: int, target: float) -> Plan:
+    def plan_view(self, row: int, target: float, quality: QualityKind = "ssim") -> Plan:
         """The cheapest levels predicted to reach `target` in a view, seen or not."""
         ...
 
-    def plan_scene(self, target: float, share: float) -> Plan:
-        """The cheapest levels predicted to reach `target` in a `share` of the training views."""
+    def plan_scene(self, target: float, share: float, quality: QualityKind = "ssim") -> Plan:
+        """The cheapest levels that reach `target` in a `share` of the viewpoints."""
         ...
 
+    def plan_scenes(self, targets: Sequence[tuple[QualityKind, float]], share: float) -> list[Plan]:
+        """Plans of the scene for several targets, checked in their compositions where that is possible."""
+        return [self.plan_scene(target, share, quality) for quality, target in targets]
+
     def plan_budget(self, config: PlanConfig) -> Plan:
-        """The levels of most predicted SSIM within the budget."""
+        """The levels of most expected quality within the budget."""
         ...
 
     def amount(self, plan: Plan) -> str:
         """What a plan takes of all there is, for people."""
         ...
+
+    @property
+    def bytes_to_send(self) -> dict[tuple[int, int], int] | None:
+        """Bytes of each (label id, level); None where the levels are not encoded."""
+        return None
 
     def unseen_labels(self) -> LabelImages | None:
         """The label images of test views; None: as the Gaussians paint them, as the paper has no others."""
@@ -102,7 +123,7 @@ class Snapshots(Method):
         if config.budget:
             self.plan_budget(config)
 
-    def predicted(self, label_id: int, level: int, row: int) -> float:
+    def predicted(self, quality: QualityKind, label_id: int, level: int, row: int) -> float:
         """See `Method`."""
         model = self._models.get((label_id, level))
         return model(self._distance(label_id, row)) if model else np.nan
@@ -110,13 +131,13 @@ class Snapshots(Method):
     def _distance(self, label_id: int, row: int) -> float:
         return float(self._distances[label_id][row]) if label_id in self._distances else np.nan
 
-    def plan_view(self, row: int, target: float) -> Plan:
+    def plan_view(self, row: int, target: float, quality: QualityKind = "ssim") -> Plan:
         """See `Method`."""
         ladder = self.job.ladder
         here = {label: self._distance(label, row) for label in self._distances}
         return plan_view(self._models, ladder.counts, here, target, row, recovering=ladder.recovering)
 
-    def plan_scene(self, target: float, share: float) -> Plan:
+    def plan_scene(self, target: float, share: float, quality: QualityKind = "ssim") -> Plan:
         """See `Method`."""
         ladder, far = self.job.ladder, self._training_distances
         return plan_scene(self._models, ladder.counts, far, target, share, recovering=ladder.recovering)
@@ -132,7 +153,7 @@ class Snapshots(Method):
 
 
 class NestedLevels(Method):
-    """Ours: prefixes of one model, a lower confidence bound of SSIM by viewpoint, the fewest bytes."""
+    """Ours: prefixes of one model, lower bounds of two qualities by viewpoint, the fewest bytes."""
 
     fit_settings = ("min_share", "region", "confidence")
     streams = True
@@ -142,7 +163,7 @@ class NestedLevels(Method):
         self.job = job
         self.level_files = [run.prefixes, run.increments / INDEX]
         self.model_files = [run.models, run.promises]
-        self.files = [*self.level_files, run.promises]
+        self.files = [*self.level_files, run.promises, run.fidelity, run.sampled, run.viewpoints]
 
     @cached_property
     def costs(self) -> Costs:
@@ -153,21 +174,51 @@ class NestedLevels(Method):
         return Costs(tuple(labels), *columns)
 
     @cached_property
-    def quality(self) -> Quality:
+    def qualities(self) -> dict[QualityKind, Quality]:
         """What is predicted of the levels in every view of the scene."""
         job = self.job
         far = distances(job, job.fit_config.distance)
         cameras = [view.camera for view in job.scene.views]
-        return quality_at(self.costs, promises_of(job), far, cameras)
+        return {
+            "fidelity": quality_at(self.costs, fidelity_of(job), far, cameras, "fidelity"),
+            "ssim": quality_at(self.costs, promises_of(job), far, cameras, "ssim"),
+        }
 
     @cached_property
     def shown(self) -> np.ndarray:
-        """Pixels of each category in each training view, float64 [V, L]; 0 for small shares."""
-        seen, pixels = _training_rows(self.job), np.zeros(self.quality.distance.shape)
-        for i, label in enumerate(self.costs.labels):
-            mine = seen.select(seen.label_id == label)
-            pixels[mine.view, i] = mine.num_pixels
-        return pixels
+        """Pixels of each category in each view of the scene, float64 [V, L]; 0 for small shares."""
+        return self._table(lambda rows: rows.num_pixels, self.job.ladder.levels[-1:], 0.0)[..., 0]
+
+    @cached_property
+    def sampled(self) -> tuple[np.ndarray, np.ndarray]:
+        """Fidelity of each level and pixels of each category at the viewpoints that were drawn."""
+        found = sampled_of(self.job)
+        at = {label: i for i, label in enumerate(found.labels)}
+        rows = [-1 if label == UNLABELLED else at.get(label, -1) for label in self.costs.labels]
+        # unlabelled pixels have no target, and stay in full
+        known = (np.array(rows) >= 0) & found.shown(self.job.fit_config.min_share)[:, rows]
+        fidelity = np.where(known[..., None], found.fidelity[:, rows].astype(np.float64), np.nan)
+        return fidelity, np.where(known, found.pixels[:, rows], 0).astype(np.float64)
+
+    @cached_property
+    def measured(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """SSIM against photos of training and calibration, pixels there, which of them training saw."""
+        scene = self.job.scene
+        rows = np.concatenate([scene.train_ids, scene.calibration_ids])
+        ssim = self._table(lambda found: found.ssim, self.job.ladder.levels, np.nan)
+        ssim[:, np.array(self.costs.labels) == UNLABELLED] = np.nan
+        return ssim[rows], self.shown[rows], np.isin(rows, scene.train_ids)
+
+    def _table(
+        self, column: Callable[[Observations], np.ndarray], levels: Sequence[int], missing: float
+    ) -> np.ndarray:
+        """A column of the observations of views that show enough of a category, float64 [V, L, K]."""
+        seen, labels = observed(self.job, self.job.fit_config), np.array(self.costs.labels)
+        seen = seen.select(np.isin(seen.label_id, labels) & np.isin(seen.level, levels))
+        table = np.full((len(self.job.scene.views), len(labels), len(levels)), missing)
+        at = np.searchsorted(labels, seen.label_id), np.searchsorted(levels, seen.level)
+        table[seen.view, *at] = column(seen)
+        return table
 
     def fit(self, table: Observations, config: FitConfig, curves: Curves) -> list[str]:
         """See `Method`."""
@@ -176,27 +227,70 @@ class NestedLevels(Method):
         statuses = [model.status for model in promises.values()]
         return ["promises: " + ", ".join(f"{statuses.count(s)} {s}" for s in sorted(set(statuses)))]
 
-    def predicted(self, label_id: int, level: int, row: int) -> float:
+    def predicted(self, quality: QualityKind, label_id: int, level: int, row: int) -> float:
         """See `Method`."""
-        return float(self.quality.bound[row, self.costs.labels.index(label_id), level - 1])
+        return float(self.qualities[quality].bound[row, self.costs.labels.index(label_id), level - 1])
 
-    def plan_view(self, row: int, target: float) -> Plan:
+    def plan_view(self, row: int, target: float, quality: QualityKind = "ssim") -> Plan:
         """See `Method`."""
-        return plan_for_view(self.quality, self.costs, target, row)
+        return plan_for_view(self.qualities[quality], self.costs, target, row, self.shown[row])
 
-    def plan_scene(self, target: float, share: float) -> Plan:
+    def plan_scene(self, target: float, share: float, quality: QualityKind = "ssim") -> Plan:
         """See `Method`."""
-        return plan_for_scene(self.quality, self.costs, target, share, self.shown)
+        if quality == "fidelity":
+            return plan_for_scene(*self.sampled, self.costs, target, share, quality)
+        ssim, pixels, trained = self.measured
+        return plan_for_scene(ssim, pixels, self.costs, target, share, quality, trained)
+
+    def plan_scenes(self, targets: Sequence[tuple[QualityKind, float]], share: float) -> list[Plan]:
+        """See `Method`: those for fidelity are measured at drawn viewpoints, and mended."""
+        plans = [self.plan_scene(target, share, quality) for quality, target in targets]
+        drawn, mean_and_pixels = viewpoints_of(self.job), pooled(*self.sampled)
+        cameras = [drawn.cameras[row] for row in drawn.rows("bias")]
+        open_ones = [i for i, plan in enumerate(plans) if plan.quality == "fidelity"]
+        for left in reversed(range(_MENDINGS + 1)):
+            if not open_ones or not cameras:
+                break
+            measured = self._in_composition([plans[i] for i in open_ones], cameras)
+            found = {
+                i: mended(plans[i], measured[:, j], self.costs, *mean_and_pixels, last=not left)
+                for j, i in enumerate(open_ones)
+            }
+            plans = [found[i][0] if i in found else plan for i, plan in enumerate(plans)]
+            open_ones = [i for i in open_ones if not found[i][1]]
+        return plans
+
+    def _in_composition(self, plans: Sequence[Plan], cameras: Sequence[Camera]) -> np.ndarray:
+        """Fidelity of each category in each plan's composition, [V, J, L]; NaN where it shows too little."""
+        levels = np.array([[plan.levels[label] for label in self.costs.labels] for plan in plans])
+        planned = np.broadcast_to(levels, (len(cameras), *levels.shape))
+        fidelity, pixels = compositions_at(self.job, cameras, planned, "plan")
+        image = np.array([camera.width * camera.height for camera in cameras])
+        shown = (pixels > 0) & (pixels >= self.job.fit_config.min_share * image[:, None])
+        shown &= np.array(self.costs.labels) != UNLABELLED
+        return np.where(shown[:, None], fidelity[..., :-1], np.nan).astype(np.float64)
 
     def plan_budget(self, config: PlanConfig) -> Plan:
         """See `Method`."""
         weights = {label_named(self.job, name): weight for name, weight in config.weights.items()}
-        return plan_within(self.quality, self.costs, config.budget, config.budget_unit, self.shown, weights)
+        train = self.job.scene.train_ids
+        if config.quality == "fidelity":
+            mean, pixels = pooled(*self.sampled)
+        else:
+            mean, pixels = pooled(self.qualities["ssim"].mean[train], self.shown[train])
+        weight = pixels * [weights.get(label, 1.0) for label in self.costs.labels]
+        return plan_within(mean, self.costs, config.budget, config.budget_unit, weight, config.quality)
 
     def amount(self, plan: Plan) -> str:
         """See `Method`."""
         full = int(self.costs.transfer_bytes[:, -1].sum())
         return f"{(plan.transfer_bytes or 0) / 1e6:.2f} of {full / 1e6:.2f} MB, {plan.count:,} Gaussians"
+
+    @property
+    def bytes_to_send(self) -> dict[tuple[int, int], int]:
+        """See `Method`."""
+        sent = zip(self.costs.labels, self.costs.transfer_bytes.tolist(), strict=True)
+        return {(label, level): n for label, row in sent for level, n in enumerate(row, 1)}
 
     def unseen_labels(self) -> LabelImages | None:
         """See `Method`: a promise is measured on the photo's own."""
@@ -204,9 +298,7 @@ class NestedLevels(Method):
 
     def coverage(self, targets: Sequence[float]) -> Decisions | None:
         """See `Method`; every category at the same level, costs in transfer bytes."""
-        job = self.job
-        sent = zip(self.costs.labels, self.costs.transfer_bytes.tolist(), strict=True)
-        costs = {(label, level): n for label, row in sent for level, n in enumerate(row, 1)}
+        job, costs = self.job, self.bytes_to_send
         return score(observed(job, job.fit_config), job.scene, promises_of(job), costs, targets)
 
 

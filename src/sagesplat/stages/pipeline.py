@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from sagesplat.adapt.plan import check_target
 from sagesplat.core.config import BlocksConfig, FitConfig, NestConfig, PlanConfig, RunConfig, TrainConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit, Progress, StageDone, StageStarted
@@ -22,9 +21,10 @@ from sagesplat.stages.fit import fit_ladder
 from sagesplat.stages.label import fuse_masks, lift_labels, make_masks
 from sagesplat.stages.nest import nest_levels
 from sagesplat.stages.observe import observe_levels
-from sagesplat.stages.plan import make_plan
+from sagesplat.stages.plan import check_targets, make_plan
 from sagesplat.stages.preflight import check_segmenter, check_training
 from sagesplat.stages.report import make_report
+from sagesplat.stages.sample import sample_levels
 from sagesplat.stages.scene import open_scene
 from sagesplat.stages.train import train_levels
 from sagesplat.train import nested
@@ -33,7 +33,7 @@ from sagesplat.train import nested
 DEMO = RunConfig(
     train=TrainConfig(max_steps=1200, level_every=60),
     nest=NestConfig(steps=600, levels=12, base_steps=600),
-    plan=PlanConfig(target_ssim=0.7),
+    plan=PlanConfig(target_fidelity=0.9),
 )
 
 
@@ -53,8 +53,7 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
     Example:
         `sagesplat.run_scene` opens a job and calls this.
     """
-    for target in config.plan.targets:  # before hours of training
-        check_target(target)
+    check_targets(config.plan, config.ladder)  # before hours of training
     nested.check(config.nest)
     blocks.check(config.blocks)
     check_segmenter(job, scene, config.masks)
@@ -73,6 +72,7 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
     if job.run.ladder == "nested":
         nest(job, config.nest, config.blocks, config.seed)
     observe_levels(job, config.fit)
+    sample_levels(job, config.sample, config.fit)
     fit_ladder(job, config.fit)
     make_plan(job, config.plan)
     compose_plan(job)
@@ -94,7 +94,9 @@ def adapt_snapshots(job: Job) -> None:
     fit: FitConfig = known.get("fit", FitConfig())
     observe_levels(job, fit)
     fit_ladder(job, fit)
-    make_plan(job, replace(known.get("plan", PlanConfig()), budget=0.0, weights={}))
+    plan: PlanConfig = known.get("plan", PlanConfig())
+    others = plan.other_targets if plan.quality == "ssim" else None  # snapshots have no fidelity
+    make_plan(job, replace(plan, target_fidelity=None, other_targets=others, budget=0.0, weights={}))
 
 
 def _recorded(job: Job) -> dict[str, Any]:

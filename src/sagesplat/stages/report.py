@@ -17,11 +17,11 @@ def make_report(job: Job) -> None:
     run = job.run
 
     def make() -> list[str]:
-        target = main_target(run)
+        quality, target = main_target(run)
         # the page leads with a target: what was composed for a budget is not what it is about
         within_budget = budget_plan_of(job) is not None
-        composed = compose(job, scene_plan(job, target)) if within_budget else read_ply(run.composed)
-        write_report(run.report, report_data(job, composed, target))
+        composed = compose(job, scene_plan(job, quality, target)) if within_budget else read_ply(run.composed)
+        write_report(run.report, report_data(job, composed, quality, target))
         return []
 
     inputs = [run.observations, run.models, run.plan, run.evaluation, *stage_records(run)]

@@ -9,34 +9,40 @@ import numpy as np
 
 from sagesplat import __version__
 from sagesplat.adapt.observe import TOTAL, as_unit, measure, render_rgb
+from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.output.figures import Colours, Panel
 from sagesplat.output.report import ReportData
 from sagesplat.run.job import Job
-from sagesplat.run.records import read_record
+from sagesplat.run.records import read_record, settings_of
 from sagesplat.run.run_dir import RunDir
 from sagesplat.scene import describe
 from sagesplat.segment.block_categories import category_of
 from sagesplat.segment.display_names import titles
 from sagesplat.segment.masks import UNLABELLED, UNLABELLED_COLOR, Taxonomy
+from sagesplat.stages.methods import method_of
 from sagesplat.stages.results import evaluation_of, models_of, observations_of, plans_of
 
 PANELS = 3  # views shown in pictures
 STAGES = (
     *("poses", "scene", "segment", "masks", "lift", "train", "fuse"),
-    *("nest", "observe", "fit", "plan", "compose", "evaluate"),
+    *("nest", "observe", "sample", "fit", "plan", "compose", "evaluate"),
 )
 
 
-def report_data(job: Job, composed: Gaussians, target: float) -> ReportData:
-    """Everything the report of a run shows; `target` is the SSIM that it leads with, `composed` its scene."""
+def report_data(job: Job, composed: Gaussians, quality: QualityKind, target: float) -> ReportData:
+    """Everything that the report shows; it leads with the plan for `target`, whose scene is `composed`."""
     run, scene, masks, ladder = job.run, job.scene, job.best_masks, job.ladder
     names = {**masks.taxonomy.names, UNLABELLED: masks.taxonomy.name(UNLABELLED)}
     categories, colours = _parts(run, names)
+    beside = settings_of(run, "plan").get("target_ssim") if quality == "fidelity" else None
     records = {path.stem: read_record(path) for path in stage_records(run)}
     return ReportData(
         title=scene.name,
         target=target,
+        quality=quality,
+        ssim_target=beside,
+        sizes=method_of(job).bytes_to_send,
         names=titles(names),
         colours=colours or {label: masks.taxonomy.color(label) for label in names},
         observations=observations_of(job),

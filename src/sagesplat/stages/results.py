@@ -8,10 +8,12 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from sagesplat.adapt.eq3 import SsimModel, read_models
-from sagesplat.adapt.evaluate import Evaluation, read_evaluation
+from sagesplat.adapt.evaluate import UNIFORM, Evaluation, read_evaluation
+from sagesplat.adapt.fidelity import SampledFidelity, read_sampled
 from sagesplat.adapt.observe import TOTAL, Observations, read_observations
 from sagesplat.adapt.plan import Plan, read_budget_plan, read_plans
-from sagesplat.adapt.viewpoint import ViewModel, read_promises
+from sagesplat.adapt.viewpoint import QualityKind, ViewModel, read_promises
+from sagesplat.adapt.viewpoints import Viewpoints, read_viewpoints
 from sagesplat.core.errors import DataError
 from sagesplat.formats.increments import INDEX, Increment, read_index
 from sagesplat.run.job import Job
@@ -31,7 +33,7 @@ def observations_of(job: Job) -> Observations:
 def evaluation_of(job: Job) -> Evaluation:
     """The run's evaluation; DataError like `observations_of`."""
     path, table = job.run.evaluation, read_evaluation(job.run.evaluation)
-    _check(path, "evaluate", "category", table.label_id.tolist(), {*job.names(), TOTAL})
+    _check(path, "evaluate", "category", table.label_id.tolist(), {*job.names(), TOTAL, UNIFORM})
     _check(path, "evaluate", "level", table.level.tolist(), {*job.ladder.levels, _WHOLE})
     _check(path, "evaluate", "view", table.view.tolist(), range(len(job.scene.views)))
     return table
@@ -60,12 +62,40 @@ def models_of(job: Job) -> dict[tuple[int, int], SsimModel]:
 
 
 def promises_of(job: Job) -> dict[int, ViewModel]:
-    """The SSIM model of each category with its bound, by label id, of levels that the run has."""
-    models = read_promises(job.run.promises)
-    _check(job.run.promises, "fit", "category", models, job.names())
+    """Models of SSIM against photos with their bounds, by label id, of levels that the run has."""
+    return _view_models(job, job.run.promises, "ssim")
+
+
+def fidelity_of(job: Job) -> dict[int, ViewModel]:
+    """Models of fidelity with their bounds, by label id, of levels that the run has."""
+    return _view_models(job, job.run.fidelity, "fidelity")
+
+
+def _view_models(job: Job, path: Path, quality: QualityKind) -> dict[int, ViewModel]:
+    models = read_promises(path)
+    _check(path, "fit", "category", models, job.names())
     levels = (level for model in models.values() for level in model.levels)
-    _check(job.run.promises, "fit", "level", levels, set(job.ladder.levels))
+    _check(path, "fit", "level", levels, set(job.ladder.levels))
+    if any(model.quality != quality for model in models.values()):
+        raise _foreign(path, "fit", "its quality")
     return models
+
+
+def viewpoints_of(job: Job) -> Viewpoints:
+    """The drawn viewpoints."""
+    return read_viewpoints(job.run.viewpoints)
+
+
+def sampled_of(job: Job) -> SampledFidelity:
+    """Fidelity at the viewpoints of the set "fit", of categories and levels that the run has."""
+    path, sampled = job.run.sampled, read_sampled(job.run.sampled)
+    _check(path, "sample", "category", sampled.labels, {label for label, _ in job.ladder.counts})
+    V, _, K = sampled.fidelity.shape
+    if len(job.ladder.levels) != K:
+        raise _foreign(path, "sample", f"{K} levels")
+    if len(viewpoints_of(job).rows("fit")) != V:
+        raise _foreign(path, "sample", f"{V} viewpoints")
+    return sampled
 
 
 def increments_of(job: Job) -> list[Increment]:

@@ -36,7 +36,7 @@ from sagesplat.stages.fit import fit_ladder
 from sagesplat.stages.methods import NestedLevels, Snapshots, method_of
 from sagesplat.stages.nest import train_capped
 from sagesplat.stages.observe import observe_levels
-from sagesplat.stages.plan import main_target
+from sagesplat.stages.plan import PAPER_TARGETS, ssim_target, ssim_targets
 from sagesplat.stages.results import increments_of
 from sagesplat.stages.shared import label_images, train_config
 from sagesplat.studies.compare.report import (
@@ -64,7 +64,6 @@ from sagesplat.studies.paper.same_size import nearest_snapshot, prune_to
 from sagesplat.train.importance import importance
 from sagesplat.train.nested import capped_config
 
-PAPER_TARGETS = (0.6, 0.7, 0.8)
 _FEWEST = 10  # Gaussians that a training can begin with
 _TOGETHER = 8  # sets in memory at a time
 
@@ -91,7 +90,7 @@ def compare(job: Job, config: CompareConfig, copy: Path | None = None) -> list[P
     _check(job, config)
     folder, file = _folder(job), _folder(job) / FILE
     lpips = lpips_hashes(config.lpips)
-    targets = list(config.targets) or sorted({*PAPER_TARGETS, *settings_of(job.run, "plan")["targets"]})
+    targets = list(config.targets) or sorted({*PAPER_TARGETS, *ssim_targets(job.run)})
     settings = json.loads(json.dumps(asdict(config) | {"targets": targets, "lpips": lpips}))
     is_done(job.run, "compare", settings, None, [file], job.force)  # refused before hours of training
     snapshots = _snapshots(job)
@@ -116,7 +115,7 @@ def compare(job: Job, config: CompareConfig, copy: Path | None = None) -> list[P
     inputs += [snapshots.run.models, *trained]
     run_stage(job, "compare", settings, inputs, [file], make)
     points, walks = read_comparison(file)
-    tables = make_tables(points, walks, main_target(run))
+    tables = make_tables(points, walks, ssim_target(run))
 
     def show() -> list[str]:
         write_report(folder, tables, points, titles(job.names()))
@@ -292,10 +291,11 @@ def _nested(nested: NestedLevels, config: CompareConfig) -> list[Contender]:
         load = partial(job.ladder.load, k + 1)
         found.append(Contender(SAME_SHARE, f"level {k + 1}", steps, load, bytes_of))
     budgets = np.ceil(np.geomspace(sent[0], sent[-1], config.budgets)).tolist()
+    main = ssim_target(job.run)
     plans: list[tuple[str, Plan]] = [
-        (f"{b / 1e6:.3g} MB", nested.plan_budget(PlanConfig(budget=b))) for b in budgets
+        (f"{b / 1e6:.3g} MB", nested.plan_budget(PlanConfig(target_ssim=main, budget=b))) for b in budgets
     ]
-    for target in made["targets"]:
+    for target in ssim_targets(job.run):
         plan = nested.plan_scene(target, made["share"])
         plans.append((f"SSIM {target:g}, {plan.status}", plan))
     seen = []
@@ -392,8 +392,8 @@ def _send(job: Job, g: Gaussians) -> tuple[dict[int, int], Gaussians]:
 def _walks(nested: NestedLevels, sage: Snapshots) -> list[Walk]:
     """From view to view by name at the main target: ours with hysteresis, and the paper's plans."""
     job, costs = nested.job, nested.costs
-    target, views = main_target(job.run), range(len(job.scene.views))
-    chosen = along(nested.quality.bound, costs.transfer_bytes, target=target) + 1
+    target, views = ssim_target(job.run), range(len(job.scene.views))
+    chosen = along(nested.qualities["ssim"].bound, costs.transfer_bytes, target=target) + 1
     ours = [dict(zip(costs.labels, levels.tolist(), strict=True)) for levels in chosen]
     increments = increments_of(job)
     increment_files = {

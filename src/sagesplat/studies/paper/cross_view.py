@@ -140,7 +140,7 @@ def _rows(
         }  # fmt: skip
         if label != TOTAL:
             choice = chosen[label]
-            row |= {"level": choice.level, "count": choice.count, "predicted": choice.predicted_ssim}
+            row |= {"level": choice.level, "count": choice.count, "predicted": choice.predicted}
             row["level_ssim"] = levels[choice.level][label]["ssim"]
             enough = [
                 (ladder.counts[label, level], -level)

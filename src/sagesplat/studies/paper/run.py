@@ -15,11 +15,11 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.columns import from_rows, write_columns
 from sagesplat.output.tables import Table, name_of, promise_kept
 from sagesplat.run.job import Job
-from sagesplat.run.records import settings_of
 from sagesplat.run.stage import run_stage
 from sagesplat.segment.display_names import titles
 from sagesplat.stages.compose import compose_inputs, tune_composition
 from sagesplat.stages.methods import method_of
+from sagesplat.stages.plan import ssim_targets
 from sagesplat.stages.results import models_of, observations_of, plans_of
 from sagesplat.stages.shared import distances, observed
 from sagesplat.studies.lpips import load_metrics, lpips_hashes
@@ -202,7 +202,7 @@ def _made_of(job: Job) -> list[Path]:
 
 
 def _targets(job: Job) -> list[float]:
-    return list(settings_of(job.run, "plan")["targets"])
+    return ssim_targets(job.run)
 
 
 def _view_plans(job: Job, view: int) -> list[Plan]:

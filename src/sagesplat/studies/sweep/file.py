@@ -16,7 +16,12 @@ MAX_LENGTH = 2**20  # characters of a file
 MAX_DOTS = 64  # in one line of it
 MAX_RUNS = 10_000
 BUILT_IN = "demo"  # as a scene's path: the built-in capture
-_SET_BY = {"seed": "seeds", "target_ssim": "targets", "other_targets": "targets"}
+_SET_BY = {
+    "seed": "seeds",
+    "target_ssim": "targets",
+    "target_fidelity": "targets",
+    "other_targets": "targets",
+}
 _NEEDED = {
     bool: "true or false", int: "a whole number", float: "a finite number", str: "text in quotes",
     Path: "a path in quotes", tuple: "a list", dict: "a table",

@@ -155,7 +155,7 @@ def _measure(cell: Cell, job: Job) -> Iterator[Row]:
     evaluation = evaluation_of(job)
     seconds = seconds_of(job.run, "train")
     for plan in plans_of(job):
-        here = evaluation.select(evaluation.target == np.float32(plan.target))
+        here = evaluation.of(plan).of_own_quality()
         whole = here.select(here.label_id == TOTAL)
         kept = promise_kept(here)
         quality = map(mean, (whole.ssim, whole.full_ssim, whole.psnr, whole.full_psnr))

@@ -1,0 +1,143 @@
+"""Coverage of fidelity bounds at fresh viewpoints, and plans beside equal levels of the same bytes."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from sagesplat.adapt.fidelity import distances_at, measure_compositions
+from sagesplat.adapt.fidelity_models import plan_nominal
+from sagesplat.adapt.viewpoints import Rule, capture_cameras, draw
+from sagesplat.run.job import Job
+from sagesplat.stages.methods import NestedLevels
+from sagesplat.stages.results import fidelity_of, viewpoints_of
+
+TARGETS = (0.8, 0.9, 0.95, 0.98)
+MORE_TARGETS = (0.5, 0.6, 0.7, 0.75, 0.85, 0.97, 0.99)  # of the curve of plans over bytes
+_DRAWS = 1000  # bootstrap
+
+
+def measure(
+    job: Job, views: int = 300, seed: int = 90_000, progress: Callable[[int, int], None] | None = None
+) -> dict[str, Any]:
+    """Plan each target at fresh viewpoints, compose, measure; also equal levels of all categories.
+
+    The viewpoints are drawn by the run's own rule with a seed that nothing was made with.
+    """
+    models, rule = fidelity_of(job), viewpoints_of(job).rule
+    fresh = Rule(rule.seed + seed, rule.neighbours, rule.shift, rule.turn)
+    cameras = draw(job.scene, capture_cameras(job.scene), fresh, {"test": views}).cameras
+    costs = NestedLevels(job).costs
+    labels, K = list(costs.labels), len(job.ladder.levels)
+    distance = distances_at(job.scene, job.point_labels, cameras, labels, job.fit_config.distance)
+    targets = np.array(sorted((*TARGETS, *MORE_TARGETS)))
+    planned = plan_nominal(models, labels, K, distance, cameras, targets)
+    uniform = np.broadcast_to(np.arange(1, K + 1)[None, :, None], (views, K, len(labels)))
+    found, pixels = measure_compositions(
+        job.ladder, cameras, np.concatenate([planned, uniform], 1),
+        backend=job.backend, antialiased=job.antialiased, progress=progress,
+    )  # fmt: skip
+    image = np.array([camera.width * camera.height for camera in cameras])
+    shown = (pixels > 0) & (pixels >= job.fit_config.min_share * image[:, None])
+    promised = _promised(models, labels, distance, cameras)
+    names = job.names()
+    bytes_of = costs.transfer_bytes[np.arange(len(labels)), planned - 1].sum(2)
+    return {
+        "views": views,
+        "categories": {names[label]: models[label].status for label in labels if label in models},
+        "targets": {
+            f"{target:g}": _coverage(
+                target, planned[:, j] - 1, found[:, j, :-1], found[:, len(targets) :, :-1],
+                shown & promised, [names[label] for label in labels],
+            )
+            for j, target in enumerate(targets)
+        },
+        "curve": _curve(found, shown, bytes_of, targets, costs.transfer_bytes.sum(0)),
+    }  # fmt: skip
+
+
+def _promised(models, labels, distance, cameras):  # type: ignore[no-untyped-def]
+    """Whether a bound is given, bool [V, L]: inside the support, of a category with a model."""
+    position = np.stack([camera.position for camera in cameras]).astype(np.float64)
+    direction = np.stack([camera.direction for camera in cameras]).astype(np.float64)
+    given = np.zeros((len(cameras), len(labels)), bool)
+    for column, label in enumerate(labels):
+        if label in models:
+            predicted = models[label].predict(distance[:, column].astype(np.float64), position, direction)
+            given[:, column] = np.isfinite(predicted.bound).any(1)
+    return given
+
+
+def _coverage(
+    target: float, taken: np.ndarray, got: np.ndarray, uniform: np.ndarray, counts: np.ndarray,
+    names: Sequence[str],
+) -> dict[str, Any]:  # fmt: skip
+    """Coverage of one target, and the excess beside that of a perfect planner.
+
+    `taken` [V, L]: levels; `got` [V, L]; `uniform` [V, K, L]: with all categories at one level; `counts`
+    [V, L]: decisions that are scored. `beyond`: how far the level below the one taken is above the target.
+    """
+    kept = (got >= target) & counts
+    best = (uniform >= target).argmax(1)
+    perfect = np.take_along_axis(uniform, best[:, None], 1)[:, 0]
+    below = np.take_along_axis(uniform, np.maximum(taken - 1, 0)[:, None], 1)[:, 0]
+    beyond = np.where(taken > 0, np.maximum(below - target, 0), 0)
+    by_view = kept.sum(1), counts.sum(1)
+    rng = np.random.default_rng(0)
+    draws = rng.integers(len(got), size=(_DRAWS, len(got)))
+    spread = by_view[0][draws].sum(1) / np.maximum(by_view[1][draws].sum(1), 1)
+    by_category = {
+        name: [int(kept[:, i].sum()), int(counts[:, i].sum())]
+        for i, name in enumerate(names)
+        if counts[:, i].any()
+    }
+    return {
+        "decisions": int(counts.sum()),
+        "kept": float(kept.sum() / counts.sum()),
+        "interval": np.quantile(spread, [0.025, 0.975]).tolist(),
+        "excess": float((got - target)[counts].mean()),
+        "perfect": float((perfect - target)[counts].mean()),
+        "beyond_step": float(beyond[counts].mean()),
+        "by_category": by_category,
+    }
+
+
+def _curve(
+    found: np.ndarray, shown: np.ndarray, bytes_of: np.ndarray, targets: np.ndarray, level_bytes: np.ndarray
+) -> dict[str, Any]:
+    """Mean bytes, whole image and lowest category of plans, and of equal levels at the same bytes."""
+    J = len(targets)
+    whole = found[..., -1].mean(0)
+    by_category = np.where(shown[:, None], found[..., :-1], np.nan)
+    lowest = np.nanmin(np.nanmean(by_category, 0), 1)
+    size = bytes_of.mean(0)
+    return {
+        "targets": targets.tolist(),
+        "bytes": size.tolist(),
+        "whole": whole[:J].tolist(),
+        "equal_levels_whole": np.interp(size, level_bytes, whole[J:]).tolist(),
+        "lowest": lowest[:J].tolist(),
+        "equal_levels_lowest": np.interp(size, level_bytes, lowest[J:]).tolist(),
+    }
+
+
+def lines(name: str, result: dict[str, Any]) -> list[str]:
+    """The result for people."""
+    out = [f"{name}: fidelity at {result['views']} fresh viewpoints"]
+    for target, row in result["targets"].items():
+        if float(target) in TARGETS:
+            low, high = row["interval"]
+            worst = min(row["by_category"].items(), key=lambda item: item[1][0] / item[1][1])
+            out.append(
+                f"  {target:>5}: kept {row['kept']:.3f} [{low:.3f}, {high:.3f}] of {row['decisions']}, "
+                f"excess {row['excess']:.4f} (perfect {row['perfect']:.4f}, beyond the step "
+                f"{row['beyond_step']:.4f}); worst {worst[0]} {worst[1][0]} of {worst[1][1]}"
+            )
+    curve = result["curve"]
+    for i, target in enumerate(curve["targets"]):
+        out.append(
+            f"  {target:>5}: {curve['bytes'][i] / 1e6:.3f} MB, whole image {curve['whole'][i]:.3f} (equal levels "
+            f"{curve['equal_levels_whole'][i]:.3f}), lowest category {curve['lowest'][i]:.3f} "
+            f"({curve['equal_levels_lowest'][i]:.3f})"
+        )
+    return out

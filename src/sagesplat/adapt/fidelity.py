@@ -1,0 +1,180 @@
+"""Fidelity: SSIM of a composition against the full model rendered from the same viewpoint, per category.
+
+It needs no photo, so it can be measured at any number of viewpoints (`adapt.viewpoints`). The pixels of a
+category are those that its Gaussians paint in the full model. In the full model itself it is 1.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Int, Int16, Int32
+
+from sagesplat.adapt.ladder import Ladder
+from sagesplat.adapt.observe import PERCENTILE, RenderedLabels, distances_in_views, render_rgb
+from sagesplat.core.errors import DataError, short
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.io.files import atomic_path
+from sagesplat.io.npz import Npz
+from sagesplat.metrics.image import means_by_label, ssim_map
+from sagesplat.raster import Backend, Workspace, device_of
+from sagesplat.scene.scene import Camera, Scene, View
+
+
+@dataclass(frozen=True, eq=False)
+class SampledFidelity:
+    """Fidelity of every category at every level, all categories at the same level, at drawn viewpoints."""
+
+    labels: tuple[int, ...]  # ids, ascending
+    fidelity: Float32[np.ndarray, "V L K"]  # NaN where the category is not in sight
+    pixels: Int32[np.ndarray, "V L"]  # of the category in the full model's image
+    image: Int32[np.ndarray, " V"]  # pixels of the whole image
+    whole: Float32[np.ndarray, "V K"]  # over all pixels
+    distance: Float32[np.ndarray, "V L"]  # d_min, world units; NaN: unknown
+
+    def shown(self, min_share: float) -> np.ndarray:
+        """Whether a category covers at least a share of the image, bool [V, L]."""
+        return (self.pixels > 0) & (self.pixels >= min_share * self.image[:, None])
+
+
+def measure_levels(
+    ladder: Ladder,
+    cameras: Sequence[Camera],
+    *,
+    backend: Backend = "auto",
+    antialiased: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[Float32[np.ndarray, "V L K"], Int32[np.ndarray, "V L"], Float32[np.ndarray, "V K"]]:
+    """Measure the fidelity of every category with all categories at the same level.
+
+    Args:
+        ladder: The levels.
+        cameras: V viewpoints.
+        backend: Rasteriser; decides the device.
+        antialiased: How the model was trained.
+        progress: Called with (viewpoints measured, viewpoints in all).
+
+    Returns:
+        fidelity [V, L, K] of the labels in ascending order, NaN where one is not in sight; pixels [V, L];
+        fidelity of the whole image [V, K].
+    """
+    labels = sorted({label for label, _ in ladder.counts})
+    levels = [ladder.load(level).to(device_of(backend)) for level in ladder.levels]
+    probe = _Probe(levels[-1], labels, backend, antialiased)
+    found = np.full((len(cameras), len(labels), len(levels)), np.nan, np.float32)
+    pixels = np.zeros(found.shape[:2], np.int32)
+    whole = np.ones((len(cameras), len(levels)), np.float32)
+    for row, camera in enumerate(cameras):
+        full, label_ids = probe.reference(camera)
+        pixels[row] = [(label_ids == label).sum() for label in labels]
+        found[row, pixels[row] > 0, -1] = 1.0
+        for column, g in enumerate(levels[:-1]):
+            found[row, :, column], whole[row, column] = probe.compare(g, camera, full, label_ids)
+        if progress:
+            progress(row + 1, len(cameras))
+    return found, pixels, whole
+
+
+def measure_compositions(
+    ladder: Ladder,
+    cameras: Sequence[Camera],
+    planned: Int[np.ndarray, "V J L"],
+    *,
+    backend: Backend = "auto",
+    antialiased: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[Float32[np.ndarray, "V J L+1"], Int32[np.ndarray, "V L"]]:
+    """Measure the fidelity of each category in J compositions at each of V viewpoints.
+
+    `planned`: level (1 to K) of each label, ascending by id. The result's last column is the whole image;
+    then come the pixels of each category. The other arguments are those of `measure_levels`.
+    """
+    labels = sorted({label for label, _ in ladder.counts})
+    probe = _Probe(ladder.load(ladder.levels[-1]).to(device_of(backend)), labels, backend, antialiased)
+    found = np.full((*planned.shape[:2], len(labels) + 1), np.nan, np.float32)
+    pixels = np.zeros((len(cameras), len(labels)), np.int32)
+    for row, camera in enumerate(cameras):
+        full, label_ids = probe.reference(camera)
+        pixels[row] = [(label_ids == label).sum() for label in labels]
+        known: dict[tuple[int, ...], int] = {}
+        for column, levels in enumerate(map(tuple, planned[row].tolist())):
+            if levels in known:
+                found[row, column] = found[row, known[levels]]
+                continue
+            known[levels] = column
+            g = ladder.compose(dict(zip(labels, levels, strict=True))).to(device_of(backend))
+            found[row, column, :-1], found[row, column, -1] = probe.compare(g, camera, full, label_ids)
+        if progress:
+            progress(row + 1, len(cameras))
+    return found, pixels
+
+
+class _Probe:
+    """Compares compositions with the full model."""
+
+    def __init__(self, full: Gaussians, labels: Sequence[int], backend: Backend, antialiased: bool):
+        self.labels, self.antialiased = labels, antialiased
+        self.backend: Backend = backend
+        self.painted = RenderedLabels(full, backend, antialiased)
+        self.workspace = Workspace()
+
+    def reference(self, camera: Camera) -> tuple[Float32[np.ndarray, "H W 3"], Int16[np.ndarray, "H W"]]:
+        """The full model's image and label image."""
+        return self.painted.paint(camera)
+
+    def compare(
+        self, g: Gaussians, camera: Camera, full: np.ndarray, label_ids: np.ndarray
+    ) -> tuple[Float32[np.ndarray, " L"], float]:
+        """Fidelity by label, NaN where one is not in sight, and of the whole image."""
+        image = render_rgb(
+            g, camera, backend=self.backend, antialiased=self.antialiased, workspace=self.workspace
+        )
+        quality = ssim_map(image, full)
+        means = means_by_label(quality, label_ids)
+        by_label = [means[label][0] if label in means else np.nan for label in self.labels]
+        return np.array(by_label, np.float32), float(quality.mean())
+
+
+def distances_at(
+    scene: Scene, point_labels: np.ndarray, cameras: Sequence[Camera], labels: Sequence[int], method: str
+) -> Float32[np.ndarray, "V L"]:
+    """d_min of each category from each viewpoint, as `FitConfig.distance` says; NaN: none in sight."""
+    views = tuple(View(str(i), camera, Path()) for i, camera in enumerate(cameras))
+    percentile = PERCENTILE if method == "percentile" else 0.0
+    known = distances_in_views(replace(scene, views=views), point_labels, percentile)
+    nowhere = np.full(len(cameras), np.nan, np.float32)
+    return np.stack([known.get(label, nowhere) for label in labels], 1)
+
+
+def write_sampled(path: Path, sampled: SampledFidelity) -> None:
+    """fidelity.npz."""
+    with atomic_path(path) as temporary:
+        np.savez(temporary, **{**vars(sampled), "labels": np.array(sampled.labels, np.int64)})
+
+
+def read_sampled(path: Path) -> SampledFidelity:
+    """What `write_sampled` wrote; DataError where the content cannot be used."""
+    cure = "delete it and run `sagesplat sample` again"
+    try:
+        with Npz(path) as file:
+            labels = file["labels"]
+            arrays = dict(_arrays(file))
+        V, L, K = arrays["fidelity"].shape
+        shapes = {"pixels": (V, L), "image": (V,), "whole": (V, K), "distance": (V, L)}
+        if labels.shape != (L,) or K < 1 or any(arrays[name].shape != s for name, s in shapes.items()):
+            raise ValueError("arrays of unequal length")
+        if (np.diff(labels) <= 0).any() or (arrays["pixels"] < 0).any():
+            raise ValueError("labels or pixels out of range")
+        if not (np.nan_to_num(np.abs(arrays["fidelity"])) <= 1 + 1e-5).all():
+            raise ValueError("a fidelity outside -1 to 1")
+    except (OSError, KeyError, TypeError, ValueError, OverflowError) as error:
+        raise DataError(f"{path}: not a file of sampled fidelity ({short(repr(error))}); {cure}") from None
+    return SampledFidelity(tuple(int(label) for label in labels), **arrays)
+
+
+def _arrays(file: Npz) -> Iterator[tuple[str, np.ndarray]]:
+    for name in ("fidelity", "whole", "distance"):
+        yield name, file[name].astype(np.float32)
+    for name in ("pixels", "image"):
+        yield name, file[name].astype(np.int32)

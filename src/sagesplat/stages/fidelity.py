@@ -1,0 +1,82 @@
+"""Makes the fidelity models of nested levels, from drawn viewpoints; compositions calibrate them."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from sagesplat.adapt.fidelity import distances_at, measure_compositions
+from sagesplat.adapt.fidelity_models import (
+    EVERYTHING_HELD,
+    NOMINAL,
+    Trial,
+    calibrated,
+    fit_fidelity,
+    plan_nominal,
+    recentred,
+    settled,
+)
+from sagesplat.adapt.viewpoint import ViewModel
+from sagesplat.core.config import FitConfig
+from sagesplat.core.events import Progress
+from sagesplat.run.executor import split
+from sagesplat.run.job import Job
+from sagesplat.run.remote import work_all
+from sagesplat.scene.scene import Camera
+from sagesplat.segment.masks import UNLABELLED
+from sagesplat.stages.results import sampled_of, viewpoints_of
+
+_ROUNDS = 2  # after one, categories whose neighbours moved much would seem to be beyond help
+
+
+def fit_drawn(job: Job, config: FitConfig) -> dict[int, ViewModel]:
+    """Models of fidelity by label id, calibrated at viewpoints that nothing was fitted to."""
+    drawn, sampled, confidence = viewpoints_of(job), sampled_of(job), config.confidence
+    fit, bias, calibration = (
+        [drawn.cameras[row] for row in drawn.rows(name)] for name in ("fit", "bias", "calibration")
+    )
+    extent = job.scene.extent if job.scene.extent > 0 else 1.0
+    models = fit_fidelity(sampled, fit, extent, config.min_share, confidence)
+    models.pop(UNLABELLED, None)  # has no target and stays in full
+    for _ in range(_ROUNDS):
+        models = recentred(models, _trial(job, config, models, sampled.labels, bias), confidence)
+    models, held = settled(models, _trial(job, config, models, sampled.labels, bias), confidence)
+    for lowered in (held, EVERYTHING_HELD):  # what calibration moved moves the neighbours: then only up
+        models = calibrated(
+            models, _trial(job, config, models, sampled.labels, calibration), confidence, lowered
+        )
+    return models
+
+
+def _trial(
+    job: Job,
+    config: FitConfig,
+    models: Mapping[int, ViewModel],
+    labels: Sequence[int],
+    cameras: Sequence[Camera],
+) -> Trial:
+    """Compositions planned with the models at viewpoints, measured."""
+    distance = distances_at(job.scene, job.point_labels, cameras, labels, config.distance)
+    planned = plan_nominal(models, labels, len(job.ladder.levels), distance, cameras, NOMINAL)
+    fidelity, pixels = compositions_at(job, cameras, planned, "fit")
+    image = np.array([camera.width * camera.height for camera in cameras])
+    shown = (pixels > 0) & (pixels >= config.min_share * image[:, None])
+    return Trial(labels, cameras, distance, shown, planned, fidelity)
+
+
+def compositions_at(
+    job: Job, cameras: Sequence[Camera], planned: np.ndarray, stage: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Fidelity [V, J, L + 1] of compositions (levels [V, J, L]) and pixels [V, L], divided among all."""
+    rows = split(range(len(cameras)), job.pieces)
+    parts = [([cameras[row] for row in some], planned[list(some)], stage) for some in rows]
+    found = work_all(job, stage, _measure_some, parts)
+    fidelity, pixels = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
+    return fidelity, pixels
+
+
+def _measure_some(job: Job, part: tuple[Sequence[Camera], np.ndarray, str]) -> tuple[np.ndarray, np.ndarray]:
+    cameras, planned, stage = part
+    return measure_compositions(
+        job.ladder, cameras, planned, backend=job.backend, antialiased=job.antialiased,
+        progress=lambda done, total: job.emit(Progress(stage, done, total)),
+    )  # fmt: skip

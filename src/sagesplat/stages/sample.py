@@ -1,0 +1,161 @@
+"""Makes the samples of fidelity: every level at drawn viewpoints, measured against the full model."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+
+import numpy as np
+
+from sagesplat.adapt.fidelity import (
+    SampledFidelity,
+    distances_at,
+    measure_levels,
+    write_sampled,
+)
+from sagesplat.adapt.fidelity_models import NOMINAL, fit_fidelity
+from sagesplat.adapt.viewpoints import (
+    Rule,
+    Viewpoints,
+    capture_cameras,
+    draw,
+    read_cameras,
+    write_viewpoints,
+)
+from sagesplat.core.config import FitConfig, SampleConfig
+from sagesplat.core.errors import RunError
+from sagesplat.core.events import Progress
+from sagesplat.run.executor import split
+from sagesplat.run.job import Job
+from sagesplat.run.records import settings_of
+from sagesplat.run.remote import work_all
+from sagesplat.run.stage import run_stage
+from sagesplat.scene.scene import Camera
+from sagesplat.stages.methods import method_of
+
+VIEWS = (60, 120, 240)  # to fit to: the next number is tried while the last step made the error smaller by
+_SHRINKS = 0.1  # at least this share
+USUAL = {"fit": VIEWS[1], "bias": 60, "calibration": 180}  # as many as half of the training's time allows;
+MOST = {"fit": VIEWS[-1], "bias": 60, "calibration": 300}  # after a long training up to these
+_RENDERS = 2.5  # a training step: a render takes about a fifth of it, so this is half of the training's time
+_LABEL_IMAGE = 4  # renders that a viewpoint's label image takes
+_FEWEST = {"fit": 20, "bias": 6, "calibration": 30}
+
+
+def sample_levels(job: Job, config: SampleConfig, fit: FitConfig) -> None:
+    """Draw viewpoints, and measure every level of every category there against the full model.
+
+    Nested levels only. `fit`: how distances are measured, and which categories are too small to count.
+    """
+    run = job.run
+    if run.ladder != "nested":
+        return
+
+    def make() -> list[str]:
+        base, source = _base_cameras(job, config)
+        counts = _counts(job, config)
+        rule = Rule(config.seed, config.neighbours, config.shift, config.turn)
+        drawn = draw(job.scene, base, rule, counts, source)
+        table, used = _until_it_stops_shrinking(job, drawn, fit, bool(config.views))
+        rows = np.sort(np.concatenate([drawn.rows("fit")[:used], drawn.rows("bias", "calibration")]))
+        drawn = replace(
+            drawn,
+            cameras=tuple(drawn.cameras[row] for row in rows),
+            sets=tuple(drawn.sets[row] for row in rows),
+        )
+        write_viewpoints(run.viewpoints, drawn)
+        write_sampled(run.sampled, table)
+        calibration = len(drawn.rows("calibration"))
+        return [f"{used} viewpoints to fit to, {len(drawn.rows('bias'))} + {calibration} to calibrate on"]
+
+    made_by = [run.provenance("train"), run.provenance("nest")]
+    inputs = [run.scene, run.labels, method_of(job).level_files[0], *made_by]
+    if config.viewpoints:
+        inputs.append(config.viewpoints)
+    settings = asdict(config) | {"distance": fit.distance, "min_share": fit.min_share}
+    run_stage(job, "sample", settings, inputs, [run.viewpoints, run.sampled], make)
+
+
+def _base_cameras(job: Job, config: SampleConfig) -> tuple[list[Camera], str]:
+    """The cameras to draw from, and where they are from."""
+    own = capture_cameras(job.scene)
+    if config.viewpoints is None:
+        return own, "capture"
+    return read_cameras(config.viewpoints, own[0]), config.viewpoints.name
+
+
+def _counts(job: Job, config: SampleConfig) -> dict[str, int]:
+    """Viewpoints by set: what is asked, else what half of the training's time allows."""
+    if config.views < 0 or config.calibration_views < 0:
+        raise RunError(
+            f"{config.views} and {config.calibration_views} viewpoints are impossible; give 0 or more"
+        )
+    train, nest = settings_of(job.run, "train"), settings_of(job.run, "nest")
+    renders = _RENDERS * (train["max_steps"] + nest["steps"] + nest["base_steps"])
+    compositions = 2 * (len(NOMINAL) + _LABEL_IMAGE)  # measured twice, for the bias three times
+    cost = {
+        "fit": len(job.ladder.levels) + _LABEL_IMAGE,
+        "bias": 1.5 * compositions,
+        "calibration": compositions,
+    }
+    part = renders / sum(USUAL[name] * cost[name] for name in USUAL)
+    counts = {name: max(int(min(part, 1) * USUAL[name]), _FEWEST[name]) for name in USUAL}
+    left = renders - sum(counts[name] * cost[name] for name in counts)
+    for name in counts:
+        more = int(np.clip(left // cost[name], 0, MOST[name] - counts[name]))
+        counts[name], left = counts[name] + more, left - more * cost[name]
+    counts["fit"] = config.views or counts["fit"]
+    counts["calibration"] = config.calibration_views or counts["calibration"]
+    return counts
+
+
+def _until_it_stops_shrinking(
+    job: Job, drawn: Viewpoints, fit: FitConfig, all_of_them: bool
+) -> tuple[SampledFidelity, int]:
+    """Measure viewpoints to fit to in growing numbers, as long as that makes the models' error smaller."""
+    cameras = [drawn.cameras[row] for row in drawn.rows("fit")]
+    stops = [len(cameras)] if all_of_them else [n for n in VIEWS if n < len(cameras)] + [len(cameras)]
+    table, errors = None, []
+    for stop in stops:
+        start = 0 if table is None else len(table.fidelity)
+        more = _measured(job, cameras[start:stop], fit)
+        table = more if table is None else _joined(table, more)
+        if stop == stops[-1]:
+            break
+        models = fit_fidelity(table, cameras[:stop], _extent(job), fit.min_share, fit.confidence)
+        errors.append(float(np.mean([model.rmse for model in models.values()])))
+        if len(errors) > 1 and errors[-1] > (1 - _SHRINKS) * errors[-2]:
+            break
+    assert table is not None
+    if not (table.pixels > 0).any():
+        raise RunError(
+            f"{job.run.path}: none of {len(table.pixels)} viewpoints shows anything of the scene; draw them "
+            "closer to its cameras (--sample.shift, --sample.turn), or leave out --sample.viewpoints"
+        )
+    return table, len(table.fidelity)
+
+
+def _extent(job: Job) -> float:
+    return job.scene.extent if job.scene.extent > 0 else 1.0  # all cameras in one place
+
+
+def _measured(job: Job, cameras: Sequence[Camera], fit: FitConfig) -> SampledFidelity:
+    """Fidelity of the levels at some viewpoints, divided among those who compute."""
+    parts = [list(part) for part in split(cameras, job.pieces)]
+    found = work_all(job, "sample", _measure_some, parts)
+    fidelity, pixels, whole = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
+    labels = tuple(sorted({label for label, _ in job.ladder.counts}))
+    distance = distances_at(job.scene, job.point_labels, cameras, labels, fit.distance)
+    image = np.array([camera.width * camera.height for camera in cameras], np.int32)
+    return SampledFidelity(labels, fidelity, pixels, image, whole, distance)
+
+
+def _measure_some(job: Job, cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return measure_levels(
+        job.ladder, cameras, backend=job.backend, antialiased=job.antialiased,
+        progress=lambda done, total: job.emit(Progress("sample", done, total)),
+    )  # fmt: skip
+
+
+def _joined(table: SampledFidelity, more: SampledFidelity) -> SampledFidelity:
+    """The rows of one after those of the other."""
+    names = ("fidelity", "pixels", "image", "whole", "distance")
+    return replace(table, **{n: np.concatenate([getattr(table, n), getattr(more, n)]) for n in names})

@@ -1,0 +1,80 @@
+"""Critical thresholds against trying every threshold, and conformal quantiles against their promise."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sagesplat.adapt.calibrate import (
+    conformal_quantile,
+    critical_nominals,
+    critical_thresholds,
+    fewest_views,
+)
+
+
+def test_views_that_a_confidence_needs():
+    assert [fewest_views(c) for c in (0.5, 0.9, 0.95, 0.99)] == [1, 9, 19, 99]
+
+
+@given(st.integers(1, 200), st.sampled_from([0.5, 0.8, 0.9, 0.95]))
+def test_the_quantile_is_the_rank_of_split_conformal_prediction(n, confidence):
+    found = conformal_quantile(np.arange(1.0, n + 1), confidence)
+    assert math.isinf(found) == (n < fewest_views(confidence))
+    if not math.isinf(found):
+        # a new value is as likely to be at any of n + 1 ranks
+        assert found / (n + 1) >= confidence - 1e-12 > (found - 1) / (n + 1) - 1e-9
+
+
+def test_the_quantile_is_kept_by_new_values():
+    rng = np.random.default_rng(0)
+    kept = [rng.exponential() <= conformal_quantile(rng.exponential(size=39), 0.9) for _ in range(4000)]
+    assert 0.9 - 0.01 < np.mean(kept) < 0.9 + 0.025 + 0.01
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 10**6), st.integers(1, 6))
+def test_critical_thresholds_by_trying_all(seed, levels):
+    rng = np.random.default_rng(seed)
+    mean = np.maximum.accumulate(rng.uniform(0, 1, (8, levels)).round(1), 1)
+    measured, target = rng.uniform(0, 1, (8, levels)), 0.5
+    found = critical_thresholds(mean, measured, target)
+    for view in range(8):
+        for threshold in np.unique([*mean.ravel(), *(mean.ravel() + 0.01), -1, 2]):
+            reached = mean[view] >= threshold
+            misses = reached.any() and measured[view, reached.argmax()] < target
+            if threshold > found[view]:
+                assert not misses
+            if threshold == found[view]:
+                assert misses
+
+
+def test_critical_nominals_between_compositions():
+    bound = np.array([[0.3, 0.5, 0.7, 0.9, 1.0]])
+    nominal = np.array([0.4, 0.6, 0.8, 0.95])
+    taken = np.array([[1, 2, 3, 4]])
+
+    def critical(measured, target=0.6):
+        return critical_nominals(bound, nominal, taken, np.array([measured]), target)[0]
+
+    assert critical([0.5, 0.7, 0.8, 1.0]) == 0.5  # level 1 misses, the next one keeps
+    assert critical([0.5, 0.55, 0.8, 1.0]) == 0.7
+    assert critical([0.7, 0.75, 0.8, 1.0]) == 0.3  # levels below the first composition count as missed
+    assert critical([0.7, 0.5, 0.8, 1.0]) == 0.7  # one that keeps below one that misses does not count
+    assert critical([0.1, 0.2, 0.3, 0.4]) == 1.0  # nothing but the full model
+    assert critical([0.7, 0.75, 0.8, 1.0], 0.05) == 0.3
+    lowest = critical_nominals(bound, nominal, np.array([[0, 2, 3, 4]]), np.array([[0.7, 0.8, 0.9, 1]]), 0.6)
+    assert lowest[0] == -np.inf
+
+
+def test_levels_that_no_composition_took_are_interpolated():
+    bound = np.array([[0.1, 0.2, 0.3, 0.4, 0.5, 0.6]])
+    found = critical_nominals(
+        bound, np.array([0.05, 0.55]), np.array([[0, 5]]), np.array([[0.0, 1.0]]), 0.5
+    )
+    assert found[0] == bound[0, 2]  # 0, .2, .4 miss
+    # the same level twice: its neighbours made the difference, and the second nominal target is needed
+    same = critical_nominals(bound, np.array([0.4, 0.45]), np.array([[4, 4]]), np.array([[0.4, 0.7]]), 0.5)
+    assert same[0] == pytest.approx(0.45)

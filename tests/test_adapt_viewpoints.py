@@ -1,0 +1,159 @@
+"""Drawn viewpoints: independent draws by a declared rule, and files that come from anybody."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import orbit
+from scipy.spatial.transform import Rotation
+
+from sagesplat.adapt.viewpoints import (
+    SETS,
+    Rule,
+    capture_cameras,
+    draw,
+    read_cameras,
+    read_viewpoints,
+    write_viewpoints,
+)
+from sagesplat.core.errors import DataError, RunError
+from sagesplat.scene.scene import Camera, Points, Scene, View
+
+NONE = np.empty(0, np.int64)
+
+
+def scene(cameras: list[Camera], xyz: np.ndarray | None = None) -> Scene:
+    xyz = np.zeros((0, 3), np.float32) if xyz is None else xyz.astype(np.float32)
+    points = Points(xyz, xyz.astype(np.uint8), NONE, NONE.astype(np.int32), np.empty((0, 2), np.float32))
+    views = tuple(View(f"{i:03}", camera, Path()) for i, camera in enumerate(cameras))
+    return Scene("s", Path(), views, points, test_every=4, calibrate_every=3)
+
+
+SCENE = scene(orbit(24))
+
+
+def poses(cameras) -> np.ndarray:
+    return np.stack([camera.w2c for camera in cameras])
+
+
+def test_draws_depend_on_their_own_number_only():
+    base = capture_cameras(SCENE)
+    few = draw(SCENE, base, Rule(3), {"fit": 5, "bias": 2, "calibration": 4})
+    many = draw(SCENE, base, Rule(3), {"fit": 9, "bias": 3, "calibration": 4})
+    for name in SETS:
+        wanted = poses(few.cameras)[few.rows(name)]
+        assert (poses(many.cameras)[many.rows(name)][: len(wanted)] == wanted).all()
+    other = draw(SCENE, base, Rule(4), {"fit": 5, "bias": 2, "calibration": 4})
+    assert not np.isclose(poses(other.cameras), poses(few.cameras)).all((1, 2)).any()
+    assert len(np.unique(poses(many.cameras).reshape(-1, 16), axis=0)) == 16  # no set repeats another's
+
+
+def test_viewpoints_lie_between_neighbours_and_close_to_them():
+    base = capture_cameras(SCENE)
+    rule = Rule(neighbours=2, shift=0.02, turn=0.03)
+    drawn = draw(SCENE, base, rule, {"fit": 200})
+    positions = np.stack([camera.position for camera in base])
+    # on an arc each camera's two neighbours are the ones beside it
+    order = np.argsort(positions[:, 0])
+    a, b = positions[order[:-1]], positions[order[1:]]
+    for camera in drawn.cameras:
+        assert np.abs(camera.w2c[:3, :3] @ camera.w2c[:3, :3].T - np.eye(3)).max() < 1e-5
+        along = np.clip(((camera.position - a) * (b - a)).sum(1) / ((b - a) ** 2).sum(1), 0, 1)[:, None]
+        nearest = np.abs(camera.position - (a + along * (b - a))).max(1).min()
+        assert nearest <= 3 * rule.shift * SCENE.extent  # ends have their neighbours on one side
+        turned = [Rotation.from_matrix(camera.w2c[:3, :3] @ c.w2c[:3, :3].T).magnitude() for c in base]
+        assert min(turned) < 0.08 + np.sqrt(3) * rule.turn
+    still = draw(SCENE, base, Rule(neighbours=0, shift=0, turn=0), {"fit": 30})
+    near = np.abs(poses(still.cameras)[:, None] - poses(base)).max((2, 3)).min(1)
+    assert near.max() < 1e-6
+
+
+def test_no_viewpoint_inside_of_something():
+    cameras = orbit(12)
+    wall = np.array([camera.position for camera in cameras[3:5]]).mean(0) + np.random.default_rng(0).normal(
+        0, 1e-3, (50, 3)
+    )
+    blocked = scene(cameras, np.concatenate([wall, [[0, 0, 4]]]))
+    drawn = draw(blocked, capture_cameras(blocked), Rule(shift=0.001), {"fit": 200})
+    away = np.array([np.linalg.norm(wall - camera.position, axis=1).min() for camera in drawn.cameras])
+    own = np.array([np.linalg.norm(wall - camera.position, axis=1).min() for camera in cameras])
+    assert away.min() > 0.49 * own.min()
+
+
+def test_test_photos_are_not_drawn_from():
+    base = capture_cameras(SCENE)
+    assert len(base) == len(SCENE.views) - len(SCENE.test_ids)
+    tests = poses([SCENE.views[row].camera for row in SCENE.test_ids])
+    assert not (poses(base)[:, None] == tests).all((2, 3)).any()
+
+
+def test_all_cameras_in_one_place_and_a_single_one():
+    one = [SCENE.views[1].camera] * 3
+    drawn = draw(scene([*one, one[0]]), one, Rule(), {"fit": 4})
+    assert np.isfinite(poses(drawn.cameras)).all()
+    assert len(draw(SCENE, one[:1], Rule(), {"fit": 2}).cameras) == 2
+
+
+@pytest.mark.parametrize(
+    "rule", [Rule(neighbours=-1), Rule(shift=-0.1), Rule(shift=float("nan")), Rule(turn=4.0)]
+)
+def test_rules_that_cannot_be_followed(rule):
+    with pytest.raises(RunError, match="cannot be used; choose"):
+        draw(SCENE, capture_cameras(SCENE), rule, {"fit": 1})
+
+
+def test_files_come_back(tmp_path):
+    drawn = draw(SCENE, capture_cameras(SCENE), Rule(7, 2, 0.1, 0.2), {"fit": 3, "calibration": 2})
+    write_viewpoints(tmp_path / "v.json", drawn)
+    back = read_viewpoints(tmp_path / "v.json")
+    assert (back.rule, back.sets, back.source) == (drawn.rule, drawn.sets, "capture")
+    assert (poses(back.cameras) == poses(drawn.cameras)).all()
+    assert [c.K.tolist() for c in back.cameras] == [c.K.tolist() for c in drawn.cameras]
+    assert (poses(read_cameras(tmp_path / "v.json", SCENE.views[0].camera)) == poses(drawn.cameras)).all()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"format": "other"},
+        {"rule": {"seed": "x"}},
+        {"viewpoints": [{}]},
+        {"viewpoints": [{"set": "fit", "w2c": [[1, 2], [3, 4]], "K": [[1]], "width": 4, "height": 4}]},
+        {"viewpoints": 4},
+    ],
+)
+def test_damaged_files_are_one_line(tmp_path, change):
+    drawn = draw(SCENE, capture_cameras(SCENE), Rule(), {"fit": 1})
+    write_viewpoints(tmp_path / "v.json", drawn)
+    document = json.loads((tmp_path / "v.json").read_text()) | change
+    (tmp_path / "v.json").write_text(json.dumps(document))
+    with pytest.raises(DataError, match="run `sagesplat sample` again"):
+        read_viewpoints(tmp_path / "v.json")
+
+
+@pytest.mark.parametrize("entry", [{"width": 10**6, "height": 10**6}, {"set": "other"}, {"K": np.zeros((3, 3)).tolist()}])
+def test_impossible_cameras_are_refused(tmp_path, entry):
+    write_viewpoints(tmp_path / "v.json", draw(SCENE, capture_cameras(SCENE), Rule(), {"fit": 1}))
+    document = json.loads((tmp_path / "v.json").read_text())
+    document["viewpoints"][0] |= entry
+    (tmp_path / "v.json").write_text(json.dumps(document))
+    with pytest.raises(DataError, match="not a file of viewpoints"):
+        read_viewpoints(tmp_path / "v.json")
+
+
+def test_own_cameras_from_the_frames_of_a_transforms_file(tmp_path):
+    like = replace(SCENE.views[0].camera, width=30, height=20)
+    c2w = np.linalg.inv(SCENE.views[5].camera.w2c.astype(np.float64)) * [1, -1, -1, 1]
+    (tmp_path / "path.json").write_text(json.dumps({"frames": [{"transform_matrix": c2w.tolist()}]}))
+    (camera,) = read_cameras(tmp_path / "path.json", like)
+    np.testing.assert_allclose(camera.w2c, SCENE.views[5].camera.w2c, atol=1e-6)
+    assert (camera.width, camera.height) == (30, 20)
+
+
+@pytest.mark.parametrize("text", ["[]", "{", '{"frames": []}', '{"frames": [{}]}', '{"frames": 3}', "4"])
+def test_lists_of_cameras_that_are_none(tmp_path, text):
+    (tmp_path / "path.json").write_text(text)
+    with pytest.raises((DataError, RunError), match="give a viewpoints.json, or a transforms.json"):
+        read_cameras(tmp_path / "path.json", SCENE.views[0].camera)
