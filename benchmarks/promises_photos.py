@@ -7,16 +7,15 @@ calibrated again. Training views stay, as the trained model depends on them.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sagesplat import open_run
 from sagesplat.adapt.coverage import Decisions, decide, together
 from sagesplat.adapt.eq3 import fit_models
 from sagesplat.adapt.observe import Observations
 from sagesplat.adapt.photo_models import fit_photo_models, measured_at
+from sagesplat.run.job import Job
 from sagesplat.scene.scene import Scene
 from sagesplat.segment.masks import UNLABELLED
 from sagesplat.stages.shared import observed
@@ -27,14 +26,26 @@ LEAST = 0.95, 0.88  # bars: mean coverage, and its 5th percentile over the draws
 MOST = 0.04  # bar: excess, SSIM
 
 
-def redraws(run: Path, targets: Sequence[float] = TARGETS, draws: int = DRAWS) -> dict[str, Any]:
-    """Coverage and excess by target, of a finished run whose views are drawn again (`summary`)."""
-    job = open_run(run).job
+def measure(job: Job, draws: int = DRAWS, targets: Sequence[float] = TARGETS) -> dict[str, Any]:
+    """Coverage and excess by target, of a finished run whose held-out views are drawn again (`summary`)."""
     table = observed(job, job.fit_config)
     table = table.select(table.label_id != UNLABELLED)
     parts = redrawn(table, job.scene, job.ladder.counts, targets, draws, job.fit_config.confidence)
     views = len(job.scene.calibration_ids), len(job.scene.test_ids)
     return {"calibration_views": views[0], "test_views": views[1], **summary(parts)}
+
+
+def lines(name: str, found: Mapping[str, Any]) -> list[str]:
+    """What `measure` found, for people."""
+    views = f"{found['calibration_views']} calibration and {found['test_views']} test views"
+    said = [f"{name}, SSIM against photos, {views} drawn again:"]
+    for target, row in found["targets"].items():
+        said.append(
+            f"  {target:>4}: kept {row['coverage']:.1%} (5th percentile {row['coverage_p5']:.1%}), excess "
+            f"{row['excess']:.3f} (perfect {row['perfect_excess']:.3f}), {row['accepted']} accepted, "
+            f"{row['false_rejections']} falsely rejected"
+        )
+    return said
 
 
 def redrawn(
@@ -61,7 +72,8 @@ def redrawn(
             cost = np.array([costs[label, level] for level in model.levels])
             says = {"bound": bound, "perfect": views.ssim}
             parts.append(decide(says, views.ssim, cost, targets, views.rows, label))
-        found.append(together(parts))
+        if parts:
+            found.append(together(parts))
     return found
 
 
@@ -72,7 +84,7 @@ def summary(draws: Sequence[Decisions]) -> dict[str, Any]:
     it, or what is beyond a perfect planner's, is at most 0.04.
     """
     rows: dict[str, Any] = {}
-    for target in np.unique(draws[0].target).tolist():
+    for target in sorted({target for draw in draws for target in draw.target.tolist()}):
         of = [draw.select((draw.target == target) & (draw.predictor == "bound")) for draw in draws]
         coverage = [one.kept.sum() / one.accepted.sum() for one in of if one.accepted.any()]
         if not coverage:

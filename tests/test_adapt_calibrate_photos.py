@@ -182,6 +182,15 @@ def test_changes_of_views_that_were_not_measured_are_those_of_the_nearest():
     assert with_changes(own, {2: np.full(len(TARGETS), np.nan)}, near) is own
 
 
+@pytest.mark.parametrize("confidence", [1e-12, 0.01, 0.5, 0.999999, 1 - 1e-15])
+def test_any_confidence_gives_a_calibration_that_can_be_stored(confidence):
+    for found in calibrate_photos({1: left_out(60, 25), 2: left_out(3, 1, std=0.0)}, confidence).values():
+        numbers = [*found.targets, *found.thresholds, found.discount, found.least_support]
+        assert np.isfinite(numbers).all()
+        assert (np.diff(found.thresholds) > 0).all()
+        assert (np.abs(found.thresholds) <= 1).all()
+
+
 def test_coverage_of_new_views_over_many_draws():
     """Calibrated on some views of a kind, tested on others: at each target what is accepted is kept."""
     accepted, kept = np.zeros(len(TARGETS)), np.zeros(len(TARGETS))

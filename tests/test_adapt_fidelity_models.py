@@ -174,7 +174,9 @@ def test_uncalibrated_is_as_wide_as_the_widest():
     shown[10:, 1] = False
     found = calibrated(models, trial(models, cameras, 4, shown=shown), 0.95)
     mean = np.linspace(0.3, 1, 50)[None]
-    assert (found[7].calibration.bound(mean, np.ones(1)) <= models[7].calibration.bound(mean, np.ones(1)) + 0.03).all()
+    assert (
+        found[7].calibration.bound(mean, np.ones(1)) <= models[7].calibration.bound(mean, np.ones(1)) + 0.03
+    ).all()
 
 
 def test_a_category_that_is_never_shown_has_no_model():
@@ -237,5 +239,7 @@ def test_damaged_samples_are_one_line(tmp_path: Path, name, value):
         "image": np.ones(2), "whole": np.ones((2, 3)), "distance": np.ones((2, 2)),
     }  # fmt: skip
     np.savez(tmp_path / "f.npz", **(arrays | {name: value}))
-    with pytest.raises(DataError, match=r"f\.npz: not a file of sampled fidelity .*run `sagesplat sample` again"):
+    with pytest.raises(
+        DataError, match=r"f\.npz: not a file of sampled fidelity .*run `sagesplat sample` again"
+    ):
         read_sampled(tmp_path / "f.npz")

@@ -133,7 +133,9 @@ def test_damaged_files_are_one_line(tmp_path, change):
         read_viewpoints(tmp_path / "v.json")
 
 
-@pytest.mark.parametrize("entry", [{"width": 10**6, "height": 10**6}, {"set": "other"}, {"K": np.zeros((3, 3)).tolist()}])
+@pytest.mark.parametrize(
+    "entry", [{"width": 10**6, "height": 10**6}, {"set": "other"}, {"K": np.zeros((3, 3)).tolist()}]
+)
 def test_impossible_cameras_are_refused(tmp_path, entry):
     write_viewpoints(tmp_path / "v.json", draw(SCENE, capture_cameras(SCENE), Rule(), {"fit": 1}))
     document = json.loads((tmp_path / "v.json").read_text())

@@ -10,12 +10,13 @@ itself. What training views cannot tell is how much larger the errors of new pho
                                 scale: root mean square of the errors; bias: what compositions add on average
     risk     = (sum over views of the share of accepted decisions missed + C) / (views that accept any + C)
 
-The multiplier of a target is the smallest one from which on the risk stays within 1 - confidence: conformal
-risk control (Angelopoulos et al. 2022) by view, since the errors of one view are alike. C views that miss
-everything are counted in: 1, or 2 where fewer than 19 calibration views tell of new photos. The calibration
-views by themselves must stay within the risk too, with none counted in. The risk is that of what is accepted,
-so a target that few views accept is hard to hold. Each target has its own multiplier, at least that of the
-targets beside it. Where none suffices no level is accepted at that target.
+The multiplier of a target is the smallest one for which, and for the next half, the risk is within
+1 - confidence; it need not fall steadily, since a higher threshold accepts less. This is conformal risk
+control (Angelopoulos et al. 2022) by view, as the errors of one view are alike. C views that miss everything
+are counted in: 1, or 2 where fewer than 19 calibration views tell of new photos. The calibration views by
+themselves must stay within the risk too, with none counted in. The risk is that of what is accepted, so a
+target that few views accept is hard to hold. Each target has its own multiplier, at least that of the targets
+beside it. Where none suffices no level is accepted at that target.
 
 A category that 19 calibration views show (at 0.95) is "calibrated", the others are widened and
 "uncalibrated". As the inflation is estimated neither is exact, unlike split conformal prediction:
@@ -28,6 +29,7 @@ from statistics import NormalDist
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.optimize import nnls
 from scipy.stats import t as student
 
@@ -40,6 +42,7 @@ MULTIPLIERS = np.arange(-1, 6.01, 0.1)  # of the scale: narrowest first; below 0
 INFLATION = 1.5  # of the errors of training views, where no calibration view tells
 OWN_VIEWS = 8  # calibration views from which a category's own errors count more than those of the others
 FEW = 2  # views that miss everything, counted in where calibration views are too few to be proof
+STEADY = 5  # of MULTIPLIERS: on these next ones too the risk is to stay small
 LEAST_ERROR = 1e-6  # SSIM; of categories that are predicted exactly
 
 
@@ -228,9 +231,10 @@ def _multipliers(
         risk = np.maximum(_risks(accepted, missed, counted_in), _risks(accepted[heldout], missed[heldout], 0))
         ok = risk <= 1 - confidence + 1e-9
         enough = (accepted > 0).sum(0) >= counted_in * fewest
-        first = len(ok) - (ok | ~enough)[::-1].cumprod().sum()  # from here on nothing fails
-        if first < len(ok) and enough[first]:
-            found[g] = MULTIPLIERS[first]
+        fine = np.pad(ok | ~enough, (0, STEADY), constant_values=True)
+        steady = ok & enough & sliding_window_view(fine, STEADY + 1).all(1)
+        if steady.any():
+            found[g] = MULTIPLIERS[steady.argmax()]
     beside = np.pad(found, 1, "edge")
     return np.max([beside[:-2], found, beside[2:]], 0)
 
