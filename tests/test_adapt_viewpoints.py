@@ -157,5 +157,5 @@ def test_own_cameras_from_the_frames_of_a_transforms_file(tmp_path):
 @pytest.mark.parametrize("text", ["[]", "{", '{"frames": []}', '{"frames": [{}]}', '{"frames": 3}', "4"])
 def test_lists_of_cameras_that_are_none(tmp_path, text):
     (tmp_path / "path.json").write_text(text)
-    with pytest.raises((DataError, RunError), match="give a viewpoints.json, or a transforms.json"):
+    with pytest.raises((DataError, RunError), match=r"give a viewpoints\.json, or a transforms\.json"):
         read_cameras(tmp_path / "path.json", SCENE.views[0].camera)
