@@ -583,7 +583,7 @@ def promises(
     redraws: int = 20,
     write: bool = False,
 ) -> None:
-    """Coverage of promises: fidelity at fresh viewpoints, SSIM against photos over redraws, on several scenes.
+    """Coverage of promises: fidelity at fresh viewpoints, SSIM against photos over redraws.
 
     Args:
         folder: where the scenes are run; what is done there already is not run again.
