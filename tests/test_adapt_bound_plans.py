@@ -73,7 +73,7 @@ def test_fidelity_is_filled_with_pixels_and_ssim_is_not():
 def test_what_nobody_sees_costs_little():
     """A category that is not in the picture has no bound there: it does not get its highest level."""
     bound, pixels = [NAN, MEAN[1], NAN], np.array([0.0, 900.0, 5.0])
-    plan = plan_for_view(quality(MEAN, bound), COSTS, 0.4, 0, pixels)
+    plan = plan_for_view(quality(MEAN, bound, "ssim"), COSTS, 0.4, 0, pixels)
     unseen, seen, lost = plan.choices
     assert (unseen.level, unseen.status, unseen.calibrated, unseen.predicted) == (2, "ok", None, 0.4)
     assert (seen.level, seen.status, seen.calibrated) == (1, "ok", True)
