@@ -8,14 +8,14 @@ from conftest import orbit
 
 from sagesplat.adapt.allocate import best_within
 from sagesplat.adapt.bound_plans import Costs, Quality, plan_for_view, plan_within, pooled, quality_at
-from sagesplat.adapt.viewpoint import NO_CALIBRATION, Calibration, ViewModel, constant_curve
+from sagesplat.adapt.viewpoint import NO_CALIBRATION, Calibration, QualityKind, ViewModel, constant_curve
 from sagesplat.core.errors import RunError
 
 BYTES = np.array([[10, 20, 60], [10, 30, 90], [5, 6, 7]])
 COSTS = Costs((3, 7, 9), BYTES * 2, BYTES, BYTES * 4)
 
 
-def quality(mean, bound=None, kind="fidelity", calibrated=(True, True, True)) -> Quality:
+def quality(mean, bound=None, kind: QualityKind = "fidelity", calibrated=(True, True, True)) -> Quality:
     """One view."""
     mean = np.array([mean], float)
     bound = mean - 0.05 if bound is None else np.array([bound], float)
@@ -112,7 +112,7 @@ def test_within_a_budget():
     pixels = np.array([100.0, 900.0, 10.0])
     plan = plan_within(np.array(MEAN), COSTS, 60, "bytes", pixels, "fidelity")
     assert [level - 1 for level in plan.levels.values()] == best_within(
-        MEAN, BYTES, pixels, 60
+        np.array(MEAN), BYTES, pixels, 60
     ).levels.tolist()
     assert plan.transfer_bytes is not None
     assert plan.transfer_bytes <= 60

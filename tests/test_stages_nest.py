@@ -290,6 +290,7 @@ STAGES = [
     "base",
     "nest",
     "observe",
+    "sample",
     "fit",
     "plan",
     "compose",
