@@ -19,7 +19,8 @@ MODULES = (
 CALLED_BY_MANY = (
     "adapt.allocate:best_within", "adapt.allocate:cheapest", "adapt.scene_plans:plan_for_scene",
     "adapt.bound_plans:plan_for_view", "adapt.bound_plans:plan_within", "adapt.bound_plans:quality_at",
-    "adapt.eq3:fit_models", "adapt.evaluate:evaluate", "adapt.fill:fill", "adapt.observe:observe", "adapt.plan:plan_scene",
+    "adapt.eq3:fit_models", "adapt.evaluate:evaluate", "adapt.fill:fill", "adapt.observe:observe",
+    "adapt.plan:plan_scene",
     "adapt.plan:plan_view", "adapt.viewpoint:fit_promises", "adapt.viewpoint:ViewModel.predict",
     "demo.capture:cached_capture", "formats.levels:read_level", "formats.ply:read_ply",
     "formats.ply:write_ply", "formats.spz:decode_spz", "formats.spz:encode_spz",
