@@ -73,8 +73,8 @@ def quality_at(
             known = np.array(promises[label].levels) - 1
             mean[:, i, known], bound[:, i, known] = predicted.mean, predicted.bound
             calibrated[i] = promises[label].status == "calibrated"
-    kind = kind or next((model.quality for model in promises.values()), "ssim")
-    return Quality(kind, mean, bound, far, calibrated)
+    of_models: QualityKind = next((model.quality for model in promises.values()), "ssim")
+    return Quality(kind or of_models, mean, bound, far, calibrated)
 
 
 def plan_for_view(
