@@ -73,8 +73,9 @@ def quality_at(
             known = np.array(promises[label].levels) - 1
             mean[:, i, known], bound[:, i, known] = predicted.mean, predicted.bound
             calibrated[i] = promises[label].status == "calibrated"
-    of_models: QualityKind = next((model.quality for model in promises.values()), "ssim")
-    return Quality(kind or of_models, mean, bound, far, calibrated)
+    for model in promises.values():
+        kind = kind or model.quality
+    return Quality(kind or "ssim", mean, bound, far, calibrated)
 
 
 def plan_for_view(
