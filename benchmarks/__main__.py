@@ -19,6 +19,7 @@ from benchmarks import freeze as freezing
 from benchmarks import fuzz as fuzzing
 from benchmarks import measure, plain, workloads
 from benchmarks import plans as planning
+from benchmarks import promises as promising
 from benchmarks import segment as overlays
 from benchmarks.gpu import base, script
 from sagesplat.core.config import TrainConfig
@@ -572,6 +573,26 @@ def structure(src: tuple[Path, ...] = (Path("src/sagesplat"),), write: bool = Fa
     results = {str(path): building.measure(path.resolve()) for path in src}
     print(building.table(results))
     _finish("structure", results, write)
+
+
+@app.command
+def promises(
+    folder: Path = Path("runs/promises"),
+    scenes: tuple[str, ...] = tuple(promising.CASES),
+    views: int = 300,
+    redraws: int = 20,
+    write: bool = False,
+) -> None:
+    """Coverage of promises: fidelity at fresh viewpoints, SSIM against photos over redraws, on several scenes.
+
+    Args:
+        folder: where the scenes are run; what is done there already is not run again.
+        scenes: which of them.
+        views: fresh viewpoints a scene.
+        redraws: of calibration and test photos.
+        write: keep the figures in benchmarks/results/cpu/promises.json.
+    """
+    _finish("promises", promising.measure(folder, scenes, views, redraws, print), write)
 
 
 @app.command

@@ -136,8 +136,8 @@ def lines(name: str, result: dict[str, Any]) -> list[str]:
     curve = result["curve"]
     for i, target in enumerate(curve["targets"]):
         out.append(
-            f"  {target:>5}: {curve['bytes'][i] / 1e6:.3f} MB, whole image {curve['whole'][i]:.3f} (equal levels "
-            f"{curve['equal_levels_whole'][i]:.3f}), lowest category {curve['lowest'][i]:.3f} "
+            f"  {target:>5}: {curve['bytes'][i] / 1e6:.3f} MB, whole image {curve['whole'][i]:.3f} "
+            f"(equal levels {curve['equal_levels_whole'][i]:.3f}), lowest category {curve['lowest'][i]:.3f} "
             f"({curve['equal_levels_lowest'][i]:.3f})"
         )
     return out

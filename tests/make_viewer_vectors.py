@@ -2,22 +2,25 @@
 
 A case of tests/data/distances.json has boxes, a camera, its half spaces and under "expected" the distance
 (null: nothing in sight), whether the category is visible and which boxes touch; planes are to be equal to
-1e-9, distances to 1e-9 of themselves. A case of tests/data/promises.json has a label of a bundle's manifest
-(its curves), the entry of promises-*.json with the views it shares, and viewpoints with the distance, what
-it is corrected to, and the expected mean, spread and bound by level and the support, to 1e-9 (null: NaN).
+1e-9, distances to 1e-9 of themselves. A case of tests/data/promises.json has a document as in
+promises-*.json with one label, and viewpoints with the distance, what it is corrected to, and the expected
+mean and bound by level and the support, to 1e-9 (null: NaN).
 """
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sagesplat.adapt.eq3 import Eq3, SsimModel
-from sagesplat.adapt.viewpoint import ViewModel
+from sagesplat.adapt.viewpoint import NO_CALIBRATION, Calibration, QualityKind, ViewModel, constant_curve
+from sagesplat.scene.scene import Camera
 from sagesplat.viewer import boxes
-from sagesplat.viewer.quality import corrected, curve_entry, promise_entry
+from sagesplat.viewer.frames import FLIP
+from sagesplat.viewer.promises import Seen, promises_document, read_model
 
 DATA = Path(__file__).parent / "data"
 Case = dict[str, Any]
@@ -74,9 +77,49 @@ def distance_cases() -> list[Case]:
     return cases
 
 
-def model(seed: int, views: int, levels: list[int], *, unseen: bool = True) -> ViewModel:
-    """A model of a category with curves of every kind."""
+def model(
+    seed: int, views: int, levels: list[int], *, quality: QualityKind = "ssim", unseen: bool = True
+) -> ViewModel:
+    """A model of a category: of SSIM with curves of every kind, or of fidelity with constants."""
     rng = np.random.default_rng(seed)
+    last = (
+        np.array([level != levels[-1] for level in levels]) if quality == "fidelity" else np.ones(len(levels))
+    )
+    position, direction = rng.normal(0, 0.7, (views, 3)), rng.normal(size=(views, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    return ViewModel(
+        label_id=7,
+        quality=quality,
+        curves=_constants(levels) if quality == "fidelity" else _curves(rng, levels),
+        extent=4.5,
+        median_log_distance=float(rng.uniform(0.3, 1.2)),
+        inputs=np.column_stack([position, direction, rng.normal(0.8, 0.4, views)]),
+        heldout_inputs=(np.arange(views) % 5 == 2) & unseen & (quality == "ssim"),
+        lengths=tuple(rng.uniform(0.2, 1.2, 3).tolist()),  # pyright: ignore[reportArgumentType]
+        heldout_variance=float(rng.uniform(0, 0.4)) * unseen,
+        weights=rng.normal(0, 0.05, (views, len(levels))) * last,
+        rmse=0.03,
+        calibration=calibration(quality),
+    )
+
+
+def calibration(quality: QualityKind) -> Calibration:
+    """Thresholds that rise unevenly; of fidelity the full model keeps all targets."""
+    targets = np.array([0.3, 0.5, 0.6, 0.8, 0.9, 0.95])
+    thresholds = np.array([0.32, 0.55, 0.601, 0.85, 0.92, 0.971])
+    if quality == "fidelity":
+        targets, thresholds = np.append(targets, 1.0), np.append(thresholds, 1.0)
+    return Calibration("calibrated", 0.95, 40, targets, thresholds, 0.3, 0.04 if quality == "ssim" else 0.0)
+
+
+def _constants(levels: list[int]) -> tuple[SsimModel, ...]:
+    means = np.linspace(0.6, 1, len(levels)) if len(levels) > 1 else [1.0]
+    return tuple(
+        constant_curve(7, level, float(mean), 0.01, 40) for level, mean in zip(levels, means, strict=True)
+    )
+
+
+def _curves(rng: np.random.Generator, levels: list[int]) -> tuple[SsimModel, ...]:
     kinds = ("two regimes", "one regime", "constant")
     curves = []
     for i, level in enumerate(levels):
@@ -87,65 +130,62 @@ def model(seed: int, views: int, levels: list[int], *, unseen: bool = True) -> V
         curves.append(
             SsimModel(7, level, Eq3(*near, *far, 2.0), (0.8, 6.0), top - 0.02, 0.03, 40, kinds[i % 3])
         )
-    position, direction = rng.normal(0, 0.7, (views, 3)), rng.normal(size=(views, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    return ViewModel(
-        label_id=7,
-        curves=tuple(curves),
-        extent=4.5,
-        median_log_distance=float(rng.uniform(0.3, 1.2)),
-        inputs=np.column_stack([position, direction, rng.normal(0.8, 0.4, views)]),
-        heldout_inputs=(np.arange(views) % 5 == 2) & unseen,
-        lengths=tuple(rng.uniform(0.2, 1.2, 3).tolist()),  # pyright: ignore[reportArgumentType]
-        heldout_variance=float(rng.uniform(0, 0.4)),
-        noise=float(rng.uniform(0.05, 0.3)),
-        weights=rng.normal(0, 0.05, (views, len(levels))),
-        amplitudes=rng.uniform(0.02, 0.08, len(levels)),
-        multiplier=float(rng.uniform(0, 2)),
-        confidence=0.95,
-        rmse=0.03,
-        status="calibrated",
-        composition_bias=0.004,
-        composition_std=0.013,
-    )
+    return tuple(curves)
+
+
+def cameras_at(made: ViewModel) -> list[Camera]:
+    """Cameras at the model's own views."""
+    cameras, K = [], np.array([[60, 0, 35], [0, 60, 25], [0, 0, 1]], np.float32)
+    for row in made.inputs:
+        z = row[3:6]
+        x = np.cross([0.1, 1, 0.2], z)
+        x /= np.linalg.norm(x)
+        w2c = np.eye(4)
+        w2c[:3, :3] = np.stack([x, np.cross(z, x), z])
+        w2c[:3, 3] = -w2c[:3, :3] @ (row[:3] * made.extent)
+        cameras.append(Camera(w2c.astype(np.float32), K, 70, 50, (0, 0, 0)))
+    return cameras
 
 
 def _promise_case(name: str, made: ViewModel, seed: int) -> Case:
     rng = np.random.default_rng(seed)
-    flip = np.array([1, -1, -1])
-    shared = np.column_stack([made.inputs[:, :3] * made.extent, made.inputs[:, 3:6]])
-    missed = rng.normal(0, 0.2, len(shared)).round(3)
-    entry = promise_entry(made, np.arange(len(shared)), np.zeros(len(shared)), missed)
+    n = made.num_views
+    seen = Seen(rng.uniform(0, 0.3, n), np.full(n, np.nan), rng.normal(0, 0.2, n))
+    document = promises_document(made.quality, {made.label_id: made}, cameras_at(made), {made.label_id: seen})
+    sent = read_model(document, made.label_id)
     position, direction = rng.normal(0, 3, (8, 3)), rng.normal(size=(8, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    position[0], direction[0] = shared[0, :3], shared[0, 3:]  # a known view
+    for i in (0, 2, 3):  # a known view, and viewpoints beside it: the support is large enough
+        position[i] = made.inputs[0, :3] * made.extent + 0.05 * i
+        direction[i] = made.inputs[0, 3:6]
     position[1] = 1e3  # far from all
-    away = np.array([math.exp(made.inputs[0, 6]), 2.0, math.nan, 0.1, 1.9999, 3.3, 50.0, 5.0])
-    told = made.predict(away, position, direction)
-    right = corrected(made, missed, away, position, direction)
+    away = np.array([math.exp(made.inputs[0, 6]), 2.0, math.nan, 2.1, 1.9999, 3.3, 50.0, 5.0])
+    told = sent.predict(away, position, direction)
+    right = sent.corrected(away, position, direction)
     points = [
         {
-            "position": (position[i] * flip).tolist(), "direction": (direction[i] * flip).tolist(),
+            "position": (position[i] * FLIP).tolist(), "direction": (direction[i] * FLIP).tolist(),
             "distance": _plain(away[i]), "corrected": _plain(right[i]),
-            "mean": told.mean[i].tolist(), "spread": told.spread[i].tolist(),
-            "bound": told.bound[i].tolist(), "support": float(told.support[i]),
+            "mean": told.mean[i].tolist(), "bound": [_plain(value) for value in told.bound[i]],
+            "support": float(told.support[i]),
         }
         for i in range(len(away))
     ]  # fmt: skip
-    views = (shared * np.tile(flip, 2)).tolist()
-    promises = {"version": 1, "extent": made.extent, "views": views, "labels": [entry]}
-    curves = [curve_entry(curve, exact=True) for curve in made.curves]
-    return {"name": name, "curves": curves, "promises": promises, "viewpoints": points}
+    return {"name": name, "promises": document, "viewpoints": points}
 
 
 def promise_cases() -> list[Case]:
     """All cases of promises.json, in the frame of a bundle."""
+    nothing = replace(model(2, 6, [1, 2, 3]), calibration=NO_CALIBRATION)
     return [
         _promise_case("one view, one level", model(1, 1, [1]), 1),
         _promise_case("curves of three kinds", model(2, 6, [1, 2, 3]), 2),
         _promise_case("levels without a promise", model(3, 9, [2, 3, 5]), 3),
         _promise_case("no view unseen", model(4, 12, [1, 2, 3, 4], unseen=False), 4),
         _promise_case("many views", model(5, 40, [1, 2, 3, 4, 5, 6]), 5),
+        _promise_case("fidelity", model(6, 20, [1, 2, 3, 4, 5], quality="fidelity"), 6),
+        _promise_case("fidelity, one level", model(7, 3, [1], quality="fidelity"), 7),
+        _promise_case("no target that can be kept", nothing, 8),
     ]
 
 

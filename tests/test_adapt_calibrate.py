@@ -71,9 +71,7 @@ def test_critical_nominals_between_compositions():
 
 def test_levels_that_no_composition_took_are_interpolated():
     bound = np.array([[0.1, 0.2, 0.3, 0.4, 0.5, 0.6]])
-    found = critical_nominals(
-        bound, np.array([0.05, 0.55]), np.array([[0, 5]]), np.array([[0.0, 1.0]]), 0.5
-    )
+    found = critical_nominals(bound, np.array([0.05, 0.55]), np.array([[0, 5]]), np.array([[0.0, 1.0]]), 0.5)
     assert found[0] == bound[0, 2]  # 0, .2, .4 miss
     # the same level twice: its neighbours made the difference, and the second nominal target is needed
     same = critical_nominals(bound, np.array([0.4, 0.45]), np.array([[4, 4]]), np.array([[0.4, 0.7]]), 0.5)

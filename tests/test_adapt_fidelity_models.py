@@ -1,4 +1,4 @@
-"""Models of fidelity on synthetic scenes: bounds are kept at new viewpoints, tightly, also beside neighbours."""
+"""Models of fidelity on synthetic scenes: bounds hold at new viewpoints, tightly, also beside neighbours."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -77,7 +77,7 @@ def trial(models, cameras: list[Camera], seed: int, spill: float = 0.0, shown=No
 def made(seed: int, confidence: float = 0.95, spill: float = 0.0, views=(80, 60, 120)):
     fit, bias, calibration = (viewpoints(n, 10 * seed + i) for i, n in enumerate(views))
     models = fit_fidelity(sampled(fit, seed), fit, 2.0, 0.01, confidence)
-    for round_ in range(2):
+    for _ in range(2):
         models = recentred(models, trial(models, bias, 100 * seed, spill), confidence)
     models, held = settled(models, trial(models, bias, 100 * seed, spill), confidence)
     return calibrated(models, trial(models, calibration, 100 * seed + 1, spill), confidence, held), held
@@ -111,7 +111,8 @@ def test_every_target_of_every_category_is_kept_at_new_viewpoints(confidence):
         assert np.mean(wasted[target]) < 0.035
 
 
-def test_a_category_that_neighbours_spoil_holds_them(seed=1):
+def test_a_category_that_neighbours_spoil_holds_them():
+    seed = 1
     without, nothing = made(seed)
     assert not nothing.any()
     models, held = made(seed, spill=0.15)
@@ -174,7 +175,9 @@ def test_uncalibrated_is_as_wide_as_the_widest():
     shown[10:, 1] = False
     found = calibrated(models, trial(models, cameras, 4, shown=shown), 0.95)
     mean = np.linspace(0.3, 1, 50)[None]
-    assert (found[7].calibration.bound(mean, np.ones(1)) <= models[7].calibration.bound(mean, np.ones(1)) + 0.03).all()
+    assert (
+        found[7].calibration.bound(mean, np.ones(1)) <= models[7].calibration.bound(mean, np.ones(1)) + 0.03
+    ).all()
 
 
 def test_a_category_that_is_never_shown_has_no_model():
@@ -204,7 +207,8 @@ def test_targets_between_those_that_are_calibrated():
     steps = Calibration("calibrated", 0.95, 30, np.array([0.4, 0.6, 0.7]), thresholds, 0.0)
     found = steps.bound(np.array([[0.3, 0.5 - 1e-9, 0.5, 0.5 + 1e-6, 0.65, 0.9]]), np.ones(1))[0]
     np.testing.assert_allclose(found, [0.2, 0.4, 0.4, 0.6, 0.65, 0.7], atol=1e-6)
-    assert (np.diff(TARGETS) > 0).all() and set(NOMINAL[NOMINAL < 0.9]) <= set(TARGETS)
+    assert (np.diff(TARGETS) > 0).all()
+    assert set(NOMINAL[NOMINAL < 0.9]) <= set(TARGETS)
 
 
 def test_files_come_back(tmp_path):
@@ -237,5 +241,7 @@ def test_damaged_samples_are_one_line(tmp_path: Path, name, value):
         "image": np.ones(2), "whole": np.ones((2, 3)), "distance": np.ones((2, 2)),
     }  # fmt: skip
     np.savez(tmp_path / "f.npz", **(arrays | {name: value}))
-    with pytest.raises(DataError, match=r"f\.npz: not a file of sampled fidelity .*run `sagesplat sample` again"):
+    with pytest.raises(
+        DataError, match=r"f\.npz: not a file of sampled fidelity .*run `sagesplat sample` again"
+    ):
         read_sampled(tmp_path / "f.npz")

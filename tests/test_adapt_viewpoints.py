@@ -133,7 +133,9 @@ def test_damaged_files_are_one_line(tmp_path, change):
         read_viewpoints(tmp_path / "v.json")
 
 
-@pytest.mark.parametrize("entry", [{"width": 10**6, "height": 10**6}, {"set": "other"}, {"K": np.zeros((3, 3)).tolist()}])
+@pytest.mark.parametrize(
+    "entry", [{"width": 10**6, "height": 10**6}, {"set": "other"}, {"K": np.zeros((3, 3)).tolist()}]
+)
 def test_impossible_cameras_are_refused(tmp_path, entry):
     write_viewpoints(tmp_path / "v.json", draw(SCENE, capture_cameras(SCENE), Rule(), {"fit": 1}))
     document = json.loads((tmp_path / "v.json").read_text())
@@ -155,5 +157,5 @@ def test_own_cameras_from_the_frames_of_a_transforms_file(tmp_path):
 @pytest.mark.parametrize("text", ["[]", "{", '{"frames": []}', '{"frames": [{}]}', '{"frames": 3}', "4"])
 def test_lists_of_cameras_that_are_none(tmp_path, text):
     (tmp_path / "path.json").write_text(text)
-    with pytest.raises((DataError, RunError), match="give a viewpoints.json, or a transforms.json"):
+    with pytest.raises((DataError, RunError), match=r"give a viewpoints\.json, or a transforms\.json"):
         read_cameras(tmp_path / "path.json", SCENE.views[0].camera)

@@ -10,8 +10,7 @@ from conftest import SMALL_RUN, random_gaussians
 from PIL import Image
 from test_viewer_bundle import manifest_of
 
-from sagesplat.adapt.viewpoint import read_promises
-from sagesplat.core.config import FitConfig
+from sagesplat.adapt.viewpoint import QualityKind, read_promises
 from sagesplat.core.errors import DataError, RunError, SageError
 from sagesplat.formats.increments import read_increments, read_index
 from sagesplat.formats.spz import read_spz
@@ -21,17 +20,16 @@ from sagesplat.run.job import Job
 from sagesplat.run.records import FORMAT, checkpoint_key
 from sagesplat.run.run_dir import RunDir
 from sagesplat.stages.bundle import _antialiased, bundle, live_bundle
+from sagesplat.stages.results import plans_of
 from sagesplat.stages.scene import open_scene
-from sagesplat.stages.shared import distances
 from sagesplat.train.checkpoint import write_checkpoint
 from sagesplat.train.state import initial_state
 from sagesplat.viewer.bundle import is_bundle
 from sagesplat.viewer.display_names import colors_of
 from sagesplat.viewer.frames import camera_at
-from sagesplat.viewer.quality import curve_of, model_of
+from sagesplat.viewer.promises import allowed, read_model
 
 ROOT = Path(__file__).resolve().parents[1]
-FIT = FitConfig()
 
 
 def job_of(run: Path) -> Job:
@@ -94,25 +92,34 @@ def test_the_poster_is_the_first_view(run: Path, tmp_path: Path, viewer: Path) -
     assert np.sqrt(np.mean((picture - truth) ** 2)) < 4  # JPEG
 
 
-def test_promises_survive_the_bundle(run: Path, tmp_path: Path, viewer: Path) -> None:
+@pytest.mark.parametrize("quality", ["fidelity", "ssim"])
+def test_promises_survive_the_bundle(run: Path, tmp_path: Path, viewer: Path, quality: QualityKind) -> None:
     job, out = job_of(run), tmp_path / "out"
     bundle(job, out, viewer=viewer)
     manifest = manifest_of(out)
-    promises = json.loads((out / manifest["promises"]["uri"]).read_text())
-    quality = {label["id"]: label["quality"] for label in manifest["labels"]}
-    models, far = read_promises(job.run.promises), distances(job, FIT.distance)
-    assert {entry["id"] for entry in promises["labels"]} == set(models)
-    cameras = [view.camera for view in job.scene.views]
-    where = [np.stack([getattr(c, of) for c in cameras]).astype(float) for of in ("position", "direction")]
-    views = np.array(promises["views"])
+    promises = json.loads((out / manifest["promises"][quality]["uri"]).read_text())
+    known = {label["id"] for label in manifest["labels"] if quality in label["quality"]}
+    path = {"fidelity": job.run.fidelity, "ssim": job.run.promises}[quality]
+    models = read_promises(path)
+    assert {entry["id"] for entry in promises["labels"]} == known == set(models)
     for entry in promises["labels"]:
-        model = models[entry["id"]]
+        model, shares = models[entry["id"]], np.cumsum(entry["shares"])
+        assert 0 < max(shares) <= 10_000
         if len(entry["levels"]) < len(model.levels):
             continue  # a level that adds nothing has no file
-        curves = [curve_of(curve) for curve in quality[entry["id"]]["curves"]]
-        told = model_of(entry, curves, views, promises["extent"]).predict(far[entry["id"]], *where)
-        np.testing.assert_allclose(told.bound, model.predict(far[entry["id"]], *where).bound, atol=1e-3)
-        assert max(entry["shares"]) > 0
+        own = model.inputs
+        at = np.exp(own[:, 6]) * (1 + 1e-9), own[:, :3] * model.extent, own[:, 3:6]
+        told, kept = read_model(promises, entry["id"]).predict(*at), model.predict(*at)
+        assert (np.abs(told.mean - kept.mean) <= allowed(kept.mean)).all()
+        asked = kept.bound >= model.calibration.targets.min(initial=2)
+        assert not (told.bound > kept.bound + 1e-9)[asked].any()
+        np.testing.assert_array_equal(np.isnan(told.bound), np.isnan(kept.bound))
+    assert (manifest["target"]["quality"], manifest["target"]["value"]) == _asked(job)
+
+
+def _asked(job: Job) -> tuple[str, float]:
+    plan = plans_of(job)[0]
+    return plan.quality, plan.target
 
 
 def test_the_same_run_gives_the_same_bytes(run: Path, tmp_path: Path, viewer: Path) -> None:
@@ -152,7 +159,13 @@ def test_an_earlier_run_gets_its_geometry(run: Path, trained: Path) -> None:
 
 @pytest.mark.parametrize(
     ("missing", "command"),
-    [("nested/increments", "nest"), ("nested/observations.csv", "observe"), ("nested/promises.json", "fit")],
+    [
+        ("nested/increments", "nest"),
+        ("nested/observations.csv", "observe"),
+        ("nested/fidelity.npz", "sample"),
+        ("nested/fidelity.json", "fit"),
+        ("nested/promises.json", "fit"),
+    ],
 )
 def test_an_unfinished_run_names_the_command(run, tmp_path, viewer, missing, command) -> None:
     path = run / missing
@@ -223,12 +236,12 @@ def test_a_live_bundle_follows_the_training(run: Path, tmp_path: Path, viewer: P
         assert (folder / "manifest.json").read_bytes() == before
         manifest = manifest_of(folder)
         assert manifest["live"]
-        assert manifest["promises"] is None
+        assert manifest["promises"] == {}
         assert all(len(label["levels"]) == 1 for label in manifest["labels"])
         uris.append({label["levels"][0]["uri"] for label in manifest["labels"]})
         for label in manifest["labels"]:
             assert len(read_spz(folder / label["levels"][0]["uri"])) == label["levels"][0]["count"]
-            assert label["quality"] is None
+            assert label["quality"] == {}
             assert label["boxes"]
     write_json(
         run / "provenance" / "train.json", {"format": FORMAT, "settings": {"antialiased": True}, "inputs": {}}

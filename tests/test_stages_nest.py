@@ -12,6 +12,7 @@ from conftest import pinhole, random_gaussians, write_capture
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sagesplat.adapt.coverage import PREDICTORS
 from sagesplat.adapt.evaluate import read_evaluation
 from sagesplat.adapt.ladder import PrefixLadder, read_prefixes
 from sagesplat.adapt.observe import TOTAL, read_observations
@@ -429,8 +430,12 @@ def test_each_view_is_planned_by_its_bound(finished: Path, tmp_path: Path) -> No
         row["by"]: row
         for row in csv.DictReader((job.run.adapted / "promises_kept.csv").read_text().splitlines())
     }
-    assert set(by) == {"eq3", "mean", "bound", "oracle"}
-    assert float(by["oracle"]["kept"]) == 1
+    assert list(by) == list(PREDICTORS)
+    assert float(by["perfect"]["coverage"]) == 1
+    rows = csv.DictReader((job.run.adapted / "promises_by_target.csv").read_text().splitlines())
+    whole = [row for row in rows if row["category"] == "all"]
+    for column in ("accepted", "violated", "false rejections"):
+        assert sum(int(row[column]) for row in whole) == int(by["bound"][column])
 
 
 def test_coverage_is_tested_on_the_plans_that_are_made_and_costs_are_bytes(finished: Path) -> None:
@@ -438,24 +443,21 @@ def test_coverage_is_tested_on_the_plans_that_are_made_and_costs_are_bytes(finis
     nested = NestedLevels(job)
     scores = nested.coverage([target])
     assert scores is not None
-    bound = scores.select(scores.predictor == "bound")
+    bound = scores.by("bound")
     table = observed(job, job.fit_config)
-    table = table.select(np.isin(table.view, job.scene.test_ids))
     plans = {row: nested.plan_view(row, target) for row in job.scene.test_ids.tolist()}
-    for i, label in enumerate(bound.label_id.tolist()):
+    for i, (label, row) in enumerate(zip(bound.label_id.tolist(), bound.view.tolist(), strict=True)):
         sent = nested.costs.transfer_bytes[nested.costs.labels.index(label)]
-        accepted, regrets = 0, []
-        for row in np.unique(table.view[table.label_id == label]).tolist():
-            here = table.select((table.label_id == label) & (table.view == row))
-            measured = dict(zip(here.level.tolist(), here.ssim.tolist(), strict=True))
-            choice = next(c for c in plans[row].choices if c.label_id == label)
-            accepted += choice.status == "ok"
-            if choice.status == "ok" and measured[choice.level] >= target:
-                enough = [sent[level - 1] for level, ssim in measured.items() if ssim >= target]
-                regrets.append(sent[choice.level - 1] - min(enough))
-        assert bound.accepted[i] == accepted
-        assert bound.regret[i] == pytest.approx(np.mean(regrets) if regrets else np.nan, nan_ok=True)
-    assert bound.accepted.sum() > 0
+        here = table.select((table.label_id == label) & (table.view == row))
+        measured = dict(zip(here.level.tolist(), here.ssim.tolist(), strict=True))
+        choice = next(c for c in plans[row].choices if c.label_id == label)
+        assert bound.accepted[i] == (choice.status == "ok")
+        if bound.accepted[i]:
+            assert bound.kept[i] == (measured[choice.level] >= target)
+        if bound.kept[i]:
+            enough = [sent[level - 1] for level, ssim in measured.items() if ssim >= target]
+            assert bound.regret[i] == sent[choice.level - 1] - min(enough)
+    assert bound.kept.sum() > 0
 
 
 def test_without_calibration_views_a_run_still_promises(capture: Path, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import shutil
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,9 @@ import numpy as np
 import pytest
 import torch
 from browser import Opened, open_page
+from make_viewer_vectors import model
 
+from sagesplat.adapt.viewpoint import QualityKind, ViewModel
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.increments import read_increments, write_increments
 from sagesplat.raster import rasterize
@@ -23,6 +26,7 @@ from sagesplat.scene.scene import Camera
 from sagesplat.viewer.built import package_viewer
 from sagesplat.viewer.bundle import write_bundle
 from sagesplat.viewer.manifest import CameraEntry, Category, Contents
+from sagesplat.viewer.promises import Seen
 
 pytestmark = [
     pytest.mark.skipif(chromium.missing() is not None, reason=chromium.missing() or ""),
@@ -104,6 +108,11 @@ def camera(x: float = 0.0) -> Camera:
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("viewer")
+    write_bundle(folder / "bundle", three_walls(folder), package_viewer())
+    return folder / "bundle"
+
+
+def three_walls(folder: Path) -> Contents:
     names = {1: "brick", 2: "grass-merged", 3: "sky-other-merged"}
     g = cloud()
     chunks = write_increments(folder / "chunks", g, SIZES, names)
@@ -114,11 +123,40 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for i, name in names.items()
     ]  # fmt: skip
     entries = [CameraEntry(f"photo{k}.jpg", "train", camera(0.2 * k)) for k in range(3)]
-    contents = Contents(
+    return Contents(
         "three walls", 1.0, entries, categories, chunks, folder / "chunks", 3, meters_per_unit=1.0
     )
-    write_bundle(folder / "bundle", contents, package_viewer())
-    return folder / "bundle"
+
+
+@pytest.fixture(scope="module")
+def promised(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """A bundle whose categories have models of both qualities; one is not calibrated."""
+    folder = tmp_path_factory.mktemp("promised")
+    contents = three_walls(folder)
+    cameras = contents.viewpoints("ssim")
+    seen = Seen(np.full(len(cameras), 0.3), np.full(len(cameras), 5.0))
+
+    def models(label: int) -> dict[QualityKind, ViewModel]:
+        inputs = np.array(
+            [[*camera.position, *camera.direction, np.log(5)] for camera in cameras], np.float64
+        )
+        found: dict[QualityKind, ViewModel] = {}
+        for quality in ("fidelity", "ssim"):
+            made = model(label, len(cameras), [1, 2, 3, 4], quality=quality, unseen=False)
+            status = "uncalibrated" if label == 2 else "calibrated"
+            found[quality] = replace(
+                made, label_id=label, inputs=inputs, extent=1.0, lengths=(2.0, 2.0, 2.0),
+                weights=made.weights * 0, calibration=replace(made.calibration, status=status),
+            )  # fmt: skip
+        return found
+
+    categories = [
+        replace(c, models=models(c.label_id), seen={"fidelity": seen, "ssim": seen})
+        for c in contents.categories
+    ]
+    write_bundle(folder / "bundle", replace(contents, categories=categories, drawn=cameras), package_viewer())
+    with serve(folder / "bundle") as url:
+        yield url
 
 
 @contextmanager
@@ -334,14 +372,56 @@ def test_the_keyboard_is_enough(site: str, browser: Any) -> None:
         page.keyboard.press("]")
         opened.wait_for("Math.abs(sagesplat.pose().position[0]) < 1e-4")
         page.keyboard.press("p")
-        slider = page.get_by_role("slider", name="Keep SSIM at")
+        slider = page.get_by_role("slider", name="Keep quality at")
         slider.focus()
         page.keyboard.press("ArrowRight")
-        assert page.evaluate("sagesplat.settings().target") == pytest.approx(0.81)
+        assert page.evaluate("sagesplat.settings().target") == pytest.approx(0.96)
         page.get_by_role("radio", name="Quality").press("ArrowRight")
         assert page.evaluate("sagesplat.settings().mode") == "budget"
         page.get_by_role("button", name="Hide brick").press("Enter")
         opened.wait_for("document.querySelector('[aria-label=\"Show brick\"]')")
+        assert opened.complaints == []
+
+
+def promises(opened: Opened) -> list[list[Any]]:
+    opened.wait_for(
+        "sagesplat.state().pending === 0 && sagesplat.state().labels.every((l) => l.shown >= l.wanted)"
+    )
+    return opened.page.evaluate("sagesplat.state().labels.map((l) => [l.shown, l.promised, l.trust])")
+
+
+def test_fidelity_is_promised_and_the_photos_are_a_choice(promised: str, browser: Any) -> None:
+    with open_page(promised, (900, 640), browser=browser) as opened:
+        ready(opened)
+        opened.wait_for("sagesplat.state().labels.every((l) => l.promised > 0)")
+        page = opened.page
+        assert page.evaluate("sagesplat.settings().quality") == "fidelity"
+        for shown, bound, trust in promises(opened):
+            assert shown == 4  # the means are 0.6, 0.73, 0.87 and 1
+            assert bound == 1
+            assert trust in ("calibrated", "uncalibrated")
+        rows = page.locator(".labels li")
+        assert "uncalibrated" in rows.filter(has_text="grass").inner_text()
+        assert "uncalibrated" not in rows.filter(has_text="brick").inner_text()
+        page.get_by_role("combobox", name="Compared with").select_option("ssim")
+        opened.wait_for("sagesplat.state().labels.every((l) => l.promised < 1)")
+        assert page.evaluate("[sagesplat.settings().quality, sagesplat.settings().target]") == ["ssim", 0.7]
+        page.get_by_role("combobox", name="Compared with").select_option("fidelity")
+        opened.wait_for("sagesplat.state().labels.every((l) => l.promised === 1)")
+        assert page.evaluate("sagesplat.settings().target") == 0.95
+        assert opened.complaints == []
+
+
+def test_no_promise_far_from_all_that_was_tried(promised: str, browser: Any) -> None:
+    with open_page(f"{promised}?target=0.7", (900, 640), browser=browser) as opened:
+        ready(opened)
+        opened.wait_for("sagesplat.state().labels.every((l) => l.promised >= 0.7)")
+        assert {shown for shown, *_ in promises(opened)} == {2}
+        opened.page.evaluate("sagesplat.setPose({ ...sagesplat.pose(), position: [0, 0, 12] })")
+        opened.wait_for("sagesplat.state().labels.every((l) => l.trust === 'outside')")
+        assert {shown for shown, *_ in promises(opened)} == {4}  # the full model
+        opened.wait_for("document.querySelector('.status').textContent.startsWith('No promise here')")
+        assert "no promise here" in opened.page.locator(".labels li").first.inner_text()
         assert opened.complaints == []
 
 
@@ -444,6 +524,7 @@ def newer(made: Path) -> bytes:
         ("?bundle=../elsewhere/", b"", "", "leaves this page"),
         ("?bundle=http://example.org/", b"", "", "leaves this page"),
         ("?target=2", b"", "", "not a number from 0 to 1"),
+        ("?quality=psnr", b"", "", "not one of fidelity, ssim"),
         ("", b"", "HTMLCanvasElement.prototype.getContext = () => null;", "WebGL 2"),
     ],
 )

@@ -4,6 +4,7 @@ import hashlib
 import json
 import math
 import shutil
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,32 +15,24 @@ import torch
 from conftest import pinhole, random_gaussians
 from hypothesis import given
 from hypothesis import strategies as st
-from make_viewer_vectors import DATA, distance_cases, model, promise_cases
+from make_viewer_vectors import DATA, cameras_at, distance_cases, model, promise_cases
 from scipy.spatial.transform import Rotation
 
-from sagesplat.adapt.viewpoint import ViewModel
+from sagesplat.adapt.viewpoint import NO_CALIBRATION, Calibration, QualityKind, ViewModel
 from sagesplat.core.errors import DataError, RunError, SageError
 from sagesplat.formats.increments import write_increments
 from sagesplat.formats.spz import read_spz
 from sagesplat.io.lock import alone
 from sagesplat.scene.scene import Camera
-from sagesplat.viewer import boxes, frames
+from sagesplat.viewer import boxes, frames, promises
 from sagesplat.viewer.bundle import SCHEMA, is_bundle, write_bundle, write_documents
 from sagesplat.viewer.frames import FLIP
 from sagesplat.viewer.manifest import CameraEntry, Category, Contents, documents
 from sagesplat.viewer.pack import NEARBY, Ladder, gains_of, order_of
-from sagesplat.viewer.quality import (
-    MOVES,
-    corrected,
-    curve_entry,
-    curve_of,
-    margins,
-    model_of,
-    of_files,
-    promise_entry,
-    significant,
-)
+from sagesplat.viewer.promises import Seen, allowed, promises_document, read_model
+from sagesplat.viewer.quality import curve_entry, curve_of, of_files, quality_entry, significant
 
+UNIT = np.array([[-1.0, -1, -1, 1, 1, 1]])
 SIZES = {-1: (4, 4, 10), 3: (3, 6, 20), 184: (0, 5, 9)}
 
 
@@ -171,17 +164,86 @@ def test_curves_keep_what_they_say(seed: int) -> None:
         np.testing.assert_allclose(curve_of(curve_entry(curve, exact=True))(away), curve(away), rtol=1e-12)
 
 
-def views_of(made: ViewModel) -> np.ndarray:
-    return np.column_stack([made.inputs[:, :3] * made.extent, made.inputs[:, 3:6]]) * np.tile(FLIP, 2)
+def own_views(made: ViewModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Distance, position and direction of a model's views."""
+    distance = np.exp(made.inputs[:, 6]) * (1 + 1e-9)  # a curve may jump exactly there
+    return distance, made.inputs[:, :3] * made.extent, made.inputs[:, 3:6]
 
 
-def test_a_promise_comes_back_as_it_was() -> None:
-    made = model(2, 12, [1, 2, 4])
-    entry = json.loads(json.dumps(promise_entry(made, np.arange(12), np.zeros(12), np.full(12, np.nan))))
-    read = model_of(entry, made.curves, views_of(made), made.extent)
-    at = np.array([2.0, np.nan]), np.ones((2, 3)), np.eye(3)[:2]
-    for a, b in zip(read.predict(*at), made.predict(*at), strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-12)
+def sent(made: ViewModel, seen: Seen | None = None) -> dict[str, Any]:
+    """The document of a model, as it is read."""
+    known = {} if seen is None else {made.label_id: seen}
+    return json.loads(
+        json.dumps(promises_document(made.quality, {made.label_id: made}, cameras_at(made), known))
+    )
+
+
+@pytest.mark.parametrize("quality", ["fidelity", "ssim"])
+@pytest.mark.parametrize(("seed", "views"), [(2, 1), (3, 12), (5, 40)])
+def test_a_model_that_is_sent_predicts_the_same(quality, seed: int, views: int) -> None:
+    made = model(seed, views, [1, 2, 4], quality=quality)
+    read = read_model(sent(made), made.label_id)
+    before, after = made.predict(*own_views(made)), read.predict(*own_views(made))
+    assert (np.abs(after.mean - before.mean) <= allowed(before.mean)).all()
+    asked = before.bound >= made.calibration.targets[0]
+    assert (after.bound <= before.bound + 1e-12)[asked].all()  # nothing is promised that was not before
+    np.testing.assert_allclose(after.bound, before.bound, atol=0.1)  # thresholds are 0.05 apart at 0.55
+    np.testing.assert_allclose(after.support, before.support, atol=0.02)
+    if quality == "fidelity":
+        assert (after.bound[:, -1] == 1).all()
+    nowhere = np.array([2.0, np.nan]), np.full((2, 3), 1e3), np.eye(3)[:2]
+    assert np.isnan(read.predict(*nowhere).bound).all()
+    known = made.predict(*nowhere).mean
+    assert (np.abs(read.predict(*nowhere).mean - known) <= allowed(known)).all()
+
+
+def test_two_photos_from_one_place_can_be_sent() -> None:
+    made = model(3, 12, [1, 2])
+    inputs = made.inputs.copy()
+    inputs[1:4] = inputs[0]
+    made = replace(made, inputs=inputs, weights=made.weights / 4)
+    read = read_model(sent(made), made.label_id)
+    known = made.predict(*own_views(made)).mean
+    assert (np.abs(read.predict(*own_views(made)).mean - known) <= allowed(known)).all()
+
+
+def test_of_very_many_views_some_are_sent_and_thresholds_allow_for_it(monkeypatch) -> None:
+    made = model(5, 40, [1, 2, 4])
+    monkeypatch.setattr(promises, "MOST_VIEWS", 16)
+    document = sent(made)
+    read = read_model(document, 7)
+    assert len(read.inputs) == 14
+    before, after = made.predict(*own_views(made)), read.predict(*own_views(made))
+    assert np.abs(after.mean - before.mean).max() > 0.01
+    asked = (before.bound >= made.calibration.targets[0]) & np.isfinite(after.bound)
+    assert (after.bound <= before.bound + 1e-12)[asked].all()
+
+
+def test_thresholds_that_are_close_stay_apart_and_below_the_full_model() -> None:
+    targets = np.array([0.5, 0.6, 0.7, 0.98, 1.0])
+    close = np.array([0.5, 0.50000001, 0.50000002, 0.99999999, 1.0])
+    made = replace(
+        model(3, 12, [1, 2], quality="fidelity"),
+        calibration=Calibration("uncalibrated", 0.95, 3, targets, close, 0.123456),
+    )
+    (entry,) = sent(made)["labels"]
+    assert entry["targets"] == [5000, 6000, 7000, 10000]  # 0.98 would need more than the full model's step
+    assert entry["thresholds"][-1] == 10000
+    assert (np.diff(entry["thresholds"]) > 0).all()
+    assert entry["leastSupport"] == 0.1235  # up: no promise that was not given
+    assert entry["status"] == "uncalibrated"
+    nothing = sent(replace(made, calibration=NO_CALIBRATION))
+    assert nothing["labels"][0]["targets"] == nothing["labels"][0]["thresholds"] == []
+    assert np.isnan(read_model(nothing, 7).predict(*own_views(made)).bound).all()
+
+
+def test_the_first_frame_knows_a_mean_and_a_bound_for_all_viewpoints() -> None:
+    made = model(5, 40, [1, 2, 3], quality="fidelity")
+    told, entry = made.predict(*own_views(made)), quality_entry(made)
+    np.testing.assert_allclose(entry["mean"], told.mean.mean(0), atol=1e-3)
+    assert ((told.bound >= np.array(entry["bound"])).mean(0) >= 0.95).all()
+    assert entry["bound"][-1] == 1
+    assert quality_entry(replace(made, calibration=NO_CALIBRATION))["bound"] is None
 
 
 def test_a_camera_there_and_back() -> None:
@@ -205,12 +267,13 @@ def test_the_first_view_is_level() -> None:
 def test_known_views_correct_the_boxes() -> None:
     made = replace(model(2, 12, [1]), lengths=(0.05, 0.05, 1.0))  # no view is close to another
     missed = np.linspace(-0.5, 0.5, 12)
-    position, direction = made.inputs[:, :3] * made.extent, made.inputs[:, 3:6]
+    read = read_model(sent(made, Seen(np.zeros(12), np.zeros(12), missed)), 7)
+    _, position, direction = own_views(made)
     told = np.linspace(1, 3, 12)
-    right = corrected(made, missed, told, position, direction)
-    np.testing.assert_allclose(right, told * np.exp(missed), rtol=1e-3)
-    np.testing.assert_allclose(corrected(made, missed, told, position + 1e3, direction), told, rtol=1e-9)
-    assert np.isnan(corrected(made, missed, np.full(12, np.nan), position, direction)).all()
+    right = read.corrected(told, position, direction)
+    np.testing.assert_allclose(right, told * np.exp(missed), rtol=3e-3)
+    np.testing.assert_allclose(read.corrected(told, position + 1e3, direction), told, rtol=1e-9)
+    assert np.isnan(read.corrected(np.full(12, np.nan), position, direction)).all()
 
 
 def test_levels_without_a_file_take_the_last_promise_of_what_they_show() -> None:
@@ -218,17 +281,8 @@ def test_levels_without_a_file_take_the_last_promise_of_what_they_show() -> None
     told = of_files(made, [2, 4], last=5)  # nothing, A, A, B, B
     assert told.levels == (1, 2)
     np.testing.assert_array_equal(told.weights, made.weights[:, [2, 4]])
-    np.testing.assert_array_equal(told.amplitudes, made.amplitudes[[2, 4]])
     assert [c.params for c in told.curves] == [made.curves[2].params, made.curves[4].params]
     assert of_files(model(1, 5, [1]), [2, 4], last=5).curves == ()
-
-
-def test_margins_keep_the_curve_below_the_bounds() -> None:
-    made = model(5, 40, [1, 2, 3])
-    away = np.exp(made.inputs[:, 6])
-    bound = made.predict(away, made.inputs[:, :3] * made.extent, made.inputs[:, 3:6]).bound
-    below = np.stack([c(away) for c in made.curves], 1) + margins(made) <= bound + 1e-12
-    assert (below.mean(0) >= 0.95).all()
 
 
 @given(st.floats(-1e12, 1e12), st.integers(2, 15))
@@ -252,31 +306,36 @@ def viewer(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def contents(tmp_path: Path) -> Contents:
-    """Three categories of three levels, one of them with a promise."""
+    """Three categories of three levels, one of them with models."""
     g = random_gaussians(39, degree=1)
     labels = torch.tensor([-1] * 10 + [3] * 20 + [184] * 9, dtype=torch.int16)
     chunks = write_increments(
         tmp_path / "chunks", replace(g, label_ids=labels), SIZES, {3: "car", 184: "tree"}
     )
     made = replace(model(3, 6, [1, 2, 3]), label_id=3)
-    entries = []
-    for i, row in enumerate(made.inputs):  # the model's own views
-        at = camera(at=tuple((row[:3] * made.extent).tolist()))
-        z = row[3:6]
-        x = np.cross([0.1, 1, 0.2], z)
-        w2c = at.w2c.copy()
-        w2c[:3, :3] = np.stack([x / np.linalg.norm(x), np.cross(z, x / np.linalg.norm(x)), z])
-        w2c[:3, 3] = -w2c[:3, :3] @ (row[:3] * made.extent)
-        split = "calibration" if made.heldout_inputs[i] else "train"
-        entries.append(CameraEntry(f"{i}.jpg", split, replace(at, w2c=w2c)))
+    fidelity = replace(model(4, 5, [1, 2, 3], quality="fidelity"), label_id=3)
+    entries = [
+        CameraEntry(f"{i}.jpg", "calibration" if heldout else "train", at)
+        for i, (at, heldout) in enumerate(zip(cameras_at(made), made.heldout_inputs, strict=True))
+    ]
     entries.append(CameraEntry("none.jpg", "test", camera()))
+    drawn = cameras_at(fidelity)
+    seen: dict[QualityKind, Seen] = {"fidelity": seen_by(drawn, 0.5), "ssim": seen_by(entries, 0.25)}
+    car = Category(3, "car", "car", "#112233", UNIT, 2.0, True, {"fidelity": fidelity, "ssim": made}, seen)
     points = np.random.default_rng(0).normal(size=(50, 3))
     categories = [
         Category(-1, "unlabelled", "everything else", "#808080", boxes.split_boxes(points)),
-        Category(3, "car", "car", "#112233", boxes.split_boxes(points), 2.0, True, made, np.full(7, 0.25)),
+        replace(car, boxes=boxes.split_boxes(points)),
         Category(184, "tree", "tree", "#445566", boxes.split_boxes(points[:3])),
     ]
-    return Contents("tiny", made.extent, entries, categories, chunks, tmp_path / "chunks", 1, points=points)
+    return Contents(
+        "tiny", made.extent, entries, categories, chunks, tmp_path / "chunks", 1, points=points,
+        drawn=drawn,
+    )  # fmt: skip
+
+
+def seen_by(viewpoints: Sequence[Any], share: float) -> Seen:
+    return Seen(np.full(len(viewpoints), share), np.full(len(viewpoints), 2.0))
 
 
 def manifest_of(folder: Path) -> dict[str, Any]:
@@ -309,39 +368,48 @@ def test_a_bundle_holds_what_its_manifest_says(tmp_path, contents, viewer) -> No
     assert manifest["totals"]["count"] == 39
     assert written.manifest == (out / "manifest.json").stat().st_size
     assert written.total == sum(p.stat().st_size for p in out.rglob("*") if p.is_file())
-    ours = {"manifest.json", "manifest.schema.json", manifest["promises"]["uri"], "chunks", "LICENSES.txt"}
-    ours.add(manifest["pack"]["uri"])
+    ours = {"manifest.json", "manifest.schema.json", manifest["pack"]["uri"], "chunks", "LICENSES.txt"}
+    documents = {reference["uri"] for reference in manifest["promises"].values()}
+    assert len(documents) == 2
+    ours |= documents
     assert {p.name for p in out.iterdir()} == ours | {"index.html", "assets", "THIRD_PARTY_LICENSES.txt"}
     assert {entry["what"] for entry in manifest["licenses"]} >= {"three.js", "Spark"}
     assert not list(tmp_path.glob(".out*"))
     assert is_bundle(out)
-    for path in (out / "manifest.json", out / manifest["promises"]["uri"]):
-        assert "://" not in path.read_text()
+    for name in ("manifest.json", *documents):
+        assert "://" not in (out / name).read_text()
 
 
-def test_promises_of_a_bundle_are_those_of_the_model(tmp_path, contents, viewer) -> None:
+@pytest.mark.parametrize(("quality", "share"), [("fidelity", 0.5), ("ssim", 0.25)])
+def test_promises_of_a_bundle_are_those_of_the_model(tmp_path, contents, viewer, quality, share) -> None:
     write_bundle(tmp_path / "out", contents, viewer)
     manifest = manifest_of(tmp_path / "out")
-    content = (tmp_path / "out" / manifest["promises"]["uri"]).read_bytes()
-    assert hashlib.sha256(content).hexdigest() == manifest["promises"]["sha256"]
+    content = (tmp_path / "out" / manifest["promises"][quality]["uri"]).read_bytes()
+    assert hashlib.sha256(content).hexdigest() == manifest["promises"][quality]["sha256"]
     promises = json.loads(content)
-    (entry,) = promises["labels"]
-    views = np.array(promises["views"])
-    assert entry["shares"] == [0.25] * len(views)
-    assert len(views) == 6  # the test view taught nothing
-    quality = next(label["quality"] for label in manifest["labels"] if label["id"] == 3)
-    read = model_of(entry, [curve_of(c) for c in quality["curves"]], views, promises["extent"])
-    made = contents.categories[1].model
-    assert made is not None
-    cameras = [entry.camera for entry in contents.cameras]
-    at = (
-        np.full(7, np.nan),
-        np.stack([c.position for c in cameras]),
-        np.stack([c.direction for c in cameras]),
-    )
-    np.testing.assert_allclose(read.predict(*at).bound, made.predict(*at).bound, atol=MOVES)
-    for row, shown in zip(made.inputs, views[entry["views"]] * np.tile(FLIP, 2), strict=True):
-        np.testing.assert_allclose(shown, [*row[:3] * made.extent, *row[3:6]], atol=1e-4)
+    assert promises["quality"] == quality
+    made, (entry,) = contents.categories[1].models[quality], promises["labels"]
+    views = np.cumsum(promises["views"], 1).T / 1e4
+    assert len(views) == made.num_views  # the test photo taught nothing
+    assert np.cumsum(entry["shares"]).tolist() == [share * 1e4] * len(views)
+    read = read_model(promises, 3)
+    known = made.predict(*own_views(made)).mean
+    assert (np.abs(read.predict(*own_views(made)).mean - known) <= allowed(known)).all()
+    shown = sorted(map(tuple, (read.inputs[:, :6]).round(3).tolist()))
+    np.testing.assert_allclose(shown, sorted(map(tuple, made.inputs[:, :6].round(3).tolist())), atol=2e-3)
+    (label,) = (label for label in manifest["labels"] if label["id"] == 3)
+    assert label["quality"][quality]["status"] == "calibrated"
+    assert label["quality"][quality]["levels"] == [1, 2, 3]
+
+
+def test_a_bundle_says_what_the_viewer_begins_with(contents) -> None:
+    assert documents(contents)[0]["target"] == {"quality": "fidelity", "value": 0.95}
+    asked = replace(contents, target=("ssim", 0.6))
+    assert documents(asked)[0]["target"] == {"quality": "ssim", "value": 0.6}
+    photos = replace(contents, drawn=())  # nothing was drawn
+    manifest, promises = documents(photos)
+    assert manifest["target"] == {"quality": "ssim", "value": 0.7}
+    assert list(promises) == list(manifest["promises"]) == ["ssim"]
 
 
 def test_the_pack_is_the_chunks_in_its_order(tmp_path, contents, viewer) -> None:
@@ -437,7 +505,7 @@ def test_an_earlier_bundle_is_replaced_and_nothing_of_it_stays(tmp_path, content
     few = replace(contents, categories=contents.categories[:1], chunks=contents.chunks[:2])
     write_bundle(out, few, viewer)
     manifest = manifest_of(out)
-    assert manifest["promises"] is None
+    assert manifest["promises"] == {}
     assert not list(out.glob("promises-*"))
     assert [path.name for path in out.glob("scene*")] == [manifest["pack"]["uri"]]
     assert len(list((out / "chunks").iterdir())) == 2
@@ -446,7 +514,7 @@ def test_an_earlier_bundle_is_replaced_and_nothing_of_it_stays(tmp_path, content
 def test_without_points_or_labels() -> None:
     empty = Contents("none", 0.0, [CameraEntry("a", "test", camera())], [], [], Path("none"), 0)
     manifest, promises = documents(empty)
-    assert promises is None
+    assert promises == manifest["promises"] == {}
     assert manifest["pack"] is None
     assert manifest["labels"] == []
     assert manifest["totals"] == {"count": 0, "bytes": 0, "gpuBytes": 0}

@@ -777,7 +777,7 @@ def write_run(folder: Path, chunks: bool = True) -> Path:
     contents = {"scene.json": b"{}", "provenance/scene.json": json.dumps({"format": FORMAT}).encode()}
     if chunks:
         contents["nested/increments/index.json"] = b'{"chunks": [{"sha256": "aa"}, {"sha256": "bb"}]}'
-        contents["nested/promises.json"] = b"{}"
+        contents["nested/promises.json"] = contents["nested/fidelity.json"] = b"{}"
     return write_bundle(folder, contents)
 
 
@@ -799,16 +799,16 @@ def test_a_newer_viewer_needs_no_new_bundle(tmp_path: Path, bundling: Bundling):
     assert bundling.made == 1
 
 
-@pytest.mark.parametrize("change", ["chunks", "promises", "manifest"])
+@pytest.mark.parametrize("change", ["chunks", "promises", "fidelity", "plan", "manifest"])
 def test_and_again_when_it_is_out_of_date(tmp_path: Path, bundling: Bundling, change: str):
     run = write_run(tmp_path / "run")
     with show(run, print, port=0):
         pass
     if change == "chunks":
         (run / "nested/increments/index.json").write_text('{"chunks": [{"sha256": "aa"}]}')
-    elif change == "promises":
+    elif change in ("promises", "fidelity", "plan"):
         time.sleep(0.02)
-        (run / "nested/promises.json").write_text("{ }")
+        (run / f"nested/{change}.json").write_text("{ }")
     else:
         (run / "bundle/manifest.json").write_text('{"format": "sagesplat-bundle", "labels": [1]}')
     for _ in range(2):

@@ -1,4 +1,4 @@
-import type { Camera, Settings, State } from "./types";
+import { type Camera, QUALITIES, type Quality, type Settings, type State } from "./types";
 import type { Pose } from "./view/frame";
 
 /** One drawn frame. */
@@ -33,22 +33,32 @@ export interface Embed {
 /** The options in the page's address. */
 export interface Options {
   readonly view: string | null;
-  readonly target: number | null; // SSIM
+  readonly quality: Quality | null; // that the target is of; null: the bundle's
+  readonly target: number | null;
   readonly budget: number | null; // MB
   readonly ui: boolean;
   readonly bundle: string; // folder, relative to the page
 }
 
-/** Reads `?view=NAME&target=0.8&budget=MB&ui=0&bundle=path/`, from the query and the fragment. Throws. */
+/** Reads `?view=NAME&quality=ssim&target=0.7&budget=MB&ui=0&bundle=path/`, from the query and the fragment. Throws. */
 export function parseOptions(search: string, hash: string): Options {
   const given = new URLSearchParams(`${search.replace(/^\?/, "")}&${hash.replace(/^#/, "")}`);
   return {
     view: given.get("view"),
+    quality: qualityOf(given.get("quality")),
     target: numeric(given, "target", 0, 1),
     budget: numeric(given, "budget", 0, 1e6),
     ui: given.get("ui") !== "0",
     bundle: bundlePath(given.get("bundle") ?? ""),
   };
+}
+
+function qualityOf(text: string | null): Quality | null {
+  const quality = QUALITIES.find((known) => known === text) ?? null;
+  if (text !== null && !quality) {
+    throw new Error(`?quality=${text} is not one of ${QUALITIES.join(", ")}; correct the address.`);
+  }
+  return quality;
 }
 
 function numeric(given: URLSearchParams, name: string, low: number, high: number): number | null {

@@ -16,19 +16,26 @@ export interface Level {
 
 /** K1 exp(-g1 |d - mu1|^a1) for d < beta, K2 exp(-g2 |d - mu2|^a2) from beta on (Eq. 3). */
 export interface Curve {
-  readonly level: number; // 1-based
   readonly params: readonly [number, number, number, number, number, number, number, number, number];
   readonly range: readonly [number, number]; // of the fitted distances
   readonly median: number; // used for an unknown distance
-  readonly rmse: number;
 }
 
-/** A category's quality model by distance alone. */
+/** What quality is measured against: the full model from the same viewpoint, or photos. Both are SSIM. */
+export const QUALITIES = ["fidelity", "ssim"] as const;
+export type Quality = (typeof QUALITIES)[number];
+
+/** Whether a bound holds at its confidence, or calibration views were too few for that. */
+export const STATUSES = ["calibrated", "uncalibrated"] as const;
+export type Status = (typeof STATUSES)[number];
+
+/** A category's quality by level whatever the viewpoint, until the viewpoint models are there. */
 export interface LabelQuality {
-  readonly status: "calibrated" | "pooled" | "uncalibrated";
+  readonly levels: readonly number[]; // 1-based levels with a prediction, ascending
+  readonly status: Status;
   readonly confidence: number;
-  readonly margin: readonly number[]; // by curve: offset to a lower confidence bound, SSIM
-  readonly curves: readonly Curve[];
+  readonly mean: readonly number[]; // over the model's viewpoints
+  readonly bound: readonly number[] | null; // below the bounds of most of them; null: no promise
 }
 
 export interface Label {
@@ -42,7 +49,7 @@ export interface Label {
   readonly always: boolean; // shipped in full whatever the plan says
   readonly boxes: readonly Box[];
   readonly levels: readonly Level[]; // level k consists of increments 1..k
-  readonly quality: LabelQuality | null;
+  readonly quality: Readonly<Partial<Record<Quality, LabelQuality>>>;
 }
 
 export interface Camera {
@@ -75,11 +82,19 @@ export interface Manifest {
   readonly background: Vec3; // 0..1
   readonly totals: { readonly count: number; readonly bytes: number; readonly gpuBytes: number };
   readonly labels: readonly Label[];
-  readonly promises: { readonly uri: string; readonly bytes: number; readonly sha256: string } | null;
+  readonly promises: Readonly<Partial<Record<Quality, Reference>>>;
+  readonly target: { readonly quality: Quality; readonly value: number }; // to begin with
   readonly pack?: Pack | null; // older bundles have none
   readonly cameras: readonly Camera[];
   readonly start: { readonly position: Vec3; readonly quaternion: Quat; readonly target: Vec3 };
   readonly licenses: readonly { readonly what: string; readonly license: string; readonly url?: string }[];
+}
+
+/** A file of the bundle. */
+export interface Reference {
+  readonly uri: string;
+  readonly bytes: number;
+  readonly sha256: string;
 }
 
 /** All increments concatenated in one file, best first: one stream is faster than many files. */
@@ -90,30 +105,36 @@ export interface Pack {
   readonly order: readonly (readonly [number, number])[]; // index of the label, level (1-based)
 }
 
-/** The viewpoint models of all categories, as evaluated by src/sagesplat/adapt/viewpoint.py. */
+/** The viewpoint models of all categories for one quality, as in src/sagesplat/viewer/promises.py. */
 export interface Promises {
   readonly version: number;
+  readonly quality: Quality;
   readonly extent: number;
-  readonly views: readonly (readonly [number, number, number, number, number, number])[]; // position, direction
-  readonly labels: readonly {
-    readonly id: number;
-    readonly levels: readonly number[]; // 1-based levels with a bound
-    readonly usual: number;
-    readonly lengths: Vec3;
-    readonly unseen: number;
-    readonly noise: number;
-    readonly factor: number;
-    readonly confidence: number;
-    readonly shift: number;
-    readonly mixing: number;
-    readonly amplitudes: readonly number[];
-    readonly views: readonly number[]; // rows of the shared views
-    readonly unseenViews: readonly number[]; // 0 or 1 for each of them
-    readonly logDistances: readonly number[];
-    readonly weights: readonly (readonly number[])[]; // [n][K]
-    readonly corrections: readonly number[]; // log of distance over distance by boxes; 0: unknown
-    readonly shares: readonly number[]; // pixel share in each shared view, 0..1
-  }[];
+  readonly views: readonly (readonly number[])[]; // x y z over the extent, direction: differences, 1/10000
+  readonly labels: readonly LabelPromises[];
+}
+
+export interface LabelPromises {
+  readonly id: number;
+  readonly levels: readonly number[]; // 1-based levels with a prediction
+  readonly status: Status;
+  readonly confidence: number;
+  readonly leastSupport: number; // below it there is no bound
+  readonly discount: number; // of the mean where the support is 0; none at a known viewpoint
+  readonly targets: readonly number[]; // ascending, 1/10000
+  readonly thresholds: readonly number[]; // of the mean, by target
+  readonly medianLogDistance: number; // for an unknown distance
+  readonly lengths: Vec3; // of position, direction, log distance
+  readonly curves: readonly Curve[]; // by level; empty: 0
+  readonly offsets: readonly number[]; // by level
+  readonly views: readonly number[]; // rows of the shared views: differences
+  readonly logDistances: { readonly unit: number; readonly steps: readonly number[] }; // by own view: differences
+  readonly values: {
+    readonly units: readonly number[]; // by level
+    readonly steps: readonly (readonly number[])[]; // by level and own view: differences along both
+  };
+  readonly shares: readonly number[]; // of the pixels, by shared view: differences, 1/10000
+  readonly corrections: readonly number[]; // log of distance over that by boxes: differences, 1/200
 }
 
 /** The viewer's position and view, in the bundle's frame. */
@@ -132,7 +153,8 @@ export interface Budget {
 
 export interface Settings {
   readonly mode: "target" | "budget" | "full" | "base";
-  readonly target: number; // SSIM
+  readonly quality: Quality; // that the target is of
+  readonly target: number;
   readonly budget: Budget; // kept in every mode
   readonly weights: ReadonlyMap<number, number>; // by label id
   readonly cacheBytes: number; // of decoded increments that are not shown
@@ -153,6 +175,9 @@ export interface Handle {
   readonly count: number;
 }
 
+/** "outside": far from all that was sampled or photographed, so no promise is given; "unknown": no model. */
+export type Trust = Status | "outside" | "unknown";
+
 export interface LabelState {
   readonly label: Label;
   readonly wanted: number; // level of the plan, 0 = none
@@ -161,8 +186,9 @@ export interface LabelState {
   readonly error: string | null;
   readonly visible: boolean; // in the frustum
   readonly distance: number; // NaN: unknown
-  readonly promised: number; // the promise: lower confidence bound of SSIM at the shown level; NaN: unknown
-  readonly expected: number; // mean SSIM at the shown level
+  readonly promised: number; // the promise: lower confidence bound of quality at the shown level; NaN: none
+  readonly expected: number; // mean quality at the shown level
+  readonly trust: Trust; // in the promise
   readonly count: number; // splats shown
   readonly bytes: number;
   readonly gpuBytes: number;

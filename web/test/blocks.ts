@@ -3,7 +3,7 @@
 import { frustumOf, rotate } from "../src/core/distance";
 import type { Box, Label, Level, Manifest, Promises, Viewpoint } from "../src/types";
 import { fnv, type Network, seeded } from "./simulate";
-import { totals } from "./worlds";
+import { differences, modelOf, PROMISES, qualityOf, totals } from "./worlds";
 
 const SIDE = 10; // of a block, world units
 
@@ -36,7 +36,7 @@ export function blocksBundle(network: Network, options: BlocksOptions = {}): Man
   const models = promisesOf(labels, side, views, random);
   return {
     format: "sagesplat-bundle",
-    version: 1,
+    version: 2,
     generator: "test",
     name: "blocks",
     live: false,
@@ -46,7 +46,8 @@ export function blocksBundle(network: Network, options: BlocksOptions = {}): Man
     background: [0, 0, 0],
     totals: totals(labels),
     labels,
-    promises: store(network, "promises-1.json", new TextEncoder().encode(JSON.stringify(models))),
+    promises: { fidelity: store(network, PROMISES, new TextEncoder().encode(JSON.stringify(models))) },
+    target: { quality: "fidelity", value: 0.95 },
     cameras: [],
     start: { ...start, target: [5, 1, 5] },
     licenses: [],
@@ -82,16 +83,7 @@ function part(
     const [a, b, h] = [x + 9 * random(), z + 9 * random(), 2 * random()];
     return [a, h, b, a + 1, h + 0.5 + random(), b + 1];
   });
-  const curves = levels.map((_, k) => {
-    const top = 0.95 * (1 - 0.5 * Math.exp(-(k + 1) / 4));
-    return {
-      level: k + 1,
-      params: [top, 0.002, 2, 1.2, top - 0.02, 0.002, 2, 1.1, 20] as const,
-      range: [1, 60] as const,
-      median: top - 0.02,
-      rmse: 0.02,
-    };
-  });
+  const means = levels.map((_, k) => 0.95 * (1 - 0.5 * Math.exp(-(k + 1) / 4)));
   return {
     id,
     name: `category-${category}@${block}`,
@@ -103,7 +95,7 @@ function part(
     always: false,
     boxes,
     levels,
-    quality: { status: "calibrated", confidence: 0.95, margin: levels.map(() => -0.02), curves },
+    quality: { fidelity: qualityOf(means) },
   };
 }
 
@@ -114,32 +106,28 @@ function promisesOf(labels: readonly Label[], side: number, views: number, rando
     const [x, z] = [SIDE * side * random(), SIDE * side * random()];
     return [x, 1.5, z, Math.sin(turn), 0, Math.cos(turn)] as const;
   });
+  const extent = SIDE * side;
+  const column = (axis: number) =>
+    differences(all.map((view) => (1e4 * (view[axis] ?? 0)) / (axis < 3 ? extent : 1)));
   return {
-    version: 1,
-    extent: SIDE * side,
-    views: all,
-    labels: labels.map(({ id, levels, boxes }) => {
-      const [x = 0, , z = 0] = boxes[0] ?? [];
+    version: 2,
+    quality: "fidelity",
+    extent,
+    views: [0, 1, 2, 3, 4, 5].map(column),
+    labels: labels.map((label) => {
+      const [x = 0, , z = 0] = label.boxes[0] ?? [];
       const away = all.map((view) => Math.hypot(view[0] - x, view[2] - z));
-      const rows = [...away.keys()].sort((a, b) => (away[a] ?? 0) - (away[b] ?? 0)).slice(0, views);
+      const nearest = [...away.keys()].sort((a, b) => (away[a] ?? 0) - (away[b] ?? 0)).slice(0, views);
+      const rows = nearest.sort((a, b) => a - b);
       return {
-        id,
-        levels: levels.map((_, k) => k + 1),
-        usual: 2,
+        ...modelOf(label, rows, random),
+        medianLogDistance: 2,
         lengths: [0.2, 0.7, 0.6] as const,
-        unseen: 0.1,
-        noise: 0.1,
-        factor: 1,
-        confidence: 0.95,
-        shift: 0,
-        mixing: 0.005,
-        amplitudes: levels.map(() => 0.01),
-        views: rows,
-        unseenViews: rows.map((i) => (i % 4 ? 0 : 1)),
-        logDistances: rows.map((row) => Math.log(1 + (away[row] ?? 0))),
-        corrections: rows.map(() => 0),
-        weights: rows.map(() => levels.map(() => 0.01 * (random() - 0.5))),
-        shares: away.map((d) => Math.min(0.2, 2 / (1 + d) ** 2)),
+        logDistances: {
+          unit: 0.01,
+          steps: differences(rows.map((row) => 100 * Math.log(1 + (away[row] ?? 0)))),
+        },
+        shares: differences(away.map((d) => 1e4 * Math.min(0.2, 2 / (1 + d) ** 2))),
       };
     }),
   };

@@ -12,7 +12,7 @@ const root = fileURLToPath(new URL("..", import.meta.url));
 const { module: sim } = await runnerImport(join(root, "test/network.ts"), { root, configFile: false });
 
 const manifest = readFileSync(join(bundle, "manifest.json"), "utf8");
-const promises = readFileSync(join(bundle, JSON.parse(manifest).promises.uri), "utf8");
+const promises = readFileSync(join(bundle, JSON.parse(manifest).promises.fidelity.uri), "utf8");
 const documents = { manifest, promises };
 const round = (value, digits) => Number(value.toFixed(digits));
 
@@ -29,7 +29,7 @@ for (const connections of [6, Infinity]) {
     const line = { mbit, connections };
     const ways = {
       streamed: await sim.streamed(documents, line, {}),
-      "target 0.8": await sim.streamed(documents, line, { mode: "target", target: 0.8 }),
+      "fidelity 0.95": await sim.streamed(documents, line, { mode: "target", target: 0.95 }),
       "file order": await sim.fileOrder(documents, line),
       "one file": sim.oneFile(documents, line),
     };
@@ -50,7 +50,7 @@ for (const connections of [6, Infinity]) {
   }
 }
 
-const walk = await sim.walked(documents, { mbit: 10, connections: 6 }, { mode: "target", target: 0.8 });
+const walk = await sim.walked(documents, { mbit: 10, connections: 6 }, { mode: "target", target: 0.95 });
 const lines = walk.map((s) => [s.second, s.bytes, s.count, round(s.ssim, 4), round(s.full, 4)].join());
 const mean = (of) => round(walk.reduce((sum, step) => sum + of(step), 0) / walk.length, 4);
 const totals = JSON.parse(manifest).totals;

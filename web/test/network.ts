@@ -12,7 +12,7 @@ import { BASE, NO_BUDGET } from "./worlds";
 /** The texts of a bundle; of its chunks only the sizes matter. */
 export interface Documents {
   readonly manifest: string;
-  readonly promises: string;
+  readonly promises: string; // of fidelity
 }
 
 /** A link with a round trip of 100 ms; without HTTP/2 a browser opens 6 connections. */
@@ -34,7 +34,8 @@ export interface Sample {
 const NOTHING: Sample = { ms: 0, bytes: 0, ssim: 0, whole: false };
 const FULL: Settings = {
   mode: "full",
-  target: 0.8,
+  quality: "fidelity",
+  target: 0.95,
   budget: NO_BUDGET,
   weights: new Map(),
   cacheBytes: 1e9,
@@ -47,7 +48,8 @@ function linkTo(documents: Documents, { mbit, connections }: Line) {
   const manifest: Manifest = JSON.parse(documents.manifest);
   const text = new TextEncoder();
   network.files.set("manifest.json", text.encode(documents.manifest));
-  if (manifest.promises) network.files.set(manifest.promises.uri, text.encode(documents.promises));
+  const { fidelity } = manifest.promises;
+  if (fidelity) network.files.set(fidelity.uri, text.encode(documents.promises));
   const { pack } = manifest;
   if (pack) network.files.set(pack.uri, new Uint8Array(pack.bytes));
   for (const { uri, bytes } of manifest.labels.flatMap((label) => label.levels)) {
@@ -58,7 +60,7 @@ function linkTo(documents: Documents, { mbit, connections }: Line) {
 
 /** Says the expected SSIM of some levels (0: nothing) at a viewpoint: 0 where nothing is drawn. */
 export function judge(manifest: Manifest, promises: string): (view: Viewpoint, levels: number[]) => number {
-  const outlook = new Outlook(manifest.labels, parsePromises(promises, "promises"));
+  const outlook = new Outlook("fidelity", manifest.labels, parsePromises(promises, "promises", "fidelity"));
   const entries = manifest.labels.map((label) => new Entry(label));
   return (view, levels) => {
     let [sum, total] = [0, 0];

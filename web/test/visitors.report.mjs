@@ -25,7 +25,7 @@ const { module: sim } = await runnerImport(join(root, "test/visitors.ts"), { roo
 
 const original = JSON.parse(readFileSync(join(bundle, "manifest.json"), "utf8"));
 const manifest = sim.resized(original, scale, !values["no-pack"]);
-const promises = original.promises?.uri;
+const promises = original.promises.fidelity?.uri;
 
 /** Bytes that a server sends, which packs text and nothing else. */
 const wire = (uri) => {

@@ -36,10 +36,12 @@ const phone = ({ totals }: Manifest): Partial<Settings> => ({
   budget: { ...NO_BUDGET, bytes: totals.bytes / 2 },
 });
 
+const TARGET: Partial<Settings> = { mode: "target", quality: "fidelity", target: 0.95 };
+
 export const PROFILES: readonly Profile[] = [
   { name: "everything", mbit: 50, aspect: 1.6, settings: () => ({ mode: "full" }) },
-  { name: "target 0.8", mbit: 50, aspect: 1.6, settings: () => ({ mode: "target", target: 0.8 }) },
-  { name: "target 0.8, phone", mbit: 10, aspect: 0.5, settings: () => ({ mode: "target", target: 0.8 }) },
+  { name: "fidelity 0.95", mbit: 50, aspect: 1.6, settings: () => TARGET },
+  { name: "fidelity 0.95, phone", mbit: 10, aspect: 0.5, settings: () => TARGET },
   { name: "half of the bytes, phone", mbit: 10, aspect: 0.5, settings: phone },
 ];
 
@@ -206,7 +208,8 @@ export async function visit(
   const fetch = recording(network, clock, log);
   const settings: Settings = {
     mode: "target",
-    target: 0.8,
+    quality: "fidelity",
+    target: 0.95,
     budget: NO_BUDGET,
     weights: new Map(manifest.labels.map(({ id, weight }) => [id, weight])),
     cacheBytes: 128e6,

@@ -1,12 +1,24 @@
 /** Small bundles made up for tests. */
 
-import type { Label, Level, Manifest, Pack, Promises, Settings, Viewpoint } from "../src/types";
+import type {
+  Label,
+  LabelPromises,
+  LabelQuality,
+  Level,
+  Manifest,
+  Pack,
+  Promises,
+  Settings,
+  Viewpoint,
+} from "../src/types";
 import { fnv, type Network, seeded } from "./simulate";
 
 export const BASE = new URL("https://example.org/");
+export const PROMISES = "promises-1.json";
 export const NO_BUDGET = { bytes: Infinity, gpuBytes: Infinity, count: Infinity };
 export const DEFAULTS: Settings = {
   mode: "target",
+  quality: "fidelity",
   target: 0.8,
   budget: NO_BUDGET,
   weights: new Map(),
@@ -46,7 +58,7 @@ export function bundle(network: Network, options: Options = {}): Manifest {
   const models = promises && labels ? promisesOf(made, random) : null;
   return {
     format: "sagesplat-bundle",
-    version: 1,
+    version: 2,
     generator: "test",
     name: "test",
     live,
@@ -56,7 +68,10 @@ export function bundle(network: Network, options: Options = {}): Manifest {
     background: [0, 0, 0],
     totals: totals(made),
     labels: made,
-    promises: models && store(network, "promises-1.json", new TextEncoder().encode(JSON.stringify(models))),
+    promises: models
+      ? { fidelity: store(network, PROMISES, new TextEncoder().encode(JSON.stringify(models))) }
+      : {},
+    target: { quality: "fidelity", value: 0.8 },
     ...(pack && { pack: packOf(network, made) }),
     cameras: [],
     start: { position: [0, 0, 0], quaternion: [0, 0, 0, 1], target: [0, 0, -1] },
@@ -93,11 +108,7 @@ function put(network: Network, uri: string, size: number, random: () => number):
 
 function labelOf(id: number, levels: readonly Level[], random: () => number): Label {
   const best = 0.88 + 0.08 * random();
-  const curves = levels.map((_, k) => {
-    const top = best * (1 - 0.6 * Math.exp(-(k + 1) / 1.5));
-    const params = [top, 0.002, 2, 1.2, top - 0.02, 0.002, 2, 1.1, 20] as const;
-    return { level: k + 1, params, range: [1, 40] as const, median: top - 0.02, rmse: 0.02 };
-  });
+  const means = levels.map((_, k) => best * (1 - 0.6 * Math.exp(-(k + 1) / 1.5)));
   const x = 4 * id - 8;
   return {
     id,
@@ -108,37 +119,63 @@ function labelOf(id: number, levels: readonly Level[], random: () => number): La
     always: false,
     boxes: [[x - 1, -1, -6, x + 1, 1, -4]],
     levels,
-    quality: { status: "calibrated", confidence: 0.95, margin: levels.map(() => -0.02), curves },
+    quality: { fidelity: qualityOf(means) },
+  };
+}
+
+/** What holds everywhere, for these means by level. */
+export const qualityOf = (means: readonly number[]): LabelQuality => ({
+  levels: means.map((_, k) => k + 1),
+  status: "calibrated",
+  confidence: 0.95,
+  mean: means,
+  bound: means.map((mean) => mean - 0.03),
+});
+
+/** Differences of whole numbers along a list, as promises hold them. */
+export const differences = (values: readonly number[]): number[] =>
+  values.map((value, i) => Math.round(value) - Math.round(values[i - 1] ?? 0));
+
+/** A model with these means by level, that vary a little from view to view. */
+export function modelOf(label: Label, rows: readonly number[], random: () => number): LabelPromises {
+  const means = label.quality.fidelity?.mean ?? [];
+  return {
+    id: label.id,
+    levels: means.map((_, k) => k + 1),
+    status: "calibrated",
+    confidence: 0.95,
+    leastSupport: 0,
+    discount: 0,
+    targets: [3000, 6000, 8000, 9000, 9900],
+    thresholds: [3200, 6200, 8200, 9200, 9990],
+    medianLogDistance: 1.6,
+    lengths: [0.5, 0.7, 0.6],
+    curves: [],
+    offsets: means,
+    views: differences(rows),
+    logDistances: { unit: 0.01, steps: differences(rows.map(() => 150 + 30 * random())) },
+    values: {
+      units: means.map(() => 1e-3),
+      steps: means.map(() => differences(rows.map(() => 2 * (random() - 0.5)))),
+    },
+    shares: [],
+    corrections: rows.map(() => 0),
   };
 }
 
 function promisesOf(labels: readonly Label[], random: () => number): Promises {
-  const views = Array.from({ length: 12 }, () => {
-    return [10 * random() - 5, 0, 4 * random(), 0, 0, -1] as const;
-  });
+  const views = Array.from({ length: 12 }, () => [10 * random() - 5, 0, 4 * random(), 0, 0, -1]);
   const rows = views.map((_, i) => i);
   return {
-    version: 1,
+    version: 2,
+    quality: "fidelity",
     extent: 5,
-    views,
+    views: [0, 1, 2, 3, 4, 5].map((axis) =>
+      differences(views.map((view) => (1e4 * (view[axis] ?? 0)) / (axis < 3 ? 5 : 1))),
+    ),
     labels: labels.map((label) => ({
-      id: label.id,
-      levels: label.levels.map((_, k) => k + 1),
-      usual: 1.6,
-      lengths: [0.5, 0.7, 0.6] as const,
-      unseen: 0.1,
-      noise: 0.1,
-      factor: 1,
-      confidence: 0.95,
-      shift: 0,
-      mixing: 0.005,
-      amplitudes: label.levels.map(() => 0.01),
-      views: rows,
-      unseenViews: rows.map((i) => (i % 4 ? 0 : 1)),
-      logDistances: rows.map(() => 1.5 + 0.3 * random()),
-      corrections: rows.map(() => 0),
-      weights: rows.map(() => label.levels.map(() => 0.01 * (random() - 0.5))),
-      shares: rows.map(() => random() / labels.length),
+      ...modelOf(label, rows, random),
+      shares: differences(rows.map(() => (10_000 * random()) / labels.length)),
     })),
   };
 }

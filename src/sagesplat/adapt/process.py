@@ -121,18 +121,24 @@ def _variances(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def _hyperparameters(squares: list[np.ndarray], u: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Logs of lengths, heldout variance and noise: marginal likelihood, mean over levels, times the prior."""
-
-    def cost(theta: np.ndarray) -> tuple[float, np.ndarray]:
-        S, slopes = _terms(squares, u, theta)
-        inverse = _inverse(S)
-        weights = inverse @ values
-        variances = _variances(values, weights)
-        z = (theta - PRIOR) / PRIOR_WIDTH
-        value = (len(u) * np.log(variances).mean() - np.linalg.slogdet(inverse)[1] + z @ z) / 2
-        slope = (inverse - (weights / variances) @ weights.T / len(variances)) / 2
-        return value, np.array([(slope * s).sum() for s in slopes]) + z / PRIOR_WIDTH
-
+    """Logs of lengths, heldout variance and noise: those of the smallest `_cost` within bounds."""
     reach = PRIOR_REACH * PRIOR_WIDTH
     bounds = list(zip(PRIOR - reach, PRIOR + reach, strict=True))
-    return minimize(cost, PRIOR, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 50}).x
+    options = {"maxiter": 50}
+    return minimize(
+        _cost, PRIOR, (squares, u, values), jac=True, method="L-BFGS-B", bounds=bounds, options=options
+    ).x
+
+
+def _cost(
+    theta: np.ndarray, squares: list[np.ndarray], u: np.ndarray, values: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """Negative log of the marginal likelihood, mean over levels, times the prior; and its derivatives."""
+    S, slopes = _terms(squares, u, theta)
+    inverse = _inverse(S)
+    weights = inverse @ values
+    variances = _variances(values, weights)
+    z = (theta - PRIOR) / PRIOR_WIDTH
+    value = (len(u) * np.log(variances).mean() - np.linalg.slogdet(inverse)[1] + z @ z) / 2
+    slope = (inverse - (weights / variances) @ weights.T / len(variances)) / 2
+    return value, np.array([(slope * s).sum() for s in slopes]) + z / PRIOR_WIDTH

@@ -1,4 +1,4 @@
-"""Quality models: what to expect of a category at each level from any viewpoint, with a lower bound.
+"""Quality models: what to expect of a category at each level from any viewpoint, and a lower bound of it.
 
 There are two qualities. Fidelity is SSIM against the full model rendered from the same viewpoint; any
 viewpoint can tell it. SSIM against photos needs a photo. Both are predicted in the same way, and a viewer
@@ -9,12 +9,13 @@ evaluates the same formulas (`web/src/core/quality.ts`):
               made monotone over the levels: half of (the largest up to k + the smallest from k on), kept in
               [-1, 1]
     support = max_i c(x, x_i)                       1 at a known viewpoint, 0 far from all
-    bound_k = the largest target whose threshold mean_k reaches
+    bound_k = the largest target whose threshold mean_k - discount * (1 - support) reaches
 
 `adapt.calibrate` finds, for each target, the threshold: the mean from which on a level keeps the target, at a
-confidence. Between targets it is interpolated. Where the support is below that of all calibration views there
-is no bound (NaN): nothing is known there. An unknown distance (NaN) counts as `median_log_distance` in x, and
-m_k is then the median.
+confidence. Between targets it is interpolated. The discount is for errors that grow away from known
+viewpoints (fidelity: 0). Where the support is below that of all calibration views there is no bound (NaN):
+nothing is known there. An unknown distance (NaN) counts as `median_log_distance` in x, and m_k is then the
+median.
 """
 
 from collections.abc import Mapping, Sequence
@@ -42,9 +43,7 @@ class Prediction(NamedTuple):
     """Quality of one category at each of its levels from V viewpoints."""
 
     mean: Float[np.ndarray, "V K"]
-    bound: Float[
-        np.ndarray, "V K"
-    ]  # lower confidence bound; like the mean, it never falls from level to level
+    bound: Float[np.ndarray, "V K"]  # lower confidence bound; like the mean, it never falls along the levels
     support: Float[np.ndarray, " V"]  # 1 at a known viewpoint, 0 far from all
 
 
@@ -58,6 +57,7 @@ class Calibration:
     targets: Float[np.ndarray, " G"]  # ascending
     thresholds: Float[np.ndarray, " G"]  # ascending: the mean from which on a level keeps the target
     least_support: float  # below it there is no bound
+    discount: float = 0.0  # of the mean where the support is 0; none at a known viewpoint
 
     def bound(
         self, mean: Float[np.ndarray, "V K"], support: Float[np.ndarray, " V"]
@@ -68,6 +68,7 @@ class Calibration:
         """
         if not len(self.targets):
             return np.full(mean.shape, np.nan)
+        mean = mean - self.discount * (1 - support)[:, None]
         found = np.interp(mean, self.thresholds, self.targets)
         low = mean < self.thresholds[0]
         found[low] = mean[low] + (self.targets[0] - self.thresholds[0])
@@ -225,12 +226,17 @@ def _from_json(entry: dict[str, Any]) -> ViewModel:
 def _calibration_from_json(entry: dict[str, Any]) -> Calibration:
     targets, thresholds = (np.array(entry[k], np.float64) for k in ("targets", "thresholds"))
     confidence, least = float(entry["confidence"]), float(entry["least_support"])
+    discount = float(entry.get("discount", 0.0))
     if targets.ndim != 1 or targets.shape != thresholds.shape:
         raise ValueError("lists of unequal length")
     rising = all((np.diff(values) > 0).all() for values in (targets, thresholds))
     within = all((np.abs(values) <= 1).all() for values in (targets, thresholds))
     if not rising or not within or not 0 < confidence < 1 or not 0 <= least <= 1:
         raise ValueError("numbers out of range")
+    if not 0 <= discount < LARGEST:
+        raise ValueError("numbers out of range")
     if entry["status"] not in STATUSES:
         raise ValueError(f"unknown status {entry['status']!r}")
-    return Calibration(str(entry["status"]), confidence, int(entry["num_views"]), targets, thresholds, least)
+    return Calibration(
+        str(entry["status"]), confidence, int(entry["num_views"]), targets, thresholds, least, discount
+    )

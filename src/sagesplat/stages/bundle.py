@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 import shutil
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,7 +14,7 @@ import torch
 from PIL import Image
 
 from sagesplat.adapt.observe import large_enough
-from sagesplat.adapt.viewpoint import ViewModel
+from sagesplat.adapt.viewpoint import QualityKind, ViewModel
 from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.names import composed
@@ -30,7 +31,15 @@ from sagesplat.scene import read_scene
 from sagesplat.segment.block_categories import split_name
 from sagesplat.segment.display_names import title_of
 from sagesplat.segment.masks import UNLABELLED
-from sagesplat.stages.results import increments_of, observations_of, promises_of
+from sagesplat.stages.results import (
+    fidelity_of,
+    increments_of,
+    observations_of,
+    plans_of,
+    promises_of,
+    sampled_of,
+    viewpoints_of,
+)
 from sagesplat.stages.shared import distances
 from sagesplat.viewer import boxes
 from sagesplat.viewer.built import check_viewer, package_viewer
@@ -47,6 +56,7 @@ from sagesplat.viewer.display_names import colors_of
 from sagesplat.viewer.frames import FLIP, camera_at
 from sagesplat.viewer.manifest import CameraEntry, Category, Contents, start_of
 from sagesplat.viewer.pack import ASPECT, FOV_Y
+from sagesplat.viewer.promises import Seen
 
 _GROUND = {"dirt", "floor", "grass", "gravel", "ground", "pavement", "platform", "playingfield", "railroad"}
 _GROUND |= {"path", "road", "sand", "sidewalk", "snow", "soil", "street", "terrain"}
@@ -97,11 +107,13 @@ def bundle(
     chunks = increments_of(job)
     if any(not chunk.uri.endswith(".spz") for chunk in chunks):
         raise RunError(f"{job.run.increments}: not SPZ files; run `sagesplat nest` again with --force")
-    g = read_increments(job.run.increments, chunks)
+    g, drawn = read_increments(job.run.increments, chunks), viewpoints_of(job)
     contents = replace(
         _contents(job, g, job.antialiased),
         chunks=chunks,
         meters_per_unit=meters_per_unit,
+        drawn=[drawn.cameras[row] for row in drawn.rows("fit")],
+        target=_target(job),
     )
     contents = replace(contents, categories=_with_quality(job, contents.categories, always, weights))
     contents = with_corrections(contents)
@@ -194,6 +206,8 @@ def _check(
     for stage, path in (
         ("nest", run.increments / INDEX),
         ("observe", run.observations),
+        ("sample", run.sampled),
+        ("fit", run.fidelity),
         ("fit", run.promises),
     ):
         if not path.exists():
@@ -292,20 +306,47 @@ def _rows_by_label(label_ids: np.ndarray) -> dict[int, np.ndarray]:
 def _with_quality(
     job: Job, categories: Sequence[Category], always: Collection[str], weights: Mapping[str, float]
 ) -> list[Category]:
-    promises: dict[int, ViewModel] = promises_of(job)
-    far = distances(job, job.fit_config.distance)
-    shares = _shares(job)
+    models: dict[QualityKind, dict[int, ViewModel]] = {
+        "fidelity": fidelity_of(job),
+        "ssim": promises_of(job),
+    }
+    seen: dict[QualityKind, dict[int, Seen]] = {
+        "fidelity": _seen_from_drawn(job),
+        "ssim": _seen_in_photos(job),
+    }
     return [
         replace(
             category,
             weight=float(weights.get(category.name, weights.get(category.category, 1.0))),
             always=category.name in always or category.category in always,
-            model=promises.get(category.label_id),
-            shares=shares.get(category.label_id),
-            distance=far.get(category.label_id),
+            models={q: some[category.label_id] for q, some in models.items() if category.label_id in some},
+            seen={q: some[category.label_id] for q, some in seen.items() if category.label_id in some},
         )
         for category in categories
     ]
+
+
+def _target(job: Job) -> tuple[QualityKind, float] | None:
+    """What the run's plan was made for; None without a plan, or for a budget alone."""
+    plans = plans_of(job) if job.run.plan.exists() else ()
+    return next(((plan.quality, plan.target) for plan in plans if not math.isnan(plan.target)), None)
+
+
+def _seen_in_photos(job: Job) -> dict[int, Seen]:
+    """By label id, its share of each photo (0 where it is too small) and its distance there."""
+    shares, far = _shares(job), distances(job, job.fit_config.distance)
+    nowhere, unknown = np.zeros(len(job.scene.views)), np.full(len(job.scene.views), np.nan)
+    return {label: Seen(shares.get(label, nowhere), far.get(label, unknown)) for label in {*shares, *far}}
+
+
+def _seen_from_drawn(job: Job) -> dict[int, Seen]:
+    """The same of the viewpoints at which fidelity was sampled."""
+    sampled = sampled_of(job)
+    shares = np.where(sampled.shown(job.fit_config.min_share), sampled.pixels / sampled.image[:, None], 0.0)
+    return {
+        label: Seen(shares[:, column], sampled.distance[:, column].astype(np.float64))
+        for column, label in enumerate(sampled.labels)
+    }
 
 
 def _shares(job: Job) -> dict[int, np.ndarray]:

@@ -116,11 +116,11 @@ def _open_run(path: Path, emit: Emit) -> "Job":
 
 
 def _is_finished(run: RunDir) -> bool:
-    return run.promises.exists() and (run.increments / "index.json").exists()
+    return all(path.exists() for path in (run.fidelity, run.promises, run.increments / "index.json"))
 
 
 def _is_current(run: RunDir, folder: Path) -> bool:
-    """Whether a bundle has the run's chunks, and promises no older than the run's."""
+    """Whether a bundle has the run's chunks, and promises and a target no older than the run's."""
     from sagesplat.formats.increments import INDEX
 
     if not (folder / MANIFEST).exists():
@@ -131,8 +131,9 @@ def _is_current(run: RunDir, folder: Path) -> bool:
         chunks = {chunk["sha256"] for chunk in read_json(run.increments / INDEX)["chunks"]}
     except (RunError, KeyError, TypeError):  # `bundle` says what is wrong with the run
         return False
-    older = (folder / MANIFEST).stat().st_mtime < run.promises.stat().st_mtime
-    return held == chunks and not older
+    made = (folder / MANIFEST).stat().st_mtime
+    newer = (path for path in (run.fidelity, run.promises, run.plan) if path.exists())
+    return held == chunks and all(path.stat().st_mtime <= made for path in newer)
 
 
 def _follow(job: "Job", site: "Site", stop: threading.Event) -> None:

@@ -85,14 +85,14 @@ def write_documents(folder: Path, contents: Contents) -> BundleSizes:
     manifest, promises = documents(contents, (folder / THIRD_PARTY).exists())
     if contents.chunks and not contents.live:
         manifest["pack"] = write_pack(folder, manifest["labels"], pack_order(contents))
-    if promises is not None:
-        (folder / manifest["promises"]["uri"]).write_bytes(promises)
+    for quality, content in promises.items():
+        (folder / manifest["promises"][quality]["uri"]).write_bytes(content)
     write_text(folder / SCHEMA, files("sagesplat.viewer").joinpath(SCHEMA).read_text(encoding="utf-8"))
     write_text(folder / "LICENSES.txt", _LICENSES)
     text = dumped(manifest)
     write_text(folder / MANIFEST, text.decode())
     total = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-    return BundleSizes(len(text), len(promises or b""), manifest["totals"]["bytes"], total)
+    return BundleSizes(len(text), sum(map(len, promises.values())), manifest["totals"]["bytes"], total)
 
 
 def check_target(out: Path) -> None:

@@ -1,41 +1,56 @@
 """How well a category's boxes give its distance, and corrections in the known views."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from sagesplat.scene.scene import Camera
 from sagesplat.viewer import boxes
 from sagesplat.viewer.frames import fov_y, position, quaternion
-from sagesplat.viewer.manifest import Category, Contents
+from sagesplat.viewer.manifest import QUALITIES, Category, Contents
+from sagesplat.viewer.promises import Seen
 
 
 def with_corrections(contents: Contents) -> Contents:
-    """The contents with `Category.corrections`: the log of d_min over the distance by boxes, per camera."""
-    views = []
-    for entry in contents.cameras:
-        camera = entry.camera
-        where = position(camera)
-        planes = boxes.frustum(where, quaternion(camera), fov_y(camera), camera.width / camera.height)
-        views.append((where, planes))
+    """The contents with `Seen.corrections`: the log of d_min over the distance by boxes, per viewpoint."""
+    views = {quality: [_view(camera) for camera in contents.viewpoints(quality)] for quality in QUALITIES}
 
-    def corrections(category: Category) -> np.ndarray:
-        by_boxes = np.array([boxes.distance(category.boxes, *view) for view in views])
-        known = np.full(len(views), np.nan) if category.distance is None else category.distance
-        valid = (known > 0) & (by_boxes > 0)
-        return np.log(np.where(valid, known / np.where(by_boxes > 0, by_boxes, 1), np.nan))
+    def corrected(category: Category) -> Category:
+        seen = {
+            quality: replace(one, corrections=_corrections(category, one, views[quality]))
+            for quality, one in category.seen.items()
+        }
+        return replace(category, seen=seen)
 
-    return replace(contents, categories=[replace(c, corrections=corrections(c)) for c in contents.categories])
+    return replace(contents, categories=[corrected(category) for category in contents.categories])
+
+
+def _view(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Position and half spaces of a camera, in the bundle's axes."""
+    where = position(camera)
+    planes = boxes.frustum(where, quaternion(camera), fov_y(camera), camera.width / camera.height)
+    return where, planes
+
+
+def _corrections(
+    category: Category, seen: Seen, views: Sequence[tuple[np.ndarray, np.ndarray]]
+) -> np.ndarray:
+    by_boxes = np.array([boxes.distance(category.boxes, *view) for view in views])
+    valid = (seen.distance > 0) & (by_boxes > 0)
+    return np.log(np.where(valid, seen.distance / np.where(by_boxes > 0, by_boxes, 1), np.nan))
 
 
 def distance_error(contents: Contents) -> tuple[dict[int, tuple[float, float]], tuple[float, float]]:
     """Median and 95th percentile of the relative error of distances by boxes: by label id, and over all.
 
-    The reference is d_min, in the views that show enough of a category.
+    The reference is d_min, in the photos that show enough of a category.
     """
+    photos = {c.label_id: c.seen["ssim"] for c in contents.categories if "ssim" in c.seen}
     by_id = {
-        c.label_id: np.abs(np.expm1(-c.corrections[c.shares > 0]))
-        for c in contents.categories
-        if c.shares is not None and c.corrections is not None
+        label: np.abs(np.expm1(-seen.corrections[seen.shares > 0]))
+        for label, seen in photos.items()
+        if seen.corrections is not None
     }
     by_label = {label: _median_and_95th(errors) for label, errors in by_id.items()}
     return by_label, _median_and_95th(np.concatenate([*by_id.values(), np.zeros(0)]))

@@ -1,37 +1,32 @@
 """The documents of a bundle as plain data: manifest.json and promises-*.json.
 
-manifest.json describes the bundle (its format: manifest.schema.json). promises-*.json holds the viewpoint
-models, which are not needed for the first frame. Both are deterministic: they contain no times.
+manifest.json describes the bundle (its format: manifest.schema.json). A promises-*.json holds the viewpoint
+models of one quality, which are not needed for the first frame. All are deterministic: they contain no times.
 """
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from sagesplat import __version__
-from sagesplat.adapt.viewpoint import ViewModel
+from sagesplat.adapt.viewpoint import QualityKind, ViewModel
 from sagesplat.formats.increments import Increment
 from sagesplat.scene.scene import Camera
 from sagesplat.segment.block_categories import split_name
 from sagesplat.viewer import frames
 from sagesplat.viewer.frames import FLIP
 from sagesplat.viewer.pack import Ladder, order_of
-from sagesplat.viewer.quality import (
-    decimals_of,
-    dumped,
-    of_files,
-    quality_entry,
-    rounded_entry,
-    rows_of,
-    significant,
-)
+from sagesplat.viewer.promises import Seen, promises_document
+from sagesplat.viewer.quality import decimals_of, dumped, of_files, quality_entry, significant
 
-FORMAT, VERSION = "sagesplat-bundle", 1
+FORMAT, VERSION = "sagesplat-bundle", 2
+QUALITIES: tuple[QualityKind, ...] = get_args(QualityKind)
+TARGETS: dict[QualityKind, float] = {"fidelity": 0.95, "ssim": 0.7}  # where no plan says one
 THIRD_PARTY = "THIRD_PARTY_LICENSES.txt"  # of the built viewer
 
 
@@ -55,10 +50,8 @@ class Category:
     boxes: Float[np.ndarray, "B 6"]  # in the bundle's axes
     weight: float = 1.0
     always: bool = False  # shipped in full whatever the plan says
-    model: ViewModel | None = None  # with the increments' levels; None: no bounds
-    shares: Float[np.ndarray, " V"] | None = None  # pixel share in each camera; None: 0
-    distance: Float[np.ndarray, " V"] | None = None  # d_min in each camera; None: unknown
-    corrections: Float[np.ndarray, " V"] | None = None  # log of d_min over the distance by boxes; None: 0
+    models: Mapping[QualityKind, ViewModel] = field(default_factory=dict)  # with the ladder's levels
+    seen: Mapping[QualityKind, Seen] = field(default_factory=dict)  # in the quality's viewpoints
     block: int | None = None  # in a scene in blocks; else None
 
     @property
@@ -83,12 +76,30 @@ class Contents:
     ground: Bool[np.ndarray, " P"] | None = None  # points on the ground
     meters_per_unit: float | None = None  # None: guessed
     live: bool = False  # training still runs
+    drawn: Sequence[Camera] = ()  # viewpoints at which fidelity was sampled
+    target: tuple[QualityKind, float] | None = None  # of the run's plan; None: a usual one
+
+    def viewpoints(self, quality: QualityKind) -> list[Camera]:
+        """The viewpoints that the models of a quality were fitted at, and maybe others."""
+        return list(self.drawn) if quality == "fidelity" else [entry.camera for entry in self.cameras]
+
+    @property
+    def qualities(self) -> list[QualityKind]:
+        """The qualities that some category has a model of, the one to show by default first."""
+        return [q for q in QUALITIES if any(q in c.models for c in self.categories) and self.viewpoints(q)]
 
 
-def documents(contents: Contents, third_party: bool = False) -> tuple[dict[str, Any], bytes | None]:
-    """The manifest as plain data, and the bytes of promises-*.json (None without viewpoint models)."""
-    by_label, models = _chunks_by_label(contents.chunks), _models(contents)
-    promises = _promises(contents, {i: m for i, m in models.items() if m.curves})
+def documents(
+    contents: Contents, third_party: bool = False
+) -> tuple[dict[str, Any], dict[QualityKind, bytes]]:
+    """The manifest as plain data, and by quality the bytes of promises-*.json."""
+    by_label = _chunks_by_label(contents.chunks)
+    models: dict[QualityKind, dict[int, ViewModel]] = {
+        quality: some for quality in contents.qualities if (some := _models(contents, quality))
+    }
+    promises: dict[QualityKind, bytes] = {
+        quality: _promises(contents, quality, some) for quality, some in models.items()
+    }
     manifest = {
         "format": FORMAT,
         "version": VERSION,
@@ -105,11 +116,12 @@ def documents(contents: Contents, third_party: bool = False) -> tuple[dict[str, 
             "gpuBytes": sum(chunk.gpu_bytes for chunk in contents.chunks),
         },
         "labels": [
-            _label(c, by_label[c.label_id], models.get(c.label_id), contents.extent)
+            _label(c, by_label[c.label_id], models, contents.extent)
             for c in contents.categories
             if by_label.get(c.label_id)
         ],
-        "promises": promises and _reference(promises),
+        "promises": {quality: _reference(content) for quality, content in promises.items()},
+        "target": _target(contents),
         "pack": None,
         "cameras": [_camera(entry, contents.extent) for entry in contents.cameras],
         "start": {key: significant(value) for key, value in start_of(contents).items()},
@@ -118,64 +130,65 @@ def documents(contents: Contents, third_party: bool = False) -> tuple[dict[str, 
     return manifest, promises
 
 
-def _models(contents: Contents) -> dict[int, ViewModel]:
-    """By label id, the viewpoint models with the levels of the label's files."""
+def _models(contents: Contents, quality: QualityKind) -> dict[int, ViewModel]:
+    """By label id, the models of a quality with the levels of the label's files; without any level none."""
     by_label = _chunks_by_label(contents.chunks)
     last = max((chunk.level for chunk in contents.chunks), default=0)
-    return {
-        c.label_id: of_files(c.model, [chunk.level for chunk in by_label[c.label_id]], last)
+    found = {
+        c.label_id: of_files(c.models[quality], [chunk.level for chunk in by_label[c.label_id]], last)
         for c in contents.categories
-        if c.model is not None and by_label.get(c.label_id)
+        if quality in c.models and by_label.get(c.label_id)
     }
+    return {label: model for label, model in found.items() if model.curves}
+
+
+def _target(contents: Contents) -> dict[str, Any]:
+    """What the viewer begins with: the plan's target, or a usual one of the first quality that there is."""
+    known = contents.qualities
+    quality, value = contents.target or ("fidelity", TARGETS["fidelity"])
+    if known and quality not in known:
+        quality, value = known[0], TARGETS[known[0]]
+    return {"quality": quality, "value": significant(value)}
 
 
 def pack_order(contents: Contents) -> list[tuple[int, int]]:
-    """The order of the files in the pack: (index of the label in the manifest, level)."""
-    by_label, models = _chunks_by_label(contents.chunks), _models(contents)
+    """The order of the files in the pack: (index of the label in the manifest, level).
+
+    By fidelity at the drawn viewpoints where the bundle has it, else by SSIM at the photos.
+    """
+    known = contents.qualities
+    quality: QualityKind = known[0] if known else "ssim"
+    by_label, models = _chunks_by_label(contents.chunks), _models(contents, quality)
     first = start_of(contents)
-    known = np.array([entry.split != "test" for entry in contents.cameras])
-    cameras = [entry.camera for entry in contents.cameras if entry.split != "test"]
+    cameras = contents.viewpoints(quality)
+    used = np.ones(len(cameras), bool)
+    if quality == "ssim":
+        used = np.array([entry.split != "test" for entry in contents.cameras])
     ladders = [
         Ladder(
             [chunk.nbytes for chunk in by_label[c.label_id]],
             c.weight,
             c.boxes,
-            models[c.label_id] if c.label_id in models and models[c.label_id].curves else None,
-            None if c.shares is None else c.shares[known],
+            models.get(c.label_id),
+            c.seen[quality].shares[used] if quality in c.seen else None,
         )
         for c in contents.categories
         if by_label.get(c.label_id)
     ]
+    cameras = [camera for camera, use in zip(cameras, used, strict=True) if use]
     return order_of(ladders, cameras, first["position"], first["quaternion"])
 
 
-def _promises(contents: Contents, models: dict[int, ViewModel]) -> bytes | None:
-    """The bytes of promises-*.json: the models, and the views that they share; None without a model."""
-    if not models:
-        return None
-    cameras = [entry.camera for entry in contents.cameras]
-    position = np.stack([camera.position for camera in cameras]).astype(np.float64)
-    direction = np.stack([camera.direction for camera in cameras]).astype(np.float64)
-    rows = {label: rows_of(model, position, direction) for label, model in models.items()}
-    used = np.unique(np.concatenate(list(rows.values())))
-    decimals = decimals_of(contents.extent, 5)
-    views = np.column_stack([np.round(position * FLIP, decimals), np.round(direction * FLIP, 5)])[used]
-    entries = []
-    for category in contents.categories:
-        if (model := models.get(category.label_id)) is None:
-            continue
-        shares = np.zeros(len(cameras)) if category.shares is None else category.shares
-        away = np.full(len(cameras), np.nan) if category.distance is None else category.distance
-        corrections = np.zeros(len(cameras)) if category.corrections is None else category.corrections
-        mine = np.searchsorted(used, rows[category.label_id])
-        at = (away, position, direction)
-        entries.append(rounded_entry(model, mine, shares[used], corrections[used], views, at))
-    extent = next(iter(models.values())).extent
-    return dumped({"version": VERSION, "extent": extent, "views": views.tolist(), "labels": entries})
+def _promises(contents: Contents, quality: QualityKind, models: Mapping[int, ViewModel]) -> bytes:
+    seen = {c.label_id: c.seen[quality] for c in contents.categories if quality in c.seen}
+    return dumped(promises_document(quality, models, contents.viewpoints(quality), seen))
 
 
 def _label(
-    category: Category, chunks: Sequence[Increment], model: ViewModel | None, extent: float
+    category: Category,
+    chunks: Sequence[Increment],
+    models: Mapping[QualityKind, Mapping[int, ViewModel]],
+    extent: float,
 ) -> dict[str, Any]:
     return {
         "id": category.label_id,
@@ -197,7 +210,11 @@ def _label(
             }
             for chunk in chunks
         ],
-        "quality": None if model is None or not model.curves else quality_entry(model),
+        "quality": {
+            quality: quality_entry(some[category.label_id])
+            for quality, some in models.items()
+            if category.label_id in some
+        },
     }
 
 

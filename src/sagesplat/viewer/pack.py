@@ -1,9 +1,9 @@
 """The pack: all increments of a bundle in one file, for the first load without a round trip per increment.
 
 It is a concatenation of the files, in the order of their benefit for the first view: level 1 of all
-visible and nearby labels, then increments by their gain of expected SSIM x pixel share per byte.
-Levels of a label must come in order. So an increment counts with the slope of the concave hull of SSIM over
-bytes. The viewer has the same rules (web/src/core/order.ts).
+visible and nearby labels, then increments by their gain of expected quality x pixel share per byte.
+Levels of a label must come in order. So an increment counts with the slope of the concave hull of quality
+over bytes. The viewer has the same rules (web/src/core/order.ts).
 """
 
 import hashlib
@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from sagesplat.adapt.viewpoint import ViewModel, matern32
+from sagesplat.adapt.process import matern32
+from sagesplat.adapt.viewpoint import ViewModel
 from sagesplat.scene.scene import Camera
 from sagesplat.viewer import boxes
 from sagesplat.viewer.frames import camera_at

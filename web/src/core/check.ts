@@ -30,6 +30,8 @@ export const share = must(
   "a number from 0 to 1",
   (v) => Number.isFinite(v) && Number(v) >= 0 && Number(v) <= 1,
 );
+export const between = (low: number, high: number): Check =>
+  must(`a number from ${low} to ${high}`, (v) => Number.isFinite(v) && Number(v) >= low && Number(v) <= high);
 export const whole = must("a whole number", Number.isSafeInteger);
 export const amount = must("a whole number from 0 on", (v) => Number.isSafeInteger(v) && Number(v) >= 0);
 export const level = must("a whole number from 1 on", (v) => Number.isSafeInteger(v) && Number(v) > 0);

@@ -46,6 +46,7 @@ function labelState(entry: Entry, overview: Overview): LabelState {
     distance: sight.distance,
     promised: prediction.bound[level - 1] ?? Number.NaN,
     expected: prediction.mean[level - 1] ?? Number.NaN,
+    trust: prediction.trust,
     count: ladder.count[level - 1] ?? 0,
     bytes: ladder.bytes[level - 1] ?? 0,
     gpuBytes: ladder.gpuBytes[level - 1] ?? 0,

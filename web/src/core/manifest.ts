@@ -1,9 +1,18 @@
 /** Reads and validates manifest.json and promises-*.json. */
 
-import type { Label, Manifest, Promises } from "../types";
+import {
+  type Label,
+  type LabelPromises,
+  type Manifest,
+  type Promises,
+  QUALITIES,
+  type Quality,
+  STATUSES,
+} from "../types";
 import {
   amount,
   BundleError,
+  between,
   type Check,
   checked,
   color,
@@ -26,7 +35,7 @@ import {
 import type { Fetch } from "./download";
 
 /** The newest version of the format that this viewer supports. */
-export const VERSION = 1;
+export const VERSION = 2;
 
 const vec3 = list(number, 3);
 const increment: Check = (value, path, wrong) => {
@@ -39,18 +48,20 @@ const increment: Check = (value, path, wrong) => {
     wrong,
   );
 };
-const quality = object({
-  status: oneOf("calibrated", "pooled", "uncalibrated"),
-  confidence: share,
-  margin: list(number),
-  curves: list(
-    object({ level, params: list(number, 9), range: list(number, 2), median: number, rmse: fromZero }),
-  ),
-});
 const optional =
   (check: Check): Check =>
   (value, path, wrong) =>
     value !== undefined && check(value, path, wrong);
+const byQuality = (check: Check): Check =>
+  object(Object.fromEntries(QUALITIES.map((quality) => [quality, optional(check)])));
+const ssim = between(-1, 1);
+const quality = object({
+  levels: list(level),
+  status: oneOf(...STATUSES),
+  confidence: share,
+  mean: list(ssim),
+  bound: orNull(list(between(-3, 1))),
+});
 const label = object({
   id: whole,
   name: text,
@@ -62,7 +73,7 @@ const label = object({
   always: flag,
   boxes: list(list(number, 6)),
   levels: list(increment),
-  quality: orNull(quality),
+  quality: byQuality(quality),
 });
 const camera = object({
   name: text,
@@ -92,7 +103,8 @@ const manifest = object({
   background: list(share, 3),
   totals: object({ count: amount, bytes: amount, gpuBytes: amount }),
   labels: list(label),
-  promises: orNull(object({ uri: relative, bytes: amount, sha256: hash })),
+  promises: byQuality(object({ uri: relative, bytes: amount, sha256: hash })),
+  target: object({ quality: oneOf(...QUALITIES), value: ssim }),
   pack: optional(orNull(pack)), // older bundles have none
   cameras: list(camera),
   start: object({ position: vec3, quaternion: list(number, 4), target: vec3 }),
@@ -108,16 +120,33 @@ export function parseManifest(json: string, file = "manifest.json"): Manifest {
       `${file}: the bundle has version ${head.version}, this viewer reads up to ${VERSION}. Open it with the index.html that came with it.`,
     );
   }
-  const found = checked<Manifest>(value, manifest, file);
+  const found = checked<Manifest>(upgraded(value), manifest, file);
   refuse([...found.labels.flatMap(oddities), ...oddPack(found)], file);
   const ids = found.labels.map((l) => l.id);
   refuse(new Set(ids).size < ids.length ? ["labels have the same id twice"] : [], file);
   return found;
 }
 
+/** The qualities that some label of a bundle is known by. */
+export const qualitiesOf = ({ labels }: Manifest): Quality[] =>
+  QUALITIES.filter((quality) => labels.some((one) => one.quality[quality]));
+
+/** A version 1 bundle, of an earlier sagesplat: what it shows can be shown, its promises were other ones. */
+function upgraded(value: unknown): unknown {
+  const old = value as { version: number; labels?: unknown };
+  if (old.version > 1) return value;
+  const labels = Array.isArray(old.labels)
+    ? old.labels.map((one: unknown) => withoutQuality(one))
+    : old.labels;
+  return { ...old, labels, promises: {}, target: { quality: "fidelity", value: 0.95 } };
+}
+
+const withoutQuality = (one: unknown): unknown =>
+  typeof one === "object" && one !== null ? { ...one, quality: {} } : one;
+
 function oddities(one: Label, i: number): string[] {
   const wrong: string[] = [];
-  const { levels, quality: q, boxes } = one;
+  const { levels, boxes } = one;
   if ((one.category === undefined) !== (one.block === undefined)) {
     wrong.push(`labels[${i}] must have both category and block, or neither`);
   }
@@ -125,12 +154,16 @@ function oddities(one: Label, i: number): string[] {
   if (boxes.some((b) => b[0] > b[3] || b[1] > b[4] || b[2] > b[5])) {
     wrong.push(`labels[${i}].boxes has one whose least is above its most`);
   }
-  if (!q) return wrong;
-  if (q.margin.length !== q.curves.length)
-    wrong.push(`labels[${i}].quality.margin must have a number a curve`);
-  const known = q.curves.map((c) => c.level);
-  if (known.some((k, j) => k > levels.length || (j > 0 && k <= (known[j - 1] ?? 0)))) {
-    wrong.push(`labels[${i}].quality.curves must be of rising levels up to ${levels.length}`);
+  for (const quality of QUALITIES) {
+    const known = one.quality[quality];
+    if (!known) continue;
+    const path = `labels[${i}].quality.${quality}`;
+    if (!isRising(known.levels) || (known.levels.at(-1) ?? 0) > levels.length) {
+      wrong.push(`${path}.levels must rise, up to ${levels.length}`);
+    }
+    for (const values of [known.mean, known.bound ?? known.mean]) {
+      if (values.length !== known.levels.length) wrong.push(`${path} must have a number a level`);
+    }
   }
   return wrong;
 }
@@ -143,51 +176,94 @@ function oddPack({ pack, labels }: Manifest): string[] {
   return bytes === pack.bytes && once ? [] : ["pack.order must name levels that fill pack.bytes, each once"];
 }
 
-const view = list(number, 6);
+const unit = between(1e-9, 1);
+const curve = object({ params: list(number, 9), range: list(number, 2), median: number });
 const model = object({
   id: whole,
   levels: list(level),
-  usual: number,
-  lengths: list(positive, 3),
-  unseen: fromZero,
-  noise: positive,
-  factor: fromZero,
+  status: oneOf(...STATUSES),
   confidence: share,
-  shift: number,
-  mixing: fromZero,
-  amplitudes: list(number),
+  leastSupport: share,
+  discount: fromZero,
+  targets: list(whole),
+  thresholds: list(whole),
+  medianLogDistance: number,
+  lengths: list(between(1e-6, 1e6), 3),
+  curves: list(curve),
+  offsets: list(between(-9, 9)),
   views: list(amount),
-  unseenViews: list(oneOf(0, 1)),
-  logDistances: list(number),
-  corrections: list(number),
-  weights: list(list(number)),
-  shares: list(share),
+  logDistances: object({ unit, steps: list(whole) }),
+  values: object({ units: list(unit), steps: list(list(whole)) }),
+  shares: list(whole),
+  corrections: list(whole),
 });
-const promises = object({ version: level, extent: positive, views: list(view), labels: list(model) });
+const promises = object({
+  version: oneOf(VERSION),
+  quality: oneOf(...QUALITIES),
+  extent: positive,
+  views: list(list(whole), 6),
+  labels: list(model),
+});
 
-/** Parses the viewpoint models. Throws a BundleError in one line if they are invalid. */
-export function parsePromises(json: string, file: string): Promises {
+/** Parses the viewpoint models of a quality. Throws a BundleError in one line if they are invalid. */
+export function parsePromises(json: string, file: string, quality: Quality): Promises {
   const found = checked<Promises>(parse(json, file), promises, file);
-  const wrong = found.labels.flatMap((one, i) => {
-    const [n, K] = [one.views.length, one.levels.length];
-    const lengths = [
-      one.unseenViews.length,
-      one.logDistances.length,
-      one.corrections.length,
-      one.weights.length,
-    ];
-    const fits =
-      n > 0 &&
-      K > 0 &&
-      lengths.every((length) => length === n) &&
-      one.amplitudes.length === K &&
-      one.weights.every((row) => row.length === K) &&
-      one.shares.length === found.views.length &&
-      one.views.every((row) => row < found.views.length);
-    return fits ? [] : [`labels[${i}] has lists that do not fit together`];
-  });
-  refuse(wrong, file);
+  const shared = found.views[0]?.length ?? 0;
+  const even = found.views.every((column) => column.length === shared);
+  refuse(even ? [] : ["views must have columns of equal length"], file);
+  refuse(found.quality === quality ? [] : [`quality must be ${JSON.stringify(quality)}`], file);
+  refuse(
+    found.labels.flatMap((one, i) => oddModel(one, shared).map((what) => `labels[${i}]${what}`)),
+    file,
+  );
   return found;
+}
+
+function oddModel(one: LabelPromises, shared: number): string[] {
+  const [n, K] = [one.views.length, one.levels.length];
+  const lists = [one.logDistances.steps, one.corrections, ...one.values.steps];
+  const fit =
+    n > 0 &&
+    K > 0 &&
+    lists.every((values) => values.length === n) &&
+    [one.offsets, one.values.units, one.values.steps].every((values) => values.length === K) &&
+    (one.curves.length === K || !one.curves.length) &&
+    one.shares.length === shared &&
+    total(one.views) < shared &&
+    one.thresholds.length === one.targets.length;
+  if (!fit) return [" has lists that do not fit together"];
+  const wrong: string[] = [];
+  if (n > MOST_VIEWS) wrong.push(` has more than ${MOST_VIEWS} views`);
+  if (!isRising(one.levels)) wrong.push(".levels must rise");
+  for (const values of [one.targets, one.thresholds]) {
+    if (!isRising(values) || values.some((v) => Math.abs(v) > WHOLE)) {
+      wrong.push(" must have targets and thresholds that rise from -1 to 1");
+    }
+  }
+  if (!within(one.shares, WHOLE) || !within(one.corrections, 1e5))
+    wrong.push(" has shares or corrections out of range");
+  const logs = one.logDistances;
+  if (!within(logs.steps, 100 / logs.unit) || one.values.steps.some((row) => !within(row, 1e9))) {
+    wrong.push(" has values out of range");
+  }
+  return wrong;
+}
+
+const MOST_VIEWS = 2048; // of a model: its weights are solved for
+const WHOLE = 10_000; // steps of shares, targets and thresholds in 1
+
+const isRising = (values: readonly number[]): boolean =>
+  values.every((value, i) => i === 0 || value > (values[i - 1] ?? 0));
+
+const total = (steps: readonly number[]): number => steps.reduce((sum, step) => sum + step, 0);
+
+/** Whether all running sums are at most so large. */
+function within(steps: readonly number[], most: number): boolean {
+  let sum = 0;
+  return steps.every((step) => {
+    sum += step;
+    return Math.abs(sum) <= most;
+  });
 }
 
 function parse(json: string, file: string): unknown {

@@ -1,18 +1,24 @@
 /** Each label from the current viewpoint: distance, quality and pixel share. */
 
-import type { Label, Promises, Settings, Viewpoint } from "../types";
+import type { Label, Promises, Quality, Settings, Viewpoint } from "../types";
 import { look } from "./distance";
 import type { Candidate } from "./planner";
-import { byDistance, ViewModel, Views } from "./quality";
+import { anywhere, type Prediction, ViewModel, Views } from "./quality";
 import type { Entry } from "./residency";
 
-/** Without viewpoint models, quality depends on the distance and pixel share on the size of the boxes. */
+/** Without viewpoint models, quality is the same everywhere and pixel share depends on the size of the boxes. */
 export class Outlook {
   readonly complete: boolean; // whether it has the viewpoint models
   private readonly models = new Map<number, ViewModel>();
+  private readonly wherever = new Map<number, Prediction>(); // without a viewpoint model, or out of sight
 
-  constructor(labels: readonly Label[] = [], promises: Promises | null = null) {
+  constructor(
+    readonly quality: Quality,
+    labels: readonly Label[] = [],
+    promises: Promises | null = null,
+  ) {
     this.complete = promises !== null;
+    for (const label of labels) this.wherever.set(label.id, anywhere(label, quality));
     if (!promises) return;
     const views = new Views(promises);
     const byId = new Map(labels.map((label) => [label.id, label]));
@@ -31,7 +37,7 @@ export class Outlook {
     if (!seen.visible && label.boxes.length) {
       // plans do not depend on labels out of sight; skipping them keeps scenes in blocks fast
       entry.sight = seen;
-      entry.prediction = entry.unseen;
+      entry.prediction = this.elsewhere(label);
       entry.share = seen.size;
       return;
     }
@@ -39,8 +45,12 @@ export class Outlook {
     const sight = { ...seen, distance };
     // a label without boxes may be anywhere
     entry.sight = label.boxes.length ? sight : { ...sight, visible: true };
-    entry.prediction = model?.predict(distance, position, direction) ?? byDistance(label, distance);
+    entry.prediction = model?.predict(distance, position, direction) ?? this.elsewhere(label);
     entry.share = model ? model.share(position, direction) : this.complete ? 0 : sight.size;
+  }
+
+  private elsewhere(label: Label): Prediction {
+    return this.wherever.get(label.id) ?? anywhere(label, this.quality);
   }
 
   /** The planner's input for a label. */

@@ -2,13 +2,14 @@
 
 import type { Budget, Label, Settings } from "../types";
 import { type Allocation, bestWithin, cheapest } from "./allocate";
+import { fill } from "./fill";
 
 /** The planner's input for one label. */
 export interface Candidate {
   readonly label: Label;
   readonly ladder: Ladder;
   readonly highest: number; // highest available level; lower if an increment is damaged
-  readonly mean: readonly number[]; // by level, SSIM; NaN: unknown
+  readonly mean: readonly number[]; // by level, quality; NaN: unknown
   readonly bound: readonly number[];
   readonly weight: number; // of the label, set by the user
   readonly share: number; // pixel share; out of sight the one that it would have
@@ -93,7 +94,7 @@ interface Chosen {
 
 function choose(free: readonly Candidate[], settings: Settings, budget: Budget): Chosen {
   if (settings.mode === "budget") return within(free, budget);
-  const asked = settings.mode === "target" ? reach(free, settings.target) : same(free, settings.mode);
+  const asked = settings.mode === "target" ? reach(free, settings) : same(free, settings.mode);
   if (fits(free, asked.levels, budget)) return asked;
   const { levels, status } = within(free, budget);
   return { levels, status: status === "ok" ? "infeasible" : status };
@@ -103,21 +104,34 @@ function same(free: readonly Candidate[], mode: "full" | "base"): Chosen {
   return { levels: free.map((c) => (mode === "full" ? c.highest - 1 : 0)), status: "ok" };
 }
 
-/** The cheapest levels that reach a target; the first level out of sight. */
-function reach(free: readonly Candidate[], target: number): Chosen {
+/**
+ * The cheapest levels that reach a target; the first level out of sight. For a target of fidelity the picture
+ * as a whole is not to be worse than equal levels of all categories would be for the same bytes.
+ */
+function reach(free: readonly Candidate[], { quality, target }: Settings): Chosen {
   const levels = free.map(() => 0);
   const seen = free.flatMap((c, i) => (c.visible && c.weight > 0 ? [{ c, i }] : []));
   if (!seen.length) return { levels, status: "ok" };
   const bounds = seen.map(({ c }) => c.bound);
   const costs = seen.map(({ c }) => costOf(c, "bytes"));
   const found = cheapest(bounds, costs, target, { previous: seen.map(({ c }) => before(c)) });
+  const weights = seen.map(({ c }) => visibleWeight(c));
+  const filled =
+    quality === "fidelity"
+      ? fill(
+          found.levels,
+          seen.map(({ c }) => c.mean),
+          costs,
+          weights,
+        )
+      : found.levels;
   seen.forEach(({ i }, row) => {
-    levels[i] = found.levels[row] ?? 0;
+    levels[i] = filled[row] ?? 0;
   });
   return { levels, status: found.status };
 }
 
-/** The levels with the largest expected SSIM within the budget in every unit. */
+/** The levels with the largest expected quality within the budget in every unit. */
 function within(free: readonly Candidate[], budget: Budget): Chosen {
   const [tightest, ...others] = [...UNITS].sort((a, b) => room(free, budget, a) - room(free, budget, b));
   const first = best(free, (c) => costOf(c, tightest as Unit), budget[tightest as Unit]);

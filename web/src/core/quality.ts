@@ -1,16 +1,22 @@
 /**
- * SSIM of a label at each level from any viewpoint. Same formulas as src/sagesplat/adapt/viewpoint.py;
- * tests/data/promises.json checks both.
+ * Quality of a label at each level from any viewpoint. Same formulas as src/sagesplat/viewer/promises.py and
+ * adapt/viewpoint.py; tests/data/promises.json checks them.
  */
 
-import type { Curve, Label, Promises, Vec3 } from "../types";
+import type { Curve, Label, LabelPromises, Promises, Quality, Trust, Vec3 } from "../types";
+import { covariance, matern, maternTable, solved } from "./process";
 
 /** The prediction for one label at one viewpoint. */
 export interface Prediction {
-  readonly mean: readonly number[]; // by level, expected SSIM, never falls; NaN: unknown
-  readonly bound: readonly number[]; // by level, lower confidence bound of SSIM, never falls
+  readonly mean: readonly number[]; // by level, expected quality, never falls; NaN: unknown
+  readonly bound: readonly number[]; // by level, lower confidence bound, never falls; NaN: no promise
   readonly support: number; // 1 at a known viewpoint, 0 far from all of them; NaN: no model
+  readonly trust: Trust;
 }
+
+/** Steps in which promises hold positions over the extent, directions, shares, targets and thresholds. */
+const STEP = 1e-4;
+const CORRECTION_STEP = 5e-3;
 
 /** Eq. 3 at a distance, clamped to the fitted range; the median for an unknown distance (NaN). */
 export function curveAt(curve: Curve, distance: number): number {
@@ -22,18 +28,16 @@ export function curveAt(curve: Curve, distance: number): number {
   return clip(K * Math.exp(-g * Math.abs(d - mu) ** a));
 }
 
-/** The prediction from the distance alone, until the viewpoint model is loaded. */
-export function byDistance(label: Label, distance: number): Prediction {
+/** What is known whatever the viewpoint, until the viewpoint models are loaded. */
+export function anywhere(label: Label, quality: Quality): Prediction {
   const unknown = label.levels.map(() => Number.NaN);
-  const quality = label.quality;
-  if (!quality) return { mean: unknown, bound: unknown, support: Number.NaN };
-  const values = quality.curves.map((curve) => curveAt(curve, distance));
-  const low = values.map((value, i) => clip(value + (quality.margin[i] ?? 0)));
-  const levels = quality.curves.map((curve) => curve.level);
+  const known = label.quality[quality];
+  if (!known) return { mean: unknown, bound: unknown, support: Number.NaN, trust: "unknown" };
   return {
-    mean: spread(rising(values), levels, unknown),
-    bound: spread(running(low, Math.max), levels, unknown),
+    mean: spread(rising(known.mean), known.levels, unknown),
+    bound: known.bound ? spread(running(known.bound, Math.max), known.levels, unknown) : unknown,
     support: Number.NaN,
+    trust: known.bound ? known.status : "unknown",
   };
 }
 
@@ -41,24 +45,22 @@ export function byDistance(label: Label, distance: number): Prediction {
 const LIKE = 16;
 const ENOUGH = 1e-3;
 
-type LabelPromises = Promises["labels"][number];
-
 /** The views that the models of all labels share, and their scaled distances from the current viewpoint. */
 export class Views {
   readonly away: Float64Array; // [V] square of the distance over the extent
   readonly turned: Float64Array; // [V] square of the difference of the directions
-  private readonly rows: Float64Array; // [V, 6]
+  readonly rows: Float64Array; // [V, 6]
   private readonly extent: number;
   private position: Vec3 | null = null;
   private direction: Vec3 | null = null;
 
   constructor({ views, extent }: Promises) {
-    this.rows = Float64Array.from(
-      views.flatMap(([x, y, z, ...d]) => [x / extent, y / extent, z / extent, ...d]),
-    );
+    const columns = views.map((column) => sums(column, STEP));
+    const count = columns[0]?.length ?? 0;
+    this.rows = Float64Array.from({ length: 6 * count }, (_, i) => columns[i % 6]?.[Math.floor(i / 6)] ?? 0);
     this.extent = extent;
-    this.away = new Float64Array(views.length);
-    this.turned = new Float64Array(views.length);
+    this.away = new Float64Array(count);
+    this.turned = new Float64Array(count);
   }
 
   /** Computes `away` and `turned` for a viewpoint, once for all labels. */
@@ -73,16 +75,6 @@ export class Views {
       this.turned[i] = square(a, b, c, rows, at + 3);
     }
   }
-
-  /** The same squares between two views. */
-  between(i: number, j: number): [number, number] {
-    const { rows } = this;
-    const [a, b] = [6 * i, 6 * i + 3];
-    return [
-      square(rows[a] as number, rows[a + 1] as number, rows[a + 2] as number, rows, 6 * j),
-      square(rows[b] as number, rows[b + 1] as number, rows[b + 2] as number, rows, 6 * j + 3),
-    ];
-  }
 }
 
 function square(x: number, y: number, z: number, rows: Float64Array, at: number): number {
@@ -92,37 +84,37 @@ function square(x: number, y: number, z: number, rows: Float64Array, at: number)
   return dx * dx + dy * dy + dz * dz;
 }
 
-/** A label's viewpoint model; its Cholesky factor is computed when the label is first in sight. */
+/** A label's viewpoint model; its weights are solved for when the label is first in sight. */
 export class ViewModel {
-  private factor: Float64Array | null = null; // [n, n] lower
-  private readonly weights: Float64Array; // [K, n]
-  private readonly unseen: Float64Array; // [n] variance at held-out views
+  private weights: Float64Array | null = null; // [K, n]
+  private readonly own: Int32Array; // [n] rows of the shared views
+  private readonly logDistances: Float64Array; // [n]
+  private readonly corrections: Float64Array; // [n]
+  private readonly shares: Float64Array; // [V]
+  private readonly targets: Float64Array;
+  private readonly thresholds: Float64Array;
   private readonly scale: Vec3; // of squares: of positions, directions, log distances
-  private readonly n: number;
-  private readonly curves: readonly Curve[];
   private readonly meanShare: number;
 
   constructor(
     private readonly label: Label,
     private readonly views: Views,
-    private readonly own: LabelPromises,
+    private readonly sent: LabelPromises,
   ) {
-    this.n = own.views.length;
-    const curves = label.quality?.curves ?? [];
-    this.curves = own.levels.flatMap((level) => curves.filter((curve) => curve.level === level));
-    const [x, y, z] = own.lengths;
+    this.own = Int32Array.from(sums(sent.views, 1));
+    this.logDistances = sums(sent.logDistances.steps, sent.logDistances.unit);
+    this.corrections = sums(sent.corrections, CORRECTION_STEP);
+    this.shares = sums(sent.shares, STEP);
+    this.targets = Float64Array.from(sent.targets, (target) => target * STEP);
+    this.thresholds = Float64Array.from(sent.thresholds, (threshold) => threshold * STEP);
+    const [x, y, z] = sent.lengths;
     this.scale = [x ** -2, y ** -2, z ** -2];
-    this.weights = Float64Array.from(
-      this.curves.flatMap((_, level) => own.weights.map((row) => row[level] ?? 0)),
-    );
-    this.unseen = Float64Array.from(own.unseenViews, (u) => own.unseen * u);
-    this.meanShare = own.shares.reduce((sum, s) => sum + s, 0) / Math.max(own.shares.length, 1);
+    this.meanShare = this.shares.reduce((sum, s) => sum + s, 0) / Math.max(this.shares.length, 1);
   }
 
-  /** Whether the label has a curve for each level of its model. */
-  static fits(label: Label, own: LabelPromises): boolean {
-    const known = (label.quality?.curves ?? []).map((curve) => curve.level);
-    return own.levels.every((level) => known.includes(level) && level <= label.levels.length);
+  /** Whether the label has the levels of its model. */
+  static fits(label: Label, sent: LabelPromises): boolean {
+    return sent.levels.every((level) => level <= label.levels.length);
   }
 
   /**
@@ -131,35 +123,35 @@ export class ViewModel {
    * @param direction - in which it looks, unit length
    */
   predict(distance: number, position: Vec3, direction: Vec3): Prediction {
-    const { own, n, scale } = this;
+    const { sent, scale } = this;
     this.views.from(position, direction);
-    const log = distance > 0 && distance < Infinity ? Math.log(distance) : own.usual;
-    const k = new Float64Array(n);
+    this.weights ??= this.solve();
+    const n = this.own.length;
+    const log = distance > 0 && distance < Infinity ? Math.log(distance) : sent.medianLogDistance;
+    const near = new Float64Array(n);
     let support = 0;
     for (let i = 0; i < n; i++) {
-      const further = log - (own.logDistances[i] as number);
-      const alike = matern(this.square(own.views[i] as number) + further * further * scale[2]);
-      support = Math.max(support, alike);
-      k[i] = alike + (this.unseen[i] as number);
+      const further = log - (this.logDistances[i] as number);
+      near[i] = matern(this.square(this.own[i] as number) + further * further * scale[2]);
+      support = Math.max(support, near[i] as number);
     }
-    const mean = this.curves.map((curve, level) => {
+    const { weights } = this;
+    const mean = sent.levels.map((_, level) => {
       let moved = 0;
-      for (let i = 0; i < n; i++) moved += (k[i] as number) * (this.weights[level * n + i] as number);
-      return curveAt(curve, distance) + moved + own.shift;
+      for (let i = 0, at = level * n; i < n; i++) moved += (near[i] as number) * (weights[at + i] as number);
+      const curve = sent.curves[level];
+      return (curve ? curveAt(curve, distance) : 0) + (sent.offsets[level] as number) + moved;
     });
-    this.factor ??= cholesky(this.covariance(), n);
-    const variance = Math.max(1 + own.unseen + own.noise - explained(this.factor, k), 0);
-    return this.promise(mean, Math.sqrt(variance), support);
+    return this.promise(rising(mean), support);
   }
 
   /** A distance by boxes, corrected by their errors in the label's views nearby; NaN stays NaN. */
   corrected(distance: number, position: Vec3, direction: Vec3): number {
-    const { views, corrections } = this.own;
     this.views.from(position, direction);
     let [sum, total] = [0, 0];
-    for (let i = 0; i < views.length; i++) {
-      const weight = matern(this.square(views[i] as number)) ** LIKE;
-      sum += weight * (corrections[i] as number);
+    for (let i = 0; i < this.own.length; i++) {
+      const weight = matern(this.square(this.own[i] as number)) ** LIKE;
+      sum += weight * (this.corrections[i] as number);
       total += weight;
     }
     return distance * Math.exp(sum / (total + ENOUGH));
@@ -167,7 +159,7 @@ export class ViewModel {
 
   /** The label's pixel share at a viewpoint, from the known views near it, 0..1. */
   share(position: Vec3, direction: Vec3): number {
-    const { shares } = this.own;
+    const { shares } = this;
     this.views.from(position, direction);
     let [sum, total] = [0, 0];
     for (let view = 0; view < shares.length; view++) {
@@ -185,80 +177,71 @@ export class ViewModel {
     );
   }
 
-  private promise(mean: readonly number[], deviation: number, support: number): Prediction {
-    const { own, label } = this;
-    const kept = rising(mean);
-    const low = kept.map((m, level) => {
-      return m - Math.hypot(own.factor * deviation * (own.amplitudes[level] ?? 0), own.mixing);
-    });
+  private promise(mean: readonly number[], support: number): Prediction {
+    const { sent, label } = this;
     const unknown = label.levels.map(() => Number.NaN);
+    const known = this.targets.length > 0;
+    const outside = support < sent.leastSupport;
+    const less = sent.discount * (1 - support);
+    const bound = mean.map((m) => (outside || !known ? Number.NaN : this.bound(m - less)));
     return {
-      mean: spread(kept, own.levels, unknown),
-      bound: spread(running(low, Math.max), own.levels, unknown),
+      mean: spread(mean, sent.levels, unknown),
+      bound: spread(bound, sent.levels, unknown),
       support,
+      trust: outside ? "outside" : known ? sent.status : "unknown",
     };
   }
 
-  private covariance(): Float64Array {
-    const { n, own, views, scale } = this;
-    const S = new Float64Array(n * n);
+  /** The largest target that a mean keeps, between targets interpolated. */
+  private bound(mean: number): number {
+    const { targets, thresholds } = this;
+    const last = targets.length - 1;
+    const above = thresholds.findIndex((threshold) => threshold > mean);
+    if (above < 0) return targets[last] as number;
+    const [t1, m1] = [targets[above] as number, thresholds[above] as number];
+    if (above === 0) return mean + (t1 - m1);
+    const [t0, m0] = [targets[above - 1] as number, thresholds[above - 1] as number];
+    return t0 + ((t1 - t0) / (m1 - m0)) * (mean - m0);
+  }
+
+  /** The weights by which the process has the values that were sent. */
+  private solve(): Float64Array {
+    const { own, scale, logDistances, sent } = this;
+    const { rows } = this.views;
+    const [a, b, c] = scale.map(Math.sqrt) as [number, number, number];
+    const scaled = new Float64Array(7 * own.length);
+    for (let i = 0; i < own.length; i++) {
+      for (let j = 0; j < 6; j++)
+        scaled[7 * i + j] = (rows[6 * (own[i] as number) + j] as number) * (j < 3 ? a : b);
+      scaled[7 * i + 6] = (logDistances[i] as number) * c;
+    }
+    return solved(covariance(scaled, own.length), valuesOf(sent), own.length);
+  }
+}
+
+/** Values [K, n] from their differences along the views and to the level below. */
+function valuesOf({ values }: LabelPromises): Float64Array {
+  const n = values.steps[0]?.length ?? 0;
+  const out = new Float64Array(n * values.steps.length);
+  const level = new Float64Array(n); // whole numbers, so the sums are exact
+  values.steps.forEach((steps, k) => {
+    let along = 0;
     for (let i = 0; i < n; i++) {
-      for (let j = 0; j <= i; j++) {
-        const both = (this.unseen[i] as number) * (own.unseenViews[j] ?? 0);
-        const [away, turned] = views.between(own.views[i] as number, own.views[j] as number);
-        const further = (own.logDistances[i] as number) - (own.logDistances[j] as number);
-        const alike = matern(away * scale[0] + turned * scale[1] + further * further * scale[2]);
-        S[i * n + j] = alike + both + (i === j ? own.noise : 0);
-      }
+      along += steps[i] as number;
+      level[i] = (level[i] as number) + along;
+      out[k * n + i] = (level[i] as number) * (values.units[k] as number);
     }
-    return S;
-  }
+  });
+  return out;
 }
 
-/** Matern 3/2 of the square of a scaled difference. */
-function matern(square: number): number {
-  const scaled = Math.sqrt(3 * square);
-  return (1 + scaled) * Math.exp(-scaled);
-}
-
-const STEPS = 256; // of a table of it, in a unit of the scaled difference
-const TABLE = Float64Array.from({ length: 32 * STEPS }, (_, i) => matern((i / STEPS) ** 2 / 3));
-
-/** The same by a table, accurate to 2e-6: pixel shares sum over all views for each label. */
-function maternTable(square: number): number {
-  const at = Math.sqrt(3 * square) * STEPS;
-  const i = Math.floor(at);
-  if (!(i < TABLE.length - 1)) return 0;
-  const low = TABLE[i] as number;
-  return low + (at - i) * ((TABLE[i + 1] as number) - low);
-}
-
-/** The lower Cholesky factor of a symmetric positive definite matrix given by its lower half, in place. */
-function cholesky(S: Float64Array, n: number): Float64Array {
-  for (let j = 0; j < n; j++) {
-    for (let i = j; i < n; i++) {
-      let sum = S[i * n + j] as number;
-      for (let k = 0; k < j; k++) sum -= (S[i * n + k] as number) * (S[j * n + k] as number);
-      // rounding can make the pivot vanish
-      S[i * n + j] = i === j ? Math.sqrt(Math.max(sum, 1e-12)) : sum / (S[j * n + j] as number);
-    }
-  }
-  return S;
-}
-
-/** k' S^-1 k from the lower factor of S. */
-function explained(factor: Float64Array, k: Float64Array): number {
-  const n = k.length;
-  const z = new Float64Array(n);
-  let square = 0;
-  for (let i = 0; i < n; i++) {
-    let sum = k[i] as number;
-    for (let j = 0; j < i; j++) sum -= (factor[i * n + j] as number) * (z[j] as number);
-    const value = sum / (factor[i * n + i] as number);
-    z[i] = value;
-    square += value * value;
-  }
-  return square;
+/** Running sums of whole numbers, times a unit. */
+function sums(steps: readonly number[], unit: number): Float64Array {
+  let sum = 0;
+  return Float64Array.from(steps, (step) => {
+    sum += step;
+    return sum * unit;
+  });
 }
 
 /** Monotone values: the mean of the running maximum and the running minimum from the end, in [-1, 1]. */

@@ -4,7 +4,7 @@ import type { Handle, Label, Level, Renderer } from "../types";
 import type { Sight } from "./distance";
 import type { Step } from "./order";
 import { type Candidate, type Ladder, ladderOf } from "./planner";
-import { byDistance, type Prediction } from "./quality";
+import type { Prediction } from "./quality";
 
 /** A label of the manifest. Drawn are increments 1..shown, or `former` until those are decoded. */
 export class Entry {
@@ -18,12 +18,10 @@ export class Entry {
   share = 0; // pixel share
   candidate: Candidate | null = null; // input of the current plan
   steps: { candidate: Candidate; have: number; found: Step[] } | null = null; // from the loaded to the planned level
-  prediction: Prediction = { mean: [], bound: [], support: Number.NaN };
-  readonly unseen: Prediction; // prediction while it is out of sight
+  prediction: Prediction = { mean: [], bound: [], support: Number.NaN, trust: "unknown" };
 
   constructor(public label: Label) {
     this.ladder = ladderOf(label);
-    this.unseen = byDistance(label, Number.NaN);
     this.decoded = label.levels.map((file) => (file.count ? undefined : null));
   }
 

@@ -1,6 +1,6 @@
 /** Streams a bundle: plans, downloads, decodes and draws increments. The only stateful part of the core. */
 
-import type { Handle, Manifest, Renderer, Settings, State, Viewpoint } from "../types";
+import type { Handle, Manifest, Quality, Renderer, Settings, State, Viewpoint } from "../types";
 import { describe } from "./describe";
 import { rotate } from "./distance";
 import { type Clock, clockOfBrowser, type Digest, digestOfBrowser, type Fetch, type File } from "./download";
@@ -33,7 +33,7 @@ const QUICK = 4; // ms; plans that are faster need no pause
 const KEEP = 64 * 2 ** 20;
 const DECODES = 4; // concurrent
 const HOLDS_UP = 0.05; // size of the viewpoint models, relative to a pack, from which on they delay it
-const BY_DISTANCE = "levels are planned by distance alone.";
+const WITHOUT_MODELS = "levels are planned by what holds for all viewpoints.";
 const UNCHECKED = "Served without https: files are checked by their size only.";
 
 export class Streamer {
@@ -49,7 +49,7 @@ export class Streamer {
   private content: Manifest;
   private entries: Entry[];
   private leaving: Drawn[] = []; // drawn increments of labels that a new manifest removed
-  private outlook = new Outlook();
+  private outlooks = new Map<Quality, Outlook>(); // those that were asked for
   private planned: Plan["status"] = "ok";
   private nextPlan = -Infinity; // ms of the clock: earliest time
   private nextWork = -Infinity;
@@ -180,7 +180,7 @@ export class Streamer {
       entry.candidate = candidates[i] ?? null;
     });
     this.wantedKeys = new Set(this.entries.flatMap((e) => e.files(0, e.wanted).map((f) => f.file.sha256)));
-    if (this.content.promises) this.wantedKeys.add(this.content.promises.sha256);
+    if (this.promises) this.wantedKeys.add(this.promises.sha256);
     const took = this.clock.now() - begun;
     this.nextPlan = begun + Math.max(PLAN_EVERY, (1 + REST) * took);
     this.work();
@@ -230,14 +230,26 @@ export class Streamer {
   /** Whether viewpoint models can wait: the plan does not depend on them, and they would delay a small pack. */
   private promisesCanWait(): boolean {
     const { mode } = this.settings;
-    const { pack, promises } = this.content;
+    const { promises, content } = this;
+    const { pack } = content;
     if (!this.supply.streams || this.planned !== "ok" || (mode !== "full" && mode !== "base")) return false;
     return (promises?.bytes ?? 0) > HOLDS_UP * (pack?.bytes ?? 0);
   }
 
   private missingPromises(): File[] {
-    const { promises } = this.content;
-    return promises && !this.outlook.complete ? [promises] : [];
+    return this.promises && !this.outlook.complete ? [this.promises] : [];
+  }
+
+  /** The file with the viewpoint models of the quality that is asked for, if the bundle has one. */
+  private get promises(): File | undefined {
+    return this.content.promises[this.settings.quality];
+  }
+
+  private get outlook(): Outlook {
+    const { quality } = this.settings;
+    const known = this.outlooks.get(quality) ?? new Outlook(quality, this.content.labels);
+    this.outlooks.set(quality, known);
+    return known;
   }
 
   /** Files of all planned increments that are not decoded. */
@@ -295,14 +307,13 @@ export class Streamer {
   }
 
   private takePromises(): void {
+    const { quality } = this.settings;
     for (const file of this.missingPromises()) {
       const content = this.supply.take(file);
       if (!content) return;
       try {
-        this.outlook = new Outlook(
-          this.content.labels,
-          parsePromises(new TextDecoder().decode(content), file.uri),
-        );
+        const promises = parsePromises(new TextDecoder().decode(content), file.uri, quality);
+        this.outlooks.set(quality, new Outlook(quality, this.content.labels, promises));
         this.replan();
       } catch (error) {
         this.supply.spoil(file, error instanceof Error ? error.message : `${file.uri} cannot be read`);
@@ -331,9 +342,7 @@ export class Streamer {
     const { entries, leaving } = exchange(this.entries, manifest.labels, this.hidden, this.renderer);
     this.entries = entries;
     this.leaving.push(...leaving);
-    if (manifest.promises?.sha256 !== this.content.promises?.sha256) {
-      this.outlook = new Outlook();
-    }
+    this.outlooks.clear();
     this.content = manifest;
     this.trouble = null;
     this.supply.forgive();
@@ -376,7 +385,7 @@ export class Streamer {
   }
 
   private describe(): State {
-    const promises = this.content.promises && this.supply.failure(this.content.promises);
+    const promises = this.promises && this.supply.failure(this.promises);
     return describe(this.entries, {
       planned: this.planned,
       bytesLoaded: this.supply.received,
@@ -386,7 +395,9 @@ export class Streamer {
       notes: [
         this.trouble,
         this.supply.note,
-        promises && (promises.lasting || promises.tries >= PATIENCE) && `${promises.message}; ${BY_DISTANCE}`,
+        promises &&
+          (promises.lasting || promises.tries >= PATIENCE) &&
+          `${promises.message}; ${WITHOUT_MODELS}`,
         !this.digest && UNCHECKED,
       ].map((note) => note || null),
       failure: (entry, level) => {

@@ -1,3 +1,5 @@
+import type { Quality } from "../types";
+
 /** "1.2 MB", with at least two digits; decimal units. */
 export function formatBytes(bytes: number): string {
   if (!Number.isFinite(bytes)) return "no limit";
@@ -22,6 +24,9 @@ export function formatDistance(metres: number): string {
   if (!Number.isFinite(metres)) return "–";
   return `${metres < 10 ? metres.toFixed(1) : Math.round(metres)} m`;
 }
+
+/** What a quality is called in a sentence. */
+export const nameOf = (quality: Quality): string => (quality === "fidelity" ? "fidelity" : "SSIM");
 
 export function formatSsim(ssim: number): string {
   return Number.isFinite(ssim) ? ssim.toFixed(2) : "–";

@@ -1,4 +1,4 @@
-import type { LabelState } from "../types";
+import type { LabelState, Trust } from "../types";
 
 /** The labels of one category: a single label, or its per-block categories in a scene in blocks. */
 export interface Group {
@@ -14,6 +14,7 @@ export interface Summary {
   readonly level: string; // "2/6", or "1–4/6" if the blocks differ
   readonly promised: number; // minimum over visible labels
   readonly expected: number;
+  readonly trust: Trust; // the least over visible labels
   readonly count: number;
   readonly bytes: number;
   readonly distance: number; // of the nearest label
@@ -43,6 +44,8 @@ export function grouped(states: readonly LabelState[]): Group[] {
   return groups.sort((a, b) => b.splats - a.splats);
 }
 
+const TRUST: readonly Trust[] = ["outside", "unknown", "uncalibrated", "calibrated"]; // least first
+
 export function summary(states: readonly LabelState[]): Summary {
   const sum = (of: (state: LabelState) => number) => states.reduce((total, state) => total + of(state), 0);
   const levels = sum(({ label }) => label.levels.length);
@@ -60,6 +63,8 @@ export function summary(states: readonly LabelState[]): Summary {
     level: `${low === high ? low : `${low}–${high}`}/${last}`,
     promised: least((state) => state.promised),
     expected: least((state) => state.expected),
+    trust:
+      TRUST.find((trust) => (visible.length ? visible : states).some((s) => s.trust === trust)) ?? "unknown",
     count: sum((state) => state.count),
     bytes: sum((state) => state.bytes),
     distance: least((state) => state.distance),

@@ -1,18 +1,29 @@
-import type { LabelState } from "../types";
+import type { LabelState, Trust } from "../types";
 import type { Viewer } from "../view/viewer";
 import { h, iconButton, setIcon, setText } from "./dom";
-import { formatBytes, formatCount, formatDistance, formatSsim } from "./format";
+import { formatBytes, formatCount, formatDistance, formatSsim, nameOf } from "./format";
 import { blockColor, grouped, summary } from "./groups";
 
 const WEIGHTS = [0.25, 0.5, 1, 2, 4];
-const PROMISE = "a promise is a lower confidence bound of SSIM, calibrated on held-out views";
+const MEANING: Readonly<Record<Trust, string>> = {
+  calibrated: "a lower bound that holds in 95 of 100 decisions",
+  uncalibrated: "too few viewpoints to calibrate it: a careful guess, not proven",
+  outside: "no promise here: too far from the viewpoints that were tried, so it is shown in full",
+  unknown: "no promise: nothing is known of its quality",
+};
+const REMARK: Readonly<Record<Trust, string>> = {
+  calibrated: "",
+  uncalibrated: "uncalibrated · ",
+  outside: "no promise here · ",
+  unknown: "",
+};
 
 interface Row {
   readonly element: HTMLElement;
   update(states: readonly LabelState[]): void;
 }
 
-/** The list of categories: colour, level, promised SSIM, size, distance, weight, and visibility. */
+/** The list of categories: colour, level, promised quality, size, distance, weight, and visibility. */
 export class LabelTable {
   readonly element = h("ul", { class: "labels", "aria-label": "Labels" });
   readonly #rows = new Map<string, Row>();
@@ -91,19 +102,19 @@ function partList(viewer: Viewer, parent: HTMLElement, title: string): Pick<Row,
   return { update };
 }
 
-/** Colour, name, level, SSIM, size and distance. */
+/** Colour, name, level, quality, size and distance. */
 function factsRow(viewer: Viewer, title: string, name: string, color: string): Row {
   const metres = viewer.manifest.frame.metersPerUnit;
   const bar = h("div", { class: "level", role: "img" }, h("i"), h("b"));
   const level = h("span", { class: "number" });
-  const ssim = h("span", { class: "number ssim" });
+  const quality = h("span", { class: "number ssim" });
   const facts = h("span", { class: "more" });
   const element = h(
     "li",
     {},
     h("span", { class: "swatch" }),
     h("span", { class: "name", title: name }, title),
-    ssim,
+    quality,
     bar,
     level,
     facts,
@@ -120,10 +131,13 @@ function factsRow(viewer: Viewer, title: string, name: string, color: string): R
       `level ${now.level}, ${Math.round(100 * now.wanted)} % of the levels planned`,
     );
     setText(level, now.level);
-    setText(ssim, formatSsim(now.promised));
-    ssim.title = `promised SSIM ${formatSsim(now.promised)}, expected ${formatSsim(now.expected)}; ${PROMISE}`;
+    const name = nameOf(viewer.settings.quality);
+    setText(quality, formatSsim(now.promised));
+    quality.title = `promised ${name} ${formatSsim(now.promised)}, expected ${formatSsim(now.expected)}; ${MEANING[now.trust]}`;
     const place = now.visible ? formatDistance(now.distance * metres) : "out of sight";
-    setText(facts, now.error ?? `${formatCount(now.count)} · ${formatBytes(now.bytes)} · ${place}`);
+    const remark = now.visible ? REMARK[now.trust] : "";
+    const size = `${formatCount(now.count)} · ${formatBytes(now.bytes)}`;
+    setText(facts, now.error ?? `${remark}${size} · ${place}`);
     element.classList.toggle("error", now.error !== null);
     element.classList.toggle("dim", !now.visible || states.every(({ label }) => viewer.isHidden(label.id)));
     element.classList.toggle("busy", now.loading);

@@ -1,6 +1,7 @@
-import type { Settings, State } from "../types";
+import type { LabelState, Settings, State } from "../types";
 import type { Viewer } from "../view/viewer";
 import { h, setText } from "./dom";
+import { nameOf } from "./format";
 import { helpDialog } from "./help";
 import { Panel } from "./panel";
 import { splitSlider } from "./split";
@@ -62,18 +63,33 @@ function sentence(viewer: Viewer, done: boolean): string {
     return `Loading the full scene, ${Math.floor(compare.progress * 100)} %`;
   if (state.status === "over budget") return "The lowest levels exceed the budget";
   if (state.status === "infeasible") return shortfall(state, viewer.settings);
-  if (done) return viewer.manifest.live ? "Training is running" : "";
+  if (done && viewer.manifest.live) return "Training is running";
+  if (done) return viewer.settings.mode === "target" ? outside(state) : "";
   return state.count ? "Refining…" : "Loading…";
 }
 
+/** Names the categories without a promise at this viewpoint. */
+function outside(state: State): string {
+  const known = state.labels.filter((l) => l.visible && l.trust !== "unknown");
+  const short = known.filter((l) => l.trust === "outside");
+  if (!short.length) return "";
+  return short.length < known.length
+    ? `No promise here for ${named(short)}`
+    : "No promise here: too far from the viewpoints that were tried";
+}
+
 /** Names the categories that miss the target, or says that the budget is the limit. */
-function shortfall(state: State, { mode, target }: Settings): string {
+function shortfall(state: State, { mode, quality, target }: Settings): string {
   const short = state.labels.filter(
     (l) => l.visible && l.wanted === l.label.levels.length && l.promised < target,
   );
   if (mode !== "target" || !short.length) return "Best quality within the budget";
-  const names = [...new Set(short.map((l) => l.label.title))];
-  const named =
-    names.length > 2 ? `${names.slice(0, 2).join(", ")} and ${names.length - 2} more` : names.join(" and ");
-  return `${named} cannot reach ${target.toFixed(2)}`;
+  return `${named(short)} cannot reach ${nameOf(quality)} ${target.toFixed(2)}`;
+}
+
+function named(states: readonly LabelState[]): string {
+  const names = [...new Set(states.map((l) => l.label.title))];
+  return names.length > 2
+    ? `${names.slice(0, 2).join(", ")} and ${names.length - 2} more`
+    : names.join(" and ");
 }

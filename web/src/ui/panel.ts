@@ -1,7 +1,8 @@
-import type { Settings } from "../types";
-import type { Viewer } from "../view/viewer";
+import { qualitiesOf } from "../core/manifest";
+import type { Quality, Settings } from "../types";
+import { USUAL, type Viewer } from "../view/viewer";
 import { h, iconButton, setText } from "./dom";
-import { formatBytes, formatCount, formatSsim } from "./format";
+import { formatBytes, formatCount, formatSsim, nameOf } from "./format";
 import { LabelTable } from "./labels";
 
 const MODES: readonly (readonly [Settings["mode"], string])[] = [
@@ -18,7 +19,7 @@ export class Panel {
   readonly #summary = h("span", { class: "summary" });
   readonly #meter = h("div", { class: "meter" }, h("i"));
   readonly #facts = h("dl", { class: "facts" });
-  readonly #sliders: Slider[];
+  readonly #sliders: Control[];
   readonly #modes: HTMLButtonElement[];
 
   constructor(readonly viewer: Viewer) {
@@ -30,7 +31,7 @@ export class Panel {
         title,
       ),
     );
-    this.#sliders = [qualitySlider(viewer), ...budgetSliders(viewer)];
+    this.#sliders = [targetSlider(viewer), ...qualityChoice(viewer), ...budgetSliders(viewer)];
     const toggle = iconButton("chevron", "Panel (P)", () => this.toggle());
     this.element = h(
       "aside",
@@ -119,7 +120,7 @@ export class Panel {
 
 const rate = (bytes: number) => (Number.isFinite(bytes) ? ` · ${formatBytes(bytes)}/s` : "");
 
-interface Slider {
+interface Control {
   readonly element: HTMLElement;
   update(settings: Settings): void;
 }
@@ -131,7 +132,7 @@ function slider(
   read: (settings: Settings) => number,
   write: (value: number) => void,
   format: (settings: Settings) => string,
-): Slider {
+): Control {
   const input = h("input", {
     type: "range",
     ...range,
@@ -151,19 +152,46 @@ function slider(
   };
 }
 
-function qualitySlider(viewer: Viewer): Slider {
+function targetSlider(viewer: Viewer): Control {
   return slider(
-    "Keep SSIM at",
+    "Keep quality at",
     ["target"],
     { min: 0.3, max: 0.99, step: 0.01 },
     ({ target }) => target,
     (target) => viewer.set({ target }),
-    ({ target }) => formatSsim(target),
+    ({ target, quality }) => `${nameOf(quality)} ${formatSsim(target)}`,
   );
 }
 
+const COMPARED: Readonly<Record<Quality, string>> = { fidelity: "the full scene", ssim: "the photos" };
+
+/** What the target is measured against; none where the bundle leaves no choice. */
+function qualityChoice(viewer: Viewer): Control[] {
+  const known = qualitiesOf(viewer.manifest);
+  if (known.length < 2) return [];
+  const targets = { ...USUAL }; // that were last asked for
+  const choose = () => {
+    const { quality, target } = viewer.settings;
+    targets[quality] = target;
+    const chosen = known[select.selectedIndex] ?? quality;
+    viewer.set({ quality: chosen, target: targets[chosen] });
+  };
+  const options = known.map((quality) => h("option", { value: quality }, COMPARED[quality]));
+  const select = h("select", { "aria-label": "Compared with", change: choose }, ...options);
+  const element = h("label", { class: "choice" }, h("span", {}, "Compared with"), select);
+  return [
+    {
+      element,
+      update: ({ mode, quality }) => {
+        element.hidden = mode !== "target";
+        if (document.activeElement !== select) select.value = quality;
+      },
+    },
+  ];
+}
+
 /** One slider per unit, as a share of the full scene; the right end means no limit. */
-function budgetSliders(viewer: Viewer): Slider[] {
+function budgetSliders(viewer: Viewer): Control[] {
   const { totals } = viewer.manifest;
   const units = [
     ["Download", "bytes", formatBytes],

@@ -1,7 +1,8 @@
 import { Vector3 } from "three";
+import { qualitiesOf } from "../core/manifest";
 import { Streamer } from "../core/streamer";
 import type { Embed, Options, Sample } from "../embed";
-import type { Budget, Manifest, Settings, State } from "../types";
+import type { Budget, Manifest, Quality, Settings, State } from "../types";
 import { Compare } from "./compare";
 import { Controls } from "./controls";
 import { type Pose, quat, transformPose, vec3 } from "./frame";
@@ -203,11 +204,21 @@ export class Viewer {
   }
 }
 
+/** Targets to begin with, where the bundle says none of the quality. */
+export const USUAL: Readonly<Record<Quality, number>> = { fidelity: 0.95, ssim: 0.7 };
+
 function startSettings(manifest: Manifest, options: Options): Settings {
+  const quality = options.quality ?? manifest.target.quality;
+  const known = qualitiesOf(manifest);
+  if (known.length && !known.includes(quality)) {
+    throw new Error(`?quality=${quality}: this bundle has only ${known.join(" and ")}; correct the address.`);
+  }
+  const usual = quality === manifest.target.quality ? manifest.target.value : USUAL[quality];
   const bytes = options.budget === null ? Infinity : options.budget * 1e6;
   return {
     mode: options.budget !== null && options.target === null ? "budget" : "target",
-    target: options.target ?? 0.8,
+    quality,
+    target: options.target ?? usual,
     budget: { ...UNLIMITED, bytes },
     weights: new Map(manifest.labels.map(({ id, weight }) => [id, weight])),
     cacheBytes: CACHE,

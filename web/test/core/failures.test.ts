@@ -135,14 +135,14 @@ test("online again: retry does not wait", async () => {
 test.each<[Fault, string]>([
   [404, "the server said 404"],
   ["corrupt", "is damaged"],
-])("without promises (%s) levels follow the distance", async (fault, words) => {
+])("without promises (%s) levels follow what holds everywhere", async (fault, words) => {
   const { w } = made();
   w.network.faults.set("promises-1.json", fault);
   w.set({ mode: "target" });
   w.streamer.start();
   await w.rest();
   expect(w.streamer.state.message).toContain(words);
-  expect(w.streamer.state.message).toContain("by distance alone");
+  expect(w.streamer.state.message).toContain("by what holds for all viewpoints");
   for (const label of w.streamer.state.labels) expect(label.promised).toBeGreaterThanOrEqual(0.8);
 });
 
@@ -150,7 +150,7 @@ test("promises that cannot be read are told of", async () => {
   const { w } = made();
   const text = new TextEncoder().encode("{}");
   w.network.files.set("promises-1.json", text);
-  const promises = { uri: "promises-1.json", bytes: 2, sha256: "" };
+  const promises = { fidelity: { uri: "promises-1.json", bytes: 2, sha256: "" } };
   const other = world({}, { manifest: { ...w.manifest, promises }, digest: null }, w);
   other.streamer.start();
   await other.pass(5000);

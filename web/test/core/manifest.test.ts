@@ -37,7 +37,7 @@ test("a good manifest is taken as it is", () => {
   const document = good();
   expect(parseManifest(JSON.stringify(document))).toEqual(document);
   expect(parseManifest(with_(good(), "labels", [])).labels).toEqual([]);
-  expect(parseManifest(with_(good(), "labels.0.quality", null)).labels[0]?.quality).toBeNull();
+  expect(parseManifest(with_(good(), "labels.0.quality", {})).labels[0]?.quality).toEqual({});
   expect(parseManifest(with_(good(), "later", { any: "thing" }))).toBeTruthy();
 });
 
@@ -79,7 +79,7 @@ describe("every field is needed", () => {
     const own = Object.entries(value).flatMap(([key, v]) => paths(v, path ? `${path}.${key}` : key));
     return path ? [path, ...own] : own;
   };
-  const names = paths(good(), "").filter((path) => !/\.\d+$|licenses/.test(path));
+  const names = paths(good(), "").filter((path) => !/\.\d+$|licenses|\.fidelity$/.test(path));
   test("there are many", () => expect(names.length).toBeGreaterThan(60));
   for (const path of names) {
     test(path, () => {
@@ -87,7 +87,7 @@ describe("every field is needed", () => {
       expect(complaint(() => parseManifest(with_(good(), path, undefined)))).toContain(
         `${spelled} is missing`,
       );
-      const odd = path === "version" ? "one" : { odd: true };
+      const odd = path === "version" ? "one" : /promises$|quality$/.test(path) ? 3 : { odd: true };
       expect(complaint(() => parseManifest(with_(good(), path, odd)))).toContain(spelled);
     });
   }
@@ -115,7 +115,7 @@ describe("paths stay below the bundle", () => {
   ];
   for (const uri of bad) {
     test(JSON.stringify(uri), () => {
-      for (const path of ["labels.1.levels.0.uri", "promises.uri"]) {
+      for (const path of ["labels.1.levels.0.uri", "promises.fidelity.uri"]) {
         expect(complaint(() => parseManifest(with_(good(), path, uri)))).toContain(
           "below the bundle's folder",
         );
@@ -134,9 +134,13 @@ test.each([
   ["labels.0.levels.0.sha256", "12", "labels[0].levels[0].sha256"],
   ["labels.0.levels.0.bytes", 1.5, "labels[0].levels[0].bytes"],
   ["labels.0.levels.0.format", "ply", 'must be "spz"'],
-  ["labels.0.quality.margin", [0], "labels[0].quality.margin"],
-  ["labels.0.quality.curves.1.level", 1, "labels[0].quality.curves"],
-  ["labels.0.quality.curves.1.level", 9, "labels[0].quality.curves"],
+  ["labels.0.quality.fidelity.mean", [0], "labels[0].quality.fidelity must have a number a level"],
+  ["labels.0.quality.fidelity.bound", [0], "labels[0].quality.fidelity must have a number a level"],
+  ["labels.0.quality.fidelity.levels.1", 1, "labels[0].quality.fidelity.levels must rise"],
+  ["labels.0.quality.fidelity.levels.1", 9, "labels[0].quality.fidelity.levels must rise"],
+  ["labels.0.quality.fidelity.mean.1", 2, "labels[0].quality.fidelity.mean[1] must be a number from -1 to 1"],
+  ["target.quality", "psnr", 'target.quality must be "fidelity" or "ssim"'],
+  ["target.value", null, "target.value must be a number"],
   ["frame.axes", "rdf", 'frame.axes must be "rub"'],
   ["frame.metersPerUnit", 0, "frame.metersPerUnit must be a number above 0"],
   ["labels", {}, "labels must be a list"],
@@ -155,23 +159,62 @@ test("no JSON, and JSON of other kinds", () => {
 });
 
 test("many things wrong are named up to a few", () => {
-  const message = complaint(() => parseManifest('{"format":"sagesplat-bundle","version":1}'));
+  const message = complaint(() => parseManifest('{"format":"sagesplat-bundle","version":2}'));
   expect(message).toContain("generator is missing; name is missing");
   expect(message).toMatch(/and \d+ more/);
 });
 
 test.each([
-  ["labels.0.shares", [0.5], "labels[0] has lists"],
-  ["labels.0.views", [0, 99], "labels[0] has lists"],
-  ["labels.0.weights", [], "labels[0] has lists"],
-  ["labels.0.noise", 0, "labels[0].noise must be a number above 0"],
-  ["labels.0.lengths", [1, 0, 1], "labels[0].lengths[1]"],
-  ["labels.0.unseenViews.0", 2, "labels[0].unseenViews[0]"],
+  ["version", 1, "version must be 2"],
+  ["quality", "ssim", 'quality must be "fidelity"'],
   ["extent", "far", "extent must be a number"],
-  ["views.0", [1], "views[0] must be a list of 6"],
+  ["views", [[1]], "views must be a list of 6"],
+  ["views.0", [1], "views must have columns of equal length"],
+  ["views.0.1", 0.5, "views[0][1] must be a whole number"],
+  ["labels.0.shares", [5000], "labels[0] has lists"],
+  ["labels.0.shares.0", 20_000, "labels[0] has shares or corrections out of range"],
+  ["labels.0.corrections.0", 1e9, "labels[0] has shares or corrections out of range"],
+  ["labels.0.views", [0, 99], "labels[0] has lists"],
+  ["labels.0.views.1", 99, "labels[0] has lists"],
+  ["labels.0.values.steps", [], "labels[0] has lists"],
+  ["labels.0.values.steps.0", [1], "labels[0] has lists"],
+  ["labels.0.values.steps.0.0", 1e10, "labels[0] has values out of range"],
+  ["labels.0.values.units.0", 0, "labels[0].values.units[0] must be a number from"],
+  ["labels.0.values.units", [1], "labels[0] has lists"],
+  ["labels.0.offsets", [0], "labels[0] has lists"],
+  [
+    "labels.0.curves",
+    [{ params: [1, 0, 0, 1, 1, 0, 0, 1, 0], range: [0, 1], median: 1 }],
+    "labels[0] has lists",
+  ],
+  ["labels.0.logDistances.steps.0", 1e6, "labels[0] has values out of range"],
+  ["labels.0.levels", [2, 1], "labels[0].levels must rise"],
+  ["labels.0.lengths", [1, 0, 1], "labels[0].lengths[1]"],
+  ["labels.0.leastSupport", 2, "labels[0].leastSupport must be a number from 0 to 1"],
+  ["labels.0.thresholds", [1, 2], "labels[0] has lists"],
+  ["labels.0.thresholds.1", 3200, "labels[0] must have targets and thresholds that rise"],
+  ["labels.0.targets.3", 10_001, "labels[0] must have targets and thresholds that rise"],
+  ["labels.0.status", "pooled", "labels[0].status must be"],
 ])("promises: %s = %j", (path, value, message) => {
-  expect(parsePromises(JSON.stringify(promises()), "p.json")).toEqual(promises());
-  expect(complaint(() => parsePromises(with_(promises(), path, value), "p.json"))).toContain(message);
+  const parsed = (json: string) => parsePromises(json, "p.json", "fidelity");
+  expect(parsed(JSON.stringify(promises()))).toEqual(promises());
+  expect(complaint(() => parsed(with_(promises(), path, value)))).toContain(message);
+});
+
+test("a bundle of version 1 is shown without promises", () => {
+  const old = { ...good(), version: 1, promises: { uri: "promises-1.json", bytes: 9, sha256: "0" } };
+  const { target, ...rest } = old as Json;
+  expect(target).toBeTruthy();
+  const labels = (rest.labels as Json[]).map((label, i) => ({
+    ...label,
+    quality: i ? null : { status: "pooled", confidence: 0.95, margin: [0], curves: [] },
+  }));
+  const found = parseManifest(JSON.stringify({ ...rest, labels }));
+  expect(found.promises).toEqual({});
+  expect(found.labels.map(({ quality }) => quality)).toEqual([{}, {}]);
+  expect(complaint(() => parseManifest(JSON.stringify({ ...rest, labels: [3] })))).toContain(
+    "labels[0] must be an object",
+  );
 });
 
 describe("loading", () => {

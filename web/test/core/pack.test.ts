@@ -30,7 +30,7 @@ test("everything comes from one stream, and is drawn while it comes", async () =
   expect(w.network.asked).toEqual([PACK, "promises-1.json"]); // the plan does not need them
   expect(w.network.aborted).toEqual([]);
   const { pack, promises } = w.manifest;
-  expect(w.streamer.state.bytesLoaded).toBe((pack?.bytes ?? 0) + (promises?.bytes ?? 0));
+  expect(w.streamer.state.bytesLoaded).toBe((pack?.bytes ?? 0) + (promises.fidelity?.bytes ?? 0));
   expect(w.streamer.state).toMatchObject({ message: null, pending: 0 });
 });
 
@@ -75,7 +75,7 @@ test("what the stream would bring late is fetched beside it", async () => {
   while (!w.network.finished.includes("promises-1.json")) await w.pass(10);
   expect(chunks()).toEqual([]);
   // one label alone is worth anything: it lies all over the pack
-  w.set({ mode: "target", target: 0.9, weights: new Map([0, 1, 2, 3, 4].map((id) => [id, 0])) });
+  w.set({ mode: "target", target: 0.95, weights: new Map([0, 1, 2, 3, 4].map((id) => [id, 0])) });
   await w.pass(1000);
   expect(chunks()).toContain(file(5, 6));
   expect(chunks().every((path) => path.startsWith("chunks/l5-"))).toBe(true);
@@ -92,7 +92,7 @@ test("a viewer with a small budget loads little more than that", async () => {
   w.set({ mode: "budget", budget: { ...NO_BUDGET, bytes } });
   w.streamer.start();
   await w.rest();
-  const models = w.manifest.promises?.bytes ?? 0;
+  const models = w.manifest.promises.fidelity?.bytes ?? 0;
   expect(w.streamer.state.bytesShown).toBeLessThanOrEqual(bytes);
   expect(w.streamer.state.bytesLoaded).toBeLessThan(models + w.manifest.totals.bytes / 2);
 });

@@ -1,6 +1,7 @@
 /** Plans: modes, several budgets at once, what is always shipped, what nobody sees. */
 
 import { expect, test } from "vitest";
+import { fill } from "../../src/core/fill";
 import { type Candidate, ladderOf, makePlan } from "../../src/core/planner";
 import type { Settings } from "../../src/types";
 import { Network, seeded, VirtualClock } from "../simulate";
@@ -27,7 +28,7 @@ const candidates = (changes: Partial<Candidate>[] = []): Candidate[] =>
     previous: 0,
     ...changes[i],
   }));
-const settings = (partial: Partial<Settings>): Settings => ({ ...DEFAULTS, ...partial });
+const settings = (partial: Partial<Settings>): Settings => ({ ...DEFAULTS, quality: "ssim", ...partial });
 const plan = (partial: Partial<Settings>, changes: Partial<Candidate>[] = []) =>
   makePlan(candidates(changes), settings(partial));
 
@@ -42,6 +43,36 @@ test("a target takes the cheapest levels whose bound reaches it", () => {
     wanted: [1, 1, 4, 4],
     status: "ok",
   });
+});
+
+test("of fidelity, a picture below equal levels gets the upgrades of most gain per byte", () => {
+  // one hard category that is small, and one that is large and easy
+  const hard: Partial<Candidate> = { share: 0.01, bound: [0.1, 0.2, 0.3, 0.5, 0.97] };
+  const easy: Partial<Candidate> = { share: 0.9, bound: [0.95, 0.96, 0.97, 0.98, 0.99] };
+  const changes = [hard, easy, easy, easy];
+  const asked = { target: 0.95 } as const;
+  expect(plan({ ...asked, quality: "ssim" }, changes).wanted).toEqual([5, 1, 1, 1]);
+  const { wanted, status } = plan({ ...asked, quality: "fidelity" }, changes);
+  expect(status).toBe("ok");
+  expect(wanted[0]).toBe(5);
+  expect(Math.max(...wanted.slice(1))).toBeGreaterThan(1);
+});
+
+test("labels of fewer levels, and of unknown quality, are filled like the others or stay", () => {
+  const q = [
+    [0.5, 0.6, 0.95],
+    [0.5, 0.9],
+    [0.1, Number.NaN, 0.3],
+  ];
+  const c = [
+    [10, 100, 1000],
+    [10, 20, Infinity],
+    [1, 2, 3],
+  ];
+  expect(fill([2, 0, 0], q, c, [1, 100, 1])).toEqual([2, 1, 0]);
+  expect(fill([2, 0, 0], q, c, [1, 0, 1])).toEqual([2, 0, 0]);
+  expect(fill([0, 0, 0], q, c, [1, 1, 1])).toEqual([0, 0, 0]); // equal levels already
+  expect(fill([], [], [], [])).toEqual([]);
 });
 
 test("broken increments cap a label, and one without any level is left out", () => {

@@ -3,17 +3,19 @@
 import { expect, test } from "vitest";
 import vectors from "../../../tests/data/plans.json?raw";
 import { bestWithin, cheapest, type Options, type Table } from "../../src/core/allocate";
+import { fill } from "../../src/core/fill";
 
 type Row = (number | null)[];
 interface Case {
   name: string;
-  mode: "target" | "budget";
+  mode: "target" | "budget" | "fill";
   quality: Row[] | Row[][];
   cost: Row[];
   target?: number | number[];
   budget?: number;
   weight?: number[] | number[][];
   previous?: number[];
+  levels?: number[]; // that upgrades are added to
   slack?: number;
   states?: number;
   expected: Record<string, unknown>;
@@ -37,6 +39,10 @@ function planned(c: Case, quality: Row[], weight: number[], previous?: number[])
 (JSON.parse(vectors) as Case[]).forEach((c, i) => {
   test(`${i}: ${c.name}, ${c.mode}`, () => {
     const ones = c.cost.map(() => 1);
+    if (c.mode === "fill") {
+      const tables = [filled(c.quality as Row[], Number.NaN), filled(c.cost, Infinity)] as const;
+      return expect({ levels: fill(c.levels ?? [], ...tables, c.weight as number[]) }).toEqual(c.expected);
+    }
     if (isWalk(c.quality)) {
       let levels: number[] | undefined;
       const walk = c.quality.map((quality, p) => {

@@ -38,7 +38,7 @@ test("bytes, GPU bytes, counts and the speed of the link are those of what came"
   expect(state.count).toBe(w.manifest.totals.count);
   expect(state.bytesShown).toBe(w.manifest.totals.bytes);
   expect(state.gpuBytes).toBe(w.manifest.totals.gpuBytes);
-  expect(state.bytesLoaded).toBe(w.manifest.totals.bytes + (w.manifest.promises?.bytes ?? 0));
+  expect(state.bytesLoaded).toBe(w.manifest.totals.bytes + (w.manifest.promises.fidelity?.bytes ?? 0));
   expect(state.bandwidth / 2e6).toBeCloseTo(1, 1);
 });
 
@@ -118,7 +118,7 @@ test("a bundle without labels, and labels without quality or boxes", async () =>
   const made = world({ labels: 3, levels: 4, promises: false });
   const labels = made.manifest.labels.map((label, i) => ({
     ...label,
-    quality: i ? label.quality : null,
+    quality: i ? label.quality : {},
     boxes: i === 1 ? [] : label.boxes,
   }));
   const w = world({}, { manifest: { ...made.manifest, labels } }, made);

@@ -4,12 +4,12 @@ import { describe, expect, test } from "vitest";
 import distances from "../../../tests/data/distances.json?raw";
 import promised from "../../../tests/data/promises.json?raw";
 import { frustumOf, look, touches } from "../../src/core/distance";
-import { byDistance, curveAt, ViewModel, Views } from "../../src/core/quality";
+import { anywhere, curveAt, ViewModel, Views } from "../../src/core/quality";
 import type { Box, Curve, Label, Promises, Quat, Vec3, Viewpoint } from "../../src/types";
+import { differences } from "../worlds";
 
 interface PromiseCase {
   name: string;
-  curves: Curve[];
   promises: Promises;
   viewpoints: {
     position: Vec3;
@@ -17,7 +17,7 @@ interface PromiseCase {
     distance: number | null;
     corrected: number | null;
     mean: number[];
-    bound: number[];
+    bound: (number | null)[];
     support: number;
   }[];
 }
@@ -38,7 +38,7 @@ function near(found: readonly number[], expected: readonly number[], relative = 
   });
 }
 
-const labelWith = (curves: Curve[], levels: number): Label => ({
+const labelWith = (levels: number): Label => ({
   id: 7,
   name: "label",
   title: "label",
@@ -54,7 +54,7 @@ const labelWith = (curves: Curve[], levels: number): Label => ({
     count: 1,
     sha256: "",
   })),
-  quality: { status: "calibrated", confidence: 0.95, margin: curves.map(() => -0.01), curves },
+  quality: {},
 });
 
 describe("promises", () => {
@@ -62,15 +62,20 @@ describe("promises", () => {
     test(c.name, () => {
       const own = c.promises.labels[0];
       if (!own) throw new Error("no label");
-      const label = labelWith(c.curves, Math.max(...own.levels));
+      const label = labelWith(Math.max(...own.levels));
       expect(ViewModel.fits(label, own)).toBe(true);
       const model = new ViewModel(label, new Views(c.promises), own);
       const ofLevels = (values: readonly number[]) => own.levels.map((k) => values[k - 1] ?? Number.NaN);
       for (const v of c.viewpoints) {
         const told = model.predict(v.distance ?? Number.NaN, v.position, v.direction);
         near(ofLevels(told.mean), v.mean);
-        near(ofLevels(told.bound), v.bound);
+        v.bound.forEach((value, k) => {
+          if (value === null) expect(ofLevels(told.bound)[k]).toBeNaN();
+          else near([ofLevels(told.bound)[k] ?? Number.NaN], [value]);
+        });
         near([told.support], [v.support]);
+        const outside = v.support < own.leastSupport;
+        expect(told.trust).toBe(outside ? "outside" : own.targets.length ? own.status : "unknown");
         const right = model.corrected(v.distance ?? Number.NaN, v.position, v.direction);
         if (v.corrected === null) expect(right).toBeNaN();
         else near([right], [v.corrected], 1);
@@ -98,11 +103,9 @@ describe("distances", () => {
 });
 
 const curve: Curve = {
-  level: 2,
   params: [0.9, 0.1, 1, 1, 0.8, 0.05, 1, 1, 3],
   range: [0.5, 8],
   median: 0.7,
-  rmse: 0.01,
 };
 
 test("a curve ends where its range ends, and says its median where the distance is unknown", () => {
@@ -114,21 +117,42 @@ test("a curve ends where its range ends, and says its median where the distance 
   expect(curveAt(curve, Number.NaN)).toBe(0.7);
 });
 
-test("distance alone: levels without a curve are unknown, bounds never fall and stay within 1", () => {
-  const label = labelWith([curve, { ...curve, level: 3, median: 0.6 }], 4);
-  const { mean, bound } = byDistance(label, Number.NaN);
-  expect(mean).toEqual([Number.NaN, 0.6499999999999999, 0.6499999999999999, Number.NaN]);
-  expect(bound).toEqual([Number.NaN, 0.69, 0.69, Number.NaN]);
-  expect(byDistance({ ...label, quality: null }, 1).mean).toEqual([1, 2, 3, 4].map(() => Number.NaN));
+test("before the models are there: levels without a prediction are unknown, bounds never fall", () => {
+  const known = {
+    levels: [2, 3],
+    status: "calibrated",
+    confidence: 0.95,
+    mean: [0.8, 0.7],
+    bound: [0.6, 0.5],
+  } as const;
+  const label: Label = { ...labelWith(4), quality: { ssim: known } };
+  const { mean, bound, trust } = anywhere(label, "ssim");
+  expect(mean).toEqual([Number.NaN, 0.75, 0.75, Number.NaN]);
+  expect(bound).toEqual([Number.NaN, 0.6, 0.6, Number.NaN]);
+  expect(trust).toBe("calibrated");
+  const unknown = [1, 2, 3, 4].map(() => Number.NaN);
+  const none = anywhere({ ...label, quality: { ssim: { ...known, bound: null } } }, "ssim");
+  expect([none.bound, none.trust]).toEqual([unknown, "unknown"]);
+  expect(anywhere(label, "fidelity")).toMatchObject({ mean: unknown, bound: unknown, trust: "unknown" });
 });
 
 test("shares of pixels come from the views near by", () => {
   const own = (JSON.parse(promised) as { cases: PromiseCase[] }).cases[4];
   if (!own?.promises.labels[0]) throw new Error("no case");
-  const shares = own.promises.views.map((_, i) => (i === 3 ? 0.5 : 0.1));
+  const count = own.promises.views[0]?.length ?? 0;
+  const shares = differences(Array.from({ length: count }, (_, i) => (i === 3 ? 5000 : 1000)));
   const entry = { ...own.promises.labels[0], shares, lengths: [0.01, 0.01, 1] as const };
-  const model = new ViewModel(labelWith(own.curves, 6), new Views(own.promises), entry);
-  const [x, y, z, a, b, c] = own.promises.views[3] ?? [0, 0, 0, 0, 0, 0];
-  expect(model.share([x, y, z], [a, b, c])).toBeCloseTo(0.5, 6);
-  expect(model.share([1e4, 0, 0], [0, 0, 1])).toBeCloseTo(0.1 + 0.4 / shares.length, 9);
+  const views = new Views(own.promises);
+  const model = new ViewModel(labelWith(6), views, entry);
+  const [x, y, z, a, b, c] = [...views.rows.slice(18, 24)] as [
+    number,
+    number,
+    number,
+    number,
+    number,
+    number,
+  ];
+  const { extent } = own.promises;
+  expect(model.share([x * extent, y * extent, z * extent], [a, b, c])).toBeCloseTo(0.5, 6);
+  expect(model.share([1e4, 0, 0], [0, 0, 1])).toBeCloseTo(0.1 + 0.4 / count, 9);
 });

@@ -22,7 +22,7 @@ function world() {
     ...bundle(network, { pack: true }),
     cameras: Array.from({ length: 12 }, (_, i) => camera(i)),
   };
-  const promises = manifest.promises?.uri ?? "";
+  const promises = manifest.promises.fidelity?.uri ?? "";
   const text = new TextDecoder().decode(network.files.get(promises));
   const files = [
     { uri: "index.html", wire: 600 },

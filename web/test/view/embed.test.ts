@@ -5,8 +5,17 @@ import { dead } from "../../src/view/controls";
 
 test("options come from the query and the fragment", () => {
   const options = parseOptions("?target=0.8&ui=0", "#view=a b.jpg&budget=1.5");
-  expect(options).toEqual({ view: "a b.jpg", target: 0.8, budget: 1.5, ui: false, bundle: "" });
+  expect(options).toEqual({
+    view: "a b.jpg",
+    quality: null,
+    target: 0.8,
+    budget: 1.5,
+    ui: false,
+    bundle: "",
+  });
   expect(parseOptions("", "").ui).toBe(true);
+  expect(parseOptions("?quality=ssim&target=0.7", "")).toMatchObject({ quality: "ssim", target: 0.7 });
+  expect(() => parseOptions("?quality=psnr", "")).toThrow("?quality=psnr is not one of fidelity, ssim");
 });
 
 test.each([

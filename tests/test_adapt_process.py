@@ -1,0 +1,102 @@
+"""The Gaussian process: its formulas in float64, and derivatives against differences."""
+
+import numpy as np
+import pytest
+
+from sagesplat.adapt.process import (
+    GROUPS,
+    PRIOR,
+    PRIOR_REACH,
+    PRIOR_WIDTH,
+    _cost,
+    _inverse,
+    _terms,
+    fit_process,
+    inputs_of,
+    matern32,
+)
+
+
+def drawn(n: int = 20, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return rng.standard_normal((n, 7)), np.arange(n) % 3 == 0, 0.1 * rng.standard_normal((n, 2))
+
+
+def squares_of(x: np.ndarray) -> list[np.ndarray]:
+    return [((x[:, None, g] - x[None, :, g]) ** 2).sum(-1) for g in GROUPS]
+
+
+def test_leaving_one_out_in_closed_form_is_what_a_fit_without_the_view_says():
+    x, u, values = drawn()
+    process = fit_process(x, u, values)
+    S = matern32(x, x, process.lengths) + process.heldout_variance * np.outer(u, u)
+    S += process.noise * np.eye(20)
+    np.testing.assert_allclose(S @ process.weights, values, atol=1e-10)
+    for i in range(20):
+        rest = np.arange(20) != i
+        k = np.linalg.solve(S[np.ix_(rest, rest)], S[rest, i])
+        np.testing.assert_allclose(process.left_out[i], k @ values[rest], atol=1e-9)
+        spread = process.amplitudes * np.sqrt(S[i, i] - k @ S[rest, i])
+        np.testing.assert_allclose(process.left_out_spread[i], spread, rtol=1e-6)
+
+
+def test_kernel_written_out():
+    x, _, _ = drawn(5)
+    lengths = (0.8, 1.2, 2.0)
+    for i in range(5):
+        for j in range(5):
+            r2 = sum(((x[i, g] - x[j, g]) ** 2).sum() / ll**2 for g, ll in zip(GROUPS, lengths, strict=True))
+            a = np.sqrt(3 * r2)
+            assert matern32(x, x, lengths)[i, j] == pytest.approx((1 + a) * np.exp(-a), abs=1e-12)
+
+
+def test_slopes_of_the_covariance():
+    x, u, _ = drawn(6)
+    theta, squares = PRIOR + 0.3, squares_of(x)
+    S, slopes = _terms(squares, u, theta)
+    lengths = [float(np.exp(t)) for t in theta[:3]]
+    whole = matern32(x, x, lengths) + np.exp(theta[3]) * np.outer(u, u) + np.exp(theta[4]) * np.eye(6)
+    np.testing.assert_allclose(S, whole, atol=1e-12)
+    for i, slope in enumerate(slopes):
+        step = 1e-6 * (np.arange(5) == i)
+        up, down = (_terms(squares, u, theta + sign * step)[0] for sign in (1, -1))
+        np.testing.assert_allclose(slope, (up - down) / 2e-6, atol=1e-7)
+
+
+def test_slopes_of_the_likelihood():
+    x, u, values = drawn()
+    for shift in (-0.5, 0.0, 0.4):
+        theta = PRIOR + shift
+        slope = _cost(theta, squares_of(x), u, values)[1]
+        for i in range(5):
+            step = 1e-6 * (np.arange(5) == i)
+            up, down = (_cost(theta + sign * step, squares_of(x), u, values)[0] for sign in (1, -1))
+            # the amplitude's own dependence on theta adds nothing but for the floor under it
+            assert slope[i] == pytest.approx((up - down) / 2e-6, rel=0.02, abs=0.02)
+
+
+def test_hyperparameters_are_the_best_near_by_and_within_bounds():
+    x, u, values = drawn(30, 3)
+    process = fit_process(x, u, values)
+    theta = np.log([*process.lengths, process.heldout_variance, process.noise])
+    assert (np.abs(theta - PRIOR) <= PRIOR_REACH * PRIOR_WIDTH + 1e-9).all()
+    best = _cost(theta, squares_of(x), u, values)[0]
+    for i in range(5):
+        for step in (-0.2, 0.2):
+            assert _cost(theta + step * (np.arange(5) == i), squares_of(x), u, values)[0] > best - 0.05
+
+
+def test_one_view_and_views_in_one_place():
+    x, u, values = drawn(1)
+    process = fit_process(x, u, values)
+    np.testing.assert_allclose(process.left_out, 0, atol=1e-12)  # nothing else is known
+    again = fit_process(np.repeat(x, 4, 0), np.zeros(4, bool), np.repeat(values, 4, 0))
+    assert np.isfinite(again.left_out).all()
+    np.testing.assert_allclose(_inverse(np.eye(3) * 2), np.eye(3) / 2)
+
+
+def test_an_unknown_distance_counts_as_the_median():
+    distance = np.array([2.0, np.nan, 0.0, -1.0, np.inf])
+    where = np.zeros((5, 3)), np.ones((5, 3))
+    x = inputs_of(distance, *where, 2.0, 0.7)
+    np.testing.assert_allclose(x[:, 6], [np.log(2), 0.7, 0.7, 0.7, 0.7])

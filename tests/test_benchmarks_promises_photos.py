@@ -1,0 +1,48 @@
+"""Redrawn splits: training views stay, figures are by target, and the result is JSON."""
+
+import json
+
+import numpy as np
+from viewpoint_fields import LEVELS, orbit, synthetic
+
+from benchmarks.promises_photos import _split, lines, redrawn, summary
+
+SCENE = orbit(96)
+COSTS = {(5, level): level for level in LEVELS}
+
+
+def test_redraws_of_a_known_field():
+    draws = redrawn(synthetic(SCENE, 1), SCENE, COSTS, [0.5, 0.6, 0.99], 3)
+    tests = [frozenset(draw.view.tolist()) for draw in draws]
+    assert len(set(tests)) == 3
+    assert all(len(views) == len(SCENE.test_ids) for views in tests)
+    assert not set().union(*tests) & set(SCENE.train_ids.tolist())
+    found = json.loads(json.dumps(summary(draws)))
+    assert set(found["targets"]) <= {"0.5", "0.6"}  # what is never accepted is left out
+    row = found["targets"]["0.5"]
+    assert row["accepted"] == sum(
+        (d.accepted & (d.target == 0.5) & (d.predictor == "bound")).sum() for d in draws
+    )
+    assert row["coverage_p5"] <= row["coverage"] <= 1
+    assert row["covered"] == (row["coverage"] >= 0.95 and row["coverage_p5"] >= 0.88)
+
+
+def test_what_was_found_is_told():
+    found = summary(redrawn(synthetic(SCENE, 1), SCENE, COSTS, [0.5, 0.6], 2))
+    said = lines("a scene", {"calibration_views": 18, "test_views": 24, **found})
+    assert len(said) == 3
+    assert all(0 < len(line) <= 110 for line in said)
+
+
+def test_nothing_to_draw():
+    none = synthetic(SCENE, 1)
+    empty = redrawn(none.select(none.label_id < 0), SCENE, COSTS, [0.5], 2)
+    assert summary(empty) == {"targets": {}, "covered": True, "tight": True}
+
+
+def test_a_split_keeps_the_training_views():
+    held = np.concatenate([SCENE.calibration_ids, SCENE.test_ids])
+    drawn = _split(SCENE, held[::2], held[1::2])
+    assert set(drawn.calibration_ids) == set(held[::2])
+    assert set(drawn.test_ids) == set(held[1::2])
+    np.testing.assert_array_equal(drawn.train_ids, SCENE.train_ids)

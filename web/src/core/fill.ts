@@ -1,0 +1,114 @@
+/**
+ * Upgrades after the cheapest levels, where those lie below equal levels of the same bytes. The rule is
+ * documented in src/sagesplat/adapt/fill.py; tests/data/plans.json (mode "fill") checks both.
+ */
+
+import type { Table } from "./allocate";
+
+const TOLERANCE = 1e-9;
+
+interface Upgrade {
+  readonly label: number;
+  readonly to: number; // level
+  readonly slope: number; // gain per cost
+}
+
+/**
+ * Adds upgrades until the composition is no worse than equal levels of the same cost.
+ *
+ * @param levels - from 0, the least that each label gets
+ * @param quality - mean quality by label and level, never falling; NaN: unknown, the label stays
+ * @param cost - Infinity for an unavailable level, above all others; such levels count as the last one there is
+ * @param weight - 0: the label stays
+ * @returns a level per label
+ */
+export function fill(
+  levels: readonly number[],
+  quality: Table,
+  cost: Table,
+  weight: readonly number[],
+): number[] {
+  const last = Math.max(0, ...cost.map((row) => row.length));
+  const rows = cost.map((costs, label) => available(quality[label] ?? [], costs, weight[label] ?? 0));
+  const total = rows.reduce((sum, row) => sum + row.weight, 0);
+  const found = [...levels];
+  if (total === 0) return found;
+  const uniform = Array.from({ length: last }, (_, k) =>
+    totals(
+      rows,
+      rows.map(() => k),
+    ),
+  );
+  let { bytes, value } = totals(rows, found);
+  if (reached(bytes, value, uniform, total)) return found;
+  const upgrades = rows.flatMap((row, label) => hull(row, found[label] ?? 0, label));
+  // the sort is stable: of equal slopes the lower label comes first, and a label's own stay in order
+  for (const { label, to } of upgrades.sort((a, b) => (a.slope === b.slope ? 0 : b.slope - a.slope))) {
+    const [row, before] = [rows[label] as Row, found[label] as number];
+    bytes += at(row.cost, to) - at(row.cost, before);
+    value += at(row.value, to) - at(row.value, before);
+    found[label] = to;
+    if (reached(bytes, value, uniform, total)) break;
+  }
+  return found;
+}
+
+interface Row {
+  readonly cost: readonly number[]; // of the available levels
+  readonly value: readonly number[]; // weight x quality
+  readonly weight: number; // 0 where a quality is unknown
+}
+
+function available(quality: readonly number[], costs: readonly number[], weight: number): Row {
+  const cost = costs.filter((c) => c < Infinity);
+  const known = cost.every((_, k) => Number.isFinite(quality[k]));
+  const counts = known ? weight : 0;
+  return { cost, value: cost.map((_, k) => (counts > 0 ? counts * at(quality, k) : 0)), weight: counts };
+}
+
+/** Cost and value of a composition; a level above the last one of a label counts as that. */
+function totals(rows: readonly Row[], levels: readonly number[]): { bytes: number; value: number } {
+  let [bytes, value] = [0, 0];
+  rows.forEach((row, label) => {
+    const level = Math.min(levels[label] ?? 0, row.cost.length - 1);
+    bytes += at(row.cost, level);
+    value += at(row.value, level);
+  });
+  return { bytes, value };
+}
+
+/** Whether a composition is no worse than the uniform curve at its cost. */
+function reached(
+  bytes: number,
+  value: number,
+  uniform: readonly { bytes: number; value: number }[],
+  total: number,
+): boolean {
+  const above = uniform.findIndex((point) => bytes <= point.bytes);
+  const to = uniform[above < 0 ? uniform.length - 1 : above] as { bytes: number; value: number };
+  const from = above > 0 ? uniform[above - 1] : undefined;
+  const curve = from
+    ? from.value + ((bytes - from.bytes) / (to.bytes - from.bytes)) * (to.value - from.value)
+    : to.value;
+  return value / total >= curve / total - TOLERANCE;
+}
+
+/** The segments of the upper concave hull of value over cost, from a level on. */
+function hull({ cost, value }: Row, from: number, label: number): Upgrade[] {
+  const found: Upgrade[] = [];
+  for (let level = from; level >= 0; ) {
+    let best: Upgrade & { more: number; gain: number } = { label, to: -1, slope: 0, more: 0, gain: 0 };
+    for (let to = level + 1; to < cost.length; to++) {
+      const [more, gain] = [at(cost, to) - at(cost, level), at(value, to) - at(value, level)];
+      if (!(gain > 0)) continue;
+      const slope = more > 0 ? gain / more : Infinity;
+      const better = more < best.more || (more === best.more && gain > best.gain);
+      if (slope > best.slope || (slope === best.slope && better)) best = { label, to, slope, more, gain };
+    }
+    if (best.to >= 0) found.push(best);
+    level = best.to;
+  }
+  return found;
+}
+
+const at = (values: readonly number[], i: number): number => values[i] as number;
