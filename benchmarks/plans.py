@@ -6,6 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 from sagesplat.adapt.allocate import along, best_within, cheapest
+from sagesplat.adapt.fill import fill
 
 SIZES = ((5, 5), (12, 16), (30, 16), (128, 16))  # labels, levels
 TARGET = 0.8
@@ -34,10 +35,14 @@ def measure(positions: int, labels: int, levels: int) -> dict[str, float]:
     middle = time.perf_counter()
     by_budget = along(quality, cost, budget=float(budgets[len(budgets) // 2]), weight=weight)
     end = time.perf_counter()
+    rising = np.maximum.accumulate(quality[0], 1)
+    cheap = cheapest(rising, cost, TARGET).levels
+    fill(cheap, rising, cost, weight)
     return {
         "labels": labels,
         "levels": levels,
         "target_ms": _ms(lambda: cheapest(quality[0], cost, TARGET)),
+        "fill_ms": _ms(lambda: fill(cheap, rising, cost, weight)),
         "budget_ms": float(np.median(times)),
         "budget_ms_most": max(times),
         "proven": float(np.mean([plan.optimal for plan in plans])),

@@ -8,14 +8,14 @@ from conftest import orbit
 
 from sagesplat.adapt.allocate import best_within
 from sagesplat.adapt.bound_plans import Costs, Quality, plan_for_view, plan_within, pooled, quality_at
-from sagesplat.adapt.viewpoint import NO_CALIBRATION, Calibration, ViewModel, constant_curve
+from sagesplat.adapt.viewpoint import NO_CALIBRATION, Calibration, QualityKind, ViewModel, constant_curve
 from sagesplat.core.errors import RunError
 
 BYTES = np.array([[10, 20, 60], [10, 30, 90], [5, 6, 7]])
 COSTS = Costs((3, 7, 9), BYTES * 2, BYTES, BYTES * 4)
 
 
-def quality(mean, bound=None, kind="fidelity", calibrated=(True, True, True)) -> Quality:
+def quality(mean, bound=None, kind: QualityKind = "fidelity", calibrated=(True, True, True)) -> Quality:
     """One view."""
     mean = np.array([mean], float)
     bound = mean - 0.05 if bound is None else np.array([bound], float)
@@ -70,6 +70,16 @@ def test_fidelity_is_filled_with_pixels_and_ssim_is_not():
     assert plan_for_view(quality(MEAN, bound, "ssim"), COSTS, 0.6, 0, pixels).levels == {3: 3, 7: 1, 9: 1}
 
 
+def test_what_nobody_sees_costs_little():
+    """A category that is not in the picture has no bound there: it does not get its highest level."""
+    bound, pixels = [NAN, MEAN[1], NAN], np.array([0.0, 900.0, 5.0])
+    plan = plan_for_view(quality(MEAN, bound, "ssim"), COSTS, 0.4, 0, pixels)
+    unseen, seen, lost = plan.choices
+    assert (unseen.level, unseen.status, unseen.calibrated, unseen.predicted) == (2, "ok", None, 0.4)
+    assert (seen.level, seen.status, seen.calibrated) == (1, "ok", True)
+    assert (lost.level, lost.status, lost.calibrated) == (3, "no promise", None)
+
+
 @pytest.mark.parametrize(("kind", "name"), [("fidelity", "target fidelity"), ("ssim", "target SSIM")])
 @pytest.mark.parametrize("target", [0.0, -1.0, 1.5, math.nan])
 def test_impossible_targets_are_one_line(kind, name, target):
@@ -102,7 +112,7 @@ def test_within_a_budget():
     pixels = np.array([100.0, 900.0, 10.0])
     plan = plan_within(np.array(MEAN), COSTS, 60, "bytes", pixels, "fidelity")
     assert [level - 1 for level in plan.levels.values()] == best_within(
-        MEAN, BYTES, pixels, 60
+        np.array(MEAN), BYTES, pixels, 60
     ).levels.tolist()
     assert plan.transfer_bytes is not None
     assert plan.transfer_bytes <= 60

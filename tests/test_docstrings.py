@@ -12,15 +12,16 @@ import sagesplat
 
 # modules whose examples run here; those that need a capture or a run are marked +SKIP
 MODULES = (
-    "adapt.allocate", "adapt.observe", "adapt.photo_models", "adapt.plan", "adapt.viewpoint",
+    "adapt.allocate", "adapt.fill", "adapt.observe", "adapt.photo_models", "adapt.plan", "adapt.viewpoint",
     "formats.levels", "formats.ply", "formats.spz", "metrics.image", "raster", "scene", "segment.masks",
     "stages.api", "train.trainer",
 )  # fmt: skip
 CALLED_BY_MANY = (
-    "adapt.allocate:best_within", "adapt.allocate:cheapest", "adapt.bound_plans:plan_for_scene",
+    "adapt.allocate:best_within", "adapt.allocate:cheapest", "adapt.scene_plans:plan_for_scene",
     "adapt.bound_plans:plan_for_view", "adapt.bound_plans:plan_within", "adapt.bound_plans:quality_at",
-    "adapt.eq3:fit_models", "adapt.evaluate:evaluate", "adapt.observe:observe", "adapt.plan:plan_scene",
-    "adapt.plan:plan_view", "adapt.photo_models:fit_photo_models", "adapt.viewpoint:ViewModel.predict",
+    "adapt.eq3:fit_models", "adapt.evaluate:evaluate", "adapt.fill:fill", "adapt.observe:observe",
+    "adapt.plan:plan_scene", "adapt.plan:plan_view", "adapt.photo_models:fit_photo_models",
+    "adapt.viewpoint:ViewModel.predict",
     "demo.capture:cached_capture", "formats.levels:read_level", "formats.ply:read_ply",
     "formats.ply:write_ply", "formats.spz:decode_spz", "formats.spz:encode_spz",
     "metrics.image:photometric_loss", "metrics.image:ssim_map", "raster:rasterize", "run.stage:run_stage",

@@ -70,9 +70,9 @@ def test_a_run_from_python_shows_its_stages_and_plans(capture, finished):
 def test_a_plan_for_a_viewer_is_written_and_grows_with_the_target(finished, tmp_path):
     folder, _ = finished
     counts = []
-    for target in (0.2, 0.4):
+    for target in (0.5, 0.95):
         ply = tmp_path / f"{target}.ply"
-        text = run("02", folder, "view_001.png", ply, "--target-ssim", target, "--back", 1).stdout
+        text = run("02", folder, "view_001.png", ply, "--target-fidelity", target, "--back", 0.01).stdout
         counts.append(int(text.splitlines()[-1].split()[1].replace(",", "")))
         assert len(read_ply(ply)) == counts[-1]
     assert 0 < counts[0] < counts[1]

@@ -14,6 +14,7 @@ from sagesplat.adapt.eq3 import fit_models
 from sagesplat.adapt.evaluate import QUALITIES, UNIFORM, Evaluation, read_evaluation
 from sagesplat.adapt.observe import TOTAL, Observations, read_observations
 from sagesplat.adapt.plan import Plan, Reached, plan_scene
+from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.io.columns import cell_text
 from sagesplat.output import figures
 from sagesplat.output.by_category import merged
@@ -188,7 +189,8 @@ def led_by_fidelity(panels: int = 0) -> ReportData:
     sizes = {key: 30 * count for key, count in data.counts.items()}
     reached = Reached(0.97, 0.94, 0.99, 240)
     plans = []
-    for kind, target in (("fidelity", 0.9), ("fidelity", 0.95), ("ssim", 0.6)):
+    asked: list[tuple[QualityKind, float]] = [("fidelity", 0.9), ("fidelity", 0.95), ("ssim", 0.6)]
+    for kind, target in asked:
         choices = [
             dataclasses.replace(
                 c, transfer_bytes=sizes[c.label_id, c.level], predicted=target + 0.01, status="ok",
@@ -256,7 +258,7 @@ def test_plans_for_fidelity_are_compared_with_equal_levels_at_the_same_views():
     uniform = data.evaluation.uniform("fidelity")
     assert uniform == pytest.approx({1000: 0.8125, 2000: 0.8225})
     figure = figures.quality_over_size(uniform, data.sizes or {}, data.plans, data.evaluation, "fidelity")
-    equal, composed = (line.get_xydata() for line in figure.axes[0].lines)
+    equal, composed = (np.asarray(line.get_xydata()) for line in figure.axes[0].lines)
     sizes = [sum(n for (_, i), n in (data.sizes or {}).items() if i == level) / 1e6 for level in uniform]
     assert equal == pytest.approx(np.column_stack([sizes, list(uniform.values())]))
     assert composed[:, 1] == pytest.approx([0.955, 0.955])  # the plan for SSIM is not in it

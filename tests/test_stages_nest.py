@@ -291,6 +291,7 @@ STAGES = [
     "base",
     "nest",
     "observe",
+    "sample",
     "fit",
     "plan",
     "compose",

@@ -18,6 +18,7 @@ from sagesplat.core.config import (
     MasksConfig,
     NestConfig,
     PlanConfig,
+    SampleConfig,
     SceneConfig,
     TrainConfig,
 )
@@ -34,6 +35,7 @@ from sagesplat.stages.label import lift_labels, make_masks
 from sagesplat.stages.nest import nest_levels
 from sagesplat.stages.observe import observe_levels
 from sagesplat.stages.plan import make_plan
+from sagesplat.stages.sample import sample_levels
 from sagesplat.stages.scene import open_scene
 from sagesplat.stages.train import train_levels
 from sagesplat.studies.compare.report import (
@@ -175,6 +177,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Job:
     train_levels(job, TrainConfig(max_steps=60, level_every=20, refine_every=5), 0)
     nest_levels(job, NestConfig(steps=20, levels=4, base_steps=20), 0)
     observe_levels(job, FitConfig())
+    sample_levels(job, SampleConfig(), FitConfig())
     fit_ladder(job, FitConfig())
     make_plan(job, PlanConfig(target_ssim=0.4))
     return job

@@ -73,8 +73,9 @@ def quality_at(
             known = np.array(promises[label].levels) - 1
             mean[:, i, known], bound[:, i, known] = predicted.mean, predicted.bound
             calibrated[i] = promises[label].status == "calibrated"
-    kind = kind or next((model.quality for model in promises.values()), "ssim")
-    return Quality(kind, mean, bound, far, calibrated)
+    for model in promises.values():
+        kind = kind or model.quality
+    return Quality(kind or "ssim", mean, bound, far, calibrated)
 
 
 def plan_for_view(
@@ -98,20 +99,25 @@ def plan_for_view(
 
     Returns:
         One choice per category; "infeasible" where no level reaches the target, "no promise" where the view
-        is too far from all that was sampled: then the highest level.
+        is too far from all that was sampled: then the highest level. A category without pixels and without a
+        bound is chosen by what is expected of it, as nobody sees it.
 
     Raises:
         RunError: For an impossible target.
     """
     check_target(target, quality.kind)
     bound, mean = quality.bound[view], quality.mean[view]
+    known, promised = ~np.isnan(mean).all(1), ~np.isnan(bound).all(1)
+    if pixels is not None:
+        unseen = known & ~promised & (pixels == 0)
+        bound = np.where(unseen[:, None], mean, bound)
     found = cheapest(bound, costs.transfer_bytes, target)
     levels = found.levels
     if quality.kind == "fidelity" and pixels is not None:
         levels = fill(levels, mean, costs.transfer_bytes, pixels)
-    known, promised = ~np.isnan(mean).all(1), ~np.isnan(bound).all(1)
+    lost = np.isnan(bound).all(1)
     statuses = np.select(
-        [~known, ~promised, found.missed], ["no model", "no promise", "infeasible"], "ok"
+        [~known, lost, found.missed], ["no model", "no promise", "infeasible"], "ok"
     ).tolist()
     calibrated = [bool(c) if p else None for c, p in zip(quality.calibrated, promised, strict=True)]
     choices = make_choices(costs, levels, bound, quality.distance[view], statuses, calibrated)

@@ -378,7 +378,8 @@ def _from_json(entry: dict[str, Any]) -> Plan:
 
 
 def _reached(entry: dict[str, Any]) -> Reached:
-    found = Reached(*(float(entry[name]) for name in ("share", "low", "high")), int(entry["num_views"]))
+    share, low, high = (float(entry[name]) for name in ("share", "low", "high"))
+    found = Reached(share, low, high, int(entry["num_views"]))
     if not 0 <= found.low <= found.share <= found.high <= 1 or found.num_views < 0:
         raise ValueError("an impossible share of views")
     return found

@@ -314,7 +314,7 @@ class PlanConfig:
     @property
     def all_targets(self) -> list[tuple[Literal["fidelity", "ssim"], float]]:
         """Every (quality, target) to plan for: those of the quality that leads, then SSIM beside fidelity."""
-        found = [(self.quality, target) for target in self.targets]
+        found: list[tuple[Literal["fidelity", "ssim"], float]] = [(self.quality, t) for t in self.targets]
         if self.quality == "fidelity" and self.target_ssim is not None:
             found.append(("ssim", round(self.target_ssim, 6)))
         return found
