@@ -372,7 +372,7 @@ def test_a_run_in_blocks(finished: Path, capture: Path) -> None:
 def test_a_run_in_blocks_is_done_once(finished: Path, capture: Path) -> None:
     events = run_in_blocks(capture, finished)
     assert not [e for e in events if isinstance(e, StageDone)]
-    assert sum(isinstance(e, StageSkipped) for e in events) == 15
+    assert sum(isinstance(e, StageSkipped) for e in events) == 16
 
 
 def test_blocks_are_the_same_in_any_order_and_process(finished: Path, capture: Path, tmp_path: Path) -> None:
