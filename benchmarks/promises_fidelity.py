@@ -5,12 +5,14 @@ from typing import Any
 
 import numpy as np
 
+from sagesplat.adapt.bound_plans import quality_at
 from sagesplat.adapt.fidelity import distances_at, measure_compositions
 from sagesplat.adapt.fidelity_models import plan_nominal
+from sagesplat.adapt.fill import fill
 from sagesplat.adapt.viewpoints import Rule, capture_cameras, draw
 from sagesplat.run.job import Job
 from sagesplat.stages.methods import NestedLevels
-from sagesplat.stages.results import fidelity_of, viewpoints_of
+from sagesplat.stages.results import fidelity_of, plans_of, viewpoints_of
 
 TARGETS = (0.8, 0.9, 0.95, 0.98)
 MORE_TARGETS = (0.5, 0.6, 0.7, 0.75, 0.85, 0.97, 0.99)  # of the curve of plans over bytes
@@ -20,39 +22,74 @@ _DRAWS = 1000  # bootstrap
 def measure(
     job: Job, views: int = 300, seed: int = 90_000, progress: Callable[[int, int], None] | None = None
 ) -> dict[str, Any]:
-    """Plan each target at fresh viewpoints, compose, measure; also equal levels of all categories.
+    """Plan each target at fresh viewpoints, compose, measure; also scene plans, and equal levels.
 
-    The viewpoints are drawn by the run's own rule with a seed that nothing was made with.
+    The viewpoints are drawn by the run's own rule with a seed that nothing was made with. Promises are scored
+    on the cheapest levels that they allow; `curve` is of plans as they are made, filled (`adapt.fill`).
     """
     models, rule = fidelity_of(job), viewpoints_of(job).rule
     fresh = Rule(rule.seed + seed, rule.neighbours, rule.shift, rule.turn)
     cameras = draw(job.scene, capture_cameras(job.scene), fresh, {"test": views}).cameras
     costs = NestedLevels(job).costs
-    labels, K = list(costs.labels), len(job.ladder.levels)
+    labels, K, names = list(costs.labels), len(job.ladder.levels), job.names()
     distance = distances_at(job.scene, job.point_labels, cameras, labels, job.fit_config.distance)
     targets = np.array(sorted((*TARGETS, *MORE_TARGETS)))
+    J = len(targets)
     planned = plan_nominal(models, labels, K, distance, cameras, targets)
-    uniform = np.broadcast_to(np.arange(1, K + 1)[None, :, None], (views, K, len(labels)))
-    found, pixels = measure_compositions(
-        job.ladder, cameras, np.concatenate([planned, uniform], 1),
-        backend=job.backend, antialiased=job.antialiased, progress=progress,
-    )  # fmt: skip
+    equal = np.broadcast_to(np.arange(1, K + 1)[None, :, None], (views, K, len(labels)))
+    whole_scene = [plan for plan in plans_of(job) if plan.quality == "fidelity"]
+    scenes = np.array([[plan.levels[label] for label in labels] for plan in whole_scene])
+    scenes = np.broadcast_to(scenes.reshape(1, -1, len(labels)), (views, len(whole_scene), len(labels)))
+
+    def measured(levels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return measure_compositions(
+            job.ladder, cameras, levels, backend=job.backend, antialiased=job.antialiased, progress=progress
+        )
+
+    found, pixels = measured(np.concatenate([planned, equal, scenes], 1))
     image = np.array([camera.width * camera.height for camera in cameras])
     shown = (pixels > 0) & (pixels >= job.fit_config.min_share * image[:, None])
+    far = dict(zip(labels, distance.T.astype(np.float64), strict=True))
+    mean = quality_at(costs, models, far, cameras, "fidelity").mean
+    filled = np.array(
+        [
+            [
+                fill(levels - 1, mean[v], costs.transfer_bytes, pixels[v].astype(float)) + 1
+                for levels in planned[v]
+            ]
+            for v in range(views)
+        ]
+    )
+    by_plan, _ = measured(filled)
     promised = _promised(models, labels, distance, cameras)
-    names = job.names()
-    bytes_of = costs.transfer_bytes[np.arange(len(labels)), planned - 1].sum(2)
+    counted = [names[label] for label in labels]
     return {
         "views": views,
         "categories": {names[label]: models[label].status for label in labels if label in models},
         "targets": {
             f"{target:g}": _coverage(
-                target, planned[:, j] - 1, found[:, j, :-1], found[:, len(targets) :, :-1],
-                shown & promised, [names[label] for label in labels],
+                target, planned[:, j] - 1, found[:, j, :-1], found[:, J : J + K, :-1],
+                shown & promised, counted,
             )
             for j, target in enumerate(targets)
         },
-        "curve": _curve(found, shown, bytes_of, targets, costs.transfer_bytes.sum(0)),
+        "scene_plans": {
+            f"{plan.target:g}": _coverage(
+                plan.target, scenes[:, j] - 1, found[:, J + K + j, :-1], found[:, J : J + K, :-1],
+                shown & [label in models for label in labels], counted,
+            )
+            for j, plan in enumerate(whole_scene)
+        },
+        "curve": _curve(
+            np.concatenate([by_plan, found[:, J : J + K]], 1), shown,
+            costs.transfer_bytes[np.arange(len(labels)), filled - 1].sum(2), targets,
+            costs.transfer_bytes.sum(0),
+        ),
+        "scene_curve": _curve(
+            np.concatenate([found[:, J + K :], found[:, J : J + K]], 1), shown,
+            costs.transfer_bytes[np.arange(len(labels)), scenes - 1].sum(2),
+            np.array([plan.target for plan in whole_scene]), costs.transfer_bytes.sum(0),
+        ),
     }  # fmt: skip
 
 
@@ -133,11 +170,18 @@ def lines(name: str, result: dict[str, Any]) -> list[str]:
                 f"excess {row['excess']:.4f} (perfect {row['perfect']:.4f}, beyond the step "
                 f"{row['beyond_step']:.4f}); worst {worst[0]} {worst[1][0]} of {worst[1][1]}"
             )
-    curve = result["curve"]
-    for i, target in enumerate(curve["targets"]):
+    for target, row in result["scene_plans"].items():
+        worst = min(row["by_category"].items(), key=lambda item: item[1][0] / item[1][1])
         out.append(
-            f"  {target:>5}: {curve['bytes'][i] / 1e6:.3f} MB, whole image {curve['whole'][i]:.3f} "
-            f"(equal levels {curve['equal_levels_whole'][i]:.3f}), lowest category {curve['lowest'][i]:.3f} "
-            f"({curve['equal_levels_lowest'][i]:.3f})"
+            f"  scene plan {target}: kept {row['kept']:.3f}; worst {worst[0]} {worst[1][0]} of {worst[1][1]}"
         )
+    for what, curve in (("viewpoints", result["curve"]), ("scene", result["scene_curve"])):
+        for i, target in enumerate(curve["targets"]):
+            whole, equal, low, equal_low = (
+                curve[name][i] for name in ("whole", "equal_levels_whole", "lowest", "equal_levels_lowest")
+            )
+            out.append(
+                f"  {what}, {target}: {curve['bytes'][i] / 1e6:.3f} MB, whole image {whole:.3f} (equal levels "
+                f"{equal:.3f}), lowest category {low:.3f} ({equal_low:.3f})"
+            )
     return out
