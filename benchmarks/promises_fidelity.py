@@ -181,7 +181,7 @@ def lines(name: str, result: dict[str, Any]) -> list[str]:
                 curve[name][i] for name in ("whole", "equal_levels_whole", "lowest", "equal_levels_lowest")
             )
             out.append(
-                f"  {what}, {target}: {curve['bytes'][i] / 1e6:.3f} MB, whole image {whole:.3f} (equal levels "
-                f"{equal:.3f}), lowest category {low:.3f} ({equal_low:.3f})"
+                f"  {what}, {target}: {curve['bytes'][i] / 1e6:.3f} MB, whole image {whole:.3f} "
+                f"(equal levels {equal:.3f}), lowest category {low:.3f} ({equal_low:.3f})"
             )
     return out
