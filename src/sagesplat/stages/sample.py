@@ -89,7 +89,8 @@ def _counts(job: Job, config: SampleConfig) -> dict[str, int]:
             f"{config.views} and {config.calibration_views} viewpoints are impossible; give 0 or more"
         )
     train, nest = settings_of(job.run, "train"), settings_of(job.run, "nest")
-    renders = _RENDERS * (train["max_steps"] + nest["steps"] + nest["base_steps"])
+    base_steps = nest["base_steps"] if nest["base_share"] else 0
+    renders = _RENDERS * (train["max_steps"] + nest["steps"] + base_steps)
     compositions = 2 * (len(NOMINAL) + _LABEL_IMAGE)  # measured twice, for the bias three times
     cost = {
         "fit": len(job.ladder.levels) + _LABEL_IMAGE,
