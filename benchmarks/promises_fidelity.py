@@ -5,10 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from sagesplat.adapt.bound_plans import quality_at
+from sagesplat.adapt.bound_plans import Costs, Quality, plan_for_view, quality_at
 from sagesplat.adapt.fidelity import distances_at, measure_compositions
 from sagesplat.adapt.fidelity_models import plan_nominal
-from sagesplat.adapt.fill import fill
 from sagesplat.adapt.viewpoints import Rule, capture_cameras, draw
 from sagesplat.run.job import Job
 from sagesplat.stages.methods import NestedLevels
@@ -25,7 +24,7 @@ def measure(
     """Plan each target at fresh viewpoints, compose, measure; also scene plans, and equal levels.
 
     The viewpoints are drawn by the run's own rule with a seed that nothing was made with. Promises are scored
-    on the cheapest levels that they allow; `curve` is of plans as they are made, filled (`adapt.fill`).
+    on the cheapest levels that they allow; `curve` is of plans as they are made (`plan_for_view`).
     """
     models, rule = fidelity_of(job), viewpoints_of(job).rule
     fresh = Rule(rule.seed + seed, rule.neighbours, rule.shift, rule.turn)
@@ -50,15 +49,9 @@ def measure(
     image = np.array([camera.width * camera.height for camera in cameras])
     shown = (pixels > 0) & (pixels >= job.fit_config.min_share * image[:, None])
     far = dict(zip(labels, distance.T.astype(np.float64), strict=True))
-    mean = quality_at(costs, models, far, cameras, "fidelity").mean
+    quality = quality_at(costs, models, far, cameras, "fidelity")
     filled = np.array(
-        [
-            [
-                fill(levels - 1, mean[v], costs.transfer_bytes, pixels[v].astype(float)) + 1
-                for levels in planned[v]
-            ]
-            for v in range(views)
-        ]
+        [[made(quality, costs, t, v, pixels[v], labels) for t in targets] for v in range(views)]
     )
     by_plan, _ = measured(filled)
     promised = _promised(models, labels, distance, cameras)
@@ -91,6 +84,14 @@ def measure(
             np.array([plan.target for plan in whole_scene]), costs.transfer_bytes.sum(0),
         ),
     }  # fmt: skip
+
+
+def made(
+    quality: Quality, costs: Costs, target: float, view: int, pixels: np.ndarray, labels: Sequence[int]
+) -> list[int]:
+    """The levels of the plan of a viewpoint."""
+    plan = plan_for_view(quality, costs, target, view, pixels.astype(np.float64))
+    return [plan.levels[label] for label in labels]
 
 
 def _promised(models, labels, distance, cameras):  # type: ignore[no-untyped-def]
@@ -161,17 +162,20 @@ def _curve(
 def lines(name: str, result: dict[str, Any]) -> list[str]:
     """The result for people."""
     out = [f"{name}: fidelity at {result['views']} fresh viewpoints"]
+    few = [name for name, status in result["categories"].items() if status != "calibrated"]
+    if few:
+        out.append(f"  uncalibrated: {', '.join(few)}")
     for target, row in result["targets"].items():
         if float(target) in TARGETS:
             low, high = row["interval"]
-            worst = min(row["by_category"].items(), key=lambda item: item[1][0] / item[1][1])
+            worst = _worst(row, result["categories"])
             out.append(
                 f"  {target:>5}: kept {row['kept']:.3f} [{low:.3f}, {high:.3f}] of {row['decisions']}, "
                 f"excess {row['excess']:.4f} (perfect {row['perfect']:.4f}, beyond the step "
                 f"{row['beyond_step']:.4f}); worst {worst[0]} {worst[1][0]} of {worst[1][1]}"
             )
     for target, row in result["scene_plans"].items():
-        worst = min(row["by_category"].items(), key=lambda item: item[1][0] / item[1][1])
+        worst = _worst(row, result["categories"])
         out.append(
             f"  scene plan {target}: kept {row['kept']:.3f}; worst {worst[0]} {worst[1][0]} of {worst[1][1]}"
         )
@@ -185,3 +189,9 @@ def lines(name: str, result: dict[str, Any]) -> list[str]:
                 f"(equal levels {equal:.3f}), lowest category {low:.3f} ({equal_low:.3f})"
             )
     return out
+
+
+def _worst(row: dict[str, Any], status: dict[str, str]) -> tuple[str, list[int]]:
+    """The calibrated category with the lowest share kept: its name, decisions kept and made."""
+    of = {name: n for name, n in row["by_category"].items() if status.get(name) == "calibrated"}
+    return min((of or row["by_category"]).items(), key=lambda item: item[1][0] / item[1][1])

@@ -28,6 +28,7 @@ from sagesplat.stages.fit import fit_ladder
 from sagesplat.stages.label import make_masks
 from sagesplat.stages.observe import observe_levels
 from sagesplat.stages.pipeline import run_all
+from sagesplat.stages.sample import sample_levels
 from sagesplat.stages.scene import open_scene
 from sagesplat.studies.compare import report as compare_report
 from sagesplat.studies.compare.run import compare
@@ -168,12 +169,15 @@ def again(finished: Path, to: Path, executor, *gone: str) -> tuple[Job, list[Eve
 
 def test_observations_and_fits_are_the_same_bit_for_bit(finished: Path, tmp_path: Path) -> None:
     executor = Shuffled()
-    job, events = again(finished, tmp_path / "run", executor, "observe", "fit")
+    job, events = again(finished, tmp_path / "run", executor, "observe", "sample", "fit")
     observe_levels(job, CONFIG.fit)
+    sample_levels(job, CONFIG.sample, CONFIG.fit)
     fit_ladder(job, CONFIG.fit)
-    assert executor.names == ["observe"] * 6 + ["fit"] * 6 + ["fit"] * len(job.scene.calibration_ids)
+    trials = 5 * 6  # compositions at drawn viewpoints
+    assert executor.names[:12] == ["observe"] * 6 + ["sample"] * 6
+    assert executor.names[12:] == ["fit"] * (6 + len(job.scene.calibration_ids) + trials)
     before = RunDir(finished)
-    for name in ("observations", "models", "promises"):
+    for name in ("observations", "models", "promises", "viewpoints", "sampled", "fidelity"):
         assert getattr(job.run, name).read_bytes() == getattr(before, name).read_bytes(), name
     bar = [event for event in events if isinstance(event, Progress) and event.name == "observe"]
     views, levels = len(job.scene.views), 3

@@ -264,7 +264,7 @@ def check_variants(
         ("fit", "nested/observations.csv", "\n3,", "\n77,", "category 77 is not this run's"),
         ("plan", "nested/observations.csv", "\n3,1,", "\n3,9,", "level 9 is not this run's"),
         ("bundle", "nested/observations.csv", "\n3,1,0,", "\n3,1,99,", "view 99 is not this run's"),
-        ("report", "nested/evaluation.csv", "\n0.4,0,", "\n0.4,-9,", "view -9 is not this run's"),
+        ("report", "nested/evaluation.csv", "\n1,0.4,0,", "\n1,0.4,-9,", "view -9 is not this run's"),
         ("compose", "nested/plan.json", '"label_id": 3', '"label_id": 4', "of category 4 is not this run's"),
         ("plan", "nested/promises.json", '"label_id": 3', '"label_id": 4', "category 4 is not this run's"),
         ("plan", "nested/increments/index.json", '"level": 4', '"level": 5', "level 5 is not this run's"),

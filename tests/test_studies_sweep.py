@@ -307,7 +307,7 @@ def test_without_variants_a_cell_is_a_scene_and_a_seed(tmp_path: Path) -> None:
     sweep = read_sweep(write(tmp_path, text))
     assert [cell.name for cell in sweep] == ["plot-seed0", "plot-seed1"]
     assert [cell.config for cell in sweep] == [
-        RunConfig(plan=PlanConfig(other_targets=()), seed=seed) for seed in (0, 1)
+        RunConfig(plan=PlanConfig(target_ssim=0.8, other_targets=()), seed=seed) for seed in (0, 1)
     ]
 
 

@@ -120,7 +120,7 @@ def plan_for_view(
         [~known, lost, found.missed], ["no model", "no promise", "infeasible"], "ok"
     ).tolist()
     calibrated = [bool(c) if p else None for c, p in zip(quality.calibrated, promised, strict=True)]
-    choices = make_choices(costs, levels, bound, quality.distance[view], statuses, calibrated)
+    choices = make_choices(costs, levels, quality.bound[view], quality.distance[view], statuses, calibrated)
     return Plan(float(target), view, choices, quality=quality.kind)
 
 

@@ -28,7 +28,7 @@ from sagesplat.core.errors import DataError, RunError, short
 from sagesplat.core.typed import check_fields, types_of
 from sagesplat.io.files import read_json, write_json
 from sagesplat.scene.loading import MAX_SIDE
-from sagesplat.scene.nerfstudio import world_to_camera
+from sagesplat.scene.nerfstudio import LARGEST, world_to_camera
 from sagesplat.scene.scene import Camera, Scene
 
 SETS = ("fit", "bias", "calibration")  # what they are for; none of them is used for another
@@ -218,9 +218,9 @@ def read_cameras(path: Path, like: Camera) -> list[Camera]:
 
 
 def _camera(entry: dict[str, Any]) -> Camera:
-    w2c, K = (np.array(entry[name], np.float32) for name in ("w2c", "K"))
+    w2c, K = (np.array(entry[name], np.float64) for name in ("w2c", "K"))
     width, height = entry["width"], entry["height"]
-    if w2c.shape != (4, 4) or K.shape != (3, 3) or not (np.isfinite(w2c).all() and np.isfinite(K).all()):
+    if w2c.shape != (4, 4) or K.shape != (3, 3) or not all((np.abs(a) <= LARGEST).all() for a in (w2c, K)):
         raise ValueError("w2c has to be 4 x 4 and K 3 x 3 numbers")
     if np.abs(w2c[:3, :3] @ w2c[:3, :3].T - np.eye(3)).max() > 1e-3 or min(K[0, 0], K[1, 1]) <= 0:
         raise ValueError("w2c is no rotation, or K has no focal length")
@@ -228,4 +228,4 @@ def _camera(entry: dict[str, Any]) -> Camera:
     if not whole or width * height > _PIXELS:
         raise ValueError(f"size {width} x {height} is out of range")
     red, green, blue = (int(value) for value in entry["background"])
-    return Camera(w2c, K, width, height, (red, green, blue))
+    return Camera(w2c.astype(np.float32), K.astype(np.float32), width, height, (red, green, blue))
