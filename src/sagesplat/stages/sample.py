@@ -37,7 +37,7 @@ USUAL = {"fit": VIEWS[1], "bias": 60, "calibration": 180}  # as many as half of 
 MOST = {"fit": VIEWS[-1], "bias": 60, "calibration": 300}  # after a long training up to these
 _RENDERS = 2.5  # a training step: a render takes about a fifth of it, so this is half of the training's time
 _LABEL_IMAGE = 4  # renders that a viewpoint's label image takes
-_FEWEST = {"fit": 20, "bias": 6, "calibration": 30}
+_FEWEST = {"fit": 20, "bias": 4, "calibration": 20}
 
 
 def sample_levels(job: Job, config: SampleConfig, fit: FitConfig) -> None:
