@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 from sagesplat.adapt.eq3 import Samples, SsimModel, fit_model, samples, write_models
 from sagesplat.adapt.observe import Observations
-from sagesplat.adapt.viewpoint import write_promises
 from sagesplat.core.config import FitConfig
 from sagesplat.core.errors import RunError
 from sagesplat.run.executor import split
@@ -13,7 +12,6 @@ from sagesplat.run.records import settings_of
 from sagesplat.run.remote import work_all
 from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
-from sagesplat.stages.fidelity import fit_drawn
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.shared import label_image_inputs, observed
 
@@ -39,23 +37,14 @@ def fit_ladder(job: Job, config: FitConfig) -> None:
         write_models(run.models, models)
         statuses = [m.status for m in models.values()]
         lines = [", ".join(f"{statuses.count(s)} {s}" for s in sorted(set(statuses)))]
-        lines += method.fit(table, config, models)
-        if run.ladder == "nested":
-            fidelity = fit_drawn(job, config)
-            write_promises(run.fidelity, fidelity)
-            statuses = [model.status for model in fidelity.values()]
-            lines.append("fidelity: " + ", ".join(f"{statuses.count(s)} {s}" for s in sorted(set(statuses))))
-        return lines
+        return lines + method.fit(table, config, models)
 
     settings = {name: getattr(config, name) for name in method.fit_settings}
     _check_observed(run, config)
     inputs = [run.scene, run.provenance("observe"), run.observations, *method.level_files]
     inputs += [run.labels, run.provenance("train"), *label_image_inputs(run)]
-    outputs = list(method.model_files)
-    if run.ladder == "nested":
-        inputs += [run.viewpoints, run.sampled]
-        outputs.append(run.fidelity)
-    run_stage(job, "fit", settings, inputs, outputs, make)
+    inputs += method.sample_files
+    run_stage(job, "fit", settings, inputs, method.model_files, make)
 
 
 def _check_observed(run: RunDir, config: FitConfig) -> None:

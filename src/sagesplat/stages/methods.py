@@ -23,7 +23,7 @@ from sagesplat.formats.increments import INDEX, totals
 from sagesplat.run.job import Job
 from sagesplat.scene.scene import Camera
 from sagesplat.segment.masks import UNLABELLED
-from sagesplat.stages.fidelity import compositions_at
+from sagesplat.stages.fidelity import compositions_at, fit_drawn
 from sagesplat.stages.results import (
     fidelity_of,
     increments_of,
@@ -43,6 +43,7 @@ class Method(Protocol):
     """Levels of a run, what predicts their SSIM, and what they cost. The levels themselves: `Job.ladder`."""
 
     level_files: Sequence[Path]  # what the levels are read from
+    sample_files: Sequence[Path] = ()  # what `sample` leaves
     model_files: Sequence[Path]  # what `fit` leaves
     files: Sequence[Path]  # what a plan, and all that is made from it, depends on
     fit_settings: tuple[str, ...]  # fields of FitConfig that the models depend on
@@ -162,8 +163,9 @@ class NestedLevels(Method):
         run = job.run
         self.job = job
         self.level_files = [run.prefixes, run.increments / INDEX]
-        self.model_files = [run.models, run.promises]
-        self.files = [*self.level_files, run.promises, run.fidelity, run.sampled, run.viewpoints]
+        self.sample_files = [run.viewpoints, run.sampled]
+        self.model_files = [run.models, run.promises, run.fidelity]
+        self.files = [*self.level_files, run.promises, run.fidelity, *self.sample_files]
 
     @cached_property
     def costs(self) -> Costs:
@@ -222,10 +224,16 @@ class NestedLevels(Method):
 
     def fit(self, table: Observations, config: FitConfig, curves: Curves) -> list[str]:
         """See `Method`."""
-        promises = fit_viewpoints(self.job, self.costs, table, config, curves)
-        write_promises(self.job.run.promises, promises)
-        statuses = [model.status for model in promises.values()]
-        return ["promises: " + ", ".join(f"{statuses.count(s)} {s}" for s in sorted(set(statuses)))]
+        run, lines = self.job.run, []
+        against_photos = fit_viewpoints(self.job, self.costs, table, config, curves)
+        for name, path, models in (
+            ("SSIM against photos", run.promises, against_photos),
+            ("fidelity", run.fidelity, fit_drawn(self.job, config)),
+        ):
+            write_promises(path, models)
+            statuses = [model.status for model in models.values()]
+            lines.append(f"{name}: " + ", ".join(f"{statuses.count(s)} {s}" for s in sorted(set(statuses))))
+        return lines
 
     def predicted(self, quality: QualityKind, label_id: int, level: int, row: int) -> float:
         """See `Method`."""
