@@ -173,7 +173,7 @@ def test_observations_and_fits_are_the_same_bit_for_bit(finished: Path, tmp_path
     observe_levels(job, CONFIG.fit)
     sample_levels(job, CONFIG.sample, CONFIG.fit)
     fit_ladder(job, CONFIG.fit)
-    trials = 5 * 6  # compositions at drawn viewpoints
+    trials = 3 * 4 + 2 * 6  # of compositions, at 4 viewpoints and at 20
     assert executor.names[:12] == ["observe"] * 6 + ["sample"] * 6
     assert executor.names[12:] == ["fit"] * (6 + len(job.scene.calibration_ids) + trials)
     before = RunDir(finished)
