@@ -20,7 +20,7 @@ from sagesplat.run.job import Job
 from sagesplat.run.records import FORMAT, checkpoint_key
 from sagesplat.run.run_dir import RunDir
 from sagesplat.stages.bundle import _antialiased, bundle, live_bundle
-from sagesplat.stages.results import plans_of
+from sagesplat.stages.plan import main_target
 from sagesplat.stages.scene import open_scene
 from sagesplat.train.checkpoint import write_checkpoint
 from sagesplat.train.state import initial_state
@@ -114,12 +114,7 @@ def test_promises_survive_the_bundle(run: Path, tmp_path: Path, viewer: Path, qu
         asked = kept.bound >= model.calibration.targets.min(initial=2)
         assert not (told.bound > kept.bound + 1e-9)[asked].any()
         np.testing.assert_array_equal(np.isnan(told.bound), np.isnan(kept.bound))
-    assert (manifest["target"]["quality"], manifest["target"]["value"]) == _asked(job)
-
-
-def _asked(job: Job) -> tuple[str, float]:
-    plan = plans_of(job)[0]
-    return plan.quality, plan.target
+    assert (manifest["target"]["quality"], manifest["target"]["value"]) == main_target(job.run)
 
 
 def test_the_same_run_gives_the_same_bytes(run: Path, tmp_path: Path, viewer: Path) -> None:

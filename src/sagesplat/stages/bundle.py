@@ -2,7 +2,6 @@
 
 import io
 import json
-import math
 import shutil
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -31,11 +30,11 @@ from sagesplat.scene import read_scene
 from sagesplat.segment.block_categories import split_name
 from sagesplat.segment.display_names import title_of
 from sagesplat.segment.masks import UNLABELLED
+from sagesplat.stages.plan import main_target
 from sagesplat.stages.results import (
     fidelity_of,
     increments_of,
     observations_of,
-    plans_of,
     promises_of,
     sampled_of,
     viewpoints_of,
@@ -327,9 +326,8 @@ def _with_quality(
 
 
 def _target(job: Job) -> tuple[QualityKind, float] | None:
-    """What the run's plan was made for; None without a plan, or for a budget alone."""
-    plans = plans_of(job) if job.run.plan.exists() else ()
-    return next(((plan.quality, plan.target) for plan in plans if not math.isnan(plan.target)), None)
+    """What the run's plan leads with; None without a plan."""
+    return main_target(job.run) if job.run.plan.exists() else None
 
 
 def _seen_in_photos(job: Job) -> dict[int, Seen]:
