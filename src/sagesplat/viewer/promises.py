@@ -229,10 +229,11 @@ def _thresholds(calibration: Calibration, moved: float) -> dict[str, list[int]]:
     targets, thresholds = calibration.targets, calibration.thresholds
     full = len(targets) > 0 and thresholds[-1] >= 1  # the full model keeps every target: that is not raised
     just_below = 1 - 1.5 * STEP - moved * MOVES
-    if full and just_below > max(thresholds[:-1], default=-1.0):
+    if full:  # targets that only the full model keeps must not lend theirs to means below
         target = np.interp(just_below, thresholds, targets)
-        targets, thresholds = np.insert(targets, -1, target), np.insert(thresholds, -1, just_below)
-    targets = np.floor(targets / STEP + 1e-6).astype(int)
+        low = thresholds < just_below
+        targets, thresholds = [*targets[low], target, 1.0], np.array([*thresholds[low], just_below, 1.0])
+    targets = np.floor(np.array(targets) / STEP + 1e-6).astype(int)
     raised = thresholds + moved * allowed(thresholds)
     raised = np.ceil(raised / STEP - 1e-6).astype(int)
     rising = np.maximum.accumulate(raised - np.arange(len(raised))) + np.arange(len(raised))
