@@ -4,10 +4,10 @@ Three sets of drawn viewpoints are used, each for one thing:
 
 1. "fit": a Gaussian process per category learns the expected fidelity of each level, all categories at the
    same level. Each viewpoint predicted without itself gives preliminary thresholds.
-2. "bias": compositions planned by the thresholds for a range of nominal targets are measured;
-   then the thresholds are mended (`recentred`). They then allow for neighbours at other levels. Where a
-   category misses a target at any level of its own, as its neighbours spill over it, all categories are held
-   at the nominal target that keeps it (`settled`).
+2. "bias": compositions planned by the thresholds for a range of nominal targets are measured, and the
+   thresholds mended (`recentred`), so that they allow for neighbours at other levels. Where a category misses
+   a target at any level of its own, as its neighbours spill over it, all categories are held at the nominal
+   target that keeps it (`settled`).
 3. "calibration": split conformal prediction says which nominal target to ask for, so that each target is kept
    at the confidence, category by category (`adapt.calibrate`). Neighbours' levels move with that, so it is
    done twice; the second time thresholds only rise.

@@ -222,7 +222,7 @@ class SampleConfig:
 
     views: int = 0
     """Viewpoints that the fidelity models are fitted to; 0: until their error stops shrinking, within about
-    half of the training's time."""
+    0.6 of the training's time."""
     calibration_views: int = 0
     """Viewpoints that calibrate the bounds; 0: 200, or fewer after a short training."""
     viewpoints: Path | None = None

@@ -33,9 +33,9 @@ from sagesplat.stages.methods import method_of
 
 VIEWS = (60, 120, 240)  # to fit to: the next number is tried while the last step made the error smaller by
 _SHRINKS = 0.1  # at least this share
-USUAL = {"fit": VIEWS[1], "bias": 60, "calibration": 180}  # as many as half of the training's time allows;
+USUAL = {"fit": VIEWS[1], "bias": 60, "calibration": 180}  # as many as the training's time allows;
 MOST = {"fit": VIEWS[-1], "bias": 60, "calibration": 300}  # after a long training up to these
-_RENDERS = 2.5  # a training step: a render takes about a fifth of it, so this is half of the training's time
+_RENDERS = 2.5  # a training step: a render takes about a quarter of it (demo: 0.6 of the training's time)
 _LABEL_IMAGE = 4  # renders that a viewpoint's label image takes
 _FEWEST = {"fit": 20, "bias": 4, "calibration": 20}
 
@@ -83,7 +83,7 @@ def _base_cameras(job: Job, config: SampleConfig) -> tuple[list[Camera], str]:
 
 
 def _counts(job: Job, config: SampleConfig) -> dict[str, int]:
-    """Viewpoints by set: what is asked, else what half of the training's time allows."""
+    """Viewpoints by set: what is asked, else what the training's time allows."""
     if config.views < 0 or config.calibration_views < 0:
         raise RunError(
             f"{config.views} and {config.calibration_views} viewpoints are impossible; give 0 or more"
