@@ -48,11 +48,11 @@ def sample_levels(job: Job, config: SampleConfig, fit: FitConfig) -> None:
     run = job.run
     if run.ladder != "nested":
         return
+    rule = _checked(config)  # before an earlier result is given up
 
     def make() -> list[str]:
         base, source = _base_cameras(job, config)
         counts = _counts(job, config)
-        rule = Rule(config.seed, config.neighbours, config.shift, config.turn)
         drawn = draw(job.scene, base, rule, counts, source)
         table, used = _until_it_stops_shrinking(job, drawn, fit, bool(config.views))
         rows = np.sort(np.concatenate([drawn.rows("fit")[:used], drawn.rows("bias", "calibration")]))
@@ -74,6 +74,17 @@ def sample_levels(job: Job, config: SampleConfig, fit: FitConfig) -> None:
     run_stage(job, "sample", settings, inputs, [run.viewpoints, run.sampled], make)
 
 
+def _checked(config: SampleConfig) -> Rule:
+    """The rule to draw by; RunError for settings that cannot be followed."""
+    if config.views < 0 or config.calibration_views < 0:
+        raise RunError(
+            f"{config.views} and {config.calibration_views} viewpoints are impossible; give 0 or more"
+        )
+    rule = Rule(config.seed, config.neighbours, config.shift, config.turn)
+    rule.check()
+    return rule
+
+
 def _base_cameras(job: Job, config: SampleConfig) -> tuple[list[Camera], str]:
     """The cameras to draw from, and where they are from."""
     own = capture_cameras(job.scene)
@@ -84,10 +95,6 @@ def _base_cameras(job: Job, config: SampleConfig) -> tuple[list[Camera], str]:
 
 def _counts(job: Job, config: SampleConfig) -> dict[str, int]:
     """Viewpoints by set: what is asked, else what the training's time allows."""
-    if config.views < 0 or config.calibration_views < 0:
-        raise RunError(
-            f"{config.views} and {config.calibration_views} viewpoints are impossible; give 0 or more"
-        )
     train, nest = settings_of(job.run, "train"), settings_of(job.run, "nest")
     base_steps = nest["base_steps"] if nest["base_share"] else 0
     renders = _RENDERS * (train["max_steps"] + nest["steps"] + base_steps)
