@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from sagesplat.adapt.bound_plans import Costs, Quality, plan_for_view, quality_at
-from sagesplat.adapt.fidelity import distances_at, measure_compositions
+from sagesplat.adapt.fidelity import distances_at, measure_compositions, shown_enough
 from sagesplat.adapt.fidelity_models import plan_nominal
 from sagesplat.adapt.viewpoints import Rule, capture_cameras, draw
 from sagesplat.run.job import Job
@@ -46,8 +46,7 @@ def measure(
         )
 
     found, pixels = measured(np.concatenate([planned, equal, scenes], 1))
-    image = np.array([camera.width * camera.height for camera in cameras])
-    shown = (pixels > 0) & (pixels >= job.fit_config.min_share * image[:, None])
+    shown = shown_enough(pixels, cameras, job.fit_config.min_share)
     far = dict(zip(labels, distance.T.astype(np.float64), strict=True))
     quality = quality_at(costs, models, far, cameras, "fidelity")
     filled = np.array(

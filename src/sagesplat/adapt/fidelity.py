@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Int, Int16, Int32
+from jaxtyping import Bool, Float32, Int, Int16, Int32
 
 from sagesplat.adapt.ladder import Ladder
 from sagesplat.adapt.observe import PERCENTILE, RenderedLabels, distances_in_views, render_rgb
@@ -36,6 +36,14 @@ class SampledFidelity:
     def shown(self, min_share: float) -> np.ndarray:
         """Whether a category covers at least a share of the image, bool [V, L]."""
         return (self.pixels > 0) & (self.pixels >= min_share * self.image[:, None])
+
+
+def shown_enough(
+    pixels: Int[np.ndarray, "V L"], cameras: Sequence[Camera], min_share: float
+) -> Bool[np.ndarray, "V L"]:
+    """Whether a category covers at least a share of the image at each viewpoint."""
+    image = np.array([camera.width * camera.height for camera in cameras])
+    return (pixels > 0) & (pixels >= min_share * image[:, None])
 
 
 def measure_levels(

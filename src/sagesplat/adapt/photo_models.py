@@ -137,7 +137,7 @@ def _fit(rows: Observations, scene: Scene, curves: tuple[SsimModel, ...]) -> Pho
         return None
     in_sight = np.log(distance[distance > 0])
     median_log_distance = float(np.median(in_sight)) if len(in_sight) else 0.0
-    extent = scene.extent if scene.extent > 0 else 1.0  # all cameras in one place
+    extent = scene.scale
     x = inputs_of(distance, position, direction, extent, median_log_distance)
     heldout = np.isin(views, scene.calibration_ids)
     means = means_at(curves, distance)

@@ -124,7 +124,7 @@ class _Sampler:
         points = scene.points.xyz
         self.points = KDTree(points) if len(points) else None
         self.free = self._free(self.position)
-        self.extent = scene.extent if scene.extent > 0 else 1.0  # all cameras in one place
+        self.extent = scene.scale
         apart = np.linalg.norm(self.position[:, None] - self.position, axis=2) / self.extent
         direction = self.rotation[:, :, 2]
         apart += np.linalg.norm(direction[:, None] - direction, axis=2)

@@ -85,6 +85,11 @@ class Scene:
         return float(1.1 * np.linalg.norm(centres - centres.mean(0), axis=1).max())
 
     @property
+    def scale(self) -> float:
+        """What positions are divided by: the extent, or 1 where all cameras are in one place."""
+        return self.extent if self.extent > 0 else 1.0
+
+    @property
     def test_ids(self) -> np.ndarray:
         """Rows of the test views, which training, fitting and calibration never use."""
         every = np.arange(len(self.views))

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from sagesplat.adapt.fidelity import distances_at, measure_compositions
+from sagesplat.adapt.fidelity import distances_at, measure_compositions, shown_enough
 from sagesplat.adapt.fidelity_models import (
     EVERYTHING_HELD,
     NOMINAL,
@@ -34,8 +34,7 @@ def fit_drawn(job: Job, config: FitConfig) -> dict[int, ViewModel]:
     fit, bias, calibration = (
         [drawn.cameras[row] for row in drawn.rows(name)] for name in ("fit", "bias", "calibration")
     )
-    extent = job.scene.extent if job.scene.extent > 0 else 1.0
-    models = fit_fidelity(sampled, fit, extent, config.min_share, confidence)
+    models = fit_fidelity(sampled, fit, job.scene.scale, config.min_share, confidence)
     models.pop(UNLABELLED, None)  # has no target and stays in full
     for _ in range(_ROUNDS):
         models = recentred(models, _trial(job, config, models, sampled.labels, bias), confidence)
@@ -58,8 +57,7 @@ def _trial(
     distance = distances_at(job.scene, job.point_labels, cameras, labels, config.distance)
     planned = plan_nominal(models, labels, len(job.ladder.levels), distance, cameras, NOMINAL)
     fidelity, pixels = compositions_at(job, cameras, planned, "fit")
-    image = np.array([camera.width * camera.height for camera in cameras])
-    shown = (pixels > 0) & (pixels >= config.min_share * image[:, None])
+    shown = shown_enough(pixels, cameras, config.min_share)
     return Trial(labels, cameras, distance, shown, planned, fidelity)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from sagesplat.adapt.bound_plans import Costs, Quality, plan_for_view, plan_within, pooled, quality_at
 from sagesplat.adapt.coverage import Decisions, score
 from sagesplat.adapt.eq3 import SsimModel
+from sagesplat.adapt.fidelity import shown_enough
 from sagesplat.adapt.observe import LabelImages, Observations
 from sagesplat.adapt.plan import Plan, plan_scene, plan_view
 from sagesplat.adapt.scene_plans import mended, plan_for_scene
@@ -273,8 +274,7 @@ class NestedLevels(Method):
         levels = np.array([[plan.levels[label] for label in self.costs.labels] for plan in plans])
         planned = np.broadcast_to(levels, (len(cameras), *levels.shape))
         fidelity, pixels = compositions_at(self.job, cameras, planned, "plan")
-        image = np.array([camera.width * camera.height for camera in cameras])
-        shown = (pixels > 0) & (pixels >= self.job.fit_config.min_share * image[:, None])
+        shown = shown_enough(pixels, cameras, self.job.fit_config.min_share)
         shown &= np.array(self.costs.labels) != UNLABELLED
         return np.where(shown[:, None], fidelity[..., :-1], np.nan).astype(np.float64)
 

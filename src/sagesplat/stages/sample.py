@@ -128,7 +128,7 @@ def _until_it_stops_shrinking(
         table = more if table is None else _joined(table, more)
         if stop == stops[-1]:
             break
-        models = fit_fidelity(table, cameras[:stop], _extent(job), fit.min_share, fit.confidence)
+        models = fit_fidelity(table, cameras[:stop], job.scene.scale, fit.min_share, fit.confidence)
         errors.append(float(np.mean([model.rmse for model in models.values()])))
         if len(errors) > 1 and errors[-1] > (1 - _SHRINKS) * errors[-2]:
             break
@@ -139,10 +139,6 @@ def _until_it_stops_shrinking(
             "closer to its cameras (--sample.shift, --sample.turn), or leave out --sample.viewpoints"
         )
     return table, len(table.fidelity)
-
-
-def _extent(job: Job) -> float:
-    return job.scene.extent if job.scene.extent > 0 else 1.0  # all cameras in one place
 
 
 def _measured(job: Job, cameras: Sequence[Camera], fit: FitConfig) -> SampledFidelity:
