@@ -104,8 +104,6 @@ def bundle(
     check_target(out)
     check_viewer(viewer)
     chunks = increments_of(job)
-    if any(not chunk.uri.endswith(".spz") for chunk in chunks):
-        raise RunError(f"{job.run.increments}: not SPZ files; run `sagesplat nest` again with --force")
     g, drawn = read_increments(job.run.increments, chunks), viewpoints_of(job)
     contents = replace(
         _contents(job, g, job.antialiased),
