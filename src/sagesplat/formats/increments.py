@@ -172,9 +172,17 @@ def _read(folder: Path, increment: Increment) -> Gaussians:
 
 def shown(listed: Sequence[Increment], label_id: int, level: int) -> list[Increment]:
     """The increments that make up a level of a category, ascending: since the newest REPLACE."""
-    mine = sorted((c for c in listed if c.label_id == label_id and c.level <= level), key=lambda c: c.level)
-    newest = max((i for i, c in enumerate(mine) if c.refine == "REPLACE"), default=0)
-    return mine[newest:]
+    mine = (c for c in listed if c.label_id == label_id and c.level <= level)
+    return full_scene(sorted(mine, key=lambda c: c.level))
+
+
+def full_scene(listed: Sequence[Increment]) -> list[Increment]:
+    """The increments that make up the highest level of every category, in their order."""
+    newest: dict[int, int] = {}
+    for one in listed:
+        if one.refine == "REPLACE":
+            newest[one.label_id] = max(newest.get(one.label_id, 0), one.level)
+    return [one for one in listed if one.level >= newest.get(one.label_id, 0)]
 
 
 def totals(listed: Sequence[Increment], labels: Sequence[int], levels: int, what: str) -> np.ndarray:
