@@ -21,6 +21,7 @@ from sagesplat.cli.base import (
 )
 from sagesplat.cli.say import say
 from sagesplat.core.config import (
+    AdoptConfig,
     BlocksConfig,
     FitConfig,
     LabelsConfig,
@@ -36,6 +37,7 @@ from sagesplat.core.config import (
     TrainConfig,
 )
 
+_SPLAT = "splat: PLY, compressed PLY, SPZ, SOG, lod-meta.json, .splat or glTF"
 _FUSE = "Fuse the label images of all views through the trained Gaussians, before the levels are made."
 
 
@@ -83,6 +85,30 @@ def run(
     )
     with open_job(run, machine, ladder) as job:
         pipeline.run_all(job, scene, config)
+
+
+@command
+def adopt(
+    splat: Positional[Annotated[Path, arg(metavar="SPLAT", help=_SPLAT)]],
+    run: Run,
+    adopt: Annotated[AdoptConfig, Flat] = AdoptConfig(),
+    scene_config: Annotated[SceneConfig, Flat] = SceneConfig(),
+    masks: Annotated[MasksConfig, Flat] = MasksConfig(),
+    labels: LabelsConfig = LabelsConfig(),
+    sample: SampleConfig = SampleConfig(),
+    fit: FitConfig = FitConfig(),
+    plan: Annotated[PlanConfig, Flat] = PlanConfig(),
+    machine: Annotated[Machine, Flat] = Machine(),
+) -> None:
+    """Make a run of a splat that somebody else trained: levels, promises, a plan and a report.
+
+    Its labels are those of the file; or label images or a network vote for them; else it is one category.
+    """
+    from sagesplat.stages import pipeline
+
+    config = RunConfig(scene=scene_config, masks=masks, labels=labels, sample=sample, fit=fit, plan=plan)
+    with open_job(run, machine) as job:
+        pipeline.adopt(job, splat, adopt, config)
 
 
 @command

@@ -217,6 +217,39 @@ class NestConfig:
 
 
 @dataclass(frozen=True)
+class AdoptConfig:
+    """How a splat that somebody else trained is looked at, and how its levels are made."""
+
+    fit: Literal["renders", "none"] = "renders"
+    """Lower levels. renders: merged Gaussians, trained on the splat's own renders; none: merged Gaussians,
+    without training."""
+    steps: int = 3000
+    """Training steps on compositions of the lower levels."""
+    shares: tuple[float, ...] = (0.004, 0.008, 0.016, 0.031, 0.0625, 0.125, 0.25, 0.5, 0.7, 1.0)
+    """Sizes of the levels, as fractions of a category's Gaussians. Levels of fewer than 50 Gaussians are
+    left out."""
+    lossless: bool = False
+    """Send the highest levels as PLY, not SPZ: the last one is then identical to the file."""
+    cameras: Path | None = None
+    """Where to look from: a capture with or without photos, a cameras.json of 3DGS, a transforms.json or a
+    viewpoints.json (default: viewpoints drawn from the splat itself)."""
+    views: int = 96
+    """Viewpoints to draw."""
+    kind: Literal["auto", "object", "place"] = "auto"
+    """How viewpoints are drawn. object: on orbits around it; place: where one can stand in it."""
+    up: str = "auto"
+    """Up direction of the viewpoints: x, -x, y, -y, z or -z (auto: from the geometry)."""
+    fov: float = 60.0
+    """Field of view of the longer side of drawn viewpoints, degrees."""
+    size: tuple[int, int] = (512, 384)
+    """Width and height of drawn viewpoints, pixels."""
+    lod: int = 0
+    """Level of a streamed SOG to take as the reference; 0: the finest."""
+    seed: int = 0
+    """Seed of the viewpoints and of the training."""
+
+
+@dataclass(frozen=True)
 class SampleConfig:
     """Viewpoints at which the levels are measured against the full model."""
 

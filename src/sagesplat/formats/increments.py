@@ -27,6 +27,7 @@ from sagesplat.io.files import atomic_folder, read_json, write_json
 Format = Literal["spz", "ply"]
 Refine = Literal["ADD", "REPLACE"]
 INDEX = "index.json"
+_FINE_BITS = 8, 8  # of SH coefficients
 _CURE = "delete that folder and run `sagesplat nest` again"
 _URI = r"(?!\.)[A-Za-z0-9_.-]{1,200}"  # a plain file name
 _GPU_BYTES = (16, 24, 40, 56)  # per Gaussian in Spark 2.2, by SH degree
@@ -85,13 +86,15 @@ def write_increments(
     replaces: Mapping[int, Collection[int]] | None = None,
     kind: Format | Callable[[int, int], Format] = "spz",
     sh_bits: tuple[int, int] = SH_BITS,
+    fine: Collection[int] = (),
     antialiased: bool = False,
 ) -> list[Increment]:
     """Write the increments of nested levels and their index; `folder` is replaced.
 
     `sizes`: by label id, the rows up to the end of each level. `names`: label id -> category. `replaces`: by
     label id, the levels that replace those below (`formats.levels.starts_of`). `kind`: of all files, or of a
-    label id and level. `sh_bits` and `antialiased` as in `encode_spz`.
+    label id and level. `sh_bits` and `antialiased` as in `encode_spz`; the levels `fine` are rounded by the
+    smallest steps of the format instead.
 
     ValueError for levels that cannot replace.
     """
@@ -106,7 +109,10 @@ def write_increments(
             suffix = kind_of(label, level)
             temporary = fresh / f"increment.{suffix}"
             if suffix == "spz":
-                temporary.write_bytes(encode_spz(part, sh_bits=sh_bits, coarse=True, antialiased=antialiased))
+                bits = _FINE_BITS if level in fine else sh_bits
+                temporary.write_bytes(
+                    encode_spz(part, sh_bits=bits, coarse=level not in fine, antialiased=antialiased)
+                )
             else:
                 write_ply(temporary, part, names)
             content = temporary.read_bytes()

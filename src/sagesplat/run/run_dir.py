@@ -10,6 +10,7 @@ from sagesplat.core.errors import RunError
 LadderKind = Literal["nested", "snapshots"]
 # stages that all ladders of a run share
 _BEFORE_LADDERS = (
+    "adopt",
     "poses",
     "scene",
     "segment",
@@ -84,6 +85,16 @@ class RunDir:
     def capture(self) -> Path:
         """The folder of the capture that was made of photos without poses."""
         return self.path / "capture"
+
+    @property
+    def adopted(self) -> Path:
+        """The Gaussians of a splat that somebody else trained, as they were read."""
+        return self.path / "adopted.npz"
+
+    @property
+    def contact_sheet(self) -> Path:
+        """Pictures from the viewpoints that an adopted splat is looked at from."""
+        return self.path / "viewpoints.png"
 
     @property
     def segmented(self) -> Path:

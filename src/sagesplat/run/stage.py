@@ -22,7 +22,7 @@ _CLOCK_STEP = 2.0  # seconds: some disks keep no finer time
 _DERIVED = {"observe", "sample", "fit", "plan", "crossview", "same_size", "paper"}
 _OF_PLAN = {"compose", "evaluate", "report"}
 _ORDER = (
-    "poses", "scene", "segment", "masks", "lift", "blocks", "train", "fuse", "block_categories",
+    "adopt", "poses", "scene", "segment", "masks", "lift", "blocks", "train", "fuse", "block_categories",
     "base", "nest", "observe", "sample", "fit", "plan", "compose", "evaluate", "report", "crossview",
     "same_size", "paper",
 )  # fmt: skip
@@ -103,7 +103,7 @@ def run_stages(
 
 def _is_done(job: Job, stage: Stage) -> bool:
     """Whether a stage is to be skipped, which is said; RunError where it cannot be done."""
-    if stage.name not in ("poses", "scene") and not job.run.scene.exists():
+    if stage.name not in ("adopt", "poses", "scene") and not job.run.scene.exists():
         raise RunError(f"{job.run.path}: {NO_RUN}")
     for path in stage.inputs:
         if not path.exists():

@@ -6,7 +6,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from sagesplat.core.config import BlocksConfig, FitConfig, NestConfig, PlanConfig, RunConfig, TrainConfig
+from sagesplat.core.config import (
+    AdoptConfig,
+    BlocksConfig,
+    FitConfig,
+    NestConfig,
+    PlanConfig,
+    RunConfig,
+    TrainConfig,
+)
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit, Progress, StageDone, StageStarted
 from sagesplat.demo.capture import cached_capture
@@ -14,6 +22,8 @@ from sagesplat.run.job import Job
 from sagesplat.run.recorded import recorded_settings
 from sagesplat.run.run_dir import RunDir
 from sagesplat.stages import blocks
+from sagesplat.stages.adopt import open_splat
+from sagesplat.stages.adopt_levels import make_levels
 from sagesplat.stages.boundaries import measure_borders
 from sagesplat.stages.compose import compose_plan
 from sagesplat.stages.evaluate import evaluate_plans
@@ -71,6 +81,31 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
         blocks.label_block_categories(job)
     if job.run.ladder == "nested":
         nest(job, config.nest, config.blocks, config.seed)
+    _promise(job, config)
+
+
+def adopt(job: Job, source: Path, adopted: AdoptConfig, config: RunConfig) -> None:
+    """Make a run of a splat that somebody else trained: levels, promises, a plan and a report.
+
+    Args:
+        job: The run folder, and where events go.
+        source: The splat file, or the folder of a SOG.
+        adopted: Viewpoints and levels.
+        config: Settings of the other stages; those of training and nesting are not used.
+
+    Raises:
+        SageError: For anything wrong with the file, the settings, the run folder or the machine.
+    """
+    check_targets(config.plan, "nested")
+    open_splat(job, source, adopted, config.scene, config.masks, config.labels)
+    if config.fuse:
+        fuse_masks(job)
+    make_levels(job, adopted)
+    _promise(job, config)
+
+
+def _promise(job: Job, config: RunConfig) -> None:
+    """From the levels to the report."""
     observe_levels(job, config.fit)
     sample_levels(job, config.sample, config.fit)
     fit_ladder(job, config.fit)

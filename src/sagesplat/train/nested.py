@@ -50,6 +50,20 @@ class Nested:
         return {label: int((self.ranks[labels == label] == 0).sum()) for label in self.gaussians.counts()}
 
 
+@dataclass(frozen=True, eq=False)
+class Spans:
+    """Several sets of Gaussians per category that replace each other: a larger share shows a larger set.
+
+    At a share `s` of a category a Gaussian is shown if its set is (`above < s <= upto`), and its place in the
+    set, as a share of the category, is before it (`order < s`).
+    """
+
+    order: Float32[np.ndarray, " N"]
+    above: Float32[np.ndarray, " N"]
+    upto: Float32[np.ndarray, " N"]
+    shares: tuple[float, ...]  # that a step draws from, for each category by itself
+
+
 @dataclass(frozen=True)
 class NestStep:
     """One step on a composition was taken."""
@@ -158,6 +172,7 @@ def nest(
     checkpoint: Path | None = None,
     settings: str = "",
     movable: np.ndarray | None = None,  # bool [N]
+    spans: Spans | None = None,
 ) -> Iterator[NestStep | Resumed | Nested]:
     """Train a nested ladder: afterwards every composition of prefixes renders well.
 
@@ -178,6 +193,8 @@ def nest(
         checkpoint: Where to save every 500 steps; one of the same `settings` is resumed.
         settings: What a checkpoint has to have been written with.
         movable: bool [N]; the others keep their values, and all keep their order. None: all are trained.
+        spans: Levels that replace each other: which share of a category shows each Gaussian, and which shares
+            are drawn; all keep their order. None: prefixes.
 
     Yields:
         `NestStep` at every step, `Resumed` after a damaged checkpoint, and the trained `Nested` last.
@@ -190,7 +207,7 @@ def nest(
     near = geometry.morton_order(nested.gaussians.means.numpy())  # neighbours in space are rendered together
     labels, ranks = nested.gaussians.label_ids.numpy()[near], nested.ranks[near]
     state = initial_state(nested.gaussians.select(torch.from_numpy(near)), seed)
-    state.order_share = order_shares(labels, ranks, -near)
+    state.order_share = torch.from_numpy(spans.order[near]) if spans else order_shares(labels, ranks, -near)
     if checkpoint and checkpoint.exists():
         state, damage = latest_checkpoint(checkpoint, settings)
         if damage:
@@ -199,7 +216,11 @@ def nest(
     categories, column = np.unique(labels, return_inverse=True)
     column = torch.from_numpy(column).to(device)
     views = scene.train_ids.tolist()
-    sort_at = {round(part * config.steps) for part in _SORT_AT} if movable is None else {}
+    stays = movable is not None or spans is not None
+    sort_at = set() if stays else {round(part * config.steps) for part in _SORT_AT}
+    edges = None
+    if spans is not None:
+        edges = torch.from_numpy(np.stack([spans.above, spans.upto])[:, near]).to(device)
     stepper = Stepper(
         PhotoLoader(scene, photos, device), replace(train_config, batch=1), ActiveTiles(scene, None), backend,
         sh_bits=config.sh_bits,
@@ -216,11 +237,18 @@ def nest(
                     state.gaussians, scene, views, config.criterion, antialiased=train_config.antialiased
                 )
                 state.order_share = order_shares(labels, ranks, importances).to(device)
-            prefix = draw_shares(state.rng, len(categories), config, state.step / config.steps)
+            if spans is None:
+                prefix = draw_shares(state.rng, len(categories), config, state.step / config.steps)
+            else:
+                prefix = state.rng.choice(np.float32(spans.shares), len(categories))
             rows = None
-            if (prefix < 1).any():
+            if spans is not None or (prefix < 1).any():
                 assert state.order_share is not None
-                rows = torch.nonzero(state.order_share < torch.from_numpy(prefix).to(device)[column])[:, 0]
+                share = torch.from_numpy(prefix).to(device)[column]
+                shown = state.order_share < share
+                if edges is not None:
+                    shown &= (edges[0] < share) & (share <= edges[1])
+                rows = torch.nonzero(shown)[:, 0]
             loss = stepper(
                 state, nested.gaussians.sh_degree, rates(state.step + 1), trainable, drawn_rows=rows
             )
@@ -231,7 +259,8 @@ def nest(
                 write_checkpoint(checkpoint, state, settings)
             yield NestStep(state.step, value)
     assert state.order_share is not None
-    rows = np.lexsort((state.order_share.cpu().numpy(), labels))
+    sets = np.zeros(len(labels)) if spans is None else spans.upto[near]
+    rows = np.lexsort((state.order_share.cpu().numpy(), sets, labels))
     yield Nested(
         state.gaussians.to("cpu").select(torch.from_numpy(rows)), nested.purity[near][rows], ranks[rows]
     )
