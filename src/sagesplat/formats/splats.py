@@ -9,6 +9,7 @@ from typing import BinaryIO
 from sagesplat.core.errors import DataError
 from sagesplat.formats.compressed_ply import is_compressed, read_compressed_ply
 from sagesplat.formats.dotsplat import read_dotsplat
+from sagesplat.formats.gltf import read_gltf
 from sagesplat.formats.labels import with_labels
 from sagesplat.formats.lod_meta import LOD_META, count_levels, read_lod_meta
 from sagesplat.formats.ply import read_ply_splat
@@ -20,7 +21,7 @@ from sagesplat.io.ply_header import read_elements
 
 __all__ = ["Splat", "num_lods", "read_splat"]
 
-_KNOWN = "PLY, compressed PLY, SPZ, SOG, lod-meta.json, .splat"
+_KNOWN = "PLY, compressed PLY, SPZ, SOG, lod-meta.json, glTF, .splat"
 _LOD = "streamed SOG"
 
 
@@ -60,6 +61,7 @@ def read_splat(path: Path, lod: int = 0, *, spz_axes: Frame = "rub") -> Splat:
         "compressed PLY": read_compressed_ply,
         "SPZ": partial(read_spz_splat, frame=spz_axes),
         "SOG": read_sog,
+        "glTF": read_gltf,
         ".splat": read_dotsplat,
     }
     return cleaned(with_labels(readers[kind](path), path), str(path))
@@ -94,6 +96,8 @@ def _kind(path: Path, file: BinaryIO) -> str | None:
     head = file.read(64)
     if head.startswith((b"\x1f\x8b", b"NGSP")):
         return "SPZ"
+    if head.startswith(b"glTF"):
+        return "glTF"
     if head.startswith(b"PK\x03\x04"):
         return "SOG"
     if head.startswith((b"ply\n", b"ply\r")):
@@ -119,4 +123,5 @@ def _kind_of_json(file: BinaryIO) -> str | None:
     except ValueError:
         return None
     keys = set(document) if isinstance(document, dict) else set()
-    return _LOD if "lodLevels" in keys else "SOG" if "means" in keys else None
+    known = {"lodLevels": _LOD, "means": "SOG", "asset": "glTF"}
+    return next((kind for key, kind in known.items() if key in keys), None)
