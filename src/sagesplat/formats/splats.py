@@ -45,11 +45,19 @@ def read_splat(path: Path, lod: int = 0, *, spz_axes: Frame = "rub") -> Splat:
             Gaussian is left.
 
     Example:
+        >>> import tempfile, torch
         >>> from pathlib import Path
+        >>> from sagesplat import Gaussians, write_ply
         >>> from sagesplat.formats.splats import read_splat
-        >>> splat = read_splat(Path("scene.sog"))  # doctest: +SKIP
-        >>> splat.kind, len(splat.gaussians), splat.dropped  # doctest: +SKIP
-        ('SOG', 500000, {'NaN or infinite': 2})
+        >>> z = torch.zeros
+        >>> ids = torch.zeros(5, dtype=torch.int16)
+        >>> g = Gaussians(z(5, 3), z(5, 4), z(5, 3), z(5), z(5, 1, 3), z(5, 3, 3), ids)
+        >>> g.quats[1:, 0] = 1
+        >>> path = Path(tempfile.mkdtemp()) / "scene.sog"  # the name does not matter
+        >>> write_ply(path, g, {0: "tree"})
+        >>> splat = read_splat(path)
+        >>> splat.kind, len(splat.gaussians), splat.dropped, splat.names
+        ('PLY', 4, {'a rotation of zeros': 1}, {0: 'tree'})
     """
     path, kind = _found(path)
     if kind == _LOD:
