@@ -377,6 +377,8 @@ def test_names_of_categories_are_no_settings_of_label_images(
     run: Path, command: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen = []
-    monkeypatch.setattr(export, "export_ply", lambda job, out, **options: seen.append(options["labels"]) or 3)
+    monkeypatch.setattr(
+        export, "export_scene", lambda job, out, **options: seen.append(options["labels"]) or 3
+    )
     assert command("export", run, "a.ply")[0] == command("export", run, "a.ply", "--labels", "tree")[0] == 0
     assert seen == [(), ("tree",)]

@@ -44,7 +44,7 @@ from sagesplat.run.stage import run_stage
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.stages.compose import compose_plan
-from sagesplat.stages.export import export_ply
+from sagesplat.stages.export import export_scene
 from sagesplat.stages.fit import fit_ladder
 from sagesplat.stages.label import lift_labels, make_masks
 from sagesplat.stages.observe import observe_levels
@@ -508,7 +508,7 @@ def test_stages_are_refused_and_readers_are_not(finished: Path, capture: Path, t
     job = Job(RunDir(run, "snapshots"), lambda event: None)
     with held_by_another(run):
         most_stages(job, capture)  # all is there: nobody writes
-        assert export_ply(job, tmp_path / "a.ply", level=40, labels=[], target=None) > 0
+        assert export_scene(job, tmp_path / "a.ply", level=40, labels=[], target=None) > 0
         again = replace(job, force=True)
         with pytest.raises(RunError, match="works on it; wait for it or stop it"):
             most_stages(again, capture, replace(CONFIG, plan=PlanConfig(target_ssim=0.5)))

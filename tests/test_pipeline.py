@@ -18,7 +18,7 @@ from sagesplat.formats.levels import read_level
 from sagesplat.formats.ply import read_ply
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
-from sagesplat.stages.export import export_ply
+from sagesplat.stages.export import export_scene
 from sagesplat.stages.pipeline import run_all
 
 STAGES = [
@@ -144,18 +144,18 @@ def test_a_folder_that_is_no_run_is_left_alone(capture: Path, tmp_path: Path) ->
 
 def test_export_takes_levels_and_categories(finished: Path, tmp_path: Path) -> None:
     job = Job(RunDir(finished, "snapshots"), print)
-    count = export_ply(job, tmp_path / "a.ply", level=60, labels=["vase", "grass-merged"], target=None)
+    count = export_scene(job, tmp_path / "a.ply", level=60, labels=["vase", "grass-merged"], target=None)
     g = read_ply(tmp_path / "a.ply")
     assert len(g) == count
     assert set(g.counts()) == {86, 193}
     expected = job.ladder.load(60, [86, 193])
     np.testing.assert_array_equal(g.means, expected.means)
     with pytest.raises(RunError, match=r"a\.ply: exists"):
-        export_ply(job, tmp_path / "a.ply", level=None, labels=[], target=None)
+        export_scene(job, tmp_path / "a.ply", level=None, labels=[], target=None)
     with pytest.raises(RunError, match="no category 'cat'"):
-        export_ply(job, tmp_path / "b.ply", level=None, labels=["cat"], target=None)
+        export_scene(job, tmp_path / "b.ply", level=None, labels=["cat"], target=None)
     with pytest.raises(RunError, match=r"no plan for SSIM 0\.77"):
-        export_ply(job, tmp_path / "b.ply", level=None, labels=[], target=("ssim", 0.77))
+        export_scene(job, tmp_path / "b.ply", level=None, labels=[], target=("ssim", 0.77))
 
 
 def test_a_broken_level_is_one_clear_error(finished: Path, capture: Path, tmp_path: Path) -> None:

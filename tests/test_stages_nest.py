@@ -25,6 +25,7 @@ from sagesplat.formats.increments import packed, read_increments, read_index, to
 from sagesplat.formats.levels import write_set
 from sagesplat.formats.ply import read_ply
 from sagesplat.formats.quantisation import in_buckets
+from sagesplat.formats.splats import num_lods, read_splat
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.scene.images import Photos
@@ -32,7 +33,7 @@ from sagesplat.scene.scene import Points, Scene, View
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.stages.compose import compose_plan
 from sagesplat.stages.evaluate import evaluate_plans
-from sagesplat.stages.export import export_increments
+from sagesplat.stages.export import export_increments, export_scene
 from sagesplat.stages.fit import fit_ladder
 from sagesplat.stages.methods import NestedLevels
 from sagesplat.stages.observe import observe_levels
@@ -500,6 +501,39 @@ def test_chunks_are_exported_as_files(finished: Path, tmp_path: Path) -> None:
         export_increments(job, tmp_path / "ply", "ply")
     with pytest.raises(RunError, match="snapshots have no chunks"):
         export_increments(Job(RunDir(finished, "snapshots"), print), tmp_path / "none", "ply")
+
+
+def test_export_writes_what_other_viewers_read(finished: Path, tmp_path: Path) -> None:
+    job, options = quiet(finished), {"level": 3, "labels": [], "target": None}
+    expected = job.ladder.load(3)
+    for name in ("a.ply", "a.spz", "a.sog"):
+        assert export_scene(job, tmp_path / name, **options) == len(expected)
+        splat = read_splat(tmp_path / name)
+        assert splat.gaussians.counts() == expected.counts()
+        assert splat.names.items() <= job.names().items()
+    with pytest.raises(RunError, match=r"a\.sog: exists; add --force"):
+        export_scene(job, tmp_path / "a.sog", **options)
+    with pytest.raises(DataError, match=r"a\.glb: its name says no format"):
+        export_scene(job, tmp_path / "a.glb", **options)
+    with pytest.raises(RunError, match="levels are for lod-meta"):
+        export_scene(job, tmp_path / "b.ply", **options, levels=[1])
+
+
+def test_export_writes_levels_of_detail(finished: Path, tmp_path: Path) -> None:
+    job, options = quiet(finished), {"level": None, "labels": [], "target": None}
+    path = tmp_path / "lods" / "lod-meta.json"
+    assert export_scene(job, path, **options) == len(job.ladder.load(5))
+    counts = [len(read_splat(path, lod).gaussians) for lod in range(num_lods(path))]
+    assert counts == [len(job.ladder.load(level)) for level in range(5, 0, -1)]
+    with pytest.raises(RunError, match="lods: not empty"):
+        export_scene(job, path, **options)
+    again = replace(job, force=True)
+    export_scene(again, path, **options, levels=[2, 4])
+    assert num_lods(path) == 2
+    (path.parent / "letter.txt").write_text("dear")
+    with pytest.raises(RunError, match="lods: not empty"):
+        export_scene(again, path, **options)
+    assert (path.parent / "letter.txt").exists()
 
 
 def test_one_gaussian_is_a_category_too(tmp_path: Path) -> None:

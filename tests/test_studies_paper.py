@@ -28,7 +28,7 @@ from sagesplat.scene.scene import View
 from sagesplat.segment.display_names import titles
 from sagesplat.stages.compose import compose_plan
 from sagesplat.stages.evaluate import evaluate_plans
-from sagesplat.stages.export import export_ply
+from sagesplat.stages.export import export_scene
 from sagesplat.stages.fit import fit_ladder
 from sagesplat.stages.label import lift_labels, make_masks
 from sagesplat.stages.observe import observe_levels
@@ -298,7 +298,7 @@ def test_tuned_compositions_are_the_same_set_made_better(finished, tmp_path):
     mean = [np.mean([float(r["ssim"]) for r in rows if r["label_id"] == "-2"]) for rows in (before, after)]
     assert mean[1] > mean[0] + 0.005
     assert read_ply(tuned.run.composed).counts() == read_ply(plain.run.composed).counts()
-    export_ply(tuned, tmp_path / "a.ply", level=None, labels=[], target=None)
+    export_scene(tuned, tmp_path / "a.ply", level=None, labels=[], target=None)
     assert torch.equal(read_ply(tmp_path / "a.ply").means, read_ply(tuned.run.composed).means)
 
 

@@ -1,5 +1,6 @@
 """Splat files as other tools write them, byte by byte, and their readers."""
 
+import base64
 import io
 import json
 import math
@@ -13,7 +14,8 @@ import torch
 from PIL import Image
 
 from benchmarks.hostile import MIB, Reader
-from benchmarks.readers.making import file, put, splats, written
+from benchmarks.readers.making import as_json, file, put, splats, written
+from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.labels import sidecar
 from sagesplat.formats.ply import write_ply
 from sagesplat.formats.splats import num_lods, read_splat
@@ -112,6 +114,50 @@ def dotsplat(count: int, seed: int = 0) -> bytes:
     return b"".join(struct.pack("<6f8B", *row, *rng.integers(0, 256, 8).tolist()) for row in rows)
 
 
+def gltf(g: Gaussians, *, byte_opacities: bool = False, **node: Any) -> tuple[dict[str, Any], bytes]:
+    """A glTF document with splats in one node, and its buffer."""
+    name = "KHR_gaussian_splatting"
+    opacities = g.logit_opacities.sigmoid().numpy()[:, None]
+    columns = {
+        "POSITION": g.means.numpy(),
+        f"{name}:ROTATION": g.quats[:, [1, 2, 3, 0]].numpy(),
+        f"{name}:SCALE": g.log_scales.exp().numpy(),
+        f"{name}:OPACITY": (opacities * 255).round().astype("u1") if byte_opacities else opacities,
+        f"{name}:SH_DEGREE_0_COEF_0": g.sh0[:, 0].numpy(),
+    }
+    for row, (degree, i) in enumerate(
+        [(d, i) for d in (1, 2, 3) for i in range(2 * d + 1)][: g.shN.shape[1]]
+    ):
+        columns[f"{name}:SH_DEGREE_{degree}_COEF_{i}"] = g.shN[:, row].numpy()
+    content, views, accessors = b"", [], []
+    for column in columns.values():
+        views.append({"buffer": 0, "byteOffset": len(content), "byteLength": column.nbytes})
+        content += column.tobytes() + bytes(-column.nbytes % 4)
+        kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[column.shape[1]]
+        component = (
+            {"componentType": 5121, "normalized": True}
+            if column.dtype == np.uint8
+            else {"componentType": 5126}
+        )
+        accessors.append({"bufferView": len(accessors), "count": len(g), "type": kind} | component)
+    primitive = {"mode": 0, "attributes": {key: i for i, key in enumerate(columns)}, "extensions": {name: {}}}
+    return {
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0, **node}],
+        "meshes": [{"primitives": [primitive]}], "buffers": [{"byteLength": len(content)}],
+        "bufferViews": views, "accessors": accessors,
+    }, content  # fmt: skip
+
+
+def glb(document: dict[str, Any], content: bytes) -> bytes:
+    """A glTF document and its buffer as a .glb."""
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    body = (
+        struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(content), b"BIN\0") + content
+    )
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
+
+
 def streamed(leaves: int = 2, size: int = 3) -> dict[str, Any]:
     """A `lod-meta.json` of two levels, with leaves of `size` rows in the finer one and one in the other."""
 
@@ -173,6 +219,25 @@ def _read_streamed(path: Path) -> None:
         read_splat(path, level)
 
 
+def _glbs(folder: Path, size: int) -> list[bytes]:
+    document, content = gltf(splats(3 * size), rotation=[0, 0.6, 0, 0.8])
+    packed = {"buffer": 0, "byteLength": len(small := encode_spz(splats()))}
+    spz: dict[str, Any] = gltf(splats(1))[0] | {"bufferViews": [packed]}
+    inside = {"extensions": {"KHR_gaussian_splatting_compression_spz_2": {"bufferView": 0}}}
+    spz["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"] = inside
+    return [glb(document, content), glb(*gltf(splats(2, 0), byte_opacities=True)), glb(spz, small)]
+
+
+def _gltfs(folder: Path, size: int) -> list[bytes]:
+    document, content = gltf(splats(3 * size))
+    (folder / "b.bin").write_bytes(content)
+    data = base64.b64encode(content).decode()
+    return as_json(
+        document | {"buffers": [{"uri": "b.bin"}]},
+        document | {"buffers": [{"uri": f"data:application/octet-stream;base64,{data}"}]},
+    )
+
+
 def _labels(folder: Path, size: int) -> list[bytes]:
     (folder / "x.splat").write_bytes(dotsplat(3 * size))
     runs = [[2, 1], [-1, 2]] * size
@@ -193,6 +258,8 @@ READERS = (
     Reader("sog-meta", ".json", _metas, file("meta.json", read_splat), 1000, 16 * MIB),
     Reader("sog-image", ".webp", _images, _read_image, 1000, 16 * MIB),
     Reader("lod-meta", ".json", _streams, file("lod-meta.json", _read_streamed), 100, 16 * MIB),
+    Reader("glb", ".glb", _glbs, file("g.glb", read_splat), 300, 4 * MIB),
+    Reader("gltf", ".gltf", _gltfs, file("g.gltf", read_splat), 300, 4 * MIB),
     Reader("dotsplat", ".splat", lambda _, size: [dotsplat(3 * size)], file("d.splat", read_splat)),
     Reader("splat-labels", ".json", _labels, _read_labels, 1000),
 )

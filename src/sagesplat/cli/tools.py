@@ -22,22 +22,27 @@ def export(
     target_fidelity: float | None = None,
     target_ssim: float | None = None,
     chunks: Literal["spz", "ply"] | None = None,
+    levels: tuple[int, ...] = (),
     ladder: Ladder = "nested",
     machine: Annotated[Compute, Flat] = Compute(),
 ) -> None:
-    """Write Gaussians as a PLY: the planned scene or one level; or the increments of the nested levels.
+    """Write Gaussians for other viewers: the planned scene, one level, all levels, or their increments.
+
+    The name of OUT chooses the format: .ply, .spz, .sog, or FOLDER/lod-meta.json, which holds all levels.
+    Categories are kept: as a property of a PLY, a record of an SPZ, in a file beside a SOG.
 
     Args:
         run: run folder
-        out: PLY to write, or with --chunks a folder
+        out: file to write, or with --chunks a folder
         level: number of a level (of snapshots: its training step) to write instead of the planned scene
         labels: names of the categories to write (default: all)
         target_fidelity: write the scene planned for this fidelity (default: for the budget, else the main
             target)
         target_ssim: write the scene planned for this SSIM against photos
+        levels: numbers of the levels that lod-meta.json gets (default: all)
         chunks: write the increment of each level of each category as a file of this format
     """
-    from sagesplat.stages.export import export_increments, export_ply
+    from sagesplat.stages.export import export_increments, export_scene
 
     with open_job(run, machine, ladder) as job:
         if chunks:
@@ -45,7 +50,8 @@ def export(
         else:
             target = None if target_ssim is None else ("ssim", target_ssim)
             target = target if target_fidelity is None else ("fidelity", target_fidelity)
-            count = export_ply(job, out, level=level, labels=labels, target=target)
+            options = {"level": level, "labels": labels, "target": target, "levels": levels}
+            count = export_scene(job, out, **options)
     say(f"{out}: {count:,} {'chunks' if chunks else 'Gaussians'}")
 
 

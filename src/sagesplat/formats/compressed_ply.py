@@ -21,7 +21,7 @@ import torch
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.sh import C0
-from sagesplat.formats.ply import BASES, antialiased
+from sagesplat.formats.ply import BASES, is_antialiased
 from sagesplat.formats.quantisation import largest_restored, logits_of_bytes
 from sagesplat.formats.splat import Splat
 from sagesplat.io.ply_header import Element, read_elements
@@ -53,7 +53,7 @@ def read_compressed_ply(path: Path) -> Splat:
     except ValueError as error:
         raise DataError(f"{path}: not readable as a PLY file ({short(error)}); give a splat .ply") from None
     with np.errstate(all="ignore"):  # NaN and infinite ranges give such values, which are dropped later
-        return Splat(_decoded(tables), "compressed PLY", antialiased=antialiased(comments))
+        return Splat(_decoded(tables), "compressed PLY", antialiased=is_antialiased(comments))
 
 
 def _tables(path: Path, file: BinaryIO, order: str, elements: list[Element]) -> dict[str, np.ndarray]:

@@ -4,7 +4,7 @@ Per Gaussian, little endian float32: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_
 then green, then blue), opacity (logit), scale_0..2 (natural log), rot_0..3 (wxyz); then `label` (int16).
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import BinaryIO
 
@@ -23,7 +23,9 @@ ROWS = 4096  # Gaussians per block, so that a block fits into the processor's ca
 BASES = (0, 3, 8, 15)  # SH coefficients beyond the constant one, by degree 0 to 3
 
 
-def write_ply(path: Path, gaussians: Gaussians, names: dict[int, str] | None = None) -> None:
+def write_ply(
+    path: Path, gaussians: Gaussians, names: Mapping[int, str] | None = None, *, antialiased: bool = False
+) -> None:
     """Write a labelled scene as a binary splat PLY in INRIA's layout, atomically.
 
     Every viewer of 3DGS reads it: the labels are one more property (`short label`) that others skip.
@@ -32,6 +34,7 @@ def write_ply(path: Path, gaussians: Gaussians, names: dict[int, str] | None = N
         path: The .ply file; replaced if it is there.
         gaussians: N Gaussians on any device.
         names: Category names by label id; they go into the header as comments.
+        antialiased: Whether the scene was trained so; a comment as Brush writes it.
 
     Raises:
         OSError: If the file cannot be written.
@@ -53,6 +56,7 @@ def write_ply(path: Path, gaussians: Gaussians, names: dict[int, str] | None = N
     labels = gaussians.label_ids.cpu().numpy()
     dtype = np.dtype([("values", "<f4", len(properties)), ("label", "<i2")])
     comments = [f"sagesplat {__version__}"]
+    comments += ["SplatRenderMode: mip"] if antialiased else []
     comments += [
         f"label {i} {' '.join(repaired(name, '?').split())}" for i, name in sorted((names or {}).items())
     ]
@@ -98,10 +102,10 @@ def read_ply_splat(path: Path) -> Splat:
     Category names are those of comments such as `label 184 tree-merged`. DataError for other defects.
     """
     columns, labels, _, comments = _read(path)
-    return Splat(_gaussians(columns, labels), "PLY", _names(comments), antialiased(comments))
+    return Splat(_gaussians(columns, labels), "PLY", _names(comments), is_antialiased(comments))
 
 
-def antialiased(comments: Iterable[str]) -> bool:
+def is_antialiased(comments: Iterable[str]) -> bool:
     """Whether comments of a PLY header say so, as Brush and Postshot write them; the last one counts."""
     said = False
     for comment in comments:

@@ -9,6 +9,7 @@ from typing import BinaryIO
 from sagesplat.core.errors import DataError
 from sagesplat.formats.compressed_ply import is_compressed, read_compressed_ply
 from sagesplat.formats.dotsplat import read_dotsplat
+from sagesplat.formats.gltf import read_gltf
 from sagesplat.formats.labels import with_labels
 from sagesplat.formats.lod_meta import LOD_META, count_levels, read_lod_meta
 from sagesplat.formats.ply import read_ply_splat
@@ -20,7 +21,7 @@ from sagesplat.io.ply_header import read_elements
 
 __all__ = ["Splat", "num_lods", "read_splat"]
 
-_KNOWN = "PLY, compressed PLY, SPZ, SOG, lod-meta.json, .splat"
+_KNOWN = "PLY, compressed PLY, SPZ, SOG, lod-meta.json, glTF, .splat"
 _LOD = "streamed SOG"
 
 
@@ -44,11 +45,19 @@ def read_splat(path: Path, lod: int = 0, *, spz_axes: Frame = "rub") -> Splat:
             Gaussian is left.
 
     Example:
+        >>> import tempfile, torch
         >>> from pathlib import Path
+        >>> from sagesplat import Gaussians, write_ply
         >>> from sagesplat.formats.splats import read_splat
-        >>> splat = read_splat(Path("scene.sog"))  # doctest: +SKIP
-        >>> splat.kind, len(splat.gaussians), splat.dropped  # doctest: +SKIP
-        ('SOG', 500000, {'NaN or infinite': 2})
+        >>> z = torch.zeros
+        >>> ids = torch.zeros(5, dtype=torch.int16)
+        >>> g = Gaussians(z(5, 3), z(5, 4), z(5, 3), z(5), z(5, 1, 3), z(5, 3, 3), ids)
+        >>> g.quats[1:, 0] = 1
+        >>> path = Path(tempfile.mkdtemp()) / "scene.sog"  # the name does not matter
+        >>> write_ply(path, g, {0: "tree"})
+        >>> splat = read_splat(path)
+        >>> splat.kind, len(splat.gaussians), splat.dropped, splat.names
+        ('PLY', 4, {'a rotation of zeros': 1}, {0: 'tree'})
     """
     path, kind = _found(path)
     if kind == _LOD:
@@ -60,6 +69,7 @@ def read_splat(path: Path, lod: int = 0, *, spz_axes: Frame = "rub") -> Splat:
         "compressed PLY": read_compressed_ply,
         "SPZ": partial(read_spz_splat, frame=spz_axes),
         "SOG": read_sog,
+        "glTF": read_gltf,
         ".splat": read_dotsplat,
     }
     return cleaned(with_labels(readers[kind](path), path), str(path))
@@ -94,6 +104,8 @@ def _kind(path: Path, file: BinaryIO) -> str | None:
     head = file.read(64)
     if head.startswith((b"\x1f\x8b", b"NGSP")):
         return "SPZ"
+    if head.startswith(b"glTF"):
+        return "glTF"
     if head.startswith(b"PK\x03\x04"):
         return "SOG"
     if head.startswith((b"ply\n", b"ply\r")):
@@ -119,4 +131,5 @@ def _kind_of_json(file: BinaryIO) -> str | None:
     except ValueError:
         return None
     keys = set(document) if isinstance(document, dict) else set()
-    return _LOD if "lodLevels" in keys else "SOG" if "means" in keys else None
+    known = {"lodLevels": _LOD, "means": "SOG", "asset": "glTF"}
+    return next((kind for key, kind in known.items() if key in keys), None)

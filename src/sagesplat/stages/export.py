@@ -1,5 +1,6 @@
-"""Makes PLY or SPZ files, from levels, compositions and increments of a run."""
+"""Makes splat files of others' formats, from levels, compositions and increments of a run."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -7,7 +8,9 @@ from sagesplat.adapt.ladder import read_prefixes
 from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.core.errors import RunError
 from sagesplat.formats.increments import INDEX, Format, write_increments
-from sagesplat.formats.ply import write_ply
+from sagesplat.formats.lod_meta import LOD_META
+from sagesplat.formats.lod_meta_write import write_lod_meta
+from sagesplat.formats.splats_write import write_splat, written_as
 from sagesplat.run.job import Job
 from sagesplat.run.records import settings_of
 from sagesplat.stages.compose import compose
@@ -29,22 +32,49 @@ def export_increments(job: Job, folder: Path, kind: Format) -> int:
     return len(chunks)
 
 
-def export_ply(
+def export_scene(
     job: Job,
     path: Path,
     *,
     level: int | None,
     labels: Sequence[str],
     target: tuple[QualityKind, float] | None,
+    levels: Sequence[int] = (),
 ) -> int:
-    """Write a level or a composition, whole or some categories, as a PLY; returns the number of Gaussians."""
-    if path.exists() and not job.force:
+    """Write a level or a composition, whole or some categories, in the format of the path's name.
+
+    `lod-meta.json` gets `levels`, or all there are, as levels of detail. Returns the number of Gaussians.
+    """
+    written = written_as(path)
+    if written == LOD_META:
+        _check_folder(job, path.parent)
+    elif path.exists() and not job.force:
         raise RunError(f"{path}: exists; add --force to replace it")
     wanted = [label_named(job, name) for name in labels] or list(job.names())
+    if written == LOD_META:
+        return _export_levels(job, path.parent, levels, wanted)
+    if levels:
+        raise RunError(f"{path}: levels are for {LOD_META}; name one with --level")
     if level is not None:
         g = job.ladder.load(level, wanted)
     else:
         plan = main_plan(job) if target is None else scene_plan(job, *target)
         g = compose(job, plan).of_labels(wanted)
-    write_ply(path, g, job.names())
+    write_splat(path, g, job.names(), antialiased=job.antialiased)
     return len(g)
+
+
+def _check_folder(job: Job, folder: Path) -> None:
+    """RunError unless `folder` is new, empty, or with --force holds an earlier export and nothing else."""
+    inside = [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
+    other = [name for name in inside if name != LOD_META and not re.fullmatch(r"\d+_\d+", name)]
+    if other or (inside and not job.force) or (folder.exists() and not folder.is_dir()):
+        raise RunError(f"{folder}: not empty; choose a new folder (--force replaces one that export wrote)")
+
+
+def _export_levels(job: Job, folder: Path, levels: Sequence[int], wanted: Sequence[int]) -> int:
+    chosen = sorted(set(levels) or job.ladder.levels, reverse=True)  # the finest is level of detail 0
+    sets = [job.ladder.load(level, wanted) for level in chosen]
+    sets = [g for i, g in enumerate(sets) if len(g) and (i == 0 or len(g) < len(sets[i - 1]))]
+    write_lod_meta(folder, sets, job.names(), antialiased=job.antialiased)
+    return len(sets[0]) if sets else 0

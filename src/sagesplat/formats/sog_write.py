@@ -1,0 +1,264 @@
+"""Writes SOG version 2: PlayCanvas's splats as lossless WebP images; `sog.py` has the layout.
+
+Scales, sh0 and harmonics get codebooks of 256 values by Lloyd's algorithm. Harmonics are rows of a palette of
+up to 65,536, found in two steps: clusters of all Gaussians, then of each cluster's own. That takes N sqrt(K)
+distances in place of N K.
+"""
+
+import io
+import json
+import math
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Int64
+from PIL import Image
+from scipy.sparse import csr_array
+
+from sagesplat import __version__
+from sagesplat.core.errors import DataError
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.core.geometry import morton_order
+from sagesplat.formats.labels import as_json, sidecar
+from sagesplat.formats.ply import BASES
+from sagesplat.formats.quantisation import OTHERS
+from sagesplat.formats.sog import META
+from sagesplat.io.files import atomic_folder, atomic_path
+
+GENERATOR = f"sagesplat {__version__}"
+_WIDEST = 16383  # pixels of a WebP
+_PALETTE = 64  # times 1024 rows, at most
+_COARSE = 256  # clusters of the first step
+_SAMPLE = 2**15  # Gaussians that these are found from
+_ROUNDS = 8  # of Lloyd's algorithm
+_BINS = 2**16  # of values, for codebooks
+_BLOCK = 2**14  # Gaussians whose distances are computed at a time
+
+
+def write_sog(
+    path: Path, g: Gaussians, names: Mapping[int, str] | None = None, *, antialiased: bool = False
+) -> int:
+    """Write Gaussians as a SOG: an archive, or for a path `.../meta.json` its folder, which is replaced.
+
+    Rows are sorted by category and then in Morton order. Labels, if there are any, go into a sidecar beside
+    it (`formats/labels.py`). The same input gives the same bytes.
+
+    Args:
+        path: The .sog file or meta.json to write.
+        g: N Gaussians in COLMAP's axes, on any device.
+        names: Category names by label id, for the sidecar.
+        antialiased: How the scene was trained; a flag for viewers.
+
+    Returns:
+        The size in bytes, without the sidecar.
+
+    Raises:
+        DataError: For NaN or Inf, a quaternion of zeros, no Gaussians, or more than WebP images hold.
+    """
+    g = g.detach().to("cpu")
+    g = g.select(torch.from_numpy(sog_order(g)))
+    files = sog_files(g, name=str(path), antialiased=antialiased)
+    if path.name == META:
+        with atomic_folder(path.parent) as fresh:
+            put_sog(fresh, files, g, names or {})
+        return sum(map(len, files.values()))
+    with atomic_path(path) as temporary:
+        with zipfile.ZipFile(temporary, "w") as archive:
+            for name, content in files.items():
+                archive.writestr(zipfile.ZipInfo(name), content)  # of 1980: no time stamp
+        nbytes = temporary.stat().st_size
+        _put_labels(path, g, names or {})
+    return nbytes
+
+
+def put_sog(folder: Path, files: Mapping[str, bytes], g: Gaussians, names: Mapping[int, str]) -> None:
+    """Put the files of a SOG scene into a folder, with the labels beside."""
+    for name, content in files.items():
+        (folder / name).write_bytes(content)
+    _put_labels(folder / META, g, names)
+
+
+def _put_labels(path: Path, g: Gaussians, names: Mapping[int, str]) -> None:
+    """Write the labels beside, or remove those of an earlier file."""
+    if bool((g.label_ids >= 0).any()):
+        with atomic_path(sidecar(path)) as temporary:
+            temporary.write_bytes(as_json(g.label_ids, names))
+    else:
+        sidecar(path).unlink(missing_ok=True)
+
+
+def sog_order(g: Gaussians) -> Int64[np.ndarray, " N"]:
+    """Rows by category, and in Morton order in each: images pack well, and labels are few runs."""
+    order = morton_order(g.means.numpy())
+    return order[np.argsort(g.label_ids.numpy()[order], kind="stable")]
+
+
+def sog_files(g: Gaussians, *, name: str = "SOG", antialiased: bool = False) -> dict[str, bytes]:
+    """The files of a SOG scene by name, of Gaussians on the CPU in their order; errors as in `write_sog`."""
+    _check(name, g)
+    count = len(g)
+    width = 4 * math.ceil(math.sqrt(count) / 4)
+
+    def webp(values: np.ndarray) -> bytes:
+        """An image of values [count, 3 or 4]."""
+        pixels = np.full((math.ceil(count / width / 4) * 4 * width, 4), 255, np.uint8)
+        pixels[:count, : values.shape[1]] = values
+        return _webp(pixels.reshape(-1, width, 4))
+
+    fixed, ends = _positions(g.means.double().numpy())
+    scales, scale_book = _coded(g.log_scales.numpy())
+    colours, colour_book = _coded(g.sh0[:, 0].numpy())
+    alphas = (torch.sigmoid(g.logit_opacities) * 255).round().numpy()[:, None]
+    files = {
+        "means_l.webp": webp(fixed & 255),
+        "means_u.webp": webp(fixed >> 8),
+        "quats.webp": webp(_rotations(g.quats.double().numpy())),
+        "scales.webp": webp(scales),
+        "sh0.webp": webp(np.concatenate([colours, alphas], 1)),
+    }
+    meta: dict[str, Any] = {"version": 2, "asset": {"generator": GENERATOR}, "count": count}
+    meta |= {"antialias": True, "model": "antialiased"} if antialiased else {}
+    meta["means"] = ends | {"files": ["means_l.webp", "means_u.webp"]}
+    meta["scales"] = {"codebook": scale_book, "files": ["scales.webp"]}
+    meta["quats"] = {"files": ["quats.webp"]}
+    meta["sh0"] = {"codebook": colour_book, "files": ["sh0.webp"]}
+    if bases := g.shN.shape[1]:
+        palette, rows = _palette(g.shN.reshape(count, -1).numpy())
+        codes, book = _coded(palette)
+        files["shN_centroids.webp"] = _webp(_centroids(codes, bases))
+        files["shN_labels.webp"] = webp(np.stack([rows & 255, rows >> 8, 0 * rows], 1))
+        meta["shN"] = {"count": len(palette), "bands": BASES.index(bases), "codebook": book}
+        meta["shN"]["files"] = ["shN_centroids.webp", "shN_labels.webp"]
+    return {META: json.dumps(meta).encode(), **files}
+
+
+def _check(name: str, g: Gaussians) -> None:
+    if not 0 < len(g) <= (_WIDEST - 4) ** 2:
+        raise DataError(
+            f"{name}: {len(g)} Gaussians; a SOG holds 1 to {(_WIDEST - 4) ** 2}, write other levels"
+        )
+    for key, values in g.parameters().items():
+        if bad := int((~torch.isfinite(values)).sum()):
+            raise DataError(f"{name}: {bad} values of {key} are NaN or infinite; train the scene again")
+    if bad := int((~g.quats.any(1)).sum()):
+        raise DataError(f"{name}: {bad} Gaussians have a rotation of zeros; train the scene again")
+
+
+def _webp(pixels: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, "WEBP", lossless=True, exact=True, quality=75, method=4)
+    return buffer.getvalue()
+
+
+def _positions(means: np.ndarray) -> tuple[np.ndarray, dict[str, list[float]]]:
+    """Positions as integers of 16 bits [N, 3], and the ends of their logarithms."""
+    logs = np.sign(means) * np.log1p(np.abs(means))
+    low, high = logs.min(0), logs.max(0)
+    fixed = np.rint((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(np.uint16)
+    return fixed, {"mins": low.tolist(), "maxs": high.tolist()}
+
+
+def _rotations(quats: np.ndarray) -> np.ndarray:
+    """Pixels [N, 4] from quaternions wxyz of any length."""
+    rows, largest = np.arange(len(quats)), np.abs(quats).argmax(1)
+    unit = quats / (np.linalg.norm(quats, axis=1) * np.sign(quats[rows, largest]))[:, None]
+    others = np.take_along_axis(unit, OTHERS[largest], axis=1)
+    return np.concatenate([np.rint((others * 2**0.5 + 1) * 127.5).clip(0, 255), 252 + largest[:, None]], 1)
+
+
+def _coded(values: np.ndarray) -> tuple[np.ndarray, list[float]]:
+    """Rows of a codebook of at most 256 values for each value, and the codebook.
+
+    Lloyd's algorithm on a histogram, from quantiles and equal steps, half each: rare values stay within such
+    a step. At most 256 different values are kept as they are.
+    """
+    book = np.unique(values[:: max(1, values.size // _SAMPLE)])
+    if len(book) > 256 or len(book := np.unique(values)) > 256:
+        book = _codebook(values.ravel().astype(np.float64))
+    codes = np.searchsorted((book[1:].astype(np.float64) + book[:-1]) / 2, values)
+    return codes.astype(np.uint8), book.astype(np.float32).tolist()
+
+
+def _codebook(values: np.ndarray) -> np.ndarray:
+    low, high = values.min(), values.max()
+    bins = ((values - low) / (high - low) * _BINS).astype(np.int64).clip(0, _BINS - 1)
+    counts, sums = np.bincount(bins, minlength=_BINS), np.bincount(bins, values, _BINS)
+    counts, sums = counts[counts > 0], sums[counts > 0]
+    means, quantiles = sums / counts, np.quantile(values, np.linspace(0, 1, 128))
+    book = np.unique(np.concatenate([quantiles, np.linspace(low, high, 128)]))
+    for _ in range(_ROUNDS):
+        nearest = np.searchsorted((book[1:] + book[:-1]) / 2, means)
+        totals = np.bincount(nearest, counts, len(book))
+        book = (np.bincount(nearest, sums, len(book)) / totals.clip(1))[totals > 0]
+    return book
+
+
+def _centroids(codes: np.ndarray, bases: int) -> np.ndarray:
+    """The palette's image: 64 rows of it, each of `bases` pixels, in a row of pixels."""
+    height = math.ceil(len(codes) / 64)
+    pixels = np.full((height * 64, bases, 4), 255, np.uint8)
+    pixels[: len(codes), :, :3] = codes.reshape(-1, bases, 3)
+    return pixels.reshape(height, 64 * bases, 4)
+
+
+def _palette(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A palette [K, D] for points [N, D], and the row of each."""
+    size = round(min(_PALETTE, 2 ** math.floor(math.log2(len(points) / 1024))) * 1024)
+    different, inverse = np.unique(points, axis=0, return_inverse=True)
+    if len(different) <= size:
+        return different, inverse
+    rng = np.random.default_rng(0)
+    coarse = _clusters(points[rng.permutation(len(points))[:_SAMPLE]], min(_COARSE, size), rng)
+    of, distances = _nearest(different, coarse)
+    spread = np.bincount(of, np.sqrt(distances), len(coarse))  # a cluster gets more rows where it is wide
+    shares = _shares(spread, np.bincount(of, minlength=len(coarse)), size)
+    rows, palette, begun = np.empty(len(different), np.int64), [], 0
+    for i, share in enumerate(shares):
+        if share:
+            members = np.flatnonzero(of == i)
+            palette.append(_clusters(different[members], share, rng))
+            rows[members] = begun + _nearest(different[members], palette[-1])[0]
+            begun += len(palette[-1])
+    return np.concatenate(palette), rows[inverse]
+
+
+def _shares(weights: np.ndarray, most: np.ndarray, size: int) -> np.ndarray:
+    """Whole numbers [C] in proportion to weights, from 1 to `most`, of `size` in total or less."""
+    shares = np.minimum(most, 1)
+    for _ in range(_ROUNDS):  # what some cannot take is for the others
+        room = np.where(shares < most, weights + 1e-12, 0)
+        shares = np.minimum(shares + (size - shares.sum()) * room / max(room.sum(), 1e-12), most)
+    return np.maximum(shares.astype(np.int64), np.minimum(most, 1))
+
+
+def _clusters(points: np.ndarray, size: int, rng: np.random.Generator) -> np.ndarray:
+    """At most `size` centres of points, by Lloyd's algorithm."""
+    if size >= len(points):
+        return points
+    centres = points[rng.permutation(len(points))[:size]]
+    for _ in range(_ROUNDS if size > 1 else 1):
+        of = _nearest(points, centres)[0]
+        members = csr_array(
+            (np.ones(len(points), np.float32), (of, np.arange(len(points)))), (len(centres), len(points))
+        )
+        totals = np.bincount(of, minlength=len(centres))
+        centres = (members @ points)[totals > 0] / totals[totals > 0, None].astype(np.float32)
+    return centres
+
+
+def _nearest(points: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The nearest centre of each point, and the squared distance."""
+    lengths = np.square(centres).sum(1)
+    of, distances = np.empty(len(points), np.int64), np.empty(len(points))
+    for start in range(0, len(points), _BLOCK):
+        block = points[start : start + _BLOCK]
+        table = lengths - 2 * (block @ centres.T)
+        nearest = table.argmin(1)
+        of[start : start + _BLOCK] = nearest
+        found = table[np.arange(len(block)), nearest] + np.square(block).sum(1)
+        distances[start : start + _BLOCK] = found.clip(0)
+    return of, distances

@@ -1,0 +1,40 @@
+"""Writes splat files for other viewers, in the format that the file's name says."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from sagesplat.core.errors import DataError
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.formats.lod_meta import LOD_META
+from sagesplat.formats.ply import write_ply
+from sagesplat.formats.sog_write import write_sog
+from sagesplat.formats.spz import write_spz
+
+_SUFFIXES = (".ply", ".spz", ".sog")
+
+
+def written_as(path: Path) -> str:
+    """The suffix that says the format, or `lod-meta.json`; DataError for a name that says none."""
+    suffix = path.suffix.lower()
+    if path.name != LOD_META and suffix not in _SUFFIXES:
+        known = ", ".join(_SUFFIXES)
+        raise DataError(f"{path}: its name says no format that is written; use {known} or {LOD_META}")
+    return LOD_META if path.name == LOD_META else suffix
+
+
+def write_splat(
+    path: Path, g: Gaussians, names: Mapping[int, str] | None = None, *, antialiased: bool = False
+) -> None:
+    """Write Gaussians as .ply, .spz (version 4) or .sog, by the suffix, with their labels and `names`.
+
+    `read_splat` finds the labels again. DataError for another suffix, and what the formats cannot hold.
+    """
+    match written_as(path):
+        case ".ply":
+            write_ply(path, g, names, antialiased=antialiased)
+        case ".spz":
+            write_spz(path, g, version=4, names=names or {}, antialiased=antialiased)
+        case ".sog":
+            write_sog(path, g, names, antialiased=antialiased)
+        case _:
+            raise DataError(f"{path}: {LOD_META} holds several levels; use `write_lod_meta`")
