@@ -24,6 +24,7 @@ from sagesplat.stages.plan import main_target
 from sagesplat.stages.scene import open_scene
 from sagesplat.train.checkpoint import write_checkpoint
 from sagesplat.train.state import initial_state
+from sagesplat.viewer.built import package_viewer
 from sagesplat.viewer.bundle import is_bundle
 from sagesplat.viewer.display_names import colors_of
 from sagesplat.viewer.frames import camera_at
@@ -273,6 +274,17 @@ def test_colours_are_distinct_and_stay() -> None:
     few = colors_of({i: wanted[i] for i in (-1, 3, 7, 9)})
     assert len(set(few.values())) == 4
     assert colors_of({5: (0, 200, 0)})[5] in ("#3f9f4f", "#6dbd6a")
+
+
+def test_a_run_as_one_page(run: Path, tmp_path: Path) -> None:
+    if not (package_viewer() / "index.html").exists():
+        pytest.skip("the viewer is not built")
+    job, out = job_of(run), tmp_path / "scene.html"
+    made = bundle(job, out, single_file=True, weights={"car": 3})
+    assert made.sizes.total == out.stat().st_size > made.sizes.chunks
+    assert out.read_text().count('data-uri="chunks/') == made.chunks == len(read_index(job.run.increments))
+    with pytest.raises(RunError, match=r"name that ends in \.html"):
+        bundle(job, tmp_path / "folder", single_file=True)
 
 
 @pytest.mark.slow

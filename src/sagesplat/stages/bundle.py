@@ -56,6 +56,7 @@ from sagesplat.viewer.frames import FLIP, camera_at
 from sagesplat.viewer.manifest import CameraEntry, Category, Contents, start_of
 from sagesplat.viewer.pack import ASPECT, FOV_Y
 from sagesplat.viewer.promises import Seen
+from sagesplat.viewer.single_file import check_page, write_single_file
 
 _GROUND = {"dirt", "floor", "grass", "gravel", "ground", "pavement", "platform", "playingfield", "railroad"}
 _GROUND |= {"path", "road", "sand", "sidewalk", "snow", "soil", "street", "terrain"}
@@ -86,9 +87,12 @@ def bundle(
     meters_per_unit: float | None = None,
     always: Collection[str] = (),
     weights: Mapping[str, float] | None = None,
+    single_file: bool = False,
     viewer: Path | None = None,
 ) -> BundleMade:
     """Write a finished run as a bundle into `out`: a new or empty folder, or an earlier bundle.
+
+    With `single_file`, `out` is one HTML page.
 
     `meters_per_unit`: scale of the scene; by default guessed from the cameras' height. `always`: categories
     shipped in full. `weights`: by category, 1 for the others. In a scene in blocks, a category's name stands
@@ -101,7 +105,7 @@ def bundle(
     job = _without_capture(replace(job, run=replace(job.run, ladder="nested")))
     _check(job, meters_per_unit, always, weights)
     viewer = viewer or package_viewer()
-    check_target(out)
+    (check_page if single_file else check_target)(out)
     check_viewer(viewer)
     chunks = increments_of(job)
     full = full_scene(chunks)
@@ -115,7 +119,8 @@ def bundle(
     )
     contents = replace(contents, categories=_with_quality(job, contents.categories, always, weights))
     contents = with_corrections(contents)
-    written = write_bundle(out, contents, viewer, _poster(g, contents))
+    write = write_single_file if single_file else write_bundle
+    written = write(out, contents, viewer, _poster(g, contents))
     agreement, error = distance_error(contents)
     count = sum(chunk.count for chunk in full)
     return BundleMade(out, len(contents.categories), len(chunks), count, written, agreement, error)
