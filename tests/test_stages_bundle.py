@@ -22,6 +22,7 @@ from sagesplat.run.run_dir import RunDir
 from sagesplat.stages.bundle import _antialiased, bundle, live_bundle
 from sagesplat.stages.plan import main_target
 from sagesplat.stages.scene import open_scene
+from sagesplat.stages.view import run_bundle
 from sagesplat.train.checkpoint import write_checkpoint
 from sagesplat.train.state import initial_state
 from sagesplat.viewer.built import package_viewer
@@ -170,6 +171,30 @@ def test_an_unfinished_run_names_the_command(run, tmp_path, viewer, missing, com
         bundle(job_of(run), tmp_path / "out", viewer=viewer)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("absent", [True, False])
+def test_a_run_without_photos_has_fidelity_only(
+    run: Path, tmp_path: Path, viewer: Path, absent: bool
+) -> None:
+    """Promises of SSIM are not there, or there are none in the file."""
+    if absent:
+        record = run / "nested" / "provenance" / "fit.json"
+        made = json.loads(record.read_text())
+        del made["inputs"]["nested/observations.csv"]
+        record.write_text(json.dumps(made))
+        (run / "nested" / "observations.csv").unlink()
+        (run / "nested" / "promises.json").unlink()
+    else:
+        (run / "nested" / "promises.json").write_text('{"promises": []}')
+    made = bundle(job_of(run), tmp_path / "out", viewer=viewer)
+    manifest = manifest_of(tmp_path / "out")
+    assert list(manifest["promises"]) == ["fidelity"]
+    assert manifest["target"]["quality"] == "fidelity"
+    assert all(list(label["quality"]) in ([], ["fidelity"]) for label in manifest["labels"])
+    assert made.error[0] >= 0
+    if (package_viewer() / "index.html").exists():
+        assert is_bundle(run_bundle(job_of(run)))
 
 
 def test_bad_input_is_one_line(run: Path, tmp_path: Path, viewer: Path) -> None:

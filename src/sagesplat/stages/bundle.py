@@ -33,6 +33,7 @@ from sagesplat.segment.masks import UNLABELLED
 from sagesplat.stages.plan import main_target
 from sagesplat.stages.results import (
     fidelity_of,
+    has_photos,
     increments_of,
     observations_of,
     promises_of,
@@ -206,12 +207,12 @@ def _check(
     job: Job, meters_per_unit: float | None, always: Collection[str], weights: Mapping[str, float]
 ) -> None:
     run = job.run
+    against_photos = (("observe", run.observations), ("fit", run.promises)) if has_photos(run) else ()
     for stage, path in (
         ("nest", run.increments / INDEX),
-        ("observe", run.observations),
+        *against_photos,
         ("sample", run.sampled),
         ("fit", run.fidelity),
-        ("fit", run.promises),
     ):
         if not path.exists():
             raise RunError(
@@ -219,7 +220,7 @@ def _check(
                 f"run `sagesplat {stage}`, or `sagesplat run`"
             )
     if not is_made_from(run, "fit", run.increments / INDEX):
-        raise RunError(f"{run.promises}: fitted to other increments; run `sagesplat fit` again with --force")
+        raise RunError(f"{run.fidelity}: fitted to other increments; run `sagesplat fit` again with --force")
     if meters_per_unit is not None and not 1e-6 <= meters_per_unit <= 1e6:
         raise RunError(f"{meters_per_unit} metres per unit are impossible; give a number such as 0.5")
     names = set(job.names().values())
@@ -315,7 +316,7 @@ def _with_quality(
     }
     seen: dict[QualityKind, dict[int, Seen]] = {
         "fidelity": _seen_from_drawn(job),
-        "ssim": _seen_in_photos(job),
+        "ssim": _seen_in_photos(job) if has_photos(job.run) else {},
     }
     return [
         replace(
