@@ -1,8 +1,8 @@
 """Test vectors of what the viewer evaluates: `python tests/make_viewer_vectors.py` writes them.
 
 A case of tests/data/distances.json has boxes, a camera, its half spaces and under "expected" the distance
-(null: nothing in sight), whether the category is visible and which boxes touch; planes are to be equal to
-1e-9, distances to 1e-9 of themselves. A case of tests/data/promises.json has a document as in
+(null: nothing in sight), whether the category is visible and which boxes touch; also the half spaces within
+LENS, the photos', and the distance by them. Planes are to be equal to 1e-9, distances to 1e-9 of themselves. A case of tests/data/promises.json has a document as in
 promises-*.json with one label, and viewpoints with the distance, what it is corrected to, and the expected
 mean and bound by level and the support, to 1e-9 (null: NaN).
 """
@@ -27,6 +27,7 @@ Case = dict[str, Any]
 
 AHEAD = (0.0, 0.0, 0.0, 1.0)
 UNIT = [[-1, -1, -6, 1, 1, -4]]
+LENS = (0.35, 0.3)  # half width and half height at distance 1
 ROOM = [[-3, -1, -3, 3, 1, 3], [-1, 0, -9, 1, 2, -7]]
 
 
@@ -38,11 +39,14 @@ def _distance_case(
         boxes.frustum(position, quaternion, fov_y, aspect),
     )
     touches = boxes.touching(box, planes)
+    photo = boxes.photo_frustum(position, quaternion, fov_y, aspect, LENS)
     camera = {"position": position, "quaternion": quaternion, "fovY": fov_y, "aspect": aspect}
     return {
         "name": name, "boxes": box.tolist(), "camera": camera, "frustum": planes.tolist(),
+        "lens": LENS, "photo": photo.tolist(),
         "expected": {
             "distance": _plain(boxes.distance(box, position, planes)),
+            "inPhoto": _plain(boxes.distance(box, position, planes, photo)),
             "visible": bool(touches.any()),
             "touching": touches.tolist(),
         },

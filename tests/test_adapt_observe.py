@@ -1,10 +1,20 @@
 """Distances of categories, eroded masks and what is measured in a view."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from conftest import random_gaussians, write_capture
+from conftest import pinhole, random_gaussians, write_capture
 
-from sagesplat.adapt.observe import TOTAL, as_unit, distances_in_views, erode, measure
+from sagesplat.adapt.observe import (
+    TOTAL,
+    as_unit,
+    distances_in_views,
+    erode,
+    measure,
+    widest_lens,
+    within_lens,
+)
 from sagesplat.metrics.image import ssim_map
 
 
@@ -29,6 +39,23 @@ def test_a_category_out_of_sight_has_no_distance(tmp_path):
     labels = np.zeros(50, np.int16)
     labels[7] = 9
     assert np.isnan(distances_in_views(scene, labels)[9]).all()
+
+
+def test_a_picture_wider_than_the_photos_is_cut_to_them():
+    photo = replace(
+        pinhole(), K=np.array([[50, 0, 30], [0, 60, 20], [0, 0, 1]], np.float32), width=60, height=40
+    )
+    lens = widest_lens([photo, replace(photo, width=30)])
+    assert lens == pytest.approx((0.6, 1 / 3))
+    assert within_lens(photo, lens) is photo
+    assert within_lens(photo.resized(600, 400), lens).width == 600
+    middle = np.array([[50, 0, 20], [0, 60, 45], [0, 0, 1]], np.float32)
+    phone = replace(photo, width=40, height=90, K=middle)
+    cut = within_lens(phone, lens)
+    assert (cut.width, cut.height) == (40, 40)  # around the principal point
+    assert cut.K[:2, 2].tolist() == [20, 20]
+    assert (cut.w2c == phone.w2c).all()
+    assert widest_lens([cut]) == pytest.approx((0.4, 1 / 3))
 
 
 def test_erode_keeps_pixels_that_are_far_from_any_border():

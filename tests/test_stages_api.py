@@ -75,6 +75,20 @@ def test_a_camera_is_planned_for_fidelity_by_default(runs):
     assert all(c.calibrated is None for c in lost.choices)
 
 
+def test_a_phone_knows_the_distances_of_the_photos(runs):
+    run = runs["nested"]
+    photo = run.scene.views[0].camera
+    K = photo.K.copy()
+    K[1, 2] += photo.height
+    phone = replace(photo, K=K, height=3 * photo.height)
+    wanted = {c.label_id: c.distance for c in run.plan_camera(photo).choices}
+    found = {c.label_id: c.distance for c in run.plan_camera(phone).choices}
+    assert any(map(math.isfinite, wanted.values()))
+    for label, distance in wanted.items():
+        if math.isfinite(distance):  # else it is only on the phone
+            assert found[label] == distance
+
+
 def test_impossible_targets_of_a_camera_are_one_line(runs):
     camera = runs["nested"].scene.views[0].camera
     for target in (0.0, 1.5, math.nan):

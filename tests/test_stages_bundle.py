@@ -22,8 +22,10 @@ from sagesplat.run.run_dir import RunDir
 from sagesplat.stages.bundle import _antialiased, bundle, live_bundle
 from sagesplat.stages.plan import main_target
 from sagesplat.stages.scene import open_scene
+from sagesplat.stages.view import run_bundle
 from sagesplat.train.checkpoint import write_checkpoint
 from sagesplat.train.state import initial_state
+from sagesplat.viewer.built import package_viewer
 from sagesplat.viewer.bundle import is_bundle
 from sagesplat.viewer.display_names import colors_of
 from sagesplat.viewer.frames import camera_at
@@ -171,6 +173,30 @@ def test_an_unfinished_run_names_the_command(run, tmp_path, viewer, missing, com
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("absent", [True, False])
+def test_a_run_without_photos_has_fidelity_only(
+    run: Path, tmp_path: Path, viewer: Path, absent: bool
+) -> None:
+    """Promises of SSIM are not there, or there are none in the file."""
+    if absent:
+        record = run / "nested" / "provenance" / "fit.json"
+        made = json.loads(record.read_text())
+        del made["inputs"]["nested/observations.csv"]
+        record.write_text(json.dumps(made))
+        (run / "nested" / "observations.csv").unlink()
+        (run / "nested" / "promises.json").unlink()
+    else:
+        (run / "nested" / "promises.json").write_text('{"promises": []}')
+    made = bundle(job_of(run), tmp_path / "out", viewer=viewer)
+    manifest = manifest_of(tmp_path / "out")
+    assert list(manifest["promises"]) == ["fidelity"]
+    assert manifest["target"]["quality"] == "fidelity"
+    assert all(list(label["quality"]) in ([], ["fidelity"]) for label in manifest["labels"])
+    assert made.error[0] >= 0
+    if (package_viewer() / "index.html").exists():
+        assert is_bundle(run_bundle(job_of(run)))
+
+
 def test_bad_input_is_one_line(run: Path, tmp_path: Path, viewer: Path) -> None:
     job, out = job_of(run), tmp_path / "out"
     with pytest.raises(RunError, match="dragon, unicorn: no such category; there are "):
@@ -273,6 +299,17 @@ def test_colours_are_distinct_and_stay() -> None:
     few = colors_of({i: wanted[i] for i in (-1, 3, 7, 9)})
     assert len(set(few.values())) == 4
     assert colors_of({5: (0, 200, 0)})[5] in ("#3f9f4f", "#6dbd6a")
+
+
+def test_a_run_as_one_page(run: Path, tmp_path: Path) -> None:
+    if not (package_viewer() / "index.html").exists():
+        pytest.skip("the viewer is not built")
+    job, out = job_of(run), tmp_path / "scene.html"
+    made = bundle(job, out, single_file=True, weights={"car": 3})
+    assert made.sizes.total == out.stat().st_size > made.sizes.chunks
+    assert out.read_text().count('data-uri="chunks/') == made.chunks == len(read_index(job.run.increments))
+    with pytest.raises(RunError, match=r"name that ends in \.html"):
+        bundle(job, tmp_path / "folder", single_file=True)
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import base64
 import http.server
 import json
+import re
 import shutil
 import threading
 from collections.abc import Iterator
@@ -20,13 +21,14 @@ from make_viewer_vectors import model
 
 from sagesplat.adapt.viewpoint import QualityKind, ViewModel
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.formats.increments import read_increments, shown, write_increments
+from sagesplat.formats.increments import full_scene, read_increments, shown, write_increments
 from sagesplat.raster import rasterize
 from sagesplat.scene.scene import Camera
 from sagesplat.viewer.built import package_viewer
 from sagesplat.viewer.bundle import write_bundle
 from sagesplat.viewer.manifest import CameraEntry, Category, Contents
 from sagesplat.viewer.promises import Seen
+from sagesplat.viewer.single_file import write_single_file
 
 pytestmark = [
     pytest.mark.skipif(chromium.missing() is not None, reason=chromium.missing() or ""),
@@ -629,3 +631,41 @@ def test_parts_are_listed_weighed_and_hidden_by_category(in_blocks: Path, browse
         bricks.get_by_label("Hide brick").click()
         assert bricks.get_by_label("Show brick").count() == 1
         assert opened.complaints == []
+
+
+def test_a_page_with_its_bundle_inside_opens_from_the_disk(tmp_path: Path, browser: Any) -> None:
+    contents = three_walls(
+        tmp_path, replaces={1: (3,)}, kind=lambda label, level: "ply" if level > 2 else "spz"
+    )
+    page = tmp_path / "walls #1 ü.html"
+    poster = b"\xff\xd8\xff\xd9"
+    written = write_single_file(page, contents, package_viewer(), poster)
+    assert written.total == page.stat().st_size
+    shutil.rmtree(tmp_path / "chunks")
+    asked: list[str] = []
+    with open_page("about:blank", browser=browser) as opened:
+        opened.page.on("request", lambda request: asked.append(request.url))
+        opened.page.goto(f"{page.as_uri()}?ui=1")
+        ready(opened)
+        full_count = WHOLE - 50  # wall 1 begins again
+        opened.page.evaluate("sagesplat.set({ mode: 'full' })")
+        opened.wait_for(f"sagesplat.state().count === {full_count}")
+        opened.page.evaluate("sagesplat.goTo('photo1.jpg')")
+        opened.page.evaluate("document.querySelectorAll('.panel, .toolbar').forEach((e) => e.remove())")
+        picture = settled(opened)
+        assert opened.page.evaluate("sagesplat.state().message") is None
+        assert opened.complaints == []
+    g = read_increments_of_page(page, contents, tmp_path / "again")
+    wanted = rasterize(g, camera(0.2), backend="cpu", antialiased=False).rgb.clamp(0, 1).numpy()
+    assert -10 * np.log10(((picture - wanted) ** 2).mean()) > 30  # dB
+    assert [url for url in asked if not url.startswith(("blob:", "data:"))] == [f"{page.as_uri()}?ui=1"]
+
+
+def read_increments_of_page(page: Path, contents: Contents, folder: Path) -> Gaussians:
+    """The full scene of a page, from the files inside it."""
+    inside = re.findall(r'data-uri="chunks/([^"]+)">([^<]+)<', page.read_text())
+    assert [uri for uri, _ in inside] == [chunk.uri for chunk in contents.chunks]
+    folder.mkdir()
+    for uri, text in inside:
+        (folder / uri).write_bytes(base64.b64decode(text))
+    return read_increments(folder, full_scene(contents.chunks))

@@ -95,6 +95,20 @@ def test_distance_lies_between_the_nearest_and_the_farthest_corner(seed: int) ->
         assert near.min() <= told <= far.max()
 
 
+def test_a_window_higher_than_the_photos_knows_the_distances_of_the_photos() -> None:
+    """The ground from one's feet on: a phone held upright sees nearer parts of it than any photo."""
+    ground = boxes.split_boxes(np.random.default_rng(0).uniform([-8, -1.6, -20], [8, -1.5, 0], (4000, 3)))
+    pose, lens = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)), (0.55, 0.4)
+    photo = boxes.distance(ground, pose[0], boxes.frustum(*pose, 2 * math.atan(0.4), 0.55 / 0.4))
+    phone = 2 * math.atan(1.2), 0.46
+    window, inside = boxes.frustum(*pose, *phone), boxes.photo_frustum(*pose, *phone, lens)
+    assert boxes.distance(ground, pose[0], window) < 0.85 * photo
+    assert boxes.distance(ground, pose[0], window, inside) == pytest.approx(photo, rel=0.05)
+    feet = np.array([[-0.1, -1.6, -2.0, 0.1, -1.5, -1.8]])  # in no photo from here
+    assert boxes.distance(feet, pose[0], window, inside) == boxes.distance(feet, pose[0], window) > 0
+    np.testing.assert_array_equal(boxes.photo_frustum(*pose, 0.5, 1.0, lens), boxes.frustum(*pose, 0.5, 1.0))
+
+
 def test_shared_vectors_are_what_is_computed() -> None:
     for name, cases in (("distances", distance_cases()), ("promises", promise_cases())):
         stored = json.loads((DATA / f"{name}.json").read_text())["cases"]

@@ -1,5 +1,6 @@
 import { loadManifest } from "./core/manifest";
 import { bundleUrl, type Embed, type Options, parseOptions } from "./embed";
+import { sourceInside } from "./inside";
 import { fail, hideNotice, messageOf } from "./ui/notice";
 import { buildPage } from "./ui/page";
 import { colorsOf } from "./view/spark";
@@ -18,15 +19,18 @@ ready.catch((error: unknown) => fail(messageOf(error)));
 async function begin(): Promise<void> {
   await Promise.resolve(); // `window.sagesplat` exists before any error
   const options = parseOptions(location.search, location.hash);
-  const base = bundleUrl(options.bundle, location.href);
+  const source = sourceInside(document) ?? {
+    base: bundleUrl(options.bundle, location.href),
+    fetch: (url: string, init?: RequestInit) => fetch(url, init),
+  };
   const canvas = document.getElementById("view");
   if (!(canvas instanceof HTMLCanvasElement))
     throw new Error("This page is incomplete; copy the bundle again.");
   if (!document.createElement("canvas").getContext("webgl2")) {
     throw new Error("This browser has no WebGL 2; enable hardware acceleration or use another browser.");
   }
-  const manifest = await loadManifest(base, (url, init) => fetch(url, init));
-  open(canvas, new Viewer(canvas, manifest, base, options), options);
+  const manifest = await loadManifest(source.base, source.fetch);
+  open(canvas, new Viewer(canvas, manifest, source, options), options);
 }
 
 function open(canvas: HTMLCanvasElement, viewer: Viewer, options: Options): void {

@@ -1,7 +1,7 @@
 """Observations: the quality of each category at each level, view by view."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Protocol
@@ -86,6 +86,30 @@ def distances_in_views(
             mine = distance[seen_labels == label]
             table[int(label)][row] = mine.mean() if percentile is None else np.percentile(mine, percentile)
     return table
+
+
+def widest_lens(cameras: Sequence[Camera]) -> tuple[float, float]:
+    """Largest half width and half height of the cameras' pictures, at distance 1."""
+    sizes = np.array([[c.width / c.K[0, 0], c.height / c.K[1, 1]] for c in cameras], np.float64) / 2
+    wide, high = sizes.max(0).tolist()
+    return wide, high
+
+
+def within_lens(camera: Camera, lens: tuple[float, float]) -> Camera:
+    """The camera with a picture no wider and no higher than `lens`, around its principal point; else itself.
+
+    Models know distances in photos: in a wider picture a category's closest points are ones that no photo has.
+    """
+    focal, size = camera.K.diagonal()[:2].astype(np.float64), np.array([camera.width, camera.height])
+    most = np.maximum(np.round(2 * focal * lens), 1).astype(int)
+    if (size <= most).all():
+        return camera
+    width, height = np.minimum(size, most).tolist()
+    K = camera.K.copy()
+    K[0, 2], K[1, 2] = (
+        K[i, 2] if old <= new else new / 2 for i, (old, new) in enumerate(zip(size, most, strict=True))
+    )
+    return replace(camera, K=K, width=width, height=height)
 
 
 def render_rgb(

@@ -131,11 +131,11 @@ def bundle(
     config: Annotated[BundleConfig, Flat] = BundleConfig(),
     machine: Annotated[Device, Flat] = Device(),
 ) -> None:
-    """Write a finished run as a folder for any static web server: scene, quality models and viewer.
+    """Write a finished run as a folder for any static web server, or as one page: scene, models and viewer.
 
     Args:
         run: run folder, finished with the nested levels
-        out: folder to write: a new or empty one, or an earlier bundle, which is replaced
+        out: folder to write (new, empty, or an earlier bundle, which is replaced); with --single-file a page
     """
     from sagesplat.stages.bundle import bundle as write
 

@@ -396,6 +396,8 @@ class BundleConfig:
     """Categories that are always shipped in full."""
     weights: dict[str, float] = field(default_factory=dict)
     """Weights of categories in the viewer's plans, as NAME VALUE ... (default: 1 each)."""
+    single_file: bool = False
+    """Write one HTML page that opens from the disk, instead of a folder for a web server."""
 
 
 @dataclass(frozen=True)

@@ -246,7 +246,7 @@ def check_level(path: Path) -> None:
 def _decode(file: Npz, label: int) -> Gaussians:
     def column(name: str) -> np.ndarray:
         with np.errstate(all="ignore"):  # values too large for float32 become Inf, which is checked later
-            return file[f"{label}/{name}"].astype(np.float32)
+            return file[f"{label}/{name}"].astype(np.float32, copy=False)
 
     values = {name: column(name) for name in ("means", *_HALVES)}
     if file[f"{label}/quats"].dtype == np.float32:  # exact

@@ -172,6 +172,11 @@ def is_made_from(run: RunDir, stage: str, path: Path) -> bool:
     return _record_of(run, stage)["inputs"].get(name) == digest
 
 
+def uses(run: RunDir, stage: str, path: Path) -> bool:
+    """Whether a finished stage's result was made from a file, whatever is in it now."""
+    return Path(os.path.relpath(path, run.path)).as_posix() in _record_of(run, stage)["inputs"]
+
+
 def _record_of(run: RunDir, stage: str) -> dict[str, Any]:
     if not run.provenance(stage).exists():
         raise RunError(f"{run.path}: stage {stage} is not done; run `sagesplat {stage}` or `sagesplat run`")

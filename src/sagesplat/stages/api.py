@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from sagesplat.adapt.bound_plans import Costs, plan_for_view, quality_at
-from sagesplat.adapt.observe import PERCENTILE, RenderedLabels, distances_in_views
+from sagesplat.adapt.observe import PERCENTILE, RenderedLabels, distances_in_views, widest_lens, within_lens
 from sagesplat.adapt.plan import Plan, plan_view
 from sagesplat.adapt.viewpoint import ViewModel
 from sagesplat.core.config import PlanConfig, RunConfig
@@ -180,8 +180,10 @@ class FinishedRun:
         kind, target = config.quality, config.target
         # Distances have to be measured as those that the models were fitted to.
         percentile = PERCENTILE if self.job.fit_config.distance == "percentile" else 0.0
-        viewer = replace(self.scene, views=(View("viewer", camera, Path()),))
-        distances = distances_in_views(viewer, self.job.point_labels, percentile)
+        lens = within_lens(camera, widest_lens([view.camera for view in self.scene.views]))
+        views = (View("photo", lens, Path()), View("viewer", camera, Path()))
+        seen = distances_in_views(replace(self.scene, views=views), self.job.point_labels, percentile)
+        distances = {label: np.where(np.isnan(d[:1]), d[1:], d[:1]) for label, d in seen.items()}
         if self.job.run.ladder == "nested":
             models = self.fidelity if kind == "fidelity" else self.promises
             quality = quality_at(self.costs, models, distances, [camera], kind)

@@ -33,6 +33,7 @@ from sagesplat.segment.masks import UNLABELLED
 from sagesplat.stages.plan import main_target
 from sagesplat.stages.results import (
     fidelity_of,
+    has_photos,
     increments_of,
     observations_of,
     promises_of,
@@ -56,6 +57,7 @@ from sagesplat.viewer.frames import FLIP, camera_at
 from sagesplat.viewer.manifest import CameraEntry, Category, Contents, start_of
 from sagesplat.viewer.pack import ASPECT, FOV_Y
 from sagesplat.viewer.promises import Seen
+from sagesplat.viewer.single_file import check_page, write_single_file
 
 _GROUND = {"dirt", "floor", "grass", "gravel", "ground", "pavement", "platform", "playingfield", "railroad"}
 _GROUND |= {"path", "road", "sand", "sidewalk", "snow", "soil", "street", "terrain"}
@@ -86,9 +88,12 @@ def bundle(
     meters_per_unit: float | None = None,
     always: Collection[str] = (),
     weights: Mapping[str, float] | None = None,
+    single_file: bool = False,
     viewer: Path | None = None,
 ) -> BundleMade:
     """Write a finished run as a bundle into `out`: a new or empty folder, or an earlier bundle.
+
+    With `single_file`, `out` is one HTML page.
 
     `meters_per_unit`: scale of the scene; by default guessed from the cameras' height. `always`: categories
     shipped in full. `weights`: by category, 1 for the others. In a scene in blocks, a category's name stands
@@ -101,7 +106,7 @@ def bundle(
     job = _without_capture(replace(job, run=replace(job.run, ladder="nested")))
     _check(job, meters_per_unit, always, weights)
     viewer = viewer or package_viewer()
-    check_target(out)
+    (check_page if single_file else check_target)(out)
     check_viewer(viewer)
     chunks = increments_of(job)
     full = full_scene(chunks)
@@ -115,7 +120,8 @@ def bundle(
     )
     contents = replace(contents, categories=_with_quality(job, contents.categories, always, weights))
     contents = with_corrections(contents)
-    written = write_bundle(out, contents, viewer, _poster(g, contents))
+    write = write_single_file if single_file else write_bundle
+    written = write(out, contents, viewer, _poster(g, contents))
     agreement, error = distance_error(contents)
     count = sum(chunk.count for chunk in full)
     return BundleMade(out, len(contents.categories), len(chunks), count, written, agreement, error)
@@ -201,12 +207,12 @@ def _check(
     job: Job, meters_per_unit: float | None, always: Collection[str], weights: Mapping[str, float]
 ) -> None:
     run = job.run
+    against_photos = (("observe", run.observations), ("fit", run.promises)) if has_photos(run) else ()
     for stage, path in (
         ("nest", run.increments / INDEX),
-        ("observe", run.observations),
+        *against_photos,
         ("sample", run.sampled),
         ("fit", run.fidelity),
-        ("fit", run.promises),
     ):
         if not path.exists():
             raise RunError(
@@ -214,7 +220,7 @@ def _check(
                 f"run `sagesplat {stage}`, or `sagesplat run`"
             )
     if not is_made_from(run, "fit", run.increments / INDEX):
-        raise RunError(f"{run.promises}: fitted to other increments; run `sagesplat fit` again with --force")
+        raise RunError(f"{run.fidelity}: fitted to other increments; run `sagesplat fit` again with --force")
     if meters_per_unit is not None and not 1e-6 <= meters_per_unit <= 1e6:
         raise RunError(f"{meters_per_unit} metres per unit are impossible; give a number such as 0.5")
     names = set(job.names().values())
@@ -310,7 +316,7 @@ def _with_quality(
     }
     seen: dict[QualityKind, dict[int, Seen]] = {
         "fidelity": _seen_from_drawn(job),
-        "ssim": _seen_in_photos(job),
+        "ssim": _seen_in_photos(job) if has_photos(job.run) else {},
     }
     return [
         replace(

@@ -17,6 +17,8 @@ from sagesplat.adapt.viewpoints import Viewpoints, read_viewpoints
 from sagesplat.core.errors import DataError
 from sagesplat.formats.increments import INDEX, Increment, read_index, totals
 from sagesplat.run.job import Job
+from sagesplat.run.records import uses
+from sagesplat.run.run_dir import RunDir
 
 _WHOLE = -1  # level of the rows of the whole image in an evaluation
 
@@ -62,8 +64,18 @@ def models_of(job: Job) -> dict[tuple[int, int], SsimModel]:
 
 
 def promises_of(job: Job) -> dict[int, ViewModel]:
-    """Models of SSIM against photos with their bounds, by label id, of levels that the run has."""
+    """Models of SSIM against photos with their bounds, by label id, of levels that the run has.
+
+    None without photos: of a splat that somebody else trained.
+    """
+    if not job.run.promises.exists() and not has_photos(job.run):
+        return {}
     return _view_models(job, job.run.promises, "ssim")
+
+
+def has_photos(run: RunDir) -> bool:
+    """Whether the levels were measured against photos: else there is fidelity only."""
+    return not run.provenance("fit").exists() or uses(run, "fit", run.observations)
 
 
 def fidelity_of(job: Job) -> dict[int, ViewModel]:

@@ -116,7 +116,10 @@ def _open_run(path: Path, emit: Emit) -> "Job":
 
 
 def _is_finished(run: RunDir) -> bool:
-    return all(path.exists() for path in (run.fidelity, run.promises, run.increments / "index.json"))
+    from sagesplat.stages.results import has_photos
+
+    finished = all(path.exists() for path in (run.fidelity, run.increments / "index.json"))
+    return finished and (run.promises.exists() or not has_photos(run))
 
 
 def _is_current(run: RunDir, folder: Path) -> bool:

@@ -9,6 +9,10 @@ Distance, from a camera's position and the half spaces of its frustum: each box 
 boxes that lie in all half spaces. If there are none, but boxes touch the frustum, it is the distance of the
 nearest centre of those boxes. Else it is NaN: out of sight. A box touches the frustum if in each half space
 its deepest corner is inside.
+
+Models know distances in photos. A window may be higher or wider than any photo, as on a phone, and show what
+lies at one's feet. So samples count inside the frustum of the photos' lens (`widest_lens`) at the same pose;
+where that has none, inside the window's.
 """
 
 import math
@@ -52,6 +56,15 @@ def frustum(
     return np.column_stack([world, -world @ np.asarray(position, np.float64)])
 
 
+def photo_frustum(
+    position: ArrayLike, quaternion: ArrayLike, fov_y: float, aspect: float, lens: tuple[float, float]
+) -> Float[np.ndarray, "5 4"]:
+    """`frustum`, but no wider and no higher than `lens` (`adapt.observe.widest_lens`)."""
+    high = math.tan(fov_y / 2)
+    wide, high = min(high * aspect, lens[0]), min(high, lens[1])
+    return frustum(position, quaternion, 2 * math.atan(high), wide / high)
+
+
 def touching(boxes: Float[np.ndarray, "B 6"], planes: Float[np.ndarray, "P 4"]) -> Bool[np.ndarray, " B"]:
     """Which boxes touch the frustum of the half spaces; all do if there are no half spaces."""
     normals, offsets = planes[:, None, :3], planes[:, None, 3]
@@ -59,14 +72,26 @@ def touching(boxes: Float[np.ndarray, "B 6"], planes: Float[np.ndarray, "P 4"]) 
     return ((deepest * normals).sum(-1) + offsets >= 0).all(0)
 
 
-def distance(boxes: Float[np.ndarray, "B 6"], position: ArrayLike, planes: Float[np.ndarray, "P 4"]) -> float:
-    """Distance of the visible boxes (see the module's docstring), world units; NaN: out of sight."""
+def distance(
+    boxes: Float[np.ndarray, "B 6"],
+    position: ArrayLike,
+    planes: Float[np.ndarray, "P 4"],
+    photo: Float[np.ndarray, "P 4"] | None = None,
+) -> float:
+    """Distance of the visible boxes (see the module's docstring), world units; NaN: out of sight.
+
+    `planes`: half spaces of the window's frustum. `photo`: those of the photos' lens, within them; None: the
+    window is that of a photo.
+    """
     near, position = boxes[touching(boxes, planes)], np.asarray(position, np.float64)
     if not len(near):
         return math.nan
     low, size = near[:, None, :3], near[:, None, 3:] - near[:, None, :3]
     samples = (low + _GRID * size).reshape(-1, 3)
-    inside = (samples @ planes[:, :3].T + planes[:, 3] >= 0).all(1)
+    inside = np.zeros(len(samples), bool)
+    for lens in (planes,) if photo is None else (photo, planes):
+        if not inside.any():
+            inside = (samples @ lens[:, :3].T + lens[:, 3] >= 0).all(1)
     if not inside.any():
         centres = (near[:, :3] + near[:, 3:]) / 2
         return float(np.linalg.norm(centres - position, axis=1).min())

@@ -19,7 +19,7 @@ from sagesplat.viewer.pack import write_pack
 from sagesplat.viewer.quality import dumped
 
 MANIFEST, SCHEMA = "manifest.json", "manifest.schema.json"
-_LICENSES = """\
+LICENSES = """\
 The viewer in this folder is part of sagesplat, licensed under the Apache License, Version 2.0
 (SPDX: Apache-2.0). It contains other people's software: see THIRD_PARTY_LICENSES.txt.
 
@@ -56,7 +56,7 @@ def write_bundle(out: Path, contents: Contents, viewer: Path, poster: bytes | No
             shutil.copytree(viewer, fresh, dirs_exist_ok=True)
             (fresh / "chunks").mkdir()
             for chunk in contents.chunks:
-                (fresh / "chunks" / chunk.uri).write_bytes(_verified(contents.folder, chunk))
+                (fresh / "chunks" / chunk.uri).write_bytes(verified(contents.folder, chunk))
             if poster is not None:
                 _put_up(fresh, poster)
             return write_documents(fresh, contents)
@@ -88,7 +88,7 @@ def write_documents(folder: Path, contents: Contents) -> BundleSizes:
     for quality, content in promises.items():
         (folder / manifest["promises"][quality]["uri"]).write_bytes(content)
     write_text(folder / SCHEMA, files("sagesplat.viewer").joinpath(SCHEMA).read_text(encoding="utf-8"))
-    write_text(folder / "LICENSES.txt", _LICENSES)
+    write_text(folder / "LICENSES.txt", LICENSES)
     text = dumped(manifest)
     write_text(folder / MANIFEST, text.decode())
     total = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
@@ -112,7 +112,8 @@ def is_bundle(folder: Path) -> bool:
         return False
 
 
-def _verified(folder: Path, chunk: Increment) -> bytes:
+def verified(folder: Path, chunk: Increment) -> bytes:
+    """The content of an increment; DataError where it is missing or not what the index says."""
     try:
         content = (folder / chunk.uri).read_bytes()
     except OSError as error:

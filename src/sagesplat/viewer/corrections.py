@@ -44,13 +44,13 @@ def _corrections(
 def distance_error(contents: Contents) -> tuple[dict[int, tuple[float, float]], tuple[float, float]]:
     """Median and 95th percentile of the relative error of distances by boxes: by label id, and over all.
 
-    The reference is d_min, in the photos that show enough of a category.
+    The reference is d_min, in the photos that show enough of a category; without photos in drawn viewpoints.
     """
-    photos = {c.label_id: c.seen["ssim"] for c in contents.categories if "ssim" in c.seen}
+    seen = {c.label_id: c.seen.get("ssim") or c.seen.get("fidelity") for c in contents.categories}
     by_id = {
-        label: np.abs(np.expm1(-seen.corrections[seen.shares > 0]))
-        for label, seen in photos.items()
-        if seen.corrections is not None
+        label: np.abs(np.expm1(-one.corrections[one.shares > 0]))
+        for label, one in seen.items()
+        if one is not None and one.corrections is not None
     }
     by_label = {label: _median_and_95th(errors) for label, errors in by_id.items()}
     return by_label, _median_and_95th(np.concatenate([*by_id.values(), np.zeros(0)]))

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from sagesplat import __version__
+from sagesplat.adapt.observe import widest_lens
 from sagesplat.adapt.viewpoint import QualityKind, ViewModel
 from sagesplat.formats.increments import Increment, full_scene
 from sagesplat.scene.scene import Camera
@@ -184,7 +185,8 @@ def pack_order(contents: Contents) -> list[tuple[int, int]]:
         if by_label.get(c.label_id)
     ]
     cameras = [camera for camera, use in zip(cameras, used, strict=True) if use]
-    return order_of(ladders, cameras, first["position"], first["quaternion"])
+    lens = widest_lens([entry.camera for entry in contents.cameras])
+    return order_of(ladders, cameras, first["position"], first["quaternion"], lens)
 
 
 def _promises(contents: Contents, quality: QualityKind, models: Mapping[int, ViewModel]) -> bytes:

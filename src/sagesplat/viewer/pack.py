@@ -50,16 +50,21 @@ def order_of(
     cameras: Sequence[Camera],
     position: Float[np.ndarray, "3"],
     quaternion: Float[np.ndarray, "4"],
+    lens: tuple[float, float] = (math.inf, math.inf),
 ) -> list[tuple[int, int]]:
-    """(index of the ladder, level) of all files, ordered for the view from a pose in the bundle's axes."""
+    """(index of the ladder, level) of all files, ordered for the view from a pose in the bundle's axes.
+
+    `lens`: of the photos (`adapt.observe.widest_lens`).
+    """
     planes = boxes.frustum(position, quaternion, FOV_Y, ASPECT)
+    photo = boxes.photo_frustum(position, quaternion, FOV_Y, ASPECT, lens)
     camera = camera_at(position, quaternion, FOV_Y, 16, 9)
     ranked, behind = [], []
     for index, ladder in enumerate(ladders):
         visible = not len(ladder.boxes) or boxes.touching(ladder.boxes, planes).any()
         weight = ladder.weight * max(_share(ladder, cameras, camera, position, planes), _LEAST_SHARE)
         weight = max(weight * (1 if visible else _LEAST), _LEAST**2)
-        distance = boxes.distance(ladder.boxes, position, planes)
+        distance = boxes.distance(ladder.boxes, position, planes, photo)
         path, skipped = _path(ladder, camera, distance)
         total = np.cumsum(np.take(ladder.sizes, path - 1), dtype=np.float64)
         ssim, limit = _expected(ladder, camera, distance, path, total), math.inf

@@ -3,7 +3,7 @@
  * tests/data/distances.json checks both.
  */
 
-import type { Box, Quat, Vec3, Viewpoint } from "../types";
+import type { Box, Camera, Quat, Vec3, Viewpoint } from "../types";
 
 /** A label as seen from a viewpoint. */
 export interface Sight {
@@ -36,6 +36,43 @@ export function frustumOf(position: Vec3, quaternion: Quat, fovY: number, aspect
   });
 }
 
+/** Half width and half height of a picture at distance 1. */
+export type Lens = readonly [number, number];
+
+/** The largest of the cameras' pictures; null without cameras. */
+export function widestLens(cameras: readonly Camera[]): Lens | null {
+  const largest = (of: (camera: Camera) => number) => Math.max(...cameras.map(of)) / 2;
+  if (!cameras.length) return null;
+  return [largest((c) => c.width / c.intrinsics[0]), largest((c) => c.height / c.intrinsics[1])];
+}
+
+/**
+ * The frustum of a viewpoint, but no wider and no higher than a lens; the same one if it is not.
+ * Models know distances in photos: a phone held upright also shows what lies at one's feet.
+ */
+export function photoFrustum(
+  { position, direction, frustum }: Viewpoint,
+  lens: Lens | null,
+): readonly Plane[] {
+  if (!lens || frustum.length < 4) return frustum; // left, right, bottom, top, ...
+  const planes = frustum.map((plane, side) => {
+    const limit = side < 4 ? lens[side < 2 ? 0 : 1] : Infinity;
+    return narrowed(plane, position, direction, limit);
+  });
+  return planes.every((plane, side) => plane === frustum[side]) ? frustum : planes;
+}
+
+/** A side of a frustum at most `limit` from the axis, at distance 1. */
+function narrowed(plane: Plane, position: Vec3, axis: Vec3, limit: number): Plane {
+  const along = plane[0] * axis[0] + plane[1] * axis[1] + plane[2] * axis[2];
+  const across = Math.sqrt(Math.max(0, 1 - along * along));
+  if (!(along > limit * across)) return plane;
+  const length = Math.hypot(1, limit);
+  const turned = (i: 0 | 1 | 2) => ((plane[i] - along * axis[i]) / across + limit * axis[i]) / length;
+  const n = [turned(0), turned(1), turned(2)] as const;
+  return [...n, -(n[0] * position[0] + n[1] * position[1] + n[2] * position[2])];
+}
+
 /** A vector rotated by a quaternion x y z w of any length. */
 export function rotate(q: Quat, v: Vec3): Vec3 {
   const length = Math.hypot(...q);
@@ -50,8 +87,16 @@ export function rotate(q: Quat, v: Vec3): Vec3 {
   ];
 }
 
-/** Distance of the visible boxes: approximates the 5th percentile over a label's points. */
-export function look(boxes: readonly Box[], { position, frustum }: Viewpoint): Sight {
+/**
+ * Distance of the visible boxes: approximates the 5th percentile over a label's points.
+ *
+ * @param photo - half spaces of `photoFrustum`, which decide the distance where anything is in them
+ */
+export function look(
+  boxes: readonly Box[],
+  { position, frustum }: Viewpoint,
+  photo: readonly Plane[] = frustum,
+): Sight {
   const near = boxes.filter((box) => touches(box, frustum));
   const visible = near.length > 0;
   let nearest = Infinity;
@@ -64,7 +109,13 @@ export function look(boxes: readonly Box[], { position, frustum }: Viewpoint): S
   if (!visible) return { visible, distance: Number.NaN, size };
   const sampled = new Float64Array(near.length * AT.length ** 3);
   let found = 0;
-  for (const box of near) found = sample(box, position, crossing(box, frustum), sampled, found);
+  for (const planes of photo === frustum ? [frustum] : [photo, frustum]) {
+    if (found) break;
+    for (const box of near) {
+      if (planes === frustum || touches(box, planes))
+        found = sample(box, position, crossing(box, planes), sampled, found);
+    }
+  }
   return { visible, distance: found ? percentile(sampled.subarray(0, found)) : nearest, size };
 }
 

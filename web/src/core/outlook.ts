@@ -28,12 +28,12 @@ export class Outlook {
     }
   }
 
-  /** Evaluates a label at the viewpoint. */
-  see(entry: Entry, viewpoint: Viewpoint): void {
+  /** Evaluates a label at the viewpoint; `photo`: its `photoFrustum`. */
+  see(entry: Entry, viewpoint: Viewpoint, photo: Viewpoint["frustum"] = viewpoint.frustum): void {
     const { label } = entry;
     const { position, direction } = viewpoint;
     const model = this.models.get(label.id);
-    const seen = look(label.boxes, viewpoint);
+    const seen = look(label.boxes, viewpoint, photo);
     if (!seen.visible && label.boxes.length) {
       // plans do not depend on labels out of sight; skipping them keeps scenes in blocks fast
       entry.sight = seen;

@@ -2,7 +2,7 @@
 
 import type { Handle, Level, Manifest, Quality, Renderer, Settings, State, Viewpoint } from "../types";
 import { describe } from "./describe";
-import { rotate } from "./distance";
+import { type Lens, photoFrustum, rotate, widestLens } from "./distance";
 import { type Clock, clockOfBrowser, type Digest, digestOfBrowser, type Fetch, type File } from "./download";
 import { same, sane } from "./inputs";
 import { poll } from "./live";
@@ -47,6 +47,7 @@ export class Streamer {
   private settings: Settings;
   private viewpoint: Viewpoint;
   private content: Manifest;
+  private lens: Lens | null; // of the photos
   private entries: Entry[];
   private leaving: Drawn[] = []; // drawn increments of labels that a new manifest removed
   private outlooks = new Map<Quality, Outlook>(); // those that were asked for
@@ -70,6 +71,7 @@ export class Streamer {
     this.renderer = renderer;
     this.settings = sane(settings);
     this.content = manifest;
+    this.lens = widestLens(manifest.cameras);
     this.entries = manifest.labels.map((label) => new Entry(label));
     this.hidden = new Hidden(renderer);
     this.digest = options.digest === undefined ? digestOfBrowser : options.digest;
@@ -169,7 +171,8 @@ export class Streamer {
   private plan(): void {
     this.dirty = false;
     const begun = this.clock.now();
-    for (const entry of this.entries) this.outlook.see(entry, this.viewpoint);
+    const photo = photoFrustum(this.viewpoint, this.lens);
+    for (const entry of this.entries) this.outlook.see(entry, this.viewpoint, photo);
     const candidates = this.entries.map((entry) => {
       return this.outlook.candidate(entry, this.settings.weights, this.highest(entry));
     });
@@ -343,6 +346,7 @@ export class Streamer {
     this.leaving.push(...leaving);
     this.outlooks.clear();
     this.content = manifest;
+    this.lens = widestLens(manifest.cameras);
     this.trouble = null;
     this.supply.forgive();
     this.plan();

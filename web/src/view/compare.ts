@@ -1,4 +1,5 @@
 import { Streamer } from "../core/streamer";
+import type { Source } from "../inside";
 import type { Manifest, Settings } from "../types";
 import type { SparkLayer } from "./spark";
 import type { Stage } from "./stage";
@@ -11,7 +12,7 @@ export class Compare {
   constructor(
     readonly stage: Stage,
     readonly manifest: Manifest,
-    readonly base: URL,
+    readonly source: Source,
     readonly settings: () => Settings,
   ) {}
 
@@ -31,8 +32,8 @@ export class Compare {
     this.#layer = layer;
     const budget = { bytes: Infinity, gpuBytes: Infinity, count: Infinity };
     const settings: Settings = { ...this.settings(), mode: "full", budget, cacheBytes: 0 };
-    const { manifest, base } = this;
-    this.#streamer = new Streamer({ manifest, base, renderer: layer, settings });
+    const { manifest, source } = this;
+    this.#streamer = new Streamer({ manifest, ...source, renderer: layer, settings });
     this.#streamer.onChange(onChange);
     this.#streamer.start();
     this.stage.full = layer;

@@ -12,10 +12,10 @@ export function flipped(bytes: Uint8Array): Uint8Array {
   if (!(count > 0) || bytes.length < start + count * stride) throw new Error("a PLY file that ends early");
   const out = bytes.slice();
   const bases = [...floats.keys()].filter((name) => name.startsWith("f_rest_")).length / 3;
-  for (const [name, offset] of floats) {
-    if (!changes(name, bases)) continue;
-    // of a little-endian float the sign is the highest bit of the last byte
-    for (let at = start + offset + 3, i = 0; i < count; i++, at += stride) out[at] = (out[at] ?? 0) ^ 0x80;
+  // of a little-endian float the sign is the highest bit of the last byte
+  const signs = [...floats].flatMap(([name, offset]) => (changes(name, bases) ? [offset + 3] : []));
+  for (let i = 0, row = start; i < count; i++, row += stride) {
+    for (const offset of signs) out[row + offset] = (out[row + offset] as number) ^ 0x80;
   }
   return out;
 }

@@ -2,6 +2,7 @@ import { Vector3 } from "three";
 import { qualitiesOf } from "../core/manifest";
 import { Streamer } from "../core/streamer";
 import type { Embed, Options, Sample } from "../embed";
+import type { Source } from "../inside";
 import type { Budget, Manifest, Quality, Settings, State } from "../types";
 import { Compare } from "./compare";
 import { Controls } from "./controls";
@@ -36,14 +37,19 @@ export class Viewer {
   constructor(
     canvas: HTMLCanvasElement,
     readonly manifest: Manifest,
-    readonly base: URL,
+    source: Source,
     options: Options,
   ) {
     this.stage = new Stage(canvas, manifest);
     this.settings = startSettings(manifest, options);
     this.controls = new Controls(canvas, this.#start(), (rig, byUser) => this.#moved(rig, byUser));
-    this.streamer = new Streamer({ manifest, base, renderer: this.stage.layer, settings: this.settings });
-    this.compare = new Compare(this.stage, manifest, base, () => this.settings);
+    this.streamer = new Streamer({
+      manifest,
+      ...source,
+      renderer: this.stage.layer,
+      settings: this.settings,
+    });
+    this.compare = new Compare(this.stage, manifest, source, () => this.settings);
     this.headset = new Headset(
       this.stage,
       () => this.settings.budget.count,

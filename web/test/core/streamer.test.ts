@@ -1,7 +1,9 @@
 /** What is loaded, drawn, kept and given up. */
 
 import { describe, expect, test } from "vitest";
+import { frustumOf } from "../../src/core/distance";
 import { digestOfBrowser } from "../../src/core/download";
+import type { Camera } from "../../src/types";
 import { type Network, settled } from "../simulate";
 import { shown, type World, wanted, world } from "../world";
 import { at, bundle, NO_BUDGET, rightOf, totals } from "../worlds";
@@ -390,4 +392,26 @@ test("changing the state inside a callback does no harm", async () => {
   await w.rest();
   await settled();
   expect(calls).toBeGreaterThan(5);
+});
+
+test("a window higher than the photos knows their distances, as the models do", async () => {
+  const made = world({ labels: 1, levels: 2 });
+  const [label] = made.manifest.labels;
+  if (!label) throw new Error("no label");
+  const ground = Array.from({ length: 20 }, (_, i) => [-4, -1.6, -i - 1, 4, -1.5, -i] as const);
+  const labels = [{ ...label, boxes: ground }];
+  const phone = { ...at(0), frustum: frustumOf([0, 0, 0], [0, 0, 0, 1], 2 * Math.atan(1.2), 0.46) };
+  const camera = { width: 400, height: 300, intrinsics: [400, 400, 200, 150] } as unknown as Camera;
+  const distances: number[] = [];
+  for (const cameras of [[], [camera]]) {
+    const w = world({}, { manifest: { ...made.manifest, labels, cameras } }, made);
+    w.streamer.start();
+    w.streamer.update(phone);
+    await made.pass(500);
+    distances.push(w.streamer.state.labels[0]?.distance ?? 0);
+    w.streamer.dispose();
+  }
+  const [window = 0, photo = 0] = distances;
+  expect(window).toBeGreaterThan(0);
+  expect(photo).toBeGreaterThan(1.3 * window);
 });

@@ -3,9 +3,17 @@
 import { describe, expect, test } from "vitest";
 import distances from "../../../tests/data/distances.json?raw";
 import promised from "../../../tests/data/promises.json?raw";
-import { frustumOf, look, touches } from "../../src/core/distance";
+import {
+  frustumOf,
+  type Lens,
+  look,
+  photoFrustum,
+  rotate,
+  touches,
+  widestLens,
+} from "../../src/core/distance";
 import { anywhere, curveAt, ViewModel, Views } from "../../src/core/quality";
-import type { Box, Curve, Label, Promises, Quat, Vec3, Viewpoint } from "../../src/types";
+import type { Box, Camera, Curve, Label, Promises, Quat, Vec3, Viewpoint } from "../../src/types";
 import { differences } from "../worlds";
 
 interface PromiseCase {
@@ -27,7 +35,9 @@ interface DistanceCase {
   boxes: Box[];
   camera: { position: Vec3; quaternion: Quat; fovY: number; aspect: number };
   frustum: Viewpoint["frustum"];
-  expected: { distance: number | null; visible: boolean; touching: boolean[] };
+  lens: Lens;
+  photo: Viewpoint["frustum"];
+  expected: { distance: number | null; inPhoto: number | null; visible: boolean; touching: boolean[] };
 }
 
 function near(found: readonly number[], expected: readonly number[], relative = 0): void {
@@ -93,13 +103,35 @@ describe("distances", () => {
       const { position, quaternion, fovY, aspect } = c.camera;
       const planes = frustumOf(position, quaternion, fovY, aspect);
       near(planes.flat(), c.frustum.flat());
-      const sight = look(c.boxes, { position, direction: [0, 0, -1], frustum: planes });
+      const viewpoint = { position, direction: rotate(quaternion, [0, 0, -1]), frustum: planes };
+      const sight = look(c.boxes, viewpoint);
       expect(sight.visible).toBe(c.expected.visible);
       expect(c.boxes.map((box) => touches(box, planes))).toEqual(c.expected.touching);
       if (c.expected.distance === null) expect(sight.distance).toBeNaN();
       else near([sight.distance], [c.expected.distance], 1);
+      const photo = photoFrustum(viewpoint, c.lens);
+      near(photo.flat(), c.photo.flat());
+      const inPhoto = look(c.boxes, viewpoint, photo);
+      if (c.expected.inPhoto === null) expect(inPhoto.distance).toBeNaN();
+      else near([inPhoto.distance], [c.expected.inPhoto], 1);
+      expect({ ...inPhoto, distance: 0 }).toEqual({ ...sight, distance: 0 });
     });
   }
+});
+
+test("a frustum that is no wider than the photos is that of the window", () => {
+  const viewpoint = {
+    position: [0, 0, 0],
+    direction: [0, 0, -1],
+    frustum: frustumOf([0, 0, 0], [0, 0, 0, 1], 1, 1),
+  };
+  const window = viewpoint as unknown as Viewpoint;
+  expect(photoFrustum(window, [0.6, 0.6])).toBe(window.frustum);
+  expect(photoFrustum(window, null)).toBe(window.frustum);
+  expect(photoFrustum({ ...window, frustum: [] }, [0.1, 0.1])).toEqual([]);
+  expect(widestLens([])).toBeNull();
+  const camera = { width: 200, height: 100, intrinsics: [100, 125, 90, 50] } as unknown as Camera;
+  expect(widestLens([camera, { ...camera, width: 100 }])).toEqual([1, 0.4]);
 });
 
 const curve: Curve = {

@@ -1,0 +1,49 @@
+/** A bundle inside its page. */
+
+import { expect, test } from "vitest";
+import { loadManifest } from "../../src/core/manifest";
+import { bytesOf, sourceInside } from "../../src/inside";
+import { Network, VirtualClock } from "../simulate";
+import { bundle } from "../worlds";
+
+/** A page with these files, as far as it is asked for them. */
+function page(files: Readonly<Record<string, Uint8Array>>): ParentNode {
+  const elements = Object.entries(files).map(([uri, content]) => ({
+    dataset: { uri },
+    textContent: Buffer.from(content).toString("base64"),
+  }));
+  return { querySelectorAll: () => elements } as unknown as ParentNode;
+}
+
+test("an ordinary page has none", () => {
+  expect(sourceInside(page({}))).toBeNull();
+});
+
+test("its files are found by their address in the bundle, and nothing else is", async () => {
+  const manifest = bundle(new Network(new VirtualClock()), { labels: 1, levels: 1 });
+  const chunk = Uint8Array.from({ length: 300 }, (_, i) => i % 256);
+  const source = sourceInside(
+    page({ "manifest.json": new TextEncoder().encode(JSON.stringify(manifest)), "chunks/a-01.spz": chunk }),
+  );
+  if (!source) throw new Error("none");
+  expect(await loadManifest(source.base, source.fetch)).toEqual(manifest);
+  const url = (uri: string) => new URL(uri, source.base).href;
+  for (let again = 0; again < 2; again++) {
+    const reader = (await source.fetch(url("chunks/a-01.spz"))).body?.getReader();
+    expect((await reader?.read())?.value).toEqual(chunk);
+    expect((await reader?.read())?.done).toBe(true);
+  }
+  expect(await source.fetch(url("chunks/b-01.spz"))).toMatchObject({ ok: false, status: 404 });
+});
+
+test("base64 with and without the browser's help", () => {
+  const bytes = Uint8Array.from({ length: 256 }, (_, i) => i);
+  const text = Buffer.from(bytes).toString("base64");
+  const native = Uint8Array as { fromBase64?: unknown };
+  const before = native.fromBase64;
+  native.fromBase64 = undefined;
+  expect(bytesOf(text)).toEqual(bytes);
+  native.fromBase64 = (given: string) => new Uint8Array(Buffer.from(given, "base64"));
+  expect(bytesOf(text)).toEqual(bytes);
+  native.fromBase64 = before;
+});
