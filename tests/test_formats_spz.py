@@ -9,13 +9,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import zstandard
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import PARAMETERS, Gaussians
 from sagesplat.formats.quantisation import rounded
-from sagesplat.formats.spz import MAX_COUNT, decode_spz, encode_spz, packing_order, read_spz, write_spz
+from sagesplat.formats.spz import (
+    MAX_COUNT,
+    decode_spz,
+    encode_spz,
+    packing_order,
+    read_spz,
+    read_spz_splat,
+    write_spz,
+)
 from sagesplat.raster import rasterize
 from sagesplat.scene.scene import Camera
 from tests.conftest import damage, pinhole, random_gaussians
@@ -299,7 +308,10 @@ BODY = bytes(20)
         (pack(bytes(36)), "not an SPZ file"),
         (pack(header(1, version=1) + BODY), "SPZ version 1 is not supported"),
         (pack(header(1, version=2**31) + BODY), "SPZ version 2147483648 is not supported"),
-        (b"NGSP" + bytes(40), "SPZ version 4 is not supported"),
+        (b"NGSP" + bytes(40), "SPZ version 0"),
+        (header(0, version=5) + bytes(16), "SPZ version 5"),
+        (header(1, version=4, flags=128) + bytes(16), "flags 128"),
+        (header(MAX_COUNT, version=4) + bytes(16), "10000000 Gaussians announced, more than fit"),
         (pack(header(1, degree=4) + BODY), "SH degree 4"),
         (pack(header(1, bits=25) + BODY), "25 fractional bits"),
         (pack(header(1, flags=2) + BODY), "flags 2"),
@@ -329,3 +341,70 @@ def test_a_wrong_checksum_is_refused():
 def test_a_missing_file_is_one_line(tmp_path):
     with pytest.raises(DataError, match=r"b\.spz: cannot be read \(No such file"):
         read_spz(tmp_path / "b.spz")
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_version_4_holds_what_version_3_does(degree):
+    g = random_gaussians(200, degree=degree, seed=5)
+    content = encode_spz(g, version=4, antialiased=True)
+    assert content[:16] == header(200, version=4, degree=degree, flags=1, bits=content[13])[:15] + bytes(
+        [5 + (degree > 0)]
+    )
+    three, four = decode_spz(encode_spz(g)), decode_spz(content)
+    assert all(torch.equal(getattr(three, name), getattr(four, name)) for name in PARAMETERS)
+    assert encode_spz(g, version=4, antialiased=True) == content
+
+
+def test_version_4_keeps_labels_and_axes(tmp_path):
+    g = random_gaussians(50, seed=6)
+    g = replace(g, label_ids=torch.arange(50, dtype=torch.int16) // 20 - 1)
+    write_spz(tmp_path / "a.spz", g, version=4, names={0: "tree", 7: "none"}, frame="luf")
+    splat = read_spz_splat(tmp_path / "a.spz", frame="rdf")
+    assert torch.equal(splat.gaussians.label_ids, g.label_ids)
+    assert (splat.kind, splat.names) == ("SPZ 4", {0: "tree"})
+    direct = decode_spz(encode_spz(g))
+    assert all(torch.equal(getattr(splat.gaussians, name), getattr(direct, name)) for name in PARAMETERS[2:5])
+    torch.testing.assert_close(splat.gaussians.means, direct.means, atol=1e-3, rtol=0)
+    torch.testing.assert_close(rotations(splat.gaussians.quats), rotations(direct.quats), atol=0.01, rtol=0)
+    torch.testing.assert_close(splat.gaussians.shN, direct.shN, atol=0.13, rtol=0)
+
+
+def version_4(count: int = 1, *, extensions: bytes = b"", sizes: tuple[int, ...] = (9, 1, 3, 3, 4)) -> bytes:
+    """Gaussians of zeros, with streams of these sizes."""
+    streams = [zstandard.compress(bytes(size)) for size in sizes]
+    head = struct.pack("<4sIIBBBBI12x", b"NGSP", 4, count, 0, 12, 2, len(sizes), 32 + len(extensions))
+    table = b"".join(struct.pack("<QQ", len(s), size) for s, size in zip(streams, sizes, strict=True))
+    return head + extensions + table + b"".join(streams)
+
+
+def test_version_4_skips_what_others_added(tmp_path):
+    (tmp_path / "a.spz").write_bytes(version_4(extensions=struct.pack("<II3s", 0x12340001, 3, b"abc")))
+    assert len(read_spz_splat(tmp_path / "a.spz").gaussians) == 1
+
+
+BOMB = zstandard.ZstdCompressor(write_content_size=False).compress(bytes(10**7))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (version_4(sizes=(9, 1, 3, 3)), "4 streams in place of 5"),
+        (version_4(sizes=(9, 1, 3, 3, 5)), "5 bytes in place of 4"),
+        (version_4(2), "9 bytes in place of 18"),
+        (version_4() + b"x", "1 bytes after the last stream"),
+        (version_4()[:-1], "damaged"),
+        (version_4(extensions=b"abc"), "damaged"),
+        (version_4(extensions=struct.pack("<II", 1, 9)), "an extension is cut off"),
+        (version_4(extensions=struct.pack("<II2s", 0xADBE0003, 2, b"\x06\x00")), "axes"),
+        (version_4(extensions=struct.pack("<III", 0xADBE0003, 4, 12)), "axes of an unknown order"),
+        (version_4(extensions=struct.pack("<II2s", 0x53470001, 2, b"{}")), "damaged labels"),
+        (
+            version_4()[:32] + struct.pack("<QQ", len(BOMB), 9) + version_4()[48:112] + BOMB,
+            "damaged",
+        ),  # a frame that does not say how large it is
+    ],
+)
+def test_damaged_version_4(tmp_path, content, message):
+    (tmp_path / "a.spz").write_bytes(content)
+    with pytest.raises(DataError, match=rf"a\.spz: .*{message}"):
+        read_spz_splat(tmp_path / "a.spz")

@@ -5,11 +5,12 @@ neither reached by a reader of this list nor an exception with a reason.
 """
 
 from benchmarks.hostile import Reader
-from benchmarks.readers import captures, downloads, networks, records, requests, splats
+from benchmarks.readers import captures, downloads, foreign_splats, networks, records, requests, splats
 
 READERS: tuple[Reader, ...] = (
     *captures.READERS,
     *splats.READERS,
+    *foreign_splats.READERS,
     *records.READERS,
     *networks.READERS,
     *downloads.READERS,

@@ -4,6 +4,7 @@ Per Gaussian, little endian float32: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_
 then green, then blue), opacity (logit), scale_0..2 (natural log), rot_0..3 (wxyz); then `label` (int16).
 """
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import BinaryIO
 
@@ -14,6 +15,7 @@ from sagesplat import __version__
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.names import repaired
+from sagesplat.formats.splat import Splat
 from sagesplat.io.files import atomic_path
 from sagesplat.io.ply_header import read_header
 
@@ -85,6 +87,44 @@ def read_ply(path: Path) -> Gaussians:
         >>> g = read_ply(Path("runs/garden/nested/composed.ply"))  # doctest: +SKIP
         >>> g.of_labels([184]).nbytes  # doctest: +SKIP
     """
+    columns, labels, wanted, _ = _read(path)
+    _check_values(path, columns, wanted)
+    return _gaussians(columns, labels)
+
+
+def read_ply_splat(path: Path) -> Splat:
+    """Read the binary splat PLY of any tool as it is: with NaN, infinities and rotations of zeros, if any.
+
+    Category names are those of comments such as `label 184 tree-merged`. DataError for other defects.
+    """
+    columns, labels, _, comments = _read(path)
+    return Splat(_gaussians(columns, labels), "PLY", _names(comments), antialiased(comments))
+
+
+def antialiased(comments: Iterable[str]) -> bool:
+    """Whether comments of a PLY header say so, as Brush and Postshot write them; the last one counts."""
+    said = False
+    for comment in comments:
+        match comment.lower().split():
+            case ["splatrendermode:", mode]:
+                said = mode == "mip"
+            case ["antialiased", "0" | "1" as value]:
+                said = value == "1"
+    return said
+
+
+def _names(comments: Iterable[str]) -> dict[int, str]:
+    """Category names by label id, as `write_ply` writes them."""
+    names = {}
+    for comment in comments:
+        match comment.split(maxsplit=2):
+            case ["label", label, name] if label.isdecimal() and len(label) <= 5 and int(label) < 2**15:
+                names[int(label)] = repaired(name, f"category {label}")
+    return names
+
+
+def _read(path: Path) -> tuple[np.ndarray, np.ndarray, list[str], tuple[str, ...]]:
+    """Float32 columns [P, N], labels [N], the columns' names, and the header's comments."""
     try:
         with path.open("rb") as file:
             header = read_header(file)
@@ -96,8 +136,9 @@ def read_ply(path: Path) -> Gaussians:
         raise DataError(f"{path}: cannot be read ({error.strerror}); give a splat .ply") from None
     except ValueError as error:
         raise DataError(f"{path}: not readable as a PLY file ({short(error)}); give a splat .ply") from None
-    _check_values(path, columns, labels, wanted)
-    return _gaussians(columns, labels)
+    if bad := int(np.count_nonzero((labels < -1) | (labels > 32767))):
+        raise DataError(f"{path}: {bad} values of label are outside -1..32767; export the scene again")
+    return columns, labels, wanted, header.comments
 
 
 def _properties(bases: int) -> list[str]:
@@ -162,7 +203,7 @@ def _read_body(
         )
     columns = np.empty((len(wanted), count), np.float32)
     labels = np.full(count, -1, np.int64)
-    labelled = "label" in (dtype.names or ()) and dtype["label"].kind in "iu"
+    labelled = "label" in (dtype.names or ())
     for start in range(0, count, ROWS):
         rows = slice(start, min(start + ROWS, count))
         block = np.fromfile(file, dtype, rows.stop - start)
@@ -170,11 +211,18 @@ def _read_body(
             for column, name in zip(columns, wanted, strict=True):
                 column[rows] = block[name]
         if labelled:
-            labels[rows] = block["label"]
+            labels[rows] = _whole(block["label"])
     return columns, labels
 
 
-def _check_values(path: Path, columns: np.ndarray, labels: np.ndarray, wanted: list[str]) -> None:
+def _whole(labels: np.ndarray) -> np.ndarray:
+    """Labels of any type as integers; -2, which is no label, for those that are no whole numbers."""
+    if labels.dtype.kind in "iu":
+        return labels
+    return np.where((np.abs(labels) < 2**15) & (labels == np.floor(labels)), labels, -2).astype(np.int64)
+
+
+def _check_values(path: Path, columns: np.ndarray, wanted: list[str]) -> None:
     for column, name in zip(columns, wanted, strict=True):
         if bad := int(np.count_nonzero(~np.isfinite(column))):
             raise DataError(f"{path}: {bad} values of {name} are NaN or infinite; export the scene again")
@@ -182,5 +230,3 @@ def _check_values(path: Path, columns: np.ndarray, labels: np.ndarray, wanted: l
         raise DataError(
             f"{path}: {bad} Gaussians have a rotation (rot_0..3) of zeros; export the scene again"
         )
-    if bad := int(np.count_nonzero((labels < -1) | (labels > 32767))):
-        raise DataError(f"{path}: {bad} values of label are outside -1..32767; export the scene again")

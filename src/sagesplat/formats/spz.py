@@ -1,8 +1,8 @@
-"""SPZ, compressed Gaussians for web viewers: writes version 3, reads versions 2 and 3.
+"""SPZ, compressed Gaussians for web viewers: versions 2 (read only) to 4.
 
-Niantic's format (MIT, github.com/nianticlabs/spz). One gzip member, little endian: a header of 16 bytes
-(magic, version, count as uint32; SH degree, fractional bits, flags, 0), then the attributes, with these bytes
-per Gaussian:
+Niantic's format (MIT, github.com/nianticlabs/spz). Versions 2 and 3 are one gzip member, little endian: a
+header of 16 bytes (magic, version, count as uint32; SH degree, fractional bits, flags, 0), then the
+attributes, with these bytes per Gaussian. Version 4 packs them with zstd (`spz_container.py`).
 
     9    x y z, signed fixed point of 24 bits
     1    opacity times 255
@@ -15,8 +15,7 @@ per Gaussian:
 In `coarse` files values are multiples of larger steps than the format allows: they compress better.
 """
 
-import struct
-import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -24,36 +23,45 @@ import numpy as np
 import torch
 from jaxtyping import Int64
 
-from sagesplat.core.errors import DataError
+from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.geometry import morton_order
 from sagesplat.core.sh import bases
+from sagesplat.formats.labels import as_json, labelled
 from sagesplat.formats.quantisation import (
     COLOUR_STEP,
+    OTHERS,
     PER_COLOUR,
     PER_LOG_SCALE,
     SCALE_STEP,
     in_buckets,
     in_steps,
+    largest_restored,
+    logits_of_bytes,
+)
+from sagesplat.formats.splat import Splat
+from sagesplat.formats.spz_container import (
+    ANTIALIASED,
+    BASES,
+    MAX_BITS,
+    MAX_COUNT,
+    Packed,
+    gzipped,
+    unpacked,
+    zstd_packed,
 )
 from sagesplat.io.files import atomic_path
 
-Frame = Literal["rub", "rdf"]  # axes in the file: right, up, back (SPZ's own); right, down, front (COLMAP's)
+# Axes in the file, left or right, up or down, front or back: SPZ's own are rub; COLMAP's and PLY's are rdf.
+Frame = Literal["rub", "ldb", "rdb", "lub", "ldf", "rdf", "luf", "ruf"]
 
 SH_BITS = (5, 4)  # of degree 1, of degrees 2 and 3; as in the reference implementation
-MAX_BITS = 24  # fractional bits; readers refuse more
-MAX_COUNT = 10_000_000  # Gaussians; the reference implementation reads no more
-_HEADER = struct.Struct("<4sIIBBBB")
-_MAGIC = b"NGSP"
-_ANTIALIASED = 1  # the flag
 _LARGEST = 2**23 - 1  # magnitude of a fixed-point coordinate
-_DEFLATE = 1032  # largest expansion ratio of a deflate stream
-_BASES = (0, 3, 8, 15)  # SH coefficients beyond the constant one, by degree 0 to 3
 _COARSE = 4, COLOUR_STEP, SCALE_STEP, 8  # steps of opacities, colours, scales and rotations
 _SMALLER = 511 * 2**0.5  # a quaternion's second largest component is at most sqrt(1/2)
-_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # components other than the largest
-_FLIP = np.array([1, -1, -1], np.float32)  # between the frames: positions, and x y z of quaternions
-_FLIP_SH = np.sign(np.divide(bases(3, -4, -5), bases(3, 4, 5)))[1:, None].astype(np.float32)
+_LABELS = 0x53470001  # type of our extension: `formats/labels.py`
+_AXES = 0xADBE0003  # type of Adobe's extension: its content is a row of _FRAMES
+_FRAMES: tuple[Frame, ...] = ("rub", "ldb", "rdb", "lub", "rub", "ldf", "rdf", "luf", "ruf")
 
 
 def write_spz(
@@ -66,6 +74,8 @@ def write_spz(
     sh_bits: tuple[int, int] = SH_BITS,
     coarse: bool = False,
     frame: Frame = "rub",
+    version: Literal[3, 4] = 3,
+    names: Mapping[int, str] | None = None,
 ) -> int:
     """Write an SPZ file atomically. Arguments and errors are those of `encode_spz`.
 
@@ -80,6 +90,8 @@ def write_spz(
         sh_bits=sh_bits,
         coarse=coarse,
         frame=frame,
+        version=version,
+        names=names,
         name=str(path),
     )
     with atomic_path(path) as temporary:
@@ -96,9 +108,11 @@ def encode_spz(
     sh_bits: tuple[int, int] = SH_BITS,
     coarse: bool = False,
     frame: Frame = "rub",
+    version: Literal[3, 4] = 3,
+    names: Mapping[int, str] | None = None,
     name: str = "SPZ",
 ) -> bytes:
-    """Encode N Gaussians in COLMAP's axes as SPZ version 3 (Niantic). Labels are left out.
+    """Encode N Gaussians in COLMAP's axes as SPZ (Niantic). Version 3 leaves labels out.
 
     Opacities are rounded to 1/255, log scales to 1/16 within [-10, 5.94], sh0 to 0.026 within [-3.33, 3.33],
     harmonics to 2^(1 - bits) within [-1, 1). Rows keep their order. Values outside are clipped. Harmonics of
@@ -115,10 +129,13 @@ def encode_spz(
             0.052, rotations to about half a degree. A tenth smaller, for 0.0008 to 0.0017 of SSIM on
             `garden`.
         frame: Axes to write: "rub" (right, up, back: SPZ's own) or "rdf" (right, down, front: COLMAP's).
+        version: 3 (gzip) or 4 (zstd). With `names`, version 4 keeps the labels as an extension record, which
+            other readers skip.
+        names: Category names by label id, for version 4.
         name: What errors call the file.
 
     Returns:
-        The file's content, gzip-compressed.
+        The file's content.
 
     Raises:
         DataError: For NaN or Inf, a quaternion of zeros, too many Gaussians, or positions that do not fit.
@@ -137,9 +154,8 @@ def encode_spz(
     g = g.detach().to("cpu")
     _check(name, g)
     degree = g.sh_degree if sh_degree is None else min(sh_degree, g.sh_degree)
-    means, quats, harmonics = g.means.numpy(), g.quats.numpy(), g.shN[:, : _BASES[degree]].numpy()
-    if frame == "rub":
-        means, quats, harmonics = _flip(means, quats, harmonics)
+    means, quats, harmonics = g.means.numpy(), g.quats.numpy(), g.shN[:, : BASES[degree]].numpy()
+    means, quats, harmonics = _flip(means, quats, harmonics, frame)
     bits = _fractional_bits(name, means, g.log_scales.numpy(), fractional_bits, coarse)
     opacity_step, colour_step, scale_step, rotation_step = _COARSE if coarse else (1, 1, 1, 1)
     fixed = np.rint(means.astype(np.float64) * 2.0**bits).astype("<i4")
@@ -151,12 +167,13 @@ def encode_spz(
         _pack_rotations(quats, rotation_step),
         _bytes(128 + 128 * in_buckets(torch.from_numpy(harmonics), sh_bits)),
     ]
-    header = _HEADER.pack(_MAGIC, 3, len(g), degree, bits, _ANTIALIASED if antialiased else 0, 0)
-    packer = zlib.compressobj(9, zlib.DEFLATED, 31, 9, zlib.Z_FILTERED)  # 31: gzip, without a time stamp
-    content = packer.compress(header)
-    for attribute in attributes:  # separate deflate blocks, each with its own codes: 5 % smaller
-        content += packer.compress(attribute.tobytes()) + packer.flush(zlib.Z_BLOCK)
-    return content + packer.flush()
+    flags = ANTIALIASED if antialiased else 0
+    if version == 3:
+        return gzipped(len(g), degree, bits, flags, attributes)
+    records = {} if names is None else {_LABELS: as_json(g.label_ids, names)}
+    if frame != "rub":
+        records[_AXES] = _FRAMES.index(frame, 1).to_bytes(4, "little")
+    return zstd_packed(len(g), degree, bits, flags, attributes, records)
 
 
 def packing_order(
@@ -169,22 +186,18 @@ def packing_order(
     """
     g = g.detach().to("cpu")
     degree = g.sh_degree if sh_degree is None else min(sh_degree, g.sh_degree)
-    harmonics = in_buckets(g.shN[:, : _BASES[degree]], sh_bits).numpy()
+    harmonics = in_buckets(g.shN[:, : BASES[degree]], sh_bits).numpy()
     colours = np.argsort(morton_order(g.sh0[:, 0].numpy()))  # ranks
-    return np.lexsort((colours, *harmonics.reshape(len(g), 3 * _BASES[degree]).T[::-1]))
+    return np.lexsort((colours, *harmonics.reshape(len(g), 3 * BASES[degree]).T[::-1]))
 
 
 def read_spz(path: Path, label_id: int = -1, *, frame: Frame = "rub") -> Gaussians:
-    """Read an SPZ file, version 2 or 3: `decode_spz` of its content. DataError where it cannot be read."""
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror}); give an .spz") from None
-    return decode_spz(content, label_id, frame=frame, name=str(path))
+    """Read an SPZ file, version 2 to 4: `decode_spz` of its content. DataError where it cannot be read."""
+    return decode_spz(_content(path), label_id, frame=frame, name=str(path))
 
 
 def decode_spz(content: bytes, label_id: int = -1, *, frame: Frame = "rub", name: str = "SPZ") -> Gaussians:
-    """Decode SPZ version 2 or 3 into N Gaussians in COLMAP's axes.
+    """Decode SPZ version 2, 3 or 4 into N Gaussians in COLMAP's axes.
 
     Opacities of 0 and 255 become those a quarter of a step further inside, so that their logits are finite.
     Memory stays within what the header promises, and the promise within what `content` can hold.
@@ -201,36 +214,48 @@ def decode_spz(content: bytes, label_id: int = -1, *, frame: Frame = "rub", name
     Raises:
         DataError: For another format or version, or a file that is damaged, cut off or too long.
     """
-    if content.startswith(_MAGIC):
-        raise DataError(f"{name}: SPZ version 4 is not supported; save it as version 3")
-    unpacker = zlib.decompressobj(31)
+    return _gaussians(unpacked(name, content), label_id, frame)
+
+
+def read_spz_splat(path: Path, *, frame: Frame = "rub") -> Splat:
+    """Read an SPZ file of any version with what it says of itself; DataError where it cannot be read.
+
+    Axes are those that version 4's extension of Adobe says, else those of `frame`.
+    """
+    content = _content(path)
+    packed = unpacked(str(path), content)
+    if (axes := packed.extensions.get(_AXES)) is not None:
+        value = int.from_bytes(axes, "little")
+        if len(axes) != 4 or value >= len(_FRAMES):
+            raise DataError(f"{path}: axes of an unknown order ({value}); save it with axes right, up, back")
+        frame = _FRAMES[value]
+    g = _gaussians(packed, -1, frame)
+    splat = Splat(g, f"SPZ {packed.version}", antialiased=packed.antialiased)
     try:
-        header = unpacker.decompress(content, _HEADER.size)
-        version, count, degree, bits = _read_header(name, header)
-        widths = (9, 1, 3, 3, version + 1, 3 * _BASES[degree])
-        size = count * sum(widths)
-        if count > MAX_COUNT or size > _DEFLATE * len(content):
-            raise DataError(f"{name}: {count} Gaussians announced, more than fit; copy it again")
-        body = unpacker.decompress(unpacker.unconsumed_tail, size + 1)  # one byte more, to detect excess data
-    except zlib.error as error:
-        raise DataError(f"{name}: not gzip, or damaged ({error}); give an .spz of version 2 or 3") from None
-    if len(body) != size or not unpacker.eof or unpacker.unused_data:
-        raise DataError(f"{name}: not the {count} Gaussians announced; the file is damaged, copy it again")
-    parts = np.split(np.frombuffer(body, np.uint8), count * np.cumsum(widths[:-1]))
-    positions, alphas, colours, scales, rotations, harmonics = (
-        part.reshape(count, width) for part, width in zip(parts, widths, strict=True)
-    )
-    means = (_fixed(positions) * 2.0**-bits).astype(np.float32)
-    quats = _unpack_rotations(rotations) if version == 3 else _first_three(rotations)
-    shN = (harmonics.reshape(count, _BASES[degree], 3).astype(np.float32) - 128) / 128
-    if frame == "rub":
-        means, quats, shN = _flip(means, quats, shN)
-    opacities = alphas[:, 0].clip(0.25, 254.75) / 255
+        return labelled(splat, packed.extensions[_LABELS]) if _LABELS in packed.extensions else splat
+    except ValueError as error:
+        raise DataError(f"{path}: damaged labels ({short(error)}); export the scene again") from None
+
+
+def _content(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror}); give an .spz") from None
+
+
+def _gaussians(packed: Packed, label_id: int, frame: Frame) -> Gaussians:
+    positions, alphas, colours, scales, rotations, harmonics = packed.attributes
+    count = len(positions)
+    means = (_fixed(positions) * 2.0**-packed.bits).astype(np.float32)
+    quats = _first_three(rotations) if packed.version == 2 else _unpack_rotations(rotations)
+    shN = (harmonics.reshape(count, harmonics.shape[1] // 3, 3).astype(np.float32) - 128) / 128
+    means, quats, shN = _flip(means, quats, shN, frame)
     return Gaussians(
         means=torch.from_numpy(means),
         quats=torch.from_numpy(quats),
         log_scales=torch.from_numpy(scales / np.float32(PER_LOG_SCALE) - 10),
-        logit_opacities=torch.from_numpy(np.log(opacities / (1 - opacities)).astype(np.float32)),
+        logit_opacities=torch.from_numpy(logits_of_bytes(alphas[:, 0])),
         sh0=torch.from_numpy(((colours[:, None] - 127.5) / PER_COLOUR).astype(np.float32)),
         shN=torch.from_numpy(shN),
         label_ids=torch.full((count,), label_id, dtype=torch.int16),
@@ -270,10 +295,16 @@ def _enough_bits(log_scales: np.ndarray, parts: int) -> int:
     return max(1, int(np.ceil(np.log2(parts) - small / np.log(2))))
 
 
-def _flip(means: np.ndarray, quats: np.ndarray, harmonics: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Means [N, 3], quaternions wxyz [N, 4] and SH coefficients [N, K, 3] with y and z negated."""
-    signs = np.concatenate([np.ones(1, np.float32), _FLIP])
-    return means * _FLIP, quats * signs, harmonics * _FLIP_SH[: harmonics.shape[1]]
+def _flip(
+    means: np.ndarray, quats: np.ndarray, harmonics: np.ndarray, frame: Frame
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Means [N, 3], quaternions wxyz [N, 4] and SH coefficients [N, K, 3] between COLMAP's and other axes."""
+    x, y, z = (1 if axis in "rdf" else -1 for axis in frame)
+    if (x, y, z) == (1, 1, 1):
+        return means, quats, harmonics
+    rotation = np.array([1, y * z, x * z, x * y], np.float32)
+    signs = np.sign(np.divide(bases(3 * x, 4 * y, 5 * z), bases(3, 4, 5)))[1:, None].astype(np.float32)
+    return means * np.array([x, y, z], np.float32), quats * rotation, harmonics * signs[: harmonics.shape[1]]
 
 
 def _bytes(values: torch.Tensor, step: int = 1) -> np.ndarray:
@@ -285,7 +316,7 @@ def _pack_rotations(quats: np.ndarray, step: int) -> np.ndarray:
     q = np.roll(quats.astype(np.float64), -1, axis=1)
     largest = np.abs(q).argmax(1)
     q /= (np.linalg.norm(q, axis=1) * np.sign(q[np.arange(len(q)), largest]))[:, None]
-    others = np.take_along_axis(q, _OTHERS[largest], axis=1)
+    others = np.take_along_axis(q, OTHERS[largest], axis=1)
     sizes = (np.rint(np.abs(others) * (_SMALLER / step)) * step).clip(0, 512 - step).astype(np.uint32)
     fields = sizes | ((others < 0) & (sizes > 0)).astype(np.uint32) << 9
     packed = largest.astype(np.uint32) << 30
@@ -297,11 +328,7 @@ def _unpack_rotations(packed: np.ndarray) -> np.ndarray:
     """Quaternions wxyz float32 [N, 4] from version 3's bytes [N, 4]."""
     fields = np.ascontiguousarray(packed).view("<u4") >> np.array([20, 10, 0], np.uint32)
     others = np.where(fields & 512, -1.0, 1.0) * (fields & 511) / _SMALLER
-    largest = packed[:, 3] >> 6
-    q = np.empty((len(packed), 4))
-    np.put_along_axis(q, _OTHERS[largest], others, axis=1)
-    q[np.arange(len(q)), largest] = np.sqrt((1 - (others**2).sum(1)).clip(0))
-    return np.roll(q, 1, axis=1).astype(np.float32)
+    return np.roll(largest_restored(packed[:, 3] >> 6, others), 1, axis=1).astype(np.float32)
 
 
 def _first_three(packed: np.ndarray) -> np.ndarray:
@@ -316,21 +343,3 @@ def _fixed(positions: np.ndarray) -> np.ndarray:
     wide = np.zeros((len(positions), 3, 4), np.uint8)
     wide[..., 1:] = positions.reshape(-1, 3, 3)
     return wide.view("<i4")[..., 0] >> 8
-
-
-def _read_header(name: str, header: bytes) -> tuple[int, int, int, int]:
-    """Version, count, SH degree and fractional bits. DataError for an unsupported header."""
-    if len(header) < _HEADER.size or not header.startswith(_MAGIC):
-        raise DataError(f"{name}: not an SPZ file; give an .spz of version 2 or 3")
-    _, version, count, degree, bits, flags, _ = _HEADER.unpack(header)
-    if version not in (2, 3):
-        raise DataError(f"{name}: SPZ version {version} is not supported; save it as version 3")
-    if degree >= len(_BASES) or bits > MAX_BITS:
-        raise DataError(
-            f"{name}: SH degree {degree}, {bits} fractional bits; at most 3 and {MAX_BITS} are supported"
-        )
-    if flags & ~_ANTIALIASED:  # extensions may change the axes, an LOD tree the meaning of opacities
-        raise DataError(
-            f"{name}: extensions or an LOD tree (flags {flags}) are not supported; save it without"
-        )
-    return version, count, degree, bits

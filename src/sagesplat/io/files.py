@@ -5,6 +5,7 @@ import json
 import math
 import os
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -238,6 +239,21 @@ def read_json(path: Path, cure: str = "") -> Any:
         raise RunError(f"{path}: not readable as JSON (nested too deeply){cure}") from None
     except (OSError, ValueError) as error:
         raise RunError(f"{path}: not readable as JSON ({short(error)}){cure}") from error
+
+
+def regular(path: Path) -> Path:
+    """The path of a file that can be read to its end, unlike a pipe or a device; OSError for others."""
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise OSError(errno.EINVAL, "no regular file", str(path))
+    return path
+
+
+def loads_json(content: bytes) -> Any:
+    """The value of JSON in UTF-8, also with a byte order mark. ValueError if it is none."""
+    try:
+        return json.loads(content.decode("utf-8-sig"))
+    except RecursionError:
+        raise ValueError("JSON that is nested too deeply") from None
 
 
 def read_object(path: Path) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import threading
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from io import BufferedReader
+from io import BufferedReader, BytesIO
 from pathlib import Path
 
 from PIL import Image, ImageFile, UnidentifiedImageError
@@ -82,12 +82,16 @@ class PictureError(Exception):
 
 @contextmanager
 def open_picture(
-    path: Path, formats: Sequence[str] = PHOTO_FORMATS, *, free: int = FREE_PIXELS, decodes: bool = True
+    source: Path | bytes,
+    formats: Sequence[str] = PHOTO_FORMATS,
+    *,
+    free: int = FREE_PIXELS,
+    decodes: bool = True,
 ) -> Iterator[ImageFile.ImageFile]:
     """A picture whose header has been read and whose pixels have not; they are decoded in the block.
 
     Args:
-        path: The file. Its content tells the format, not its name.
+        source: The file, or the content of a WebP file. The content tells the format, not the name.
         formats: Those of `PHOTO_FORMATS` that are accepted.
         free: Number of pixels that any file may have. A larger picture may have `PIXELS_PER_BYTE` times its
             file's size, and never more than `MAX_PIXELS`.
@@ -99,9 +103,9 @@ def open_picture(
             file is missing or damaged.
     """
     try:
-        with _without_warnings(), _regular(path).open("rb") as file:
+        with _without_warnings(), _opened_source(source) as file:
             kind = _checked_format(file, formats)
-            nbytes = path.stat().st_size
+            nbytes = len(source) if isinstance(source, bytes) else source.stat().st_size
             _check_metadata(file, kind, nbytes, decodes)
             with _opened(file, kind) as image:
                 _check_pixels(image.size, nbytes, free)
@@ -122,6 +126,10 @@ def _without_warnings() -> AbstractContextManager[None]:
     if threading.current_thread() is not threading.main_thread():
         return nullcontext()
     return warnings.catch_warnings(action="ignore")
+
+
+def _opened_source(source: Path | bytes) -> BufferedReader:
+    return BufferedReader(BytesIO(source)) if isinstance(source, bytes) else _regular(source).open("rb")  # type: ignore[arg-type]
 
 
 def _regular(path: Path) -> Path:

@@ -1,0 +1,112 @@
+"""Streamed SOG, PlayCanvas's levels of detail: `lod-meta.json` and a SOG scene for each part of each level.
+
+    {"lodLevels": 7, "filenames": ["0_0/meta.json", ...], "environment": null, "tree": NODE}
+
+Level 0 is the finest. A NODE of the tree has a `bound` and `children`, or it is a leaf: `lods` says for each
+level which rows of which file are in it ({"0": {"file": 0, "offset": 0, "count": 248155}, ...}).
+`environment` is a SOG scene that is shown with every level, such as a sky.
+"""
+
+from collections import defaultdict
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import torch
+
+from sagesplat.core.errors import DataError, short
+from sagesplat.core.gaussians import concat
+from sagesplat.formats.labels import with_labels
+from sagesplat.formats.sog import read_sog
+from sagesplat.formats.splat import Splat
+from sagesplat.io.files import loads_json, regular
+
+LOD_META = "lod-meta.json"
+_MOST_LEVELS = 100
+_CURE = "copy its folder again"
+
+Slices = dict[int, list[tuple[int, int]]]  # by file: first row and number of rows of each leaf
+
+
+def read_lod_meta(path: Path, lod: int = 0) -> Splat:
+    """Read a level of a streamed SOG, with its environment, if it has one.
+
+    Rows are in the order of the files. Labels come from the sidecars of the SOG scenes. DataError for another
+    file, a level that it does not have, files outside of its folder, or rows that they do not have.
+    """
+    levels, files, environment, slices = _parsed(path, lod)
+    if not 0 <= lod < levels:
+        raise DataError(f"{path}: no level {lod}; it has 0 (the finest) to {levels - 1}")
+    parts = []
+    for file in sorted(slices):
+        part = _read(path, files[file])
+        rows, count = sorted(slices[file]), len(part.gaussians)
+        ends = [0, *(offset + size for offset, size in rows)]
+        if any(offset < end for (offset, _), end in zip(rows, ends, strict=False)) or ends[-1] > count:
+            raise DataError(f"{path}: leaves that do not fit the {count} rows of {files[file]}; {_CURE}")
+        taken = [torch.arange(offset, offset + size) for offset, size in rows]
+        whole = sum(size for _, size in rows) == count
+        parts.append(part if whole else replace(part, gaussians=part.gaussians.select(torch.cat(taken))))
+    if environment is not None:
+        parts.append(_read(path, environment))
+    if not parts:
+        raise DataError(f"{path}: level {lod} has no Gaussians; choose another one")
+    names: dict[int, str] = {}
+    for part in parts:
+        names |= part.names
+    g = parts[0].gaussians if len(parts) == 1 else concat([part.gaussians for part in parts])
+    antialiased = any(part.antialiased for part in parts)
+    return Splat(g, f"streamed {parts[0].kind}", names, antialiased)
+
+
+def count_levels(path: Path) -> int:
+    """How many levels a streamed SOG has; DataError for another file."""
+    return _parsed(path, 0)[0]
+
+
+def _read(path: Path, name: str) -> Splat:
+    """A SOG scene of the folder; DataError for one outside of it."""
+    file = path.parent / name
+    inside = file.resolve().is_relative_to(path.parent.resolve())
+    if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts or "\\" in name or not inside:
+        raise DataError(f"{path}: {short(name)} is not in its folder; {_CURE}")
+    return with_labels(read_sog(file), file)
+
+
+def _parsed(path: Path, lod: int) -> tuple[int, list[str], str | None, Slices]:
+    """Number of levels, file names, the environment's, and the rows of a level by file."""
+    try:
+        meta = loads_json(regular(path).read_bytes())
+        levels, files, environment = meta["lodLevels"], meta["filenames"], meta.get("environment")
+        if type(levels) is not int or not 0 < levels <= _MOST_LEVELS or meta.get("version", 1) != 1:
+            raise ValueError(f"version {meta.get('version', 1)!r:.20}, {levels!r:.20} levels")
+        if not isinstance(files, list) or not all(map(_is_name, files)) or not _is_name(environment or "."):
+            raise ValueError("names of files that are none")
+        return levels, files, environment or None, _slices(meta["tree"], str(lod), len(files))
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror}); give a {LOD_META}") from None
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise DataError(f"{path}: not a streamed SOG ({short(repr(error))}); {_CURE}") from None
+
+
+def _is_name(value: Any) -> bool:
+    return isinstance(value, str) and 0 < len(value) <= 1000 and value.isprintable()
+
+
+def _slices(tree: Any, lod: str, files: int) -> Slices:
+    found: Slices = defaultdict(list)
+    nodes = [tree]
+    while nodes:
+        node = nodes.pop()
+        nodes += node.get("children") or []
+        if (rows := (node.get("lods") or {}).get(lod)) is None:
+            continue
+        numbers = [rows["file"], rows["offset"], rows["count"]]
+        if (
+            any(type(number) is not int or not 0 <= number < 2**40 for number in numbers)
+            or numbers[0] >= files
+        ):
+            raise ValueError(f"rows {numbers!r:.60}")
+        if numbers[2]:
+            found[numbers[0]].append((numbers[1], numbers[2]))
+    return found

@@ -1,0 +1,60 @@
+"""The Splat type: Gaussians of somebody else's file, and what was wrong with them."""
+
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from sagesplat.core.errors import DataError
+from sagesplat.core.gaussians import Gaussians
+
+OPAQUE = 16.0  # logit of opacities that a file has as infinite; its sigmoid is 1 - 1e-7
+
+
+@dataclass(frozen=True, eq=False)
+class Splat:
+    """A splat file's content, in COLMAP's axes as INRIA's PLY has it."""
+
+    gaussians: Gaussians  # on the CPU; label ids -1 where the file has none
+    kind: str  # the format, such as "PLY" or "SPZ 3"
+    names: dict[int, str] = field(default_factory=dict)  # category names by label id, where the file has them
+    antialiased: bool = False  # trained with an antialiasing filter, if the file says so
+    announced: int = -1  # Gaussians in the file; -1: as many as there are
+    dropped: dict[str, int] = field(default_factory=dict)  # reason -> Gaussians that were left out
+
+
+def cleaned(splat: Splat, name: str) -> Splat:
+    """The splat without the Gaussians that cannot be drawn, which `dropped` counts by reason.
+
+    These hold NaN or infinities, have a rotation of zeros, or are invisible (an opacity or a scale of zero,
+    whose logarithm is -infinity). An opacity logit of +infinity becomes `OPAQUE`. DataError, which calls the
+    file `name`, if none is left.
+    """
+    g = splat.gaussians
+    announced = len(g) if splat.announced < 0 else splat.announced
+    if not len(g):
+        raise DataError(f"{name}: no Gaussians in it; export the scene again")
+    invisible = torch.isneginf(g.logit_opacities) | torch.isneginf(g.log_scales).any(1)
+    if opaque := bool(torch.isposinf(g.logit_opacities).any()):
+        g = replace(g, logit_opacities=g.logit_opacities.clamp(max=OPAQUE))
+    broken = ~invisible & ~_all_finite(g)
+    zero = ~invisible & ~broken & ~g.quats.any(1)
+    reasons = {"NaN or infinite": broken, "a rotation of zeros": zero, "invisible": invisible}
+    dropped = {reason: count for reason, rows in reasons.items() if (count := int(rows.sum()))}
+    if sum(dropped.values()) == len(g):
+        why = ", ".join(f"{count} {reason}" for reason, count in dropped.items())
+        raise DataError(
+            f"{name}: none of its {len(g)} Gaussians can be drawn ({why}); export the scene again"
+        )
+    if dropped:
+        g = g.select(~(broken | zero | invisible))
+    if not dropped and not opaque and splat.announced >= 0:
+        return splat
+    return replace(splat, gaussians=g, announced=announced, dropped=splat.dropped | dropped)
+
+
+def _all_finite(g: Gaussians) -> Tensor:
+    rows = torch.ones(len(g), dtype=torch.bool)
+    for values in g.parameters().values():
+        rows &= torch.isfinite(values.reshape(len(g), -1)).all(1)
+    return rows
