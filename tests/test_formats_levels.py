@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import PARAMETERS
-from sagesplat.formats.levels import read_header, read_level, write_level
+from sagesplat.formats.levels import read_header, read_level, write_level, write_set
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
@@ -42,6 +42,21 @@ def test_round_trip_within_the_quantisation(tmp_path, degree):
         assert ((back.shN[of] - g.shN[of]).abs()[tiny] <= largest.expand(tiny.shape)[tiny] / 1000).all()
     for p in back.parameters().values():
         assert p.dtype == torch.float32
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_an_exact_level_is_identical_bit_for_bit(tmp_path, degree):
+    g = random_gaussians(60, degree=degree)
+    g.quats[0] = torch.tensor([3.0, -0.0, 1e-20, -7.5])  # as they came, of any length
+    g.log_scales[1] = torch.tensor([-40.0, 1e-7, 12.3456789])
+    g.sh0[2] = -0.0
+    path = write_level(tmp_path, 7, g, recovering=False, sh_degree=degree, exact=True)
+    write_set(tmp_path / "set.npz", g, 7, exact=True)
+    g = g.select(torch.argsort(g.label_ids, stable=True))
+    for back in (read_level(path), read_level(tmp_path / "set.npz")):
+        for name in (*PARAMETERS, "label_ids"):
+            assert getattr(back, name).numpy().tobytes() == getattr(g, name).numpy().tobytes(), name
+    assert (tmp_path / "set.npz").stat().st_size < len(g) * (14 + 3 * g.shN.shape[1]) * 4 + 12_000
 
 
 def test_harmonics_not_yet_in_use_are_left_out(tmp_path):

@@ -20,7 +20,7 @@ from make_viewer_vectors import model
 
 from sagesplat.adapt.viewpoint import QualityKind, ViewModel
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.formats.increments import read_increments, write_increments
+from sagesplat.formats.increments import read_increments, shown, write_increments
 from sagesplat.raster import rasterize
 from sagesplat.scene.scene import Camera
 from sagesplat.viewer.built import package_viewer
@@ -112,10 +112,10 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "bundle"
 
 
-def three_walls(folder: Path) -> Contents:
+def three_walls(folder: Path, **increments: Any) -> Contents:
     names = {1: "brick", 2: "grass-merged", 3: "sky-other-merged"}
     g = cloud()
-    chunks = write_increments(folder / "chunks", g, SIZES, names)
+    chunks = write_increments(folder / "chunks", g, SIZES, names, **increments)
     places = {i: g.means[g.label_ids == i].numpy() * [1, -1, -1] for i in names}
     categories = [
         Category(i, name, name.split("-")[0], "#" + bytes(int(255 * c) for c in COLOURS[i]).hex(),
@@ -277,6 +277,40 @@ def read_chunks_of(made: Path, manifest: dict[str, Any]) -> Gaussians:
             for k, e in enumerate(label["levels"], 1)
         ],
     )
+
+
+def test_levels_that_replace_are_drawn_alone_and_change_in_one_frame(tmp_path: Path, browser: Any) -> None:
+    """Walls 1 and 3 begin again at level 3, in PLY files, which are in the capture's axes."""
+    contents = three_walls(
+        tmp_path, replaces={1: (3,), 3: (3,)}, kind=lambda label, level: "ply" if level > 2 else "spz"
+    )
+    write_bundle(tmp_path / "bundle", contents, package_viewer())
+    with (
+        serve(tmp_path / "bundle") as url,
+        open_page(f"{url}?ui=0&view=photo1.jpg", browser=browser) as opened,
+    ):
+        ready(opened)
+        settled(opened)
+        opened.page.evaluate(WATCH)
+        seen = set()
+        for count in (WHOLE, 2 * BASE, WHOLE, 350, 300, 470):
+            budget = f"{{ bytes: Infinity, gpuBytes: Infinity, count: {count} }}"
+            opened.page.evaluate(f"sagesplat.set({{ mode: 'budget', budget: {budget} }})")
+            opened.wait_for("sagesplat.state().labels.every((l) => l.shown === l.wanted)")
+            picture = settled(opened)
+            levels = opened.page.evaluate("sagesplat.state().labels.map((l) => [l.label.id, l.shown])")
+            files = [chunk for label, level in levels for chunk in shown(contents.chunks, label, level)]
+            g = read_increments(contents.folder, files)
+            assert opened.page.evaluate("sagesplat.state().count") == len(g) <= count
+            wanted = rasterize(g, camera(0.2), backend="cpu", antialiased=False).rgb.clamp(0, 1).numpy()
+            assert -10 * np.log10(((picture - wanted) ** 2).mean()) > 30  # dB
+            seen.add(tuple(level for _, level in levels))
+        samples = opened.page.evaluate("samples")
+        assert opened.complaints == []
+    assert (4, 4, 4) in seen
+    assert min(seen)[0] < 3  # below the level that replaces, too
+    assert min(sample["lit"] for sample in samples) > 0.05  # no hole
+    assert max(sample["drawn"] for sample in samples) <= 150 + 200 + 150  # nothing twice
 
 
 def test_a_walk_with_swaps_has_no_empty_frame_and_keeps_the_budget(viewer: Opened) -> None:

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from sagesplat.adapt.viewpoint import NO_CALIBRATION, Calibration, QualityKind, ViewModel
 from sagesplat.core.errors import DataError, RunError, SageError
 from sagesplat.formats.increments import write_increments
+from sagesplat.formats.ply import read_ply
 from sagesplat.formats.spz import read_spz
 from sagesplat.io.lock import alone
 from sagesplat.scene.scene import Camera
@@ -435,6 +436,53 @@ def test_a_live_bundle_has_no_pack(tmp_path, contents) -> None:
     write_documents(tmp_path, replace(contents, live=True))
     assert manifest_of(tmp_path)["pack"] is None
     assert not list(tmp_path.glob("*.pack"))
+
+
+def test_levels_that_replace_are_in_the_manifest_and_others_leave_it_as_it_was(
+    tmp_path, contents, viewer
+) -> None:
+    assert documents(contents)[0]["version"] == 2
+    g = replace(
+        random_gaussians(39, degree=1),
+        label_ids=torch.tensor([-1] * 10 + [3] * 20 + [184] * 9, dtype=torch.int16),
+    )
+    names, replaces = {3: "car", 184: "tree"}, {3: (3,)}
+    chunks = write_increments(
+        tmp_path / "chunks", g, SIZES, names, replaces=replaces,
+        kind=lambda label, level: "ply" if label == 3 and level == 3 else "spz",
+    )  # fmt: skip
+    written = write_bundle(tmp_path / "out", replace(contents, chunks=chunks), viewer)
+    manifest = manifest_of(tmp_path / "out")
+    assert manifest["version"] == 3
+    (label,) = (label for label in manifest["labels"] if label["id"] == 3)
+    assert [level.get("refine") for level in label["levels"]] == [None, None, "REPLACE"]
+    assert [level["format"] for level in label["levels"]] == ["spz", "spz", "ply"]
+    others = [level for one in manifest["labels"] if one["id"] != 3 for level in one["levels"]]
+    assert {"refine"} & {key for level in others for key in level} == set()
+    assert manifest["totals"]["count"] == 39 - 6  # of the full scene
+    assert written.chunks == sum(chunk.nbytes for chunk in chunks) > manifest["totals"]["bytes"]
+    assert manifest["pack"]["bytes"] == written.chunks
+    assert len(read_ply(tmp_path / "out" / label["levels"][2]["uri"])) == label["levels"][2]["count"] == 14
+
+
+def test_in_the_pack_what_the_first_view_skips_comes_last() -> None:
+    made = replace(model(2, 6, [1, 2, 3, 4]), weights=np.zeros((6, 4)))
+    made = replace(made, inputs=np.tile([0, 0, 0, 0, 0, 1.0, math.log(5)], (6, 1)))  # where it is looked from
+    flat = replace(made.curves[0], params=made.curves[0].params._replace(g1=0, g2=0))
+    means = (0.3, 0.62, 0.9, 0.95)
+    curves = tuple(
+        replace(flat, level=k, params=flat.params._replace(K1=mean, K2=mean))
+        for k, mean in enumerate(means, 1)
+    )
+    one = Ladder([10, 20, 100, 50], 1.0, FRONT, replace(made, curves=curves), np.full(1, 0.1), [3])
+    assert order_at_origin(one) == [(0, 1), (0, 3), (0, 4), (0, 2)]  # nothing reaches 1
+    assert order_at_origin(replace(one, target=0.8)) == [(0, 1), (0, 3), (0, 4), (0, 2)]
+    assert order_at_origin(replace(one, target=0.5)) == [(0, 1), (0, 2), (0, 3), (0, 4)]
+    assert order_at_origin(replace(one, model=None)) == [(0, 1), (0, 3), (0, 4), (0, 2)]
+    plain = Ladder([10, 20, 100, 50], 1.0, FRONT, None, None)
+    order = order_at_origin(plain, replace(one, replaces=[2, 3]))
+    assert order[-1] == (1, 2)
+    assert sorted(order) == [(i, k) for i in (0, 1) for k in (1, 2, 3, 4)]
 
 
 FRONT, BEHIND = np.array([[-1.0, -1, -6, 1, 1, -4]]), np.array([[-1.0, -1, 4, 1, 1, 6]])

@@ -1,6 +1,7 @@
 """Readers of splat files, levels, arrays and training checkpoints."""
 
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +45,10 @@ def _index(folder: Path, size: int) -> list[bytes]:
     (folder / "sky-01.spz").write_bytes(content)
     chunk = CHUNK | {"uri": "sky-01.spz", "nbytes": len(content)}
     chunks = [chunk | {"level": 1 + i % 3} for i in range(size)]
-    return as_json({"format": "spz", "chunks": chunks}, {"format": "spz", "chunks": [chunk, chunk]})
+    write_ply(folder / "sky-02.ply", splats())
+    replacing = chunk | {"uri": "sky-02.ply", "level": 2, "refine": "REPLACE"}
+    both = {"format": "spz+ply", "chunks": [chunk, replacing]}
+    return as_json({"format": "spz", "chunks": chunks}, {"format": "spz", "chunks": [chunk, chunk]}, both)
 
 
 def _read_index(path: Path) -> None:
@@ -82,7 +86,12 @@ def _read_snapshots(path: Path) -> None:
 def _nested(folder: Path, size: int) -> list[bytes]:
     g = splats(3 * size)
     sizes = {2: [1, 3 * size - 1], 5: [0, 1]}
-    return [written(folder / "n.npz", lambda path: write_set(path, g, 7, sizes, place=np.ones(3 * size)))]
+    plain = partial(write_set, g=g, step=7, sizes=sizes, place=np.ones(3 * size))
+    if size > 1:
+        return [written(folder / "n.npz", plain)]
+    return [
+        written(folder / "n.npz", write) for write in (plain, partial(plain, replaces={2: [2]}, exact=True))
+    ]
 
 
 def _read_nested(path: Path) -> None:

@@ -4,10 +4,15 @@ export type Vec3 = readonly [number, number, number];
 export type Quat = readonly [number, number, number, number]; // x y z w
 export type Box = readonly [number, number, number, number, number, number]; // min x y z, max x y z
 
-/** One increment: the splats that a level adds to the level below. */
+/** How a file holds splats. PLY is INRIA's, its y and z opposite to the bundle's; nothing is rounded in it. */
+export const FORMATS = ["spz", "ply"] as const;
+export type Format = (typeof FORMATS)[number];
+
+/** One increment: the splats that a level adds to the level below, or replaces it by. */
 export interface Level {
   readonly uri: string;
-  readonly format: "spz";
+  readonly format: Format;
+  readonly refine?: "REPLACE"; // the level shows none of the increments below
   readonly bytes: number;
   readonly gpuBytes: number;
   readonly count: number;
@@ -48,7 +53,7 @@ export interface Label {
   readonly weight: number;
   readonly always: boolean; // shipped in full whatever the plan says
   readonly boxes: readonly Box[];
-  readonly levels: readonly Level[]; // level k consists of increments 1..k
+  readonly levels: readonly Level[]; // level k consists of increments up to k, from the newest REPLACE on
   readonly quality: Readonly<Partial<Record<Quality, LabelQuality>>>;
 }
 
@@ -80,6 +85,7 @@ export interface Manifest {
   readonly shDegree: number;
   readonly antialiased: boolean;
   readonly background: Vec3; // 0..1
+  /** Of the full scene: every label at its last level. */
   readonly totals: { readonly count: number; readonly bytes: number; readonly gpuBytes: number };
   readonly labels: readonly Label[];
   readonly promises: Readonly<Partial<Record<Quality, Reference>>>;
@@ -163,7 +169,7 @@ export interface Settings {
 /** Draws increments; independent of plans and networks. */
 export interface Renderer {
   /** Decodes an increment, which is drawn after `swap` shows it. Rejects for an invalid file. */
-  decode(label: number, level: number, bytes: Uint8Array): Promise<Handle>;
+  decode(label: number, level: number, bytes: Uint8Array, format: Format): Promise<Handle>;
   /** Shows some increments and hides others in one tick; hidden ones stay drawn until the next sort is done. */
   swap(show: readonly Handle[], hide: readonly Handle[]): void;
   dispose(handle: Handle): void;

@@ -74,13 +74,15 @@ function watcher(streamer: Streamer, renderer: FakeRenderer): () => void {
     let drawn = 0;
     for (const { label, shown, wanted } of labels) {
       const levels = renderer.levels(label.id);
-      const expected = label.levels.flatMap((file, i) => (i < shown && file.count ? [i + 1] : []));
+      const start = label.levels.slice(0, shown).findLastIndex(({ refine }) => refine);
+      const isDrawn = (i: number) => i >= start && i < shown;
+      const expected = label.levels.flatMap((file, i) => (isDrawn(i) && file.count ? [i + 1] : []));
       if (!live && levels.join() !== expected.join()) {
         throw new Error(`${label.name}: draws ${levels}, says ${expected}`);
       }
       if (seen.has(label.id) && wanted && !shown) throw new Error(`${label.name}: a hole`);
       if (shown) seen.add(label.id);
-      drawn += label.levels.reduce((sum, file, i) => sum + (i < shown ? file.count : 0), 0);
+      drawn += label.levels.reduce((sum, file, i) => sum + (isDrawn(i) ? file.count : 0), 0);
     }
     if (!live && drawn !== count) throw new Error(`counts ${count}, draws ${drawn}`);
   };

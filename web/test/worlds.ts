@@ -41,17 +41,20 @@ export interface Options {
   readonly live?: boolean;
   readonly promises?: boolean;
   readonly pack?: boolean;
+  readonly replaces?: readonly number[]; // levels that replace those below
 }
 
 /** A bundle whose files are on a network; label i stands at x = 4 i - 8. */
 export function bundle(network: Network, options: Options = {}): Manifest {
   const { labels = 4, levels = 5, bytes = 20_000, seed = 1, live = false, promises = true } = options;
-  const { pack = false } = options;
+  const { pack = false, replaces = [] } = options;
   const random = seeded(seed);
   const made = Array.from({ length: labels }, (_, id) => {
     const files = Array.from({ length: levels }, (_, k) => {
-      const size = Math.round(bytes * (0.5 + random()) * (k ? 1 : 0.3));
-      return put(network, `chunks/l${id}-${k + 1}-${seed}.spz`, size, random);
+      const more = replaces.includes(k + 1) ? k + 1 : 1; // than all those below it
+      const size = Math.round(bytes * (0.5 + random()) * (k ? 1 : 0.3) * more);
+      const file = put(network, `chunks/l${id}-${k + 1}-${seed}.spz`, size, random);
+      return replaces.includes(k + 1) ? { ...file, refine: "REPLACE" as const } : file;
     });
     return labelOf(id, files, random);
   });
@@ -181,7 +184,14 @@ function promisesOf(labels: readonly Label[], random: () => number): Promises {
 }
 
 export function totals(labels: readonly Label[]): Manifest["totals"] {
-  const all = labels.flatMap((label) => label.levels);
+  const all = labels.flatMap(({ levels }) =>
+    levels.slice(
+      Math.max(
+        0,
+        levels.findLastIndex((l) => l.refine),
+      ),
+    ),
+  );
   const sum = (unit: "count" | "bytes" | "gpuBytes") => all.reduce((total, level) => total + level[unit], 0);
   return { count: sum("count"), bytes: sum("bytes"), gpuBytes: sum("gpuBytes") };
 }

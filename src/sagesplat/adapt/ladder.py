@@ -1,7 +1,7 @@
 """The levels of every category, snapshots or nested, read from disk on demand."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Protocol
@@ -10,7 +10,14 @@ import numpy as np
 
 from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import Gaussians, concat
-from sagesplat.formats.levels import LevelFile, read_header, read_level, read_sizes
+from sagesplat.formats.levels import (
+    LevelFile,
+    read_header,
+    read_level,
+    read_replaces,
+    read_sizes,
+    starts_of,
+)
 
 
 class Ladder(Protocol):
@@ -85,10 +92,15 @@ class SnapshotLadder(Ladder):
 
 @dataclass(frozen=True)
 class PrefixLadder(Ladder):
-    """Ours: one ordered set of Gaussians per category; level k is its first `sizes[label][k - 1]`."""
+    """Ours: one ordered set of Gaussians per category, of which each level is a range of rows.
+
+    Level k of a category ends at row `sizes[label][k - 1]`. It begins at row 0; or, where it or a level below
+    replaces what is below it, where that begins (`starts`).
+    """
 
     path: Path
     sizes: dict[int, tuple[int, ...]]
+    replaces: dict[int, tuple[int, ...]] = field(default_factory=dict)  # by label id; none: only prefixes
 
     @property
     def levels(self) -> list[int]:
@@ -98,7 +110,16 @@ class PrefixLadder(Ladder):
     @property
     def counts(self) -> dict[tuple[int, int], int]:
         """Gaussians of each (label id, level)."""
-        return {(label, k): n for label, sizes in self.sizes.items() for k, n in enumerate(sizes, 1)}
+        return {
+            (label, k): end - start
+            for label, sizes in self.sizes.items()
+            for k, (start, end) in enumerate(zip(self.starts[label], sizes, strict=True), 1)
+        }
+
+    @cached_property
+    def starts(self) -> dict[int, tuple[int, ...]]:
+        """The row of the category that each level begins with, by label id."""
+        return {label: starts_of(sizes, self.replaces.get(label, ())) for label, sizes in self.sizes.items()}
 
     @cached_property
     def gaussians(self) -> Gaussians:
@@ -125,11 +146,11 @@ class PrefixLadder(Ladder):
                 raise _unknown(level, self.levels)
         # slices are copied several times as fast as rows are gathered
         parts = [
-            slice(rows.start, rows.start + min(len(rows), self.sizes[label][levels[label] - 1]))
+            rows[self.starts[label][levels[label] - 1] : self.sizes[label][levels[label] - 1]]
             for label, rows in self._rows.items()
             if label in levels and label in self.sizes
         ]
-        return self.gaussians.slices(parts)
+        return self.gaussians.slices([slice(rows.start, rows.stop) for rows in parts])
 
 
 def _unknown(level: int, levels: list[int]) -> RunError:
@@ -148,4 +169,5 @@ def read_prefixes(path: Path) -> PrefixLadder:
     """The nested ladder in a file."""
     if not path.exists():
         raise RunError(f"{path}: no nested ladder; run `sagesplat nest` first")
-    return PrefixLadder(path, read_sizes(path))
+    sizes = read_sizes(path)
+    return PrefixLadder(path, sizes, read_replaces(path, sizes))

@@ -1,12 +1,13 @@
 """Level files: one .npz per level, with one set of arrays per category, at most 79 bytes per Gaussian.
 
 means are float32, quats int16, log_scales, logit_opacities and sh0 float16, shN int8 on a square-root scale
-per coefficient. Single categories can be read, so a composition reads only what it uses. Reading needs
-at most 32 bytes of memory per byte of the file.
+per coefficient. An exact file has float32 everywhere, and gives back what was written bit for bit. Single
+categories can be read, so a composition reads only what it uses. Reading needs at most 32 bytes of memory per
+byte of the file.
 """
 
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from sagesplat.io.files import atomic_path
 from sagesplat.io.npz import Npz
 
 _DAMAGED = (OSError, KeyError, TypeError, ValueError)  # raised for truncated or damaged files
+_LADDER = (["sizes"], ["replaces"])  # arrays of a category that are no Gaussians
 _HALVES = ("log_scales", "logit_opacities", "sh0")
 
 
@@ -35,42 +37,81 @@ class LevelFile:
     counts: dict[int, int]  # Gaussians by label id
 
 
-def write_level(folder: Path, step: int, g: Gaussians, *, recovering: bool, sh_degree: int) -> Path:
+def write_level(
+    folder: Path, step: int, g: Gaussians, *, recovering: bool, sh_degree: int, exact: bool = False
+) -> Path:
     """Write Gaussians as the level FOLDER/STEP.npz, without SH coefficients above `sh_degree`; its path."""
     path = folder / f"{step:06d}.npz"
-    _write(path, step, g, recovering, sh_degree, {})
+    _write(path, LevelFile(path, step, recovering, sh_degree, g.counts()), g, {}, exact)
     return path
 
 
 def write_set(
-    path: Path, g: Gaussians, step: int, sizes: Mapping[int, Sequence[int]] | None = None, **more: Any
+    path: Path,
+    g: Gaussians,
+    step: int,
+    sizes: Mapping[int, Sequence[int]] | None = None,
+    *,
+    replaces: Mapping[int, Collection[int]] | None = None,
+    exact: bool = False,
+    **more: Any,
 ) -> None:
-    """Write Gaussians in order, with the sizes of nested levels by label id, and further arrays `more`."""
+    """Write Gaussians in order, as nested levels by label id, with further arrays `more`.
+
+    `sizes`: rows of the category up to the end of each level. `replaces`: levels that replace those below
+    (see `starts_of`). `exact`: as float32, identical when read.
+    """
     arrays = {f"{label}/sizes": np.array(n, np.int64) for label, n in (sizes or {}).items()}
-    _write(path, step, g, False, g.sh_degree, arrays | {f"more/{k}": np.asarray(v) for k, v in more.items()})
+    for label, levels in (replaces or {}).items():
+        if levels:
+            arrays[f"{label}/replaces"] = np.array(sorted(levels), np.int64)
+    arrays |= {f"more/{name}": np.asarray(value) for name, value in more.items()}
+    _write(path, LevelFile(path, step, False, g.sh_degree, g.counts()), g, arrays, exact)
 
 
-def _write(
-    path: Path, step: int, g: Gaussians, recovering: bool, sh_degree: int, more: dict[str, Any]
-) -> None:
-    arrays: dict[str, np.ndarray] = {"meta": np.array([step, recovering, sh_degree], np.int64), **more}
-    for label in g.counts():
+def starts_of(sizes: Sequence[int], replaces: Collection[int] = ()) -> tuple[int, ...]:
+    """The first row of each level of a category: level k is the rows from starts[k-1] to before sizes[k-1].
+
+    `sizes`: the rows up to the end of each level, ascending. `replaces`: the levels, from 2 on, that replace
+    those below: they begin where the level below ends. ValueError for one that cannot, since it adds nothing
+    or has nothing below.
+    """
+    starts = [0] * len(sizes)
+    for level in sorted(replaces):
+        if not 2 <= level <= len(sizes) or not 0 < sizes[level - 2] < sizes[level - 1]:
+            raise ValueError(f"level {level} of {len(sizes)} cannot replace those below it")
+        starts[level - 1 :] = [sizes[level - 2]] * (len(sizes) - level + 1)
+    return tuple(starts)
+
+
+def _write(path: Path, header: LevelFile, g: Gaussians, more: dict[str, Any], exact: bool) -> None:
+    meta = np.array([header.step, header.recovering, header.sh_degree], np.int64)
+    arrays: dict[str, np.ndarray] = {"meta": meta, **more}
+    columns_of = _exact if exact else _encoded
+    for label in header.counts:
         part = g.of_labels([label])
-        values = {name: p.detach().numpy() for name, p in part.parameters().items()}
-        quats = values["quats"] / np.linalg.norm(values["quats"], axis=1, keepdims=True)
-        coefficients = values["shN"][:, : num_bases(sh_degree) - 1]
-        scale = np.abs(coefficients).max(axis=0, initial=0)
-        share = coefficients / np.where(scale > 0, scale, 1)
-        columns = {
-            "means": values["means"],
-            "quats": np.round(quats * 32767).astype(np.int16),
-            **{name: values[name].astype(np.float16) for name in _HALVES},
-            "shN": np.round(np.sign(share) * np.sqrt(np.abs(share)) * 127).astype(np.int8),
-            "shN_scale": scale.astype(np.float32),
-        }
-        arrays |= {f"{label}/{name}": column for name, column in columns.items()}
+        values = {name: p.detach().cpu().numpy() for name, p in part.parameters().items()}
+        values["shN"] = values["shN"][:, : num_bases(header.sh_degree) - 1]
+        arrays |= {f"{label}/{name}": column for name, column in columns_of(values).items()}
     with atomic_path(path, nbytes=sum(a.nbytes for a in arrays.values())) as temporary:
         np.savez(temporary, allow_pickle=False, **arrays)
+
+
+def _exact(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    return {name: value.astype(np.float32, copy=False) for name, value in values.items()}
+
+
+def _encoded(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    quats = values["quats"] / np.linalg.norm(values["quats"], axis=1, keepdims=True)
+    scale = np.abs(values["shN"]).max(axis=0, initial=0)
+    share = values["shN"] / np.where(scale > 0, scale, 1)
+    return {
+        "means": values["means"],
+        "quats": np.round(quats * 32767).astype(np.int16),
+        **{name: values[name].astype(np.float16) for name in _HALVES},
+        "shN": np.round(np.sign(share) * np.sqrt(np.abs(share)) * 127).astype(np.int8),
+        "shN_scale": scale.astype(np.float32),
+    }
 
 
 def read_sizes(path: Path) -> dict[int, tuple[int, ...]]:
@@ -78,7 +119,7 @@ def read_sizes(path: Path) -> dict[int, tuple[int, ...]]:
     counts = read_header(path).counts
     with _open(path) as file:
         try:
-            sizes = {label: tuple(map(int, file[f"{label}/sizes"])) for label in counts}
+            sizes = {label: _integers(file, f"{label}/sizes") for label in counts}
         except _DAMAGED as error:
             raise DataError(f"{path}: not nested levels ({short(error)}); {_again(path)}") from None
     lengths = {len(s) for s in sizes.values()}
@@ -89,6 +130,32 @@ def read_sizes(path: Path) -> dict[int, tuple[int, ...]]:
     ):
         raise DataError(f"{path}: level sizes that do not fit its Gaussians; {_again(path)}")
     return sizes
+
+
+def read_replaces(path: Path, sizes: Mapping[int, tuple[int, ...]]) -> dict[int, tuple[int, ...]]:
+    """By label id the levels that replace those below, of categories that have some.
+
+    `sizes`: of `read_sizes`. DataError for a damaged file, or levels that cannot replace.
+    """
+    with _open(path) as file:
+        try:
+            labels = [label for label in sizes if f"{label}/replaces" in file]
+            replaces = {label: _integers(file, f"{label}/replaces") for label in labels}
+            for label, levels in replaces.items():
+                if len(levels) > len(sizes[label]):
+                    raise ValueError(f"{len(levels)} of {len(sizes[label])} levels")
+                starts_of(sizes[label], levels)
+        except _DAMAGED as error:
+            raise DataError(f"{path}: impossible replacing levels ({short(error)}); {_again(path)}") from None
+    return replaces
+
+
+def _integers(file: Npz, name: str) -> tuple[int, ...]:
+    """A vector of integers; ValueError for another array."""
+    values = file[name]
+    if values.ndim != 1 or values.dtype.kind not in "iu":
+        raise ValueError(f"{name[:40]!r} is of shape {list(values.shape)} and type {values.dtype.str}")
+    return tuple(values.tolist())
 
 
 def read_more(path: Path, name: str) -> np.ndarray[Any, Any]:
@@ -118,10 +185,10 @@ def read_header(path: Path) -> LevelFile:
     """The header of a level file, without reading its Gaussians. DataError for another file."""
     with _open(path) as file:
         try:
-            step, recovering, degree = (int(value) for value in file["meta"])
+            step, recovering, degree = _integers(file, "meta")
             # of all arrays: a category with a damaged array name must not be lost silently
             names = [n.split("/") for n in file.names if n != "meta"]
-            labels = sorted({int(label) for label, *kind in names if label != "more" and kind != ["sizes"]})
+            labels = sorted({int(label) for label, *kind in names if label != "more" and kind not in _LADDER})
             counts = {label: len(file[f"{label}/logit_opacities"]) for label in labels}
             if step < 0 or not 0 <= degree <= 3 or not all(-1 <= label < 2**15 for label in labels):
                 raise ValueError(f"step {step}, degree {degree}, categories {labels}")
@@ -181,12 +248,15 @@ def _decode(file: Npz, label: int) -> Gaussians:
         with np.errstate(all="ignore"):  # values too large for float32 become Inf, which is checked later
             return file[f"{label}/{name}"].astype(np.float32)
 
-    share, scale = column("shN") / 127, column("shN_scale")
-    if share.shape[1:] != scale.shape:
-        raise ValueError(f"scales of shape {scale.shape} for harmonics of {share.shape}")
     values = {name: column(name) for name in ("means", *_HALVES)}
-    values["quats"] = column("quats") / 32767
-    values["shN"] = np.sign(share) * share**2 * scale
+    if file[f"{label}/quats"].dtype == np.float32:  # exact
+        values |= {name: column(name) for name in ("quats", "shN")}
+    else:
+        share, scale = column("shN") / 127, column("shN_scale")
+        if share.shape[1:] != scale.shape:
+            raise ValueError(f"scales of shape {scale.shape} for harmonics of {share.shape}")
+        values["quats"] = column("quats") / 32767
+        values["shN"] = np.sign(share) * share**2 * scale
     labels = torch.full((len(values["means"]),), label, dtype=torch.int16)
     return checked(Gaussians(**{name: torch.from_numpy(v) for name, v in values.items()}, label_ids=labels))
 

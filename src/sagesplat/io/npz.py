@@ -49,6 +49,9 @@ class Npz:
         """Names of the arrays, in the file's order."""
         return list(self._infos)
 
+    def __contains__(self, name: str) -> bool:
+        return name in self._infos
+
     def __getitem__(self, name: str) -> np.ndarray[Any, Any]:
         info = self._infos[name]
         try:

@@ -18,7 +18,7 @@ from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.names import composed
 from sagesplat.core.typed import fits
-from sagesplat.formats.increments import INDEX, read_increments, write_increments
+from sagesplat.formats.increments import INDEX, full_scene, read_increments, write_increments
 from sagesplat.formats.levels import read_level
 from sagesplat.io.files import read_json, write_json
 from sagesplat.io.lock import alone
@@ -104,9 +104,8 @@ def bundle(
     check_target(out)
     check_viewer(viewer)
     chunks = increments_of(job)
-    if any(not chunk.uri.endswith(".spz") for chunk in chunks):
-        raise RunError(f"{job.run.increments}: not SPZ files; run `sagesplat nest` again with --force")
-    g, drawn = read_increments(job.run.increments, chunks), viewpoints_of(job)
+    full = full_scene(chunks)
+    g, drawn = read_increments(job.run.increments, full), viewpoints_of(job)
     contents = replace(
         _contents(job, g, job.antialiased),
         chunks=chunks,
@@ -118,7 +117,7 @@ def bundle(
     contents = with_corrections(contents)
     written = write_bundle(out, contents, viewer, _poster(g, contents))
     agreement, error = distance_error(contents)
-    count = sum(chunk.count for chunk in chunks)
+    count = sum(chunk.count for chunk in full)
     return BundleMade(out, len(contents.categories), len(chunks), count, written, agreement, error)
 
 

@@ -23,7 +23,7 @@ def export_increments(job: Job, folder: Path, kind: Format) -> int:
         raise RunError(f"{folder}: exists; choose a new folder (--force replaces one of chunks)")
     ladder, made = read_prefixes(job.run.prefixes), settings_of(job.run, "nest")
     chunks = write_increments(
-        folder, ladder.gaussians, ladder.sizes, job.names(), kind=kind,
+        folder, ladder.gaussians, ladder.sizes, job.names(), replaces=ladder.replaces, kind=kind,
         sh_bits=tuple(made["sh_bits"]), antialiased=job.antialiased,
     )  # fmt: skip
     return len(chunks)

@@ -15,7 +15,7 @@ from sagesplat.adapt.plan import Plan, read_budget_plan, read_plans
 from sagesplat.adapt.viewpoint import QualityKind, ViewModel, read_promises
 from sagesplat.adapt.viewpoints import Viewpoints, read_viewpoints
 from sagesplat.core.errors import DataError
-from sagesplat.formats.increments import INDEX, Increment, read_index
+from sagesplat.formats.increments import INDEX, Increment, read_index, totals
 from sagesplat.run.job import Job
 
 _WHOLE = -1  # level of the rows of the whole image in an evaluation
@@ -103,13 +103,12 @@ def increments_of(job: Job) -> list[Increment]:
     path, listed = job.run.increments / INDEX, read_index(job.run.increments)
     _check(path, "nest", "category", (one.label_id for one in listed), {i for i, _ in job.ladder.counts})
     _check(path, "nest", "level", (one.level for one in listed), set(job.ladder.levels))
-    counts = dict.fromkeys((label for label, _ in job.ladder.counts), 0)
-    for one in listed:
-        counts[one.label_id] += one.count
-    last = job.ladder.levels[-1]
-    for label, count in counts.items():
-        if count != job.ladder.counts[label, last]:
-            raise _foreign(path, "nest", f"{count:,} Gaussians of category {label}")
+    labels = sorted({label for label, _ in job.ladder.counts})
+    counts = totals(listed, labels, len(job.ladder.levels), "count").tolist()
+    for label, row in zip(labels, counts, strict=True):
+        for level, count in reversed(list(enumerate(row, 1))):
+            if count != job.ladder.counts[label, level]:
+                raise _foreign(path, "nest", f"{count:,} Gaussians of category {label}")
     return listed
 
 

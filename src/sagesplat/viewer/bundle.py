@@ -92,7 +92,8 @@ def write_documents(folder: Path, contents: Contents) -> BundleSizes:
     text = dumped(manifest)
     write_text(folder / MANIFEST, text.decode())
     total = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-    return BundleSizes(len(text), sum(map(len, promises.values())), manifest["totals"]["bytes"], total)
+    chunks = sum(chunk.nbytes for chunk in contents.chunks)
+    return BundleSizes(len(text), sum(map(len, promises.values())), chunks, total)
 
 
 def check_target(out: Path) -> None:

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 
 from sagesplat import __version__
 from sagesplat.adapt.viewpoint import QualityKind, ViewModel
-from sagesplat.formats.increments import Increment
+from sagesplat.formats.increments import Increment, full_scene
 from sagesplat.scene.scene import Camera
 from sagesplat.segment.block_categories import split_name
 from sagesplat.viewer import frames
@@ -25,6 +25,7 @@ from sagesplat.viewer.promises import Seen, promises_document
 from sagesplat.viewer.quality import decimals_of, dumped, of_files, quality_entry, significant
 
 FORMAT, VERSION = "sagesplat-bundle", 2
+REPLACING = 3  # version of a bundle with levels that replace, or PLY files: older viewers refuse it
 QUALITIES: tuple[QualityKind, ...] = get_args(QualityKind)
 TARGETS: dict[QualityKind, float] = {"fidelity": 0.95, "ssim": 0.7}  # where no plan says one
 THIRD_PARTY = "THIRD_PARTY_LICENSES.txt"  # of the built viewer
@@ -68,7 +69,7 @@ class Contents:
     extent: float  # Scene.extent, world units
     cameras: Sequence[CameraEntry]  # at least one
     categories: Sequence[Category]
-    chunks: Sequence[Increment]  # SPZ increments of these categories: the files in chunks/
+    chunks: Sequence[Increment]  # of these categories: the files in chunks/
     folder: Path  # of the increments
     sh_degree: int
     antialiased: bool = False
@@ -94,6 +95,7 @@ def documents(
 ) -> tuple[dict[str, Any], dict[QualityKind, bytes]]:
     """The manifest as plain data, and by quality the bytes of promises-*.json."""
     by_label = _chunks_by_label(contents.chunks)
+    full = full_scene(contents.chunks)
     models: dict[QualityKind, dict[int, ViewModel]] = {
         quality: some for quality in contents.qualities if (some := _models(contents, quality))
     }
@@ -102,7 +104,7 @@ def documents(
     }
     manifest = {
         "format": FORMAT,
-        "version": VERSION,
+        "version": REPLACING if any(map(_is_new, contents.chunks)) else VERSION,
         "generator": f"sagesplat {__version__}",
         "name": contents.name,
         "live": contents.live,
@@ -111,9 +113,9 @@ def documents(
         "antialiased": contents.antialiased,
         "background": [round(c / 255, 6) for c in contents.cameras[0].camera.background],
         "totals": {
-            "count": sum(chunk.count for chunk in contents.chunks),
-            "bytes": sum(chunk.nbytes for chunk in contents.chunks),
-            "gpuBytes": sum(chunk.gpu_bytes for chunk in contents.chunks),
+            "count": sum(chunk.count for chunk in full),
+            "bytes": sum(chunk.nbytes for chunk in full),
+            "gpuBytes": sum(chunk.gpu_bytes for chunk in full),
         },
         "labels": [
             _label(c, by_label[c.label_id], models, contents.extent)
@@ -128,6 +130,10 @@ def documents(
         "licenses": _licenses(third_party),
     }
     return manifest, promises
+
+
+def _is_new(chunk: Increment) -> bool:
+    return chunk.refine == "REPLACE" or chunk.format != "spz"
 
 
 def _models(contents: Contents, quality: QualityKind) -> dict[int, ViewModel]:
@@ -159,7 +165,7 @@ def pack_order(contents: Contents) -> list[tuple[int, int]]:
     known = contents.qualities
     quality: QualityKind = known[0] if known else "ssim"
     by_label, models = _chunks_by_label(contents.chunks), _models(contents, quality)
-    first = start_of(contents)
+    first, target = start_of(contents), _target(contents)
     cameras = contents.viewpoints(quality)
     used = np.ones(len(cameras), bool)
     if quality == "ssim":
@@ -171,6 +177,8 @@ def pack_order(contents: Contents) -> list[tuple[int, int]]:
             c.boxes,
             models.get(c.label_id),
             c.seen[quality].shares[used] if quality in c.seen else None,
+            [level for level, chunk in enumerate(by_label[c.label_id], 1) if chunk.refine == "REPLACE"],
+            target["value"] if target["quality"] == quality else 1.0,
         )
         for c in contents.categories
         if by_label.get(c.label_id)
@@ -202,7 +210,8 @@ def _label(
         "levels": [
             {
                 "uri": f"chunks/{chunk.uri}",
-                "format": "spz",
+                "format": chunk.format,
+                **({"refine": "REPLACE"} if chunk.refine == "REPLACE" else {}),
                 "bytes": chunk.nbytes,
                 "gpuBytes": chunk.gpu_bytes,
                 "count": chunk.count,

@@ -4,12 +4,15 @@ It is a concatenation of the files, in the order of their benefit for the first 
 visible and nearby labels, then increments by their gain of expected quality x pixel share per byte.
 Levels of a label must come in order. So an increment counts with the slope of the concave hull of quality
 over bytes. The viewer has the same rules (web/src/core/order.ts).
+
+Where the first view needs a level that replaces those below, the ones between the first and that come last:
+nobody is to download what is thrown away at once.
 """
 
 import hashlib
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sagesplat.adapt.process import matern32
-from sagesplat.adapt.viewpoint import ViewModel
+from sagesplat.adapt.viewpoint import Prediction, ViewModel
 from sagesplat.scene.scene import Camera
 from sagesplat.viewer import boxes
 from sagesplat.viewer.frames import camera_at
@@ -38,6 +41,8 @@ class Ladder:
     boxes: Float[np.ndarray, "B 6"]  # in the bundle's axes
     model: ViewModel | None  # with the files' levels; None: no quality model
     shares: Float[np.ndarray, " V"] | None  # share of each camera's pixels
+    replaces: Sequence[int] = field(default_factory=list)  # levels that replace those below, ascending
+    target: float = 1.0  # quality that a viewer begins with
 
 
 def order_of(
@@ -54,9 +59,10 @@ def order_of(
         visible = not len(ladder.boxes) or boxes.touching(ladder.boxes, planes).any()
         weight = ladder.weight * max(_share(ladder, cameras, camera, position, planes), _LEAST_SHARE)
         weight = max(weight * (1 if visible else _LEAST), _LEAST**2)
-        total = np.cumsum(ladder.sizes, dtype=np.float64)
         distance = boxes.distance(ladder.boxes, position, planes)
-        ssim, limit = _expected(ladder, camera, distance, total), math.inf
+        path, skipped = _path(ladder, camera, distance)
+        total = np.cumsum(np.take(ladder.sizes, path - 1), dtype=np.float64)
+        ssim, limit = _expected(ladder, camera, distance, path, total), math.inf
         if visible:
             ranked.append((0, -weight / total[0], index, 1))
         else:
@@ -65,7 +71,11 @@ def order_of(
             limit = _TURN * around * first / total[0]
             behind.append((-limit, index, total[0]))
         gains = gains_of(ssim, total)
-        ranked += [(2, -min(weight * gain, limit), index, k) for k, gain in enumerate(gains.tolist(), 2)]
+        ranked += [
+            (2, -min(weight * gain, limit), index, k)
+            for k, gain in zip(path[1:].tolist(), gains.tolist(), strict=True)
+        ]
+        ranked += [(3, 0.0, index, k) for k in skipped]
     nearby = 0
     for value, index, nbytes in sorted(behind):
         nearby += nbytes
@@ -105,14 +115,34 @@ def write_pack(
     return {"uri": uri, "bytes": size, "sha256": digest.hexdigest(), "order": [list(one) for one in order]}
 
 
-def _expected(ladder: Ladder, camera: Camera, distance: float, total: np.ndarray) -> np.ndarray:
+def _path(ladder: Ladder, camera: Camera, distance: float) -> tuple[np.ndarray, list[int]]:
+    """The levels whose files a viewer loads for the target, ascending; and those that it skips."""
+    every = range(1, 1 + len(ladder.sizes))
+    if not ladder.replaces:
+        return np.array(every), []
+    wanted = len(ladder.sizes)
+    if ladder.model is not None:
+        reached = _predicted(ladder.model, camera, distance).bound[0] >= ladder.target
+        if reached.any():
+            wanted = ladder.model.levels[int(reached.argmax())]
+    start = max((level for level in ladder.replaces if level <= wanted), default=1)
+    return np.array([1, *range(max(start, 2), len(ladder.sizes) + 1)]), list(every[1 : start - 1])
+
+
+def _expected(
+    ladder: Ladder, camera: Camera, distance: float, path: np.ndarray, total: np.ndarray
+) -> np.ndarray:
     """Expected SSIM by level; without a model the square root of the share of bytes, as in the planner."""
     if ladder.model is None:
         return np.sqrt(total / total[-1])
-    at = np.array([distance]), camera.position[None].astype(np.float64), camera.direction[None].astype(float)
-    ssim = np.full(len(total), np.nan)
-    ssim[np.array(ladder.model.levels) - 1] = ladder.model.predict(*at).mean[0]
-    return ssim
+    ssim = np.full(len(ladder.sizes), np.nan)
+    ssim[np.array(ladder.model.levels) - 1] = _predicted(ladder.model, camera, distance).mean[0]
+    return ssim[path - 1]
+
+
+def _predicted(model: ViewModel, camera: Camera, distance: float) -> Prediction:
+    position, direction = (value[None].astype(np.float64) for value in (camera.position, camera.direction))
+    return model.predict(np.array([distance]), position, direction)
 
 
 def _share(

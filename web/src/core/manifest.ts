@@ -1,6 +1,7 @@
 /** Reads and validates manifest.json and promises-*.json. */
 
 import {
+  FORMATS,
   type Label,
   type LabelPromises,
   type Manifest,
@@ -35,23 +36,27 @@ import {
 import type { Fetch } from "./download";
 
 /** The newest version of the format that this viewer supports. */
-export const VERSION = 2;
+export const VERSION = 3;
+const PROMISES_VERSION = 2;
 
 const vec3 = list(number, 3);
-const increment: Check = (value, path, wrong) => {
-  // a level that adds nothing has no file
-  const empty = typeof value === "object" && value !== null && "count" in value && value.count === 0;
-  const file = empty ? {} : { uri: relative, sha256: hash };
-  object({ ...file, format: oneOf("spz"), bytes: amount, gpuBytes: amount, count: amount })(
-    value,
-    path,
-    wrong,
-  );
-};
 const optional =
   (check: Check): Check =>
   (value, path, wrong) =>
     value !== undefined && check(value, path, wrong);
+const increment: Check = (value, path, wrong) => {
+  // a level that adds nothing has no file
+  const empty = typeof value === "object" && value !== null && "count" in value && value.count === 0;
+  const file = empty ? {} : { uri: relative, sha256: hash };
+  object({
+    ...file,
+    format: oneOf(...FORMATS),
+    refine: optional(oneOf("REPLACE")),
+    bytes: amount,
+    gpuBytes: amount,
+    count: amount,
+  })(value, path, wrong);
+};
 const byQuality = (check: Check): Check =>
   object(Object.fromEntries(QUALITIES.map((quality) => [quality, optional(check)])));
 const ssim = between(-1, 1);
@@ -151,6 +156,10 @@ function oddities(one: Label, i: number): string[] {
     wrong.push(`labels[${i}] must have both category and block, or neither`);
   }
   if (!levels.length) wrong.push(`labels[${i}].levels is empty`);
+  levels.forEach(({ refine, count }, k) => {
+    const below = levels.slice(0, k).some((level) => level.count);
+    if (refine && !(count && below)) wrong.push(`labels[${i}].levels[${k}] has nothing to replace`);
+  });
   if (boxes.some((b) => b[0] > b[3] || b[1] > b[4] || b[2] > b[5])) {
     wrong.push(`labels[${i}].boxes has one whose least is above its most`);
   }
@@ -198,7 +207,7 @@ const model = object({
   corrections: list(whole),
 });
 const promises = object({
-  version: oneOf(VERSION),
+  version: oneOf(PROMISES_VERSION),
   quality: oneOf(...QUALITIES),
   extent: positive,
   views: list(list(whole), 6),

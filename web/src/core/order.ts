@@ -22,34 +22,50 @@ export interface Step {
 }
 
 /**
- * The increments from `have` to `wanted` with their values. Since they must come in order, an increment
+ * The increments of a path from `have` on with their values. Since they must come in order, an increment
  * counts with the slope of the concave hull of SSIM over bytes.
  *
+ * @param path - levels of the increments on the way to the planned level
+ * @param have - how many of them are there
  * @param weight - of the label in the picture
+ * @param shown - level whose quality there is already
  */
-export function steps(c: Candidate, have: number, wanted: number, weight: number): Step[] {
+export function steps(
+  c: Candidate,
+  path: readonly number[],
+  have: number,
+  weight: number,
+  shown = 0,
+): Step[] {
   const { q, c: bytes } = known([c.mean], [c.ladder.bytes]);
-  const quality = q[0] ?? [];
-  const cost = bytes[0] ?? [];
+  const quality = path.map((level) => q[0]?.[level - 1] ?? 0);
+  const sums = sumsOf(c, path);
   const found: Step[] = [];
   let from = have;
   let last = Infinity;
-  while (from < wanted) {
-    const start = from > 0 ? (c.ladder.bytes[from - 1] ?? 0) : 0;
-    const before = Math.max(0, ...quality.slice(0, from));
-    let to = wanted;
+  while (from < path.length) {
+    const start = sums[from] ?? 0;
+    const before = Math.max(0, q[0]?.[shown - 1] ?? 0, ...quality.slice(0, from));
+    let to = path.length;
     let slope = 0;
-    for (let k = from + 1; k <= wanted; k++) {
-      const more = (cost[k - 1] ?? Infinity) - start;
+    for (let k = from + 1; k <= path.length; k++) {
+      const isKnown = (bytes[0]?.[(path[k - 1] ?? 0) - 1] ?? Infinity) < Infinity;
+      const more = isKnown ? (sums[k] ?? 0) - start : Infinity;
       const gained = ((quality[k - 1] ?? 0) - before) / Math.max(more, 1);
       if (gained > slope) [to, slope] = [k, gained];
     }
-    const least = LEAST / Math.max((c.ladder.bytes[to - 1] ?? 0) - start, 1);
+    const least = LEAST / Math.max((sums[to] ?? 0) - start, 1);
     last = Math.min(last, Math.max(weight, LEAST) * Math.max(slope, least));
-    for (let level = from + 1; level <= to; level++) found.push({ level, value: last });
+    for (const level of path.slice(from, to)) found.push({ level, value: last });
     from = to;
   }
   return found;
+}
+
+/** Bytes of the first 0, 1, ... increments of a path. */
+function sumsOf({ label }: Candidate, path: readonly number[]): number[] {
+  let sum = 0;
+  return [0, ...path.map((level) => (sum += label.levels[level - 1]?.bytes ?? 0))];
 }
 
 interface Wanted {
@@ -73,24 +89,31 @@ export function inOrder(
   const rest: Wanted[] = [];
   for (const entry of entries) {
     const { candidate } = entry;
-    const files = entry.files(0, entry.wanted);
+    const files = entry.path;
+    const first = files[0]?.level ?? 0;
     const isHere = ({ file, level }: { file: File; level: number }) =>
       entry.decoded[level - 1] !== undefined || entry.decoding === level || supply.isHere(file);
     const have = files.findIndex((one) => !isHere(one));
-    const lowest = files[0];
-    if (!candidate || !lowest) continue;
+    const lowest = entry.label.levels[0];
+    if (!candidate || !lowest || !first) continue;
     const weight = visibleWeight(candidate);
     let most = Infinity; // keeps the levels of a label in order
     if (!candidate.visible) {
-      most = (TURN * potentialWeight(candidate) * (candidate.mean[0] || 1)) / Math.max(lowest.file.bytes, 1);
-      behind.push({ file: lowest.file, value: most, missing: have === 0 && !supply.rests(lowest.file) });
+      most = (TURN * potentialWeight(candidate) * (candidate.mean[0] || 1)) / Math.max(lowest.bytes, 1);
+      const missing = first === 1 && have === 0 && !supply.rests(lowest);
+      behind.push({ file: lowest, value: most, missing });
     }
     if (have < 0) continue;
-    if (entry.steps?.candidate !== candidate || entry.steps.have !== have) {
-      entry.steps = { candidate, have, found: steps(candidate, have, entry.wanted, weight) };
+    const { steps: told } = entry;
+    if (told?.candidate !== candidate || told.have !== have || told.first !== first) {
+      const path = files.map(({ level }) => level);
+      const found = steps(candidate, path, have, weight, first > 1 ? entry.shown : 0);
+      entry.steps = { candidate, have, first, found };
     }
-    for (const { level, value } of entry.steps.found) {
-      const one = files[level - 1];
+    let at = have;
+    for (const { level, value } of entry.steps?.found ?? []) {
+      const one = files[at];
+      at += 1;
       if (!one || supply.rests(one.file)) break; // later increments depend on it
       if (isHere(one)) continue;
       if (level > 1) rest.push({ file: one.file, value: Math.min(value, most), missing: true });

@@ -34,12 +34,12 @@ type Unit = (typeof UNITS)[number];
 const FINE = 2 ** 20; // steps of a budget when several units are combined
 const LEAST_SHARE = 1e-4; // least pixel share, so that every visible label counts
 
-/** Costs of levels as sums over their increments. */
+/** Costs of levels as sums over their increments, from the newest that replaces those below. */
 export function ladderOf(label: Label): Ladder {
   const sums = (unit: Unit) => {
     let sum = 0;
     return label.levels.map((level) => {
-      sum += level[unit];
+      sum = level[unit] + (level.refine ? 0 : sum);
       return sum;
     });
   };

@@ -1,6 +1,6 @@
 /** Streams a bundle: plans, downloads, decodes and draws increments. The only stateful part of the core. */
 
-import type { Handle, Manifest, Quality, Renderer, Settings, State, Viewpoint } from "../types";
+import type { Handle, Level, Manifest, Quality, Renderer, Settings, State, Viewpoint } from "../types";
 import { describe } from "./describe";
 import { rotate } from "./distance";
 import { type Clock, clockOfBrowser, type Digest, digestOfBrowser, type Fetch, type File } from "./download";
@@ -149,7 +149,7 @@ export class Streamer {
       (d) => d.handles,
     );
     const all = [...former, ...this.entries.flatMap((e) => e.handles(0, e.decoded.length))];
-    this.renderer.swap([], [...former, ...this.entries.flatMap((e) => e.handles(0, e.shown))]);
+    this.renderer.swap([], [...former, ...this.entries.flatMap((e) => e.drawn(e.shown))]);
     for (const handle of all) this.renderer.dispose(handle);
     this.entries = [];
     this.leaving = [];
@@ -179,7 +179,7 @@ export class Streamer {
       entry.wanted = wanted[i] ?? 0;
       entry.candidate = candidates[i] ?? null;
     });
-    this.wantedKeys = new Set(this.entries.flatMap((e) => e.files(0, e.wanted).map((f) => f.file.sha256)));
+    this.wantedKeys = new Set(this.entries.flatMap((e) => e.path.map((f) => f.file.sha256)));
     if (this.promises) this.wantedKeys.add(this.promises.sha256);
     const took = this.clock.now() - begun;
     this.nextPlan = begun + Math.max(PLAN_EVERY, (1 + REST) * took);
@@ -255,33 +255,32 @@ export class Streamer {
   /** Files of all planned increments that are not decoded. */
   private wantedFiles(): File[] {
     return this.entries.flatMap((entry) => {
-      const files = entry.files(0, entry.wanted);
-      return files.flatMap(({ file, level }) => (entry.decoded[level - 1] === undefined ? file : []));
+      return entry.path.flatMap(({ file, level }) => (entry.decoded[level - 1] === undefined ? file : []));
     });
   }
 
   /** Decodes in the order of arrival, which is that of value. */
   private decodeMore(): void {
     const came = this.supply.waiting;
-    const place = (entry: Entry) => came.get(entry.label.levels[entry.ready]?.sha256 ?? "") ?? -1;
+    const place = (entry: Entry) => came.get(entry.label.levels[entry.next - 1]?.sha256 ?? "") ?? -1;
     for (const entry of [...this.entries].sort((a, b) => place(a) - place(b))) this.decodeNext(entry);
   }
 
   private decodeNext(entry: Entry): void {
-    const level = entry.ready + 1;
+    const level = entry.next;
     const file = entry.label.levels[level - 1];
-    if (!file || level > entry.wanted || entry.decoding || this.decodes >= DECODES) return;
+    if (!file || entry.decoding || this.decodes >= DECODES) return;
     if (this.supply.failure(file)?.lasting) return;
     const content = this.supply.take(file);
     if (content) void this.decode(entry, file, level, content);
   }
 
-  private async decode(entry: Entry, file: File, level: number, content: Uint8Array): Promise<void> {
+  private async decode(entry: Entry, file: Level, level: number, content: Uint8Array): Promise<void> {
     entry.decoding = level;
     this.decodes += 1;
     let handle: Handle | undefined;
     try {
-      handle = await this.renderer.decode(entry.label.id, level, content);
+      handle = await this.renderer.decode(entry.label.id, level, content, file.format);
     } catch {
       this.supply.spoil(file, `${file.uri} cannot be decoded`);
     }
@@ -290,7 +289,7 @@ export class Streamer {
     if (handle && (this.phase === "disposed" || !this.entries.includes(entry))) this.renderer.dispose(handle);
     else if (handle) {
       entry.decoded[level - 1] = handle;
-      if (level > entry.wanted) this.hidden.add(entry, handle);
+      if (!entry.path.some((one) => one.level === level)) this.hidden.add(entry, handle);
     }
     if (this.phase !== "running") return;
     if (handle) this.work();

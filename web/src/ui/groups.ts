@@ -1,10 +1,11 @@
+import { ladderOf } from "../core/planner";
 import type { LabelState, Trust } from "../types";
 
 /** The labels of one category: a single label, or its per-block categories in a scene in blocks. */
 export interface Group {
   readonly key: string;
   readonly states: readonly LabelState[]; // sorted by block
-  readonly splats: number; // of all levels
+  readonly splats: number; // of the last level
 }
 
 /** The content of a group's row. */
@@ -36,10 +37,7 @@ export function grouped(states: readonly LabelState[]): Group[] {
   const groups = [...byCategory].map(([key, parts]) => ({
     key,
     states: parts.sort((a, b) => (a.label.block ?? 0) - (b.label.block ?? 0)),
-    splats: parts.reduce(
-      (sum, { label }) => sum + label.levels.reduce((all, { count }) => all + count, 0),
-      0,
-    ),
+    splats: parts.reduce((sum, { label }) => sum + (ladderOf(label).count.at(-1) ?? 0), 0),
   }));
   return groups.sort((a, b) => b.splats - a.splats);
 }

@@ -1,6 +1,6 @@
 import { dyno, type PackedSplats, SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
 import { Group, type Matrix4, Scene, Vector3, type WebGLRenderer } from "three";
-import type { Handle, Manifest, Renderer } from "../types";
+import type { Format, Handle, Manifest, Renderer } from "../types";
 import { rootMatrix } from "./frame";
 import { decodePart, joined, type Part } from "./splats";
 
@@ -89,8 +89,8 @@ export class SparkLayer implements Renderer {
     }
   }
 
-  async decode(label: number, level: number, bytes: Uint8Array): Promise<Increment> {
-    const part = await decodePart(bytes);
+  async decode(label: number, level: number, bytes: Uint8Array, format: Format): Promise<Increment> {
+    const part = await decodePart(bytes, format);
     return { label, level, count: part.count, part };
   }
 

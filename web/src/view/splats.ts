@@ -1,4 +1,6 @@
 import { PackedSplats } from "@sparkjsdev/spark";
+import type { Format } from "../types";
+import { flipped } from "./ply";
 
 const ROW = 2048; // splats per row of Spark's textures: arrays hold complete rows
 const HARMONICS = ["sh1", "sh2", "sh3"] as const;
@@ -23,9 +25,10 @@ export interface Part {
   readonly harmonics: ReadonlyMap<(typeof HARMONICS)[number], Uint32Array>;
 }
 
-/** Decodes an SPZ file in Spark's worker; rejects for an invalid file. */
-export async function decodePart(bytes: Uint8Array): Promise<Part> {
-  const packed = new PackedSplats({ fileBytes: bytes, splatEncoding: ENCODING });
+/** Decodes a file in Spark's worker; rejects for an invalid one. */
+export async function decodePart(bytes: Uint8Array, format: Format): Promise<Part> {
+  const fileBytes = format === "ply" ? flipped(bytes) : bytes;
+  const packed = new PackedSplats({ fileBytes, splatEncoding: ENCODING });
   await packed.initialized;
   const count = packed.numSplats;
   if (!packed.packedArray || count === 0) throw new Error("no splats in it");

@@ -67,6 +67,23 @@ test("a level that adds nothing needs no file", () => {
   expect(parseManifest(with_(good(), "labels.0.levels.1", empty)).labels[0]?.levels[1]?.count).toBe(0);
 });
 
+test("a level may replace those below, if there are any", () => {
+  const level = "labels.0.levels.1";
+  const read = (path: string, value: unknown) => parseManifest(with_(good(), path, value));
+  expect(read(`${level}.refine`, "REPLACE").labels[0]?.levels[1]?.refine).toBe("REPLACE");
+  expect(read(`${level}.format`, "ply").labels[0]?.levels[1]?.format).toBe("ply");
+  const empty = { uri: "", format: "spz", refine: "REPLACE", bytes: 0, gpuBytes: 0, count: 0, sha256: "" };
+  for (const [path, value, message] of [
+    [`${level}.refine`, "SWAP", "levels[1].refine must be"],
+    [`${level}.refine`, null, "levels[1].refine must be"],
+    [`${level}.format`, "ksplat", "levels[1].format must be"],
+    ["labels.0.levels.0.refine", "REPLACE", "labels[0].levels[0] has nothing to replace"],
+    [level, empty, "labels[0].levels[1] has nothing to replace"],
+  ] as const) {
+    expect(complaint(() => read(path, value))).toContain(message);
+  }
+});
+
 test("a newer version says so, whatever else it holds", () => {
   const document = { format: "sagesplat-bundle", version: VERSION + 1 };
   const message = complaint(() => parseManifest(JSON.stringify(document)));
@@ -133,7 +150,7 @@ test.each([
   ["labels.0.color", "red", "labels[0].color"],
   ["labels.0.levels.0.sha256", "12", "labels[0].levels[0].sha256"],
   ["labels.0.levels.0.bytes", 1.5, "labels[0].levels[0].bytes"],
-  ["labels.0.levels.0.format", "ply", 'must be "spz"'],
+  ["labels.0.levels.0.format", "ksplat", 'must be "spz"'],
   ["labels.0.quality.fidelity.mean", [0], "labels[0].quality.fidelity must have a number a level"],
   ["labels.0.quality.fidelity.bound", [0], "labels[0].quality.fidelity must have a number a level"],
   ["labels.0.quality.fidelity.levels.1", 1, "labels[0].quality.fidelity.levels must rise"],

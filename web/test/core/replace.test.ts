@@ -1,0 +1,168 @@
+/** Levels that replace those below: no hole, nothing drawn twice, nothing fetched in vain, nothing kept too long. */
+
+import { expect, test } from "vitest";
+import { steps } from "../../src/core/order";
+import { ladderOf, makePlan } from "../../src/core/planner";
+import { Network, seeded, VirtualClock } from "../simulate";
+import { shown, type World, wanted, world } from "../world";
+import { at, bundle, NO_BUDGET, rightOf } from "../worlds";
+
+const OPTIONS = { labels: 3, levels: 5, replaces: [4] };
+const levelsAsked = (w: World, label: number) =>
+  w.network.asked.flatMap((path) => {
+    const found = path.match(`^chunks/l${label}-(\\d)`);
+    return found ? Number(found[1]) : [];
+  });
+
+async function started(mode: "base" | "full" | "target", options = {}, more = {}): Promise<World> {
+  const w = world({ ...OPTIONS, ...options }, more);
+  w.set({ mode });
+  w.streamer.start();
+  await w.rest();
+  return w;
+}
+
+test("a level costs what it holds", () => {
+  const [label] = bundle(new Network(new VirtualClock()), { ...OPTIONS, replaces: [2, 4] }).labels;
+  if (!label) throw new Error("no label");
+  const [a = 0, b = 0, c = 0, d = 0, e = 0] = label.levels.map(({ bytes }) => bytes);
+  expect(ladderOf(label).bytes).toEqual([a, b, b + c, d, d + e]);
+});
+
+test("above a level that replaces, the first comes first, and those between are never fetched", async () => {
+  const w = await started("full");
+  expect(shown(w.streamer.state)).toEqual([5, 5, 5]);
+  for (const label of [0, 1, 2]) {
+    expect(levelsAsked(w, label)).toEqual([1, 4, 5]);
+    expect(w.renderer.levels(label)).toEqual([4, 5]);
+  }
+  const { count, bytesShown, gpuBytes } = w.streamer.state;
+  expect([count, bytesShown]).toEqual([w.manifest.totals.count, w.manifest.totals.bytes]);
+  const first = w.manifest.labels.reduce((sum, label) => sum + (label.levels[0]?.gpuBytes ?? 0), 0);
+  expect(gpuBytes).toBe(w.manifest.totals.gpuBytes + first); // in memory, for the way back
+});
+
+test("below it levels add up as ever", async () => {
+  const w = await started("base");
+  expect(shown(w.streamer.state)).toEqual([1, 1, 1]);
+  const third = w.manifest.labels.map((label) => ladderOf(label).count[2] ?? 0);
+  w.set({ mode: "budget", budget: { ...NO_BUDGET, count: third.reduce((sum, n) => sum + n) } });
+  await w.rest();
+  expect(Math.max(...wanted(w.streamer.state))).toBeLessThan(5);
+  expect(w.streamer.state.count).toBeLessThanOrEqual(w.settings.budget.count);
+});
+
+test("the old and the new change places in one swap, up and down", async () => {
+  const w = await started("base", { labels: 1 });
+  w.renderer.swaps = [];
+  w.set({ mode: "full" });
+  await w.rest();
+  expect(w.renderer.swaps.map(({ show, hide }) => [show, hide].map((l) => l.map((h) => h.level)))).toEqual([
+    [[4], [1]],
+    [[5], []],
+  ]);
+  w.renderer.swaps = [];
+  w.set({ mode: "base" });
+  await w.rest();
+  expect(w.renderer.swaps.map(({ show, hide }) => [show, hide].map((l) => l.map((h) => h.level)))).toEqual([
+    [[1], [4, 5]],
+  ]);
+});
+
+test("on the way down the upper level stays until the whole lower one is there", async () => {
+  const w = await started("full", { labels: 1, bytes: 100_000 });
+  const third = ladderOf(w.manifest.labels[0] as never).count[2] ?? 0;
+  w.set({ cacheBytes: 0 });
+  w.renderer.swaps = [];
+  w.set({ budget: { ...NO_BUDGET, count: third } });
+  await w.pass(150);
+  expect(wanted(w.streamer.state)).toEqual([3]);
+  expect(shown(w.streamer.state)).toEqual([5]);
+  await w.rest();
+  expect(shown(w.streamer.state)).toEqual([3]);
+  expect(w.renderer.swaps).toHaveLength(1);
+  expect(w.renderer.alive.size).toBe(3);
+});
+
+test("who changes his mind on the way down leaves nothing in memory", async () => {
+  const w = await started("full", { labels: 1, bytes: 100_000 });
+  const third = ladderOf(w.manifest.labels[0] as never).count[2] ?? 0;
+  w.set({ cacheBytes: 0 });
+  w.network.bandwidth = 1e5;
+  w.set({ budget: { ...NO_BUDGET, count: third } });
+  while (w.renderer.alive.size < 3) await w.pass(50);
+  expect(shown(w.streamer.state)).toEqual([5]);
+  w.set({ budget: NO_BUDGET });
+  await w.rest();
+  expect(shown(w.streamer.state)).toEqual([5]);
+  expect(w.renderer.alive.size).toBe(2);
+});
+
+test("a damaged level below one that replaces is as if there were no higher ones", async () => {
+  const w = world({ ...OPTIONS, labels: 1 });
+  w.renderer.spoiled.add("0/4");
+  w.set({ mode: "full" });
+  w.streamer.start();
+  await w.rest();
+  expect(shown(w.streamer.state)).toEqual([3]);
+  expect(w.streamer.state.message).toContain("stays at level 3");
+});
+
+test("a pack brings them too, and the rest of it is not waited for", async () => {
+  const w = await started("full", { pack: true });
+  expect(shown(w.streamer.state)).toEqual([5, 5, 5]);
+  w.set({ mode: "base" });
+  await w.rest();
+  expect(shown(w.streamer.state)).toEqual([1, 1, 1]);
+});
+
+test("its gain is that over what is shown, for all of its bytes", () => {
+  const [label] = bundle(new Network(new VirtualClock()), OPTIONS).labels;
+  if (!label) throw new Error("no label");
+  const mean = [0.4, 0.5, 0.6, 0.9, 0.95];
+  const c = {
+    label,
+    ladder: ladderOf(label),
+    highest: 5,
+    mean,
+    bound: mean,
+    weight: 1,
+    share: 1,
+    visible: true,
+    previous: 0,
+  };
+  const [, , , fourth = 1] = label.levels.map(({ bytes }) => bytes);
+  const [first, second] = steps(c, [4, 5], 0, 1, 3);
+  expect(first).toEqual({ level: 4, value: expect.closeTo(0.3 / fourth, 9) });
+  expect(second?.level).toBe(5);
+  expect(steps(c, [1, 4, 5], 1, 1)[0]).toEqual({ level: 4, value: expect.closeTo(0.5 / fourth, 9) });
+  const settings = { ...world().settings, mode: "budget" as const };
+  const budget = { ...NO_BUDGET, bytes: fourth };
+  expect(makePlan([c], { ...settings, budget }).wanted).toEqual([4]);
+});
+
+test.each([1, 2, 3, 4, 5, 6])("a walk at random %i", async (seed) => {
+  const random = seeded(seed);
+  const w = await started("target", { labels: 4, levels: 6, replaces: seed % 2 ? [3, 5] : [4], seed });
+  w.network.bandwidth = 3e5;
+  for (let step = 0; step < 40; step++) {
+    const count = random() < 0.5 ? Infinity : w.manifest.totals.count * random() * 1.2;
+    const mode = (["base", "full", "target", "budget"] as const)[Math.floor(4 * random())] ?? "full";
+    w.set({
+      mode,
+      target: 0.5 + 0.5 * random(),
+      budget: { ...NO_BUDGET, count },
+      cacheBytes: random() < 0.5 ? 0 : 1e6,
+    });
+    const view = at(4 * random() - 2);
+    w.streamer.update(random() < 0.3 ? rightOf(view) : view);
+    await w.pass(600 * random());
+  }
+  w.set({ mode: "full", budget: NO_BUDGET, cacheBytes: 0 });
+  w.streamer.update(at(0));
+  await w.rest();
+  expect(shown(w.streamer.state)).toEqual([6, 6, 6, 6]);
+  expect(w.streamer.state.gpuBytes).toBe(w.manifest.totals.gpuBytes);
+  w.streamer.dispose();
+  expect(w.renderer.alive.size).toBe(0);
+});
