@@ -10,6 +10,7 @@ from jaxtyping import UInt8
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from sagesplat.adapt.observe import TOTAL
 from sagesplat.io.files import write_json
@@ -175,14 +176,19 @@ def _figure(measured: Measured, strip: Strip) -> Figure:
     cell = _WIDTH / per_row
     height = 6.2 + rows * (cell + 0.25) + 0.4
     figure = Figure(figsize=(_WIDTH, height))
-    top, bottom = figure.subfigures(2, 1, height_ratios=[6.2, height - 6.2])
+    panels: Any = figure.subfigures(2, 1, height_ratios=[6.2, height - 6.2])
+    top, bottom = panels
     grid = top.subplots(2, len(fields), squeeze=False)
     top.subplots_adjust(left=0.07, right=0.98, top=0.93, bottom=0.09, wspace=0.28, hspace=0.35)
     sizes = (measured.counts, "Gaussians"), (np.array(measured.nbytes) / MB, "MB")
     for axes, (values, unit) in zip(grid, sizes, strict=True):
         for one, field in zip(axes, fields, strict=True):
             _curves(one, measured, np.asarray(values, float), field)
-            one.set(xscale="log", xlabel=unit, ylabel=field.upper().replace("_", " "))
+            one.set_xscale("log")
+            one.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            one.xaxis.set_major_formatter(lambda value, _: f"{value:,.6g}")
+            one.xaxis.set_minor_formatter(NullFormatter())
+            one.set(xlabel=unit, ylabel=field.upper().replace("_", " "))
     grid[0, 0].legend(loc="lower right")
     bottom.text(0.01, 0.99, f"where the levels differ most: {shortened(strip.view)}", va="top", color=FAINT)
     for i, (name, picture) in enumerate(pictures):

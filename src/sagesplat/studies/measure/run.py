@@ -149,10 +149,9 @@ def _strip(truth: Splat, levels: Sequence[Level], camera: Camera, name: str, ren
     image = renderer.rgb(truth, camera).copy()
     images = [renderer.rgb(level.load(), camera).copy() for level in levels]
     loss = np.mean([1 - ssim_map(other, image) for other in images], axis=0)
-    side = min(SIDE, *image.shape[:2])
-    height, width = image.shape[:2]
-    worst = uniform_filter(loss, side, mode="constant")[side // 2 : height - side // 2 or None]
-    worst = worst[:, side // 2 : width - side // 2 or None]
+    side = min(SIDE, *loss.shape)
+    inside = [slice(side // 2, side // 2 + length - side + 1) for length in loss.shape]  # centres of windows
+    worst = uniform_filter(loss, side, mode="constant")[inside[0], inside[1]]
     y, x = np.unravel_index(int(worst.argmax()), worst.shape)
 
     def crop(picture: np.ndarray) -> np.ndarray:
