@@ -28,6 +28,7 @@ from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import Stage, _follows
 from sagesplat.scene import load_scene
 from sagesplat.scene.blocks import Blocks, read_blocks, read_division, write_blocks
+from sagesplat.scene.cameras import read_camera_file
 from sagesplat.scene.scene import Camera
 from sagesplat.segment import segmenters
 from sagesplat.segment.masks import Taxonomy
@@ -35,6 +36,7 @@ from sagesplat.stages import bundle, label, view
 from sagesplat.stages.boundaries import _seconds
 from sagesplat.stages.train import _fit_memory, read_frozen
 from sagesplat.studies.compare.report import OfLabel, Point, Walk, read_comparison, write_comparison
+from sagesplat.studies.measure.levels import levels_of
 from sagesplat.studies.paper.cross_view import CrossView, read_cross_view
 from sagesplat.studies.paper.same_size import SameSize, read_same_size
 from sagesplat.studies.sweep.file import read_sweep
@@ -92,6 +94,20 @@ def _viewpoints(folder: Path, size: int) -> list[bytes]:
 
 def _read_cameras(path: Path) -> None:
     viewpoints.read_cameras(path, Camera(np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32), 4, 3))
+
+
+def _camera_files(folder: Path, size: int) -> list[bytes]:
+    entry = {"id": 0, "img_name": "a", "width": 4, "height": 3, "position": [0, 0, 1], "fx": 4.0, "fy": 4.0}
+    entry |= {"rotation": np.eye(3).tolist()}
+    frames = [{"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}] * size
+    shared = {"w": 4, "h": 3, "fl_x": 4.0, "cx": 2.0, "k1": 0.01}
+    return [*as_json([entry] * size, shared | {"frames": frames}), *_viewpoints(folder, size)]
+
+
+def _bundled(folder: Path, size: int) -> list[bytes]:
+    chunk = {"uri": "chunks/a.spz", "count": 3, "bytes": 9, "gpuBytes": 9, "sha256": "0" * 64}
+    label = {"id": 2, "title": "sky", "levels": [chunk, chunk | {"refine": "REPLACE"}] * size}
+    return as_json({"format": "sagesplat-bundle", "antialiased": True, "labels": [label]})
 
 
 def _cameras(folder: Path, size: int) -> list[bytes]:
@@ -320,6 +336,8 @@ READERS = (
     Reader("models", ".json", _models, file("models.json", eq3.read_models)),
     Reader("promises", ".json", _promises, file("promises.json", viewpoint.read_promises)),
     Reader("viewpoints", ".json", _viewpoints, file("viewpoints.json", viewpoints.read_viewpoints), 100),
+    Reader("bundle-levels", ".json", _bundled, file("manifest.json", lambda p: levels_of(p.parent)), 100),
+    Reader("camera-files", ".json", _camera_files, file("c.json", read_camera_file), 100),
     Reader("cameras", ".json", _cameras, file("path.json", _read_cameras), 100),
     Reader("sampled", ".npz", _sampled, file("fidelity.npz", fidelity.read_sampled), 1000),
     Reader("plans", ".json", _plans, file("plan.json", _read_plans), 100),

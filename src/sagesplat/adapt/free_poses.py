@@ -70,7 +70,7 @@ def _looking(position: np.ndarray, direction: np.ndarray, up: np.ndarray) -> Flo
     return w2c
 
 
-def _level_axes(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def level_axes(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Two directions that are perpendicular to `up` and to each other."""
     first = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     first /= np.linalg.norm(first)
@@ -84,7 +84,7 @@ class Orbits:
         self.up, self.seed = upward.up, seed
         cloud = cloud.select(np.linalg.norm(cloud.means, axis=1) < _BACKGROUND)
         weight = np.minimum(cloud.area, weighted_quantile(cloud.area, cloud.area + 1e-30, 0.9)) + 1e-30
-        axes = np.stack([*_level_axes(self.up), self.up])
+        axes = np.stack([*level_axes(self.up), self.up])
         along = cloud.means @ axes.T
         ends = [[weighted_quantile(column, weight, q) for q in (1 - _FRAMED, _FRAMED)] for column in along.T]
         self.centre = np.mean(ends, axis=1) @ axes
@@ -100,7 +100,7 @@ class Orbits:
 
     def poses(self) -> Iterator[np.ndarray]:
         """World to camera, [4, 4] each, without end."""
-        first, second = _level_axes(self.up)
+        first, second = level_axes(self.up)
         low, high = np.sin(self.lowest), np.sin(np.radians(_ELEVATIONS[1]))
         start = 0
         while True:
@@ -172,7 +172,7 @@ class Standing:
 
     def _direction(self, detail: np.ndarray, turn: float, rise: float) -> np.ndarray:
         """A direction of view: finer Gaussians make its azimuth likelier; its elevation is near the level."""
-        first, second = _level_axes(self.up)
+        first, second = level_axes(self.up)
         tilt = float(ndtri(np.clip(rise, 1e-6, 1 - 1e-6)))
         tilt = np.radians(np.clip(_TILT[0] + _TILT[1] * tilt, -_STEEPEST, _STEEPEST))
         angles = 2 * np.pi * (np.arange(_AZIMUTHS + 1) / _AZIMUTHS)

@@ -18,7 +18,6 @@ visitor who moves as the rule says.
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -27,8 +26,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from sagesplat.core.errors import DataError, RunError, short
 from sagesplat.core.typed import check_fields, types_of
 from sagesplat.io.files import read_json, write_json
-from sagesplat.scene.loading import MAX_SIDE
-from sagesplat.scene.nerfstudio import LARGEST, world_to_camera
+from sagesplat.scene.cameras import VIEWPOINTS, camera_of_entry
+from sagesplat.scene.nerfstudio import world_to_camera
 from sagesplat.scene.scene import Camera, Scene
 
 SETS = ("fit", "bias", "calibration")  # what they are for; none of them is used for another
@@ -36,8 +35,6 @@ LARGEST_SHIFT = 1.0  # of the extent
 LARGEST_TURN = float(np.pi)
 _TRIES = 50
 _CLEAR = 0.5  # of the way to the closest point that its cameras have
-_PIXELS = 2**28  # most of a viewpoint's image
-_FORMAT = "sagesplat-viewpoints"
 
 
 @dataclass(frozen=True)
@@ -168,7 +165,7 @@ def write_viewpoints(path: Path, drawn: Viewpoints) -> None:
         }
         for camera, name in zip(drawn.cameras, drawn.sets, strict=True)
     ]
-    head = {"format": _FORMAT, "version": 1, "rule": asdict(drawn.rule), "cameras": drawn.source}
+    head = {"format": VIEWPOINTS, "version": 1, "rule": asdict(drawn.rule), "cameras": drawn.source}
     write_json(path, {**head, "viewpoints": entries})
 
 
@@ -177,10 +174,10 @@ def read_viewpoints(path: Path) -> Viewpoints:
     cure = "delete it and run `sagesplat sample` again"
     document = read_json(path, cure)
     try:
-        if document["format"] != _FORMAT:
+        if document["format"] != VIEWPOINTS:
             raise ValueError(f"format {document['format']!r}")
         check_fields(document["rule"], types_of(Rule))
-        cameras = tuple(_camera(entry) for entry in document["viewpoints"])
+        cameras = tuple(camera_of_entry(entry) for entry in document["viewpoints"])
         sets = tuple(str(entry["set"]) for entry in document["viewpoints"])
         if unknown := set(sets) - set(SETS):
             raise ValueError(f"unknown set {unknown.pop()!r}")
@@ -205,8 +202,8 @@ def read_cameras(path: Path, like: Camera) -> list[Camera]:
     cure = "give a viewpoints.json, or a transforms.json whose frames have a transform_matrix"
     document = read_json(path, cure)
     try:
-        if document.get("format") == _FORMAT:
-            cameras = [_camera(entry) for entry in document["viewpoints"]]
+        if document.get("format") == VIEWPOINTS:
+            cameras = [camera_of_entry(entry) for entry in document["viewpoints"]]
         else:
             poses = [world_to_camera(frame.get("transform_matrix")) for frame in document["frames"]]
             cameras = [replace(like, w2c=w2c.astype(np.float32)) for w2c in poses]
@@ -215,17 +212,3 @@ def read_cameras(path: Path, like: Camera) -> list[Camera]:
     except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
         raise DataError(f"{path}: no list of viewpoints ({short(repr(error))}); {cure}") from None
     return cameras
-
-
-def _camera(entry: dict[str, Any]) -> Camera:
-    w2c, K = (np.array(entry[name], np.float64) for name in ("w2c", "K"))
-    width, height = entry["width"], entry["height"]
-    if w2c.shape != (4, 4) or K.shape != (3, 3) or not all((np.abs(a) <= LARGEST).all() for a in (w2c, K)):
-        raise ValueError("w2c has to be 4 x 4 and K 3 x 3 numbers")
-    if np.abs(w2c[:3, :3] @ w2c[:3, :3].T - np.eye(3)).max() > 1e-3 or min(K[0, 0], K[1, 1]) <= 0:
-        raise ValueError("w2c is no rotation, or K has no focal length")
-    whole = all(isinstance(side, int) and 0 < side <= MAX_SIDE for side in (width, height))
-    if not whole or width * height > _PIXELS:
-        raise ValueError(f"size {width} x {height} is out of range")
-    red, green, blue = (int(value) for value in entry["background"])
-    return Camera(w2c.astype(np.float32), K.astype(np.float32), width, height, (red, green, blue))

@@ -6,9 +6,21 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from sagesplat.cli.base import Compute, Flat, Ladder, Machine, Parallel, Run, command, computing, open_job
+from sagesplat.cli.base import (
+    Compute,
+    Device,
+    Flat,
+    Ladder,
+    Machine,
+    Parallel,
+    Run,
+    command,
+    computing,
+    open_job,
+    prepare,
+)
 from sagesplat.cli.say import say
-from sagesplat.core.config import CompareConfig
+from sagesplat.core.config import CompareConfig, MeasureConfig
 
 
 @command
@@ -103,6 +115,33 @@ def compare(
     with open_job(run, machine) as job:
         warn_of_lpips(job, compare.lpips)
         compare_methods(job, compare, json)
+
+
+@command
+def measure(
+    reference: Positional[Annotated[Path, arg(metavar="REFERENCE")]],
+    levels: Positional[Annotated[tuple[Path, ...], arg(metavar="LEVELS")]] = (),
+    out: Path = Path("measure"),
+    measure: Annotated[MeasureConfig, Flat] = MeasureConfig(),
+    device: Annotated[Device, Flat] = Device(),
+) -> None:
+    """Measure levels of detail against their scene: SSIM, PSNR and LPIPS over Gaussians and bytes.
+
+    Splats of any format, streamed SOG, bundles and run folders. Of several levels in one path, the finest is
+    the reference.
+
+    Args:
+        reference: the full scene; or, without LEVELS, a lod-meta.json, a bundle or a run with its levels
+        levels: what is measured against it; every level of each
+        out: folder for tables, curves and a contact sheet of the viewpoints
+    """
+    from sagesplat.cli.console import Console
+    from sagesplat.studies.measure.run import measure as measure_levels
+
+    backend, _ = prepare(Machine(**vars(device)))
+    with Console() as console:
+        measure_levels([reference, *levels], out, measure, console, backend)
+    say(out)
 
 
 @command

@@ -386,6 +386,29 @@ class CompareConfig:
 
 
 @dataclass(frozen=True)
+class MeasureConfig:
+    """Viewpoints and metrics."""
+
+    views: int = 24
+    """Number of viewpoints; of those of a file as many, evenly spread."""
+    cameras: Path | None = None
+    """Viewpoints of a file or a capture, instead of drawn ones: cameras.json of 3DGS, viewpoints.json,
+    transforms.json, a COLMAP workspace."""
+    up: str = "auto"
+    """Up direction for drawn viewpoints: x, -x, y, -y, z or -z (auto: the normal of a floor, or -y)."""
+    kind: Literal["auto", "object", "place"] = "auto"
+    """Draw viewpoints around an object, or inside of a place (auto: by the free space)."""
+    fov: float = 60.0
+    """Field of view of drawn viewpoints along the longer side, degrees."""
+    size: int = 512
+    """Longer side of the images, px; those of a file are made no larger."""
+    seed: int = 0
+    """Seed of drawn viewpoints."""
+    lpips: Path | None = None
+    """Folder with the LPIPS weights (default: where `sagesplat download lpips` puts them)."""
+
+
+@dataclass(frozen=True)
 class BundleConfig:
     """Contents of the bundle."""
 

@@ -137,9 +137,7 @@ def read_index(folder: Path) -> list[Increment]:
     """The increments that `write_increments` listed; DataError for an invalid index."""
     document: Any = read_json(folder / INDEX, _CURE)
     try:
-        listed = [Increment(**entry) for entry in document["chunks"]]
-        for increment in listed:
-            _check(increment)
+        listed = [checked(Increment(**entry)) for entry in document["chunks"]]
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(
             f"{folder / INDEX}: not an index of increments ({short(repr(error))}); {_CURE}"
@@ -147,8 +145,8 @@ def read_index(folder: Path) -> list[Increment]:
     return listed
 
 
-def _check(increment: Increment) -> None:
-    """ValueError for an impossible entry, such as a file outside the folder."""
+def checked(increment: Increment) -> Increment:
+    """The increment; ValueError for an impossible entry, such as a file outside the folder."""
     sizes = (increment.level, increment.count, increment.nbytes, increment.gpu_bytes)
     if not all(type(size) is int and 0 < size < 2**53 for size in sizes):
         raise ValueError("an increment without content")
@@ -160,6 +158,7 @@ def _check(increment: Increment) -> None:
         raise ValueError(f"{increment.sha256!r} is not a SHA-256")
     if increment.refine not in get_args(Refine):
         raise ValueError(f"refine {increment.refine!r}")
+    return increment
 
 
 def read_increments(folder: Path, listed: Sequence[Increment]) -> Gaussians:

@@ -64,13 +64,25 @@ def count_levels(path: Path) -> int:
     return _parsed(path, 0)[0]
 
 
+def level_files(path: Path, lod: int) -> list[Path]:
+    """The SOG scenes (`meta.json`, or bundled files) of a level; DataError for a file without them."""
+    _, files, environment, slices = _parsed(path, lod)
+    names = [files[file] for file in sorted(slices)] + ([] if environment is None else [environment])
+    return [_inside(path, name) for name in names]
+
+
 def _read(path: Path, name: str) -> Splat:
     """A SOG scene of the folder; DataError for one outside of it."""
+    file = _inside(path, name)
+    return with_labels(read_sog(file), file)
+
+
+def _inside(path: Path, name: str) -> Path:
     file = path.parent / name
     inside = file.resolve().is_relative_to(path.parent.resolve())
     if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts or "\\" in name or not inside:
         raise DataError(f"{path}: {short(name)} is not in its folder; {_CURE}")
-    return with_labels(read_sog(file), file)
+    return file
 
 
 def _parsed(path: Path, lod: int) -> tuple[int, list[str], str | None, Slices]:

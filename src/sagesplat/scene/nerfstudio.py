@@ -21,7 +21,7 @@ from sagesplat.io.files import read_json
 from sagesplat.scene.images import has_alpha, photo_size
 from sagesplat.scene.loading import MAX_SIDE, MIN_VIEWS, camera_of, check_settings
 from sagesplat.scene.points import random_points, read_points
-from sagesplat.scene.scene import Lens, Scene, View
+from sagesplat.scene.scene import Camera, Lens, Scene, View
 from sagesplat.scene.undistort import intrinsics, is_pinhole, pinhole
 
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
@@ -81,6 +81,34 @@ def load_blender(path: Path, *, downscale: int = 1, test_every: int = 8) -> Scen
         views = tuple(replace(view, camera=replace(view.camera, background=WHITE)) for view in views)
     points = random_points(views, cube=BLENDER_CUBE)
     return Scene(repaired(folder.resolve().name), folder, views, points, test_every, test_names=test_names)
+
+
+def frame_cameras(file: Path) -> tuple[list[tuple[str, Camera]], bool]:
+    """Name and camera of each frame of a transforms file, and whether all of their photos are there.
+
+    Lenses are replaced by pinholes. Without a photo, a frame (or the file) has to give its size, w and h.
+    Raises SceneError.
+    """
+    _, frames = _read(file)
+    found, photos = [], []
+    pinholes: dict[tuple, np.ndarray] = {}  # computing one takes milliseconds
+    for number, frame in enumerate(frames):
+        name = str(frame.get("file_path") or f"{number:03}")
+        try:
+            path = _inside(file, "file_path", name)
+            photos.append(_photo(file.parent, path))
+            if photos[-1] is None and (frame.get("w") is None or frame.get("h") is None):
+                raise ValueError("neither w and h nor its photo")
+            lens = _lens(frame, photos[-1] or file)
+            key = (lens.model, lens.params, lens.width, lens.height)
+            if key not in pinholes:
+                pinholes[key] = intrinsics(lens) if is_pinhole(lens) else pinhole(lens)
+            w2c = world_to_camera(frame.get("transform_matrix")).astype(np.float32)
+        except (TypeError, ValueError, OverflowError) as error:
+            cure = "export the transforms again"
+            raise SceneError(f"{file}: frame {short(repr(name))}: {short(error)}; {cure}") from None
+        found.append((name, Camera(w2c, pinholes[key].astype(np.float32), lens.width, lens.height)))
+    return found, None not in photos
 
 
 def _read(file: Path) -> tuple[dict[str, Any], list[Mapping[str, Any]]]:

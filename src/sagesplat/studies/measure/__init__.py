@@ -1,0 +1,1 @@
+"""How close levels of detail are to their scene, whoever made them."""

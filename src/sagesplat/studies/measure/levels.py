@@ -1,0 +1,147 @@
+"""The levels that are measured: files of splats, streamed SOG, bundles and run folders."""
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from sagesplat.core.errors import DataError, RunError, short
+from sagesplat.core.names import repaired
+from sagesplat.formats.increments import INDEX, Increment, checked, read_increments, read_index, shown
+from sagesplat.formats.lod_meta import LOD_META, level_files
+from sagesplat.formats.sog import META
+from sagesplat.formats.splats import Splat, num_lods, read_splat
+from sagesplat.io.files import read_json
+from sagesplat.run.records import settings_of
+from sagesplat.run.run_dir import RunDir
+from sagesplat.segment.display_names import titles
+from sagesplat.segment.masks import Taxonomy
+from sagesplat.viewer.bundle import MANIFEST, is_bundle
+
+_MOST_LABELS = 2**15
+_BUNDLE_CURE = "make it again with `sagesplat bundle`"
+
+
+@dataclass(frozen=True)
+class Level:
+    """A level of detail of a scene."""
+
+    name: str
+    series: str  # what it is a level of: curves connect these
+    nbytes: int  # of the files that hold it
+    load: Callable[[], Splat]
+
+
+def levels_of(path: Path) -> list[Level]:
+    """The levels at a path, the finest first; a file of one splat is one level.
+
+    Args:
+        path: A splat file of any format, a folder or lod-meta.json of streamed SOG, a bundle, or a finished
+            run folder. Level k of a bundle or a run is level k of every category.
+
+    Raises:
+        DataError: Where there is none, or its description is damaged.
+        RunError: For a run without levels.
+    """
+    name = repaired(path.name or path.resolve().name)
+    if path.is_dir() and is_bundle(path):
+        return _of_bundle(path, name)
+    if (path / "provenance").is_dir():
+        return _of_run(path, name)
+    count = num_lods(path)
+    if count == 1:
+        return [Level(name, "files", stored_bytes(path), partial(read_splat, path))]
+    file = path / LOD_META if path.is_dir() else path
+    series = repaired(path.resolve().name if path.is_dir() else path.resolve().parent.name)
+    return [
+        Level(
+            f"{series} level {lod}", series, sum(map(stored_bytes, level_files(file, lod))),
+            partial(read_splat, path, lod),
+        )
+        for lod in range(count)
+    ]  # fmt: skip
+
+
+def stored_bytes(path: Path) -> int:
+    """Size of a splat file; of an unpacked SOG that of its folder's description and pictures."""
+    file = path / META if path.is_dir() else path
+    try:
+        beside = file.parent.glob("*.webp") if file.name == META else ()
+        return file.stat().st_size + sum(picture.stat().st_size for picture in beside)
+    except OSError as error:
+        raise DataError(f"{file}: cannot be read ({error.strerror}); copy it again") from None
+
+
+def unique_names(levels: Sequence[Level], paths: Sequence[Path]) -> list[str]:
+    """Their names; of those that several have, with the folder, or else a number."""
+    times = Counter(level.name for level in levels)
+    names = [
+        level.name if times[level.name] == 1 else f"{repaired(path.resolve().parent.name)}/{level.name}"
+        for level, path in zip(levels, paths, strict=True)
+    ]
+    times, seen = Counter(names), Counter[str]()
+    for i, name in enumerate(names):
+        seen[name] += 1
+        names[i] = name if times[name] == 1 else f"{name} ({seen[name]})"
+    return names
+
+
+def _of_bundle(path: Path, name: str) -> list[Level]:
+    file = path / MANIFEST
+    manifest = read_json(file, _BUNDLE_CURE)
+    try:
+        labels = manifest["labels"]
+        if not isinstance(labels, list) or len(labels) > _MOST_LABELS:
+            raise ValueError(f"labels {labels!r:.40}")
+        names = {entry["id"]: repaired(entry["title"], "?") for entry in labels}
+        listed = [
+            _chunk(entry["id"], number, level)
+            for entry in labels
+            for number, level in enumerate(entry["levels"], 1)
+        ]
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise DataError(f"{file}: no bundle of sagesplat ({short(repr(error))}); {_BUNDLE_CURE}") from None
+    return _of_chunks(path / "chunks", listed, names, name, manifest.get("antialiased") is True)
+
+
+def _chunk(label_id: int, number: int, level: Mapping[str, Any]) -> Increment:
+    """A level of a category in a bundle's manifest. ValueError, KeyError or TypeError where it is none."""
+    uri = level["uri"]
+    if not isinstance(uri, str) or not uri.startswith("chunks/"):
+        raise ValueError(f"uri {uri!r:.60}")
+    sizes = level["count"], level["bytes"], level["gpuBytes"]
+    refine = level.get("refine", "ADD")
+    return checked(Increment(label_id, number, uri[len("chunks/") :], *sizes, level["sha256"], refine))
+
+
+def _of_run(path: Path, name: str) -> list[Level]:
+    run = RunDir(path, "nested")
+    if not (run.increments / INDEX).exists():
+        raise RunError(f"{path}: a run without nested levels; finish it with `sagesplat run`")
+    antialiased = bool(settings_of(run, "train")["antialiased"])
+    in_blocks = (run.block_categories / "labels.json").exists()
+    folder = run.block_categories if in_blocks else run.masks
+    names = titles(Taxonomy.read(folder / "labels.json").names)
+    return _of_chunks(run.increments, read_index(run.increments), names, name, antialiased)
+
+
+def _of_chunks(
+    folder: Path, listed: Sequence[Increment], names: dict[int, str], name: str, antialiased: bool
+) -> list[Level]:
+    labels = sorted({chunk.label_id for chunk in listed})
+    if not labels:
+        raise DataError(f"{folder.parent}: no levels in it; {_BUNDLE_CURE}")
+    levels = []
+    for number in sorted({chunk.level for chunk in listed}, reverse=True):
+        chunks = [chunk for label in labels for chunk in shown(listed, label, number)]
+        load = partial(_read_chunks, folder, chunks, names, antialiased)
+        levels.append(Level(f"{name} level {number}", name, sum(chunk.nbytes for chunk in chunks), load))
+    return levels
+
+
+def _read_chunks(
+    folder: Path, chunks: Sequence[Increment], names: dict[int, str], antialiased: bool
+) -> Splat:
+    return Splat(read_increments(folder, chunks), "increments", names, antialiased)

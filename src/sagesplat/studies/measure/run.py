@@ -1,0 +1,168 @@
+"""Measures how close levels of detail are to their scene, whoever made them."""
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+from scipy.ndimage import uniform_filter
+
+from sagesplat.adapt.free_viewpoints import free_cameras
+from sagesplat.core.config import MeasureConfig
+from sagesplat.core.errors import RunError, SageError
+from sagesplat.core.events import Emit, Progress, StageStarted, TableMade, Warned
+from sagesplat.formats.splats import Splat
+from sagesplat.metrics.image import ssim_map
+from sagesplat.metrics.lpips import Lpips, load_lpips
+from sagesplat.output.contact_sheet import contact_sheet
+from sagesplat.raster import Backend
+from sagesplat.scene.cameras import read_camera_file
+from sagesplat.scene.scene import Camera
+from sagesplat.studies.lpips import NETS
+from sagesplat.studies.measure.levels import Level, levels_of, unique_names
+from sagesplat.studies.measure.report import (
+    SIDE,
+    Measured,
+    Strip,
+    categories_table,
+    levels_table,
+    worst_view,
+    write_report,
+)
+from sagesplat.studies.measure.score import Renderer, compare
+
+_TABLE = ("level", "Gaussians", "share", "MB", "SSIM", "PSNR", "worst SSIM", "at")
+
+
+def measure(
+    paths: Sequence[Path], out: Path, config: MeasureConfig, emit: Emit, backend: Backend = "cpu"
+) -> Measured:
+    """Measure levels against their scene; write tables, curves and viewpoints to `out`.
+
+    Args:
+        paths: The reference, and what is measured against it: each as `levels.levels_of` takes it. One path:
+            its finest level is the reference of its others. Of several, all levels of all but the first are
+            measured, against the finest of the first.
+        out: Folder for levels.csv, views.csv, measure.json, measure.png and .svg, viewpoints.png.
+        config: Viewpoints and metrics.
+        emit: Hears of progress and gets the tables.
+        backend: Of the renders.
+
+    Raises:
+        DataError: For a file that cannot be read.
+        RunError: For one level alone, and where no viewpoint has anything in sight.
+    """
+    emit(StageStarted("measure"))
+    _check(config)
+    reference, levels, names = _levels(paths)
+    truth = reference.load()
+    _tell_dropped(truth, reference.name, emit)
+    cameras, views, lines = _viewpoints(truth, config, backend)
+    metrics = _metrics(config.lpips, emit)
+    renderer, total = Renderer(backend), len(levels) * len(cameras)
+
+    def done(images: int) -> None:
+        emit(Progress("measure", images, total))
+
+    rows, counts = compare(truth, levels, cameras, metrics, renderer, done)
+    measured = Measured(
+        reference.name, len(truth.gaussians), names, [level.series for level in levels], counts,
+        [level.nbytes for level in levels], views, truth.names, list(metrics), rows,
+    )  # fmt: skip
+    out.mkdir(parents=True, exist_ok=True)
+    up = np.mean([-camera.w2c[1, :3] for camera in cameras], axis=0)
+    up = up / max(float(np.linalg.norm(up)), 1e-9)
+    contact_sheet(
+        out / "viewpoints.png", truth.gaussians, cameras, up, [reference.name, *lines], views,
+        antialiased=truth.antialiased, backend=backend,
+    )  # fmt: skip
+    how = {"viewpoints": lines, "settings": {k: v for k, v in asdict(config).items() if k != "lpips"}}
+    how["settings"]["cameras"] = config.cameras and config.cameras.name
+    row = worst_view(measured)
+    write_report(out, measured, how, _strip(truth, levels, cameras[row], views[row], renderer))
+    _show(measured, emit)
+    return measured
+
+
+def _check(config: MeasureConfig) -> None:
+    if config.views < 1:
+        raise RunError(f"--views {config.views} is impossible; choose 1 or more")
+    if not 16 <= config.size <= 8192:
+        raise RunError(f"--size {config.size} cannot be used; choose 16 to 8192 px")
+
+
+def _levels(paths: Sequence[Path]) -> tuple[Level, list[Level], list[str]]:
+    """The reference, the levels, and their names, each another."""
+    first, *others = [levels_of(path) for path in paths]
+    levels = [level for some in others for level in some] if others else first[1:]
+    if not levels:
+        raise RunError(
+            f"{paths[0]}: one level, and nothing to compare it with; name its levels after it, or give a "
+            "lod-meta.json, a bundle or a run"
+        )
+    owners = [path for path, some in zip(paths[1:], others, strict=True) for _ in some]
+    return first[0], levels, unique_names(levels, owners or [paths[0]] * len(levels))
+
+
+def _tell_dropped(splat: Splat, name: str, emit: Emit) -> None:
+    if splat.dropped:
+        what = ", ".join(f"{count:,} {reason}" for reason, count in splat.dropped.items())
+        emit(Warned(f"{name}: Gaussians left out: {what}"))
+
+
+def _viewpoints(
+    truth: Splat, config: MeasureConfig, backend: Backend
+) -> tuple[list[Camera], list[str], list[str]]:
+    """Viewpoints, their names, and lines about them."""
+    if config.cameras is None:
+        size = config.size, max(1, round(0.75 * config.size))
+        drawn = free_cameras(
+            truth.gaussians, config.views, up=config.up, fov=config.fov, size=size, seed=config.seed,
+            kind=config.kind, backend=backend,
+        )  # fmt: skip
+        return list(drawn.cameras), [f"{i:03}" for i in range(1, len(drawn.cameras) + 1)], [drawn.reason]
+    found = read_camera_file(config.cameras)
+    picked = np.linspace(0, len(found) - 1, min(config.views, len(found))).round().astype(int)
+    some = [found[i] for i in picked]
+    line = f"{len(some)} of the {len(found)} cameras of {config.cameras.name}"
+    return [_resized(one.camera, config.size) for one in some], [one.name for one in some], [line]
+
+
+def _resized(camera: Camera, size: int) -> Camera:
+    share = min(1.0, size / max(camera.width, camera.height))
+    return camera.resized(max(1, round(camera.width * share)), max(1, round(camera.height * share)))
+
+
+def _metrics(folder: Path | None, emit: Emit) -> dict[str, Lpips]:
+    """LPIPS as the field feeds it, by column; what cannot be loaded is left out with a warning."""
+    found = {}
+    for net in NETS:
+        try:
+            found[f"lpips_{net}"] = load_lpips(net, folder, as_3dgs=net == "vgg")
+        except SageError as error:
+            emit(Warned(f"no LPIPS ({net}): {error}"))
+    return found
+
+
+def _strip(truth: Splat, levels: Sequence[Level], camera: Camera, name: str, renderer: Renderer) -> Strip:
+    """The part of a viewpoint in which the levels differ most from the reference."""
+    image = renderer.rgb(truth, camera).copy()
+    images = [renderer.rgb(level.load(), camera).copy() for level in levels]
+    loss = np.mean([1 - ssim_map(other, image) for other in images], axis=0)
+    side = min(SIDE, *loss.shape)
+    inside = [slice(side // 2, side // 2 + length - side + 1) for length in loss.shape]  # centres of windows
+    worst = uniform_filter(loss, side, mode="constant")[inside[0], inside[1]]
+    y, x = np.unravel_index(int(worst.argmax()), worst.shape)
+
+    def crop(picture: np.ndarray) -> np.ndarray:
+        return (255 * picture[y : y + side, x : x + side]).round().astype(np.uint8)
+
+    return Strip(name, crop(image), [crop(picture) for picture in images])
+
+
+def _show(measured: Measured, emit: Emit) -> None:
+    table = levels_table(measured).only(*_TABLE)
+    emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
+    if measured.labels():
+        table = categories_table(measured)
+        emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))

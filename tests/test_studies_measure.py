@@ -1,0 +1,249 @@
+"""Levels of anybody against their scene: files, streamed SOG, bundles and runs; tables, picture and files."""
+
+import csv
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import orbit, random_gaussians
+from PIL import Image
+
+from benchmarks.readers.foreign_splats import put_sog, sog, streamed
+from sagesplat.adapt.observe import TOTAL
+from sagesplat.adapt.viewpoints import Rule, Viewpoints, write_viewpoints
+from sagesplat.core.config import MeasureConfig
+from sagesplat.core.errors import DataError, RunError, SageError
+from sagesplat.core.events import Event, TableMade, Warned
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.formats.increments import read_increments, read_index, shown
+from sagesplat.formats.ply import write_ply
+from sagesplat.formats.spz import encode_spz
+from sagesplat.metrics.image import psnr, ssim_map
+from sagesplat.raster import rasterize
+from sagesplat.run.job import Job
+from sagesplat.run.run_dir import RunDir
+from sagesplat.stages.bundle import bundle
+from sagesplat.studies.measure import score
+from sagesplat.studies.measure.levels import levels_of, stored_bytes, unique_names
+from sagesplat.studies.measure.report import levels_table
+from sagesplat.studies.measure.run import measure
+from sagesplat.studies.measure.score import COVERED
+
+FULL = random_gaussians(150, degree=1, logit=2.0)
+NAMES = {3: "car", 184: "tree"}
+VIEWS = 3
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> Path:
+    """A scene, the same again, a third of it, and viewpoints; nothing for LPIPS."""
+    write_ply(tmp_path / "full.ply", FULL, NAMES)
+    write_ply(tmp_path / "same.ply", FULL, NAMES)
+    write_ply(tmp_path / "third.ply", third())
+    drawn = Viewpoints(Rule(), "capture", tuple(orbit(VIEWS)), ("fit",) * VIEWS)
+    write_viewpoints(tmp_path / "views.json", drawn)
+    return tmp_path
+
+
+def third() -> Gaussians:
+    return FULL.select(torch.arange(0, 150, 3))
+
+
+def settings(folder: Path, **more) -> MeasureConfig:
+    return MeasureConfig(**{"cameras": folder / "views.json", "lpips": folder / "no-weights", **more})
+
+
+def ignore(event: Event) -> None:
+    pass
+
+
+def test_files_against_a_file(files):
+    events: list[Event] = []
+    paths = [files / name for name in ("full.ply", "same.ply", "third.ply")]
+    found = measure(paths, files / "out", settings(files), events.append)
+    assert found.names == ["same.ply", "third.ply"]
+    assert found.counts == [150, 50]
+    assert found.nbytes == [path.stat().st_size for path in paths[1:]]
+    assert all(row.ssim > 0.99999 and row.psnr > 99 for row in found.of(0, TOTAL))
+    for row, camera in zip(found.of(1, TOTAL), orbit(VIEWS), strict=True):
+        a, b = (rasterize(g, camera).rgb.clamp(0, 1).numpy().copy() for g in (third(), FULL))
+        assert row.ssim == pytest.approx(float(ssim_map(a, b).mean()), abs=1e-6)
+        assert row.psnr == pytest.approx(float(psnr(np.square(a - b).mean())), abs=1e-4)
+    assert max(row.ssim for row in found.of(1, TOTAL)) < 0.9
+    assert found.labels() == [3, 184] or found.labels() == [184, 3]
+    assert {found.region(label) for label in found.labels()} == {"car", "tree"}
+    titles = [event.title for event in events if isinstance(event, TableMade)]
+    assert titles == ["Levels against full.ply, means over 3 viewpoints", "SSIM by category"]
+    assert [e.text[:15] for e in events if isinstance(e, Warned)] == ["no LPIPS (alex)", "no LPIPS (vgg):"]
+
+
+def test_what_is_written(files):
+    paths = [files / name for name in ("full.ply", "same.ply", "third.ply")]
+    measure(paths, files / "out", settings(files), ignore)
+    out = files / "out"
+    assert {p.name for p in out.iterdir()} == {
+        *("levels.csv", "views.csv", "measure.json", "measure.png", "measure.svg", "viewpoints.png"),
+    }
+    rows = list(csv.DictReader((out / "views.csv").read_text().splitlines()))
+    assert len(rows) == 2 * VIEWS * 4  # whole image, covered, two categories
+    assert {row["viewpoint"] for row in rows} == {"000", "001", "002"}
+    document = json.loads((out / "measure.json").read_text())
+    assert document["reference"] == {"name": "full.ply", "Gaussians": 150}
+    assert document["viewpoints"] == ["3 of the 3 cameras of views.json"]
+    assert [(one["level"], one["region"]) for one in document["levels"]][:2] == [
+        ("same.ply", "whole image"),
+        ("same.ply", "covered by the reference"),
+    ]
+    assert Image.open(out / "measure.png").size[0] > 1000
+
+
+def test_an_empty_background_does_not_count_as_covered(files):
+    found = measure([files / "full.ply", files / "third.ply"], files / "out", settings(files), ignore)
+    for whole, covered in zip(found.of(0, TOTAL), found.of(0, COVERED), strict=True):
+        assert 0 < covered.pixels < whole.pixels
+        assert covered.ssim < whole.ssim
+    table = levels_table(found)
+    assert table.rows[0][table.header.index("share")] == pytest.approx(1 / 3)
+
+
+def test_viewpoints_are_drawn_where_none_are_given(files):
+    config = settings(files, cameras=None, views=2, size=64, kind="object")
+    found = measure([files / "full.ply", files / "third.ply"], files / "out", config, ignore)
+    assert found.views == ["001", "002"]
+    assert found.of(0, TOTAL)[0].pixels == 64 * 48
+    lines = json.loads((files / "out" / "measure.json").read_text())["viewpoints"]
+    assert lines[0].startswith("object: as asked")
+
+
+def test_fewer_viewpoints_of_a_file_and_smaller_images(files):
+    found = measure(
+        [files / "full.ply", files / "third.ply"], files / "out", settings(files, views=2, size=24), ignore
+    )
+    assert found.views == ["000", "002"]
+    assert found.of(0, TOTAL)[0].pixels == 24 * 16
+
+
+def put_streamed(folder: Path) -> Path:
+    for level in ("0", "1"):
+        put_sog(folder / f"{level}_0", *sog(6, 0))
+    (folder / "lod-meta.json").write_text(json.dumps(streamed()))
+    return folder / "lod-meta.json"
+
+
+def test_levels_of_streamed_sog(tmp_path):
+    path = put_streamed(tmp_path / "robot")
+    for given in (path, path.parent):
+        levels = levels_of(given)
+        assert [level.name for level in levels] == ["robot level 0", "robot level 1"]
+        assert {level.series for level in levels} == {"robot"}
+    files = [p for p in (path.parent / "0_0").iterdir() if p.suffix in (".json", ".webp")]
+    assert levels[0].nbytes == sum(p.stat().st_size for p in files)
+    assert len(levels[0].load().gaussians) > len(levels[1].load().gaussians)
+
+
+def test_levels_of_a_run_and_of_its_bundle(finished_run, tmp_path):
+    viewer = tmp_path / "viewer"
+    viewer.mkdir()
+    (viewer / "index.html").write_text("<!doctype html><body><!-- poster --></body>")
+    bundle(Job(RunDir(finished_run), ignore), tmp_path / "out", viewer=viewer)
+    of_run, of_bundle = levels_of(finished_run), levels_of(tmp_path / "out")
+    assert [level.name for level in of_run] == [f"run level {k}" for k in (4, 3, 2, 1)]
+    assert [level.nbytes for level in of_run] == [level.nbytes for level in of_bundle]
+    folder = RunDir(finished_run).increments
+    listed = read_index(folder)
+    chunks = [chunk for label in {c.label_id for c in listed} for chunk in shown(listed, label, 2)]
+    assert len(of_run[2].load().gaussians) == len(read_increments(folder, chunks))
+    for a, b in zip(of_run, of_bundle, strict=True):
+        a, b = a.load(), b.load()
+        assert torch.equal(a.gaussians.means, b.gaussians.means)
+        assert torch.equal(a.gaussians.label_ids, b.gaussians.label_ids)
+        assert (a.names, a.antialiased) == (b.names, b.antialiased)
+
+
+def test_the_finest_level_is_the_reference_of_the_others(finished_run, files):
+    found = measure([finished_run], files / "out", settings(files), ignore)
+    assert found.reference == "run level 4"
+    assert found.names == ["run level 3", "run level 2", "run level 1"]
+    assert list(found.counts) == sorted(found.counts, reverse=True)
+    quality = [np.mean([row.ssim for row in found.of(level, TOTAL)]) for level in range(3)]
+    assert quality[0] > quality[2]
+    assert found.labels()
+
+
+def test_levels_that_do_not_fit_into_memory_together(files, monkeypatch):
+    paths = [files / name for name in ("full.ply", "same.ply", "third.ply")]
+    together = measure(paths, files / "out", settings(files), ignore)
+    monkeypatch.setattr(score, "_TOGETHER", 1)
+    alone = measure(paths, files / "out", settings(files), ignore)
+    key = [(row.level, row.view, row.label_id) for row in together.rows]
+    assert sorted(key) == sorted((row.level, row.view, row.label_id) for row in alone.rows)
+    assert together.counts == alone.counts
+    assert together.of(1, TOTAL) == alone.of(1, TOTAL)
+
+
+def test_files_of_one_name_are_told_apart(files):
+    for folder in ("a", "b"):
+        (files / folder).mkdir()
+        shutil.copy(files / "third.ply", files / folder / "x.ply")
+    paths = [files / "a" / "x.ply", files / "b" / "x.ply", files / "a" / "x.ply"]
+    found = [levels_of(path)[0] for path in paths]
+    assert unique_names(found, paths) == ["a/x.ply (1)", "b/x.ply", "a/x.ply (2)"]
+
+
+def test_what_is_left_out_is_told(files):
+    bad = FULL.means.clone()
+    bad[0] = float("nan")
+    write_ply(files / "bad.ply", replace(FULL, means=bad))
+    events: list[Event] = []
+    measure([files / "bad.ply", files / "third.ply"], files / "out", settings(files), events.append)
+    assert "bad.ply: Gaussians left out: 1 NaN or infinite" in [
+        event.text for event in events if isinstance(event, Warned)
+    ]
+
+
+def test_one_level_alone(files):
+    with pytest.raises(RunError, match=r"full\.ply: one level, and nothing to compare it with; name its"):
+        measure([files / "full.ply"], files / "out", settings(files), ignore)
+
+
+@pytest.mark.parametrize("wrong", [{"views": 0}, {"size": 3}, {"size": 10**6}])
+def test_impossible_settings(files, wrong):
+    with pytest.raises(RunError, match="choose"):
+        measure([files / "full.ply", files / "third.ply"], files / "out", settings(files, **wrong), ignore)
+    assert not (files / "out").exists()
+
+
+def test_files_that_are_none(files):
+    for name, content in (("empty.ply", b""), ("text.spz", b"hello"), ("cut.spz", encode_spz(FULL)[:90])):
+        (files / name).write_bytes(content)
+        with pytest.raises(DataError, match=name):
+            measure([files / "full.ply", files / name], files / "out", settings(files), ignore)
+    with pytest.raises(SageError, match="nowhere"):
+        measure([files / "full.ply", files / "nowhere.ply"], files / "out", settings(files), ignore)
+    with pytest.raises(DataError, match="cannot be read"):
+        stored_bytes(files / "nowhere.ply")
+
+
+CHUNK = {"uri": "chunks/a.spz", "count": 3, "bytes": 9, "gpuBytes": 9, "sha256": "0" * 64}
+LABEL = {"id": 3, "title": "car", "levels": [CHUNK]}
+
+
+@pytest.mark.parametrize(
+    "labels",
+    [
+        *(4, None, "x", [4], [{}], [LABEL | {"id": "x"}], [LABEL | {"id": [1]}], [LABEL | {"title": 4}]),
+        *([LABEL | {"levels": value}] for value in (3, [4], [{}], [[]], {"a": 1})),
+        *([LABEL | {"levels": [CHUNK | {"uri": uri}]}] for uri in (3, "a.spz", "chunks/../a", "/etc/passwd")),
+        *([LABEL | {"levels": [CHUNK | {key: -1}]}] for key in ("count", "bytes", "sha256", "refine")),
+        [],
+    ],
+)
+def test_damaged_bundles_are_one_line(tmp_path, labels):
+    document = {"format": "sagesplat-bundle", "labels": labels}
+    (tmp_path / "manifest.json").write_text(json.dumps(document))
+    with pytest.raises(DataError, match="make it again with `sagesplat bundle`"):
+        levels_of(tmp_path)
