@@ -18,9 +18,11 @@ from sagesplat.core.names import repaired
 from sagesplat.core.sh import sh0_to_rgb
 from sagesplat.formats.levels import read_header, read_level, read_more, write_level, write_set
 from sagesplat.formats.splats import Splat, read_splat
+from sagesplat.output.contact_sheet import contact_sheet
 from sagesplat.run.job import Job
 from sagesplat.run.records import file_hash
 from sagesplat.run.stage import run_stage
+from sagesplat.scene.cameras import NamedCamera, read_camera_file
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage, write_model
 from sagesplat.scene.scene import Camera, View
 from sagesplat.segment.lift import LiftedLabels
@@ -28,10 +30,12 @@ from sagesplat.segment.masks import UNLABELLED, Taxonomy, prepare_folder, write_
 from sagesplat.stages.label import make_masks
 from sagesplat.stages.scene import open_scene
 from sagesplat.train.votes import vote
+from sagesplat.viewer.frames import FLIP, upward
 
 _WHOLE = {0: "scene"}  # the one category of a splat without labels
 _POINTS = 50_000  # means that stand for the points of a capture
 _OPAQUE = 0.1  # their least opacity, as far as there are such
+_STEPS = 1500  # of a training, whose time the sampling of fidelity may take a part of
 _LEVEL = 1  # number of the one level that a splat from elsewhere has
 
 
@@ -51,11 +55,13 @@ def open_splat(
 
 
 def _make_capture(job: Job, source: Path, config: AdoptConfig, *, labelled: bool) -> Path:
-    """Make RUN/adopted.npz and a capture of the splat's own renders; the capture's folder."""
+    """Make RUN/adopted.npz and viewpoints.png; the capture, which holds renders unless there are photos."""
     run = job.run
-    folder = run.capture / repaired(source.resolve().stem)
+    given = [] if config.cameras is None else read_camera_file(config.cameras)
+    photos = bool(given) and all(one.photo is not None for one in given)
+    own = run.capture / repaired(source.resolve().stem)
     names = ("cameras", "views", "kind", "up", "fov", "size", "lod", "seed")
-    settings = {name: getattr(config, name) for name in names} | {"labelled": labelled}
+    settings = {name: getattr(config, name) for name in names} | {"labelled": labelled, "photos": photos}
     settings |= {"source": str(source.resolve()), "content": file_hash(source)}
 
     def make() -> list[str]:
@@ -65,15 +71,24 @@ def _make_capture(job: Job, source: Path, config: AdoptConfig, *, labelled: bool
         if labelled:
             splat = _labelled(splat)
         g = splat.gaussians
-        cameras, how = _cameras(g, config, job)
+        cameras, up, how = _cameras(job, g, given, config)
         rows = _points(g, config.seed)
-        _write_photos(job, folder, splat, cameras, labelled=labelled)
-        _write_model(folder / "sparse" / "0", g, cameras, rows)
+        if not photos:
+            _write_photos(job, own, splat, cameras, labelled=labelled)
+            _write_model(own / "sparse" / "0", g, cameras, rows)
+        contact_sheet(
+            run.contact_sheet, g, cameras, up, [f"{source.name}: {len(g):,} Gaussians", how],
+            antialiased=splat.antialiased, backend=job.backend,
+        )  # fmt: skip
         write_set(run.adopted, g, _LEVEL, exact=True, points=rows, antialiased=splat.antialiased)
-        return [f"{len(g):,} Gaussians ({splat.kind})", f"{len(cameras)} viewpoints: {how}"]
+        return [
+            f"{len(g):,} Gaussians ({splat.kind})",
+            f"{len(cameras)} viewpoints, {run.contact_sheet}: {how}",
+        ]
 
-    run_stage(job, "adopt", settings, [source], [run.adopted, folder / "sparse"], make)
-    return folder
+    outputs = [run.adopted, run.contact_sheet, *([] if photos else [own / "sparse"])]
+    run_stage(job, "adopt", settings, [source], outputs, make)
+    return config.cameras if photos and config.cameras else own
 
 
 def _labelled(splat: Splat) -> Splat:
@@ -87,13 +102,18 @@ def _labelled(splat: Splat) -> Splat:
     return replace(splat, gaussians=g.select(torch.argsort(g.label_ids, stable=True)), names=names)
 
 
-def _cameras(g: Gaussians, config: AdoptConfig, job: Job) -> tuple[Sequence[Camera], str]:
-    """Where to look from, and what that was decided by."""
+def _cameras(
+    job: Job, g: Gaussians, given: Sequence[NamedCamera], config: AdoptConfig
+) -> tuple[Sequence[Camera], np.ndarray, str]:
+    """Where to look from, which direction is up there, and what that was decided by."""
+    if given:
+        cameras = [one.camera for one in given]
+        return cameras, upward(cameras) * FLIP, f"those of {config.cameras}"
     drawn = free_cameras(
         g, config.views, up=config.up, fov=config.fov, size=config.size, seed=config.seed, kind=config.kind,
         backend=job.backend,
     )  # fmt: skip
-    return drawn.cameras, drawn.reason
+    return drawn.cameras, drawn.up, drawn.reason
 
 
 def _points(g: Gaussians, seed: int) -> np.ndarray:
@@ -172,6 +192,6 @@ def _label(job: Job, *, voted: bool) -> None:
     inputs = [run.scene, run.adopted, run.masks / "labels.json"]
     run_stage(job, "lift", {"voted": voted}, inputs, [run.labels, run.levels], make)
     # what later stages ask of the training
-    config = TrainConfig(sh_degree=read_header(run.adopted).sh_degree, antialiased=antialiased)
+    config = TrainConfig(max_steps=_STEPS, sh_degree=read_header(run.adopted).sh_degree, antialiased=antialiased)
     settings = {**asdict(config), "seed": 0, "adopted": True}
     run_stage(job, "train", settings, [run.scene, run.labels], [run.levels], lambda: ["trained elsewhere"])

@@ -48,7 +48,8 @@ def make_levels(job: Job, config: AdoptConfig) -> None:
     run = job.run
     g = job.snapshots.load(job.snapshots.levels[-1])
     shares = usable_shares(config.shares, len(g))
-    settings = asdict(NestConfig(steps=config.steps, levels=len(shares), base_share=0))
+    steps = config.steps if config.fit == "renders" else 0
+    settings = asdict(NestConfig(steps=steps, levels=len(shares), base_share=0))
     settings |= {"fit": config.fit, "shares": shares, "lossless": config.lossless, "seed": config.seed}
     inputs = [run.scene, run.labels, run.levels, run.provenance("train"), *label_image_inputs(run)]
 

@@ -27,6 +27,7 @@ from sagesplat.segment.masks import UNLABELLED
 from sagesplat.stages.fidelity import compositions_at, fit_drawn
 from sagesplat.stages.results import (
     fidelity_of,
+    has_photos,
     increments_of,
     models_of,
     promises_of,
@@ -168,6 +169,14 @@ class NestedLevels(Method):
         self.model_files = [run.models, run.promises, run.fidelity]
         self.files = [*self.level_files, run.promises, run.fidelity, *self.sample_files]
 
+    def check(self, config: PlanConfig) -> None:
+        """See `Method`."""
+        if config.target_ssim is not None and not has_photos(self.job.run):
+            raise RunError(
+                f"{self.job.run.path}: a splat without photos has no SSIM against photos; give "
+                "--target-fidelity, or adopt it again with --cameras CAPTURE"
+            )
+
     @cached_property
     def costs(self) -> Costs:
         """What the levels cost."""
@@ -226,7 +235,9 @@ class NestedLevels(Method):
     def fit(self, table: Observations, config: FitConfig, curves: Curves) -> list[str]:
         """See `Method`."""
         run, lines = self.job.run, []
-        against_photos = fit_viewpoints(self.job, self.costs, table, config, curves)
+        against_photos = (
+            fit_viewpoints(self.job, self.costs, table, config, curves) if has_photos(run) else {}
+        )
         for name, path, models in (
             ("SSIM against photos", run.promises, against_photos),
             ("fidelity", run.fidelity, fit_drawn(self.job, config)),

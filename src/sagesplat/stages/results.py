@@ -17,7 +17,7 @@ from sagesplat.adapt.viewpoints import Viewpoints, read_viewpoints
 from sagesplat.core.errors import DataError
 from sagesplat.formats.increments import INDEX, Increment, read_index, totals
 from sagesplat.run.job import Job
-from sagesplat.run.records import uses
+from sagesplat.run.records import settings_of, uses
 from sagesplat.run.run_dir import RunDir
 
 _WHOLE = -1  # level of the rows of the whole image in an evaluation
@@ -75,6 +75,8 @@ def promises_of(job: Job) -> dict[int, ViewModel]:
 
 def has_photos(run: RunDir) -> bool:
     """Whether the levels were measured against photos: else there is fidelity only."""
+    if run.adopted.exists() and not settings_of(run, "adopt").get("photos"):
+        return False
     return not run.provenance("fit").exists() or uses(run, "fit", run.observations)
 
 

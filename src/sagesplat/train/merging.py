@@ -151,7 +151,7 @@ def _at_most(count: int) -> int:
 def _neighbours(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pairs of close rows (int64 [P] each), every pair once; at least one pair of two rows or more."""
     n = len(means)
-    near = KDTree(means).query(means, min(_NEIGHBOURS + 1, n), workers=-1)[1]
+    near = np.asarray(KDTree(means).query(means, min(_NEIGHBOURS + 1, n), workers=-1)[1])
     one = np.repeat(np.arange(n), near.shape[1])
     other = near.ravel()
     keys = np.unique(np.minimum(one, other) * n + np.maximum(one, other))

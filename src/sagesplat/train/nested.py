@@ -240,7 +240,7 @@ def nest(
             if spans is None:
                 prefix = draw_shares(state.rng, len(categories), config, state.step / config.steps)
             else:
-                prefix = state.rng.choice(np.float32(spans.shares), len(categories))
+                prefix = state.rng.choice(np.array(spans.shares, np.float32), len(categories))
             rows = None
             if spans is not None or (prefix < 1).any():
                 assert state.order_share is not None
