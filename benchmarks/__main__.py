@@ -15,6 +15,7 @@ import tyro
 
 from benchmarks import audit as table_iii
 from benchmarks import deeplab as segmenting
+from benchmarks import formats as formatting
 from benchmarks import freeze as freezing
 from benchmarks import fuzz as fuzzing
 from benchmarks import measure, plain, workloads
@@ -142,6 +143,30 @@ def garden(
     for name, value in result.items():
         print(f"{name:32} {value:,.4g}" if isinstance(value, float) else f"{name:32} {value}")
     _finish(f"{capture.name}_{camera.width}_{steps}", result, write)
+
+
+@app.command
+def formats(
+    splats: tuple[str, ...] = (), splat_transform: Path | None = None, count: int = 5000, write: bool = False
+) -> None:
+    """Round trips of splat files with PlayCanvas's splat-transform: errors in steps of each format.
+
+    Args:
+        splats: files of splats to use besides random ones; of a streamed SOG level K as PATH@K.
+        splat_transform: the program (default: npx; it needs Node 22).
+        count: random Gaussians.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        transform = formatting.found(splat_transform)
+        result = formatting.run([Path(path) for path in splats], transform, Path(folder), count)
+    for scene, pairs in result.items():
+        for pair, errors in pairs.items():
+            shown = " ".join(f"{name} {error:.2g}" for name, error in errors.items() if name != "rows")
+            print(f"{scene:20} {pair:26} {errors['rows']:>8,.0f}  {shown}")
+    if write:
+        path = RESULTS.parent / "formats.json"
+        path.write_text(json.dumps({"worst": formatting.verdict(result), "scenes": result}, indent=1) + "\n")
+    _finish("formats", {"worst_in_steps": formatting.verdict(result)}, False)
 
 
 @app.command

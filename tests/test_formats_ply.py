@@ -36,7 +36,7 @@ def split(path: Path) -> tuple[bytes, bytes]:
 
 
 def foreign(path: Path, columns: dict[str, np.ndarray], order: str = "<", extra: str = "") -> None:
-    kinds = {"f4": "float", "f8": "double", "i4": "int", "u1": "uchar"}
+    kinds = {"f4": "float", "f8": "double", "i4": "int", "u1": "uchar", "u2": "ushort", "u4": "uint"}
     names = "".join(f"property {kinds[c.dtype.str[1:]]} {name}\n" for name, c in columns.items())
     form = "binary_little_endian" if order == "<" else "binary_big_endian"
     count = len(next(iter(columns.values())))

@@ -71,6 +71,11 @@ def test_a_ply_of_any_order_and_type(tmp_path, bases):
     read = read_splat(tmp_path / "a.ply")
     assert all(torch.equal(getattr(read.gaussians, name), getattr(g, name)) for name in PARAMETERS)
     assert read.gaussians.label_ids.tolist() == list(range(20))
+    for dtype in ("u1", "u2", "u4"):
+        unsigned = np.arange(20).astype(dtype)
+        unsigned[3] = np.iinfo(dtype).max
+        foreign(tmp_path / "a.ply", columns | {"label": unsigned})
+        assert read_splat(tmp_path / "a.ply").gaussians.label_ids[2:5].tolist() == [2, -1, 4]
     foreign(tmp_path / "a.ply", columns | {"label": np.full(20, 2.5)})
     refused(tmp_path / "a.ply", "20 values of label")
 

@@ -220,8 +220,13 @@ def _read_body(
 
 
 def _whole(labels: np.ndarray) -> np.ndarray:
-    """Labels of any type as integers; -2, which is no label, for those that are no whole numbers."""
-    if labels.dtype.kind in "iu":
+    """Labels of any type as integers; -2, which is no label, for those that are no whole numbers.
+
+    The largest value of an unsigned type is -1: tools that have no signed ones write it so.
+    """
+    if labels.dtype.kind == "u":
+        return np.where(labels == np.iinfo(labels.dtype).max, -1, labels.astype(np.int64))
+    if labels.dtype.kind == "i":
         return labels
     return np.where((np.abs(labels) < 2**15) & (labels == np.floor(labels)), labels, -2).astype(np.int64)
 
