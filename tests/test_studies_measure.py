@@ -98,7 +98,8 @@ def test_what_is_written(files):
         ("same.ply", "whole image"),
         ("same.ply", "covered by the reference"),
     ]
-    assert Image.open(out / "measure.png").size[0] > 1000
+    with Image.open(out / "measure.png") as picture:
+        assert picture.size[0] > 1000
 
 
 def test_an_empty_background_does_not_count_as_covered(files):

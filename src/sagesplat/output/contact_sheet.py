@@ -26,6 +26,7 @@ _WIDTH = 14.0  # inches
 _MAPS = 4.2  # inches, height of the maps
 _SIDE = 200  # px, longer side of a picture
 _DOTS = 20_000  # Gaussians on a map
+_AROUND = 0.8  # what is farther from the cameras than so many times their spread is not aimed at
 _MARGIN = 0.08  # of a map around what it shows
 _ARROW = 0.25  # inches, length of a viewing direction
 _MAP_WIDTH, _MAP_HEIGHT = 0.46, 0.84  # of a map, as shares of the sheet's width and of _MAPS
@@ -127,10 +128,13 @@ def _map(
     at: Float[np.ndarray, "V 2"],
     towards: Float[np.ndarray, "V 2"],
 ) -> None:
-    low = np.minimum(at.min(0), np.quantile(dots, 0.03, axis=0))
-    high = np.maximum(at.max(0), np.quantile(dots, 0.97, axis=0))
+    reach = _AROUND * float(np.ptp(at, axis=0).max()) or np.inf
+    near = dots[((dots > at.min(0) - reach) & (dots < at.max(0) + reach)).all(1)]  # or a far sky decides
+    shown = np.concatenate([at, *([np.quantile(near, [0.02, 0.98], axis=0)] if len(near) else [])])
+    low, high = shown.min(0), shown.max(0)
     shape = np.array([_MAP_WIDTH * _WIDTH, _MAP_HEIGHT * _MAPS])  # inches
-    scale = max(float(((high - low) / shape).max()), 1e-30) * (1 + 2 * _MARGIN)  # world units per inch
+    least = 1e-6 * float(np.abs(shown).max()) + 1e-30  # of one point
+    scale = max(float(((high - low) / shape).max()), least) * (1 + 2 * _MARGIN)  # world units per inch
     (left, bottom), (right, top) = (low + high) / 2 - scale * shape / 2, (low + high) / 2 + scale * shape / 2
     axes.scatter(*dots.T, s=1.5, c=colours, linewidths=0, rasterized=True)
     axes.scatter(*at.T, s=9, color=ACCENT, linewidths=0, zorder=3)
