@@ -584,6 +584,40 @@ def freeze(
 
 
 @app.command
+def adopt(
+    folder: Path = Path("runs/adopt"),
+    scenes: tuple[str, ...] = ("playbot", "garden", "built-in-11"),
+    splat_transform: Path | None = None,
+    views: int = 40,
+    steps: int = 3000,
+    write: bool = False,
+) -> None:
+    """Levels of adopted splats beside those of splat-transform, at equal counts.
+
+    Args:
+        folder: where runs are made; what is done already is skipped.
+        scenes: a streamed SOG in the folder of splats, and scenes of `promises`.
+        splat_transform: its command (default: by npx).
+        views: viewpoints to draw for a splat without a capture.
+        steps: of the training of the lower levels.
+        write: keep the figures in benchmarks/results/cpu/adopt.json.
+    """
+    from benchmarks import adopt as adopting
+    from benchmarks.formats import found
+
+    results = {}
+    for name in scenes:
+        streamed = adopting.SPLATS / name / "lod-meta.json"
+        case = (
+            adopting.published(streamed)
+            if streamed.exists()
+            else adopting.trained(name, folder, found(splat_transform))
+        )
+        results[name] = adopting.measure(case, folder / "adopted" / name, views, steps, print)
+    _finish("adopt", results, write)
+
+
+@app.command
 def structure(src: tuple[Path, ...] = (Path("src/sagesplat"),), write: bool = False) -> None:
     """How the package is built: entries, imports between them, cycles, lengths; of several checkouts in turn.
 

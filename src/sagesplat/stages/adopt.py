@@ -192,6 +192,8 @@ def _label(job: Job, *, voted: bool) -> None:
     inputs = [run.scene, run.adopted, run.masks / "labels.json"]
     run_stage(job, "lift", {"voted": voted}, inputs, [run.labels, run.levels], make)
     # what later stages ask of the training
-    config = TrainConfig(max_steps=_STEPS, sh_degree=read_header(run.adopted).sh_degree, antialiased=antialiased)
+    config = TrainConfig(
+        max_steps=_STEPS, sh_degree=read_header(run.adopted).sh_degree, antialiased=antialiased
+    )
     settings = {**asdict(config), "seed": 0, "adopted": True}
     run_stage(job, "train", settings, [run.scene, run.labels], [run.levels], lambda: ["trained elsewhere"])

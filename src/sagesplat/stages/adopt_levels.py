@@ -9,6 +9,7 @@ import torch
 
 from sagesplat.adapt.ladder import read_prefixes
 from sagesplat.adapt.observe import as_unit, render_rgb
+from sagesplat.adapt.renders import Renders
 from sagesplat.core.config import AdoptConfig, NestConfig
 from sagesplat.core.events import Progress
 from sagesplat.core.gaussians import Gaussians
@@ -18,6 +19,7 @@ from sagesplat.metrics.image import ssim_map
 from sagesplat.run.job import Job
 from sagesplat.run.records import checkpoint_key
 from sagesplat.run.stage import run_stage
+from sagesplat.scene.images import Photos
 from sagesplat.stages.shared import label_image_inputs, train_config
 from sagesplat.train import nested
 from sagesplat.train.checkpoint import remove_checkpoints
@@ -35,11 +37,13 @@ from sagesplat.train.lower_levels import (
     trained_sets,
     usable_shares,
 )
+from sagesplat.train.memory import photo_cache
 from sagesplat.train.nested import Nested, NestStep
 from sagesplat.train.refit import refit_colors, refit_coverage
 
 _WEIGH = 32  # views that importance is measured in
 _REFIT = 24  # views that merged Gaussians are fitted to
+_TRAINED = 0.5  # largest share that is trained; above, the most important originals lose little
 _COMPARE = 8  # views that merged Gaussians and prefixes of the originals are compared in
 
 
@@ -54,18 +58,22 @@ def make_levels(job: Job, config: AdoptConfig) -> None:
     inputs = [run.scene, run.labels, run.levels, run.provenance("train"), *label_image_inputs(run)]
 
     def make() -> list[str]:
+        key = checkpoint_key(run, settings, inputs)
+        targets = Renders(g, job.scene.views, job.backend, job.antialiased, photo_cache(job.memory_limit))
         views = spread(job.scene.train_ids.tolist(), _WEIGH)
         weights = importance(g, job.scene, views, "weight", antialiased=job.antialiased)
         order = importance(g, job.scene, views, "sensitivity", antialiased=job.antialiased)
         ordered = g.select(torch.from_numpy(np.argsort(-order, kind="stable")))
-        rungs = merged_rungs(g, weights, [share for share in shares if share < 1])
+        lower = [share for share in shares if share < 1 and (config.fit == "none" or share <= _TRAINED)]
+        rungs = merged_rungs(g, weights, lower)
         rungs = [replace(rung, gaussians=_covering(job, rung, views)) for rung in rungs]
-        rungs = rungs[: _merges_until(job, rungs, ordered, g.counts())]
+        pruned = [_prefix(ordered, rung.share) for rung in rungs]
+        merges = _merges_until(job, targets, [rung.gaussians for rung in rungs], pruned)
         if config.fit == "renders":
-            key = checkpoint_key(run, settings, inputs)
-            sets = _trained(job, rungs, g.counts(), config, key)
+            starts = [r.gaussians if i < merges else pruned[i] for i, r in enumerate(rungs)]
+            sets = _trained(job, targets, dict(zip(lower, starts, strict=True)), g.counts(), config, key)
         else:
-            sets = [(_colored(job, rung.gaussians), (rung.share,)) for rung in rungs]
+            sets = [(_colored(job, targets, rung.gaussians), (rung.share,)) for rung in rungs[:merges]]
         used = {share for _, levels in sets for share in levels}
         ladder = assemble(sets, ordered, [share for share in shares if share not in used])
         lines = _write(job, ladder, len(used), g, settings, config.lossless)
@@ -83,48 +91,58 @@ def _covering(job: Job, rung: Rung, views: Sequence[int]) -> Gaussians:
     )
 
 
-def _colored(job: Job, g: Gaussians) -> Gaussians:
+def _colored(job: Job, targets: Photos, g: Gaussians) -> Gaussians:
     rows = spread(job.scene.train_ids.tolist(), _REFIT)
     cameras = [job.scene.views[row].camera for row in rows]
-    images = [torch.from_numpy(as_unit(job.photos[row])) for row in rows]
+    images = [torch.from_numpy(as_unit(targets[row])) for row in rows]
     return refit_colors(g, cameras, images, antialiased=job.antialiased, backend=job.backend)
 
 
-def _merges_until(job: Job, rungs: Sequence[Rung], ordered: Gaussians, counts: Mapping[int, int]) -> int:
-    """How many of the rungs are better than as many of the originals, by SSIM; the larger ones are not."""
+def _prefix(ordered: Gaussians, share: float) -> Gaussians:
+    """The first Gaussians of each category, as many as a level of `share` has."""
+    rows = [mine[: size_of(share, len(mine))] for mine in by_label(ordered).values()]
+    return ordered.select(torch.from_numpy(np.sort(np.concatenate(rows))))
+
+
+def _merges_until(job: Job, targets: Photos, merged: Sequence[Gaussians], pruned: Sequence[Gaussians]) -> int:
+    """How many levels are better merged than pruned to the most important originals; larger ones are not."""
     rows = spread(job.scene.train_ids.tolist(), _COMPARE)
-    for number in range(len(rungs), 0, -1):
-        rung = rungs[number - 1]
-        prefix = [mine[: size_of(rung.share, counts[label])] for label, mine in by_label(ordered).items()]
-        originals = ordered.select(torch.from_numpy(np.sort(np.concatenate(prefix))))
-        if _ssim(job, rung.gaussians, rows) > _ssim(job, originals, rows):
+    for number in range(len(merged), 0, -1):
+        one, other = (_ssim(job, targets, some[number - 1], rows) for some in (merged, pruned))
+        if one > other:
             return number
     return 0
 
 
 def _trained(
-    job: Job, rungs: Sequence[Rung], counts: Mapping[int, int], config: AdoptConfig, key: str
+    job: Job,
+    targets: Photos,
+    starts: Mapping[float, Gaussians],
+    counts: Mapping[int, int],
+    config: AdoptConfig,
+    key: str,
 ) -> list[tuple[Gaussians, tuple[float, ...]]]:
-    """The rungs trained on renders of the originals: levels of similar size as prefixes of one set."""
-    sets = trained_sets([rung.share for rung in rungs])
-    tops = [rung for rung in rungs for levels in sets if rung.share == levels[-1]]
+    """Levels trained on renders of the originals, those of similar size as prefixes of one set.
+
+    `starts`: Gaussians to start from, by share.
+    """
+    sets = trained_sets(list(starts))
+    tops = {levels[-1]: starts[levels[-1]] for levels in sets}
     views = spread(job.scene.train_ids.tolist(), _REFIT)
     ranks = [
-        importance(rung.gaussians, job.scene, views, "sensitivity", antialiased=job.antialiased)
-        for rung in tops
+        importance(g, job.scene, views, "sensitivity", antialiased=job.antialiased) for g in tops.values()
     ]
-    start, spans = joined(tops, ranks, sets, counts)
-    nest = NestConfig(steps=config.steps)
+    start, spans = joined(tops, ranks, tuple(starts), counts)
     trained = start
     for event in nested.nest(
-        start, job.scene, job.photos, train_config(job), nest, seed=config.seed, backend=job.backend,
-        checkpoint=job.run.nest_checkpoint, settings=key, spans=spans,
+        start, job.scene, targets, train_config(job), NestConfig(steps=config.steps), seed=config.seed,
+        backend=job.backend, checkpoint=job.run.nest_checkpoint, settings=key, spans=spans,
     ):  # fmt: skip
         if isinstance(event, NestStep):
             job.emit(Progress("nest", event.step, config.steps, f"loss {event.loss:.3f}"))
         elif isinstance(event, Nested):
             trained = event
-    return split_sets(trained.gaussians, tops, sets)
+    return split_sets(trained.gaussians, tops.values(), sets)
 
 
 def _write(
@@ -164,8 +182,8 @@ def _loss(job: Job, top: Gaussians, before: Gaussians) -> str:
     return "as it came in" if error == 0 else f"PSNR {-10 * np.log10(error):.1f} dB against what came in"
 
 
-def _ssim(job: Job, g: Gaussians, rows: Sequence[int]) -> float:
-    return float(np.mean([ssim_map(_image(job, g, row), as_unit(job.photos[row])).mean() for row in rows]))
+def _ssim(job: Job, targets: Photos, g: Gaussians, rows: Sequence[int]) -> float:
+    return float(np.mean([ssim_map(_image(job, g, row), as_unit(targets[row])).mean() for row in rows]))
 
 
 def _image(job: Job, g: Gaussians, row: int) -> np.ndarray:

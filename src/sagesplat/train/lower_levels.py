@@ -5,7 +5,7 @@ originals or trained on them; a set replaces the smaller one. From a certain lev
 originals, ordered by importance; the last level is all of them.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -19,7 +19,7 @@ from sagesplat.train.nested import Nested, Spans
 
 FEWEST = 50  # Gaussians of a level, all categories together
 _WHOLE = 100  # Gaussians of a category that is too small to merge
-_SPAN = 4.5  # ratio of the sizes of the levels that share a trained set
+_SPAN = 2.5  # ratio of the sizes of the levels that share a trained set
 
 
 def usable_shares(shares: Sequence[float], count: int) -> tuple[float, ...]:
@@ -85,30 +85,29 @@ def trained_sets(shares: Sequence[float]) -> list[tuple[float, ...]]:
 
 
 def joined(
-    rungs: Sequence[Rung],
+    tops: Mapping[float, Gaussians],
     importances: Sequence[np.ndarray],
-    sets: Sequence[Sequence[float]],
+    shares: Sequence[float],
     counts: Mapping[int, int],
 ) -> tuple[Nested, Spans]:
-    """The rungs as one model to train, each in the order of its importances; `sets`: shares of each.
+    """Sets of Gaussians as one model to train, each in the order of its importances.
 
+    `tops`: the sets by their size as a share of each category, ascending; `shares`: of all levels to train;
     `counts`: originals of each category.
     """
-    order, above, upto, places = [], [], [], []
-    edges = [0.0, *(rung.share for rung in rungs)]
-    for rung, importance, (low, high) in zip(rungs, importances, pairwise(edges), strict=True):
-        place = np.empty(len(rung.gaussians), np.float32)
-        for label, rows in by_label(rung.gaussians).items():
+    order, above, upto = [], [], []
+    for g, importance, (low, high) in zip(tops.values(), importances, pairwise([0.0, *tops]), strict=True):
+        place = np.empty(len(g), np.float32)
+        for label, rows in by_label(g).items():
             ranked = rows[np.argsort(-importance[rows], kind="stable")]
-            place[ranked] = (np.arange(len(rows)) / counts[label]).astype(np.float32)
+            place[ranked] = np.arange(len(rows), dtype=np.float32) / counts[label]
         order.append(place)
-        above.append(np.full(len(place), low, np.float32))
-        upto.append(np.full(len(place), high, np.float32))
-        places.append(rung.gaussians)
-    g = concat(places)
+        above.append(np.full(len(g), low, np.float32))
+        upto.append(np.full(len(g), high, np.float32))
+    g = concat(list(tops.values()))
     nested = Nested(g, np.ones(len(g), np.float32), np.full(len(g), 2, np.int8))
-    shares = tuple(share for one in sets for share in one)
-    return nested, Spans(np.concatenate(order), np.concatenate(above), np.concatenate(upto), shares)
+    spans = Spans(np.concatenate(order), np.concatenate(above), np.concatenate(upto), tuple(shares))
+    return nested, spans
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,13 +146,13 @@ def assemble(
 
 
 def split_sets(
-    g: Gaussians, tops: Sequence[Rung], sets: Sequence[tuple[float, ...]]
+    g: Gaussians, tops: Iterable[Gaussians], sets: Sequence[tuple[float, ...]]
 ) -> list[tuple[Gaussians, tuple[float, ...]]]:
-    """What `joined` joined, trained: each set in its order with its shares."""
+    """The sets that `joined` joined, once trained: each in its order, with the shares of its levels."""
     whole, taken, found = by_label(g), dict[int, int](), []
-    for rung, levels in zip(tops, sets, strict=True):
+    for top, levels in zip(tops, sets, strict=True):
         rows = []
-        for label, count in rung.gaussians.counts().items():
+        for label, count in top.counts().items():
             begin = taken.get(label, 0)
             rows.append(whole[label][begin : begin + count])
             taken[label] = begin + count

@@ -1,0 +1,158 @@
+"""Levels of adopted splats beside those of splat-transform, at equal counts.
+
+playbot comes with levels that its author published; garden and the built-in scene are trained here, written
+as PLY with labels, and decimated by splat-transform. Every image is compared with the splat that came in.
+"""
+
+import resource
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.formats import Transform
+from benchmarks.promises import CASES
+from benchmarks.workloads import GARDEN
+from sagesplat.adapt.free_viewpoints import free_cameras
+from sagesplat.adapt.observe import render_rgb
+from sagesplat.core.config import AdoptConfig, LabelsConfig, MasksConfig, SceneConfig
+from sagesplat.core.events import Event, StageDone
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.formats.ply import write_ply
+from sagesplat.formats.splats import num_lods, read_splat
+from sagesplat.metrics.image import ssim_map
+from sagesplat.raster import Workspace
+from sagesplat.run.job import Job
+from sagesplat.run.run_dir import RunDir
+from sagesplat.scene.scene import Camera
+from sagesplat.stages.adopt import open_splat
+from sagesplat.stages.adopt_levels import make_levels
+from sagesplat.stages.api import run_scene
+
+SPLATS = GARDEN.parent.parent / "splats"
+SHARES = (0.05, 0.1, 0.2, 0.35, 0.5, 0.7)
+BELOW = (0.0125, 0.025)  # so that small levels share a set with those as in a usual ladder
+FRESH = 1  # seed of viewpoints that nothing was made from
+Say = Callable[[str], None]
+Quality = dict[str, float]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A splat to adopt, the levels of others to compare with, and where from."""
+
+    source: Path
+    rivals: Mapping[float, Gaussians]  # by share of the Gaussians
+    cameras: Path | None  # a capture; None: viewpoints are drawn
+    antialiased: bool = False
+
+
+def published(source: Path) -> Case:
+    """A streamed SOG with the levels that came with it."""
+    full = len(read_splat(source).gaussians)
+    levels = [read_splat(source, lod).gaussians for lod in range(1, num_lods(source))]
+    return Case(source, {len(g) / full: g for g in levels}, None)
+
+
+def trained(name: str, folder: Path, transform: Transform) -> Case:
+    """A scene trained here as a PLY, decimated by splat-transform; `name` is one of `promises.CASES`."""
+    case = CASES[name]
+    capture = case.capture(folder / "captures" / name)
+    job = run_scene(capture, folder / name, case.config, force=True).job
+    g = job.snapshots.load(job.snapshots.levels[-1])
+    source = folder / f"{name}.ply"
+    write_ply(source, g, job.names())
+    rivals = {}
+    for share in SHARES:
+        out = folder / f"{name}-{share}.ply"
+        if not out.exists():
+            transform(source, "--decimate", str(round(share * len(g))), out)
+        rivals[share] = read_splat(out).gaussians
+    return Case(source, rivals, capture)
+
+
+def measure(case: Case, folder: Path, views: int, steps: int, say: Say) -> dict[str, Any]:
+    """SSIM and PSNR of the rivals' levels and of ours, trained and not, at the same counts."""
+    reference = read_splat(case.source)
+    g, antialiased = reference.gaussians, reference.antialiased
+    shares = tuple(sorted(case.rivals))
+    result: dict[str, Any] = {"count": len(g)}
+    scored: dict[str, dict[float, Quality]] = {}
+    cameras: Sequence[Camera] = ()
+    for fit in ("none", "renders"):
+        config = AdoptConfig(
+            fit=fit, steps=steps, shares=(*_below(shares), *shares, 0.7, 1.0), cameras=case.cameras
+        )
+        job, seconds = _adopted(case, folder / f"{case.source.stem}-{fit}", config, say)
+        if not cameras:
+            cameras = _test_cameras(job, g, case, views)
+            scored["rival"] = {s: score(case.rivals[s], g, cameras, antialiased) for s in shares}
+        ladder = job.ladder
+        by_count = {ladder.size(level): level for level in ladder.levels}
+        ours = {s: min(by_count, key=lambda n, s=s: abs(n - s * len(g))) for s in shares}
+        scored[fit] = {
+            s: score(ladder.load(by_count[n]), g, cameras, antialiased) | {"count": n}
+            for s, n in ours.items()
+        }
+        full = score(ladder.load(ladder.levels[-1]), g, cameras, antialiased)
+        result[fit] = {"seconds": seconds, "full_psnr": full["psnr"]}
+        for share in shares:
+            say(f"{case.source.stem} {fit:8}" + _line(share, case, scored, fit))
+    result["levels"] = {str(len(case.rivals[s])): {who: scored[who][s] for who in scored} for s in shares}
+    for fit in ("none", "renders"):
+        for metric in ("psnr", "ssim"):
+            ahead = [scored[fit][s][metric] - scored["rival"][s][metric] for s in shares]
+            result[fit][f"{metric}_ahead"] = {"mean": float(np.mean(ahead)), "least": float(min(ahead))}
+    result["peak_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    return result
+
+
+def _below(shares: Sequence[float]) -> tuple[float, ...]:
+    return BELOW if min(shares) > max(BELOW) else ()
+
+
+def _adopted(case: Case, folder: Path, config: AdoptConfig, say: Say) -> tuple[Job, dict[str, float]]:
+    seconds: dict[str, float] = {}
+
+    def emit(event: Event) -> None:
+        if isinstance(event, StageDone):
+            seconds[event.name] = round(event.seconds, 1)
+            say(f"  {event.name}: {event.seconds:.1f} s, {'; '.join(event.lines)}")
+
+    job = Job(RunDir(folder), emit, "cpu", 2, force=True)
+    begin = time.perf_counter()
+    open_splat(job, case.source, config, SceneConfig(), MasksConfig(), LabelsConfig())
+    make_levels(job, config)
+    return job, seconds | {"all": round(time.perf_counter() - begin, 1)}
+
+
+def _test_cameras(job: Job, g: Gaussians, case: Case, views: int) -> Sequence[Camera]:
+    if case.cameras is None:
+        return free_cameras(g, views, seed=FRESH).cameras
+    return [job.scene.views[row].camera for row in job.scene.test_ids]
+
+
+def score(g: Gaussians, full: Gaussians, cameras: Sequence[Camera], antialiased: bool) -> Quality:
+    """Mean SSIM and PSNR (dB) of a level against the full model."""
+    psnr, ssim, work = [], [], (Workspace(), Workspace())
+    for camera in cameras:
+        one, other = (
+            render_rgb(some, camera, backend="cpu", antialiased=antialiased, workspace=space)
+            for some, space in zip((g, full), work, strict=True)
+        )
+        error = max(float(np.square(one - other).mean()), 1e-10)
+        psnr.append(-10 * np.log10(error))
+        ssim.append(float(ssim_map(one, other).mean()))
+    return {"psnr": float(np.mean(psnr)), "ssim": float(np.mean(ssim))}
+
+
+def _line(share: float, case: Case, scored: Mapping[str, Mapping[float, Quality]], fit: str) -> str:
+    rival, ours = scored["rival"][share], scored[fit][share]
+    return (
+        f" {len(case.rivals[share]):8,} Gaussians: {rival['psnr']:.2f} dB {rival['ssim']:.4f}, ours "
+        f"{int(ours['count']):,} {ours['psnr']:.2f} dB {ours['ssim']:.4f}: "
+        f"{ours['psnr'] - rival['psnr']:+.2f} dB {ours['ssim'] - rival['ssim']:+.4f}"
+    )

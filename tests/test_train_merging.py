@@ -1,0 +1,110 @@
+"""Merging of Gaussians by moments, and what fits merged ones to renders."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from conftest import random_gaussians
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.train.merging import Merged, merge
+
+
+def _merged(g: Gaussians, count: int, weights: np.ndarray | None = None) -> Merged:
+    weights = np.ones(len(g), np.float32) if weights is None else weights
+    return next(merge(g, weights, [count]))
+
+
+def _moments(g: Gaussians) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Opacity times area, mean and covariance of each Gaussian, float64: the definition, slowly."""
+    scales = np.exp(g.log_scales.double().numpy())
+    axes = Rotation.from_quat(np.roll(g.quats.double().numpy(), -1, axis=1)).as_matrix() * scales[:, None]
+    covs = axes @ axes.swapaxes(1, 2)
+    a, b, c = (scales**2).T
+    mass = torch.sigmoid(g.logit_opacities.double()).numpy() * np.sqrt(a * b + a * c + b * c)
+    return mass, g.means.double().numpy(), covs
+
+
+def test_two_become_their_mixture() -> None:
+    g = random_gaussians(2, logit=-2.0)
+    mass, means, covs = _moments(g)
+    share = mass / mass.sum()
+    mean = share @ means
+    apart = means - mean
+    cov = np.einsum("i,ijk->jk", share, covs + apart[:, :, None] * apart[:, None])
+    one = _merged(g, 1).gaussians
+    got_mass, got_mean, got_cov = _moments(one)
+    np.testing.assert_allclose(got_mean[0], mean, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(got_cov[0], cov, rtol=1e-3, atol=1e-7)
+    np.testing.assert_allclose(got_mass[0], mass.sum(), rtol=1e-3)
+    np.testing.assert_allclose(one.sh0[0, 0], share @ g.sh0[:, 0].numpy(), rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(one.shN[0], np.einsum("i,ijk->jk", share, g.shN.numpy()), rtol=1e-3, atol=1e-5)
+
+
+def test_opacity_is_at_most_one() -> None:
+    g = random_gaussians(2, logit=6.0)
+    g = replace(g, means=torch.zeros(2, 3), log_scales=g.log_scales[:1].expand(2, 3).clone())
+    assert 0.999 < float(torch.sigmoid(_merged(g, 1).gaussians.logit_opacities[0])) < 1
+
+
+def test_those_that_stay_keep_every_bit() -> None:
+    g = random_gaussians(60)
+    found = _merged(g, 45)
+    assert len(found.gaussians) == 45
+    parts = np.bincount(found.into, minlength=45)
+    assert parts.sum() == 60 and parts.min() == 1
+    alone = np.flatnonzero(parts == 1)
+    before = np.array([np.flatnonzero(found.into == row)[0] for row in alone])
+    for name, value in found.gaussians.parameters().items():
+        assert torch.equal(value[torch.from_numpy(alone)], getattr(g, name)[torch.from_numpy(before)]), name
+
+
+def test_what_looks_the_same_merges_first() -> None:
+    """Two red ones beside two blue ones: each with its own."""
+    g = random_gaussians(4, degree=0, logit=1.0)
+    x = torch.tensor([0.0, 0.1, 0.15, 0.25])
+    red, blue = torch.tensor([1.5, -1.5, -1.5]), torch.tensor([-1.5, -1.5, 1.5])
+    g = replace(
+        g,
+        means=torch.stack([x, 0 * x, 0 * x], 1),
+        log_scales=torch.full((4, 3), -2.5),
+        sh0=torch.stack([red, red, blue, blue])[:, None],
+    )
+    into = _merged(g, 2).into
+    assert into[0] == into[1] != into[2] == into[3]
+
+
+def test_what_nobody_sees_merges_first() -> None:
+    g = random_gaussians(4, degree=0)
+    x = torch.tensor([0.0, 0.2, 3.0, 3.2])
+    g = replace(g, means=torch.stack([x, 0 * x, 0 * x], 1), log_scales=torch.full((4, 3), -2.0))
+    g = replace(g, sh0=torch.tensor([1.0, -1.0, 1.0, -1.0])[:, None, None].expand(4, 1, 3).clone())
+    into = _merged(g, 3, np.array([1, 1, 0, 0], np.float32)).into
+    assert into[2] == into[3] and into[0] != into[1]
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 40), st.data())
+def test_counts_are_reached_and_all_is_finite(count: int, data: st.DataObject) -> None:
+    g = random_gaussians(count, seed=count, degree=data.draw(st.sampled_from([0, 1, 3])))
+    if data.draw(st.booleans()):  # all in one place
+        g = replace(g, means=torch.zeros(count, 3))
+    if data.draw(st.booleans()):  # flat, or needles
+        g = replace(g, log_scales=g.log_scales + torch.tensor([0.0, -20.0, data.draw(st.floats(-20, 0))]))
+    weights = np.zeros(count, np.float32) if data.draw(st.booleans()) else np.ones(count, np.float32)
+    wanted = sorted(data.draw(st.lists(st.integers(1, count), min_size=1, max_size=3)), reverse=True)
+    for number, found in zip(wanted, merge(g, weights, wanted), strict=True):
+        assert len(found.gaussians) == number and found.into.max() == number - 1
+        assert all(torch.isfinite(p).all() for p in found.gaussians.parameters().values())
+        assert found.gaussians.quats.norm(dim=1).min() > 0.1
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e6])
+def test_the_unit_does_not_matter(scale: float) -> None:
+    g = random_gaussians(50)
+    larger = replace(g, means=g.means * scale, log_scales=g.log_scales + float(np.log(scale)))
+    assert (_merged(g, 20).into == _merged(larger, 20).into).mean() > 0.8  # ties apart
