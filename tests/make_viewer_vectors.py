@@ -2,9 +2,10 @@
 
 A case of tests/data/distances.json has boxes, a camera, its half spaces and under "expected" the distance
 (null: nothing in sight), whether the category is visible and which boxes touch; also the half spaces within
-LENS, the photos', and the distance by them. Planes are to be equal to 1e-9, distances to 1e-9 of themselves. A case of tests/data/promises.json has a document as in
-promises-*.json with one label, and viewpoints with the distance, what it is corrected to, and the expected
-mean and bound by level and the support, to 1e-9 (null: NaN).
+LENS, the photos', and the distance by them. Planes are to be equal to 1e-9, distances to 1e-9 of themselves.
+A case of tests/data/promises.json has a document as in promises-*.json with one label, and viewpoints with
+the distance, what it is corrected to, and the expected mean and bound by level and the support, to 1e-9
+(null: NaN).
 """
 
 import json

@@ -6,21 +6,26 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from conftest import SMALL_RUN, random_gaussians
 from PIL import Image
 from test_viewer_bundle import manifest_of
 
+from sagesplat.adapt.ladder import read_prefixes
 from sagesplat.adapt.viewpoint import QualityKind, read_promises
 from sagesplat.core.errors import DataError, RunError, SageError
-from sagesplat.formats.increments import read_increments, read_index
+from sagesplat.formats.increments import read_increments, read_index, write_increments
+from sagesplat.formats.levels import write_set
 from sagesplat.formats.spz import read_spz
 from sagesplat.io.files import read_json, write_json
 from sagesplat.raster import rasterize
 from sagesplat.run.job import Job
-from sagesplat.run.records import FORMAT, checkpoint_key
+from sagesplat.run.records import FORMAT, checkpoint_key, input_hashes
 from sagesplat.run.run_dir import RunDir
 from sagesplat.stages.bundle import _antialiased, bundle, live_bundle
+from sagesplat.stages.methods import NestedLevels
 from sagesplat.stages.plan import main_target
+from sagesplat.stages.results import increments_of
 from sagesplat.stages.scene import open_scene
 from sagesplat.stages.view import run_bundle
 from sagesplat.train.checkpoint import write_checkpoint
@@ -299,6 +304,43 @@ def test_colours_are_distinct_and_stay() -> None:
     few = colors_of({i: wanted[i] for i in (-1, 3, 7, 9)})
     assert len(set(few.values())) == 4
     assert colors_of({5: (0, 200, 0)})[5] in ("#3f9f4f", "#6dbd6a")
+
+
+def test_a_run_with_levels_that_replace(run: Path, tmp_path: Path, viewer: Path) -> None:
+    """Costs, full scene and bundle are of what the levels hold, and PLY levels lose nothing."""
+    job = job_of(run)
+    before = read_prefixes(job.run.prefixes)
+    g, sizes = before.gaussians, before.sizes
+    label, ends = max(sizes.items(), key=lambda item: item[1][-1])
+    level = next(k for k in range(3, 1 + len(ends)) if ends[k - 1] > ends[k - 2])
+    replaces = {label: (level,)}
+    chunks = write_increments(
+        job.run.increments, g, sizes, job.names(), replaces=replaces,
+        kind=lambda i, k: "ply" if i == label and k >= level else "spz",
+    )  # fmt: skip
+    sent = read_increments(job.run.increments, chunks)
+    write_set(job.run.prefixes, sent, 1, sizes, replaces=replaces, exact=True)
+    record = run / "nested" / "provenance" / "fit.json"
+    made = json.loads(record.read_text())
+    index = job.run.increments / "index.json"
+    made["inputs"] |= input_hashes(job.run, [index])
+    record.write_text(json.dumps(made))
+
+    job = job_of(run)
+    costs, row = NestedLevels(job).costs, sorted(sizes).index(label)
+    below = ends[level - 2]
+    assert costs.count[row].tolist() == [n - below * (k >= level) for k, n in enumerate(ends, 1)]
+    top = job.ladder.load(len(ends), [label])
+    mine = g.of_labels([label])
+    assert torch.equal(top.sh0, mine.sh0[below:])
+    assert torch.equal(top.quats, mine.quats[below:])
+    bundled = bundle(job, tmp_path / "out", viewer=viewer)
+    manifest = manifest_of(tmp_path / "out")
+    assert bundled.count == manifest["totals"]["count"] == costs.count[:, -1].sum()
+    assert (bundled.chunks, manifest["version"]) == (len(chunks), 3)
+    index.write_text(index.read_text().replace("REPLACE", "ADD"))
+    with pytest.raises(DataError, match=rf"Gaussians of category {label} is not this run's"):
+        increments_of(job_of(run))
 
 
 def test_a_run_as_one_page(run: Path, tmp_path: Path) -> None:

@@ -98,8 +98,7 @@ def widest_lens(cameras: Sequence[Camera]) -> tuple[float, float]:
 def within_lens(camera: Camera, lens: tuple[float, float]) -> Camera:
     """The camera with a picture no wider and no higher than `lens`, around its principal point; else itself.
 
-    Models know distances in photos: in a wider picture a category's closest points are ones that no photo
-    has.
+    Models know distances in photos: the closest points in a wider picture are ones that no photo has.
     """
     focal, size = camera.K.diagonal()[:2].astype(np.float64), np.array([camera.width, camera.height])
     most = np.maximum(np.round(2 * focal * lens), 1).astype(int)
