@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter
+from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
 from sagesplat.adapt.observe import TOTAL
 from sagesplat.io.files import write_json
@@ -186,7 +186,7 @@ def _figure(measured: Measured, strip: Strip) -> Figure:
             _curves(one, measured, np.asarray(values, float), field)
             one.set_xscale("log")
             one.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-            one.xaxis.set_major_formatter(lambda value, _: f"{value:,.6g}")
+            one.xaxis.set_major_formatter(EngFormatter(sep="") if unit != "MB" else lambda x, _: f"{x:g}")
             one.xaxis.set_minor_formatter(NullFormatter())
             one.set(xlabel=unit, ylabel=field.upper().replace("_", " "))
     grid[0, 0].legend(loc="lower right")

@@ -31,8 +31,6 @@ from sagesplat.studies.measure.report import (
 )
 from sagesplat.studies.measure.score import Renderer, compare
 
-_TABLE = ("level", "Gaussians", "share", "MB", "SSIM", "PSNR", "worst SSIM", "at")
-
 
 def measure(
     paths: Sequence[Path], out: Path, config: MeasureConfig, emit: Emit, backend: Backend = "cpu"
@@ -161,7 +159,18 @@ def _strip(truth: Splat, levels: Sequence[Level], camera: Camera, name: str, ren
 
 
 def _show(measured: Measured, emit: Emit) -> None:
-    table = levels_table(measured).only(*_TABLE)
+    columns = (
+        "level",
+        "Gaussians",
+        "share",
+        "MB",
+        "SSIM",
+        "PSNR",
+        *measured.nets,
+        "SSIM covered",
+        "worst SSIM",
+    )
+    table = levels_table(measured).only(*columns)
     emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
     if measured.labels():
         table = categories_table(measured)
