@@ -56,7 +56,7 @@ def test_those_that_stay_keep_every_bit() -> None:
     found = _merged(g, 45)
     assert len(found.gaussians) == 45
     parts = np.bincount(found.into, minlength=45)
-    assert parts.sum() == 60 and parts.min() == 1
+    assert (parts.sum(), parts.min()) == (60, 1)
     alone = np.flatnonzero(parts == 1)
     before = np.array([np.flatnonzero(found.into == row)[0] for row in alone])
     for name, value in found.gaussians.parameters().items():
@@ -84,7 +84,8 @@ def test_what_nobody_sees_merges_first() -> None:
     g = replace(g, means=torch.stack([x, 0 * x, 0 * x], 1), log_scales=torch.full((4, 3), -2.0))
     g = replace(g, sh0=torch.tensor([1.0, -1.0, 1.0, -1.0])[:, None, None].expand(4, 1, 3).clone())
     into = _merged(g, 3, np.array([1, 1, 0, 0], np.float32)).into
-    assert into[2] == into[3] and into[0] != into[1]
+    assert into[2] == into[3]
+    assert into[0] != into[1]
 
 
 @settings(max_examples=25, deadline=None)
@@ -98,7 +99,7 @@ def test_counts_are_reached_and_all_is_finite(count: int, data: st.DataObject) -
     weights = np.zeros(count, np.float32) if data.draw(st.booleans()) else np.ones(count, np.float32)
     wanted = sorted(data.draw(st.lists(st.integers(1, count), min_size=1, max_size=3)), reverse=True)
     for number, found in zip(wanted, merge(g, weights, wanted), strict=True):
-        assert len(found.gaussians) == number and found.into.max() == number - 1
+        assert len(found.gaussians) == found.into.max() + 1 == number
         assert all(torch.isfinite(p).all() for p in found.gaussians.parameters().values())
         assert found.gaussians.quats.norm(dim=1).min() > 0.1
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
+from scipy.spatial import KDTree
 
 from sagesplat.adapt.free_viewpoints import free_cameras
 from sagesplat.adapt.observe import RenderedLabels
@@ -17,7 +18,7 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.names import repaired
 from sagesplat.core.sh import sh0_to_rgb
 from sagesplat.formats.levels import read_header, read_level, read_more, write_level, write_set
-from sagesplat.formats.splats import Splat, read_splat
+from sagesplat.formats.splats import Splat, num_lods, read_splat
 from sagesplat.output.contact_sheet import contact_sheet
 from sagesplat.run.job import Job
 from sagesplat.run.records import file_hash
@@ -28,7 +29,7 @@ from sagesplat.scene.scene import Camera, View
 from sagesplat.segment.lift import LiftedLabels
 from sagesplat.segment.masks import UNLABELLED, Taxonomy, prepare_folder, write_labels, write_mask
 from sagesplat.stages.label import make_masks
-from sagesplat.stages.scene import open_scene
+from sagesplat.stages.scene import check_folder, open_scene
 from sagesplat.train.votes import vote
 from sagesplat.viewer.frames import FLIP, upward
 
@@ -48,21 +49,27 @@ def open_splat(
     A splat without any is one category, "scene".
     """
     segmented = masks.segmenter != "auto" or masks.masks is not None or masks.model is not None
-    capture = _make_capture(job, source, config, labelled=not segmented)
-    open_scene(job, capture, scene)
+    check_folder(job.run)
+    own = job.run.capture / repaired(source.resolve().stem)
+    photos = _make_capture(job, source, own, config, labelled=not segmented)
+    open_scene(job, config.cameras if photos and config.cameras else own, scene)
+    if not segmented:
+        masks = replace(masks, masks=own / "masks")
     make_masks(job, masks, labels)
     _label(job, voted=segmented)
 
 
-def _make_capture(job: Job, source: Path, config: AdoptConfig, *, labelled: bool) -> Path:
-    """Make RUN/adopted.npz and viewpoints.png; the capture, which holds renders unless there are photos."""
+def _make_capture(job: Job, source: Path, own: Path, config: AdoptConfig, *, labelled: bool) -> bool:
+    """Make RUN/adopted.npz, viewpoints.png, and a capture of renders, as far as there is none with photos.
+
+    Returns whether there are photos.
+    """
     run = job.run
     given = [] if config.cameras is None else read_camera_file(config.cameras)
     photos = bool(given) and all(one.photo is not None for one in given)
-    own = run.capture / repaired(source.resolve().stem)
     names = ("cameras", "views", "kind", "up", "fov", "size", "lod", "seed")
     settings = {name: getattr(config, name) for name in names} | {"labelled": labelled, "photos": photos}
-    settings |= {"source": str(source.resolve()), "content": file_hash(source)}
+    settings |= {"source": str(source.resolve()), "content": _content(source)}
 
     def make() -> list[str]:
         splat = read_splat(source, config.lod)
@@ -72,23 +79,31 @@ def _make_capture(job: Job, source: Path, config: AdoptConfig, *, labelled: bool
             splat = _labelled(splat)
         g = splat.gaussians
         cameras, up, how = _cameras(job, g, given, config)
-        rows = _points(g, config.seed)
+        views = [one.photo for one in given if one.photo is not None] if photos else _views(own, cameras)
+        _write_pictures(job, own, splat, views, labelled=labelled, photos=photos)
         if not photos:
-            _write_photos(job, own, splat, cameras, labelled=labelled)
-            _write_model(own / "sparse" / "0", g, cameras, rows)
+            _write_model(own / "sparse" / "0", g, views, _points(g, config.seed))
         contact_sheet(
             run.contact_sheet, g, cameras, up, [f"{source.name}: {len(g):,} Gaussians", how],
             antialiased=splat.antialiased, backend=job.backend,
         )  # fmt: skip
-        write_set(run.adopted, g, _LEVEL, exact=True, points=rows, antialiased=splat.antialiased)
+        write_set(run.adopted, g, _LEVEL, exact=True, antialiased=splat.antialiased)
         return [
             f"{len(g):,} Gaussians ({splat.kind})",
             f"{len(cameras)} viewpoints, {run.contact_sheet}: {how}",
         ]
 
-    outputs = [run.adopted, run.contact_sheet, *([] if photos else [own / "sparse"])]
+    outputs = [run.adopted, run.contact_sheet]
+    outputs += [] if photos else [own / "sparse"]
+    outputs += [own / "masks" / "labels.json"] if labelled else []
     run_stage(job, "adopt", settings, [source], outputs, make)
-    return config.cameras if photos and config.cameras else own
+    return photos
+
+
+def _content(source: Path) -> str:
+    """The hash of a splat; of one in several files, of all in its folder. DataError where it is none."""
+    num_lods(source)
+    return file_hash(source.parent if source.suffix == ".json" else source)
 
 
 def _labelled(splat: Splat) -> Splat:
@@ -116,51 +131,60 @@ def _cameras(
     return drawn.cameras, drawn.up, drawn.reason
 
 
-def _points(g: Gaussians, seed: int) -> np.ndarray:
+def _points(g: Gaussians, seed: int, most: int = _POINTS) -> np.ndarray:
     """Rows of the Gaussians that stand for the points of a capture, ascending."""
     opaque = torch.nonzero(torch.sigmoid(g.logit_opacities) >= _OPAQUE)[:, 0].numpy()
     rows = opaque if len(opaque) else np.arange(len(g))
-    if len(rows) > _POINTS:
-        rows = np.random.default_rng(seed).choice(rows, _POINTS, replace=False)
+    if len(rows) > most:
+        rows = np.random.default_rng(seed).choice(rows, most, replace=False)
     return np.sort(rows)
 
 
-def _write_photos(job: Job, folder: Path, splat: Splat, cameras: Sequence[Camera], *, labelled: bool) -> None:
-    """Write a capture's photos, which are renders; with `labelled` also their label images."""
-    images, masks, taxonomy = folder / "images", folder / "masks", Taxonomy(splat.names)
-    for below in (images, masks):
-        shutil.rmtree(below, ignore_errors=True)
-    images.mkdir(parents=True)
+def _views(folder: Path, cameras: Sequence[Camera]) -> list[View]:
+    """Views of a capture of renders."""
+    digits = max(3, len(str(len(cameras))))
+    names = [f"view_{number:0{digits}d}.png" for number in range(len(cameras))]
+    return [View(name, camera, folder / "images" / name) for name, camera in zip(names, cameras, strict=True)]
+
+
+def _write_pictures(
+    job: Job, folder: Path, splat: Splat, views: Sequence[View], *, labelled: bool, photos: bool
+) -> None:
+    """Write renders in place of photos, where there are none, and with `labelled` their label images."""
+    masks, taxonomy = folder / "masks", Taxonomy(splat.names)
+    for below in ("images", "masks"):
+        shutil.rmtree(folder / below, ignore_errors=True)
+        (folder / below).mkdir(parents=True)
     paint = RenderedLabels(splat.gaussians, job.backend, splat.antialiased)
-    views = [View(name, camera, images / name) for name, camera in zip(_names(cameras), cameras, strict=True)]
     paths = prepare_folder(masks, views) if labelled else []
     occurring: set[int] = set()
     for done, view in enumerate(views):
+        if photos and not labelled:
+            break
         rgb, ids = paint.paint(view.camera)
-        Image.fromarray((rgb * 255).round().astype(np.uint8)).save(view.image_path)
+        if not photos:
+            Image.fromarray((rgb * 255).round().astype(np.uint8)).save(view.image_path)
         if labelled:
             write_mask(paths[done], ids, taxonomy)
             occurring.update(np.unique(ids).tolist())
         job.emit(Progress("adopt", done + 1, len(views)))
     if labelled:
         write_labels(masks, taxonomy, occurring)
+    else:
+        masks.rmdir()  # a folder of that name would be taken for label images
 
 
-def _names(cameras: Sequence[Camera]) -> list[str]:
-    digits = max(3, len(str(len(cameras))))
-    return [f"view_{number:0{digits}d}.png" for number in range(len(cameras))]
-
-
-def _write_model(folder: Path, g: Gaussians, cameras: Sequence[Camera], rows: np.ndarray) -> None:
+def _write_model(folder: Path, g: Gaussians, views: Sequence[View], rows: np.ndarray) -> None:
     """Write the cameras, and some Gaussians as points, as a COLMAP model."""
     folder.mkdir(parents=True, exist_ok=True)
+    cameras = [view.camera for view in views]
     lenses = [(c.width, c.height, c.K[0, 0], c.K[1, 1], c.K[0, 2], c.K[1, 2]) for c in cameras]
     ids = {lens: number for number, lens in enumerate(dict.fromkeys(lenses), 1)}
     models = [ModelCamera(i, "PINHOLE", *lens[:2], tuple(map(float, lens[2:]))) for lens, i in ids.items()]
     nothing = np.zeros((0, 2)), np.zeros(0, np.int64)
     images = [
-        ModelImage(number, name, ids[lens], camera.w2c, *nothing)
-        for number, (name, lens, camera) in enumerate(zip(_names(cameras), lenses, cameras, strict=True), 1)
+        ModelImage(number, view.name, ids[lens], view.camera.w2c, *nothing)
+        for number, (view, lens) in enumerate(zip(views, lenses, strict=True), 1)
     ]
     points = torch.from_numpy(rows)
     rgb = (sh0_to_rgb(g.sh0[points, 0]).clamp(0, 1) * 255).round().to(torch.uint8).numpy()
@@ -173,7 +197,7 @@ def _label(job: Job, *, voted: bool) -> None:
     antialiased = bool(read_more(run.adopted, "antialiased"))
 
     def make() -> list[str]:
-        g, rows = read_level(run.adopted), read_more(run.adopted, "points")
+        g = read_level(run.adopted)
         if voted:
             g = replace(g, label_ids=torch.full_like(g.label_ids, UNLABELLED))
             g = replace(
@@ -182,7 +206,10 @@ def _label(job: Job, *, voted: bool) -> None:
                     g, job.scene, job.masks, job.scene.train_ids.tolist(), antialiased=antialiased
                 ),
             )
-        ids, one = g.label_ids.numpy()[rows], np.ones(len(rows), np.int32)
+        points = job.scene.points.xyz
+        rows = _points(g, 0, most=len(g))
+        ids = g.label_ids.numpy()[rows[KDTree(g.means.numpy()[rows]).query(points)[1]]]
+        one = np.ones(len(points), np.int32)
         LiftedLabels(ids, one, one).write(run.labels)
         shutil.rmtree(run.levels, ignore_errors=True)
         run.levels.mkdir()

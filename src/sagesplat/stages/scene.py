@@ -19,6 +19,7 @@ from sagesplat.run.capture import (
 )
 from sagesplat.run.job import Job
 from sagesplat.run.records import settings_of
+from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
 from sagesplat.scene import load_scene
 from sagesplat.scene.detect import detect
@@ -26,12 +27,19 @@ from sagesplat.scene.scene import Scene
 from sagesplat.scene.stored import write_scene
 
 
+def check_folder(run: RunDir) -> None:
+    """RunError for a folder that holds something else than a run."""
+    ours = (run.scene, run.capture, run.adopted, run.provenance("scene"))
+    if not run.path.exists() or any(path.exists() for path in ours):
+        return
+    if any(not p.name.startswith(".") for p in run.path.iterdir()):
+        raise RunError(f"{run.path}: not empty and not a run folder; choose a new folder")
+
+
 def open_scene(job: Job, path: Path, config: SceneConfig, poses: PosesConfig | None = None) -> None:
     """Read a capture and write scene.json. For photos without poses, or a video, estimate the poses first."""
     run = job.run
-    ours = run.scene.exists() or run.capture.exists() or run.provenance("scene").exists()
-    if run.path.exists() and not ours and any(not p.name.startswith(".") for p in run.path.iterdir()):
-        raise RunError(f"{run.path}: not empty and not a run folder; choose a new folder")
+    check_folder(run)
     if detect(path) in ("photos", "video"):
         capture = run.capture / repaired(path.resolve().stem)  # the scene will have that name
         _find_poses(job, path, capture, poses or PosesConfig())

@@ -1,0 +1,198 @@
+"""A splat that somebody else trained becomes a run: `sagesplat adopt`."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from conftest import random_gaussians, write_capture
+from PIL import Image
+
+from sagesplat.core.config import (
+    AdoptConfig,
+    LabelsConfig,
+    MasksConfig,
+    PlanConfig,
+    RunConfig,
+    SampleConfig,
+    SceneConfig,
+)
+from sagesplat.core.errors import DataError, RunError, SageError
+from sagesplat.core.events import Event, StageDone, Warned
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.formats.increments import read_index
+from sagesplat.formats.ply import read_ply, write_ply
+from sagesplat.run.job import Job
+from sagesplat.run.run_dir import RunDir
+from sagesplat.stages import pipeline
+from sagesplat.stages.adopt import open_splat
+from sagesplat.stages.adopt_levels import make_levels
+from sagesplat.stages.api import open_run
+from sagesplat.stages.bundle import bundle
+from sagesplat.stages.results import promises_of
+
+SMALL = AdoptConfig(fit="none", views=14, size=(48, 36), shares=(0.2, 0.4, 0.7, 1.0), kind="object")
+REST = RunConfig(
+    sample=SampleConfig(views=6, calibration_views=6), plan=PlanConfig(target_fidelity=0.6, other_targets=())
+)
+
+
+def _ball(labels: bool = True) -> Gaussians:
+    g = random_gaussians(400, degree=1, logit=2.0)
+    return g if labels else replace(g, label_ids=torch.full_like(g.label_ids, -1))
+
+
+def _adopt(folder: Path, source: Path, config: AdoptConfig) -> tuple[Job, list[Event]]:
+    """The whole run."""
+    events: list[Event] = []
+    job = Job(RunDir(folder / "run"), events.append, "cpu")
+    pipeline.adopt(job, source, config, REST)
+    return job, events
+
+
+def _levels(
+    folder: Path, source: Path, config: AdoptConfig, masks: MasksConfig = MasksConfig()
+) -> tuple[Job, list[Event]]:
+    """The run up to its levels."""
+    events: list[Event] = []
+    job = Job(RunDir(folder / "run"), events.append, "cpu")
+    open_splat(job, source, config, SceneConfig(), masks, LabelsConfig())
+    make_levels(job, config)
+    return job, events
+
+
+@pytest.fixture(scope="module")
+def adopted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of a labelled PLY, without training; the PLY is beside it."""
+    folder = tmp_path_factory.mktemp("adopted")
+    write_ply(folder / "ball.ply", _ball(), {3: "car", 184: "tree-merged"})
+    _adopt(folder, folder / "ball.ply", SMALL)
+    return folder / "run"
+
+
+def test_levels_end_with_what_came_in(adopted: Path) -> None:
+    job = Job(RunDir(adopted), lambda event: None, "cpu")
+    ladder, before = job.ladder, read_ply(adopted.parent / "ball.ply")
+    assert len(ladder.levels) == 4
+    assert [ladder.size(level) for level in ladder.levels] == sorted(ladder.size(x) for x in ladder.levels)
+    assert ladder.size(4) == len(before)
+    top = ladder.load(4)
+    for label, count in before.counts().items():
+        assert top.counts()[label] == count
+        mine, theirs = (np.sort(g.of_labels([label]).means[:, 0].numpy()) for g in (top, before))
+        np.testing.assert_allclose(mine, theirs, atol=0.01)  # SPZ's steps
+
+
+def test_a_run_without_photos_has_fidelity_and_no_ssim(adopted: Path) -> None:
+    run = open_run(adopted)
+    assert {run.names[label] for label in run.fidelity} >= {"car", "tree-merged"}
+    assert not promises_of(run.job)
+    plan = run.plan_camera(run.scene.views[0].camera, target_fidelity=0.6)
+    assert len(run.compose(plan)) == plan.count
+    job = Job(RunDir(adopted), lambda event: None, "cpu")
+    with pytest.raises(RunError, match="without photos"):
+        pipeline.make_plan(replace(job, force=True), PlanConfig(target_ssim=0.7))
+
+
+def test_it_bundles(adopted: Path, tmp_path: Path) -> None:
+    made = bundle(Job(RunDir(adopted), lambda event: None, "cpu"), tmp_path / "bundle")
+    manifest = json.loads((made.path / "manifest.json").read_text())
+    assert list(manifest["promises"]) == ["fidelity"]
+    refine = [level.get("refine") for label in manifest["labels"] for level in label["levels"]]
+    assert "REPLACE" in refine
+    assert (adopted / "viewpoints.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_second_call_does_nothing(adopted: Path) -> None:
+    _, events = _adopt(adopted.parent, adopted.parent / "ball.ply", SMALL)
+    assert not [event for event in events if isinstance(event, StageDone)]
+
+
+@pytest.mark.parametrize("fit", ["none", "renders"])
+def test_lossless_is_identical(tmp_path: Path, fit: Any) -> None:
+    before = replace(_ball(labels=False), quats=_ball().quats * 3)  # of any length
+    write_ply(tmp_path / "ball.ply", before)
+    job, events = _levels(tmp_path, tmp_path / "ball.ply", replace(SMALL, fit=fit, steps=12, lossless=True))
+    top = job.ladder.load(job.ladder.levels[-1])
+    assert job.names()[0] == "scene"
+    assert set(top.counts()) == {0}
+    order, other = (np.lexsort(g.means.numpy().T) for g in (top, before))
+    for name, value in before.parameters().items():
+        mine = top.parameters()[name]
+        assert torch.equal(mine[torch.from_numpy(order)], value[torch.from_numpy(other)]), name
+    said = [line for e in events if isinstance(e, StageDone) and e.name == "nest" for line in e.lines]
+    assert any("as it came in" in line for line in said)
+    kinds = {one.level: one.format for one in read_index(job.run.increments)}
+    assert (kinds[4], kinds[1]) == ("ply", "spz")
+
+
+def test_cameras_with_photos_promise_ssim_too(tmp_path: Path) -> None:
+    truth = random_gaussians(150, degree=1, logit=2.0)
+    write_capture(tmp_path / "capture", truth, noise=0.02)
+    write_ply(
+        tmp_path / "ball.ply", replace(truth, label_ids=torch.full_like(truth.label_ids, 3)), {3: "car"}
+    )
+    config = replace(SMALL, cameras=tmp_path / "capture", shares=(0.4, 1.0))
+    job, _ = _adopt(tmp_path, tmp_path / "ball.ply", config)
+    assert promises_of(job)
+    assert job.scene.path == tmp_path / "capture"
+
+
+def test_label_images_vote(tmp_path: Path) -> None:
+    """Labels that the file has not: given for the cameras, as pictures."""
+    truth = random_gaussians(150, degree=1, logit=2.0)
+    scene = write_capture(tmp_path / "capture", truth, noise=0.0)
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    for view in scene.views:
+        ids = np.full((view.camera.height, view.camera.width), 3, np.uint8)
+        ids[:, view.camera.width // 2 :] = 184
+        Image.fromarray(ids).save((masks / view.name).with_suffix(".png"))
+    (masks / "labels.json").write_text('{"labels": {"3": "car", "184": "tree-merged"}}')
+    write_ply(tmp_path / "ball.ply", replace(truth, label_ids=torch.full_like(truth.label_ids, -1)))
+    config = replace(SMALL, cameras=tmp_path / "capture", shares=(0.4, 1.0))
+    job, _ = _levels(tmp_path, tmp_path / "ball.ply", config, MasksConfig(masks=masks))
+    counts = job.ladder.load(job.ladder.levels[-1]).counts()
+    assert min(counts[3], counts[184]) > 30
+
+
+def test_what_cannot_be_drawn_is_left_out_and_said(tmp_path: Path) -> None:
+    g = _ball()
+    broken = g.means.clone()
+    broken[:7] = float("nan")
+    write_ply(tmp_path / "ball.ply", replace(g, means=broken), {3: "car", 184: "tree-merged"})
+    job, events = _levels(tmp_path, tmp_path / "ball.ply", replace(SMALL, shares=(1.0,)))
+    assert job.ladder.size(1) == len(g) - 7
+    assert any("7 Gaussians left out" in str(event) for event in events if isinstance(event, Warned))
+
+
+@pytest.mark.parametrize("count", [1, 3, 60])
+def test_a_few_gaussians(tmp_path: Path, count: int) -> None:
+    g = random_gaussians(count, degree=0, log_scale=-0.5, logit=3.0)
+    write_ply(tmp_path / "few.ply", replace(g, label_ids=torch.full_like(g.label_ids, -1)))
+    job, _ = _levels(tmp_path, tmp_path / "few.ply", SMALL)
+    assert job.ladder.size(job.ladder.levels[-1]) == count
+
+
+def test_errors_are_one_line(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no-such"):
+        _levels(tmp_path, tmp_path / "no-such.ply", SMALL)
+    (tmp_path / "text.ply").write_text("nothing of the kind")
+    with pytest.raises(DataError, match=r"text\.ply"):
+        _levels(tmp_path, tmp_path / "text.ply", SMALL)
+    write_ply(tmp_path / "ball.ply", _ball())
+    for config in (
+        replace(SMALL, views=0),
+        replace(SMALL, up="sideways"),
+        replace(SMALL, fov=0),
+        replace(SMALL, shares=(0.0, 2.0)),
+        replace(SMALL, lod=1),
+        replace(SMALL, cameras=tmp_path / "no-such.json"),
+    ):
+        with pytest.raises(SageError) as error:
+            _levels(tmp_path, tmp_path / "ball.ply", config)
+        assert "\n" not in str(error.value)
+    assert not (tmp_path / "run" / "levels").exists()
