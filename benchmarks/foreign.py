@@ -38,6 +38,7 @@ EXCEPTIONS: dict[str, str] = {
     "demo.capture:cached_capture": OURS,
     "download.scenes:read_registry": OURS,
     "formats.increments:write_increments": _WROTE,
+    "formats.sog_write:write_sog": _WROTE,
     "io.lock:_exclusive": _HASHED,
     "io.lock:_open": _HASHED,
     "kernels.jit:_file_hash": OURS,

@@ -2,7 +2,7 @@
 
 Each scene is written as a PLY, which splat-transform converts to each of its formats; sagesplat reads these.
 Then sagesplat writes each of its own, which splat-transform converts to PLY. Rows come back in another order:
-each is compared with the most similar one of the nearest eight. An error of 1 is one step of the format's
+each is compared with the most similar one of the nearest sixteen. An error of 1 is one step of the format's
 quantisation at that value. The palette of a SOG's harmonics has no step: its error is relative to their
 standard deviation (root mean squares).
 """
@@ -28,7 +28,8 @@ from sagesplat.formats.spz import write_spz
 
 PACKAGE = "@playcanvas/splat-transform@3.7"
 ATTRIBUTES = ("positions", "rotations", "scales", "opacities", "colours", "harmonics")
-NEIGHBOURS = 8
+NEIGHBOURS = 16
+ALIKE = {"positions": 1e-4, "rotations": 0.01, "scales": 0.02, "opacities": 1 / 255, "colours": 0.02}
 TURN = 2 * 3**0.5  # products of components per component, where each of three is off by one step
 Steps = dict[str, np.ndarray | float]
 
@@ -162,17 +163,19 @@ def errors(read: Gaussians, g: Gaussians, steps: Callable[[Gaussians, Gaussians]
 
 
 def _matched(read: Gaussians, g: Gaussians) -> np.ndarray:
-    """For each row that was read, the most similar row of `g` among the nearest ones.
-
-    All that are as near as the nearest one to within a ten-thousandth count as the same place.
-    """
+    """For each row that was read, the most similar row of `g`: the same row, or one of the nearest ones."""
     k = min(NEIGHBOURS, len(g))
-    distances, rows = KDTree(g.means.numpy()).query(read.means.numpy(), k=k)
-    distances, rows = distances.reshape(len(read), k), rows.reshape(len(read), k)
-    near = distances <= distances[:, :1] + 1e-4 * (1 + np.abs(read.means.numpy()).max(1, keepdims=True))
-    cost = np.where(near, 0.0, np.inf)
-    for values, original in ((read.log_scales, g.log_scales), (read.sh0[:, 0], g.sh0[:, 0])):
-        cost += np.abs(values.numpy()[:, None] - original.numpy()[rows]).clip(0, 1).sum(-1)
+    rows = KDTree(g.means.numpy()).query(read.means.numpy(), k=k)[1].reshape(len(read), k)
+    if len(read) == len(g):
+        rows = np.concatenate([np.arange(len(g))[:, None], rows], 1)
+    ours, theirs = _values(read), _values(g)
+    cost = np.zeros(rows.shape)
+    for name, step in ALIKE.items():
+        scale = 1 + np.abs(ours["positions"]).max(1) if name == "positions" else np.ones(len(read))
+        values, originals = ours[name].reshape(len(read), -1), theirs[name].reshape(len(g), -1)
+        for column in range(rows.shape[1]):
+            error = np.abs(values - originals[rows[:, column]]).max(1) / scale / step
+            cost[:, column] += error.clip(0, 10)  # one value that is far off does not make another row
     return rows[np.arange(len(rows)), cost.argmin(1)]
 
 
@@ -253,7 +256,7 @@ def _sog(read: Gaussians, g: Gaussians) -> Steps:
         "positions": np.ptp(logs, axis=0) / 65535 * (1 + np.abs(means)) + 1e-6,
         "rotations": TURN * 2**0.5 / 255,
         "scales": gaps(g.log_scales.numpy(), read.log_scales.numpy()),
-        "opacities": 1 / 255,
+        "opacities": 1 / 255 + 1e-6,
         "colours": gaps(g.sh0[:, 0].numpy(), read.sh0[:, 0].numpy()) + unseen[:, None],
         "harmonics rms": 1.0,
     }

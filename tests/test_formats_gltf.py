@@ -125,6 +125,7 @@ def change(document: dict[str, Any], key: str, value: Any) -> dict[str, Any]:
         ("nodes.0.children", [0], "in its tree twice"),
         ("nodes.0.mesh", 1, "entry 1 of 1"),
         ("nodes.0.translation", [1e300, 0, 0], "in place of 3 numbers"),
+        ("nodes.0.translation", [10**400, 0, 0], "OverflowError"),
         ("nodes", [{"mesh": 0, "children": [1]}, {"mesh": 0}], "a mesh in several nodes"),
         ("accessors.0.count", 10**9, "1000000000 values, more than fit"),
         ("accessors.0.type", "VEC4", "'VEC4' in place of VEC3"),

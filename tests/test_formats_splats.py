@@ -291,6 +291,9 @@ def test_a_streamed_sog_that_does_not_fit_together(tmp_path):
     ):
         path.write_text(json.dumps(streamed() | change))
         refused(path, message)
+    (tmp_path / "a" / "circle").symlink_to("circle")
+    path.write_text(json.dumps(streamed() | {"filenames": ["circle/meta.json"] * 2}))
+    refused(path, "circle/meta.json")
     (tmp_path / "a" / "link").symlink_to(tmp_path / "b")
     path.write_text(json.dumps(streamed() | {"filenames": ["link/meta.json"] * 2}))
     refused(path, "is not in its folder")

@@ -93,7 +93,7 @@ def read_gltf(path: Path) -> Splat:
     except OSError as error:
         name = Path(error.filename or path).name
         raise DataError(f"{path}: {name} cannot be read ({error.strerror}); {_CURE}") from None
-    except (ValueError, TypeError, KeyError, IndexError, AttributeError, struct.error) as error:
+    except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, struct.error) as error:
         text = short(error) if isinstance(error, ValueError) else short(repr(error))
         raise DataError(f"{path}: not a glTF with splats ({text}); {_CURE}") from None
     return Splat(parts[0] if len(parts) == 1 else concat(parts), "glTF")
@@ -137,10 +137,9 @@ def _buffer(path: Path, uri: str) -> bytes:
         except binascii.Error as error:
             raise ValueError(f"a data URI: {error}") from None
     name = unquote(uri)
-    file = path.parent / name
-    if set(name) & set("/\\:\0") or not file.resolve().is_relative_to(path.parent.resolve()):
+    if set(name) & set("/\\:\0") or (path.parent / name).is_symlink():
         raise ValueError(f"{short(name)} is not in its folder")
-    return regular(file).read_bytes()
+    return regular(path.parent / name).read_bytes()
 
 
 def _meshes(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarray]]:

@@ -79,7 +79,10 @@ def _read(path: Path, name: str) -> Splat:
 
 def _inside(path: Path, name: str) -> Path:
     file = path.parent / name
-    inside = file.resolve().is_relative_to(path.parent.resolve())
+    try:
+        inside = file.resolve().is_relative_to(path.parent.resolve())
+    except (OSError, RuntimeError):  # links that lead in a circle
+        inside = False
     if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts or "\\" in name or not inside:
         raise DataError(f"{path}: {short(name)} is not in its folder; {_CURE}")
     return file
