@@ -16,6 +16,8 @@ from test_cli import call
 from benchmarks.readers.foreign_splats import put_sog, sog, streamed
 from sagesplat.adapt.observe import TOTAL
 from sagesplat.adapt.viewpoints import Rule, Viewpoints, write_viewpoints
+from sagesplat.cli import COMMANDS
+from sagesplat.cli.parse import arguments
 from sagesplat.core.config import MeasureConfig
 from sagesplat.core.errors import DataError, RunError, SageError
 from sagesplat.core.events import Event, TableMade, Warned
@@ -240,6 +242,13 @@ def test_the_command(files, monkeypatch, capsys):
     )
     assert code == 0
     assert (files / "measure" / "levels.csv").is_file()
+
+
+@pytest.mark.parametrize("words", [["--up", "-z"], ["--up=-z"], ["--up", "z"]])
+def test_a_direction_with_a_minus_is_a_value(words):
+    values = arguments("measure", COMMANDS["measure"], ["a.ply", "b.ply", *words])
+    assert values["measure"].up == words[-1].removeprefix("--up=")
+    assert values["levels"] == (Path("b.ply"),)
 
 
 @pytest.mark.parametrize("wrong", [{"views": 0}, {"size": 3}, {"size": 10**6}])
