@@ -11,10 +11,13 @@ import pytest
 import torch
 from conftest import orbit, random_gaussians
 from PIL import Image
+from test_cli import call
 
 from benchmarks.readers.foreign_splats import put_sog, sog, streamed
 from sagesplat.adapt.observe import TOTAL
 from sagesplat.adapt.viewpoints import Rule, Viewpoints, write_viewpoints
+from sagesplat.cli import COMMANDS
+from sagesplat.cli.parse import arguments
 from sagesplat.core.config import MeasureConfig
 from sagesplat.core.errors import DataError, RunError, SageError
 from sagesplat.core.events import Event, TableMade, Warned
@@ -209,6 +212,43 @@ def test_what_is_left_out_is_told(files):
 def test_one_level_alone(files):
     with pytest.raises(RunError, match=r"full\.ply: one level, and nothing to compare it with; name its"):
         measure([files / "full.ply"], files / "out", settings(files), ignore)
+
+
+def test_cameras_of_another_scene(files):
+    away = [
+        replace(camera, w2c=camera.w2c @ np.diag([-1, 1, -1, 1]).astype(np.float32)) for camera in orbit(2)
+    ]
+    write_viewpoints(files / "away.json", Viewpoints(Rule(), "capture", tuple(away), ("fit",) * 2))
+    config = settings(files, cameras=files / "away.json")
+    with pytest.raises(RunError, match=r"away\.json: no camera has full\.ply in sight; give cameras of this"):
+        measure([files / "full.ply", files / "third.ply"], files / "out", config, ignore)
+
+
+def test_the_command(files, monkeypatch, capsys):
+    monkeypatch.chdir(files)
+    weights = ["--lpips", "none", "--threads", "1"]
+    code, _ = call(monkeypatch, capsys, "measure", "full.ply", "nowhere.ply", *weights)
+    assert code == 2
+    code, _ = call(
+        monkeypatch,
+        capsys,
+        "measure",
+        "full.ply",
+        "third.ply",
+        "same.ply",
+        "--cameras",
+        "views.json",
+        *weights,
+    )
+    assert code == 0
+    assert (files / "measure" / "levels.csv").is_file()
+
+
+@pytest.mark.parametrize("words", [["--up", "-z"], ["--up=-z"], ["--up", "z"]])
+def test_a_direction_with_a_minus_is_a_value(words):
+    values = arguments("measure", COMMANDS["measure"], ["a.ply", "b.ply", *words])
+    assert values["measure"].up == words[-1].removeprefix("--up=")
+    assert values["levels"] == (Path("b.ply"),)
 
 
 @pytest.mark.parametrize("wrong", [{"views": 0}, {"size": 3}, {"size": 10**6}])

@@ -19,6 +19,7 @@ _LEVEL = 0.35  # sine of the elevation up to which a direction counts as level
 
 _FRAMED = 0.98  # of an object is within its radius, and in the frame
 _BACKGROUND = 8.0  # units; what is farther is no part of an object
+_MOST = 200_000  # Gaussians of an object that its size is measured by
 _PARTS = 2000  # of an object, that frames are fitted to
 _DISTANCES = (0.6, 2.0)  # times the one at which the object fits
 _ELEVATIONS = (-20.0, 70.0)  # degrees
@@ -82,7 +83,8 @@ class Orbits:
 
     def __init__(self, cloud: Cloud, upward: Upright, K: np.ndarray, size: tuple[int, int], seed: int):
         self.up, self.seed = upward.up, seed
-        cloud = cloud.select(np.linalg.norm(cloud.means, axis=1) < _BACKGROUND)
+        rows = np.flatnonzero(np.linalg.norm(cloud.means, axis=1) < _BACKGROUND)
+        cloud = cloud.select(rows[:: 1 + len(rows) // _MOST])
         weight = np.minimum(cloud.area, weighted_quantile(cloud.area, cloud.area + 1e-30, 0.9)) + 1e-30
         axes = np.stack([*level_axes(self.up), self.up])
         along = cloud.means @ axes.T

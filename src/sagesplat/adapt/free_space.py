@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Float64
+from jaxtyping import Float, Float32, Float64, Int64
 from scipy.spatial.transform import Rotation
 
 from sagesplat.core.gaussians import Gaussians
@@ -38,10 +38,10 @@ class Cloud:
     def __len__(self) -> int:
         return len(self.means)
 
-    def select(self, keep: Bool[np.ndarray, " N"]) -> "Cloud":
+    def select(self, rows: Int64[np.ndarray, " n"]) -> "Cloud":
         """Some of the bodies."""
-        means, axes, radii = self.means[keep], self.axes[keep], self.radii[keep]
-        return Cloud(self.centre, self.unit, means, axes, radii, self.opacity[keep])
+        means, axes, radii = self.means[rows], self.axes[rows], self.radii[rows]
+        return Cloud(self.centre, self.unit, means, axes, radii, self.opacity[rows])
 
     @cached_property
     def breadths(self) -> Float64[np.ndarray, "N 3"]:

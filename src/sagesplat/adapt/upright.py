@@ -19,6 +19,7 @@ _ALIGNED = 0.9  # cosine of a floor's normals with its own
 _STEP = 0.03  # units; a floor is three of these thick
 _LEAST_FLOOR = {"place": 0.06, "object": 0.15}  # of all area is in a floor; objects have flat backs
 _MOST_BELOW = 0.15  # of all area lies below a floor
+_MOST = 200_000  # Gaussians that floors are looked for among
 _LOOKED_AT = 50_000  # Gaussians, for a first guess
 _PREFERRED = 0.5  # a floor of the convention may be so much smaller than the best
 
@@ -99,7 +100,8 @@ class _Floors:
     """Looks for floors among the Gaussians around the centre."""
 
     def __init__(self, cloud: Cloud):
-        near = np.linalg.norm(cloud.means, axis=1) < _WITHIN
+        near = np.flatnonzero(np.linalg.norm(cloud.means, axis=1) < _WITHIN)
+        near = near[:: 1 + len(near) // _MOST]
         self.means, self.normals = cloud.means[near], cloud.normals[near]
         self.area = np.minimum(cloud.area[near], _LARGEST)
         self.flat = cloud.breadths[near, 0] < _FLAT * cloud.breadths[near, 1]

@@ -27,6 +27,7 @@ OLD_FLAGS = {
     "--nest.gain": "--nest.lr-multiplier",
     "--blocks.seam-steps": "--blocks.boundary-steps",
 }
+_DIRECTIONS = {"-x", "-y", "-z"}
 _TARGETS = {"--target-fidelity", "--target-ssim"}  # of a plan: one given, the recorded ones are gone
 _SOURCES = {"--segmenter", "--masks", "--model", "--classes"}  # of label images: one given, all are anew
 
@@ -42,7 +43,7 @@ def arguments(name: str, function: Callable[..., None], words: Sequence[str]) ->
     """
     if name == "demo":  # whose folder is positional now
         words = [word.removeprefix("--run=") for word in words if word != "--run"]
-    words = _renamed(words)
+    words = _joined(_renamed(words))
     values = _parse(name, function, words)
     known = _recorded(name, function, values, words)
     return _parse(name, _with_defaults(function, known), words) if known else values
@@ -65,6 +66,17 @@ def _renamed(words: Sequence[str]) -> list[str]:
             _say(f"{flag} is called {new} now; the old name will go")
         renamed.append(f"{new}{equals}{value}" if new else word)
     return renamed
+
+
+def _joined(words: Sequence[str]) -> list[str]:
+    """Words with `--up -y` as `--up=-y`: a direction is no flag, though it looks like one."""
+    joined: list[str] = []
+    for word in words:
+        if joined and joined[-1] == "--up" and word in _DIRECTIONS:
+            joined[-1] = f"--up={word}"
+        else:
+            joined.append(word)
+    return joined
 
 
 def _say(text: str) -> None:

@@ -56,8 +56,12 @@ def measure(
     truth = reference.load()
     _tell_dropped(truth, reference.name, emit)
     cameras, views, lines = _viewpoints(truth, config, backend)
-    metrics = _metrics(config.lpips, emit)
     renderer, total = Renderer(backend), len(levels) * len(cameras)
+    if not any(renderer.covered(truth, camera).any() for camera in cameras):
+        raise RunError(
+            f"{config.cameras}: no camera has {reference.name} in sight; give cameras of this scene"
+        )
+    metrics = _metrics(config.lpips, emit)
 
     def done(images: int) -> None:
         emit(Progress("measure", images, total))
