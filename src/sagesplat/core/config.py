@@ -245,6 +245,9 @@ class AdoptConfig:
     """Width and height of drawn viewpoints, pixels."""
     lod: int = 0
     """Level of a streamed SOG to take as the reference; 0: the finest."""
+    spz_axes: Literal["rub", "rdf"] = "rub"
+    """Axes of an SPZ file that does not say them. rub: right, up, back, as the format has it; rdf: those of
+    PLY, as PlayCanvas's tools write it."""
     seed: int = 0
     """Seed of the viewpoints and of the training."""
 

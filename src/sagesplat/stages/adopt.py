@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 
 from sagesplat.adapt.free_viewpoints import free_cameras
 from sagesplat.adapt.observe import RenderedLabels
-from sagesplat.core.config import AdoptConfig, LabelsConfig, MasksConfig, SceneConfig, TrainConfig
+from sagesplat.core.config import AdoptConfig, LabelsConfig, MasksConfig, NestConfig, SceneConfig, TrainConfig
 from sagesplat.core.events import Progress, Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.names import repaired
@@ -30,6 +30,8 @@ from sagesplat.segment.lift import LiftedLabels
 from sagesplat.segment.masks import UNLABELLED, Taxonomy, prepare_folder, write_labels, write_mask
 from sagesplat.stages.label import make_masks
 from sagesplat.stages.scene import check_folder, open_scene
+from sagesplat.train.lower_levels import check_shares
+from sagesplat.train.nested import check
 from sagesplat.train.votes import vote
 from sagesplat.viewer.frames import FLIP, upward
 
@@ -50,6 +52,8 @@ def open_splat(
     """
     segmented = masks.segmenter != "auto" or masks.masks is not None or masks.model is not None
     check_folder(job.run)
+    check_shares(config.shares)
+    check(NestConfig(steps=config.steps))
     own = job.run.capture / repaired(source.resolve().stem)
     photos = _make_capture(job, source, own, config, labelled=not segmented)
     open_scene(job, config.cameras if photos and config.cameras else own, scene)
@@ -67,12 +71,12 @@ def _make_capture(job: Job, source: Path, own: Path, config: AdoptConfig, *, lab
     run = job.run
     given = [] if config.cameras is None else read_camera_file(config.cameras)
     photos = bool(given) and all(one.photo is not None for one in given)
-    names = ("cameras", "views", "kind", "up", "fov", "size", "lod", "seed")
+    names = ("cameras", "views", "kind", "up", "fov", "size", "lod", "spz_axes", "seed")
     settings = {name: getattr(config, name) for name in names} | {"labelled": labelled, "photos": photos}
     settings |= {"source": str(source.resolve()), "content": _content(source)}
 
     def make() -> list[str]:
-        splat = read_splat(source, config.lod)
+        splat = read_splat(source, config.lod, spz_axes=config.spz_axes)
         for reason, count in splat.dropped.items():
             job.emit(Warned(f"{source}: {count:,} Gaussians left out: {reason}"))
         if labelled:

@@ -22,12 +22,16 @@ _WHOLE = 100  # Gaussians of a category that is too small to merge
 _SPAN = 2.5  # ratio of the sizes of the levels that share a trained set
 
 
+def check_shares(shares: Sequence[float]) -> None:
+    """RunError for sizes of levels that cannot be."""
+    if not shares or not all(0 < share <= 1 for share in shares):
+        named = " ".join(map(str, shares))
+        raise RunError(f"--shares {named}: impossible; give fractions such as 0.1 0.5 1")
+
+
 def usable_shares(shares: Sequence[float], count: int) -> tuple[float, ...]:
     """Sizes of levels as fractions of `count` Gaussians, ascending, ending with 1; RunError for others."""
-    if not all(0 < share <= 1 for share in shares):
-        raise RunError(
-            f"shares {' '.join(map(str, shares))} are impossible; give fractions such as 0.1 0.5 1"
-        )
+    check_shares(shares)
     return (*sorted({share for share in shares if share < 1 and share * count >= FEWEST}), 1.0)
 
 
