@@ -47,7 +47,7 @@ class Case:
     source: Path
     rivals: Mapping[float, Gaussians]  # by share of the Gaussians
     cameras: Path | None  # a capture; None: viewpoints are drawn
-    antialiased: bool = False
+    scene: SceneConfig = SceneConfig()
 
 
 def published(source: Path) -> Case:
@@ -71,7 +71,7 @@ def trained(name: str, folder: Path, transform: Transform) -> Case:
         if not out.exists():
             transform(source, "--decimate", str(round(share * len(g))), out)
         rivals[share] = read_splat(out).gaussians
-    return Case(source, rivals, capture)
+    return Case(source, rivals, capture, case.config.scene)
 
 
 def measure(case: Case, folder: Path, views: int, steps: int, say: Say) -> dict[str, Any]:
@@ -124,7 +124,7 @@ def _adopted(case: Case, folder: Path, config: AdoptConfig, say: Say) -> tuple[J
 
     job = Job(RunDir(folder), emit, "cpu", 2, force=True)
     begin = time.perf_counter()
-    open_splat(job, case.source, config, SceneConfig(), MasksConfig(), LabelsConfig())
+    open_splat(job, case.source, config, case.scene, MasksConfig(), LabelsConfig())
     make_levels(job, config)
     return job, seconds | {"all": round(time.perf_counter() - begin, 1)}
 

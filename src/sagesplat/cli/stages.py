@@ -92,6 +92,7 @@ def adopt(
     splat: Positional[Annotated[Path, arg(metavar="SPLAT", help=_SPLAT)]],
     run: Run,
     adopt: Annotated[AdoptConfig, Flat] = AdoptConfig(),
+    scene_config: Annotated[SceneConfig, Flat] = SceneConfig(),
     masks: Annotated[MasksConfig, Flat] = MasksConfig(),
     labels: LabelsConfig = LabelsConfig(),
     sample: SampleConfig = SampleConfig(),
@@ -105,7 +106,7 @@ def adopt(
     """
     from sagesplat.stages import pipeline
 
-    config = RunConfig(masks=masks, labels=labels, sample=sample, fit=fit, plan=plan)
+    config = RunConfig(scene_config, masks=masks, labels=labels, sample=sample, fit=fit, plan=plan)
     with open_job(run, machine) as job:
         pipeline.adopt(job, splat, adopt, config)
 

@@ -23,6 +23,7 @@ from sagesplat.output.contact_sheet import contact_sheet
 from sagesplat.run.job import Job
 from sagesplat.run.records import file_hash
 from sagesplat.run.stage import run_stage
+from sagesplat.scene import load_scene
 from sagesplat.scene.cameras import NamedCamera, read_camera_file
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage, write_model
 from sagesplat.scene.scene import Camera, View
@@ -55,7 +56,7 @@ def open_splat(
     check_shares(config.shares)
     check(NestConfig(steps=config.steps))
     own = job.run.capture / repaired(source.resolve().stem)
-    photos = _make_capture(job, source, own, config, labelled=not segmented)
+    photos = _make_capture(job, source, own, config, scene, labelled=not segmented)
     open_scene(job, config.cameras if photos and config.cameras else own, scene)
     if not segmented:
         masks = replace(masks, masks=own / "masks")
@@ -63,7 +64,9 @@ def open_splat(
     _label(job, voted=segmented)
 
 
-def _make_capture(job: Job, source: Path, own: Path, config: AdoptConfig, *, labelled: bool) -> bool:
+def _make_capture(
+    job: Job, source: Path, own: Path, config: AdoptConfig, scene: SceneConfig, *, labelled: bool
+) -> bool:
     """Make RUN/adopted.npz, viewpoints.png, and a capture of renders, as far as there is none with photos.
 
     Returns whether there are photos.
@@ -73,6 +76,7 @@ def _make_capture(job: Job, source: Path, own: Path, config: AdoptConfig, *, lab
     photos = bool(given) and all(one.photo is not None for one in given)
     names = ("cameras", "views", "kind", "up", "fov", "size", "lod", "spz_axes", "seed")
     settings = {name: getattr(config, name) for name in names} | {"labelled": labelled, "photos": photos}
+    settings["downscale"] = scene.downscale
     settings |= {"source": str(source.resolve()), "content": _content(source)}
 
     def make() -> list[str]:
@@ -82,11 +86,15 @@ def _make_capture(job: Job, source: Path, own: Path, config: AdoptConfig, *, lab
         if labelled:
             splat = _labelled(splat)
         g = splat.gaussians
-        cameras, up, how = _cameras(job, g, given, config)
-        views = [one.photo for one in given if one.photo is not None] if photos else _views(own, cameras)
-        _write_pictures(job, own, splat, views, labelled=labelled, photos=photos)
-        if not photos:
+        if photos and config.cameras:
+            views = list(load_scene(config.cameras, **asdict(scene)).views)
+            cameras = [view.camera for view in views]
+            up, how = upward(cameras) * FLIP, f"those of {config.cameras}"
+        else:
+            cameras, up, how = _cameras(job, g, given, config)
+            views = _views(own, cameras)
             _write_model(own / "sparse" / "0", g, views, _points(g, config.seed))
+        _write_pictures(job, own, splat, views, labelled=labelled, photos=photos)
         contact_sheet(
             run.contact_sheet, g, cameras, up, [f"{source.name}: {len(g):,} Gaussians", how],
             antialiased=splat.antialiased, backend=job.backend,
