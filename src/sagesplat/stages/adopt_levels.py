@@ -43,7 +43,8 @@ from sagesplat.train.refit import refit_colors, refit_coverage
 
 _WEIGH = 32  # views that importance is measured in
 _REFIT = 24  # views that merged Gaussians are fitted to
-_TRAINED = 0.5  # largest share that is trained; above, the most important originals lose little
+_LOWER = 0.5  # largest share that is merged or trained; above, the most important originals lose little
+_SMALL = 0.1  # share up to which fitting takes more rounds: little is left as it was, and rounds are cheap
 _COMPARE = 8  # views that merged Gaussians and prefixes of the originals are compared in
 
 
@@ -64,7 +65,7 @@ def make_levels(job: Job, config: AdoptConfig) -> None:
         weights = importance(g, job.scene, views, "weight", antialiased=job.antialiased)
         order = importance(g, job.scene, views, "sensitivity", antialiased=job.antialiased)
         ordered = g.select(torch.from_numpy(np.argsort(-order, kind="stable")))
-        lower = [share for share in shares if share < 1 and (config.fit == "none" or share <= _TRAINED)]
+        lower = [share for share in shares if share <= _LOWER]
         rungs = merged_rungs(g, weights, lower)
         rungs = [replace(rung, gaussians=_covering(job, rung, views)) for rung in rungs]
         pruned = [_prefix(ordered, rung.share) for rung in rungs]
@@ -73,7 +74,7 @@ def make_levels(job: Job, config: AdoptConfig) -> None:
             starts = [r.gaussians if i < merges else pruned[i] for i, r in enumerate(rungs)]
             sets = _trained(job, targets, dict(zip(lower, starts, strict=True)), g.counts(), config, key)
         else:
-            sets = [(_colored(job, targets, rung.gaussians), (rung.share,)) for rung in rungs[:merges]]
+            sets = [(_colored(job, targets, rung), (rung.share,)) for rung in rungs[:merges]]
         used = {share for _, levels in sets for share in levels}
         ladder = assemble(sets, ordered, [share for share in shares if share not in used])
         lines = _write(job, ladder, len(used), g, settings, config.lossless)
@@ -84,18 +85,19 @@ def make_levels(job: Job, config: AdoptConfig) -> None:
 
 
 def _covering(job: Job, rung: Rung, views: Sequence[int]) -> Gaussians:
-    few = spread(list(views), _REFIT)
-    share = len(few) / len(views)
-    return refit_coverage(
-        rung.gaussians, rung.stands_for * share, job.scene, few, antialiased=job.antialiased
-    )
+    few, rounds = spread(list(views), _REFIT), 3 if rung.share <= _SMALL else 1
+    wanted = rung.stands_for * (len(few) / len(views))
+    return refit_coverage(rung.gaussians, wanted, job.scene, few, rounds, antialiased=job.antialiased)
 
 
-def _colored(job: Job, targets: Photos, g: Gaussians) -> Gaussians:
+def _colored(job: Job, targets: Photos, rung: Rung) -> Gaussians:
     rows = spread(job.scene.train_ids.tolist(), _REFIT)
     cameras = [job.scene.views[row].camera for row in rows]
     images = [torch.from_numpy(as_unit(targets[row])) for row in rows]
-    return refit_colors(g, cameras, images, antialiased=job.antialiased, backend=job.backend)
+    rounds = 3 if rung.share <= _SMALL else 2
+    return refit_colors(
+        rung.gaussians, cameras, images, rounds, antialiased=job.antialiased, backend=job.backend
+    )
 
 
 def _prefix(ordered: Gaussians, share: float) -> Gaussians:
