@@ -1,0 +1,112 @@
+"""What fits merged Gaussians to renders, and the sets of lower levels."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from conftest import orbit, random_gaussians
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sagesplat.core.errors import RunError
+from sagesplat.core.gaussians import concat
+from sagesplat.formats.levels import starts_of
+from sagesplat.raster import rasterize
+from sagesplat.scene.points import untracked
+from sagesplat.scene.scene import Scene, View
+from sagesplat.train.importance import importance
+from sagesplat.train.lower_levels import (
+    assemble,
+    by_label,
+    joined,
+    merged_rungs,
+    size_of,
+    split_sets,
+    trained_sets,
+    usable_shares,
+)
+from sagesplat.train.refit import refit_colors, refit_coverage
+
+
+def _scene(tmp_path) -> Scene:  # type: ignore[no-untyped-def]
+    cameras = orbit(6)
+    views = tuple(View(f"{i}.png", camera, tmp_path / f"{i}.png") for i, camera in enumerate(cameras))
+    points = untracked(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8))
+    return Scene("views", tmp_path, views, points, test_every=0)
+
+
+def test_colours_come_back(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    """Gaussians with wrong colours, and the pictures of the right ones."""
+    truth = random_gaussians(40, degree=0, logit=1.0)
+    truth = replace(truth, sh0=truth.sh0.clamp(-1, 1))
+    cameras = [view.camera for view in _scene(tmp_path).views]
+    images = [rasterize(truth, camera).rgb for camera in cameras]
+    grey = replace(truth, sh0=torch.zeros_like(truth.sh0))
+
+    def error(g) -> float:  # type: ignore[no-untyped-def]
+        pairs = zip(cameras, images, strict=True)
+        return float(sum(((rasterize(g, camera).rgb - image) ** 2).mean() for camera, image in pairs))
+
+    errors = [error(refit_colors(grey, cameras, images, rounds)) for rounds in (0, 1, 3, 10)]
+    assert errors == sorted(errors, reverse=True)
+    assert errors[-1] < 0.05 * errors[0]
+
+
+def test_coverage_comes_back(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    scene = _scene(tmp_path)
+    truth = random_gaussians(30, degree=0, logit=0.5)
+    wanted = importance(truth, scene, range(6))
+    faint = replace(truth, logit_opacities=truth.logit_opacities - 1.5)
+
+    def error(g) -> float:  # type: ignore[no-untyped-def]
+        return float(np.abs(importance(g, scene, range(6)) - wanted).sum())
+
+    assert error(refit_coverage(faint, wanted, scene, range(6))) < 0.3 * error(faint)
+
+
+@given(st.lists(st.floats(0.001, 1), min_size=1, max_size=12), st.integers(1, 10_000))
+def test_sizes_grow_and_end_with_all(shares: list[float], count: int) -> None:
+    usable = usable_shares(shares, count)
+    assert usable == tuple(sorted(set(usable)))
+    assert usable[-1] == 1.0
+    assert [size_of(share, count) for share in usable][-1] == count
+
+
+@pytest.mark.parametrize("shares", [(), (0.0, 1.0), (0.5, 1.5), (float("nan"),)])
+def test_impossible_sizes(shares: tuple[float, ...]) -> None:
+    with pytest.raises(RunError, match="--shares"):
+        usable_shares(shares, 100)
+
+
+def test_sets_hold_levels_of_similar_size() -> None:
+    assert trained_sets([0.01, 0.02, 0.1, 0.2]) == [(0.01, 0.02), (0.1, 0.2)]
+    assert trained_sets([0.5]) == [(0.5,)]
+
+
+def test_a_ladder_of_merged_sets_and_originals() -> None:
+    """Levels grow in each category, each but the first set replaces what is below, the last is all."""
+    g = concat([random_gaussians(300, seed=1), random_gaussians(7, seed=2)])  # a small category, too
+    g = replace(g, label_ids=torch.tensor([3] * 300 + [184] * 7, dtype=torch.int16))
+    weights = np.random.default_rng(0).uniform(0, 1, len(g)).astype(np.float32)
+    shares = (0.05, 0.1, 0.4)
+    rungs = merged_rungs(g, weights, shares)
+    assert [rung.gaussians.counts()[3] for rung in rungs] == [15, 30, 120]
+    for rung in rungs:
+        np.testing.assert_allclose(
+            rung.stands_for[rung.gaussians.label_ids == 3].sum(), weights[:300].sum(), rtol=1e-4
+        )
+    sets = trained_sets(shares)
+    tops = {levels[-1]: next(r.gaussians for r in rungs if r.share == levels[-1]) for levels in sets}
+    nested, spans = joined(tops, [np.arange(len(x))[::-1] for x in tops.values()], shares, g.counts())
+    shown = (spans.order < 0.05) & (spans.above < 0.05) & (spans.upto >= 0.05)
+    assert by_label(nested.gaussians.select(torch.from_numpy(shown)))[3].size == 15
+    order = np.lexsort((spans.order, spans.upto, nested.gaussians.label_ids.numpy()))
+    trained = split_sets(nested.gaussians.select(torch.from_numpy(order)), tops.values(), sets)
+    ladder = assemble(trained, g, (0.7, 1.0))
+    for label, sizes in ladder.sizes.items():
+        starts = starts_of(sizes, ladder.replaces[label])
+        counts = [end - start for start, end in zip(starts, sizes, strict=True)]
+        assert counts == [size_of(share, g.counts()[label]) for share in (*shares, 0.7, 1.0)]
+    assert set(ladder.replaces) == {3, 184}
+    assert ladder.replaces[3] == (3, 4)
