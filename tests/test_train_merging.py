@@ -1,6 +1,7 @@
 """Merging of Gaussians by moments, and what fits merged ones to renders."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.train.merging import Merged, merge
+
+
+def _cloud(count: int, **options: Any) -> Gaussians:
+    """Of one category: others do not merge."""
+    g = random_gaussians(count, **options)
+    return replace(g, label_ids=torch.full_like(g.label_ids, 3))
 
 
 def _merged(g: Gaussians, count: int, weights: np.ndarray | None = None) -> Merged:
@@ -30,7 +37,7 @@ def _moments(g: Gaussians) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def test_two_become_their_mixture() -> None:
-    g = random_gaussians(2, logit=-2.0)
+    g = _cloud(2, logit=-2.0)
     mass, means, covs = _moments(g)
     share = mass / mass.sum()
     mean = share @ means
@@ -46,13 +53,13 @@ def test_two_become_their_mixture() -> None:
 
 
 def test_opacity_is_at_most_one() -> None:
-    g = random_gaussians(2, logit=6.0)
+    g = _cloud(2, logit=6.0)
     g = replace(g, means=torch.zeros(2, 3), log_scales=g.log_scales[:1].expand(2, 3).clone())
     assert 0.999 < float(torch.sigmoid(_merged(g, 1).gaussians.logit_opacities[0])) < 1
 
 
 def test_those_that_stay_keep_every_bit() -> None:
-    g = random_gaussians(60)
+    g = _cloud(60)
     found = _merged(g, 45)
     assert len(found.gaussians) == 45
     parts = np.bincount(found.into, minlength=45)
@@ -65,7 +72,7 @@ def test_those_that_stay_keep_every_bit() -> None:
 
 def test_what_looks_the_same_merges_first() -> None:
     """Two red ones beside two blue ones: each with its own."""
-    g = random_gaussians(4, degree=0, logit=1.0)
+    g = _cloud(4, degree=0, logit=1.0)
     x = torch.tensor([0.0, 0.1, 0.15, 0.25])
     red, blue = torch.tensor([1.5, -1.5, -1.5]), torch.tensor([-1.5, -1.5, 1.5])
     g = replace(
@@ -79,7 +86,7 @@ def test_what_looks_the_same_merges_first() -> None:
 
 
 def test_what_nobody_sees_merges_first() -> None:
-    g = random_gaussians(4, degree=0)
+    g = _cloud(4, degree=0)
     x = torch.tensor([0.0, 0.2, 3.0, 3.2])
     g = replace(g, means=torch.stack([x, 0 * x, 0 * x], 1), log_scales=torch.full((4, 3), -2.0))
     g = replace(g, sh0=torch.tensor([1.0, -1.0, 1.0, -1.0])[:, None, None].expand(4, 1, 3).clone())
@@ -91,7 +98,7 @@ def test_what_nobody_sees_merges_first() -> None:
 @settings(max_examples=25, deadline=None)
 @given(st.integers(1, 40), st.data())
 def test_counts_are_reached_and_all_is_finite(count: int, data: st.DataObject) -> None:
-    g = random_gaussians(count, seed=count, degree=data.draw(st.sampled_from([0, 1, 3])))
+    g = _cloud(count, seed=count, degree=data.draw(st.sampled_from([0, 1, 3])))
     if data.draw(st.booleans()):  # all in one place
         g = replace(g, means=torch.zeros(count, 3))
     if data.draw(st.booleans()):  # flat, or needles
@@ -106,6 +113,14 @@ def test_counts_are_reached_and_all_is_finite(count: int, data: st.DataObject) -
 
 @pytest.mark.parametrize("scale", [1e-6, 1e6])
 def test_the_unit_does_not_matter(scale: float) -> None:
-    g = random_gaussians(50)
+    g = _cloud(50)
     larger = replace(g, means=g.means * scale, log_scales=g.log_scales + float(np.log(scale)))
     assert (_merged(g, 20).into == _merged(larger, 20).into).mean() > 0.8  # ties apart
+
+
+def test_categories_do_not_merge() -> None:
+    g = replace(random_gaussians(40), label_ids=torch.tensor([3, 184] * 20, dtype=torch.int16))
+    found = _merged(g, 10)
+    for row, into in enumerate(found.into):
+        assert found.gaussians.label_ids[into] == g.label_ids[row]
+    assert len(_merged(g, 1).gaussians) == 2

@@ -27,15 +27,17 @@ from sagesplat.train.early_stopping import spread
 from sagesplat.train.importance import importance
 from sagesplat.train.lower_levels import (
     Assembled,
+    Counts,
     Rung,
+    Set,
     assemble,
-    by_label,
+    first_of_all,
     joined,
     merged_rungs,
-    size_of,
     split_sets,
     trained_sets,
     usable_shares,
+    whole,
 )
 from sagesplat.train.memory import photo_cache
 from sagesplat.train.nested import Nested, NestStep
@@ -43,8 +45,8 @@ from sagesplat.train.refit import refit_colors, refit_coverage
 
 _WEIGH = 32  # views that importance is measured in
 _REFIT = 24  # views that merged Gaussians are fitted to
-_LOWER = 0.5  # largest share that is merged or trained; above, the most important originals lose little
-_SMALL = 0.1  # share up to which fitting takes more rounds: little is left as it was, and rounds are cheap
+_TRAINED = 0.5  # largest share that is trained
+_SMALL = 0.1  # share up to which colours take more rounds: little is left as it was, and rounds are cheap
 _COMPARE = 8  # views that merged Gaussians and prefixes of the originals are compared in
 
 
@@ -65,19 +67,25 @@ def make_levels(job: Job, config: AdoptConfig) -> None:
         weights = importance(g, job.scene, views, "weight", antialiased=job.antialiased)
         order = importance(g, job.scene, views, "sensitivity", antialiased=job.antialiased)
         ordered = g.select(torch.from_numpy(np.argsort(-order, kind="stable")))
-        lower = [share for share in shares if share <= _LOWER]
-        rungs = merged_rungs(g, weights, lower)
+        rungs = merged_rungs(g, weights, shares[:-1])
         rungs = [replace(rung, gaussians=_covering(job, rung, views)) for rung in rungs]
-        pruned = [_prefix(ordered, rung.share) for rung in rungs]
+        pruned, least = list[Gaussians](), dict[int, int]()
+        for rung in rungs:
+            pruned.append(first_of_all(ordered, rung.share, least))
+            least = rung.gaussians.counts()
         merges = _merges_until(job, targets, [rung.gaussians for rung in rungs], pruned)
-        if config.fit == "renders":
-            starts = [r.gaussians if i < merges else pruned[i] for i, r in enumerate(rungs)]
-            sets = _trained(job, targets, dict(zip(lower, starts, strict=True)), g.counts(), config, key)
-        else:
-            sets = [(_colored(job, targets, rung), (rung.share,)) for rung in rungs[:merges]]
-        used = {share for _, levels in sets for share in levels}
-        ladder = assemble(sets, ordered, [share for share in shares if share not in used])
-        lines = _write(job, ladder, len(used), g, settings, config.lossless)
+        trained = len([share for share in shares[:-1] if share <= _TRAINED]) if config.fit == "renders" else 0
+        starts = [r.gaussians if i < merges else pruned[i] for i, r in enumerate(rungs[:trained])]
+        sets = _trained(job, targets, dict(zip(shares, starts, strict=False)), config, key)
+        sets += [whole(_colored(job, targets, rung)) for rung in rungs[trained:merges]]
+        num_lower = sum(len(one.levels) for one in sets)
+        least = dict(sets[-1].levels[-1]) if sets else {}
+        levels = list[Counts]()
+        for share in shares[num_lower:]:
+            least = first_of_all(ordered, share, least).counts()
+            levels.append(least)
+        ladder = assemble([*sets, Set(ordered, tuple(levels))])
+        lines = _write(job, ladder, num_lower, g, settings, config.lossless)
         remove_checkpoints(run.nest_checkpoint)
         return lines
 
@@ -85,25 +93,19 @@ def make_levels(job: Job, config: AdoptConfig) -> None:
 
 
 def _covering(job: Job, rung: Rung, views: Sequence[int]) -> Gaussians:
-    few, rounds = spread(list(views), _REFIT), 3 if rung.share <= _SMALL else 1
+    few = spread(list(views), _REFIT)
     wanted = rung.stands_for * (len(few) / len(views))
-    return refit_coverage(rung.gaussians, wanted, job.scene, few, rounds, antialiased=job.antialiased)
+    return refit_coverage(rung.gaussians, wanted, job.scene, few, antialiased=job.antialiased)
 
 
 def _colored(job: Job, targets: Photos, rung: Rung) -> Gaussians:
     rows = spread(job.scene.train_ids.tolist(), _REFIT)
     cameras = [job.scene.views[row].camera for row in rows]
     images = [torch.from_numpy(as_unit(targets[row])) for row in rows]
-    rounds = 3 if rung.share <= _SMALL else 2
+    rounds = 5 if rung.share <= _SMALL else 3
     return refit_colors(
         rung.gaussians, cameras, images, rounds, antialiased=job.antialiased, backend=job.backend
     )
-
-
-def _prefix(ordered: Gaussians, share: float) -> Gaussians:
-    """The first Gaussians of each category, as many as a level of `share` has."""
-    rows = [mine[: size_of(share, len(mine))] for mine in by_label(ordered).values()]
-    return ordered.select(torch.from_numpy(np.sort(np.concatenate(rows))))
 
 
 def _merges_until(job: Job, targets: Photos, merged: Sequence[Gaussians], pruned: Sequence[Gaussians]) -> int:
@@ -117,24 +119,25 @@ def _merges_until(job: Job, targets: Photos, merged: Sequence[Gaussians], pruned
 
 
 def _trained(
-    job: Job,
-    targets: Photos,
-    starts: Mapping[float, Gaussians],
-    counts: Mapping[int, int],
-    config: AdoptConfig,
-    key: str,
-) -> list[tuple[Gaussians, tuple[float, ...]]]:
+    job: Job, targets: Photos, starts: Mapping[float, Gaussians], config: AdoptConfig, key: str
+) -> list[Set]:
     """Levels trained on renders of the originals, those of similar size as prefixes of one set.
 
     `starts`: Gaussians to start from, by share.
     """
-    sets = trained_sets(list(starts))
-    tops = {levels[-1]: starts[levels[-1]] for levels in sets}
-    views = spread(job.scene.train_ids.tolist(), _REFIT)
+    if not starts:
+        return []
+    sets, views = list[Set](), spread(job.scene.train_ids.tolist(), _REFIT)
+    for shares in trained_sets(list(starts)):
+        top = starts[shares[-1]]
+        most = top.counts()
+        sizes = [starts[share].counts() for share in shares]
+        sets.append(Set(top, tuple({i: min(n, most[i]) for i, n in size.items()} for size in sizes)))
     ranks = [
-        importance(g, job.scene, views, "sensitivity", antialiased=job.antialiased) for g in tops.values()
+        importance(one.gaussians, job.scene, views, "sensitivity", antialiased=job.antialiased)
+        for one in sets
     ]
-    start, spans = joined(tops, ranks, tuple(starts), counts)
+    start, spans = joined(sets, ranks)
     trained = start
     for event in nested.nest(
         start, job.scene, targets, train_config(job), NestConfig(steps=config.steps), seed=config.seed,
@@ -144,7 +147,7 @@ def _trained(
             job.emit(Progress("nest", event.step, config.steps, f"loss {event.loss:.3f}"))
         elif isinstance(event, Nested):
             trained = event
-    return split_sets(trained.gaussians, tops.values(), sets)
+    return split_sets(trained.gaussians, sets)
 
 
 def _write(

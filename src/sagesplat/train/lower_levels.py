@@ -5,9 +5,8 @@ originals or trained on them; a set replaces the smaller one. From a certain lev
 originals, ordered by importance; the last level is all of them.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 import torch
@@ -18,7 +17,7 @@ from sagesplat.train.merging import merge
 from sagesplat.train.nested import Nested, Spans
 
 FEWEST = 50  # Gaussians of a level, all categories together
-_WHOLE = 100  # Gaussians of a category that is too small to merge
+Counts = Mapping[int, int]  # label id -> Gaussians
 _SPAN = 2.5  # ratio of the sizes of the levels that share a trained set
 
 
@@ -41,11 +40,24 @@ def size_of(share: float, count: int) -> int:
 
 
 @dataclass(frozen=True, eq=False)
-class Rung:
-    """A set of Gaussians of all categories that replaces the smaller ones."""
+class Set:
+    """Gaussians of all categories, and the levels that are prefixes of them, in each category by itself."""
 
-    gaussians: Gaussians  # by category
-    share: float  # its size, as a share of each category
+    gaussians: Gaussians
+    levels: tuple[Counts, ...]  # Gaussians of each category; the last has all
+
+
+def whole(g: Gaussians) -> Set:
+    """All Gaussians as one level."""
+    return Set(g, (g.counts(),))
+
+
+@dataclass(frozen=True, eq=False)
+class Rung:
+    """All Gaussians merged to fewer."""
+
+    gaussians: Gaussians
+    share: float  # of all
     stands_for: np.ndarray  # float32 [N], blending weight of the originals that each is made of
 
 
@@ -56,25 +68,26 @@ def by_label(g: Gaussians) -> dict[int, np.ndarray]:
 
 
 def merged_rungs(g: Gaussians, weights: np.ndarray, shares: Sequence[float]) -> list[Rung]:
-    """The originals merged to each of `shares`, ascending; small categories keep their most visible ones."""
-    parts: dict[float, list[tuple[Gaussians, np.ndarray]]] = {share: [] for share in shares}
+    """The originals merged to each of `shares` of all Gaussians, ascending.
+
+    A category keeps more of its Gaussians where mergers show more.
+    """
     descending = sorted(shares, reverse=True)
-    for rows in by_label(g).values():
-        mine, weight = g.select(torch.from_numpy(rows)), weights[rows]
-        sizes = [size_of(share, len(rows)) for share in descending]
-        if len(rows) < _WHOLE:
-            order = np.argsort(-weight, kind="stable")
-            for share, size in zip(descending, sizes, strict=True):
-                kept = np.sort(order[:size])
-                parts[share].append((mine.select(torch.from_numpy(kept)), weight[kept]))
-            continue
-        for share, merged in zip(descending, merge(mine, weight, sizes), strict=True):
-            stands = np.bincount(merged.into, weight, len(merged.gaussians)).astype(np.float32)
-            parts[share].append((merged.gaussians, stands))
-    return [
-        Rung(concat([g for g, _ in parts[share]]), share, np.concatenate([w for _, w in parts[share]]))
-        for share in sorted(shares)
-    ]
+    found = []
+    for share, merged in zip(
+        descending, merge(g, weights, [size_of(share, len(g)) for share in descending]), strict=True
+    ):
+        stands = np.bincount(merged.into, weights, len(merged.gaussians)).astype(np.float32)
+        found.append(Rung(merged.gaussians, share, stands))
+    return found[::-1]
+
+
+def first_of_all(ordered: Gaussians, share: float, least: Counts) -> Gaussians:
+    """The first Gaussians, `share` of all, with at least `least` and one of each category."""
+    kept = np.arange(len(ordered)) < size_of(share, len(ordered))
+    for label, rows in by_label(ordered).items():
+        kept[rows[: max(1, least.get(label, 0))]] = True
+    return ordered.select(torch.from_numpy(kept))
 
 
 def trained_sets(shares: Sequence[float]) -> list[tuple[float, ...]]:
@@ -88,30 +101,23 @@ def trained_sets(shares: Sequence[float]) -> list[tuple[float, ...]]:
     return [tuple(sorted(one)) for one in reversed(sets)]
 
 
-def joined(
-    tops: Mapping[float, Gaussians],
-    importances: Sequence[np.ndarray],
-    shares: Sequence[float],
-    counts: Mapping[int, int],
-) -> tuple[Nested, Spans]:
-    """Sets of Gaussians as one model to train, each in the order of its importances.
-
-    `tops`: the sets by their size as a share of each category, ascending; `shares`: of all levels to train;
-    `counts`: originals of each category.
-    """
-    order, above, upto = [], [], []
-    for g, importance, (low, high) in zip(tops.values(), importances, pairwise([0.0, *tops]), strict=True):
-        place = np.empty(len(g), np.float32)
-        for label, rows in by_label(g).items():
+def joined(sets: Sequence[Set], importances: Sequence[np.ndarray]) -> tuple[Nested, Spans]:
+    """Sets of Gaussians as one model to train, each in the order of its importances."""
+    order, first, last, level = [], [], [], 0
+    for one, importance in zip(sets, importances, strict=True):
+        place, shown = np.empty(len(one.gaussians), np.float32), np.empty(len(one.gaussians), np.int8)
+        for label, rows in by_label(one.gaussians).items():
             ranked = rows[np.argsort(-importance[rows], kind="stable")]
-            place[ranked] = np.arange(len(rows), dtype=np.float32) / counts[label]
+            place[ranked] = np.arange(len(rows), dtype=np.float32) / len(rows)
+            ends = [counts[label] for counts in one.levels]
+            shown[ranked] = level + np.searchsorted(ends, np.arange(len(rows)), side="right")
         order.append(place)
-        above.append(np.full(len(g), low, np.float32))
-        upto.append(np.full(len(g), high, np.float32))
-    g = concat(list(tops.values()))
+        first.append(shown)
+        level += len(one.levels)
+        last.append(np.full(len(place), level - 1, np.int8))
+    g = concat([one.gaussians for one in sets])
     nested = Nested(g, np.ones(len(g), np.float32), np.full(len(g), 2, np.int8))
-    spans = Spans(np.concatenate(order), np.concatenate(above), np.concatenate(upto), tuple(shares))
-    return nested, spans
+    return nested, Spans(np.concatenate(order), np.concatenate(first), np.concatenate(last), level)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,42 +129,30 @@ class Assembled:
     replaces: dict[int, tuple[int, ...]]  # levels that replace those below
 
 
-def assemble(
-    sets: Sequence[tuple[Gaussians, Sequence[float]]], originals: Gaussians, shares: Sequence[float]
-) -> Assembled:
-    """Join sets of lower levels, ascending, and the originals, all in their order, into one ladder.
-
-    `sets`: each with the shares of the levels that are prefixes of it; `shares`: of the originals' levels.
-    """
-    whole = by_label(originals)
-    parts, sizes, replaces = [], {}, {}
-    stages = [*sets, (originals, shares)]
-    rows = [by_label(g) for g, _ in stages]
-    for label, all_rows in whole.items():
+def assemble(sets: Sequence[Set]) -> Assembled:
+    """Join sets of levels, ascending, each in its order, into one ladder; the last is the originals."""
+    parts, sizes, replaces = [], dict[int, tuple[int, ...]](), dict[int, tuple[int, ...]]()
+    rows = [by_label(one.gaussians) for one in sets]
+    for label in rows[-1]:
         ends, replacing, begin = list[int](), list[int](), 0
-        for (g, levels), mine in zip(stages, rows, strict=True):
-            here = mine.get(label, np.zeros(0, np.int64))
+        for one, mine in zip(sets, rows, strict=True):
             if ends:
                 replacing.append(len(ends) + 1)
-            for share in levels:
-                ends.append(begin + min(len(here), size_of(share, len(all_rows))))
-            ends[-1] = begin + len(here)
-            begin += len(here)
-            parts.append(g.select(torch.from_numpy(here)))
+            ends += [begin + counts[label] for counts in one.levels]
+            begin = ends[-1]
+            parts.append(one.gaussians.select(torch.from_numpy(mine[label])))
         sizes[label], replaces[label] = tuple(ends), tuple(replacing)
     return Assembled(concat(parts), sizes, replaces)
 
 
-def split_sets(
-    g: Gaussians, tops: Iterable[Gaussians], sets: Sequence[tuple[float, ...]]
-) -> list[tuple[Gaussians, tuple[float, ...]]]:
-    """The sets that `joined` joined, once trained: each in its order, with the shares of its levels."""
+def split_sets(g: Gaussians, sets: Sequence[Set]) -> list[Set]:
+    """The sets that `joined` joined, once trained: each in its order."""
     whole, taken, found = by_label(g), dict[int, int](), []
-    for top, levels in zip(tops, sets, strict=True):
+    for one in sets:
         rows = []
-        for label, count in top.counts().items():
+        for label, count in one.gaussians.counts().items():
             begin = taken.get(label, 0)
             rows.append(whole[label][begin : begin + count])
             taken[label] = begin + count
-        found.append((g.select(torch.from_numpy(np.concatenate(rows))), levels))
+        found.append(Set(g.select(torch.from_numpy(np.concatenate(rows))), one.levels))
     return found

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Float32, Float64, Int16, Int64
 from numba import prange
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
@@ -21,11 +21,11 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.sh import sh0_to_rgb
 from sagesplat.kernels.jit import njit
 
-_NEIGHBOURS = 8
+_NEIGHBOURS = 12
 _ROUND = 0.35  # pairs that merge in a round at most, as a share of the Gaussians
 _BLUR = 0.25  # variance that differences are blurred by, as a share of the merged one's area
 _HIDDEN = 1e-3  # visibility of what no render shows
-_OPACITY = 0.5  # weight of a difference in opacity, beside one in a colour channel
+_OPACITY = 2.0  # weight of a difference in opacity, beside one in a colour channel
 _CLOSED = 0.9999  # opacity of what hides all behind it, so that its logit is finite
 _UPPER = [0, 1, 2, 4, 5, 8]  # entries of a symmetric 3 x 3 matrix that are stored
 _WHOLE = [0, 1, 2, 1, 3, 4, 2, 4, 5]
@@ -45,6 +45,7 @@ class _Mixture:
     covs: Float64[np.ndarray, "N 6"]  # upper triangle
     opacities: Float64[np.ndarray, " N"]
     sh: Float32[np.ndarray, "N C"]  # all SH coefficients
+    labels: Int16[np.ndarray, " N"]
     mass: Float64[np.ndarray, " N"]  # opacity times area
     visible: Float64[np.ndarray, " N"]  # share of the mass that renders show, relative to the mean
     origin: Int64[np.ndarray, " N"]  # row before, -1: merged
@@ -55,20 +56,24 @@ class _Mixture:
 
 
 def merge(g: Gaussians, weights: Float32[np.ndarray, " N"], counts: Sequence[int]) -> Iterator[Merged]:
-    """Merge Gaussians down to each of `counts` in turn.
+    """Merge Gaussians down to each of `counts` in turn; those of different categories never merge.
 
     Args:
-        g: N Gaussians on the CPU; all of one category, as any two of them may merge.
+        g: N Gaussians on the CPU.
         weights: Blending weight of each over some renders (`importance` by "weight").
         counts: Descending, each at least 1.
 
     Yields:
-        For each count as many Gaussians, or all there are. Those that did not merge keep their values.
+        For each count as many Gaussians, or all there are, or one of each category. Those that did not merge
+        keep their values.
     """
     mixture = _mixture(g, weights)
     for count in counts:
         while len(mixture) > count:
-            mixture = _merge_round(mixture, len(mixture) - count)
+            fewer = _merge_round(mixture, len(mixture) - count)
+            if fewer is None:
+                break
+            mixture = fewer
         yield Merged(_gaussians(mixture, g), mixture.into)
 
 
@@ -83,8 +88,9 @@ def _mixture(g: Gaussians, weights: np.ndarray) -> _Mixture:
     sh = torch.cat([g.sh0, g.shN], 1).reshape(n, -1).numpy()
     rows = np.arange(n)
     return _Mixture(
-        g.means.numpy().astype(np.float64), covs, opacities, sh, mass, np.maximum(shown, _HIDDEN), rows, rows
-    )
+        g.means.numpy().astype(np.float64), covs, opacities, sh, g.label_ids.numpy(), mass,
+        np.maximum(shown, _HIDDEN), rows, rows,
+    )  # fmt: skip
 
 
 def _gaussians(mixture: _Mixture, before: Gaussians) -> Gaussians:
@@ -107,13 +113,17 @@ def _gaussians(mixture: _Mixture, before: Gaussians) -> Gaussians:
     same = torch.from_numpy(mixture.origin[mixture.origin >= 0])
     for name, value in values.items():
         value[rows] = getattr(before, name)[same]
-    labels = before.label_ids[:1].expand(len(mixture)).clone()
-    return Gaussians(**values, label_ids=labels)
+    return Gaussians(**values, label_ids=torch.from_numpy(mixture.labels))
 
 
-def _merge_round(m: _Mixture, most: int) -> _Mixture:
-    """Merge the cheapest pairs of neighbours, each Gaussian at most once and at most `most` pairs."""
-    first, second = _neighbours(m.means)
+def _merge_round(m: _Mixture, most: int) -> _Mixture | None:
+    """Merge the cheapest pairs of neighbours, each Gaussian at most once and at most `most` pairs.
+
+    None where every category has one Gaussian left.
+    """
+    first, second = _neighbours(m.means, m.labels)
+    if not len(first):
+        return None
     rgb = sh0_to_rgb(torch.from_numpy(m.sh[:, :3])).numpy().astype(np.float64)
     cost = _costs(first, second, m.means, m.covs, m.opacities, rgb, m.mass, m.visible)
     pairs = _cheapest(np.argsort(cost, kind="stable"), first, second, len(m), min(most, _at_most(len(m))))
@@ -130,6 +140,7 @@ def _merge_round(m: _Mixture, most: int) -> _Mixture:
         covs=covs,
         opacities=opacities,
         sh=(share * m.sh[i] + (1 - share) * m.sh[j]).astype(np.float32),
+        labels=m.labels[i],
         mass=mass,
         visible=(m.visible[i] * m.mass[i] + m.visible[j] * m.mass[j]) / mass,
         origin=np.full(len(i), -1),
@@ -139,7 +150,7 @@ def _merge_round(m: _Mixture, most: int) -> _Mixture:
     row = np.empty(len(m), np.int64)
     row[alone] = np.arange(alone.sum())
     row[i] = row[j] = alone.sum() + np.arange(len(i))
-    names = ("means", "covs", "opacities", "sh", "mass", "visible", "origin")
+    names = ("means", "covs", "opacities", "sh", "labels", "mass", "visible", "origin")
     columns = {name: np.concatenate([getattr(m, name)[alone], getattr(merged, name)]) for name in names}
     return _Mixture(**columns, into=row[m.into])
 
@@ -148,10 +159,20 @@ def _at_most(count: int) -> int:
     return max(1, int(_ROUND * count))
 
 
-def _neighbours(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of close rows (int64 [P] each), every pair once; at least one pair of two rows or more."""
+def _neighbours(means: np.ndarray, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of close rows of one label (int64 [P] each), every pair once."""
+    pairs = [np.zeros((2, 0), np.int64)]
+    for label in np.unique(labels):
+        rows = np.flatnonzero(labels == label)
+        pairs.append(rows[np.stack(_neighbours_in(means[rows]))])
+    first, second = np.concatenate(pairs, axis=1)
+    return first, second
+
+
+def _neighbours_in(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same among all rows: at least one pair of two rows or more."""
     n = len(means)
-    near = np.asarray(KDTree(means).query(means, min(_NEIGHBOURS + 1, n), workers=-1)[1])
+    near = np.asarray(KDTree(means).query(means, min(_NEIGHBOURS + 1, n), workers=-1)[1]).reshape(n, -1)
     one = np.repeat(np.arange(n), near.shape[1])
     other = near.ravel()
     keys = np.unique(np.minimum(one, other) * n + np.maximum(one, other))

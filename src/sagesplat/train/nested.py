@@ -52,16 +52,15 @@ class Nested:
 
 @dataclass(frozen=True, eq=False)
 class Spans:
-    """Several sets of Gaussians per category that replace each other: a larger share shows a larger set.
+    """Several sets of Gaussians that replace each other, in each category by itself.
 
-    At a share `s` of a category a Gaussian is shown if its set is (`above < s <= upto`), and its place in the
-    set, as a share of the category, is before it (`order < s`).
+    At a level, numbered from 0, those Gaussians of a category are shown whose span holds it.
     """
 
-    order: Float32[np.ndarray, " N"]
-    above: Float32[np.ndarray, " N"]
-    upto: Float32[np.ndarray, " N"]
-    shares: tuple[float, ...]  # that a step draws from, for each category by itself
+    order: Float32[np.ndarray, " N"]  # ascending in a category of a set
+    first: Int8[np.ndarray, " N"]
+    last: Int8[np.ndarray, " N"]  # the same in a set
+    levels: int  # that a step draws from, for each category
 
 
 @dataclass(frozen=True)
@@ -193,8 +192,7 @@ def nest(
         checkpoint: Where to save every 500 steps; one of the same `settings` is resumed.
         settings: What a checkpoint has to have been written with.
         movable: bool [N]; the others keep their values, and all keep their order. None: all are trained.
-        spans: Levels that replace each other: which share of a category shows each Gaussian, and which shares
-            are drawn; all keep their order. None: prefixes.
+        spans: Levels that replace each other; all Gaussians keep their order. None: prefixes.
 
     Yields:
         `NestStep` at every step, `Resumed` after a damaged checkpoint, and the trained `Nested` last.
@@ -220,7 +218,7 @@ def nest(
     sort_at = set() if stays else {round(part * config.steps) for part in _SORT_AT}
     edges = None
     if spans is not None:
-        edges = torch.from_numpy(np.stack([spans.above, spans.upto])[:, near]).to(device)
+        edges = torch.from_numpy(np.stack([spans.first, spans.last])[:, near]).to(device)
     stepper = Stepper(
         PhotoLoader(scene, photos, device), replace(train_config, batch=1), ActiveTiles(scene, None), backend,
         sh_bits=config.sh_bits,
@@ -237,18 +235,17 @@ def nest(
                     state.gaussians, scene, views, config.criterion, antialiased=train_config.antialiased
                 )
                 state.order_share = order_shares(labels, ranks, importances).to(device)
-            if spans is None:
-                prefix = draw_shares(state.rng, len(categories), config, state.step / config.steps)
-            else:
-                prefix = state.rng.choice(np.array(spans.shares, np.float32), len(categories))
             rows = None
-            if spans is not None or (prefix < 1).any():
-                assert state.order_share is not None
-                share = torch.from_numpy(prefix).to(device)[column]
-                shown = state.order_share < share
-                if edges is not None:
-                    shown &= (edges[0] < share) & (share <= edges[1])
-                rows = torch.nonzero(shown)[:, 0]
+            if spans is None or edges is None:
+                prefix = draw_shares(state.rng, len(categories), config, state.step / config.steps)
+                if (prefix < 1).any():
+                    assert state.order_share is not None
+                    shown = state.order_share < torch.from_numpy(prefix).to(device)[column]
+                    rows = torch.nonzero(shown)[:, 0]
+            else:
+                levels = torch.from_numpy(state.rng.integers(spans.levels, size=len(categories)))
+                level = levels.to(device)[column]
+                rows = torch.nonzero((edges[0] <= level) & (level <= edges[1]))[:, 0]
             loss = stepper(
                 state, nested.gaussians.sh_degree, rates(state.step + 1), trainable, drawn_rows=rows
             )
@@ -259,7 +256,7 @@ def nest(
                 write_checkpoint(checkpoint, state, settings)
             yield NestStep(state.step, value)
     assert state.order_share is not None
-    sets = np.zeros(len(labels)) if spans is None else spans.upto[near]
+    sets = np.zeros(len(labels)) if spans is None else spans.last[near]
     rows = np.lexsort((state.order_share.cpu().numpy(), sets, labels))
     yield Nested(
         state.gaussians.to("cpu").select(torch.from_numpy(rows)), nested.purity[near][rows], ranks[rows]

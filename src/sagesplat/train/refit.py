@@ -26,7 +26,6 @@ def refit_coverage(
     wanted: Float32[np.ndarray, " N"],
     scene: Scene,
     views: Sequence[int],
-    rounds: int = 3,
     *,
     antialiased: bool = False,
 ) -> Gaussians:
@@ -35,14 +34,12 @@ def refit_coverage(
     What merges covers less: a mixture's tails are longer than those of its parts, and an opacity is at most
     1. `wanted`: the blending weight over `views` (rows of `scene.views`) of what each Gaussian stands for.
     """
-    for _ in range(rounds):
-        has = importance(g, scene, views, "weight", antialiased=antialiased)
-        ratio = ((wanted + _LEAST[1]) / (has + _LEAST[1])) ** _DAMPED
-        opacity = torch.sigmoid(g.logit_opacities) * torch.from_numpy(ratio).clamp(1 / _MOST, _MOST)
-        possible = opacity.clamp(_LEAST[0], _OPAQUE)
-        grows = (opacity / possible).clamp(1, _GROWS).log() / 2
-        g = replace(g, logit_opacities=torch.logit(possible), log_scales=g.log_scales + grows[:, None])
-    return g
+    has = importance(g, scene, views, "weight", antialiased=antialiased)
+    ratio = ((wanted + _LEAST[1]) / (has + _LEAST[1])) ** _DAMPED
+    opacity = torch.sigmoid(g.logit_opacities) * torch.from_numpy(ratio).clamp(1 / _MOST, _MOST)
+    possible = opacity.clamp(_LEAST[0], _OPAQUE)
+    grows = (opacity / possible).clamp(1, _GROWS).log() / 2
+    return replace(g, logit_opacities=torch.logit(possible), log_scales=g.log_scales + grows[:, None])
 
 
 def refit_colors(
