@@ -73,7 +73,7 @@ def test_those_that_stay_keep_every_bit() -> None:
 def test_what_looks_the_same_merges_first() -> None:
     """Two red ones beside two blue ones: each with its own."""
     g = _cloud(4, degree=0, logit=1.0)
-    x = torch.tensor([0.0, 0.1, 0.15, 0.25])
+    x = torch.tensor([0.0, 0.1, 0.2, 0.3])
     red, blue = torch.tensor([1.5, -1.5, -1.5]), torch.tensor([-1.5, -1.5, 1.5])
     g = replace(
         g,
