@@ -1,5 +1,6 @@
 """Begins a run with a splat that somebody else trained: its Gaussians, viewpoints, labels."""
 
+import json
 import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -13,6 +14,7 @@ from scipy.spatial import KDTree
 from sagesplat.adapt.free_viewpoints import free_cameras
 from sagesplat.adapt.observe import RenderedLabels
 from sagesplat.core.config import AdoptConfig, LabelsConfig, MasksConfig, NestConfig, SceneConfig, TrainConfig
+from sagesplat.core.errors import RunError
 from sagesplat.core.events import Progress, Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.names import repaired
@@ -21,7 +23,8 @@ from sagesplat.formats.levels import read_header, read_level, read_more, write_l
 from sagesplat.formats.splats import Splat, num_lods, read_splat
 from sagesplat.output.contact_sheet import contact_sheet
 from sagesplat.run.job import Job
-from sagesplat.run.records import file_hash
+from sagesplat.run.records import file_hash, is_done
+from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
 from sagesplat.scene.cameras import NamedCamera, read_camera_file
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage, write_model
@@ -52,6 +55,7 @@ def open_splat(
     """
     segmented = masks.segmenter != "auto" or masks.masks is not None or masks.model is not None
     check_folder(job.run)
+    _check_run(job.run, config)
     check_shares(config.shares)
     check(NestConfig(steps=config.steps))
     own = job.run.capture / repaired(source.resolve().stem)
@@ -61,6 +65,16 @@ def open_splat(
         masks = replace(masks, masks=own / "masks")
     make_masks(job, masks, labels)
     _label(job, voted=segmented)
+
+
+def _check_run(run: RunDir, config: AdoptConfig) -> None:
+    """RunError where adopting would overwrite what it reads, or a run that was trained here."""
+    if run.scene.exists() and not run.adopted.exists():
+        raise RunError(f"{run.path}: holds a run of its own; choose a new folder for the splat")
+    if config.cameras is not None and config.cameras.resolve().is_relative_to(run.path.resolve()):
+        raise RunError(
+            f"{config.cameras}: in the run folder, where adopt writes; copy it elsewhere, and give that path"
+        )
 
 
 def _make_capture(job: Job, source: Path, own: Path, config: AdoptConfig, *, labelled: bool) -> bool:
@@ -73,6 +87,7 @@ def _make_capture(job: Job, source: Path, own: Path, config: AdoptConfig, *, lab
     photos = bool(given) and all(one.photo is not None for one in given)
     names = ("cameras", "views", "kind", "up", "fov", "size", "lod", "spz_axes", "seed")
     settings = {name: getattr(config, name) for name in names} | {"labelled": labelled, "photos": photos}
+    settings["cameras"] = config.cameras and str(config.cameras.resolve())
     settings |= {"source": str(source.resolve()), "content": _content(source)}
 
     def make() -> list[str]:
@@ -97,6 +112,8 @@ def _make_capture(job: Job, source: Path, own: Path, config: AdoptConfig, *, lab
             f"{len(cameras)} viewpoints, {run.contact_sheet}: {how}",
         ]
 
+    # the capture's folder is named after the splat: for another splat it is missing, and not out of date
+    is_done(run, "adopt", json.loads(json.dumps(settings)), None, [run.adopted], job.force)
     outputs = [run.adopted, run.contact_sheet]
     outputs += [] if photos else [own / "sparse"]
     outputs += [own / "masks" / "labels.json"] if labelled else []
