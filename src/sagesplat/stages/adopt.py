@@ -29,9 +29,10 @@ from sagesplat.run.stage import run_stage
 from sagesplat.scene.cameras import NamedCamera, read_camera_file
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage, write_model
 from sagesplat.scene.scene import Camera, View
+from sagesplat.segment.edit import apply
 from sagesplat.segment.lift import LiftedLabels
 from sagesplat.segment.masks import UNLABELLED, Taxonomy, prepare_folder, write_labels, write_mask
-from sagesplat.stages.label import make_masks
+from sagesplat.stages.label import edit_of, make_masks
 from sagesplat.stages.scene import check_folder, open_scene
 from sagesplat.train.lower_levels import check_shares
 from sagesplat.train.nested import check
@@ -212,6 +213,20 @@ def _write_model(folder: Path, g: Gaussians, views: Sequence[View], rows: np.nda
     write_model(folder, models, images, g.means[points].numpy(), rgb, np.zeros(len(rows)))
 
 
+def _edited(job: Job, g: Gaussians) -> Gaussians:
+    """Gaussians with the labels of the file, as its label images were edited: merged, kept or left out.
+
+    Unlabelled are those of categories that no label image shows: no viewpoint would tell what their levels
+    are worth.
+    """
+    ids = g.label_ids.numpy()
+    before = Taxonomy.read(job.run.segmented / "labels.json")
+    unseen = ~np.isin(ids, (UNLABELLED, *before.names))
+    if unseen.any():
+        job.emit(Warned(f"{unseen.sum():,} Gaussians of categories that no viewpoint shows are unlabelled"))
+    return replace(g, label_ids=torch.from_numpy(apply(ids, edit_of(job.run))))
+
+
 def _label(job: Job, *, voted: bool) -> None:
     """Label all Gaussians, by the file or by votes of the label images: the one level that was trained."""
     run = job.run
@@ -227,6 +242,8 @@ def _label(job: Job, *, voted: bool) -> None:
                     g, job.scene, job.masks, job.scene.train_ids.tolist(), antialiased=antialiased
                 ),
             )
+        else:
+            g = _edited(job, g)
         points = job.scene.points.xyz
         rows = _points(g, 0, most=len(g))
         ids = g.label_ids.numpy()[rows[KDTree(g.means.numpy()[rows]).query(points)[1]]]
@@ -237,7 +254,7 @@ def _label(job: Job, *, voted: bool) -> None:
         write_level(run.levels, _LEVEL, g, recovering=False, sh_degree=g.sh_degree, exact=True)
         return [f"{len(g):,} Gaussians of {len(g.counts())} categories"]
 
-    inputs = [run.scene, run.adopted, run.masks / "labels.json"]
+    inputs = [run.scene, run.adopted, run.provenance("masks"), run.masks / "labels.json"]
     run_stage(job, "lift", {"voted": voted}, inputs, [run.labels, run.levels], make)
     # what later stages ask of the training
     config = TrainConfig(
