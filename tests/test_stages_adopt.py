@@ -159,6 +159,44 @@ def test_label_images_vote(tmp_path: Path) -> None:
     assert min(counts[3], counts[184]) > 30
 
 
+@pytest.mark.parametrize(
+    ("labels", "left"),
+    [
+        (LabelsConfig(merge="car=tree-merged"), {184}),
+        (LabelsConfig(keep="car"), {3, -1}),
+        (LabelsConfig(merge="car=thing"), {184, 201}),
+    ],
+)
+def test_labels_of_the_file_are_merged_and_left_out(
+    tmp_path: Path, labels: LabelsConfig, left: set[int]
+) -> None:
+    g = _ball()
+    g = replace(g, label_ids=torch.where(g.label_ids < 0, 3, g.label_ids))
+    write_ply(tmp_path / "ball.ply", g, {3: "car", 184: "tree-merged"})
+    job = Job(RunDir(tmp_path / "run"), lambda event: None, "cpu")
+    open_splat(job, tmp_path / "ball.ply", SMALL, SceneConfig(), MasksConfig(), labels)
+    counts = job.snapshots.load(job.snapshots.levels[-1]).counts()
+    assert set(counts) == left
+    assert sum(counts.values()) == len(g)
+    assert set(job.point_labels.tolist()) <= left
+
+
+def test_a_category_that_nothing_shows_is_unlabelled_and_said(tmp_path: Path) -> None:
+    g = _ball()
+    labels = torch.full_like(g.label_ids, 3)
+    labels[:5] = 200
+    means, faint = g.means.clone(), g.logit_opacities.clone()
+    means[:5], faint[:5] = 0, -6  # too faint to be seen within the others
+    write_ply(
+        tmp_path / "ball.ply",
+        replace(g, means=means, logit_opacities=faint, label_ids=labels),
+        {3: "car", 200: "inside"},
+    )
+    job, events = _levels(tmp_path, tmp_path / "ball.ply", SMALL)
+    assert job.ladder.load(job.ladder.levels[-1]).counts() == {-1: 5, 3: len(g) - 5}
+    assert any("5 Gaussians" in str(event) for event in events if isinstance(event, Warned))
+
+
 def test_what_cannot_be_drawn_is_left_out_and_said(tmp_path: Path) -> None:
     g = _ball()
     broken = g.means.clone()

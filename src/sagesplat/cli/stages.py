@@ -141,9 +141,10 @@ def masks(
 ) -> None:
     """Begin a run: read the capture, estimate its camera poses if need be, make or import label images."""
     from sagesplat.stages.label import make_masks
-    from sagesplat.stages.scene import open_scene
+    from sagesplat.stages.scene import check_not_adopted, open_scene
 
     with open_job(run, machine) as job:
+        check_not_adopted(job.run)
         open_scene(job, scene, scene_config, poses)
         make_masks(job, masks, labels)
 
@@ -152,8 +153,10 @@ def masks(
 def lift(run: Run, lift: LiftConfig = LiftConfig(), machine: Annotated[Redo, Flat] = Redo()) -> None:
     """Transfer the labels of the images to the 3D points of the capture."""
     from sagesplat.stages.label import lift_labels
+    from sagesplat.stages.scene import check_not_adopted
 
     with open_job(run, machine) as job:
+        check_not_adopted(job.run)
         lift_labels(job, lift)
 
 
@@ -161,8 +164,10 @@ def lift(run: Run, lift: LiftConfig = LiftConfig(), machine: Annotated[Redo, Fla
 def fuse(run: Run, machine: Annotated[Compute, Flat] = Compute()) -> None:
     """Fuse the label images of all views through the trained Gaussians; later stages use the fused ones."""
     from sagesplat.stages.label import fuse_masks
+    from sagesplat.stages.scene import check_not_adopted
 
     with open_job(run, machine) as job:
+        check_not_adopted(job.run)
         fuse_masks(job)
 
 
@@ -185,8 +190,10 @@ def train(
 def block_categories(run: Run, machine: Annotated[Compute, Flat] = Compute()) -> None:
     """Render the label images of a scene in blocks; each (block, category) pair becomes a category."""
     from sagesplat.stages import blocks
+    from sagesplat.stages.scene import check_not_adopted
 
     with open_job(run, machine) as job:
+        check_not_adopted(job.run)
         blocks.label_block_categories(job)
 
 

@@ -83,6 +83,7 @@ def early_stopping(
     """
     from sagesplat.core.events import TableMade
     from sagesplat.stages import pipeline
+    from sagesplat.stages.scene import check_not_adopted
     from sagesplat.studies.early_stopping import compare_early_stopping
 
     out = out or stopped / "early_stopping"
@@ -90,6 +91,7 @@ def early_stopping(
         open_job(stopped, machine, "snapshots") as job_stopped,
         open_job(full, machine, "snapshots") as job_full,
     ):
+        check_not_adopted(job_stopped.run)
         pipeline.observe_snapshots(job_full)
         table, _ = compare_early_stopping(job_stopped, job_full, out)
         job_stopped.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
@@ -109,10 +111,12 @@ def compare(
         run: run folder, finished with the nested levels; trained baselines are kept in RUN/compare
         json: file to write every measurement to, as JSON
     """
+    from sagesplat.stages.scene import check_not_adopted
     from sagesplat.studies.compare.run import compare as compare_methods
     from sagesplat.studies.lpips import warn_of_lpips
 
     with open_job(run, machine) as job:
+        check_not_adopted(job.run)
         warn_of_lpips(job, compare.lpips)
         compare_methods(job, compare, json)
 

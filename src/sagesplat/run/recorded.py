@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any, TypeVar, get_args
 
 from sagesplat.core.config import (
+    AdoptConfig,
     BlocksConfig,
     FitConfig,
     LabelsConfig,
@@ -43,10 +44,13 @@ def recorded_settings(run: RunDir, of: str = "run") -> dict[str, Any]:
     observed = {**_made(run, "observe"), **_made(run, "fit")}
     tuned = nest.get("boundary_steps")
     boundary = {} if tuned is None else {"boundary_steps": tuned}
+    adopted = _made(run, "adopt")
+    label_images = {} if adopted.get("labelled") else read_object(run.segmentation)  # else made by adopt
     known: dict[str, Any] = {
+        "adopt": _config(AdoptConfig, {**adopted, **_levels_of_adopted(nest)}) if adopted else None,
         "scene_config": _config(SceneConfig, read_object(run.scene).get("settings")),
         "poses": _config(PosesConfig, _made(run, "poses")),
-        "masks": _config(MasksConfig, read_object(run.segmentation)),
+        "masks": _config(MasksConfig, label_images),
         "labels": _config(LabelsConfig, _made(run, "masks")),
         "lift": _config(LiftConfig, _made(run, "lift")),
         "train": _config(TrainConfig, train),
@@ -59,6 +63,12 @@ def recorded_settings(run: RunDir, of: str = "run") -> dict[str, Any]:
         "fuse": True if run.provenance("fuse").exists() else None,
     }
     return {name: value for name, value in known.items() if value is not None}
+
+
+def _levels_of_adopted(nest: dict[str, Any]) -> dict[str, Any]:
+    """The settings of an adopted splat's levels; without training there are no steps to remember."""
+    names = ("fit", "shares", "lossless", *(("steps",) if nest.get("fit") == "renders" else ()))
+    return {name: nest[name] for name in names if name in nest}
 
 
 def stage_seconds(run: RunDir) -> dict[str, float]:

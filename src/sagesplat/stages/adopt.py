@@ -1,5 +1,6 @@
 """Begins a run with a splat that somebody else trained: its Gaussians, viewpoints, labels."""
 
+import json
 import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -13,6 +14,7 @@ from scipy.spatial import KDTree
 from sagesplat.adapt.free_viewpoints import free_cameras
 from sagesplat.adapt.observe import RenderedLabels
 from sagesplat.core.config import AdoptConfig, LabelsConfig, MasksConfig, NestConfig, SceneConfig, TrainConfig
+from sagesplat.core.errors import RunError
 from sagesplat.core.events import Progress, Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.names import repaired
@@ -21,15 +23,17 @@ from sagesplat.formats.levels import read_header, read_level, read_more, write_l
 from sagesplat.formats.splats import Splat, num_lods, read_splat
 from sagesplat.output.contact_sheet import contact_sheet
 from sagesplat.run.job import Job
-from sagesplat.run.records import file_hash
+from sagesplat.run.records import file_hash, is_done
+from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
 from sagesplat.scene import load_scene
 from sagesplat.scene.cameras import NamedCamera, read_camera_file
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage, write_model
 from sagesplat.scene.scene import Camera, View
+from sagesplat.segment.edit import apply
 from sagesplat.segment.lift import LiftedLabels
 from sagesplat.segment.masks import UNLABELLED, Taxonomy, prepare_folder, write_labels, write_mask
-from sagesplat.stages.label import make_masks
+from sagesplat.stages.label import edit_of, make_masks
 from sagesplat.stages.scene import check_folder, open_scene
 from sagesplat.train.lower_levels import check_shares
 from sagesplat.train.nested import check
@@ -53,6 +57,7 @@ def open_splat(
     """
     segmented = masks.segmenter != "auto" or masks.masks is not None or masks.model is not None
     check_folder(job.run)
+    _check_run(job.run, config)
     check_shares(config.shares)
     check(NestConfig(steps=config.steps))
     own = job.run.capture / repaired(source.resolve().stem)
@@ -62,6 +67,16 @@ def open_splat(
         masks = replace(masks, masks=own / "masks")
     make_masks(job, masks, labels)
     _label(job, voted=segmented)
+
+
+def _check_run(run: RunDir, config: AdoptConfig) -> None:
+    """RunError where adopting would overwrite what it reads, or a run that was trained here."""
+    if run.scene.exists() and not run.adopted.exists():
+        raise RunError(f"{run.path}: holds a run of its own; choose a new folder for the splat")
+    if config.cameras is not None and config.cameras.resolve().is_relative_to(run.path.resolve()):
+        raise RunError(
+            f"{config.cameras}: in the run folder, where adopt writes; copy it elsewhere, and give that path"
+        )
 
 
 def _make_capture(
@@ -77,6 +92,7 @@ def _make_capture(
     names = ("cameras", "views", "kind", "up", "fov", "size", "lod", "spz_axes", "seed")
     settings = {name: getattr(config, name) for name in names} | {"labelled": labelled, "photos": photos}
     settings["downscale"] = scene.downscale
+    settings["cameras"] = config.cameras and str(config.cameras.resolve())
     settings |= {"source": str(source.resolve()), "content": _content(source)}
 
     def make() -> list[str]:
@@ -105,6 +121,8 @@ def _make_capture(
             f"{len(cameras)} viewpoints, {run.contact_sheet}: {how}",
         ]
 
+    # the capture's folder is named after the splat: for another splat it is missing, and not out of date
+    is_done(run, "adopt", json.loads(json.dumps(settings)), None, [run.adopted], job.force)
     outputs = [run.adopted, run.contact_sheet]
     outputs += [] if photos else [own / "sparse"]
     outputs += [own / "masks" / "labels.json"] if labelled else []
@@ -203,6 +221,20 @@ def _write_model(folder: Path, g: Gaussians, views: Sequence[View], rows: np.nda
     write_model(folder, models, images, g.means[points].numpy(), rgb, np.zeros(len(rows)))
 
 
+def _edited(job: Job, g: Gaussians) -> Gaussians:
+    """Gaussians with the labels of the file, as its label images were edited: merged, kept or left out.
+
+    Unlabelled are those of categories that no label image shows: no viewpoint would tell what their levels
+    are worth.
+    """
+    ids = g.label_ids.numpy()
+    before = Taxonomy.read(job.run.segmented / "labels.json")
+    unseen = ~np.isin(ids, (UNLABELLED, *before.names))
+    if unseen.any():
+        job.emit(Warned(f"{unseen.sum():,} Gaussians of categories that no viewpoint shows are unlabelled"))
+    return replace(g, label_ids=torch.from_numpy(apply(ids, edit_of(job.run))))
+
+
 def _label(job: Job, *, voted: bool) -> None:
     """Label all Gaussians, by the file or by votes of the label images: the one level that was trained."""
     run = job.run
@@ -218,6 +250,8 @@ def _label(job: Job, *, voted: bool) -> None:
                     g, job.scene, job.masks, job.scene.train_ids.tolist(), antialiased=antialiased
                 ),
             )
+        else:
+            g = _edited(job, g)
         points = job.scene.points.xyz
         rows = _points(g, 0, most=len(g))
         ids = g.label_ids.numpy()[rows[KDTree(g.means.numpy()[rows]).query(points)[1]]]
@@ -228,7 +262,7 @@ def _label(job: Job, *, voted: bool) -> None:
         write_level(run.levels, _LEVEL, g, recovering=False, sh_degree=g.sh_degree, exact=True)
         return [f"{len(g):,} Gaussians of {len(g.counts())} categories"]
 
-    inputs = [run.scene, run.adopted, run.masks / "labels.json"]
+    inputs = [run.scene, run.adopted, run.provenance("masks"), run.masks / "labels.json"]
     run_stage(job, "lift", {"voted": voted}, inputs, [run.labels, run.levels], make)
     # what later stages ask of the training
     config = TrainConfig(

@@ -19,6 +19,7 @@ from sagesplat.run.executor import split
 from sagesplat.run.job import Job
 from sagesplat.run.records import file_hash
 from sagesplat.run.remote import work_all
+from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
 from sagesplat.segment.edit import Edited, edit_labels, parse_keep, parse_merge
 from sagesplat.segment.lift import agreement_in, lift
@@ -203,6 +204,15 @@ def read_edit_table(path: Path, before: Taxonomy) -> Int16[np.ndarray, " T"]:
     return np.array(table, np.int16)
 
 
+def edit_of(run: RunDir) -> Int16[np.ndarray, " T"]:
+    """What became of any id when the label images were edited: -1 for one that none of them has."""
+    before = Taxonomy.read(run.segmented / "labels.json")
+    edited = read_edit_table(run.masks / _EDIT, before)
+    table = np.full(MAX_LABEL_ID + 2, UNLABELLED, np.int16)
+    table[list(before.names)] = edited[list(before.names)]
+    return table
+
+
 def _agreement(job: Job, masks: Masks) -> float:
     """Share of what views without a vote show of the points that is the points' label; NaN without any."""
     voters = set(job.scene.train_ids.tolist())
@@ -213,10 +223,7 @@ def _agreement(job: Job, masks: Masks) -> float:
 
 def _soft(job: Job) -> Soft:
     """The network's probabilities, of the categories that are left."""
-    before = Taxonomy.read(job.run.segmented / "labels.json")
-    edited = read_edit_table(job.run.masks / _EDIT, before)
-    table = np.full(MAX_LABEL_ID + 2, UNLABELLED, np.int16)  # what never was likeliest has no label
-    table[list(before.names)] = edited[list(before.names)]
+    table = edit_of(job.run)  # what never was likeliest has no label
 
     def soft(row: int) -> tuple[np.ndarray, np.ndarray]:
         ids, p = read_soft(soft_path(job.run.soft, job.scene.views[row]))

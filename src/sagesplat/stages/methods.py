@@ -174,7 +174,7 @@ class NestedLevels(Method):
         if config.target_ssim is not None and not has_photos(self.job.run):
             raise RunError(
                 f"{self.job.run.path}: a splat without photos has no SSIM against photos; give "
-                "--target-fidelity, or adopt it again with --cameras CAPTURE"
+                "--target-fidelity, or adopt it again with --cameras CAPTURE --force"
             )
 
     @cached_property
@@ -244,6 +244,8 @@ class NestedLevels(Method):
         ):
             write_promises(path, models)
             statuses = [model.status for model in models.values()]
+            if not statuses:
+                continue  # without photos no SSIM against them
             lines.append(f"{name}: " + ", ".join(f"{statuses.count(s)} {s}" for s in sorted(set(statuses))))
         return lines
 

@@ -29,13 +29,14 @@ from sagesplat.stages.compose import compose_plan
 from sagesplat.stages.evaluate import evaluate_plans
 from sagesplat.stages.fit import fit_ladder
 from sagesplat.stages.label import fuse_masks, lift_labels, make_masks
+from sagesplat.stages.methods import method_of
 from sagesplat.stages.nest import nest_levels
 from sagesplat.stages.observe import observe_levels
 from sagesplat.stages.plan import check_targets, make_plan
 from sagesplat.stages.preflight import check_segmenter, check_training
 from sagesplat.stages.report import make_report
 from sagesplat.stages.sample import sample_levels
-from sagesplat.stages.scene import open_scene
+from sagesplat.stages.scene import check_not_adopted, open_scene
 from sagesplat.stages.train import train_levels
 from sagesplat.train import nested
 
@@ -63,6 +64,7 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
     Example:
         `sagesplat.run_scene` opens a job and calls this.
     """
+    check_not_adopted(job.run)
     check_targets(config.plan, config.ladder)  # before hours of training
     nested.check(config.nest)
     blocks.check(config.blocks)
@@ -98,6 +100,7 @@ def adopt(job: Job, source: Path, adopted: AdoptConfig, config: RunConfig) -> No
     """
     check_targets(config.plan, "nested")
     open_splat(job, source, adopted, config.scene, config.masks, config.labels)
+    method_of(job).check(config.plan)
     if config.fuse:
         fuse_masks(job)
     make_levels(job, adopted)
@@ -117,6 +120,7 @@ def _promise(job: Job, config: RunConfig) -> None:
 
 def observe_snapshots(job: Job) -> None:
     """Measure the training snapshots of a run, as its levels were measured; `job` is one on the snapshots."""
+    check_not_adopted(job.run)
     observe_levels(job, _recorded(job).get("fit", FitConfig()))
 
 
@@ -125,6 +129,7 @@ def adapt_snapshots(job: Job) -> None:
 
     `job` is one on the snapshots. Stages that are done are skipped.
     """
+    check_not_adopted(job.run)
     known = _recorded(job)
     fit: FitConfig = known.get("fit", FitConfig())
     observe_levels(job, fit)
@@ -142,6 +147,7 @@ def _recorded(job: Job) -> dict[str, Any]:
 
 def train(job: Job, config: TrainConfig, of_blocks: BlocksConfig, seed: int) -> None:
     """Train the scene as one, or in blocks."""
+    check_not_adopted(job.run)
     if of_blocks.count > 1:
         blocks.train_blocks(job, of_blocks, config, seed)
     elif job.has_blocks:
@@ -152,6 +158,7 @@ def train(job: Job, config: TrainConfig, of_blocks: BlocksConfig, seed: int) -> 
 
 def nest(job: Job, config: NestConfig, of_blocks: BlocksConfig, seed: int) -> None:
     """Make the nested ladder of a trained scene, or of its blocks."""
+    check_not_adopted(job.run)
     if job.has_blocks:
         blocks.nest_blocks(job, of_blocks, config, seed)
         measure_borders(job)

@@ -36,6 +36,15 @@ def check_folder(run: RunDir) -> None:
         raise RunError(f"{run.path}: not empty and not a run folder; choose a new folder")
 
 
+def check_not_adopted(run: RunDir) -> None:
+    """RunError for a run of a splat that somebody else trained: labels and training came with the splat."""
+    if run.adopted.exists():
+        raise RunError(
+            f"{run.path}: a splat that was trained elsewhere; to change this run, repeat `sagesplat adopt` "
+            "with --force; to train, choose another run folder: `sagesplat run CAPTURE NEW_RUN`"
+        )
+
+
 def open_scene(job: Job, path: Path, config: SceneConfig, poses: PosesConfig | None = None) -> None:
     """Read a capture and write scene.json. For photos without poses, or a video, estimate the poses first."""
     run = job.run

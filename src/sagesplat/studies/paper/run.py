@@ -20,7 +20,7 @@ from sagesplat.segment.display_names import titles
 from sagesplat.stages.compose import compose_inputs, tune_composition
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.plan import ssim_targets
-from sagesplat.stages.results import models_of, observations_of, plans_of
+from sagesplat.stages.results import has_photos, models_of, observations_of, plans_of
 from sagesplat.stages.shared import distances, observed
 from sagesplat.studies.lpips import load_metrics, lpips_hashes
 from sagesplat.studies.paper.cross_view import NONE, cross_view, read_cross_view
@@ -40,6 +40,11 @@ def paper_report(job: Job, config: PaperConfig) -> None:
 def cross_views(job: Job) -> None:
     """Plan each unseen view by itself and measure its composition."""
     run, method, targets = job.run, method_of(job), _targets(job)
+    if not has_photos(run):
+        raise RunError(
+            f"{run.path}: crossview needs photos, and this splat came without; "
+            f"`sagesplat measure {run.path}` needs none"
+        )
 
     def make() -> list[str]:
         fitted = job.fit_config

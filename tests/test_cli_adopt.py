@@ -1,0 +1,155 @@
+"""`sagesplat adopt` as typed: repeated, refused, and what other commands do with its run."""
+
+import shutil
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from conftest import random_gaussians
+
+from sagesplat.formats.ply import write_ply
+
+Call = Callable[..., tuple[int, str]]
+SMALL = ("--fit", "none", "--views", "14", "--size", "48", "36", "--shares", "0.3", "1", "--kind", "object")
+FEW = ("--sample.views", "6", "--sample.calibration-views", "6", "--target-fidelity", "0.6")
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Call:
+    def typed(*words: str | Path) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["sagesplat", *map(str, words)])
+        code = 0
+        try:
+            from sagesplat import cli
+
+            cli.main()
+        except SystemExit as end:
+            code = int(end.code or 0)
+        out = capsys.readouterr()
+        return code, out.out + out.err
+
+    return typed
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of ball.ply, which is beside it, as is other.ply."""
+    from sagesplat import cli
+
+    folder = tmp_path_factory.mktemp("adopted")
+    g = random_gaussians(400, degree=1, logit=2.0)
+    write_ply(folder / "ball.ply", g, {3: "car", 184: "tree-merged"})
+    write_ply(folder / "other.ply", replace(g, means=g.means + 1), {3: "car", 184: "tree-merged"})
+    with pytest.MonkeyPatch.context() as patch:
+        words = ["sagesplat", "adopt", str(folder / "ball.ply"), str(folder / "run"), *SMALL, *FEW]
+        patch.setattr(sys, "argv", words)
+        cli.main()
+    return folder / "run"
+
+
+def _files(run: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(run)): path.read_bytes()
+        for path in sorted(run.rglob("*"))
+        if path.is_file() and path.name != ".lock"
+    }
+
+
+def _refused(command: Call, *words: str | Path) -> str:
+    code, said = command(*words)
+    assert code == 2, said
+    assert "Traceback" not in said
+    assert said.splitlines()[-1].startswith("sagesplat: ")
+    return said
+
+
+def test_its_settings_are_the_defaults_of_the_next_call(finished: Path, command: Call) -> None:
+    code, said = command("adopt", finished.parent / "ball.ply", finished)
+    assert code == 0
+    assert "--fit none" in said
+    assert "--views 14" in said
+    assert "--masks" not in said  # label images that adopt made are none that somebody gave
+    assert "✓" not in said  # nothing is redone
+
+
+def test_another_splat_replaces_it_only_with_force(finished: Path, tmp_path: Path, command: Call) -> None:
+    run = Path(shutil.copytree(finished, tmp_path / "run"))
+    before = _files(run)
+    said = _refused(command, "adopt", finished.parent / "other.ply", run)
+    assert "--force" in said
+    assert _files(run) == before
+    code, said = command("adopt", finished.parent / "other.ply", run, "--force")
+    assert code == 0, said
+    assert (run / "capture" / "other").is_dir()
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        *(("train",), ("nest",), ("fuse",), ("lift",), ("block-categories",), ("compare",)),
+        *(("report", "--paper"), ("nest", "--force"), ("train", "--force"), ("crossview",)),
+        ("plan", "--target-ssim", "0.7", "--force"),
+    ],
+)
+def test_what_came_in_is_not_trained_again(finished: Path, command: Call, words: tuple[str, ...]) -> None:
+    before = _files(finished)
+    said = _refused(command, words[0], finished, *words[1:])
+    assert "splat" in said
+    assert _files(finished) == before
+
+
+def test_its_capture_is_not_run_over_it(finished: Path, command: Call) -> None:
+    before, capture = _files(finished), finished / "capture" / "ball"
+    for words in (("run", capture, finished, "--force"), ("masks", capture, finished, "--force")):
+        assert "trained elsewhere" in _refused(command, *words)
+    assert "trained elsewhere" in _refused(command, "transfer", finished, finished)
+    assert _files(finished) == before
+
+
+def test_it_does_not_overwrite_what_it_reads(finished: Path, command: Call) -> None:
+    before = _files(finished)
+    ball, cameras = finished.parent / "ball.ply", finished / "capture" / "ball"
+    assert "run folder" in _refused(command, "adopt", ball, finished, "--cameras", cameras, "--force")
+    assert _files(finished) == before
+
+
+def test_a_run_of_a_capture_is_kept(finished_run: Path, finished: Path, command: Call) -> None:
+    before = _files(finished_run)
+    said = _refused(command, "adopt", finished.parent / "ball.ply", finished_run, "--force")
+    assert "choose a new folder" in said
+    assert _files(finished_run) == before
+
+
+def test_ssim_needs_photos_which_is_told_before_levels_are_made(
+    finished: Path, tmp_path: Path, command: Call
+) -> None:
+    said = _refused(
+        command, "adopt", finished.parent / "ball.ply", tmp_path / "run", *SMALL, "--target-ssim", "0.7"
+    )
+    assert "--cameras" in said
+    assert not (tmp_path / "run" / "nested" / "ladder.npz").exists()
+    code, said = command("adopt", finished.parent / "ball.ply", tmp_path / "run", *SMALL, *FEW)
+    assert code == 0, said
+
+
+def test_a_killed_one_resumes_with_the_same_command(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Call
+) -> None:
+    from sagesplat.stages import adopt_levels
+
+    def killed(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    words = ("adopt", finished.parent / "ball.ply", tmp_path / "run", *SMALL, *FEW)
+    with monkeypatch.context() as patch:
+        patch.setattr(adopt_levels, "_write", killed)
+        code, said = command(*words)
+    assert code != 0
+    assert "Traceback" not in said
+    code, said = command(*words)
+    assert code == 0, said
+    made, undisturbed = _files(tmp_path / "run"), _files(finished)
+    for name in ("nested/ladder.npz", "nested/increments/index.json"):
+        assert made[name] == undisturbed[name]
