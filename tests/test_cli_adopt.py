@@ -1,5 +1,6 @@
 """`sagesplat adopt` as typed: repeated, refused, and what other commands do with its run."""
 
+import math
 import shutil
 import sys
 from collections.abc import Callable
@@ -9,7 +10,7 @@ from pathlib import Path
 import pytest
 from conftest import random_gaussians
 
-from sagesplat.formats.ply import write_ply
+from sagesplat.formats.ply import read_ply, write_ply
 
 Call = Callable[..., tuple[int, str]]
 SMALL = ("--fit", "none", "--views", "14", "--size", "48", "36", "--shares", "0.3", "1", "--kind", "object")
@@ -132,6 +133,22 @@ def test_ssim_needs_photos_which_is_told_before_levels_are_made(
     assert not (tmp_path / "run" / "nested" / "ladder.npz").exists()
     code, said = command("adopt", finished.parent / "ball.ply", tmp_path / "run", *SMALL, *FEW)
     assert code == 0, said
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e-6])
+def test_a_splat_before_the_near_plane_is_refused(
+    finished: Path, tmp_path: Path, command: Call, factor: float
+) -> None:
+    g = read_ply(finished.parent / "ball.ply")
+    small = replace(g, means=g.means * factor, log_scales=g.log_scales + math.log(factor))
+    write_ply(tmp_path / "small.ply", small)
+    for words in (
+        ("adopt", tmp_path / "small.ply", tmp_path / "run", *SMALL),
+        ("measure", tmp_path / "small.ply", finished.parent / "ball.ply", "--out", tmp_path / "out"),
+    ):
+        said = _refused(command, *words)
+        factors = {1e-3: "1000", 1e-6: "1000000"}
+        assert f"small.ply --scale {factors[factor]} larger.ply" in said
 
 
 def test_a_killed_one_resumes_with_the_same_command(

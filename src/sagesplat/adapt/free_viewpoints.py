@@ -14,6 +14,7 @@ Viewpoints are taken in the order of low-discrepancy sequences, so that the firs
 too, whatever the count.
 """
 
+import math
 from dataclasses import dataclass
 from itertools import islice
 from typing import Literal
@@ -28,6 +29,7 @@ from sagesplat.adapt.upright import upright
 from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.raster import Backend, Workspace, device_of, rasterize
+from sagesplat.raster.render import NEAR
 from sagesplat.scene.loading import MAX_SIDE
 from sagesplat.scene.scene import Camera
 
@@ -43,6 +45,7 @@ _PLACE = 0.2  # of free space is surrounded
 _SMALL = 96  # px, longer side of the renders that viewpoints are checked by
 _SEEN = {"object": 0.01, "place": 0.5}  # least share of the image that is covered
 _MOST_NEAR = 0.3  # of what is seen may be closer than CLEAR
+_SMALLEST = 0.02  # world units; here the nearest orbits keep clear of the near plane
 _TRIES = 12  # for each viewpoint
 
 
@@ -116,6 +119,20 @@ def free_cameras(
     centre = cloud.world(drawer.centre[None])[0]
     reason = f"{decided}: {how}; {upward.reason}{wanted}"
     return FreeViewpoints(cameras, decided, upward.up, centre, drawer.radius * cloud.unit, reason)
+
+
+def check_size(g: Gaussians, name: str) -> None:
+    """RunError for a splat in units so large that it would lie before the near plane, or be rounded away.
+
+    `name`: of its file.
+    """
+    unit = cloud_of(g).unit if len(g) else 1.0
+    if unit < _SMALLEST:
+        factor = 10 ** math.ceil(-math.log10(max(unit, 1e-30)))
+        raise RunError(
+            f"{name}: too small, half of its Gaussians are within {unit:.2g} units, and nothing nearer than "
+            f"{NEAR} to a camera is drawn; enlarge it: `splat-transform {name} --scale {factor} larger.ply`"
+        )
 
 
 def _check(g: Gaussians, count: int, fov: float, size: tuple[int, int]) -> None:

@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 from scipy.spatial import KDTree
 
-from sagesplat.adapt.free_viewpoints import free_cameras
+from sagesplat.adapt.free_viewpoints import check_size, free_cameras
 from sagesplat.adapt.observe import RenderedLabels
 from sagesplat.core.config import AdoptConfig, LabelsConfig, MasksConfig, NestConfig, SceneConfig, TrainConfig
 from sagesplat.core.errors import RunError
@@ -99,8 +99,10 @@ def _make_capture(
         splat = read_splat(source, config.lod, spz_axes=config.spz_axes)
         for reason, count in splat.dropped.items():
             job.emit(Warned(f"{source}: {count:,} Gaussians left out: {reason}"))
+        check_size(splat.gaussians, str(source))
         if labelled:
             splat = _labelled(splat)
+        left_out = "".join(f", {count:,} left out ({reason})" for reason, count in splat.dropped.items())
         g = splat.gaussians
         if photos and config.cameras:
             views = list(load_scene(config.cameras, **asdict(scene)).views)
@@ -112,7 +114,7 @@ def _make_capture(
             _write_model(own / "sparse" / "0", g, views, _points(g, config.seed))
         _write_pictures(job, own, splat, views, labelled=labelled, photos=photos)
         contact_sheet(
-            run.contact_sheet, g, cameras, up, [f"{source.name}: {len(g):,} Gaussians", how],
+            run.contact_sheet, g, cameras, up, [f"{source.name}: {len(g):,} Gaussians{left_out}", how],
             antialiased=splat.antialiased, backend=job.backend,
         )  # fmt: skip
         write_set(run.adopted, g, _LEVEL, exact=True, antialiased=splat.antialiased)

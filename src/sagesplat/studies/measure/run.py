@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import uniform_filter
 
-from sagesplat.adapt.free_viewpoints import free_cameras
+from sagesplat.adapt.free_viewpoints import check_size, free_cameras
 from sagesplat.core.config import MeasureConfig
 from sagesplat.core.errors import RunError, SageError
 from sagesplat.core.events import Emit, Progress, StageStarted, TableMade, Warned
@@ -55,6 +55,7 @@ def measure(
     reference, levels, names = _levels(paths)
     truth = reference.load()
     _tell_dropped(truth, reference.name, emit)
+    check_size(truth.gaussians, reference.name)
     cameras, views, lines = _viewpoints(truth, config, backend)
     renderer, total = Renderer(backend), len(levels) * len(cameras)
     if not any(renderer.covered(truth, camera).any() for camera in cameras):
