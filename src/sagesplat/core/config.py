@@ -226,7 +226,7 @@ class AdoptConfig:
     steps: int = 3000
     """Training steps on compositions of the lower levels."""
     shares: tuple[float, ...] = (0.004, 0.008, 0.016, 0.031, 0.0625, 0.125, 0.25, 0.5, 0.7, 1.0)
-    """Sizes of the levels, as fractions of all Gaussians; categories that lose less by it keep fewer. Levels of
+    """Sizes of the levels, as fractions of all Gaussians; categories that lose less keep fewer. Levels of
     fewer than 50 Gaussians are left out."""
     lossless: bool = False
     """Send the highest levels as PLY, not SPZ: the last one is then identical to the file."""
