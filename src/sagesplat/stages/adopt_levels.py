@@ -16,10 +16,12 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.increments import packed, read_increments, write_increments
 from sagesplat.formats.levels import write_set
 from sagesplat.metrics.image import ssim_map
+from sagesplat.raster import device_of
 from sagesplat.run.job import Job
 from sagesplat.run.records import checkpoint_key
 from sagesplat.run.stage import run_stage
 from sagesplat.scene.images import Photos
+from sagesplat.stages.memory import check_nest
 from sagesplat.stages.shared import label_image_inputs, train_config
 from sagesplat.train import nested
 from sagesplat.train.checkpoint import remove_checkpoints
@@ -61,25 +63,17 @@ def make_levels(job: Job, config: AdoptConfig) -> None:
     inputs = [run.scene, run.labels, run.levels, run.provenance("train"), *label_image_inputs(run)]
 
     def make() -> list[str]:
+        if config.fit == "renders":
+            check_nest(job, len(g), g.sh_degree)
         key = checkpoint_key(run, settings, inputs)
         targets = Renders(g, job.scene.views, job.backend, job.antialiased, photo_cache(job.memory_limit))
         views = spread(job.scene.train_ids.tolist(), _WEIGH)
         weights = importance(g, job.scene, views, "weight", antialiased=job.antialiased)
         order = importance(g, job.scene, views, "sensitivity", antialiased=job.antialiased)
         ordered = g.select(torch.from_numpy(np.argsort(-order, kind="stable")))
-        rungs = merged_rungs(g, weights, shares[:-1])
-        rungs = [replace(rung, gaussians=_covering(job, rung, views)) for rung in rungs]
-        pruned, least = list[Gaussians](), dict[int, int]()
-        for rung in rungs:
-            pruned.append(first_of_all(ordered, rung.share, least))
-            least = rung.gaussians.counts()
-        merges = _merges_until(job, targets, [rung.gaussians for rung in rungs], pruned)
-        trained = len([share for share in shares[:-1] if share <= _TRAINED]) if config.fit == "renders" else 0
-        starts = [r.gaussians if i < merges else pruned[i] for i, r in enumerate(rungs[:trained])]
-        sets = _trained(job, targets, dict(zip(shares, starts, strict=False)), config, key)
-        sets += [whole(_colored(job, targets, rung)) for rung in rungs[trained:merges]]
+        sets = _lower_levels(job, targets, ordered, merged_rungs(g, weights, shares[:-1]), views, config, key)
         num_lower = sum(len(one.levels) for one in sets)
-        least = dict(sets[-1].levels[-1]) if sets else {}
+        least: Counts = sets[-1].levels[-1] if sets else {}
         levels = list[Counts]()
         for share in shares[num_lower:]:
             least = first_of_all(ordered, share, least).counts()
@@ -92,6 +86,34 @@ def make_levels(job: Job, config: AdoptConfig) -> None:
     run_stage(job, "nest", settings, inputs, [run.prefixes, run.increments], make, swaps=True)
 
 
+def _lower_levels(
+    job: Job,
+    targets: Photos,
+    ordered: Gaussians,
+    rungs: Sequence[Rung],
+    views: Sequence[int],
+    config: AdoptConfig,
+    key: str,
+) -> list[Set]:
+    """The levels that are not prefixes of the originals, ascending.
+
+    Trained ones start from whichever is closer to the originals: merged Gaussians, or as many of the most
+    important ones. Of the larger ones, those that are closer merged stay merged.
+    """
+    rungs = [replace(rung, gaussians=_covering(job, rung, views)) for rung in rungs]
+    pruned, least = list[Gaussians](), dict[int, int]()
+    for rung in rungs:
+        pruned.append(first_of_all(ordered, rung.share, least))
+        least = rung.gaussians.counts()
+    merges = _merges_until(job, targets, [rung.gaussians for rung in rungs], pruned)
+    small = [rung for rung in rungs if rung.share <= _TRAINED] if config.fit == "renders" else []
+    starts = {
+        rung.share: rung.gaussians if number < merges else pruned[number] for number, rung in enumerate(small)
+    }
+    sets = _trained(job, targets, starts, config, key) if starts else []
+    return sets + [whole(_colored(job, targets, rung)) for rung in rungs[len(small) : merges]]
+
+
 def _covering(job: Job, rung: Rung, views: Sequence[int]) -> Gaussians:
     few = spread(list(views), _REFIT)
     wanted = rung.stands_for * (len(few) / len(views))
@@ -101,10 +123,11 @@ def _covering(job: Job, rung: Rung, views: Sequence[int]) -> Gaussians:
 def _colored(job: Job, targets: Photos, rung: Rung) -> Gaussians:
     rows = spread(job.scene.train_ids.tolist(), _REFIT)
     cameras = [job.scene.views[row].camera for row in rows]
-    images = [torch.from_numpy(as_unit(targets[row])) for row in rows]
-    rounds = 5 if rung.share <= _SMALL else 3
-    return refit_colors(
-        rung.gaussians, cameras, images, rounds, antialiased=job.antialiased, backend=job.backend
+    device = device_of(job.backend)
+    images = [torch.from_numpy(as_unit(targets[row])).to(device) for row in rows]
+    rounds, g = 5 if rung.share <= _SMALL else 3, rung.gaussians.to(device)
+    return refit_colors(g, cameras, images, rounds, antialiased=job.antialiased, backend=job.backend).to(
+        "cpu"
     )
 
 
@@ -125,8 +148,6 @@ def _trained(
 
     `starts`: Gaussians to start from, by share.
     """
-    if not starts:
-        return []
     sets, views = list[Set](), spread(job.scene.train_ids.tolist(), _REFIT)
     for shares in trained_sets(list(starts)):
         top = starts[shares[-1]]

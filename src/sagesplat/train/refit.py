@@ -57,7 +57,7 @@ def refit_colors(
     Gaussian paints, weighted by how much it paints of them.
     """
     workspace = Workspace()
-    painted = torch.zeros(len(g), 1, 1)
+    painted = torch.zeros(len(g), 1, 1, device=g.means.device)
     for turn in range(rounds):
         moved = torch.zeros_like(g.sh0)
         for camera, image in zip(cameras, images, strict=True):
