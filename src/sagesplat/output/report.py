@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import UInt8
 from jinja2 import Environment, StrictUndefined, Template
 from PIL import Image
 
@@ -58,6 +59,9 @@ class ReportData:
     settings: Facts = ()
     timings: Sequence[tuple[str, float]] = ()  # stage, seconds
     provenance: Facts = ()  # versions, hashes of the inputs
+    photos: bool = True  # False: renders of a splat that somebody else trained
+    adopted: Facts = ()  # how such a splat was looked at, and how its levels were made
+    viewpoints: UInt8[np.ndarray, "H W 3"] | None = None  # what its viewpoints see
     categories: Categories = field(default_factory=dict)  # of per-block categories
 
 
@@ -94,7 +98,8 @@ def write_report(folder: Path, data: ReportData) -> Path:
         table_rows=TABLE_ROWS,
         plots={name: (title, image) for name, title, image in plots},
         sheets=sheets,
-        panels=[_pictures(panel, data.colours) for panel in data.panels],
+        viewpoints=None if data.viewpoints is None else _picture(data.viewpoints, "JPEG"),
+        panels=[_pictures(panel, data.colours, data.photos) for panel in data.panels],
         chips={name_of(i, data.names): _css(data.colours.get(i, (128, 128, 128))) for i in labels},
     )
     write_text(folder / "index.html", page)
@@ -303,7 +308,7 @@ def _save(figure: figures.Figure, folder: Path, name: str) -> str:
     return _address(figures.save_figure(figure, folder / "figures" / name), "image/svg+xml")
 
 
-def _pictures(panel: Panel, colours: Colours) -> dict:
+def _pictures(panel: Panel, colours: Colours, photos: bool) -> dict:
     """A panel with its pictures as data addresses."""
     labels = figures.label_image(panel.label_ids, colours)
     error = figures.error_image(panel.composed, panel.photo)
@@ -312,7 +317,7 @@ def _pictures(panel: Panel, colours: Colours) -> dict:
         "ratio": f"{panel.photo.shape[1]} / {panel.photo.shape[0]}",
         "pictures": [
             ("full model", _picture(panel.full, "JPEG")),
-            ("photo", _picture(panel.photo, "JPEG")),
+            ("photo" if photos else "as it came in", _picture(panel.photo, "JPEG")),
             ("categories", _picture(labels, "PNG")),
             ("error", _picture(error, "JPEG")),
             ("composed", _picture(panel.composed, "JPEG")),

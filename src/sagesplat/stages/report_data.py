@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from sagesplat import __version__
+from sagesplat.adapt.ladder import PrefixLadder
 from sagesplat.adapt.observe import TOTAL, as_unit, measure, render_rgb
 from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.core.gaussians import Gaussians
+from sagesplat.io.pictures import open_picture
 from sagesplat.output.figures import Colours, Panel
 from sagesplat.output.report import ReportData
 from sagesplat.run.job import Job
@@ -21,11 +23,11 @@ from sagesplat.segment.block_categories import category_of
 from sagesplat.segment.display_names import titles
 from sagesplat.segment.masks import UNLABELLED, UNLABELLED_COLOR, Taxonomy
 from sagesplat.stages.methods import method_of
-from sagesplat.stages.results import evaluation_of, models_of, observations_of, plans_of
+from sagesplat.stages.results import evaluation_of, has_photos, models_of, observations_of, plans_of
 
 PANELS = 3  # views shown in pictures
 STAGES = (
-    *("poses", "scene", "segment", "masks", "lift", "train", "fuse"),
+    *("adopt", "poses", "scene", "segment", "masks", "lift", "train", "fuse"),
     *("nest", "observe", "sample", "fit", "plan", "compose", "evaluate"),
 )
 
@@ -60,7 +62,41 @@ def report_data(job: Job, composed: Gaussians, quality: QualityKind, target: flo
         timings=[(stage, float(made.get("seconds", math.nan))) for stage, made in records.items()],
         provenance=_provenance(records),
         categories=categories,
+        photos=has_photos(run),
+        adopted=_adopted(job, ladder) if run.adopted.exists() and isinstance(ladder, PrefixLadder) else (),
+        viewpoints=_viewpoints(run),
     )
+
+
+def _viewpoints(run: RunDir) -> np.ndarray | None:
+    """The contact sheet of an adopted splat."""
+    if not (run.adopted.exists() and run.contact_sheet.exists()):
+        return None
+    with open_picture(run.contact_sheet, ("PNG",)) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+def _adopted(job: Job, ladder: PrefixLadder) -> list[tuple[str, str]]:
+    """How a splat that somebody else trained was looked at, and how its levels were made."""
+    made, nest = settings_of(job.run, "adopt"), settings_of(job.run, "nest")
+    trained = f"trained on renders of the splat, {nest['steps']:,} steps"
+    first = {job.names()[label]: max(levels) for label, levels in ladder.replaces.items() if levels}
+    originals = ", ".join(f"{titled} {level}" for titled, level in first.items())
+    return [
+        ("file", Path(made["source"]).name),
+        (
+            "viewpoints",
+            made["cameras"] or f"{made['views']} drawn from the splat, kind {made['kind']}",
+        ),
+        ("compared with", "photos" if made["photos"] else "renders of the splat as it came in"),
+        ("labels", "those of the file, if it has any" if made["labelled"] else "votes of label images"),
+        ("lower levels", trained if nest["fit"] == "renders" else "merged Gaussians, not trained"),
+        ("originals from level", originals or "1"),
+        (
+            "last level",
+            "identical to the file" if nest["lossless"] else "the file, rounded as SPZ",
+        ),
+    ]
 
 
 def stage_records(run: RunDir) -> list[Path]:
