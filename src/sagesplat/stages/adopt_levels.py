@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -46,7 +47,7 @@ from sagesplat.train.nested import Nested, NestStep
 from sagesplat.train.refit import refit_colors, refit_coverage
 
 _WEIGH = 32  # views that importance is measured in
-_REFIT = 24  # views that merged Gaussians are fitted to
+_REFIT = 24  # views that colours are fitted to
 _TRAINED = 0.5  # largest share that is trained
 _SMALL = 0.1  # share up to which colours take more rounds: little is left as it was, and rounds are cheap
 _COMPARE = 8  # views that merged Gaussians and prefixes of the originals are compared in
@@ -100,7 +101,8 @@ def _lower_levels(
     Trained ones start from whichever is closer to the originals: merged Gaussians, or as many of the most
     important ones. Of the larger ones, those that are closer merged stay merged.
     """
-    rungs = [replace(rung, gaussians=_covering(job, rung, views)) for rung in rungs]
+    covering = partial(refit_coverage, scene=job.scene, views=views, antialiased=job.antialiased)
+    rungs = [replace(rung, gaussians=covering(rung.gaussians, rung.stands_for)) for rung in rungs]
     pruned, least = list[Gaussians](), dict[int, int]()
     for rung in rungs:
         pruned.append(first_of_all(ordered, rung.share, least))
@@ -112,12 +114,6 @@ def _lower_levels(
     }
     sets = _trained(job, targets, starts, config, key) if starts else []
     return sets + [whole(_colored(job, targets, rung)) for rung in rungs[len(small) : merges]]
-
-
-def _covering(job: Job, rung: Rung, views: Sequence[int]) -> Gaussians:
-    few = spread(list(views), _REFIT)
-    wanted = rung.stands_for * (len(few) / len(views))
-    return refit_coverage(rung.gaussians, wanted, job.scene, few, antialiased=job.antialiased)
 
 
 def _colored(job: Job, targets: Photos, rung: Rung) -> Gaussians:

@@ -32,7 +32,8 @@ def refit_coverage(
     """Opacities, and areas where those are at their limit, so that blending weights come near `wanted`.
 
     What merges covers less: a mixture's tails are longer than those of its parts, and an opacity is at most
-    1. `wanted`: the blending weight over `views` (rows of `scene.views`) of what each Gaussian stands for.
+    1. `wanted`: the blending weight over the same `views` (rows of `scene.views`) of what each stands for;
+    over others, what only those show would grow into floaters.
     """
     has = importance(g, scene, views, "weight", antialiased=antialiased)
     ratio = ((wanted + _LEAST[1]) / (has + _LEAST[1])) ** _DAMPED
