@@ -80,7 +80,8 @@ def make_levels(job: Job, config: AdoptConfig) -> None:
             least = first_of_all(ordered, share, least).counts()
             levels.append(least)
         ladder = assemble([*sets, Set(ordered, tuple(levels))])
-        lines = _write(job, ladder, num_lower, g, settings, config.lossless)
+        coarse = sum(share <= _TRAINED for share in shares[:-1]) if config.fit == "renders" else 0
+        lines = _write(job, ladder, num_lower, coarse, g, settings, config.lossless)
         remove_checkpoints(run.nest_checkpoint)
         return lines
 
@@ -168,9 +169,19 @@ def _trained(
 
 
 def _write(
-    job: Job, ladder: Assembled, num_lower: int, before: Gaussians, settings: dict[str, Any], lossless: bool
+    job: Job,
+    ladder: Assembled,
+    num_lower: int,
+    coarse: int,
+    before: Gaussians,
+    settings: dict[str, Any],
+    lossless: bool,
 ) -> list[str]:
-    """Write the ladder and its increments; the levels above `num_lower` are of the originals."""
+    """Write the ladder and its increments.
+
+    The levels above `num_lower` are of the originals. Those up to `coarse` were trained as the larger steps of
+    SPZ round them; the others would lose by it.
+    """
     run, levels = job.run, len(next(iter(ladder.sizes.values())))
     run.provenance("nest").unlink(missing_ok=True)  # from here on the earlier ladder is gone
     bits = tuple(settings["sh_bits"])
@@ -178,7 +189,7 @@ def _write(
     chunks = write_increments(
         run.increments, g, ladder.sizes, job.names(), replaces=ladder.replaces, sh_bits=bits,
         kind=lambda _, level: "ply" if lossless and level > num_lower else "spz",
-        fine=range(num_lower + 1, levels + 1), antialiased=job.antialiased,
+        fine=range(coarse + 1, levels + 1), antialiased=job.antialiased,
     )  # fmt: skip
     sent = read_increments(run.increments, chunks)
     ones = np.ones(len(sent), np.float32)  # no Gaussian is told to lie on a border
