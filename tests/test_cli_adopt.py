@@ -1,5 +1,6 @@
 """`sagesplat adopt` as typed: repeated, refused, and what other commands do with its run."""
 
+import json
 import math
 import shutil
 import sys
@@ -140,6 +141,54 @@ def test_ssim_needs_photos_which_is_told_before_levels_are_made(
     assert "--cameras" in said
     assert not (tmp_path / "run" / "nested" / "ladder.npz").exists()
     code, said = command("adopt", finished.parent / "ball.ply", tmp_path / "run", *SMALL, *FEW)
+    assert code == 0, said
+
+
+def test_bad_files_are_one_line_and_make_nothing(finished: Path, tmp_path: Path, command: Call) -> None:
+    ball = (finished.parent / "ball.ply").read_bytes()
+    g = read_ply(finished.parent / "ball.ply")
+    write_ply(tmp_path / "nan.ply", replace(g, means=g.means * float("nan")))
+    write_ply(tmp_path / "zeros.ply", replace(g, quats=g.quats * 0))
+    damaged = {
+        "cut.ply": ball[: len(ball) // 2],
+        "count.ply": ball.replace(b"element vertex 400", b"element vertex 90000000000"),
+        "none.ply": ball.replace(b"element vertex 400", b"element vertex 0"),
+        "picture.sog": (finished / "viewpoints.png").read_bytes(),
+        "empty.ply": b"",
+        "scene.obj": b"v 0 0 0",
+        "lod-meta.json": b'{"lodLevels": 2}',
+    }
+    for name, content in damaged.items():
+        (tmp_path / name).write_bytes(content)
+    for name in (*damaged, "nan.ply", "zeros.ply", "missing.ply"):
+        said = _refused(command, "adopt", tmp_path / name, tmp_path / "run", *SMALL)
+        assert name in said
+        assert len(said.splitlines()) == 1
+        assert not (tmp_path / "run" / "levels").exists()
+
+
+def test_a_file_of_another_format_is_read_as_what_it_is(
+    finished: Path, tmp_path: Path, command: Call
+) -> None:
+    shutil.copy(finished.parent / "ball.ply", tmp_path / "ball.spz")
+    code, said = command("adopt", tmp_path / "ball.spz", tmp_path / "run", *SMALL, *FEW)
+    assert code == 0
+    assert "400 Gaussians (PLY)" in said
+
+
+def test_cameras_that_look_elsewhere_are_told(finished: Path, tmp_path: Path, command: Call) -> None:
+    away = [
+        {
+            **{"id": i, "img_name": str(i), "width": 48, "height": 36, "fx": 40, "fy": 40},
+            **{"position": [1000, i, 0], "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]},
+        }
+        for i in range(12)
+    ]
+    (tmp_path / "cameras.json").write_text(json.dumps(away))
+    ball = finished.parent / "ball.ply"
+    said = _refused(command, "adopt", ball, tmp_path / "run", *SMALL, "--cameras", tmp_path / "cameras.json")
+    assert "no viewpoint shows" in said
+    code, said = command("adopt", ball, tmp_path / "run", *SMALL, *FEW)
     assert code == 0, said
 
 

@@ -171,7 +171,9 @@ def _streams(content: bytes, table: int, streams: int, sizes: Sequence[int]) -> 
         at += packed
         try:
             told = zstandard.frame_content_size(frame)  # -1: the frame does not say
-            if announced != size or told not in (-1, size) or len(frame) != packed:
+            if len(frame) != packed:
+                raise ValueError(f"{len(frame)} of {packed} bytes of a stream")
+            if announced != size or told not in (-1, size):
                 raise ValueError(f"a stream of {announced} bytes in place of {size}")
             part = unpacker.decompress(frame, max_output_size=size, allow_extra_data=False)
         except zstandard.ZstdError as error:

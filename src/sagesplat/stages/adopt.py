@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from sagesplat.adapt.free_viewpoints import check_size, free_cameras
 from sagesplat.adapt.observe import RenderedLabels
 from sagesplat.core.config import AdoptConfig, LabelsConfig, MasksConfig, NestConfig, SceneConfig, TrainConfig
-from sagesplat.core.errors import RunError
+from sagesplat.core.errors import DataError, RunError
 from sagesplat.core.events import Progress, Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.names import repaired
@@ -200,6 +200,11 @@ def _write_pictures(
             write_mask(paths[done], ids, taxonomy)
             occurring.update(np.unique(ids).tolist())
         job.emit(Progress("adopt", done + 1, len(views)))
+    if labelled and not occurring - {UNLABELLED}:
+        raise DataError(
+            f"{folder.name}: no viewpoint shows any of its labelled Gaussians; give --cameras of this "
+            "scene, in its frame, or none"
+        )
     if labelled:
         write_labels(masks, taxonomy, occurring)
     else:
