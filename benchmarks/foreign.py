@@ -45,6 +45,8 @@ EXCEPTIONS: dict[str, str] = {
     "output.report:template": OURS,
     "run.remote:_piece": _HASHED,
     "run.stage:run_stages": _WROTE,
+    "stages.adopt:_label": "by read_header and read_level, which the readers run",
+    "stages.adopt:_make_capture": _WROTE,
     "scene._sfm:Stages._reasons": _COLMAP,
     "scene._sfm:Stages.features": _COLMAP,
     "scene._sfm:Stages.matches": _COLMAP,

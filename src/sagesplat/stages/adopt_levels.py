@@ -179,8 +179,8 @@ def _write(
 ) -> list[str]:
     """Write the ladder and its increments.
 
-    The levels above `num_lower` are of the originals. Those up to `coarse` were trained as the larger steps of
-    SPZ round them; the others would lose by it.
+    The levels above `num_lower` are of the originals. Those up to `coarse` were trained in the larger steps
+    that they are rounded to; the others would lose by it.
     """
     run, levels = job.run, len(next(iter(ladder.sizes.values())))
     run.provenance("nest").unlink(missing_ok=True)  # from here on the earlier ladder is gone
