@@ -18,7 +18,7 @@ from sagesplat import cli
 
 ROOT = Path(__file__).parents[1]
 DOCS = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
-FOREIGN = {  # flags of other tools
+FOREIGN = {"--decimate",   # flags of other tools
     *("--only-binary", "--constraint", "--dest", "--require-hashes"),  # pip
     "--fix", "--address", "--generate", "--no-index", "--find-links", "--revision", "--extra", "--upgrade",
 }  # fmt: skip
