@@ -18,9 +18,9 @@ from sagesplat import cli
 
 ROOT = Path(__file__).parents[1]
 DOCS = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
-FOREIGN = {"--decimate",   # flags of other tools
+FOREIGN = {  # flags of other tools
     *("--only-binary", "--constraint", "--dest", "--require-hashes"),  # pip
-    "--fix", "--address", "--generate", "--no-index", "--find-links", "--revision", "--extra", "--upgrade",
+    "--fix", "--address", "--generate", "--no-index", "--find-links", "--revision", "--extra", "--upgrade", "--decimate",
 }  # fmt: skip
 
 FOREIGN_FILES = {"stages/NAME.py", "simple_trainer.py"}  # a placeholder; gsplat's
