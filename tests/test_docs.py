@@ -20,7 +20,8 @@ ROOT = Path(__file__).parents[1]
 DOCS = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
 FOREIGN = {  # flags of other tools
     *("--only-binary", "--constraint", "--dest", "--require-hashes"),  # pip
-    "--fix", "--address", "--generate", "--no-index", "--find-links", "--revision", "--extra", "--upgrade", "--decimate",
+    "--fix", "--address", "--generate", "--no-index", "--find-links", "--revision", "--extra", "--upgrade",
+    "--decimate",  # splat-transform
 }  # fmt: skip
 
 FOREIGN_FILES = {"stages/NAME.py", "simple_trainer.py"}  # a placeholder; gsplat's
