@@ -250,13 +250,9 @@ def _label(job: Job, *, voted: bool) -> None:
     def make() -> list[str]:
         g = read_level(run.adopted)
         if voted:
+            views = job.scene.train_ids.tolist()
             g = replace(g, label_ids=torch.full_like(g.label_ids, UNLABELLED))
-            g = replace(
-                g,
-                label_ids=vote(
-                    g, job.scene, job.masks, job.scene.train_ids.tolist(), antialiased=antialiased
-                ),
-            )
+            g = replace(g, label_ids=vote(g, job.scene, job.masks, views, antialiased=antialiased))
         else:
             g = _edited(job, g)
         points = job.scene.points.xyz

@@ -47,7 +47,7 @@ from sagesplat.train.nested import Nested, NestStep
 from sagesplat.train.refit import refit_colors, refit_coverage
 
 _WEIGH = 32  # views that importance is measured in
-_REFIT = 24  # views that colours are fitted to
+_REFIT = 24  # views that colours are fitted to, and trained sets are ordered by
 _TRAINED = 0.5  # largest share that is trained
 _SMALL = 0.1  # share up to which colours take more rounds: little is left as it was, and rounds are cheap
 _COMPARE = 8  # views that merged Gaussians and prefixes of the originals are compared in
@@ -155,10 +155,9 @@ def _trained(
         importance(one.gaussians, job.scene, views, "sensitivity", antialiased=job.antialiased)
         for one in sets
     ]
-    start, spans = joined(sets, ranks)
-    trained = start
+    trained, spans = joined(sets, ranks)
     for event in nested.nest(
-        start, job.scene, targets, train_config(job), NestConfig(steps=config.steps), seed=config.seed,
+        trained, job.scene, targets, train_config(job), NestConfig(steps=config.steps), seed=config.seed,
         backend=job.backend, checkpoint=job.run.nest_checkpoint, settings=key, spans=spans,
     ):  # fmt: skip
         if isinstance(event, NestStep):

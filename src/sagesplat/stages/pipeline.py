@@ -101,8 +101,6 @@ def adopt(job: Job, source: Path, adopted: AdoptConfig, config: RunConfig) -> No
     check_targets(config.plan, "nested")
     open_splat(job, source, adopted, config.scene, config.masks, config.labels)
     method_of(job).check(config.plan)
-    if config.fuse:
-        fuse_masks(job)
     make_levels(job, adopted)
     _promise(job, config)
 

@@ -35,7 +35,7 @@ def usable_shares(shares: Sequence[float], count: int) -> tuple[float, ...]:
 
 
 def size_of(share: float, count: int) -> int:
-    """Gaussians of a level of a category with `count` of them."""
+    """Gaussians of a level of `share` of `count`."""
     return max(1, int(np.ceil(share * count - 1e-9)))
 
 
@@ -147,12 +147,12 @@ def assemble(sets: Sequence[Set]) -> Assembled:
 
 def split_sets(g: Gaussians, sets: Sequence[Set]) -> list[Set]:
     """The sets that `joined` joined, once trained: each in its order."""
-    whole, taken, found = by_label(g), dict[int, int](), []
+    trained, taken, found = by_label(g), dict[int, int](), []
     for one in sets:
         rows = []
         for label, count in one.gaussians.counts().items():
             begin = taken.get(label, 0)
-            rows.append(whole[label][begin : begin + count])
+            rows.append(trained[label][begin : begin + count])
             taken[label] = begin + count
         found.append(Set(g.select(torch.from_numpy(np.concatenate(rows))), one.levels))
     return found
