@@ -22,6 +22,7 @@ from sagesplat.metrics.image import means_by_label, ssim_map
 from sagesplat.raster import Backend, Workspace, device_of
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene
+from sagesplat.segment.valid import ALL_VALID, ValidPixels
 
 QUALITIES: tuple[QualityKind, ...] = get_args(QualityKind)  # by the number in the table
 UNIFORM = -3  # label id of the whole image with all categories at one level
@@ -98,6 +99,7 @@ def evaluate(
     min_share: float = 0.0,
     uniform: Sequence[int] = (),
     compose: Callable[[Plan], Gaussians] | None = None,
+    valid: ValidPixels = ALL_VALID,
     backend: Backend = "auto",
     antialiased: bool = False,
     progress: Callable[[int, int], None] | None = None,
@@ -115,6 +117,7 @@ def evaluate(
         min_share: Fidelity is not measured where a category covers less than this fraction of the pixels.
         uniform: Levels to measure with all categories at that level, to compare the plans with.
         compose: The Gaussians of a plan; None: its levels as they are.
+        valid: The pixels of photos that count; views without any are left out.
         backend: Rasteriser; decides the device.
         antialiased: How the model was trained.
         progress: Called with (images measured, images in all).
@@ -124,7 +127,7 @@ def evaluate(
     """
     ssim = "ssim_eroded" if region == "eroded" else "ssim"
     rows: list[dict[str, float]] = []
-    views = scene.test_ids.tolist()
+    views = valid.rows(scene, scene.test_ids)
     inner = {row: erode(masks[scene.views[row]]) for row in views}
     done, total = 0, len(views) * (1 + len(plans) + len(uniform))
     workspace = Workspace()
@@ -149,7 +152,7 @@ def evaluate(
             image = reference if g is last else render(g, view.camera)
             least = min_share * image.shape[0] * image.shape[1]
             alike = fidelity_by_label(image, reference, labels[view], least)
-            yield row, measure(image, as_unit(photos[row]), masks[view], inner[row]), alike
+            yield row, measure(image, as_unit(photos[row]), masks[view], inner[row], valid[view]), alike
             done += 1
             if progress:
                 progress(done, total)

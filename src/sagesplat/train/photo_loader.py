@@ -2,12 +2,15 @@
 
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene
+from sagesplat.segment.valid import ALL_VALID, ValidPixels
 from sagesplat.train.lr_schedule import smaller
 
 Seen = tuple[Tensor, Camera]
@@ -23,9 +26,11 @@ class PhotoLoader:
     scene: Scene
     photos: Photos
     device: torch.device
+    valid_pixels: ValidPixels = ALL_VALID
     limit: int = -1  # bytes of photos kept on a GPU; -1: a quarter of what is free
     _kept: dict[tuple[int, int], Seen] = field(default_factory=dict)
     _coming: dict[tuple[int, int], "Future[Seen]"] = field(default_factory=dict)
+    _valid: dict[tuple[int, int], Tensor] = field(default_factory=dict)
     _used: int = 0
     _worker: ThreadPoolExecutor = field(init=False)
 
@@ -53,6 +58,27 @@ class PhotoLoader:
             self._kept[key] = photo, camera
             self._used += photo.nbytes
         return photo, camera
+
+    @cached_property
+    def rows(self) -> np.ndarray:
+        """Rows of the views to train on: the training views that have a pixel that counts."""
+        return np.array(self.valid_pixels.rows(self.scene, self.scene.train_ids), np.int64)
+
+    def valid(self, row: int, factor: int = 1) -> Tensor | None:
+        """Which pixels of a photo `factor` times smaller count, bool [H, W]; None: all.
+
+        A smaller photo's pixel counts if all those do that it is the mean of.
+        """
+        key = row, factor
+        if key not in self._valid:
+            view = self.scene.views[row]
+            valid = self.valid_pixels[view]
+            if valid is None:
+                return None
+            grey = np.repeat(np.where(valid, np.uint8(255), np.uint8(0))[..., None], 3, 2)
+            small, _ = smaller(grey, view.camera, factor)
+            self._valid[key] = torch.from_numpy(small[..., 0] == 255).to(self.device)
+        return self._valid[key]
 
     def expect(self, row: int, factor: int = 1) -> None:
         """Begin to fetch a photo that a later step will look at."""
