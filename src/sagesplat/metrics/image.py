@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 from numba import get_num_threads
 from torch import Tensor
 
@@ -131,7 +131,7 @@ class _PhotometricLoss(torch.autograd.Function):
 
 def photometric_loss(
     rgb: Float[Tensor, "H W 3"],
-    photo: Float[Tensor, "H W 3"],
+    photo: Float[Tensor, "H W 3"] | UInt8[Tensor, "H W 3"],
     ssim_weight: float = SSIM_WEIGHT,
     tile_mask: Bool[np.ndarray, "h w"] | Bool[Tensor, "h w"] | None = None,
     workspace: Workspace | None = None,
