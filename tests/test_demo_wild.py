@@ -138,6 +138,6 @@ def test_refusals(tmp_path, monkeypatch):
     with pytest.raises(SceneError, match="one place"):
         make_capture(tmp_path / "grid", views=80, places=(2, 1), wild=POSES)
     monkeypatch.setattr(off_path, "APART", 100.0)
-    with pytest.raises(SceneError, match="0 of 2 viewpoints .* draw more photos"):
+    with pytest.raises(SceneError, match=r"0 of 2 viewpoints .* draw more photos"):
         make_capture(tmp_path / "few", views=3, width=32, height=24, wild=Wild(off_path=2))
     assert list(tmp_path.iterdir()) == []
