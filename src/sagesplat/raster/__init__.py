@@ -1,5 +1,6 @@
 """Rasterising Gaussians: one function, several backends."""
 
+from dataclasses import replace
 from typing import Literal
 
 import numba
@@ -12,12 +13,13 @@ from torch import Tensor
 from sagesplat.core.errors import BackendUnavailable, DataError
 from sagesplat.core.gaussians import PARAMETERS, Gaussians
 from sagesplat.kernels.workspace import Workspace
+from sagesplat.raster.exposure import expose
 from sagesplat.raster.render import TILE, Render
 from sagesplat.scene.scene import Camera
 
 __all__ = [
-    "TILE", "Backend", "Render", "Workspace", "add_weights", "device_of", "rasterize", "resolve_backend",
-    "set_threads",
+    "TILE", "Backend", "Render", "Workspace", "add_weights", "device_of", "expose", "rasterize",
+    "resolve_backend", "set_threads",
 ]  # fmt: skip
 
 Backend = Literal["auto", "cpu", "cuda", "reference"]
@@ -88,7 +90,8 @@ def rasterize(
 
     Args:
         gaussians: N Gaussians, all tensors on one device.
-        camera: Pose, intrinsics in pixels, and size of the image (H, W).
+        camera: Pose, intrinsics in pixels, and size of the image (H, W). Its `exposure` is applied to the image,
+            background included.
         sh_degree: Harmonics up to this degree are used; None: all there are.
         background: RGB in [0, 1] behind everything, [3]; None: the camera's.
         features: [N, C], blended like colours, over zero; C is any number.
@@ -150,14 +153,19 @@ def rasterize(
     if backend == "reference":
         from sagesplat.raster import reference
 
-        return reference.render(gaussians, camera, **shared)
-    if backend == "cuda":
+        render = reference.render(gaussians, camera, **shared)
+    elif backend == "cuda":
         from sagesplat.raster import cuda
 
-        return cuda.render(gaussians, camera, **shared)
-    from sagesplat.raster import cpu
+        render = cuda.render(gaussians, camera, **shared)
+    else:
+        from sagesplat.raster import cpu
 
-    return cpu.render(gaussians, camera, workspace=workspace, **shared)
+        render = cpu.render(gaussians, camera, workspace=workspace, **shared)
+    if camera.exposure is None:
+        return render
+    exposure = torch.from_numpy(camera.exposure).to(render.rgb.device)
+    return replace(render, rgb=expose(render.rgb, exposure))
 
 
 def _check(
