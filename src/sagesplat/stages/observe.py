@@ -33,7 +33,7 @@ def observe_levels(job: Job, config: FitConfig) -> None:
         ]
 
     levels = method_of(job).level_files[0]
-    inputs = [run.scene, run.labels, run.provenance("train"), levels, *label_image_inputs(run)]
+    inputs = [*run.scene_files, run.labels, run.provenance("train"), levels, *label_image_inputs(run)]
     settings = {"distance": config.distance, "masks": config.masks}
     run_stage(job, "observe", settings, inputs, [run.observations], make)
 

@@ -1,9 +1,10 @@
 """What training reports: a stream of these events."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from sagesplat.core.gaussians import Gaussians
+from sagesplat.train.view_parameters import ViewParameters
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,7 @@ class Trained:
     gaussians: Gaussians
     step: int
     frozen: dict[int, int]  # label id -> step from which on the category did not change
+    per_view: dict[str, ViewParameters] = field(default_factory=dict)  # what was refined
 
 
 Event = Resumed | Step | LevelSaved | LabelFrozen | Trained

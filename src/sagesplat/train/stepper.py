@@ -22,6 +22,7 @@ from sagesplat.train.lr_schedule import LrSchedule
 from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.state import TrainState, initial_state
 from sagesplat.train.strategy import Strategy
+from sagesplat.train.view_parameters import ViewGradients, ViewUpdate
 
 FINISHED_SHARE = 1 / 8  # of the rounds include a view whose categories have all stopped; it is drawn in full
 
@@ -38,6 +39,7 @@ class Stepper:
     strategy: Strategy = field(default_factory=Strategy)  # without one the set of Gaussians is fixed
     gradient_freezing: GradientFreezing | None = None
     sh_bits: tuple[int, int] | None = None  # render Gaussians rounded as SPZ files will store them
+    view_updates: Mapping[str, ViewUpdate] = field(default_factory=dict)  # of `TrainState.per_view`
     drawn: float = 1.0  # share of the tiles that the last step drew
     workspace: Workspace = field(default_factory=Workspace)
 
@@ -61,7 +63,10 @@ class Stepper:
             drawn_rows: Indices of the Gaussians to render; the others take no part in this step.
         """
         batch = max(self.config.batch, self.group.size)
-        views = self.group.share([self._next_view(state) for _ in range(batch)])
+        of_batch = [self._next_view(state) for _ in range(batch)]
+        views = self.group.share(of_batch)
+        refined = [n for n, update in self.view_updates.items() if update.first_step <= state.step + 1]
+        of_views = ViewGradients({name: state.per_view[name] for name in refined}, of_batch)
         if state.queue:
             self.photo_loader.expect(state.queue[-1 - self.group.rank % len(state.queue)], factor)
         shown = state.gaussians if drawn_rows is None else state.gaussians.select(drawn_rows)
@@ -73,8 +78,10 @@ class Stepper:
         self.drawn = 0.0
         grads: dict[str, Tensor] = {}
         for view in views:
-            loss, render = self._draw(moving, view, degree, trainable, factor)
+            own = of_views.leaves(view)
+            loss, render = self._draw(moving, view, degree, trainable, factor, own)
             loss.backward()
+            of_views.add(view, own)
             losses.append(loss.detach())
             self.strategy.step_post_backward(state, render, trainable)
             for name, leaf in leaves.items():
@@ -87,7 +94,7 @@ class Stepper:
         self.drawn /= len(views)
         total = torch.stack(losses).sum()
         if batch > 1:
-            self.group.add(total, *grads.values())
+            self.group.add(total, *grads.values(), *of_views.grads.values())
             grads = {name: grad / batch for name, grad in grads.items()}
         if drawn_rows is not None:
             grads, trainable = _spread(grads, drawn_rows, trainable)
@@ -97,6 +104,7 @@ class Stepper:
         self.strategy.step_pre_update(state, grads, trainable)
         scaled = {name: rate * math.sqrt(batch) for name, rate in learning_rates.items()}
         optim.update(state, grads, scaled, degree, trainable)
+        of_views.update(self.view_updates, state.step)
         self.strategy.step_post_update(state, trainable)
         return total / batch
 
@@ -106,7 +114,13 @@ class Stepper:
             self.active_tiles = replace(self.active_tiles, frozen=frozenset(frozen))
 
     def _draw(
-        self, moving: Gaussians, view: int, degree: int, trainable: Tensor, factor: int
+        self,
+        moving: Gaussians,
+        view: int,
+        degree: int,
+        trainable: Tensor,
+        factor: int,
+        own: Mapping[str, Tensor],  # parameters of this view alone, by kind
     ) -> tuple[Tensor, Render]:
         photo, camera = self.photo_loader(view, factor)
         # nobody may paint over what is finished, so it is looked at now and then

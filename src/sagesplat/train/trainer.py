@@ -28,6 +28,7 @@ from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.state import TrainState, from_points, initial_state
 from sagesplat.train.stepper import Stepper
 from sagesplat.train.strategy import Densification, make_strategy
+from sagesplat.train.view_parameters import ViewParameters, ViewUpdate
 
 CHECKPOINT = "checkpoint.npz"
 _LESS = "lower --train.max-gaussians, or begin a run with --downscale 2"
@@ -155,7 +156,8 @@ class Training:
             yield from self._after_step()
         if self.folder:
             previous(self.folder / CHECKPOINT).unlink(missing_ok=True)  # nobody resumes from here
-        yield Trained(self.state.gaussians.to("cpu"), self.state.step, self.state.frozen)
+        done = self.state.to(torch.device("cpu"))
+        yield Trained(done.gaussians, done.step, done.frozen, done.per_view)
 
     def _step(self) -> Step:
         """One optimiser step."""
@@ -252,7 +254,10 @@ def begin(
     g = from_points(
         scene.points, label_ids, config.sh_degree, strategy.initial_opacity, strategy.initial_scale
     )
+    updates = view_updates(scene, config)
     state, resumed = initial_state(g, seed).to(device), None
+    for name, update in updates.items():
+        state.per_view[name] = ViewParameters.zeros(len(scene.views), update.size).to(device)
     state.sort()
     if folder and (folder / CHECKPOINT).exists():
         state, damage = latest_checkpoint(folder / CHECKPOINT, settings)
@@ -264,10 +269,18 @@ def begin(
     share = config.gradient_freeze_share
     freezing = GradientFreezing(share) if share else None
     tiles = ActiveTiles(scene, masks, frozenset(state.frozen), device)
-    stepper = Stepper(PhotoLoader(scene, photos, device), config, tiles, backend, group, strategy, freezing)
+    stepper = Stepper(
+        PhotoLoader(scene, photos, device), config, tiles, backend, group, strategy, freezing,
+        view_updates=updates,
+    )  # fmt: skip
     measured = measured_views(scene, masks) if config.freeze_at is not None and masks is not None else {}
     folder = folder if group.leads else None
     return Training(config, state, stepper, strategy, rates, measured, freezing, folder, settings, resumed)
+
+
+def view_updates(scene: Scene, config: TrainConfig) -> dict[str, ViewUpdate]:
+    """What a training refines of the cameras, by kind: "pose", "exposure"."""
+    return {}
 
 
 def _check_levels(checkpoint: Path, step: int) -> None:
