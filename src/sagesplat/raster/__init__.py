@@ -90,8 +90,8 @@ def rasterize(
 
     Args:
         gaussians: N Gaussians, all tensors on one device.
-        camera: Pose, intrinsics in pixels, and size of the image (H, W). Its `exposure` is applied to the image,
-            background included.
+        camera: Pose, intrinsics in pixels, and size of the image (H, W). Its `exposure` is applied to the
+            image, background included.
         sh_degree: Harmonics up to this degree are used; None: all there are.
         background: RGB in [0, 1] behind everything, [3]; None: the camera's.
         features: [N, C], blended like colours, over zero; C is any number.

@@ -42,8 +42,8 @@ def expose(
         rgb: Rendered image.
         exposure: E; both it and `rgb` may require gradients.
         photo: The photo that the result is compared with, in [0, 1], or uint8 on a GPU. Where it is saturated
-            and the result is beyond that, the result is the photo, without a gradient: a sensor shows no more.
-            None: the result is not limited.
+            and the result is beyond that, the result is the photo, without a gradient: a sensor shows no
+            more. None: the result is not limited.
 
     Returns:
         The image, which is not limited to [0, 1].

@@ -11,11 +11,12 @@ from sagesplat.core.config import TrainConfig
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.quantisation import rounded
 from sagesplat.metrics.image import photometric_loss
-from sagesplat.raster import Backend, Render, Workspace, device_of, rasterize
+from sagesplat.raster import Backend, Render, Workspace, device_of, expose, rasterize
 from sagesplat.scene.images import Photos
-from sagesplat.scene.scene import Scene
+from sagesplat.scene.scene import Camera, Scene
 from sagesplat.train import optim
 from sagesplat.train.early_stopping import ActiveTiles, trainable_rows
+from sagesplat.train.exposure import transform
 from sagesplat.train.gradient_freezing import GradientFreezing
 from sagesplat.train.group import ALONE, Group
 from sagesplat.train.lr_schedule import LrSchedule
@@ -127,9 +128,10 @@ class Stepper:
         finished, left = self.active_tiles.finished(view), self.active_tiles.tiles(view, factor)
         self.drawn += 1.0 if finished or left is None else float(left.mean())
         tiles = None if finished else self.active_tiles.mask(view, factor)
+        exposure = _exposure(own, camera, photo.device)
         render = rasterize(
             moving,
-            camera,
+            camera if camera.exposure is None else camera.neutral,
             sh_degree=degree,
             antialiased=self.config.antialiased,
             tile_mask=tiles,
@@ -138,7 +140,8 @@ class Stepper:
             workspace=self.workspace,
             backend=self.backend,
         )
-        return photometric_loss(render.rgb, photo, self.config.ssim_weight, tiles, self.workspace), render
+        rgb = render.rgb if exposure is None else expose(render.rgb, exposure, photo)
+        return photometric_loss(rgb, photo, self.config.ssim_weight, tiles, self.workspace), render
 
     def _next_view(self, state: TrainState) -> int:
         """Views in random order, each once a round; finished ones in a round out of eight."""
@@ -149,6 +152,13 @@ class Stepper:
                 if not self.active_tiles.finished(view) or state.rng.random() < FINISHED_SHARE
             ]
         return state.queue.pop()
+
+
+def _exposure(own: Mapping[str, Tensor], camera: Camera, device: torch.device) -> Tensor | None:
+    """The colour transform of a view: the one that is learned, else its camera's, else none."""
+    if "exposure" in own:
+        return transform(own["exposure"])
+    return None if camera.exposure is None else torch.from_numpy(camera.exposure).to(device)
 
 
 def _spread(grads: Mapping[str, Tensor], rows: Tensor, trainable: Tensor) -> tuple[dict[str, Tensor], Tensor]:
