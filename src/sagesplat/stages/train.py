@@ -69,12 +69,12 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
                 case Trained(gaussians, step, frozen) as trained:
                     write_frozen(place.frozen, frozen)
                     lines = [f"{len(gaussians):,} Gaussians after {step} steps"]
-                    lines += write_cameras(job, place.cameras, trained)
+                    lines += write_cameras(job, place, config, trained)
         if place != run:
             _swap(run, place)
         return lines
 
-    outputs = [run.levels, run.checkpoint]
+    outputs = [run.levels, run.checkpoint, *([run.cameras, run.refined] if config.poses else [])]
     run_stage(job, "train", settings, inputs, outputs, make, swaps=True)
 
 
@@ -140,8 +140,9 @@ def _swap(run: RunDir, made: RunDir) -> None:
             run.levels.rename(old)
         made.levels.rename(run.levels)
     remove_checkpoints(run.checkpoint)
-    run.cameras.unlink(missing_ok=True)  # of the earlier training
-    kinds = ("frozen", "cap", "cameras", "checkpoint")
+    for earlier in (run.cameras, run.refined):
+        earlier.unlink(missing_ok=True)
+    kinds = ("frozen", "cap", "cameras", "refined", "checkpoint")
     for new, place in ((getattr(made, kind), getattr(run, kind)) for kind in kinds):
         if new.exists():
             new.replace(place)

@@ -20,6 +20,7 @@ from sagesplat.train.gradient_freezing import GradientFreezing
 from sagesplat.train.group import ALONE, Group
 from sagesplat.train.lr_schedule import LrSchedule
 from sagesplat.train.photo_loader import PhotoLoader
+from sagesplat.train.poses import PoseUpdate, moved
 from sagesplat.train.state import TrainState, initial_state
 from sagesplat.train.strategy import Strategy
 from sagesplat.train.view_parameters import ViewGradients, ViewUpdate
@@ -127,6 +128,13 @@ class Stepper:
         finished, left = self.active_tiles.finished(view), self.active_tiles.tiles(view, factor)
         self.drawn += 1.0 if finished or left is None else float(left.mean())
         tiles = None if finished else self.active_tiles.mask(view, factor)
+        pose = None
+        if "pose" in own:
+            update = self.view_updates["pose"]
+            assert isinstance(update, PoseUpdate)
+            pose = update.motion(view, own["pose"])
+            motion = pose.detach().cpu().double().numpy()
+            camera, pose = replace(camera, w2c=moved(camera.w2c, motion)), pose - pose.detach()
         render = rasterize(
             moving,
             camera,
@@ -135,6 +143,7 @@ class Stepper:
             tile_mask=tiles,
             trainable=trainable if self.active_tiles.frozen or self.gradient_freezing else None,
             absgrad=self.config.absgrad,
+            pose=pose,
             workspace=self.workspace,
             backend=self.backend,
         )

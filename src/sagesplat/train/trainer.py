@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +25,7 @@ from sagesplat.train.gradient_freezing import GradientFreezing
 from sagesplat.train.group import ALONE, Group
 from sagesplat.train.lr_schedule import LrSchedule, lr_schedule
 from sagesplat.train.photo_loader import PhotoLoader
+from sagesplat.train.poses import pose_update
 from sagesplat.train.state import TrainState, from_points, initial_state
 from sagesplat.train.stepper import Stepper
 from sagesplat.train.strategy import Densification, make_strategy
@@ -254,7 +255,7 @@ def begin(
     g = from_points(
         scene.points, label_ids, config.sh_degree, strategy.initial_opacity, strategy.initial_scale
     )
-    updates = view_updates(scene, config)
+    updates = view_updates(scene, replace(config, batch=max(config.batch, group.size)))
     state, resumed = initial_state(g, seed).to(device), None
     for name, update in updates.items():
         state.per_view[name] = ViewParameters.zeros(len(scene.views), update.size).to(device)
@@ -280,7 +281,10 @@ def begin(
 
 def view_updates(scene: Scene, config: TrainConfig) -> dict[str, ViewUpdate]:
     """What a training refines of the cameras, by kind: "pose", "exposure"."""
-    return {}
+    updates: dict[str, ViewUpdate] = {}
+    if config.poses:
+        updates["pose"] = pose_update(scene, config.max_steps, config.batch)
+    return updates
 
 
 def _check_levels(checkpoint: Path, step: int) -> None:
