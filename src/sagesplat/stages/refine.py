@@ -1,7 +1,7 @@
 """Writes what training refined of the cameras, for everything after it."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -10,7 +10,7 @@ import torch
 
 from sagesplat.adapt.observe import as_unit, render_rgb
 from sagesplat.core.config import TrainConfig
-from sagesplat.core.errors import RunError
+from sagesplat.core.errors import RunError, short
 from sagesplat.core.events import Progress
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.typed import check_fields, types_of
@@ -115,6 +115,8 @@ def pose_lines(figures: PoseFigures) -> list[str]:
     ]
     if figures.diverged:
         lines.append(f"{figures.diverged} poses diverged and were put back as given")
+    if missed := figures.held_out - figures.fitted:
+        lines.append(f"{missed} of {figures.held_out} held-out poses could not be fitted, and stay as given")
     if figures.psnr and figures.ssim:
         (given_psnr, psnr), (given_ssim, ssim) = figures.psnr, figures.ssim
         lines.append(
@@ -131,14 +133,16 @@ def read_pose_figures(path: Path) -> PoseFigures | None:
     cure = "run `sagesplat train` again with --force"
     made = read_json(path, cure)
     try:
-        entry = made["poses"] if isinstance(made, Mapping) and "poses" in made else None
-        if entry is None:
+        if not isinstance(made, dict) or not isinstance(made.get("poses", {}), dict):
+            raise ValueError("no object")
+        if "poses" not in made:
             return None
+        entry = made["poses"]
         check_fields(entry, types_of(PoseFigures))
         figures = PoseFigures(**entry)
         return replace(figures, psnr=_pair(figures.psnr), ssim=_pair(figures.ssim))
-    except (KeyError, TypeError, ValueError) as error:
-        raise RunError(f"{path}: not what was refined ({str(error)[:80]}); {cure}") from None
+    except (TypeError, ValueError) as error:
+        raise RunError(f"{path}: not what was refined ({short(error)}); {cure}") from None
 
 
 def _pair(values: Sequence[float] | None) -> tuple[float, float] | None:

@@ -26,6 +26,7 @@ from sagesplat.train.lr_schedule import smaller
 from sagesplat.train.view_parameters import ViewParameters
 
 _REACH = 0.03  # rad in the image: how far all steps of one view lead in one direction
+_FASTEST = 0.004  # rad in the image: the largest learning rate, whatever the views' number
 _SHRINK_TO = 0.01  # the learning rate at the end, as a share of that at the start
 _FROM = 0.03  # share of the run after which poses are refined: the model has some shape by then
 _PRIOR = 3.0  # rad, and extents: a step of 1 rad in the image moves no camera farther than this
@@ -93,7 +94,7 @@ class PoseUpdate:
         """Learning rate in rad of the image: it decays exponentially."""
         share = (step - self.first_step) / max(1, self.last_step - self.first_step)
         mean = (1 - _SHRINK_TO) / -np.log(_SHRINK_TO)
-        return float(_REACH / (mean * max(1.0, self.visits)) * _SHRINK_TO**share)
+        return float(min(_FASTEST, _REACH / (mean * max(1.0, self.visits))) * _SHRINK_TO**share)
 
 
 def pose_update(scene: Scene, max_steps: int, batch: int) -> PoseUpdate:
