@@ -33,7 +33,9 @@ _PRIOR = 3.0  # rad, and extents: a step of 1 rad in the image moves no camera f
 _NEAREST = 0.01  # extents: points that are nearer to a camera say nothing about its motions
 _FARTHEST = 0.1  # rad, and extents: a pose that moves farther than this diverges
 _HELD = 1e30  # second moment of parameters that Adam no longer moves
-_FIT = ((4, 12), (2, 8), (1, 8))  # how many times smaller a photo is that a pose is fitted to, and iterations
+_SMALLEST = 40  # pixels of the shorter side of a smaller photo
+_SETTLED = 1e-5  # relative change of the loss at which a fit ends
+_FIT = ((4, 12), (2, 8), (1, 6))  # how many times smaller a photo is that a pose is fitted to, and iterations
 
 
 def moved(w2c: Float32[np.ndarray, "4 4"], motion: Float[np.ndarray, "6"]) -> Float32[np.ndarray, "4 4"]:
@@ -190,7 +192,8 @@ def fit_pose(
         workspace: Memory to use again.
     """
     device, found = gaussians.means.device, camera
-    for factor, iterations in _FIT:
+    shortest = min(camera.width, camera.height)
+    for factor, iterations in (f for f in _FIT if f[0] == 1 or shortest >= f[0] * _SMALLEST):
         pixels, small = smaller(photo, found, factor)
         target = torch.from_numpy(pixels).to(device)
         target = target.float() / 255 if device.type == "cpu" else target
@@ -206,7 +209,9 @@ def fit_pose(
             assert pose.grad is not None
             return float(value.detach()), axes.T @ pose.grad.cpu().numpy().astype(np.float64)
 
-        best = minimize(loss, np.zeros(6), jac=True, method="L-BFGS-B", options={"maxiter": iterations})
+        best = minimize(
+            loss, np.zeros(6), jac=True, method="L-BFGS-B", options={"maxiter": iterations, "ftol": _SETTLED}
+        )
         found = replace(found, w2c=moved(found.w2c, axes @ best.x))
     return found if _near(camera, found, scale) else camera
 
