@@ -26,9 +26,14 @@ from sagesplat.train.lr_schedule import smaller
 from sagesplat.train.view_parameters import ViewParameters
 
 _REACH = 0.03  # rad in the image: how far all steps of one view lead in one direction
-_FASTEST = 0.004  # rad in the image: the largest learning rate, whatever the views' number
+_FASTEST, _PER_VISIT = 0.004, 2.5e-4  # rad in the image: largest learning rate, and for each visit of a view
 _SHRINK_TO = 0.01  # the learning rate at the end, as a share of that at the start
-_FROM = 0.03  # share of the run after which poses are refined: the model has some shape by then
+_FROM, _ROUNDS, _LATEST = (
+    0.03,
+    2,
+    0.2,
+)  # first step: share of the run, rounds of views; at most
+_WARM_UP = 5  # updates of a view in which its learning rate grows
 _PRIOR = 3.0  # rad, and extents: a step of 1 rad in the image moves no camera farther than this
 _NEAREST = 0.01  # extents: points that are nearer to a camera say nothing about its motions
 _FARTHEST = 0.1  # rad, and extents: a pose that moves farther than this diverges
@@ -71,7 +76,8 @@ class PoseUpdate:
     ) -> None:
         """See `ViewUpdate`."""
         gauge, rows = self.gauge.to(grad.device), self.train_ids.to(grad.device)
-        parameters.adam_step(views, grad, self.rate(step), joint=True)
+        warm = (parameters.counts[list(views)][:, None] + 1) / _WARM_UP
+        parameters.adam_step(views, grad, self.rate(step) * warm.clamp_max(1.0), joint=True)
         self._hold(parameters, rows)
         values = parameters.values[rows].reshape(-1)
         parameters.values[rows] = (values - gauge @ (gauge.T @ values)).view(-1, 6)
@@ -96,12 +102,14 @@ class PoseUpdate:
         """Learning rate in rad of the image: it decays exponentially."""
         share = (step - self.first_step) / max(1, self.last_step - self.first_step)
         mean = (1 - _SHRINK_TO) / -np.log(_SHRINK_TO)
-        return float(min(_FASTEST, _REACH / (mean * max(1.0, self.visits))) * _SHRINK_TO**share)
+        rate = min(_FASTEST, _PER_VISIT * self.visits, _REACH / (mean * max(1.0, self.visits)))
+        return float(rate * _SHRINK_TO**share)
 
 
 def pose_update(scene: Scene, max_steps: int, batch: int) -> PoseUpdate:
     """The pose refinement of a training of `max_steps` steps of `batch` photos."""
-    rows, first = scene.train_ids, 1 + round(_FROM * max_steps)
+    rows = scene.train_ids
+    first = 1 + round(min(_LATEST * max_steps, max(_FROM * max_steps, _ROUNDS * len(rows) / batch)))
     axes = np.stack([motion_axes(scene, view) for view in range(len(scene.views))])
     cameras = np.stack([scene.views[row].camera.w2c for row in rows]).astype(np.float64)
     gauge = np.linalg.solve(axes[rows], gauge_motions(cameras, scene.scale)).reshape(-1, 7)
