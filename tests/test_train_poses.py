@@ -1,6 +1,8 @@
 """Pose refinement: gauge, axes and divergence; poses that are a little off are found again."""
 
 from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from sagesplat.core.geometry import project, to_camera
 from sagesplat.raster import rasterize
 from sagesplat.scene.images import Photos
 from sagesplat.train import poses
+from sagesplat.train.early_stopping import label_quality
 from sagesplat.train.events import Trained
 from sagesplat.train.poses import (
     diverged,
@@ -25,7 +28,7 @@ from sagesplat.train.poses import (
     pose_update,
     refined_cameras,
 )
-from sagesplat.train.trainer import train
+from sagesplat.train.trainer import begin, train
 from sagesplat.train.view_parameters import ViewParameters
 
 TRUTH = random_gaussians(60, degree=0, logit=2.0, log_scale=-1.8)
@@ -164,6 +167,25 @@ def test_training_mends_poses(scene):
         for some in ([view.camera for view in off.views], cameras)
     )
     assert np.mean(after) < 0.5 * np.mean(before)
+
+
+def test_categories_are_measured_from_refined_cameras(scene):
+    labels = np.full(len(scene.points.xyz), -1, np.int16)
+    training = begin(scene, Photos(scene.views), labels, TrainConfig(max_steps=10, poses=True))
+    training.state.per_view["pose"].values[2] = 0.01
+    update = pose_update(scene, 10, 1)
+    expected = refined_cameras(scene, update, training.state.per_view["pose"])
+    for row in (1, 2):
+        assert np.array_equal(training.stepper.camera(training.state, row).w2c, expected[row].w2c)
+    masks: Any = {view: np.full((32, 48), -1, np.int16) for view in scene.views}
+    tiles, photos = replace(training.stepper.active_tiles, masks=masks), training.stepper.photo_loader
+    given, refined = (
+        label_quality(
+            training.state.gaussians, tiles, photos, {-1: [2]}, training.config, 0, camera_of=camera
+        )
+        for camera in (None, partial(training.stepper.camera, training.state))
+    )
+    assert given != refined
 
 
 def test_without_poses_nothing_is_kept_of_views(scene):

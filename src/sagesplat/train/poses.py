@@ -50,6 +50,11 @@ def moved(w2c: Float32[np.ndarray, "4 4"], motion: Float[np.ndarray, "6"]) -> Fl
     return (step @ w2c).astype(np.float32)
 
 
+def moved_camera(camera: Camera, motion: Float32[Tensor, "6"]) -> Camera:
+    """A camera after a motion that is a tensor on any device."""
+    return replace(camera, w2c=moved(camera.w2c, motion.detach().cpu().double().numpy()))
+
+
 @dataclass(frozen=True, eq=False)
 class PoseUpdate:
     """A `ViewUpdate`: Adam on the motions of the training cameras.
@@ -131,9 +136,10 @@ def diverged(parameters: ViewParameters) -> Bool[Tensor, " V"]:
 
 def refined_cameras(scene: Scene, update: PoseUpdate, parameters: ViewParameters) -> list[Camera]:
     """The cameras of all views after training; those of held-out views are as they were given."""
-    motions = update.motions(parameters.values, torch.arange(len(scene.views))).double().numpy()
-    cameras = [view.camera for view in scene.views]
-    return [replace(c, w2c=moved(c.w2c, m)) if m.any() else c for c, m in zip(cameras, motions, strict=True)]
+    return [
+        moved_camera(view.camera, update.motion(row, values)) if values.any() else view.camera
+        for row, (view, values) in enumerate(zip(scene.views, parameters.values, strict=True))
+    ]
 
 
 def motion_axes(scene: Scene, view: int) -> Float[np.ndarray, "6 6"]:

@@ -13,14 +13,14 @@ from sagesplat.formats.quantisation import rounded
 from sagesplat.metrics.image import photometric_loss
 from sagesplat.raster import Backend, Render, Workspace, device_of, rasterize
 from sagesplat.scene.images import Photos
-from sagesplat.scene.scene import Scene
+from sagesplat.scene.scene import Camera, Scene
 from sagesplat.train import optim
 from sagesplat.train.early_stopping import ActiveTiles, trainable_rows
 from sagesplat.train.gradient_freezing import GradientFreezing
 from sagesplat.train.group import ALONE, Group
 from sagesplat.train.lr_schedule import LrSchedule
 from sagesplat.train.photo_loader import PhotoLoader
-from sagesplat.train.poses import PoseUpdate, moved
+from sagesplat.train.poses import PoseUpdate, moved_camera
 from sagesplat.train.state import TrainState, initial_state
 from sagesplat.train.strategy import Strategy
 from sagesplat.train.view_parameters import ViewGradients, ViewUpdate
@@ -109,6 +109,13 @@ class Stepper:
         self.strategy.step_post_update(state, trainable)
         return total / batch
 
+    def camera(self, state: TrainState, view: int) -> Camera:
+        """A view's camera with what is refined of it so far."""
+        camera, update = self.photo_loader.scene.views[view].camera, self.view_updates.get("pose")
+        if not isinstance(update, PoseUpdate):
+            return camera
+        return moved_camera(camera, update.motion(view, state.per_view["pose"].values[view]))
+
     def stop(self, frozen: Collection[int]) -> None:
         """From now on, skip tiles that show nothing but the categories `frozen` (label ids)."""
         if len(frozen) > len(self.active_tiles.frozen):
@@ -128,13 +135,10 @@ class Stepper:
         finished, left = self.active_tiles.finished(view), self.active_tiles.tiles(view, factor)
         self.drawn += 1.0 if finished or left is None else float(left.mean())
         tiles = None if finished else self.active_tiles.mask(view, factor)
-        pose = None
-        if "pose" in own:
-            update = self.view_updates["pose"]
-            assert isinstance(update, PoseUpdate)
-            pose = update.motion(view, own["pose"])
-            motion = pose.detach().cpu().double().numpy()
-            camera, pose = replace(camera, w2c=moved(camera.w2c, motion)), pose - pose.detach()
+        pose, update = None, self.view_updates.get("pose")
+        if isinstance(update, PoseUpdate) and "pose" in own:
+            motion = update.motion(view, own["pose"])
+            camera, pose = moved_camera(camera, motion), motion - motion.detach()
         render = rasterize(
             moving,
             camera,

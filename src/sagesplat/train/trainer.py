@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -221,6 +222,7 @@ class Training:
             state.gaussians, stepper.active_tiles, stepper.photo_loader, self.measured, self.config,
             self._sh_degree(state.step),
             backend=stepper.backend, workspace=stepper.workspace, group=stepper.group,
+            camera_of=partial(stepper.camera, state),
         )  # fmt: skip
         counts = state.gaussians.counts()
         for label, ssim in quality.items():
