@@ -51,7 +51,7 @@ def write_cameras(job: Job, place: RunDir, config: TrainConfig, trained: Trained
     scene, cameras, lines = job.given_scene, given_cameras(job.given_scene), list[str]()
     if "pose" in trained.per_view:
         update = pose_update(scene, config.max_steps, max(config.batch, job.processes))
-        poses, figures = _refined_poses(job, config, update, trained)
+        poses, figures = _refined_poses(job, scene, config, update, trained)
         fitted = np.array([pose is not view.camera for pose, view in zip(poses, scene.views, strict=True)])
         fitted[scene.train_ids] = False
         cameras = replace(cameras, w2c=np.stack([camera.w2c for camera in poses]), fitted=fitted)
@@ -62,10 +62,10 @@ def write_cameras(job: Job, place: RunDir, config: TrainConfig, trained: Trained
 
 
 def _refined_poses(
-    job: Job, config: TrainConfig, update: PoseUpdate, trained: Trained
+    job: Job, scene: Scene, config: TrainConfig, update: PoseUpdate, trained: Trained
 ) -> tuple[list[Camera], PoseFigures]:
     """The cameras of all views, those of held-out ones fitted to their photos, and what that did."""
-    scene, parameters = job.given_scene, trained.per_view["pose"]
+    parameters = trained.per_view["pose"]
     poses = refined_cameras(scene, update, parameters)
     held_out = np.setdiff1d(np.arange(len(poses)), scene.train_ids).tolist()
     g, space = trained.gaussians.to(device_of(job.backend)), Workspace()
@@ -77,7 +77,9 @@ def _refined_poses(
         job.emit(Progress("held-out poses", number, len(held_out)))
     given = [view.camera for view in scene.views]
     fitted = sum(poses[row] is not given[row] for row in held_out)
-    before, after = (_quality(job, g, cameras, config.antialiased) for cameras in (given, poses))
+    before, after = (
+        _quality(job, g, scene.test_ids, cameras, config.antialiased) for cameras in (given, poses)
+    )
     figures = replace(
         _moves(scene, update, parameters), fitted=fitted, held_out=len(held_out),
         psnr=before and after and (before[0], after[0]), ssim=before and after and (before[1], after[1]),
@@ -96,10 +98,12 @@ def _moves(scene: Scene, update: PoseUpdate, parameters: ViewParameters) -> Pose
     return PoseFigures(pixels, math.degrees(turns), shifts / scene.scale, count, 0, 0, None, None)
 
 
-def _quality(job: Job, g: Gaussians, cameras: list[Camera], antialiased: bool) -> tuple[float, float] | None:
-    """Mean PSNR and SSIM over the test views from given cameras; None without test views."""
+def _quality(
+    job: Job, g: Gaussians, rows: np.ndarray, cameras: list[Camera], antialiased: bool
+) -> tuple[float, float] | None:
+    """Mean PSNR and SSIM over some rows of the scene's views; None without any."""
     found = []
-    for row in job.given_scene.test_ids.tolist():
+    for row in rows.tolist():
         image = render_rgb(g, cameras[row], backend=job.backend, antialiased=antialiased)
         photo = as_unit(job.photos[row])
         found.append((psnr(squared_error_map(image, photo).mean()), ssim_map(image, photo).mean()))
