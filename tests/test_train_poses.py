@@ -86,6 +86,13 @@ def test_a_view_of_few_points_has_axes(scene):
     assert np.linalg.matrix_rank(axes) == 6
 
 
+def test_a_view_without_tracks_has_the_axes_of_the_points_in_it(scene):
+    none = {name: getattr(scene.points, name)[:0] for name in ("track_points", "track_views", "track_uv")}
+    axes = motion_axes(replace(scene, points=replace(scene.points, **none)), 0)
+    expected = motion_axes(scene, 0)
+    assert np.abs(np.linalg.norm(axes, axis=0) / np.linalg.norm(expected, axis=0) - 1).max() < 0.1
+
+
 def test_a_similarity_of_the_world_is_a_motion_without_effect(scene):
     """The cameras of a turned, shifted and scaled world differ by combinations of the gauge motions."""
     w2c = np.stack([view.camera.w2c for view in scene.views]).astype(np.float64)

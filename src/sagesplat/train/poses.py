@@ -18,7 +18,7 @@ from torch import Tensor
 
 from sagesplat.core.config import TrainConfig
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.core.geometry import to_camera
+from sagesplat.core.geometry import project, to_camera
 from sagesplat.metrics.image import photometric_loss
 from sagesplat.raster import Backend, Workspace, rasterize
 from sagesplat.scene.scene import Camera, Scene
@@ -36,6 +36,7 @@ _FROM, _ROUNDS, _LATEST = (
 _WARM_UP = 5  # updates of a view in which its learning rate grows
 _PRIOR = 3.0  # rad, and extents: a step of 1 rad in the image moves no camera farther than this
 _NEAREST = 0.01  # extents: points that are nearer to a camera say nothing about its motions
+_ENOUGH = 10_000  # points, of a view without tracks
 _FARTHEST = 0.1  # rad, and extents: a pose that moves farther than this diverges
 _HELD = 1e30  # second moment of parameters that Adam no longer moves
 _SMALLEST = 40  # pixels of the shorter side of a smaller photo
@@ -145,13 +146,16 @@ def refined_cameras(scene: Scene, update: PoseUpdate, parameters: ViewParameters
 def motion_axes(scene: Scene, view: int) -> Float[np.ndarray, "6 6"]:
     """Columns: motions of a view's camera that each move its image by about 1 rad, without common effects.
 
-    The eigenvectors of J^T J, with J the derivative of the view's SfM points in the image (focal length 1),
-    divided by the roots of the eigenvalues. A prior keeps motions small that hardly show.
+    The inverse root of J^T J, with J the derivative of the view's SfM points in the image (focal length 1).
+    A prior keeps motions small that hardly show.
     """
-    points, w2c = scene.points, scene.views[view].camera.w2c.astype(np.float64)
+    points, camera = scene.points, scene.views[view].camera
     seen = np.unique(points.track_points[points.track_views == view])
-    local = to_camera(points.xyz[seen if len(seen) else slice(None)].astype(np.float64), w2c)
-    local = local[local[:, 2] > _NEAREST * scene.scale]
+    xyz = points.xyz[seen] if len(seen) else points.xyz[:: 1 + len(points.xyz) // _ENOUGH]
+    xyz, w2c = xyz.astype(np.float64), camera.w2c.astype(np.float64)
+    pixels, depths = project(xyz, w2c, camera.K.astype(np.float64))
+    inside = ((pixels >= 0) & (pixels <= [camera.width, camera.height])).all(1)
+    local = to_camera(xyz[inside & (depths > _NEAREST * scene.scale)], w2c)
     x, y, z = local.T
     zero, one = np.zeros_like(z), np.ones_like(z)
     turned = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], -1).reshape(-1, 3, 3)
@@ -160,7 +164,9 @@ def motion_axes(scene: Scene, view: int) -> Float[np.ndarray, "6 6"]:
     prior = np.diag([1 / _PRIOR**2] * 3 + [1 / (_PRIOR * scene.scale) ** 2] * 3)
     information = np.einsum("pij,pik->jk", jacobian, jacobian) / max(1, len(local)) + prior
     values, vectors = np.linalg.eigh(information)
-    return vectors / np.sqrt(values)
+    return (
+        vectors / np.sqrt(values) @ vectors.T
+    )  # unlike the eigenvectors unique: checkpoints keep parameters
 
 
 def gauge_motions(w2c: Float[np.ndarray, "T 4 4"], scale: float) -> Float[np.ndarray, "T 6 7"]:
