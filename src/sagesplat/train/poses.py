@@ -164,9 +164,7 @@ def motion_axes(scene: Scene, view: int) -> Float[np.ndarray, "6 6"]:
     prior = np.diag([1 / _PRIOR**2] * 3 + [1 / (_PRIOR * scene.scale) ** 2] * 3)
     information = np.einsum("pij,pik->jk", jacobian, jacobian) / max(1, len(local)) + prior
     values, vectors = np.linalg.eigh(information)
-    return (
-        vectors / np.sqrt(values) @ vectors.T
-    )  # unlike the eigenvectors unique: checkpoints keep parameters
+    return vectors / np.sqrt(values) @ vectors.T  # symmetric: the signs of eigenvectors are arbitrary
 
 
 def gauge_motions(w2c: Float[np.ndarray, "T 4 4"], scale: float) -> Float[np.ndarray, "T 6 7"]:
