@@ -155,6 +155,9 @@ class TrainConfig:
     max_gaussians: int = 0
     """Maximum number of Gaussians; the limit grows linearly during densification (0: choose from the image
     size)."""
+    poses: bool = False
+    """Refine the camera poses of the training views with the Gaussians. Those of held-out views are fitted to
+    their photos afterwards."""
     mcmc_noise: float = 5e5
     """SGLD noise of 3DGS-MCMC, times the learning rate of the means."""
     mcmc_opacity: float = 0.01

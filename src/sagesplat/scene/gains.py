@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Float, Float32, Float64, Int64
 from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import cg
 
@@ -27,13 +27,21 @@ _LEAST_EV = 0.1  # range of exposures that is worth a transform
 _LEAST_EXIF_EV = 0.3  # the same where nothing but EXIF tells it
 
 
+def exposure_values(transforms: Float[np.ndarray, "V 3 4"]) -> Float64[np.ndarray, " V"]:
+    """How much brighter colour transforms make a middle grey, EV."""
+    grey = transforms[:, :, :3].sum(2) * 0.5 + transforms[:, :, 3]
+    return _CURVE * np.log2(np.maximum(grey + _OFFSET, 1e-3) / (0.5 + _OFFSET)).mean(1)
+
+
 @dataclass(frozen=True, eq=False)
 class Gains:
     """Exposure and white balance of V photos relative to their mean."""
 
     gain: Float32[np.ndarray, "V 3"]  # of stored value + 0.055 in [0, 1]; mean 1 over the photos
     source: Literal["tracks", "EXIF", "nothing"]
-    explained: float = 0.0  # share by which the spread of a point's colours falls; of tracks only
+    explained: float = (
+        0.0  # share by which the spread of a point's colours falls, cross-validated; of tracks only
+    )
 
     @property
     def ev(self) -> Float32[np.ndarray, " V"]:
@@ -66,14 +74,38 @@ def photo_gains(scene: Scene, photos: Photos, rows: Sequence[int]) -> Gains:
     points, views, colours = _track_colours(scene, photos, rows)
     if len(points) >= _ENOUGH * len(rows):
         logs = np.log(colours + _OFFSET)
-        found = np.stack([_log_gains(points, views, channel, len(rows)) for channel in logs.T], 1)
-        before, after = _spread(points, logs), _spread(points, logs - found[views])
-        return Gains(_relative(found), "tracks", 1 - after / max(before, 1e-12))
+        explained = _explained(points, views, logs, len(rows))
+        return Gains(_relative(_fit(points, views, logs, len(rows))), "tracks", explained)
     ev = [exposure_of(scene.views[row].image_path) for row in rows]
     if ev and all(value is not None for value in ev):
         found = np.array(ev, np.float64)[:, None].repeat(3, 1) * np.log(2) / _CURVE
         return Gains(_relative(found), "EXIF")
     return Gains(np.ones((len(rows), 3), np.float32), "nothing")
+
+
+def _fit(
+    points: Int64[np.ndarray, " T"],
+    views: Int64[np.ndarray, " T"],
+    logs: Float64[np.ndarray, "T 3"],
+    count: int,
+) -> Float64[np.ndarray, "V 3"]:
+    return np.stack([_log_gains(points, views, channel, count) for channel in logs.T], 1)
+
+
+def _explained(
+    points: Int64[np.ndarray, " T"],
+    views: Int64[np.ndarray, " T"],
+    logs: Float64[np.ndarray, "T 3"],
+    count: int,
+) -> float:
+    """Share by which gains bring together the colours of points that they were not fitted to."""
+    before, after = 0.0, 0.0
+    for half in (0, 1):
+        a, b = points % 2 == half, points % 2 != half
+        gains = _fit(points[a], views[a], logs[a], count)
+        before += _spread(points[b], logs[b])
+        after += _spread(points[b], logs[b] - gains[views[b]])
+    return 1 - after / max(before, 1e-12)
 
 
 def _relative(logs: Float64[np.ndarray, "V 3"]) -> Float32[np.ndarray, "V 3"]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -17,6 +18,7 @@ from sagesplat.train.view_parameters import ViewParameters
 
 SIZE = 12  # parameters of a view: the transform [3, 4], less the identity
 _LR, _LR_END = 5e-3, 5e-4  # of Adam, decaying exponentially
+_PIXELS = 60_000  # that a fit takes, evenly spread
 _ROUNDS = 5  # of iteratively reweighted least squares
 _PRIOR = 1e-3  # weight of the identity in a fit, as a fraction of the pixels
 
@@ -29,8 +31,8 @@ class ExposureUpdate:
     max_steps: int
     start: Float32[Tensor, "V 12"]  # of all views; of held-out ones zeros
     gains: Gains
-    size: int = SIZE
     first_step: int = 1
+    size: ClassVar[int] = SIZE
 
     def __call__(self, parameters: ViewParameters, views: Sequence[int], grad: Tensor, step: int) -> None:
         """Update the transforms of some views, then shift all so that their mean is the identity."""
@@ -84,8 +86,9 @@ def fit_exposure(
     Pixels count for a channel where the photo is neither black nor saturated there; Cauchy weights give
     little to what differs in content.
     """
-    x = np.concatenate([image.reshape(-1, 3), np.ones((image.shape[0] * image.shape[1], 1), np.float32)], 1)
-    y, found = photo.reshape(-1, 3), np.eye(3, 4)
+    some = slice(None, None, 1 + image.shape[0] * image.shape[1] // _PIXELS)
+    colours, y, found = image.reshape(-1, 3)[some], photo.reshape(-1, 3)[some], np.eye(3, 4)
+    x = np.concatenate([colours, np.ones_like(colours[:, :1])], 1)
     prior = _PRIOR * len(x) * np.eye(4)
     for c in range(3):
         within = (y[:, c] > 1 - SATURATED) & (y[:, c] < SATURATED)

@@ -21,6 +21,7 @@ from sagesplat.train.gradient_freezing import GradientFreezing
 from sagesplat.train.group import ALONE, Group
 from sagesplat.train.lr_schedule import LrSchedule
 from sagesplat.train.photo_loader import PhotoLoader
+from sagesplat.train.poses import PoseUpdate, moved_camera
 from sagesplat.train.state import TrainState, initial_state
 from sagesplat.train.strategy import Strategy
 from sagesplat.train.view_parameters import ViewGradients, ViewUpdate
@@ -109,6 +110,16 @@ class Stepper:
         self.strategy.step_post_update(state, trainable)
         return total / batch
 
+    def camera(self, state: TrainState, view: int) -> Camera:
+        """A view's camera with what is refined of it so far."""
+        camera, update = self.photo_loader.scene.views[view].camera, self.view_updates.get("pose")
+        if "exposure" in self.view_updates:
+            exposure = transform(state.per_view["exposure"].values[view]).cpu().numpy()
+            camera = replace(camera, exposure=exposure)
+        if not isinstance(update, PoseUpdate):
+            return camera
+        return moved_camera(camera, update.motion(view, state.per_view["pose"].values[view]))
+
     def stop(self, frozen: Collection[int]) -> None:
         """From now on, skip tiles that show nothing but the categories `frozen` (label ids)."""
         if len(frozen) > len(self.active_tiles.frozen):
@@ -128,6 +139,10 @@ class Stepper:
         finished, left = self.active_tiles.finished(view), self.active_tiles.tiles(view, factor)
         self.drawn += 1.0 if finished or left is None else float(left.mean())
         tiles = None if finished else self.active_tiles.mask(view, factor)
+        pose, update = None, self.view_updates.get("pose")
+        if isinstance(update, PoseUpdate) and "pose" in own:
+            motion = update.motion(view, own["pose"])
+            camera, pose = moved_camera(camera, motion), motion - motion.detach()
         exposure = _exposure(own, camera, photo.device)
         render = rasterize(
             moving,
@@ -137,6 +152,7 @@ class Stepper:
             tile_mask=tiles,
             trainable=trainable if self.active_tiles.frozen or self.gradient_freezing else None,
             absgrad=self.config.absgrad,
+            pose=pose,
             workspace=self.workspace,
             backend=self.backend,
         )

@@ -3,7 +3,8 @@
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,7 @@ from sagesplat.train.gradient_freezing import GradientFreezing
 from sagesplat.train.group import ALONE, Group
 from sagesplat.train.lr_schedule import LrSchedule, lr_schedule
 from sagesplat.train.photo_loader import PhotoLoader
+from sagesplat.train.poses import pose_update
 from sagesplat.train.state import TrainState, from_points, initial_state
 from sagesplat.train.stepper import Stepper
 from sagesplat.train.strategy import Densification, make_strategy
@@ -223,6 +225,7 @@ class Training:
             state.gaussians, stepper.active_tiles, stepper.photo_loader, self.measured, self.config,
             self._sh_degree(state.step),
             backend=stepper.backend, workspace=stepper.workspace, group=stepper.group,
+            camera_of=partial(stepper.camera, state),
         )  # fmt: skip
         counts = state.gaussians.counts()
         for label, ssim in quality.items():
@@ -257,7 +260,8 @@ def begin(
     g = from_points(
         scene.points, label_ids, config.sh_degree, strategy.initial_opacity, strategy.initial_scale
     )
-    updates, found = view_updates(scene, photos, config)
+    batched = replace(config, batch=max(config.batch, group.size))
+    updates, found = view_updates(scene, photos, batched)
     state, resumed = initial_state(g, seed).to(device), None
     for name, update in updates.items():
         parameters = ViewParameters.zeros(len(scene.views), update.size)
@@ -291,6 +295,8 @@ def view_updates(
 ) -> tuple[dict[str, ViewUpdate], list[str]]:
     """What a training refines of the cameras, by kind ("pose", "exposure"), and lines about it."""
     updates: dict[str, ViewUpdate] = {}
+    if config.poses:
+        updates["pose"] = pose_update(scene, config.max_steps, config.batch)
     exposure, found = exposure_update(scene, photos, config)
     if exposure:
         updates["exposure"] = exposure
