@@ -16,6 +16,7 @@ from sagesplat.adapt.ladder import Ladder
 from sagesplat.core import geometry
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.columns import from_rows, read_columns, write_columns
+from sagesplat.metrics.color_correct import color_correct_affine
 from sagesplat.metrics.image import means_by_label, psnr, squared_error_map, ssim_map
 from sagesplat.raster import Backend, Workspace, device_of, rasterize
 from sagesplat.scene.images import Photos
@@ -221,6 +222,18 @@ def measure(
     return rows
 
 
+def measure_colours(
+    image: Float32[np.ndarray, "H W 3"], photo: Float32[np.ndarray, "H W 3"]
+) -> dict[str, float]:
+    """PSNR of an image without its photo's exposure, and of it colour-corrected, as gsplat names them."""
+    corrected = color_correct_affine(image, photo)
+    return {
+        "plain_psnr": float(psnr(squared_error_map(image, photo).mean())),
+        "cc_psnr": float(psnr(squared_error_map(corrected, photo).mean())),
+        "cc_ssim": float(ssim_map(corrected, photo).mean()),
+    }
+
+
 def observe(
     scene: Scene,
     photos: Photos,
@@ -234,6 +247,9 @@ def observe(
     progress: Callable[[int, int], None] | None = None,
 ) -> Observations:
     """Render every level into views of the scene and measure SSIM and PSNR of each category there.
+
+    Cameras that have an exposure are rendered with it: of training photos the one that was learned, of others
+    the one that the full model was fitted to their photo with.
 
     Args:
         scene: The capture.

@@ -77,6 +77,21 @@ class RunDir:
         return self.path / "geometry.npz"
 
     @property
+    def cameras(self) -> Path:
+        """Poses and exposures of the views, where training refined them."""
+        return self.path / "cameras.npz"
+
+    @property
+    def refined(self) -> Path:
+        """What refining the cameras did, in figures."""
+        return self.path / "refined.json"
+
+    @property
+    def scene_files(self) -> list[Path]:
+        """What decides the scene that everything after training uses."""
+        return [self.scene, *([self.cameras] if self.cameras.exists() else [])]
+
+    @property
     def masks(self) -> Path:
         """Label images at training size, with labels.json."""
         return self.path / "masks"

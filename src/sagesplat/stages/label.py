@@ -153,9 +153,10 @@ def lift_labels(job: Job, config: LiftConfig) -> None:
     run = job.run
 
     def make() -> list[str]:
-        if config.votes == "track" and not len(job.scene.points.track_points):
+        if config.votes == "track" and not len(job.given_scene.points.track_points):
             job.emit(Warned("the points have no tracks: all views that a point projects into vote"))
-        lifted = lift(job.scene, job.masks, votes=config.votes, views=set(job.scene.train_ids.tolist()))
+        scene = job.given_scene
+        lifted = lift(scene, job.masks, votes=config.votes, views=set(scene.train_ids.tolist()))
         lifted.write(run.labels)
         return [f"{100 * lifted.agreement:.1f} % of the votes agree with the label of their point"]
 
@@ -186,7 +187,7 @@ def fuse_masks(job: Job) -> None:
         ]
 
     made = [run.provenance(stage) for stage in ("masks", "train")]
-    inputs = [run.scene, run.masks / "labels.json", run.levels, *made]
+    inputs = [*run.scene_files, run.masks / "labels.json", run.levels, *made]
     run_stage(job, "fuse", {"soft": soft is not None}, inputs, [run.fused / "labels.json"], make)
 
 

@@ -58,7 +58,7 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
         remove_checkpoints(run.nest_checkpoint)
         return lines
 
-    inputs = [run.scene, run.labels, run.levels, run.provenance("train"), *label_image_inputs(run)]
+    inputs = [*run.scene_files, run.labels, run.levels, run.provenance("train"), *label_image_inputs(run)]
     if config.base_share:
         _make_base_model(job, config, seed)
         inputs.append(run.base_model)
@@ -77,7 +77,7 @@ def _make_base_model(job: Job, config: NestConfig, seed: int) -> None:
         write_set(run.base_model, g, config.base_steps)
         return [f"{len(g):,} Gaussians"]
 
-    run_stage(job, "base", settings, [run.scene, run.labels], [run.base_model], make)
+    run_stage(job, "base", settings, [*run.scene_files, run.labels], [run.base_model], make)
 
 
 def train_capped(job: Job, stage: str, cap: int, steps: int, seed: int) -> Gaussians:

@@ -10,6 +10,7 @@ from sagesplat.core import geometry
 from sagesplat.core.gaussians import PARAMETERS, Gaussians, concat
 from sagesplat.core.sh import num_bases, rgb_to_sh0
 from sagesplat.scene.scene import Points
+from sagesplat.train.view_parameters import ViewParameters
 
 INITIAL_OPACITY = 0.1
 
@@ -30,6 +31,7 @@ class TrainState:
     frozen: dict[int, int] = field(default_factory=dict)  # label id -> step from which on it stays as it is
     withheld: int = 0  # Gaussians that stopped categories did not get
     order_share: Tensor | None = None  # [N] of a nested model: share of its category that comes before it
+    per_view: dict[str, ViewParameters] = field(default_factory=dict)  # "pose" and "exposure", if refined
 
     def replace_rows(self, keep: Tensor, new: Gaussians) -> None:
         """Keep some rows (bool [N]) and append new Gaussians with fresh moments and statistics."""
@@ -69,6 +71,7 @@ class TrainState:
             self, gaussians=self.gaussians.to(device), exp_avg=exp_avg, exp_avg_sq=exp_avg_sq,
             grad_sum=self.grad_sum.to(device), grad_count=self.grad_count.to(device),
             order_share=None if self.order_share is None else self.order_share.to(device),
+            per_view={name: parameters.to(device) for name, parameters in self.per_view.items()},
         )  # fmt: skip
 
 

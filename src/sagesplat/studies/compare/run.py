@@ -197,7 +197,7 @@ def _pruned(job: Job, config: CompareConfig, folder: Path) -> list[_Baseline]:
     return [
         _Baseline(
             PRUNED, f"{share:.0%}, {steps} steps", folder / f"pruned-{share:g}-{steps}.npz",
-            last.step + steps, {"share": share, "tune_steps": steps}, [job.run.scene, last.path],
+            last.step + steps, {"share": share, "tune_steps": steps}, [*job.run.scene_files, last.path],
             _prune, lambda share=share: (share, steps, weights()),
         )
         for share in sorted(set(config.shares))
@@ -219,7 +219,7 @@ def _mcmc(job: Job, config: CompareConfig, folder: Path) -> list[_Baseline]:
         settings = {**asdict(capped_config(made, cap, made.max_steps)), "seed": seed}
         of = path.stem, cap, made.max_steps, seed
         baseline = _Baseline(
-            MCMC, f"cap {share:.0%}", path, made.max_steps, settings, [run.scene, run.labels],
+            MCMC, f"cap {share:.0%}", path, made.max_steps, settings, [*run.scene_files, run.labels],
             _cap, lambda of=of: of,
         )  # fmt: skip
         found.append(baseline)
