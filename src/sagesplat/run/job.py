@@ -23,6 +23,7 @@ from sagesplat.scene.refined import read_refined, with_cameras
 from sagesplat.scene.scene import Scene
 from sagesplat.segment.lift import LiftedLabels
 from sagesplat.segment.masks import Masks, Taxonomy
+from sagesplat.segment.valid import ValidPixels
 from sagesplat.train import memory
 
 _PIECES = 2  # of work for each task that can run: the slower ones then have less to wait for
@@ -135,6 +136,11 @@ class Job:
     def masks(self) -> Masks:
         """The label images before fusion, loaded when asked for."""
         return Masks(self.run.masks, Taxonomy.read(self.run.masks / "labels.json"))
+
+    @cached_property
+    def valid(self) -> ValidPixels:
+        """The pixels that count, loaded when asked for."""
+        return ValidPixels(self.run.valid)
 
     @property
     def whole_masks(self) -> Masks:
