@@ -146,6 +146,24 @@ def garden(
 
 
 @app.command
+def refine(
+    scene: Path = workloads.GARDEN, downscale: int = 1, threads: int = 1, steps: int = 60, write: bool = False
+) -> None:
+    """What refining the cameras adds to a training step: settings take turns, one step each."""
+    used = set_threads(threads)
+    capture = load_scene(scene, downscale=downscale)
+    plain = TrainConfig(max_steps=2 * steps, level_every=2 * steps, lr_schedule="published")
+    times = measure.steps_side_by_side(capture, {"plain": plain, "poses": replace(plain, poses=True)}, steps)
+    camera = capture.views[0].camera
+    result = {"scene": capture.name, "size": [camera.width, camera.height], "threads": used}
+    result |= {"gaussians": len(capture.points.xyz), **{f"{name}_ms": ms for name, ms in times.items()}}
+    result |= {f"{name}_ratio": ms / times["plain"] for name, ms in times.items() if name != "plain"}
+    for name, value in result.items():
+        print(f"{name:32} {value}")
+    _finish(f"refine_{capture.name}_{camera.width}", result, write)
+
+
+@app.command
 def formats(
     splats: tuple[str, ...] = (), splat_transform: Path | None = None, count: int = 5000, write: bool = False
 ) -> None:

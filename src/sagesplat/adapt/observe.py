@@ -16,6 +16,7 @@ from sagesplat.adapt.ladder import Ladder
 from sagesplat.core import geometry
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.columns import from_rows, read_columns, write_columns
+from sagesplat.metrics.color_correct import color_correct_affine
 from sagesplat.metrics.image import means_by_label, pasted, psnr, squared_error_map, ssim_map
 from sagesplat.raster import Backend, Workspace, device_of, rasterize
 from sagesplat.scene.images import Photos
@@ -252,6 +253,17 @@ def _total(
     return {"ssim": whole, "ssim_eroded": whole, "psnr": decibels, "num_pixels": quality.size}
 
 
+def measure_colours(
+    image: Float32[np.ndarray, "H W 3"],
+    photo: Float32[np.ndarray, "H W 3"],
+    valid: Bool[np.ndarray, "H W"] | None = None,
+) -> dict[str, float]:
+    """PSNR of an image without its photo's exposure, and of it colour-corrected, as gsplat names them."""
+    corrected = color_correct_affine(image, photo, valid)
+    plain, of_corrected = measure_total(image, photo, valid), measure_total(corrected, photo, valid)
+    return {"plain_psnr": plain["psnr"], "cc_psnr": of_corrected["psnr"], "cc_ssim": of_corrected["ssim"]}
+
+
 def observe(
     scene: Scene,
     photos: Photos,
@@ -266,6 +278,9 @@ def observe(
     progress: Callable[[int, int], None] | None = None,
 ) -> Observations:
     """Render every level into views of the scene and measure SSIM and PSNR of each category there.
+
+    Cameras that have an exposure are rendered with it: of training photos the one that was learned, of others
+    the one that the full model was fitted to their photo with.
 
     Args:
         scene: The capture.

@@ -120,6 +120,9 @@ class TrainConfig:
     batch: int = 1
     """Photos per step, at least one per process. Learning rates grow with its square root; the number of
     steps stays."""
+    exposure: Literal["auto", "off", "affine"] = "auto"
+    """Exposure and white balance of the photos. affine: learn a colour transform per photo; off: none; auto:
+    affine where the photos differ."""
     means_lr: float = 1.6e-4
     """Learning rate of the means, times the scene extent; decays exponentially to 1 %."""
     quats_lr: float = 1e-3
@@ -160,6 +163,9 @@ class TrainConfig:
     max_gaussians: int = 0
     """Maximum number of Gaussians; the limit grows linearly during densification (0: choose from the image
     size)."""
+    poses: bool = False
+    """Refine the camera poses of the training views with the Gaussians. Those of held-out views are fitted to
+    their photos afterwards."""
     mcmc_noise: float = 5e5
     """SGLD noise of 3DGS-MCMC, times the learning rate of the means."""
     mcmc_opacity: float = 0.01

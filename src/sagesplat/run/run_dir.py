@@ -82,6 +82,11 @@ class RunDir:
         return self.path / "cameras.npz"
 
     @property
+    def refined(self) -> Path:
+        """What refining the cameras did, in figures."""
+        return self.path / "refined.json"
+
+    @property
     def scene_files(self) -> list[Path]:
         """What decides the scene that everything after training uses."""
         return [self.scene, *([self.cameras] if self.cameras.exists() else [])]

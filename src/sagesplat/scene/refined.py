@@ -43,7 +43,8 @@ def with_cameras(scene: Scene, cameras: RefinedCameras) -> Scene:
 
 
 def _with(camera: Camera, w2c: Float32[np.ndarray, "4 4"], exposure: Float32[np.ndarray, "3 4"]) -> Camera:
-    return replace(camera, w2c=w2c)
+    neutral = (exposure == np.eye(3, 4)).all()
+    return replace(camera, w2c=w2c, exposure=None if neutral else exposure)
 
 
 def write_refined(path: Path, cameras: RefinedCameras) -> None:

@@ -18,6 +18,14 @@ class Camera:
     width: int
     height: int
     background: tuple[int, int, int] = (0, 0, 0)  # RGB; photos with alpha are composited over it
+    exposure: Float32[np.ndarray, "3 4"] | None = (
+        None  # photo's colours = E[:, :3] @ rgb + E[:, 3]; None: rgb
+    )
+
+    @property
+    def neutral(self) -> "Camera":
+        """The same camera without its photo's exposure, for pictures that stand beside no photo."""
+        return replace(self, exposure=None)
 
     @property
     def position(self) -> Float32[np.ndarray, "3"]:

@@ -51,8 +51,8 @@ from sagesplat.train.nested import Nested, NestStep
 _SEEN = 0.01  # share of a photo's visible points from which on it sees a block
 
 
-def check(config: BlocksConfig) -> None:
-    """RunError for settings out of range."""
+def check(config: BlocksConfig, train: TrainConfig) -> None:
+    """RunError for settings out of range, or that do not go together."""
     wrong = (
         ("count", config.count, config.count >= 1, "1 or more"),
         ("margin", config.margin, 0 <= config.margin <= 2, "a share such as 0.2"),
@@ -63,6 +63,10 @@ def check(config: BlocksConfig) -> None:
     for name, value, fine, cure in wrong:
         if not fine:
             raise RunError(f"--blocks.{name} {value} is impossible; choose {cure}")
+    if config.count > 1 and train.poses:  # a photo of several blocks would get several poses
+        raise RunError("--train.poses does not go with --blocks.count; leave out one of them")
+    if config.count > 1 and train.exposure == "affine":
+        raise RunError("--train.exposure affine does not go with --blocks.count; leave out one of them")
 
 
 def _division(config: BlocksConfig) -> dict[str, float]:
@@ -157,6 +161,8 @@ def _needed(block: Job, config: TrainConfig) -> int:
 
 def train_blocks(job: Job, config: BlocksConfig, train: TrainConfig, seed: int) -> None:
     """Split the scene, train its blocks as tasks, and merge their levels."""
+    check(config, train)
+    train = replace(train, exposure="off")  # a photo of several blocks would get several
     run = job.run
     settings = {**asdict(train), "batch": max(train.batch, job.processes), "seed": seed}
     settings["blocks"] = _division(config)

@@ -28,8 +28,11 @@ def observe_levels(job: Job, config: FitConfig) -> None:
         table.write_csv(run.observations)
         seen = table.select(np.isin(table.view, job.scene.train_ids))
         _show(job, tables.ladder_table(seen, job.ladder.counts, job.ladder.recovering, titles(job.names())))
+        exposed = any(view.camera.exposure is not None for view in job.scene.views)
+        how = ", rendered with the exposure of their photos" if exposed else ""
         return [
-            f"{len(table):,} observations of {len(job.ladder.levels)} levels in {len(job.scene.views)} views"
+            f"{len(table):,} observations of {len(job.ladder.levels)} levels in "
+            f"{len(job.scene.views)} views{how}"
         ]
 
     levels = method_of(job).level_files[0]

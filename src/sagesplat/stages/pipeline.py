@@ -67,7 +67,7 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
     check_not_adopted(job.run)
     check_targets(config.plan, config.ladder)  # before hours of training
     nested.check(config.nest)
-    blocks.check(config.blocks)
+    blocks.check(config.blocks, config.train)
     check_segmenter(job, scene, config.masks)
     open_scene(job, scene, config.scene, config.poses)
     if config.blocks.count == 1:

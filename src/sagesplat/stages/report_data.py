@@ -62,6 +62,7 @@ def report_data(job: Job, composed: Gaussians, quality: QualityKind, target: flo
         timings=[(stage, float(made.get("seconds", math.nan))) for stage, made in records.items()],
         provenance=_provenance(records),
         categories=categories,
+        exposed=any(scene.views[row].camera.exposure is not None for row in scene.test_ids),
         photos=has_photos(run),
         adopted=_adopted(job, ladder) if run.adopted.exists() and isinstance(ladder, PrefixLadder) else (),
         viewpoints=_viewpoints(run),

@@ -22,7 +22,7 @@ from sagesplat.stages.refine import write_cameras
 from sagesplat.stages.shared import valid_inputs
 from sagesplat.train import memory
 from sagesplat.train.checkpoint import can_resume, remove_checkpoints
-from sagesplat.train.events import LabelFrozen, LevelSaved, Resumed, Step, Trained
+from sagesplat.train.events import Found, LabelFrozen, LevelSaved, Resumed, Step, Trained
 from sagesplat.train.parallel import train_together
 from sagesplat.train.trainer import train
 
@@ -58,6 +58,8 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
                 case Resumed(step, damage):
                     before = f", the checkpoint before the newest: {damage}" if damage else ""
                     job.emit(Warned(f"resuming from step {step}{before}"))
+                case Found(text):
+                    job.emit(Warned(text))
                 case Step(step, loss, num, _):
                     job.emit(Training(step, config.max_steps, loss, counts, num))
                 case LevelSaved():
@@ -70,12 +72,14 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
                 case Trained(gaussians, step, frozen) as trained:
                     write_frozen(place.frozen, frozen)
                     lines = [f"{len(gaussians):,} Gaussians after {step} steps"]
-                    lines += write_cameras(job, place.cameras, trained)
+                    lines += write_cameras(job, place, config, trained)
         if place != run:
             _swap(run, place)
         return lines
 
-    outputs = [run.levels, run.checkpoint]
+    # with exposure auto it depends on the photos: what was refined once must be there
+    refines = config.poses or config.exposure == "affine" or run.refined.exists()
+    outputs = [run.levels, run.checkpoint, *([run.cameras, run.refined] if refines else [])]
     run_stage(job, "train", settings, inputs, outputs, make, swaps=True)
 
 
@@ -142,8 +146,9 @@ def _swap(run: RunDir, made: RunDir) -> None:
             run.levels.rename(old)
         made.levels.rename(run.levels)
     remove_checkpoints(run.checkpoint)
-    run.cameras.unlink(missing_ok=True)  # of the earlier training
-    kinds = ("frozen", "cap", "cameras", "checkpoint")
+    for earlier in (run.cameras, run.refined):
+        earlier.unlink(missing_ok=True)
+    kinds = ("frozen", "cap", "cameras", "refined", "checkpoint")
     for new, place in ((getattr(made, kind), getattr(run, kind)) for kind in kinds):
         if new.exists():
             new.replace(place)

@@ -1,6 +1,6 @@
 """Per-category early stopping (Fig. 1 of the paper): a category at its target quality stops training."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,7 +12,7 @@ from sagesplat.core.config import TrainConfig
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.metrics.image import means_by_label, ssim_map
 from sagesplat.raster import TILE, Backend, Workspace, rasterize
-from sagesplat.scene.scene import Scene
+from sagesplat.scene.scene import Camera, Scene
 from sagesplat.segment.masks import Masks
 from sagesplat.segment.valid import ALL_VALID, ValidPixels
 from sagesplat.train.group import ALONE, Group
@@ -113,10 +113,12 @@ def label_quality(
     backend: Backend = "auto",
     workspace: Workspace | None = None,
     group: Group = ALONE,
+    camera_of: Callable[[int], Camera] | None = None,
 ) -> dict[int, float]:
     """Mean SSIM of each category that has not stopped, over the rows of views that `views` has for it.
 
-    The processes of a `group` measure some views each.
+    The processes of a `group` measure some views each. `camera_of`: the camera of a row of the scene's views,
+    where it is not the given one.
     """
     assert active_tiles.masks is not None
     found: dict[int, dict[int, float]] = {}
@@ -127,8 +129,8 @@ def label_quality(
             tiles = binary_dilation(tiles, np.ones((3, 3)))
         with torch.no_grad():
             render = rasterize(
-                gaussians, view.camera, sh_degree=sh_degree, antialiased=config.antialiased,
-                tile_mask=tiles, backend=backend, workspace=workspace,
+                gaussians, camera_of(row) if camera_of else view.camera, sh_degree=sh_degree,
+                antialiased=config.antialiased, tile_mask=tiles, backend=backend, workspace=workspace,
             )  # fmt: skip
         image, (photo, _) = render.rgb.clamp(0, 1).float(), photo_loader(row)
         valid = photo_loader.valid_pixels[view]

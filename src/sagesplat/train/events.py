@@ -16,6 +16,13 @@ class Resumed:
 
 
 @dataclass(frozen=True)
+class Found:
+    """Something about the photos that decides how they are trained on, in words."""
+
+    text: str
+
+
+@dataclass(frozen=True)
 class Step:
     """One optimiser step was taken."""
 
@@ -55,4 +62,4 @@ class Trained:
     per_view: dict[str, ViewParameters] = field(default_factory=dict)  # what was refined
 
 
-Event = Resumed | Step | LevelSaved | LabelFrozen | Trained
+Event = Resumed | Found | Step | LevelSaved | LabelFrozen | Trained

@@ -11,7 +11,7 @@ from torch import Tensor
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene
 from sagesplat.segment.valid import ALL_VALID, ValidPixels
-from sagesplat.train.lr_schedule import smaller
+from sagesplat.train.lr_schedule import smaller, smaller_valid
 
 Seen = tuple[Tensor, Camera]
 _MEMORY_SHARE = 0.25  # of a GPU's free memory, for photos
@@ -65,19 +65,13 @@ class PhotoLoader:
         return np.array(self.valid_pixels.rows(self.scene, self.scene.train_ids), np.int64)
 
     def valid(self, row: int, factor: int = 1) -> Tensor | None:
-        """Which pixels of a photo `factor` times smaller count, bool [H, W]; None: all.
-
-        A smaller photo's pixel counts if all those do that it is the mean of.
-        """
+        """Which pixels of a photo `factor` times smaller count, bool [H, W]; None: all."""
         key = row, factor
         if key not in self._valid:
-            view = self.scene.views[row]
-            valid = self.valid_pixels[view]
+            valid = self.valid_pixels[self.scene.views[row]]
             if valid is None:
                 return None
-            grey = np.repeat(np.where(valid, np.uint8(255), np.uint8(0))[..., None], 3, 2)
-            small, _ = smaller(grey, view.camera, factor)
-            self._valid[key] = torch.from_numpy(small[..., 0] == 255).to(self.device)
+            self._valid[key] = torch.from_numpy(smaller_valid(valid, factor)).to(self.device)
         return self._valid[key]
 
     def expect(self, row: int, factor: int = 1) -> None:

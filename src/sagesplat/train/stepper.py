@@ -11,16 +11,18 @@ from sagesplat.core.config import TrainConfig
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.quantisation import rounded
 from sagesplat.metrics.image import photometric_loss
-from sagesplat.raster import Backend, Render, Workspace, device_of, rasterize
+from sagesplat.raster import Backend, Render, Workspace, device_of, expose, rasterize
 from sagesplat.scene.images import Photos
-from sagesplat.scene.scene import Scene
+from sagesplat.scene.scene import Camera, Scene
 from sagesplat.segment.valid import ALL_VALID, ValidPixels
 from sagesplat.train import optim
 from sagesplat.train.early_stopping import ActiveTiles, trainable_rows
+from sagesplat.train.exposure import transform
 from sagesplat.train.gradient_freezing import GradientFreezing
 from sagesplat.train.group import ALONE, Group
 from sagesplat.train.lr_schedule import LrSchedule
 from sagesplat.train.photo_loader import PhotoLoader
+from sagesplat.train.poses import PoseUpdate, moved_camera
 from sagesplat.train.state import TrainState, initial_state
 from sagesplat.train.strategy import Strategy
 from sagesplat.train.view_parameters import ViewGradients, ViewUpdate
@@ -109,6 +111,16 @@ class Stepper:
         self.strategy.step_post_update(state, trainable)
         return total / batch
 
+    def camera(self, state: TrainState, view: int) -> Camera:
+        """A view's camera with what is refined of it so far."""
+        camera, update = self.photo_loader.scene.views[view].camera, self.view_updates.get("pose")
+        if "exposure" in self.view_updates:
+            exposure = transform(state.per_view["exposure"].values[view]).cpu().numpy()
+            camera = replace(camera, exposure=exposure)
+        if not isinstance(update, PoseUpdate):
+            return camera
+        return moved_camera(camera, update.motion(view, state.per_view["pose"].values[view]))
+
     def stop(self, frozen: Collection[int]) -> None:
         """From now on, skip tiles that show nothing but the categories `frozen` (label ids)."""
         if len(frozen) > len(self.active_tiles.frozen):
@@ -128,19 +140,26 @@ class Stepper:
         finished, left = self.active_tiles.finished(view), self.active_tiles.tiles(view, factor)
         self.drawn += 1.0 if finished or left is None else float(left.mean())
         tiles = None if finished else self.active_tiles.mask(view, factor)
+        pose, update = None, self.view_updates.get("pose")
+        if isinstance(update, PoseUpdate) and "pose" in own:
+            motion = update.motion(view, own["pose"])
+            camera, pose = moved_camera(camera, motion), motion - motion.detach()
+        exposure = _exposure(own, camera, photo.device)
         render = rasterize(
             moving,
-            camera,
+            camera if camera.exposure is None else camera.neutral,
             sh_degree=degree,
             antialiased=self.config.antialiased,
             tile_mask=tiles,
             trainable=trainable if self.active_tiles.frozen or self.gradient_freezing else None,
             absgrad=self.config.absgrad,
+            pose=pose,
             workspace=self.workspace,
             backend=self.backend,
         )
+        rgb = render.rgb if exposure is None else expose(render.rgb, exposure, photo)
         valid = self.photo_loader.valid(view, factor)
-        loss = photometric_loss(render.rgb, photo, self.config.ssim_weight, tiles, self.workspace, valid)
+        loss = photometric_loss(rgb, photo, self.config.ssim_weight, tiles, self.workspace, valid)
         return loss, render
 
     def _next_view(self, state: TrainState) -> int:
@@ -152,6 +171,13 @@ class Stepper:
                 if not self.active_tiles.finished(view) or state.rng.random() < FINISHED_SHARE
             ]
         return state.queue.pop()
+
+
+def _exposure(own: Mapping[str, Tensor], camera: Camera, device: torch.device) -> Tensor | None:
+    """The colour transform of a view: the one that is learned, else its camera's, else none."""
+    if "exposure" in own:
+        return transform(own["exposure"])
+    return None if camera.exposure is None else torch.from_numpy(camera.exposure).to(device)
 
 
 def _spread(grads: Mapping[str, Tensor], rows: Tensor, trainable: Tensor) -> tuple[dict[str, Tensor], Tensor]:

@@ -3,7 +3,8 @@
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,11 +22,13 @@ from sagesplat.segment.masks import Masks
 from sagesplat.segment.valid import ALL_VALID, ValidPixels
 from sagesplat.train.checkpoint import latest_checkpoint, previous, write_checkpoint
 from sagesplat.train.early_stopping import ActiveTiles, label_quality, measured_views, trainable_rows
-from sagesplat.train.events import Event, LabelFrozen, LevelSaved, Resumed, Step, Trained
+from sagesplat.train.events import Event, Found, LabelFrozen, LevelSaved, Resumed, Step, Trained
+from sagesplat.train.exposure import ExposureUpdate, exposure_update
 from sagesplat.train.gradient_freezing import GradientFreezing
 from sagesplat.train.group import ALONE, Group
 from sagesplat.train.lr_schedule import LrSchedule, lr_schedule
 from sagesplat.train.photo_loader import PhotoLoader
+from sagesplat.train.poses import pose_update
 from sagesplat.train.state import TrainState, from_points, initial_state
 from sagesplat.train.stepper import Stepper
 from sagesplat.train.strategy import Densification, make_strategy
@@ -72,8 +75,8 @@ def train(
         group: Processes that train one model together. All call this with the same arguments.
 
     Yields:
-        `Resumed` first where a checkpoint was found, `Step` at every step, `LevelSaved`, `LabelFrozen`, and
-        `Trained` last, with the Gaussians on the CPU.
+        `Resumed` first where a checkpoint was found, `Found`, `Step` at every step, `LevelSaved`,
+        `LabelFrozen`, and `Trained` last, with the Gaussians on the CPU.
 
     Raises:
         RunError: If the loss is not finite, memory runs out, a GPU fails, or a setting is impossible.
@@ -145,6 +148,7 @@ class Training:
     folder: Path | None  # None: this process writes nothing
     settings: str
     resumed: Resumed | None
+    found: list[str]  # about the photos, in words
     loss: float = 0.0  # when it was last looked at
 
     def __post_init__(self) -> None:
@@ -156,6 +160,7 @@ class Training:
         """Train to the end; the events of `train`."""
         if self.resumed:
             yield self.resumed
+        yield from map(Found, self.found)
         while self.state.step < self.config.max_steps and self.unfinished:
             yield self._step()
             yield from self._after_step()
@@ -225,6 +230,7 @@ class Training:
             state.gaussians, stepper.active_tiles, stepper.photo_loader, self.measured, self.config,
             self._sh_degree(state.step),
             backend=stepper.backend, workspace=stepper.workspace, group=stepper.group,
+            camera_of=partial(stepper.camera, state),
         )  # fmt: skip
         counts = state.gaussians.counts()
         for label, ssim in quality.items():
@@ -260,10 +266,14 @@ def begin(
     g = from_points(
         scene.points, label_ids, config.sh_degree, strategy.initial_opacity, strategy.initial_scale
     )
-    updates = view_updates(scene, config)
+    batched = replace(config, batch=max(config.batch, group.size))
+    updates, found = view_updates(scene, photos, batched)
     state, resumed = initial_state(g, seed).to(device), None
     for name, update in updates.items():
-        state.per_view[name] = ViewParameters.zeros(len(scene.views), update.size).to(device)
+        parameters = ViewParameters.zeros(len(scene.views), update.size)
+        if isinstance(update, ExposureUpdate):
+            parameters.values += update.start
+        state.per_view[name] = parameters.to(device)
     state.sort()
     if folder and (folder / CHECKPOINT).exists():
         state, damage = latest_checkpoint(folder / CHECKPOINT, settings)
@@ -281,12 +291,22 @@ def begin(
     )  # fmt: skip
     measured = measured_views(scene, masks) if config.freeze_at is not None and masks is not None else {}
     folder = folder if group.leads else None
-    return Training(config, state, stepper, strategy, rates, measured, freezing, folder, settings, resumed)
+    return Training(
+        config, state, stepper, strategy, rates, measured, freezing, folder, settings, resumed, found
+    )
 
 
-def view_updates(scene: Scene, config: TrainConfig) -> dict[str, ViewUpdate]:
-    """What a training refines of the cameras, by kind: "pose", "exposure"."""
-    return {}
+def view_updates(
+    scene: Scene, photos: Photos, config: TrainConfig
+) -> tuple[dict[str, ViewUpdate], list[str]]:
+    """What a training refines of the cameras, by kind ("pose", "exposure"), and lines about it."""
+    updates: dict[str, ViewUpdate] = {}
+    if config.poses:
+        updates["pose"] = pose_update(scene, config.max_steps, config.batch)
+    exposure, found = exposure_update(scene, photos, config)
+    if exposure:
+        updates["exposure"] = exposure
+    return updates, [found] if found else []
 
 
 def _check_levels(checkpoint: Path, step: int) -> None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import torch
 from jaxtyping import Float32, Int64
@@ -39,14 +39,25 @@ class ViewParameters:
         grad: Float32[Tensor, "R D"],
         lr: float | Tensor,
         betas: tuple[float, float] = (0.9, 0.999),
+        *,
+        joint: bool = False,
     ) -> None:
-        """One Adam step on R different views. `lr`: a number or a tensor that broadcasts to [R, D]."""
+        """One Adam step on R different views.
+
+        Args:
+            views: Rows.
+            grad: Their gradients.
+            lr: A number, or a tensor that broadcasts to [R, D].
+            betas: Of the two moments.
+            joint: The parameters of a view share their second moment: a step keeps the gradient's direction.
+        """
         rows = torch.tensor(views, device=self.values.device)
         b1, b2 = betas
         self.counts[rows] += 1
         unbiased1, unbiased2 = ((1 - b ** self.counts[rows][:, None].double()).to(grad.dtype) for b in betas)
         m = b1 * self.exp_avg[rows] + (1 - b1) * grad
-        v = b2 * self.exp_avg_sq[rows] + (1 - b2) * grad * grad
+        squares = (grad * grad).mean(1, keepdim=True).expand_as(grad) if joint else grad * grad
+        v = b2 * self.exp_avg_sq[rows] + (1 - b2) * squares
         self.exp_avg[rows], self.exp_avg_sq[rows] = m, v
         self.values[rows] -= lr * (m / unbiased1) / ((v / unbiased2).sqrt() + _EPS)
 
@@ -59,8 +70,12 @@ class ViewParameters:
 class ViewUpdate(Protocol):
     """Updates one kind of parameters of the views, a value of `Stepper.view_updates`."""
 
-    size: int  # D of its `ViewParameters`
-    first_step: int  # from which on a step takes the gradient of the parameters of its views
+    size: ClassVar[int]  # D of its `ViewParameters`
+
+    @property
+    def first_step(self) -> int:
+        """The step from which on gradients of the parameters are taken."""
+        ...
 
     def __call__(
         self, parameters: ViewParameters, views: Sequence[int], grad: Float32[Tensor, "R D"], step: int
