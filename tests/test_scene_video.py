@@ -73,6 +73,24 @@ def test_the_sharpest_of_each_stretch_is_taken(tmp_path: Path) -> None:
     assert set(numbers(paths)) == sharp
 
 
+@pytest.mark.parametrize("count", [24, 60, 90, 240])
+def test_every_other_frame_is_blurred(tmp_path: Path, count: int) -> None:
+    """Also where the video is so short that each frame is a stretch of its own; exposure does not matter."""
+    frames = [
+        gaussian_filter(f, (0, 5, 0)) if i % 2 else (f * (0.5 + 0.5 * (i % 4 == 0))).astype(np.uint8)
+        for i, f in enumerate(pan(count))
+    ]
+    found = numbers(extract_frames(write_video(tmp_path / "a.mp4", frames), tmp_path / "f"))
+    assert all(i % 2 == 0 for i in found)
+    assert len(found) >= min(count // 2, 30)
+
+
+def test_a_blurred_stretch_leaves_no_wide_gap(tmp_path: Path) -> None:
+    frames = [gaussian_filter(f, (0, 5, 0)) if 10 <= i < 16 else f for i, f in enumerate(pan(30))]
+    found = numbers(extract_frames(write_video(tmp_path / "a.mp4", frames), tmp_path / "f"))
+    assert np.diff(found).max() <= 2
+
+
 def test_a_standing_camera_gives_one_frame(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     still = [np.clip(pan(1)[0] + rng.normal(0, 4, (HEIGHT, WIDTH, 3)), 0, 255).astype(np.uint8)] * 30
