@@ -277,6 +277,56 @@ def test_too_few_poses_is_one_line_and_keeps_the_work(tmp_path: Path) -> None:
 
 
 @needs_pycolmap
+@needs_pycolmap
+def test_no_features_where_pixels_do_not_count(folder: Path, tmp_path: Path) -> None:
+    """By alpha, a mask of half the size, a mask of a photo that EXIF turns, and label images."""
+    alpha, masked, turned, labelled = (folder / f"view {i}.png" for i in range(4))
+    pixels = np.dstack([read(alpha), np.full((HEIGHT, WIDTH), 255, np.uint8)])
+    pixels[:, : WIDTH // 2, 3] = 0
+    Image.fromarray(pixels).save(alpha)
+    (folder / "masks_valid").mkdir()
+    half = Image.new("1", (WIDTH // 2, HEIGHT // 2))
+    half.paste(1, (WIDTH // 4, 0, WIDTH // 2, HEIGHT // 2))
+    half.save(folder / "masks_valid" / masked.name)
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    with Image.open(turned) as image:
+        image.transpose(Image.Transpose.ROTATE_90).save(turned, exif=exif)
+    stored = Image.new("L", (HEIGHT, WIDTH))
+    stored.paste(200, (0, 0, HEIGHT, WIDTH // 2))  # of the stored pixels the upper half is the right one
+    stored.save(folder / "masks_valid" / f"{turned.name}.png")
+    right = np.arange(WIDTH)[None].repeat(HEIGHT, 0) >= WIDTH // 2
+
+    def stop(stage: str, done: int, total: int) -> None:
+        if stage == "matches":
+            raise KeyboardInterrupt
+
+    def features(name: str) -> np.ndarray:
+        work = tmp_path / "out" / "sfm"
+        names = json.loads((work / "request.json").read_text())["names"]
+        prepared = next(key for key, final in names.items() if final == name)
+        with sqlite3.connect(work / "database.db") as database:
+            (row,) = database.execute(
+                "select rows, cols, data from keypoints natural join images where name = ?", (prepared,)
+            ).fetchall()
+        database.close()
+        return np.frombuffer(row[2], np.float32).reshape(row[:2])
+
+    options = {"ignored": lambda name: right if name == labelled.name else None}
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(folder, tmp_path / "out", CONFIG, stop, **options)
+    assert features("view 4.png")[:, 0].min() < WIDTH / 4
+    for path in (alpha, masked, turned, labelled):
+        found = features(path.name)
+        assert len(found) > 20, path
+        assert found[:, 0].min() > WIDTH / 2 - 1, path
+    kept = sorted(path.name for path in (tmp_path / "out" / "masks_valid").iterdir())
+    assert kept == ["view 0.png", "view 1.png", "view 2.png"]  # label images are the stage's that follows
+    Image.new("L", (50, 50)).save(folder / "masks_valid" / masked.name)
+    with pytest.raises(SceneError, match=r"view 1\.png: a mask or label image of 50 x 50 pixels"):
+        reconstruct(folder, tmp_path / "out", CONFIG, stop)
+
+
 def test_focal_lengths_of_exif_reach_colmap(tmp_path: Path) -> None:
     """Through a plain JPEG, a turned one and a PNG with alpha: 35 mm on 36 mm wide film."""
     source, noise = (

@@ -69,7 +69,7 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
     nested.check(config.nest)
     blocks.check(config.blocks, config.train)
     check_segmenter(job, scene, config.masks)
-    open_scene(job, scene, config.scene, config.poses)
+    open_scene(job, scene, config.scene, config.poses, config.masks, config.labels)
     if config.blocks.count == 1:
         check_training(job, config.train)
     make_masks(job, config.masks, config.labels)
