@@ -1,7 +1,7 @@
 """Nested levels beside their baselines: same data, same training views, same evaluation."""
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -21,7 +21,8 @@ from sagesplat.formats.increments import INDEX, read_increments, shown, write_in
 from sagesplat.formats.levels import read_level, write_set
 from sagesplat.formats.spz import SH_BITS
 from sagesplat.io.files import read_json, write_json
-from sagesplat.metrics.image import ssim_map
+from sagesplat.metrics.color_correct import color_correct_affine
+from sagesplat.metrics.image import psnr, squared_error_map, ssim_map
 from sagesplat.metrics.lpips import Lpips
 from sagesplat.raster import Workspace
 from sagesplat.run.executor import Local
@@ -319,9 +320,13 @@ def _measure(job: Job, contenders: Sequence[Contender], metrics: dict[str, Lpips
     tests, workspace, points = job.scene.test_ids.tolist(), Workspace(), []
     done, total = 0, len(contenders) * len(tests)
 
-    def image_of(g: Gaussians, row: int) -> np.ndarray:
+    def exposed(row: int) -> bool:
+        return job.scene.views[row].camera.exposure is not None
+
+    def image_of(g: Gaussians, row: int, neutral: bool = False) -> np.ndarray:
         drawn = {"backend": job.backend, "antialiased": job.antialiased, "workspace": workspace}
-        return render_rgb(g, job.scene.views[row].camera, **drawn)
+        camera = job.scene.views[row].camera
+        return render_rgb(g, camera.neutral if neutral else camera, **drawn)
 
     for begin in range(0, len(contenders), _TOGETHER):
         some = contenders[begin : begin + _TOGETHER]
@@ -339,6 +344,9 @@ def _measure(job: Job, contenders: Sequence[Contender], metrics: dict[str, Lpips
                 values.append(_values(job, image, photo, here))
                 for column, metric in metrics.items():
                     values[-1][column] = metric.distance(metric.features(image), of_photo[column])
+                if exposed(row):
+                    corrected = color_correct_affine(image_of(g, row, neutral=True), photo)
+                    values[-1] |= _corrected(corrected, photo, metrics, of_photo)
                 if arrived is not None:
                     values[-1]["ssim_sent"] = float(ssim_map(image_of(arrived, row), photo).mean())
                 done += 1
@@ -346,6 +354,17 @@ def _measure(job: Job, contenders: Sequence[Contender], metrics: dict[str, Lpips
         parts = zip(some, sets, sent, found, strict=True)
         points += [_point(c, g, encoded, values) for c, g, (encoded, _), values in parts]
     return points
+
+
+def _corrected(
+    image: np.ndarray, photo: np.ndarray, metrics: Mapping[str, Lpips], of_photo: Mapping[str, Any]
+) -> dict[str | int, float]:
+    """The metrics of a colour-corrected image, by the names that gsplat has for them."""
+    decibels, ssim = psnr(squared_error_map(image, photo).mean()), ssim_map(image, photo).mean()
+    found: dict[str | int, float] = {"cc_psnr": float(decibels), "cc_ssim": float(ssim)}
+    for column, metric in metrics.items():
+        found[f"cc_{column}"] = metric.distance(metric.features(image), of_photo[column])
+    return found
 
 
 def _values(job: Job, image: np.ndarray, photo: np.ndarray, labels: np.ndarray) -> dict[str | int, float]:
