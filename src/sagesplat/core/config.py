@@ -15,6 +15,9 @@ class SceneConfig:
     """Every n-th view by name is a test view, used for evaluation only; 0: none."""
     calibrate_every: int = 8
     """Every n-th of the other views is held out of training, to calibrate the quality models; 0: none."""
+    alpha: Literal["auto", "background", "ignore"] = "auto"
+    """Transparent pixels of photos. background: an object that was cut out, composited over the background;
+    ignore: pixels that do not count; auto: background if most of the photos' border is transparent."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +76,7 @@ class MasksConfig:
 
 @dataclass(frozen=True)
 class LabelsConfig:
-    """Changes to the categories: merge first, then keep, then the minimum share."""
+    """Changes to the categories: merge first, then ignore, then keep, then the minimum share."""
 
     keep: str = ""
     """Keep these categories, e.g. "grass-merged,tree-merged"; all others become unlabelled."""
@@ -81,6 +84,11 @@ class LabelsConfig:
     """Merge categories, e.g. "vase=potted plant,potted plant=tree-merged"."""
     min_share: float = 0.0
     """Categories that cover less than this fraction of all pixels become unlabelled."""
+    ignore: str = ""
+    """Categories that do not belong to the scene, e.g. "person,car": their pixels are not trained on, not
+    measured and have no vote."""
+    ignore_dilation: int = 3
+    """Grow ignored regions by this many pixels of the training photos, whatever they were ignored for."""
 
 
 @dataclass(frozen=True)

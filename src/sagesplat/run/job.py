@@ -23,6 +23,7 @@ from sagesplat.scene.refined import read_refined, with_cameras
 from sagesplat.scene.scene import Scene
 from sagesplat.segment.lift import LiftedLabels
 from sagesplat.segment.masks import Masks, Taxonomy
+from sagesplat.segment.valid import ValidPixels
 from sagesplat.train import memory
 
 _PIECES = 2  # of work for each task that can run: the slower ones then have less to wait for
@@ -136,6 +137,11 @@ class Job:
         """The label images before fusion, loaded when asked for."""
         return Masks(self.run.masks, Taxonomy.read(self.run.masks / "labels.json"))
 
+    @cached_property
+    def valid(self) -> ValidPixels:
+        """The pixels that count, loaded when asked for."""
+        return ValidPixels(self.run.valid)
+
     @property
     def whole_masks(self) -> Masks:
         """The label images that all views agreed on, if they were asked to."""
@@ -152,10 +158,20 @@ class Job:
     @property
     def point_labels(self) -> np.ndarray:
         """Category of each SfM point."""
+        return self._lifted.label_ids
+
+    @property
+    def initial_labels(self) -> np.ndarray:
+        """Category of the Gaussian that begins at each SfM point; `lift.IGNORED` where none does."""
+        return self._lifted.initial_ids
+
+    @property
+    def _lifted(self) -> LiftedLabels:
         path = self.run.block_category_labels if self.has_block_categories else self.run.labels
-        ids = LiftedLabels.read(path, len(self.scene.points.xyz)).label_ids
-        self.check_named(path, np.flatnonzero(np.bincount(ids.astype(np.int64) + 1)) - 1)
-        return ids
+        lifted = LiftedLabels.read(path, len(self.scene.points.xyz))
+        ids = np.flatnonzero(np.bincount(lifted.label_ids.astype(np.int64) + 1)) - 1
+        self.check_named(path, ids)
+        return lifted
 
     @cached_property
     def snapshots(self) -> SnapshotLadder:

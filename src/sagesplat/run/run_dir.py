@@ -97,6 +97,11 @@ class RunDir:
         return self.path / "masks"
 
     @property
+    def valid(self) -> Path:
+        """Which pixels count, by view: images of the views with some that do not."""
+        return self.path / "valid"
+
+    @property
     def capture(self) -> Path:
         """The folder of the capture that was made of photos without poses."""
         return self.path / "capture"

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32
 from torch import Tensor
 
 from sagesplat.core.config import TrainConfig
@@ -79,15 +79,18 @@ def transforms(parameters: ViewParameters) -> Float32[np.ndarray, "V 3 4"]:
 
 
 def fit_exposure(
-    image: Float32[np.ndarray, "H W 3"], photo: Float32[np.ndarray, "H W 3"]
+    image: Float32[np.ndarray, "H W 3"],
+    photo: Float32[np.ndarray, "H W 3"],
+    valid: Bool[np.ndarray, "H W"] | None = None,
 ) -> Float32[np.ndarray, "3 4"]:
     """The colour transform [3, 4] that brings a rendering to a photo, by robust least squares.
 
-    Pixels count for a channel where the photo is neither black nor saturated there; Cauchy weights give
-    little to what differs in content.
+    Of the `valid` pixels those count for a channel where the photo is neither black nor saturated there;
+    Cauchy weights give little to what differs in content.
     """
-    some = slice(None, None, 1 + image.shape[0] * image.shape[1] // _PIXELS)
-    colours, y, found = image.reshape(-1, 3)[some], photo.reshape(-1, 3)[some], np.eye(3, 4)
+    x, y = (image.reshape(-1, 3), photo.reshape(-1, 3)) if valid is None else (image[valid], photo[valid])
+    some = slice(None, None, 1 + len(x) // _PIXELS)
+    colours, y, found = x[some], y[some], np.eye(3, 4)
     x = np.concatenate([colours, np.ones_like(colours[:, :1])], 1)
     for c in range(3):
         within = (y[:, c] > 1 - SATURATED) & (y[:, c] < SATURATED)
