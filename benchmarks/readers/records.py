@@ -211,7 +211,7 @@ def _capture(folder: Path) -> dict[str, Any]:
     frames = [{"file_path": f"images/{name}", "transform_matrix": pose} for name in PHOTOS]
     shared = {"w": 16, "h": 12, "fl_x": 14.0, "ply_file_path": "points.ply", "frames": frames}
     (capture / "transforms.json").write_text(json.dumps(shared))
-    settings = {"downscale": 1, "test_every": 8}
+    settings: dict[str, Any] = {"downscale": 1, "test_every": 8}
     scene = load_scene(capture, **settings)
     photos = photo_hashes(folder / "none.json", scene).sha256
     return {"path": str(capture), "settings": settings, "fingerprint": fingerprint(scene), "photos": photos}
