@@ -26,8 +26,8 @@ def test_a_far_gaussian_leaves_the_cameras_alone():
     away = float((g.means - centre).norm())
     assert keep_clear(g, centre, 5.0, torch.ones(1, dtype=torch.bool)).tolist() == [0]
     assert float(g.log_scales.exp().max()) == pytest.approx(away / CLEAR, rel=1e-5)
-    assert before > 0.3
-    assert rasterize(g, camera).alpha.mean() < 0.05
+    assert before > 0.45
+    assert rasterize(g, camera).alpha.mean() < before / 7
 
 
 def test_small_and_stopped_gaussians_keep_every_bit():
