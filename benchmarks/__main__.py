@@ -180,8 +180,9 @@ def refine(
     """What refining the cameras adds to a training step: settings take turns, one step each."""
     used = set_threads(threads)
     capture = load_scene(scene, downscale=downscale)
-    plain = TrainConfig(max_steps=2 * steps, level_every=2 * steps, lr_schedule="published")
-    times = measure.steps_side_by_side(capture, {"plain": plain, "poses": replace(plain, poses=True)}, steps)
+    plain = TrainConfig(max_steps=2 * steps, level_every=2 * steps, lr_schedule="published", exposure="off")
+    settings = {"poses": replace(plain, poses=True), "exposure": replace(plain, exposure="affine")}
+    times = measure.steps_side_by_side(capture, {"plain": plain, **settings}, steps)
     camera = capture.views[0].camera
     result = {"scene": capture.name, "size": [camera.width, camera.height], "threads": used}
     result |= {"gaussians": len(capture.points.xyz), **{f"{name}_ms": ms for name, ms in times.items()}}

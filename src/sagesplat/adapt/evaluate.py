@@ -31,6 +31,7 @@ from sagesplat.metrics.image import means_by_label, ssim_map
 from sagesplat.raster import Backend, Workspace, device_of
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene
+from sagesplat.segment.valid import ALL_VALID, ValidPixels
 
 QUALITIES: tuple[QualityKind, ...] = get_args(QualityKind)  # by the number in the table
 UNIFORM = -3  # label id of the whole image with all categories at one level
@@ -115,6 +116,7 @@ def evaluate(
     min_share: float = 0.0,
     uniform: Sequence[int] = (),
     compose: Callable[[Plan], Gaussians] | None = None,
+    valid: ValidPixels = ALL_VALID,
     backend: Backend = "auto",
     antialiased: bool = False,
     progress: Callable[[int, int], None] | None = None,
@@ -132,6 +134,7 @@ def evaluate(
         min_share: Fidelity is not measured where a category covers less than this fraction of the pixels.
         uniform: Levels to measure with all categories at that level, to compare the plans with.
         compose: The Gaussians of a plan; None: its levels as they are.
+        valid: The pixels of photos that count; views without any are left out.
         backend: Rasteriser; decides the device.
         antialiased: How the model was trained.
         progress: Called with (images measured, images in all).
@@ -141,7 +144,7 @@ def evaluate(
     """
     ssim = "ssim_eroded" if region == "eroded" else "ssim"
     rows: list[dict[str, float]] = []
-    views = scene.test_ids.tolist()
+    views = valid.rows(scene, scene.test_ids)
     inner = {row: erode(masks[scene.views[row]]) for row in views}
     done, total = 0, len(views) * (1 + len(plans) + len(uniform))
     workspace = Workspace()
@@ -167,10 +170,10 @@ def evaluate(
             image = reference if g is last else render(g, neutral)
             least = min_share * image.shape[0] * image.shape[1]
             alike = fidelity_by_label(image, reference, labels[view], least)
-            colours = measure_colours(image, photo)
+            colours = measure_colours(image, photo, valid[view])
             if view.camera.exposure is not None:
                 image = render(g, view.camera)
-            measured = measure(image, photo, masks[view], inner[row])
+            measured = measure(image, photo, masks[view], inner[row], valid[view])
             measured[TOTAL] |= colours
             yield row, measured, alike
             done += 1

@@ -158,10 +158,20 @@ class Job:
     @property
     def point_labels(self) -> np.ndarray:
         """Category of each SfM point."""
+        return self._lifted.label_ids
+
+    @property
+    def initial_labels(self) -> np.ndarray:
+        """Category of the Gaussian that begins at each SfM point; `lift.IGNORED` where none does."""
+        return self._lifted.initial_ids
+
+    @property
+    def _lifted(self) -> LiftedLabels:
         path = self.run.block_category_labels if self.has_block_categories else self.run.labels
-        ids = LiftedLabels.read(path, len(self.scene.points.xyz)).label_ids
-        self.check_named(path, np.flatnonzero(np.bincount(ids.astype(np.int64) + 1)) - 1)
-        return ids
+        lifted = LiftedLabels.read(path, len(self.scene.points.xyz))
+        ids = np.flatnonzero(np.bincount(lifted.label_ids.astype(np.int64) + 1)) - 1
+        self.check_named(path, ids)
+        return lifted
 
     @cached_property
     def snapshots(self) -> SnapshotLadder:

@@ -82,7 +82,7 @@ def read_black(path: Path, pixels: int) -> Pixels:
     except PictureError as error:
         cure = error.cure or "export it again"
         raise LabelError(f"{path}: not a readable PNG ({error.reason}); {cure}") from None
-    return values.any(2) if values.ndim == 3 else values.astype(bool)
+    return np.array(values.any(2) if values.ndim == 3 else values, bool)
 
 
 def write_valid(

@@ -116,7 +116,7 @@ def _begin(run: RunDir, scene: Scene, labels: LiftedLabels, rows: np.ndarray, ph
     run.path.mkdir(parents=True, exist_ok=True)
     capture = run.path / "capture.npz"
     write_scene(capture, scene)
-    LiftedLabels(labels.label_ids[rows], labels.num_votes[rows], labels.num_agreeing[rows]).write(run.labels)
+    labels.select(rows).write(run.labels)
     mine = photos.of({view.name for view in scene.views})
     stored = {"path": str(capture.resolve()), "settings": {}, "fingerprint": fingerprint(scene)}
     stored |= {"photos": mine.sha256, "extent": scene.extent, "points": len(rows), "views": []}
@@ -138,6 +138,10 @@ def _share_masks(job: Job, block: Job) -> None:
         for path in [*(mask_path(source, view) for view in block.scene.views), source / "labels.json"]:
             link(path, target / path.relative_to(source))
         link(of.provenance(stage), run.provenance(stage))
+    shutil.rmtree(run.valid, ignore_errors=True)
+    for view in block.scene.views:
+        if (path := mask_path(of.valid, view)).exists():
+            link(path, mask_path(run.valid, view))
 
 
 def _spec(job: Job, number: int) -> JobSpec:
@@ -367,7 +371,7 @@ def _tuned(
     ladder = Nested(g, np.ones(n, np.float32), np.zeros(n, np.int8))
     for event in nested.nest(
         ladder, narrowed, job.photos, train_config(job), config,
-        seed=seed, backend=job.backend, movable=movable,
+        valid=job.valid, seed=seed, backend=job.backend, movable=movable,
     ):  # fmt: skip
         if isinstance(event, NestStep):
             job.emit(Progress("boundaries", event.step, config.steps, f"loss {event.loss:.3f}"))

@@ -19,7 +19,8 @@ def tune_composition(job: Job, g: Gaussians, steps: int) -> Gaussians:
     if steps <= 0:
         return g
     seed = settings_of(job.run, "train")["seed"]
-    return tune(g, job.scene, job.photos, train_config(job), steps, seed=seed, backend=job.backend)
+    config = train_config(job)
+    return tune(g, job.scene, job.photos, config, steps, valid=job.valid, seed=seed, backend=job.backend)
 
 
 def compose(job: Job, plan: Plan) -> Gaussians:

@@ -30,7 +30,8 @@ def evaluate_plans(job: Job) -> None:
         table = evaluate(
             job.scene, job.photos, label_images(job, fitted.masks), job.ladder, plans, method.predicted,
             region=fitted.region, min_share=fitted.min_share, uniform=_levels_beside(job, plans),
-            compose=lambda plan: compose(job, plan), backend=job.backend, antialiased=job.antialiased,
+            compose=lambda plan: compose(job, plan), valid=job.valid,
+            backend=job.backend, antialiased=job.antialiased,
             progress=lambda done, total: job.emit(Progress("evaluate", done, total)),
         )  # fmt: skip
         table.write_csv(run.evaluation)

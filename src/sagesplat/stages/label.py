@@ -198,9 +198,13 @@ def lift_labels(job: Job, config: LiftConfig) -> None:
         if config.votes == "track" and not len(job.given_scene.points.track_points):
             job.emit(Warned("the points have no tracks: all views that a point projects into vote"))
         scene = job.given_scene
-        lifted = lift(scene, job.masks, votes=config.votes, views=set(scene.train_ids.tolist()))
+        voters = set(scene.train_ids.tolist())
+        lifted = lift(scene, job.masks, votes=config.votes, views=voters, valid=job.valid)
         lifted.write(run.labels)
-        return [f"{100 * lifted.agreement:.1f} % of the votes agree with the label of their point"]
+        lines = [f"{100 * lifted.agreement:.1f} % of the votes agree with the label of their point"]
+        if lifted.ignored is not None:
+            lines.append(f"{lifted.ignored.sum():,} points show what is ignored, and become no Gaussians")
+        return lines
 
     labels = run.masks / "labels.json"
     run_stage(job, "lift", asdict(config), [run.scene, run.provenance("masks"), labels], [run.labels], make)
@@ -218,7 +222,8 @@ def fuse_masks(job: Job) -> None:
         shutil.rmtree(run.fused, ignore_errors=True)
         g = job.snapshots.load(job.snapshots.levels[-1])
         fused = fuse(
-            g, job.scene, job.masks, run.fused, soft=soft, antialiased=job.antialiased, backend=job.backend,
+            g, job.scene, job.masks, run.fused,
+            soft=soft, valid=job.valid, antialiased=job.antialiased, backend=job.backend,
             on_view=lambda done, total: job.emit(Progress("fuse", done, total)),
         )  # fmt: skip
         before, after = (_agreement(job, masks) for masks in (job.masks, job.whole_masks))

@@ -46,6 +46,6 @@ def _observe_views(job: Job, part: tuple[Sequence[int], str, dict[int, np.ndarra
     rows, masks, far = part
     return observe(
         job.scene, job.photos, label_images(job, masks), job.ladder, far,
-        views=rows, backend=job.backend, antialiased=job.antialiased,
+        views=rows, valid=job.valid, backend=job.backend, antialiased=job.antialiased,
         progress=lambda done, total: job.emit(Progress("observe", done, total)),
     )  # fmt: skip

@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from sagesplat.adapt.observe import as_unit, render_rgb
+from sagesplat.adapt.observe import as_unit, measure_total, render_rgb
 from sagesplat.core.config import TrainConfig
 from sagesplat.core.errors import RunError, short
 from sagesplat.core.events import Progress
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.typed import check_fields, types_of
 from sagesplat.io.files import read_json, write_json
-from sagesplat.metrics.image import psnr, squared_error_map, ssim_map
 from sagesplat.raster import Workspace, device_of
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
@@ -86,10 +85,11 @@ def _refined_poses(
     poses = refined_cameras(scene, update, parameters)
     held_out = np.setdiff1d(np.arange(len(poses)), scene.train_ids).tolist()
     g, space = trained.gaussians.to(device_of(job.backend)), Workspace()
+    held_out = job.valid.rows(scene, held_out)
     for number, row in enumerate(held_out, 1):
         poses[row] = fit_pose(
             g, poses[row], job.photos[row], update.axes[row].double().numpy(), scene.scale, config,
-            backend=job.backend, workspace=space,
+            valid=job.valid[scene.views[row]], backend=job.backend, workspace=space,
         )  # fmt: skip
         job.emit(Progress("held-out poses", number, len(held_out)))
     given = [view.camera for view in scene.views]
@@ -120,10 +120,11 @@ def _quality(
 ) -> tuple[float, float] | None:
     """Mean PSNR and SSIM over some rows of the scene's views; None without any."""
     found = []
-    for row in rows.tolist():
+    for row in job.valid.rows(job.given_scene, rows):
         image = render_rgb(g, cameras[row], backend=job.backend, antialiased=antialiased)
-        photo = as_unit(job.photos[row])
-        found.append((psnr(squared_error_map(image, photo).mean()), ssim_map(image, photo).mean()))
+        view = job.given_scene.views[row]
+        measured = measure_total(image, as_unit(job.photos[row]), job.valid[view])
+        found.append((measured["psnr"], measured["ssim"]))
     means = np.mean(found, 0).tolist() if found else None
     return means and (means[0], means[1])
 

@@ -6,13 +6,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from sagesplat.adapt.observe import as_unit, render_rgb
+from sagesplat.adapt.observe import as_unit, measure_total, render_rgb
 from sagesplat.core.errors import RunError, short
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.typed import check_fields, types_of
 from sagesplat.io.files import read_json
 from sagesplat.metrics.color_correct import color_correct_affine
-from sagesplat.metrics.image import psnr, squared_error_map, ssim_map
 from sagesplat.raster import Workspace, device_of
 from sagesplat.run.job import Job
 from sagesplat.scene.gains import exposure_values
@@ -42,12 +41,13 @@ def with_exposures(
     """The cameras with the exposures of all views; `scene` has their poses."""
     exposure, fitted = transforms(trained.per_view["exposure"]), cameras.fitted.copy()
     g, space = trained.gaussians.to(device_of(job.backend)), Workspace()
-    for row in np.setdiff1d(np.arange(len(scene.views)), scene.train_ids).tolist():
+    for row in job.valid.rows(scene, np.setdiff1d(np.arange(len(scene.views)), scene.train_ids)):
         image = render_rgb(
             g, scene.views[row].camera.neutral,
             backend=job.backend, antialiased=antialiased, workspace=space,
         )  # fmt: skip
-        exposure[row], fitted[row] = fit_exposure(image, as_unit(job.photos[row])), True
+        photo, valid = as_unit(job.photos[row]), job.valid[scene.views[row]]
+        exposure[row], fitted[row] = fit_exposure(image, photo, valid), True
     return replace(cameras, exposure=exposure, fitted=fitted)
 
 
@@ -56,11 +56,13 @@ def exposure_figures(job: Job, scene: Scene, antialiased: bool, trained: Trained
     exposures = [scene.views[row].camera.exposure for row in scene.train_ids]
     ev = exposure_values(np.stack([np.eye(3, 4) if e is None else e for e in exposures]))
     g, space, found = trained.gaussians.to(device_of(job.backend)), Workspace(), []
-    for row in scene.test_ids.tolist():
+    for row in job.valid.rows(scene, scene.test_ids):
+        valid = job.valid[scene.views[row]]
         camera, photo = scene.views[row].camera, as_unit(job.photos[row])
         plain, exposed = (_image(job, g, one, antialiased, space) for one in (camera.neutral, camera))
-        images = plain, exposed, color_correct_affine(plain, photo)
-        found.append([(psnr(squared_error_map(i, photo).mean()), ssim_map(i, photo).mean()) for i in images])
+        images = plain, exposed, color_correct_affine(plain, photo, valid)
+        measured = [measure_total(image, photo, valid) for image in images]
+        found.append([(of["psnr"], of["ssim"]) for of in measured])
     if not found:
         return ExposureFigures(float(np.ptp(ev)), None, None)
     decibels, ssim = np.mean(found, 0).T.tolist()

@@ -19,6 +19,7 @@ from sagesplat.run.stage import run_stage
 from sagesplat.segment.display_names import titles
 from sagesplat.segment.masks import MAX_LABEL_ID
 from sagesplat.stages.refine import write_cameras
+from sagesplat.stages.shared import valid_inputs
 from sagesplat.train import memory
 from sagesplat.train.checkpoint import can_resume, remove_checkpoints
 from sagesplat.train.events import Found, LabelFrozen, LevelSaved, Resumed, Step, Trained
@@ -47,8 +48,8 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
         names = titles(job.names())
         start = partial(train_together, job.processes, job.threads) if job.processes > 1 else train
         events = start(
-            job.given_scene, job.photos, job.point_labels, fitted,
-            masks=job.masks if config.freeze_at is not None else None,
+            job.given_scene, job.photos, job.initial_labels, fitted,
+            masks=job.masks if config.freeze_at is not None else None, valid=job.valid,
             seed=seed, backend=job.backend, folder=place.path, settings=key,
         )  # fmt: skip
         lines = []
@@ -118,7 +119,8 @@ def read_frozen(path: Path) -> dict[int, int]:
 
 def train_inputs(run: RunDir, config: TrainConfig) -> list[Path]:
     """What a training reads besides photos: label images only where categories may stop early."""
-    return [run.scene, run.labels, *([run.provenance("masks")] if config.freeze_at is not None else [])]
+    masks = [run.provenance("masks")] if config.freeze_at is not None else []
+    return [run.scene, run.labels, *masks, *valid_inputs(run)]
 
 
 def _place(job: Job, key: str) -> RunDir:

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32
 from torch import Tensor
 
 from sagesplat.core.config import TrainConfig
@@ -17,10 +17,10 @@ from sagesplat.scene.scene import Scene
 from sagesplat.train.view_parameters import ViewParameters
 
 SIZE = 12  # parameters of a view: the transform [3, 4], less the identity
-_LR, _LR_END = 5e-3, 5e-4  # of Adam, decaying exponentially
+_LR, _LR_END = 1e-2, 1e-3  # of Adam, decaying exponentially
 _PIXELS = 60_000  # that a fit takes, evenly spread
 _ROUNDS = 5  # of iteratively reweighted least squares
-_PRIOR = 1e-3  # weight of the identity in a fit, as a fraction of the pixels
+_PRIOR = 1e-4  # weight of the identity in a fit, as a fraction of the pixels
 
 
 @dataclass(eq=False)
@@ -79,23 +79,26 @@ def transforms(parameters: ViewParameters) -> Float32[np.ndarray, "V 3 4"]:
 
 
 def fit_exposure(
-    image: Float32[np.ndarray, "H W 3"], photo: Float32[np.ndarray, "H W 3"]
+    image: Float32[np.ndarray, "H W 3"],
+    photo: Float32[np.ndarray, "H W 3"],
+    valid: Bool[np.ndarray, "H W"] | None = None,
 ) -> Float32[np.ndarray, "3 4"]:
     """The colour transform [3, 4] that brings a rendering to a photo, by robust least squares.
 
-    Pixels count for a channel where the photo is neither black nor saturated there; Cauchy weights give
-    little to what differs in content.
+    Of the `valid` pixels those count for a channel where the photo is neither black nor saturated there;
+    Cauchy weights give little to what differs in content.
     """
-    some = slice(None, None, 1 + image.shape[0] * image.shape[1] // _PIXELS)
-    colours, y, found = image.reshape(-1, 3)[some], photo.reshape(-1, 3)[some], np.eye(3, 4)
+    x, y = (image.reshape(-1, 3), photo.reshape(-1, 3)) if valid is None else (image[valid], photo[valid])
+    some = slice(None, None, 1 + len(x) // _PIXELS)
+    colours, y, found = x[some], y[some], np.eye(3, 4)
     x = np.concatenate([colours, np.ones_like(colours[:, :1])], 1)
-    prior = _PRIOR * len(x) * np.eye(4)
     for c in range(3):
         within = (y[:, c] > 1 - SATURATED) & (y[:, c] < SATURATED)
         a, b = x[within].astype(np.float64), y[within, c].astype(np.float64)
         weight = np.ones(len(b))
         for _ in range(_ROUNDS):
             weighted = a * weight[:, None]
+            prior = (_PRIOR * weight.sum() + 1e-6) * np.eye(4)
             found[c] = np.linalg.solve(weighted.T @ a + prior, weighted.T @ b + prior @ np.eye(3, 4)[c])
             errors = np.abs(a @ found[c] - b)
             weight = 1 / (1 + (errors / (2 * np.median(errors) + 1e-4)) ** 2) if len(b) else weight

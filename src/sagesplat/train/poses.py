@@ -22,7 +22,7 @@ from sagesplat.core.geometry import project, to_camera
 from sagesplat.metrics.image import photometric_loss
 from sagesplat.raster import Backend, Workspace, rasterize
 from sagesplat.scene.scene import Camera, Scene
-from sagesplat.train.lr_schedule import smaller
+from sagesplat.train.lr_schedule import smaller, smaller_valid
 from sagesplat.train.view_parameters import ViewParameters
 
 _REACH = 0.03  # rad in the image: how far all steps of one view lead in one direction
@@ -191,6 +191,7 @@ def fit_pose(
     scale: float,
     config: TrainConfig,
     *,
+    valid: Bool[np.ndarray, "H W"] | None = None,
     backend: Backend = "auto",
     workspace: Workspace | None = None,
 ) -> Camera:
@@ -206,6 +207,7 @@ def fit_pose(
         axes: Of `motion_axes`.
         scale: The scene's, world units.
         config: Of the training: antialiasing and the loss.
+        valid: The pixels of the photo that count; None: all.
         backend: Rasteriser.
         workspace: Memory to use again.
     """
@@ -215,14 +217,17 @@ def fit_pose(
         pixels, small = smaller(photo, found, factor)
         target = torch.from_numpy(pixels).to(device)
         target = target.float() / 255 if device.type == "cpu" else target
+        counts = None if valid is None else torch.from_numpy(smaller_valid(valid, factor)).to(device)
 
-        def loss(at: np.ndarray, small: Camera = small, target: Tensor = target) -> tuple[float, np.ndarray]:
+        def loss(
+            at: np.ndarray, small: Camera = small, target: Tensor = target, counts: Tensor | None = counts
+        ) -> tuple[float, np.ndarray]:
             pose = torch.zeros(6, device=device, requires_grad=True)
             render = rasterize(
                 gaussians, replace(small, w2c=moved(small.w2c, axes @ at)),
                 antialiased=config.antialiased, pose=pose, workspace=workspace, backend=backend,
             )  # fmt: skip
-            value = photometric_loss(render.rgb, target, config.ssim_weight, workspace=workspace)
+            value = photometric_loss(render.rgb, target, config.ssim_weight, None, workspace, counts)
             value.backward()
             assert pose.grad is not None
             return float(value.detach()), axes.T @ pose.grad.cpu().numpy().astype(np.float64)

@@ -14,6 +14,7 @@ from sagesplat.metrics.image import photometric_loss
 from sagesplat.raster import Backend, Render, Workspace, device_of, expose, rasterize
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene
+from sagesplat.segment.valid import ALL_VALID, ValidPixels
 from sagesplat.train import optim
 from sagesplat.train.early_stopping import ActiveTiles, trainable_rows
 from sagesplat.train.exposure import transform
@@ -157,14 +158,16 @@ class Stepper:
             backend=self.backend,
         )
         rgb = render.rgb if exposure is None else expose(render.rgb, exposure, photo)
-        return photometric_loss(rgb, photo, self.config.ssim_weight, tiles, self.workspace), render
+        valid = self.photo_loader.valid(view, factor)
+        loss = photometric_loss(rgb, photo, self.config.ssim_weight, tiles, self.workspace, valid)
+        return loss, render
 
     def _next_view(self, state: TrainState) -> int:
         """Views in random order, each once a round; finished ones in a round out of eight."""
         while not state.queue:
             state.queue = [
                 view
-                for view in state.rng.permutation(self.photo_loader.scene.train_ids).tolist()
+                for view in state.rng.permutation(self.photo_loader.rows).tolist()
                 if not self.active_tiles.finished(view) or state.rng.random() < FINISHED_SHARE
             ]
         return state.queue.pop()
@@ -195,6 +198,7 @@ def tune(
     config: TrainConfig,
     steps: int,
     *,
+    valid: ValidPixels = ALL_VALID,
     seed: int = 0,
     backend: Backend = "auto",
 ) -> Gaussians:
@@ -210,7 +214,8 @@ def tune(
     copies = {name: p.detach().clone() for name, p in gaussians.parameters().items()}
     state = initial_state(replace(gaussians, **copies).to(device), seed)
     state.sort()
-    stepper = Stepper(PhotoLoader(scene, photos, device), config, ActiveTiles(scene, None), backend)
+    loader = PhotoLoader(scene, photos, device, valid)
+    stepper = Stepper(loader, config, ActiveTiles(scene, None), backend)
     trainable = trainable_rows(state.gaussians, {})
     for step in range(1, steps + 1):
         stepper(state, gaussians.sh_degree, learning_rates(2 * steps + step), trainable)

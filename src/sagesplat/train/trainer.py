@@ -19,6 +19,7 @@ from sagesplat.raster import Backend, device_of
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.segment.masks import Masks
+from sagesplat.segment.valid import ALL_VALID, ValidPixels
 from sagesplat.train.checkpoint import latest_checkpoint, previous, write_checkpoint
 from sagesplat.train.early_stopping import ActiveTiles, label_quality, measured_views, trainable_rows
 from sagesplat.train.events import Event, Found, LabelFrozen, LevelSaved, Resumed, Step, Trained
@@ -45,6 +46,7 @@ def train(
     config: TrainConfig,
     *,
     masks: Masks | None = None,
+    valid: ValidPixels = ALL_VALID,
     seed: int = 0,
     backend: Backend = "auto",
     folder: Path | None = None,
@@ -61,9 +63,11 @@ def train(
     Args:
         scene: The capture; `scene.train_ids` are used.
         photos: Its photos, uint8 [H, W, 3] by row of `scene.views`.
-        label_ids: int16 [P], category of each SfM point; -1: unlabelled. Clones and splits inherit it.
+        label_ids: int16 [P], category of each SfM point; -1: unlabelled, -2 (`IGNORED`): no Gaussian begins
+            there. Clones and splits inherit it.
         config: Steps, learning rates, densification and levels.
         masks: Label images; needed for `config.freeze_at`.
+        valid: The pixels that count; nothing is learnt from the others.
         seed: Of all random numbers. The same seed gives the same bits on the CPU.
         backend: Rasteriser, see `rasterize`; decides the device.
         folder: Levels and a checkpoint are written here (levels/, checkpoint.npz); None: nothing is written.
@@ -92,7 +96,8 @@ def train(
     with named_failures(lambda: _where(training and training.state, folder)):
         training = begin(
             scene, photos, label_ids, config,
-            masks=masks, seed=seed, backend=backend, folder=folder, settings=settings, group=group,
+            masks=masks, valid=valid, seed=seed, backend=backend, folder=folder, settings=settings,
+            group=group,
         )  # fmt: skip
         yield from training.run()
 
@@ -244,6 +249,7 @@ def begin(
     config: TrainConfig,
     *,
     masks: Masks | None = None,
+    valid: ValidPixels = ALL_VALID,
     seed: int = 0,
     backend: Backend = "auto",
     folder: Path | None = None,
@@ -278,9 +284,9 @@ def begin(
             state.clear_statistics()  # the first process has those of all
     share = config.gradient_freeze_share
     freezing = GradientFreezing(share) if share else None
-    tiles = ActiveTiles(scene, masks, frozenset(state.frozen), device)
+    tiles = ActiveTiles(scene, masks, frozenset(state.frozen), device, valid)
     stepper = Stepper(
-        PhotoLoader(scene, photos, device), config, tiles, backend, group, strategy, freezing,
+        PhotoLoader(scene, photos, device, valid), config, tiles, backend, group, strategy, freezing,
         view_updates=updates,
     )  # fmt: skip
     measured = measured_views(scene, masks) if config.freeze_at is not None and masks is not None else {}
