@@ -4,11 +4,8 @@ A new strategy is a class here, an entry of `STRATEGIES` and a name for `--train
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import ClassVar
 
-import numpy as np
-import torch
 from torch import Tensor
 
 from sagesplat.core.config import TrainConfig
@@ -18,7 +15,6 @@ from sagesplat.train import densify, mcmc
 from sagesplat.train.early_stopping import trainable_rows
 from sagesplat.train.group import ALONE, Group
 from sagesplat.train.lr_schedule import LrSchedule
-from sagesplat.train.reach import EVERY, keep_clear
 from sagesplat.train.schedule import Schedule, scaled_schedule
 from sagesplat.train.state import INITIAL_OPACITY, TrainState
 
@@ -77,18 +73,6 @@ class Densification(Strategy):
     def num_points(self) -> int:
         """SfM points that the training starts from."""
         return len(self.scene.points.xyz)
-
-    @cached_property
-    def cameras(self) -> Tensor:
-        """Centres of the training cameras, [V, 3]."""
-        centres = [self.scene.views[i].camera.position for i in self.scene.train_ids]
-        return torch.from_numpy(np.stack(centres).astype(np.float32))
-
-    def step_post_update(self, state: TrainState, trainable: Tensor) -> None:
-        """Keep large Gaussians off the cameras."""
-        if state.step % EVERY == 0:
-            cameras = self.cameras.to(state.gaussians.means.device)
-            keep_clear(state.gaussians, cameras, self.scene.scale, trainable)
 
     def step_post(self, state: TrainState) -> bool:
         """Refine every `refine_every` steps while densification is active; see `Strategy`."""
@@ -161,8 +145,7 @@ class McmcStrategy(Densification):
         mcmc.add_regularisation_gradients(state, grads, opacity, scale, trainable)
 
     def step_post_update(self, state: TrainState, trainable: Tensor) -> None:
-        """Add SGLD noise to the means; see `Densification`."""
-        super().step_post_update(state, trainable)
+        """Add SGLD noise to the means."""
         if noise := self.rates.sgld_noise(state.step):
             mcmc.perturb(state, noise, trainable)
 
