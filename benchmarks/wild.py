@@ -23,7 +23,6 @@ from sagesplat.metrics.color_correct import color_correct_affine
 from sagesplat.metrics.image import psnr, squared_error_map, ssim_map
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
-from sagesplat.scene.colmap import load_colmap
 from sagesplat.scene.images import Photos
 from sagesplat.scene.nerfstudio import load_transforms
 from sagesplat.scene.scene import Camera, Scene
@@ -106,8 +105,8 @@ def _measure(folder: Path, name: str, row: Row, steps: int, seed: int) -> dict[s
     off, by_category = off_path(g, capture, alignment(truth, job.scene) if wild.pose_shift else np.eye(4))
     result["off_path"], result["off_path_by_category"] = _means(off), by_category
     if wild.pose_shift:
-        given = load_colmap(capture)
-        result["position_error"] = [position_error(truth, given), position_error(truth, job.scene)]
+        scenes = job.given_scene, job.scene
+        result["position_error"] = [position_error(truth, scene) for scene in scenes]
     return result
 
 

@@ -1,5 +1,6 @@
 import json
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from sagesplat.demo.wild import POSES, Wild, camera_gains, kept_views, lens_fall
 from sagesplat.scene.colmap import load_colmap
 from sagesplat.scene.nerfstudio import load_transforms
 
-SIZE = {"views": 12, "width": 64, "height": 48}
+SIZE: dict[str, Any] = {"views": 12, "width": 64, "height": 48}
 WILD = Wild(0.7, 0.15, 0.4, 2, True, 0.5, 0.005, keep=0.75, half_circle=True, off_path=4)
 
 

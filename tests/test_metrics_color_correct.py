@@ -11,7 +11,7 @@ def photo() -> np.ndarray:
 
 def test_it_undoes_gains_and_offsets_of_each_channel():
     y = photo()
-    image = y * np.float32([0.7, 0.8, 0.5]) + np.float32([0.1, 0.0, 0.2])
+    image = y * np.array([0.7, 0.8, 0.5], np.float32) + np.array([0.1, 0.0, 0.2], np.float32)
     np.testing.assert_allclose(color_correct_affine(image, y), y, atol=1e-5)
 
 

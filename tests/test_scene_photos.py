@@ -312,9 +312,11 @@ def test_no_features_where_pixels_do_not_count(folder: Path, tmp_path: Path) -> 
         database.close()
         return np.frombuffer(row[2], np.float32).reshape(row[:2])
 
-    options = {"ignored": lambda name: right if name == labelled.name else None}
+    def ignored(name: str) -> np.ndarray | None:
+        return right if name == labelled.name else None
+
     with pytest.raises(KeyboardInterrupt):
-        reconstruct(folder, tmp_path / "out", CONFIG, stop, **options)
+        reconstruct(folder, tmp_path / "out", CONFIG, stop, ignored=ignored)
     assert features("view 4.png")[:, 0].min() < WIDTH / 4
     for path in (alpha, masked, turned, labelled):
         found = features(path.name)

@@ -36,6 +36,7 @@ from sagesplat.segment.masks import Taxonomy
 from sagesplat.stages import bundle, label, view
 from sagesplat.stages.boundaries import _seconds
 from sagesplat.stages.refine import read_pose_figures
+from sagesplat.stages.refine_exposure import read_exposure_figures
 from sagesplat.stages.train import _fit_memory, read_frozen
 from sagesplat.studies.compare.report import OfLabel, Point, Walk, read_comparison, write_comparison
 from sagesplat.studies.measure.levels import levels_of
@@ -87,7 +88,14 @@ def _read_refined(path: Path) -> None:
 def _figures(folder: Path, size: int) -> list[bytes]:
     numbers = {"pixels": 0.3, "degrees": 0.1, "shift": 0.01, "diverged": 1, "fitted": 2, "held_out": 3}
     entry = numbers | {"psnr": [20.5, 24.0], "ssim": None}
-    return as_json({"poses": entry} | {f"note{i}": i for i in range(size - 1)})
+    measured = dict.fromkeys(("plain", "exposed", "cc"), 20.5)
+    exposure = {"range_ev": 1.4, "psnr": measured, "ssim": None}
+    return as_json({"poses": entry, "exposure": exposure} | {f"note{i}": i for i in range(size - 1)})
+
+
+def _read_figures(path: Path) -> None:
+    read_pose_figures(path)
+    read_exposure_figures(path)
 
 
 def _models(folder: Path, size: int) -> list[bytes]:
@@ -203,7 +211,7 @@ def _capture(folder: Path) -> dict[str, Any]:
     frames = [{"file_path": f"images/{name}", "transform_matrix": pose} for name in PHOTOS]
     shared = {"w": 16, "h": 12, "fl_x": 14.0, "ply_file_path": "points.ply", "frames": frames}
     (capture / "transforms.json").write_text(json.dumps(shared))
-    settings = {"downscale": 1, "test_every": 8}
+    settings: dict[str, Any] = {"downscale": 1, "test_every": 8}
     scene = load_scene(capture, **settings)
     photos = photo_hashes(folder / "none.json", scene).sha256
     return {"path": str(capture), "settings": settings, "fingerprint": fingerprint(scene), "photos": photos}
@@ -359,7 +367,7 @@ READERS = (
     Reader("camera-files", ".json", _camera_files, file("c.json", read_camera_file), 100),
     Reader("cameras", ".json", _cameras, file("path.json", _read_cameras), 100),
     Reader("refined", ".npz", _refined, file("cameras.npz", _read_refined), 1000),
-    Reader("refined-figures", ".json", _figures, file("refined.json", read_pose_figures), 3000),
+    Reader("refined-figures", ".json", _figures, file("refined.json", _read_figures), 3000),
     Reader("sampled", ".npz", _sampled, file("fidelity.npz", fidelity.read_sampled), 1000),
     Reader("plans", ".json", _plans, file("plan.json", _read_plans), 100),
     Reader("observations", ".csv", _table(Observations), file("o.csv", read_observations), 1000),

@@ -176,9 +176,6 @@ class TrainConfig:
     """Record a snapshot that falls on an opacity reset after the reset, as the paper may have, not before."""
     freeze_at: float | None = None
     """Stop each category when its mean SSIM in the training views reaches this (Fig. 1 of the paper)."""
-    outliers: bool = False
-    """Leave out of the loss what single photos show and the others do not, by its residual: people and cars
-    that no mask names."""
     gradient_freeze_share: float = 0.0
     """Freeze the fraction of Gaussians with the smallest gradients in alternate 100-step windows after
     densification (GSta), as a baseline. A run that resumes is then not bit for bit the same."""

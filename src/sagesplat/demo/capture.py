@@ -75,7 +75,9 @@ def make_capture(
 
 
 def cached_capture(
-    on_view: Callable[[int, int], None] | None = None, places: tuple[int, int] = (1, 1)
+    on_view: Callable[[int, int], None] | None = None,
+    places: tuple[int, int] = (1, 1),
+    wild: Wild = NOTHING,
 ) -> Path:
     """Return the folder of the built-in capture, made on the first call.
 
@@ -85,6 +87,7 @@ def cached_capture(
     Args:
         on_view: Called with (views drawn, views in all).
         places: Courtyards along x and y. (1, 1): one, in photos of full size; else 105 small photos of each.
+        wild: Disturbances of a single courtyard.
 
     Returns:
         A COLMAP workspace with label images.
@@ -99,10 +102,12 @@ def cached_capture(
     if places != (1, 1):
         nx, ny = places
         name, size = f"courtyards-{nx}x{ny}", {"views": 105 * nx * ny, "width": 192, "height": 144}
+    if not wild.quiet:
+        name += "-wild-" + hashlib.sha256(repr(wild).encode()).hexdigest()[:8]
     folder = cache_folder() / f"demo-{release}" / name
     if not folder.exists():
         try:
-            make_capture(folder, **size, places=places, on_view=on_view)
+            make_capture(folder, **size, places=places, wild=wild, on_view=on_view)
         except SceneError:
             if not folder.exists():  # else another process was faster
                 raise

@@ -20,14 +20,14 @@ from sagesplat.scene.scene import Scene
 _OFFSET, _CURVE = 0.055, 2.4
 _DARK, _BRIGHT = 10.0, 245.0  # of 255; values beyond tell nothing of a gain
 _ROUNDS = 10  # of iteratively reweighted least squares
-_PRIOR = 3.0  # observations that say of every photo that it has no gain
+_PRIOR = 0.3  # observations that say of every photo that it has no gain
 _ENOUGH, _PLENTY = 30, 400  # observations of a photo, on average: at least, and no more than are used
 _EXPLAINED = 0.08  # least share by which gains have to bring colours of the same point together
 _LEAST_EV = 0.1  # range of exposures that is worth a transform
 _LEAST_EXIF_EV = 0.3  # the same where nothing but EXIF tells it
 
 
-def exposure_values(transforms: Float[np.ndarray, "V 3 4"]) -> Float64[np.ndarray, " V"]:
+def exposure_values(transforms: Float[np.ndarray, "V 3 4"]) -> Float[np.ndarray, " V"]:
     """How much brighter colour transforms make a middle grey, EV."""
     grey = transforms[:, :, :3].sum(2) * 0.5 + transforms[:, :, 3]
     return _CURVE * np.log2(np.maximum(grey + _OFFSET, 1e-3) / (0.5 + _OFFSET)).mean(1)
@@ -69,7 +69,7 @@ class Gains:
         return found
 
 
-def photo_gains(scene: Scene, photos: Photos, rows: Sequence[int]) -> Gains:
+def photo_gains(scene: Scene, photos: Photos | Sequence[np.ndarray], rows: Sequence[int]) -> Gains:
     """Gains of some photos (rows of `scene.views`): from tracks, else from EXIF, else none."""
     points, views, colours = _track_colours(scene, photos, rows)
     if len(points) >= _ENOUGH * len(rows):
@@ -114,7 +114,7 @@ def _relative(logs: Float64[np.ndarray, "V 3"]) -> Float32[np.ndarray, "V 3"]:
 
 
 def _track_colours(
-    scene: Scene, photos: Photos, rows: Sequence[int]
+    scene: Scene, photos: Photos | Sequence[np.ndarray], rows: Sequence[int]
 ) -> tuple[Int64[np.ndarray, " T"], Int64[np.ndarray, " T"], Float64[np.ndarray, "T 3"]]:
     """Points, photos (places in `rows`) and colours in [0, 1] of points that two photos or more observe."""
     tracks, no = scene.points, np.zeros(0, np.int64)

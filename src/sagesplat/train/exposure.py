@@ -17,10 +17,10 @@ from sagesplat.scene.scene import Scene
 from sagesplat.train.view_parameters import ViewParameters
 
 SIZE = 12  # parameters of a view: the transform [3, 4], less the identity
-_LR, _LR_END = 5e-3, 5e-4  # of Adam, decaying exponentially
+_LR, _LR_END = 1e-2, 1e-3  # of Adam, decaying exponentially
 _PIXELS = 60_000  # that a fit takes, evenly spread
 _ROUNDS = 5  # of iteratively reweighted least squares
-_PRIOR = 1e-3  # weight of the identity in a fit, as a fraction of the pixels
+_PRIOR = 1e-4  # weight of the identity in a fit, as a fraction of the pixels
 
 
 @dataclass(eq=False)
@@ -92,13 +92,13 @@ def fit_exposure(
     some = slice(None, None, 1 + len(x) // _PIXELS)
     colours, y, found = x[some], y[some], np.eye(3, 4)
     x = np.concatenate([colours, np.ones_like(colours[:, :1])], 1)
-    prior = _PRIOR * len(x) * np.eye(4)
     for c in range(3):
         within = (y[:, c] > 1 - SATURATED) & (y[:, c] < SATURATED)
         a, b = x[within].astype(np.float64), y[within, c].astype(np.float64)
         weight = np.ones(len(b))
         for _ in range(_ROUNDS):
             weighted = a * weight[:, None]
+            prior = (_PRIOR * weight.sum() + 1e-6) * np.eye(4)
             found[c] = np.linalg.solve(weighted.T @ a + prior, weighted.T @ b + prior @ np.eye(3, 4)[c])
             errors = np.abs(a @ found[c] - b)
             weight = 1 / (1 + (errors / (2 * np.median(errors) + 1e-4)) ** 2) if len(b) else weight

@@ -21,7 +21,6 @@ from sagesplat.train.exposure import transform
 from sagesplat.train.gradient_freezing import GradientFreezing
 from sagesplat.train.group import ALONE, Group
 from sagesplat.train.lr_schedule import LrSchedule
-from sagesplat.train.outliers import Outliers
 from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.poses import PoseUpdate, moved_camera
 from sagesplat.train.state import TrainState, initial_state
@@ -44,8 +43,6 @@ class Stepper:
     gradient_freezing: GradientFreezing | None = None
     sh_bits: tuple[int, int] | None = None  # render Gaussians rounded as SPZ files will store them
     view_updates: Mapping[str, ViewUpdate] = field(default_factory=dict)  # of `TrainState.per_view`
-    outliers: Outliers | None = None
-    step: int = 0
     drawn: float = 1.0  # share of the tiles that the last step drew
     workspace: Workspace = field(default_factory=Workspace)
 
@@ -68,7 +65,6 @@ class Stepper:
             factor: Train on photos this many times smaller.
             drawn_rows: Indices of the Gaussians to render; the others take no part in this step.
         """
-        self.step = state.step
         batch = max(self.config.batch, self.group.size)
         of_batch = [self._next_view(state) for _ in range(batch)]
         views = self.group.share(of_batch)
@@ -163,8 +159,6 @@ class Stepper:
         )
         rgb = render.rgb if exposure is None else expose(render.rgb, exposure, photo)
         valid = self.photo_loader.valid(view, factor)
-        if self.outliers is not None:
-            valid = self.outliers(rgb.detach(), photo, valid, self.step)
         loss = photometric_loss(rgb, photo, self.config.ssim_weight, tiles, self.workspace, valid)
         return loss, render
 

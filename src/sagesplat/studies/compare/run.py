@@ -1,7 +1,7 @@
 """Nested levels beside their baselines: same data, same training views, same evaluation."""
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -21,6 +21,7 @@ from sagesplat.formats.increments import INDEX, read_increments, shown, write_in
 from sagesplat.formats.levels import read_level, write_set
 from sagesplat.formats.spz import SH_BITS
 from sagesplat.io.files import read_json, write_json
+from sagesplat.metrics.color_correct import color_correct_affine
 from sagesplat.metrics.image import pasted
 from sagesplat.metrics.lpips import Lpips
 from sagesplat.raster import Workspace
@@ -319,9 +320,13 @@ def _measure(job: Job, contenders: Sequence[Contender], metrics: dict[str, Lpips
     tests, workspace, points = job.valid.rows(job.scene, job.scene.test_ids), Workspace(), []
     done, total = 0, len(contenders) * len(tests)
 
-    def image_of(g: Gaussians, row: int) -> np.ndarray:
+    def exposed(row: int) -> bool:
+        return job.scene.views[row].camera.exposure is not None
+
+    def image_of(g: Gaussians, row: int, neutral: bool = False) -> np.ndarray:
         drawn = {"backend": job.backend, "antialiased": job.antialiased, "workspace": workspace}
-        return render_rgb(g, job.scene.views[row].camera, **drawn)
+        camera = job.scene.views[row].camera
+        return render_rgb(g, camera.neutral if neutral else camera, **drawn)
 
     for begin in range(0, len(contenders), _TOGETHER):
         some = contenders[begin : begin + _TOGETHER]
@@ -341,6 +346,8 @@ def _measure(job: Job, contenders: Sequence[Contender], metrics: dict[str, Lpips
                     of_photo = features_of(metrics, pasted(photo, image, valid))
                 for column, metric in metrics.items():
                     values[-1][column] = metric.distance(metric.features(image), of_photo[column])
+                if exposed(row):
+                    values[-1] |= _corrected(image_of(g, row, neutral=True), photo, valid, metrics)
                 if arrived is not None:
                     values[-1]["ssim_sent"] = measure_total(image_of(arrived, row), photo, valid)["ssim"]
                 done += 1
@@ -348,6 +355,19 @@ def _measure(job: Job, contenders: Sequence[Contender], metrics: dict[str, Lpips
         parts = zip(some, sets, sent, found, strict=True)
         points += [_point(c, g, encoded, values) for c, g, (encoded, _), values in parts]
     return points
+
+
+def _corrected(
+    image: np.ndarray, photo: np.ndarray, valid: np.ndarray | None, metrics: Mapping[str, Lpips]
+) -> dict[str | int, float]:
+    """The metrics of a colour-corrected image, by the names that gsplat has for them."""
+    corrected = color_correct_affine(image, photo, valid)
+    total = measure_total(corrected, photo, valid)
+    found: dict[str | int, float] = {"cc_psnr": total["psnr"], "cc_ssim": total["ssim"]}
+    of_photo = features_of(metrics, pasted(photo, corrected, valid))
+    for column, metric in metrics.items():
+        found[f"cc_{column}"] = metric.distance(metric.features(corrected), of_photo[column])
+    return found
 
 
 def _values(
