@@ -1,10 +1,12 @@
 """Outlier masks of a finished training: written, used by what is fitted afterwards, and removed again."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import SMALL_RUN
 from PIL import Image
 
 from sagesplat.adapt.observe import render_rgb
@@ -16,6 +18,7 @@ from sagesplat.segment.valid import ValidPixels, write_view
 from sagesplat.stages import compose
 from sagesplat.stages.outliers import write_inliers
 from sagesplat.stages.shared import inlier_inputs
+from sagesplat.stages.train import train_levels
 
 FIGURE = slice(8, 24), slice(8, 20)
 ON, OFF = TrainConfig(outliers=True), TrainConfig()
@@ -69,3 +72,13 @@ def test_photos_without_outliers_are_said_to_have_none(job: Job):
     (line,) = write_inliers(job, job.run, ON, g)
     assert line == f"outliers in 0 of {len(job.scene.train_ids)} training photos, 0.0% of their pixels"
     assert not list(job.run.inliers.iterdir())
+
+
+def test_another_training_has_masks_of_its_own_or_none(finished_run: Path, tmp_path: Path):
+    shutil.copytree(finished_run, tmp_path / "run")
+    job = Job(RunDir(tmp_path / "run"), lambda event: None, "cpu", force=True)
+    config = replace(SMALL_RUN.train, max_steps=4, level_every=4)
+    for outliers in (True, False, True):
+        train_levels(job, replace(config, outliers=outliers), 0)
+        assert job.run.inliers.exists() == outliers
+        assert not job.run.replacement.path.exists()

@@ -46,9 +46,11 @@ def inliers(
     Returns:
         bool [H, W]; `valid` itself where there are no outliers.
     """
-    residual = (photo if photo.is_floating_point() else photo.float() / 255) - rgb.detach()
-    seen = _seen(residual, valid, tile_mask)
-    height, width = residual.shape[:2]
+    height, width = rgb.shape[:2]
+    step = max(1, max(height, width) // (2 * _GRID))  # two pixels across a cell will do
+    some, shown = photo[::step, ::step], rgb.detach()[::step, ::step]
+    residual = (some if some.is_floating_point() else some.float() / 255) - shown
+    seen = _seen(rgb, valid, tile_mask)[::step, ::step, None]
     scale = min(1.0, _GRID / max(height, width))
     grid = max(1, round(scale * height)), max(1, round(scale * width))
     channels = torch.cat([residual * seen, seen], -1).permute(2, 0, 1)[None]
@@ -62,17 +64,15 @@ def inliers(
 
 
 def _seen(
-    residual: Tensor, valid: Tensor | None, tile_mask: np.ndarray | Tensor | None
-) -> Float[Tensor, "H W 1"]:
+    rgb: Float[Tensor, "H W 3"], valid: Tensor | None, tile_mask: np.ndarray | Tensor | None
+) -> Float[Tensor, "H W"]:
     """1 at the pixels that are compared, 0 at the others."""
-    height, width = residual.shape[:2]
-    seen = residual.new_ones(height, width)
+    height, width = rgb.shape[:2]
+    seen = rgb.new_ones(()).expand(height, width)
     if tile_mask is not None:
-        tiles = torch.as_tensor(tile_mask, device=residual.device)
-        seen *= tiles.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[:height, :width]
-    if valid is not None:
-        seen *= valid
-    return seen[..., None]
+        tiles = torch.as_tensor(tile_mask, device=rgb.device)
+        seen = seen * tiles.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[:height, :width]
+    return seen if valid is None else seen * valid
 
 
 def outlier_cells(
