@@ -42,8 +42,8 @@ class Gains:
 
     gain: Float32[np.ndarray, "V 3"]  # of stored value + 0.055 in [0, 1]; mean 1 over the photos
     source: Literal["tracks", "EXIF", "nothing"]
-    # of tracks only, cross-validated: the share by which the spread of a point's colours falls, and the share of
-    # the variance of exposures that the viewing direction tells
+    # of tracks only, cross-validated: the share by which the spread of a point's colours falls,
+    # and the share of the variance of exposures that the viewing direction tells
     explained: float = 0.0
     by_direction: float = 0.0
 
@@ -63,17 +63,21 @@ class Gains:
         """Whether the photos differ by more than noise and what depends on the viewing direction."""
         if self.source == "EXIF":
             return self.range_ev > _LEAST_EXIF_EV
-        worth = self.explained > _EXPLAINED and self.range_ev > _LEAST_EV
-        return worth and not self.follows_direction
+        return self.vary and self.by_direction <= _BY_DIRECTION
 
     @property
-    def follows_direction(self) -> bool:
-        """Whether exposures follow the viewing direction: then the harmonics of the model explain them.
+    def follow_direction(self) -> bool:
+        """Whether the photos differ, but the viewing direction tells most of it.
 
-        Photos that were taken towards the sun are darker, all of them: a photo that nobody has seen is as dark
-        as its neighbours, and transforms would only take that knowledge from the model.
+        Photos towards the sun are darker, all of them. The harmonics of the model explain that, for photos
+        that nobody has seen too; transforms would only take it from the model.
         """
-        return self.by_direction > _BY_DIRECTION
+        return self.vary and self.by_direction > _BY_DIRECTION
+
+    @property
+    def vary(self) -> bool:
+        """Whether tracks tell that the photos differ, whatever by."""
+        return self.explained > _EXPLAINED and self.range_ev > _LEAST_EV
 
     def transforms(self) -> Float32[np.ndarray, "V 3 4"]:
         """The gains as affine transforms of colours, whose mean over the photos is the identity."""
@@ -125,7 +129,7 @@ def _explained(
 
 
 def _by_direction(gains: Float64[np.ndarray, " V"], forward: Float64[np.ndarray, "V 3"]) -> float:
-    """Share of the variance of log gains that harmonics of the viewing direction, fitted to the other photos, tell."""
+    """Share of the variance of log gains that harmonics of the direction tell, fitted to the other photos."""
     basis = np.stack(np.broadcast_arrays(*bases(*forward.T)), 1)
     fit = basis @ np.linalg.solve(basis.T @ basis + _RIDGE * np.eye(basis.shape[1]), basis.T)
     own = fit.diagonal()
