@@ -143,10 +143,17 @@ def test_training_leaves_figures_out(scene):
     clean, figures = Photos(scene.views), Figures(scene.views)
     plain, losses = trained(scene, figures, CONFIG)
     robust, robust_losses = trained(scene, figures, replace(CONFIG, outliers=True))
-    first = first_step(CONFIG.max_steps)
+    first = first_step(CONFIG.max_steps, CONFIG.max_steps / len(scene.train_ids))
     assert robust_losses[:first] == losses[:first]
     assert np.mean(robust_losses[-20:]) < 0.7 * np.mean(losses[-20:])  # less is compared
     assert quality(robust, scene, clean) > quality(plain, scene, clean) + 1
+
+
+def test_views_are_seen_before_they_are_judged():
+    assert first_step(30_000, 150) == 9000
+    assert first_step(2000, 2000 / 46) == 600
+    assert first_step(7000, 7000 / 300) == 3000  # ten visits
+    assert first_step(1000, 1000 / 162) == 600  # there is no time for ten
 
 
 @pytest.mark.parametrize("more", [{"exposure": "affine"}, {"poses": True}, {"batch": 2}])

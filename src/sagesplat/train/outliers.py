@@ -14,7 +14,9 @@ from torch import Tensor
 
 from sagesplat.raster import TILE
 
-FIRST_SHARE = 0.3  # of the steps, without masks: the model gets its shape
+_FIRST = 0.3  # of the steps, without masks: the model gets its shape
+_VISITS = 10  # of each view before that, if there is time
+_LATEST = 0.6  # of the steps
 SMALLEST = 9  # cells, side of the window that an outlier holds
 _GRID = 160  # cells along the longer side of a photo
 _BLUR = 5  # cells, side of the window that residuals are averaged over
@@ -24,9 +26,10 @@ _EDGE = 0.5  # times that threshold: residuals at the edges of outliers
 _MOST = 1 / 3  # of a photo; one with more does not fit as a whole, and all of it counts
 
 
-def first_step(max_steps: int) -> int:
-    """Number of steps that are taken without outlier masks."""
-    return round(FIRST_SHARE * max_steps)
+def first_step(max_steps: int, visits: float) -> int:
+    """Number of steps that are taken without outlier masks; `visits`: of each view in all steps."""
+    wanted = max(_FIRST * max_steps, _VISITS * max_steps / visits)
+    return round(min(wanted, _LATEST * max_steps))
 
 
 def inliers(

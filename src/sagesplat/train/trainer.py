@@ -288,13 +288,20 @@ def begin(
     tiles = ActiveTiles(scene, masks, frozenset(state.frozen), device, valid)
     stepper = Stepper(
         PhotoLoader(scene, photos, device, valid), config, tiles, backend, group, strategy, freezing,
-        view_updates=updates, outliers_after=first_step(config.max_steps) if config.outliers else math.inf,
+        view_updates=updates, outliers_after=_outliers_after(batched, len(scene.train_ids)),
     )  # fmt: skip
     measured = measured_views(scene, masks) if config.freeze_at is not None and masks is not None else {}
     folder = folder if group.leads else None
     return Training(
         config, state, stepper, strategy, rates, measured, freezing, folder, settings, resumed, found
     )
+
+
+def _outliers_after(config: TrainConfig, views: int) -> float:
+    """The number of steps after which outliers of the photos are left out."""
+    if not config.outliers:
+        return math.inf
+    return first_step(config.max_steps, config.max_steps * config.batch / views)
 
 
 def view_updates(
