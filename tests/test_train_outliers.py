@@ -19,7 +19,7 @@ from sagesplat.scene.scene import Scene
 from sagesplat.stages import blocks
 from sagesplat.train.events import Step, Trained
 from sagesplat.train.nested import capped_config
-from sagesplat.train.outliers import SMALLEST, first_step, inliers
+from sagesplat.train.outliers import SMALLEST, OutlierSchedule, inliers
 from sagesplat.train.trainer import train
 
 HEIGHT, WIDTH = 240, 320  # two pixels a cell
@@ -113,7 +113,7 @@ class Figures(Photos):
         return photo
 
 
-CONFIG = TrainConfig(max_steps=90, sh_degree=0, exposure="off")
+CONFIG = TrainConfig(max_steps=150, sh_degree=0, exposure="off")
 LABELS = np.full(60, -1, np.int16)
 
 
@@ -143,17 +143,23 @@ def test_training_leaves_figures_out(scene):
     clean, figures = Photos(scene.views), Figures(scene.views)
     plain, losses = trained(scene, figures, CONFIG)
     robust, robust_losses = trained(scene, figures, replace(CONFIG, outliers=True))
-    first = first_step(CONFIG.max_steps, CONFIG.max_steps / len(scene.train_ids))
+    first = OutlierSchedule.of(CONFIG.max_steps, 1, len(scene.train_ids)).first
     assert robust_losses[:first] == losses[:first]
     assert np.mean(robust_losses[-20:]) < 0.7 * np.mean(losses[-20:])  # less is compared
     assert quality(robust, scene, clean) > quality(plain, scene, clean) + 1
 
 
 def test_views_are_seen_before_they_are_judged():
-    assert first_step(30_000, 150) == 9000
-    assert first_step(2000, 2000 / 46) == 600
-    assert first_step(7000, 7000 / 300) == 3000  # ten visits
-    assert first_step(1000, 1000 / 162) == 600  # there is no time for ten
+    of = OutlierSchedule.of
+    assert of(30_000, 1, 150).first == 9000
+    assert of(2000, 1, 46).first == 600
+    assert of(7000, 1, 300).first == 3000  # ten visits
+    assert of(7000, 2, 300).first == 2100
+    assert of(1000, 1, 162).first == 600  # there is no time for ten
+    schedule = of(2000, 1, 46)
+    assert not any(map(schedule, range(600)))
+    rounds = [{schedule(step) for step in range(46 * i, 46 * (i + 1))} for i in range(14, 20)]
+    assert rounds == [{True}, {False}, {True}, {True}, {False}, {True}]
 
 
 @pytest.mark.parametrize("more", [{"exposure": "affine"}, {"poses": True}, {"batch": 2}])
