@@ -25,7 +25,7 @@ from sagesplat.core.geometry import project, weighted_quantile
 from sagesplat.metrics.image import psnr, squared_error_map
 from sagesplat.raster import Backend, Workspace, add_weights, device_of, rasterize
 from sagesplat.scene.images import Photos
-from sagesplat.scene.scene import Camera, Scene, View
+from sagesplat.scene.scene import Scene, View
 from sagesplat.segment.masks import UNLABELLED
 from sagesplat.segment.valid import ALL_VALID, ValidPixels
 from sagesplat.train.early_stopping import spread
@@ -34,12 +34,12 @@ CRITERIA = ("few views", "near cameras", "category")
 LabelImage = Callable[[View], np.ndarray]  # a view's category ids, int16 [H, W]; -1: unlabelled
 
 _MOST = 0.5  # of the views that support a Gaussian, or of its weight
-_NEAR = 0.05  # quantile of the depths of tracked points that is a view's near content
-_TRACKED = 20  # points in a view that tell it
-_WINDOW = 7  # px around a Gaussian's centre; the nearest content there counts
+_NEAR = 0.05  # quantile of the depths of tracked points, or of the pixels, that is a view's near content
+_TRACKED = 20  # points in a view at least
+_WINDOW = 3  # px of half the size, around a Gaussian's centre; the nearest content there counts
 _COVERED = 0.5  # alpha of pixels that show content
 _GUARDS = 12  # views of a kind that are rendered before and after
-_HALVINGS = 4  # of what a criterion found, where all of it costs too much
+_TRIES = 5  # of how much may go of what a criterion found
 _UNKNOWN_ERROR = 1e-3  # mean squared error of a splat without photos: 30 dB
 
 
@@ -101,7 +101,7 @@ def find_floaters(
     ids = np.unique(np.append(g.label_ids.cpu().numpy(), UNLABELLED))
     if len(ids) < 3 or not config.category_depth:  # of one category nothing can contradict
         label_image = None
-    space = Workspace()
+    xyz, space = g.means.cpu().numpy(), Workspace()
     for done, row in enumerate(views, 1):
         view, counts = scene.views[row], valid[scene.views[row]]
         columns = _columns(view, counts, ids, label_image)
@@ -111,12 +111,10 @@ def find_floaters(
         supports = total >= config.min_weight
         weight += total
         supported += supports
-        pixels, depth = project(g.means.cpu().numpy().astype(np.float64), view.camera.w2c, view.camera.K)
+        depth = xyz @ view.camera.w2c[2, :3] + view.camera.w2c[2, 3]
         if config.near_depth:
-            content = _content(g, view.camera, pixels, depth, antialiased, space)
-            in_front += supports & (
-                depth < config.near_depth * np.maximum(content, _near_content(scene, row))
-            )
+            content = _content(g, scene, row, depth, antialiased, space)
+            in_front += supports & (depth < config.near_depth * content)
         if label_image is not None:
             contradicting += _contradicting(weights[:, 1:], depth, config.category_depth)
         if on_view:
@@ -148,8 +146,8 @@ def clean(
 ) -> Cleaned:
     """Choose what to remove of the floaters, so that no kind of view loses more than `config.max_loss` dB.
 
-    Criteria are tried in their order. Where all that one found would cost too much, it is halved, and those
-    of the least blending weight go.
+    Criteria are tried in their order. Where all that one found would cost too much, those of the least
+    blending weight go, as many as the views do not miss (bisection).
 
     Args:
         g: N Gaussians.
@@ -186,15 +184,22 @@ def clean(
     before = after = quality(keep)
     removed = dict[str, np.ndarray]()
     for name, rows in floaters.found.items():
-        removed[name] = np.zeros(len(g), bool)
         order = np.flatnonzero(rows)[np.argsort(floaters.weight[rows], kind="stable")]
-        for count in _halved(len(order)):
+        removed[name] = np.zeros(len(g), bool)
+        low, count, high = 0, len(order), len(order)  # so many may go; so many are tried; at most so many
+        for _ in range(_TRIES):
+            if count == low:
+                break
             tried = keep.copy()
             tried[order[:count]] = False
             now = quality(tried)
             if all(before[kind] - now[kind] <= config.max_loss for kind in kinds):
-                removed[name], keep, after = keep & ~tried, tried, now
-                break
+                low, after = count, now
+            else:
+                high = count - 1
+            count = (low + high + 1) // 2
+        removed[name][order[:low]] = True
+        keep &= ~removed[name]
     found = {name: int(rows.sum()) for name, rows in floaters.found.items()}
     return Cleaned(removed, found, before, after)
 
@@ -207,12 +212,6 @@ def check(config: CleanConfig) -> None:
         if not 0 <= value <= most:
             flag = name.replace("_", "-")
             raise RunError(f"--clean.{flag} {value:g} is impossible; choose 0 to {most:,}")
-
-
-def _halved(count: int) -> list[int]:
-    """How many to try: all, then half of them, and so on."""
-    tried = [count >> halving for halving in range(_HALVINGS + 1)]
-    return [number for number in dict.fromkeys(tried) if number]
 
 
 def _columns(
@@ -233,36 +232,42 @@ def _columns(
     return columns
 
 
-def _near_content(scene: Scene, row: int) -> float:
-    """Depth of the near content of a view, by its tracked points; 0 where it has too few."""
-    points = scene.points.track_points[scene.points.track_views == row]
-    if len(points) < _TRACKED:
-        return 0.0
-    camera = scene.views[row].camera
-    return float(np.quantile(scene.points.xyz[points] @ camera.w2c[2, :3] + camera.w2c[2, 3], _NEAR))
-
-
 def _content(
     g: Gaussians,
-    camera: Camera,
-    pixels: Float[np.ndarray, "N 2"],
+    scene: Scene,
+    row: int,
     depth: Float[np.ndarray, " N"],
     antialiased: bool,
     space: Workspace,
 ) -> Float[np.ndarray, " N"]:
-    """Depth of the nearest content around each Gaussian's centre; 0 where there is none, or outside."""
+    """Depth of what a view shows around each Gaussian's centre, or of its near content where that is more."""
+    camera = scene.views[row].camera
+    half = camera.resized(max(1, camera.width // 2), max(1, camera.height // 2))  # exact enough, and faster
     feature = torch.from_numpy(np.maximum(depth, 0).astype(np.float32))[:, None].to(g.means.device)
     with torch.no_grad():
-        render = rasterize(g, camera, sh_degree=0, features=feature, antialiased=antialiased, workspace=space)
+        render = rasterize(g, half, sh_degree=0, features=feature, antialiased=antialiased, workspace=space)
     assert render.features is not None
     alpha = render.alpha.float().cpu().numpy()
-    mean = render.features[..., 0].float().cpu().numpy() / np.maximum(alpha, _COVERED)
-    nearest = minimum_filter(np.where(alpha >= _COVERED, mean, np.inf), _WINDOW)
+    shown = render.features[..., 0].float().cpu().numpy() / np.maximum(alpha, _COVERED)
+    covered = alpha >= _COVERED
+    nearest = minimum_filter(np.where(covered, shown, np.inf), _WINDOW)
+    pixels = project(g.means.cpu().numpy(), half.w2c, half.K)[0]
     at = np.floor(np.nan_to_num(pixels, nan=-1.0)).clip(-1, 1e6).astype(np.int64)
-    inside = (at >= 0).all(1) & (at < (camera.width, camera.height)).all(1)
+    inside = (at >= 0).all(1) & (at < (half.width, half.height)).all(1)
     found = np.zeros(len(depth))
     found[inside] = nearest[at[inside, 1], at[inside, 0]]
-    return np.where(np.isfinite(found), found, 0)
+    near = _tracked(scene, row)
+    if not len(near):
+        near = shown[covered] if covered.any() else np.zeros(1)
+    return np.maximum(np.where(np.isfinite(found), found, 0), np.quantile(near, _NEAR))
+
+
+def _tracked(scene: Scene, row: int) -> Float[np.ndarray, " P"]:
+    """Depths of the points whose tracks are in a view; none where they are too few."""
+    points = scene.points.track_points[scene.points.track_views == row]
+    camera = scene.views[row].camera
+    depth = scene.points.xyz[points] @ camera.w2c[2, :3] + camera.w2c[2, 3]
+    return depth if len(points) >= _TRACKED else depth[:0]
 
 
 def _contradicting(
