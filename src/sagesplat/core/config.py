@@ -191,13 +191,13 @@ class CleanConfig:
     """Few views: remove Gaussians that fewer training views support; 0: do not look for them."""
     min_weight: float = 0.1
     """A view supports a Gaussian if its blending weight there, summed over the pixels, is at least this."""
-    near_depth: float = 0.5
-    """Near cameras: remove Gaussians that are nearer than this fraction of the depth of the content around
-    them, in most of the views that support them; 0: do not look for them."""
+    content_depth: float = 0.8
+    """In front: remove Gaussians that are nearer than this fraction of the depth of the content around them,
+    in most of the views that support them; 0: do not look for them."""
     category_depth: float = 0.3
     """Category: remove Gaussians that are nearer than this fraction of the median depth of the category whose
     pixels they paint, by most of their weight; 0: do not look for them."""
-    max_loss: float = 0.03
+    max_loss: float = 0.02
     """Largest loss of PSNR on the training and on the calibration views, dB. Where it would be more, fewer
     are removed."""
 

@@ -3,7 +3,7 @@
 Criteria, each by itself:
 
 - few views: hardly any training view supports them, so nothing says where they are;
-- near cameras: most views that support them show content far behind them;
+- in front: most views that support them show content far behind them;
 - category: they paint pixels of a category that is far behind them, such as the sky.
 
 What a floater hides no photo has shown, and what it paints the training needed: taking it away may leave a
@@ -30,7 +30,7 @@ from sagesplat.segment.masks import UNLABELLED
 from sagesplat.segment.valid import ALL_VALID, ValidPixels
 from sagesplat.train.early_stopping import spread
 
-CRITERIA = ("few views", "near cameras", "category")
+CRITERIA = ("few views", "in front", "category")
 LabelImage = Callable[[View], np.ndarray]  # a view's category ids, int16 [H, W]; -1: unlabelled
 
 _MOST = 0.5  # of the views that support a Gaussian, or of its weight
@@ -112,16 +112,16 @@ def find_floaters(
         weight += total
         supported += supports
         depth = xyz @ view.camera.w2c[2, :3] + view.camera.w2c[2, 3]
-        if config.near_depth:
+        if config.content_depth:
             content = _content(g, scene, row, depth, antialiased, space)
-            in_front += supports & (depth < config.near_depth * content)
+            in_front += supports & (depth < config.content_depth * content)
         if label_image is not None:
             contradicting += _contradicting(weights[:, 1:], depth, config.category_depth)
         if on_view:
             on_view(done)
     found = {
         "few views": supported < config.min_views,
-        "near cameras": (supported > 0) & (in_front > _MOST * supported),
+        "in front": (supported > 0) & (in_front > _MOST * supported),
         "category": (supported > 0) & (contradicting > _MOST * weight),
     }
     taken = np.zeros(n, bool)
@@ -181,7 +181,7 @@ def clean(
         return float(psnr(mean if real else mean + _UNKNOWN_ERROR))
 
     keep = np.ones(len(g), bool)
-    before = after = quality(keep)
+    before = after = best = quality(keep)
     removed = dict[str, np.ndarray]()
     for name, rows in floaters.found.items():
         order = np.flatnonzero(rows)[np.argsort(floaters.weight[rows], kind="stable")]
@@ -193,20 +193,27 @@ def clean(
             tried = keep.copy()
             tried[order[:count]] = False
             now = quality(tried)
-            if all(before[kind] - now[kind] <= config.max_loss for kind in kinds):
+            if all(best[kind] - now[kind] <= config.max_loss for kind in kinds):
                 low, after = count, now
             else:
                 high = count - 1
             count = (low + high + 1) // 2
         removed[name][order[:low]] = True
         keep &= ~removed[name]
+        best = {kind: max(best[kind], after[kind]) for kind in kinds}
     found = {name: int(rows.sum()) for name, rows in floaters.found.items()}
     return Cleaned(removed, found, before, after)
 
 
 def check(config: CleanConfig) -> None:
     """RunError for a threshold that is impossible."""
-    limits = {"min_views": 10**6, "min_weight": 10**6, "near_depth": 1, "category_depth": 1, "max_loss": 100}
+    limits = {
+        "min_views": 10**6,
+        "min_weight": 10**6,
+        "content_depth": 1,
+        "category_depth": 1,
+        "max_loss": 100,
+    }
     for name, most in limits.items():
         value = getattr(config, name)
         if not 0 <= value <= most:
