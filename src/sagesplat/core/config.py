@@ -471,6 +471,7 @@ class RunConfig:
     labels: LabelsConfig = field(default_factory=LabelsConfig)
     lift: LiftConfig = field(default_factory=LiftConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
+    clean: CleanConfig = field(default_factory=CleanConfig)
     blocks: BlocksConfig = field(default_factory=BlocksConfig)
     nest: NestConfig = field(default_factory=NestConfig)
     sample: SampleConfig = field(default_factory=SampleConfig)

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Bool
 
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians, checked, concat
@@ -67,6 +68,33 @@ def write_set(
             arrays[f"{label}/replaces"] = np.array(sorted(levels), np.int64)
     arrays |= {f"more/{name}": np.asarray(value) for name, value in more.items()}
     _write(path, LevelFile(path, step, False, g.sh_degree, g.counts()), g, arrays, exact)
+
+
+def select_level(source: Path, target: Path, keep: Bool[np.ndarray, " N"]) -> None:
+    """Write the Gaussians of a level file that `keep` selects, in the order of `read_level`, unchanged.
+
+    Columns are copied as they are stored: what stays keeps every bit. Categories without any left have no
+    arrays. DataError for a damaged file; ValueError where `keep` is of another number of Gaussians.
+    """
+    counts = read_header(source).counts
+    labels = sorted(counts)
+    if sum(counts.values()) != len(keep):
+        raise ValueError(f"{len(keep)} rows for {sum(counts.values())} Gaussians")
+    rows = np.split(keep, np.cumsum([counts[label] for label in labels])[:-1])
+    kept = dict(zip(map(str, labels), rows, strict=True))
+    with _open(source) as file:
+        try:
+            arrays = {name: file[name] for name in file.names}
+        except _DAMAGED as error:
+            raise DataError(f"{source}: a broken level ({short(error)}); {_again(source)}") from None
+    for name in [name for name in arrays if "/" in name]:
+        label, column = name.split("/")
+        if not kept[label].any():
+            del arrays[name]
+        elif column != "shN_scale":
+            arrays[name] = arrays[name][kept[label]]
+    with atomic_path(target, nbytes=sum(a.nbytes for a in arrays.values())) as temporary:
+        np.savez(temporary, allow_pickle=False, **arrays)
 
 
 def starts_of(sizes: Sequence[int], replaces: Collection[int] = ()) -> tuple[int, ...]:

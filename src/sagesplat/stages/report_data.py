@@ -27,7 +27,7 @@ from sagesplat.stages.results import evaluation_of, has_photos, models_of, obser
 
 PANELS = 3  # views shown in pictures
 STAGES = (
-    *("adopt", "poses", "scene", "segment", "masks", "lift", "train", "fuse"),
+    *("adopt", "poses", "scene", "segment", "masks", "lift", "train", "clean", "fuse"),
     *("nest", "observe", "sample", "fit", "plan", "compose", "evaluate"),
 )
 
