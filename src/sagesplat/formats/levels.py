@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool
 
 from sagesplat.core.errors import DataError, short
-from sagesplat.core.gaussians import Gaussians, checked, concat
+from sagesplat.core.gaussians import PARAMETERS, Gaussians, checked, concat
 from sagesplat.core.sh import num_bases
 from sagesplat.io.files import atomic_path
 from sagesplat.io.npz import Npz
@@ -73,26 +73,23 @@ def write_set(
 def select_level(source: Path, target: Path, keep: Bool[np.ndarray, " N"]) -> None:
     """Write the Gaussians of a level file that `keep` selects, in the order of `read_level`, unchanged.
 
-    Columns are copied as they are stored: what stays keeps every bit. Categories without any left have no
-    arrays. DataError for a damaged file; ValueError where `keep` is of another number of Gaussians.
+    Columns are copied as they are stored: what stays keeps every bit. DataError for a damaged file;
+    ValueError where `keep` is of another number of Gaussians.
     """
     counts = read_header(source).counts
-    labels = sorted(counts)
     if sum(counts.values()) != len(keep):
         raise ValueError(f"{len(keep)} rows for {sum(counts.values())} Gaussians")
-    rows = np.split(keep, np.cumsum([counts[label] for label in labels])[:-1])
-    kept = dict(zip(map(str, labels), rows, strict=True))
+    ends = np.cumsum([counts[label] for label in sorted(counts)])
     with _open(source) as file:
         try:
-            arrays = {name: file[name] for name in file.names}
-        except _DAMAGED as error:
+            arrays = {"meta": file["meta"]}
+            for label, rows in zip(sorted(counts), np.split(keep, ends[:-1]), strict=True):
+                names = [f"{label}/{column}" for column in (*PARAMETERS, "shN_scale")]
+                for name in names if rows.any() else []:
+                    if name in file:
+                        arrays[name] = file[name] if name.endswith("_scale") else file[name][rows]
+        except (*_DAMAGED, IndexError) as error:
             raise DataError(f"{source}: a broken level ({short(error)}); {_again(source)}") from None
-    for name in [name for name in arrays if "/" in name]:
-        label, column = name.split("/")
-        if not kept[label].any():
-            del arrays[name]
-        elif column != "shN_scale":
-            arrays[name] = arrays[name][kept[label]]
     with atomic_path(target, nbytes=sum(a.nbytes for a in arrays.values())) as temporary:
         np.savez(temporary, allow_pickle=False, **arrays)
 

@@ -114,13 +114,14 @@ def read_clean_figures(path: Path) -> CleanFigures | None:
     try:
         if not isinstance(made, dict):
             raise ValueError("no object")
-        check_fields(made, types_of(CleanFigures))
-        figures = CleanFigures(**made)
+        types = types_of(CleanFigures)
+        check_fields(made, types)
+        figures = CleanFigures(**{name: made[name] for name in types})
         _check_counts(figures.found, figures.removed)
         if figures.before.keys() != figures.after.keys():
             raise ValueError("other views before than after")
         return figures
-    except (TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise RunError(f"{path}: not what was cleaned ({short(error)}); {cure}") from None
 
 
