@@ -35,6 +35,7 @@ from sagesplat.segment import segmenters
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.stages import bundle, label, view
 from sagesplat.stages.boundaries import _seconds
+from sagesplat.stages.clean import read_clean_figures
 from sagesplat.stages.refine import read_pose_figures
 from sagesplat.stages.refine_exposure import read_exposure_figures
 from sagesplat.stages.train import _fit_memory, read_frozen
@@ -43,6 +44,7 @@ from sagesplat.studies.measure.levels import levels_of
 from sagesplat.studies.paper.cross_view import CrossView, read_cross_view
 from sagesplat.studies.paper.same_size import SameSize, read_same_size
 from sagesplat.studies.sweep.file import read_sweep
+from sagesplat.train.clean import CRITERIA
 from sagesplat.viewer.bundle import is_bundle
 
 CURVE = {
@@ -96,6 +98,12 @@ def _figures(folder: Path, size: int) -> list[bytes]:
 def _read_figures(path: Path) -> None:
     read_pose_figures(path)
     read_exposure_figures(path)
+
+
+def _floaters(folder: Path, size: int) -> list[bytes]:
+    counts, decibels = dict.fromkeys(CRITERIA, 3), {"train": 20.5, "calibration": 19.0}
+    entry = {"gaussians": 50, "found": counts, "removed": counts, "before": decibels, "after": decibels}
+    return as_json(entry | {f"note{i}": i for i in range(size - 1)})
 
 
 def _models(folder: Path, size: int) -> list[bytes]:
@@ -368,6 +376,7 @@ READERS = (
     Reader("cameras", ".json", _cameras, file("path.json", _read_cameras), 100),
     Reader("refined", ".npz", _refined, file("cameras.npz", _read_refined), 1000),
     Reader("refined-figures", ".json", _figures, file("refined.json", _read_figures), 3000),
+    Reader("floaters", ".json", _floaters, file("floaters.json", read_clean_figures), 3000),
     Reader("sampled", ".npz", _sampled, file("fidelity.npz", fidelity.read_sampled), 1000),
     Reader("plans", ".json", _plans, file("plan.json", _read_plans), 100),
     Reader("observations", ".csv", _table(Observations), file("o.csv", read_observations), 1000),

@@ -23,6 +23,7 @@ from sagesplat.cli.say import say
 from sagesplat.core.config import (
     AdoptConfig,
     BlocksConfig,
+    CleanConfig,
     FitConfig,
     LabelsConfig,
     LiftConfig,
@@ -62,6 +63,7 @@ def run(
     labels: LabelsConfig = LabelsConfig(),
     lift: LiftConfig = LiftConfig(),
     train: TrainConfig = TrainConfig(),
+    clean: CleanConfig = CleanConfig(),
     blocks: BlocksConfig = BlocksConfig(),
     nest: NestConfig = NestConfig(),
     sample: SampleConfig = SampleConfig(),
@@ -81,7 +83,21 @@ def run(
     from sagesplat.stages import pipeline
 
     config = RunConfig(
-        scene_config, poses, masks, labels, lift, train, blocks, nest, sample, fit, plan, fuse, ladder, seed
+        scene_config,
+        poses,
+        masks,
+        labels,
+        lift,
+        train,
+        clean,
+        blocks,
+        nest,
+        sample,
+        fit,
+        plan,
+        fuse,
+        ladder,
+        seed,
     )
     with open_job(run, machine, ladder) as job:
         pipeline.run_all(job, scene, config)

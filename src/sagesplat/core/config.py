@@ -182,6 +182,27 @@ class TrainConfig:
 
 
 @dataclass(frozen=True)
+class CleanConfig:
+    """Floaters: Gaussians in free space, removed after training."""
+
+    floaters: Literal["remove", "keep"] = "remove"
+    """remove: floaters are removed before the levels are made; keep: nothing is removed."""
+    min_views: int = 2
+    """Few views: remove Gaussians that fewer training views support; 0: do not look for them."""
+    min_weight: float = 0.1
+    """A view supports a Gaussian if its blending weight there, summed over the pixels, is at least this."""
+    content_depth: float = 0.8
+    """In front: remove Gaussians that are nearer than this fraction of the depth of the content around them,
+    in most of the views that support them; 0: do not look for them."""
+    category_depth: float = 0.3
+    """Category: remove Gaussians that are nearer than this fraction of the median depth of the category whose
+    pixels they paint, by most of their weight; 0: do not look for them."""
+    max_loss: float = 0.02
+    """Largest loss of PSNR on the training and on the calibration views, dB. Where it would be more, fewer
+    are removed."""
+
+
+@dataclass(frozen=True)
 class BlocksConfig:
     """Blocks of a large scene."""
 
@@ -450,6 +471,7 @@ class RunConfig:
     labels: LabelsConfig = field(default_factory=LabelsConfig)
     lift: LiftConfig = field(default_factory=LiftConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
+    clean: CleanConfig = field(default_factory=CleanConfig)
     blocks: BlocksConfig = field(default_factory=BlocksConfig)
     nest: NestConfig = field(default_factory=NestConfig)
     sample: SampleConfig = field(default_factory=SampleConfig)

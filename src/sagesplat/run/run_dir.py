@@ -18,6 +18,7 @@ _BEFORE_LADDERS = (
     "lift",
     "blocks",
     "train",
+    "clean",
     "fuse",
     "block_categories",
 )
@@ -145,6 +146,21 @@ class RunDir:
     def levels(self) -> Path:
         """The recorded levels."""
         return self.path / "levels"
+
+    @property
+    def uncleaned(self) -> Path:
+        """The last level as training recorded it, where floaters were removed from it."""
+        return self.path / "uncleaned.npz"
+
+    @property
+    def floaters(self) -> Path:
+        """How many floaters were found and removed, and what that cost."""
+        return self.path / "floaters.json"
+
+    @property
+    def floaters_picture(self) -> Path:
+        """Views before and after, and what was removed."""
+        return self.path / "floaters.png"
 
     @property
     def checkpoint(self) -> Path:

@@ -42,6 +42,7 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
         if not resuming:
             remove_checkpoints(place.checkpoint)
             shutil.rmtree(place.levels, ignore_errors=True)
+            _forget_cleaning(place)
         place.path.mkdir(exist_ok=True)
         write_cap(place.cap, cap, settings)
         counts: dict[str, int] = {}
@@ -139,6 +140,7 @@ def _swap(run: RunDir, made: RunDir) -> None:
     The checkpoint comes last: where this is killed, training finds it, ends at once and swaps what is left.
     """
     run.provenance("train").unlink(missing_ok=True)
+    _forget_cleaning(run)
     if made.levels.exists():
         old = made.path / "old-levels"
         shutil.rmtree(old, ignore_errors=True)
@@ -153,6 +155,12 @@ def _swap(run: RunDir, made: RunDir) -> None:
         if new.exists():
             new.replace(place)
     shutil.rmtree(made.path)
+
+
+def _forget_cleaning(run: RunDir) -> None:
+    """Remove what was made of another training's last level, above all that level itself."""
+    for path in (run.provenance("clean"), run.uncleaned, run.floaters, run.floaters_picture):
+        path.unlink(missing_ok=True)
 
 
 def _fit_memory(job: Job, place: RunDir, config: TrainConfig, resuming: bool) -> tuple[TrainConfig, int]:
