@@ -69,6 +69,18 @@ def test_what_no_view_shows_has_few_views(truth: Gaussians, scene: Scene) -> Non
     assert floaters.weight[N:].max() == 0 < floaters.weight[:N].max()
 
 
+def test_mist_beside_the_cameras_is_hardly_shown(truth: Gaussians, scene: Scene) -> None:
+    """Photos show the rim of it only; who turned around would stand before a wall."""
+    centre = scene.views[0].camera.position
+    beside = centre + 0.5 * scene.views[0].camera.w2c[0, :3] + 0.1 * scene.views[0].camera.w2c[2, :3]
+    mist = blobs(torch.from_numpy(beside)[None], size=0.12)
+    g = concat([truth, mist])
+    floaters = find(g, scene, replace(CONFIG, min_views=0, content_depth=0, shown_share=0.02))
+    assert N in rows_of(floaters, "hardly shown")
+    assert len(rows_of(floaters, "hardly shown")) <= 3
+    assert not rows_of(find(g, scene, replace(CONFIG, min_views=0, shown_share=0)), "hardly shown")
+
+
 def test_blobs_before_the_cameras_are_in_front_and_little_else(truth: Gaussians, scene: Scene) -> None:
     g = concat([truth, blobs(before_cameras(8, 0.2), size=0.02)])
     floaters = find(g, scene, replace(CONFIG, min_views=0))
@@ -142,7 +154,8 @@ def test_without_photos_what_is_seen_of_the_splat_itself_stays(truth: Gaussians,
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("content_depth", 1.5), ("min_views", -1), ("max_loss", float("nan"))]
+    ("name", "value"),
+    [("shown_share", 1.5), ("content_depth", 1.5), ("min_views", -1), ("max_loss", float("nan"))],
 )
 def test_impossible_thresholds_are_refused(truth: Gaussians, scene: Scene, name: str, value: float) -> None:
     with pytest.raises(RunError, match=rf"--clean\.{name.replace('_', '-')} .* is impossible; choose 0 to"):

@@ -191,6 +191,9 @@ class CleanConfig:
     """Few views: remove Gaussians that fewer training views support; 0: do not look for them."""
     min_weight: float = 0.1
     """A view supports a Gaussian if its blending weight there, summed over the pixels, is at least this."""
+    shown_share: float = 0.003
+    """Hardly shown: remove Gaussians whose weight in all training views together is below this fraction of
+    what they would have in the nearest camera, if it looked at them; 0: do not look for them."""
     content_depth: float = 0.8
     """In front: remove Gaussians that are nearer than this fraction of the depth of the content around them,
     in most of the views that support them; 0: do not look for them."""
