@@ -31,6 +31,7 @@ from sagesplat.train.clean import check, clean, find_floaters
 
 _VIEWS = 96  # viewpoints that are drawn where there are none
 _FOV, _SIZE = 60.0, (512, 384)  # degrees along the longer side, px
+_DRAWN = "viewpoints were drawn, so few views mean nothing; --cameras of its photos would tell more"
 _SIDE = 1024  # px, longer side of the views of a capture; larger ones are looked at smaller
 
 
@@ -46,7 +47,7 @@ def clean_splat(
         config: Thresholds. "keep" is refused.
         emit: Hears of progress, and gets the result in words.
         cameras: Where its photos were taken from: a capture with or without photos, or a file of cameras;
-            None: viewpoints are drawn.
+            None: viewpoints are drawn, and few views are no criterion.
         picture: PNG of views before and after.
         backend: Rasteriser.
 
@@ -63,6 +64,8 @@ def clean_splat(
     check_size(splat.gaussians, str(source))
     g, filtered = splat.gaussians.to(device_of(backend)), splat.antialiased
     scene, photos, how = _views(g, filtered, cameras, backend)
+    if cameras is None:  # what few of them show may be seen from nearer, or from elsewhere
+        config = replace(config, min_views=0)
     real, rows = not isinstance(photos, Renders), list(range(len(scene.views)))
     floaters = find_floaters(
         g, scene, rows, config,
@@ -107,7 +110,7 @@ def _views(
     if cameras is None:
         drawn = free_cameras(g, _VIEWS, up="auto", fov=_FOV, size=_SIZE, seed=0, kind="auto", backend=backend)
         scene = _scene_of(Path(), drawn.cameras)
-        return scene, Renders(g, scene.views, backend, antialiased), f"{len(scene.views)} viewpoints drawn"
+        return scene, Renders(g, scene.views, backend, antialiased), _DRAWN
     given = read_camera_file(cameras)
     if all(one.photo is not None for one in given):
         scene = load_scene(cameras, test_every=0)
@@ -138,9 +141,8 @@ def _write(source: Path, out: Path, splat: Splat, keep: np.ndarray) -> None:
     if splat.kind == "PLY" and written_as(out) == ".ply":
         g = read_ply_splat(source).gaussians
         drawn = ~torch.stack(list(undrawable(g).values())).any(0).numpy()
-        if torch.equal(
-            g.label_ids[torch.from_numpy(drawn)], splat.gaussians.label_ids
-        ):  # no labels beside it
+        labelled_here = torch.equal(g.label_ids[torch.from_numpy(drawn)], splat.gaussians.label_ids)
+        if labelled_here:  # and not by a file beside it
             drawn[drawn] = keep
             select_ply(source, out, drawn)
             return
