@@ -18,7 +18,7 @@ from sagesplat.raster import Backend, Workspace
 from sagesplat.scene.scene import Camera
 
 ROWS = 4  # views that are shown, those that change most
-_LOOKED = 32  # cameras that are compared
+_LOOKED = 12  # cameras that are compared
 _SIDE = 640  # px, longer side of a picture
 _GREY = (110, 110, 110)  # behind what goes: bright and dark Gaussians are seen
 _WIDTH = 15.0  # inches
