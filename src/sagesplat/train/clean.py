@@ -215,6 +215,7 @@ def check(config: CleanConfig) -> None:
     limits = {
         "min_views": 10**6,
         "min_weight": 10**6,
+        "shown_share": 1,
         "content_depth": 1,
         "category_depth": 1,
         "max_loss": 100,
