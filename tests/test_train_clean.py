@@ -72,14 +72,15 @@ def test_what_no_view_shows_has_few_views(truth: Gaussians, scene: Scene) -> Non
 def test_mist_beside_the_cameras_is_hardly_shown(truth: Gaussians, scene: Scene) -> None:
     """Photos show the rim of it only; who turned around would stand before a wall."""
     camera = scene.views[0].camera
-    beside = camera.position + 0.5 * camera.w2c[0, :3] + 0.05 * camera.w2c[2, :3]
+    right = 0.5 * (camera.width - camera.K[0, 2]) / camera.K[0, 0] + 0.25  # 2.5 standard deviations outside
+    beside = camera.position + right * camera.w2c[0, :3] + 0.5 * camera.w2c[2, :3]
     g = concat([truth, blobs(torch.from_numpy(beside)[None], size=0.1, logit=6.0)])
-    config = replace(CONFIG, min_views=0, content_depth=0)
+    config = replace(CONFIG, min_views=0, content_depth=0, shown_share=0.1)  # photos are small
     floaters = find_floaters(g, scene, [0], config)
     found = rows_of(floaters, "hardly shown")
     assert N in found
-    assert 0 < floaters.weight[N]
-    assert not set(found) & set(np.argsort(floaters.weight[:N])[N // 2 :])  # others that it found are hidden
+    assert floaters.weight[N] > 0
+    assert np.median(floaters.weight[found]) < 0.3 * np.median(floaters.weight[:N])  # the others are hidden
     assert not rows_of(find(g, scene, replace(config, shown_share=0)), "hardly shown")
 
 
