@@ -462,6 +462,49 @@ def test_heic_photos_are_read(tmp_path: Path) -> None:
     assert np.abs(image[10, 50] - [40, 40, 200]).max() < 20
 
 
+def turned_heic() -> bytes:
+    """A HEIC as a phone held upright writes it: pixels as the sensor lies, and a turn of 90 degrees."""
+    content = bytearray((Path(__file__).parent / "data" / "two_halves.heic").read_bytes())
+    turn = b"\0\0\0\x09irot\x01"
+    properties = content.index(b"\x05\x81\x02\x03\x05\x84")  # of the image: five; the new one is the sixth
+    content[properties : properties + 6] = b"\x06\x81\x02\x03\x05\x84\x86"
+    end = content.index(b"ipma") - 4
+    content[end:end] = turn
+    offset = content.index(b"\0\0\x01\xa1")  # of the pixels in the file
+    sizes = [
+        (content.index(box) - 4, more)
+        for box, more in ((b"meta", 10), (b"iprp", 10), (b"ipco", 9), (b"ipma", 1))
+    ]
+    for at, more in [*sizes, (offset, 10)]:
+        content[at : at + 4] = (int.from_bytes(content[at : at + 4], "big") + more).to_bytes(4, "big")
+    return bytes(content)
+
+
+def test_heic_photos_of_a_turned_phone_are_upright(tmp_path: Path) -> None:
+    pytest.importorskip("pi_heif")
+    (tmp_path / "a.heic").write_bytes(turned_heic())
+    (photo,), unreadable = prepare_photos(tmp_path, tmp_path / "t", tmp_path / "t", lambda done, total: None)
+    assert not unreadable
+    assert photo.size == (48, 64)
+    assert photo.orientation == 1  # the decoder has turned it; nothing else may turn it again
+    image = np.asarray(Image.open(tmp_path / "t" / photo.prepared), int)
+    assert np.abs(image[54, 10] - [200, 40, 40]).max() < 20
+    assert np.abs(image[10, 10] - [40, 40, 200]).max() < 20
+
+
+def test_portrait_and_landscape_of_a_phone_are_cameras_of_their_own(tmp_path: Path) -> None:
+    """4:3, 16:9 and portrait, which EXIF turns: photos of one upright size share intrinsics."""
+    exif = Image.Exif()
+    exif[0x0110] = "Phone"
+    for i, (size, orientation) in enumerate((((64, 48), 1), ((64, 36), 1), ((64, 48), 6), ((48, 64), 1)) * 2):
+        exif[0x0112] = orientation
+        Image.new("RGB", size).save(tmp_path / f"{i}.jpg", exif=exif)
+    found, _ = prepare_photos(tmp_path, tmp_path / "t", tmp_path / "t", lambda done, total: None)
+    assert [photo.size for photo in found[:4]] == [(64, 48), (64, 36), (48, 64), (48, 64)]
+    groups = photos._request(tmp_path, found, PosesConfig())["cameras"]
+    assert sorted(len(group) for group in groups) == [2, 2, 4]
+
+
 def test_many_photos_and_videos_are_matched_in_sequence(tmp_path: Path) -> None:
     Image.new("RGB", (30, 20)).save(tmp_path / "a.png")
     found, _ = prepare_photos(tmp_path, tmp_path / "t", tmp_path / "t", lambda done, total: None)

@@ -66,7 +66,7 @@ def test_a_view_without_a_pixel_and_a_scene_without_one(tmp_path, scene):
     assert ValidPixels(tmp_path / "valid").rows(one, range(4)) == [1, 2, 3]
     with pytest.raises(LabelError, match="no pixel of any training photo counts"):
         write_valid(scene, tmp_path / "valid", label_ids=masks, ignore=[PERSON, TREE])
-    with pytest.raises(LabelError, match="ignore_dilation -1"):
+    with pytest.raises(LabelError, match=r"--labels\.ignore-dilation -1"):
         write_valid(scene, tmp_path / "valid", dilation=-1)
 
 

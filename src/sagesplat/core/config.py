@@ -166,6 +166,9 @@ class TrainConfig:
     poses: bool = False
     """Refine the camera poses of the training views with the Gaussians. Those of held-out views are fitted to
     their photos afterwards."""
+    outliers: bool = False
+    """Leave out what single photos show and the model does not, such as people that no mask names: found by
+    the residual, from 30 % of the steps on."""
     mcmc_noise: float = 5e5
     """SGLD noise of 3DGS-MCMC, times the learning rate of the means."""
     mcmc_opacity: float = 0.01

@@ -103,6 +103,11 @@ class RunDir:
         return self.path / "valid"
 
     @property
+    def inliers(self) -> Path:
+        """The same without the outliers of training photos, where training looked for them."""
+        return self.path / "inliers"
+
+    @property
     def capture(self) -> Path:
         """The folder of the capture that was made of photos without poses."""
         return self.path / "capture"

@@ -98,7 +98,7 @@ def write_valid(
         LabelError: For masks that cannot be used, or where no pixel of a training view is left.
     """
     if dilation < 0:
-        raise LabelError(f"ignore_dilation {dilation} is no number of pixels; give 0 or more")
+        raise LabelError(f"--labels.ignore-dilation {dilation} is no number of pixels; give 0 or more")
     shutil.rmtree(target, ignore_errors=True)
     given, transparent = _Given(scene), ignores_alpha(scene)
     shares = np.zeros(len(scene.views), np.float32)
@@ -112,8 +112,7 @@ def write_valid(
             if dilation:
                 valid = np.asarray(minimum_filter(valid, 2 * dilation + 1, mode="nearest"))
             shares[row] = 1 - valid.mean()
-            with atomic_path(mask_path(target, view), sync=False) as temporary:
-                Image.fromarray(valid).save(temporary, format="PNG")
+            write_view(target, view, valid)
         if on_view:
             on_view(row + 1, len(scene.views))
     if (shares[scene.train_ids] == 1).all():
@@ -122,6 +121,12 @@ def write_valid(
             "masks of the photos"
         )
     return shares
+
+
+def write_view(folder: Path, view: View, valid: Pixels) -> None:
+    """Write which pixels of a view count, as `ValidPixels` reads it."""
+    with atomic_path(mask_path(folder, view), sync=False) as temporary:
+        Image.fromarray(valid).save(temporary, format="PNG")
 
 
 class _Given:

@@ -18,6 +18,7 @@ from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
 from sagesplat.segment.display_names import titles
 from sagesplat.segment.masks import MAX_LABEL_ID
+from sagesplat.stages.outliers import write_inliers
 from sagesplat.stages.refine import write_cameras
 from sagesplat.stages.shared import valid_inputs
 from sagesplat.train import memory
@@ -74,6 +75,7 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
                     write_frozen(place.frozen, frozen)
                     lines = [f"{len(gaussians):,} Gaussians after {step} steps"]
                     lines += write_cameras(job, place, config, trained)
+                    lines += write_inliers(job, place, config, gaussians)
         if place != run:
             _swap(run, place)
         return lines
@@ -81,6 +83,7 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
     # with exposure auto it depends on the photos: what was refined once must be there
     refines = config.poses or config.exposure == "affine" or run.refined.exists()
     outputs = [run.levels, run.checkpoint, *([run.cameras, run.refined] if refines else [])]
+    outputs += [run.inliers] if config.outliers else []
     run_stage(job, "train", settings, inputs, outputs, make, swaps=True)
 
 
@@ -150,7 +153,8 @@ def _swap(run: RunDir, made: RunDir) -> None:
     remove_checkpoints(run.checkpoint)
     for earlier in (run.cameras, run.refined):
         earlier.unlink(missing_ok=True)
-    kinds = ("frozen", "cap", "cameras", "refined", "checkpoint")
+    shutil.rmtree(run.inliers, ignore_errors=True)
+    kinds = ("frozen", "cap", "cameras", "refined", "inliers", "checkpoint")
     for new, place in ((getattr(made, kind), getattr(run, kind)) for kind in kinds):
         if new.exists():
             new.replace(place)
