@@ -13,6 +13,7 @@ from sagesplat.kernels.jit import njit
 from sagesplat.raster.reference import rotation_matrices
 from sagesplat.raster.render import Render
 from sagesplat.train.schedule import Schedule
+from sagesplat.train.sky import Shell
 from sagesplat.train.state import TrainState
 
 _SPLIT_SHRINK = 1.6
@@ -74,10 +75,12 @@ def room(state: TrainState, most: int, trainable: Tensor) -> int:
     return given
 
 
-def refine(state: TrainState, config: TrainConfig, extent: float, room: int, trainable: Tensor) -> None:
+def refine(state: TrainState, config: TrainConfig, extent: float, room: int, trainable: Tensor, shell: Shell | None = None) -> None:
     """Clone small, split large Gaussians with high gradients; prune faint and, after a reset, huge ones."""
     g = state.gaussians
     size = g.log_scales.exp().amax(-1)
+    if shell:  # by their angle: as if the shell were as near as the scene is
+        size[shell.rows(g)] *= extent / shell.radius
     threshold = config.grow_absgrad if config.absgrad else config.grow_grad
     grows = (state.grad_sum / state.grad_count.clamp_min(1) > threshold) & trainable
     if int(grows.sum()) > room:

@@ -16,6 +16,7 @@ from sagesplat.train.early_stopping import trainable_rows
 from sagesplat.train.group import ALONE, Group
 from sagesplat.train.lr_schedule import LrSchedule
 from sagesplat.train.schedule import Schedule, scaled_schedule
+from sagesplat.train.sky import Shell
 from sagesplat.train.state import INITIAL_OPACITY, TrainState
 
 
@@ -52,6 +53,7 @@ class Densification(Strategy):
     schedule: Schedule
     rates: LrSchedule
     group: Group = ALONE
+    shell: Shell | None = None
 
     @classmethod
     def schedule_of(cls, config: TrainConfig) -> Schedule:
@@ -112,7 +114,7 @@ class DefaultStrategy(Densification):
         )
         self.group.add(state.grad_sum, state.grad_count)
         room = densify.room(state, budget, trainable)
-        densify.refine(state, self.config, self.scene.extent, room, trainable)
+        densify.refine(state, self.config, self.scene.extent, room, trainable, self.shell)
 
     def step_post(self, state: TrainState) -> bool:
         """Refine, then reset opacities; see `Strategy`."""
@@ -162,11 +164,11 @@ STRATEGIES: dict[str, type[Densification]] = {"default": DefaultStrategy, "mcmc"
 
 
 def make_strategy(
-    config: TrainConfig, scene: Scene, rates: LrSchedule, group: Group = ALONE
+    config: TrainConfig, scene: Scene, rates: LrSchedule, group: Group = ALONE, shell: Shell | None = None
 ) -> Densification:
     """The strategy that `config.strategy` names, for one training."""
     kind = STRATEGIES[config.strategy]
-    return kind(config, scene, kind.schedule_of(config), rates, group)
+    return kind(config, scene, kind.schedule_of(config), rates, group, shell)
 
 
 def schedule_of(config: TrainConfig) -> Schedule:

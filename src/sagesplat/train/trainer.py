@@ -25,6 +25,7 @@ from sagesplat.train.gradient_freezing import GradientFreezing
 from sagesplat.train.group import ALONE, Group
 from sagesplat.train.lr_schedule import LrSchedule, lr_schedule
 from sagesplat.train.photo_loader import PhotoLoader
+from sagesplat.train.sky import Shell
 from sagesplat.train.state import TrainState, from_points, initial_state
 from sagesplat.train.stepper import Stepper
 from sagesplat.train.strategy import Densification, make_strategy
@@ -46,6 +47,7 @@ def train(
     folder: Path | None = None,
     settings: str = "",
     group: Group = ALONE,
+    shell: Shell | None = None,
 ) -> Iterator[Event]:
     """Train 3D Gaussians on the training views of a scene: a generator of events.
 
@@ -88,7 +90,7 @@ def train(
     with named_failures(lambda: _where(training and training.state, folder)):
         training = begin(
             scene, photos, label_ids, config,
-            masks=masks, seed=seed, backend=backend, folder=folder, settings=settings, group=group,
+            masks=masks, seed=seed, backend=backend, folder=folder, settings=settings, group=group, shell=shell,
         )  # fmt: skip
         yield from training.run()
 
@@ -139,6 +141,7 @@ class Training:
     folder: Path | None  # None: this process writes nothing
     settings: str
     resumed: Resumed | None
+    shell: Shell | None = None
     loss: float = 0.0  # when it was last looked at
 
     def __post_init__(self) -> None:
@@ -164,6 +167,8 @@ class Training:
             self.state, self._sh_degree(step - 1), self.rates.learning_rates(step), self.active,
             self.rates.factor(step),
         )  # fmt: skip
+        if self.shell:
+            self.shell.hold(self.state.gaussians)
         on_cpu = not loss.is_cuda
         if on_cpu or self._records(step) or step % LOOK_EVERY == 0:  # reading it waits for a GPU
             self.loss = finite(loss, step)
@@ -241,6 +246,7 @@ def begin(
     folder: Path | None = None,
     settings: str = "",
     group: Group = ALONE,
+    shell: Shell | None = None,
 ) -> Training:
     """A training at its start, or at the checkpoint in `folder`; the arguments are those of `train`."""
     rows = scene.train_ids[:: max(1, len(scene.train_ids) // 8)]
@@ -248,7 +254,7 @@ def begin(
         config, scene.extent, [photos[i] for i in rows] if config.lr_schedule == "fast" else []
     )
     device = device_of(backend, group.rank)
-    strategy = make_strategy(config, scene, rates, group)
+    strategy = make_strategy(config, scene, rates, group, shell)
     g = from_points(
         scene.points, label_ids, config.sh_degree, strategy.initial_opacity, strategy.initial_scale
     )
@@ -267,7 +273,7 @@ def begin(
     stepper = Stepper(PhotoLoader(scene, photos, device), config, tiles, backend, group, strategy, freezing)
     measured = measured_views(scene, masks) if config.freeze_at is not None and masks is not None else {}
     folder = folder if group.leads else None
-    return Training(config, state, stepper, strategy, rates, measured, freezing, folder, settings, resumed)
+    return Training(config, state, stepper, strategy, rates, measured, freezing, folder, settings, resumed, shell)
 
 
 def _check_levels(checkpoint: Path, step: int) -> None:
