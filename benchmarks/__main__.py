@@ -22,6 +22,7 @@ from benchmarks import measure, plain, workloads
 from benchmarks import plans as planning
 from benchmarks import promises as promising
 from benchmarks import segment as overlays
+from benchmarks import wild as disturbed
 from benchmarks.gpu import base, script
 from sagesplat.core.config import TrainConfig
 from sagesplat.core.gaussians import PARAMETERS, Gaussians
@@ -42,7 +43,7 @@ OPENSPLAT_STEP_MS = 1830  # its CPU path (1.1.5) on garden at 512 px from 42,599
 app = tyro.extras.SubcommandApp()
 
 
-def _finish(name: str, result: dict, write: bool) -> None:  # type: ignore[type-arg]
+def _finish(name: str, result: dict, write: bool, folder: Path = RESULTS) -> None:  # type: ignore[type-arg]
     """Print the last line; with --write, keep it."""
 
     def short(value):  # type: ignore[no-untyped-def]
@@ -54,8 +55,8 @@ def _finish(name: str, result: dict, write: bool) -> None:  # type: ignore[type-
 
     line = json.dumps(short(result))
     if write:
-        RESULTS.mkdir(parents=True, exist_ok=True)
-        (RESULTS / f"{name}.json").write_text(line + "\n")
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / f"{name}.json").write_text(line + "\n")
     print(line)
 
 
@@ -67,6 +68,33 @@ def _photo(scene: Scene, row: int) -> torch.Tensor:
 def deeplab(steps: int = 160, views: int = 30, write: bool = False) -> None:
     """A small DeepLabV2 trained on the built-in garden: mIoU on views it has not seen."""
     _finish("deeplab", segmenting.measure(steps, views), write)
+
+
+@app.command
+def wild(
+    out: Path,
+    rows: tuple[str, ...] = (),
+    steps: int = 2000,
+    seed: int = 0,
+    threads: int = 0,
+    write: bool = False,
+) -> None:
+    """Disturbed captures with and without their remedies: test views, and the truth off the path.
+
+    Args:
+        out: folder for captures and runs; what is done is not done again.
+        rows: some of the rows, by name (default: all).
+        steps: of each training.
+        seed: of captures and trainings.
+        threads: 0: one per core.
+        write: keep the results in benchmarks/results/wild.json.
+    """
+    set_threads(threads)
+    unknown = [row for row in rows if row not in disturbed.ROWS]
+    if unknown:
+        raise SystemExit(f"wild: no row {unknown[0]!r}; choose from {', '.join(disturbed.ROWS)}")
+    found = disturbed.measure(out, rows or tuple(disturbed.ROWS), steps, seed, print)
+    _finish("wild", {"steps": steps, "seed": seed, "rows": found}, write, RESULTS.parent)
 
 
 @app.command
@@ -143,6 +171,25 @@ def garden(
     for name, value in result.items():
         print(f"{name:32} {value:,.4g}" if isinstance(value, float) else f"{name:32} {value}")
     _finish(f"{capture.name}_{camera.width}_{steps}", result, write)
+
+
+@app.command
+def refine(
+    scene: Path = workloads.GARDEN, downscale: int = 1, threads: int = 1, steps: int = 60, write: bool = False
+) -> None:
+    """What refining the cameras adds to a training step: settings take turns, one step each."""
+    used = set_threads(threads)
+    capture = load_scene(scene, downscale=downscale)
+    plain = TrainConfig(max_steps=2 * steps, level_every=2 * steps, lr_schedule="published", exposure="off")
+    settings = {"poses": replace(plain, poses=True), "exposure": replace(plain, exposure="affine")}
+    times = measure.steps_side_by_side(capture, {"plain": plain, **settings}, steps)
+    camera = capture.views[0].camera
+    result = {"scene": capture.name, "size": [camera.width, camera.height], "threads": used}
+    result |= {"gaussians": len(capture.points.xyz), **{f"{name}_ms": ms for name, ms in times.items()}}
+    result |= {f"{name}_ratio": ms / times["plain"] for name, ms in times.items() if name != "plain"}
+    for name, value in result.items():
+        print(f"{name:32} {value}")
+    _finish(f"refine_{capture.name}_{camera.width}", result, write)
 
 
 @app.command

@@ -2,7 +2,7 @@
 
 import resource
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -17,8 +17,11 @@ from sagesplat.core.sh import num_bases
 from sagesplat.kernels.simd import fma, splat16, total
 from sagesplat.metrics.image import photometric_loss
 from sagesplat.raster import Workspace, blend, cpu, rasterize
-from sagesplat.scene.scene import Camera
+from sagesplat.scene.images import Photos
+from sagesplat.scene.scene import Camera, Scene
+from sagesplat.train.events import Step
 from sagesplat.train.optim import adam_step
+from sagesplat.train.trainer import train
 
 # operations that the blending loops cost per pixel and Gaussian (docs/performance.md)
 FORWARD_OPERATIONS, BACKWARD_OPERATIONS = 34, 75
@@ -140,6 +143,19 @@ def parts(g: Gaussians, camera: Camera, photo: torch.Tensor, degree: int, repeat
         ),
         "adam_ms": milliseconds(adam, repeats),
     }
+
+
+def steps_side_by_side(scene: Scene, configs: Mapping[str, TrainConfig], count: int) -> dict[str, float]:
+    """Median milliseconds of a training step with each of several settings, which take turns: second half."""
+    labels, photos = np.full(len(scene.points.xyz), -1, np.int16), Photos(scene.views)
+    runs = {name: train(scene, photos, labels, config) for name, config in configs.items()}
+    times: dict[str, list[float]] = {name: [] for name in runs}
+    for _ in range(count):
+        for name, run in runs.items():
+            begin = time.perf_counter()
+            next(event for event in run if isinstance(event, Step))
+            times[name].append(1e3 * (time.perf_counter() - begin))
+    return {name: float(np.median(found[count // 2 :])) for name, found in times.items()}
 
 
 def peak_mib() -> float:

@@ -84,6 +84,7 @@ def render_with_gradients(
     *,
     features: Tensor | None = None,
     pixels: Tensor | None = None,
+    pose: bool = False,
     **options: Any,
 ) -> tuple[Render, dict[str, Tensor]]:
     """A render and the gradients of a fixed random weighting of its outputs (of `pixels` [H, W] only)."""
@@ -91,6 +92,8 @@ def render_with_gradients(
     if features is not None:
         features = features.clone().requires_grad_()
         leaves["features"] = features
+    if pose:
+        leaves["pose"] = options["pose"] = torch.zeros(6, device=g.means.device, requires_grad=True)
     moving = replace(g, **{name: leaves[name] for name in PARAMETERS})
     render = rasterize(moving, camera, features=features, backend=backend, **options)
     generator = torch.Generator().manual_seed(9)

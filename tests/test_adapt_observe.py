@@ -15,7 +15,7 @@ from sagesplat.adapt.observe import (
     widest_lens,
     within_lens,
 )
-from sagesplat.metrics.image import ssim_map
+from sagesplat.metrics.image import psnr, squared_error_map, ssim_map
 
 
 def test_distances_are_the_percentile_of_the_points_in_sight(tmp_path):
@@ -81,3 +81,20 @@ def test_measure_takes_means_of_the_map_over_each_mask():
     assert rows[-1]["psnr"] == pytest.approx(-10 * np.log10(error), abs=1e-3)
     assert rows[TOTAL]["num_pixels"] == 2000
     assert measure(as_unit(photo), as_unit(photo), label_ids)[TOTAL]["psnr"] == pytest.approx(100)
+
+
+def test_pixels_that_do_not_count_are_in_no_mean():
+    rng = np.random.default_rng(3)
+    image, photo = rng.random((2, 30, 40, 3)).astype(np.float32)
+    label_ids = np.where(np.arange(40) < 20, 3, 7)[None].repeat(30, 0).astype(np.int16)
+    valid = np.ones((30, 40), bool)
+    valid[:, 25:] = False
+    rows = measure(image, photo, label_ids, valid=valid)
+    noise = np.where(valid[..., None], photo, 0.5).astype(np.float32)
+    assert measure(image, noise, label_ids, valid=valid) == rows
+    assert {label: of["num_pixels"] for label, of in rows.items()} == {3: 600, 7: 150, TOTAL: 750}
+    errors = squared_error_map(image, photo)
+    assert rows[TOTAL]["psnr"] == pytest.approx(float(psnr(errors[valid].mean())))
+    assert rows[7]["psnr"] == pytest.approx(float(psnr(errors[:, 20:25].mean())))
+    assert rows[3]["ssim"] == pytest.approx(measure(image, photo, label_ids)[3]["ssim"])
+    assert np.isnan(measure(image, photo, label_ids, valid=np.zeros_like(valid))[TOTAL]["psnr"])

@@ -230,7 +230,7 @@ def test_demo_takes_its_folder_with_and_without_the_flag(
     from sagesplat.stages import pipeline
 
     seen = []
-    monkeypatch.setattr(pipeline, "run_demo", lambda job, places: seen.append(job.run.path.name))
+    monkeypatch.setattr(pipeline, "run_demo", lambda job, places, wild: seen.append(job.run.path.name))
     for words in ([], ["x"], ["--run", "y"], ["--run=z"]):
         assert call(monkeypatch, capsys, "demo", *words)[0] == 0
     assert seen == ["demo", "x", "y", "z"]

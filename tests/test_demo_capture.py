@@ -125,8 +125,9 @@ def test_refusals(tmp_path):
 def test_cache_is_made_once(tmp_path, monkeypatch):
     calls = []
 
-    def fake(folder, places, on_view=None):
+    def fake(folder, places, wild, on_view=None):
         assert places == (1, 1)
+        assert wild.quiet
         calls.append(folder)
         folder.mkdir(parents=True)
 

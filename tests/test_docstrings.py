@@ -13,7 +13,8 @@ import sagesplat
 # modules whose examples run here; those that need a capture or a run are marked +SKIP
 MODULES = (
     "adapt.allocate", "adapt.fill", "adapt.observe", "adapt.photo_models", "adapt.plan", "adapt.viewpoint",
-    "formats.levels", "formats.ply", "formats.splats", "formats.spz", "metrics.image", "raster", "scene",
+    "formats.levels", "formats.ply", "formats.splats", "formats.spz", "metrics.color_correct",
+    "metrics.image", "raster", "scene",
     "segment.masks", "stages.api", "train.trainer",
 )  # fmt: skip
 CALLED_BY_MANY = (

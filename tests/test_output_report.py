@@ -34,7 +34,8 @@ def quality(label: int, level: int, view: int) -> float:
 
 def columns(kind, rows: list[tuple]):
     types = [np.dtype(f.type.dtypes[0]) for f in dataclasses.fields(kind)]  # pyright: ignore
-    return kind(*(np.array([row[i] for row in rows], t) for i, t in enumerate(types)))
+    missing = (0.75,) * (len(types) - len(rows[0]))  # without the photo's exposure, and colour-corrected
+    return kind(*(np.array([(*row, *missing)[i] for row in rows], t) for i, t in enumerate(types)))
 
 
 def make(panels: int = 2) -> ReportData:
@@ -128,6 +129,15 @@ def test_every_category_is_on_it(written):
     assert "<b>&amp;amp; _odd" not in path.read_text("utf-8")  # escaped, not markup
     assert "a <scene>" in page.text
     assert "nan" not in page.text.lower().split()
+
+
+def test_exposures_of_the_photos_are_said(tmp_path):
+    data = make()
+    assert "cc_psnr" not in write_report(tmp_path / "a", data).read_text("utf-8").split("<h2>")[0]
+    page = write_report(tmp_path / "b", dataclasses.replace(data, exposed=True)).read_text("utf-8")
+    said = page.split("<h2>")[0]
+    assert "The photos differ in exposure" in said
+    assert "cc_ssim 0.750 and cc_psnr 0.75 dB" in said
 
 
 def test_headline_is_computed_from_unseen_views(written):

@@ -61,8 +61,10 @@ def assert_agree(
 def test_agrees_with_the_oracle(degree, antialiased, backend):
     g = random_gaussians(80, seed=degree, degree=degree)
     background = torch.tensor([0.2, 0.3, 0.4])
-    _, grads = assert_agree(g, pinhole(50, 38), backend, background=background, antialiased=antialiased)
-    for name in ("means", "quats", "log_scales", "logit_opacities", "sh0", "means2d"):
+    _, grads = assert_agree(
+        g, pinhole(50, 38), backend, background=background, antialiased=antialiased, pose=True
+    )
+    for name in ("means", "quats", "log_scales", "logit_opacities", "sh0", "means2d", "pose"):
         assert grads[name].abs().max() > 1e-3, name  # something was compared
 
 
@@ -102,7 +104,7 @@ def test_a_jacobian_clamped_outside_the_image(backend):
     g = random_gaussians(80, seed=3, degree=1, log_scale=-1.0)
     g.means[:, 0] *= 6  # most centres lie outside
     g.means[:, 2] = g.means[:, 2].clamp_min(1.0)
-    render, _ = assert_agree(g, pinhole(60, 40), backend)
+    render, _ = assert_agree(g, pinhole(60, 40), backend, pose=True)
     clamped = ((render.means2d[:, 0].cpu() - 30).abs() > 1.3 * 30) & (render.radii > 0)
     assert clamped.sum() > 3
 
@@ -129,6 +131,24 @@ def test_same_bits_twice_and_with_any_number_of_threads():
         assert torch.equal(render.alpha, first.alpha)
         assert torch.equal(render.features, first.features)
         assert all(torch.equal(grads[name], first_grads[name]) for name in first_grads)
+
+
+@pytest.mark.parametrize("count", [3, 8, 13])
+def test_the_gradient_of_the_pose_of_few_gaussians(count, backend):
+    _, grads = assert_agree(random_gaussians(count, seed=5, logit=2.0), pinhole(), backend, pose=True)
+    assert (grads["pose"] != 0).all()
+
+
+def test_the_pose_changes_no_other_gradient():
+    g, trainable = random_gaussians(300, seed=8), torch.arange(300) % 4 > 0
+    with_pose, without = (
+        render_with_gradients(g, pinhole(), pose=pose, trainable=trainable)[1] for pose in (True, False)
+    )
+    moved = with_pose.pop("pose")
+    for name, grad in without.items():
+        assert torch.equal(with_pose[name], grad), name
+    everything = render_with_gradients(g, pinhole(), pose=True)[1]["pose"]
+    assert torch.equal(moved, everything)  # Gaussians that are not trainable show where the camera is, too
 
 
 def test_the_order_of_the_rows_does_not_matter():

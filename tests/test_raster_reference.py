@@ -86,17 +86,19 @@ def test_gradients_against_central_differences(antialiased):
     leaves[4] = leaves[4] * 0.3
     features = torch.rand(3, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
 
-    def images(features: Tensor, *parameters: Tensor) -> Tensor:
+    def images(features: Tensor, pose: Tensor, *parameters: Tensor) -> Tensor:
         moved = Gaussians(*parameters, label_ids=g.label_ids)
-        render = rasterize(moved, camera, features=features, antialiased=antialiased, backend="reference")
+        options = {"features": features, "antialiased": antialiased, "pose": pose}
+        render = rasterize(moved, camera, backend="reference", **options)
         assert render.features is not None
         return torch.cat([render.rgb, render.alpha[..., None], render.features], -1)
 
-    drawn = images(features, *leaves)
+    pose = torch.zeros(6, dtype=torch.float64)
+    drawn = images(features, pose, *leaves)
     assert drawn[..., :3].min() > 0.01
     assert drawn[..., 3].min() > 0.2
     assert drawn[..., 3].max() < 0.99
-    inputs = [leaf.requires_grad_() for leaf in (features, *leaves)]
+    inputs = [leaf.requires_grad_() for leaf in (features, pose, *leaves)]
     # fast mode takes a random direction in each input at once; a wrong entry anywhere shows
     assert torch.autograd.gradcheck(images, inputs, eps=1e-5, atol=1e-7, rtol=1e-5, fast_mode=True)
 

@@ -161,7 +161,7 @@ class Watch:
         self._check(one, mine, read)
         if not self.at_work:
             others = [set()]  # of the next one: it reads before it is a stage
-            for name in ("scene", "photos", "masks", "snapshots", "ladder", "antialiased"):
+            for name in ("given_scene", "_refined", "photos", "masks", "snapshots", "ladder", "antialiased"):
                 vars(job).pop(name, None)  # else only the first stage would read them
         _reading.extend(others)
 
@@ -196,10 +196,14 @@ class Watch:
 @pytest.mark.parametrize(
     "changes",
     [
-        {"fuse": True, "plan": PlanConfig(target_ssim=0.4, tune_steps=2, budget=1e4)},
-        {"ladder": "snapshots", "train": replace(CONFIG.train, freeze_at=0.5)},
+        {
+            "fuse": True,
+            "plan": PlanConfig(target_ssim=0.4, tune_steps=2, budget=1e4),
+            "train": replace(CONFIG.train, poses=True),
+        },
+        {"ladder": "snapshots", "train": replace(CONFIG.train, freeze_at=0.5, poses=True)},
         {"fuse": True, "blocks": BLOCKS, "train": replace(CONFIG.train, freeze_at=0.5)},
-        {"fit": FitConfig(masks="rendered")},
+        {"fit": FitConfig(masks="rendered"), "train": replace(CONFIG.train, poses=True)},
     ],
     ids=["nested", "snapshots", "blocks", "rendered"],
 )

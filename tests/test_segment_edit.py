@@ -180,7 +180,8 @@ def test_a_folder_is_merged_kept_and_folded_in_this_order(tmp_path: Path) -> Non
     ]
     assert heard == [(1, 4), (2, 4), (3, 4), (4, 4)]
     assert edited.record == {
-        "merge": {"vase": "potted plant"}, "keep": ["potted plant", "tree-merged"], "min_share": 5 / 16,
+        "merge": {"vase": "potted plant"}, "keep": ["potted plant", "tree-merged"], "ignore": [],
+        "min_share": 5 / 16,
         "shares": {"tree-merged": 6 / 16}, "dropped": {"car": 3 / 16}, "folded": {"potted plant": 4 / 16},
     }  # fmt: skip
     assert json.loads(json.dumps(edited.record)) == edited.record

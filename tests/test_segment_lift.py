@@ -5,12 +5,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
 from sagesplat.core.errors import LabelError
 from sagesplat.scene import load_scene
 from sagesplat.scene.scene import Camera, Points, Scene, View
-from sagesplat.segment.lift import LiftedLabels, agreement_in, lift
+from sagesplat.segment.lift import IGNORED, LiftedLabels, agreement_in, lift
 from sagesplat.segment.masks import Masks, Taxonomy, mask_path, write_mask
+from sagesplat.segment.valid import ValidPixels
 
 SCENES = Path(__file__).resolve().parents[2] / "shared" / "scenes"
 CAR, TREE, WALL = 3, 184, 199
@@ -112,12 +114,34 @@ def test_against_a_loop(tmp_path_factory, seed):
         assert (lifted.num_votes[p], lifted.num_agreeing[p]) == (sum(votes.values()), votes[best])
 
 
+def test_points_on_pixels_that_do_not_count_are_ignored(tmp_path):
+    """A point that most of its pixels show on what is ignored; a tie, or no pixel at all, is no reason."""
+    images = [[[CAR] * 4] * 2, [[CAR] * 4] * 2]
+    at, left = [(0.5, 0.5), (3.5, 0.5)], np.array([[True, True, True, False]] * 2)
+    observations = [(0, 0, at[1]), (1, 0, at[1]), (1, 1, at[1]), (2, 0, at[0]), (2, 1, at[1])]
+    scene = scene_of(np.zeros((4, 3)), [camera_at(), camera_at()], observations)
+    masks = masks_of(tmp_path / "masks", scene, images)
+    assert lift(scene, masks).ignored is None
+    path = mask_path(tmp_path / "valid", scene.views[0])
+    path.parent.mkdir()
+    Image.fromarray(left).save(path)
+    lifted = lift(scene, masks, valid=ValidPixels(tmp_path / "valid"))
+    assert lifted.ignored is not None
+    assert lifted.ignored.tolist() == [True, False, False, False]
+    assert lifted.initial_ids.tolist() == [IGNORED, CAR, CAR, -1]
+    lifted.write(tmp_path / "labels.npz")
+    again = LiftedLabels.read(tmp_path / "labels.npz", 4).select(np.array([0, 3]))
+    assert again.initial_ids.tolist() == [IGNORED, -1]
+
+
 def test_labels_npz(tmp_path):
     path = tmp_path / "labels.npz"
     labels = LiftedLabels(np.array([3, -1], np.int16), np.array([4, 0], np.int32), np.array([3, 0], np.int32))
     labels.write(path)
     again = LiftedLabels.read(path, 2)
-    for name, column in vars(labels).items():
+    assert again.ignored is None
+    for name in ("label_ids", "num_votes", "num_agreeing"):
+        column = getattr(labels, name)
         np.testing.assert_array_equal(getattr(again, name), column)
         assert getattr(again, name).dtype == column.dtype
     with pytest.raises(LabelError, match=r"\(2,\)\} where the scene has 3 points"):

@@ -177,7 +177,7 @@ def test_impossible_numbers_of_blocks(count: int) -> None:
 )
 def test_impossible_settings(config: BlocksConfig, named: str) -> None:
     with pytest.raises(RunError, match=rf"--blocks\.{named} is impossible; choose"):
-        check(config)
+        check(config, TrainConfig())
 
 
 def test_partition_reads_back(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from sagesplat.core.config import LabelsConfig, LiftConfig, MasksConfig, PosesConfig, SceneConfig, TrainConfig
 from sagesplat.core.errors import LabelError, RunError
@@ -16,7 +17,8 @@ from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.scene import photos as photos_module
 from sagesplat.segment import hf
-from sagesplat.segment.masks import Taxonomy
+from sagesplat.segment.lift import IGNORED
+from sagesplat.segment.masks import Taxonomy, mask_path
 from sagesplat.segment.segmenters import Segmented
 from sagesplat.stages.label import _soft, fuse_masks, lift_labels, make_masks
 from sagesplat.stages.scene import open_scene
@@ -163,3 +165,61 @@ def test_given_label_images_have_no_networks_probabilities(capture: Path, tmp_pa
     job.run.soft.mkdir()
     make_masks(job, MasksConfig())
     assert not job.run.soft.exists()
+
+
+def valid_in(job: Job) -> list[np.ndarray | None]:
+    return [job.valid[view] for view in job.scene.views]
+
+
+def test_ignored_categories_have_no_pixel_no_vote_and_no_gaussian(capture: Path, tmp_path: Path) -> None:
+    job, events = begun(tmp_path / "run", capture)
+    make_masks(job, MasksConfig())
+    lift_labels(job, LiftConfig())
+    with_all, tree = job.initial_labels, next(i for i, n in job.taxonomy.names.items() if n == "tree-merged")
+    trees = [job.masks[view] == tree for view in job.scene.views]
+    shutil.rmtree(tmp_path / "run")
+
+    job, events = begun(tmp_path / "run", capture)
+    make_masks(job, MasksConfig(), LabelsConfig(ignore="tree-merged,person", ignore_dilation=0))
+    assert [str(e.text) for e in events if isinstance(e, Warned)] == ["ignore: no photo shows person"]
+    assert "tree-merged" not in job.taxonomy.names.values()
+    for pixels, valid, view in zip(trees, valid_in(job), job.scene.views, strict=True):
+        np.testing.assert_array_equal(pixels, np.zeros_like(pixels) if valid is None else ~valid)
+        assert (job.masks[view][pixels] == -1).all()
+    lift_labels(job, LiftConfig())
+    assert (job.initial_labels[with_all == tree] == IGNORED).mean() > 0.9
+    assert (job.initial_labels == IGNORED).sum() > 10
+    assert job.point_labels.min() == -1
+    train_levels(job, TrainConfig(max_steps=3, level_every=3), 0)
+    assert job.snapshots.size(3) == (job.initial_labels != IGNORED).sum()
+
+    for wrong, message in (
+        (LabelsConfig(ignore="dgo"), "no category 'dgo'"),
+        (LabelsConfig(ignore="a,,b"), "a name is empty"),
+        (LabelsConfig(ignore="tree-merged", keep="tree-merged"), "keep: no category 'tree-merged'"),
+    ):
+        again, _ = begun(tmp_path / "run", capture, force=True)
+        with pytest.raises(LabelError, match=message):
+            make_masks(again, MasksConfig(), wrong)
+
+
+def test_masks_of_a_capture_are_found_and_photos_without_a_pixel_are_named(
+    capture: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(capture, tmp_path / "capture")
+    job, _ = begun(tmp_path / "run", tmp_path / "capture")
+    folder, first, second = tmp_path / "capture" / "masks_valid", *job.scene.views[1:3]
+    folder.mkdir()
+    Image.new("1", (64, 48)).save(mask_path(folder, first))
+    half = Image.new("L", (64, 48))
+    half.paste(255, (0, 0, 32, 48))
+    half.save(mask_path(folder, second))
+    job, events = begun(tmp_path / "run", tmp_path / "capture")
+    make_masks(job, MasksConfig(), LabelsConfig(ignore_dilation=0))
+    texts = [e.text for e in events if isinstance(e, Warned)]
+    assert texts == [f"1 of 8 photos have no pixel that counts: {first.name}"]
+    assert job.valid.rows(job.scene, range(8)) == [0, *range(2, 8)]
+    make_masks(job, MasksConfig(), LabelsConfig(ignore_dilation=0))  # done already
+    half.rotate(180).save(mask_path(folder, second))
+    with pytest.raises(RunError, match="made with other valid"):
+        make_masks(job, MasksConfig(), LabelsConfig(ignore_dilation=0))

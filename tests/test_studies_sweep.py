@@ -174,6 +174,7 @@ def test_a_shared_training_is_there_as_a_whole_or_not_at_all(copy: Path, monkeyp
     cells = read_sweep(write(copy, text))
     like, new = cells[0], cells[-1]
     runs, times = copy / "out" / "runs", 0
+    RunDir(runs / like.name).cameras.write_bytes(b"refined")
 
     def fails(path: Path, target: Path) -> None:
         nonlocal times
@@ -188,6 +189,7 @@ def test_a_shared_training_is_there_as_a_whole_or_not_at_all(copy: Path, monkeyp
     assert not (runs / new.name).exists()
     _share_training(runs, like, new)
     assert RunDir(runs / new.name).provenance("train").exists()
+    assert RunDir(runs / new.name).cameras.read_bytes() == b"refined"
 
 
 def test_blocks_are_trained_by_each_cell(tmp_path: Path) -> None:

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import PARAMETERS
-from sagesplat.train.checkpoint import read_checkpoint, write_checkpoint
+from sagesplat.train.checkpoint import _checksum, read_checkpoint, write_checkpoint
 from sagesplat.train.state import TrainState, initial_state
+from sagesplat.train.view_parameters import ViewParameters
 
 
 def some_state() -> TrainState:
@@ -27,6 +28,8 @@ def some_state() -> TrainState:
     state.grad_count += 3
     state.rng.standard_normal(5)
     state.queue, state.step, state.last_reset = [4, 1, 7], 1200, 1000
+    state.per_view = {"pose": ViewParameters.zeros(8, 6), "exposure": ViewParameters.zeros(8, 12)}
+    state.per_view["pose"].adam_step([3], torch.rand(1, 6, generator=generator), 0.1)
     return state
 
 
@@ -50,6 +53,10 @@ def test_round_trip_is_identical(tmp_path):
         assert torch.equal(back.exp_avg_sq[name], state.exp_avg_sq[name])
     assert torch.equal(back.grad_sum, state.grad_sum)
     assert torch.equal(back.grad_count, state.grad_count)
+    assert list(back.per_view) == ["exposure", "pose"]
+    for kind, parameters in state.per_view.items():
+        for name, tensor in vars(parameters).items():
+            assert torch.equal(getattr(back.per_view[kind], name), tensor)
     assert (back.queue, back.step, back.last_reset) == ([4, 1, 7], 1200, 1000)
     assert back.rng.integers(0, 2**60) == state.rng.integers(0, 2**60)  # the same random future
     assert [p.name for p in path.parent.iterdir()] == [path.name]
@@ -114,3 +121,19 @@ def test_damage_is_one_line_or_harmless(tmp_path, data):
         assert all(torch.isfinite(p).all() for p in state.gaussians.parameters().values())
     assert str(path) in message
     assert "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("name", "array"),
+    [("values", np.zeros((8, 5), np.float32)), ("counts", np.full(8, -1)), ("counts", np.zeros(7, np.int64))],
+)
+def test_parameters_of_views_that_do_not_fit_are_refused(tmp_path, name, array):
+    path = tmp_path / "checkpoint.npz"
+    write_checkpoint(path, some_state(), "a")
+    with np.load(path) as file:
+        content = {n: file[n] for n in file.files if n != "meta"} | {f"view/pose/{name}": array}
+        meta = json.loads(str(file["meta"]))
+    meta["crc32"] = _checksum(meta, content)
+    change(path, **{f"view/pose/{name}": array}, meta=np.array(json.dumps(meta)))
+    with pytest.raises(RunError, match="not a whole checkpoint"):
+        read_checkpoint(path, "a")

@@ -27,7 +27,8 @@ def run(events):
 
 
 @pytest.mark.parametrize(
-    "config", [SHORT, replace(SHORT, freeze_at=0.45), replace(SHORT, strategy="mcmc", batch=4)]
+    "config",
+    [replace(SHORT, poses=True), replace(SHORT, freeze_at=0.45), replace(SHORT, strategy="mcmc", batch=4)],
 )
 def test_two_processes_do_what_one_does_with_twice_the_batch(capture, tmp_path, config):  # noqa: F811
     scene, photos, masks, labels = capture
@@ -44,6 +45,11 @@ def test_two_processes_do_what_one_does_with_twice_the_batch(capture, tmp_path, 
         a, b = getattr(one.gaussians, name), getattr(two.gaussians, name)
         # sums in another order: rounding, which Adam magnifies where gradients are tiny
         assert float((a - b).abs().mean()) < 1e-3 * float(a.std()), name
+    if config.poses:
+        a, b = (end.per_view["pose"] for end in (one, two))
+        assert a.counts.tolist() == b.counts.tolist()
+        assert float((a.values - b.values).abs().max()) < 1e-2 * float(a.values.abs().max())
+        assert float(a.values.abs().max()) > 0
     losses = [[e.loss for e in run if isinstance(e, Step)] for run in (events, together)]
     np.testing.assert_allclose(*losses, rtol=1e-2 if drawn else 2e-3)
     assert len([e for e in together if isinstance(e, LevelSaved) and e.path]) == 40 // 10

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import random_gaussians, write_capture
+from PIL import Image
 
 from sagesplat.core.config import TrainConfig
 from sagesplat.core.errors import OutOfMemory, RunError
@@ -17,8 +18,12 @@ from sagesplat.formats.levels import read_header, read_level
 from sagesplat.raster import rasterize
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
+from sagesplat.segment.lift import IGNORED
+from sagesplat.segment.masks import mask_path
+from sagesplat.segment.valid import ValidPixels
 from sagesplat.train import stepper, trainer
 from sagesplat.train.events import Event, LevelSaved, Resumed, Step, Trained
+from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.state import from_points, initial_state
 from sagesplat.train.trainer import train
 
@@ -282,3 +287,52 @@ def test_gsplats_translation_trains_like_the_cpu(scene, monkeypatch):
         monkeypatch.setattr(module, "device_of", lambda *_: torch.device("cpu"))
     actual = [e.loss for e in run(scene, config, backend="cuda") if isinstance(e, Step)]
     np.testing.assert_allclose(actual, expected, rtol=1e-3)
+
+
+class Painted(Photos):
+    """Photos with noise below a mask."""
+
+    def __init__(self, scene: Scene, valid: ValidPixels):
+        super().__init__(scene.views)
+        self.valid, self.rng = valid, np.random.default_rng(0)
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        photo, valid = super().__getitem__(index), self.valid[self.views[index]]
+        if valid is None:
+            return photo
+        return np.where(valid[..., None], photo, self.rng.integers(0, 256, photo.shape, np.uint8))
+
+
+def test_nothing_is_learnt_from_pixels_that_do_not_count(scene, tmp_path):
+    """Not a bit depends on what photos show there; a view of nothing else is never drawn."""
+    for row, view in enumerate(scene.views):
+        valid = np.ones((view.camera.height, view.camera.width), bool)
+        valid[4:20, 9:30] = row % 2
+        valid &= row != 3
+        Image.fromarray(valid).save(mask_path(tmp_path, view))
+    valid = ValidPixels(tmp_path)
+    config = replace(BUSY, max_steps=40, batch=2)
+    plain, painted = (
+        final(list(train(scene, photos, LABEL_IDS, config, valid=valid)))
+        for photos in (Photos(scene.views), Painted(scene, valid))
+    )
+    assert_identical(plain, painted)
+    loader = PhotoLoader(scene, Photos(scene.views), torch.device("cpu"), valid)
+    assert loader.rows.tolist() == [1, 2, 4, 5, 6, 7]
+    half = loader.valid(2, 2)
+    assert half is not None
+    assert half.shape == (16, 24)
+    assert not half[2:10, 4:15].any()
+    assert half[:2].all()
+    assert half[10:].all()
+    assert half[:, :4].all()
+    assert half[:, 15:].all()
+
+
+def test_no_gaussian_begins_at_an_ignored_point(scene):
+    labels = LABEL_IDS.copy()
+    labels[:9] = IGNORED
+    g = from_points(scene.points, labels, 1)
+    assert len(g) == 51
+    assert (g.label_ids.numpy() == LABEL_IDS[9:]).all()
+    np.testing.assert_array_equal(g.means.numpy(), scene.points.xyz[9:])

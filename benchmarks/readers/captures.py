@@ -17,6 +17,7 @@ from sagesplat.io.pictures import PictureError
 from sagesplat.scene import _prepare, photos, video
 from sagesplat.scene.colmap import load_colmap
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage, write_model
+from sagesplat.scene.exif import exposure_of
 from sagesplat.scene.images import has_alpha, load_photo, photo_size
 from sagesplat.scene.nerfstudio import load_transforms
 from sagesplat.scene.points import read_points
@@ -104,6 +105,7 @@ def _photos(folder: Path, size: int) -> list[bytes]:
 def _read_photo(path: Path) -> None:
     photo_size(path)
     has_alpha(path)
+    exposure_of(path)
     load_photo(View("a", CAMERA, path))
 
 

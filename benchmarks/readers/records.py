@@ -29,11 +29,14 @@ from sagesplat.run.stage import Stage, _follows
 from sagesplat.scene import load_scene
 from sagesplat.scene.blocks import Blocks, read_blocks, read_division, write_blocks
 from sagesplat.scene.cameras import read_camera_file
+from sagesplat.scene.refined import RefinedCameras, read_refined, write_refined
 from sagesplat.scene.scene import Camera
 from sagesplat.segment import segmenters
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.stages import bundle, label, view
 from sagesplat.stages.boundaries import _seconds
+from sagesplat.stages.refine import read_pose_figures
+from sagesplat.stages.refine_exposure import read_exposure_figures
 from sagesplat.stages.train import _fit_memory, read_frozen
 from sagesplat.studies.compare.report import OfLabel, Point, Walk, read_comparison, write_comparison
 from sagesplat.studies.measure.levels import levels_of
@@ -69,6 +72,30 @@ def _ignore(event: Event) -> None:
 
 def _json(folder: Path, size: int) -> list[bytes]:
     return as_json({"a": [1, "x", None, 1.5] * size}, [[], {}])
+
+
+def _refined(folder: Path, size: int) -> list[bytes]:
+    w2c, exposure = (np.tile(np.eye(n, 4, dtype=np.float32), (3 * size, 1, 1)) for n in (4, 3))
+    cameras = RefinedCameras(w2c, exposure, np.zeros(len(w2c), bool))
+    (folder / "views").write_text(str(len(w2c)))
+    return [written(folder / "c.npz", lambda path: write_refined(path, cameras))]
+
+
+def _read_refined(path: Path) -> None:
+    read_refined(path, int(path.with_name("views").read_text()))
+
+
+def _figures(folder: Path, size: int) -> list[bytes]:
+    numbers = {"pixels": 0.3, "degrees": 0.1, "shift": 0.01, "diverged": 1, "fitted": 2, "held_out": 3}
+    entry = numbers | {"psnr": [20.5, 24.0], "ssim": None}
+    measured = dict.fromkeys(("plain", "exposed", "cc"), 20.5)
+    exposure = {"range_ev": 1.4, "psnr": measured, "ssim": None}
+    return as_json({"poses": entry, "exposure": exposure} | {f"note{i}": i for i in range(size - 1)})
+
+
+def _read_figures(path: Path) -> None:
+    read_pose_figures(path)
+    read_exposure_figures(path)
 
 
 def _models(folder: Path, size: int) -> list[bytes]:
@@ -184,7 +211,7 @@ def _capture(folder: Path) -> dict[str, Any]:
     frames = [{"file_path": f"images/{name}", "transform_matrix": pose} for name in PHOTOS]
     shared = {"w": 16, "h": 12, "fl_x": 14.0, "ply_file_path": "points.ply", "frames": frames}
     (capture / "transforms.json").write_text(json.dumps(shared))
-    settings = {"downscale": 1, "test_every": 8}
+    settings: dict[str, Any] = {"downscale": 1, "test_every": 8}
     scene = load_scene(capture, **settings)
     photos = photo_hashes(folder / "none.json", scene).sha256
     return {"path": str(capture), "settings": settings, "fingerprint": fingerprint(scene), "photos": photos}
@@ -339,6 +366,8 @@ READERS = (
     Reader("bundle-levels", ".json", _bundled, file("manifest.json", lambda p: levels_of(p.parent)), 100),
     Reader("camera-files", ".json", _camera_files, file("c.json", read_camera_file), 100),
     Reader("cameras", ".json", _cameras, file("path.json", _read_cameras), 100),
+    Reader("refined", ".npz", _refined, file("cameras.npz", _read_refined), 1000),
+    Reader("refined-figures", ".json", _figures, file("refined.json", _read_figures), 3000),
     Reader("sampled", ".npz", _sampled, file("fidelity.npz", fidelity.read_sampled), 1000),
     Reader("plans", ".json", _plans, file("plan.json", _read_plans), 100),
     Reader("observations", ".csv", _table(Observations), file("o.csv", read_observations), 1000),

@@ -21,6 +21,7 @@ from sagesplat.segment.lift import LiftedLabels
 from sagesplat.segment.soft import read_soft, write_soft
 from sagesplat.train.checkpoint import latest_checkpoint, write_checkpoint
 from sagesplat.train.state import initial_state
+from sagesplat.train.view_parameters import ViewParameters
 
 SETTINGS = json.dumps({"settings": {"steps": 2, "antialiased": True}})  # of the checkpoint
 CHUNK = {"label_id": 2, "level": 1, "count": 3, "nbytes": 99, "gpu_bytes": 48, "sha256": "0" * 64}
@@ -61,6 +62,7 @@ def _read_index(path: Path) -> None:
 def _checkpoints(folder: Path, size: int) -> list[bytes]:
     state = initial_state(splats(3 * size), 0)
     state.queue, state.frozen = [1, 0], {2: 1}
+    state.per_view = {"pose": ViewParameters.zeros(3, 6)}
     return [written(folder / "c.npz", lambda path: write_checkpoint(path, state, SETTINGS))]
 
 

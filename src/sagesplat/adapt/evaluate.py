@@ -4,7 +4,7 @@ Each composition is compared with the photo, over the pixels of the photo's labe
 model rendered from the same viewpoint, over the pixels that the full model's Gaussians paint.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Literal, get_args
@@ -13,7 +13,16 @@ import numpy as np
 from jaxtyping import Float32, Int16, Int32
 
 from sagesplat.adapt.ladder import Ladder
-from sagesplat.adapt.observe import TOTAL, LabelImages, RenderedLabels, as_unit, erode, measure, render_rgb
+from sagesplat.adapt.observe import (
+    TOTAL,
+    LabelImages,
+    RenderedLabels,
+    as_unit,
+    erode,
+    measure,
+    measure_colours,
+    render_rgb,
+)  # fmt: skip
 from sagesplat.adapt.plan import Plan
 from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.core.gaussians import Gaussians
@@ -22,9 +31,11 @@ from sagesplat.metrics.image import means_by_label, ssim_map
 from sagesplat.raster import Backend, Workspace, device_of
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene
+from sagesplat.segment.valid import ALL_VALID, ValidPixels
 
 QUALITIES: tuple[QualityKind, ...] = get_args(QualityKind)  # by the number in the table
 UNIFORM = -3  # label id of the whole image with all categories at one level
+COLOURS = ("plain_psnr", "cc_psnr", "cc_ssim")  # of `measure_colours`
 KEPT = 512 * 2**20  # bytes of the full model's images to keep; of further views they are rendered again
 
 
@@ -44,11 +55,18 @@ class Evaluation:
     level: Int32[np.ndarray, " R"]  # the level chosen; -1 for the whole image of a plan
     predicted: Float32[np.ndarray, " R"]  # that the plan counts on in this view; NaN for the whole image
     fidelity: Float32[np.ndarray, " R"]  # SSIM against the full model; NaN where it shows too little of it
-    ssim: Float32[np.ndarray, " R"]  # against the photo, over the category's pixels
+    ssim: Float32[np.ndarray, " R"]  # against the photo, with its exposure, over the category's pixels
     psnr: Float32[np.ndarray, " R"]  # dB, the same
     full_ssim: Float32[np.ndarray, " R"]  # of the full model: every category at its last level
     full_psnr: Float32[np.ndarray, " R"]  # dB, the same
     num_pixels: Int32[np.ndarray, " R"]
+    # of the whole image of a plan, NaN in other rows: without the photo's exposure, and colour-corrected
+    plain_psnr: Float32[np.ndarray, " R"]  # dB
+    cc_psnr: Float32[np.ndarray, " R"]  # dB
+    cc_ssim: Float32[np.ndarray, " R"]
+    full_plain_psnr: Float32[np.ndarray, " R"]
+    full_cc_psnr: Float32[np.ndarray, " R"]
+    full_cc_ssim: Float32[np.ndarray, " R"]
 
     def __len__(self) -> int:
         return len(self.label_id)
@@ -98,6 +116,7 @@ def evaluate(
     min_share: float = 0.0,
     uniform: Sequence[int] = (),
     compose: Callable[[Plan], Gaussians] | None = None,
+    valid: ValidPixels = ALL_VALID,
     backend: Backend = "auto",
     antialiased: bool = False,
     progress: Callable[[int, int], None] | None = None,
@@ -115,6 +134,7 @@ def evaluate(
         min_share: Fidelity is not measured where a category covers less than this fraction of the pixels.
         uniform: Levels to measure with all categories at that level, to compare the plans with.
         compose: The Gaussians of a plan; None: its levels as they are.
+        valid: The pixels of photos that count; views without any are left out.
         backend: Rasteriser; decides the device.
         antialiased: How the model was trained.
         progress: Called with (images measured, images in all).
@@ -124,7 +144,7 @@ def evaluate(
     """
     ssim = "ssim_eroded" if region == "eroded" else "ssim"
     rows: list[dict[str, float]] = []
-    views = scene.test_ids.tolist()
+    views = valid.rows(scene, scene.test_ids)
     inner = {row: erode(masks[scene.views[row]]) for row in views}
     done, total = 0, len(views) * (1 + len(plans) + len(uniform))
     workspace = Workspace()
@@ -138,18 +158,24 @@ def evaluate(
         nonlocal done, size
         g = g.to(device_of(backend))
         for row in views:
-            view = scene.views[row]
+            view, photo = scene.views[row], as_unit(photos[row])
+            neutral = view.camera.neutral  # fidelity is promised of pictures without a photo's exposure
             if row not in kept:
-                reference = render(last, view.camera)
+                reference = render(last, neutral)
                 size += reference.nbytes
                 if size <= KEPT:
                     kept[row] = reference
             else:
                 reference = kept[row]
-            image = reference if g is last else render(g, view.camera)
+            image = reference if g is last else render(g, neutral)
             least = min_share * image.shape[0] * image.shape[1]
             alike = fidelity_by_label(image, reference, labels[view], least)
-            yield row, measure(image, as_unit(photos[row]), masks[view], inner[row]), alike
+            colours = measure_colours(image, photo, valid[view])
+            if view.camera.exposure is not None:
+                image = render(g, view.camera)
+            measured = measure(image, photo, masks[view], inner[row], valid[view])
+            measured[TOTAL] |= colours
+            yield row, measured, alike
             done += 1
             if progress:
                 progress(done, total)
@@ -164,6 +190,7 @@ def evaluate(
                 "ssim": measured[TOTAL][ssim], "psnr": measured[TOTAL]["psnr"],
                 "num_pixels": measured[TOTAL]["num_pixels"],
                 "full_ssim": full[row][TOTAL][ssim], "full_psnr": full[row][TOTAL]["psnr"],
+                **_colours({}, {}),
             })  # fmt: skip
     for plan in plans:
         for row, measured, alike in measure_all(compose(plan) if compose else ladder.compose(plan.levels)):
@@ -176,8 +203,16 @@ def evaluate(
                     "fidelity": alike.get(label, np.nan),
                     "ssim": values[ssim], "psnr": values["psnr"], "num_pixels": values["num_pixels"],
                     "full_ssim": full[row][label][ssim], "full_psnr": full[row][label]["psnr"],
+                    **_colours(values, full[row][label]),
                 })  # fmt: skip
     return from_rows(Evaluation, rows)
+
+
+def _colours(values: Mapping[str, float], full: Mapping[str, float]) -> dict[str, float]:
+    """Columns of plain and colour-corrected metrics; NaN where they were not measured."""
+    return {name: values.get(name, np.nan) for name in COLOURS} | {
+        f"full_{name}": full.get(name, np.nan) for name in COLOURS
+    }
 
 
 def fidelity_by_label(

@@ -16,11 +16,13 @@ from sagesplat.adapt.ladder import Ladder
 from sagesplat.core import geometry
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.columns import from_rows, read_columns, write_columns
-from sagesplat.metrics.image import means_by_label, psnr, squared_error_map, ssim_map
+from sagesplat.metrics.color_correct import color_correct_affine
+from sagesplat.metrics.image import means_by_label, pasted, psnr, squared_error_map, ssim_map
 from sagesplat.raster import Backend, Workspace, device_of, rasterize
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene, View
 from sagesplat.segment.masks import UNLABELLED
+from sagesplat.segment.valid import ALL_VALID, ValidPixels
 
 TOTAL = -2  # label id of the rows that average over all pixels of the image
 
@@ -197,14 +199,16 @@ def measure(
     photo: Float32[np.ndarray, "H W 3"],
     label_ids: Int16[np.ndarray, "H W"],
     inner_ids: Int16[np.ndarray, "H W"] | None = None,
+    valid: Bool[np.ndarray, "H W"] | None = None,
 ) -> dict[int, dict[str, float]]:
     """SSIM, eroded SSIM, PSNR and pixels by label id, and under TOTAL those of the whole image.
 
-    `inner_ids`: the eroded label image, where it is at hand.
+    `inner_ids`: the eroded label image, where it is at hand. `valid`: the pixels that count; windows of SSIM
+    that reach into others see the image there, and not the photo.
     """
-    quality, error = ssim_map(image, photo), squared_error_map(image, photo)
-    inner = means_by_label(quality, erode(label_ids) if inner_ids is None else inner_ids)
-    errors = means_by_label(error, label_ids)
+    quality, error = _maps(image, photo, valid)
+    inner = means_by_label(quality, erode(label_ids) if inner_ids is None else inner_ids, valid)
+    errors = means_by_label(error, label_ids, valid)
     rows = {
         label: {
             "ssim": mean,
@@ -212,13 +216,52 @@ def measure(
             "psnr": float(psnr(errors[label][0])),
             "num_pixels": pixels,
         }
-        for label, (mean, pixels) in means_by_label(quality, label_ids).items()
+        for label, (mean, pixels) in means_by_label(quality, label_ids, valid).items()
     }
-    whole = float(quality.mean())
-    rows[TOTAL] = {
-        "ssim": whole, "ssim_eroded": whole, "psnr": float(psnr(error.mean())), "num_pixels": quality.size,
-    }  # fmt: skip
+    rows[TOTAL] = _total(quality, error, valid)
     return rows
+
+
+def measure_total(
+    image: Float32[np.ndarray, "H W 3"],
+    photo: Float32[np.ndarray, "H W 3"],
+    valid: Bool[np.ndarray, "H W"] | None = None,
+) -> dict[str, float]:
+    """What `measure` finds of the whole image."""
+    return _total(*_maps(image, photo, valid), valid)
+
+
+def _maps(
+    image: Float32[np.ndarray, "H W 3"],
+    photo: Float32[np.ndarray, "H W 3"],
+    valid: Bool[np.ndarray, "H W"] | None,
+) -> tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W"]]:
+    """SSIM and squared error at every pixel, none at those that do not count."""
+    photo = pasted(photo, image, valid)
+    return ssim_map(image, photo), squared_error_map(image, photo)
+
+
+def _total(
+    quality: Float32[np.ndarray, "H W"],
+    error: Float32[np.ndarray, "H W"],
+    valid: Bool[np.ndarray, "H W"] | None,
+) -> dict[str, float]:
+    if valid is not None:
+        quality, error = quality[valid], error[valid]
+    whole = float(quality.mean()) if quality.size else np.nan
+    decibels = float(psnr(error.mean())) if error.size else np.nan
+    return {"ssim": whole, "ssim_eroded": whole, "psnr": decibels, "num_pixels": quality.size}
+
+
+def measure_colours(
+    image: Float32[np.ndarray, "H W 3"],
+    photo: Float32[np.ndarray, "H W 3"],
+    valid: Bool[np.ndarray, "H W"] | None = None,
+) -> dict[str, float]:
+    """PSNR of an image without its photo's exposure, and of it colour-corrected, as gsplat names them."""
+    corrected = color_correct_affine(image, photo, valid)
+    plain, of_corrected = measure_total(image, photo, valid), measure_total(corrected, photo, valid)
+    return {"plain_psnr": plain["psnr"], "cc_psnr": of_corrected["psnr"], "cc_ssim": of_corrected["ssim"]}
 
 
 def observe(
@@ -229,11 +272,15 @@ def observe(
     distances: Mapping[int, Float32[np.ndarray, " V"]],
     *,
     views: Sequence[int] | None = None,
+    valid: ValidPixels = ALL_VALID,
     backend: Backend = "auto",
     antialiased: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Observations:
     """Render every level into views of the scene and measure SSIM and PSNR of each category there.
+
+    Cameras that have an exposure are rendered with it: of training photos the one that was learned, of others
+    the one that the full model was fitted to their photo with.
 
     Args:
         scene: The capture.
@@ -241,7 +288,8 @@ def observe(
         masks: Label images, [H, W] of category ids; indexed by view.
         ladder: The levels.
         distances: d_min by label id, float32 [V] in world units (`distances_in_views`); NaN: not in sight.
-        views: Rows of `scene.views`; None: all.
+        views: Rows of `scene.views`; None: all. Those without a pixel that counts are left out.
+        valid: The pixels that count.
         backend: Rasteriser; decides the device.
         antialiased: How the model was trained.
         progress: Called with (images measured, images in all).
@@ -257,7 +305,7 @@ def observe(
         >>> table = observe(run.scene, run.photos, run.best_masks, run.ladder, near)  # doctest: +SKIP
     """
     rows: list[dict[str, float]] = []
-    views = range(len(scene.views)) if views is None else views
+    views = valid.rows(scene, range(len(scene.views)) if views is None else views)
     inner = {row: erode(masks[scene.views[row]]) for row in views}
     done, total = 0, len(ladder.levels) * len(views)
     workspace = Workspace()
@@ -266,7 +314,8 @@ def observe(
         for row in views:
             view = scene.views[row]
             image = render_rgb(g, view.camera, backend=backend, antialiased=antialiased, workspace=workspace)
-            for label, values in measure(image, as_unit(photos[row]), masks[view], inner[row]).items():
+            found = measure(image, as_unit(photos[row]), masks[view], inner[row], valid[view])
+            for label, values in found.items():
                 distance = distances[label][row] if label in distances else np.nan
                 rows.append({"label_id": label, "level": level, "view": row, "distance": distance, **values})
             done += 1

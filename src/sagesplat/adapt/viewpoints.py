@@ -108,7 +108,7 @@ def _number_of(name: str) -> int:
 
 def capture_cameras(scene: Scene) -> list[Camera]:
     """The cameras of training and calibration photos: test photos stay out of everything."""
-    return [scene.views[row].camera for row in (*scene.train_ids, *scene.calibration_ids)]
+    return [scene.views[row].camera.neutral for row in (*scene.train_ids, *scene.calibration_ids)]
 
 
 class _Sampler:
@@ -206,7 +206,7 @@ def read_cameras(path: Path, like: Camera) -> list[Camera]:
             cameras = [camera_of_entry(entry) for entry in document["viewpoints"]]
         else:
             poses = [world_to_camera(frame.get("transform_matrix")) for frame in document["frames"]]
-            cameras = [replace(like, w2c=w2c.astype(np.float32)) for w2c in poses]
+            cameras = [replace(like.neutral, w2c=w2c.astype(np.float32)) for w2c in poses]
         if not cameras:
             raise ValueError("no viewpoints")
     except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:

@@ -115,6 +115,7 @@ def adopt(
 def demo(
     run: Positional[Annotated[Path, arg(metavar="RUN")]] = Path("runs/demo"),
     places: tuple[int, int] = (1, 1),
+    wild: bool = False,
     machine: Annotated[Machine, Flat] = Machine(),
 ) -> None:
     """Run the whole pipeline on the built-in capture, and say where to look.
@@ -122,11 +123,13 @@ def demo(
     Args:
         run: run folder
         places: rows and columns of courtyards; more than one makes a large scene, trained in that many blocks
+        wild: disturb the capture as photos of people are: exposure, vignetting, people who walk by, poses
+            that are a little off; and use --labels.ignore person --train.poses
     """
     from sagesplat.stages import pipeline
 
     with open_job(run, machine) as job:
-        pipeline.run_demo(job, places)
+        pipeline.run_demo(job, places, wild)
 
 
 @command

@@ -15,6 +15,9 @@ class SceneConfig:
     """Every n-th view by name is a test view, used for evaluation only; 0: none."""
     calibrate_every: int = 8
     """Every n-th of the other views is held out of training, to calibrate the quality models; 0: none."""
+    alpha: Literal["auto", "background", "ignore"] = "auto"
+    """Transparent pixels of photos. background: an object that was cut out, composited over the background;
+    ignore: pixels that do not count; auto: background if most of the photos' border is transparent."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +76,7 @@ class MasksConfig:
 
 @dataclass(frozen=True)
 class LabelsConfig:
-    """Changes to the categories: merge first, then keep, then the minimum share."""
+    """Changes to the categories: merge first, then ignore, then keep, then the minimum share."""
 
     keep: str = ""
     """Keep these categories, e.g. "grass-merged,tree-merged"; all others become unlabelled."""
@@ -81,6 +84,11 @@ class LabelsConfig:
     """Merge categories, e.g. "vase=potted plant,potted plant=tree-merged"."""
     min_share: float = 0.0
     """Categories that cover less than this fraction of all pixels become unlabelled."""
+    ignore: str = ""
+    """Categories that do not belong to the scene, e.g. "person,car": their pixels are not trained on, not
+    measured and have no vote."""
+    ignore_dilation: int = 3
+    """Grow ignored regions by this many pixels of the training photos, whatever they were ignored for."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +120,9 @@ class TrainConfig:
     batch: int = 1
     """Photos per step, at least one per process. Learning rates grow with its square root; the number of
     steps stays."""
+    exposure: Literal["auto", "off", "affine"] = "auto"
+    """Exposure and white balance of the photos. affine: learn a colour transform per photo; off: none; auto:
+    affine where the photos differ."""
     means_lr: float = 1.6e-4
     """Learning rate of the means, times the scene extent; decays exponentially to 1 %."""
     quats_lr: float = 1e-3
@@ -152,6 +163,9 @@ class TrainConfig:
     max_gaussians: int = 0
     """Maximum number of Gaussians; the limit grows linearly during densification (0: choose from the image
     size)."""
+    poses: bool = False
+    """Refine the camera poses of the training views with the Gaussians. Those of held-out views are fitted to
+    their photos afterwards."""
     mcmc_noise: float = 5e5
     """SGLD noise of 3DGS-MCMC, times the learning rate of the means."""
     mcmc_opacity: float = 0.01

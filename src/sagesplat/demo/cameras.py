@@ -6,8 +6,13 @@ from sagesplat.demo.places import centres_of, ways_of
 from sagesplat.scene.scene import Camera
 
 
-def demo_cameras(views: int, width: int, height: int, seed: int) -> list[Camera]:
-    """Cameras on two orbits around the table at different heights; a sixth of them nearer or farther."""
+def demo_cameras(
+    views: int, width: int, height: int, seed: int, arc: float = 2 * np.pi, start: float = 0.0
+) -> list[Camera]:
+    """Cameras on two orbits around the table at different heights; a sixth of them nearer or farther.
+
+    The orbits go around by `arc` radians from the angle `start`.
+    """
     rng = np.random.default_rng([seed, 1])
     others = views // 6
     near, lower = (others + 1) // 2, (views - others) // 2
@@ -18,7 +23,7 @@ def demo_cameras(views: int, width: int, height: int, seed: int) -> list[Camera]
         (others - near, 4.7, 1.6, 1.25),
     )
     turn = np.concatenate(
-        [2 * np.pi * (np.arange(ring[0]) + rng.random()) / max(ring[0], 1) for ring in rings]
+        [arc * (np.arange(ring[0]) + rng.random()) / max(ring[0], 1) + start for ring in rings]
     )
     radius, z, aim = np.repeat(np.array(rings)[:, 1:], [ring[0] for ring in rings], axis=0).T
     order = turn.argsort(kind="stable")  # by angle, so that every n-th view comes from all rings
@@ -26,6 +31,11 @@ def demo_cameras(views: int, width: int, height: int, seed: int) -> list[Camera]
     target = np.stack([0 * aim, 0 * aim, aim], 1)[order]
     place += rng.uniform(-1, 1, place.shape) * [0.15, 0.15, 0.2]
     target += rng.uniform(-1, 1, target.shape) * [0.25, 0.25, 0.12]
+    return looking_cameras(place, target, width, height)
+
+
+def looking_cameras(place: np.ndarray, target: np.ndarray, width: int, height: int) -> list[Camera]:
+    """Level cameras at places [n, 3] that look at targets [n, 3]."""
     K = _intrinsics(width, height)
     return [Camera(_look(p, t), K, width, height) for p, t in zip(place, target, strict=True)]
 

@@ -1,10 +1,11 @@
-"""Writes the garden as a capture: a COLMAP workspace with label images."""
+"""Writes the garden as a capture: a COLMAP workspace with label images, clean or with known disturbances."""
 
 import hashlib
 import shutil
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -12,8 +13,12 @@ from PIL import Image
 from sagesplat import __version__
 from sagesplat.core.errors import SceneError
 from sagesplat.demo.cameras import demo_cameras, grid_cameras
-from sagesplat.demo.points import write_points
-from sagesplat.demo.render import lit_world, render_view, threads_map
+from sagesplat.demo.figures import PERSON
+from sagesplat.demo.off_path import off_path_pictures, write_pictures, write_transforms
+from sagesplat.demo.points import Taken, write_points
+from sagesplat.demo.render import lit_world, threads_map
+from sagesplat.demo.shots import Shot, take_shot
+from sagesplat.demo.wild import FACING, NOTHING, Wild, camera_gains, kept_views, noisy_cameras
 from sagesplat.demo.world import LABELS
 from sagesplat.io.files import cache_folder, unwritable, write_json
 from sagesplat.scene.scene import Camera
@@ -27,14 +32,19 @@ def make_capture(
     height: int = 240,
     seed: int = 0,
     places: tuple[int, int] = (1, 1),
+    wild: Wild = NOTHING,
     on_view: Callable[[int, int], None] | None = None,
 ) -> None:
     """Render the garden into `folder`: images/*.png, masks/*.png with labels.json, sparse/0/*.bin.
 
     `places` (nx, ny) makes a large capture: a grid of different courtyards, with photos from orbits in each
-    and, a fifth of them, from the ways in between. The files depend on the arguments only. The folder is
-    written atomically. `on_view(done, views)` is called after each photo. SceneError if `folder` exists or
-    cannot be written, or `places` or `views` are too few.
+    and, a fifth of them, from the ways in between. With disturbances (`wild`) truth/ has what they are
+    measured against: exact poses and undisturbed photos of the same views (transforms.json, images/), where
+    figures stand (figures/*.png, 255) and `off_path` viewpoints (off_path/, see `off_path.write_pictures`).
+
+    The files depend on the arguments only. The folder is written atomically. `on_view(done, views)` is called
+    after each photo. SceneError if `folder` exists or cannot be written, `places` or `views` are too few, or
+    a grid is to be disturbed.
     """
     if views < 3:
         raise SceneError(f"{folder}: {views} views; a capture needs at least 3")
@@ -44,15 +54,17 @@ def make_capture(
         raise SceneError(f"{folder}: {views} views; {places[0]} x {places[1]} places need at least 10 each")
     if folder.exists():
         raise SceneError(f"{folder}: already exists; remove it or name another folder")
+    if places != (1, 1) and not wild.quiet:
+        raise SceneError(f"{folder}: disturbances need one place, not {places[0]} x {places[1]}")
     if places == (1, 1):
-        cameras = demo_cameras(views, width, height, seed)
+        cameras = demo_cameras(views, width, height, seed, *_arc(wild))
     else:
         cameras = grid_cameras(places, views, width, height, seed)
     temporary = None
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         temporary = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}-"))
-        _write(temporary, cameras, seed, places, on_view)
+        _write(temporary, cameras, seed, places, wild, on_view)
         temporary.chmod(0o755)
         temporary.rename(folder)
     except OSError as error:
@@ -63,7 +75,9 @@ def make_capture(
 
 
 def cached_capture(
-    on_view: Callable[[int, int], None] | None = None, places: tuple[int, int] = (1, 1)
+    on_view: Callable[[int, int], None] | None = None,
+    places: tuple[int, int] = (1, 1),
+    wild: Wild = NOTHING,
 ) -> Path:
     """Return the folder of the built-in capture, made on the first call.
 
@@ -73,6 +87,7 @@ def cached_capture(
     Args:
         on_view: Called with (views drawn, views in all).
         places: Courtyards along x and y. (1, 1): one, in photos of full size; else 105 small photos of each.
+        wild: Disturbances of a single courtyard.
 
     Returns:
         A COLMAP workspace with label images.
@@ -82,18 +97,26 @@ def cached_capture(
     """
     code = b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
     release = hashlib.sha256(__version__.encode() + code).hexdigest()[:12]
-    name, size = "courtyard", {}
+    size: dict[str, Any] = {}
+    name = "courtyard"
     if places != (1, 1):
         nx, ny = places
         name, size = f"courtyards-{nx}x{ny}", {"views": 105 * nx * ny, "width": 192, "height": 144}
+    if not wild.quiet:
+        name += "-wild-" + hashlib.sha256(repr(wild).encode()).hexdigest()[:8]
     folder = cache_folder() / f"demo-{release}" / name
     if not folder.exists():
         try:
-            make_capture(folder, **size, places=places, on_view=on_view)
+            make_capture(folder, **size, places=places, wild=wild, on_view=on_view)
         except SceneError:
             if not folder.exists():  # else another process was faster
                 raise
     return folder
+
+
+def _arc(wild: Wild) -> tuple[float, float]:
+    """How far around the path goes, and from where; radians."""
+    return (np.pi, FACING) if wild.half_circle else (2 * np.pi, 0.0)
 
 
 def _write(
@@ -101,23 +124,57 @@ def _write(
     cameras: list[Camera],
     seed: int,
     places: tuple[int, int],
+    wild: Wild,
     on_view: Callable[[int, int], None] | None,
 ) -> None:
     digits = max(3, len(str(len(cameras) - 1)))
-    names = [f"view_{i:0{digits}d}.png" for i in range(len(cameras))]
+    gains, rows = camera_gains(wild, len(cameras), seed), kept_views(wild, len(cameras), seed)
+    names, cameras = [f"view_{i:0{digits}d}.png" for i in rows], [cameras[i] for i in rows]
     for below in ("images", "masks", "sparse/0"):
         (folder / below).mkdir(parents=True)
     lit_world(seed, places)  # cached here, before threads use it
-    shape = len(cameras), cameras[0].height, cameras[0].width
-    photos, labels = np.empty((*shape, 3), np.uint8), np.empty(shape, np.uint8)
-    for done, (rgb, label, _) in enumerate(threads_map(lambda c: render_view(c, seed, places), cameras)):
-        photos[done], labels[done] = rgb, label
-        Image.fromarray(rgb).save(folder / "images" / names[done])
-        Image.fromarray(labels[done]).save(folder / "masks" / names[done])
+
+    def take(i: int) -> Shot:
+        return take_shot(cameras[i], rows[i], seed, places, wild, gains[rows[i]])
+
+    shots = []
+    for i, shot in enumerate(threads_map(take, range(len(cameras)))):
+        shots.append(shot)
+        Image.fromarray(shot.photo).save(folder / "images" / names[i])
+        Image.fromarray(shot.label).save(folder / "masks" / names[i])
         if on_view:
-            on_view(done + 1, len(cameras))
-    taxonomy = {str(i): name for i, name in LABELS.items()}
+            on_view(i + 1, len(cameras))
+    people = {PERSON: "person"} if wild.figures and wild.figure_masks else {}
+    write_taxonomy(folder, people | LABELS)
+    photos, labels = np.stack([s.true_photo for s in shots]), np.stack([s.true_label for s in shots])
+    taken = None
+    if not wild.quiet:
+        photo, hidden = np.stack([s.photo for s in shots]), np.stack([s.hidden for s in shots])
+        taken = Taken(noisy_cameras(wild, cameras, seed), photo, hidden)
+        _write_truth(folder / "truth", names, cameras, shots, seed, wild)
+    write_points(folder / "sparse" / "0", names, cameras, photos, labels, seed, places, taken)
+
+
+def _write_truth(
+    folder: Path, names: list[str], cameras: list[Camera], shots: list[Shot], seed: int, wild: Wild
+) -> None:
+    """Undisturbed photos, exact poses, figures and viewpoints off the path."""
+    for below in ("images", "figures"):
+        (folder / below).mkdir(parents=True)
+    for name, shot in zip(names, shots, strict=True):
+        Image.fromarray(shot.true_photo).save(folder / "images" / name)
+        Image.fromarray(255 * shot.hidden.astype(np.uint8)).save(folder / "figures" / name)
+    write_transforms(folder, names, cameras)
+    if wild.off_path:
+        depths = [shot.depth for shot in shots]
+        pictures = off_path_pictures(cameras, depths, wild.off_path, seed, *_arc(wild))
+        write_pictures(folder / "off_path", pictures)
+        write_taxonomy(folder / "off_path", LABELS)
+
+
+def write_taxonomy(folder: Path, labels: dict[int, str]) -> None:
+    """Write the names of the ids in label images: masks/labels.json."""
+    taxonomy = {str(i): name for i, name in labels.items()}
     write_json(
         folder / "masks" / "labels.json", {"taxonomy": "coco-panoptic", "unlabelled": 255, "labels": taxonomy}
     )
-    write_points(folder / "sparse" / "0", names, cameras, photos, labels, seed, places)

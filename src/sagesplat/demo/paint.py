@@ -67,12 +67,17 @@ def _lit(world: World, kind: int, at, directions, part, sun, width) -> np.ndarra
         sky = (0.5 + 0.5 * normal[:, 2]) * (0.4 + 1.5 * at[:, 2]).clip(0, 1)
     if kind in (GRASS, PAVING):
         sun, sky = _baked(world, at).T
-    rgb *= SUN_RGB * (sun * facing.clip(0))[:, None] + SKY_RGB * sky[:, None] + BOUNCE_RGB
+    rgb *= light_on(facing, sun, sky)
     if kind == GLAZE:
         mirror = directions - 2 * slant[:, None] * normal
         gleam = 2.5 * sun * (mirror @ SUN).clip(0) ** 60 + 0.10 * mirror[:, 2].clip(0)
         rgb += gleam[:, None]
     return rgb
+
+
+def light_on(facing: np.ndarray, sun: np.ndarray, sky: np.ndarray) -> Float64[np.ndarray, "n 3"]:
+    """Linear RGB of the light on surfaces: `facing` the sun by this cosine, in this share of sun and sky."""
+    return SUN_RGB * (sun * facing.clip(0))[:, None] + SKY_RGB * sky[:, None] + BOUNCE_RGB
 
 
 def _in_place(world: World, kind: int, hits: Hits) -> tuple[Hits, np.ndarray | float]:
@@ -111,7 +116,13 @@ def _normals(world: World, kind: int, part: np.ndarray, at: np.ndarray) -> np.nd
         return world.bodies[part // 8, part % 8, :3]
     if kind in (GRASS, PAVING):
         return np.tile([0.0, 0.0, 1.0], (len(at), 1))
-    solid = world.solids[part]
+    return solid_normals(world.solids[part], at)
+
+
+def solid_normals(
+    solid: Float64[np.ndarray, "n 9"], at: Float64[np.ndarray, "n 3"]
+) -> Float64[np.ndarray, "n 3"]:
+    """Unit outward normals of points on solids of revolution (rows of `World.solids`)."""
     height = (at[:, 2] - solid[:, 2]) / solid[:, 3]
     slope = (radius_at(solid.T, height + 0.01) - radius_at(solid.T, height - 0.01)) / (0.02 * solid[:, 3])
     side = (at[:, :2] - solid[:, :2]) / (np.linalg.norm(at[:, :2] - solid[:, :2], axis=1)[:, None] + 1e-9)

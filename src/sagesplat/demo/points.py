@@ -1,9 +1,10 @@
 """Simulated structure from motion of the garden: points and tracks."""
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 
 from sagesplat.demo.paint import dome_distance
 from sagesplat.demo.render import FAR, camera_rays, cast_rays, lit_world
@@ -16,6 +17,14 @@ UV_NOISE = 0.4  # standard deviation of a feature's position, pixels
 SKY_ID = 187
 
 
+class Taken(NamedTuple):
+    """A disturbed capture, where it differs from the scene."""
+
+    cameras: list[Camera]  # poses as structure from motion gives them
+    photos: UInt8[np.ndarray, "V H W 3"]
+    hidden: Bool[np.ndarray, "V H W"]  # pixels where something moving hides the scene
+
+
 def write_points(
     folder: Path,
     names: list[str],
@@ -24,12 +33,21 @@ def write_points(
     labels: UInt8[np.ndarray, "V H W"],
     seed: int,
     places: tuple[int, int] = (1, 1),
+    taken: Taken | None = None,
 ) -> None:
-    """Write a simulated COLMAP model: points on textured surfaces, seen in at least 3 views."""
+    """Write a simulated COLMAP model: points on textured surfaces, seen in at least 3 views.
+
+    `photos` and `labels` show the scene alone. `taken` are the photos and poses of a disturbed capture. Its
+    points and tracks are those of exact poses: structure from motion that errs would err in them as well.
+    """
     rng, world = np.random.default_rng([seed, 2]), lit_world(seed, places)
     sought = CANDIDATES * places[0] * places[1]
     xyz, home, distance = _candidates(world, cameras, photos, labels, sought, rng)
     point, view, uv, depth = _matched(world, cameras, xyz, home, distance, rng)
+    if taken:
+        column, row = uv.astype(int).T
+        open_view = ~taken.hidden[view, row, column]
+        point, view, uv, depth = (values[open_view] for values in (point, view, uv, depth))
     keep = np.bincount(point, minlength=len(xyz)) >= 3
     xyz, kept = xyz[keep], keep[point]
     point, view, uv, depth = (np.cumsum(keep) - 1)[point[kept]], view[kept], uv[kept], depth[kept]
@@ -44,7 +62,7 @@ def write_points(
     error = np.linalg.norm(again - noisy, axis=1)
     column, row = noisy.astype(int).T
     rgb = np.zeros((len(xyz), 3))
-    np.add.at(rgb, point, photos[view, row, column])
+    np.add.at(rgb, point, (taken.photos if taken else photos)[view, row, column])
     count = np.bincount(point, minlength=len(xyz))
     K = cameras[0].K
     model = ModelCamera(
@@ -54,8 +72,9 @@ def write_points(
         cameras[0].height,
         tuple(map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))),
     )
+    posed = taken.cameras if taken else cameras
     images = [
-        ModelImage(i + 1, names[i], 1, cameras[i].w2c, noisy[view == i], point[view == i])
+        ModelImage(i + 1, names[i], 1, posed[i].w2c, noisy[view == i], point[view == i])
         for i in range(len(cameras))
     ]
     colour = (rgb / count[:, None]).round().astype(np.uint8)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int16, Int64, UInt8
 from numba import get_num_threads
 
+from sagesplat.demo.figures import PERSON, Figures, cast_figures, shade_figures
 from sagesplat.demo.paint import shade
 from sagesplat.demo.places import build_places
 from sagesplat.demo.raycast import cast
@@ -18,6 +19,7 @@ from sagesplat.scene.scene import Camera
 FAR = 1e9
 HORIZON = 20.0  # metres; nothing farther away casts a shadow
 SENSOR_NOISE = 1.0  # standard deviation, 8-bit steps
+FIGURE = LEAF + 1  # material of `figures.Figures`
 NEEDS_RAY = 3  # materials from this one on, except leaves, cast a shadow ray
 
 
@@ -47,27 +49,41 @@ def render_view(
     Label and depth are those of the ray through the pixel's centre. The clouds are on a dome of 80 m radius.
     The sensor noise depends on seed and pose, so a view always gives the same photo.
     """
+    light, label, depth = render_light(camera, seed, places)
+    return take_photo(light, camera, seed), label, depth
+
+
+def render_light(
+    camera: Camera, seed: int = 0, places: tuple[int, int] = (1, 1), figures: Figures | None = None
+) -> tuple[Float64[np.ndarray, "H W 3"], Int16[np.ndarray, "H W"], Float32[np.ndarray, "H W"]]:
+    """Linear RGB that reaches a camera, with labels and depths as `render_view` gives them.
+
+    `figures` stand in the scene, without shadows.
+    """
     world, shape = lit_world(seed, places), (camera.height, camera.width)
     pixel = float(1 / camera.K[0, 0])
     v, u = (np.indices(shape) + 0.5).reshape(2, -1)
     uv = np.stack([u, v], 1)
-    hit, rgb, z_share = _sample(world, camera, uv, pixel, 0)
+    hit, rgb, z_share = _sample(world, camera, uv, pixel, 0, figures)
     t, material, part = hit
-    label = np.where(material == LEAF, world.leaf_label[part], LABEL_OF[material]).astype(np.int16)
+    label = np.select(
+        [material == LEAF, material == FIGURE], [world.leaf_label[part], PERSON], LABEL_OF[material % FIGURE]
+    ).astype(np.int16)
     depth = np.where(material == SKY, np.inf, t * z_share).astype(np.float32)
     tone = _develop(rgb.mean(1))
     rough = _edges(material.reshape(shape), part.reshape(shape), tone.reshape(shape)).ravel()
     for k in range(1, 4):  # three more rays per pixel where the image is not smooth
         offset = 0.38 * np.array([np.cos(2.1 * k), np.sin(2.1 * k)])
-        rgb[rough] += _sample(world, camera, uv[rough] + offset, pixel, k)[1]
+        rgb[rough] += _sample(world, camera, uv[rough] + offset, pixel, k, figures)[1]
     rgb[rough] /= 4
+    return rgb.reshape(*shape, 3), label.reshape(shape), depth.reshape(shape)
+
+
+def take_photo(light: Float64[np.ndarray, "H W 3"], camera: Camera, seed: int) -> UInt8[np.ndarray, "H W 3"]:
+    """The photo (sRGB) of linear RGB: tone curve, sensor noise, 8 bits."""
     rng = np.random.default_rng([seed, crc32(camera.w2c.tobytes())])
-    photo = 255 * _develop(rgb) + rng.normal(0, SENSOR_NOISE, rgb.shape)
-    return (
-        photo.round().clip(0, 255).astype(np.uint8).reshape(*shape, 3),
-        label.reshape(shape),
-        depth.reshape(shape),
-    )
+    photo = 255 * _develop(light) + rng.normal(0, SENSOR_NOISE, light.shape)
+    return photo.round().clip(0, 255).astype(np.uint8)
 
 
 def cast_rays(
@@ -95,7 +111,7 @@ def camera_rays(camera: Camera, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray,
     return np.tile(camera.position.astype(float), (len(uv), 1)), directions, 1 / length
 
 
-def _sample(world: World, camera: Camera, uv: np.ndarray, pixel: float, k: int):
+def _sample(world: World, camera: Camera, uv: np.ndarray, pixel: float, k: int, figures: Figures | None):
     """Hits, linear RGB and camera z per distance of rays through uv; shadow rays aim at sun point k."""
     origins, directions, z_share = camera_rays(camera, uv)
     hit = cast_rays(world, origins, directions, FAR, pixel)
@@ -105,7 +121,23 @@ def _sample(world: World, camera: Camera, uv: np.ndarray, pixel: float, k: int):
     at = origins[ask] + (t[ask, None] - 2e-3) * directions[ask]
     toward = np.tile(_sun_directions()[k], (len(at), 1))
     sun[ask] = cast_rays(world, at, toward, HORIZON, pixel, True)[1] == SKY
-    return hit, shade(world, origins, directions, hit, sun, pixel), z_share
+    rgb = shade(world, origins, directions, hit, sun, pixel)
+    if figures:
+        _draw_figures(world, figures, origins, directions, hit, rgb, k, pixel)
+    return hit, rgb, z_share
+
+
+def _draw_figures(world: World, figures: Figures, origins, directions, hit, rgb, k: int, pixel: float):
+    """Change hits and colours of the rays that figures stop."""
+    t, row = cast_figures(figures, origins, directions, hit[0])
+    rows = np.flatnonzero(row >= 0)
+    t, row = t[rows], row[rows]
+    at = origins[rows] + (t - 2e-3)[:, None] * directions[rows]
+    toward = np.tile(_sun_directions()[k], (len(at), 1))
+    sun = (cast_rays(world, at, toward, HORIZON, pixel, True)[1] == SKY).astype(float)
+    rgb[rows] = shade_figures(figures, row, at, sun, pixel * t)
+    for values, new in zip(hit, (t, FIGURE, row), strict=True):
+        values[rows] = new
 
 
 def _edges(material: np.ndarray, part: np.ndarray, tone: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 from numba import get_num_threads
 from torch import Tensor
 
@@ -80,10 +80,23 @@ def psnr(mean_squared_error: float | np.ndarray) -> Any:
     return -10.0 * np.log10(np.maximum(mean_squared_error, 1e-10))
 
 
+def pasted(
+    photo: Float32[np.ndarray, "H W 3"],
+    image: Float32[np.ndarray, "H W 3"],
+    valid: Bool[np.ndarray, "H W"] | None,
+) -> Float32[np.ndarray, "H W 3"]:
+    """The photo with the image itself where pixels do not count, so that windows find no difference there."""
+    return photo if valid is None else np.where(valid[..., None], photo, image)
+
+
 def means_by_label(
-    values: Float[np.ndarray, "H W"], label_ids: Int[np.ndarray, "H W"]
+    values: Float[np.ndarray, "H W"],
+    label_ids: Int[np.ndarray, "H W"],
+    valid: Bool[np.ndarray, "H W"] | None = None,
 ) -> dict[int, tuple[float, int]]:
-    """Mean of a map over each label's pixels, and how many there are, by label id."""
+    """Mean of a map over each label's pixels (the `valid` ones), and how many there are, by label id."""
+    if valid is not None:
+        values, label_ids = values[valid], label_ids[valid]
     lowest = int(label_ids.min(initial=0))
     shifted = label_ids.ravel().astype(np.int64) - lowest
     counts = np.bincount(shifted)
@@ -118,10 +131,11 @@ class _PhotometricLoss(torch.autograd.Function):
 
 def photometric_loss(
     rgb: Float[Tensor, "H W 3"],
-    photo: Float[Tensor, "H W 3"],
+    photo: Float[Tensor, "H W 3"] | UInt8[Tensor, "H W 3"],
     ssim_weight: float = SSIM_WEIGHT,
     tile_mask: Bool[np.ndarray, "h w"] | Bool[Tensor, "h w"] | None = None,
     workspace: Workspace | None = None,
+    valid: Bool[Tensor, "H W"] | None = None,
 ) -> Tensor:
     """Compute the training loss of 3DGS: (1 - w) L1 + w (1 - SSIM); differentiable by `rgb`.
 
@@ -132,6 +146,8 @@ def photometric_loss(
         tile_mask: bool [ceil(H/16), ceil(W/16)], a tensor on a GPU. Tiles that are False add nothing to the
             sum, which is divided by the number of all pixels; windows of other tiles see the photo there.
         workspace: Memory to use again (CPU only). Go backward before the next call with it.
+        valid: bool [H, W]; None: all. Of other pixels the photo is not looked at, and their gradient is zero:
+            windows see the rendering in both images there. The sum is divided by the number of all pixels.
 
     Returns:
         The loss, a scalar.
@@ -145,6 +161,10 @@ def photometric_loss(
         >>> bool(loss > 0), rgb.grad.shape
         (True, torch.Size([32, 32, 3]))
     """
+    if valid is not None:
+        counts, rendered = valid[..., None], rgb.detach()
+        photo = photo if photo.is_floating_point() else photo.float() / 255
+        rgb, photo = torch.where(counts, rgb, rendered), torch.where(counts, photo, rendered)
     if rgb.is_cuda:
         from sagesplat.metrics import ssim_triton
 

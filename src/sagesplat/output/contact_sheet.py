@@ -83,7 +83,7 @@ def contact_sheet(
 
 def _small(camera: Camera) -> Camera:
     share = min(1.0, _SIDE / max(camera.width, camera.height))
-    return camera.resized(max(1, round(camera.width * share)), max(1, round(camera.height * share)))
+    return camera.neutral.resized(max(1, round(camera.width * share)), max(1, round(camera.height * share)))
 
 
 def _picture(

@@ -14,7 +14,7 @@ from PIL import Image
 
 from sagesplat import __version__
 from sagesplat.adapt.eq3 import SsimModel
-from sagesplat.adapt.evaluate import UNIFORM, Evaluation
+from sagesplat.adapt.evaluate import COLOURS, UNIFORM, Evaluation
 from sagesplat.adapt.observe import TOTAL, Observations
 from sagesplat.adapt.plan import Choice, Counts, Plan, quality_title
 from sagesplat.adapt.viewpoint import QualityKind
@@ -59,6 +59,7 @@ class ReportData:
     settings: Facts = ()
     timings: Sequence[tuple[str, float]] = ()  # stage, seconds
     provenance: Facts = ()  # versions, hashes of the inputs
+    exposed: bool = False  # views are rendered with the exposure of their photos, fitted where held out
     photos: bool = True  # False: renders of a splat that somebody else trained
     adopted: Facts = ()  # how such a splat was looked at, and how its levels were made
     viewpoints: UInt8[np.ndarray, "H W 3"] | None = None  # what its viewpoints see
@@ -177,6 +178,7 @@ def _headline(data: ReportData, promises: Evaluation) -> dict:
         "psnr": tables.mean(whole.psnr),
         "full_ssim": tables.mean(whole.full_ssim),
         "full_psnr": tables.mean(whole.full_psnr),
+        **{f.name: tables.mean(getattr(whole, f.name)) for f in fields(whole) if f.name.endswith(COLOURS)},
         "num_views": len(np.unique(whole.view)),
         "kept": _kept(plan, promises.of(plan)),
         "least": min(shares, key=lambda share: share.share) if shares else None,

@@ -339,11 +339,16 @@ def evaluation_table(evaluation: Evaluation, labels: Sequence[int], names: Mappi
             share = (math.nan,) * 3 if none else (kept.promised, kept.kept, kept.share)
             found = (mean(rows.predicted), mean(rows.fidelity), mean(rows.ssim))
             others = (mean(rows.full_ssim), mean(rows.psnr), mean(rows.full_psnr))
+            others += (mean(rows.plain_psnr), mean(rows.cc_ssim), mean(rows.cc_psnr))
+            others += (mean(rows.full_plain_psnr), mean(rows.full_cc_ssim), mean(rows.full_cc_psnr))
             named = (quality_title(QUALITIES[i]), float(f"{target:g}"), name_of(label_id, names), len(rows))
             body.append((*named, *share, *found, mean(np.abs(own.predicted - own.ssim)), *others))
     header = ("quality", "target", "category", "views", "promised", "kept", "share kept", "bound", "fidelity")
     header += ("SSIM", "error of bound", "full model SSIM", "PSNR", "full model PSNR")
     formats = ("", "g", "", ",d", ",d", ",d", ".0%", ".3f", ".3f", ".3f", ".3f", ".3f", ".2f", ".2f")
+    for model in ("", "full model "):
+        header += (f"{model}plain PSNR", f"{model}cc_ssim", f"{model}cc_psnr")
+        formats += (".2f", ".3f", ".2f")
     return Table("Bound against measurement, unseen views", header, formats, body)
 
 

@@ -1,23 +1,25 @@
 """Rasterising Gaussians: one function, several backends."""
 
+from dataclasses import replace
 from typing import Literal
 
 import numba
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Int64
+from jaxtyping import Bool, Float, Float32, Int64
 from numba.core import config as numba_config
 from torch import Tensor
 
 from sagesplat.core.errors import BackendUnavailable, DataError
 from sagesplat.core.gaussians import PARAMETERS, Gaussians
 from sagesplat.kernels.workspace import Workspace
+from sagesplat.raster.exposure import expose
 from sagesplat.raster.render import TILE, Render
 from sagesplat.scene.scene import Camera
 
 __all__ = [
-    "TILE", "Backend", "Render", "Workspace", "add_weights", "device_of", "rasterize", "resolve_backend",
-    "set_threads",
+    "TILE", "Backend", "Render", "Workspace", "add_weights", "device_of", "expose", "rasterize",
+    "resolve_backend", "set_threads",
 ]  # fmt: skip
 
 Backend = Literal["auto", "cpu", "cuda", "reference"]
@@ -78,6 +80,7 @@ def rasterize(
     tile_mask: Bool[np.ndarray, "tiles_y tiles_x"] | Bool[Tensor, "tiles_y tiles_x"] | None = None,
     trainable: Bool[Tensor, " N"] | None = None,
     absgrad: bool = False,
+    pose: Float[Tensor, "6"] | None = None,
     workspace: Workspace | None = None,
     backend: Backend = "auto",
 ) -> Render:
@@ -88,7 +91,8 @@ def rasterize(
 
     Args:
         gaussians: N Gaussians, all tensors on one device.
-        camera: Pose, intrinsics in pixels, and size of the image (H, W).
+        camera: Pose, intrinsics in pixels, and size of the image (H, W). Its `exposure` is applied to the
+            image, background included.
         sh_degree: Harmonics up to this degree are used; None: all there are.
         background: RGB in [0, 1] behind everything, [3]; None: the camera's.
         features: [N, C], blended like colours, over zero; C is any number.
@@ -97,6 +101,9 @@ def rasterize(
         trainable: bool [N]; rows that are False are drawn, and their gradients are zero. Pass the same tensor
             at every step: `cuda` caches what it derives from it.
         absgrad: `means2d.grad` sums the absolute gradients over pixels (AbsGS, arXiv:2404.10484).
+        pose: Zeros [6] that require a gradient; it is that of a small motion of the camera in its own frame:
+            x' = R x + t for x in camera coordinates, with the rotation vector `pose[:3]` (rad) and
+            t = `pose[3:]` (world units). All Gaussians take part, trainable or not.
         workspace: Memory to use again (`cpu` only). Results and gradients hold until the next call with it.
         backend: "cpu", "cuda", "reference" (float64, slow) or "auto": the one of the device of the means.
 
@@ -136,7 +143,7 @@ def rasterize(
         backend = resolve_backend(backend)
     _check(
         backend, gaussians, camera,
-        background=background, features=features, tile_mask=tile_mask, trainable=trainable,
+        background=background, features=features, tile_mask=tile_mask, trainable=trainable, pose=pose,
     )  # fmt: skip
     shared = {
         "degree": degree,
@@ -146,18 +153,24 @@ def rasterize(
         "tile_mask": tile_mask,
         "trainable": trainable,
         "absgrad": absgrad,
+        "pose": pose,
     }
     if backend == "reference":
         from sagesplat.raster import reference
 
-        return reference.render(gaussians, camera, **shared)
-    if backend == "cuda":
+        render = reference.render(gaussians, camera, **shared)
+    elif backend == "cuda":
         from sagesplat.raster import cuda
 
-        return cuda.render(gaussians, camera, **shared)
-    from sagesplat.raster import cpu
+        render = cuda.render(gaussians, camera, **shared)
+    else:
+        from sagesplat.raster import cpu
 
-    return cpu.render(gaussians, camera, workspace=workspace, **shared)
+        render = cpu.render(gaussians, camera, workspace=workspace, **shared)
+    if camera.exposure is None:
+        return render
+    exposure = torch.from_numpy(camera.exposure).to(render.rgb.device)
+    return replace(render, rgb=expose(render.rgb, exposure))
 
 
 def _check(
@@ -179,7 +192,7 @@ def _check(
         if isinstance(tensor, Tensor) and tensor.device != means:
             raise DataError(f"{name} is on {tensor.device}, means is on {means}; move them to one device")
     tiles = (-(-camera.height // TILE), -(-camera.width // TILE))
-    for name, shape in (("tile_mask", tiles), ("trainable", (len(gaussians),))):
+    for name, shape in (("tile_mask", tiles), ("trainable", (len(gaussians),)), ("pose", (6,))):
         given = others.get(name)
         if given is not None and tuple(given.shape) != shape:
             raise DataError(f"{name} has shape {tuple(given.shape)}, not {shape}; make it for this view")

@@ -81,7 +81,7 @@ def _intersections(options: _Options, records: np.ndarray, depths: np.ndarray, r
 
 
 class _Rasterize(torch.autograd.Function):
-    """(parameters, features, background, means2d leaf) -> rgb, alpha, features; radii and means2d aside."""
+    """(parameters, features, background, means2d leaf, pose) -> rgb, alpha, features, radii."""
 
     @staticmethod
     def forward(
@@ -90,6 +90,7 @@ class _Rasterize(torch.autograd.Function):
         means2d: Tensor,
         background: Tensor,
         features: Tensor,
+        pose: Tensor | None,
         *parameters: Tensor,
     ):
         camera = options.camera
@@ -129,7 +130,9 @@ class _Rasterize(torch.autograd.Function):
         sums = space.take("sums", len(found.ids), blend.SUMS)
         absolute = space.take("absolute", len(found.ids), 2) if options.absgrad else None
         g_absolute = np.zeros((n, 2), np.float32) if options.absgrad else g_mean2d
-        moved = radii if options.trainable is None else radii * options.trainable
+        to_pose = ctx.needs_input_grad[4]  # all Gaussians that are drawn have their share in it
+        masked = options.trainable is not None and not to_pose
+        moved = radii * options.trainable if masked else radii
         no_alpha = np.zeros_like(g_alpha)
         for index, (records, image) in enumerate(zip(painted, images, strict=True)):
             first = index == 0
@@ -156,11 +159,24 @@ class _Rasterize(torch.autograd.Function):
             space.gradients_of = n, num_bases
         lists = _enough(painted[0], moved, g_mean2d, g_conic, g_opacity, g_color)
         fixed = project.camera_vector(camera), num_bases, options.antialiased
-        project.backward(*fixed, *enough, *lists, *gradients)
+        d_turns = np.zeros((len(enough[0]) if to_pose else 0, 3), np.float32)
+        project.backward(*fixed, *enough, *lists, *gradients, d_turns)
+        gradients = [g[:n] for g in gradients]
+        pose = _of_pose(camera, gradients[0], d_turns[:n]) if to_pose else None
+        if to_pose and options.trainable is not None:
+            for g in (g_absolute, g_features, *gradients):
+                g[~options.trainable] = 0
         return (
-            None, torch.from_numpy(g_absolute), None, torch.from_numpy(g_features),
-            *(torch.from_numpy(g[:n]) for g in gradients),
+            None, torch.from_numpy(g_absolute), None, torch.from_numpy(g_features), pose,
+            *map(torch.from_numpy, gradients),
         )  # fmt: skip
+
+
+def _of_pose(camera: Camera, d_means: np.ndarray, d_turns: np.ndarray) -> Tensor:
+    """Gradient [6] of the camera's rotation and translation: to move it is to move all means."""
+    translation = camera.w2c[:3, :3].astype(np.float64) @ d_means.sum(0, dtype=np.float64)
+    pose = np.concatenate([d_turns.sum(0, dtype=np.float64), translation])
+    return torch.from_numpy(pose.astype(np.float32))
 
 
 def _chunks(features: np.ndarray) -> list[np.ndarray]:
@@ -190,12 +206,14 @@ def render(
     tile_mask: np.ndarray | Tensor | None,
     trainable: Tensor | None,
     absgrad: bool,
+    pose: Tensor | None,
     workspace: Workspace | None,
 ) -> Render:
     """Render in float32 on the CPU; see `sagesplat.raster.rasterize` for the arguments."""
     extra = g.means.new_zeros(len(g), 0) if features is None else features
     parameters = [getattr(g, name) for name in PARAMETERS]
-    tracked = torch.is_grad_enabled() and any(p.requires_grad for p in (*parameters, extra))
+    posed = () if pose is None else (pose,)
+    tracked = torch.is_grad_enabled() and any(p.requires_grad for p in (*parameters, extra, *posed))
     means2d = torch.zeros(len(g), 2, requires_grad=tracked)
     options = _Options(
         camera, degree, antialiased, None if tile_mask is None else np.asarray(tile_mask),
@@ -206,6 +224,7 @@ def render(
         means2d,
         background,
         extra,
+        pose,
         *parameters,
     )  # type: ignore[misc]
     return Render(rgb, alpha, None if features is None else painted, means2d, radii)

@@ -177,17 +177,29 @@ def _take(g: Gaussians, rows: Tensor) -> Gaussians:
     return replace(g, **{name: getattr(g, name).index_select(0, rows) for name in (*PARAMETERS, "label_ids")})
 
 
-def splat(g: Gaussians, camera: Camera, degree: int, antialiased: bool) -> Splats:
+def _small_motion(pose: Tensor) -> Tensor:
+    """The matrix [4, 4] of a rotation vector and a translation near zero [6]: right to first order."""
+    a, b, c, x, y, z = pose.unbind()
+    one, zero = torch.ones_like(a), torch.zeros_like(a)
+    rows = (one, -c, b, x, c, one, -a, y, -b, a, one, z, zero, zero, zero, one)
+    return torch.stack(rows).view(4, 4)
+
+
+def splat(g: Gaussians, camera: Camera, degree: int, antialiased: bool, pose: Tensor | None = None) -> Splats:
     """Project Gaussians into a view and shade them with harmonics up to `degree`."""
     opacities = g.logit_opacities.sigmoid()
     if len(g) == 0:  # gsplat divides by their number; all parameters take part, so that all get gradients
         none = g.means.new_zeros(0, 2, dtype=torch.int32)
         conics, colors = g.quats[:, :3] * g.log_scales, g.sh0[:, 0] + g.shN.sum(1)
         return Splats(none, g.means[:, :2], g.means[:, 2], conics, opacities, colors, None)
-    pose = np.concatenate([camera.w2c.ravel(), camera.K.ravel(), camera.position]).astype(np.float32)
-    pose = torch.from_numpy(pose).to(g.means.device, non_blocking=True)  # one copy, too small to wait for
+    packed = np.concatenate([camera.w2c.ravel(), camera.K.ravel(), camera.position]).astype(np.float32)
+    packed = torch.from_numpy(packed).to(g.means.device, non_blocking=True)  # one copy, too small to wait for
+    w2c, K, position = packed[:16].view(4, 4), packed[16:25].view(1, 3, 3), packed[25:]
+    if pose is not None:
+        w2c = _small_motion(pose) @ w2c
+        position = -w2c[:3, :3].T @ w2c[:3, 3]
     found: Any = kernels().fully_fused_projection(
-        g.means, None, g.quats, g.log_scales.exp(), pose[:16].view(1, 4, 4), pose[16:25].view(1, 3, 3),
+        g.means, None, g.quats, g.log_scales.exp(), w2c[None], K,
         camera.width, camera.height,
         eps2d=BLUR, near_plane=NEAR, far_plane=FAR, packed=PACKED, calc_compensations=antialiased,
         opacities=opacities,  # for tight bounding boxes; their gradient comes from the pixels
@@ -203,7 +215,7 @@ def splat(g: Gaussians, camera: Camera, degree: int, antialiased: bool) -> Splat
         opacities = opacities * compensations
     coefficients = torch.cat([g.sh0, g.shN[:, : num_bases(degree) - 1]], 1)
     seen = (radii > 0).all(-1)
-    colors = kernels().spherical_harmonics(degree, g.means - pose[25:], coefficients, masks=seen)
+    colors = kernels().spherical_harmonics(degree, g.means - position, coefficients, masks=seen)
     return Splats(radii, means2d, depths, conics, opacities, (colors + 0.5).clamp_min(0), rows)
 
 
@@ -218,11 +230,25 @@ def _rows(trainable: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _project(
-    g: Gaussians, camera: Camera, degree: int, antialiased: bool, trainable: Tensor | None
+    g: Gaussians,
+    camera: Camera,
+    degree: int,
+    antialiased: bool,
+    trainable: Tensor | None,
+    pose: Tensor | None = None,
 ) -> Splats:
-    """All Gaussians; those that are not trainable in a call of their own, without a graph."""
+    """All Gaussians; those that are not trainable in a call of their own, without a graph.
+
+    With a pose in one call, without gradients of their parameters: that of the pose comes from all.
+    """
     if trainable is None or len(_rows(trainable)[1]) == 0:
-        return splat(g, camera, degree, antialiased)
+        return splat(g, camera, degree, antialiased, pose)
+    if pose is not None:
+        parts = {}
+        for name in PARAMETERS:
+            p = getattr(g, name)
+            parts[name] = torch.where(trainable.view(-1, *[1] * (p.ndim - 1)), p, p.detach())
+        return splat(replace(g, **parts), camera, degree, antialiased, pose)
     moving, still = _rows(trainable)
     parts = [splat(_take(g, moving), camera, degree, antialiased)]
     with torch.no_grad():
@@ -332,13 +358,14 @@ def render(
     tile_mask: np.ndarray | Tensor | None,
     trainable: Tensor | None,
     absgrad: bool,
+    pose: Tensor | None,
 ) -> Render:
     """Render in float32 on a GPU; see `sagesplat.raster.rasterize` for the arguments.
 
     `absgrad` sees what one pass draws: colours and at most 29 features. Raises `OutOfMemory`; a backward pass
     raises it where `named_out_of_memory` stands around it.
     """
-    splats = _project(g, camera, degree, antialiased, trainable)
+    splats = _project(g, camera, degree, antialiased, trainable, pose)
     drawn = (splats.radii > 0).all(-1)
     radii = splats.spread(torch.where(drawn, splats.radii.amax(-1), 0).float(), len(g))
     leaf = splats.spread(torch.where(drawn[:, None], splats.means2d.detach(), 0.0), len(g))
@@ -357,7 +384,8 @@ def render(
     behind = pad(background.detach().float(), (0, channels.shape[1] - 3))
     shapes = splats.means2d[None], splats.conics, splats.opacities
     parameters = [getattr(g, name) for name in PARAMETERS]
-    tracked = torch.is_grad_enabled() and any(p.requires_grad for p in (*parameters, channels))
+    graphs = (*parameters, channels, splats.means2d)
+    tracked = torch.is_grad_enabled() and any(p.requires_grad for p in graphs)
     watched = leaf
     if tracked:
         leaf.requires_grad_()

@@ -329,7 +329,7 @@ def _color_gradient(i, drawn, dx, dy, dz, shN, num_bases, records, g_color, d_sh
 def _backward_eight(
     i, cam, means, quats, log_scales, logits, shN, num_bases, antialiased, records, radii,
     g_mean2d, g_conic, g_opacity, g_color, d_means, d_quats, d_log_scales, d_logits, d_sh0, d_shN,
-    scratch, weights,
+    d_turns, scratch, weights,
 ):  # fmt: skip
     drawn32 = load8(radii, i) > 0.0
     if count(drawn32) == 0:
@@ -339,6 +339,7 @@ def _backward_eight(
         d_logits[i : i + LANES] = 0.0
         d_sh0[i : i + LANES] = 0.0
         d_shN[i : i + LANES, : num_bases - 1] = 0.0
+        d_turns[i : i + LANES] = 0.0  # it may have no rows
         return
     mx, my, mz = _three(means, i)
     qw, qx, qy, qz = _four(quats, i)
@@ -411,6 +412,18 @@ def _backward_eight(
     d_v = where(kept_v, -fy * over_z * along_y, 0.0) + _column(g_mean2d, i, 2, 1) * fy
     d_z = -over_z * over_z * (d_sx * fx + d_sy * fy + d_u * x + d_v * y)
     d_x, d_y = d_u * over_z, d_v * over_z
+    if d_turns.size > 0:  # a small turn w of the camera: x' = x + w x x, and so all columns of W
+        sx, sy = fx * over_z, fy * over_z
+        jx_w0, jy_w1 = d_sx + u * along_x, d_sy + v * along_y
+        jx_w1 = jx0 * cam[3] + jx1 * cam[4] + jx2 * cam[5]
+        jy_w0 = jy0 * cam[0] + jy1 * cam[1] + jy2 * cam[2]
+        turns = (
+            d_z * y - d_y * z - sx * u * jx_w1 - sy * v * jy_w1 - sy * along_y,
+            d_x * z - d_z * x + sx * along_x + sx * u * jx_w0 + sy * v * jy_w0,
+            d_y * x - d_x * y + sy * jy_w0 - sx * jx_w1,
+        )
+        for k, value in enumerate(turns):
+            scatter(d_turns, 3 * i + k, 3, where(drawn32, single(value), 0.0))
 
     dx, dy, dz, over_distance = _direction(cam, mx, my, mz)
     gx, gy, gz = _color_gradient(
@@ -429,13 +442,14 @@ def _backward_eight(
 @njit(parallel=True, error_model="numpy", cache=True)
 def backward(
     cam, num_bases, antialiased, means, quats, log_scales, logits, sh0, shN, records, radii,
-    g_mean2d, g_conic, g_opacity, g_color, d_means, d_quats, d_log_scales, d_logits, d_sh0, d_shN,
+    g_mean2d, g_conic, g_opacity, g_color, d_means, d_quats, d_log_scales, d_logits, d_sh0, d_shN, d_turns,
 ):  # fmt: skip
     """Gradients of all parameters from those of the 2D Gaussians; N >= 8.
 
     g_mean2d [N, 2]; g_conic [N, 3] for the inverse covariance's xx, xy (counted once), yy;
     g_opacity [N] of the opacity that blending saw; g_color [N, 3]. All rows are written, of d_shN
-    [N, bases - 1, 3] only the first num_bases - 1.
+    [N, bases - 1, 3] only the first num_bases - 1. d_turns [N, 3]: of a small turn of the camera about its
+    axes (rotation vector, rad); with no rows it is left out.
     """
     n = len(means)
     for chunk in prange((n + _CHUNK - 1) // _CHUNK):
@@ -445,5 +459,5 @@ def backward(
             _backward_eight(
                 min(start, n - LANES), cam, means, quats, log_scales, logits, shN, num_bases, antialiased,
                 records, radii, g_mean2d, g_conic, g_opacity, g_color, d_means, d_quats, d_log_scales,
-                d_logits, d_sh0, d_shN, scratch, weights,
+                d_logits, d_sh0, d_shN, d_turns, scratch, weights,
             )  # fmt: skip

@@ -41,9 +41,20 @@ def _still(values: Tensor, trainable: Tensor) -> Tensor:
     return torch.where(trainable.view(-1, *[1] * (values.ndim - 1)), values, values.detach())
 
 
-def _project(g: Gaussians, camera: Camera, antialiased: bool):
+def _world_to_camera(camera: Camera, pose: Tensor | None) -> Tensor:
+    """The camera's matrix [4, 4] in float64, moved by a rotation vector and a translation."""
+    w2c = torch.tensor(camera.w2c).double()
+    if pose is None:
+        return w2c
+    zero, (a, b, c, *translation) = w2c.new_zeros(()), pose.double().unbind()
+    turn = torch.linalg.matrix_exp(torch.stack([zero, -c, b, c, zero, -a, -b, a, zero]).view(3, 3))
+    top = torch.cat([turn, torch.stack(translation)[:, None]], 1)
+    return torch.cat([top, w2c.new_tensor([[0, 0, 0, 1]])]) @ w2c
+
+
+def _project(g: Gaussians, camera: Camera, w2c: Tensor, antialiased: bool):
     """Depths, 2D means, 2D covariances and opacities (EWA splatting as 3DGS uses it)."""
-    w2c, K = torch.tensor(camera.w2c).double(), torch.tensor(camera.K).double()
+    K = torch.tensor(camera.K).double()
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     x, y, z = (g.means.double() @ w2c[:3, :3].T + w2c[:3, 3]).unbind(-1)
     safe = torch.where(z > NEAR, z, 1.0)
@@ -63,11 +74,9 @@ def _project(g: Gaussians, camera: Camera, antialiased: bool):
     return z, means2d, cov, opacity
 
 
-def shade(g: Gaussians, camera: Camera, degree: int) -> Tensor:
-    """Colours [N, 3] seen from the camera, by spherical harmonics up to `degree`."""
-    directions = torch.nn.functional.normalize(
-        g.means.double() - torch.tensor(camera.position).double(), dim=-1
-    )
+def shade(g: Gaussians, position: Tensor, degree: int) -> Tensor:
+    """Colours [N, 3] seen from a position [3], by spherical harmonics up to `degree`."""
+    directions = torch.nn.functional.normalize(g.means.double() - position.double(), dim=-1)
     basis = torch.stack([torch.as_tensor(b).expand(len(g)) for b in sh.bases(*directions.unbind(-1))], -1)
     coefficients = torch.cat([g.sh0, g.shN], 1).double()[:, : sh.num_bases(degree)]
     return ((basis[:, : coefficients.shape[1], None] * coefficients).sum(1) + 0.5).clamp_min(0)
@@ -96,18 +105,20 @@ def render(
     tile_mask: np.ndarray | Tensor | None = None,
     trainable: Tensor | None = None,
     absgrad: bool = False,
+    pose: Tensor | None = None,
 ) -> Render:
     """Render in float64; see `sagesplat.raster.rasterize` for the arguments."""
     if trainable is not None:
         parts = {name: _still(getattr(g, name), trainable) for name in PARAMETERS}
         g, features = replace(g, **parts), None if features is None else _still(features, trainable)
-    z, means2d, cov, opacity = _project(g, camera, antialiased)
-    watched = means2d.detach().requires_grad_(means2d.requires_grad) if absgrad else means2d
-    if watched.requires_grad:
-        if trainable is not None:
-            watched.register_hook(lambda grad: torch.where(trainable[:, None], grad, 0.0))
-        watched.retain_grad()
-    channels = shade(g, camera, degree)
+    w2c = _world_to_camera(camera, pose)
+    z, means2d, cov, opacity = _project(g, camera, w2c, antialiased)
+    watched = means2d.detach().requires_grad_(means2d.requires_grad)
+    if watched.requires_grad and trainable is not None:
+        watched.register_hook(lambda grad: torch.where(trainable[:, None], grad, 0.0))
+    if not absgrad:
+        means2d = means2d + (watched - watched.detach())
+    channels = shade(g, -w2c[:3, :3].T @ w2c[:3, 3], degree)
     if features is not None:
         channels = torch.cat([channels, features.double()], -1)
     order = torch.argsort(z, stable=True)

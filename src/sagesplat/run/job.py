@@ -19,9 +19,11 @@ from sagesplat.run.records import settings_of
 from sagesplat.run.run_dir import RunDir
 from sagesplat.scene import load_scene
 from sagesplat.scene.images import Photos
+from sagesplat.scene.refined import read_refined, with_cameras
 from sagesplat.scene.scene import Scene
 from sagesplat.segment.lift import LiftedLabels
 from sagesplat.segment.masks import Masks, Taxonomy
+from sagesplat.segment.valid import ValidPixels
 from sagesplat.train import memory
 
 _PIECES = 2  # of work for each task that can run: the slower ones then have less to wait for
@@ -68,11 +70,25 @@ class Job:
         """What to divide work by that one task would do as well."""
         return 1 if isinstance(self.executor, Local) else _PIECES * self.executor.parallel
 
-    @cached_property
+    @property
     def scene(self) -> Scene:
-        """The capture that scene.json names, unchanged since."""
+        """The capture with the cameras that training refined: what everything after training uses."""
+        given, path = self.given_scene, self.run.cameras
+        if not path.exists():
+            return given
+        stat = path.stat()
+        state = stat.st_mtime_ns, stat.st_size, stat.st_ino  # a training of this job may replace the file
+        kept = self.__dict__.get("_refined")
+        if kept is None or kept[0] != state:
+            refined = with_cameras(given, read_refined(path, len(given.views)))
+            kept = self.__dict__["_refined"] = state, refined
+        return kept[1]
+
+    @cached_property
+    def given_scene(self) -> Scene:
+        """The capture that scene.json names, unchanged since, with its cameras as they were given."""
         if self.source is not None:
-            return self.source.scene
+            return self.source.given_scene
         if not self.run.scene.exists():
             raise RunError(f"{self.run.path}: {NO_RUN}")
         made = read_capture(self.run.scene)
@@ -94,7 +110,7 @@ class Job:
         """The photos, loaded when asked for; those of the scene when it was opened."""
         if self.source is not None:
             return self.source.photos
-        _ = self.scene
+        _ = self.given_scene
         return self.__dict__["photos"]
 
     @property
@@ -121,6 +137,11 @@ class Job:
         """The label images before fusion, loaded when asked for."""
         return Masks(self.run.masks, Taxonomy.read(self.run.masks / "labels.json"))
 
+    @cached_property
+    def valid(self) -> ValidPixels:
+        """The pixels that count, loaded when asked for."""
+        return ValidPixels(self.run.valid)
+
     @property
     def whole_masks(self) -> Masks:
         """The label images that all views agreed on, if they were asked to."""
@@ -137,10 +158,20 @@ class Job:
     @property
     def point_labels(self) -> np.ndarray:
         """Category of each SfM point."""
+        return self._lifted.label_ids
+
+    @property
+    def initial_labels(self) -> np.ndarray:
+        """Category of the Gaussian that begins at each SfM point; `lift.IGNORED` where none does."""
+        return self._lifted.initial_ids
+
+    @property
+    def _lifted(self) -> LiftedLabels:
         path = self.run.block_category_labels if self.has_block_categories else self.run.labels
-        ids = LiftedLabels.read(path, len(self.scene.points.xyz)).label_ids
-        self.check_named(path, np.flatnonzero(np.bincount(ids.astype(np.int64) + 1)) - 1)
-        return ids
+        lifted = LiftedLabels.read(path, len(self.scene.points.xyz))
+        ids = np.flatnonzero(np.bincount(lifted.label_ids.astype(np.int64) + 1)) - 1
+        self.check_named(path, ids)
+        return lifted
 
     @cached_property
     def snapshots(self) -> SnapshotLadder:

@@ -77,9 +77,29 @@ class RunDir:
         return self.path / "geometry.npz"
 
     @property
+    def cameras(self) -> Path:
+        """Poses and exposures of the views, where training refined them."""
+        return self.path / "cameras.npz"
+
+    @property
+    def refined(self) -> Path:
+        """What refining the cameras did, in figures."""
+        return self.path / "refined.json"
+
+    @property
+    def scene_files(self) -> list[Path]:
+        """What decides the scene that everything after training uses."""
+        return [self.scene, *([self.cameras] if self.cameras.exists() else [])]
+
+    @property
     def masks(self) -> Path:
         """Label images at training size, with labels.json."""
         return self.path / "masks"
+
+    @property
+    def valid(self) -> Path:
+        """Which pixels count, by view: images of the views with some that do not."""
+        return self.path / "valid"
 
     @property
     def capture(self) -> Path:

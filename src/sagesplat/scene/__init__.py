@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -15,7 +16,10 @@ from sagesplat.scene.stored import read_scene
 __all__ = ["describe", "load_scene"]
 
 
-def load_scene(path: Path, *, downscale: int = 1, test_every: int = 8, calibrate_every: int = 0) -> Scene:
+def load_scene(
+    path: Path, *, downscale: int = 1, test_every: int = 8, calibrate_every: int = 0,
+    alpha: Literal["auto", "background", "ignore"] = "auto",
+) -> Scene:  # fmt: skip
     """Load a capture: posed photos and structure-from-motion points.
 
     The format is detected: a COLMAP workspace, nerfstudio's transforms.json, a Blender scene, or a scene that
@@ -27,6 +31,8 @@ def load_scene(path: Path, *, downscale: int = 1, test_every: int = 8, calibrate
         downscale: Photos are this many times smaller than the files in images/. Intrinsics follow.
         test_every: Every n-th view by name is a test view; 0: none. A split that the dataset lists is kept.
         calibrate_every: Every n-th of the other views calibrates promises; 0: none, 1 is refused.
+        alpha: Transparent pixels of photos. background: of an object that was cut out, composited over the
+            background; ignore: pixels that do not count; auto: by their place in the photos.
 
     Returns:
         The scene. Photos themselves are read when they are needed (`scene.images.Photos`). A stored scene is
@@ -50,7 +56,7 @@ def load_scene(path: Path, *, downscale: int = 1, test_every: int = 8, calibrate
         return read_scene(path)
     load = {"colmap": load_colmap, "transforms": load_transforms, "blender": load_blender}[kind]
     scene = load(path, downscale=downscale, test_every=test_every)
-    return replace(scene, calibrate_every=calibrate_every)
+    return replace(scene, calibrate_every=calibrate_every, alpha=scene.alpha if alpha == "auto" else alpha)
 
 
 def describe(scene: Scene) -> list[tuple[str, str]]:

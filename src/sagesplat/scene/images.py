@@ -13,6 +13,7 @@ from sagesplat.scene.scene import View
 from sagesplat.scene.undistort import undistort
 
 _STRIP = 2**20  # pixels that are converted at a time
+_LOOKED_AT = 8  # photos that decide what transparent pixels mean
 _HUGE = 180 * 10**6  # pixels
 
 
@@ -32,6 +33,29 @@ def has_alpha(path: Path) -> bool:
             return image.has_transparency_data
     except PictureError as error:
         raise _unreadable(path, error) from None
+
+
+def load_alpha(path: Path) -> UInt8[np.ndarray, "h w"]:
+    """Opacity of each pixel of a photo, 255 where it has no alpha channel. Raises SceneError."""
+    try:
+        with open_picture(path) as image:
+            if not image.has_transparency_data or image.mode.startswith("I"):
+                return np.full((image.height, image.width), 255, np.uint8)
+            return np.array(image.convert("RGBA").getchannel("A"))
+    except PictureError as error:
+        raise _unreadable(path, error) from None
+
+
+def cut_out(paths: Sequence[Path]) -> bool:
+    """Whether photos with alpha show an object that was cut out: most of their border is transparent."""
+    some = paths[:: max(1, len(paths) // _LOOKED_AT)]
+    return float(np.median([_clear_border(load_alpha(path)) for path in some])) > 0.5
+
+
+def _clear_border(alpha: UInt8[np.ndarray, "h w"]) -> float:
+    """Share of an image's border whose pixels are more transparent than opaque."""
+    border = np.concatenate([alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]])
+    return float((border < 128).mean())
 
 
 def load_photo(view: View) -> UInt8[np.ndarray, "H W 3"]:

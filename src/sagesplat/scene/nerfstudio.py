@@ -40,8 +40,8 @@ def load_transforms(path: Path, *, downscale: int = 1, test_every: int = 8) -> S
     exists. Otherwise they are area-resampled. If the file lists train_, val_ or test_filenames, they define
     the split unless `test_every` is 0: `val` is used only without `test`, and unlisted frames are dropped.
     Points are read from `ply_file_path`, else made by `points.random_points`. They are in the frame of the
-    poses: `applied_transform` has been applied to both. Depths are not read. Neither is `mask_path`, which
-    excludes pixels from the loss and does not name categories. Raises SceneError.
+    poses: `applied_transform` has been applied to both. A frame's `mask_path` says which pixels count (not
+    black). Depths are not read. Raises SceneError.
     """
     file = path if path.suffix == ".json" else path / "transforms.json"
     check_settings(path, downscale, test_every)
@@ -64,8 +64,8 @@ def load_blender(path: Path, *, downscale: int = 1, test_every: int = 8) -> Scen
     """The scene of a NeRF Blender folder: transforms_train.json, and transforms_test.json or else _val.
 
     The train file's views are training views and the test file's are test views, as in 3DGS. With
-    `test_every` 0 all are training views. Photos with alpha are composited over white. The initial points
-    are random in the cube [-1.3, 1.3]^3. Raises SceneError.
+    `test_every` 0 all are training views. Photos with alpha are of a cut-out object, composited over white.
+    The initial points are random in the cube [-1.3, 1.3]^3. Raises SceneError.
     """
     check_settings(path, downscale, test_every)
     folder = path.parent if path.suffix == ".json" else path
@@ -80,7 +80,8 @@ def load_blender(path: Path, *, downscale: int = 1, test_every: int = 8) -> Scen
     if has_alpha(views[0].image_path):
         views = tuple(replace(view, camera=replace(view.camera, background=WHITE)) for view in views)
     points = random_points(views, cube=BLENDER_CUBE)
-    return Scene(repaired(folder.resolve().name), folder, views, points, test_every, test_names=test_names)
+    name = repaired(folder.resolve().name)
+    return Scene(name, folder, views, points, test_every, test_names=test_names, alpha="background")
 
 
 def frame_cameras(file: Path) -> tuple[list[tuple[str, Camera]], bool]:
@@ -167,14 +168,26 @@ def _views(file: Path, frames: Sequence[Mapping[str, Any]], downscale: int) -> l
             if key not in lenses:
                 lenses[key] = lens, intrinsics(lens) if is_pinhole(lens) else pinhole(lens)
             w2c = world_to_camera(frame.get("transform_matrix"))
+            valid = _mask(file, frame)
         except (TypeError, ValueError, OverflowError) as error:
             reason = short(error)
             raise SceneError(f"{file}: frame {str(path)!r}: {reason}; export the transforms again") from None
         lens, K = lenses[key]
         camera = camera_of(photo, w2c, lens, K, divisor)
         name = photo.relative_to(root).as_posix()
-        views.append(View(name, camera, photo, None if is_pinhole(lens) else lens))
+        views.append(View(name, camera, photo, None if is_pinhole(lens) else lens, valid))
     return views
+
+
+def _mask(file: Path, frame: Mapping[str, Any]) -> Path | None:
+    """The image that says which pixels of a frame's photo count. Raises ValueError where it is missing."""
+    value = frame.get("mask_path")
+    if value is None:
+        return None
+    path = file.parent / _inside(file, "mask_path", value)
+    if not path.is_file():
+        raise ValueError(f"no file {short(repr(value))}, its mask_path")
+    return path
 
 
 def _photo(root: Path, path: PurePosixPath) -> Path | None:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float32, Int32, Int64, UInt8
@@ -17,6 +18,14 @@ class Camera:
     width: int
     height: int
     background: tuple[int, int, int] = (0, 0, 0)  # RGB; photos with alpha are composited over it
+    exposure: Float32[np.ndarray, "3 4"] | None = (
+        None  # photo's colours = E[:, :3] @ rgb + E[:, 3]; None: rgb
+    )
+
+    @property
+    def neutral(self) -> "Camera":
+        """The same camera without its photo's exposure, for pictures that stand beside no photo."""
+        return replace(self, exposure=None)
 
     @property
     def position(self) -> Float32[np.ndarray, "3"]:
@@ -52,6 +61,7 @@ class View:
     camera: Camera  # pinhole, at the size that training uses
     image_path: Path
     lens: Lens | None = None  # None: the file on disk needs no undistortion
+    valid_path: Path | None = None  # an image of the photo's shape whose black pixels do not count
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +87,7 @@ class Scene:
     calibrate_every: int = 0  # every n-th of the others is a calibration view; 0 = none
     test_names: frozenset[str] | None = None  # overrides test_every: test views that the data set lists
     calibration_names: frozenset[str] | None = None  # likewise overrides calibrate_every
+    alpha: Literal["auto", "background", "ignore"] = "auto"  # what transparent pixels mean (`SceneConfig`)
 
     @cached_property
     def extent(self) -> float:

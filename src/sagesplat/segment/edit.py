@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int16, Int64
+from jaxtyping import Bool, Int16, Int64
 
 from sagesplat.core.errors import LabelError, short
 from sagesplat.core.names import RULE, checked
@@ -26,6 +26,7 @@ from sagesplat.segment.masks import (
     write_labels,
     write_mask,
 )
+from sagesplat.segment.valid import ALL_VALID, ValidPixels
 
 Table = Int16[np.ndarray, " M"]  # new id of each old one; the last entry, which -1 names, stays -1
 NO_MERGE: Mapping[str, str] = MappingProxyType({})
@@ -50,10 +51,19 @@ class Edited:
 
 def parse_keep(text: str) -> tuple[str, ...]:
     """The categories in "grass-merged,tree-merged"; LabelError for what is no name."""
+    return _parse_names(text, "keep")
+
+
+def _parse_names(text: str, option: str) -> tuple[str, ...]:
     names = tuple(name.strip() for name in text.split(",")) if text.strip() else ()
     if "" in names:
-        raise LabelError(f"keep {short(repr(text))}: a name is empty; write NAME,NAME")
-    return tuple(dict.fromkeys(_named(name, "keep") for name in names))
+        raise LabelError(f"{option} {short(repr(text))}: a name is empty; write NAME,NAME")
+    return tuple(dict.fromkeys(_named(name, option) for name in names))
+
+
+def parse_ignore(text: str) -> tuple[str, ...]:
+    """The categories in "person,car"; LabelError for what is no name."""
+    return _parse_names(text, "ignore")
 
 
 def parse_merge(text: str) -> dict[str, str]:
@@ -96,9 +106,13 @@ def resolve(merge: Mapping[str, str]) -> dict[str, str]:
 
 
 def edit_table(
-    taxonomy: Taxonomy, *, keep: Sequence[str] = (), merge: Mapping[str, str] = NO_MERGE
+    taxonomy: Taxonomy,
+    *,
+    keep: Sequence[str] = (),
+    merge: Mapping[str, str] = NO_MERGE,
+    ignore: Sequence[str] = (),
 ) -> tuple[Taxonomy, Table]:
-    """The categories that are left and the table that `apply` takes: first `merge`, then `keep` (empty: all).
+    """The categories that are left and the table that `apply` takes: `merge`, `ignore`, `keep` (empty: all).
 
     `merge` maps a category to the one it goes into: one of the taxonomy, `unlabelled`, or a new one, which
     gets COCO panoptic's id where that is its name and the id is free, else the first free id from 201 on.
@@ -111,11 +125,9 @@ def edit_table(
         if new not in ids:
             ids[new] = _free_id(new, set(ids.values()))
     names = {i: n for n, i in ids.items() if n not in merge and i != UNLABELLED}
-    kept = dict(sorted(names.items()))
+    kept = {i: n for i, n in sorted(names.items()) if n not in ignore}
     if keep:
-        for name in keep:
-            if name in merge:
-                raise LabelError(f"keep: {name} is merged into {merge[name]}; keep that")
+        _check_unmerged(keep, merge, "keep")
         _check_known(Taxonomy(kept), keep, "keep")
         kept = {i: n for i, n in kept.items() if n in keep}
     table = np.full(max(taxonomy.names, default=0) + 2, UNLABELLED, np.int16)
@@ -123,6 +135,21 @@ def edit_table(
         new_id = ids[merge.get(name, name)]
         table[label_id] = new_id if new_id in kept else UNLABELLED
     return Taxonomy(kept), table
+
+
+def ignored_ids(
+    taxonomy: Taxonomy, ignore: Sequence[str], merge: Mapping[str, str] = NO_MERGE
+) -> tuple[list[int], list[str]]:
+    """Ids that are ignored, as they were before `merge`, and the names of which there are no pixels.
+
+    LabelError for a name that is neither a category of the taxonomy, after `merge`, nor one of COCO's.
+    """
+    merge = resolve(merge)
+    _check_unmerged(ignore, merge, "ignore")
+    after = {label_id: merge.get(name, name) for label_id, name in taxonomy.names.items()}
+    unseen = [name for name in ignore if name not in after.values()]
+    _check_known(Taxonomy(after), [name for name in unseen if name not in coco.NAMES.values()], "ignore")
+    return [label_id for label_id, name in after.items() if name in ignore], unseen
 
 
 def apply(label_ids: Int16[np.ndarray, "*S"], table: Table) -> Int16[np.ndarray, "*S"]:
@@ -164,24 +191,27 @@ def edit_labels(
     *,
     keep: Sequence[str] = (),
     merge: Mapping[str, str] = NO_MERGE,
+    ignore: Sequence[str] = (),
     min_share: float = 0.0,
+    valid: ValidPixels = ALL_VALID,
     on_view: Callable[[int, int], None] | None = None,
 ) -> Edited:
-    """Edit a normalised folder of masks: first `merge`, then `keep`, then fold what is below `min_share`.
+    """Edit a folder of masks: first `merge`, then `ignore` and `keep`, then fold what is below `min_share`.
 
-    `keep`: the categories that stay, all others become unlabelled; none named: all stay. `merge`: see
-    `edit_table`. `min_share`: of the pixels of all views, unlabelled ones included. `target`: where the
-    result goes, the folder itself by default; a killed edit is finished by calling it again. `on_view(done,
-    total)` is called after each image, read or written. LabelError for names that there are not, when
-    nothing would be left, or for masks that cannot be read: then nothing is written.
+    `ignore`: categories that become unlabelled, and so do all pixels that are not `valid`. `keep`: the
+    categories that stay, all others become unlabelled; none named: all stay. `merge`: see `edit_table`.
+    `min_share`: of the pixels of all views, unlabelled ones included. `target`: where the result goes, the
+    folder itself by default; a killed edit is finished by calling it again. `on_view(done, total)` is called
+    after each image, read or written. LabelError for names that there are not, when nothing would be left, or
+    for masks that cannot be read: then nothing is written.
     """
     target = target or folder
     before = Taxonomy.read(folder / "labels.json")
     masks = Masks(folder, before)
-    after, table = edit_table(before, keep=keep, merge=merge)
+    after, table = edit_table(before, keep=keep, merge=merge, ignore=ignore)
     counts, total = np.zeros(len(table), np.int64), 2 * len(views)
     for row, view in enumerate(views):
-        counts += count_pixels(masks[view], before)
+        counts += count_pixels(_valid_only(masks[view], valid[view]), before)
         if on_view:
             on_view(row + 1, total)
     new_counts = np.zeros(max(after.names, default=0) + 2, np.int64)
@@ -190,7 +220,7 @@ def edit_labels(
     table = fold[table]
     _prepare(folder, target, views, before, left)
     for row, view in enumerate(views):
-        write_mask(mask_path(target, view), apply(masks[view], table), left)
+        write_mask(mask_path(target, view), apply(_valid_only(masks[view], valid[view]), table), left)
         if on_view:
             on_view(len(views) + row + 1, total)
     write_labels(target, left, set(left.names))
@@ -203,8 +233,14 @@ def edit_labels(
         shares={name: new_counts[i] / pixels for i, name in left.names.items()},
         dropped={name: counts[i] / pixels for i, name in gone.items()},
         folded={n: new_counts[i] / pixels for i, n in after.names.items() if i not in left.names},
-        asked={"merge": merge, "keep": list(keep), "min_share": min_share},
+        asked={"merge": merge, "ignore": list(ignore), "keep": list(keep), "min_share": min_share},
     )
+
+
+def _valid_only(
+    label_ids: Int16[np.ndarray, "H W"], valid: Bool[np.ndarray, "H W"] | None
+) -> Int16[np.ndarray, "H W"]:
+    return label_ids if valid is None else np.where(valid, label_ids, np.int16(UNLABELLED))
 
 
 def _prepare(folder: Path, target: Path, views: Sequence[View], before: Taxonomy, after: Taxonomy) -> None:
@@ -213,6 +249,12 @@ def _prepare(folder: Path, target: Path, views: Sequence[View], before: Taxonomy
         Taxonomy(dict(sorted((before.names | after.names).items()))).write(target / "labels.json")
     else:
         prepare_folder(target, views)
+
+
+def _check_unmerged(names: Sequence[str], merge: Mapping[str, str], option: str) -> None:
+    for name in names:
+        if name in merge:
+            raise LabelError(f"{option}: {name} is merged into {merge[name]}; {option} that")
 
 
 def _check_known(taxonomy: Taxonomy, names: Mapping[str, str] | Sequence[str], option: str) -> None:
@@ -225,7 +267,7 @@ def _check_known(taxonomy: Taxonomy, names: Mapping[str, str] | Sequence[str], o
 
 
 def _listed(taxonomy: Taxonomy) -> str:
-    return ", ".join(sorted(taxonomy.names.values()))
+    return ", ".join(sorted(set(taxonomy.names.values())))
 
 
 def _free_id(name: str, taken: set[int]) -> int:

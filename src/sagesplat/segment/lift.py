@@ -7,13 +7,18 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float32, Int16, Int32, Int64
+from jaxtyping import Bool, Float32, Int16, Int32, Int64, Shaped
 
 from sagesplat.core.errors import LabelError, short
 from sagesplat.io.files import atomic_path
 from sagesplat.io.npz import Npz
 from sagesplat.scene.scene import Camera, Scene
 from sagesplat.segment.masks import UNLABELLED, Masks
+from sagesplat.segment.valid import ALL_VALID, ValidPixels
+
+IGNORED = (
+    -2
+)  # label of the points that no Gaussian is to begin at: they show what does not belong to the scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,6 +28,19 @@ class LiftedLabels:
     label_ids: Int16[np.ndarray, " P"]  # category id, -1 where nothing voted
     num_votes: Int32[np.ndarray, " P"]  # labelled pixels that the point was seen on
     num_agreeing: Int32[np.ndarray, " P"]  # those among them with the point's label
+    ignored: Bool[np.ndarray, " P"] | None = None  # most of its pixels do not count; None: of no point
+
+    @property
+    def initial_ids(self) -> Int16[np.ndarray, " P"]:
+        """Label of the Gaussian that begins at each point; `IGNORED` where none does."""
+        if self.ignored is None:
+            return self.label_ids
+        return np.where(self.ignored, np.int16(IGNORED), self.label_ids)
+
+    def select(self, rows: Int64[np.ndarray, " M"]) -> "LiftedLabels":
+        """The labels of some points."""
+        ignored = None if self.ignored is None else self.ignored[rows]
+        return LiftedLabels(self.label_ids[rows], self.num_votes[rows], self.num_agreeing[rows], ignored)
 
     @property
     def agreement(self) -> float:
@@ -40,7 +58,8 @@ class LiftedLabels:
     def write(self, path: Path) -> None:
         """Write labels.npz."""
         with atomic_path(path) as temporary:
-            np.savez(temporary, **{f.name: getattr(self, f.name) for f in fields(self)})
+            columns = {f.name: getattr(self, f.name) for f in fields(self)}
+            np.savez(temporary, **{name: column for name, column in columns.items() if column is not None})
 
     @classmethod
     def read(cls, path: Path, num_points: int) -> "LiftedLabels":
@@ -48,7 +67,10 @@ class LiftedLabels:
         types = {"label_ids": np.int16, "num_votes": np.int32, "num_agreeing": np.int32}
         try:
             with Npz(path) as stored:
-                columns = {name: stored[name].astype(dtype, casting="safe") for name, dtype in types.items()}
+                more = {"ignored": np.bool_} if "ignored" in stored else {}
+                columns = {
+                    name: stored[name].astype(dtype, casting="safe") for name, dtype in (types | more).items()
+                }
         except FileNotFoundError:
             raise LabelError(f"{path}: no such file; lift the labels first") from None
         except (OSError, KeyError, TypeError, ValueError) as error:
@@ -67,6 +89,7 @@ def lift(
     *,
     votes: Literal["track", "projection"] = "track",
     views: Collection[int] | None = None,
+    valid: ValidPixels = ALL_VALID,
 ) -> LiftedLabels:
     """Transfer 2D labels to the SfM points: each point takes the label that most of its pixels have.
 
@@ -76,10 +99,11 @@ def lift(
         votes: "track": a point votes once per observation of its track. "projection": once per view whose
             frustum it is in, occluded or not; used too where a scene has no tracks.
         views: Rows of `Scene.views` that vote; None: all.
+        valid: The pixels that count. A point that is seen on more that do not count than that do is ignored.
 
     Returns:
-        Label ids int16 [P] (-1: no vote), and how many votes each point had and how many agreed. Ties go to
-        the label with more pixels in all label images.
+        Label ids int16 [P] (-1: no vote), how many votes each point had and how many agreed, and which points
+        are ignored. Ties go to the label with more pixels in all label images.
     """
     ids = np.array(sorted(masks.taxonomy.names))
     column_of = np.zeros(ids[-1] + 1, np.int64)
@@ -87,15 +111,18 @@ def lift(
     counts = np.zeros((len(scene.points.xyz), len(ids)), np.int32)
     flat_counts = counts.reshape(-1)  # np.add.at is several times faster on one axis
     num_pixels = np.zeros(len(ids), np.int64)
+    balance = np.zeros(len(scene.points.xyz), np.int32)  # pixels that count less those that do not
     tracked = votes == "track" and len(scene.points.track_points) > 0
     pixels = _track_pixels(scene) if tracked else _projected_pixels(scene)
     for row, (view, (points, uv)) in enumerate(zip(scene.views, pixels, strict=True)):
         if views is not None and row not in views:
             continue
-        label_ids = masks[view]
+        label_ids, counts_here = masks[view], valid[view]
         # unsigned, unlabelled pixels are 65535: out of the way
         num_pixels += np.bincount(label_ids.view(np.uint16).ravel(), minlength=ids[-1] + 1)[ids]
-        seen, points = _labels_at(label_ids, points, uv)
+        on_valid = None if counts_here is None else _pixels_at(counts_here, points, uv)[0]
+        seen, points = _pixels_at(label_ids, points, uv)
+        np.add.at(balance, points, 1 if on_valid is None else 2 * on_valid.astype(np.int32) - 1)
         voted = seen != UNLABELLED
         np.add.at(flat_counts, points[voted] * len(ids) + column_of[seen[voted]], 1)
     order = np.argsort(-num_pixels, kind="stable")  # arg max takes the first of several
@@ -105,6 +132,7 @@ def lift(
         label_ids=np.where(num_votes > 0, ids[winner], UNLABELLED).astype(np.int16),
         num_votes=num_votes,
         num_agreeing=np.take_along_axis(counts, winner[:, None], 1)[:, 0],
+        ignored=balance < 0 if (balance < 0).any() else None,
     )
 
 
@@ -117,17 +145,17 @@ def agreement_in(
     for row, (view, (points, uv)) in enumerate(zip(scene.views, pixels, strict=True)):
         if row not in views:
             continue
-        found, points = _labels_at(masks[view], points, uv)
+        found, points = _pixels_at(masks[view], points, uv)
         both = (found != UNLABELLED) & (label_ids[points] != UNLABELLED)
         seen += int(both.sum())
         same += int((found == label_ids[points])[both].sum())
     return same / seen if seen else float("nan")
 
 
-def _labels_at(
-    image: Int16[np.ndarray, "H W"], points: Int64[np.ndarray, " M"], uv: Float32[np.ndarray, "M 2"]
-) -> tuple[Int16[np.ndarray, " m"], Int64[np.ndarray, " m"]]:
-    """Labels at pixels, and their points; on the far edge or, after undistortion, outside there is none."""
+def _pixels_at(
+    image: Shaped[np.ndarray, "H W"], points: Int64[np.ndarray, " M"], uv: Float32[np.ndarray, "M 2"]
+) -> tuple[Shaped[np.ndarray, " m"], Int64[np.ndarray, " m"]]:
+    """An image at pixels, and their points; on the far edge or, after undistortion, outside there is none."""
     inside = (uv >= 0).all(1) & (uv < image.shape[::-1]).all(1)
     x, y = uv[inside].astype(np.int64).T
     return image[y, x], points[inside]

@@ -51,8 +51,8 @@ from sagesplat.train.nested import Nested, NestStep
 _SEEN = 0.01  # share of a photo's visible points from which on it sees a block
 
 
-def check(config: BlocksConfig) -> None:
-    """RunError for settings out of range."""
+def check(config: BlocksConfig, train: TrainConfig) -> None:
+    """RunError for settings out of range, or that do not go together."""
     wrong = (
         ("count", config.count, config.count >= 1, "1 or more"),
         ("margin", config.margin, 0 <= config.margin <= 2, "a share such as 0.2"),
@@ -63,6 +63,10 @@ def check(config: BlocksConfig) -> None:
     for name, value, fine, cure in wrong:
         if not fine:
             raise RunError(f"--blocks.{name} {value} is impossible; choose {cure}")
+    if config.count > 1 and train.poses:  # a photo of several blocks would get several poses
+        raise RunError("--train.poses does not go with --blocks.count; leave out one of them")
+    if config.count > 1 and train.exposure == "affine":
+        raise RunError("--train.exposure affine does not go with --blocks.count; leave out one of them")
 
 
 def _division(config: BlocksConfig) -> dict[str, float]:
@@ -112,7 +116,7 @@ def _begin(run: RunDir, scene: Scene, labels: LiftedLabels, rows: np.ndarray, ph
     run.path.mkdir(parents=True, exist_ok=True)
     capture = run.path / "capture.npz"
     write_scene(capture, scene)
-    LiftedLabels(labels.label_ids[rows], labels.num_votes[rows], labels.num_agreeing[rows]).write(run.labels)
+    labels.select(rows).write(run.labels)
     mine = photos.of({view.name for view in scene.views})
     stored = {"path": str(capture.resolve()), "settings": {}, "fingerprint": fingerprint(scene)}
     stored |= {"photos": mine.sha256, "extent": scene.extent, "points": len(rows), "views": []}
@@ -134,6 +138,10 @@ def _share_masks(job: Job, block: Job) -> None:
         for path in [*(mask_path(source, view) for view in block.scene.views), source / "labels.json"]:
             link(path, target / path.relative_to(source))
         link(of.provenance(stage), run.provenance(stage))
+    shutil.rmtree(run.valid, ignore_errors=True)
+    for view in block.scene.views:
+        if (path := mask_path(of.valid, view)).exists():
+            link(path, mask_path(run.valid, view))
 
 
 def _spec(job: Job, number: int) -> JobSpec:
@@ -153,6 +161,8 @@ def _needed(block: Job, config: TrainConfig) -> int:
 
 def train_blocks(job: Job, config: BlocksConfig, train: TrainConfig, seed: int) -> None:
     """Split the scene, train its blocks as tasks, and merge their levels."""
+    check(config, train)
+    train = replace(train, exposure="off")  # a photo of several blocks would get several
     run = job.run
     settings = {**asdict(train), "batch": max(train.batch, job.processes), "seed": seed}
     settings["blocks"] = _division(config)
@@ -361,7 +371,7 @@ def _tuned(
     ladder = Nested(g, np.ones(n, np.float32), np.zeros(n, np.int8))
     for event in nested.nest(
         ladder, narrowed, job.photos, train_config(job), config,
-        seed=seed, backend=job.backend, movable=movable,
+        valid=job.valid, seed=seed, backend=job.backend, movable=movable,
     ):  # fmt: skip
         if isinstance(event, NestStep):
             job.emit(Progress("boundaries", event.step, config.steps, f"loss {event.loss:.3f}"))

@@ -9,7 +9,7 @@ from sagesplat.core.events import Progress, TableMade
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.levels import read_sizes
 from sagesplat.io.files import write_text
-from sagesplat.metrics.image import squared_error_map, ssim_map
+from sagesplat.metrics.image import pasted, squared_error_map, ssim_map
 from sagesplat.output.tables import Table
 from sagesplat.raster import Workspace, device_of, rasterize
 from sagesplat.run.job import Job
@@ -43,7 +43,7 @@ def measure_borders(job: Job) -> None:
         return [str(run.adapted / "blocks.md")]
 
     made = [run.block(i).provenance(s) for i in range(len(read_blocks(file))) for s in (*_TIMED, "interior")]
-    inputs = [run.scene, run.provenance("train"), run.prefixes, file, *(p for p in made if p.exists())]
+    inputs = [*run.scene_files, run.provenance("train"), run.prefixes, file, *(p for p in made if p.exists())]
     run_stage(job, "borders", {}, inputs, [table_file, run.adapted / "borders.csv"], make)
 
 
@@ -72,7 +72,7 @@ def border_table(job: Job, blocks: Blocks, sets: dict[str, Gaussians]) -> Table:
     most of it.
     """
     scene = job.scene
-    rows = scene.test_ids.tolist() or spread(scene.train_ids.tolist(), _VIEWS)
+    rows = job.valid.rows(scene, scene.test_ids) or spread(job.valid.rows(scene, scene.train_ids), _VIEWS)
     first = next(iter(sets.values()))
     near = torch.from_numpy(blocks.to_border(first.means.numpy()) < blocks.margin / 2)
     in_band = [_shows(job, first, near, row) for row in rows]
@@ -87,7 +87,7 @@ def border_table(job: Job, blocks: Blocks, sets: dict[str, Gaussians]) -> Table:
                 antialiased=job.antialiased,
                 workspace=workspace,
             )
-            photo = as_unit(job.photos[row])
+            photo = pasted(as_unit(job.photos[row]), image, job.valid[scene.views[row]])
             errors.append(squared_error_map(image, photo))
             quality.append(ssim_map(image, photo))
         b = bands(in_band, errors, quality)

@@ -132,7 +132,7 @@ def _without_capture(job: Job) -> Job:
     if not job.run.geometry.exists():  # of an earlier version
         return job
     source = replace(job)
-    vars(source)["scene"] = read_scene(job.run.geometry)
+    vars(source)["given_scene"] = read_scene(job.run.geometry)
     return replace(job, source=source)
 
 

@@ -19,7 +19,8 @@ def tune_composition(job: Job, g: Gaussians, steps: int) -> Gaussians:
     if steps <= 0:
         return g
     seed = settings_of(job.run, "train")["seed"]
-    return tune(g, job.scene, job.photos, train_config(job), steps, seed=seed, backend=job.backend)
+    config = train_config(job)
+    return tune(g, job.scene, job.photos, config, steps, valid=job.valid, seed=seed, backend=job.backend)
 
 
 def compose(job: Job, plan: Plan) -> Gaussians:
@@ -49,4 +50,4 @@ def compose_inputs(job: Job) -> list[Path]:
     """What a plan's composition is made from."""
     run = job.run
     made = [run.provenance("plan"), run.provenance("train"), *label_image_inputs(run)]
-    return [run.scene, run.plan, method_of(job).level_files[0], *made]
+    return [*run.scene_files, run.plan, method_of(job).level_files[0], *made]

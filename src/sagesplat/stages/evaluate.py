@@ -30,18 +30,20 @@ def evaluate_plans(job: Job) -> None:
         table = evaluate(
             job.scene, job.photos, label_images(job, fitted.masks), job.ladder, plans, method.predicted,
             region=fitted.region, min_share=fitted.min_share, uniform=_levels_beside(job, plans),
-            compose=lambda plan: compose(job, plan), backend=job.backend, antialiased=job.antialiased,
+            compose=lambda plan: compose(job, plan), valid=job.valid,
+            backend=job.backend, antialiased=job.antialiased,
             progress=lambda done, total: job.emit(Progress("evaluate", done, total)),
         )  # fmt: skip
         table.write_csv(run.evaluation)
         if len(table):
             plan = scene_plan(job, *main_target(run))
             _show(job, tables.outcome_table(plan, job.ladder.counts, table, titles(job.names())))
-        return [line for plan in plans for line in _lines(plan, table.of(plan))]
+        exposed = any(job.scene.views[row].camera.exposure is not None for row in job.scene.test_ids)
+        return [line for plan in plans for line in _lines(plan, table.of(plan), exposed)]
 
     fitted = [run.provenance("observe"), run.provenance("fit")]
     inputs = [run.labels, *method.files, *fitted, *compose_inputs(job)]
-    settings = {"tune_steps": settings_of(run, "plan").get("tune_steps", 0)}
+    settings = {"tune_steps": settings_of(run, "plan").get("tune_steps", 0), "colours": True}
     run_stage(job, "evaluate", settings, inputs, [run.evaluation], make)
 
 
@@ -54,8 +56,8 @@ def _levels_beside(job: Job, plans: Sequence[Plan]) -> list[int]:
     return [levels[i] for i in sorted(near)]
 
 
-def _lines(plan: Plan, rows: Evaluation) -> list[str]:
-    """What test views measure of a plan, in words."""
+def _lines(plan: Plan, rows: Evaluation, exposed: bool) -> list[str]:
+    """What test views measure of a plan, in words; `exposed`: with colours fitted to their photos."""
     at = rows.select(rows.label_id == TOTAL)
     if not len(at):
         return []
@@ -64,4 +66,18 @@ def _lines(plan: Plan, rows: Evaluation) -> list[str]:
     return [
         f"{asked}: test views {alike}{at.ssim.mean():.3f} / {at.psnr.mean():.2f} dB "
         f"(full model {at.full_ssim.mean():.3f} / {at.full_psnr.mean():.2f} dB)"
+        f"{', with colours fitted to their photos' if exposed else ''}",
+        *([_colours(at)] if exposed else []),
     ]
+
+
+def _colours(at: Evaluation) -> str:
+    """The same views without that fit: plain, and colour-corrected."""
+    plan, full = (
+        f"plain {plain.mean():.2f} dB, cc_ssim {ssim.mean():.3f} / cc_psnr {decibels.mean():.2f} dB"
+        for plain, ssim, decibels in (
+            (at.plain_psnr, at.cc_ssim, at.cc_psnr),
+            (at.full_plain_psnr, at.full_cc_ssim, at.full_cc_psnr),
+        )
+    )
+    return f"  {plan} (full model {full})"

@@ -41,7 +41,7 @@ def fit_ladder(job: Job, config: FitConfig) -> None:
 
     settings = {name: getattr(config, name) for name in method.fit_settings}
     _check_observed(run, config)
-    inputs = [run.scene, run.provenance("observe"), run.observations, *method.level_files]
+    inputs = [*run.scene_files, run.provenance("observe"), run.observations, *method.level_files]
     inputs += [run.labels, run.provenance("train"), *label_image_inputs(run)]
     inputs += method.sample_files
     run_stage(job, "fit", settings, inputs, method.model_files, make)

@@ -2,13 +2,13 @@
 
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int16
+from jaxtyping import Float32, Int16
 
 from sagesplat.core.config import LabelsConfig, LiftConfig, MasksConfig
 from sagesplat.core.errors import LabelError, RunError
@@ -21,12 +21,20 @@ from sagesplat.run.records import file_hash
 from sagesplat.run.remote import work_all
 from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
-from sagesplat.segment.edit import Edited, edit_labels, parse_keep, parse_merge
+from sagesplat.segment.edit import (
+    Edited,
+    edit_labels,
+    ignored_ids,
+    parse_ignore,
+    parse_keep,
+    parse_merge,
+)
 from sagesplat.segment.lift import agreement_in, lift
 from sagesplat.segment.masks import MAX_LABEL_ID, UNLABELLED, Masks, Taxonomy, import_masks, write_labels
 from sagesplat.segment.registry import SEGMENTERS, segmenter_for
 from sagesplat.segment.segmenters import segment_some
 from sagesplat.segment.soft import read_soft, soft_path
+from sagesplat.segment.valid import FOLDER, ValidPixels, write_valid
 from sagesplat.stages.memory import check_network
 from sagesplat.train.fuse import Soft, fuse
 
@@ -35,9 +43,9 @@ _EDIT = "edit.json"
 
 
 def make_masks(job: Job, config: MasksConfig, labels: LabelsConfig = LabelsConfig()) -> None:
-    """Import label images or segment the photos, then merge and drop categories."""
+    """Import label images or segment the photos, find the pixels that count, merge and drop categories."""
     run, kind = job.run, segmenter_kind(job.scene.path, config)
-    merge, keep = parse_merge(labels.merge), parse_keep(labels.keep)
+    merge, keep, ignore = parse_merge(labels.merge), parse_keep(labels.keep), parse_ignore(labels.ignore)
     if kind == "masks":
         _import(job, config)
     else:
@@ -45,15 +53,49 @@ def make_masks(job: Job, config: MasksConfig, labels: LabelsConfig = LabelsConfi
 
     def make() -> list[str]:
         shutil.rmtree(run.masks, ignore_errors=True)
+        ignored = _find_valid(job, labels, ignore, merge)
         edited = edit_labels(
-            run.segmented, job.scene.views, run.masks, keep=keep, merge=merge, min_share=labels.min_share,
+            run.segmented, job.scene.views, run.masks,
+            keep=keep, merge=merge, ignore=ignore, min_share=labels.min_share, valid=ValidPixels(run.valid),
             on_view=lambda done, total: job.emit(Progress("masks", done, total)),
         )  # fmt: skip
         write_json(run.masks / _EDIT, {**edited.record, "table": edited.table.tolist()})
-        return _lines(edited)
+        return [*_lines(edited), *_ignored_lines(ignored)]
 
+    settings = asdict(labels)
+    if (given := job.scene.path / FOLDER).is_dir():
+        settings["valid"] = file_hash(given)
     inputs = [run.provenance("segment"), run.segmented / "labels.json"]
-    run_stage(job, "masks", asdict(labels), inputs, [run.masks / "labels.json"], make)
+    inputs += {view.valid_path: None for view in job.scene.views if view.valid_path}
+    run_stage(job, "masks", settings, inputs, [run.masks / "labels.json"], make)
+
+
+def _find_valid(
+    job: Job, labels: LabelsConfig, ignore: Sequence[str], merge: Mapping[str, str]
+) -> Float32[np.ndarray, " V"]:
+    """Write which pixels count; the share of each view's pixels that do not."""
+    run, views = job.run, job.scene.views
+    before = Taxonomy.read(run.segmented / "labels.json")
+    ids, unseen = ignored_ids(before, ignore, merge)
+    if unseen:
+        job.emit(Warned(f"ignore: no photo shows {', '.join(unseen)}"))
+    shares = write_valid(
+        job.scene,
+        run.valid,
+        label_ids=Masks(run.segmented, before),
+        ignore=ids,
+        dilation=labels.ignore_dilation,
+    )
+    if empty := [view.name for view, share in zip(views, shares, strict=True) if share == 1]:
+        names = ", ".join(empty[:5]) + (", ..." if len(empty) > 5 else "")
+        job.emit(Warned(f"{len(empty)} of {len(views)} photos have no pixel that counts: {names}"))
+    return shares
+
+
+def _ignored_lines(shares: Float32[np.ndarray, " V"]) -> list[str]:
+    if not shares.any():
+        return []
+    return [f"{shares.mean():.1%} of the pixels are ignored, in {(shares > 0).sum()} of {len(shares)} photos"]
 
 
 def _lines(edited: Edited) -> list[str]:
@@ -153,11 +195,16 @@ def lift_labels(job: Job, config: LiftConfig) -> None:
     run = job.run
 
     def make() -> list[str]:
-        if config.votes == "track" and not len(job.scene.points.track_points):
+        if config.votes == "track" and not len(job.given_scene.points.track_points):
             job.emit(Warned("the points have no tracks: all views that a point projects into vote"))
-        lifted = lift(job.scene, job.masks, votes=config.votes, views=set(job.scene.train_ids.tolist()))
+        scene = job.given_scene
+        voters = set(scene.train_ids.tolist())
+        lifted = lift(scene, job.masks, votes=config.votes, views=voters, valid=job.valid)
         lifted.write(run.labels)
-        return [f"{100 * lifted.agreement:.1f} % of the votes agree with the label of their point"]
+        lines = [f"{100 * lifted.agreement:.1f} % of the votes agree with the label of their point"]
+        if lifted.ignored is not None:
+            lines.append(f"{lifted.ignored.sum():,} points show what is ignored, and become no Gaussians")
+        return lines
 
     labels = run.masks / "labels.json"
     run_stage(job, "lift", asdict(config), [run.scene, run.provenance("masks"), labels], [run.labels], make)
@@ -175,7 +222,8 @@ def fuse_masks(job: Job) -> None:
         shutil.rmtree(run.fused, ignore_errors=True)
         g = job.snapshots.load(job.snapshots.levels[-1])
         fused = fuse(
-            g, job.scene, job.masks, run.fused, soft=soft, antialiased=job.antialiased, backend=job.backend,
+            g, job.scene, job.masks, run.fused,
+            soft=soft, valid=job.valid, antialiased=job.antialiased, backend=job.backend,
             on_view=lambda done, total: job.emit(Progress("fuse", done, total)),
         )  # fmt: skip
         before, after = (_agreement(job, masks) for masks in (job.masks, job.whole_masks))
@@ -186,7 +234,7 @@ def fuse_masks(job: Job) -> None:
         ]
 
     made = [run.provenance(stage) for stage in ("masks", "train")]
-    inputs = [run.scene, run.masks / "labels.json", run.levels, *made]
+    inputs = [*run.scene_files, run.masks / "labels.json", run.levels, *made]
     run_stage(job, "fuse", {"soft": soft is not None}, inputs, [run.fused / "labels.json"], make)
 
 

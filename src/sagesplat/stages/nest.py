@@ -5,18 +5,17 @@ from dataclasses import asdict
 import numpy as np
 import torch
 
-from sagesplat.adapt.observe import as_unit, render_rgb
+from sagesplat.adapt.observe import as_unit, measure_total, render_rgb
 from sagesplat.core.config import NestConfig
 from sagesplat.core.events import Progress, Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.increments import packed, read_increments, write_increments
 from sagesplat.formats.levels import read_level, write_set
-from sagesplat.metrics.image import ssim_map
 from sagesplat.run.job import Job
 from sagesplat.run.records import checkpoint_key
 from sagesplat.run.stage import run_stage
 from sagesplat.stages.memory import check_nest
-from sagesplat.stages.shared import label_image_inputs, train_config
+from sagesplat.stages.shared import label_image_inputs, train_config, valid_inputs
 from sagesplat.train import nested
 from sagesplat.train.checkpoint import can_resume, remove_checkpoints
 from sagesplat.train.early_stopping import VIEWS, spread
@@ -35,14 +34,16 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
         full = job.snapshots.load(job.snapshots.levels[-1])
         base = read_level(run.base_model) if config.base_share else None
         masks = job.best_masks
-        ordered = nested.order(full, job.scene, masks, config, base=base, antialiased=job.antialiased)
+        ordered = nested.order(
+            full, job.scene, masks, config, base=base, valid=job.valid, antialiased=job.antialiased
+        )
         key = checkpoint_key(run, settings, inputs)
         if job.force and not can_resume(run.nest_checkpoint, key):
             remove_checkpoints(run.nest_checkpoint)
         trained = ordered
         for event in nested.nest(
             ordered, job.scene, job.photos, train_config(job), config,
-            seed=seed, backend=job.backend, checkpoint=run.nest_checkpoint, settings=key,
+            valid=job.valid, seed=seed, backend=job.backend, checkpoint=run.nest_checkpoint, settings=key,
         ):  # fmt: skip
             if isinstance(event, NestStep):
                 job.emit(Progress("nest", event.step, config.steps, f"loss {event.loss:.3f}"))
@@ -58,7 +59,7 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
         remove_checkpoints(run.nest_checkpoint)
         return lines
 
-    inputs = [run.scene, run.labels, run.levels, run.provenance("train"), *label_image_inputs(run)]
+    inputs = [*run.scene_files, run.labels, run.levels, run.provenance("train"), *label_image_inputs(run)]
     if config.base_share:
         _make_base_model(job, config, seed)
         inputs.append(run.base_model)
@@ -72,19 +73,22 @@ def _make_base_model(job: Job, config: NestConfig, seed: int) -> None:
     cap = max(1, round(config.base_share * full))
     settings = {**asdict(nested.capped_config(made, cap, config.base_steps)), "seed": seed}
 
+    inputs = [*run.scene_files, run.labels, *valid_inputs(run)]
+
     def make() -> list[str]:
         g = train_capped(job, "base", cap, config.base_steps, seed)
         write_set(run.base_model, g, config.base_steps)
         return [f"{len(g):,} Gaussians"]
 
-    run_stage(job, "base", settings, [run.scene, run.labels], [run.base_model], make)
+    run_stage(job, "base", settings, inputs, [run.base_model], make)
 
 
 def train_capped(job: Job, stage: str, cap: int, steps: int, seed: int) -> Gaussians:
     """3DGS-MCMC of at most `cap` Gaussians, otherwise trained as the run; progress goes to `stage`."""
     for event in nested.train_capped(
-        job.scene, job.photos, job.point_labels, train_config(job), cap, steps, seed=seed, backend=job.backend
-    ):
+        job.scene, job.photos, job.initial_labels, train_config(job), cap, steps,
+        valid=job.valid, seed=seed, backend=job.backend,
+    ):  # fmt: skip
         if isinstance(event, Step):
             text = f"loss {event.loss:.3f}, {event.num_gaussians:,} Gaussians"
             job.emit(Progress(stage, event.step, steps, text))
@@ -121,8 +125,8 @@ def write_ladder(
 def _quality(job: Job, g: Gaussians) -> float:
     """Mean SSIM over some of the training views."""
     found = []
-    for row in spread(job.scene.train_ids.tolist(), VIEWS):
-        camera = job.scene.views[row].camera
-        image = render_rgb(g, camera, backend=job.backend, antialiased=job.antialiased)
-        found.append(ssim_map(image, as_unit(job.photos[row])).mean())
+    for row in spread(job.valid.rows(job.scene, job.scene.train_ids), VIEWS):
+        view = job.scene.views[row]
+        image = render_rgb(g, view.camera, backend=job.backend, antialiased=job.antialiased)
+        found.append(measure_total(image, as_unit(job.photos[row]), job.valid[view])["ssim"])
     return float(np.mean(found))

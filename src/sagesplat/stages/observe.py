@@ -28,12 +28,15 @@ def observe_levels(job: Job, config: FitConfig) -> None:
         table.write_csv(run.observations)
         seen = table.select(np.isin(table.view, job.scene.train_ids))
         _show(job, tables.ladder_table(seen, job.ladder.counts, job.ladder.recovering, titles(job.names())))
+        exposed = any(view.camera.exposure is not None for view in job.scene.views)
+        how = ", rendered with the exposure of their photos" if exposed else ""
         return [
-            f"{len(table):,} observations of {len(job.ladder.levels)} levels in {len(job.scene.views)} views"
+            f"{len(table):,} observations of {len(job.ladder.levels)} levels in "
+            f"{len(job.scene.views)} views{how}"
         ]
 
     levels = method_of(job).level_files[0]
-    inputs = [run.scene, run.labels, run.provenance("train"), levels, *label_image_inputs(run)]
+    inputs = [*run.scene_files, run.labels, run.provenance("train"), levels, *label_image_inputs(run)]
     settings = {"distance": config.distance, "masks": config.masks}
     run_stage(job, "observe", settings, inputs, [run.observations], make)
 
@@ -43,6 +46,6 @@ def _observe_views(job: Job, part: tuple[Sequence[int], str, dict[int, np.ndarra
     rows, masks, far = part
     return observe(
         job.scene, job.photos, label_images(job, masks), job.ladder, far,
-        views=rows, backend=job.backend, antialiased=job.antialiased,
+        views=rows, valid=job.valid, backend=job.backend, antialiased=job.antialiased,
         progress=lambda done, total: job.emit(Progress("observe", done, total)),
     )  # fmt: skip

@@ -10,6 +10,7 @@ from sagesplat.core.config import (
     AdoptConfig,
     BlocksConfig,
     FitConfig,
+    LabelsConfig,
     NestConfig,
     PlanConfig,
     RunConfig,
@@ -18,6 +19,7 @@ from sagesplat.core.config import (
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit, Progress, StageDone, StageStarted
 from sagesplat.demo.capture import cached_capture
+from sagesplat.demo.wild import EVERYTHING, NOTHING, Wild
 from sagesplat.run.job import Job
 from sagesplat.run.recorded import recorded_settings
 from sagesplat.run.run_dir import RunDir
@@ -46,6 +48,7 @@ DEMO = RunConfig(
     nest=NestConfig(steps=600, levels=12, base_steps=600),
     plan=PlanConfig(target_fidelity=0.9),
 )
+WILD_DEMO = replace(DEMO, labels=LabelsConfig(ignore="person"), train=replace(DEMO.train, poses=True))
 
 
 def run_all(job: Job, scene: Path, config: RunConfig) -> None:
@@ -67,7 +70,7 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
     check_not_adopted(job.run)
     check_targets(config.plan, config.ladder)  # before hours of training
     nested.check(config.nest)
-    blocks.check(config.blocks)
+    blocks.check(config.blocks, config.train)
     check_segmenter(job, scene, config.masks)
     open_scene(job, scene, config.scene, config.poses)
     if config.blocks.count == 1:
@@ -164,15 +167,20 @@ def nest(job: Job, config: NestConfig, of_blocks: BlocksConfig, seed: int) -> No
         nest_levels(job, config, seed)
 
 
-def demo_capture(emit: Emit, places: tuple[int, int] = (1, 1)) -> Path:
+def demo_capture(emit: Emit, places: tuple[int, int] = (1, 1), wild: Wild = NOTHING) -> Path:
     """The built-in capture's folder, made on the first call; `places` makes a grid of courtyards."""
     emit(StageStarted("capture"))
     begin = time.perf_counter()
-    capture = cached_capture(lambda done, total: emit(Progress("capture", done, total)), places)
+    capture = cached_capture(lambda done, total: emit(Progress("capture", done, total)), places, wild)
     emit(StageDone("capture", time.perf_counter() - begin, (f"the built-in scene, in {capture}",)))
     return capture
 
 
-def run_demo(job: Job, places: tuple[int, int] = (1, 1)) -> None:
-    """Make the built-in capture (once) and run everything on it; a grid of courtyards in as many blocks."""
-    run_all(job, demo_capture(job.emit, places), replace(DEMO, blocks=BlocksConfig(math.prod(places))))
+def run_demo(job: Job, places: tuple[int, int] = (1, 1), wild: bool = False) -> None:
+    """Make the built-in capture (once) and run everything on it; a grid of courtyards in as many blocks.
+
+    With `wild` the capture is disturbed, and run with the options that such a capture needs.
+    """
+    disturbances, config = (EVERYTHING, WILD_DEMO) if wild else (NOTHING, DEMO)
+    capture = demo_capture(job.emit, places, disturbances)
+    run_all(job, capture, replace(config, blocks=BlocksConfig(math.prod(places))))

@@ -45,7 +45,7 @@ def make_plan(job: Job, config: PlanConfig) -> None:
         plans = [*scene_plans, *([within] if within else [])]
         return [f"{plan.asked}: {method.amount(plan)}, {plan.verdict}" for plan in plans]
 
-    inputs = [run.scene, run.labels, *label_image_inputs(run), *method.files, run.observations]
+    inputs = [*run.scene_files, run.labels, *label_image_inputs(run), *method.files, run.observations]
     inputs += [run.provenance("observe"), run.provenance("fit")]
     settings = asdict(config) | {"targets": config.targets}
     run_stage(job, "plan", settings, inputs, [run.plan], make)

@@ -44,8 +44,8 @@ def check_training(job: Job, config: TrainConfig) -> None:
     run = job.run
     if run.provenance("train").exists() or job.backend == "cuda":
         return
-    fitted = memory.fit(job.scene, config, job.memory_limit, processes=job.processes)
-    points, levels = len(job.scene.points.xyz), config.max_steps // schedule_of(config).level_every
+    fitted = memory.fit(job.given_scene, config, job.memory_limit, processes=job.processes)
+    points, levels = len(job.given_scene.points.xyz), config.max_steps // schedule_of(config).level_every
     free = shutil.disk_usage(run.path).free
     state = 4 * (11 + 3 * (config.sh_degree + 1) ** 2) * _STATES  # bytes a Gaussian in the checkpoints
     counts = points, fitted.lowered

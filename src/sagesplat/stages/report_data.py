@@ -9,7 +9,7 @@ import numpy as np
 
 from sagesplat import __version__
 from sagesplat.adapt.ladder import PrefixLadder
-from sagesplat.adapt.observe import TOTAL, as_unit, measure, render_rgb
+from sagesplat.adapt.observe import as_unit, measure_total, render_rgb
 from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.pictures import open_picture
@@ -62,6 +62,7 @@ def report_data(job: Job, composed: Gaussians, quality: QualityKind, target: flo
         timings=[(stage, float(made.get("seconds", math.nan))) for stage, made in records.items()],
         provenance=_provenance(records),
         categories=categories,
+        exposed=any(scene.views[row].camera.exposure is not None for row in scene.test_ids),
         photos=has_photos(run),
         adopted=_adopted(job, ladder) if run.adopted.exists() and isinstance(ladder, PrefixLadder) else (),
         viewpoints=_viewpoints(run),
@@ -122,13 +123,12 @@ def _parts(run: RunDir, names: dict[int, str]) -> tuple[dict[int, int], Colours]
 def _panels(job: Job, composed: Gaussians) -> list[Panel]:
     """A few test views, spread over the capture, in pictures."""
     scene, photos, masks, ladder = job.scene, job.photos, job.best_masks, job.ladder
-    if not len(scene.test_ids):
+    tests = np.array(job.valid.rows(scene, scene.test_ids), int)
+    if not len(tests):
         return []
-    rows = scene.test_ids[
-        np.unique(np.linspace(0, len(scene.test_ids) - 1, PANELS + 2).round().astype(int))[1:-1]
-    ]
+    rows = tests[np.unique(np.linspace(0, len(tests) - 1, PANELS + 2).round().astype(int))[1:-1]]
     if not len(rows):
-        rows = scene.test_ids[:1]
+        rows = tests[:1]
     full = ladder.load(ladder.levels[-1])
     panels = []
     for row in rows.tolist():
@@ -138,7 +138,7 @@ def _panels(job: Job, composed: Gaussians) -> list[Panel]:
             render_rgb(g, view.camera, backend=job.backend, antialiased=job.antialiased)
             for g in (full, composed)
         ]
-        of_full, of_composed = (measure(image, as_unit(photo), masks[view])[TOTAL] for image in images)
+        of_full, of_composed = (measure_total(image, as_unit(photo), job.valid[view]) for image in images)
         eight_bit = [np.round(image * 255).astype(np.uint8) for image in images]
         panels.append(
             Panel(

@@ -67,7 +67,7 @@ def sample_levels(job: Job, config: SampleConfig, fit: FitConfig) -> None:
         return [f"{used} viewpoints to fit to, {len(drawn.rows('bias'))} + {calibration} to calibrate on"]
 
     made_by = [run.provenance("train"), run.provenance("nest")]
-    inputs = [run.scene, run.labels, method_of(job).level_files[0], *made_by]
+    inputs = [*run.scene_files, run.labels, method_of(job).level_files[0], *made_by]
     if config.viewpoints:
         inputs.append(config.viewpoints)
     settings = asdict(config) | {"distance": fit.distance, "min_share": fit.min_share}

@@ -36,6 +36,11 @@ def label_image_inputs(run: RunDir) -> list[Path]:
     return [run.provenance(stage) for stage, folder in made if (folder / "labels.json").exists()]
 
 
+def valid_inputs(run: RunDir) -> list[Path]:
+    """The images of the pixels that count, where some do not."""
+    return [run.valid] if run.valid.exists() else []
+
+
 def label_images(job: Job, source: str) -> LabelImages:
     """The label images that came with the photos ("given"), or those of the 3D labels ("rendered")."""
     if source == "given":

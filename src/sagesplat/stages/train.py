@@ -18,9 +18,11 @@ from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
 from sagesplat.segment.display_names import titles
 from sagesplat.segment.masks import MAX_LABEL_ID
+from sagesplat.stages.refine import write_cameras
+from sagesplat.stages.shared import valid_inputs
 from sagesplat.train import memory
 from sagesplat.train.checkpoint import can_resume, remove_checkpoints
-from sagesplat.train.events import LabelFrozen, LevelSaved, Resumed, Step, Trained
+from sagesplat.train.events import Found, LabelFrozen, LevelSaved, Resumed, Step, Trained
 from sagesplat.train.parallel import train_together
 from sagesplat.train.trainer import train
 
@@ -46,8 +48,8 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
         names = titles(job.names())
         start = partial(train_together, job.processes, job.threads) if job.processes > 1 else train
         events = start(
-            job.scene, job.photos, job.point_labels, fitted,
-            masks=job.masks if config.freeze_at is not None else None,
+            job.given_scene, job.photos, job.initial_labels, fitted,
+            masks=job.masks if config.freeze_at is not None else None, valid=job.valid,
             seed=seed, backend=job.backend, folder=place.path, settings=key,
         )  # fmt: skip
         lines = []
@@ -56,6 +58,8 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
                 case Resumed(step, damage):
                     before = f", the checkpoint before the newest: {damage}" if damage else ""
                     job.emit(Warned(f"resuming from step {step}{before}"))
+                case Found(text):
+                    job.emit(Warned(text))
                 case Step(step, loss, num, _):
                     job.emit(Training(step, config.max_steps, loss, counts, num))
                 case LevelSaved():
@@ -65,14 +69,17 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
                     job.emit(
                         Warned(f"{name} stops at step {step} with SSIM {ssim:.3f} and {count:,} Gaussians")
                     )
-                case Trained(gaussians, step, frozen):
+                case Trained(gaussians, step, frozen) as trained:
                     write_frozen(place.frozen, frozen)
                     lines = [f"{len(gaussians):,} Gaussians after {step} steps"]
+                    lines += write_cameras(job, place, config, trained)
         if place != run:
             _swap(run, place)
         return lines
 
-    outputs = [run.levels, run.checkpoint]
+    # with exposure auto it depends on the photos: what was refined once must be there
+    refines = config.poses or config.exposure == "affine" or run.refined.exists()
+    outputs = [run.levels, run.checkpoint, *([run.cameras, run.refined] if refines else [])]
     run_stage(job, "train", settings, inputs, outputs, make, swaps=True)
 
 
@@ -112,7 +119,8 @@ def read_frozen(path: Path) -> dict[int, int]:
 
 def train_inputs(run: RunDir, config: TrainConfig) -> list[Path]:
     """What a training reads besides photos: label images only where categories may stop early."""
-    return [run.scene, run.labels, *([run.provenance("masks")] if config.freeze_at is not None else [])]
+    masks = [run.provenance("masks")] if config.freeze_at is not None else []
+    return [run.scene, run.labels, *masks, *valid_inputs(run)]
 
 
 def _place(job: Job, key: str) -> RunDir:
@@ -138,7 +146,10 @@ def _swap(run: RunDir, made: RunDir) -> None:
             run.levels.rename(old)
         made.levels.rename(run.levels)
     remove_checkpoints(run.checkpoint)
-    for new, place in ((made.frozen, run.frozen), (made.cap, run.cap), (made.checkpoint, run.checkpoint)):
+    for earlier in (run.cameras, run.refined):
+        earlier.unlink(missing_ok=True)
+    kinds = ("frozen", "cap", "cameras", "refined", "checkpoint")
+    for new, place in ((getattr(made, kind), getattr(run, kind)) for kind in kinds):
         if new.exists():
             new.replace(place)
     shutil.rmtree(made.path)
@@ -152,6 +163,6 @@ def _fit_memory(job: Job, place: RunDir, config: TrainConfig, resuming: bool) ->
     if job.backend == "cuda":  # Gaussians are not in the machine's memory
         return config, 0
     began = read_cap(place.cap) if resuming and place.cap.exists() else 0
-    fitted = memory.fit(job.scene, config, job.memory_limit, processes=job.processes, began=began)
+    fitted = memory.fit(job.given_scene, config, job.memory_limit, processes=job.processes, began=began)
     job.emit(Warned(str(fitted)))
     return fitted.config, fitted.lowered

@@ -85,7 +85,7 @@ def _measure_compositions(
                 job.ladder.compose(levels), view.camera,
                 backend=job.backend, antialiased=job.antialiased, workspace=workspace,
             )  # fmt: skip
-            found = measure(image, as_unit(job.photos[row]), masks[view])
+            found = measure(image, as_unit(job.photos[row]), masks[view], valid=job.valid[view])
             rows += [
                 (label, levels.get(label, -1), row, targets, values[name]) for label, values in found.items()
             ]

@@ -124,20 +124,22 @@ def _measure(job: Job, g: Gaussians) -> Mapping[str | int, float]:
     """Means over the test views: SSIM and PSNR of the image, PSNR near and off borders, SSIM by label id."""
     found: dict[str | int, list[float]] = {}
     workspace = Workspace()
-    for row in job.scene.test_ids.tolist():
+    for row in job.valid.rows(job.scene, job.scene.test_ids):
         view = job.scene.views[row]
         photo, label_ids = as_unit(job.photos[row]), job.masks[view]
         image = render_rgb(
             g, view.camera, backend=job.backend, antialiased=job.antialiased, workspace=workspace
         )
+        valid = job.valid[view]
         error, band = squared_error_map(image, photo), near_border(label_ids, BAND)
+        counts = np.ones_like(band) if valid is None else valid
         values: dict[str | int, float] = {}
-        for label, quality in measure(image, photo, label_ids).items():
+        for label, quality in measure(image, photo, label_ids, valid=valid).items():
             if label == TOTAL:
                 values |= {"ssim": quality["ssim"], "psnr": quality["psnr"]}
             else:
                 values[label] = quality["ssim"]
-        for name, pixels in (("band", error[band]), ("inside", error[~band])):
+        for name, pixels in (("band", error[band & counts]), ("inside", error[~band & counts])):
             if pixels.size:
                 values[name] = float(psnr(pixels.mean()))
         for name, value in values.items():

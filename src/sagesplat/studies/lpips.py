@@ -1,11 +1,14 @@
 """LPIPS for the studies: which weights are there, and the networks that they make."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
 
 from sagesplat.core.errors import SageError
 from sagesplat.core.events import Warned
-from sagesplat.metrics.lpips import Lpips, Net, load_lpips, weights_path
+from sagesplat.metrics.lpips import Features, Lpips, Net, load_lpips, weights_path
 from sagesplat.run.job import Job
 from sagesplat.run.records import file_hash
 
@@ -27,6 +30,11 @@ def load_metrics(job: Job, folder: Path | None, nets: Sequence[Net] = NETS) -> d
         except SageError as error:
             job.emit(Warned(f"no LPIPS ({net}): {error}"))
     return found
+
+
+def features_of(metrics: Mapping[str, Lpips], image: Float[np.ndarray, "H W 3"]) -> dict[str, Features]:
+    """What each metric compares of an image, by its column."""
+    return {column: metric.features(image) for column, metric in metrics.items()}
 
 
 def warn_of_lpips(job: Job, folder: Path | None) -> None:

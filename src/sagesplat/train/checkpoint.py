@@ -20,8 +20,10 @@ from sagesplat.core.gaussians import PARAMETERS, Gaussians, checked
 from sagesplat.io.files import atomic_path, sync_files
 from sagesplat.io.npz import Npz
 from sagesplat.train.state import TrainState
+from sagesplat.train.view_parameters import ViewParameters
 
 _VERSION = 3
+_OF_VIEWS = ("values", "exp_avg", "exp_avg_sq", "counts")  # of `ViewParameters`
 # what truncated or changed files raise
 _DAMAGED = (OSError, KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError)
 
@@ -65,6 +67,8 @@ def write_checkpoint(path: Path, state: TrainState, settings: str) -> None:
         arrays["order_share"] = state.order_share.numpy()
     arrays |= {"label_ids": g.label_ids.numpy(), "grad_sum": state.grad_sum.numpy()}
     arrays["grad_count"] = state.grad_count.numpy()
+    for kind, parameters in state.per_view.items():
+        arrays |= {f"view/{kind}/{name}": getattr(parameters, name).numpy() for name in _OF_VIEWS}
     meta = {
         "version": _VERSION,
         "settings": settings,
@@ -197,4 +201,19 @@ def _state(found: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> TrainSta
         frozen={int(label): int(step) for label, step in meta.get("frozen", ())},
         withheld=int(meta.get("withheld", 0)),
         order_share=arrays.get("order_share"),
+        per_view=_per_view(arrays),
     )
+
+
+def _per_view(arrays: Mapping[str, torch.Tensor]) -> dict[str, ViewParameters]:
+    """The parameters of the views, by kind; none in the checkpoints of earlier versions."""
+    found: dict[str, ViewParameters] = {}
+    for kind in sorted({name.split("/")[1] for name in arrays if name.startswith("view/")}):
+        values, exp_avg, exp_avg_sq, counts = (arrays[f"view/{kind}/{name}"] for name in _OF_VIEWS)
+        floats = (values, exp_avg, exp_avg_sq)
+        if values.ndim != 2 or any(a.shape != values.shape or a.dtype != torch.float32 for a in floats):
+            raise ValueError(f"shape of view/{kind}")
+        if counts.shape != values.shape[:1] or counts.dtype != torch.int64 or (counts < 0).any():
+            raise ValueError(f"counts of view/{kind}")
+        found[kind] = ViewParameters(*floats, counts)
+    return found

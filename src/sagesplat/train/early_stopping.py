@@ -1,6 +1,6 @@
 """Per-category early stopping (Fig. 1 of the paper): a category at its target quality stops training."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,8 +12,9 @@ from sagesplat.core.config import TrainConfig
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.metrics.image import means_by_label, ssim_map
 from sagesplat.raster import TILE, Backend, Workspace, rasterize
-from sagesplat.scene.scene import Scene
+from sagesplat.scene.scene import Camera, Scene
 from sagesplat.segment.masks import Masks
+from sagesplat.segment.valid import ALL_VALID, ValidPixels
 from sagesplat.train.group import ALONE, Group
 from sagesplat.train.photo_loader import PhotoLoader
 
@@ -50,6 +51,7 @@ class ActiveTiles:
     masks: Masks | None  # needed once a category has stopped
     frozen: frozenset[int] = frozenset()  # label ids
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+    valid: ValidPixels = ALL_VALID
     _kept: dict[tuple[int, int], np.ndarray] = field(default_factory=dict, init=False)
     _there: dict[tuple[int, int], torch.Tensor] = field(default_factory=dict, init=False)
 
@@ -58,7 +60,8 @@ class ActiveTiles:
         if not self.frozen or self.masks is None:
             return None
         if (row, factor) not in self._kept:
-            self._kept[row, factor] = active_tiles(self.masks[self.scene.views[row]], self.frozen, factor)
+            view = self.scene.views[row]
+            self._kept[row, factor] = active_tiles(self.masks[view], self.frozen, factor, self.valid[view])
         return self._kept[row, factor]
 
     def mask(self, row: int, factor: int = 1) -> Bool[np.ndarray, "h w"] | Bool[torch.Tensor, "h w"] | None:
@@ -77,9 +80,15 @@ class ActiveTiles:
 
 
 def active_tiles(
-    label_ids: Int16[np.ndarray, "H W"], frozen: Collection[int], factor: int = 1
+    label_ids: Int16[np.ndarray, "H W"],
+    frozen: Collection[int],
+    factor: int = 1,
+    valid: Bool[np.ndarray, "H W"] | None = None,
 ) -> Bool[np.ndarray, "h w"]:
-    """Which tiles of 16 x 16 pixels, of an image `factor` times smaller, show another than those labels."""
+    """Which tiles of 16 x 16 pixels, of an image `factor` times smaller, show another than those labels.
+
+    Pixels that are not `valid` show nothing.
+    """
     height, width = label_ids.shape
     side = TILE * factor
     rows, columns = (-(-max(1, round(n / factor)) // TILE) for n in (height, width))
@@ -87,6 +96,8 @@ def active_tiles(
     moves = np.ones(2**16, bool)  # by the bits of an int16: a look-up takes a third of np.isin's time
     moves[np.array(list(frozen), np.int16).view(np.uint16)] = False
     shown = moves[label_ids.view(np.uint16)[: rows * side, : columns * side]]
+    if valid is not None:
+        shown &= valid[: rows * side, : columns * side]
     learns[: shown.shape[0], : shown.shape[1]] = shown
     return np.asarray(learns.reshape(rows, side, columns, side).any((1, 3)))
 
@@ -102,10 +113,12 @@ def label_quality(
     backend: Backend = "auto",
     workspace: Workspace | None = None,
     group: Group = ALONE,
+    camera_of: Callable[[int], Camera] | None = None,
 ) -> dict[int, float]:
     """Mean SSIM of each category that has not stopped, over the rows of views that `views` has for it.
 
-    The processes of a `group` measure some views each.
+    The processes of a `group` measure some views each. `camera_of`: the camera of a row of the scene's views,
+    where it is not the given one.
     """
     assert active_tiles.masks is not None
     found: dict[int, dict[int, float]] = {}
@@ -116,17 +129,21 @@ def label_quality(
             tiles = binary_dilation(tiles, np.ones((3, 3)))
         with torch.no_grad():
             render = rasterize(
-                gaussians, view.camera, sh_degree=sh_degree, antialiased=config.antialiased,
-                tile_mask=tiles, backend=backend, workspace=workspace,
+                gaussians, camera_of(row) if camera_of else view.camera, sh_degree=sh_degree,
+                antialiased=config.antialiased, tile_mask=tiles, backend=backend, workspace=workspace,
             )  # fmt: skip
         image, (photo, _) = render.rgb.clamp(0, 1).float(), photo_loader(row)
+        valid = photo_loader.valid_pixels[view]
+        if (counts := photo_loader.valid(row)) is not None:
+            unit = photo if photo.is_floating_point() else photo.float() / 255
+            photo = torch.where(counts[..., None], unit, image)
         if image.is_cuda:
             from sagesplat.metrics import ssim_triton
 
             quality = ssim_triton.ssim_map(image, photo).cpu().numpy()
         else:
             quality = ssim_map(image.numpy(), photo.numpy(), tiles)
-        for label, (mean, _) in means_by_label(quality, active_tiles.masks[view]).items():
+        for label, (mean, _) in means_by_label(quality, active_tiles.masks[view], valid).items():
             if row in left.get(label, ()):
                 found.setdefault(label, {})[row] = mean
     values: dict[int, dict[int, float]] = {}  # by label and view, whoever measured it

@@ -1,9 +1,10 @@
 """What training reports: a stream of these events."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from sagesplat.core.gaussians import Gaussians
+from sagesplat.train.view_parameters import ViewParameters
 
 
 @dataclass(frozen=True)
@@ -12,6 +13,13 @@ class Resumed:
 
     step: int
     damage: str = ""  # what was wrong with the newest checkpoint, where the one before it is used
+
+
+@dataclass(frozen=True)
+class Found:
+    """Something about the photos that decides how they are trained on, in words."""
+
+    text: str
 
 
 @dataclass(frozen=True)
@@ -51,6 +59,7 @@ class Trained:
     gaussians: Gaussians
     step: int
     frozen: dict[int, int]  # label id -> step from which on the category did not change
+    per_view: dict[str, ViewParameters] = field(default_factory=dict)  # what was refined
 
 
-Event = Resumed | Step | LevelSaved | LabelFrozen | Trained
+Event = Resumed | Found | Step | LevelSaved | LabelFrozen | Trained

@@ -16,6 +16,7 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.raster import Backend, Workspace, add_weights, device_of, rasterize
 from sagesplat.scene.scene import Camera, Scene
 from sagesplat.segment.masks import UNLABELLED, Masks, prepare_folder, write_labels, write_mask
+from sagesplat.segment.valid import ALL_VALID, ValidPixels
 
 Soft = Callable[[int], tuple[Int16[np.ndarray, " K"], Float32[np.ndarray, "K h w"]]]
 """Row of Scene.views -> category ids (-1 = none; repeated ones add up), probabilities at any resolution."""
@@ -58,6 +59,7 @@ def gather(
     views: Collection[int],
     *,
     soft: Soft | None = None,
+    valid: ValidPixels = ALL_VALID,
     antialiased: bool = False,
     on_view: Callable[[int], None] | None = None,
 ) -> Votes:
@@ -65,18 +67,23 @@ def gather(
 
     A pixel's vote is its category in `masks`, or its distribution with `soft`, times the blending weight
     (alpha times transmittance) of the Gaussian. Unlabelled is a candidate too, but views without any label
-    do not vote. `on_view(done)` is called after each view.
+    do not vote, and no pixel that is not `valid`. `on_view(done)` is called after each view.
     """
     ids = np.array([UNLABELLED, *sorted(masks.taxonomy.names)], np.int16)
     votes, workspace = np.zeros((len(gaussians), len(ids)), np.float32), Workspace()
     for done, row in enumerate(views):
         camera, label_ids = scene.views[row].camera, masks[scene.views[row]]
+        counts = valid[scene.views[row]]
         if (label_ids != UNLABELLED).any():
             if soft is None:
                 columns = np.searchsorted(ids, label_ids)
+                if counts is not None:
+                    columns[~counts] = -1
                 add_weights(gaussians, camera, columns, votes, antialiased=antialiased, workspace=workspace)
             else:
                 pixels = soft_pixels(soft, row, camera, ids)
+                if counts is not None:
+                    pixels *= counts
                 _add_soft(gaussians, camera, pixels, votes, antialiased, workspace)
         if on_view:
             on_view(done + 1)
@@ -179,6 +186,7 @@ def fuse(
     *,
     views: Collection[int] | None = None,
     soft: Soft | None = None,
+    valid: ValidPixels = ALL_VALID,
     options: FuseOptions | None = None,
     antialiased: bool = False,
     backend: Backend = "auto",
@@ -197,6 +205,7 @@ def fuse(
         target: Folder to write, in the format of `import_masks`.
         views: Rows of `Scene.views` that vote; None: the training views. All views are written.
         soft: Class probabilities beside the hard labels.
+        valid: The pixels that vote; the others get labels as unlabelled ones do.
         options: Weights and thresholds.
         antialiased: How the model was trained.
         backend: Rasteriser; decides the device.
@@ -219,7 +228,7 @@ def fuse(
             on_view(done, total)
 
     g = gaussians.detach().to(device_of(backend))
-    votes = gather(g, scene, masks, voters, soft=soft, antialiased=antialiased, on_view=report)
+    votes = gather(g, scene, masks, voters, soft=soft, valid=valid, antialiased=antialiased, on_view=report)
     paths, workspace = prepare_folder(target, scene.views), Workspace()
     occurring: set[int] = set()
     changed: list[float] = []

@@ -11,6 +11,7 @@ from jaxtyping import Float32
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.raster import Workspace, add_weights, rasterize
 from sagesplat.scene.scene import Scene
+from sagesplat.segment.valid import ALL_VALID, ValidPixels
 
 Criterion = Literal["weight", "weight-volume", "peak", "sensitivity", "opacity"]
 _VOLUME_POWER, _LARGE = 0.1, 0.9  # LightGaussian's exponent, and the quantile at which its volumes are cut
@@ -22,10 +23,13 @@ def importance(
     views: Collection[int],
     criterion: Criterion = "weight",
     *,
+    valid: ValidPixels = ALL_VALID,
     antialiased: bool = False,
     seed: int = 0,
 ) -> Float32[np.ndarray, " N"]:
     """Importance of each Gaussian for `views` (rows of Scene.views), without unit; larger is more important.
+
+    Only pixels that are `valid` count.
 
     weight: blending weight (alpha times transmittance) summed over all pixels; weight-volume: times the
     volume to the power 0.1, as LightGaussian (arXiv:2311.17245, eq. 3); peak: the largest sum of one view;
@@ -36,12 +40,14 @@ def importance(
     if criterion == "opacity":
         return torch.sigmoid(g.logit_opacities.detach()).cpu().numpy()
     if criterion == "sensitivity":
-        return _sensitivity(g, scene, views, antialiased, seed)
+        return _sensitivity(g, scene, views, valid, antialiased, seed)
     total, workspace = np.zeros(len(g), np.float32), Workspace()
     for row in views:
-        camera = scene.views[row].camera
+        camera, counts = scene.views[row].camera, valid[scene.views[row]]
         weights = np.zeros((len(g), 1), np.float32)
         columns = np.zeros((camera.height, camera.width), np.int64)
+        if counts is not None:
+            columns[~counts] = -1
         add_weights(g, camera, columns, weights, antialiased=antialiased, workspace=workspace)
         total = np.maximum(total, weights[:, 0]) if criterion == "peak" else total + weights[:, 0]
     if criterion == "weight-volume" and len(g):
@@ -51,7 +57,7 @@ def importance(
 
 
 def _sensitivity(
-    g: Gaussians, scene: Scene, views: Collection[int], antialiased: bool, seed: int
+    g: Gaussians, scene: Scene, views: Collection[int], valid: ValidPixels, antialiased: bool, seed: int
 ) -> Float32[np.ndarray, " N"]:
     total, workspace = torch.zeros(len(g), device=g.means.device), Workspace()
     signs = torch.Generator().manual_seed(seed)
@@ -62,6 +68,8 @@ def _sensitivity(
         fading = replace(g.detach(), logit_opacities=logits)
         image = rasterize(fading, camera, antialiased=antialiased, workspace=workspace).rgb
         probe = torch.randint(0, 2, image.shape, generator=signs).float().mul_(2).sub_(1)
+        if (counts := valid[scene.views[row]]) is not None:
+            probe *= torch.from_numpy(counts)[..., None]
         (grad,) = torch.autograd.grad(image, logits, probe.to(image.device))
         # by the logarithm of the opacity: what is left when all of it goes
         total += (grad / (1 - opacity).clamp_min(1e-6)) ** 2

@@ -8,7 +8,7 @@ content of the photos decides for how long).
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 from PIL import Image
 
 from sagesplat.core.config import TrainConfig
@@ -94,3 +94,13 @@ def smaller(
     size = max(1, round(camera.width / factor)), max(1, round(camera.height / factor))
     image = Image.fromarray(photo).resize(size, Image.Resampling.BOX)
     return np.array(image), camera.resized(*size)
+
+
+def smaller_valid(valid: Bool[np.ndarray, "H W"], factor: int) -> Bool[np.ndarray, "h w"]:
+    """Which pixels of a photo `factor` times smaller count: means of pixels that all do."""
+    if factor == 1:
+        return valid
+    height, width = valid.shape
+    size = max(1, round(width / factor)), max(1, round(height / factor))
+    grey = Image.fromarray(np.where(valid, np.uint8(255), np.uint8(0)))
+    return np.asarray(grey.resize(size, Image.Resampling.BOX)) == 255

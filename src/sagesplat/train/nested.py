@@ -17,6 +17,7 @@ from sagesplat.raster import Backend, device_of
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Points, Scene
 from sagesplat.segment.masks import Masks
+from sagesplat.segment.valid import ALL_VALID, ValidPixels
 from sagesplat.train.checkpoint import latest_checkpoint, write_checkpoint
 from sagesplat.train.early_stopping import ActiveTiles, trainable_rows
 from sagesplat.train.events import Event, Resumed
@@ -88,6 +89,7 @@ def order(
     config: NestConfig,
     *,
     base: Gaussians | None = None,
+    valid: ValidPixels = ALL_VALID,
     antialiased: bool = False,
 ) -> Nested:
     """Label Gaussians by the pixels that they contribute to, and order each category by importance.
@@ -98,11 +100,11 @@ def order(
     does not help: nine in ten of the halves are boundary Gaussians too.
     """
     views = scene.train_ids.tolist()
-    importances = importance(g, scene, views, config.criterion, antialiased=antialiased)
+    importances = importance(g, scene, views, config.criterion, valid=valid, antialiased=antialiased)
     ranks = np.full(len(g), 2, np.int8)
     if base is not None and len(base):
         kept = np.sort(np.argsort(-importances, kind="stable")[: max(len(g) - len(base), 0)])
-        of_base = importance(base, scene, views, config.criterion, antialiased=antialiased)
+        of_base = importance(base, scene, views, config.criterion, valid=valid, antialiased=antialiased)
         g = concat([base, g.select(torch.from_numpy(kept))])
         importances = np.concatenate([of_base, importances[kept]])
         ranks = np.repeat(np.array([1, 2], np.int8), [len(base), len(kept)])
@@ -134,7 +136,7 @@ def with_at_most(scene: Scene, labels: np.ndarray, count: int, seed: int) -> tup
 def capped_config(config: TrainConfig, cap: int, steps: int) -> TrainConfig:
     """3DGS-MCMC with at most `cap` Gaussians, otherwise as `config`; only the last level is recorded."""
     mcmc = replace(config, strategy="mcmc", max_gaussians=cap, max_steps=steps, level_every=steps)
-    return replace(mcmc, freeze_at=None, gradient_freeze_share=0.0)
+    return replace(mcmc, freeze_at=None, gradient_freeze_share=0.0, poses=False, exposure="off")
 
 
 def train_capped(
@@ -145,12 +147,14 @@ def train_capped(
     cap: int,
     steps: int,
     *,
+    valid: ValidPixels = ALL_VALID,
     seed: int = 0,
     backend: Backend = "auto",
 ) -> Iterator[Event]:
     """The events of a training of `capped_config`, from `cap` of the points where there are more."""
     some, labels = with_at_most(scene, point_labels, cap, seed)
-    yield from train(some, photos, labels, capped_config(config, cap, steps), seed=seed, backend=backend)
+    capped = capped_config(config, cap, steps)
+    yield from train(some, photos, labels, capped, valid=valid, seed=seed, backend=backend)
 
 
 def is_boundary(weights: Float32[np.ndarray, "N L"], num_views: int) -> np.ndarray:
@@ -166,6 +170,7 @@ def nest(
     train_config: TrainConfig,
     config: NestConfig,
     *,
+    valid: ValidPixels = ALL_VALID,
     seed: int = 0,
     backend: Backend = "auto",
     checkpoint: Path | None = None,
@@ -187,6 +192,7 @@ def nest(
         photos: Its photos.
         train_config: Settings of the training that made the model.
         config: Steps, levels and learning-rate multiplier of this one.
+        valid: The pixels that count; nothing is learnt from the others.
         seed: Of all random numbers.
         backend: Rasteriser; decides the device.
         checkpoint: Where to save every 500 steps; one of the same `settings` is resumed.
@@ -220,8 +226,8 @@ def nest(
     if spans is not None:
         edges = torch.from_numpy(np.stack([spans.first, spans.last])[:, near]).to(device)
     stepper = Stepper(
-        PhotoLoader(scene, photos, device), replace(train_config, batch=1), ActiveTiles(scene, None), backend,
-        sh_bits=config.sh_bits,
+        PhotoLoader(scene, photos, device, valid), replace(train_config, batch=1), ActiveTiles(scene, None),
+        backend, sh_bits=config.sh_bits,
     )  # fmt: skip
     rates = _rates(train_config, config, scene)
     trainable = trainable_rows(state.gaussians, {})
@@ -232,8 +238,9 @@ def nest(
         while state.step < config.steps:
             if state.step in sort_at:
                 importances = importance(
-                    state.gaussians, scene, views, config.criterion, antialiased=train_config.antialiased
-                )
+                    state.gaussians, scene, views, config.criterion,
+                    valid=valid, antialiased=train_config.antialiased,
+                )  # fmt: skip
                 state.order_share = order_shares(labels, ranks, importances).to(device)
             rows = None
             if spans is None or edges is None:

@@ -2,13 +2,16 @@
 
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene
-from sagesplat.train.lr_schedule import smaller
+from sagesplat.segment.valid import ALL_VALID, ValidPixels
+from sagesplat.train.lr_schedule import smaller, smaller_valid
 
 Seen = tuple[Tensor, Camera]
 _MEMORY_SHARE = 0.25  # of a GPU's free memory, for photos
@@ -23,9 +26,11 @@ class PhotoLoader:
     scene: Scene
     photos: Photos
     device: torch.device
+    valid_pixels: ValidPixels = ALL_VALID
     limit: int = -1  # bytes of photos kept on a GPU; -1: a quarter of what is free
     _kept: dict[tuple[int, int], Seen] = field(default_factory=dict)
     _coming: dict[tuple[int, int], "Future[Seen]"] = field(default_factory=dict)
+    _valid: dict[tuple[int, int], Tensor] = field(default_factory=dict)
     _used: int = 0
     _worker: ThreadPoolExecutor = field(init=False)
 
@@ -53,6 +58,21 @@ class PhotoLoader:
             self._kept[key] = photo, camera
             self._used += photo.nbytes
         return photo, camera
+
+    @cached_property
+    def rows(self) -> np.ndarray:
+        """Rows of the views to train on: the training views that have a pixel that counts."""
+        return np.array(self.valid_pixels.rows(self.scene, self.scene.train_ids), np.int64)
+
+    def valid(self, row: int, factor: int = 1) -> Tensor | None:
+        """Which pixels of a photo `factor` times smaller count, bool [H, W]; None: all."""
+        key = row, factor
+        if key not in self._valid:
+            valid = self.valid_pixels[self.scene.views[row]]
+            if valid is None:
+                return None
+            self._valid[key] = torch.from_numpy(smaller_valid(valid, factor)).to(self.device)
+        return self._valid[key]
 
     def expect(self, row: int, factor: int = 1) -> None:
         """Begin to fetch a photo that a later step will look at."""

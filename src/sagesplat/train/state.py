@@ -10,6 +10,8 @@ from sagesplat.core import geometry
 from sagesplat.core.gaussians import PARAMETERS, Gaussians, concat
 from sagesplat.core.sh import num_bases, rgb_to_sh0
 from sagesplat.scene.scene import Points
+from sagesplat.segment.lift import IGNORED
+from sagesplat.train.view_parameters import ViewParameters
 
 INITIAL_OPACITY = 0.1
 
@@ -30,6 +32,7 @@ class TrainState:
     frozen: dict[int, int] = field(default_factory=dict)  # label id -> step from which on it stays as it is
     withheld: int = 0  # Gaussians that stopped categories did not get
     order_share: Tensor | None = None  # [N] of a nested model: share of its category that comes before it
+    per_view: dict[str, ViewParameters] = field(default_factory=dict)  # "pose" and "exposure", if refined
 
     def replace_rows(self, keep: Tensor, new: Gaussians) -> None:
         """Keep some rows (bool [N]) and append new Gaussians with fresh moments and statistics."""
@@ -69,6 +72,7 @@ class TrainState:
             self, gaussians=self.gaussians.to(device), exp_avg=exp_avg, exp_avg_sq=exp_avg_sq,
             grad_sum=self.grad_sum.to(device), grad_count=self.grad_count.to(device),
             order_share=None if self.order_share is None else self.order_share.to(device),
+            per_view={name: parameters.to(device) for name, parameters in self.per_view.items()},
         )  # fmt: skip
 
 
@@ -79,14 +83,19 @@ def from_points(
     opacity: float = INITIAL_OPACITY,
     scale: float = 1.0,
 ) -> Gaussians:
-    """Gaussians at the SfM points: isotropic, scale `scale` times the mean distance to three neighbours."""
-    n = len(points.xyz)
-    scales = scale * geometry.mean_neighbour_distance(points.xyz)
+    """Gaussians at the SfM points: isotropic, scale `scale` times the mean distance to three neighbours.
+
+    There is none at the points labelled `IGNORED`, which show what does not belong to the scene.
+    """
+    kept = label_ids != IGNORED
+    xyz, label_ids = points.xyz[kept], label_ids[kept]
+    n = len(xyz)
+    scales = scale * geometry.mean_neighbour_distance(xyz)
     quats = torch.zeros(n, 4)
     quats[:, 0] = 1
-    rgb = torch.from_numpy(points.rgb.astype(np.float32) / 255)
+    rgb = torch.from_numpy(points.rgb[kept].astype(np.float32) / 255)
     return Gaussians(
-        means=torch.from_numpy(points.xyz.copy()),
+        means=torch.from_numpy(xyz),
         quats=quats,
         log_scales=torch.from_numpy(np.log(scales))[:, None].repeat(1, 3),
         logit_opacities=torch.full((n,), float(np.log(opacity / (1 - opacity)))),

@@ -11,17 +11,21 @@ from sagesplat.core.config import TrainConfig
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.quantisation import rounded
 from sagesplat.metrics.image import photometric_loss
-from sagesplat.raster import Backend, Render, Workspace, device_of, rasterize
+from sagesplat.raster import Backend, Render, Workspace, device_of, expose, rasterize
 from sagesplat.scene.images import Photos
-from sagesplat.scene.scene import Scene
+from sagesplat.scene.scene import Camera, Scene
+from sagesplat.segment.valid import ALL_VALID, ValidPixels
 from sagesplat.train import optim
 from sagesplat.train.early_stopping import ActiveTiles, trainable_rows
+from sagesplat.train.exposure import transform
 from sagesplat.train.gradient_freezing import GradientFreezing
 from sagesplat.train.group import ALONE, Group
 from sagesplat.train.lr_schedule import LrSchedule
 from sagesplat.train.photo_loader import PhotoLoader
+from sagesplat.train.poses import PoseUpdate, moved_camera
 from sagesplat.train.state import TrainState, initial_state
 from sagesplat.train.strategy import Strategy
+from sagesplat.train.view_parameters import ViewGradients, ViewUpdate
 
 FINISHED_SHARE = 1 / 8  # of the rounds include a view whose categories have all stopped; it is drawn in full
 
@@ -38,6 +42,7 @@ class Stepper:
     strategy: Strategy = field(default_factory=Strategy)  # without one the set of Gaussians is fixed
     gradient_freezing: GradientFreezing | None = None
     sh_bits: tuple[int, int] | None = None  # render Gaussians rounded as SPZ files will store them
+    view_updates: Mapping[str, ViewUpdate] = field(default_factory=dict)  # of `TrainState.per_view`
     drawn: float = 1.0  # share of the tiles that the last step drew
     workspace: Workspace = field(default_factory=Workspace)
 
@@ -61,7 +66,10 @@ class Stepper:
             drawn_rows: Indices of the Gaussians to render; the others take no part in this step.
         """
         batch = max(self.config.batch, self.group.size)
-        views = self.group.share([self._next_view(state) for _ in range(batch)])
+        of_batch = [self._next_view(state) for _ in range(batch)]
+        views = self.group.share(of_batch)
+        refined = [n for n, update in self.view_updates.items() if update.first_step <= state.step + 1]
+        of_views = ViewGradients({name: state.per_view[name] for name in refined}, of_batch)
         if state.queue:
             self.photo_loader.expect(state.queue[-1 - self.group.rank % len(state.queue)], factor)
         shown = state.gaussians if drawn_rows is None else state.gaussians.select(drawn_rows)
@@ -73,8 +81,10 @@ class Stepper:
         self.drawn = 0.0
         grads: dict[str, Tensor] = {}
         for view in views:
-            loss, render = self._draw(moving, view, degree, trainable, factor)
+            own = of_views.leaves(view)
+            loss, render = self._draw(moving, view, degree, trainable, factor, own)
             loss.backward()
+            of_views.add(view, own)
             losses.append(loss.detach())
             self.strategy.step_post_backward(state, render, trainable)
             for name, leaf in leaves.items():
@@ -87,7 +97,7 @@ class Stepper:
         self.drawn /= len(views)
         total = torch.stack(losses).sum()
         if batch > 1:
-            self.group.add(total, *grads.values())
+            self.group.add(total, *grads.values(), *of_views.grads.values())
             grads = {name: grad / batch for name, grad in grads.items()}
         if drawn_rows is not None:
             grads, trainable = _spread(grads, drawn_rows, trainable)
@@ -97,8 +107,19 @@ class Stepper:
         self.strategy.step_pre_update(state, grads, trainable)
         scaled = {name: rate * math.sqrt(batch) for name, rate in learning_rates.items()}
         optim.update(state, grads, scaled, degree, trainable)
+        of_views.update(self.view_updates, state.step)
         self.strategy.step_post_update(state, trainable)
         return total / batch
+
+    def camera(self, state: TrainState, view: int) -> Camera:
+        """A view's camera with what is refined of it so far."""
+        camera, update = self.photo_loader.scene.views[view].camera, self.view_updates.get("pose")
+        if "exposure" in self.view_updates:
+            exposure = transform(state.per_view["exposure"].values[view]).cpu().numpy()
+            camera = replace(camera, exposure=exposure)
+        if not isinstance(update, PoseUpdate):
+            return camera
+        return moved_camera(camera, update.motion(view, state.per_view["pose"].values[view]))
 
     def stop(self, frozen: Collection[int]) -> None:
         """From now on, skip tiles that show nothing but the categories `frozen` (label ids)."""
@@ -106,35 +127,57 @@ class Stepper:
             self.active_tiles = replace(self.active_tiles, frozen=frozenset(frozen))
 
     def _draw(
-        self, moving: Gaussians, view: int, degree: int, trainable: Tensor, factor: int
+        self,
+        moving: Gaussians,
+        view: int,
+        degree: int,
+        trainable: Tensor,
+        factor: int,
+        own: Mapping[str, Tensor],  # parameters of this view alone, by kind
     ) -> tuple[Tensor, Render]:
         photo, camera = self.photo_loader(view, factor)
         # nobody may paint over what is finished, so it is looked at now and then
         finished, left = self.active_tiles.finished(view), self.active_tiles.tiles(view, factor)
         self.drawn += 1.0 if finished or left is None else float(left.mean())
         tiles = None if finished else self.active_tiles.mask(view, factor)
+        pose, update = None, self.view_updates.get("pose")
+        if isinstance(update, PoseUpdate) and "pose" in own:
+            motion = update.motion(view, own["pose"])
+            camera, pose = moved_camera(camera, motion), motion - motion.detach()
+        exposure = _exposure(own, camera, photo.device)
         render = rasterize(
             moving,
-            camera,
+            camera if camera.exposure is None else camera.neutral,
             sh_degree=degree,
             antialiased=self.config.antialiased,
             tile_mask=tiles,
             trainable=trainable if self.active_tiles.frozen or self.gradient_freezing else None,
             absgrad=self.config.absgrad,
+            pose=pose,
             workspace=self.workspace,
             backend=self.backend,
         )
-        return photometric_loss(render.rgb, photo, self.config.ssim_weight, tiles, self.workspace), render
+        rgb = render.rgb if exposure is None else expose(render.rgb, exposure, photo)
+        valid = self.photo_loader.valid(view, factor)
+        loss = photometric_loss(rgb, photo, self.config.ssim_weight, tiles, self.workspace, valid)
+        return loss, render
 
     def _next_view(self, state: TrainState) -> int:
         """Views in random order, each once a round; finished ones in a round out of eight."""
         while not state.queue:
             state.queue = [
                 view
-                for view in state.rng.permutation(self.photo_loader.scene.train_ids).tolist()
+                for view in state.rng.permutation(self.photo_loader.rows).tolist()
                 if not self.active_tiles.finished(view) or state.rng.random() < FINISHED_SHARE
             ]
         return state.queue.pop()
+
+
+def _exposure(own: Mapping[str, Tensor], camera: Camera, device: torch.device) -> Tensor | None:
+    """The colour transform of a view: the one that is learned, else its camera's, else none."""
+    if "exposure" in own:
+        return transform(own["exposure"])
+    return None if camera.exposure is None else torch.from_numpy(camera.exposure).to(device)
 
 
 def _spread(grads: Mapping[str, Tensor], rows: Tensor, trainable: Tensor) -> tuple[dict[str, Tensor], Tensor]:
@@ -155,6 +198,7 @@ def tune(
     config: TrainConfig,
     steps: int,
     *,
+    valid: ValidPixels = ALL_VALID,
     seed: int = 0,
     backend: Backend = "auto",
 ) -> Gaussians:
@@ -170,7 +214,8 @@ def tune(
     copies = {name: p.detach().clone() for name, p in gaussians.parameters().items()}
     state = initial_state(replace(gaussians, **copies).to(device), seed)
     state.sort()
-    stepper = Stepper(PhotoLoader(scene, photos, device), config, ActiveTiles(scene, None), backend)
+    loader = PhotoLoader(scene, photos, device, valid)
+    stepper = Stepper(loader, config, ActiveTiles(scene, None), backend)
     trainable = trainable_rows(state.gaussians, {})
     for step in range(1, steps + 1):
         stepper(state, gaussians.sh_degree, learning_rates(2 * steps + step), trainable)

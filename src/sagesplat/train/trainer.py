@@ -3,7 +3,8 @@
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,17 +19,21 @@ from sagesplat.raster import Backend, device_of
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.segment.masks import Masks
+from sagesplat.segment.valid import ALL_VALID, ValidPixels
 from sagesplat.train.checkpoint import latest_checkpoint, previous, write_checkpoint
 from sagesplat.train.early_stopping import ActiveTiles, label_quality, measured_views, trainable_rows
-from sagesplat.train.events import Event, LabelFrozen, LevelSaved, Resumed, Step, Trained
+from sagesplat.train.events import Event, Found, LabelFrozen, LevelSaved, Resumed, Step, Trained
+from sagesplat.train.exposure import ExposureUpdate, exposure_update
 from sagesplat.train.gradient_freezing import GradientFreezing
 from sagesplat.train.group import ALONE, Group
 from sagesplat.train.lr_schedule import LrSchedule, lr_schedule
 from sagesplat.train.photo_loader import PhotoLoader
+from sagesplat.train.poses import pose_update
 from sagesplat.train.sky import Shell
 from sagesplat.train.state import TrainState, from_points, initial_state
 from sagesplat.train.stepper import Stepper
 from sagesplat.train.strategy import Densification, make_strategy
+from sagesplat.train.view_parameters import ViewParameters, ViewUpdate
 
 CHECKPOINT = "checkpoint.npz"
 _LESS = "lower --train.max-gaussians, or begin a run with --downscale 2"
@@ -42,6 +47,7 @@ def train(
     config: TrainConfig,
     *,
     masks: Masks | None = None,
+    valid: ValidPixels = ALL_VALID,
     seed: int = 0,
     backend: Backend = "auto",
     folder: Path | None = None,
@@ -59,9 +65,11 @@ def train(
     Args:
         scene: The capture; `scene.train_ids` are used.
         photos: Its photos, uint8 [H, W, 3] by row of `scene.views`.
-        label_ids: int16 [P], category of each SfM point; -1: unlabelled. Clones and splits inherit it.
+        label_ids: int16 [P], category of each SfM point; -1: unlabelled, -2 (`IGNORED`): no Gaussian begins
+            there. Clones and splits inherit it.
         config: Steps, learning rates, densification and levels.
         masks: Label images; needed for `config.freeze_at`.
+        valid: The pixels that count; nothing is learnt from the others.
         seed: Of all random numbers. The same seed gives the same bits on the CPU.
         backend: Rasteriser, see `rasterize`; decides the device.
         folder: Levels and a checkpoint are written here (levels/, checkpoint.npz); None: nothing is written.
@@ -69,8 +77,8 @@ def train(
         group: Processes that train one model together. All call this with the same arguments.
 
     Yields:
-        `Resumed` first where a checkpoint was found, `Step` at every step, `LevelSaved`, `LabelFrozen`, and
-        `Trained` last, with the Gaussians on the CPU.
+        `Resumed` first where a checkpoint was found, `Found`, `Step` at every step, `LevelSaved`,
+        `LabelFrozen`, and `Trained` last, with the Gaussians on the CPU.
 
     Raises:
         RunError: If the loss is not finite, memory runs out, a GPU fails, or a setting is impossible.
@@ -90,7 +98,8 @@ def train(
     with named_failures(lambda: _where(training and training.state, folder)):
         training = begin(
             scene, photos, label_ids, config,
-            masks=masks, seed=seed, backend=backend, folder=folder, settings=settings, group=group, shell=shell,
+            masks=masks, valid=valid, seed=seed, backend=backend, folder=folder, settings=settings,
+            group=group, shell=shell,
         )  # fmt: skip
         yield from training.run()
 
@@ -141,6 +150,7 @@ class Training:
     folder: Path | None  # None: this process writes nothing
     settings: str
     resumed: Resumed | None
+    found: list[str]  # about the photos, in words
     shell: Shell | None = None
     loss: float = 0.0  # when it was last looked at
 
@@ -153,12 +163,14 @@ class Training:
         """Train to the end; the events of `train`."""
         if self.resumed:
             yield self.resumed
+        yield from map(Found, self.found)
         while self.state.step < self.config.max_steps and self.unfinished:
             yield self._step()
             yield from self._after_step()
         if self.folder:
             previous(self.folder / CHECKPOINT).unlink(missing_ok=True)  # nobody resumes from here
-        yield Trained(self.state.gaussians.to("cpu"), self.state.step, self.state.frozen)
+        done = self.state.to(torch.device("cpu"))
+        yield Trained(done.gaussians, done.step, done.frozen, done.per_view)
 
     def _step(self) -> Step:
         """One optimiser step."""
@@ -223,6 +235,7 @@ class Training:
             state.gaussians, stepper.active_tiles, stepper.photo_loader, self.measured, self.config,
             self._sh_degree(state.step),
             backend=stepper.backend, workspace=stepper.workspace, group=stepper.group,
+            camera_of=partial(stepper.camera, state),
         )  # fmt: skip
         counts = state.gaussians.counts()
         for label, ssim in quality.items():
@@ -241,6 +254,7 @@ def begin(
     config: TrainConfig,
     *,
     masks: Masks | None = None,
+    valid: ValidPixels = ALL_VALID,
     seed: int = 0,
     backend: Backend = "auto",
     folder: Path | None = None,
@@ -258,7 +272,14 @@ def begin(
     g = from_points(
         scene.points, label_ids, config.sh_degree, strategy.initial_opacity, strategy.initial_scale
     )
+    batched = replace(config, batch=max(config.batch, group.size))
+    updates, found = view_updates(scene, photos, batched)
     state, resumed = initial_state(g, seed).to(device), None
+    for name, update in updates.items():
+        parameters = ViewParameters.zeros(len(scene.views), update.size)
+        if isinstance(update, ExposureUpdate):
+            parameters.values += update.start
+        state.per_view[name] = parameters.to(device)
     state.sort()
     if folder and (folder / CHECKPOINT).exists():
         state, damage = latest_checkpoint(folder / CHECKPOINT, settings)
@@ -269,11 +290,29 @@ def begin(
             state.clear_statistics()  # the first process has those of all
     share = config.gradient_freeze_share
     freezing = GradientFreezing(share) if share else None
-    tiles = ActiveTiles(scene, masks, frozenset(state.frozen), device)
-    stepper = Stepper(PhotoLoader(scene, photos, device), config, tiles, backend, group, strategy, freezing)
+    tiles = ActiveTiles(scene, masks, frozenset(state.frozen), device, valid)
+    stepper = Stepper(
+        PhotoLoader(scene, photos, device, valid), config, tiles, backend, group, strategy, freezing,
+        view_updates=updates,
+    )  # fmt: skip
     measured = measured_views(scene, masks) if config.freeze_at is not None and masks is not None else {}
     folder = folder if group.leads else None
-    return Training(config, state, stepper, strategy, rates, measured, freezing, folder, settings, resumed, shell)
+    return Training(
+        config, state, stepper, strategy, rates, measured, freezing, folder, settings, resumed, found, shell
+    )
+
+
+def view_updates(
+    scene: Scene, photos: Photos, config: TrainConfig
+) -> tuple[dict[str, ViewUpdate], list[str]]:
+    """What a training refines of the cameras, by kind ("pose", "exposure"), and lines about it."""
+    updates: dict[str, ViewUpdate] = {}
+    if config.poses:
+        updates["pose"] = pose_update(scene, config.max_steps, config.batch)
+    exposure, found = exposure_update(scene, photos, config)
+    if exposure:
+        updates["exposure"] = exposure
+    return updates, [found] if found else []
 
 
 def _check_levels(checkpoint: Path, step: int) -> None:

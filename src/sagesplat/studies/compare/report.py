@@ -26,6 +26,8 @@ LINES = {  # colour and marker by method
     SAME_SHARE: ("#f5b183", "."), PLANNED: (ACCENT, "o"),
 }  # fmt: skip
 MEASURES = {"ssim": "SSIM", "psnr": "PSNR (dB)", "lpips_alex": "LPIPS (alex)", "lpips_vgg": "LPIPS (vgg)"}
+# the same, colour-corrected: measured where photos have an exposure of their own
+MEASURES |= {f"cc_{name}": f"cc_{title}" for name, title in MEASURES.items()}
 FILE, PAGE = "compare.json", "compare.md"
 _MB = "raw MB: 248 bytes a Gaussian; MB: encoded, all SPZ files with the same settings."
 _HOW = (
@@ -75,6 +77,10 @@ class Point:
     psnr: float  # dB
     lpips_alex: float  # NaN where it could not be measured
     lpips_vgg: float
+    cc_ssim: float = math.nan  # colour-corrected, as gsplat; NaN where no photo has an exposure of its own
+    cc_psnr: float = math.nan
+    cc_lpips_alex: float = math.nan
+    cc_lpips_vgg: float = math.nan
     labels: dict[int, OfLabel] = field(default_factory=dict)
 
     @property
@@ -284,20 +290,27 @@ def walk_table(walks: Sequence[Walk], target: float) -> Table:
 
 def points_table(points: Sequence[Point]) -> Table:
     """Everything that was measured."""
+    cc = [name for name in MEASURES if name.startswith("cc_") and _measured(points, name)]
+    others = ["lpips_alex", "lpips_vgg", *cc]
     body = [
         (p.method, p.name, p.count, p.raw / MB, p.encoded / MB, p.steps, p.ssim, p.ssim_sent, p.psnr,
-         p.lpips_alex, p.lpips_vgg)
+         *(getattr(p, name) for name in others))
         for p in points
     ]  # fmt: skip
     header = ("method", "which", "Gaussians", "raw MB", "MB", "steps", "SSIM", "as sent", "PSNR")
     formats = ("", "", ",d", ".3f", ".3f", ",d", ".4f", ".4f", ".2f", ".4f", ".4f")
-    return Table("All sets, test views", (*header, "LPIPS alex", "LPIPS vgg"), formats, body)
+    formats += tuple(".2f" if name == "cc_psnr" else ".4f" for name in cc)
+    return Table("All sets, test views", (*header, "LPIPS alex", "LPIPS vgg", *cc), formats, body)
+
+
+def _measured(points: Sequence[Point], name: str) -> bool:
+    return any(np.isfinite(getattr(p, name)) for p in points)
 
 
 @rc_context(STYLE)
 def curves(points: Sequence[Point]) -> Figure:
     """Quality over count and over encoded bytes, a line per method."""
-    measures = [name for name in MEASURES if any(np.isfinite(getattr(p, name)) for p in points)]
+    measures = [name for name in MEASURES if _measured(points, name)]
     figure = Figure(figsize=(3.9 * len(measures) + 0.4, 6.6), layout="constrained")
     grid = figure.subplots(2, len(measures), squeeze=False)
     for line, (size, scale, label) in enumerate((("count", 1, "Gaussians"), ("encoded", MB, "MB encoded"))):

@@ -1,7 +1,7 @@
 """Nested levels beside their baselines: same data, same training views, same evaluation."""
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sagesplat.adapt.allocate import along
-from sagesplat.adapt.observe import TOTAL, as_unit, measure, render_rgb
+from sagesplat.adapt.observe import TOTAL, as_unit, measure, measure_total, render_rgb
 from sagesplat.adapt.plan import Plan, check_target
 from sagesplat.core.config import CompareConfig, PlanConfig
 from sagesplat.core.errors import RunError
@@ -21,7 +21,8 @@ from sagesplat.formats.increments import INDEX, read_increments, shown, write_in
 from sagesplat.formats.levels import read_level, write_set
 from sagesplat.formats.spz import SH_BITS
 from sagesplat.io.files import read_json, write_json
-from sagesplat.metrics.image import ssim_map
+from sagesplat.metrics.color_correct import color_correct_affine
+from sagesplat.metrics.image import pasted
 from sagesplat.metrics.lpips import Lpips
 from sagesplat.raster import Workspace
 from sagesplat.run.executor import Local
@@ -59,7 +60,7 @@ from sagesplat.studies.compare.report import (
     write_comparison,
     write_report,
 )
-from sagesplat.studies.lpips import load_metrics, lpips_hashes
+from sagesplat.studies.lpips import features_of, load_metrics, lpips_hashes
 from sagesplat.studies.paper.same_size import nearest_snapshot, prune_to
 from sagesplat.train.importance import importance
 from sagesplat.train.nested import capped_config
@@ -197,7 +198,7 @@ def _pruned(job: Job, config: CompareConfig, folder: Path) -> list[_Baseline]:
     return [
         _Baseline(
             PRUNED, f"{share:.0%}, {steps} steps", folder / f"pruned-{share:g}-{steps}.npz",
-            last.step + steps, {"share": share, "tune_steps": steps}, [job.run.scene, last.path],
+            last.step + steps, {"share": share, "tune_steps": steps}, [*job.run.scene_files, last.path],
             _prune, lambda share=share: (share, steps, weights()),
         )
         for share in sorted(set(config.shares))
@@ -219,7 +220,7 @@ def _mcmc(job: Job, config: CompareConfig, folder: Path) -> list[_Baseline]:
         settings = {**asdict(capped_config(made, cap, made.max_steps)), "seed": seed}
         of = path.stem, cap, made.max_steps, seed
         baseline = _Baseline(
-            MCMC, f"cap {share:.0%}", path, made.max_steps, settings, [run.scene, run.labels],
+            MCMC, f"cap {share:.0%}", path, made.max_steps, settings, [*run.scene_files, run.labels],
             _cap, lambda of=of: of,
         )  # fmt: skip
         found.append(baseline)
@@ -316,12 +317,16 @@ def _nested(nested: NestedLevels, config: CompareConfig) -> list[Contender]:
 def _measure(job: Job, contenders: Sequence[Contender], metrics: dict[str, Lpips]) -> list[Point]:
     """All contenders on all test views, some at a time."""
     labels = label_images(job, job.fit_config.masks)
-    tests, workspace, points = job.scene.test_ids.tolist(), Workspace(), []
+    tests, workspace, points = job.valid.rows(job.scene, job.scene.test_ids), Workspace(), []
     done, total = 0, len(contenders) * len(tests)
 
-    def image_of(g: Gaussians, row: int) -> np.ndarray:
+    def exposed(row: int) -> bool:
+        return job.scene.views[row].camera.exposure is not None
+
+    def image_of(g: Gaussians, row: int, neutral: bool = False) -> np.ndarray:
         drawn = {"backend": job.backend, "antialiased": job.antialiased, "workspace": workspace}
-        return render_rgb(g, job.scene.views[row].camera, **drawn)
+        camera = job.scene.views[row].camera
+        return render_rgb(g, camera.neutral if neutral else camera, **drawn)
 
     for begin in range(0, len(contenders), _TOGETHER):
         some = contenders[begin : begin + _TOGETHER]
@@ -333,14 +338,18 @@ def _measure(job: Job, contenders: Sequence[Contender], metrics: dict[str, Lpips
         ]
         for row in tests:
             photo, here = as_unit(job.photos[row]), labels[job.scene.views[row]]
-            of_photo = {column: metric.features(photo) for column, metric in metrics.items()}
+            valid, of_photo = job.valid[job.scene.views[row]], features_of(metrics, photo)
             for g, (_, arrived), values in zip(sets, sent, found, strict=True):
                 image = image_of(g, row)
-                values.append(_values(job, image, photo, here))
+                values.append(_values(job, image, photo, here, valid))
+                if valid is not None:
+                    of_photo = features_of(metrics, pasted(photo, image, valid))
                 for column, metric in metrics.items():
                     values[-1][column] = metric.distance(metric.features(image), of_photo[column])
+                if exposed(row):
+                    values[-1] |= _corrected(image_of(g, row, neutral=True), photo, valid, metrics)
                 if arrived is not None:
-                    values[-1]["ssim_sent"] = float(ssim_map(image_of(arrived, row), photo).mean())
+                    values[-1]["ssim_sent"] = measure_total(image_of(arrived, row), photo, valid)["ssim"]
                 done += 1
                 job.emit(Progress("compare", done, total))
         parts = zip(some, sets, sent, found, strict=True)
@@ -348,10 +357,25 @@ def _measure(job: Job, contenders: Sequence[Contender], metrics: dict[str, Lpips
     return points
 
 
-def _values(job: Job, image: np.ndarray, photo: np.ndarray, labels: np.ndarray) -> dict[str | int, float]:
+def _corrected(
+    image: np.ndarray, photo: np.ndarray, valid: np.ndarray | None, metrics: Mapping[str, Lpips]
+) -> dict[str | int, float]:
+    """The metrics of a colour-corrected image, by the names that gsplat has for them."""
+    corrected = color_correct_affine(image, photo, valid)
+    total = measure_total(corrected, photo, valid)
+    found: dict[str | int, float] = {"cc_psnr": total["psnr"], "cc_ssim": total["ssim"]}
+    of_photo = features_of(metrics, pasted(photo, corrected, valid))
+    for column, metric in metrics.items():
+        found[f"cc_{column}"] = metric.distance(metric.features(corrected), of_photo[column])
+    return found
+
+
+def _values(
+    job: Job, image: np.ndarray, photo: np.ndarray, labels: np.ndarray, valid: np.ndarray | None
+) -> dict[str | int, float]:
     """What is measured of one image: of the whole by name, SSIM of its categories by label id."""
     name = "ssim_eroded" if job.fit_config.region == "eroded" else "ssim"
-    rows, few = measure(image, photo, labels), job.fit_config.min_share * labels.size
+    rows, few = measure(image, photo, labels, valid=valid), job.fit_config.min_share * labels.size
     whole = {"ssim": rows[TOTAL]["ssim"], "ssim_sent": rows[TOTAL]["ssim"], "psnr": rows[TOTAL]["psnr"]}
     return whole | {i: of[name] for i, of in rows.items() if i != TOTAL and of["num_pixels"] >= few}
 

@@ -16,6 +16,7 @@ from sagesplat.io.columns import from_rows, read_columns, write_columns
 from sagesplat.raster import Backend, Workspace
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
+from sagesplat.segment.valid import ALL_VALID, ValidPixels
 
 NONE = -1  # level or count where there is none
 
@@ -70,6 +71,7 @@ def cross_view(
     plan_for: Callable[[int, float], Plan],
     *,
     labels: LabelImages | None = None,
+    valid: ValidPixels = ALL_VALID,
     min_share: float = 0.0,
     region: Literal["mask", "eroded"] = "mask",
     backend: Backend = "auto",
@@ -79,7 +81,7 @@ def cross_view(
     """Plan each test view, compose, and measure per category, beside an oracle.
 
     `plan_for` (row of Scene.views, target). `labels`: the pixels of each category (default: as the Gaussians
-    paint them, as nobody has masks of unseen views).
+    paint them, as nobody has masks of unseen views). `valid`: the pixels of photos that count.
 
     The oracle knows what every settled level measures in that view. Categories with less than `min_share` of
     the rendered pixels are planned but make no row. `region`: where SSIM is measured. `progress` hears
@@ -88,7 +90,7 @@ def cross_view(
     rows: list[dict[str, float]] = []
     labels = labels or RenderedLabels(ladder.load(ladder.levels[-1]), backend, antialiased)
     workspace = Workspace()
-    views = scene.test_ids.tolist()
+    views = valid.rows(scene, scene.test_ids)
     done, total = 0, len(views) * (len(ladder.levels) + len(targets))
 
     def measured(g: Gaussians, row: int) -> dict[int, dict[str, float]]:
@@ -98,7 +100,7 @@ def cross_view(
         done += 1
         if progress:
             progress(done, total)
-        rows = measure(image, as_unit(photos[row]), labels[view])
+        rows = measure(image, as_unit(photos[row]), labels[view], valid=valid[view])
         if region == "eroded":
             rows = {label: {**values, "ssim": values["ssim_eroded"]} for label, values in rows.items()}
         return rows

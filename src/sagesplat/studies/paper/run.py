@@ -49,8 +49,8 @@ def cross_views(job: Job) -> None:
     def make() -> list[str]:
         fitted = job.fit_config
         table = cross_view(
-            job.scene, job.photos, job.ladder, targets, method.plan_view, labels=method.unseen_labels(),
-            min_share=fitted.min_share, region=fitted.region,
+            job.scene, job.photos, job.ladder, targets, method.plan_view,
+            labels=method.unseen_labels(), valid=job.valid, min_share=fitted.min_share, region=fitted.region,
             backend=job.backend, antialiased=job.antialiased,
             progress=lambda done, total: job.emit(Progress("crossview", done, total)),
         )  # fmt: skip
@@ -127,7 +127,7 @@ def equal_size(job: Job, config: PaperConfig) -> None:
     settings = {"view": view, "tune_steps": config.tune_steps, "lpips": lpips_hashes(config.lpips)}
 
     def make() -> list[str]:
-        tests = job.scene.test_ids.tolist()
+        tests = job.valid.rows(job.scene, job.scene.test_ids)
         comparisons = [(NONE, plans_of(job), tests), (view, _view_plans(job, view), [view])]
         comparisons = [c for c in comparisons if c[2]]
         images = sum(len(views) * (4 * len(plans) + 1) for _, plans, views in comparisons)
@@ -149,7 +149,7 @@ def equal_size(job: Job, config: PaperConfig) -> None:
         for of_view, plans, views in comparisons:
             sets = contenders(job.scene, job.ladder, plans, tuned, antialiased=job.antialiased)
             rows += compare(
-                job.scene, job.photos, views, sets, metrics, of_view=of_view,
+                job.scene, job.photos, views, sets, metrics, of_view=of_view, valid=job.valid,
                 backend=job.backend, antialiased=job.antialiased, progress=lambda *_: advance(1),
             )  # fmt: skip
         write_columns(run.same_size, from_rows(SameSize, rows))

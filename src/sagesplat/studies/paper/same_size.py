@@ -10,15 +10,17 @@ import torch
 from jaxtyping import Float32, Int32
 
 from sagesplat.adapt.ladder import Ladder
-from sagesplat.adapt.observe import as_unit, render_rgb
+from sagesplat.adapt.observe import as_unit, measure_total, render_rgb
 from sagesplat.adapt.plan import Plan
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.columns import read_columns
-from sagesplat.metrics.image import psnr, squared_error_map, ssim_map
+from sagesplat.metrics.image import pasted
 from sagesplat.metrics.lpips import Lpips
 from sagesplat.raster import Backend, Workspace
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
+from sagesplat.segment.valid import ALL_VALID, ValidPixels
+from sagesplat.studies.lpips import features_of
 from sagesplat.train.importance import importance
 
 METHODS = ("SAGE", "SAGE, tuned", "3DGS, snapshot", "3DGS, pruned and tuned", "3DGS, full model")
@@ -103,26 +105,30 @@ def compare(
     metrics: Mapping[str, Lpips],
     *,
     of_view: int = -1,
+    valid: ValidPixels = ALL_VALID,
     backend: Backend = "auto",
     antialiased: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[dict[str, float]]:
     """Rows of `SameSize`: every contender in every view (rows of Scene.views).
 
-    `metrics`: LPIPS by column name. `progress` hears (images measured, images in all).
+    `metrics`: LPIPS by column name. `valid`: the pixels that count; at others LPIPS sees the image itself.
+    `progress` hears (images measured, images in all).
     """
     rows: list[dict[str, float]] = []
     workspace = Workspace()
     for row in views:
-        photo, camera = as_unit(photos[row]), scene.views[row].camera
-        of_photo = {name: metric.features(photo) for name, metric in metrics.items()}
+        photo, view = as_unit(photos[row]), scene.views[row]
+        of_photo = features_of(metrics, photo)
         for target, method, g in sets:
-            image = render_rgb(g, camera, backend=backend, antialiased=antialiased, workspace=workspace)
+            image = render_rgb(g, view.camera, backend=backend, antialiased=antialiased, workspace=workspace)
+            found = measure_total(image, photo, valid[view])
+            if valid[view] is not None:
+                of_photo = features_of(metrics, pasted(photo, image, valid[view]))
             lpips = {n: metric.distance(metric.features(image), of_photo[n]) for n, metric in metrics.items()}
             rows.append({
                 "of_view": of_view, "target": target, "method": method, "view": row, "count": len(g),
-                "ssim": float(ssim_map(image, photo).mean()),
-                "psnr": float(psnr(squared_error_map(image, photo).mean())),
+                "ssim": found["ssim"], "psnr": found["psnr"],
                 "lpips_alex": np.nan, "lpips_vgg": np.nan, **lpips,
             })  # fmt: skip
             if progress:

@@ -1,0 +1,41 @@
+"""What a camera wrote into a photo about its exposure."""
+
+import math
+from pathlib import Path
+
+from sagesplat.io.pictures import PictureError, open_picture
+
+_DETAILS = 0x8769  # tag of EXIF's own directory
+_TIME, _APERTURE, _ISO = 0x829A, 0x829D, 0x8827
+_MOST_EV = 40.0  # from moonlight to the sun's disc is less
+_LARGEST = 2**20  # bytes of EXIF
+
+
+def exposure_of(path: Path) -> float | None:
+    """How bright a photo shows a given light, in EV (log2 of time x ISO / f-number^2); None: it does not say.
+
+    Tags that are missing, zero, or no numbers are None too, and so is a file that is no photo.
+    """
+    try:
+        with open_picture(path, decodes=False) as image:
+            if len(image.info.get("exif") or b"") > _LARGEST:
+                return None
+            tags = image.getexif().get_ifd(_DETAILS)
+            time, aperture, iso = (_number(tags.get(tag)) for tag in (_TIME, _APERTURE, _ISO))
+    except (PictureError, OSError, ValueError, TypeError, KeyError, SyntaxError, OverflowError):
+        return None
+    if not (time > 0 and iso > 0):
+        return None
+    value = math.log2(time) + math.log2(iso) - 2 * math.log2(aperture if aperture > 0 else 1.0)
+    return value if abs(value) <= _MOST_EV else None
+
+
+def _number(value: object) -> float:
+    """A tag's number, the first where there are several; 0 for anything else."""
+    if isinstance(value, tuple | list):
+        value = value[0] if value else 0
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return 0.0
+    return number if math.isfinite(number) else 0.0

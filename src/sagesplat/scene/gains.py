@@ -1,0 +1,176 @@
+"""How exposure and white balance differ between photos, from the colours that they show of the same points.
+
+sRGB's curve is v = 1.055 L^(1/2.4) - 0.055 but for the darkest colours. So light times a gain is, in stored
+values, (v + 0.055) times gain^(1/2.4): what is fitted here is that factor, for each photo and channel.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64, Int64
+from scipy.sparse import csr_array, diags_array
+from scipy.sparse.linalg import cg
+
+from sagesplat.scene.exif import exposure_of
+from sagesplat.scene.images import Photos
+from sagesplat.scene.scene import Scene
+
+_OFFSET, _CURVE = 0.055, 2.4
+_DARK, _BRIGHT = 10.0, 245.0  # of 255; values beyond tell nothing of a gain
+_ROUNDS = 10  # of iteratively reweighted least squares
+_PRIOR = 0.3  # observations that say of every photo that it has no gain
+_ENOUGH, _PLENTY = 30, 400  # observations of a photo, on average: at least, and no more than are used
+_EXPLAINED = 0.08  # least share by which gains have to bring colours of the same point together
+_LEAST_EV = 0.1  # range of exposures that is worth a transform
+_LEAST_EXIF_EV = 0.3  # the same where nothing but EXIF tells it
+
+
+def exposure_values(transforms: Float[np.ndarray, "V 3 4"]) -> Float[np.ndarray, " V"]:
+    """How much brighter colour transforms make a middle grey, EV."""
+    grey = transforms[:, :, :3].sum(2) * 0.5 + transforms[:, :, 3]
+    return _CURVE * np.log2(np.maximum(grey + _OFFSET, 1e-3) / (0.5 + _OFFSET)).mean(1)
+
+
+@dataclass(frozen=True, eq=False)
+class Gains:
+    """Exposure and white balance of V photos relative to their mean."""
+
+    gain: Float32[np.ndarray, "V 3"]  # of stored value + 0.055 in [0, 1]; mean 1 over the photos
+    source: Literal["tracks", "EXIF", "nothing"]
+    explained: float = (
+        0.0  # share by which the spread of a point's colours falls, cross-validated; of tracks only
+    )
+
+    @property
+    def ev(self) -> Float32[np.ndarray, " V"]:
+        """Exposure of each photo relative to the mean, EV."""
+        ev = _CURVE * np.log2(self.gain).mean(1)
+        return ev - ev.mean()
+
+    @property
+    def range_ev(self) -> float:
+        """From the darkest to the brightest photo."""
+        return float(np.ptp(self.ev))
+
+    @property
+    def differ(self) -> bool:
+        """Whether the photos differ by more than noise and what depends on the viewing direction."""
+        if self.source == "EXIF":
+            return self.range_ev > _LEAST_EXIF_EV
+        return self.explained > _EXPLAINED and self.range_ev > _LEAST_EV
+
+    def transforms(self) -> Float32[np.ndarray, "V 3 4"]:
+        """The gains as affine transforms of colours, whose mean over the photos is the identity."""
+        found = np.zeros((len(self.gain), 3, 4), np.float32)
+        found[:, range(3), range(3)] = self.gain
+        found[:, :, 3] = _OFFSET * (self.gain - 1)
+        return found
+
+
+def photo_gains(scene: Scene, photos: Photos | Sequence[np.ndarray], rows: Sequence[int]) -> Gains:
+    """Gains of some photos (rows of `scene.views`): from tracks, else from EXIF, else none."""
+    points, views, colours = _track_colours(scene, photos, rows)
+    if len(points) >= _ENOUGH * len(rows):
+        logs = np.log(colours + _OFFSET)
+        explained = _explained(points, views, logs, len(rows))
+        return Gains(_relative(_fit(points, views, logs, len(rows))), "tracks", explained)
+    ev = [exposure_of(scene.views[row].image_path) for row in rows]
+    if ev and all(value is not None for value in ev):
+        found = np.array(ev, np.float64)[:, None].repeat(3, 1) * np.log(2) / _CURVE
+        return Gains(_relative(found), "EXIF")
+    return Gains(np.ones((len(rows), 3), np.float32), "nothing")
+
+
+def _fit(
+    points: Int64[np.ndarray, " T"],
+    views: Int64[np.ndarray, " T"],
+    logs: Float64[np.ndarray, "T 3"],
+    count: int,
+) -> Float64[np.ndarray, "V 3"]:
+    return np.stack([_log_gains(points, views, channel, count) for channel in logs.T], 1)
+
+
+def _explained(
+    points: Int64[np.ndarray, " T"],
+    views: Int64[np.ndarray, " T"],
+    logs: Float64[np.ndarray, "T 3"],
+    count: int,
+) -> float:
+    """Share by which gains bring together the colours of points that they were not fitted to."""
+    before, after = 0.0, 0.0
+    for half in (0, 1):
+        a, b = points % 2 == half, points % 2 != half
+        gains = _fit(points[a], views[a], logs[a], count)
+        before += _spread(points[b], logs[b])
+        after += _spread(points[b], logs[b] - gains[views[b]])
+    return 1 - after / max(before, 1e-12)
+
+
+def _relative(logs: Float64[np.ndarray, "V 3"]) -> Float32[np.ndarray, "V 3"]:
+    gain = np.exp(np.clip(logs - logs.mean(0), -3, 3))
+    return (gain / gain.mean(0)).astype(np.float32)
+
+
+def _track_colours(
+    scene: Scene, photos: Photos | Sequence[np.ndarray], rows: Sequence[int]
+) -> tuple[Int64[np.ndarray, " T"], Int64[np.ndarray, " T"], Float64[np.ndarray, "T 3"]]:
+    """Points, photos (places in `rows`) and colours in [0, 1] of points that two photos or more observe."""
+    tracks, no = scene.points, np.zeros(0, np.int64)
+    points, views, colours = [no], [no], [np.zeros((0, 3))]
+    order = np.argsort(tracks.track_views, kind="stable")
+    ends = np.searchsorted(tracks.track_views[order], [(row, row + 1) for row in rows]).reshape(-1, 2)
+    for number, (row, (begin, end)) in enumerate(zip(rows, ends.tolist(), strict=True)):
+        if begin == end:
+            continue
+        mine, photo = order[begin:end], photos[row]
+        u, v = np.floor(tracks.track_uv[mine]).astype(np.int64).T
+        inside = (u >= 1) & (v >= 1) & (u < photo.shape[1] - 1) & (v < photo.shape[0] - 1)
+        mine, u, v = mine[inside], u[inside], v[inside]
+        around = [photo[v + i, u + j].astype(np.float64) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+        mean = np.mean(around, 0) if len(mine) else np.zeros((0, 3))
+        fine = ((mean > _DARK) & (mean < _BRIGHT)).all(1)
+        points.append(tracks.track_points[mine[fine]])
+        views.append(np.full(int(fine.sum()), number))
+        colours.append(mean[fine] / 255)
+    _, point, seen = np.unique(np.concatenate(points), return_inverse=True, return_counts=True)
+    every = max(1, len(point) // (_PLENTY * len(rows)))
+    shared = (seen[point] > 1) & (point % every == 0) if len(point) else np.zeros(0, bool)
+    _, of = np.unique(point[shared], return_inverse=True)
+    return of, np.concatenate(views)[shared], np.concatenate(colours)[shared]
+
+
+def _log_gains(
+    points: Int64[np.ndarray, " T"],
+    views: Int64[np.ndarray, " T"],
+    logs: Float64[np.ndarray, " T"],
+    count: int,
+) -> Float64[np.ndarray, " V"]:
+    """Minimise the robust sum of (log value - gain of the photo - colour of the point)^2; the gains.
+
+    Geman-McClure weights; the points are eliminated, so that what is solved has a row for each photo.
+    """
+    num = int(points.max()) + 1
+    gain, weight = np.zeros(count), np.ones(len(logs))
+    for _ in range(_ROUNDS):
+        table = csr_array((weight, (points, views)), shape=(num, count))
+        per_point = np.maximum(np.asarray(table.sum(1)).ravel(), 1e-9)
+        per_view = np.asarray(table.sum(0)).ravel()
+        point_sums, view_sums = (
+            np.bincount(of, weight * logs, n) for of, n in ((points, num), (views, count))
+        )
+        matrix = diags_array(per_view + _PRIOR) - table.T @ diags_array(1 / per_point) @ table
+        gain, _ = cg(matrix, view_sums - table.T @ (point_sums / per_point), x0=gain, rtol=1e-5)
+        colour = (point_sums - table @ gain) / per_point
+        errors = logs - gain[views] - colour[points]
+        scale = 2 * 1.4826 * float(np.median(np.abs(errors))) + 1e-4
+        weight = 1 / (1 + (errors / scale) ** 2) ** 2
+    return gain
+
+
+def _spread(points: Int64[np.ndarray, " T"], logs: Float64[np.ndarray, "T 3"]) -> float:
+    """Median distance of a point's colours from their mean, over all observations."""
+    seen = np.bincount(points)
+    means = np.stack([np.bincount(points, channel) for channel in logs.T], 1) / np.maximum(seen, 1)[:, None]
+    return float(np.median(np.abs(logs - means[points])))

@@ -1,0 +1,190 @@
+"""Pixels that count: what does not belong to a scene is not trained on, not measured and has no vote.
+
+Pixels do not count where a category is ignored, where a mask of the photo is black (`masks_valid/`, the
+`mask_path` of nerfstudio), and where a photo is transparent and that means it (`Scene.alpha`).
+"""
+
+import shutil
+from collections.abc import Callable, Collection
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float32
+from PIL import Image
+from scipy.ndimage import minimum_filter
+
+from sagesplat.core.errors import LabelError
+from sagesplat.io.files import atomic_path
+from sagesplat.io.pictures import FREE_PIXELS, PictureError, open_picture
+from sagesplat.scene.images import cut_out, has_alpha, load_alpha
+from sagesplat.scene.raw_photos import RawPhoto, raw_photos
+from sagesplat.scene.scene import Scene, View
+from sagesplat.segment.fit import fit
+from sagesplat.segment.masks import Masks, mask_path
+
+FOLDER = "masks_valid"  # of a capture: masks named like the photos, black where pixels do not count
+Pixels = Bool[np.ndarray, "H W"]
+
+
+class ValidPixels:
+    """Which pixels of the views count, from a folder that `write_valid` wrote; without one all of them.
+
+    Images are kept until `cache_bytes` are full, as those of `Masks` are.
+    """
+
+    def __init__(self, folder: Path | None = None, cache_bytes: int = 2**28):
+        self.folder, self.cache_bytes = folder, cache_bytes
+        self._cache: dict[str, Pixels] = {}
+        self._used = 0
+
+    def __getitem__(self, view: View) -> Pixels | None:
+        """True where a pixel counts, at the size of the view's camera; None where all do.
+
+        Shared, so not to be changed.
+        """
+        if (valid := self._cache.get(view.name)) is not None:
+            return valid
+        if self.folder is None or not (path := mask_path(self.folder, view)).exists():
+            return None
+        valid = read_valid(path, view)
+        if self._used + valid.nbytes <= self.cache_bytes:
+            self._cache[view.name] = valid
+            self._used += valid.nbytes
+        return valid
+
+    def rows(self, scene: Scene, rows: Collection[int]) -> list[int]:
+        """Those of the rows of `Scene.views` that have a pixel that counts."""
+        of_rows = ((int(row), self[scene.views[row]]) for row in rows)
+        return [row for row, valid in of_rows if valid is None or valid.any()]
+
+
+ALL_VALID = ValidPixels()
+
+
+def read_valid(path: Path, view: View) -> Pixels:
+    """One image of a folder that `write_valid` wrote; LabelError where it is no use for the view."""
+    valid = read_black(path, view.camera.width * view.camera.height)
+    if valid.shape != (view.camera.height, view.camera.width):
+        h, w = valid.shape
+        raise LabelError(
+            f"{path}: {w} x {h} pixels where the scene has {view.camera.width} x {view.camera.height}; "
+            "make the masks again"
+        )
+    return valid
+
+
+def read_black(path: Path, pixels: int) -> Pixels:
+    """Where an image of any PNG mode is not black; `pixels`: of its photo. LabelError for no image."""
+    try:
+        with open_picture(path, ("PNG",), free=max(FREE_PIXELS, 4 * pixels)) as image:
+            coloured = image.convert("RGB") if image.mode in ("P", "PA", "RGBA") else image
+            values = np.asarray(coloured.getchannel(0) if coloured.mode == "LA" else coloured)
+    except PictureError as error:
+        cure = error.cure or "export it again"
+        raise LabelError(f"{path}: not a readable PNG ({error.reason}); {cure}") from None
+    return np.array(values.any(2) if values.ndim == 3 else values, bool)
+
+
+def write_valid(
+    scene: Scene,
+    target: Path,
+    *,
+    label_ids: Masks | None = None,
+    ignore: Collection[int] = (),
+    dilation: int = 0,
+    on_view: Callable[[int, int], None] | None = None,
+) -> Float32[np.ndarray, " V"]:
+    """Find the pixels of all views that do not count, and write an image for each view that has some.
+
+    Args:
+        scene: The capture: its masks, and its photos where they are transparent.
+        target: Folder to write; it is removed where all pixels count.
+        label_ids: Label images; needed for `ignore`.
+        ignore: Category ids whose pixels do not count.
+        dilation: Pixels by which regions that do not count are grown.
+        on_view: Called with (views done, views in all).
+
+    Returns:
+        Share of each view's pixels that do not count; 1 where none does.
+
+    Raises:
+        LabelError: For masks that cannot be used, or where no pixel of a training view is left.
+    """
+    if dilation < 0:
+        raise LabelError(f"ignore_dilation {dilation} is no number of pixels; give 0 or more")
+    shutil.rmtree(target, ignore_errors=True)
+    given, transparent = _Given(scene), ignores_alpha(scene)
+    shares = np.zeros(len(scene.views), np.float32)
+    for row, view in enumerate(scene.views):
+        valid = given(view)
+        if ignore and label_ids is not None:
+            valid &= ~np.isin(label_ids[view], np.array(sorted(ignore), np.int16))
+        if transparent:
+            valid &= opaque(view)
+        if not valid.all():
+            if dilation:
+                valid = np.asarray(minimum_filter(valid, 2 * dilation + 1, mode="nearest"))
+            shares[row] = 1 - valid.mean()
+            with atomic_path(mask_path(target, view), sync=False) as temporary:
+                Image.fromarray(valid).save(temporary, format="PNG")
+        if on_view:
+            on_view(row + 1, len(scene.views))
+    if (shares[scene.train_ids] == 1).all():
+        raise LabelError(
+            f"{scene.path}: no pixel of any training photo counts; ignore fewer categories, or mend the "
+            "masks of the photos"
+        )
+    return shares
+
+
+class _Given:
+    """The masks that came with the photos: `masks_valid/`, and those that views name."""
+
+    def __init__(self, scene: Scene):
+        folder = scene.path / FOLDER
+        self.folder = folder if folder.is_dir() else None
+        self.raw = raw_photos(scene.path) if self.folder else {}
+        if self.folder and not any(self._in_folder(view) for view in scene.views):
+            name = mask_path(self.folder, scene.views[0]).name
+            raise LabelError(f"{self.folder}: no mask of any photo; name them like the photos ({name}, ...)")
+
+    def __call__(self, view: View) -> Pixels:
+        """Whether the pixels of a view count, at the size of its camera."""
+        valid = np.ones((view.camera.height, view.camera.width), bool)
+        if (path := self._in_folder(view)) is not None:
+            valid &= _seen(path, view, self.raw.get(view.name))
+        if view.valid_path is not None:
+            valid &= _seen(view.valid_path, view, None)
+        return valid
+
+    def _in_folder(self, view: View) -> Path | None:
+        if self.folder is None:
+            return None
+        paths = (self.folder / f"{view.name}.png", mask_path(self.folder, view))
+        return next((path for path in paths if path.is_file()), None)
+
+
+def _seen(path: Path, view: View, raw: RawPhoto | None) -> Pixels:
+    """A mask of a photo as the view's camera sees it."""
+    valid = read_black(path, view.camera.width * view.camera.height)
+    return fit(valid.astype(np.int16), view, raw, path).astype(bool)
+
+
+def opaque(view: View) -> Pixels:
+    """Where the photo of a view is opaque, at the size of its camera."""
+    if not has_alpha(view.image_path):
+        return np.ones((view.camera.height, view.camera.width), bool)
+    alpha = load_alpha(view.image_path)
+    return fit((alpha == 255).astype(np.int16), view, None, view.image_path).astype(bool)
+
+
+def ignores_alpha(scene: Scene) -> bool:
+    """Whether transparent pixels of a scene's photos do not count, by its setting or by the photos.
+
+    An object that was cut out has a transparent border in most photos: then the photos are of the object over
+    the background.
+    """
+    if scene.alpha != "auto":
+        return scene.alpha == "ignore"
+    paths = [view.image_path for view in scene.views if has_alpha(view.image_path)]
+    return bool(paths) and not cut_out(paths)

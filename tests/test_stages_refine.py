@@ -1,0 +1,100 @@
+"""Refined cameras in a run: written, used by what comes after training, removed when nothing is refined."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import SMALL_RUN
+
+from sagesplat.core.config import BlocksConfig
+from sagesplat.core.errors import RunError
+from sagesplat.core.events import StageDone
+from sagesplat.io.files import write_json
+from sagesplat.run.job import Job
+from sagesplat.run.records import uses
+from sagesplat.run.run_dir import RunDir
+from sagesplat.scene.refined import read_refined
+from sagesplat.stages import blocks
+from sagesplat.stages.observe import observe_levels
+from sagesplat.stages.pipeline import nest, train
+from sagesplat.stages.refine import PoseFigures, pose_lines, read_pose_figures
+
+POSES = replace(SMALL_RUN.train, max_steps=40, level_every=20, poses=True)
+FIGURES = PoseFigures(0.3, 0.02, 0.001, 1, 2, 3, (20.0, 24.5), (0.7, 0.8))
+
+
+@pytest.fixture(scope="module")
+def refined(finished_run, tmp_path_factory):
+    """A run whose training was done again with --train.poses, and the training's lines."""
+    folder = tmp_path_factory.mktemp("refined") / "run"
+    shutil.copytree(finished_run, folder)
+    shutil.copytree(finished_run.parent / "capture", folder.parent / "capture")
+    events = []
+    train(Job(RunDir(folder), events.append, "cpu", force=True), POSES, BlocksConfig(), 0)
+    return folder, next(event.lines for event in events if isinstance(event, StageDone))
+
+
+def test_cameras_and_figures_are_written(refined):
+    folder, lines = refined
+    job = Job(RunDir(folder), lambda event: None, "cpu")
+    cameras, given = read_refined(job.run.cameras, len(job.scene.views)), job.given_scene
+    moved = [not np.array_equal(w2c, v.camera.w2c) for w2c, v in zip(cameras.w2c, given.views, strict=True)]
+    assert any(moved[row] for row in given.train_ids)
+    assert not cameras.fitted[given.train_ids].any()
+    assert cameras.fitted[given.test_ids].any()
+    assert all(np.array_equal(v.camera.w2c, w2c) for v, w2c in zip(job.scene.views, cameras.w2c, strict=True))
+    figures = read_pose_figures(job.run.refined)
+    assert figures is not None
+    assert figures.psnr is not None
+    assert figures.psnr[1] > figures.psnr[0] - 0.01
+    assert "poses of training views moved by" in lines[1]
+    assert f"{figures.psnr[1]:.2f} dB with poses fitted to their photos" in lines[-1]
+
+
+def test_what_follows_is_made_from_them(refined, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(refined[0], folder)
+    job = Job(RunDir(folder), lambda event: None, "cpu", force=True)
+    nest(job, SMALL_RUN.nest, BlocksConfig(), 0)
+    observe_levels(job, SMALL_RUN.fit)
+    assert uses(job.run, "nest", job.run.cameras)
+    assert uses(job.run, "observe", job.run.cameras)
+    train(job, SMALL_RUN.train, BlocksConfig(), 0)  # without poses
+    assert not job.run.cameras.exists()
+    assert not job.run.refined.exists()
+    assert job.scene is job.given_scene
+
+
+def test_a_run_that_ended_before_they_were_written_writes_them(refined, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(refined[0], folder)
+    run = RunDir(folder)
+    before = read_refined(run.cameras, 8)
+    for path in (run.cameras, run.refined, run.provenance("train")):
+        path.unlink()
+    train(Job(run, lambda event: None, "cpu"), POSES, BlocksConfig(), 0)
+    after = read_refined(run.cameras, 8)
+    assert np.array_equal(before.w2c, after.w2c)
+    assert np.array_equal(before.fitted, after.fitted)
+
+
+def test_poses_and_blocks_are_refused():
+    with pytest.raises(RunError, match=r"--train\.poses does not go with --blocks\.count; leave out one"):
+        blocks.check(BlocksConfig(count=2), POSES)
+    blocks.check(BlocksConfig(), POSES)
+
+
+def test_lines_say_what_diverged():
+    assert "1 poses diverged and were put back as given" in pose_lines(FIGURES)
+    assert "1 of 3 held-out poses could not be fitted, and stay as given" in pose_lines(FIGURES)
+    assert len(pose_lines(replace(FIGURES, diverged=0, fitted=3, psnr=None, ssim=None))) == 1
+
+
+@pytest.mark.parametrize("content", [[], {"poses": []}, *({"poses": {"pixels": x}} for x in ("far", 1.0))])
+def test_other_figures_are_refused(tmp_path, content):
+    path = tmp_path / "refined.json"
+    assert read_pose_figures(path) is None
+    write_json(path, content)
+    with pytest.raises(RunError, match=r"refined\.json: not what was refined .*--force"):
+        read_pose_figures(path)

@@ -1,0 +1,114 @@
+"""Exposures in a run: learned, fitted for held-out views, used and named by what follows."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import SMALL_RUN, random_gaussians, write_capture
+from PIL import Image
+
+from sagesplat.adapt.viewpoints import capture_cameras
+from sagesplat.core.config import BlocksConfig, RunConfig
+from sagesplat.core.errors import RunError
+from sagesplat.core.events import StageDone, Warned
+from sagesplat.io.files import write_json
+from sagesplat.run.job import Job
+from sagesplat.run.run_dir import RunDir
+from sagesplat.scene.refined import read_refined
+from sagesplat.stages import blocks
+from sagesplat.stages.pipeline import run_all, train
+from sagesplat.stages.refine_exposure import ExposureFigures, exposure_lines, read_exposure_figures
+from sagesplat.stages.results import evaluation_of
+
+CONFIG = replace(SMALL_RUN, train=replace(SMALL_RUN.train, exposure="affine"))
+FIGURES = ExposureFigures(
+    1.4, {"plain": 20.0, "exposed": 24.0, "cc": 23.5}, {"plain": 0.7, "exposed": 0.75, "cc": 0.74}
+)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run on photos of which every third one is darker, and its events."""
+    folder, events = tmp_path_factory.mktemp("exposed"), []
+    truth = random_gaussians(120, degree=0, logit=2.0)
+    scene, masks = write_capture(folder / "capture", truth, noise=0.02), folder / "capture" / "masks"
+    masks.mkdir()
+    for row, view in enumerate(scene.views):
+        size = (view.camera.width, view.camera.height)
+        Image.new("L", size, 3).save(masks / view.name)
+        photo = np.asarray(Image.open(view.image_path)).astype(float)
+        Image.fromarray((photo * (0.6 if row % 3 == 0 else 1.0)).round().astype(np.uint8)).save(
+            view.image_path
+        )
+    write_json(masks / "labels.json", {"labels": {"3": "car"}})
+    run_all(Job(RunDir(folder / "run"), events.append, "cpu"), folder / "capture", CONFIG)
+    return folder / "run", events
+
+
+def test_held_out_views_are_fitted_to_their_photos(run):
+    job = Job(RunDir(run[0]), lambda event: None, "cpu")
+    scene = job.scene
+    cameras = read_refined(job.run.cameras, len(scene.views))
+    np.testing.assert_allclose(cameras.exposure[scene.train_ids].mean(0), np.eye(3, 4), atol=1e-5)
+    held_out = np.setdiff1d(np.arange(len(scene.views)), scene.train_ids)
+    assert cameras.fitted[held_out].all()
+    assert not cameras.fitted[scene.train_ids].any()
+    assert np.array_equal(cameras.w2c, [view.camera.w2c for view in job.given_scene.views])
+    assert all(view.camera.exposure is not None for view in scene.views)
+    assert all(view.camera.exposure is None for view in job.given_scene.views)
+
+
+def test_figures_are_kept_and_said(run):
+    figures = read_exposure_figures(RunDir(run[0]).refined)
+    assert figures is not None
+    assert figures.psnr is not None
+    assert figures.psnr["exposed"] > figures.psnr["plain"]
+    lines = {event.name: event.lines for event in run[1] if isinstance(event, StageDone)}
+    assert any("with colours fitted to their photos" in line for line in lines["train"])
+    assert "rendered with the exposure of their photos" in lines["observe"][0]
+    assert any("cc_psnr" in line for line in lines["evaluate"])
+    assert any("colour transform per photo" in event.text for event in run[1] if isinstance(event, Warned))
+
+
+def test_fidelity_and_drawn_viewpoints_are_without_exposure(run):
+    job = Job(RunDir(run[0], "nested"), lambda event: None, "cpu")
+    assert all(camera.exposure is None for camera in capture_cameras(job.scene))
+    rows = evaluation_of(job)
+    whole = rows.select(np.isfinite(rows.cc_psnr))
+    assert len(whole)
+    assert (whole.psnr >= whole.plain_psnr).mean() > 0.5
+    page = (job.run.adapted / "report" / "index.html").read_text("utf-8")
+    assert "The photos differ in exposure" in page
+
+
+def test_switched_off_nothing_is_left(run, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(run[0], folder)
+    job = Job(RunDir(folder), lambda event: None, "cpu", force=True)
+    train(job, replace(CONFIG.train, exposure="off", max_steps=4, level_every=4), BlocksConfig(), 0)
+    assert not job.run.cameras.exists()
+    assert not job.run.refined.exists()
+    assert job.scene is job.given_scene
+
+
+def test_blocks_refuse_it():
+    config = replace(RunConfig().train, exposure="affine")
+    with pytest.raises(RunError, match=r"--train\.exposure affine does not go with --blocks.count"):
+        blocks.check(BlocksConfig(count=2), config)
+    blocks.check(BlocksConfig(count=2), RunConfig().train)
+
+
+def test_lines_and_files_of_figures(tmp_path):
+    assert "cc_ssim 0.740 / cc_psnr 23.50 dB" in exposure_lines(FIGURES)[1]
+    assert len(exposure_lines(replace(FIGURES, psnr=None, ssim=None))) == 1
+    path = tmp_path / "refined.json"
+    assert read_exposure_figures(path) is None
+    for content in ([], {"exposure": 3}, {"exposure": {"range_ev": 1}}):
+        write_json(path, content)
+        with pytest.raises(RunError, match=r"refined\.json"):
+            read_exposure_figures(path)
+    wrong = {"range_ev": 1.0, "psnr": {"plain": 1.0}, "ssim": None}
+    write_json(path, {"exposure": wrong})
+    with pytest.raises(RunError, match="other measurements"):
+        read_exposure_figures(path)
