@@ -53,7 +53,7 @@ class Densification(Strategy):
     schedule: Schedule
     rates: LrSchedule
     group: Group = ALONE
-    shell: Shell | None = None
+    shell: Shell | None = None  # of the sky
 
     @classmethod
     def schedule_of(cls, config: TrainConfig) -> Schedule:
@@ -144,12 +144,16 @@ class McmcStrategy(Densification):
     def step_pre_update(self, state: TrainState, grads: dict[str, Tensor], trainable: Tensor) -> None:
         """Add the gradients of the regularisation of opacities and scales."""
         opacity, scale = self.config.mcmc_opacity, self.config.mcmc_scale / self.scene.extent
-        mcmc.add_regularisation_gradients(state, grads, opacity, scale, trainable)
+        mcmc.add_regularisation_gradients(state, grads, opacity, scale, self._near(state, trainable))
 
     def step_post_update(self, state: TrainState, trainable: Tensor) -> None:
         """Add SGLD noise to the means."""
         if noise := self.rates.sgld_noise(state.step):
-            mcmc.perturb(state, noise, trainable)
+            mcmc.perturb(state, noise, self._near(state, trainable))
+
+    def _near(self, state: TrainState, trainable: Tensor) -> Tensor:
+        """Those of the `trainable` rows (bool [N]) that are not on the shell, where all sizes are larger."""
+        return trainable & ~self.shell.holds(state.gaussians.means) if self.shell else trainable
 
     def refine(self, state: TrainState, trainable: Tensor) -> None:
         """Relocate dead Gaussians, then add new ones up to the cap."""

@@ -75,6 +75,7 @@ def train(
         folder: Levels and a checkpoint are written here (levels/, checkpoint.npz); None: nothing is written.
         settings: A checkpoint in `folder` is resumed if it was written with the same text.
         group: Processes that train one model together. All call this with the same arguments.
+        shell: Gaussians that lie on it stay on it (see `train.sky`).
 
     Yields:
         `Resumed` first where a checkpoint was found, `Found`, `Step` at every step, `LevelSaved`,
@@ -151,7 +152,6 @@ class Training:
     settings: str
     resumed: Resumed | None
     found: list[str]  # about the photos, in words
-    shell: Shell | None = None
     loss: float = 0.0  # when it was last looked at
 
     def __post_init__(self) -> None:
@@ -179,8 +179,6 @@ class Training:
             self.state, self._sh_degree(step - 1), self.rates.learning_rates(step), self.active,
             self.rates.factor(step),
         )  # fmt: skip
-        if self.shell:
-            self.shell.hold(self.state.gaussians)
         on_cpu = not loss.is_cuda
         if on_cpu or self._records(step) or step % LOOK_EVERY == 0:  # reading it waits for a GPU
             self.loss = finite(loss, step)
@@ -293,12 +291,12 @@ def begin(
     tiles = ActiveTiles(scene, masks, frozenset(state.frozen), device, valid)
     stepper = Stepper(
         PhotoLoader(scene, photos, device, valid), config, tiles, backend, group, strategy, freezing,
-        view_updates=updates,
+        view_updates=updates, shell=shell,
     )  # fmt: skip
     measured = measured_views(scene, masks) if config.freeze_at is not None and masks is not None else {}
     folder = folder if group.leads else None
     return Training(
-        config, state, stepper, strategy, rates, measured, freezing, folder, settings, resumed, found, shell
+        config, state, stepper, strategy, rates, measured, freezing, folder, settings, resumed, found
     )
 
 
