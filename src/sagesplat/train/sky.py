@@ -24,9 +24,9 @@ from sagesplat.segment.valid import ALL_VALID, ValidPixels
 _FAR_POINTS = 99.0  # percentile of the points' distances that the shell lies beyond
 _BEYOND, _LEAST, _MOST = 1.5, 10.0, 100.0  # times that distance; smallest and largest radius, scene extents
 _PER_VIEW = 24  # points of the shell along the longer side of a photo
-_MARGIN = 20.0  # degrees around the sky in the photos that get points too: other views see more of it
+_MARGIN = 8.0  # degrees around the sky in the photos that get points too: other views see more of it
 _PIXELS = 20_000  # of a photo's sky that are looked at, at most
-_THICKNESS = 1e-3  # of the radius: what is closer to the shell lies on it
+_THICKNESS = 0.03  # of the radius: what is closer to the shell lies on it, as SPZ files round positions too
 _MOST_POINTS = 10_000_000
 _FORMAT = 1
 
@@ -186,7 +186,7 @@ def _with_margin(
     z, turn = 1 - (2 * np.arange(n) + 1) / n, np.pi * (1 + 5**0.5) * (np.arange(n) + 0.5)  # Fibonacci's
     across = np.sqrt(1 - z * z)
     grid = np.stack([across * np.cos(turn), across * np.sin(turn), z], 1)
-    distance, nearest = KDTree(seen).query(grid)
+    distance, nearest = map(np.asarray, KDTree(seen).query(grid))
     margin = (distance > 0.7 * spacing) & (distance < 2 * np.sin(np.radians(_MARGIN) / 2))
     return np.concatenate([seen, grid[margin]]), np.concatenate([rgb, rgb[nearest[margin]]])
 
@@ -234,5 +234,5 @@ def _check(
     if any(a.dtype != kind or a.shape != (len(xyz), 3) for a, kind in kinds) or len(xyz) > _MOST_POINTS:
         raise ValueError("no points with colours")
     off = np.linalg.norm(xyz.astype(np.float64) - centre, axis=1) / radius - 1
-    if not (np.abs(off) < _THICKNESS).all():
+    if not (np.abs(off) < 1e-3).all():
         raise ValueError("points that are not on the shell")
