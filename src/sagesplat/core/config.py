@@ -123,6 +123,9 @@ class TrainConfig:
     exposure: Literal["auto", "off", "affine"] = "auto"
     """Exposure and white balance of the photos. affine: learn a colour transform per photo; off: none; auto:
     affine where the photos differ."""
+    sky: Literal["auto", "off"] = "auto"
+    """Sky on a far sphere. auto: Gaussians begin there where photos show a category of that name, and stay on
+    it; off: the sky is trained like everything else."""
     means_lr: float = 1.6e-4
     """Learning rate of the means, times the scene extent; decays exponentially to 1 %."""
     quats_lr: float = 1e-3
