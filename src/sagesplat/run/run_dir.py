@@ -18,6 +18,7 @@ _BEFORE_LADDERS = (
     "lift",
     "blocks",
     "train",
+    "clean",
     "fuse",
     "block_categories",
 )
@@ -87,6 +88,11 @@ class RunDir:
         return self.path / "refined.json"
 
     @property
+    def sky(self) -> Path:
+        """The sphere of the sky and the points on it, where photos show sky."""
+        return self.path / "sky.npz"
+
+    @property
     def scene_files(self) -> list[Path]:
         """What decides the scene that everything after training uses."""
         return [self.scene, *([self.cameras] if self.cameras.exists() else [])]
@@ -150,6 +156,21 @@ class RunDir:
     def levels(self) -> Path:
         """The recorded levels."""
         return self.path / "levels"
+
+    @property
+    def uncleaned(self) -> Path:
+        """The last level as training recorded it, where floaters were removed from it."""
+        return self.path / "uncleaned.npz"
+
+    @property
+    def floaters(self) -> Path:
+        """How many floaters were found and removed, and what that cost."""
+        return self.path / "floaters.json"
+
+    @property
+    def floaters_picture(self) -> Path:
+        """Views before and after, and what was removed."""
+        return self.path / "floaters.png"
 
     @property
     def checkpoint(self) -> Path:

@@ -46,6 +46,11 @@ def inlier_inputs(run: RunDir) -> list[Path]:
     return [run.inliers] if run.inliers.exists() else valid_inputs(run)
 
 
+def sky_inputs(run: RunDir) -> list[Path]:
+    """The sky that training began with, where photos show some."""
+    return [run.sky] if run.sky.exists() else []
+
+
 def label_images(job: Job, source: str) -> LabelImages:
     """The label images that came with the photos ("given"), or those of the 3D labels ("rendered")."""
     if source == "given":
