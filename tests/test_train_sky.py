@@ -28,10 +28,12 @@ from sagesplat.stages.pipeline import nest, train
 from sagesplat.stages.scene import open_scene
 from sagesplat.train import densify, sky
 from sagesplat.train.events import Step, Trained
+from sagesplat.train.lr_schedule import lr_schedule
 from sagesplat.train.nested import order, train_capped
 from sagesplat.train.sky import Shell, find_sky, read_sky, sky_labels, write_sky
-from sagesplat.train.state import initial_state
+from sagesplat.train.state import from_points, initial_state
 from sagesplat.train.stepper import tune
+from sagesplat.train.strategy import make_strategy
 from sagesplat.train.trainer import train as train_gaussians
 
 SKY, TREE = 187, 184
@@ -111,6 +113,18 @@ def test_no_sky_no_shell(capture, tmp_path):
     assert find_sky(scene, photos, masks, labels, ValidPixels(tmp_path)) is None
 
 
+def test_opacities_on_the_shell_are_not_reset(capture):
+    found, labels = of(capture)
+    scene, ids = found.begin(capture[0], labels)
+    config = TrainConfig(max_steps=3000, sh_degree=0, lr_schedule="published")
+    strategy = make_strategy(config, scene, lr_schedule(config, 1.0, []), shell=found.shell)
+    state = initial_state(from_points(scene.points, ids, 0, opacity=0.9), 0)
+    state.step = next(step for step in range(1, 3000) if strategy.resets(step))
+    strategy.step_post(state)
+    faint = state.gaussians.logit_opacities.sigmoid() < 0.5
+    assert torch.equal(faint, ~found.shell.holds(state.gaussians.means))
+
+
 @given(st.integers(0, 99))
 @settings(max_examples=10, deadline=None)
 def test_halves_and_sizes_on_the_shell(seed):
@@ -162,6 +176,9 @@ def test_training_keeps_the_sky_on_the_shell(capture, tmp_path, strategy):
     assert int(is_sky.sum()) > 20
     assert torch.equal(is_sky, found.shell.holds(g.means))
     assert off_shell(found.shell, g.means[is_sky]) < 1e-5
+    for view in scene.views:  # nothing of the sky is between a camera and the scene
+        away = (g.means - torch.from_numpy(view.camera.position)).norm(dim=1)
+        assert away[is_sky].min() > away[~is_sky].max()
     tuned = tune(g, scene, photos, config, 3, backend="cpu", shell=found.shell)
     assert off_shell(found.shell, tuned.means[tuned.label_ids == SKY]) < 1e-5
 
