@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sagesplat.adapt import free_space
-from sagesplat.adapt.free_space import cloud_of, space_of, sphere, weighted_quantile
+from sagesplat.adapt.free_space import cloud_of, space_of, sphere
 from sagesplat.adapt.free_viewpoints import FreeViewpoints, free_cameras
 from sagesplat.adapt.upright import AXES
 from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import Gaussians, concat
-from sagesplat.core.geometry import project
+from sagesplat.core.geometry import project, weighted_quantile
 from sagesplat.raster import rasterize
 
 

@@ -27,6 +27,7 @@ STAGES = [
     "masks",
     "lift",
     "train",
+    "clean",
     "observe",
     "fit",
     "plan",

@@ -34,6 +34,7 @@ from sagesplat.segment import segmenters
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.stages import bundle, label, view
 from sagesplat.stages.boundaries import _seconds
+from sagesplat.stages.clean import read_clean_figures
 from sagesplat.stages.refine import read_pose_figures
 from sagesplat.stages.refine_exposure import read_exposure_figures
 from sagesplat.stages.train import read_cap, read_frozen
@@ -42,6 +43,7 @@ from sagesplat.studies.measure.levels import levels_of
 from sagesplat.studies.paper.cross_view import CrossView, read_cross_view
 from sagesplat.studies.paper.same_size import SameSize, read_same_size
 from sagesplat.studies.sweep.file import read_sweep
+from sagesplat.train.clean import CRITERIA
 from sagesplat.train.sky import Shell, Sky, read_sky, write_sky
 from sagesplat.viewer.bundle import is_bundle
 
@@ -102,6 +104,12 @@ def _figures(folder: Path, size: int) -> list[bytes]:
 def _read_figures(path: Path) -> None:
     read_pose_figures(path)
     read_exposure_figures(path)
+
+
+def _floaters(folder: Path, size: int) -> list[bytes]:
+    counts, decibels = dict.fromkeys(CRITERIA, 3), {"train": 20.5, "calibration": 19.0}
+    entry = {"gaussians": 50, "found": counts, "removed": counts, "before": decibels, "after": decibels}
+    return as_json(entry | {f"note{i}": i for i in range(size - 1)})
 
 
 def _models(folder: Path, size: int) -> list[bytes]:
@@ -375,6 +383,7 @@ READERS = (
     Reader("refined", ".npz", _refined, file("cameras.npz", _read_refined), 1000),
     Reader("sky", ".npz", _sky, file("sky.npz", read_sky), 1000),
     Reader("refined-figures", ".json", _figures, file("refined.json", _read_figures), 3000),
+    Reader("floaters", ".json", _floaters, file("floaters.json", read_clean_figures), 3000),
     Reader("sampled", ".npz", _sampled, file("fidelity.npz", fidelity.read_sampled), 1000),
     Reader("plans", ".json", _plans, file("plan.json", _read_plans), 100),
     Reader("observations", ".csv", _table(Observations), file("o.csv", read_observations), 1000),

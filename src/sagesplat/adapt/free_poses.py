@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.special import ndtri
 
-from sagesplat.adapt.free_space import Cloud, Space, sphere, weighted_quantile
+from sagesplat.adapt.free_space import Cloud, Space, sphere
 from sagesplat.adapt.upright import Upright
+from sagesplat.core.geometry import weighted_quantile
 
 RAYS = sphere(128)
 CLEAR = 0.1  # units; nothing is closer to where one stands, but for a twentieth of all directions

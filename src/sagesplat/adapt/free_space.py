@@ -13,6 +13,7 @@ from jaxtyping import Float, Float32, Float64, Int64
 from scipy.spatial.transform import Rotation
 
 from sagesplat.core.gaussians import Gaussians
+from sagesplat.core.geometry import weighted_quantile
 from sagesplat.kernels.jit import njit
 
 SIDE = 112  # cells along an axis of the contracted cube, which is 4 units wide
@@ -85,15 +86,6 @@ def in_units(g: Gaussians, cloud: Cloud) -> Gaussians:
     """The same Gaussians in the cloud's units: the rasteriser's near plane is a fixed distance."""
     scales = g.log_scales.detach() - float(np.log(cloud.unit))
     return replace(g, means=torch.from_numpy(cloud.means.astype(np.float32)), log_scales=scales.float())
-
-
-def weighted_quantile(
-    values: Float[np.ndarray, " N"], weights: Float[np.ndarray, " N"], share: float
-) -> float:
-    """The value below which this share of the weight is."""
-    order = np.argsort(values, kind="stable")
-    sums = np.cumsum(weights[order])
-    return float(values[order[min(int(np.searchsorted(sums, share * sums[-1])), len(order) - 1)]])
 
 
 @dataclass(frozen=True, eq=False)

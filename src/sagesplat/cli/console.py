@@ -113,7 +113,9 @@ class Console:
                     self.say(f"{'':21}{line}")
             case TableMade(title, header, rows):
                 self._show_table(title, header, rows)
-            case RunDone(report, run):
+            case RunDone(report, run, noticed):
+                if noticed:
+                    self.say(f"Noticed: {'; '.join(noticed)}")
                 self.say(f"Report: {report.resolve()}")
                 if run:
                     self.say(f"Walk through it: {_program()} view {run}")

@@ -18,11 +18,13 @@ from sagesplat.cli.base import (
     Seed,
     command,
     open_job,
+    prepare,
 )
 from sagesplat.cli.say import say
 from sagesplat.core.config import (
     AdoptConfig,
     BlocksConfig,
+    CleanConfig,
     FitConfig,
     LabelsConfig,
     LiftConfig,
@@ -36,6 +38,7 @@ from sagesplat.core.config import (
     SceneConfig,
     TrainConfig,
 )
+from sagesplat.core.errors import RunError
 
 _SPLAT = "splat: PLY, compressed PLY, SPZ, SOG, lod-meta.json, .splat or glTF"
 _FUSE = "Fuse the label images of all views through the trained Gaussians, before the levels are made."
@@ -62,6 +65,7 @@ def run(
     labels: LabelsConfig = LabelsConfig(),
     lift: LiftConfig = LiftConfig(),
     train: TrainConfig = TrainConfig(),
+    clean: CleanConfig = CleanConfig(),
     blocks: BlocksConfig = BlocksConfig(),
     nest: NestConfig = NestConfig(),
     sample: SampleConfig = SampleConfig(),
@@ -81,7 +85,21 @@ def run(
     from sagesplat.stages import pipeline
 
     config = RunConfig(
-        scene_config, poses, masks, labels, lift, train, blocks, nest, sample, fit, plan, fuse, ladder, seed
+        scene_config,
+        poses,
+        masks,
+        labels,
+        lift,
+        train,
+        clean,
+        blocks,
+        nest,
+        sample,
+        fit,
+        plan,
+        fuse,
+        ladder,
+        seed,
     )
     with open_job(run, machine, ladder) as job:
         pipeline.run_all(job, scene, config)
@@ -148,7 +166,7 @@ def masks(
 
     with open_job(run, machine) as job:
         check_not_adopted(job.run)
-        open_scene(job, scene, scene_config, poses)
+        open_scene(job, scene, scene_config, poses, masks, labels)
         make_masks(job, masks, labels)
 
 
@@ -187,6 +205,44 @@ def train(
 
     with open_job(run, machine) as job:
         pipeline.train(job, train, blocks, seed)
+
+
+@command
+def clean(
+    run: Positional[Annotated[Path, arg(metavar="RUN|SPLAT")]],
+    out: Positional[Annotated[Path | None, arg(metavar="OUT")]] = None,
+    cameras: Path | None = None,
+    picture: Path | None = None,
+    clean: CleanConfig = CleanConfig(),
+    machine: Annotated[Compute, Flat] = Compute(),
+) -> None:
+    """Remove floaters: from the trained scene of a run, or from a splat file of any tool.
+
+    Args:
+        run: run folder; or a splat, of which OUT gets what stays
+        out: .ply, .spz or .sog to write; only with a splat
+        cameras: of a splat: where its photos were taken from, as a capture (best with its photos), a
+            cameras.json of 3DGS, a transforms.json or a viewpoints.json (default: viewpoints drawn from the
+            splat, which tell less)
+        picture: of a splat: PNG of views before and after, and of what goes (of a run: RUN/floaters.png)
+    """
+    if (run / "scene.json").is_file() or (run / "provenance").is_dir():
+        if out or cameras or picture:
+            raise RunError(f"{run}: a run folder; leave out OUT, --cameras and --picture")
+        from sagesplat.stages import pipeline
+
+        with open_job(run, machine) as job:
+            pipeline.clean(job, clean)
+        return
+    if out is None:
+        raise RunError(f"{run}: not a run folder; of a splat, name the file to write after it")
+    from sagesplat.cli.console import Console
+    from sagesplat.stages.clean_splat import clean_splat
+
+    backend, _ = prepare(Machine(**vars(machine)))
+    with Console() as console:
+        clean_splat(run, out, clean, console, cameras=cameras, picture=picture, backend=backend)
+    say(*[out] if picture is None else [out, picture])
 
 
 @command

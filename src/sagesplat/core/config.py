@@ -169,6 +169,9 @@ class TrainConfig:
     poses: bool = False
     """Refine the camera poses of the training views with the Gaussians. Those of held-out views are fitted to
     their photos afterwards."""
+    outliers: bool = False
+    """Leave out what single photos show and the model does not, such as people that no mask names: found by
+    the residual, from 30 % of the steps on."""
     mcmc_noise: float = 5e5
     """SGLD noise of 3DGS-MCMC, times the learning rate of the means."""
     mcmc_opacity: float = 0.01
@@ -182,6 +185,30 @@ class TrainConfig:
     gradient_freeze_share: float = 0.0
     """Freeze the fraction of Gaussians with the smallest gradients in alternate 100-step windows after
     densification (GSta), as a baseline. A run that resumes is then not bit for bit the same."""
+
+
+@dataclass(frozen=True)
+class CleanConfig:
+    """Floaters: Gaussians in free space, removed after training."""
+
+    floaters: Literal["remove", "keep"] = "remove"
+    """remove: floaters are removed before the levels are made; keep: nothing is removed."""
+    min_views: int = 2
+    """Few views: remove Gaussians that fewer training views support; 0: do not look for them."""
+    min_weight: float = 0.1
+    """A view supports a Gaussian if its blending weight there, summed over the pixels, is at least this."""
+    shown_share: float = 0.003
+    """Hardly shown: remove Gaussians whose weight in all training views together is below this fraction of
+    what they would have in the nearest camera, if it looked at them; 0: do not look for them."""
+    content_depth: float = 0.8
+    """In front: remove Gaussians that are nearer than this fraction of the depth of the content around them,
+    in most of the views that support them; 0: do not look for them."""
+    category_depth: float = 0.3
+    """Category: remove Gaussians that are nearer than this fraction of the median depth of the category whose
+    pixels they paint, by most of their weight; 0: do not look for them."""
+    max_loss: float = 0.02
+    """Largest loss of PSNR on the training and on the calibration views, dB. Where it would be more, fewer
+    are removed."""
 
 
 @dataclass(frozen=True)
@@ -453,6 +480,7 @@ class RunConfig:
     labels: LabelsConfig = field(default_factory=LabelsConfig)
     lift: LiftConfig = field(default_factory=LiftConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
+    clean: CleanConfig = field(default_factory=CleanConfig)
     blocks: BlocksConfig = field(default_factory=BlocksConfig)
     nest: NestConfig = field(default_factory=NestConfig)
     sample: SampleConfig = field(default_factory=SampleConfig)

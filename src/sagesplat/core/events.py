@@ -71,6 +71,7 @@ class RunDone:
 
     report: Path
     run: Path | None = None  # run folder, if `sagesplat view` can show it
+    noticed: tuple[str, ...] = ()  # what the run noticed, and dealt with, in words
 
 
 Event = StageStarted | StageSkipped | Progress | Training | Warned | StageDone | TableMade | RunDone

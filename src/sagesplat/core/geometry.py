@@ -41,3 +41,12 @@ def morton_order(points: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
         for axis in range(3):
             codes |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
     return np.argsort(codes, kind="stable")
+
+
+def weighted_quantile(
+    values: Float[np.ndarray, " N"], weights: Float[np.ndarray, " N"], share: float
+) -> float:
+    """The value below which this share of the weight is."""
+    order = np.argsort(values, kind="stable")
+    sums = np.cumsum(weights[order])
+    return float(values[order[min(int(np.searchsorted(sums, share * sums[-1])), len(order) - 1)]])

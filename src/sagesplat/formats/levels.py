@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Bool
 
 from sagesplat.core.errors import DataError, short
-from sagesplat.core.gaussians import Gaussians, checked, concat
+from sagesplat.core.gaussians import PARAMETERS, Gaussians, checked, concat
 from sagesplat.core.sh import num_bases
 from sagesplat.io.files import atomic_path
 from sagesplat.io.npz import Npz
@@ -67,6 +68,30 @@ def write_set(
             arrays[f"{label}/replaces"] = np.array(sorted(levels), np.int64)
     arrays |= {f"more/{name}": np.asarray(value) for name, value in more.items()}
     _write(path, LevelFile(path, step, False, g.sh_degree, g.counts()), g, arrays, exact)
+
+
+def select_level(source: Path, target: Path, keep: Bool[np.ndarray, " N"]) -> None:
+    """Write the Gaussians of a level file that `keep` selects, in the order of `read_level`, unchanged.
+
+    Columns are copied as they are stored: what stays keeps every bit. DataError for a damaged file;
+    ValueError where `keep` is of another number of Gaussians.
+    """
+    counts = read_header(source).counts
+    if sum(counts.values()) != len(keep):
+        raise ValueError(f"{len(keep)} rows for {sum(counts.values())} Gaussians")
+    ends = np.cumsum([counts[label] for label in sorted(counts)])
+    with _open(source) as file:
+        try:
+            arrays = {"meta": file["meta"]}
+            for label, rows in zip(sorted(counts), np.split(keep, ends[:-1]), strict=True):
+                names = [f"{label}/{column}" for column in (*PARAMETERS, "shN_scale")]
+                for name in names if rows.any() else []:
+                    if name in file:
+                        arrays[name] = file[name] if name.endswith("_scale") else file[name][rows]
+        except (*_DAMAGED, IndexError) as error:
+            raise DataError(f"{source}: a broken level ({short(error)}); {_again(source)}") from None
+    with atomic_path(target, nbytes=sum(a.nbytes for a in arrays.values())) as temporary:
+        np.savez(temporary, allow_pickle=False, **arrays)
 
 
 def starts_of(sizes: Sequence[int], replaces: Collection[int] = ()) -> tuple[int, ...]:

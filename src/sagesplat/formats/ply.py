@@ -4,12 +4,13 @@ Per Gaussian, little endian float32: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_
 then green, then blue), opacity (logit), scale_0..2 (natural log), rot_0..3 (wxyz); then `label` (int16).
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 import torch
+from jaxtyping import Bool
 
 from sagesplat import __version__
 from sagesplat.core.errors import DataError, short
@@ -103,6 +104,40 @@ def read_ply_splat(path: Path) -> Splat:
     """
     columns, labels, _, comments = _read(path)
     return Splat(_gaussians(columns, labels), "PLY", _names(comments), is_antialiased(comments))
+
+
+def select_ply(source: Path, target: Path, keep: Bool[np.ndarray, " N"]) -> None:
+    """Write the rows of a binary splat PLY that `keep` selects: header and properties as they are.
+
+    What follows the vertices is left out. DataError for a file that cannot be read as a splat, or has another
+    number of rows.
+    """
+    try:
+        with source.open("rb") as file:
+            header = read_header(file)
+            start = file.tell()
+            file.seek(0)
+            lines = file.read(start).splitlines(keepends=True)
+            rows = np.fromfile(file, header.dtype, header.count)
+    except (OSError, ValueError) as error:
+        raise DataError(f"{source}: not readable as a PLY file ({short(error)}); give a splat .ply") from None
+    if len(rows) != len(keep):
+        raise DataError(f"{source}: {len(rows)} Gaussians, not {len(keep)}; it changed while it was read")
+    with atomic_path(target) as temporary, temporary.open("wb") as file:
+        file.writelines(_header_of(lines, int(keep.sum())))
+        rows[keep].tofile(file)
+
+
+def _header_of(lines: Iterable[bytes], count: int) -> Iterator[bytes]:
+    """The lines of a header for another number of vertices, without the elements after them."""
+    element = b""
+    for line in lines:
+        words = line.split()
+        if words[:1] == [b"element"]:
+            element = words[1]
+            line = line.replace(words[2], str(count).encode()) if element == b"vertex" else line
+        if element in (b"", b"vertex") or words[:1] == [b"end_header"]:
+            yield line
 
 
 def is_antialiased(comments: Iterable[str]) -> bool:

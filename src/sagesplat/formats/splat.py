@@ -34,12 +34,9 @@ def cleaned(splat: Splat, name: str) -> Splat:
     announced = len(g) if splat.announced < 0 else splat.announced
     if not len(g):
         raise DataError(f"{name}: no Gaussians in it; export the scene again")
-    invisible = torch.isneginf(g.logit_opacities) | torch.isneginf(g.log_scales).any(1)
     if opaque := bool(torch.isposinf(g.logit_opacities).any()):
         g = replace(g, logit_opacities=g.logit_opacities.clamp(max=OPAQUE))
-    broken = ~invisible & ~_all_finite(g)
-    zero = ~invisible & ~broken & ~g.quats.any(1)
-    reasons = {"NaN or infinite": broken, "a rotation of zeros": zero, "invisible": invisible}
+    reasons = undrawable(g)
     dropped = {reason: count for reason, rows in reasons.items() if (count := int(rows.sum()))}
     if sum(dropped.values()) == len(g):
         why = ", ".join(f"{count} {reason}" for reason, count in dropped.items())
@@ -47,10 +44,19 @@ def cleaned(splat: Splat, name: str) -> Splat:
             f"{name}: none of its {len(g)} Gaussians can be drawn ({why}); export the scene again"
         )
     if dropped:
-        g = g.select(~(broken | zero | invisible))
+        g = g.select(~torch.stack(list(reasons.values())).any(0))
     if not dropped and not opaque and splat.announced >= 0:
         return splat
     return replace(splat, gaussians=g, announced=announced, dropped=splat.dropped | dropped)
+
+
+def undrawable(g: Gaussians) -> dict[str, Tensor]:
+    """Bool [N] by reason: the Gaussians that `cleaned` leaves out. An infinite opacity logit can be drawn."""
+    invisible = torch.isneginf(g.logit_opacities) | torch.isneginf(g.log_scales).any(1)
+    g = replace(g, logit_opacities=g.logit_opacities.clamp(max=OPAQUE))
+    broken = ~invisible & ~_all_finite(g)
+    zero = ~invisible & ~broken & ~g.quats.any(1)
+    return {"NaN or infinite": broken, "a rotation of zeros": zero, "invisible": invisible}
 
 
 def _all_finite(g: Gaussians) -> Tensor:

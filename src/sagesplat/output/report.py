@@ -64,6 +64,7 @@ class ReportData:
     adopted: Facts = ()  # how such a splat was looked at, and how its levels were made
     viewpoints: UInt8[np.ndarray, "H W 3"] | None = None  # what its viewpoints see
     categories: Categories = field(default_factory=dict)  # of per-block categories
+    noticed: Sequence[str] = ()  # what the run noticed, and dealt with, in words
 
 
 def write_report(folder: Path, data: ReportData) -> Path:

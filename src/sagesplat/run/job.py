@@ -144,6 +144,11 @@ class Job:
         return ValidPixels(self.run.valid)
 
     @property
+    def inliers(self) -> ValidPixels:
+        """The pixels that Gaussians are fitted to after training: those that count, without outliers."""
+        return ValidPixels(self.run.inliers) if self.run.inliers.exists() else self.valid
+
+    @property
     def whole_masks(self) -> Masks:
         """The label images that all views agreed on, if they were asked to."""
         fused = self.run.fused

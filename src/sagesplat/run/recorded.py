@@ -6,6 +6,7 @@ from typing import Any, TypeVar, get_args
 from sagesplat.core.config import (
     AdoptConfig,
     BlocksConfig,
+    CleanConfig,
     FitConfig,
     LabelsConfig,
     LiftConfig,
@@ -54,6 +55,7 @@ def recorded_settings(run: RunDir, of: str = "run") -> dict[str, Any]:
         "labels": _config(LabelsConfig, _made(run, "masks")),
         "lift": _config(LiftConfig, _made(run, "lift")),
         "train": _config(TrainConfig, train),
+        "clean": _config(CleanConfig, _made(run, "clean")),
         "blocks": _config(BlocksConfig, {**_made(run, "blocks"), **boundary}),
         "nest": _config(NestConfig, nest),
         "sample": _config(SampleConfig, _made(run, "sample")),

@@ -23,6 +23,7 @@ _KINDS = {  # settings by stage; those of other stages are compared, and never u
     "lift": config.LiftConfig,
     "train": config.TrainConfig,
     "base": config.TrainConfig,
+    "clean": config.CleanConfig,
     "blocks": config.BlocksConfig,
     "nest": config.NestConfig,
     "observe": config.FitConfig,

@@ -18,6 +18,7 @@ _BEFORE_LADDERS = (
     "lift",
     "blocks",
     "train",
+    "clean",
     "fuse",
     "block_categories",
 )
@@ -107,6 +108,11 @@ class RunDir:
         return self.path / "valid"
 
     @property
+    def inliers(self) -> Path:
+        """The same without the outliers of training photos, where training looked for them."""
+        return self.path / "inliers"
+
+    @property
     def capture(self) -> Path:
         """The folder of the capture that was made of photos without poses."""
         return self.path / "capture"
@@ -150,6 +156,21 @@ class RunDir:
     def levels(self) -> Path:
         """The recorded levels."""
         return self.path / "levels"
+
+    @property
+    def uncleaned(self) -> Path:
+        """The last level as training recorded it, where floaters were removed from it."""
+        return self.path / "uncleaned.npz"
+
+    @property
+    def floaters(self) -> Path:
+        """How many floaters were found and removed, and what that cost."""
+        return self.path / "floaters.json"
+
+    @property
+    def floaters_picture(self) -> Path:
+        """Views before and after, and what was removed."""
+        return self.path / "floaters.png"
 
     @property
     def checkpoint(self) -> Path:

@@ -67,6 +67,8 @@ def check(config: BlocksConfig, train: TrainConfig) -> None:
         raise RunError("--train.poses does not go with --blocks.count; leave out one of them")
     if config.count > 1 and train.exposure == "affine":
         raise RunError("--train.exposure affine does not go with --blocks.count; leave out one of them")
+    if config.count > 1 and train.outliers:  # a block does not explain all of a photo
+        raise RunError("--train.outliers does not go with --blocks.count; leave out one of them")
 
 
 def _division(config: BlocksConfig) -> dict[str, float]:

@@ -22,7 +22,7 @@ def tune_composition(job: Job, g: Gaussians, steps: int) -> Gaussians:
     config = train_config(job)
     return tune(
         g, job.scene, job.photos, config, steps,
-        valid=job.valid, seed=seed, backend=job.backend, shell=job.sky.shell if job.sky else None,
+        valid=job.inliers, seed=seed, backend=job.backend, shell=job.sky.shell if job.sky else None,
     )  # fmt: skip
 
 

@@ -9,6 +9,7 @@ from typing import Any
 from sagesplat.core.config import (
     AdoptConfig,
     BlocksConfig,
+    CleanConfig,
     FitConfig,
     LabelsConfig,
     NestConfig,
@@ -27,6 +28,7 @@ from sagesplat.stages import blocks
 from sagesplat.stages.adopt import open_splat
 from sagesplat.stages.adopt_levels import make_levels
 from sagesplat.stages.boundaries import measure_borders
+from sagesplat.stages.clean import clean_levels
 from sagesplat.stages.compose import compose_plan
 from sagesplat.stages.evaluate import evaluate_plans
 from sagesplat.stages.fit import fit_ladder
@@ -41,6 +43,7 @@ from sagesplat.stages.sample import sample_levels
 from sagesplat.stages.scene import check_not_adopted, open_scene
 from sagesplat.stages.train import train_levels
 from sagesplat.train import nested
+from sagesplat.train.clean import check as check_clean
 
 # the built-in capture, within minutes on two cores
 DEMO = RunConfig(
@@ -70,14 +73,16 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
     check_not_adopted(job.run)
     check_targets(config.plan, config.ladder)  # before hours of training
     nested.check(config.nest)
+    check_clean(config.clean)
     blocks.check(config.blocks, config.train)
     check_segmenter(job, scene, config.masks)
-    open_scene(job, scene, config.scene, config.poses)
+    open_scene(job, scene, config.scene, config.poses, config.masks, config.labels)
     if config.blocks.count == 1:
         check_training(job, config.train)
     make_masks(job, config.masks, config.labels)
     lift_labels(job, config.lift)
     train(job, config.train, config.blocks, config.seed)
+    clean(job, config.clean)
     if config.fuse:
         fuse_masks(job)
     elif job.run.fused.exists():
@@ -155,6 +160,13 @@ def train(job: Job, config: TrainConfig, of_blocks: BlocksConfig, seed: int) -> 
         raise RunError(f"{job.run.blocks}: this run is in blocks; add --blocks.count, or begin another run")
     else:
         train_levels(job, config, seed)
+
+
+def clean(job: Job, config: CleanConfig) -> None:
+    """Remove floaters from the last level of a training; a scene in blocks stays as it was trained."""
+    check_not_adopted(job.run)
+    if not job.has_blocks:
+        clean_levels(job, config)
 
 
 def nest(job: Job, config: NestConfig, of_blocks: BlocksConfig, seed: int) -> None:

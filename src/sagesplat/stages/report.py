@@ -7,6 +7,7 @@ from sagesplat.run.job import Job
 from sagesplat.run.stage import run_stage
 from sagesplat.stages.compose import compose
 from sagesplat.stages.methods import method_of
+from sagesplat.stages.noticed import noticed
 from sagesplat.stages.plan import main_target, scene_plan
 from sagesplat.stages.report_data import report_data, stage_records
 from sagesplat.stages.results import budget_plan_of
@@ -14,16 +15,16 @@ from sagesplat.stages.results import budget_plan_of
 
 def make_report(job: Job) -> None:
     """Write the report."""
-    run = job.run
+    run, found = job.run, noticed(job)
 
     def make() -> list[str]:
         quality, target = main_target(run)
         # the page leads with a target: what was composed for a budget is not what it is about
         within_budget = budget_plan_of(job) is not None
         composed = compose(job, scene_plan(job, quality, target)) if within_budget else read_ply(run.composed)
-        write_report(run.report, report_data(job, composed, quality, target))
+        write_report(run.report, report_data(job, composed, quality, target, found))
         return []
 
     inputs = [run.observations, run.models, run.plan, run.evaluation, *stage_records(run)]
     run_stage(job, "report", {}, inputs, [run.report / "index.html"], make)
-    job.emit(RunDone(run.report / "index.html", run.path if method_of(job).streams else None))
+    job.emit(RunDone(run.report / "index.html", run.path if method_of(job).streams else None, found))

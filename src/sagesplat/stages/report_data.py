@@ -3,6 +3,7 @@
 import json
 import math
 import platform
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -27,12 +28,14 @@ from sagesplat.stages.results import evaluation_of, has_photos, models_of, obser
 
 PANELS = 3  # views shown in pictures
 STAGES = (
-    *("adopt", "poses", "scene", "segment", "masks", "lift", "train", "fuse"),
+    *("adopt", "poses", "scene", "segment", "masks", "lift", "train", "clean", "fuse"),
     *("nest", "observe", "sample", "fit", "plan", "compose", "evaluate"),
 )
 
 
-def report_data(job: Job, composed: Gaussians, quality: QualityKind, target: float) -> ReportData:
+def report_data(
+    job: Job, composed: Gaussians, quality: QualityKind, target: float, noticed: Sequence[str] = ()
+) -> ReportData:
     """Everything that the report shows; it leads with the plan for `target`, whose scene is `composed`."""
     run, scene, masks, ladder = job.run, job.scene, job.best_masks, job.ladder
     names = {**masks.taxonomy.names, UNLABELLED: masks.taxonomy.name(UNLABELLED)}
@@ -66,6 +69,7 @@ def report_data(job: Job, composed: Gaussians, quality: QualityKind, target: flo
         photos=has_photos(run),
         adopted=_adopted(job, ladder) if run.adopted.exists() and isinstance(ladder, PrefixLadder) else (),
         viewpoints=_viewpoints(run),
+        noticed=noticed,
     )
 
 

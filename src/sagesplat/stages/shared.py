@@ -41,6 +41,11 @@ def valid_inputs(run: RunDir) -> list[Path]:
     return [run.valid] if run.valid.exists() else []
 
 
+def inlier_inputs(run: RunDir) -> list[Path]:
+    """The images of the pixels that Gaussians are fitted to after training, where some are not."""
+    return [run.inliers] if run.inliers.exists() else valid_inputs(run)
+
+
 def sky_inputs(run: RunDir) -> list[Path]:
     """The sky that training began with, where photos show some."""
     return [run.sky] if run.sky.exists() else []

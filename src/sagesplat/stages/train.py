@@ -21,6 +21,7 @@ from sagesplat.run.stage import run_stage
 from sagesplat.scene.scene import Scene
 from sagesplat.segment.display_names import titles
 from sagesplat.segment.masks import MAX_LABEL_ID
+from sagesplat.stages.outliers import write_inliers
 from sagesplat.stages.refine import write_cameras
 from sagesplat.stages.shared import valid_inputs
 from sagesplat.train import memory
@@ -49,6 +50,7 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
         if not resuming:
             remove_checkpoints(place.checkpoint)
             shutil.rmtree(place.levels, ignore_errors=True)
+            _forget_cleaning(place)
         place.path.mkdir(exist_ok=True)
         write_cap(place.cap, cap, settings)
         place.sky.unlink(missing_ok=True)
@@ -89,6 +91,7 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
                             f"sky: {on_shell:,} of them on a sphere {sky.shell.scale:.0f} scene extents away"
                         )
                     lines += write_cameras(job, place, config, trained)
+                    lines += write_inliers(job, place, config, gaussians)
         if place != run:
             _swap(run, place)
         return lines
@@ -96,6 +99,7 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
     # with exposure auto it depends on the photos: what was refined once must be there
     refines = config.poses or config.exposure == "affine" or run.refined.exists()
     outputs = [run.levels, run.checkpoint, *([run.cameras, run.refined] if refines else [])]
+    outputs += [run.inliers] if config.outliers else []
     run_stage(job, "train", settings, inputs, outputs, make, swaps=True)
 
 
@@ -155,6 +159,7 @@ def _swap(run: RunDir, made: RunDir) -> None:
     The checkpoint comes last: where this is killed, training finds it, ends at once and swaps what is left.
     """
     run.provenance("train").unlink(missing_ok=True)
+    _forget_cleaning(run)
     if made.levels.exists():
         old = made.path / "old-levels"
         shutil.rmtree(old, ignore_errors=True)
@@ -164,11 +169,18 @@ def _swap(run: RunDir, made: RunDir) -> None:
     remove_checkpoints(run.checkpoint)
     for earlier in (run.cameras, run.refined, run.sky):
         earlier.unlink(missing_ok=True)
-    kinds = ("frozen", "cap", "cameras", "refined", "sky", "checkpoint")
+    shutil.rmtree(run.inliers, ignore_errors=True)
+    kinds = ("frozen", "cap", "cameras", "refined", "sky", "inliers", "checkpoint")
     for new, place in ((getattr(made, kind), getattr(run, kind)) for kind in kinds):
         if new.exists():
             new.replace(place)
     shutil.rmtree(made.path)
+
+
+def _forget_cleaning(run: RunDir) -> None:
+    """Remove what was made of another training's last level, above all that level itself."""
+    for path in (run.provenance("clean"), run.uncleaned, run.floaters, run.floaters_picture):
+        path.unlink(missing_ok=True)
 
 
 def _with_sky(job: Job, config: TrainConfig) -> tuple[Sky | None, Scene, np.ndarray]:

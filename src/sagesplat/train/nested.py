@@ -150,7 +150,9 @@ def with_at_most(scene: Scene, labels: np.ndarray, count: int, seed: int) -> tup
 def capped_config(config: TrainConfig, cap: int, steps: int) -> TrainConfig:
     """3DGS-MCMC with at most `cap` Gaussians, otherwise as `config`; only the last level is recorded."""
     mcmc = replace(config, strategy="mcmc", max_gaussians=cap, max_steps=steps, level_every=steps)
-    return replace(mcmc, freeze_at=None, gradient_freeze_share=0.0, poses=False, exposure="off")
+    return replace(
+        mcmc, freeze_at=None, gradient_freeze_share=0.0, poses=False, exposure="off", outliers=False
+    )
 
 
 def train_capped(

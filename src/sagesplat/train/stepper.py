@@ -21,6 +21,7 @@ from sagesplat.train.exposure import transform
 from sagesplat.train.gradient_freezing import GradientFreezing
 from sagesplat.train.group import ALONE, Group
 from sagesplat.train.lr_schedule import LrSchedule
+from sagesplat.train.outliers import inliers
 from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.poses import PoseUpdate, moved_camera
 from sagesplat.train.sky import Shell
@@ -44,6 +45,7 @@ class Stepper:
     gradient_freezing: GradientFreezing | None = None
     sh_bits: tuple[int, int] | None = None  # render Gaussians rounded as SPZ files will store them
     view_updates: Mapping[str, ViewUpdate] = field(default_factory=dict)  # of `TrainState.per_view`
+    outliers_after: float = math.inf  # steps; from then on outliers of the photos are left out
     shell: Shell | None = None  # that Gaussians of the sky stay on
     drawn: float = 1.0  # share of the tiles that the last step drew
     workspace: Workspace = field(default_factory=Workspace)
@@ -84,7 +86,7 @@ class Stepper:
         grads: dict[str, Tensor] = {}
         for view in views:
             own = of_views.leaves(view)
-            loss, render = self._draw(moving, view, degree, trainable, factor, own)
+            loss, render = self._draw(moving, view, degree, trainable, factor, own, state.step)
             loss.backward()
             of_views.add(view, own)
             losses.append(loss.detach())
@@ -147,6 +149,7 @@ class Stepper:
         trainable: Tensor,
         factor: int,
         own: Mapping[str, Tensor],  # parameters of this view alone, by kind
+        step: int,
     ) -> tuple[Tensor, Render]:
         photo, camera = self.photo_loader(view, factor)
         # nobody may paint over what is finished, so it is looked at now and then
@@ -172,6 +175,8 @@ class Stepper:
         )
         rgb = render.rgb if exposure is None else expose(render.rgb, exposure, photo)
         valid = self.photo_loader.valid(view, factor)
+        if step >= self.outliers_after:
+            valid = inliers(rgb, photo, valid, tiles)
         loss = photometric_loss(rgb, photo, self.config.ssim_weight, tiles, self.workspace, valid)
         return loss, render
 

@@ -1,0 +1,137 @@
+"""Removes floaters from the last level of a training: what the nested levels are made of."""
+
+import shutil
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from sagesplat.adapt.ladder import read_ladder
+from sagesplat.core.config import CleanConfig
+from sagesplat.core.errors import RunError, short
+from sagesplat.core.events import Progress
+from sagesplat.core.typed import check_fields, types_of
+from sagesplat.formats.levels import read_level, select_level
+from sagesplat.io.files import atomic_path, read_json, write_json
+from sagesplat.output.before_after import before_after
+from sagesplat.raster import device_of
+from sagesplat.run.job import Job
+from sagesplat.run.stage import run_stage
+from sagesplat.stages.shared import valid_inputs
+from sagesplat.train.clean import CRITERIA, Cleaned, check, clean, find_floaters
+
+
+@dataclass(frozen=True)
+class CleanFigures:
+    """What was found and removed, by criterion, and what that cost."""
+
+    gaussians: int  # before
+    found: dict[str, int]
+    removed: dict[str, int]
+    before: dict[str, float]  # mean PSNR of some views, by kind ("train", "calibration"), dB
+    after: dict[str, float]
+
+
+def clean_levels(job: Job, config: CleanConfig) -> None:
+    """Remove floaters from the last level; it is kept as it was in `RunDir.uncleaned`."""
+    run = job.run
+    check(config)
+
+    def make() -> list[str]:
+        last = read_ladder(run.levels).files[-1].path
+        if run.uncleaned.exists():  # of an earlier cleaning
+            _copy(run.uncleaned, last)
+            run.uncleaned.unlink()
+        job.__dict__.pop("snapshots", None)  # read before this stage, perhaps
+        run.floaters_picture.unlink(missing_ok=True)
+        if config.floaters == "keep":
+            nothing = CleanFigures(sum(read_ladder(run.levels).files[-1].counts.values()), {}, {}, {}, {})
+            write_json(run.floaters, asdict(nothing))
+            return ["nothing is removed"]
+        cleaned = _clean(job, last, config)
+        if not cleaned.keep.all():
+            _copy(last, run.uncleaned)
+            select_level(run.uncleaned, last, cleaned.keep)
+        figures = figures_of(cleaned)
+        write_json(run.floaters, asdict(figures))
+        return clean_lines(figures)
+
+    inputs = [*run.scene_files, run.provenance("masks"), run.provenance("train"), *valid_inputs(run)]
+    run_stage(job, "clean", asdict(config), inputs, [run.levels, run.floaters], make)
+
+
+def _clean(job: Job, last: Path, config: CleanConfig) -> Cleaned:
+    """What to remove of a level, with a picture of it."""
+    g, scene = read_level(last).to(device_of(job.backend)), job.scene
+    rows = job.valid.rows(scene, scene.train_ids)
+    floaters = find_floaters(
+        g, scene, rows, config,
+        label_image=job.masks.__getitem__, valid=job.valid, antialiased=job.antialiased,
+        on_view=lambda done: job.emit(Progress("clean", done, len(rows))),
+    )  # fmt: skip
+    kinds = {"train": rows, "calibration": scene.calibration_ids.tolist()}
+    cleaned = clean(
+        g, floaters, scene, job.photos, config,
+        kinds=kinds, valid=job.valid, antialiased=job.antialiased, backend=job.backend,
+    )  # fmt: skip
+    if not cleaned.keep.all():
+        cameras = [view.camera for view in scene.views]
+        before_after(
+            job.run.floaters_picture, g, cleaned.keep, cameras, clean_lines(figures_of(cleaned))[0],
+            antialiased=job.antialiased, backend=job.backend,
+        )  # fmt: skip
+    return cleaned
+
+
+def figures_of(cleaned: Cleaned) -> CleanFigures:
+    """The figures of a cleaning."""
+    removed = {name: int(rows.sum()) for name, rows in cleaned.removed.items()}
+    return CleanFigures(len(cleaned.keep), cleaned.found, removed, cleaned.before, cleaned.after)
+
+
+def clean_lines(figures: CleanFigures) -> list[str]:
+    """The figures in words."""
+    total = sum(figures.removed.values())
+    parts = [
+        f"{count:,} {name}" + (f" (of {figures.found[name]:,})" if count < figures.found[name] else "")
+        for name, count in figures.removed.items()
+        if figures.found[name]
+    ]
+    lines = [f"{total:,} of {figures.gaussians:,} Gaussians removed: {', '.join(parts) or 'no floaters'}"]
+    if total and figures.after:
+        changes = [
+            f"{kind} views {figures.after[kind] - before:+.3f} dB" for kind, before in figures.before.items()
+        ]
+        lines.append(", ".join(changes))
+    return lines
+
+
+def read_clean_figures(path: Path) -> CleanFigures | None:
+    """What `clean_levels` wrote; None where it never ran. RunError for anything else."""
+    if not path.exists():
+        return None
+    cure = "run `sagesplat clean RUN` again with --force"
+    made = read_json(path, cure)
+    try:
+        if not isinstance(made, dict):
+            raise ValueError("no object")
+        types = types_of(CleanFigures)
+        check_fields(made, types)
+        figures = CleanFigures(**{name: made[name] for name in types})
+        _check_counts(figures.found, figures.removed)
+        if figures.before.keys() != figures.after.keys():
+            raise ValueError("other views before than after")
+        return figures
+    except (KeyError, TypeError, ValueError) as error:
+        raise RunError(f"{path}: not what was cleaned ({short(error)}); {cure}") from None
+
+
+def _check_counts(found: Mapping[str, int], removed: Mapping[str, int]) -> None:
+    if found.keys() != removed.keys() or not found.keys() <= set(CRITERIA):
+        raise ValueError("other criteria")
+    if not all(0 <= removed[name] <= count < 2**40 for name, count in found.items()):
+        raise ValueError("impossible counts")
+
+
+def _copy(source: Path, target: Path) -> None:
+    with atomic_path(target) as temporary:
+        shutil.copyfile(source, temporary)

@@ -1,0 +1,150 @@
+"""Removes floaters from a splat file of any tool."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from sagesplat.adapt.free_viewpoints import check_size, free_cameras
+from sagesplat.adapt.observe import RenderedLabels
+from sagesplat.adapt.renders import Renders
+from sagesplat.core.config import CleanConfig
+from sagesplat.core.errors import DataError, RunError
+from sagesplat.core.events import Emit, Progress, StageDone, StageStarted, Warned
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.formats.lod_meta import LOD_META
+from sagesplat.formats.ply import read_ply_splat, select_ply
+from sagesplat.formats.splat import Splat, undrawable
+from sagesplat.formats.splats import read_splat
+from sagesplat.formats.splats_write import write_splat, written_as
+from sagesplat.output.before_after import before_after
+from sagesplat.raster import Backend, device_of
+from sagesplat.scene import load_scene
+from sagesplat.scene.cameras import read_camera_file
+from sagesplat.scene.images import Photos
+from sagesplat.scene.scene import Camera, Points, Scene, View
+from sagesplat.stages.clean import CleanFigures, clean_lines, figures_of
+from sagesplat.train.clean import check, clean, find_floaters
+
+_VIEWS = 96  # viewpoints that are drawn where there are none
+_FOV, _SIZE = 60.0, (512, 384)  # degrees along the longer side, px
+_DRAWN = "viewpoints were drawn, so few views mean nothing; --cameras of its photos would tell more"
+_SIDE = 1024  # px, longer side of the views of a capture; larger ones are looked at smaller
+
+
+def clean_splat(
+    source: Path, out: Path, config: CleanConfig, emit: Emit, *,
+    cameras: Path | None = None, picture: Path | None = None, backend: Backend = "cpu",
+) -> CleanFigures:  # fmt: skip
+    """Write a splat without its floaters; what stays is as it was.
+
+    Args:
+        source: The splat file, or the folder of a SOG.
+        out: A .ply, .spz or .sog. From PLY to PLY rows are copied with all their properties.
+        config: Thresholds. "keep" is refused.
+        emit: Hears of progress, and gets the result in words.
+        cameras: Where its photos were taken from: a capture with or without photos, or a file of cameras;
+            None: viewpoints are drawn, and few views are no criterion.
+        picture: PNG of views before and after.
+        backend: Rasteriser.
+
+    Raises:
+        SageError: For a file that cannot be read or written, or cameras that do not fit the splat.
+    """
+    check(config)
+    _check_paths(source, out, picture, config)
+    emit(StageStarted("clean"))
+    begin = time.perf_counter()
+    splat = read_splat(source)
+    for reason, count in splat.dropped.items():
+        emit(Warned(f"{source}: {count:,} Gaussians left out: {reason}"))
+    check_size(splat.gaussians, str(source))
+    g, filtered = splat.gaussians.to(device_of(backend)), splat.antialiased
+    scene, photos, how = _views(g, filtered, cameras, backend)
+    if cameras is None:  # what few of them show may be seen from nearer, or from elsewhere
+        config = replace(config, min_views=0)
+    real, rows = not isinstance(photos, Renders), list(range(len(scene.views)))
+    floaters = find_floaters(
+        g, scene, rows, config,
+        label_image=RenderedLabels(g, backend, filtered).__getitem__, antialiased=filtered,
+        on_view=lambda done: emit(Progress("clean", done, len(rows))),
+    )  # fmt: skip
+    if not floaters.weight.any():
+        raise RunError(f"{cameras}: no camera has {source} in sight; give cameras of this scene, or none")
+    cleaned = clean(
+        g, floaters, scene, photos, config,
+        kinds={"train": rows}, real=real, antialiased=filtered, backend=backend,
+    )  # fmt: skip
+    figures = figures_of(cleaned)
+    lines = clean_lines(figures)[: 2 if real else 1]  # renders have no PSNR to lose
+    if picture:
+        before_after(
+            picture, g, cleaned.keep, [view.camera for view in scene.views], f"{source.name}: {lines[0]}",
+            antialiased=filtered, backend=backend,
+        )  # fmt: skip
+    _write(source, out, splat, cleaned.keep)
+    emit(StageDone("clean", time.perf_counter() - begin, (*lines, how)))
+    return figures
+
+
+def _check_paths(source: Path, out: Path, picture: Path | None, config: CleanConfig) -> None:
+    """RunError for what would overwrite the splat, or write nothing."""
+    if config.floaters == "keep":
+        raise RunError("--clean.floaters keep: nothing would be removed; leave it out")
+    if written_as(out) == LOD_META:
+        raise DataError(f"{out}: holds several levels; name a .ply, .spz or .sog")
+    for path in (out, picture):
+        if path is not None and path.resolve() == source.resolve():
+            raise RunError(f"{path}: the splat itself; name another file")
+    if picture is not None and picture.suffix.lower() != ".png":
+        raise RunError(f"{picture}: pictures are PNG; name it {picture.with_suffix('.png').name}")
+
+
+def _views(
+    g: Gaussians, antialiased: bool, cameras: Path | None, backend: Backend
+) -> tuple[Scene, Photos, str]:
+    """Where to look from, what is seen there, and where that comes from."""
+    if cameras is None:
+        drawn = free_cameras(g, _VIEWS, up="auto", fov=_FOV, size=_SIZE, seed=0, kind="auto", backend=backend)
+        scene = _scene_of(Path(), drawn.cameras)
+        return scene, Renders(g, scene.views, backend, antialiased), _DRAWN
+    given = read_camera_file(cameras)
+    if all(one.photo is not None for one in given):
+        scene = load_scene(cameras, test_every=0)
+        scene = replace(scene, views=tuple(replace(v, camera=_small(v.camera)) for v in scene.views))
+        return scene, Photos(scene.views), f"{len(scene.views)} photos of {cameras}"
+    scene = _scene_of(cameras, [_small(one.camera) for one in given])
+    return scene, Renders(g, scene.views, backend, antialiased), f"{len(scene.views)} cameras of {cameras}"
+
+
+def _scene_of(path: Path, cameras: Sequence[Camera]) -> Scene:
+    """Cameras without photos and points as a scene."""
+    views = tuple(View(f"{i:03d}", camera, path) for i, camera in enumerate(cameras))
+    nothing = np.zeros(0, np.int64)
+    points = Points(
+        np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), nothing, nothing.astype(np.int32),
+        np.zeros((0, 2), np.float32),
+    )  # fmt: skip
+    return Scene(path.name, path, views, points, test_every=0)
+
+
+def _small(camera: Camera) -> Camera:
+    share = min(1.0, _SIDE / max(camera.width, camera.height))
+    return camera.resized(max(1, round(camera.width * share)), max(1, round(camera.height * share)))
+
+
+def _write(source: Path, out: Path, splat: Splat, keep: np.ndarray) -> None:
+    """Write the Gaussians that stay; from PLY to PLY their rows with all properties that the file has."""
+    if splat.kind == "PLY" and written_as(out) == ".ply":
+        g = read_ply_splat(source).gaussians
+        drawn = ~torch.stack(list(undrawable(g).values())).any(0).numpy()
+        labelled_here = torch.equal(g.label_ids[torch.from_numpy(drawn)], splat.gaussians.label_ids)
+        if labelled_here:  # and not by a file beside it
+            drawn[drawn] = keep
+            select_ply(source, out, drawn)
+            return
+    stays = splat.gaussians.select(torch.from_numpy(keep))
+    write_splat(out, stays, splat.names, antialiased=splat.antialiased)

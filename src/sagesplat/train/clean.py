@@ -1,0 +1,304 @@
+"""Floaters: Gaussians that hang in free space, found after training by what each view shows of them.
+
+Criteria, each by itself:
+
+- few views: hardly any training view supports them, so nothing says where they are;
+- hardly shown: a camera of the capture that turned towards them would show little else, but all photos
+  together show next to nothing of them;
+- in front: most views that support them show content far behind them;
+- category: they paint pixels of a category that is far behind them, such as the sky.
+
+What a floater hides no photo has shown, and what it paints the training needed: taking it away may leave a
+hole. So `clean` renders training and calibration views, and takes only what costs next to nothing there.
+"""
+
+import math
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Int64
+from scipy.ndimage import minimum_filter
+
+from sagesplat.core.config import CleanConfig
+from sagesplat.core.errors import RunError
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.core.geometry import project, weighted_quantile
+from sagesplat.metrics.image import psnr, squared_error_map
+from sagesplat.raster import Backend, Workspace, add_weights, device_of, rasterize
+from sagesplat.scene.images import Photos
+from sagesplat.scene.scene import Camera, Scene, View
+from sagesplat.segment.masks import UNLABELLED
+from sagesplat.segment.valid import ALL_VALID, ValidPixels
+from sagesplat.train.early_stopping import spread
+
+CRITERIA = ("few views", "hardly shown", "in front", "category")
+LabelImage = Callable[[View], np.ndarray]  # a view's category ids, int16 [H, W]; -1: unlabelled
+
+_MOST = 0.5  # of the views that support a Gaussian, or of its weight
+_NEAR = 0.05  # quantile of the depths of tracked points, or of the pixels, that is a view's near content
+_TRACKED = 20  # points in a view at least
+_WINDOW = 3  # px of half the size, around a Gaussian's centre; the nearest content there counts
+_COVERED = 0.5  # alpha of pixels that show content
+_GUARDS = 12  # views of a kind that are rendered before and after
+_TRIES = 5  # of how much may go of what a criterion found
+_UNKNOWN_ERROR = 1e-3  # mean squared error of a splat without photos: 30 dB
+
+
+@dataclass(frozen=True, eq=False)
+class Floaters:
+    """Gaussians that criteria found; one that fits several is of the first."""
+
+    found: dict[str, Bool[np.ndarray, " N"]]  # by criterion, in the order of `CRITERIA`
+    weight: Float32[np.ndarray, " N"]  # blending weight, summed over pixels and views
+
+
+@dataclass(frozen=True, eq=False)
+class Cleaned:
+    """What `clean` takes away, and what it costs."""
+
+    removed: dict[str, Bool[np.ndarray, " N"]]  # by criterion
+    found: dict[str, int]  # by criterion, whether it is removed or not
+    before: dict[str, float]  # mean PSNR by kind of view ("train", "calibration"), dB
+    after: dict[str, float]
+
+    @property
+    def keep(self) -> Bool[np.ndarray, " N"]:
+        """The Gaussians that stay."""
+        return ~np.any(list(self.removed.values()), axis=0)
+
+
+def find_floaters(
+    g: Gaussians,
+    scene: Scene,
+    views: Collection[int],
+    config: CleanConfig,
+    *,
+    label_image: LabelImage | None = None,
+    valid: ValidPixels = ALL_VALID,
+    antialiased: bool = False,
+    on_view: Callable[[int], None] | None = None,
+) -> Floaters:
+    """Find floaters by the criteria of `config`.
+
+    Args:
+        g: N trained Gaussians.
+        scene: Views, and points whose tracks tell how near the content of a view is, where it has some.
+        views: Rows of `Scene.views` that the Gaussians were trained on.
+        config: Thresholds.
+        label_image: Needed for the criterion "category", and for Gaussians of at least two categories.
+        valid: The pixels that count.
+        antialiased: How the Gaussians were trained.
+        on_view: Called with the number of views done.
+
+    Returns:
+        The Gaussians that each criterion found, and their importance.
+
+    Raises:
+        RunError: If a threshold is impossible.
+    """
+    check(config)
+    n = len(g)
+    supported, in_front, contradicting, weight = np.zeros((4, n), np.float32)
+    ids = np.unique(np.append(g.label_ids.cpu().numpy(), UNLABELLED))
+    if len(ids) < 3 or not config.category_depth:  # of one category nothing can contradict
+        label_image = None
+    xyz, space, most = g.means.cpu().numpy(), Workspace(), np.zeros(n, np.float32)
+    for done, row in enumerate(views, 1):
+        view, counts = scene.views[row], valid[scene.views[row]]
+        columns = _columns(view, counts, ids, label_image)
+        weights = np.zeros((n, 1 if label_image is None else len(ids)), np.float32)
+        add_weights(g, view.camera, columns, weights, antialiased=antialiased, workspace=space)
+        total = weights.sum(1)
+        supports = total >= config.min_weight
+        weight += total
+        supported += supports
+        most = np.maximum(most, _most_pixels(g, view.camera))
+        depth = xyz @ view.camera.w2c[2, :3] + view.camera.w2c[2, 3]
+        if config.content_depth:
+            content = _content(g, scene, row, depth, antialiased, space)
+            in_front += supports & (depth < config.content_depth * content)
+        if label_image is not None:
+            contradicting += _contradicting(weights[:, 1:], depth, config.category_depth)
+        if on_view:
+            on_view(done)
+    found = {
+        "few views": supported < config.min_views,
+        "hardly shown": weight < config.shown_share * most,
+        "in front": (supported > 0) & (in_front > _MOST * supported),
+        "category": (supported > 0) & (contradicting > _MOST * weight),
+    }
+    taken = np.zeros(n, bool)
+    for name, rows in found.items():
+        found[name] = rows & ~taken
+        taken |= rows
+    return Floaters(found, weight)
+
+
+def clean(
+    g: Gaussians,
+    floaters: Floaters,
+    scene: Scene,
+    photos: Photos,
+    config: CleanConfig,
+    *,
+    kinds: Mapping[str, Collection[int]],
+    real: bool = True,
+    valid: ValidPixels = ALL_VALID,
+    antialiased: bool = False,
+    backend: Backend = "auto",
+) -> Cleaned:
+    """Choose what to remove of the floaters, so that no kind of view loses more than `config.max_loss` dB.
+
+    Criteria are tried in their order. Where all that one found would cost too much, those of the least
+    blending weight go, as many as the views do not miss (bisection).
+
+    Args:
+        g: N Gaussians.
+        floaters: What `find_floaters` found of them.
+        scene: The capture.
+        photos: What the Gaussians should look like, by row of `scene.views`.
+        config: The largest loss.
+        kinds: Rows of views by kind ("train", "calibration"); some of each are rendered. Kinds without rows
+            do not count.
+        real: False: `photos` are renders of these Gaussians, which are taken to be 30 dB off the truth.
+        valid: The pixels that count.
+        antialiased: How the Gaussians were trained.
+        backend: Rasteriser; decides the device.
+    """
+    kinds = {kind: spread(valid.rows(scene, rows), _GUARDS) for kind, rows in kinds.items()}
+    kinds = {kind: rows for kind, rows in kinds.items() if rows}
+    on_device, space = g.to(device_of(backend)), Workspace()
+
+    def quality(keep: Bool[np.ndarray, " N"]) -> dict[str, float]:
+        kept = on_device.select(torch.from_numpy(keep).to(on_device.means.device))
+        return {kind: float(np.mean([_psnr(kept, row) for row in rows])) for kind, rows in kinds.items()}
+
+    def _psnr(kept: Gaussians, row: int) -> float:
+        view = scene.views[row]
+        with torch.no_grad():
+            render = rasterize(kept, view.camera, antialiased=antialiased, backend=backend, workspace=space)
+        image = render.rgb.clamp(0, 1).float().cpu().numpy()
+        errors = squared_error_map(image, photos[row].astype(np.float32) / 255)
+        counts = valid[view]
+        mean = float((errors if counts is None else errors[counts]).mean())
+        return float(psnr(mean if real else mean + _UNKNOWN_ERROR))
+
+    keep = np.ones(len(g), bool)
+    before = after = best = quality(keep)
+    removed = dict[str, np.ndarray]()
+    for name, rows in floaters.found.items():
+        order = np.flatnonzero(rows)[np.argsort(floaters.weight[rows], kind="stable")]
+        removed[name] = np.zeros(len(g), bool)
+        low, count, high = 0, len(order), len(order)  # so many may go; so many are tried; at most so many
+        for _ in range(_TRIES):
+            if count == low:
+                break
+            tried = keep.copy()
+            tried[order[:count]] = False
+            now = quality(tried)
+            if all(best[kind] - now[kind] <= config.max_loss for kind in kinds):
+                low, after = count, now
+            else:
+                high = count - 1
+            count = (low + high + 1) // 2
+        removed[name][order[:low]] = True
+        keep &= ~removed[name]
+        best = {kind: max(best[kind], after[kind]) for kind in kinds}
+    found = {name: int(rows.sum()) for name, rows in floaters.found.items()}
+    return Cleaned(removed, found, before, after)
+
+
+def check(config: CleanConfig) -> None:
+    """RunError for a threshold that is impossible."""
+    limits = {
+        "min_views": 10**6,
+        "min_weight": 10**6,
+        "shown_share": 1,
+        "content_depth": 1,
+        "category_depth": 1,
+        "max_loss": 100,
+    }
+    for name, most in limits.items():
+        value = getattr(config, name)
+        if not 0 <= value <= most:
+            flag = name.replace("_", "-")
+            raise RunError(f"--clean.{flag} {value:g} is impossible; choose 0 to {most:,}")
+
+
+def _most_pixels(g: Gaussians, camera: Camera) -> Float32[np.ndarray, " N"]:
+    """Blending weight of each Gaussian where the camera looks straight at it and nothing else is in front."""
+    away = torch.linalg.vector_norm(g.means - g.means.new_tensor(camera.position), dim=1).clamp_min(1e-9)
+    sides = g.log_scales.exp().sort(dim=1).values[:, 1:]  # of its broadest side
+    pixels = 2 * math.pi * sides.prod(1) * float(camera.K[0, 0] * camera.K[1, 1]) / away**2
+    return (g.logit_opacities.sigmoid() * pixels.clamp_max(camera.width * camera.height)).cpu().numpy()
+
+
+def _columns(
+    view: View,
+    counts: np.ndarray | None,
+    ids: np.ndarray,
+    label_image: LabelImage | None,
+) -> Int64[np.ndarray, "H W"]:
+    """The column of each pixel: of its category's row in `ids`, 0 where it has none; -1: does not count."""
+    if label_image is None:
+        columns = np.zeros((view.camera.height, view.camera.width), np.int64)
+    else:
+        labels = label_image(view)
+        columns = np.searchsorted(ids, labels).clip(0, len(ids) - 1)
+        columns[ids[columns] != labels] = 0
+    if counts is not None:
+        columns[~counts] = -1
+    return columns
+
+
+def _content(
+    g: Gaussians,
+    scene: Scene,
+    row: int,
+    depth: Float[np.ndarray, " N"],
+    antialiased: bool,
+    space: Workspace,
+) -> Float[np.ndarray, " N"]:
+    """Depth of what a view shows around each Gaussian's centre, or of its near content where that is more."""
+    camera = scene.views[row].camera
+    half = camera.resized(max(1, camera.width // 2), max(1, camera.height // 2))  # exact enough, and faster
+    feature = torch.from_numpy(np.maximum(depth, 0).astype(np.float32))[:, None].to(g.means.device)
+    with torch.no_grad():
+        render = rasterize(g, half, sh_degree=0, features=feature, antialiased=antialiased, workspace=space)
+    assert render.features is not None
+    alpha = render.alpha.float().cpu().numpy()
+    shown = render.features[..., 0].float().cpu().numpy() / np.maximum(alpha, _COVERED)
+    covered = alpha >= _COVERED
+    nearest = minimum_filter(np.where(covered, shown, np.inf), _WINDOW)
+    pixels = project(g.means.cpu().numpy(), half.w2c, half.K)[0]
+    at = np.floor(np.nan_to_num(pixels, nan=-1.0)).clip(-1, 1e6).astype(np.int64)
+    inside = (at >= 0).all(1) & (at < (half.width, half.height)).all(1)
+    found = np.zeros(len(depth))
+    found[inside] = nearest[at[inside, 1], at[inside, 0]]
+    near = _tracked(scene, row)
+    if not len(near):
+        near = shown[covered] if covered.any() else np.zeros(1)
+    return np.maximum(np.where(np.isfinite(found), found, 0), np.quantile(near, _NEAR))
+
+
+def _tracked(scene: Scene, row: int) -> Float[np.ndarray, " P"]:
+    """Depths of the points whose tracks are in a view; none where they are too few."""
+    points = scene.points.track_points[scene.points.track_views == row]
+    camera = scene.views[row].camera
+    depth = scene.points.xyz[points] @ camera.w2c[2, :3] + camera.w2c[2, 3]
+    return depth if len(points) >= _TRACKED else depth[:0]
+
+
+def _contradicting(
+    weights: Float32[np.ndarray, "N L"], depth: Float[np.ndarray, " N"], share: float
+) -> Float32[np.ndarray, " N"]:
+    """Weight of each Gaussian on pixels of categories whose median depth is far behind it."""
+    found = np.zeros(len(depth), np.float32)
+    for column in weights.T:
+        rows = np.flatnonzero(column)
+        if len(rows):
+            median = weighted_quantile(depth[rows], column[rows], 0.5)
+            found[rows] += column[rows] * (depth[rows] < share * median)
+    return found

@@ -1,0 +1,132 @@
+"""Floaters go from the last level, which is kept as it was trained."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import SMALL_RUN
+
+from sagesplat.core.config import BlocksConfig, CleanConfig
+from sagesplat.core.errors import RunError
+from sagesplat.core.events import Event, StageDone, StageSkipped
+from sagesplat.formats.levels import read_header, read_level, select_level, write_level
+from sagesplat.run.job import Job
+from sagesplat.run.run_dir import RunDir
+from sagesplat.stages.clean import CleanFigures, clean_levels, clean_lines, read_clean_figures
+from sagesplat.stages.pipeline import train
+
+LOSSES = CleanConfig(min_views=10**6, max_loss=100)  # everything is a floater, whatever it costs
+
+
+@pytest.fixture
+def run(finished_run: Path, tmp_path: Path) -> RunDir:
+    shutil.copytree(finished_run, tmp_path / "run")
+    return RunDir(tmp_path / "run")
+
+
+def job_of(run: RunDir, events: list[Event] | None = None, *, force: bool = False) -> Job:
+    return Job(run, (events if events is not None else []).append, "cpu", force=force)
+
+
+def last_level(run: RunDir) -> Path:
+    return max(run.levels.glob("*.npz"))
+
+
+def spoil(run: RunDir) -> int:
+    """A few Gaussians of the last level where no view sees them; how many."""
+    g = read_level(last_level(run))
+    header = read_header(last_level(run))
+    g.means[::10] = torch.tensor([0.0, 0, -50])
+    for path in (run.uncleaned, run.floaters, run.provenance("clean")):
+        path.unlink(missing_ok=True)
+    write_level(run.levels, header.step, g, recovering=header.recovering, sh_degree=header.sh_degree)
+    return len(g.means[::10])
+
+
+def test_hidden_gaussians_go_and_the_others_keep_every_bit(run: RunDir) -> None:
+    hidden, events = spoil(run), list[Event]()
+    before = read_level(last_level(run))
+    clean_levels(job_of(run, events), CleanConfig())
+    after, figures = read_level(last_level(run)), read_clean_figures(run.floaters)
+    assert figures is not None
+    assert figures.removed["few views"] >= hidden
+    assert len(after) == figures.gaussians - sum(figures.removed.values()) < len(before)
+    assert run.floaters_picture.exists()
+    rows = set(map(tuple, before.select(before.means[:, 2] > -40).means.tolist()))
+    assert set(map(tuple, after.means.tolist())) <= rows
+    done = next(event for event in events if isinstance(event, StageDone))
+    assert done.lines == tuple(clean_lines(figures))
+
+
+def test_it_is_done_once_and_the_level_comes_back(run: RunDir) -> None:
+    spoil(run)
+    before = last_level(run).read_bytes()
+    clean_levels(job_of(run), CleanConfig())
+    assert run.uncleaned.read_bytes() == before != last_level(run).read_bytes()
+    events: list[Event] = []
+    clean_levels(job_of(run, events), CleanConfig())
+    assert [type(e) for e in events] == [StageSkipped]
+    with pytest.raises(RunError, match=r"made with other floaters .*--force"):
+        clean_levels(job_of(run), CleanConfig(floaters="keep"))
+    clean_levels(job_of(run, force=True), CleanConfig(floaters="keep"))
+    assert last_level(run).read_bytes() == before
+    assert not run.uncleaned.exists()
+    assert not run.floaters_picture.exists()
+    figures = read_clean_figures(run.floaters)
+    assert figures is not None
+    assert not figures.removed
+
+
+def test_another_training_is_cleaned_anew(run: RunDir) -> None:
+    spoil(run)
+    clean_levels(job_of(run), CleanConfig())
+    train(job_of(run, force=True), replace(SMALL_RUN.train, max_steps=4), BlocksConfig(), 0)
+    assert not any(path.exists() for path in (run.uncleaned, run.floaters, run.provenance("clean")))
+    clean_levels(job_of(run), CleanConfig())
+    figures = read_clean_figures(run.floaters)
+    assert figures is not None
+    left = sum(read_header(last_level(run)).counts.values())
+    assert figures.gaussians == left + sum(figures.removed.values())
+
+
+def test_a_level_is_selected_as_it_is_stored(run: RunDir, tmp_path: Path) -> None:
+    source = last_level(run)
+    g = read_level(source)
+    keep = np.arange(len(g)) % 3 > 0
+    keep[(g.label_ids == g.label_ids[0]).numpy()] = False  # a category that is gone
+    select_level(source, tmp_path / "some.npz", keep)
+    some = read_level(tmp_path / "some.npz")
+    for name, values in g.select(torch.from_numpy(keep)).parameters().items():
+        assert torch.equal(values, getattr(some, name)), name
+    assert read_header(tmp_path / "some.npz").step == read_header(source).step
+    with pytest.raises(ValueError, match="3 rows for"):
+        select_level(source, tmp_path / "none.npz", np.ones(3, bool))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "[]",
+        "{}",
+        '{"gaussians": 3, "found": {"few views": 1}, "removed": {"few views": 2}, "before": {}, "after": {}}',
+    ],
+)
+def test_figures_that_are_none_are_refused(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "floaters.json"
+    path.write_text(content)
+    with pytest.raises(RunError, match=r"floaters\.json: not what was cleaned .*sagesplat clean RUN"):
+        read_clean_figures(path)
+
+
+def test_figures_in_words() -> None:
+    figures = CleanFigures(
+        1000, {"few views": 5, "in front": 4, "category": 0}, {"few views": 5, "in front": 1, "category": 0},
+        {"train": 20.0}, {"train": 19.99},
+    )  # fmt: skip
+    assert clean_lines(figures) == [
+        "6 of 1,000 Gaussians removed: 5 few views, 1 in front (of 4)",
+        "train views -0.010 dB",
+    ]

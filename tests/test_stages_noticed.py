@@ -1,0 +1,89 @@
+"""What a run noticed is told at its end: on the console and in the report."""
+
+import io
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from rich.console import Console as RichConsole
+
+from sagesplat.cli.console import Console
+from sagesplat.core.errors import RunError
+from sagesplat.core.events import Event, RunDone
+from sagesplat.io.files import write_json
+from sagesplat.run.job import Job
+from sagesplat.run.run_dir import RunDir
+from sagesplat.segment.masks import mask_path
+from sagesplat.stages.noticed import noticed
+from sagesplat.stages.report import make_report
+
+POSES = {
+    "pixels": 0.31, "degrees": 0.01, "shift": 0.001, "diverged": 0, "fitted": 2, "held_out": 2,
+    "psnr": None, "ssim": None,
+}  # fmt: skip
+EXPOSURE = {"range_ev": 0.84, "psnr": None, "ssim": None}
+FLOATERS = {
+    "gaussians": 9000, "found": {"few views": 300, "in front": 1300, "category": 40},
+    "removed": {"few views": 300, "in front": 1200, "category": 40},
+    "before": {"train": 20.0}, "after": {"train": 20.0},
+}  # fmt: skip
+WORDS = (
+    "exposure varies by 0.8 EV",
+    "2.8 % of pixels ignored",
+    "1,240 floaters removed",
+    "300 Gaussians removed that hardly any photo shows",
+    "poses moved by 0.3 px",
+)
+
+
+@pytest.fixture
+def job(finished_run: Path, tmp_path: Path) -> Job:
+    shutil.copytree(finished_run, tmp_path / "run")
+    for name in ("floaters.json", "floaters.png"):
+        (tmp_path / "run" / name).unlink(missing_ok=True)
+    return Job(RunDir(tmp_path / "run"), lambda event: None, "cpu")
+
+
+def disturb(job: Job) -> None:
+    """Leave what a run on a disturbed capture leaves."""
+    write_json(job.run.refined, {"poses": POSES, "exposure": EXPOSURE})
+    write_json(job.run.floaters, FLOATERS)
+    for view in job.scene.views[::2]:
+        counts = np.ones((view.camera.height, view.camera.width), bool)
+        counts[:2, : view.camera.width * 9 // 10] = False
+        path = mask_path(job.run.valid, view)
+        path.parent.mkdir(exist_ok=True)
+        Image.fromarray(counts).save(path)
+
+
+def test_nothing_is_told_of_a_clean_capture(job: Job) -> None:
+    assert noticed(job) == ()
+
+
+def test_each_is_told_in_a_few_words(job: Job) -> None:
+    disturb(job)
+    assert noticed(job) == WORDS
+
+
+def test_the_console_and_the_page_tell_it(job: Job) -> None:
+    disturb(job)
+    job.run.provenance("report").unlink()
+    events: list[Event] = []
+    make_report(Job(job.run, events.append, "cpu"))
+    assert isinstance(events[-1], RunDone)
+    assert events[-1].noticed == WORDS
+    assert "; ".join(WORDS) in (job.run.report / "index.html").read_text()
+    printed = io.StringIO()
+    console = Console(RichConsole(file=printed, width=300))
+    console(events[-1])
+    console(RunDone(Path("report")))
+    assert printed.getvalue().splitlines()[0] == f"Noticed: {'; '.join(WORDS)}"
+    assert printed.getvalue().count("Noticed") == 1
+
+
+def test_a_damaged_file_is_one_line(job: Job) -> None:
+    job.run.floaters.write_text('{"gaussians": "many"}')
+    with pytest.raises(RunError, match=r"floaters\.json: not what was cleaned"):
+        noticed(job)
