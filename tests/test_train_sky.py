@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from sagesplat.core.config import BlocksConfig, TrainConfig
+from sagesplat.core.config import BlocksConfig, CleanConfig, TrainConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import StageDone
 from sagesplat.core.gaussians import PARAMETERS, concat
@@ -23,6 +23,7 @@ from sagesplat.run.run_dir import RunDir
 from sagesplat.scene.images import Photos
 from sagesplat.segment.masks import Masks, Taxonomy, mask_path
 from sagesplat.segment.valid import ValidPixels
+from sagesplat.stages.clean import clean_levels
 from sagesplat.stages.label import lift_labels, make_masks
 from sagesplat.stages.pipeline import nest, train
 from sagesplat.stages.scene import open_scene
@@ -260,10 +261,15 @@ def test_a_run_with_sky(capture, tmp_path):
     make_masks(job, SMALL_RUN.masks, SMALL_RUN.labels)
     lift_labels(job, SMALL_RUN.lift)
     train(job, replace(SMALL_RUN.train, max_steps=2), BlocksConfig(), 0)
+    trained = job.snapshots.load(job.snapshots.levels[-1])
+    clean_levels(job, CleanConfig(min_views=6, max_loss=9.0))
     nest(job, replace(SMALL_RUN.nest, base_share=0.3, base_steps=1), BlocksConfig(), 0)
     found = job.sky
     assert found is not None
     lines = [line for event in events if isinstance(event, StageDone) for line in event.lines]
+    cleaned = job.snapshots.load(job.snapshots.levels[-1])
+    assert len(cleaned) < len(trained)
+    assert found.shell.holds(cleaned.means).sum() == found.shell.holds(trained.means).sum()
     assert any("on a sphere 10 scene extents away" in line for line in lines)
     for g in (job.snapshots.load(job.snapshots.levels[-1]), job.ladder.load(job.ladder.levels[-1])):
         on = g.label_ids == SKY
@@ -283,5 +289,5 @@ def test_without_sky_nothing_changes(finished_run, tmp_path):
     job = Job(RunDir(folder), lambda event: None, "cpu", force=True)
     assert job.sky is None
     train(job, replace(SMALL_RUN.train, sky="off"), BlocksConfig(), 0)
-    before, after = (read_level(path / "levels" / "000006.npz") for path in (finished_run, folder))
+    before, after = (read_level(path / "levels" / "000004.npz") for path in (finished_run, folder))
     assert all(torch.equal(getattr(before, name), getattr(after, name)) for name in PARAMETERS)
