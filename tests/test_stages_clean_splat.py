@@ -58,15 +58,16 @@ def test_rows_of_a_ply_keep_properties_that_nobody_knows(folder: Path, tmp_path:
     with (folder / "scene.ply").open("rb") as file:
         known = read_header(file)
         rows = np.fromfile(file, known.dtype, known.count)
-    dtype = np.dtype([*known.dtype.descr, ("heat", "<f8")])
+    types = known.types | {"heat": "f8"}
+    dtype = np.dtype([(name, f"<{kind}") for name, kind in types.items()])
     wider = np.zeros(len(rows), dtype)
     for name in rows.dtype.names or ():
         wider[name] = rows[name]
     wider["heat"] = np.arange(len(rows))
     wider["opacity"][5] = np.nan  # cannot be drawn, and is left out
-    kinds = {"<f4": "float", "<i2": "short", "<f8": "double"}
+    words = {"f4": "float", "i2": "short", "f8": "double"}
     lines = ["ply", "format binary_little_endian 1.0", "comment by hand", f"element vertex {len(rows)}"]
-    lines += [f"property {kinds[kind]} {name}" for name, kind in dtype.descr]
+    lines += [f"property {words[kind]} {name}" for name, kind in types.items()]
     lines += ["element camera 2", "property float x", "end_header", ""]
     strange.write_bytes("\n".join(lines).encode() + wider.tobytes() + bytes(8))
     run(folder, tmp_path / "out.ply", source=strange)
