@@ -10,7 +10,7 @@ from sagesplat.core.config import NestConfig
 from sagesplat.core.events import Progress, Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.increments import packed, read_increments, write_increments
-from sagesplat.formats.levels import read_level, write_set
+from sagesplat.formats.levels import read_header, read_level, write_set
 from sagesplat.run.job import Job
 from sagesplat.run.records import checkpoint_key
 from sagesplat.run.stage import run_stage
@@ -30,8 +30,8 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
     settings = {**asdict(config), "seed": seed}
 
     def make() -> list[str]:
-        check_nest(job, job.snapshots.size(job.snapshots.levels[-1]), train_config(job).sh_degree)
-        full = job.snapshots.load(job.snapshots.levels[-1])
+        full = read_level(job.trained)
+        check_nest(job, len(full), train_config(job).sh_degree)
         base = read_level(run.base_model) if config.base_share else None
         masks = job.best_masks
         ordered = nested.order(
@@ -60,6 +60,7 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
         return lines
 
     inputs = [*run.scene_files, run.labels, run.levels, run.provenance("train"), *label_image_inputs(run)]
+    inputs += [run.cleaned] if run.cleaned.exists() else []
     if config.base_share:
         _make_base_model(job, config, seed)
         inputs.append(run.base_model)
@@ -69,7 +70,7 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
 def _make_base_model(job: Job, config: NestConfig, seed: int) -> None:
     """Train the small model that the ladder begins with: a stage, so that a killed run has it already."""
     run, made = job.run, train_config(job)
-    full = job.snapshots.size(job.snapshots.levels[-1])
+    full = sum(read_header(job.trained).counts.values())
     cap = max(1, round(config.base_share * full))
     settings = {**asdict(nested.capped_config(made, cap, config.base_steps)), "seed": seed}
 

@@ -82,8 +82,6 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
     make_masks(job, config.masks, config.labels)
     lift_labels(job, config.lift)
     train(job, config.train, config.blocks, config.seed)
-    if not job.has_blocks:
-        clean(job, config.clean)
     if config.fuse:
         fuse_masks(job)
     elif job.run.fused.exists():
@@ -91,6 +89,8 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
     if job.has_blocks:
         blocks.label_block_categories(job)
     if job.run.ladder == "nested":
+        if not job.has_blocks:
+            clean(job, config.clean)
         nest(job, config.nest, config.blocks, config.seed)
     _promise(job, config)
 
