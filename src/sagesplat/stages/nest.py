@@ -30,8 +30,8 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
     settings = {**asdict(config), "seed": seed}
 
     def make() -> list[str]:
+        check_nest(job, _count(job), train_config(job).sh_degree)
         full = read_level(job.trained)
-        check_nest(job, len(full), train_config(job).sh_degree)
         base = read_level(run.base_model) if config.base_share else None
         masks = job.best_masks
         ordered = nested.order(
@@ -70,8 +70,7 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
 def _make_base_model(job: Job, config: NestConfig, seed: int) -> None:
     """Train the small model that the ladder begins with: a stage, so that a killed run has it already."""
     run, made = job.run, train_config(job)
-    full = sum(read_header(job.trained).counts.values())
-    cap = max(1, round(config.base_share * full))
+    cap = max(1, round(config.base_share * _count(job)))
     settings = {**asdict(nested.capped_config(made, cap, config.base_steps)), "seed": seed}
 
     inputs = [*run.scene_files, run.labels, *valid_inputs(run)]
@@ -82,6 +81,11 @@ def _make_base_model(job: Job, config: NestConfig, seed: int) -> None:
         return [f"{len(g):,} Gaussians"]
 
     run_stage(job, "base", settings, inputs, [run.base_model], make)
+
+
+def _count(job: Job) -> int:
+    """Gaussians of the trained model."""
+    return sum(read_header(job.trained).counts.values())
 
 
 def train_capped(job: Job, stage: str, cap: int, steps: int, seed: int) -> Gaussians:
