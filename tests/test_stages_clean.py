@@ -13,10 +13,11 @@ from sagesplat.core.config import BlocksConfig, CleanConfig
 from sagesplat.core.errors import DataError, RunError
 from sagesplat.core.events import Event, StageDone, StageSkipped
 from sagesplat.formats.levels import read_header, read_level, select_level, write_level
+from sagesplat.io.files import write_json
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.stages.clean import CleanFigures, clean_levels, clean_lines, read_clean_figures
-from sagesplat.stages.pipeline import nest, train
+from sagesplat.stages.pipeline import clean, nest, train
 
 
 @pytest.fixture
@@ -91,10 +92,20 @@ def test_nested_levels_are_made_of_what_is_left(run: RunDir) -> None:
 
 
 def test_another_training_is_cleaned_anew(run: RunDir) -> None:
-    spoil(run)
-    clean_levels(job_of(run), CleanConfig())
+    made = (run.cleaned, run.floaters, run.floaters_picture, run.provenance("clean"))
+    for path in made:
+        path.write_bytes(b"of this training")
     train(job_of(run, force=True), replace(SMALL_RUN.train, max_steps=4), BlocksConfig(), 0)
-    assert not any(path.exists() for path in (run.cleaned, run.floaters, run.provenance("clean")))
+    assert not any(path.exists() for path in made)
+
+
+def test_a_scene_in_blocks_and_an_adopted_splat_are_refused(run: RunDir) -> None:
+    write_json(run.blocks / "blocks.json", {})
+    with pytest.raises(RunError, match=r"blocks: floaters are not removed from a scene in blocks"):
+        clean(job_of(run), CleanConfig())
+    run.adopted.write_bytes(b"")
+    with pytest.raises(RunError, match=r"a splat that was trained elsewhere"):
+        clean(job_of(run), CleanConfig())
 
 
 def test_a_level_is_selected_as_it_is_stored(run: RunDir, tmp_path: Path) -> None:
