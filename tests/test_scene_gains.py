@@ -33,11 +33,14 @@ def capture(light: np.ndarray, noise: float = 0.02) -> tuple[Scene, list[np.ndar
         photos.append(cell.repeat(4, 0).repeat(4, 1))
     count = len(colours)
     points = Points(
-        np.zeros((count, 3), np.float32), np.zeros((count, 3), np.uint8), np.tile(np.arange(count), VIEWS),
-        np.repeat(np.arange(VIEWS, dtype=np.int32), count),
-        np.tile(4 * cells + 1.5, (VIEWS, 1)).astype(np.float32),
+        np.zeros((count, 3), np.float32), np.zeros((count, 3), np.uint8),
+        np.tile(np.arange(count), len(light)),
+        np.repeat(np.arange(len(light), dtype=np.int32), count),
+        np.tile(4 * cells + 1.5, (len(light), 1)).astype(np.float32),
     )  # fmt: skip
-    views = tuple(View(f"{i}", camera, Path(f"{i}.jpg")) for i, camera in enumerate(orbit(VIEWS, SIZE, SIZE)))
+    views = tuple(
+        View(f"{i}", camera, Path(f"{i}.jpg")) for i, camera in enumerate(orbit(len(light), SIZE, SIZE))
+    )
     return Scene("patches", Path(), views, points, test_every=0), photos
 
 
@@ -69,6 +72,20 @@ def test_what_differs_by_point_is_no_exposure():
     """Colours that change with the viewing direction, each as it likes."""
     scene, photos = capture(np.ones((VIEWS, 3)), noise=0.5)
     assert not photo_gains(scene, photos, range(VIEWS)).differ
+
+
+def test_light_that_follows_the_direction_needs_no_transforms():
+    """The same exposures are worth a transform where neighbours on the path do not have the same."""
+    light = 2 ** np.sin(2 * np.pi * np.arange(40) / 40)[:, None].repeat(3, 1)
+    found = {}
+    for name, of_views in {"smooth": light, "mixed": np.random.default_rng(2).permutation(light)}.items():
+        scene, photos = capture(of_views)
+        found[name] = photo_gains(scene, photos, range(40))
+        assert found[name].range_ev == pytest.approx(2, abs=0.1)
+    assert found["smooth"].follow_direction
+    assert not found["smooth"].differ
+    assert found["mixed"].differ
+    assert not found["mixed"].follow_direction
 
 
 def test_a_few_occluded_points_change_little():

@@ -277,6 +277,58 @@ def test_too_few_poses_is_one_line_and_keeps_the_work(tmp_path: Path) -> None:
 
 
 @needs_pycolmap
+@needs_pycolmap
+def test_no_features_where_pixels_do_not_count(folder: Path, tmp_path: Path) -> None:
+    """By alpha, a mask of half the size, a mask of a photo that EXIF turns, and label images."""
+    alpha, masked, turned, labelled = (folder / f"view {i}.png" for i in range(4))
+    pixels = np.dstack([read(alpha), np.full((HEIGHT, WIDTH), 255, np.uint8)])
+    pixels[:, : WIDTH // 2, 3] = 0
+    Image.fromarray(pixels).save(alpha)
+    (folder / "masks_valid").mkdir()
+    half = Image.new("1", (WIDTH // 2, HEIGHT // 2))
+    half.paste(1, (WIDTH // 4, 0, WIDTH // 2, HEIGHT // 2))
+    half.save(folder / "masks_valid" / masked.name)
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    with Image.open(turned) as image:
+        image.transpose(Image.Transpose.ROTATE_90).save(turned, exif=exif)
+    stored = Image.new("L", (HEIGHT, WIDTH))
+    stored.paste(200, (0, 0, HEIGHT, WIDTH // 2))  # of the stored pixels the upper half is the right one
+    stored.save(folder / "masks_valid" / f"{turned.name}.png")
+    right = np.arange(WIDTH)[None].repeat(HEIGHT, 0) >= WIDTH // 2
+
+    def stop(stage: str, done: int, total: int) -> None:
+        if stage == "matches":
+            raise KeyboardInterrupt
+
+    def features(name: str) -> np.ndarray:
+        work = tmp_path / "out" / "sfm"
+        names = json.loads((work / "request.json").read_text())["names"]
+        prepared = next(key for key, final in names.items() if final == name)
+        with sqlite3.connect(work / "database.db") as database:
+            (row,) = database.execute(
+                "select rows, cols, data from keypoints natural join images where name = ?", (prepared,)
+            ).fetchall()
+        database.close()
+        return np.frombuffer(row[2], np.float32).reshape(row[:2])
+
+    def ignored(name: str) -> np.ndarray | None:
+        return right if name == labelled.name else None
+
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(folder, tmp_path / "out", CONFIG, stop, ignored=ignored)
+    assert features("view 4.png")[:, 0].min() < WIDTH / 4
+    for path in (alpha, masked, turned, labelled):
+        found = features(path.name)
+        assert len(found) > 20, path
+        assert found[:, 0].min() > WIDTH / 2 - 1, path
+    kept = sorted(path.name for path in (tmp_path / "out" / "masks_valid").iterdir())
+    assert kept == ["view 0.png", "view 1.png", "view 2.png"]  # label images are the stage's that follows
+    Image.new("L", (50, 50)).save(folder / "masks_valid" / masked.name)
+    with pytest.raises(SceneError, match=r"view 1\.png: a mask or label image of 50 x 50 pixels"):
+        reconstruct(folder, tmp_path / "out", CONFIG, stop)
+
+
 def test_focal_lengths_of_exif_reach_colmap(tmp_path: Path) -> None:
     """Through a plain JPEG, a turned one and a PNG with alpha: 35 mm on 36 mm wide film."""
     source, noise = (
@@ -408,6 +460,49 @@ def test_heic_photos_are_read(tmp_path: Path) -> None:
     image = np.asarray(Image.open(tmp_path / "t" / photo.prepared), int)
     assert np.abs(image[10, 10] - [200, 40, 40]).max() < 20
     assert np.abs(image[10, 50] - [40, 40, 200]).max() < 20
+
+
+def turned_heic() -> bytes:
+    """A HEIC as a phone held upright writes it: pixels as the sensor lies, and a turn of 90 degrees."""
+    content = bytearray((Path(__file__).parent / "data" / "two_halves.heic").read_bytes())
+    turn = b"\0\0\0\x09irot\x01"
+    properties = content.index(b"\x05\x81\x02\x03\x05\x84")  # of the image: five; the new one is the sixth
+    content[properties : properties + 6] = b"\x06\x81\x02\x03\x05\x84\x86"
+    end = content.index(b"ipma") - 4
+    content[end:end] = turn
+    offset = content.index(b"\0\0\x01\xa1")  # of the pixels in the file
+    sizes = [
+        (content.index(box) - 4, more)
+        for box, more in ((b"meta", 10), (b"iprp", 10), (b"ipco", 9), (b"ipma", 1))
+    ]
+    for at, more in [*sizes, (offset, 10)]:
+        content[at : at + 4] = (int.from_bytes(content[at : at + 4], "big") + more).to_bytes(4, "big")
+    return bytes(content)
+
+
+def test_heic_photos_of_a_turned_phone_are_upright(tmp_path: Path) -> None:
+    pytest.importorskip("pi_heif")
+    (tmp_path / "a.heic").write_bytes(turned_heic())
+    (photo,), unreadable = prepare_photos(tmp_path, tmp_path / "t", tmp_path / "t", lambda done, total: None)
+    assert not unreadable
+    assert photo.size == (48, 64)
+    assert photo.orientation == 1  # the decoder has turned it; nothing else may turn it again
+    image = np.asarray(Image.open(tmp_path / "t" / photo.prepared), int)
+    assert np.abs(image[54, 10] - [200, 40, 40]).max() < 20
+    assert np.abs(image[10, 10] - [40, 40, 200]).max() < 20
+
+
+def test_portrait_and_landscape_of_a_phone_are_cameras_of_their_own(tmp_path: Path) -> None:
+    """4:3, 16:9 and portrait, which EXIF turns: photos of one upright size share intrinsics."""
+    exif = Image.Exif()
+    exif[0x0110] = "Phone"
+    for i, (size, orientation) in enumerate((((64, 48), 1), ((64, 36), 1), ((64, 48), 6), ((48, 64), 1)) * 2):
+        exif[0x0112] = orientation
+        Image.new("RGB", size).save(tmp_path / f"{i}.jpg", exif=exif)
+    found, _ = prepare_photos(tmp_path, tmp_path / "t", tmp_path / "t", lambda done, total: None)
+    assert [photo.size for photo in found[:4]] == [(64, 48), (64, 36), (48, 64), (48, 64)]
+    groups = photos._request(tmp_path, found, PosesConfig())["cameras"]
+    assert sorted(len(group) for group in groups) == [2, 2, 4]
 
 
 def test_many_photos_and_videos_are_matched_in_sequence(tmp_path: Path) -> None:

@@ -21,16 +21,16 @@ av = pytest.importorskip("av", reason="needs PyAV (the extra `video`)")
 WIDTH, HEIGHT = 128, 96
 
 
-def scenery() -> np.ndarray:
+def scenery(radius: float) -> np.ndarray:
     """A wide picture with blobs of a few pixels."""
     noise = np.random.default_rng(0).normal(size=(HEIGHT, 1200))
-    grey = np.clip(128 + 600 * gaussian_filter(noise, 3), 0, 255)
+    grey = np.clip(128 + 200 * radius * gaussian_filter(noise, radius), 0, 255)
     return np.repeat(grey[..., None], 3, axis=2).astype(np.uint8)
 
 
-def pan(count: int, step: int = 4) -> list[np.ndarray]:
+def pan(count: int, step: int = 4, radius: float = 3) -> list[np.ndarray]:
     """Frames of a camera that moves to the right by `step` pixels each."""
-    wide = scenery()
+    wide = scenery(radius)
     return [wide[:, i * step : i * step + WIDTH] for i in range(count)]
 
 
@@ -71,6 +71,24 @@ def test_the_sharpest_of_each_stretch_is_taken(tmp_path: Path) -> None:
     frames = [f if i in sharp else gaussian_filter(f, (3, 3, 0)) for i, f in enumerate(pan(32))]
     paths = extract_frames(write_video(tmp_path / "a.mp4", frames), tmp_path / "f", max_frames=4)
     assert set(numbers(paths)) == sharp
+
+
+@pytest.mark.parametrize("count", [24, 60, 90, 240])
+def test_every_other_frame_is_blurred(tmp_path: Path, count: int) -> None:
+    """Also where the video is so short that each frame is a stretch of its own; exposure does not matter."""
+    frames = [
+        gaussian_filter(f, (0, 5, 0)) if i % 2 else (f * (0.5 + 0.5 * (i % 4 == 0))).astype(np.uint8)
+        for i, f in enumerate(pan(count, radius=1.5))
+    ]
+    found = numbers(extract_frames(write_video(tmp_path / "a.mp4", frames), tmp_path / "f"))
+    assert all(i % 2 == 0 for i in found)
+    assert len(found) >= min(count // 2, 30)
+
+
+def test_a_blurred_stretch_leaves_no_wide_gap(tmp_path: Path) -> None:
+    frames = [gaussian_filter(f, (0, 5, 0)) if 10 <= i < 16 else f for i, f in enumerate(pan(30, radius=1.5))]
+    found = numbers(extract_frames(write_video(tmp_path / "a.mp4", frames), tmp_path / "f"))
+    assert np.diff(found).max() <= 2
 
 
 def test_a_standing_camera_gives_one_frame(tmp_path: Path) -> None:

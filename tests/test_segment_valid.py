@@ -8,10 +8,12 @@ import pytest
 from conftest import random_gaussians, write_capture
 from PIL import Image
 
-from sagesplat.core.errors import LabelError
+from sagesplat.core.errors import LabelError, SceneError
+from sagesplat.scene.detect import VALID_FOLDER as FOLDER
+from sagesplat.scene.images import read_black
 from sagesplat.scene.scene import Lens, Scene
 from sagesplat.segment.masks import Masks, Taxonomy, mask_path, write_mask
-from sagesplat.segment.valid import ALL_VALID, FOLDER, ValidPixels, ignores_alpha, read_black, write_valid
+from sagesplat.segment.valid import ALL_VALID, ValidPixels, ignores_alpha, write_valid
 
 PERSON, TREE = 1, 184
 TAXONOMY = Taxonomy({PERSON: "person", TREE: "tree-merged"})
@@ -64,7 +66,7 @@ def test_a_view_without_a_pixel_and_a_scene_without_one(tmp_path, scene):
     assert ValidPixels(tmp_path / "valid").rows(one, range(4)) == [1, 2, 3]
     with pytest.raises(LabelError, match="no pixel of any training photo counts"):
         write_valid(scene, tmp_path / "valid", label_ids=masks, ignore=[PERSON, TREE])
-    with pytest.raises(LabelError, match="ignore_dilation -1"):
+    with pytest.raises(LabelError, match=r"--labels\.ignore-dilation -1"):
         write_valid(scene, tmp_path / "valid", dilation=-1)
 
 
@@ -110,7 +112,7 @@ def test_masks_that_cannot_be_used(tmp_path, scene):
     with pytest.raises(LabelError, match=r"no mask of any photo; name them like the photos \(00.png"):
         write_valid(scene, tmp_path / "valid")
     path.write_bytes(b"GIF89a")
-    with pytest.raises(LabelError, match="not a readable PNG"):
+    with pytest.raises(SceneError, match="not a readable PNG"):
         write_valid(scene, tmp_path / "valid")
     Image.new("1", (4, 4)).save(tmp_path / "00.png")
     with pytest.raises(LabelError, match="4 x 4 pixels where the scene has 48 x 32; make the masks again"):

@@ -132,7 +132,7 @@ def test_photos_without_poses_become_a_capture(
     """What structure from motion itself does is tested with `scene.photos`."""
     asked = []
 
-    def reconstruct(source, workspace, config, on_progress):
+    def reconstruct(source, workspace, config, on_progress, **_):
         asked.append((source, config))
         shutil.copytree(capture, workspace)
         (workspace / "poses.json").write_text("{}")

@@ -69,9 +69,24 @@ def test_what_no_view_shows_has_few_views(truth: Gaussians, scene: Scene) -> Non
     assert floaters.weight[N:].max() == 0 < floaters.weight[:N].max()
 
 
+def test_mist_beside_the_cameras_is_hardly_shown(truth: Gaussians, scene: Scene) -> None:
+    """Photos show the rim of it only; who turned around would stand before a wall."""
+    camera = scene.views[0].camera
+    right = 0.5 * (camera.width - camera.K[0, 2]) / camera.K[0, 0] + 0.25  # 2.5 standard deviations outside
+    beside = camera.position + right * camera.w2c[0, :3] + 0.5 * camera.w2c[2, :3]
+    g = concat([truth, blobs(torch.from_numpy(beside)[None], size=0.1, logit=6.0)])
+    config = replace(CONFIG, min_views=0, content_depth=0, shown_share=0.1)  # photos are small
+    floaters = find_floaters(g, scene, [0], config)
+    found = rows_of(floaters, "hardly shown")
+    assert N in found
+    assert floaters.weight[N] > 0
+    assert np.median(floaters.weight[found]) < 0.3 * np.median(floaters.weight[:N])  # the others are hidden
+    assert not rows_of(find(g, scene, replace(config, shown_share=0)), "hardly shown")
+
+
 def test_blobs_before_the_cameras_are_in_front_and_little_else(truth: Gaussians, scene: Scene) -> None:
     g = concat([truth, blobs(before_cameras(8, 0.2), size=0.02)])
-    floaters = find(g, scene, replace(CONFIG, min_views=0))
+    floaters = find(g, scene, replace(CONFIG, min_views=0, shown_share=0))
     found = set(rows_of(floaters, "in front"))
     assert found >= set(range(N, N + 8))
     assert len(found) <= 8 + 2
@@ -142,7 +157,8 @@ def test_without_photos_what_is_seen_of_the_splat_itself_stays(truth: Gaussians,
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("content_depth", 1.5), ("min_views", -1), ("max_loss", float("nan"))]
+    ("name", "value"),
+    [("shown_share", 1.5), ("content_depth", 1.5), ("min_views", -1), ("max_loss", float("nan"))],
 )
 def test_impossible_thresholds_are_refused(truth: Gaussians, scene: Scene, name: str, value: float) -> None:
     with pytest.raises(RunError, match=rf"--clean\.{name.replace('_', '-')} .* is impossible; choose 0 to"):

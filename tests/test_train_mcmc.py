@@ -293,10 +293,11 @@ def test_opaque_ones_hardly_move():
     assert moved[0.5] == 0
 
 
+@pytest.mark.threads
 def test_noise_is_the_same_with_any_number_of_threads_and_for_a_seed():
     results = []
     for threads, seed in ((1, 5), (2, 5), (1, 6)):
-        set_threads(threads)
+        assert set_threads(threads) == threads
         state = state_of(random_gaussians(5000, logit=-3), seed)
         for _ in range(2):
             mcmc.perturb(state, 0.3, all_of(state))

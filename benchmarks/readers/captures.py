@@ -18,7 +18,7 @@ from sagesplat.scene import _prepare, photos, video
 from sagesplat.scene.colmap import load_colmap
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage, write_model
 from sagesplat.scene.exif import exposure_of
-from sagesplat.scene.images import has_alpha, load_photo, photo_size
+from sagesplat.scene.images import has_alpha, load_alpha, load_photo, photo_size, read_black
 from sagesplat.scene.nerfstudio import load_transforms
 from sagesplat.scene.points import read_points
 from sagesplat.scene.scene import Camera, View
@@ -107,6 +107,7 @@ def _read_photo(path: Path) -> None:
     has_alpha(path)
     exposure_of(path)
     load_photo(View("a", CAMERA, path))
+    load_alpha(path)
 
 
 def _prepare_photo(path: Path) -> None:
@@ -130,6 +131,11 @@ def _masks(folder: Path, size: int) -> list[bytes]:
 
 def _write_mask(ids: np.ndarray, taxonomy: Taxonomy, path: Path) -> None:
     write_mask(path, ids, taxonomy)
+
+
+def _valid(folder: Path, size: int) -> list[bytes]:
+    """Masks of pixels that count, of all modes of PNG that have other rows in memory."""
+    return [_picture(mode, size, format="PNG") for mode in ("1", "L", "LA", "RGB", "RGBA", "I;16", "P")]
 
 
 def _import(folder: Path, content: bytes) -> None:
@@ -233,6 +239,7 @@ READERS = (
         file("m.png", lambda path: read_mask(path, Taxonomy({1: "sky", 2: "tree"}))),
     ),
     Reader("label-image", ".png", _masks, _import),
+    Reader("valid", ".png", _valid, file("v.png", lambda path: read_black(path, 192)), 100, 16 * MIB),
     Reader("labels", ".json", _labels, file("labels.json", Taxonomy.read), 1000),
     Reader("panoptic", ".json", _panoptic, file("p.json", _read_panoptic), 1000),
     Reader("video", ".mp4", _videos, file("v.mp4", _read_video), 60, 16 * MIB),

@@ -14,7 +14,6 @@ from benchmarks.readers.splats import CHUNK
 from sagesplat.adapt import eq3, fidelity, plan, viewpoint, viewpoints
 from sagesplat.adapt.evaluate import Evaluation, read_evaluation
 from sagesplat.adapt.observe import Observations, read_observations
-from sagesplat.core.config import TrainConfig
 from sagesplat.core.events import Event
 from sagesplat.io import lock
 from sagesplat.io.columns import write_columns
@@ -38,13 +37,14 @@ from sagesplat.stages.boundaries import _seconds
 from sagesplat.stages.clean import read_clean_figures
 from sagesplat.stages.refine import read_pose_figures
 from sagesplat.stages.refine_exposure import read_exposure_figures
-from sagesplat.stages.train import _fit_memory, read_frozen
+from sagesplat.stages.train import read_cap, read_frozen
 from sagesplat.studies.compare.report import OfLabel, Point, Walk, read_comparison, write_comparison
 from sagesplat.studies.measure.levels import levels_of
 from sagesplat.studies.paper.cross_view import CrossView, read_cross_view
 from sagesplat.studies.paper.same_size import SameSize, read_same_size
 from sagesplat.studies.sweep.file import read_sweep
 from sagesplat.train.clean import CRITERIA
+from sagesplat.train.sky import Shell, Sky, read_sky, write_sky
 from sagesplat.viewer.bundle import is_bundle
 
 CURVE = {
@@ -85,6 +85,12 @@ def _refined(folder: Path, size: int) -> list[bytes]:
 
 def _read_refined(path: Path) -> None:
     read_refined(path, int(path.with_name("views").read_text()))
+
+
+def _sky(folder: Path, size: int) -> list[bytes]:
+    xyz = np.tile(np.array([[20, 0, 1], [0, 20, 1]], np.float32), (20 * size, 1))
+    sky = Sky(Shell(np.array([0, 0, 1], np.float32), 20.0, 2.0, (3, 9)), xyz, np.ones(xyz.shape, np.uint8))
+    return [written(folder / "s.npz", lambda path: write_sky(path, sky))]
 
 
 def _figures(folder: Path, size: int) -> list[bytes]:
@@ -294,7 +300,7 @@ def _caps(folder: Path, size: int) -> list[bytes]:
 def _read_cap(path: Path) -> None:
     run = RunDir(path.parent)
     recorded_settings(run)
-    _fit_memory(Job(run, _ignore, "cpu"), run, TrainConfig(max_steps=9), True)
+    read_cap(path)
 
 
 def _options(folder: Path, size: int) -> list[bytes]:
@@ -375,6 +381,7 @@ READERS = (
     Reader("camera-files", ".json", _camera_files, file("c.json", read_camera_file), 100),
     Reader("cameras", ".json", _cameras, file("path.json", _read_cameras), 100),
     Reader("refined", ".npz", _refined, file("cameras.npz", _read_refined), 1000),
+    Reader("sky", ".npz", _sky, file("sky.npz", read_sky), 1000),
     Reader("refined-figures", ".json", _figures, file("refined.json", _read_figures), 3000),
     Reader("floaters", ".json", _floaters, file("floaters.json", read_clean_figures), 3000),
     Reader("sampled", ".npz", _sampled, file("fidelity.npz", fidelity.read_sampled), 1000),

@@ -166,7 +166,7 @@ def masks(
 
     with open_job(run, machine) as job:
         check_not_adopted(job.run)
-        open_scene(job, scene, scene_config, poses)
+        open_scene(job, scene, scene_config, poses, masks, labels)
         make_masks(job, masks, labels)
 
 

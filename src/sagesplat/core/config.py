@@ -123,6 +123,9 @@ class TrainConfig:
     exposure: Literal["auto", "off", "affine"] = "auto"
     """Exposure and white balance of the photos. affine: learn a colour transform per photo; off: none; auto:
     affine where the photos differ."""
+    sky: Literal["auto", "off"] = "auto"
+    """Sky on a far sphere. auto: Gaussians begin there where photos show a category of that name, and stay on
+    it; off: the sky is trained like everything else."""
     means_lr: float = 1.6e-4
     """Learning rate of the means, times the scene extent; decays exponentially to 1 %."""
     quats_lr: float = 1e-3
@@ -166,6 +169,9 @@ class TrainConfig:
     poses: bool = False
     """Refine the camera poses of the training views with the Gaussians. Those of held-out views are fitted to
     their photos afterwards."""
+    outliers: bool = False
+    """Leave out what single photos show and the model does not, such as people that no mask names: found by
+    the residual, from 30 % of the steps on."""
     mcmc_noise: float = 5e5
     """SGLD noise of 3DGS-MCMC, times the learning rate of the means."""
     mcmc_opacity: float = 0.01
@@ -191,6 +197,9 @@ class CleanConfig:
     """Few views: remove Gaussians that fewer training views support; 0: do not look for them."""
     min_weight: float = 0.1
     """A view supports a Gaussian if its blending weight there, summed over the pixels, is at least this."""
+    shown_share: float = 0.003
+    """Hardly shown: remove Gaussians whose weight in all training views together is below this fraction of
+    what they would have in the nearest camera, if it looked at them; 0: do not look for them."""
     content_depth: float = 0.8
     """In front: remove Gaussians that are nearer than this fraction of the depth of the content around them,
     in most of the views that support them; 0: do not look for them."""

@@ -25,6 +25,7 @@ from sagesplat.segment.lift import LiftedLabels
 from sagesplat.segment.masks import Masks, Taxonomy
 from sagesplat.segment.valid import ValidPixels
 from sagesplat.train import memory
+from sagesplat.train.sky import Sky, read_sky
 
 _PIECES = 2  # of work for each task that can run: the slower ones then have less to wait for
 _LOCK_WAIT = 60.0  # seconds that a task waits for one which a killed run left behind
@@ -143,6 +144,11 @@ class Job:
         return ValidPixels(self.run.valid)
 
     @property
+    def inliers(self) -> ValidPixels:
+        """The pixels that Gaussians are fitted to after training: those that count, without outliers."""
+        return ValidPixels(self.run.inliers) if self.run.inliers.exists() else self.valid
+
+    @property
     def whole_masks(self) -> Masks:
         """The label images that all views agreed on, if they were asked to."""
         fused = self.run.fused
@@ -154,6 +160,11 @@ class Job:
         return (
             Masks(self.run.block_categories, self.taxonomy) if self.has_block_categories else self.whole_masks
         )
+
+    @property
+    def sky(self) -> Sky | None:
+        """The sky that the run was trained with."""
+        return read_sky(self.run.sky) if self.run.sky.exists() else None
 
     @property
     def point_labels(self) -> np.ndarray:

@@ -88,6 +88,11 @@ class RunDir:
         return self.path / "refined.json"
 
     @property
+    def sky(self) -> Path:
+        """The sphere of the sky and the points on it, where photos show sky."""
+        return self.path / "sky.npz"
+
+    @property
     def scene_files(self) -> list[Path]:
         """What decides the scene that everything after training uses."""
         return [self.scene, *([self.cameras] if self.cameras.exists() else [])]
@@ -101,6 +106,11 @@ class RunDir:
     def valid(self) -> Path:
         """Which pixels count, by view: images of the views with some that do not."""
         return self.path / "valid"
+
+    @property
+    def inliers(self) -> Path:
+        """The same without the outliers of training photos, where training looked for them."""
+        return self.path / "inliers"
 
     @property
     def capture(self) -> Path:

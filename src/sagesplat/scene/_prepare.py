@@ -13,7 +13,7 @@ from PIL import Image, ImageOps
 from sagesplat.core.names import cleaned, clipped, collision_key
 from sagesplat.io.files import atomic_path, link
 from sagesplat.io.pictures import PictureError, open_picture
-from sagesplat.scene.detect import PHOTOS
+from sagesplat.scene.detect import PHOTOS, VALID_FOLDER
 from sagesplat.scene.images import as_rgb
 
 _LONGEST, _ROOM = 250, 30  # bytes of a name, and what is left of them for suffixes
@@ -31,6 +31,12 @@ class PreparedPhoto:
     camera: tuple[Any, ...]  # size, maker, model, focal lengths; photos with equal values share a camera
     state: tuple[int, int]  # size in bytes and modification time (ns) of the source
     orientation: int  # of the source's pixels, by EXIF: 1 ... 8
+    path: str  # below the source, as the file is named
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the upright photo."""
+        return self.camera[0], self.camera[1]
 
 
 def prepare_photos(
@@ -49,7 +55,8 @@ def prepare_photos(
     taken: set[str] = set()
     for i, path in enumerate(paths):
         on_photo(i, len(paths))
-        name = _clean(path.relative_to(source).as_posix())
+        below = path.relative_to(source).as_posix()
+        name = _clean(below)
         key = hashlib.sha256(os.fsencode(path.relative_to(source))).hexdigest()[:16]
         try:
             prepared, camera, state, turned = _prepare_photo(path, target, key)
@@ -57,7 +64,7 @@ def prepare_photos(
             unreadable[name] = f"unreadable: {error.reason}; {error.cure or 'replace or remove it'}"
         else:
             final = _free(name, prepared.suffix, taken)
-            photos.append(PreparedPhoto(name, prepared.name, final, camera, state, turned))
+            photos.append(PreparedPhoto(name, prepared.name, final, camera, state, turned, below))
     on_photo(len(paths), len(paths))
     for old in {p.name for p in target.iterdir()} - {photo.prepared for photo in photos}:
         (target / old).unlink()
@@ -65,12 +72,13 @@ def prepare_photos(
 
 
 def _list(source: Path, skipped: Path) -> list[Path]:
-    """Photos below a folder, without hidden ones, sorted by name with numbers by value."""
-    skipped = skipped.resolve()
+    """Photos below a folder, without hidden ones and masks, sorted by name with numbers by value."""
+    skipped, masks = skipped.resolve(), source / VALID_FOLDER
     outside = not source.resolve().is_relative_to(skipped)
     photos = []
     for path in source.rglob("*"):
         hidden = any(part.startswith(".") for part in path.relative_to(source).parts)
+        hidden |= path.is_relative_to(masks)
         if path.suffix.lower() not in PHOTOS or hidden or not path.is_file():
             continue
         if not (outside and path.resolve().is_relative_to(skipped)):

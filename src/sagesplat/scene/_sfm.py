@@ -76,6 +76,8 @@ class Stages:
         self.device = pycolmap.Device(request["device"])
         self.threads: int = request["threads"]
         self.reader = pycolmap.ImageReaderOptions(camera_model=request["model"])
+        if request.get("masks"):
+            self.reader.mask_path = folder / "masks"
 
     def features(self, on_progress: OnProgress) -> None:
         """Add photos and cameras to the database; extract SIFT features of photos without any."""

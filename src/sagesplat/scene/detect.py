@@ -10,6 +10,7 @@ from sagesplat.scene import stored
 Kind = Literal["colmap", "transforms", "blender", "stored", "photos", "video"]
 # Their content decides how they are read (`io.pictures`).
 PHOTOS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".avif", ".heic", ".heif"})
+VALID_FOLDER = "masks_valid"  # beside photos: masks named like them, black where pixels do not count
 VIDEOS = frozenset(
     {".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".mts", ".m2ts", ".mpg", ".mpeg", ".3gp"}
 )

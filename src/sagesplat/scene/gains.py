@@ -13,6 +13,7 @@ from jaxtyping import Float, Float32, Float64, Int64
 from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import cg
 
+from sagesplat.core.sh import bases
 from sagesplat.scene.exif import exposure_of
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
@@ -22,6 +23,8 @@ _DARK, _BRIGHT = 10.0, 245.0  # of 255; values beyond tell nothing of a gain
 _ROUNDS = 10  # of iteratively reweighted least squares
 _PRIOR = 0.3  # observations that say of every photo that it has no gain
 _ENOUGH, _PLENTY = 30, 400  # observations of a photo, on average: at least, and no more than are used
+_RIDGE = 0.01  # of the harmonics fitted to log gains
+_BY_DIRECTION = 0.5  # share of the variance of exposures: with more the direction tells most of it
 _EXPLAINED = 0.08  # least share by which gains have to bring colours of the same point together
 _LEAST_EV = 0.1  # range of exposures that is worth a transform
 _LEAST_EXIF_EV = 0.3  # the same where nothing but EXIF tells it
@@ -39,9 +42,10 @@ class Gains:
 
     gain: Float32[np.ndarray, "V 3"]  # of stored value + 0.055 in [0, 1]; mean 1 over the photos
     source: Literal["tracks", "EXIF", "nothing"]
-    explained: float = (
-        0.0  # share by which the spread of a point's colours falls, cross-validated; of tracks only
-    )
+    # of tracks only, cross-validated: the share by which the spread of a point's colours falls,
+    # and the share of the variance of exposures that the viewing direction tells
+    explained: float = 0.0
+    by_direction: float = 0.0
 
     @property
     def ev(self) -> Float32[np.ndarray, " V"]:
@@ -59,6 +63,20 @@ class Gains:
         """Whether the photos differ by more than noise and what depends on the viewing direction."""
         if self.source == "EXIF":
             return self.range_ev > _LEAST_EXIF_EV
+        return self.vary and self.by_direction <= _BY_DIRECTION
+
+    @property
+    def follow_direction(self) -> bool:
+        """Whether the photos differ, but the viewing direction tells most of it.
+
+        Photos towards the sun are darker, all of them. The harmonics of the model explain that, for photos
+        that nobody has seen too; transforms would only take it from the model.
+        """
+        return self.vary and self.by_direction > _BY_DIRECTION
+
+    @property
+    def vary(self) -> bool:
+        """Whether tracks tell that the photos differ, whatever by."""
         return self.explained > _EXPLAINED and self.range_ev > _LEAST_EV
 
     def transforms(self) -> Float32[np.ndarray, "V 3 4"]:
@@ -75,7 +93,9 @@ def photo_gains(scene: Scene, photos: Photos | Sequence[np.ndarray], rows: Seque
     if len(points) >= _ENOUGH * len(rows):
         logs = np.log(colours + _OFFSET)
         explained = _explained(points, views, logs, len(rows))
-        return Gains(_relative(_fit(points, views, logs, len(rows))), "tracks", explained)
+        gains = _fit(points, views, logs, len(rows))
+        forward = np.stack([scene.views[row].camera.w2c[2, :3] for row in rows]).astype(np.float64)
+        return Gains(_relative(gains), "tracks", explained, _by_direction(gains.mean(1), forward))
     ev = [exposure_of(scene.views[row].image_path) for row in rows]
     if ev and all(value is not None for value in ev):
         found = np.array(ev, np.float64)[:, None].repeat(3, 1) * np.log(2) / _CURVE
@@ -106,6 +126,15 @@ def _explained(
         before += _spread(points[b], logs[b])
         after += _spread(points[b], logs[b] - gains[views[b]])
     return 1 - after / max(before, 1e-12)
+
+
+def _by_direction(gains: Float64[np.ndarray, " V"], forward: Float64[np.ndarray, "V 3"]) -> float:
+    """Share of the variance of log gains that harmonics of the direction tell, fitted to the other photos."""
+    basis = np.stack(np.broadcast_arrays(*bases(*forward.T)), 1)
+    fit = basis @ np.linalg.solve(basis.T @ basis + _RIDGE * np.eye(basis.shape[1]), basis.T)
+    own = fit.diagonal()
+    missed = (gains - fit @ gains) / np.maximum(1 - own, 1e-3)  # each by a fit that leaves it out
+    return float(1 - missed.var() / max(gains.var(), 1e-12))
 
 
 def _relative(logs: Float64[np.ndarray, "V 3"]) -> Float32[np.ndarray, "V 3"]:

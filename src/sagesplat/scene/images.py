@@ -4,11 +4,11 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 from PIL import Image
 
 from sagesplat.core.errors import SceneError
-from sagesplat.io.pictures import PictureError, open_picture
+from sagesplat.io.pictures import FREE_PIXELS, PictureError, open_picture
 from sagesplat.scene.scene import View
 from sagesplat.scene.undistort import undistort
 
@@ -56,6 +56,18 @@ def _clear_border(alpha: UInt8[np.ndarray, "h w"]) -> float:
     """Share of an image's border whose pixels are more transparent than opaque."""
     border = np.concatenate([alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]])
     return float((border < 128).mean())
+
+
+def read_black(path: Path, pixels: int) -> Bool[np.ndarray, "h w"]:
+    """Where a PNG of any mode is not black; `pixels`: of its photo. SceneError for what is no image."""
+    try:
+        with open_picture(path, ("PNG",), free=max(FREE_PIXELS, 4 * pixels)) as image:
+            coloured = image.convert("RGB") if image.mode in ("P", "PA", "RGBA") else image
+            values = np.asarray(coloured.getchannel(0) if coloured.mode == "LA" else coloured)
+    except PictureError as error:
+        cure = error.cure or "export it again"
+        raise SceneError(f"{path}: not a readable PNG ({error.reason}); {cure}") from None
+    return np.array(values.any(2) if values.ndim == 3 else values, bool)
 
 
 def load_photo(view: View) -> UInt8[np.ndarray, "H W 3"]:

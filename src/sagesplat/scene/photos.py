@@ -19,6 +19,7 @@ from sagesplat.core.typed import check_fields, types_of
 from sagesplat.io.files import read_object, write_json
 from sagesplat.scene._prepare import PreparedPhoto, prepare_photos
 from sagesplat.scene.detect import PHOTOS
+from sagesplat.scene.feature_masks import OfPhoto, write_feature_masks
 from sagesplat.scene.raw_photos import REPORT, describe_raw
 from sagesplat.scene.video import extract_frames
 
@@ -49,6 +50,9 @@ def reconstruct(
     workspace: Path,
     config: PosesConfig = PosesConfig(),
     on_progress: OnProgress = lambda stage, done, total: None,
+    *,
+    alpha: str = "auto",
+    ignored: OfPhoto = lambda name: None,
 ) -> Reconstruction:
     """Estimate the poses of a folder of photos or of a video; make `workspace` a capture for `load_scene`.
 
@@ -56,6 +60,10 @@ def reconstruct(
     poses.json. Intermediate results are kept in sfm/: a killed run resumes, unless photos or settings
     changed. The stages of `on_progress` are prepare, features, matches, mapping and undistortion. Raises
     SceneError, and BackendUnavailable without pycolmap.
+
+    There are no features in pixels that do not count: black in `masks_valid/` below the source, transparent
+    (`alpha`, see `SceneConfig`), or `ignored` (the pixels of a photo that label images do not ignore, by the
+    photo's name in images/).
     """
     _check(source, workspace, config)
     work, started = workspace / "sfm", time.perf_counter()
@@ -70,7 +78,8 @@ def reconstruct(
     photos, unreadable = prepare_photos(folder, work / "photos", workspace, on_prepared)
     if len(photos) < MIN_PHOTOS:
         raise SceneError(_too_few(source, photos, unreadable))
-    request = _request(source, photos, config)
+    masks = write_feature_masks(photos, folder, work / "masks", workspace, alpha, ignored)
+    request = _request(source, photos, config) | ({"masks": masks} if masks else {})
     finished = _resume(workspace, request)
     if finished and not (unreadable.keys() - finished.unregistered.keys()):
         return finished

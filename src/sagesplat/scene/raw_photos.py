@@ -34,6 +34,13 @@ class RawPhoto:
         return self.orientation in _SIDEWAYS
 
 
+def oriented(image: Shaped[np.ndarray, "h w"], orientation: int) -> Shaped[np.ndarray, "H W"]:
+    """An image of stored pixels as EXIF says that it is to be looked at; `orientation` is 1 ... 8."""
+    if orientation >= 5:
+        return upright(image, orientation)
+    return {1: image, 2: image[:, ::-1], 3: image[::-1, ::-1], 4: image[::-1]}[orientation]
+
+
 def upright(image: Shaped[np.ndarray, "h w"], orientation: int) -> Shaped[np.ndarray, "H W"]:
     """An image of stored pixels as EXIF says that it is to be looked at; `orientation` is 5 ... 8."""
     return {5: image.T, 6: np.rot90(image, -1), 7: np.rot90(image, 2).T, 8: np.rot90(image)}[orientation]

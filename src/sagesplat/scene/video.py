@@ -3,7 +3,7 @@
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, UInt8
@@ -14,6 +14,7 @@ from sagesplat.io.files import atomic_path, read_json, write_json
 
 _GREY_WIDTH = 640  # px, of the copies that sharpness is measured on
 _THUMB_WIDTH = 64  # px, of the copies that are compared for motion
+_BLURRED = 0.75  # of the sharpness of both neighbours
 _SAME = 1.0  # mean absolute difference, grey levels, below which the camera has not moved
 _FRAME = re.compile(r"frame_[0-9]{1,20}\.jpg")
 MAX_PIXELS = 2**26  # of a frame; 8K video has half as many
@@ -35,9 +36,10 @@ def extract_frames(
 
     The video is divided into at most `max_frames` intervals of equal length, of at least three frames each if
     it is long enough. The sharpest frame of each is selected (largest variance of the Laplacian: Pech-Pacheco
-    et al. 2000), unless the camera has not moved since the previous one. Frames already extracted from the
-    same file are reused. `on_frame(done, total)` counts decoded frames. Raises SceneError for an unusable
-    file, and BackendUnavailable without PyAV.
+    et al. 2000, over the variance of the frame), unless the camera has not moved since the previous one, or
+    both neighbours are much sharper. Frames already extracted from the same file are reused.
+    `on_frame(done, total)` counts decoded frames. Raises SceneError for an unusable file, and
+    BackendUnavailable without PyAV.
     """
     try:
         from av.error import FFmpegError
@@ -55,7 +57,10 @@ def extract_frames(
     for old in folder.glob("frame_*.jpg"):
         old.unlink()
     try:
-        paths = [_write(frame, folder, i) for i, frame in _moving(_sharpest(path, max_frames, on_frame))]
+        paths = [
+            _write(frame, folder, i)
+            for i, frame in _moving(_unblurred(_sharpest(path, max_frames, on_frame)))
+        ]
     except (FFmpegError, ValueError, IndexError, MemoryError) as error:  # PyAV's own for a late stream
         reason = short(getattr(error, "strerror", None) or str(error) or "too little memory is free for it")
         raise SceneError(f"{path}: not readable as a video ({reason}); convert it to MP4") from None
@@ -81,32 +86,54 @@ def _finished(folder: Path, source: dict[str, int]) -> list[Path] | None:
     return paths if all(path.is_file() for path in paths) else None
 
 
-def _sharpest(
-    path: Path, max_frames: int, on_frame: Callable[[int, int], None] | None
-) -> Iterator[tuple[int, Any, UInt8[np.ndarray, "h w"]]]:
-    """Number, frame and grey copy of the sharpest frame in each interval."""
+class _Frame(NamedTuple):
+    number: int
+    frame: Any  # PyAV's
+    grey: UInt8[np.ndarray, "h w"]
+    score: float  # sharpness by contrast: of one camera and scene, whatever the exposure
+
+
+def _sharpest(path: Path, max_frames: int, on_frame: Callable[[int, int], None] | None) -> Iterator[_Frame]:
+    """The sharpest frame in each interval."""
     total = _count(path)
     windows = max(1, min(max_frames, max(total // 3, min(total, 60))))
-    best: tuple[int, Any, np.ndarray] | None = None
-    best_window, best_score = 0, -1.0
+    best: _Frame | None = None
+    best_window = 0
     for i, frame in enumerate(_decode(path)):
         window = min(i * windows // max(total, 1), windows - 1)
         if best is not None and window != best_window:
             yield best
-            best_score = -1.0
+            best = None
         grey = _grey(frame)
-        if (score := sharpness(grey)) > best_score:
-            best, best_window, best_score = (i, frame, grey), window, score
+        score = sharpness(grey) / (float(grey.var()) + 1)
+        if best is None or score > best.score:
+            best, best_window = _Frame(i, frame, grey, score), window
         if on_frame is not None:
             on_frame(min(i + 1, total), total)
     if best is not None:
         yield best
 
 
-def _moving(frames: Iterator[tuple[int, Any, UInt8[np.ndarray, "h w"]]]) -> Iterator[tuple[int, Any]]:
+def _unblurred(frames: Iterator[_Frame]) -> Iterator[_Frame]:
+    """Without frames that are much less sharp than both neighbours: intervals of a blurred frame alone.
+
+    Of two such in a row both stay, so that no gap is wider than an interval.
+    """
+    first, last = _Frame(-1, None, np.zeros((1, 1), np.uint8), np.inf), None
+    for after in frames:
+        if last is not None:
+            if last.score >= _BLURRED * min(first.score, after.score):
+                yield last
+            first = last
+        last = after
+    if last is not None and (first.number < 0 or last.score >= _BLURRED * first.score):
+        yield last
+
+
+def _moving(frames: Iterator[_Frame]) -> Iterator[tuple[int, Any]]:
     """Number and frame, without frames that look like the previous one kept."""
     last: np.ndarray | None = None
-    for i, frame, grey in frames:
+    for i, frame, grey, _ in frames:
         thumb = _thumb(grey)
         if last is None or thumb.shape != last.shape or np.abs(thumb - last).mean() >= _SAME:
             last = thumb

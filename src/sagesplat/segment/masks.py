@@ -99,9 +99,13 @@ class Masks:
 
 def mask_path(folder: Path, view: View) -> Path:
     """Where a normalised folder keeps the label image of a view."""
-    name = PurePosixPath(view.name)
+    return _png_path(folder, view.name)
+
+
+def _png_path(folder: Path, photo: str) -> Path:
+    name = PurePosixPath(photo)
     if name.is_absolute() or ".." in name.parts:
-        raise LabelError(f"{view.name}: a photo outside the image folder; move it there and rename it")
+        raise LabelError(f"{photo}: a photo outside the image folder; move it there and rename it")
     return folder / name.with_suffix(".png")
 
 
@@ -173,8 +177,8 @@ def import_masks(scene: Scene, source: Path, target: Path) -> list[str]:
         raise LabelError(f"{source}: these are the masks of the run itself; name the folder they came from")
     if not source.is_dir():
         raise LabelError(f"{source}: no such folder; name the one with the label images")
-    taxonomy, find = _id_source(source) if (source / "labels.json").exists() else _panoptic_source(source)
-    found = {view.name: find(view) for view in scene.views}
+    taxonomy, find = _source(source)
+    found = {view.name: find(view.name) for view in scene.views}
     missing = [name for name, file in found.items() if file is None]
     if len(missing) == len(scene.views):
         raise LabelError(
@@ -214,7 +218,27 @@ class _File:
         return _translate(_read_png(self.path, free, self.segments), self.ids, self.path, self.cure)
 
 
-_Find = Callable[[View], _File | None]
+_Find = Callable[[str], _File | None]  # by the name of a photo
+
+
+def label_images_of(folder: Path) -> tuple[Taxonomy, Callable[[str], Int16[np.ndarray, "h w"] | None]]:
+    """The categories of a folder as `import_masks` takes it, and what reads an image by its photo's name.
+
+    None for a photo without one. LabelError as of `import_masks`.
+    """
+    if not folder.is_dir():
+        raise LabelError(f"{folder}: no such folder; name the one with the label images")
+    taxonomy, find = _source(folder)
+
+    def read(name: str) -> Int16[np.ndarray, "h w"] | None:
+        file = find(name)
+        return None if file is None else file.read(4 * FREE_PIXELS)
+
+    return taxonomy, read
+
+
+def _source(folder: Path) -> tuple[Taxonomy, _Find]:
+    return _id_source(folder) if (folder / "labels.json").exists() else _panoptic_source(folder)
 
 
 def _id_source(folder: Path) -> tuple[Taxonomy, _Find]:
@@ -224,8 +248,8 @@ def _id_source(folder: Path) -> tuple[Taxonomy, _Find]:
     ids = dict.fromkeys(voids, UNLABELLED) | {i: i for i in taxonomy.names}
     cure = 'name them in labels.json (or say there which value is "unlabelled")'
 
-    def find(view: View) -> _File | None:
-        paths = (folder / f"{view.name}.png", mask_path(folder, view))
+    def find(name: str) -> _File | None:
+        paths = (folder / f"{name}.png", _png_path(folder, name))
         path = next((p for p in paths if p.exists()), None)
         return None if path is None else _File(path, ids, False, cure)
 
@@ -242,8 +266,8 @@ def _panoptic_source(folder: Path) -> tuple[Taxonomy, _Find]:
         )
     taxonomy = taxonomy_of(panoptic.names, folder)
 
-    def find(view: View) -> _File | None:
-        key = str(PurePosixPath(view.name).with_suffix(""))
+    def find(name: str) -> _File | None:
+        key = str(PurePosixPath(name).with_suffix(""))
         path = panoptic.pngs.get(key)
         if path is None or not path.exists():
             return None

@@ -15,14 +15,13 @@ from scipy.ndimage import minimum_filter
 
 from sagesplat.core.errors import LabelError
 from sagesplat.io.files import atomic_path
-from sagesplat.io.pictures import FREE_PIXELS, PictureError, open_picture
-from sagesplat.scene.images import cut_out, has_alpha, load_alpha
+from sagesplat.scene.detect import VALID_FOLDER
+from sagesplat.scene.images import cut_out, has_alpha, load_alpha, read_black
 from sagesplat.scene.raw_photos import RawPhoto, raw_photos
 from sagesplat.scene.scene import Scene, View
 from sagesplat.segment.fit import fit
 from sagesplat.segment.masks import Masks, mask_path
 
-FOLDER = "masks_valid"  # of a capture: masks named like the photos, black where pixels do not count
 Pixels = Bool[np.ndarray, "H W"]
 
 
@@ -73,18 +72,6 @@ def read_valid(path: Path, view: View) -> Pixels:
     return valid
 
 
-def read_black(path: Path, pixels: int) -> Pixels:
-    """Where an image of any PNG mode is not black; `pixels`: of its photo. LabelError for no image."""
-    try:
-        with open_picture(path, ("PNG",), free=max(FREE_PIXELS, 4 * pixels)) as image:
-            coloured = image.convert("RGB") if image.mode in ("P", "PA", "RGBA") else image
-            values = np.asarray(coloured.getchannel(0) if coloured.mode == "LA" else coloured)
-    except PictureError as error:
-        cure = error.cure or "export it again"
-        raise LabelError(f"{path}: not a readable PNG ({error.reason}); {cure}") from None
-    return np.array(values.any(2) if values.ndim == 3 else values, bool)
-
-
 def write_valid(
     scene: Scene,
     target: Path,
@@ -111,7 +98,7 @@ def write_valid(
         LabelError: For masks that cannot be used, or where no pixel of a training view is left.
     """
     if dilation < 0:
-        raise LabelError(f"ignore_dilation {dilation} is no number of pixels; give 0 or more")
+        raise LabelError(f"--labels.ignore-dilation {dilation} is no number of pixels; give 0 or more")
     shutil.rmtree(target, ignore_errors=True)
     given, transparent = _Given(scene), ignores_alpha(scene)
     shares = np.zeros(len(scene.views), np.float32)
@@ -125,8 +112,7 @@ def write_valid(
             if dilation:
                 valid = np.asarray(minimum_filter(valid, 2 * dilation + 1, mode="nearest"))
             shares[row] = 1 - valid.mean()
-            with atomic_path(mask_path(target, view), sync=False) as temporary:
-                Image.fromarray(valid).save(temporary, format="PNG")
+            write_view(target, view, valid)
         if on_view:
             on_view(row + 1, len(scene.views))
     if (shares[scene.train_ids] == 1).all():
@@ -137,14 +123,21 @@ def write_valid(
     return shares
 
 
+def write_view(folder: Path, view: View, valid: Pixels) -> None:
+    """Write which pixels of a view count, as `ValidPixels` reads it."""
+    with atomic_path(mask_path(folder, view), sync=False) as temporary:
+        Image.fromarray(valid).save(temporary, format="PNG")
+
+
 class _Given:
     """The masks that came with the photos: `masks_valid/`, and those that views name."""
 
     def __init__(self, scene: Scene):
-        folder = scene.path / FOLDER
+        folder = scene.path / VALID_FOLDER
         self.folder = folder if folder.is_dir() else None
         self.raw = raw_photos(scene.path) if self.folder else {}
-        if self.folder and not any(self._in_folder(view) for view in scene.views):
+        # structure from motion may have left out all photos with a mask, and wrote the folder itself
+        if self.folder and not self.raw and not any(self._in_folder(view) for view in scene.views):
             name = mask_path(self.folder, scene.views[0]).name
             raise LabelError(f"{self.folder}: no mask of any photo; name them like the photos ({name}, ...)")
 

@@ -67,6 +67,8 @@ def check(config: BlocksConfig, train: TrainConfig) -> None:
         raise RunError("--train.poses does not go with --blocks.count; leave out one of them")
     if config.count > 1 and train.exposure == "affine":
         raise RunError("--train.exposure affine does not go with --blocks.count; leave out one of them")
+    if config.count > 1 and train.outliers:  # a block does not explain all of a photo
+        raise RunError("--train.outliers does not go with --blocks.count; leave out one of them")
 
 
 def _division(config: BlocksConfig) -> dict[str, float]:
@@ -162,7 +164,8 @@ def _needed(block: Job, config: TrainConfig) -> int:
 def train_blocks(job: Job, config: BlocksConfig, train: TrainConfig, seed: int) -> None:
     """Split the scene, train its blocks as tasks, and merge their levels."""
     check(config, train)
-    train = replace(train, exposure="off")  # a photo of several blocks would get several
+    # a photo of several blocks would get several exposures, and every block a sky around the others
+    train = replace(train, exposure="off", sky="off")
     run = job.run
     settings = {**asdict(train), "batch": max(train.batch, job.processes), "seed": seed}
     settings["blocks"] = _division(config)

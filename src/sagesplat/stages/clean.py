@@ -14,7 +14,7 @@ from sagesplat.output.before_after import before_after
 from sagesplat.raster import device_of
 from sagesplat.run.job import Job
 from sagesplat.run.stage import run_stage
-from sagesplat.stages.shared import valid_inputs
+from sagesplat.stages.shared import inlier_inputs
 from sagesplat.train.clean import CRITERIA, Cleaned, check, clean, find_floaters
 
 
@@ -52,22 +52,22 @@ def clean_levels(job: Job, config: CleanConfig) -> None:
     figures = read_clean_figures(run.floaters)
     removed = figures is not None and any(figures.removed.values())
     outputs = [run.floaters, *([run.cleaned] if removed else [])]
-    run_stage(job, "clean", asdict(config), [*inputs, *valid_inputs(run)], outputs, make)
+    run_stage(job, "clean", asdict(config), [*inputs, *inlier_inputs(run)], outputs, make)
 
 
 def _clean(job: Job, last: Path, config: CleanConfig) -> Cleaned:
     """What to remove of a level, with a picture of it."""
     g, scene = read_level(last).to(device_of(job.backend)), job.scene
-    rows = job.valid.rows(scene, scene.train_ids)
+    rows = job.inliers.rows(scene, scene.train_ids)
     floaters = find_floaters(
         g, scene, rows, config,
-        label_image=job.masks.__getitem__, valid=job.valid, antialiased=job.antialiased,
+        label_image=job.masks.__getitem__, valid=job.inliers, antialiased=job.antialiased,
         on_view=lambda done: job.emit(Progress("clean", done, len(rows))),
     )  # fmt: skip
     kinds = {"train": rows, "calibration": scene.calibration_ids.tolist()}
     cleaned = clean(
         g, floaters, scene, job.photos, config,
-        kinds=kinds, valid=job.valid, antialiased=job.antialiased, backend=job.backend,
+        kinds=kinds, valid=job.inliers, antialiased=job.antialiased, backend=job.backend,
     )  # fmt: skip
     if not cleaned.keep.all():
         cameras = [view.camera for view in scene.views]

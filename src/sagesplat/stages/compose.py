@@ -20,7 +20,10 @@ def tune_composition(job: Job, g: Gaussians, steps: int) -> Gaussians:
         return g
     seed = settings_of(job.run, "train")["seed"]
     config = train_config(job)
-    return tune(g, job.scene, job.photos, config, steps, valid=job.valid, seed=seed, backend=job.backend)
+    return tune(
+        g, job.scene, job.photos, config, steps,
+        valid=job.inliers, seed=seed, backend=job.backend, shell=job.sky.shell if job.sky else None,
+    )  # fmt: skip
 
 
 def compose(job: Job, plan: Plan) -> Gaussians:

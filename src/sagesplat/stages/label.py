@@ -21,6 +21,7 @@ from sagesplat.run.records import file_hash
 from sagesplat.run.remote import work_all
 from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
+from sagesplat.scene.detect import VALID_FOLDER
 from sagesplat.segment.edit import (
     Edited,
     edit_labels,
@@ -34,7 +35,7 @@ from sagesplat.segment.masks import MAX_LABEL_ID, UNLABELLED, Masks, Taxonomy, i
 from sagesplat.segment.registry import SEGMENTERS, segmenter_for
 from sagesplat.segment.segmenters import segment_some
 from sagesplat.segment.soft import read_soft, soft_path
-from sagesplat.segment.valid import FOLDER, ValidPixels, write_valid
+from sagesplat.segment.valid import ValidPixels, write_valid
 from sagesplat.stages.memory import check_network
 from sagesplat.train.fuse import Soft, fuse
 
@@ -63,7 +64,7 @@ def make_masks(job: Job, config: MasksConfig, labels: LabelsConfig = LabelsConfi
         return [*_lines(edited), *_ignored_lines(ignored)]
 
     settings = asdict(labels)
-    if (given := job.scene.path / FOLDER).is_dir():
+    if (given := job.scene.path / VALID_FOLDER).is_dir():
         settings["valid"] = file_hash(given)
     inputs = [run.provenance("segment"), run.segmented / "labels.json"]
     inputs += {view.valid_path: None for view in job.scene.views if view.valid_path}

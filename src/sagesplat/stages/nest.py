@@ -15,7 +15,7 @@ from sagesplat.run.job import Job
 from sagesplat.run.records import checkpoint_key
 from sagesplat.run.stage import run_stage
 from sagesplat.stages.memory import check_nest
-from sagesplat.stages.shared import label_image_inputs, train_config, valid_inputs
+from sagesplat.stages.shared import inlier_inputs, label_image_inputs, sky_inputs, train_config
 from sagesplat.train import nested
 from sagesplat.train.checkpoint import can_resume, remove_checkpoints
 from sagesplat.train.early_stopping import VIEWS, spread
@@ -33,17 +33,20 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
         check_nest(job, _count(job), train_config(job).sh_degree)
         full = read_level(job.trained)
         base = read_level(run.base_model) if config.base_share else None
-        masks = job.best_masks
+        masks, sky = job.best_masks, job.sky
+        shell = sky.shell if sky else None
         ordered = nested.order(
-            full, job.scene, masks, config, base=base, valid=job.valid, antialiased=job.antialiased
-        )
+            full, job.scene, masks, config,
+            base=base, valid=job.inliers, antialiased=job.antialiased, shell=shell,
+        )  # fmt: skip
         key = checkpoint_key(run, settings, inputs)
         if job.force and not can_resume(run.nest_checkpoint, key):
             remove_checkpoints(run.nest_checkpoint)
         trained = ordered
         for event in nested.nest(
             ordered, job.scene, job.photos, train_config(job), config,
-            valid=job.valid, seed=seed, backend=job.backend, checkpoint=run.nest_checkpoint, settings=key,
+            valid=job.inliers, seed=seed, backend=job.backend, checkpoint=run.nest_checkpoint, settings=key,
+            shell=shell,
         ):  # fmt: skip
             if isinstance(event, NestStep):
                 job.emit(Progress("nest", event.step, config.steps, f"loss {event.loss:.3f}"))
@@ -59,8 +62,9 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
         remove_checkpoints(run.nest_checkpoint)
         return lines
 
-    inputs = [*run.scene_files, run.labels, run.levels, run.provenance("train"), *label_image_inputs(run)]
-    inputs += [run.cleaned] if run.cleaned.exists() else []
+    made = [run.provenance("train"), *label_image_inputs(run), *sky_inputs(run)]
+    made += [run.cleaned] if run.cleaned.exists() else []
+    inputs = [*run.scene_files, run.labels, run.levels, *made]
     if config.base_share:
         _make_base_model(job, config, seed)
         inputs.append(run.base_model)
@@ -73,7 +77,7 @@ def _make_base_model(job: Job, config: NestConfig, seed: int) -> None:
     cap = max(1, round(config.base_share * _count(job)))
     settings = {**asdict(nested.capped_config(made, cap, config.base_steps)), "seed": seed}
 
-    inputs = [*run.scene_files, run.labels, *valid_inputs(run)]
+    inputs = [*run.scene_files, run.labels, *inlier_inputs(run), *sky_inputs(run)]
 
     def make() -> list[str]:
         g = train_capped(job, "base", cap, config.base_steps, seed)
@@ -92,7 +96,7 @@ def train_capped(job: Job, stage: str, cap: int, steps: int, seed: int) -> Gauss
     """3DGS-MCMC of at most `cap` Gaussians, otherwise trained as the run; progress goes to `stage`."""
     for event in nested.train_capped(
         job.scene, job.photos, job.initial_labels, train_config(job), cap, steps,
-        valid=job.valid, seed=seed, backend=job.backend,
+        valid=job.inliers, seed=seed, backend=job.backend, sky=job.sky,
     ):  # fmt: skip
         if isinstance(event, Step):
             text = f"loss {event.loss:.3f}, {event.num_gaussians:,} Gaussians"

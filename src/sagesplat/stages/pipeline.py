@@ -76,7 +76,7 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
     check_clean(config.clean)
     blocks.check(config.blocks, config.train)
     check_segmenter(job, scene, config.masks)
-    open_scene(job, scene, config.scene, config.poses)
+    open_scene(job, scene, config.scene, config.poses, config.masks, config.labels)
     if config.blocks.count == 1:
         check_training(job, config.train)
     make_masks(job, config.masks, config.labels)

@@ -1,10 +1,13 @@
 """Makes scene.json from a capture, and a capture from photos or a video without poses."""
 
 import hashlib
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
-from sagesplat.core.config import PosesConfig, SceneConfig
+import numpy as np
+
+from sagesplat.core.config import LabelsConfig, MasksConfig, PosesConfig, SceneConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Progress, Warned
 from sagesplat.core.names import repaired
@@ -18,13 +21,16 @@ from sagesplat.run.capture import (
     read_capture,
 )
 from sagesplat.run.job import Job
-from sagesplat.run.records import settings_of
+from sagesplat.run.records import file_hash, settings_of
 from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
 from sagesplat.scene import load_scene
 from sagesplat.scene.detect import detect
+from sagesplat.scene.feature_masks import OfPhoto
 from sagesplat.scene.scene import Scene
 from sagesplat.scene.stored import write_scene
+from sagesplat.segment.edit import ignored_ids, parse_ignore, parse_merge
+from sagesplat.segment.masks import label_images_of
 
 
 def check_folder(run: RunDir) -> None:
@@ -45,13 +51,24 @@ def check_not_adopted(run: RunDir) -> None:
         )
 
 
-def open_scene(job: Job, path: Path, config: SceneConfig, poses: PosesConfig | None = None) -> None:
-    """Read a capture and write scene.json. For photos without poses, or a video, estimate the poses first."""
+def open_scene(
+    job: Job,
+    path: Path,
+    config: SceneConfig,
+    poses: PosesConfig | None = None,
+    masks: MasksConfig | None = None,
+    labels: LabelsConfig | None = None,
+) -> None:
+    """Read a capture and write scene.json. For photos without poses, or a video, estimate the poses first.
+
+    Then no features come from what the photos' alpha, masks and given label images leave out.
+    """
     run = job.run
     check_folder(run)
     if detect(path) in ("photos", "video"):
         capture = run.capture / repaired(path.resolve().stem)  # the scene will have that name
-        _find_poses(job, path, capture, poses or PosesConfig())
+        leaving_out = _LeavingOut(config, masks or MasksConfig(), labels or LabelsConfig())
+        _find_poses(job, path, capture, poses or PosesConfig(), leaving_out)
         path = capture
     scene = load_scene(path, **asdict(config))
     photos = photo_hashes(run.photo_hashes, scene)
@@ -120,19 +137,58 @@ def _poses_progress(stage: str, done: float) -> Progress:
     return Progress("poses", round(100 * (_POSES.index(stage) + done)), 100 * len(_POSES), stage)
 
 
-def _find_poses(job: Job, source: Path, capture: Path, config: PosesConfig) -> None:
+@dataclass(frozen=True)
+class _LeavingOut:
+    """What structure from motion takes no features from."""
+
+    scene: SceneConfig
+    masks: MasksConfig
+    labels: LabelsConfig
+
+    @property
+    def folder(self) -> Path | None:
+        """Label images whose ignored categories are known before there are poses."""
+        given = self.labels.ignore and self.masks.segmenter in ("auto", "masks")
+        return self.masks.masks if given else None
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What the result depends on, where there is something."""
+        made: dict[str, Any] = {} if self.scene.alpha == "auto" else {"alpha": self.scene.alpha}
+        if self.folder is not None and self.folder.is_dir():
+            made |= {"ignore": self.labels.ignore, "merge": self.labels.merge}
+            made["label_images"] = file_hash(self.folder)
+        return made
+
+    def of_photos(self) -> OfPhoto:
+        """The pixels of a photo, by its name, that label images do not ignore."""
+        if self.folder is None:
+            return lambda name: None
+        taxonomy, read = label_images_of(self.folder)
+        names, merge = parse_ignore(self.labels.ignore), parse_merge(self.labels.merge)
+        ids = np.array(ignored_ids(taxonomy, names, merge)[0], np.int16)
+
+        def of_photo(name: str) -> np.ndarray | None:
+            label_ids = read(name)
+            return None if label_ids is None else ~np.isin(label_ids, ids)
+
+        return of_photo
+
+
+def _find_poses(job: Job, source: Path, capture: Path, config: PosesConfig, leaving_out: _LeavingOut) -> None:
     """Make a capture from photos or a video by structure from motion."""
     from sagesplat.scene.photos import reconstruct
 
     if job.run.path.resolve().is_relative_to(source.resolve()):
         raise RunError(f"{job.run.path}: lies among the photos; name a run folder outside of {source}")
     digest, hashes = _hashes(job, source)
-    settings = {"source": str(source.resolve()), **asdict(config), "files": digest}
+    settings = {"source": str(source.resolve()), **asdict(config), "files": digest, **leaving_out.settings}
 
     def make() -> list[str]:
         result = reconstruct(
             source, capture, config,
             lambda stage, done, total: job.emit(_poses_progress(stage, done / max(total, 1))),
+            alpha=leaving_out.scene.alpha, ignored=leaving_out.of_photos(),
         )  # fmt: skip
         for name, reason in list(result.unregistered.items())[:5]:
             job.emit(Warned(f"{name}: {reason}"))

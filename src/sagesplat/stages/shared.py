@@ -41,6 +41,16 @@ def valid_inputs(run: RunDir) -> list[Path]:
     return [run.valid] if run.valid.exists() else []
 
 
+def inlier_inputs(run: RunDir) -> list[Path]:
+    """The images of the pixels that Gaussians are fitted to after training, where some are not."""
+    return [run.inliers] if run.inliers.exists() else valid_inputs(run)
+
+
+def sky_inputs(run: RunDir) -> list[Path]:
+    """The sky that training began with, where photos show some."""
+    return [run.sky] if run.sky.exists() else []
+
+
 def label_images(job: Job, source: str) -> LabelImages:
     """The label images that came with the photos ("given"), or those of the 3D labels ("rendered")."""
     if source == "given":

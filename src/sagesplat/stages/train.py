@@ -7,6 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sagesplat.core.config import TrainConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Training, Warned
@@ -16,14 +18,17 @@ from sagesplat.run.job import Job
 from sagesplat.run.records import checkpoint_key
 from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
+from sagesplat.scene.scene import Scene
 from sagesplat.segment.display_names import titles
 from sagesplat.segment.masks import MAX_LABEL_ID
+from sagesplat.stages.outliers import write_inliers
 from sagesplat.stages.refine import write_cameras
 from sagesplat.stages.shared import valid_inputs
 from sagesplat.train import memory
 from sagesplat.train.checkpoint import can_resume, remove_checkpoints
 from sagesplat.train.events import Found, LabelFrozen, LevelSaved, Resumed, Step, Trained
 from sagesplat.train.parallel import train_together
+from sagesplat.train.sky import Sky, find_sky, sky_labels, write_sky
 from sagesplat.train.trainer import train
 
 
@@ -33,25 +38,32 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
     # the photos of a step decide the result, not the processes that compute it
     settings = {**asdict(config), "batch": max(config.batch, job.processes), "seed": seed}
     inputs = train_inputs(run, config)
+    if config.sky == "auto" and sky_labels(job.masks.taxonomy) and run.provenance("masks") not in inputs:
+        inputs.append(run.provenance("masks"))
 
     def make() -> list[str]:
         key = checkpoint_key(run, settings, inputs)
         place = _place(job, key)
         resuming = place.checkpoint.exists() and (not job.force or can_resume(place.checkpoint, key))
-        fitted, cap = _fit_memory(job, place, config, resuming)  # before anything is given up
+        sky, scene, label_ids = _with_sky(job, config)
+        fitted, cap = _fit_memory(job, scene, place, config, resuming)  # before anything is given up
         if not resuming:
             remove_checkpoints(place.checkpoint)
             shutil.rmtree(place.levels, ignore_errors=True)
             _forget_cleaning(place)
         place.path.mkdir(exist_ok=True)
         write_cap(place.cap, cap, settings)
+        place.sky.unlink(missing_ok=True)
+        if sky:
+            write_sky(place.sky, sky)
         counts: dict[str, int] = {}
         names = titles(job.names())
         start = partial(train_together, job.processes, job.threads) if job.processes > 1 else train
         events = start(
-            job.given_scene, job.photos, job.initial_labels, fitted,
+            scene, job.photos, label_ids, fitted,
             masks=job.masks if config.freeze_at is not None else None, valid=job.valid,
             seed=seed, backend=job.backend, folder=place.path, settings=key,
+            shell=sky.shell if sky else None,
         )  # fmt: skip
         lines = []
         for event in events:
@@ -73,7 +85,13 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
                 case Trained(gaussians, step, frozen) as trained:
                     write_frozen(place.frozen, frozen)
                     lines = [f"{len(gaussians):,} Gaussians after {step} steps"]
+                    if sky:
+                        on_shell = int(sky.shell.holds(gaussians.means).sum())
+                        lines.append(
+                            f"sky: {on_shell:,} of them on a sphere {sky.shell.scale:.0f} scene extents away"
+                        )
                     lines += write_cameras(job, place, config, trained)
+                    lines += write_inliers(job, place, config, gaussians)
         if place != run:
             _swap(run, place)
         return lines
@@ -81,6 +99,7 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
     # with exposure auto it depends on the photos: what was refined once must be there
     refines = config.poses or config.exposure == "affine" or run.refined.exists()
     outputs = [run.levels, run.checkpoint, *([run.cameras, run.refined] if refines else [])]
+    outputs += [run.inliers] if config.outliers else []
     run_stage(job, "train", settings, inputs, outputs, make, swaps=True)
 
 
@@ -148,9 +167,10 @@ def _swap(run: RunDir, made: RunDir) -> None:
             run.levels.rename(old)
         made.levels.rename(run.levels)
     remove_checkpoints(run.checkpoint)
-    for earlier in (run.cameras, run.refined):
+    for earlier in (run.cameras, run.refined, run.sky):
         earlier.unlink(missing_ok=True)
-    kinds = ("frozen", "cap", "cameras", "refined", "checkpoint")
+    shutil.rmtree(run.inliers, ignore_errors=True)
+    kinds = ("frozen", "cap", "cameras", "refined", "sky", "inliers", "checkpoint")
     for new, place in ((getattr(made, kind), getattr(run, kind)) for kind in kinds):
         if new.exists():
             new.replace(place)
@@ -163,7 +183,17 @@ def _forget_cleaning(run: RunDir) -> None:
         path.unlink(missing_ok=True)
 
 
-def _fit_memory(job: Job, place: RunDir, config: TrainConfig, resuming: bool) -> tuple[TrainConfig, int]:
+def _with_sky(job: Job, config: TrainConfig) -> tuple[Sky | None, Scene, np.ndarray]:
+    """The sky, if there is one, and the scene and the labels of its points (int16 [P]) with it."""
+    scene, label_ids, sky = job.given_scene, job.initial_labels, None
+    if config.sky == "auto":
+        sky = find_sky(scene, job.photos, job.masks, label_ids, job.valid)
+    return (sky, *sky.begin(scene, label_ids)) if sky else (None, scene, label_ids)
+
+
+def _fit_memory(
+    job: Job, scene: Scene, place: RunDir, config: TrainConfig, resuming: bool
+) -> tuple[TrainConfig, int]:
     """The settings with a cap that fits into memory, and that cap (0: none needed).
 
     A training that resumes keeps the cap it began with.
@@ -171,6 +201,6 @@ def _fit_memory(job: Job, place: RunDir, config: TrainConfig, resuming: bool) ->
     if job.backend == "cuda":  # Gaussians are not in the machine's memory
         return config, 0
     began = read_cap(place.cap) if resuming and place.cap.exists() else 0
-    fitted = memory.fit(job.given_scene, config, job.memory_limit, processes=job.processes, began=began)
+    fitted = memory.fit(scene, config, job.memory_limit, processes=job.processes, began=began)
     job.emit(Warned(str(fitted)))
     return fitted.config, fitted.lowered

@@ -3,6 +3,8 @@
 Criteria, each by itself:
 
 - few views: hardly any training view supports them, so nothing says where they are;
+- hardly shown: a camera of the capture that turned towards them would show little else, but all photos
+  together show next to nothing of them;
 - in front: most views that support them show content far behind them;
 - category: they paint pixels of a category that is far behind them, such as the sky.
 
@@ -10,6 +12,7 @@ What a floater hides no photo has shown, and what it paints the training needed:
 hole. So `clean` renders training and calibration views, and takes only what costs next to nothing there.
 """
 
+import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 
@@ -25,12 +28,12 @@ from sagesplat.core.geometry import project, weighted_quantile
 from sagesplat.metrics.image import psnr, squared_error_map
 from sagesplat.raster import Backend, Workspace, add_weights, device_of, rasterize
 from sagesplat.scene.images import Photos
-from sagesplat.scene.scene import Scene, View
+from sagesplat.scene.scene import Camera, Scene, View
 from sagesplat.segment.masks import UNLABELLED
 from sagesplat.segment.valid import ALL_VALID, ValidPixels
 from sagesplat.train.early_stopping import spread
 
-CRITERIA = ("few views", "in front", "category")
+CRITERIA = ("few views", "hardly shown", "in front", "category")
 LabelImage = Callable[[View], np.ndarray]  # a view's category ids, int16 [H, W]; -1: unlabelled
 
 _MOST = 0.5  # of the views that support a Gaussian, or of its weight
@@ -101,7 +104,7 @@ def find_floaters(
     ids = np.unique(np.append(g.label_ids.cpu().numpy(), UNLABELLED))
     if len(ids) < 3 or not config.category_depth:  # of one category nothing can contradict
         label_image = None
-    xyz, space = g.means.cpu().numpy(), Workspace()
+    xyz, space, most = g.means.cpu().numpy(), Workspace(), np.zeros(n, np.float32)
     for done, row in enumerate(views, 1):
         view, counts = scene.views[row], valid[scene.views[row]]
         columns = _columns(view, counts, ids, label_image)
@@ -111,6 +114,7 @@ def find_floaters(
         supports = total >= config.min_weight
         weight += total
         supported += supports
+        most = np.maximum(most, _most_pixels(g, view.camera))
         depth = xyz @ view.camera.w2c[2, :3] + view.camera.w2c[2, 3]
         if config.content_depth:
             content = _content(g, scene, row, depth, antialiased, space)
@@ -121,6 +125,7 @@ def find_floaters(
             on_view(done)
     found = {
         "few views": supported < config.min_views,
+        "hardly shown": weight < config.shown_share * most,
         "in front": (supported > 0) & (in_front > _MOST * supported),
         "category": (supported > 0) & (contradicting > _MOST * weight),
     }
@@ -224,6 +229,7 @@ def check(config: CleanConfig) -> None:
     limits = {
         "min_views": 10**6,
         "min_weight": 10**6,
+        "shown_share": 1,
         "content_depth": 1,
         "category_depth": 1,
         "max_loss": 100,
@@ -233,6 +239,14 @@ def check(config: CleanConfig) -> None:
         if not 0 <= value <= most:
             flag = name.replace("_", "-")
             raise RunError(f"--clean.{flag} {value:g} is impossible; choose 0 to {most:,}")
+
+
+def _most_pixels(g: Gaussians, camera: Camera) -> Float32[np.ndarray, " N"]:
+    """Blending weight of each Gaussian where the camera looks straight at it and nothing else is in front."""
+    away = torch.linalg.vector_norm(g.means - g.means.new_tensor(camera.position), dim=1).clamp_min(1e-9)
+    sides = g.log_scales.exp().sort(dim=1).values[:, 1:]  # of its broadest side
+    pixels = 2 * math.pi * sides.prod(1) * float(camera.K[0, 0] * camera.K[1, 1]) / away**2
+    return (g.logit_opacities.sigmoid() * pixels.clamp_max(camera.width * camera.height)).cpu().numpy()
 
 
 def _columns(

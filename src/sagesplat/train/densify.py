@@ -13,6 +13,7 @@ from sagesplat.kernels.jit import njit
 from sagesplat.raster.reference import rotation_matrices
 from sagesplat.raster.render import Render
 from sagesplat.train.schedule import Schedule
+from sagesplat.train.sky import Shell
 from sagesplat.train.state import TrainState
 
 _SPLIT_SHRINK = 1.6
@@ -74,10 +75,19 @@ def room(state: TrainState, most: int, trainable: Tensor) -> int:
     return given
 
 
-def refine(state: TrainState, config: TrainConfig, extent: float, room: int, trainable: Tensor) -> None:
+def refine(
+    state: TrainState,
+    config: TrainConfig,
+    extent: float,
+    room: int,
+    trainable: Tensor,
+    shell: Shell | None = None,
+) -> None:
     """Clone small, split large Gaussians with high gradients; prune faint and, after a reset, huge ones."""
     g = state.gaussians
     size = g.log_scales.exp().amax(-1)
+    if shell:  # on it as seen from within
+        size = torch.where(shell.holds(g.means), size / shell.scale, size)
     threshold = config.grow_absgrad if config.absgrad else config.grow_grad
     grows = (state.grad_sum / state.grad_count.clamp_min(1) > threshold) & trainable
     if int(grows.sum()) > room:
@@ -86,20 +96,23 @@ def refine(state: TrainState, config: TrainConfig, extent: float, room: int, tra
         grows[torch.topk(strength, max(room, 0)).indices] = True
     small = size <= config.grow_scale * extent
     clones = g.select(grows & small)
-    halves = _split(g.select(grows & ~small), state.rng)
+    halves = _split(g.select(grows & ~small), state.rng, shell)
     faint = g.logit_opacities.sigmoid() < config.prune_opacity
     if state.last_reset >= 0:
         faint |= size > config.prune_scale * extent
     state.replace_rows(~(grows & ~small) & ~(faint & trainable), concat([clones, halves]))
 
 
-def _split(g: Gaussians, rng: np.random.Generator) -> Gaussians:
+def _split(g: Gaussians, rng: np.random.Generator, shell: Shell | None = None) -> Gaussians:
     """Two smaller Gaussians drawn from each."""
     both = concat([g, g])
     normal = torch.from_numpy(rng.standard_normal((len(both), 3), np.float32)).to(both.means.device)
     noise = normal * both.log_scales.exp()
     shift = (rotation_matrices(both.quats) @ noise[..., None]).squeeze(-1)
-    return replace(both, means=both.means + shift, log_scales=both.log_scales - float(np.log(_SPLIT_SHRINK)))
+    means = both.means + shift
+    if shell:
+        means = torch.where(shell.holds(both.means)[:, None], shell.place(means), means)
+    return replace(both, means=means, log_scales=both.log_scales - float(np.log(_SPLIT_SHRINK)))
 
 
 def reset_opacities(state: TrainState, config: TrainConfig, trainable: Tensor) -> None:

@@ -57,6 +57,11 @@ def exposure_update(scene: Scene, photos: Photos, config: TrainConfig) -> tuple[
                 "exposure is not looked at: no tracks and no EXIF tell it;"
                 " add --train.exposure affine where photos differ"
             )
+        if gains.follow_direction:
+            return None, (
+                f"exposure varies by {gains.range_ev:.1f} EV with the viewing direction: the model has it so;"
+                " --train.exposure affine takes it out"
+            )
         return None, ""
     found = f"exposure varies by {gains.range_ev:.1f} EV: a colour transform per photo"
     if not gains.differ:

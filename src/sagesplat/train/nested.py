@@ -24,6 +24,7 @@ from sagesplat.train.events import Event, Resumed
 from sagesplat.train.importance import importance
 from sagesplat.train.lr_schedule import LrSchedule
 from sagesplat.train.photo_loader import PhotoLoader
+from sagesplat.train.sky import Shell, Sky
 from sagesplat.train.state import initial_state
 from sagesplat.train.stepper import Stepper
 from sagesplat.train.trainer import LOOK_EVERY, finite, named_failures, train
@@ -91,13 +92,15 @@ def order(
     base: Gaussians | None = None,
     valid: ValidPixels = ALL_VALID,
     antialiased: bool = False,
+    shell: Shell | None = None,
 ) -> Nested:
     """Label Gaussians by the pixels that they contribute to, and order each category by importance.
 
     `base`, a small model of the same scene, replaces as many of the least important Gaussians and is ordered
     before the others: a model trained small makes better low levels than the most important part of a large
     one. Boundary Gaussians come first in their category, so that every composition has them. Splitting them
-    does not help: nine in ten of the halves are boundary Gaussians too.
+    does not help: nine in ten of the halves are boundary Gaussians too. Those on the `shell`,
+    and no others, are of the sky.
     """
     views = scene.train_ids.tolist()
     importances = importance(g, scene, views, config.criterion, valid=valid, antialiased=antialiased)
@@ -109,7 +112,7 @@ def order(
         importances = np.concatenate([of_base, importances[kept]])
         ranks = np.repeat(np.array([1, 2], np.int8), [len(base), len(kept)])
     ids, weights = label_weights(g, scene, masks, views, antialiased=antialiased)
-    g = replace(g, label_ids=winners(g, ids, weights))
+    g = replace(g, label_ids=_labels(g, ids, weights, shell))
     total = weights.sum(1)
     labels = g.label_ids.numpy()
     column = np.searchsorted(ids, labels).clip(0, max(len(ids) - 1, 0))
@@ -118,6 +121,17 @@ def order(
     ranks[is_boundary(weights, len(views))] = 0  # whichever side is there needs them
     rows = np.lexsort((-importances, ranks, labels))  # the last key decides first
     return Nested(g.select(torch.from_numpy(rows)), purity[rows], ranks[rows])
+
+
+def _labels(
+    g: Gaussians, ids: np.ndarray, weights: Float32[np.ndarray, "N L"], shell: Shell | None
+) -> Tensor:
+    """The category (int16 [N]) that each Gaussian paints most of: sky on the shell, another elsewhere."""
+    if not shell:
+        return winners(g, ids, weights)
+    sky = np.isin(ids, shell.label_ids)
+    far, near = (winners(g, ids[some], weights[:, some]) for some in (sky, ~sky))
+    return torch.where(shell.holds(g.means), far, near)
 
 
 def with_at_most(scene: Scene, labels: np.ndarray, count: int, seed: int) -> tuple[Scene, np.ndarray]:
@@ -136,7 +150,9 @@ def with_at_most(scene: Scene, labels: np.ndarray, count: int, seed: int) -> tup
 def capped_config(config: TrainConfig, cap: int, steps: int) -> TrainConfig:
     """3DGS-MCMC with at most `cap` Gaussians, otherwise as `config`; only the last level is recorded."""
     mcmc = replace(config, strategy="mcmc", max_gaussians=cap, max_steps=steps, level_every=steps)
-    return replace(mcmc, freeze_at=None, gradient_freeze_share=0.0, poses=False, exposure="off")
+    return replace(
+        mcmc, freeze_at=None, gradient_freeze_share=0.0, poses=False, exposure="off", outliers=False
+    )
 
 
 def train_capped(
@@ -150,11 +166,15 @@ def train_capped(
     valid: ValidPixels = ALL_VALID,
     seed: int = 0,
     backend: Backend = "auto",
+    sky: Sky | None = None,
 ) -> Iterator[Event]:
     """The events of a training of `capped_config`, from `cap` of the points where there are more."""
+    if sky:
+        scene, point_labels = sky.begin(scene, point_labels)
     some, labels = with_at_most(scene, point_labels, cap, seed)
     capped = capped_config(config, cap, steps)
-    yield from train(some, photos, labels, capped, valid=valid, seed=seed, backend=backend)
+    shell = sky.shell if sky else None
+    yield from train(some, photos, labels, capped, valid=valid, seed=seed, backend=backend, shell=shell)
 
 
 def is_boundary(weights: Float32[np.ndarray, "N L"], num_views: int) -> np.ndarray:
@@ -177,6 +197,7 @@ def nest(
     settings: str = "",
     movable: np.ndarray | None = None,  # bool [N]
     spans: Spans | None = None,
+    shell: Shell | None = None,
 ) -> Iterator[NestStep | Resumed | Nested]:
     """Train a nested ladder: afterwards every composition of prefixes renders well.
 
@@ -199,6 +220,7 @@ def nest(
         settings: What a checkpoint has to have been written with.
         movable: bool [N]; the others keep their values, and all keep their order. None: all are trained.
         spans: Levels that replace each other; all Gaussians keep their order. None: prefixes.
+        shell: Gaussians that lie on it stay on it (see `train.sky`).
 
     Yields:
         `NestStep` at every step, `Resumed` after a damaged checkpoint, and the trained `Nested` last.
@@ -227,7 +249,7 @@ def nest(
         edges = torch.from_numpy(np.stack([spans.first, spans.last])[:, near]).to(device)
     stepper = Stepper(
         PhotoLoader(scene, photos, device, valid), replace(train_config, batch=1), ActiveTiles(scene, None),
-        backend, sh_bits=config.sh_bits,
+        backend, sh_bits=config.sh_bits, shell=shell,
     )  # fmt: skip
     rates = _rates(train_config, config, scene)
     trainable = trainable_rows(state.gaussians, {})

@@ -21,8 +21,10 @@ from sagesplat.train.exposure import transform
 from sagesplat.train.gradient_freezing import GradientFreezing
 from sagesplat.train.group import ALONE, Group
 from sagesplat.train.lr_schedule import LrSchedule
+from sagesplat.train.outliers import inliers
 from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.poses import PoseUpdate, moved_camera
+from sagesplat.train.sky import Shell
 from sagesplat.train.state import TrainState, initial_state
 from sagesplat.train.strategy import Strategy
 from sagesplat.train.view_parameters import ViewGradients, ViewUpdate
@@ -43,6 +45,8 @@ class Stepper:
     gradient_freezing: GradientFreezing | None = None
     sh_bits: tuple[int, int] | None = None  # render Gaussians rounded as SPZ files will store them
     view_updates: Mapping[str, ViewUpdate] = field(default_factory=dict)  # of `TrainState.per_view`
+    outliers_after: float = math.inf  # steps; from then on outliers of the photos are left out
+    shell: Shell | None = None  # that Gaussians of the sky stay on
     drawn: float = 1.0  # share of the tiles that the last step drew
     workspace: Workspace = field(default_factory=Workspace)
 
@@ -82,7 +86,7 @@ class Stepper:
         grads: dict[str, Tensor] = {}
         for view in views:
             own = of_views.leaves(view)
-            loss, render = self._draw(moving, view, degree, trainable, factor, own)
+            loss, render = self._draw(moving, view, degree, trainable, factor, own, state.step)
             loss.backward()
             of_views.add(view, own)
             losses.append(loss.detach())
@@ -106,9 +110,12 @@ class Stepper:
         state.step += 1
         self.strategy.step_pre_update(state, grads, trainable)
         scaled = {name: rate * math.sqrt(batch) for name, rate in learning_rates.items()}
+        sky, before = self._on_shell(state, trainable)
         optim.update(state, grads, scaled, degree, trainable)
         of_views.update(self.view_updates, state.step)
         self.strategy.step_post_update(state, trainable)
+        if self.shell:
+            self.shell.step(state.gaussians.means, before, sky)
         return total / batch
 
     def camera(self, state: TrainState, view: int) -> Camera:
@@ -126,6 +133,14 @@ class Stepper:
         if len(frozen) > len(self.active_tiles.frozen):
             self.active_tiles = replace(self.active_tiles, frozen=frozenset(frozen))
 
+    def _on_shell(self, state: TrainState, trainable: Tensor) -> tuple[Tensor, Tensor]:
+        """Indices of the Gaussians of the sky that a step may move, and their means before it."""
+        means = state.gaussians.means
+        if not self.shell:
+            return trainable.new_zeros(0, dtype=torch.int64), means[:0]
+        rows = torch.nonzero(self.shell.holds(means) & trainable)[:, 0]
+        return rows, means[rows]
+
     def _draw(
         self,
         moving: Gaussians,
@@ -134,6 +149,7 @@ class Stepper:
         trainable: Tensor,
         factor: int,
         own: Mapping[str, Tensor],  # parameters of this view alone, by kind
+        step: int,
     ) -> tuple[Tensor, Render]:
         photo, camera = self.photo_loader(view, factor)
         # nobody may paint over what is finished, so it is looked at now and then
@@ -159,6 +175,8 @@ class Stepper:
         )
         rgb = render.rgb if exposure is None else expose(render.rgb, exposure, photo)
         valid = self.photo_loader.valid(view, factor)
+        if step >= self.outliers_after:
+            valid = inliers(rgb, photo, valid, tiles)
         loss = photometric_loss(rgb, photo, self.config.ssim_weight, tiles, self.workspace, valid)
         return loss, render
 
@@ -201,6 +219,7 @@ def tune(
     valid: ValidPixels = ALL_VALID,
     seed: int = 0,
     backend: Backend = "auto",
+    shell: Shell | None = None,
 ) -> Gaussians:
     """Train a fixed set of Gaussians for `steps` more steps; returns the result on the CPU.
 
@@ -215,7 +234,7 @@ def tune(
     state = initial_state(replace(gaussians, **copies).to(device), seed)
     state.sort()
     loader = PhotoLoader(scene, photos, device, valid)
-    stepper = Stepper(loader, config, ActiveTiles(scene, None), backend)
+    stepper = Stepper(loader, config, ActiveTiles(scene, None), backend, shell=shell)
     trainable = trainable_rows(state.gaussians, {})
     for step in range(1, steps + 1):
         stepper(state, gaussians.sh_degree, learning_rates(2 * steps + step), trainable)

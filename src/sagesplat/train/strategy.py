@@ -16,6 +16,7 @@ from sagesplat.train.early_stopping import trainable_rows
 from sagesplat.train.group import ALONE, Group
 from sagesplat.train.lr_schedule import LrSchedule
 from sagesplat.train.schedule import Schedule, scaled_schedule
+from sagesplat.train.sky import Shell
 from sagesplat.train.state import INITIAL_OPACITY, TrainState
 
 
@@ -52,6 +53,7 @@ class Densification(Strategy):
     schedule: Schedule
     rates: LrSchedule
     group: Group = ALONE
+    shell: Shell | None = None  # of the sky
 
     @classmethod
     def schedule_of(cls, config: TrainConfig) -> Schedule:
@@ -112,7 +114,7 @@ class DefaultStrategy(Densification):
         )
         self.group.add(state.grad_sum, state.grad_count)
         room = densify.room(state, budget, trainable)
-        densify.refine(state, self.config, self.scene.extent, room, trainable)
+        densify.refine(state, self.config, self.scene.extent, room, trainable, self.shell)
 
     def step_post(self, state: TrainState) -> bool:
         """Refine, then reset opacities; see `Strategy`."""
@@ -142,12 +144,16 @@ class McmcStrategy(Densification):
     def step_pre_update(self, state: TrainState, grads: dict[str, Tensor], trainable: Tensor) -> None:
         """Add the gradients of the regularisation of opacities and scales."""
         opacity, scale = self.config.mcmc_opacity, self.config.mcmc_scale / self.scene.extent
-        mcmc.add_regularisation_gradients(state, grads, opacity, scale, trainable)
+        mcmc.add_regularisation_gradients(state, grads, opacity, scale, self._near(state, trainable))
 
     def step_post_update(self, state: TrainState, trainable: Tensor) -> None:
         """Add SGLD noise to the means."""
         if noise := self.rates.sgld_noise(state.step):
-            mcmc.perturb(state, noise, trainable)
+            mcmc.perturb(state, noise, self._near(state, trainable))
+
+    def _near(self, state: TrainState, trainable: Tensor) -> Tensor:
+        """Those of the `trainable` rows (bool [N]) that are not on the shell, where all sizes are larger."""
+        return trainable & ~self.shell.holds(state.gaussians.means) if self.shell else trainable
 
     def refine(self, state: TrainState, trainable: Tensor) -> None:
         """Relocate dead Gaussians, then add new ones up to the cap."""
@@ -162,11 +168,11 @@ STRATEGIES: dict[str, type[Densification]] = {"default": DefaultStrategy, "mcmc"
 
 
 def make_strategy(
-    config: TrainConfig, scene: Scene, rates: LrSchedule, group: Group = ALONE
+    config: TrainConfig, scene: Scene, rates: LrSchedule, group: Group = ALONE, shell: Shell | None = None
 ) -> Densification:
     """The strategy that `config.strategy` names, for one training."""
     kind = STRATEGIES[config.strategy]
-    return kind(config, scene, kind.schedule_of(config), rates, group)
+    return kind(config, scene, kind.schedule_of(config), rates, group, shell)
 
 
 def schedule_of(config: TrainConfig) -> Schedule:

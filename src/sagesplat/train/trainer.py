@@ -27,8 +27,10 @@ from sagesplat.train.exposure import ExposureUpdate, exposure_update
 from sagesplat.train.gradient_freezing import GradientFreezing
 from sagesplat.train.group import ALONE, Group
 from sagesplat.train.lr_schedule import LrSchedule, lr_schedule
+from sagesplat.train.outliers import first_step
 from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.poses import pose_update
+from sagesplat.train.sky import Shell
 from sagesplat.train.state import TrainState, from_points, initial_state
 from sagesplat.train.stepper import Stepper
 from sagesplat.train.strategy import Densification, make_strategy
@@ -52,6 +54,7 @@ def train(
     folder: Path | None = None,
     settings: str = "",
     group: Group = ALONE,
+    shell: Shell | None = None,
 ) -> Iterator[Event]:
     """Train 3D Gaussians on the training views of a scene: a generator of events.
 
@@ -73,6 +76,7 @@ def train(
         folder: Levels and a checkpoint are written here (levels/, checkpoint.npz); None: nothing is written.
         settings: A checkpoint in `folder` is resumed if it was written with the same text.
         group: Processes that train one model together. All call this with the same arguments.
+        shell: Gaussians that lie on it stay on it (see `train.sky`).
 
     Yields:
         `Resumed` first where a checkpoint was found, `Found`, `Step` at every step, `LevelSaved`,
@@ -97,7 +101,7 @@ def train(
         training = begin(
             scene, photos, label_ids, config,
             masks=masks, valid=valid, seed=seed, backend=backend, folder=folder, settings=settings,
-            group=group,
+            group=group, shell=shell,
         )  # fmt: skip
         yield from training.run()
 
@@ -255,6 +259,7 @@ def begin(
     folder: Path | None = None,
     settings: str = "",
     group: Group = ALONE,
+    shell: Shell | None = None,
 ) -> Training:
     """A training at its start, or at the checkpoint in `folder`; the arguments are those of `train`."""
     rows = scene.train_ids[:: max(1, len(scene.train_ids) // 8)]
@@ -262,7 +267,7 @@ def begin(
         config, scene.extent, [photos[i] for i in rows] if config.lr_schedule == "fast" else []
     )
     device = device_of(backend, group.rank)
-    strategy = make_strategy(config, scene, rates, group)
+    strategy = make_strategy(config, scene, rates, group, shell)
     g = from_points(
         scene.points, label_ids, config.sh_degree, strategy.initial_opacity, strategy.initial_scale
     )
@@ -287,7 +292,8 @@ def begin(
     tiles = ActiveTiles(scene, masks, frozenset(state.frozen), device, valid)
     stepper = Stepper(
         PhotoLoader(scene, photos, device, valid), config, tiles, backend, group, strategy, freezing,
-        view_updates=updates,
+        view_updates=updates, outliers_after=first_step(config.max_steps) if config.outliers else math.inf,
+        shell=shell,
     )  # fmt: skip
     measured = measured_views(scene, masks) if config.freeze_at is not None and masks is not None else {}
     folder = folder if group.leads else None

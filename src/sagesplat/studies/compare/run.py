@@ -39,7 +39,7 @@ from sagesplat.stages.nest import train_capped
 from sagesplat.stages.observe import observe_levels
 from sagesplat.stages.plan import PAPER_TARGETS, ssim_target, ssim_targets
 from sagesplat.stages.results import increments_of
-from sagesplat.stages.shared import label_images, train_config
+from sagesplat.stages.shared import inlier_inputs, label_images, train_config
 from sagesplat.studies.compare.report import (
     CONSOLE,
     FILE,
@@ -220,7 +220,8 @@ def _mcmc(job: Job, config: CompareConfig, folder: Path) -> list[_Baseline]:
         settings = {**asdict(capped_config(made, cap, made.max_steps)), "seed": seed}
         of = path.stem, cap, made.max_steps, seed
         baseline = _Baseline(
-            MCMC, f"cap {share:.0%}", path, made.max_steps, settings, [*run.scene_files, run.labels],
+            MCMC, f"cap {share:.0%}", path, made.max_steps, settings,
+            [*run.scene_files, run.labels, *inlier_inputs(run)],
             _cap, lambda of=of: of,
         )  # fmt: skip
         found.append(baseline)
