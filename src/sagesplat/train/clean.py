@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Int64
 from scipy.ndimage import minimum_filter
+from torch import Tensor
 
 from sagesplat.core.config import CleanConfig
 from sagesplat.core.errors import RunError
@@ -105,6 +106,7 @@ def find_floaters(
     if len(ids) < 3 or not config.category_depth:  # of one category nothing can contradict
         label_image = None
     xyz, space, most = g.means.cpu().numpy(), Workspace(), np.zeros(n, np.float32)
+    breadth = g.log_scales.exp().sort(dim=1).values[:, 1:].prod(1)
     for done, row in enumerate(views, 1):
         view, counts = scene.views[row], valid[scene.views[row]]
         columns = _columns(view, counts, ids, label_image)
@@ -114,7 +116,7 @@ def find_floaters(
         supports = total >= config.min_weight
         weight += total
         supported += supports
-        most = np.maximum(most, _most_pixels(g, view.camera))
+        most = np.maximum(most, _most_pixels(g, breadth, view.camera))
         depth = xyz @ view.camera.w2c[2, :3] + view.camera.w2c[2, 3]
         if config.content_depth:
             content = _content(g, scene, row, depth, antialiased, space)
@@ -241,11 +243,13 @@ def check(config: CleanConfig) -> None:
             raise RunError(f"--clean.{flag} {value:g} is impossible; choose 0 to {most:,}")
 
 
-def _most_pixels(g: Gaussians, camera: Camera) -> Float32[np.ndarray, " N"]:
-    """Blending weight of each Gaussian where the camera looks straight at it and nothing else is in front."""
+def _most_pixels(g: Gaussians, breadth: Float[Tensor, " N"], camera: Camera) -> Float32[np.ndarray, " N"]:
+    """Blending weight of each Gaussian where the camera looks straight at it and nothing else is in front.
+
+    `breadth`: product of the standard deviations of its broadest side, square world units.
+    """
     away = torch.linalg.vector_norm(g.means - g.means.new_tensor(camera.position), dim=1).clamp_min(1e-9)
-    sides = g.log_scales.exp().sort(dim=1).values[:, 1:]  # of its broadest side
-    pixels = 2 * math.pi * sides.prod(1) * float(camera.K[0, 0] * camera.K[1, 1]) / away**2
+    pixels = 2 * math.pi * breadth * float(camera.K[0, 0] * camera.K[1, 1]) / away**2
     return (g.logit_opacities.sigmoid() * pixels.clamp_max(camera.width * camera.height)).cpu().numpy()
 
 
