@@ -339,8 +339,10 @@ def test_other_label_images_are_noticed_though_points_keep_their_labels(copy: Pa
 
 
 def test_early_stopping_depends_on_label_images_and_other_training_does_not(copy: Path) -> None:
-    early = replace(CONFIG.train, freeze_at=0.5)
+    early = replace(CONFIG.train, freeze_at=0.5, sky="off")
     job = quiet(copy, force=True)
+    assert "provenance/masks.json" in read_json(job.run.provenance("train"))["inputs"]  # photos show some sky
+    train_levels(job, replace(early, freeze_at=None), 0)
     assert "provenance/masks.json" not in read_json(job.run.provenance("train"))["inputs"]
     train_levels(job, early, 0)
     assert "provenance/masks.json" in read_json(job.run.provenance("train"))["inputs"]

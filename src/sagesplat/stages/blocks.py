@@ -184,7 +184,7 @@ def train_blocks(job: Job, config: BlocksConfig, train: TrainConfig, seed: int) 
         merged = _merge_levels(run, blocks, parts)
         return [f"{merged:,} Gaussians of {len(blocks)} blocks"]
 
-    inputs = [*train_inputs(run, train), run.blocks / "blocks.json", run.provenance("blocks")]
+    inputs = [*train_inputs(job, train), run.blocks / "blocks.json", run.provenance("blocks")]
     run_stage(job, "train", settings, inputs, [run.levels], make, swaps=True)
 
 

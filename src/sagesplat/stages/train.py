@@ -37,9 +37,7 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
     run = job.run
     # the photos of a step decide the result, not the processes that compute it
     settings = {**asdict(config), "batch": max(config.batch, job.processes), "seed": seed}
-    inputs = train_inputs(run, config)
-    if config.sky == "auto" and sky_labels(job.masks.taxonomy) and run.provenance("masks") not in inputs:
-        inputs.append(run.provenance("masks"))
+    inputs = train_inputs(job, config)
 
     def make() -> list[str]:
         key = checkpoint_key(run, settings, inputs)
@@ -137,10 +135,19 @@ def read_frozen(path: Path) -> dict[int, int]:
     return steps
 
 
-def train_inputs(run: RunDir, config: TrainConfig) -> list[Path]:
-    """What a training reads besides photos: label images only where categories may stop early."""
-    masks = [run.provenance("masks")] if config.freeze_at is not None else []
+def train_inputs(job: Job, config: TrainConfig) -> list[Path]:
+    """What a training reads besides photos: label images where categories may stop early, or one is sky."""
+    run = job.run
+    masks = [run.provenance("masks")] if config.freeze_at is not None or _may_show_sky(job, config) else []
     return [run.scene, run.labels, *masks, *valid_inputs(run)]
+
+
+def _may_show_sky(job: Job, config: TrainConfig) -> bool:
+    return (
+        config.sky == "auto"
+        and (job.run.masks / "labels.json").exists()
+        and bool(sky_labels(job.masks.taxonomy))
+    )
 
 
 def _place(job: Job, key: str) -> RunDir:
