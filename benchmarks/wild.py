@@ -33,7 +33,7 @@ from sagesplat.stages.scene import open_scene
 from sagesplat.stages.train import train_levels
 
 Say = Callable[[str], None]
-PLAIN: dict[str, Any] = {"exposure": "off"}  # training settings without any remedy
+PLAIN: dict[str, Any] = {"exposure": "off", "sky": "off"}  # training settings without any remedy
 
 
 class Row(NamedTuple):
@@ -60,6 +60,7 @@ ROWS = {
     "poses, refined": Row(POSES, PLAIN | {"poses": True}),
     "fewer": Row(FEWER, PLAIN),
     "half circle": Row(Wild(half_circle=True), PLAIN),
+    "half circle, sky": Row(Wild(half_circle=True), PLAIN | {"sky": "auto"}),
     "everything": Row(EVERYTHING, PLAIN),
     "everything, remedies": Row(EVERYTHING, {"poses": True}, "person"),
 }

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from sagesplat.core.config import BlocksConfig, TrainConfig
+from sagesplat.core.config import BlocksConfig, CleanConfig, TrainConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import StageDone
 from sagesplat.core.gaussians import PARAMETERS, concat
@@ -23,15 +23,18 @@ from sagesplat.run.run_dir import RunDir
 from sagesplat.scene.images import Photos
 from sagesplat.segment.masks import Masks, Taxonomy, mask_path
 from sagesplat.segment.valid import ValidPixels
+from sagesplat.stages.clean import clean_levels
 from sagesplat.stages.label import lift_labels, make_masks
 from sagesplat.stages.pipeline import nest, train
 from sagesplat.stages.scene import open_scene
 from sagesplat.train import densify, sky
 from sagesplat.train.events import Step, Trained
+from sagesplat.train.lr_schedule import lr_schedule
 from sagesplat.train.nested import order, train_capped
 from sagesplat.train.sky import Shell, find_sky, read_sky, sky_labels, write_sky
-from sagesplat.train.state import initial_state
+from sagesplat.train.state import from_points, initial_state
 from sagesplat.train.stepper import tune
+from sagesplat.train.strategy import make_strategy
 from sagesplat.train.trainer import train as train_gaussians
 
 SKY, TREE = 187, 184
@@ -111,6 +114,18 @@ def test_no_sky_no_shell(capture, tmp_path):
     assert find_sky(scene, photos, masks, labels, ValidPixels(tmp_path)) is None
 
 
+def test_opacities_on_the_shell_are_not_reset(capture):
+    found, labels = of(capture)
+    scene, ids = found.begin(capture[0], labels)
+    config = TrainConfig(max_steps=30_000, sh_degree=0, lr_schedule="published")
+    strategy = make_strategy(config, scene, lr_schedule(config, 1.0, []), shell=found.shell)
+    state = initial_state(from_points(scene.points, ids, 0, opacity=0.9), 0)
+    state.step = next(step for step in range(1, 9999) if strategy.resets(step))
+    strategy.step_post(state)
+    faint = state.gaussians.logit_opacities.sigmoid() < 0.5
+    assert torch.equal(faint, ~found.shell.holds(state.gaussians.means))
+
+
 @given(st.integers(0, 99))
 @settings(max_examples=10, deadline=None)
 def test_halves_and_sizes_on_the_shell(seed):
@@ -162,6 +177,9 @@ def test_training_keeps_the_sky_on_the_shell(capture, tmp_path, strategy):
     assert int(is_sky.sum()) > 20
     assert torch.equal(is_sky, found.shell.holds(g.means))
     assert off_shell(found.shell, g.means[is_sky]) < 1e-5
+    for view in scene.views:  # nothing of the sky is between a camera and the scene
+        away = (g.means - torch.from_numpy(view.camera.position)).norm(dim=1)
+        assert away[is_sky].min() > away[~is_sky].max()
     tuned = tune(g, scene, photos, config, 3, backend="cpu", shell=found.shell)
     assert off_shell(found.shell, tuned.means[tuned.label_ids == SKY]) < 1e-5
 
@@ -243,10 +261,15 @@ def test_a_run_with_sky(capture, tmp_path):
     make_masks(job, SMALL_RUN.masks, SMALL_RUN.labels)
     lift_labels(job, SMALL_RUN.lift)
     train(job, replace(SMALL_RUN.train, max_steps=2), BlocksConfig(), 0)
+    trained = job.snapshots.load(job.snapshots.levels[-1])
+    clean_levels(job, CleanConfig(min_views=6, max_loss=9.0))
     nest(job, replace(SMALL_RUN.nest, base_share=0.3, base_steps=1), BlocksConfig(), 0)
     found = job.sky
     assert found is not None
     lines = [line for event in events if isinstance(event, StageDone) for line in event.lines]
+    cleaned = job.snapshots.load(job.snapshots.levels[-1])
+    assert len(cleaned) < len(trained)
+    assert found.shell.holds(cleaned.means).sum() == found.shell.holds(trained.means).sum()
     assert any("on a sphere 10 scene extents away" in line for line in lines)
     for g in (job.snapshots.load(job.snapshots.levels[-1]), job.ladder.load(job.ladder.levels[-1])):
         on = g.label_ids == SKY
@@ -266,5 +289,5 @@ def test_without_sky_nothing_changes(finished_run, tmp_path):
     job = Job(RunDir(folder), lambda event: None, "cpu", force=True)
     assert job.sky is None
     train(job, replace(SMALL_RUN.train, sky="off"), BlocksConfig(), 0)
-    before, after = (read_level(path / "levels" / "000006.npz") for path in (finished_run, folder))
+    before, after = (read_level(path / "levels" / "000004.npz") for path in (finished_run, folder))
     assert all(torch.equal(getattr(before, name), getattr(after, name)) for name in PARAMETERS)

@@ -1,7 +1,7 @@
 """Removes floaters from the last level of a training: what the nested levels are made of."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from sagesplat.core.config import CleanConfig
@@ -64,6 +64,9 @@ def _clean(job: Job, last: Path, config: CleanConfig) -> Cleaned:
         label_image=job.masks.__getitem__, valid=job.inliers, antialiased=job.antialiased,
         on_view=lambda done: job.emit(Progress("clean", done, len(rows))),
     )  # fmt: skip
+    if job.sky:  # what few views show of it stands before nothing
+        near = ~job.sky.shell.holds(g.means).cpu().numpy()
+        floaters = replace(floaters, found={name: rows & near for name, rows in floaters.found.items()})
     kinds = {"train": rows, "calibration": scene.calibration_ids.tolist()}
     cleaned = clean(
         g, floaters, scene, job.photos, config,

@@ -85,6 +85,10 @@ class Densification(Strategy):
             state.sort()
         return refines
 
+    def _near(self, state: TrainState, trainable: Tensor) -> Tensor:
+        """Those of the `trainable` rows (bool [N]) that are not on the shell."""
+        return trainable & ~self.shell.holds(state.gaussians.means) if self.shell else trainable
+
     def refine(self, state: TrainState, trainable: Tensor) -> None:
         """Add, move and remove Gaussians, of the `trainable` rows (bool [N]) only."""
         raise NotImplementedError
@@ -121,7 +125,8 @@ class DefaultStrategy(Densification):
         refined = super().step_post(state)
         if self.resets(state.step):
             trainable = trainable_rows(state.gaussians, state.frozen)
-            densify.reset_opacities(state, self.config, trainable)
+            # nothing on the shell stands before anything, and what no photo shows would never come back
+            densify.reset_opacities(state, self.config, self._near(state, trainable))
         return refined
 
     def resets(self, step: int) -> bool:
@@ -150,10 +155,6 @@ class McmcStrategy(Densification):
         """Add SGLD noise to the means."""
         if noise := self.rates.sgld_noise(state.step):
             mcmc.perturb(state, noise, self._near(state, trainable))
-
-    def _near(self, state: TrainState, trainable: Tensor) -> Tensor:
-        """Those of the `trainable` rows (bool [N]) that are not on the shell, where all sizes are larger."""
-        return trainable & ~self.shell.holds(state.gaussians.means) if self.shell else trainable
 
     def refine(self, state: TrainState, trainable: Tensor) -> None:
         """Relocate dead Gaussians, then add new ones up to the cap."""
