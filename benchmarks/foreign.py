@@ -49,6 +49,7 @@ EXCEPTIONS: dict[str, str] = {
     "run.stage:run_stages": _WROTE,
     "stages.adopt:_label": "by read_header and read_level, which the readers run",
     "stages.adopt:_make_capture": _WROTE,
+    "stages.nest:nest_levels.make": "by read_header and read_level, which the readers run",
     "scene._sfm:Stages._reasons": _COLMAP,
     "scene._sfm:Stages.features": _COLMAP,
     "scene._sfm:Stages.matches": _COLMAP,

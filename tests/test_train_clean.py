@@ -16,7 +16,7 @@ from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene, View
 from sagesplat.train.clean import CRITERIA, Floaters, clean, find_floaters
 
-CONFIG = CleanConfig()
+CONFIG = CleanConfig(min_views=2)
 N = 120
 
 

@@ -193,8 +193,9 @@ class CleanConfig:
 
     floaters: Literal["remove", "keep"] = "remove"
     """remove: floaters are removed before the levels are made; keep: nothing is removed."""
-    min_views: int = 2
-    """Few views: remove Gaussians that fewer training views support; 0: do not look for them."""
+    min_views: int = 0
+    """Few views: remove Gaussians that fewer training views support, e.g. 2; 0: do not look for them. Nested
+    levels make use of them, a splat as it is does not miss them."""
     min_weight: float = 0.1
     """A view supports a Gaussian if its blending weight there, summed over the pixels, is at least this."""
     shown_share: float = 0.003

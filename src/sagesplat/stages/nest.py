@@ -30,7 +30,8 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
     settings = {**asdict(config), "seed": seed}
 
     def make() -> list[str]:
-        check_nest(job, _count(job), train_config(job).sh_degree)
+        count = sum(read_header(job.trained).counts.values())
+        check_nest(job, count, train_config(job).sh_degree)
         full = read_level(job.trained)
         base = read_level(run.base_model) if config.base_share else None
         masks, sky = job.best_masks, job.sky
@@ -74,7 +75,8 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
 def _make_base_model(job: Job, config: NestConfig, seed: int) -> None:
     """Train the small model that the ladder begins with: a stage, so that a killed run has it already."""
     run, made = job.run, train_config(job)
-    cap = max(1, round(config.base_share * _count(job)))
+    full = job.snapshots.size(job.snapshots.levels[-1])  # floaters included: it is trained the same
+    cap = max(1, round(config.base_share * full))
     settings = {**asdict(nested.capped_config(made, cap, config.base_steps)), "seed": seed}
 
     inputs = [*run.scene_files, run.labels, *inlier_inputs(run), *sky_inputs(run)]
@@ -85,11 +87,6 @@ def _make_base_model(job: Job, config: NestConfig, seed: int) -> None:
         return [f"{len(g):,} Gaussians"]
 
     run_stage(job, "base", settings, inputs, [run.base_model], make)
-
-
-def _count(job: Job) -> int:
-    """Gaussians of the trained model."""
-    return sum(read_header(job.trained).counts.values())
 
 
 def train_capped(job: Job, stage: str, cap: int, steps: int, seed: int) -> Gaussians:
