@@ -134,7 +134,11 @@ def test_every_category_is_on_it(written):
 def test_exposures_of_the_photos_are_said(tmp_path):
     data = make()
     assert "cc_psnr" not in write_report(tmp_path / "a", data).read_text("utf-8").split("<h2>")[0]
-    page = write_report(tmp_path / "b", dataclasses.replace(data, exposed=True)).read_text("utf-8")
+    more = dataclasses.replace(
+        data, exposed=True, noticed=("exposure varies by 0.8 EV", "3 floaters removed")
+    )
+    page = write_report(tmp_path / "b", more).read_text("utf-8")
+    assert "Noticed in this capture: exposure varies by 0.8 EV; 3 floaters removed." in page
     said = page.split("<h2>")[0]
     assert "The photos differ in exposure" in said
     assert "cc_ssim 0.750 and cc_psnr 0.75 dB" in said

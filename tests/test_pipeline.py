@@ -27,7 +27,6 @@ STAGES = [
     "masks",
     "lift",
     "train",
-    "clean",
     "observe",
     "fit",
     "plan",

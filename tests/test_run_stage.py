@@ -116,6 +116,7 @@ _NO_INPUTS = {
     ("train", "labels.json"),  # names that are shown on the way
     ("base", "train.json"),  # its settings are among those of the small model
     ("base", "levels"),  # their number of Gaussians is in the settings
+    ("base", "cleaned.npz"),
     ("base", "labels.json"),  # only looked at: ids without a name are refused
     ("borders", "labels.json"),
 }

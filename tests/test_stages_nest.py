@@ -289,6 +289,7 @@ STAGES = [
     "masks",
     "lift",
     "train",
+    "clean",
     "base",
     "nest",
     "observe",

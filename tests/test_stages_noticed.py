@@ -13,11 +13,12 @@ from sagesplat.cli.console import Console
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Event, RunDone
 from sagesplat.io.files import write_json
+from sagesplat.output.report import ReportData
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.segment.masks import mask_path
+from sagesplat.stages import report
 from sagesplat.stages.noticed import noticed
-from sagesplat.stages.report import make_report
 
 POSES = {
     "pixels": 0.31, "degrees": 0.01, "shift": 0.001, "diverged": 0, "fitted": 2, "held_out": 2,
@@ -67,17 +68,19 @@ def test_each_is_told_in_a_few_words(job: Job) -> None:
     assert noticed(job) == WORDS
 
 
-def test_the_console_and_the_page_tell_it(job: Job) -> None:
+def test_the_console_and_the_page_get_it(job: Job, monkeypatch: pytest.MonkeyPatch) -> None:
     disturb(job)
+    events, pages = list[Event](), list[ReportData]()
+    monkeypatch.setattr(report, "write_report", lambda folder, data: pages.append(data))
     job.run.provenance("report").unlink()
-    events: list[Event] = []
-    make_report(Job(job.run, events.append, "cpu"))
-    assert isinstance(events[-1], RunDone)
-    assert events[-1].noticed == WORDS
-    assert "; ".join(WORDS) in (job.run.report / "index.html").read_text()
+    report.make_report(Job(job.run, events.append, "cpu"))
+    report.make_report(Job(job.run, events.append, "cpu"))  # there already, and yet it is told
+    assert [page.noticed for page in pages] == [WORDS]
+    done = [event for event in events if isinstance(event, RunDone)]
+    assert [event.noticed for event in done] == [WORDS, WORDS]
     printed = io.StringIO()
     console = Console(RichConsole(file=printed, width=300))
-    console(events[-1])
+    console(done[0])
     console(RunDone(Path("report")))
     assert printed.getvalue().splitlines()[0] == f"Noticed: {'; '.join(WORDS)}"
     assert printed.getvalue().count("Noticed") == 1

@@ -171,7 +171,7 @@ class TrainConfig:
     their photos afterwards."""
     outliers: bool = False
     """Leave out what single photos show and the model does not, such as people that no mask names: found by
-    the residual, from 30 % of the steps on."""
+    the residual, from 30 % of the steps on and after ten visits of each view (at the latest from 60 %)."""
     mcmc_noise: float = 5e5
     """SGLD noise of 3DGS-MCMC, times the learning rate of the means."""
     mcmc_opacity: float = 0.01

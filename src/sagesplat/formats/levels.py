@@ -194,6 +194,8 @@ def read_more(path: Path, name: str) -> np.ndarray[Any, Any]:
 
 def _again(path: Path) -> str:
     """How a damaged file is made again: one that is there counts as done."""
+    if path.name == "cleaned.npz":
+        return "delete it and run `sagesplat clean` again"
     if path.parent.name != "levels":
         return "delete it and run `sagesplat nest` again"
     return f"delete {path.parent} and the checkpoint*.npz beside it, and run `sagesplat train` again"

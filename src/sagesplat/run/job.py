@@ -189,6 +189,11 @@ class Job:
         """The levels that training recorded."""
         return read_ladder(self.run.levels)
 
+    @property
+    def trained(self) -> Path:
+        """The trained model: the last level, without its floaters where some were removed."""
+        return self.run.cleaned if self.run.cleaned.exists() else self.snapshots.files[-1].path
+
     @cached_property
     def ladder(self) -> Ladder:
         """The levels to choose from: prefixes of the nested model, or the snapshots."""

@@ -158,9 +158,9 @@ class RunDir:
         return self.path / "levels"
 
     @property
-    def uncleaned(self) -> Path:
-        """The last level as training recorded it, where floaters were removed from it."""
-        return self.path / "uncleaned.npz"
+    def cleaned(self) -> Path:
+        """The last level without its floaters, where some were removed."""
+        return self.path / "cleaned.npz"
 
     @property
     def floaters(self) -> Path:

@@ -1,22 +1,20 @@
 """Removes floaters from the last level of a training: what the nested levels are made of."""
 
-import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from sagesplat.adapt.ladder import read_ladder
 from sagesplat.core.config import CleanConfig
 from sagesplat.core.errors import RunError, short
 from sagesplat.core.events import Progress
 from sagesplat.core.typed import check_fields, types_of
 from sagesplat.formats.levels import read_level, select_level
-from sagesplat.io.files import atomic_path, read_json, write_json
+from sagesplat.io.files import read_json, write_json
 from sagesplat.output.before_after import before_after
 from sagesplat.raster import device_of
 from sagesplat.run.job import Job
 from sagesplat.run.stage import run_stage
-from sagesplat.stages.shared import valid_inputs
+from sagesplat.stages.shared import inlier_inputs
 from sagesplat.train.clean import CRITERIA, Cleaned, check, clean, find_floaters
 
 
@@ -32,40 +30,38 @@ class CleanFigures:
 
 
 def clean_levels(job: Job, config: CleanConfig) -> None:
-    """Remove floaters from the last level; it is kept as it was in `RunDir.uncleaned`."""
+    """Write the last level without its floaters (`RunDir.cleaned`); the level itself stays as recorded."""
     run = job.run
     check(config)
 
     def make() -> list[str]:
-        last = read_ladder(run.levels).files[-1].path
-        if run.uncleaned.exists():  # of an earlier cleaning
-            _copy(run.uncleaned, last)
-            run.uncleaned.unlink()
-        job.__dict__.pop("snapshots", None)  # read before this stage, perhaps
-        run.floaters_picture.unlink(missing_ok=True)
+        for earlier in (run.cleaned, run.floaters_picture):
+            earlier.unlink(missing_ok=True)
+        last = job.snapshots.files[-1]
         if config.floaters == "keep":
-            nothing = CleanFigures(sum(read_ladder(run.levels).files[-1].counts.values()), {}, {}, {}, {})
-            write_json(run.floaters, asdict(nothing))
+            write_json(run.floaters, asdict(CleanFigures(sum(last.counts.values()), {}, {}, {}, {})))
             return ["nothing is removed"]
-        cleaned = _clean(job, last, config)
+        cleaned = _clean(job, last.path, config)
         if not cleaned.keep.all():
-            _copy(last, run.uncleaned)
-            select_level(run.uncleaned, last, cleaned.keep)
+            select_level(last.path, run.cleaned, cleaned.keep)
         figures = figures_of(cleaned)
         write_json(run.floaters, asdict(figures))
         return clean_lines(figures)
 
-    inputs = [*run.scene_files, run.provenance("masks"), run.provenance("train"), *valid_inputs(run)]
-    run_stage(job, "clean", asdict(config), inputs, [run.levels, run.floaters], make)
+    inputs = [*run.scene_files, run.provenance("masks"), run.levels, run.provenance("train")]
+    figures = read_clean_figures(run.floaters)
+    removed = figures is not None and any(figures.removed.values())
+    outputs = [run.floaters, *([run.cleaned] if removed else [])]
+    run_stage(job, "clean", asdict(config), [*inputs, *inlier_inputs(run)], outputs, make)
 
 
 def _clean(job: Job, last: Path, config: CleanConfig) -> Cleaned:
     """What to remove of a level, with a picture of it."""
     g, scene = read_level(last).to(device_of(job.backend)), job.scene
-    rows = job.valid.rows(scene, scene.train_ids)
+    rows = job.inliers.rows(scene, scene.train_ids)
     floaters = find_floaters(
         g, scene, rows, config,
-        label_image=job.masks.__getitem__, valid=job.valid, antialiased=job.antialiased,
+        label_image=job.masks.__getitem__, valid=job.inliers, antialiased=job.antialiased,
         on_view=lambda done: job.emit(Progress("clean", done, len(rows))),
     )  # fmt: skip
     if job.sky:  # what few views show of it stands before nothing
@@ -74,7 +70,7 @@ def _clean(job: Job, last: Path, config: CleanConfig) -> Cleaned:
     kinds = {"train": rows, "calibration": scene.calibration_ids.tolist()}
     cleaned = clean(
         g, floaters, scene, job.photos, config,
-        kinds=kinds, valid=job.valid, antialiased=job.antialiased, backend=job.backend,
+        kinds=kinds, valid=job.inliers, antialiased=job.antialiased, backend=job.backend,
     )  # fmt: skip
     if not cleaned.keep.all():
         cameras = [view.camera for view in scene.views]
@@ -133,8 +129,3 @@ def _check_counts(found: Mapping[str, int], removed: Mapping[str, int]) -> None:
         raise ValueError("other criteria")
     if not all(0 <= removed[name] <= count < 2**40 for name, count in found.items()):
         raise ValueError("impossible counts")
-
-
-def _copy(source: Path, target: Path) -> None:
-    with atomic_path(target) as temporary:
-        shutil.copyfile(source, temporary)

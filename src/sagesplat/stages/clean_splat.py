@@ -31,7 +31,7 @@ from sagesplat.train.clean import check, clean, find_floaters
 
 _VIEWS = 96  # viewpoints that are drawn where there are none
 _FOV, _SIZE = 60.0, (512, 384)  # degrees along the longer side, px
-_DRAWN = "viewpoints were drawn, so few views mean nothing; --cameras of its photos would tell more"
+_DRAWN = "viewpoints were drawn; --cameras of its photos would tell what few views show"
 _SIDE = 1024  # px, longer side of the views of a capture; larger ones are looked at smaller
 
 
@@ -47,7 +47,7 @@ def clean_splat(
         config: Thresholds. "keep" is refused.
         emit: Hears of progress, and gets the result in words.
         cameras: Where its photos were taken from: a capture with or without photos, or a file of cameras;
-            None: viewpoints are drawn, and few views are no criterion.
+            None: viewpoints are drawn; what few views or hardly any show is then no criterion.
         picture: PNG of views before and after.
         backend: Rasteriser.
 
@@ -64,8 +64,8 @@ def clean_splat(
     check_size(splat.gaussians, str(source))
     g, filtered = splat.gaussians.to(device_of(backend)), splat.antialiased
     scene, photos, how = _views(g, filtered, cameras, backend)
-    if cameras is None:  # what few of them show may be seen from nearer, or from elsewhere
-        config = replace(config, min_views=0)
+    if cameras is None:  # what they hardly show may be seen from nearer, or from elsewhere
+        config = replace(config, min_views=0, shown_share=0)
     real, rows = not isinstance(photos, Renders), list(range(len(scene.views)))
     floaters = find_floaters(
         g, scene, rows, config,

@@ -10,7 +10,7 @@ from sagesplat.core.config import NestConfig
 from sagesplat.core.events import Progress, Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.increments import packed, read_increments, write_increments
-from sagesplat.formats.levels import read_level, write_set
+from sagesplat.formats.levels import read_header, read_level, write_set
 from sagesplat.run.job import Job
 from sagesplat.run.records import checkpoint_key
 from sagesplat.run.stage import run_stage
@@ -30,8 +30,8 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
     settings = {**asdict(config), "seed": seed}
 
     def make() -> list[str]:
-        check_nest(job, job.snapshots.size(job.snapshots.levels[-1]), train_config(job).sh_degree)
-        full = job.snapshots.load(job.snapshots.levels[-1])
+        check_nest(job, _count(job), train_config(job).sh_degree)
+        full = read_level(job.trained)
         base = read_level(run.base_model) if config.base_share else None
         masks, sky = job.best_masks, job.sky
         shell = sky.shell if sky else None
@@ -63,6 +63,7 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
         return lines
 
     made = [run.provenance("train"), *label_image_inputs(run), *sky_inputs(run)]
+    made += [run.cleaned] if run.cleaned.exists() else []
     inputs = [*run.scene_files, run.labels, run.levels, *made]
     if config.base_share:
         _make_base_model(job, config, seed)
@@ -73,8 +74,7 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
 def _make_base_model(job: Job, config: NestConfig, seed: int) -> None:
     """Train the small model that the ladder begins with: a stage, so that a killed run has it already."""
     run, made = job.run, train_config(job)
-    full = job.snapshots.size(job.snapshots.levels[-1])
-    cap = max(1, round(config.base_share * full))
+    cap = max(1, round(config.base_share * _count(job)))
     settings = {**asdict(nested.capped_config(made, cap, config.base_steps)), "seed": seed}
 
     inputs = [*run.scene_files, run.labels, *inlier_inputs(run), *sky_inputs(run)]
@@ -85,6 +85,11 @@ def _make_base_model(job: Job, config: NestConfig, seed: int) -> None:
         return [f"{len(g):,} Gaussians"]
 
     run_stage(job, "base", settings, inputs, [run.base_model], make)
+
+
+def _count(job: Job) -> int:
+    """Gaussians of the trained model."""
+    return sum(read_header(job.trained).counts.values())
 
 
 def train_capped(job: Job, stage: str, cap: int, steps: int, seed: int) -> Gaussians:

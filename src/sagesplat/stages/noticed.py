@@ -18,7 +18,7 @@ def noticed(job: Job) -> tuple[str, ...]:
         lines.append(f"exposure varies by {exposure.range_ev:.1f} EV")
     if (share := _ignored(job)) >= _LEAST_SHARE:
         lines.append(f"{100 * share:.2g} % of pixels ignored")
-    if floaters := read_clean_figures(run.floaters):
+    if run.ladder == "nested" and (floaters := read_clean_figures(run.floaters)):
         lines += _removed(floaters)
     poses = read_pose_figures(run.refined)
     if poses and poses.pixels >= _LEAST_MOVE:

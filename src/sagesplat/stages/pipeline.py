@@ -82,7 +82,6 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
     make_masks(job, config.masks, config.labels)
     lift_labels(job, config.lift)
     train(job, config.train, config.blocks, config.seed)
-    clean(job, config.clean)
     if config.fuse:
         fuse_masks(job)
     elif job.run.fused.exists():
@@ -90,6 +89,8 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
     if job.has_blocks:
         blocks.label_block_categories(job)
     if job.run.ladder == "nested":
+        if not job.has_blocks:
+            clean(job, config.clean)
         nest(job, config.nest, config.blocks, config.seed)
     _promise(job, config)
 
@@ -163,10 +164,11 @@ def train(job: Job, config: TrainConfig, of_blocks: BlocksConfig, seed: int) -> 
 
 
 def clean(job: Job, config: CleanConfig) -> None:
-    """Remove floaters from the last level of a training; a scene in blocks stays as it was trained."""
+    """Remove floaters from the last level of a training."""
     check_not_adopted(job.run)
-    if not job.has_blocks:
-        clean_levels(job, config)
+    if job.has_blocks:
+        raise RunError(f"{job.run.blocks}: floaters are not removed from a scene in blocks; nest it as it is")
+    clean_levels(job, config)
 
 
 def nest(job: Job, config: NestConfig, of_blocks: BlocksConfig, seed: int) -> None:

@@ -106,8 +106,9 @@ def _adopted(job: Job, ladder: PrefixLadder) -> list[tuple[str, str]]:
 
 def stage_records(run: RunDir) -> list[Path]:
     """The records of the stages that a run's results were made by: not of one whose result was deleted."""
-    stages = [stage for stage in STAGES if stage != "fuse" or (run.fused / "labels.json").exists()]
-    return [path for path in map(run.provenance, stages) if path.exists()]
+    without = set() if (run.fused / "labels.json").exists() else {"fuse"}
+    without |= {"clean"} if run.ladder != "nested" else set()  # snapshots are as training recorded them
+    return [path for s in STAGES if s not in without and (path := run.provenance(s)).exists()]
 
 
 def _parts(run: RunDir, names: dict[int, str]) -> tuple[dict[int, int], Colours]:

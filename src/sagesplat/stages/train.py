@@ -178,8 +178,8 @@ def _swap(run: RunDir, made: RunDir) -> None:
 
 
 def _forget_cleaning(run: RunDir) -> None:
-    """Remove what was made of another training's last level, above all that level itself."""
-    for path in (run.provenance("clean"), run.uncleaned, run.floaters, run.floaters_picture):
+    """Remove what was made of another training's last level."""
+    for path in (run.provenance("clean"), run.cleaned, run.floaters, run.floaters_picture):
         path.unlink(missing_ok=True)
 
 

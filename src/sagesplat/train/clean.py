@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Int64
 from scipy.ndimage import minimum_filter
+from torch import Tensor
 
 from sagesplat.core.config import CleanConfig
 from sagesplat.core.errors import RunError
@@ -105,6 +106,7 @@ def find_floaters(
     if len(ids) < 3 or not config.category_depth:  # of one category nothing can contradict
         label_image = None
     xyz, space, most = g.means.cpu().numpy(), Workspace(), np.zeros(n, np.float32)
+    breadth = g.log_scales.exp().sort(dim=1).values[:, 1:].prod(1)
     for done, row in enumerate(views, 1):
         view, counts = scene.views[row], valid[scene.views[row]]
         columns = _columns(view, counts, ids, label_image)
@@ -114,7 +116,7 @@ def find_floaters(
         supports = total >= config.min_weight
         weight += total
         supported += supports
-        most = np.maximum(most, _most_pixels(g, view.camera))
+        most = np.maximum(most, _most_pixels(g, breadth, view.camera))
         depth = xyz @ view.camera.w2c[2, :3] + view.camera.w2c[2, 3]
         if config.content_depth:
             content = _content(g, scene, row, depth, antialiased, space)
@@ -173,16 +175,14 @@ def clean(
 
     def quality(keep: Bool[np.ndarray, " N"]) -> dict[str, float]:
         kept = on_device.select(torch.from_numpy(keep).to(on_device.means.device))
-        return {kind: float(np.mean([_psnr(kept, row) for row in rows])) for kind, rows in kinds.items()}
+        return {kind: float(np.mean([of_view(kept, row) for row in rows])) for kind, rows in kinds.items()}
 
-    def _psnr(kept: Gaussians, row: int) -> float:
-        view = scene.views[row]
+    def of_view(kept: Gaussians, row: int) -> float:
+        view, photo = scene.views[row], photos[row].astype(np.float32) / 255
         with torch.no_grad():
             render = rasterize(kept, view.camera, antialiased=antialiased, backend=backend, workspace=space)
-        image = render.rgb.clamp(0, 1).float().cpu().numpy()
-        errors = squared_error_map(image, photos[row].astype(np.float32) / 255)
-        counts = valid[view]
-        mean = float((errors if counts is None else errors[counts]).mean())
+        errors = squared_error_map(render.rgb.clamp(0, 1).float().cpu().numpy(), photo)
+        mean = float((errors if (counts := valid[view]) is None else errors[counts]).mean())
         return float(psnr(mean if real else mean + _UNKNOWN_ERROR))
 
     keep = np.ones(len(g), bool)
@@ -190,24 +190,40 @@ def clean(
     removed = dict[str, np.ndarray]()
     for name, rows in floaters.found.items():
         order = np.flatnonzero(rows)[np.argsort(floaters.weight[rows], kind="stable")]
-        removed[name] = np.zeros(len(g), bool)
-        low, count, high = 0, len(order), len(order)  # so many may go; so many are tried; at most so many
-        for _ in range(_TRIES):
-            if count == low:
-                break
-            tried = keep.copy()
-            tried[order[:count]] = False
-            now = quality(tried)
-            if all(best[kind] - now[kind] <= config.max_loss for kind in kinds):
-                low, after = count, now
-            else:
-                high = count - 1
-            count = (low + high + 1) // 2
-        removed[name][order[:low]] = True
+        least = {kind: best[kind] - config.max_loss for kind in kinds}
+        removed[name], after = _unmissed(order, keep, after, least, quality)
         keep &= ~removed[name]
-        best = {kind: max(best[kind], after[kind]) for kind in kinds}
+        best = {kind: max(best[kind], after[kind]) for kind in kinds}  # a gain pays for nothing else
     found = {name: int(rows.sum()) for name, rows in floaters.found.items()}
     return Cleaned(removed, found, before, after)
+
+
+def _unmissed(
+    order: Int64[np.ndarray, " F"],
+    keep: Bool[np.ndarray, " N"],
+    now: dict[str, float],
+    least: Mapping[str, float],
+    quality: Callable[[Bool[np.ndarray, " N"]], dict[str, float]],
+) -> tuple[Bool[np.ndarray, " N"], dict[str, float]]:
+    """The first ones of `order` that can go from `keep` at a quality of `least`, by bisection.
+
+    Returns which they are, and the quality without them (`now`: with them).
+    """
+    low, count, high = 0, len(order), len(order)  # so many can go; so many are tried; more cannot
+    for _ in range(_TRIES):
+        if count == low:
+            break
+        tried = keep.copy()
+        tried[order[:count]] = False
+        found = quality(tried)
+        if all(found[kind] >= limit for kind, limit in least.items()):
+            low, now = count, found
+        else:
+            high = count - 1
+        count = (low + high + 1) // 2
+    gone = np.zeros(len(keep), bool)
+    gone[order[:low]] = True
+    return gone, now
 
 
 def check(config: CleanConfig) -> None:
@@ -227,11 +243,13 @@ def check(config: CleanConfig) -> None:
             raise RunError(f"--clean.{flag} {value:g} is impossible; choose 0 to {most:,}")
 
 
-def _most_pixels(g: Gaussians, camera: Camera) -> Float32[np.ndarray, " N"]:
-    """Blending weight of each Gaussian where the camera looks straight at it and nothing else is in front."""
+def _most_pixels(g: Gaussians, breadth: Float[Tensor, " N"], camera: Camera) -> Float32[np.ndarray, " N"]:
+    """Blending weight of each Gaussian where the camera looks straight at it and nothing else is in front.
+
+    `breadth`: product of the standard deviations of its broadest side, square world units.
+    """
     away = torch.linalg.vector_norm(g.means - g.means.new_tensor(camera.position), dim=1).clamp_min(1e-9)
-    sides = g.log_scales.exp().sort(dim=1).values[:, 1:]  # of its broadest side
-    pixels = 2 * math.pi * sides.prod(1) * float(camera.K[0, 0] * camera.K[1, 1]) / away**2
+    pixels = 2 * math.pi * breadth * float(camera.K[0, 0] * camera.K[1, 1]) / away**2
     return (g.logit_opacities.sigmoid() * pixels.clamp_max(camera.width * camera.height)).cpu().numpy()
 
 

@@ -5,6 +5,8 @@ yet have large residuals as well, but of both signs and in small regions: so the
 it is averaged, and only regions that hold a whole window are outliers.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -14,7 +16,10 @@ from torch import Tensor
 
 from sagesplat.raster import TILE
 
-FIRST_SHARE = 0.3  # of the steps, without masks: the model gets its shape
+_FIRST = 0.3  # of the steps, without masks: the model gets its shape
+_VISITS = 10  # of each view before that, if there is time
+_LATEST = 0.6  # of the steps
+_WHOLE_EVERY = 3  # rounds; in one of them all pixels count
 SMALLEST = 9  # cells, side of the window that an outlier holds
 _GRID = 160  # cells along the longer side of a photo
 _BLUR = 5  # cells, side of the window that residuals are averaged over
@@ -24,9 +29,25 @@ _EDGE = 0.5  # times that threshold: residuals at the edges of outliers
 _MOST = 1 / 3  # of a photo; one with more does not fit as a whole, and all of it counts
 
 
-def first_step(max_steps: int) -> int:
-    """Number of steps that are taken without outlier masks."""
-    return round(FIRST_SHARE * max_steps)
+@dataclass(frozen=True)
+class OutlierSchedule:
+    """When outliers are left out: not in the first steps, and not in every third round of the views.
+
+    What is left out wrongly would never be learned, and be an outlier for ever, if no round had all pixels.
+    """
+
+    first: int  # steps that are taken without masks
+    round: float  # steps in which each view is drawn once
+
+    @classmethod
+    def of(cls, max_steps: int, batch: int, views: int) -> "OutlierSchedule":
+        """The schedule of a training of `views` views, `batch` of them a step."""
+        wanted = max(_FIRST * max_steps, _VISITS * views / batch)
+        return cls(round(min(wanted, _LATEST * max_steps)), views / batch)
+
+    def __call__(self, step: int) -> bool:
+        """Whether outliers are left out after this number of steps."""
+        return step >= self.first and int(step / self.round) % _WHOLE_EVERY > 0
 
 
 def inliers(

@@ -21,7 +21,7 @@ from sagesplat.train.exposure import transform
 from sagesplat.train.gradient_freezing import GradientFreezing
 from sagesplat.train.group import ALONE, Group
 from sagesplat.train.lr_schedule import LrSchedule
-from sagesplat.train.outliers import inliers
+from sagesplat.train.outliers import OutlierSchedule, inliers
 from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.poses import PoseUpdate, moved_camera
 from sagesplat.train.sky import Shell
@@ -45,7 +45,7 @@ class Stepper:
     gradient_freezing: GradientFreezing | None = None
     sh_bits: tuple[int, int] | None = None  # render Gaussians rounded as SPZ files will store them
     view_updates: Mapping[str, ViewUpdate] = field(default_factory=dict)  # of `TrainState.per_view`
-    outliers_after: float = math.inf  # steps; from then on outliers of the photos are left out
+    outliers: OutlierSchedule | None = None  # when those of the photos are left out; None: never
     shell: Shell | None = None  # that Gaussians of the sky stay on
     drawn: float = 1.0  # share of the tiles that the last step drew
     workspace: Workspace = field(default_factory=Workspace)
@@ -175,7 +175,7 @@ class Stepper:
         )
         rgb = render.rgb if exposure is None else expose(render.rgb, exposure, photo)
         valid = self.photo_loader.valid(view, factor)
-        if step >= self.outliers_after:
+        if self.outliers is not None and self.outliers(step):
             valid = inliers(rgb, photo, valid, tiles)
         loss = photometric_loss(rgb, photo, self.config.ssim_weight, tiles, self.workspace, valid)
         return loss, render

@@ -27,7 +27,7 @@ from sagesplat.train.exposure import ExposureUpdate, exposure_update
 from sagesplat.train.gradient_freezing import GradientFreezing
 from sagesplat.train.group import ALONE, Group
 from sagesplat.train.lr_schedule import LrSchedule, lr_schedule
-from sagesplat.train.outliers import first_step
+from sagesplat.train.outliers import OutlierSchedule
 from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.poses import pose_update
 from sagesplat.train.sky import Shell
@@ -290,10 +290,10 @@ def begin(
     share = config.gradient_freeze_share
     freezing = GradientFreezing(share) if share else None
     tiles = ActiveTiles(scene, masks, frozenset(state.frozen), device, valid)
+    outliers = OutlierSchedule.of(config.max_steps, batched.batch, len(scene.train_ids))
     stepper = Stepper(
         PhotoLoader(scene, photos, device, valid), config, tiles, backend, group, strategy, freezing,
-        view_updates=updates, outliers_after=first_step(config.max_steps) if config.outliers else math.inf,
-        shell=shell,
+        view_updates=updates, outliers=outliers if config.outliers else None, shell=shell,
     )  # fmt: skip
     measured = measured_views(scene, masks) if config.freeze_at is not None and masks is not None else {}
     folder = folder if group.leads else None

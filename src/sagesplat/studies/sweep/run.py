@@ -142,7 +142,7 @@ def _share_training(runs: Path, like: Cell | None, cell: Cell) -> None:
     stages = [old.provenance(stage) for stage in ("scene", "segment", "masks", "lift", "train", "clean")]
     made = [old.scene, old.segmented, old.soft, old.masks, old.labels]
     made += [old.levels, old.checkpoint, old.cap, old.frozen, old.cameras, old.refined, old.inliers]
-    made += [old.uncleaned, old.floaters, old.floaters_picture, *stages]
+    made += [old.sky, old.cleaned, old.floaters, old.floaters_picture, *stages]
     with atomic_folder(new.path) as fresh:
         # links take no room; nothing in a run is changed in place
         for path in (p for p in made if p.exists()):
