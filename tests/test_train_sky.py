@@ -267,7 +267,7 @@ def test_a_run_with_sky(capture, tmp_path):
     found = job.sky
     assert found is not None
     lines = [line for event in events if isinstance(event, StageDone) for line in event.lines]
-    cleaned = job.snapshots.load(job.snapshots.levels[-1])
+    cleaned = read_level(job.run.cleaned)
     assert len(cleaned) < len(trained)
     assert found.shell.holds(cleaned.means).sum() == found.shell.holds(trained.means).sum()
     assert any("on a sphere 10 scene extents away" in line for line in lines)
