@@ -16,10 +16,11 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from sagesplat.adapt.observe import as_unit, render_rgb
-from sagesplat.core.config import LabelsConfig, LiftConfig, MasksConfig, SceneConfig, TrainConfig
+from sagesplat.core.config import CleanConfig, LabelsConfig, LiftConfig, MasksConfig, SceneConfig, TrainConfig
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.demo.capture import make_capture
 from sagesplat.demo.wild import EVERYTHING, EXPOSURE, FIGURES, NOTHING, POSES, VIGNETTING, Wild
+from sagesplat.formats.levels import read_level
 from sagesplat.metrics.color_correct import color_correct_affine
 from sagesplat.metrics.image import psnr, squared_error_map, ssim_map
 from sagesplat.run.job import Job
@@ -28,6 +29,7 @@ from sagesplat.scene.images import Photos
 from sagesplat.scene.nerfstudio import load_transforms
 from sagesplat.scene.scene import Camera, Scene
 from sagesplat.segment.masks import Taxonomy
+from sagesplat.stages.clean import clean_levels
 from sagesplat.stages.label import lift_labels, make_masks
 from sagesplat.stages.scene import open_scene
 from sagesplat.stages.train import train_levels
@@ -42,6 +44,7 @@ class Row(NamedTuple):
     wild: Wild
     train: dict[str, Any]  # settings of training
     ignore: str = ""  # categories that do not belong to the scene
+    clean: bool = False  # floaters are removed after training
 
 
 FEWER = Wild(keep=0.45)  # 27 photos, of which 23 train
@@ -61,8 +64,9 @@ ROWS = {
     "fewer": Row(FEWER, PLAIN),
     "half circle": Row(Wild(half_circle=True), PLAIN),
     "half circle, sky": Row(Wild(half_circle=True), PLAIN | {"sky": "auto"}),
+    "half circle, sky, clean": Row(Wild(half_circle=True), PLAIN | {"sky": "auto"}, clean=True),
     "everything": Row(EVERYTHING, PLAIN),
-    "everything, remedies": Row(EVERYTHING, {"poses": True}, "person"),
+    "everything, remedies": Row(EVERYTHING, {"poses": True}, "person", clean=True),
 }
 OFF_PATH_VIEWS = 40
 BLUR, OFF = 4.0, 0.1  # px and colour in [0, 1]: floaters and mist outlast a blur, missing detail does not
@@ -102,7 +106,9 @@ def _measure(folder: Path, name: str, row: Row, steps: int, seed: int) -> dict[s
     make_masks(job, MasksConfig(), LabelsConfig(ignore=row.ignore))
     lift_labels(job, LiftConfig())
     train_levels(job, config, seed)
-    g = job.snapshots.load(job.snapshots.levels[-1])
+    if row.clean:
+        clean_levels(job, CleanConfig())
+    g = read_level(job.trained)
     truth = load_transforms(capture / "truth")
     result: dict[str, Any] = {"gaussians": len(g), "train_views": len(job.scene.train_ids)}
     result["test"] = _means(on_path(job, g, capture))

@@ -22,7 +22,7 @@ import torch
 from conftest import random_gaussians, write_capture
 from test_io_lock import HOLDS, held_by_another
 
-from sagesplat.core.config import PlanConfig, RunConfig, TrainConfig
+from sagesplat.core.config import PlanConfig, RunConfig, SampleConfig, TrainConfig
 from sagesplat.core.errors import DataError, RunError
 from sagesplat.core.gaussians import PARAMETERS
 from sagesplat.demo.capture import make_capture
@@ -57,7 +57,11 @@ from sagesplat.train.events import Event, Resumed, Trained
 from sagesplat.train.state import TrainState, initial_state
 from sagesplat.train.trainer import train
 
-CONFIG = RunConfig(train=TrainConfig(max_steps=40, level_every=10), plan=PlanConfig(target_ssim=0.4))
+CONFIG = RunConfig(
+    train=TrainConfig(max_steps=40, level_every=10),
+    plan=PlanConfig(target_ssim=0.4),
+    sample=SampleConfig(views=8, calibration_views=8),
+)
 TRAINING = TrainConfig(max_steps=24, level_every=4, sh_degree=1)
 FULL = r"no space left, the disk is full; free [\d,]+ MB and run the same command again \(nothing was lost\)"
 EXACT = (

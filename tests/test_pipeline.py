@@ -10,7 +10,7 @@ import pytest
 from sagesplat.adapt.evaluate import read_evaluation
 from sagesplat.adapt.observe import TOTAL, read_observations
 from sagesplat.adapt.plan import read_plans
-from sagesplat.core.config import PlanConfig, RunConfig, TrainConfig
+from sagesplat.core.config import PlanConfig, RunConfig, SampleConfig, TrainConfig
 from sagesplat.core.errors import DataError, RunError
 from sagesplat.core.events import Event, RunDone, StageDone, StageSkipped, Training
 from sagesplat.demo.capture import make_capture
@@ -34,7 +34,11 @@ STAGES = [
     "evaluate",
     "report",
 ]
-CONFIG = RunConfig(train=TrainConfig(max_steps=90, level_every=30), plan=PlanConfig(target_ssim=0.4))
+CONFIG = RunConfig(
+    train=TrainConfig(max_steps=90, level_every=30),
+    plan=PlanConfig(target_ssim=0.4),
+    sample=SampleConfig(views=8, calibration_views=8),
+)
 
 
 def work(run: Path, capture: Path, config: RunConfig = CONFIG, *, force: bool = False) -> list[Event]:

@@ -10,7 +10,15 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
-from sagesplat.core.config import CompareConfig, MasksConfig, NestConfig, PlanConfig, RunConfig, TrainConfig
+from sagesplat.core.config import (
+    CompareConfig,
+    MasksConfig,
+    NestConfig,
+    PlanConfig,
+    RunConfig,
+    SampleConfig,
+    TrainConfig,
+)
 from sagesplat.core.errors import LabelError, RunError
 from sagesplat.core.events import Event, Progress, StageDone, StageStarted, Training, Warned
 from sagesplat.demo.capture import make_capture
@@ -38,6 +46,7 @@ from sagesplat.studies.sweep.run import run_sweep
 CONFIG = RunConfig(
     train=TrainConfig(max_steps=40, level_every=20),
     nest=NestConfig(steps=6, levels=3, base_steps=10),
+    sample=SampleConfig(views=8, calibration_views=8),
     plan=PlanConfig(target_ssim=0.4),
 )
 COMPARE = CompareConfig(

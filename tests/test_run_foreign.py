@@ -33,6 +33,7 @@ from sagesplat.segment.masks import Taxonomy
 from sagesplat.stages import report, view
 from sagesplat.stages.api import open_run
 from sagesplat.stages.bundle import bundle, live_bundle
+from sagesplat.stages.clean import clean_levels
 from sagesplat.stages.compose import compose_plan
 from sagesplat.stages.evaluate import evaluate_plans
 from sagesplat.stages.fit import fit_ladder
@@ -92,6 +93,7 @@ COMMAND = {
     "fit": lambda run: redone("fit", run, lambda job: fit_ladder(job, FitConfig())),
     "run": lambda run: run_all(job_of(run), run.parent / "capture", SMALL_RUN),
     "nest": lambda run: redone("nest", run, lambda job: nest_levels(job, SMALL_RUN.nest, 0)),
+    "clean": lambda run: redone("clean", run, lambda job: clean_levels(job, SMALL_RUN.clean)),
     "resume": resume,
 }
 READERS = {  # the commands that read a document
@@ -295,7 +297,7 @@ def test_documents_that_do_not_belong_to_the_others(
         ("report", "nested/evaluation.csv", "nested/evaluation.csv", "evaluate"),
         ("plan", "nested/increments/index.json", "nested/increments", "nest"),
         ("compose", "nested/ladder.npz", "nested/ladder.npz", "nest"),
-        ("nest", "levels/000006.npz", "levels", "train"),
+        ("clean", "levels/000006.npz", "levels", "train"),
     ],
 )
 def test_a_damaged_document_is_made_again_as_its_error_says(

@@ -18,6 +18,7 @@ from sagesplat.core.config import (
     PaperConfig,
     PlanConfig,
     RunConfig,
+    SampleConfig,
     SceneConfig,
     TrainConfig,
 )
@@ -43,6 +44,7 @@ CONFIG = RunConfig(
     scene=SceneConfig(calibrate_every=4),
     train=TrainConfig(max_steps=20, level_every=10),
     nest=NestConfig(steps=12, levels=3, smallest=0.1, base_steps=10),
+    sample=SampleConfig(views=8, calibration_views=8),
     plan=PlanConfig(target_ssim=0.4),
 )
 BLOCKS = BlocksConfig(count=2, boundary_steps=5)

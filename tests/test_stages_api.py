@@ -28,6 +28,7 @@ from sagesplat.demo.capture import make_capture
 CONFIG = RunConfig(
     train=TrainConfig(max_steps=60, level_every=20),
     nest=NestConfig(steps=20, levels=4, base_steps=20),
+    sample=SampleConfig(views=8, calibration_views=8),
     plan=PlanConfig(target_ssim=0.4),
 )
 

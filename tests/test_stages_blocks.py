@@ -20,6 +20,7 @@ from sagesplat.core.config import (
     NestConfig,
     PlanConfig,
     RunConfig,
+    SampleConfig,
     SceneConfig,
     TrainConfig,
 )
@@ -306,6 +307,7 @@ CONFIG = RunConfig(
     blocks=BlocksConfig(count=2, boundary_steps=20),
     nest=NestConfig(steps=30, levels=4, smallest=0.1, base_steps=30),
     fit=FitConfig(),
+    sample=SampleConfig(views=8, calibration_views=8),
     plan=PlanConfig(target_ssim=0.4),
 )
 

@@ -13,7 +13,15 @@ from PIL import Image
 
 from sagesplat.adapt.ladder import read_ladder
 from sagesplat.adapt.observe import TOTAL, RenderedLabels, near_border, read_observations
-from sagesplat.core.config import FitConfig, PaperConfig, PlanConfig, RunConfig, SceneConfig, TrainConfig
+from sagesplat.core.config import (
+    FitConfig,
+    PaperConfig,
+    PlanConfig,
+    RunConfig,
+    SampleConfig,
+    SceneConfig,
+    TrainConfig,
+)
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Event, StageSkipped, Warned
 from sagesplat.demo.capture import make_capture
@@ -43,7 +51,11 @@ from sagesplat.studies.paper.run import paper_report
 from sagesplat.studies.paper.same_size import FULL, METHODS, nearest_snapshot, prune_to, read_same_size
 from sagesplat.train.importance import importance
 
-CONFIG = RunConfig(train=TrainConfig(max_steps=90, level_every=15), plan=PlanConfig(target_ssim=0.4))
+CONFIG = RunConfig(
+    train=TrainConfig(max_steps=90, level_every=15),
+    plan=PlanConfig(target_ssim=0.4),
+    sample=SampleConfig(views=8, calibration_views=8),
+)
 PAPER = PaperConfig(tune_steps=5)
 
 
@@ -123,7 +135,9 @@ def test_table_iii_marks_what_was_selected(finished):
         label = next(i for i, name in titles(job.names()).items() if name == row["category"])
         chosen = [part.rpartition(": ")[2] for part in row["marks"].split("; ")]
         assert ", ".join(chosen).count(",") == 2  # every target chose one of the four iterations
-        assert float(row["distance min"]) <= float(row["distance 5 %"]) <= float(row["distance mean"])
+        distances = [row[f"distance {which}"] for which in ("min", "5 %", "mean")]
+        if any(distances):  # else nothing of the category is in the view: the sky may be behind the camera
+            assert sorted(map(float, distances)) == [float(value) for value in distances]
         counts = [job.ladder.counts[label, level] for level in (15, 30, 45, 90)]
         assert int(row["Gaussians t=0.4"]) in counts
         assert float(row["MB t=0.4"]) == pytest.approx(int(row["Gaussians t=0.4"]) * 248 / 1e6)

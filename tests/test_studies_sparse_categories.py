@@ -19,6 +19,7 @@ from sagesplat.core.config import (
     PaperConfig,
     PlanConfig,
     RunConfig,
+    SampleConfig,
     SceneConfig,
     TrainConfig,
 )
@@ -47,6 +48,7 @@ CONFIG = RunConfig(
     scene=SceneConfig(calibrate_every=4),
     train=TrainConfig(max_steps=30, level_every=10),
     nest=NestConfig(steps=4, levels=3, smallest=0.2, base_share=0.0),
+    sample=SampleConfig(views=8, calibration_views=8),
     plan=PlanConfig(target_ssim=0.3),
 )
 
