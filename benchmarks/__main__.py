@@ -73,6 +73,8 @@ def deeplab(steps: int = 160, views: int = 30, write: bool = False) -> None:
 @app.command
 def wild(
     out: Path,
+    /,
+    *,
     rows: tuple[str, ...] = (),
     steps: int = 2000,
     seed: int = 0,

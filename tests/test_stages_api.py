@@ -22,6 +22,7 @@ from sagesplat import (
     run_scene,
 )
 from sagesplat.adapt.plan import Plan, read_plans
+from sagesplat.core.config import SampleConfig
 from sagesplat.core.errors import RunError
 from sagesplat.demo.capture import make_capture
 
