@@ -16,7 +16,7 @@ demo: $(INSTALLED)
 # two processes of one thread each: the tests are small, and idle threads would spin in each other's way;
 # a file stays in one process, which makes its fixtures once
 test: lint browser
-	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/pytest -q -n 2 --dist loadfile -m 'not slow and not threads'
+	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m 'not slow and not threads'
 	NUMBA_NUM_THREADS=2 $(BIN)/pytest -q -m threads
 
 test-slow: $(INSTALLED)

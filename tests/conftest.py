@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from sagesplat.adapt.observe import RenderedLabels
-from sagesplat.core.config import NestConfig, PlanConfig, RunConfig, SampleConfig, SceneConfig, TrainConfig
+from sagesplat.core.config import NestConfig, PlanConfig, RunConfig, SceneConfig, TrainConfig
 from sagesplat.core.gaussians import PARAMETERS, Gaussians
 from sagesplat.core.sh import num_bases, sh0_to_rgb
 from sagesplat.io.files import write_json
@@ -32,9 +32,16 @@ SMALL_RUN = RunConfig(  # of `finished_run`
     scene=SceneConfig(test_every=4, calibrate_every=3),
     train=TrainConfig(max_steps=6, level_every=2),
     nest=NestConfig(steps=2, levels=4, smallest=0.1, base_share=0),
-    sample=SampleConfig(views=8, calibration_views=8),
     plan=PlanConfig(target_ssim=0.4, other_targets=()),
 )
+
+
+# the files that take longest: begun last, one of two processes would wait for the other
+_LONG = ("test_run_stage", "test_viewer_browser", "test_stages_nest", "test_stages_blocks", "test_run_ray")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: item.path.stem not in _LONG)
 
 
 @pytest.fixture
