@@ -54,7 +54,7 @@ def before_after(
         return render_rgb(part, camera, **options).copy()
 
     some = np.unique(np.linspace(0, len(cameras) - 1, min(_LOOKED, len(cameras))).round().astype(int))
-    looked = [_small(cameras[i]) for i in some]
+    looked = [cameras[i].neutral.within(_SIDE) for i in some]
     change = [float(np.abs(render(parts[0], c) - render(parts[1], c)).mean()) for c in looked]
     shown = [looked[i] for i in np.argsort(change)[::-1][:ROWS]]
     heights = [_WIDTH / 3 * camera.height / camera.width for camera in shown]
@@ -74,8 +74,3 @@ def before_after(
             top += height
         with atomic_path(path) as temporary:
             figure.savefig(temporary, format="png", dpi=100)
-
-
-def _small(camera: Camera) -> Camera:
-    share = min(1.0, _SIDE / max(camera.width, camera.height))
-    return camera.neutral.resized(max(1, round(camera.width * share)), max(1, round(camera.height * share)))

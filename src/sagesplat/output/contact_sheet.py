@@ -57,7 +57,9 @@ def contact_sheet(
     """
     shown, workspace = cameras[:MOST], Workspace()
     pictures = [
-        render_rgb(g, _small(camera), backend=backend, antialiased=antialiased, workspace=workspace).copy()
+        render_rgb(
+            g, camera.neutral.within(_SIDE), backend=backend, antialiased=antialiased, workspace=workspace
+        ).copy()
         for camera in shown
     ]
     titles = list(names or map(str, range(1, len(cameras) + 1)))
@@ -79,11 +81,6 @@ def contact_sheet(
         with warnings.catch_warnings(), atomic_path(path) as temporary:
             warnings.filterwarnings("ignore", message="Glyph .* missing from font")  # names in Chinese
             figure.savefig(temporary, format="png", dpi=100)
-
-
-def _small(camera: Camera) -> Camera:
-    share = min(1.0, _SIDE / max(camera.width, camera.height))
-    return camera.neutral.resized(max(1, round(camera.width * share)), max(1, round(camera.height * share)))
 
 
 def _picture(

@@ -42,6 +42,11 @@ class Camera:
         scale = np.array([width / self.width, height / self.height, 1.0], np.float32)
         return replace(self, K=(self.K * scale[:, None]).astype(np.float32), width=width, height=height)
 
+    def within(self, side: int) -> "Camera":
+        """The same camera for an image whose longer side is at most `side` pixels."""
+        share = min(1.0, side / max(self.width, self.height))
+        return self.resized(max(1, round(self.width * share)), max(1, round(self.height * share)))
+
 
 @dataclass(frozen=True, eq=False)
 class Lens:

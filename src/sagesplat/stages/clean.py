@@ -64,8 +64,8 @@ def _clean(job: Job, last: Path, config: CleanConfig) -> Cleaned:
         label_image=job.masks.__getitem__, valid=job.inliers, antialiased=job.antialiased,
         on_view=lambda done: job.emit(Progress("clean", done, len(rows))),
     )  # fmt: skip
-    if job.sky:  # what few views show of it stands before nothing
-        near = ~job.sky.shell.holds(g.means).cpu().numpy()
+    if sky := job.sky:  # what few views show of it stands before nothing
+        near = ~sky.shell.holds(g.means).cpu().numpy()
         floaters = replace(floaters, found={name: rows & near for name, rows in floaters.found.items()})
     kinds = {"train": rows, "calibration": scene.calibration_ids.tolist()}
     cleaned = clean(

@@ -114,9 +114,9 @@ def _views(
     given = read_camera_file(cameras)
     if all(one.photo is not None for one in given):
         scene = load_scene(cameras, test_every=0)
-        scene = replace(scene, views=tuple(replace(v, camera=_small(v.camera)) for v in scene.views))
+        scene = replace(scene, views=tuple(replace(v, camera=v.camera.within(_SIDE)) for v in scene.views))
         return scene, Photos(scene.views), f"{len(scene.views)} photos of {cameras}"
-    scene = _scene_of(cameras, [_small(one.camera) for one in given])
+    scene = _scene_of(cameras, [one.camera.within(_SIDE) for one in given])
     return scene, Renders(g, scene.views, backend, antialiased), f"{len(scene.views)} cameras of {cameras}"
 
 
@@ -129,11 +129,6 @@ def _scene_of(path: Path, cameras: Sequence[Camera]) -> Scene:
         np.zeros((0, 2), np.float32),
     )  # fmt: skip
     return Scene(path.name, path, views, points, test_every=0)
-
-
-def _small(camera: Camera) -> Camera:
-    share = min(1.0, _SIDE / max(camera.width, camera.height))
-    return camera.resized(max(1, round(camera.width * share)), max(1, round(camera.height * share)))
 
 
 def _write(source: Path, out: Path, splat: Splat, keep: np.ndarray) -> None:

@@ -59,8 +59,8 @@ def exposure_update(scene: Scene, photos: Photos, config: TrainConfig) -> tuple[
             )
         if gains.follow_direction:
             return None, (
-                f"exposure varies by {gains.range_ev:.1f} EV with the viewing direction: the model has it so;"
-                " --train.exposure affine takes it out"
+                f"exposure varies by {gains.range_ev:.1f} EV with the viewing direction,"
+                " learned as view-dependent colour; --train.exposure affine takes it out"
             )
         return None, ""
     found = f"exposure varies by {gains.range_ev:.1f} EV: a colour transform per photo"

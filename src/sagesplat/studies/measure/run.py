@@ -128,12 +128,7 @@ def _viewpoints(
     picked = np.linspace(0, len(found) - 1, min(config.views, len(found))).round().astype(int)
     some = [found[i] for i in picked]
     line = f"{len(some)} of the {len(found)} cameras of {config.cameras.name}"
-    return [_resized(one.camera, config.size) for one in some], [one.name for one in some], [line]
-
-
-def _resized(camera: Camera, size: int) -> Camera:
-    share = min(1.0, size / max(camera.width, camera.height))
-    return camera.resized(max(1, round(camera.width * share)), max(1, round(camera.height * share)))
+    return [one.camera.within(config.size) for one in some], [one.name for one in some], [line]
 
 
 def _metrics(folder: Path | None, emit: Emit) -> dict[str, Lpips]:
