@@ -137,6 +137,16 @@ def test_figures_that_are_none_are_refused(tmp_path: Path, content: str) -> None
         read_clean_figures(path)
 
 
+def test_damaged_figures_are_made_again_as_their_error_says(run: RunDir) -> None:
+    spoil(run)
+    run.floaters.write_text("[]")
+    with pytest.raises(RunError, match=r"delete it and run `sagesplat clean RUN`"):
+        clean_levels(job_of(run), CleanConfig())
+    run.floaters.unlink()
+    clean_levels(job_of(run), CleanConfig())
+    assert read_clean_figures(run.floaters) is not None
+
+
 def test_figures_in_words() -> None:
     figures = CleanFigures(
         1000, {"few views": 5, "in front": 4, "category": 0}, {"few views": 5, "in front": 1, "category": 0},

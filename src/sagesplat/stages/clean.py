@@ -108,7 +108,7 @@ def read_clean_figures(path: Path) -> CleanFigures | None:
     """What `clean_levels` wrote; None where it never ran. RunError for anything else."""
     if not path.exists():
         return None
-    cure = "run `sagesplat clean RUN` again with --force"
+    cure = "delete it and run `sagesplat clean RUN`"
     made = read_json(path, cure)
     try:
         if not isinstance(made, dict):
