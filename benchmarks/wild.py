@@ -45,6 +45,7 @@ class Row(NamedTuple):
     train: dict[str, Any]  # settings of training
     ignore: str = ""  # categories that do not belong to the scene
     clean: bool = False  # floaters are removed after training
+    vignetting: bool = False  # photos are corrected
 
 
 FEWER = Wild(keep=0.45)  # 27 photos, of which 23 train
@@ -55,6 +56,7 @@ ROWS = {
     "exposure, auto": Row(EXPOSURE, {}),
     "vignetting": Row(VIGNETTING, PLAIN),
     "vignetting, auto": Row(VIGNETTING, {}),
+    "vignetting, corrected": Row(VIGNETTING, {}, vignetting=True),
     "figures": Row(FIGURES, PLAIN),
     "figures, ignore": Row(FIGURES, PLAIN, "person"),
     "figures without masks": Row(replace(FIGURES, figure_masks=False), PLAIN),
@@ -66,7 +68,7 @@ ROWS = {
     "half circle, sky": Row(Wild(half_circle=True), PLAIN | {"sky": "auto"}),
     "half circle, sky, clean": Row(Wild(half_circle=True), PLAIN | {"sky": "auto"}, clean=True),
     "everything": Row(EVERYTHING, PLAIN),
-    "everything, remedies": Row(EVERYTHING, {"poses": True}, "person", clean=True),
+    "everything, remedies": Row(EVERYTHING, {"poses": True}, "person", clean=True, vignetting=True),
 }
 OFF_PATH_VIEWS = 40
 BLUR, OFF = 4.0, 0.1  # px and colour in [0, 1]: floaters and mist outlast a blur, missing detail does not
@@ -102,7 +104,7 @@ def _measure(folder: Path, name: str, row: Row, steps: int, seed: int) -> dict[s
     path = folder / "runs" / f"{name.replace(', ', '-').replace(' ', '-')}-{seed}-{steps}"
     job = Job(RunDir(path), lambda event: None)
     config = replace(TrainConfig(), max_steps=steps, **row.train)
-    open_scene(job, capture, SceneConfig())
+    open_scene(job, capture, SceneConfig(vignetting=row.vignetting))
     make_masks(job, MasksConfig(), LabelsConfig(ignore=row.ignore))
     lift_labels(job, LiftConfig())
     train_levels(job, config, seed)
@@ -112,6 +114,10 @@ def _measure(folder: Path, name: str, row: Row, steps: int, seed: int) -> dict[s
     truth = load_transforms(capture / "truth")
     result: dict[str, Any] = {"gaussians": len(g), "train_views": len(job.scene.train_ids)}
     result["test"] = _means(on_path(job, g, capture))
+    undisturbed = RunDir(folder / "runs" / f"clean-{seed}-{steps}")
+    if wild.figures and undisturbed.levels.exists():  # its model, on the same photos and pixels
+        plain = read_level(Job(undisturbed, job.emit).trained)
+        result["test_undisturbed"] = _means(on_path(job, plain, capture))
     off, by_category = off_path(g, capture, alignment(truth, job.scene) if wild.pose_shift else np.eye(4))
     result["off_path"], result["off_path_by_category"] = _means(off), by_category
     if wild.pose_shift:
@@ -207,6 +213,9 @@ def _line(name: str, result: dict[str, Any]) -> str:
         f"off path {off['psnr']:6.2f} dB (cc {off['cc_psnr']:6.2f}) {off['ssim']:.3f}"
         f" mist {off['mist']:.2%}"
     )
+    if "test_undisturbed" in result:
+        plain = result["test_undisturbed"]
+        line += f"   undisturbed model on the same pixels {plain['psnr']:.2f} dB, {plain['ssim']:.3f}"
     if "position_error" in result:
         before, after = result["position_error"]
         line += f"   positions off by {before:.3%}, then {after:.3%}"

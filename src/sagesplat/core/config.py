@@ -18,6 +18,9 @@ class SceneConfig:
     alpha: Literal["auto", "background", "ignore"] = "auto"
     """Transparent pixels of photos. background: an object that was cut out, composited over the background;
     ignore: pixels that do not count; auto: background if most of the photos' border is transparent."""
+    vignetting: bool = False
+    """Undo the vignetting of the photos: the light that the lens loses towards the corners, estimated from
+    points that photos show at different places. Quality is then measured against the corrected photos."""
 
 
 @dataclass(frozen=True)

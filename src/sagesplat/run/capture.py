@@ -13,7 +13,10 @@ from sagesplat.core.errors import RunError, short
 from sagesplat.core.typed import check_fields, types_of
 from sagesplat.io.files import read_json, read_object, write_json
 from sagesplat.run.records import file_hash
-from sagesplat.scene.scene import Scene
+from sagesplat.scene import load_scene
+from sagesplat.scene.scene import Scene, Vignetting
+from sagesplat.scene.vignetting import parse_vignetting
+from sagesplat.scene.vignetting_fit import with_vignetting
 
 _CURE = "delete it, and run `sagesplat run SCENE RUN` again with the same settings"
 _TYPES = {"path": Path, "fingerprint": str}
@@ -27,6 +30,12 @@ class Capture:
     settings: dict[str, Any]  # how it is read; none for a stored scene
     fingerprint: str
     photos: dict[str, str] | None  # SHA-256 by name; None in run folders made before it was kept
+    vignetting: Vignetting | None = None  # that was found in the photos, where it was looked for
+
+    def load(self) -> Scene:
+        """The capture, whose vignetting is not estimated again. Raises SceneError."""
+        scene = load_scene(self.path, **{**self.settings, "vignetting": False})
+        return with_vignetting(scene, self.vignetting) if self.vignetting else scene
 
 
 def read_capture(path: Path) -> Capture:
@@ -42,9 +51,10 @@ def read_capture(path: Path) -> Capture:
         photos = made.get("photos")
         if photos is not None and not (isinstance(photos, dict) and set(map(type, photos.values())) <= {str}):
             raise ValueError("photos without hashes")
+        vignetting = parse_vignetting(made.get("vignetting"))
     except ValueError as error:
         raise RunError(f"{path}: not the scene of a run ({short(error)}); {_CURE}") from None
-    return Capture(Path(made["path"]), made["settings"], made["fingerprint"], photos)
+    return Capture(Path(made["path"]), made["settings"], made["fingerprint"], photos, vignetting)
 
 
 def fingerprint(scene: Scene) -> str:
@@ -56,6 +66,8 @@ def fingerprint(scene: Scene) -> str:
         digest.update(view.camera.w2c.tobytes() + view.camera.K.tobytes())
         if any(view.camera.background):
             digest.update(bytes(view.camera.background))
+        if view.vignetting:
+            digest.update(repr(view.vignetting).encode())
     digest.update(scene.points.xyz.tobytes())
     if scene.test_names is not None:
         digest.update("\n".join(sorted(scene.test_names)).encode())

@@ -17,7 +17,6 @@ from sagesplat.run.capture import check_photos, fingerprint, photo_hashes, read_
 from sagesplat.run.executor import LOCAL, Executor, Local
 from sagesplat.run.records import settings_of
 from sagesplat.run.run_dir import RunDir
-from sagesplat.scene import load_scene
 from sagesplat.scene.images import Photos
 from sagesplat.scene.refined import read_refined, with_cameras
 from sagesplat.scene.scene import Scene
@@ -93,7 +92,7 @@ class Job:
         if not self.run.scene.exists():
             raise RunError(f"{self.run.path}: {NO_RUN}")
         made = read_capture(self.run.scene)
-        scene = load_scene(made.path, **made.settings)
+        scene = made.load()
         if fingerprint(scene) != made.fingerprint:
             raise RunError(
                 f"{made.path}: the capture changed since this run began; choose another run folder"

@@ -9,16 +9,18 @@ import numpy as np
 from sagesplat.core.errors import SceneError
 from sagesplat.scene.colmap import load_colmap
 from sagesplat.scene.detect import detect
+from sagesplat.scene.images import Photos
 from sagesplat.scene.nerfstudio import load_blender, load_transforms
 from sagesplat.scene.scene import Scene
 from sagesplat.scene.stored import read_scene
+from sagesplat.scene.vignetting_fit import estimate_vignetting, with_vignetting
 
 __all__ = ["describe", "load_scene"]
 
 
 def load_scene(
     path: Path, *, downscale: int = 1, test_every: int = 8, calibrate_every: int = 0,
-    alpha: Literal["auto", "background", "ignore"] = "auto",
+    alpha: Literal["auto", "background", "ignore"] = "auto", vignetting: bool = False,
 ) -> Scene:  # fmt: skip
     """Load a capture: posed photos and structure-from-motion points.
 
@@ -33,6 +35,7 @@ def load_scene(
         calibrate_every: Every n-th of the other views calibrates promises; 0: none, 1 is refused.
         alpha: Transparent pixels of photos. background: of an object that was cut out, composited over the
             background; ignore: pixels that do not count; auto: by their place in the photos.
+        vignetting: Estimate it from the photos, which are then read without it (`View.vignetting`).
 
     Returns:
         The scene. Photos themselves are read when they are needed (`scene.images.Photos`). A stored scene is
@@ -56,7 +59,9 @@ def load_scene(
         return read_scene(path)
     load = {"colmap": load_colmap, "transforms": load_transforms, "blender": load_blender}[kind]
     scene = load(path, downscale=downscale, test_every=test_every)
-    return replace(scene, calibrate_every=calibrate_every, alpha=scene.alpha if alpha == "auto" else alpha)
+    alpha = scene.alpha if alpha == "auto" else alpha
+    scene = replace(scene, calibrate_every=calibrate_every, alpha=alpha)
+    return with_vignetting(scene, estimate_vignetting(scene, Photos(scene.views))) if vignetting else scene
 
 
 def describe(scene: Scene) -> list[tuple[str, str]]:

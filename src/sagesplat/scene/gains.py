@@ -17,12 +17,12 @@ from sagesplat.core.sh import bases
 from sagesplat.scene.exif import exposure_of
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
+from sagesplat.scene.track_colours import track_colours
+from sagesplat.scene.vignetting import CURVE, OFFSET
 
-_OFFSET, _CURVE = 0.055, 2.4
-_DARK, _BRIGHT = 10.0, 245.0  # of 255; values beyond tell nothing of a gain
 _ROUNDS = 10  # of iteratively reweighted least squares
 _PRIOR = 0.3  # observations that say of every photo that it has no gain
-_ENOUGH, _PLENTY = 30, 400  # observations of a photo, on average: at least, and no more than are used
+_ENOUGH = 30  # observations of a photo, on average, at least
 _RIDGE = 0.01  # of the harmonics fitted to log gains
 _BY_DIRECTION = 0.5  # share of the variance of exposures: with more the direction tells most of it
 _EXPLAINED = 0.08  # least share by which gains have to bring colours of the same point together
@@ -33,7 +33,7 @@ _LEAST_EXIF_EV = 0.3  # the same where nothing but EXIF tells it
 def exposure_values(transforms: Float[np.ndarray, "V 3 4"]) -> Float[np.ndarray, " V"]:
     """How much brighter colour transforms make a middle grey, EV."""
     grey = transforms[:, :, :3].sum(2) * 0.5 + transforms[:, :, 3]
-    return _CURVE * np.log2(np.maximum(grey + _OFFSET, 1e-3) / (0.5 + _OFFSET)).mean(1)
+    return CURVE * np.log2(np.maximum(grey + OFFSET, 1e-3) / (0.5 + OFFSET)).mean(1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ class Gains:
     @property
     def ev(self) -> Float32[np.ndarray, " V"]:
         """Exposure of each photo relative to the mean, EV."""
-        ev = _CURVE * np.log2(self.gain).mean(1)
+        ev = CURVE * np.log2(self.gain).mean(1)
         return ev - ev.mean()
 
     @property
@@ -83,22 +83,23 @@ class Gains:
         """The gains as affine transforms of colours, whose mean over the photos is the identity."""
         found = np.zeros((len(self.gain), 3, 4), np.float32)
         found[:, range(3), range(3)] = self.gain
-        found[:, :, 3] = _OFFSET * (self.gain - 1)
+        found[:, :, 3] = OFFSET * (self.gain - 1)
         return found
 
 
 def photo_gains(scene: Scene, photos: Photos | Sequence[np.ndarray], rows: Sequence[int]) -> Gains:
     """Gains of some photos (rows of `scene.views`): from tracks, else from EXIF, else none."""
-    points, views, colours = _track_colours(scene, photos, rows)
+    tracks = track_colours(scene, photos, rows)
+    points, views = tracks.points, tracks.views
     if len(points) >= _ENOUGH * len(rows):
-        logs = np.log(colours + _OFFSET)
+        logs = np.log(tracks.colours + OFFSET)
         explained = _explained(points, views, logs, len(rows))
         gains = _fit(points, views, logs, len(rows))
         forward = np.stack([scene.views[row].camera.w2c[2, :3] for row in rows]).astype(np.float64)
         return Gains(_relative(gains), "tracks", explained, _by_direction(gains.mean(1), forward))
     ev = [exposure_of(scene.views[row].image_path) for row in rows]
     if ev and all(value is not None for value in ev):
-        found = np.array(ev, np.float64)[:, None].repeat(3, 1) * np.log(2) / _CURVE
+        found = np.array(ev, np.float64)[:, None].repeat(3, 1) * np.log(2) / CURVE
         return Gains(_relative(found), "EXIF")
     return Gains(np.ones((len(rows), 3), np.float32), "nothing")
 
@@ -109,7 +110,7 @@ def _fit(
     logs: Float64[np.ndarray, "T 3"],
     count: int,
 ) -> Float64[np.ndarray, "V 3"]:
-    return np.stack([_log_gains(points, views, channel, count) for channel in logs.T], 1)
+    return np.stack([log_gains(points, views, channel, count) for channel in logs.T], 1)
 
 
 def _explained(
@@ -123,8 +124,8 @@ def _explained(
     for half in (0, 1):
         a, b = points % 2 == half, points % 2 != half
         gains = _fit(points[a], views[a], logs[a], count)
-        before += _spread(points[b], logs[b])
-        after += _spread(points[b], logs[b] - gains[views[b]])
+        before += spread(points[b], logs[b])
+        after += spread(points[b], logs[b] - gains[views[b]])
     return 1 - after / max(before, 1e-12)
 
 
@@ -142,35 +143,7 @@ def _relative(logs: Float64[np.ndarray, "V 3"]) -> Float32[np.ndarray, "V 3"]:
     return (gain / gain.mean(0)).astype(np.float32)
 
 
-def _track_colours(
-    scene: Scene, photos: Photos | Sequence[np.ndarray], rows: Sequence[int]
-) -> tuple[Int64[np.ndarray, " T"], Int64[np.ndarray, " T"], Float64[np.ndarray, "T 3"]]:
-    """Points, photos (places in `rows`) and colours in [0, 1] of points that two photos or more observe."""
-    tracks, no = scene.points, np.zeros(0, np.int64)
-    points, views, colours = [no], [no], [np.zeros((0, 3))]
-    order = np.argsort(tracks.track_views, kind="stable")
-    ends = np.searchsorted(tracks.track_views[order], [(row, row + 1) for row in rows]).reshape(-1, 2)
-    for number, (row, (begin, end)) in enumerate(zip(rows, ends.tolist(), strict=True)):
-        if begin == end:
-            continue
-        mine, photo = order[begin:end], photos[row]
-        u, v = np.floor(tracks.track_uv[mine]).astype(np.int64).T
-        inside = (u >= 1) & (v >= 1) & (u < photo.shape[1] - 1) & (v < photo.shape[0] - 1)
-        mine, u, v = mine[inside], u[inside], v[inside]
-        around = [photo[v + i, u + j].astype(np.float64) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-        mean = np.mean(around, 0) if len(mine) else np.zeros((0, 3))
-        fine = ((mean > _DARK) & (mean < _BRIGHT)).all(1)
-        points.append(tracks.track_points[mine[fine]])
-        views.append(np.full(int(fine.sum()), number))
-        colours.append(mean[fine] / 255)
-    _, point, seen = np.unique(np.concatenate(points), return_inverse=True, return_counts=True)
-    every = max(1, len(point) // (_PLENTY * len(rows)))
-    shared = (seen[point] > 1) & (point % every == 0) if len(point) else np.zeros(0, bool)
-    _, of = np.unique(point[shared], return_inverse=True)
-    return of, np.concatenate(views)[shared], np.concatenate(colours)[shared]
-
-
-def _log_gains(
+def log_gains(
     points: Int64[np.ndarray, " T"],
     views: Int64[np.ndarray, " T"],
     logs: Float64[np.ndarray, " T"],
@@ -198,7 +171,7 @@ def _log_gains(
     return gain
 
 
-def _spread(points: Int64[np.ndarray, " T"], logs: Float64[np.ndarray, "T 3"]) -> float:
+def spread(points: Int64[np.ndarray, " T"], logs: Float64[np.ndarray, "T C"]) -> float:
     """Median distance of a point's colours from their mean, over all observations."""
     seen = np.bincount(points)
     means = np.stack([np.bincount(points, channel) for channel in logs.T], 1) / np.maximum(seen, 1)[:, None]

@@ -11,6 +11,7 @@ from sagesplat.core.errors import SceneError
 from sagesplat.io.pictures import FREE_PIXELS, PictureError, open_picture
 from sagesplat.scene.scene import View
 from sagesplat.scene.undistort import undistort
+from sagesplat.scene.vignetting import corrected
 
 _STRIP = 2**20  # pixels that are converted at a time
 _LOOKED_AT = 8  # photos that decide what transparent pixels mean
@@ -73,6 +74,8 @@ def read_black(path: Path, pixels: int) -> Bool[np.ndarray, "h w"]:
 def load_photo(view: View) -> UInt8[np.ndarray, "H W 3"]:
     """The photo as `view.camera` sees it: area-resampled to the camera's size, then undistorted.
 
+    The view's vignetting, if it is known, is undone.
+
     EXIF orientation is not applied, because COLMAP's poses refer to the stored pixels. Grey photos
     become RGB, 16 bits become 8, and alpha is composited over the camera's background. Raises SceneError.
     Memory: up to 24 bytes for each pixel of the file, whose number `open_picture` limits.
@@ -87,7 +90,8 @@ def load_photo(view: View) -> UInt8[np.ndarray, "H W 3"]:
         raise _unreadable(view.image_path, error) from None
     if image.size != size:
         image = image.resize(size, Image.Resampling.BOX)  # first, as undistortion costs more per pixel
-    return undistort(np.array(image), view.lens, view.camera, order=1)
+    photo = undistort(np.array(image), view.lens, view.camera, order=1)
+    return photo if view.vignetting is None else corrected(photo, view.vignetting, view.camera)
 
 
 class Photos:

@@ -1,5 +1,6 @@
 """The types Camera, View, Points and Scene (OpenCV axes: x right, y down, z forward)."""
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -58,6 +59,22 @@ class Lens:
     height: int
 
 
+@dataclass(frozen=True)
+class Vignetting:
+    """Share of the light that a lens lets through: exp(a s + b s^2) for s = tan^2(angle to its axis) / reach.
+
+    Farther out than `reach` it stays what it is there.
+    """
+
+    coefficients: tuple[float, float]  # a, b
+    reach: float  # tan^2
+
+    @property
+    def lost(self) -> float:
+        """Share of the light that is lost at the reach."""
+        return 1 - math.exp(sum(self.coefficients))
+
+
 @dataclass(frozen=True, eq=False)
 class View:
     """One posed photo."""
@@ -67,6 +84,7 @@ class View:
     image_path: Path
     lens: Lens | None = None  # None: the file on disk needs no undistortion
     valid_path: Path | None = None  # an image of the photo's shape whose black pixels do not count
+    vignetting: Vignetting | None = None  # of the photo, to be taken out of it
 
 
 @dataclass(frozen=True, eq=False)

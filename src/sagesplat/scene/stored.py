@@ -11,6 +11,7 @@ from sagesplat.core.names import check_photo, repaired
 from sagesplat.io.files import atomic_path
 from sagesplat.io.npz import Npz
 from sagesplat.scene.scene import Camera, Lens, Points, Scene, View
+from sagesplat.scene.vignetting import parse_vignetting
 
 SUFFIX = ".npz"
 _POINTS = {
@@ -31,6 +32,7 @@ def write_scene(path: Path, scene: Scene) -> None:
             "size": [view.camera.width, view.camera.height],
             "background": view.camera.background,
             "lens": asdict(view.lens) if view.lens else None,
+            "vignetting": asdict(view.vignetting) if view.vignetting else None,
         }
         for view in scene.views
     ]
@@ -80,7 +82,8 @@ def _view(about: dict, w2c: np.ndarray, K: np.ndarray) -> View:
     lens = about["lens"]
     if lens:
         lens = Lens(lens["model"], tuple(map(float, lens["params"])), int(lens["width"]), int(lens["height"]))
-    return View(str(about["name"]), Camera(w2c, K, width, height, (r, g, b)), Path(about["image"]), lens)
+    camera, vignetting = Camera(w2c, K, width, height, (r, g, b)), parse_vignetting(about.get("vignetting"))
+    return View(str(about["name"]), camera, Path(about["image"]), lens, vignetting=vignetting)
 
 
 def _check(points: Points, num_views: int) -> None:

@@ -27,7 +27,7 @@ from sagesplat.run.stage import run_stage
 from sagesplat.scene import load_scene
 from sagesplat.scene.detect import detect
 from sagesplat.scene.feature_masks import OfPhoto
-from sagesplat.scene.scene import Scene
+from sagesplat.scene.scene import Scene, Vignetting
 from sagesplat.scene.stored import write_scene
 from sagesplat.segment.edit import ignored_ids, parse_ignore, parse_merge
 from sagesplat.segment.masks import label_images_of
@@ -71,7 +71,7 @@ def open_scene(
         _find_poses(job, path, capture, poses or PosesConfig(), leaving_out)
         path = capture
     scene = load_scene(path, **asdict(config))
-    photos = photo_hashes(run.photo_hashes, scene)
+    photos, found = photo_hashes(run.photo_hashes, scene), scene.views[0].vignetting
     settings = {"path": str(path.resolve()), **asdict(config), "fingerprint": fingerprint(scene)}
     begun = _begun(job)
     if begun is None or begun.photos is not None or begun.fingerprint != settings["fingerprint"]:
@@ -88,6 +88,7 @@ def open_scene(
                 "settings": asdict(config),
                 "fingerprint": settings["fingerprint"],
                 "photos": photos.sha256,
+                "vignetting": found and asdict(found),
                 "extent": scene.extent,
                 "points": len(scene.points.xyz),
                 "views": [
@@ -104,15 +105,24 @@ def open_scene(
             },
         )
         size = scene.views[0].camera
-        return [
+        lines = [
             f"{len(scene.train_ids)} training, {len(scene.test_ids)} test views, {size.width}x{size.height}",
             f"{len(scene.points.xyz):,} points",
         ]
+        if config.vignetting:
+            lines.append(_of_lens(found))
+        return lines
 
     run_stage(job, "scene", settings, [], [run.scene], make)
     photos.keep()
     if not run.geometry.exists():  # the run began before it was kept
         _write_geometry(run.geometry, scene)
+
+
+def _of_lens(found: Vignetting | None) -> str:
+    if found is None:
+        return "no vignetting that points of structure from motion tell: the photos stay as they are"
+    return f"the lens loses {found.lost:.0%} of the light in the corners: the photos are corrected"
 
 
 def _begun(job: Job) -> Capture | None:

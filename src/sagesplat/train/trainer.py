@@ -18,6 +18,7 @@ from sagesplat.formats.levels import check_level, write_level
 from sagesplat.raster import Backend, device_of
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
+from sagesplat.scene.vignetting_fit import estimate_vignetting
 from sagesplat.segment.masks import Masks
 from sagesplat.segment.valid import ALL_VALID, ValidPixels
 from sagesplat.train.checkpoint import latest_checkpoint, previous, write_checkpoint
@@ -312,7 +313,20 @@ def view_updates(
     exposure, found = exposure_update(scene, photos, config)
     if exposure:
         updates["exposure"] = exposure
-    return updates, [found] if found else []
+    return updates, [line for line in (found, _of_lens(scene, photos, config)) if line]
+
+
+def _of_lens(scene: Scene, photos: Photos, config: TrainConfig) -> str:
+    """What photos that nobody corrected show of their lens, in words; nothing where they show nothing."""
+    if config.exposure == "off" or any(view.vignetting for view in scene.views):
+        return ""
+    found = estimate_vignetting(scene, photos)
+    return (
+        f"the lens loses {found.lost:.0%} of the light in the corners;"
+        " `sagesplat run CAPTURE NEW_RUN --vignetting` corrects the photos"
+        if found
+        else ""
+    )
 
 
 def _check_levels(checkpoint: Path, step: int) -> None:
