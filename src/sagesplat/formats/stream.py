@@ -17,7 +17,6 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.stream_columns import AXIS_BITS, Columns, Layout, code_block, joined, new_tables
 from sagesplat.formats.stream_header import (
     SIZE,
-    Header,
     Precision,
     header_of,
     quantised,
@@ -29,6 +28,7 @@ from sagesplat.kernels.rans import Coder, Reader, Tables, Writer
 
 MAX_COUNT = 10_000_000  # Gaussians of a stream
 _MAX_LEVELS = 255
+_FARTHEST = 1e17  # positions, world units
 _PER_BYTE = 128  # Gaussians in a byte, at most: what the least frequencies of the tables allow is 97
 _SMALLEST, _LARGEST = 16, 1024  # Gaussians of a block
 
@@ -95,7 +95,7 @@ def encode_stream(
     seen = torch.round(torch.sigmoid(g.logit_opacities.double()) * (255 / precision.opacity)) > 0
     rows = np.flatnonzero(seen.numpy())
     g = turned_round(g.select(seen))
-    header = header_of(g, len(sizes), precision, antialiased=antialiased)
+    header = read_header(header_of(g, len(sizes), precision, antialiased=antialiased).pack())
     columns = quantised(g, header)
     ends = np.searchsorted(rows, sizes)
     tables, content, cuts, order = Tables(new_tables(header.layout)), header.pack(), [], []
@@ -136,7 +136,9 @@ def decode_stream(
         if levels is not None and not 1 <= levels <= header.levels:
             raise ValueError(f"level {levels} of {header.levels}")
         tables, at, parts, sizes = Tables(new_tables(header.layout)), SIZE, [], [0]
-        while len(sizes) <= (levels or header.levels) and (levels or at < len(content)):
+        while len(sizes) <= (levels or header.levels):
+            if levels is None and at == len(content):
+                break
             count, at = _read_leb128(content, at)
             nbytes, at = _read_leb128(content, at)
             if nbytes > len(content) - at or count > min(MAX_COUNT - sizes[-1], _PER_BYTE * nbytes):
@@ -162,6 +164,8 @@ def _check(name: str, g: Gaussians, sizes: Sequence[int]) -> None:
     for key, values in g.parameters().items():
         if bad := int((~torch.isfinite(values)).sum()):
             raise DataError(f"{name}: {bad} values of {key} are NaN or infinite; train the scene again")
+    if float(g.means.abs().max() if len(g) else 0) > _FARTHEST:
+        raise DataError(f"{name}: positions beyond {_FARTHEST:.0e} units; scale the scene down")
     if bad := int((~g.quats.any(1)).sum()):
         raise DataError(f"{name}: {bad} Gaussians have a rotation of zeros; train the scene again")
 
@@ -178,10 +182,8 @@ def _read_level(payload: bytes, tables: Tables, layout: Layout, done: int, count
     return parts
 
 
-def _code_level(
-    coder: Coder, layout: Layout, done: int, count: int, given: Columns | None
-) -> list[Columns]:
-    """Code `count` Gaussians after `done` ones in blocks, which grow with what the tables have learnt from."""
+def _code_level(coder: Coder, layout: Layout, done: int, count: int, given: Columns | None) -> list[Columns]:
+    """Code `count` Gaussians after `done` ones in blocks, which grow with `done`."""
     parts, before, at = [], 0, 0
     while at < count:
         size = min(max(_SMALLEST, min((done + at) // 2, _LARGEST)), count - at)

@@ -129,10 +129,11 @@ def _code_gaps(coder: Coder, zero: np.ndarray, given: np.ndarray | None) -> np.n
 
 def _code_scales(coder: Coder, zero: np.ndarray, given: np.ndarray | None) -> np.ndarray:
     """The largest, and how much smaller each of the others is than the one before it."""
-    found = np.empty((len(zero), 3), np.int64)
+    found, wanted = np.empty((len(zero), 3), np.int64), None
     for axis in range(3):
-        wanted = None if given is None else given[:, axis] if axis == 0 else given[:, axis - 1] - given[:, axis]
-        value = _code_values(coder, "scale", zero + axis, (0 if axis else _SCALE), _SCALES, wanted)
+        if given is not None:
+            wanted = given[:, axis - 1] - given[:, axis] if axis else given[:, 0]
+        value = _code_values(coder, "scale", zero + axis, 0 if axis else _SCALE, _SCALES, wanted)
         found[:, axis] = found[:, axis - 1] - value if axis else value
     return found
 

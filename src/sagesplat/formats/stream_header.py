@@ -19,8 +19,9 @@ _ANTIALIASED = 1  # flag
 _FRAME = "rub"  # axes: right, up, back, as in SPZ
 _CELLS = 2**AXIS_BITS
 _LONGEST_LOG = 40  # magnitude of a log scale
-_RANGE = 1e30  # magnitude of a position; its square is finite in float32
-_TURNS = np.zeros((9, 4))  # by 3 x the first + the second axis: wxyz that turns x and y (or their opposites) there
+_RANGE = 1e18  # magnitude of a position; its square is finite in float32
+# by 3 times the first axis plus the second: the rotation wxyz that turns x and y to them or their opposites
+_TURNS = np.zeros((9, 4))
 _TURNS[[1, 2, 3, 5, 6, 7]] = np.array(
     [[1, 0, 0, 0], [0.5**0.5, 0.5**0.5, 0, 0], [0.5**0.5, 0, 0, 0.5**0.5],
      [0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0.5, -0.5], [0.5**0.5, 0, 0.5**0.5, 0]]
@@ -67,12 +68,16 @@ class Header:
         return Layout(self.sh_degree, opacities, self.rotation_origin, self.rotation_spread)
 
     def pack(self) -> bytes:
-        """Its bytes."""
-        return _HEADER.pack(
-            MAGIC, VERSION, _ANTIALIASED * self.antialiased, self.sh_degree, self.levels, self.opacity_step,
-            *self.sh_bits, self.rotation_spread, *self.origin, self.step, self.scale_step, self.colour_step,
-            self.scale_origin, self.colour_origin, self.rotation_origin, 0,
-        )  # fmt: skip
+        """Its bytes; ValueError for a value that has no place in them."""
+        try:
+            return _HEADER.pack(
+                MAGIC, VERSION, _ANTIALIASED * self.antialiased, self.sh_degree, self.levels,
+                self.opacity_step, *self.sh_bits, self.rotation_spread, *self.origin, self.step,
+                self.scale_step, self.colour_step, self.scale_origin, self.colour_origin,
+                self.rotation_origin, 0,
+            )  # fmt: skip
+        except struct.error as error:
+            raise ValueError(f"a precision that the format does not have ({error})") from None
 
 
 def read_header(content: bytes) -> Header:
@@ -85,7 +90,7 @@ def read_header(content: bytes) -> Header:
         raise ValueError(f"version {version}, flags {flags}: a newer stream than this reader knows")
     steps = np.array([step, scale_step, colour_step])
     reach = np.abs(origin) + step * _CELLS
-    if not (1e-30 <= steps).all() or not (steps <= _RANGE).all() or not (reach <= _RANGE).all():
+    if not (steps >= 1e-18).all() or not (steps <= _RANGE).all() or not (reach <= _RANGE).all():
         raise ValueError("impossible steps")
     if degree > 3 or not levels or not opacity or not spread or not (1 <= low <= 8 and 1 <= high <= 8):
         raise ValueError(f"degree {degree}, {levels} levels, steps {opacity}, {low}, {high}, {spread}")
@@ -96,14 +101,11 @@ def read_header(content: bytes) -> Header:
 
 
 def header_of(g: Gaussians, levels: int, precision: Precision, *, antialiased: bool) -> Header:
-    """The header of a stream of these Gaussians, in right, up, back.
-
-    ValueError for a precision that the format does not have.
-    """
+    """The header of a stream of these Gaussians, in right, up, back."""
     means, logs = g.means.double().numpy(), np.sort(g.log_scales.double().numpy(), axis=1)
     if not len(means):
         means, logs = np.zeros((1, 3)), np.zeros((1, 3))
-    low = np.nextafter(means.min(0).astype(np.float32), np.float32(-np.inf))
+    low = means.min(0)
     middle = float(np.exp(np.median(logs[:, 1]).clip(-_LONGEST_LOG, _LONGEST_LOG)))
     widest = float((means - low).max()) / (_CELLS - 2)
     scales = np.rint(logs.clip(-_LONGEST_LOG, _LONGEST_LOG) / precision.log_scale)
@@ -119,9 +121,9 @@ def header_of(g: Gaussians, levels: int, precision: Precision, *, antialiased: b
         precision.sh_bits,
         spread,
         (float(low[0]), float(low[1]), float(low[2])),
-        float(np.float32(max(precision.position * middle, widest, 1e-30))),
-        float(np.float32(precision.log_scale)),
-        float(np.float32(precision.colour)),
+        max(precision.position * middle, widest, 1e-18),
+        precision.log_scale,
+        precision.colour,
         origin,
         int(np.median(colours).clip(-30_000, 30_000)) if len(g) else 0,
         usual - round((6.5 + precision.rotation) * spread),
