@@ -18,6 +18,10 @@ SIZE = _HEADER.size
 _ANTIALIASED = 1  # flag
 _FRAME = "rub"  # axes: right, up, back, as in SPZ
 _CELLS = 2**AXIS_BITS
+_SMALLEST = 2**-8  # step that a precision can ask for
+_CLASS = 11 / 8  # natural log of what makes a rotation one class finer: of 2 log(largest) - log(smallest)
+_MIDDLE = 6.5  # class of the median
+_FARTHEST = 2**15 - 1  # magnitude of an origin
 _LONGEST_LOG = 40  # magnitude of a log scale
 _RANGE = 1e18  # magnitude of a position; its square is finite in float32
 # by 3 times the first axis plus the second: the rotation wxyz that turns x and y to them or their opposites
@@ -41,6 +45,13 @@ class Precision:
     log_scale: float = 1 / 8  # steps
     sh_bits: tuple[int, int] = (5, 4)  # steps of 2^(1 - bits): of degree 1, and of 2 and 3
     rotation: float = 0.0  # classes finer than usual; two halve the steps
+
+    def __post_init__(self) -> None:
+        steps = (self.position, self.colour, self.log_scale)
+        if min(steps) < _SMALLEST or max(steps) > 1 / _SMALLEST or not 1 <= self.opacity <= 255:
+            raise ValueError(f"steps {steps} and {self.opacity}/255 of opacities are not in the format")
+        if not all(1 <= bits <= 8 for bits in self.sh_bits) or abs(self.rotation) > 9:
+            raise ValueError(f"{self.sh_bits} bits, {self.rotation} classes; 1 to 8 and -9 to 9 are there")
 
 
 @dataclass(frozen=True)
@@ -68,16 +79,12 @@ class Header:
         return Layout(self.sh_degree, opacities, self.rotation_origin, self.rotation_spread)
 
     def pack(self) -> bytes:
-        """Its bytes; ValueError for a value that has no place in them."""
-        try:
-            return _HEADER.pack(
-                MAGIC, VERSION, _ANTIALIASED * self.antialiased, self.sh_degree, self.levels,
-                self.opacity_step, *self.sh_bits, self.rotation_spread, *self.origin, self.step,
-                self.scale_step, self.colour_step, self.scale_origin, self.colour_origin,
-                self.rotation_origin, 0,
-            )  # fmt: skip
-        except struct.error as error:
-            raise ValueError(f"a precision that the format does not have ({error})") from None
+        """Its bytes."""
+        return _HEADER.pack(
+            MAGIC, VERSION, _ANTIALIASED * self.antialiased, self.sh_degree, self.levels, self.opacity_step,
+            *self.sh_bits, self.rotation_spread, *self.origin, self.step, self.scale_step, self.colour_step,
+            self.scale_origin, self.colour_origin, self.rotation_origin, 0,
+        )  # fmt: skip
 
 
 def read_header(content: bytes) -> Header:
@@ -111,7 +118,7 @@ def header_of(g: Gaussians, levels: int, precision: Precision, *, antialiased: b
     scales = np.rint(logs.clip(-_LONGEST_LOG, _LONGEST_LOG) / precision.log_scale)
     colours = (g.sh0.double().numpy() * PER_COLOUR + 127.5) / precision.colour
     origin = int(np.median(scales[:, 2]))
-    spread = max(1, round(11 / 8 / precision.log_scale))  # a class of rotations: two octaves of a scale
+    spread = int(np.clip(round(_CLASS / precision.log_scale), 1, 255))
     usual = int(np.median(2 * scales[:, 2] - scales[:, 0])) - origin
     return Header(
         antialiased,
@@ -125,8 +132,8 @@ def header_of(g: Gaussians, levels: int, precision: Precision, *, antialiased: b
         precision.log_scale,
         precision.colour,
         origin,
-        int(np.median(colours).clip(-30_000, 30_000)) if len(g) else 0,
-        usual - round((6.5 + precision.rotation) * spread),
+        int(np.median(colours).clip(-_FARTHEST, _FARTHEST)) if len(g) else 0,
+        int(np.clip(usual - round((_MIDDLE + precision.rotation) * spread), -_FARTHEST, _FARTHEST)),
     )
 
 
