@@ -1,0 +1,393 @@
+/** Coded streams: the nested levels of a category, decoded level by level. docs/formats.md specifies them. */
+
+import { Reader, Table } from "./rans";
+
+const HEADER = 44;
+const MAGIC = 0x53475354;
+const MAX_COUNT = 10_000_000;
+const PER_BYTE = 128; // Gaussians in a byte, at most
+const SMALLEST = 16; // Gaussians of a block
+const LARGEST = 1024;
+const BASES = [0, 3, 8, 15] as const;
+const ROTATIONS = [4, 6, 8, 11, 16, 23, 32, 45, 64, 90, 127] as const;
+const GREATEST = 1e18;
+const LONGEST_LOG = 40;
+const ESCAPE_BITS = 20;
+const POSITION_BITS = 51;
+
+/** The Gaussians of a level, in right, up, back. */
+export interface Gaussians {
+  readonly count: number;
+  readonly means: Float32Array; // [count, 3]
+  readonly quats: Float32Array; // [count, 4], w x y z
+  readonly logScales: Float32Array; // [count, 3]
+  readonly opacities: Float32Array;
+  readonly sh0: Float32Array; // [count, 3]
+  readonly shN: Float32Array; // [count, K, 3]
+}
+
+/** What a stream says of all its Gaussians. */
+export interface Header {
+  readonly antialiased: boolean;
+  readonly degree: number;
+  readonly levels: number;
+  readonly opacityStep: number; // of 1/255
+  readonly shBits: readonly [number, number];
+  readonly spread: number;
+  readonly origin: readonly [number, number, number];
+  readonly step: number;
+  readonly scaleStep: number;
+  readonly colourStep: number;
+  readonly scaleOrigin: number;
+  readonly colourOrigin: number;
+  readonly rotationOrigin: number;
+}
+
+/** The header of a stream; throws for another format. */
+export function readHeader(bytes: Uint8Array): Header {
+  const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
+  if (bytes.length < HEADER || view.getUint32(0) !== MAGIC) throw new Error("not a sagesplat-stream");
+  if (view.getUint8(4) !== 1 || view.getUint8(5) > 1 || view.getUint16(42, true)) {
+    throw new Error("a newer stream than this viewer knows");
+  }
+  const float = (at: number) => view.getFloat32(at, true);
+  const header: Header = {
+    antialiased: view.getUint8(5) === 1,
+    degree: view.getUint8(6),
+    levels: view.getUint8(7),
+    opacityStep: view.getUint8(8),
+    shBits: [view.getUint8(9), view.getUint8(10)],
+    spread: view.getUint8(11),
+    origin: [float(12), float(16), float(20)],
+    step: float(24),
+    scaleStep: float(28),
+    colourStep: float(32),
+    scaleOrigin: view.getInt16(36, true),
+    colourOrigin: view.getInt16(38, true),
+    rotationOrigin: view.getInt16(40, true),
+  };
+  const { step, scaleStep, colourStep, origin, levels, opacityStep, spread, shBits } = header;
+  const steps = [step, scaleStep, colourStep].every((s) => s >= 1 / GREATEST && s <= GREATEST);
+  const inReach = origin.every((at) => Math.abs(at) + step * 2 ** 17 <= GREATEST);
+  const bits = shBits.every((n) => n >= 1 && n <= 8);
+  if (!steps || !inReach || !bits || header.degree > 3 || !levels || !opacityStep || !spread) {
+    throw new Error("a stream with an impossible header");
+  }
+  return header;
+}
+
+/** Decodes a stream while its bytes arrive. */
+export class StreamDecoder {
+  private waiting: Uint8Array = new Uint8Array(0);
+  private header: Header | null = null;
+  private block: BlockDecoder | null = null;
+  private done = 0; // Gaussians
+  private levels = 0;
+
+  /** Takes the next bytes of the stream; the levels that they complete. Throws for a damaged stream. */
+  push(bytes: Uint8Array): Gaussians[] {
+    this.waiting = this.waiting.length ? joined(this.waiting, bytes) : bytes;
+    if (!this.header) {
+      if (this.waiting.length < HEADER) return [];
+      this.header = readHeader(this.waiting);
+      this.block = new BlockDecoder(this.header);
+      this.waiting = this.waiting.subarray(HEADER);
+    }
+    const found: Gaussians[] = [];
+    while (this.waiting.length) {
+      if (this.levels === this.header.levels) throw new Error("bytes after the last level");
+      const level = this.next(this.header);
+      if (!level) break;
+      found.push(level);
+    }
+    return found;
+  }
+
+  /** The next level, if all of it is here. */
+  private next(header: Header): Gaussians | null {
+    const [count, afterCount] = number(this.waiting, 0);
+    const [size, start] = number(this.waiting, afterCount);
+    if (count > Math.min(MAX_COUNT - this.done, PER_BYTE * size) || (!count && size)) {
+      throw new Error("a level with more Gaussians than fit");
+    }
+    if (Number.isNaN(size) || this.waiting.length < start + size) return null;
+    const level = empty(count, header);
+    if (count) this.decode(this.waiting.subarray(start, start + size), level);
+    this.waiting = this.waiting.subarray(start + size);
+    this.levels++;
+    return level;
+  }
+
+  private decode(payload: Uint8Array, level: Gaussians): void {
+    const reader = new Reader(payload);
+    let before = 0;
+    for (let at = 0; at < level.count; ) {
+      const block = Math.max(SMALLEST, Math.min(this.done >> 1, LARGEST));
+      const count = Math.min(block, level.count - at);
+      before = (this.block as BlockDecoder).decode(reader, level, at, count, before);
+      at += count;
+      this.done += count;
+    }
+    reader.finish();
+  }
+}
+
+/** LEB128 at an offset, and where it ends; NaN where bytes are missing. */
+function number(bytes: Uint8Array, at: number): [number, number] {
+  let value = 0;
+  for (let i = 0; i < 4; i++) {
+    const byte = bytes[at + i];
+    if (byte === undefined) return [Number.NaN, at];
+    value |= (byte & 127) << (7 * i);
+    if (byte < 128) return [value, at + i + 1];
+  }
+  throw new Error("no number of Gaussians or bytes");
+}
+
+function joined(a: Uint8Array, b: Uint8Array): Uint8Array {
+  const both = new Uint8Array(a.length + b.length);
+  both.set(a);
+  both.set(b, a.length);
+  return both;
+}
+
+function empty(count: number, { degree }: Header): Gaussians {
+  return {
+    count,
+    means: new Float32Array(3 * count),
+    quats: new Float32Array(4 * count),
+    logScales: new Float32Array(3 * count),
+    opacities: new Float32Array(count),
+    sh0: new Float32Array(3 * count),
+    shN: new Float32Array(3 * count * (BASES[degree] ?? 0)),
+  };
+}
+
+const peak = (likeliest: number, half: number) => (symbol: number) =>
+  Math.max(1, 64 >> Math.min(31, Math.floor(Math.abs(symbol - likeliest) / half)));
+
+const column = () => new Int32Array(LARGEST);
+
+/** Decodes blocks of Gaussians, and learns from them. */
+class BlockDecoder {
+  private readonly gap = new Table(1, POSITION_BITS + 1, () => 8);
+  private readonly opacity: Table;
+  private readonly scale: Table;
+  private readonly rotation = new Table(11, 255, (symbol, row) =>
+    Math.abs(symbol - 127) <= (ROTATIONS[row] as number) ? 8 : 0,
+  );
+  private readonly colour: Table;
+  private readonly bands: Band[] = [];
+  private readonly tables: Table[];
+  private readonly values = column();
+  private readonly first = column();
+  private readonly second = column();
+  private readonly positions = new Float64Array(LARGEST);
+
+  constructor(private readonly header: Header) {
+    const opacities = Math.ceil(255 / header.opacityStep);
+    this.opacity = new Table(1, 256, (symbol) => (symbol > 0 && symbol <= opacities ? 8 : 0));
+    const [large, small] = [peak(64, 12), peak(9, 6)];
+    this.scale = new Table(3, 128, (symbol, row) => (row ? small : large)(symbol));
+    const [green, others] = [peak(80, 12), peak(80, 4)];
+    this.colour = new Table(3, 160, (symbol, row) => (row ? others : green)(symbol));
+    for (let degree = 1; degree <= header.degree; degree++) this.bands.push(new Band(degree, header));
+    this.tables = [this.gap, this.opacity, this.scale, this.rotation, this.colour];
+    this.tables.push(...this.bands.flatMap((band) => band.tables));
+  }
+
+  /** Decodes `count` Gaussians into rows from `start` on; the last position, as Morton code. */
+  decode(reader: Reader, level: Gaussians, start: number, count: number, before: number): number {
+    const last = this.decodePositions(reader, level.means, start, count, before);
+    const { header, values } = this;
+    reader.symbols(this.opacity, 0, values, count);
+    for (let i = 0; i < count; i++) {
+      level.opacities[start + i] = Math.min((values[i] as number) * header.opacityStep, 254.75) / 255;
+    }
+    this.decodeScales(reader, level.logScales, start, count);
+    this.decodeRotations(reader, level.quats, start, count);
+    this.decodeColours(reader, level.sh0, start, count);
+    this.first.fill(0);
+    for (const band of this.bands) band.decode(reader, level.shN, start, count, this.first);
+    for (const table of this.tables) table.endBlock();
+    return last;
+  }
+
+  private decodePositions(
+    reader: Reader,
+    means: Float32Array,
+    start: number,
+    count: number,
+    before: number,
+  ): number {
+    const { positions, values } = this;
+    const { origin, step } = this.header;
+    reader.symbols(this.gap, 0, values, count);
+    for (let i = 0; i < count; i++) positions[i] = Math.min(values[i] as number, 1);
+    for (let i = 0; i < count; i++) values[i] = (values[i] as number) - 1;
+    reader.bits(values, positions, count);
+    let code = before;
+    for (let i = 0; i < count; i++) {
+      code += positions[i] as number;
+      const low = code % 2 ** 24;
+      const high = (code - low) / 2 ** 24;
+      for (let axis = 0; axis < 3; axis++) {
+        const cell = thirds(low >> axis) | (thirds(high >> axis) << 8);
+        means[3 * (start + i) + axis] = (origin[axis] as number) + step * cell;
+      }
+    }
+    if (code >= 2 ** POSITION_BITS) throw new Error("a position outside the grid");
+    return code;
+  }
+
+  /** Leaves the classes of rotations in `first`. */
+  private decodeScales(reader: Reader, logScales: Float32Array, start: number, count: number): void {
+    const { values, first, second } = this;
+    const { scaleOrigin, scaleStep, rotationOrigin, spread } = this.header;
+    const log = (steps: number) =>
+      Math.max(-LONGEST_LOG, Math.min((steps + scaleOrigin) * scaleStep, LONGEST_LOG));
+    readValues(reader, this.scale, 0, 64, first, count);
+    readValues(reader, this.scale, 1, 0, second, count);
+    readValues(reader, this.scale, 2, 0, values, count);
+    for (let i = 0, at = 3 * start; i < count; i++, at += 3) {
+      const largest = first[i] as number;
+      const middle = largest - (second[i] as number);
+      const smallest = middle - (values[i] as number);
+      logScales[at] = log(largest);
+      logScales[at + 1] = log(middle);
+      logScales[at + 2] = log(smallest);
+      const size = Math.floor((2 * largest - smallest - rotationOrigin) / spread);
+      first[i] = Math.max(0, Math.min(size, ROTATIONS.length - 1));
+    }
+  }
+
+  private decodeRotations(reader: Reader, quats: Float32Array, start: number, count: number): void {
+    const { values, first } = this;
+    for (let axis = 1; axis < 4; axis++) {
+      reader.symbols(this.rotation, first, values, count);
+      for (let i = 0; i < count; i++) {
+        const step = Math.SQRT1_2 / (ROTATIONS[first[i] as number] as number);
+        quats[4 * (start + i) + axis] = ((values[i] as number) - 127) * step;
+      }
+    }
+    for (let at = 4 * start; at < 4 * (start + count); at += 4) {
+      const [x, y, z] = [quats[at + 1] as number, quats[at + 2] as number, quats[at + 3] as number];
+      quats[at] = Math.sqrt(Math.max(0, 1 - x * x - y * y - z * z));
+    }
+  }
+
+  private decodeColours(reader: Reader, sh0: Float32Array, start: number, count: number): void {
+    const { values, first, second } = this;
+    const { colourOrigin, colourStep } = this.header;
+    readValues(reader, this.colour, 0, 80, first, count);
+    readValues(reader, this.colour, 1, 80, second, count);
+    readValues(reader, this.colour, 2, 80, values, count);
+    const colour = (steps: number) => ((steps + colourOrigin) * colourStep - 127.5) / 38.25;
+    for (let i = 0, at = 3 * start; i < count; i++, at += 3) {
+      const green = first[i] as number;
+      sh0[at] = colour(green + (second[i] as number));
+      sh0[at + 1] = colour(green);
+      sh0[at + 2] = colour(green + (values[i] as number));
+    }
+  }
+}
+
+/** The harmonics of one degree. */
+class Band {
+  readonly tables: readonly [Table, Table, Table, Table]; // masks, green, red, blue
+  private readonly low: number;
+  private readonly bases: number; // of all degrees
+  private readonly step: number;
+  private readonly masks = column();
+  private readonly places: Int32Array; // of the coefficients that are not 0, in shN
+  private readonly green: Int32Array;
+  private readonly red: Int32Array;
+  private readonly blue: Int32Array;
+  private readonly contexts: Int32Array;
+
+  constructor(degree: number, header: Header) {
+    this.low = BASES[degree - 1] as number;
+    this.bases = BASES[header.degree] as number;
+    this.step = 2 ** (1 - header.shBits[degree === 1 ? 0 : 1]);
+    const bits = 2 * degree + 1;
+    const values = (rows: number) => new Table(rows, 64, peak(31, 1));
+    const masks = new Table(this.low + 1, 1 << bits, (mask) => Math.max(1, 64 >> (2 * ones(mask))));
+    this.tables = [masks, values(1), values(7), values(15)];
+    const columns = Array.from({ length: 5 }, () => new Int32Array(LARGEST * bits));
+    [this.places, this.green, this.red, this.blue, this.contexts] = columns as [
+      Int32Array,
+      Int32Array,
+      Int32Array,
+      Int32Array,
+      Int32Array,
+    ];
+  }
+
+  /** `before`: coefficients of lower degrees that are not 0; this degree's are added. */
+  decode(reader: Reader, shN: Float32Array, start: number, count: number, before: Int32Array): void {
+    const { places, green, red, blue, contexts, masks, step } = this;
+    reader.symbols(this.tables[0], before, masks, count);
+    let found = 0;
+    for (let i = 0; i < count; i++) {
+      let place = 3 * ((start + i) * this.bases + this.low);
+      const earlier = found;
+      for (let mask = masks[i] as number; mask; mask >>= 1, place += 3) {
+        if (mask & 1) places[found++] = place;
+      }
+      before[i] = (before[i] as number) + found - earlier;
+    }
+    readValues(reader, this.tables[1], 0, 31, green, found);
+    for (let i = 0; i < found; i++) contexts[i] = Math.max(-3, Math.min(green[i] as number, 3)) + 3;
+    readValues(reader, this.tables[2], contexts, 31, red, found);
+    for (let i = 0; i < found; i++) {
+      const [g, r] = [green[i] as number, red[i] as number];
+      contexts[i] = 3 * (Math.max(-2, Math.min(g, 2)) + 2) + Math.max(-1, Math.min(r, 1)) + 1;
+    }
+    readValues(reader, this.tables[3], contexts, 31, blue, found);
+    for (let i = 0; i < found; i++) {
+      const place = places[i] as number;
+      const g = green[i] as number;
+      shN[place] = step * (g + (red[i] as number));
+      shN[place + 1] = step * g;
+      shN[place + 2] = step * (g + (blue[i] as number));
+    }
+  }
+}
+
+/** Values around the symbol `zero` of a table, whose last symbol is an escape. */
+function readValues(
+  reader: Reader,
+  table: Table,
+  rows: number | Int32Array,
+  zero: number,
+  out: Int32Array,
+  count: number,
+): void {
+  reader.symbols(table, rows, out, count);
+  const rare: number[] = [];
+  for (let i = 0; i < count; i++) {
+    if (out[i] === table.symbols - 1) rare.push(i);
+    out[i] = (out[i] as number) - zero;
+  }
+  if (!rare.length) return;
+  const wide = new Float64Array(rare.length);
+  reader.bits(new Int32Array(rare.length).fill(ESCAPE_BITS), wide, rare.length);
+  rare.forEach((i, k) => {
+    out[i] = (wide[k] as number) - 2 ** (ESCAPE_BITS - 1);
+  });
+}
+
+function ones(mask: number): number {
+  let count = 0;
+  for (let left = mask; left; left >>= 1) count += left & 1;
+  return count;
+}
+
+/** Every third bit of 27, from the lowest, side by side. */
+function thirds(bits: number): number {
+  let x = bits & 0x09249249;
+  x = (x ^ (x >> 2)) & 0x030c30c3;
+  x = (x ^ (x >> 4)) & 0x0300f00f;
+  x = (x ^ (x >> 8)) & 0x030000ff;
+  return (x ^ (x >> 16)) & 0x3ff;
+}
