@@ -14,7 +14,7 @@ from jaxtyping import Int64
 
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.formats.stream_columns import AXIS_BITS, Columns, Layout, code_block, joined, new_tables
+from sagesplat.formats.stream_columns import AXIS_BITS, Columns, Layout, code_columns, joined, new_tables
 from sagesplat.formats.stream_header import (
     SIZE,
     Precision,
@@ -30,7 +30,7 @@ MAX_COUNT = 10_000_000  # Gaussians of a stream
 _MAX_LEVELS = 255
 _FARTHEST = 1e17  # positions, world units
 _PER_BYTE = 128  # Gaussians in a byte, at most: what the least frequencies of the tables allow is 97
-_SMALLEST, _LARGEST = 16, 1024  # Gaussians of a block
+_SMALLEST, _LARGEST = 4, 11  # log2 of the Gaussians of a block
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,13 +183,17 @@ def _read_level(payload: bytes, tables: Tables, layout: Layout, done: int, count
 
 
 def _code_level(coder: Coder, layout: Layout, done: int, count: int, given: Columns | None) -> list[Columns]:
-    """Code `count` Gaussians after `done` ones in blocks, which grow with `done`."""
+    """Code `count` Gaussians after `done` ones: up to the end of a block, or what the level has of it."""
     parts, before, at = [], 0, 0
     while at < count:
-        size = min(max(_SMALLEST, min((done + at) // 2, _LARGEST)), count - at)
-        some = None if given is None else given.rows(slice(at, at + size))
-        parts.append(code_block(coder, layout, size, before, some))
-        before, at = int(parts[-1].positions[-1]), at + size
+        size = 1 << min(max((done >> 1).bit_length() - 1, _SMALLEST), _LARGEST)
+        left = size - done % size  # of the block
+        now = min(left, count - at)
+        some = None if given is None else given.rows(slice(at, at + now))
+        parts.append(code_columns(coder, layout, now, before, some))
+        if now == left:
+            coder.end_block()
+        before, at, done = int(parts[-1].positions[-1]), at + now, done + now
         if before >> 3 * AXIS_BITS:
             raise ValueError("a position outside the grid")
     return parts

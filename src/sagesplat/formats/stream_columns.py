@@ -1,4 +1,4 @@
-"""How the columns of a coded stream are coded: in what order, and by which tables.
+"""How the columns of integers of a coded stream are coded: in what order, and by which tables.
 
 The same functions write and read: a writer gets columns, a reader returns what it reads. The table of a
 symbol may depend on what was coded before it. docs/formats.md specifies the columns.
@@ -101,8 +101,8 @@ def _few(bits: int) -> np.ndarray:
     return np.maximum(_PEAK >> 2 * ones, 1)
 
 
-def code_block(coder: Coder, layout: Layout, count: int, before: int, given: Columns | None) -> Columns:
-    """Code the columns of a block of `count` Gaussians; a reader is given none.
+def code_columns(coder: Coder, layout: Layout, count: int, before: int, given: Columns | None) -> Columns:
+    """Code the columns of `count` Gaussians; a reader is given none.
 
     `before`: the Morton code before them in the level, or 0.
     """
@@ -116,7 +116,6 @@ def code_block(coder: Coder, layout: Layout, count: int, before: int, given: Col
         rotations[:, axis] = coder.symbols("rotation", classes, wanted) - _ROTATION
     colours = _code_colours(coder, zero, None if given is None else given.colours)
     harmonics = _code_harmonics(coder, layout, zero, None if given is None else given.harmonics)
-    coder.end_block()
     return Columns(before + gaps.cumsum(), opacities, scales, rotations, colours, harmonics)
 
 

@@ -50,7 +50,7 @@ class Tables:
         self._seen: list[tuple[str, np.ndarray, np.ndarray]] = []
 
     def saw(self, name: str, contexts: np.ndarray, symbols: np.ndarray) -> None:
-        """Remember symbols for the end of the block."""
+        """Remember symbols until the end of the block."""
         self._seen.append((name, contexts, symbols))
 
     def end_block(self) -> None:
@@ -153,9 +153,10 @@ def _refresh(counts, ends, rows):  # pragma: no cover - compiled
             for s in range(len(count)):
                 count[s] = (count[s] + 1) >> 1
         total, possible = count.sum(), (count > 0).sum()
+        share = ((TOTAL - possible) << 16) // total
         largest, left = 0, TOTAL
         for s in range(len(count)):
-            frequency = count[s] * (TOTAL - possible) // total + (1 if count[s] > 0 else 0)
+            frequency = (count[s] * share >> 16) + 1 if count[s] > 0 else 0
             ends[row, s + 1] = frequency
             left -= frequency
             if count[s] > count[largest]:

@@ -33,38 +33,43 @@ export class Table {
     for (let row = 0; row < this.rows; row++) {
       if (!this.used[row]) continue;
       this.used[row] = 0;
-      this.renew(row, this.counts.subarray(row * this.symbols, (row + 1) * this.symbols));
+      this.renew(row);
     }
   }
 
-  private renew(row: number, counts: Int32Array): void {
-    let sum = 0;
-    let possible = 0;
-    let largest = 0;
-    for (let s = 0; s < counts.length; s++) {
-      sum += counts[s] as number;
-      if (counts[s]) possible++;
+  private renew(row: number): void {
+    const { symbols, counts, firsts, index } = this;
+    const low = row * symbols;
+    const high = low + symbols;
+    let [sum, possible] = [0, 0];
+    for (let i = low; i < high; i++) {
+      const count = counts[i] as number;
+      sum += count;
+      if (count > 0) possible++;
     }
     while (sum > MOST) {
       sum = 0;
-      for (let s = 0; s < counts.length; s++) sum += counts[s] = ((counts[s] as number) + 1) >> 1;
+      for (let i = low; i < high; i++) {
+        counts[i] = ((counts[i] as number) + 1) >> 1;
+        sum += counts[i] as number;
+      }
     }
-    const start = row * (this.symbols + 1);
-    let given = 0;
-    for (let s = 0; s < counts.length; s++) {
-      const count = counts[s] as number;
-      const frequency = count ? Math.floor((count * (TOTAL - possible)) / sum) + 1 : 0;
-      this.firsts[start + s + 1] = frequency; // for now
-      given += frequency;
-      if (count > (counts[largest] as number)) largest = s;
+    const share = Math.floor(((TOTAL - possible) * 2 ** 16) / sum);
+    let [left, largest] = [TOTAL, low];
+    for (let i = low; i < high; i++) {
+      const count = counts[i] as number;
+      if (count > 0) left -= (Math.imul(count, share) >> 16) + 1;
+      if (count > (counts[largest] as number)) largest = i;
     }
-    this.firsts[start + largest + 1] = (this.firsts[start + largest + 1] as number) + TOTAL - given;
-    const index = this.index.subarray(row << (BITS - PIECE), (row + 1) << (BITS - PIECE));
-    for (let s = 0, first = 0; s < counts.length; s++) {
-      const end = first + (this.firsts[start + s + 1] as number);
-      // the slots 64 i with first <= 64 i < end
-      index.fill(s, (first + (1 << PIECE) - 1) >> PIECE, (end + (1 << PIECE) - 1) >> PIECE);
-      this.firsts[start + s + 1] = first = end;
+    const end = (row + 1) << (BITS - PIECE);
+    let next = row << (BITS - PIECE); // of the index
+    for (let i = low, first = 0, at = low + row; i < high; i++, at++) {
+      const count = counts[i] as number;
+      if (count > 0) first += (Math.imul(count, share) >> 16) + 1;
+      if (i === largest) first += left;
+      firsts[at + 1] = first;
+      const until = (end << PIECE) - TOTAL + first;
+      for (; next << PIECE < until; next++) index[next] = i - low;
     }
   }
 }
@@ -79,26 +84,64 @@ export class Reader {
     if (this.state < LOWEST || this.state >= LOWEST * 256) throw new Error("an impossible first state");
   }
 
-  /** Symbols into `out`: all of the row `rows`, or each of its own. */
-  symbols(table: Table, rows: number | Int32Array, out: Int32Array, count: number): void {
+  /**
+   * Symbols less `zero` into `out`: all of one row, or each of its own.
+   * How many were the table's last symbol.
+   */
+  symbols(table: Table, rows: number | Int32Array, zero: number, out: Int32Array, count: number): number {
+    return typeof rows === "number"
+      ? this.ofRow(table, rows, zero, out, count)
+      : this.ofRows(table, rows, zero, out, count);
+  }
+
+  private ofRow(table: Table, row: number, zero: number, out: Int32Array, count: number): number {
     const { bytes } = this;
     const { symbols, firsts, index, counts } = table;
+    const [start, base, indices] = [row * (symbols + 1), row * symbols, row << (BITS - PIECE)];
     let { state, at } = this;
+    let last = 0;
     for (let i = 0; i < count; i++) {
-      const row = typeof rows === "number" ? rows : (rows[i] as number);
+      const slot = state & (TOTAL - 1);
+      let symbol = index[indices | (slot >> PIECE)] as number;
+      let end = firsts[start + symbol + 1] as number;
+      while (end <= slot) end = firsts[start + ++symbol + 1] as number;
+      const first = firsts[start + symbol] as number;
+      state = Math.imul(end - first, state >> BITS) + slot - first;
+      while (state < LOWEST) state = (state << 8) | (bytes[at++] as number);
+      out[i] = symbol - zero;
+      if (symbol === symbols - 1) last++;
+      counts[base + symbol] = (counts[base + symbol] as number) + COUNTED;
+    }
+    if (count) table.used[row] = 1;
+    this.state = state;
+    this.goOn(at);
+    return last;
+  }
+
+  private ofRows(table: Table, rows: Int32Array, zero: number, out: Int32Array, count: number): number {
+    const { bytes } = this;
+    const { symbols, firsts, index, counts, used } = table;
+    let { state, at } = this;
+    let last = 0;
+    for (let i = 0; i < count; i++) {
+      const row = rows[i] as number;
       const slot = state & (TOTAL - 1);
       let symbol = index[(row << (BITS - PIECE)) | (slot >> PIECE)] as number;
-      let place = row * (symbols + 1) + symbol;
-      for (; (firsts[place + 1] as number) <= slot; place++) symbol++;
-      const first = firsts[place] as number;
-      state = Math.imul((firsts[place + 1] as number) - first, state >> BITS) + slot - first;
+      const start = row * (symbols + 1);
+      let end = firsts[start + symbol + 1] as number;
+      while (end <= slot) end = firsts[start + ++symbol + 1] as number;
+      const first = firsts[start + symbol] as number;
+      state = Math.imul(end - first, state >> BITS) + slot - first;
       while (state < LOWEST) state = (state << 8) | (bytes[at++] as number);
-      out[i] = symbol;
-      counts[row * symbols + symbol] = (counts[row * symbols + symbol] as number) + COUNTED;
-      table.used[row] = 1;
+      out[i] = symbol - zero;
+      if (symbol === symbols - 1) last++;
+      const place = row * symbols + symbol;
+      counts[place] = (counts[place] as number) + COUNTED;
+      used[row] = 1;
     }
     this.state = state;
     this.goOn(at);
+    return last;
   }
 
   /** Appends `widths` bits to each of `values`: 14 to all that have as many left, then the next. */

@@ -6,8 +6,8 @@ const HEADER = 44;
 const MAGIC = 0x53475354;
 const MAX_COUNT = 10_000_000;
 const PER_BYTE = 128; // Gaussians in a byte, at most
-const SMALLEST = 16; // Gaussians of a block
-const LARGEST = 1024;
+const SMALLEST = 16; // Gaussians of a block: a power of two
+const LARGEST = 2048;
 const BASES = [0, 3, 8, 15] as const;
 const ROTATIONS = [4, 6, 8, 11, 16, 23, 32, 45, 64, 90, 127] as const;
 const GREATEST = 1e18;
@@ -80,7 +80,7 @@ export function readHeader(bytes: Uint8Array): Header {
 export class StreamDecoder {
   private waiting: Uint8Array = new Uint8Array(0);
   private header: Header | null = null;
-  private block: BlockDecoder | null = null;
+  private columns: Columns | null = null;
   private done = 0; // Gaussians
   private levels = 0;
 
@@ -90,7 +90,7 @@ export class StreamDecoder {
     if (!this.header) {
       if (this.waiting.length < HEADER) return [];
       this.header = readHeader(this.waiting);
-      this.block = new BlockDecoder(this.header);
+      this.columns = new Columns(this.header);
       this.waiting = this.waiting.subarray(HEADER);
     }
     const found: Gaussians[] = [];
@@ -122,9 +122,11 @@ export class StreamDecoder {
     const reader = new Reader(payload);
     let before = 0;
     for (let at = 0; at < level.count; ) {
-      const block = Math.max(SMALLEST, Math.min(this.done >> 1, LARGEST));
-      const count = Math.min(block, level.count - at);
-      before = (this.block as BlockDecoder).decode(reader, level, at, count, before);
+      const block = Math.max(SMALLEST, Math.min(2 ** (30 - Math.clz32(this.done)), LARGEST));
+      const left = block - (this.done % block);
+      const count = Math.min(left, level.count - at);
+      before = (this.columns as Columns).decode(reader, level, at, count, before);
+      if (count === left) this.columns?.endBlock();
       at += count;
       this.done += count;
     }
@@ -168,8 +170,8 @@ const peak = (likeliest: number, half: number) => (symbol: number) =>
 
 const column = () => new Int32Array(LARGEST);
 
-/** Decodes blocks of Gaussians, and learns from them. */
-class BlockDecoder {
+/** Decodes columns of Gaussians, and learns from them at the end of a block. */
+class Columns {
   private readonly gap = new Table(1, POSITION_BITS + 1, () => 8);
   private readonly opacity: Table;
   private readonly scale: Table;
@@ -200,7 +202,7 @@ class BlockDecoder {
   decode(reader: Reader, level: Gaussians, start: number, count: number, before: number): number {
     const last = this.decodePositions(reader, level.means, start, count, before);
     const { header, values } = this;
-    reader.symbols(this.opacity, 0, values, count);
+    reader.symbols(this.opacity, 0, 0, values, count);
     for (let i = 0; i < count; i++) {
       level.opacities[start + i] = Math.min((values[i] as number) * header.opacityStep, 254.75) / 255;
     }
@@ -209,8 +211,11 @@ class BlockDecoder {
     this.decodeColours(reader, level.sh0, start, count);
     this.first.fill(0);
     for (const band of this.bands) band.decode(reader, level.shN, start, count, this.first);
-    for (const table of this.tables) table.endBlock();
     return last;
+  }
+
+  endBlock(): void {
+    for (const table of this.tables) table.endBlock();
   }
 
   private decodePositions(
@@ -222,15 +227,14 @@ class BlockDecoder {
   ): number {
     const { positions, values } = this;
     const { origin, step } = this.header;
-    reader.symbols(this.gap, 0, values, count);
-    for (let i = 0; i < count; i++) positions[i] = Math.min(values[i] as number, 1);
-    for (let i = 0; i < count; i++) values[i] = (values[i] as number) - 1;
+    reader.symbols(this.gap, 0, 1, values, count);
+    for (let i = 0; i < count; i++) positions[i] = (values[i] as number) < 0 ? 0 : 1;
     reader.bits(values, positions, count);
     let code = before;
     for (let i = 0; i < count; i++) {
       code += positions[i] as number;
-      const low = code % 2 ** 24;
-      const high = (code - low) / 2 ** 24;
+      const high = Math.floor(code / 2 ** 24);
+      const low = code - high * 2 ** 24;
       for (let axis = 0; axis < 3; axis++) {
         const cell = thirds(low >> axis) | (thirds(high >> axis) << 8);
         means[3 * (start + i) + axis] = (origin[axis] as number) + step * cell;
@@ -264,10 +268,10 @@ class BlockDecoder {
   private decodeRotations(reader: Reader, quats: Float32Array, start: number, count: number): void {
     const { values, first } = this;
     for (let axis = 1; axis < 4; axis++) {
-      reader.symbols(this.rotation, first, values, count);
+      reader.symbols(this.rotation, first, 127, values, count);
       for (let i = 0; i < count; i++) {
         const step = Math.SQRT1_2 / (ROTATIONS[first[i] as number] as number);
-        quats[4 * (start + i) + axis] = ((values[i] as number) - 127) * step;
+        quats[4 * (start + i) + axis] = (values[i] as number) * step;
       }
     }
     for (let at = 4 * start; at < 4 * (start + count); at += 4) {
@@ -326,7 +330,7 @@ class Band {
   /** `before`: coefficients of lower degrees that are not 0; this degree's are added. */
   decode(reader: Reader, shN: Float32Array, start: number, count: number, before: Int32Array): void {
     const { places, green, red, blue, contexts, masks, step } = this;
-    reader.symbols(this.tables[0], before, masks, count);
+    reader.symbols(this.tables[0], before, 0, masks, count);
     let found = 0;
     for (let i = 0; i < count; i++) {
       let place = 3 * ((start + i) * this.bases + this.low);
@@ -363,13 +367,9 @@ function readValues(
   out: Int32Array,
   count: number,
 ): void {
-  reader.symbols(table, rows, out, count);
+  if (!reader.symbols(table, rows, zero, out, count)) return;
   const rare: number[] = [];
-  for (let i = 0; i < count; i++) {
-    if (out[i] === table.symbols - 1) rare.push(i);
-    out[i] = (out[i] as number) - zero;
-  }
-  if (!rare.length) return;
+  for (let i = 0; i < count; i++) if (out[i] === table.symbols - 1 - zero) rare.push(i);
   const wide = new Float64Array(rare.length);
   reader.bits(new Int32Array(rare.length).fill(ESCAPE_BITS), wide, rare.length);
   rare.forEach((i, k) => {
