@@ -22,8 +22,8 @@ _SCALE, _COLOUR, _HARMONIC = 64, 80, 31  # symbol of 0
 _ROTATION = ROTATIONS[-1]
 _GAPS = 3 * AXIS_BITS + 1
 _OPACITIES = 256
-_PEAK = 64  # count of the likeliest symbol of a new table
-_FLAT = 8  # of each symbol of a new table where none is likelier
+_PEAK = 512
+_FLAT = 128
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def new_tables(layout: Layout) -> dict[str, np.ndarray]:
     """Counts that a stream begins with, by name: int [contexts, symbols]."""
     opacities = np.arange(_OPACITIES)
     tables = {
-        "gap": np.full((1, _GAPS), _FLAT),
+        "gap": _peaked(_GAPS, 24, 4)[None],
         "opacity": np.where((opacities > 0) & (opacities <= layout.opacities), _FLAT, 0)[None],
         "scale": np.stack([_peaked(_SCALES, _SCALE, 12), *[_peaked(_SCALES, 9, 6)] * 2]),
         "rotation": np.stack([_within(steps) for steps in ROTATIONS]),
@@ -81,13 +81,14 @@ def new_tables(layout: Layout) -> dict[str, np.ndarray]:
         low, high = BASES[degree - 1 : degree + 1]
         tables[f"mask {degree}"] = np.tile(_few(high - low), (low + 1, 1))
         for name, contexts in (("green", 1), ("red", 7), ("blue", 15)):
-            tables[f"{name} {degree}"] = np.tile(_peaked(_HARMONICS, _HARMONIC, 1), (contexts, 1))
+            tables[f"{name} {degree}"] = np.tile(_peaked(_HARMONICS, _HARMONIC, 0.5), (contexts, 1))
     return tables
 
 
-def _peaked(symbols: int, likeliest: int, half: int) -> np.ndarray:
+def _peaked(symbols: int, likeliest: int, half: float) -> np.ndarray:
     """Counts that halve every `half` symbols to both sides, at least 1."""
-    return np.maximum(_PEAK >> np.abs(np.arange(symbols) - likeliest) // half, 1)
+    halvings = (np.abs(np.arange(symbols) - likeliest) / half).astype(np.int64)
+    return np.maximum(_PEAK >> halvings.clip(max=30), 1)
 
 
 def _within(steps: int) -> np.ndarray:

@@ -15,8 +15,8 @@ from sagesplat.kernels.jit import njit
 BITS = 14
 TOTAL = 1 << BITS  # of the frequencies of a table
 LOWEST = 1 << 23  # state
-COUNTED = 32  # what a symbol adds to its count
-MOST = 1 << 16
+COUNTED = 128  # what a symbol adds to its count
+MOST = 1 << 18
 
 
 class Coder(Protocol):

@@ -3,8 +3,8 @@
 const BITS = 14;
 const TOTAL = 1 << BITS; // of the frequencies of a row
 const LOWEST = 2 ** 23; // state
-const COUNTED = 32; // what a symbol adds to its count
-const MOST = 2 ** 16; // sum of counts beyond which they are halved
+const COUNTED = 128; // what a symbol adds to its count
+const MOST = 2 ** 18; // sum of counts beyond which they are halved
 const PIECE = 6; // bits of a slot that the index of symbols leaves out
 
 /** Counts of symbols by row, and the frequencies that follow from them. */

@@ -14,6 +14,8 @@ const GREATEST = 1e18;
 const LONGEST_LOG = 40;
 const ESCAPE_BITS = 20;
 const POSITION_BITS = 51;
+const PEAK = 512; // count of the likeliest symbol of a new table
+const FLAT = 128; // of each symbol of a new table where none is likelier
 
 /** The Gaussians of a level, in right, up, back. */
 export interface Gaussians {
@@ -166,17 +168,17 @@ function empty(count: number, { degree }: Header): Gaussians {
 }
 
 const peak = (likeliest: number, half: number) => (symbol: number) =>
-  Math.max(1, 64 >> Math.min(31, Math.floor(Math.abs(symbol - likeliest) / half)));
+  Math.max(1, PEAK >> Math.min(31, Math.floor(Math.abs(symbol - likeliest) / half)));
 
 const column = () => new Int32Array(LARGEST);
 
 /** Decodes columns of Gaussians, and learns from them at the end of a block. */
 class Columns {
-  private readonly gap = new Table(1, POSITION_BITS + 1, () => 8);
+  private readonly gap = new Table(1, POSITION_BITS + 1, peak(24, 4));
   private readonly opacity: Table;
   private readonly scale: Table;
   private readonly rotation = new Table(11, 255, (symbol, row) =>
-    Math.abs(symbol - 127) <= (ROTATIONS[row] as number) ? 8 : 0,
+    Math.abs(symbol - 127) <= (ROTATIONS[row] as number) ? FLAT : 0,
   );
   private readonly colour: Table;
   private readonly bands: Band[] = [];
@@ -188,7 +190,7 @@ class Columns {
 
   constructor(private readonly header: Header) {
     const opacities = Math.ceil(255 / header.opacityStep);
-    this.opacity = new Table(1, 256, (symbol) => (symbol > 0 && symbol <= opacities ? 8 : 0));
+    this.opacity = new Table(1, 256, (symbol) => (symbol > 0 && symbol <= opacities ? FLAT : 0));
     const [large, small] = [peak(64, 12), peak(9, 6)];
     this.scale = new Table(3, 128, (symbol, row) => (row ? small : large)(symbol));
     const [green, others] = [peak(80, 12), peak(80, 4)];
@@ -314,8 +316,8 @@ class Band {
     this.bases = BASES[header.degree] as number;
     this.step = 2 ** (1 - header.shBits[degree === 1 ? 0 : 1]);
     const bits = 2 * degree + 1;
-    const values = (rows: number) => new Table(rows, 64, peak(31, 1));
-    const masks = new Table(this.low + 1, 1 << bits, (mask) => Math.max(1, 64 >> (2 * ones(mask))));
+    const values = (rows: number) => new Table(rows, 64, peak(31, 0.5));
+    const masks = new Table(this.low + 1, 1 << bits, (mask) => Math.max(1, PEAK >> (2 * ones(mask))));
     this.tables = [masks, values(1), values(7), values(15)];
     const columns = Array.from({ length: 5 }, () => new Int32Array(LARGEST * bits));
     [this.places, this.green, this.red, this.blue, this.contexts] = columns as [
