@@ -19,9 +19,10 @@ export class Table {
     readonly symbols: number,
     count: (symbol: number, row: number) => number,
   ) {
-    this.counts = Int32Array.from({ length: rows * symbols }, (_, i) =>
-      count(i % symbols, Math.floor(i / symbols)),
-    );
+    this.counts = new Int32Array(rows * symbols);
+    for (let row = 0, i = 0; row < rows; row++) {
+      for (let symbol = 0; symbol < symbols; symbol++) this.counts[i++] = count(symbol, row);
+    }
     this.firsts = new Uint16Array(rows * (symbols + 1));
     this.index = new Uint8Array(rows << (BITS - PIECE));
     this.used = new Uint8Array(rows).fill(1);

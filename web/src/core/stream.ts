@@ -10,6 +10,7 @@ const SMALLEST = 16; // Gaussians of a block: a power of two
 const LARGEST = 2048;
 const BASES = [0, 3, 8, 15] as const;
 const ROTATIONS = [4, 6, 8, 11, 16, 23, 32, 45, 64, 90, 127] as const;
+const STEPS = Float64Array.from(ROTATIONS, (steps) => Math.SQRT1_2 / steps);
 const GREATEST = 1e18;
 const LONGEST_LOG = 40;
 const ESCAPE_BITS = 20;
@@ -272,13 +273,13 @@ class Columns {
     for (let axis = 1; axis < 4; axis++) {
       reader.symbols(this.rotation, first, 127, values, count);
       for (let i = 0; i < count; i++) {
-        const step = Math.SQRT1_2 / (ROTATIONS[first[i] as number] as number);
-        quats[4 * (start + i) + axis] = (values[i] as number) * step;
+        quats[4 * (start + i) + axis] = (values[i] as number) * (STEPS[first[i] as number] as number);
       }
     }
     for (let at = 4 * start; at < 4 * (start + count); at += 4) {
-      const [x, y, z] = [quats[at + 1] as number, quats[at + 2] as number, quats[at + 3] as number];
-      quats[at] = Math.sqrt(Math.max(0, 1 - x * x - y * y - z * z));
+      let square = 1;
+      for (let axis = 1; axis < 4; axis++) square -= (quats[at + axis] as number) ** 2;
+      quats[at] = square > 0 ? Math.sqrt(square) : 0;
     }
   }
 
