@@ -317,7 +317,7 @@ class Band {
     this.bases = BASES[header.degree] as number;
     this.step = 2 ** (1 - header.shBits[degree === 1 ? 0 : 1]);
     const bits = 2 * degree + 1;
-    const values = (rows: number) => new Table(rows, 64, peak(31, 0.5));
+    const values = (rows: number) => new Table(rows, 32, peak(15, 0.5));
     const masks = new Table(this.low + 1, 1 << bits, (mask) => Math.max(1, PEAK >> (2 * ones(mask))));
     this.tables = [masks, values(1), values(7), values(15)];
     const columns = Array.from({ length: 5 }, () => new Int32Array(LARGEST * bits));
@@ -343,14 +343,14 @@ class Band {
       }
       before[i] = (before[i] as number) + found - earlier;
     }
-    readValues(reader, this.tables[1], 0, 31, green, found);
+    readValues(reader, this.tables[1], 0, 15, green, found);
     for (let i = 0; i < found; i++) contexts[i] = Math.max(-3, Math.min(green[i] as number, 3)) + 3;
-    readValues(reader, this.tables[2], contexts, 31, red, found);
+    readValues(reader, this.tables[2], contexts, 15, red, found);
     for (let i = 0; i < found; i++) {
       const [g, r] = [green[i] as number, red[i] as number];
       contexts[i] = 3 * (Math.max(-2, Math.min(g, 2)) + 2) + Math.max(-1, Math.min(r, 1)) + 1;
     }
-    readValues(reader, this.tables[3], contexts, 31, blue, found);
+    readValues(reader, this.tables[3], contexts, 15, blue, found);
     for (let i = 0; i < found; i++) {
       const place = places[i] as number;
       const g = green[i] as number;
