@@ -115,7 +115,8 @@ def _measure(folder: Path, name: str, row: Row, steps: int, seed: int) -> dict[s
     result: dict[str, Any] = {"gaussians": len(g), "train_views": len(job.scene.train_ids)}
     result["test"] = _means(on_path(job, g, capture))
     undisturbed = RunDir(folder / "runs" / f"clean-{seed}-{steps}")
-    if wild.figures and undisturbed.levels.exists():  # its model, on the same photos and pixels
+    only_figures = wild.figures and replace(wild, figures=0, off_path=0).quiet
+    if only_figures and undisturbed.levels.exists():  # its model, on the same photos and pixels
         plain = read_level(Job(undisturbed, job.emit).trained)
         result["test_undisturbed"] = _means(on_path(job, plain, capture))
     off, by_category = off_path(g, capture, alignment(truth, job.scene) if wild.pose_shift else np.eye(4))

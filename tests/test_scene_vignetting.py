@@ -19,7 +19,7 @@ from sagesplat.demo.wild import Wild
 from sagesplat.run.capture import fingerprint
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
-from sagesplat.scene import load_scene, vignetting_fit
+from sagesplat.scene import describe, load_scene, vignetting_fit
 from sagesplat.scene.images import Photos, load_photo
 from sagesplat.scene.scene import Camera, Points, Scene, View, Vignetting
 from sagesplat.scene.stored import read_scene, write_scene
@@ -145,6 +145,9 @@ def test_a_capture_is_read_without_its_vignetting(capture):
     truth = np.array(Image.open(capture / "truth" / "images" / scene.views[0].name), float)
     corner = np.s_[:12, :12]
     assert abs((flat - truth)[corner].mean()) < 0.4 * abs((plain - truth)[corner].mean())
+    assert ("vignetting", f"{found.lost:.0%} of the light is lost in the corners, corrected") in describe(
+        scene
+    )
     assert fingerprint(scene) != fingerprint(with_vignetting(scene, None))
 
 

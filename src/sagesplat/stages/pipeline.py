@@ -51,7 +51,12 @@ DEMO = RunConfig(
     nest=NestConfig(steps=600, levels=12, base_steps=600),
     plan=PlanConfig(target_fidelity=0.9),
 )
-WILD_DEMO = replace(DEMO, labels=LabelsConfig(ignore="person"), train=replace(DEMO.train, poses=True))
+WILD_DEMO = replace(
+    DEMO,
+    scene=replace(DEMO.scene, vignetting=True),
+    labels=LabelsConfig(ignore="person"),
+    train=replace(DEMO.train, poses=True),
+)
 
 
 def run_all(job: Job, scene: Path, config: RunConfig) -> None:
