@@ -218,7 +218,7 @@ def test_more_gaussians_than_bytes_can_hold(count: int):
         decode_stream(content + number + b"\x0a" + b"\x55" * 10)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(st.data())
 def test_damage_ends_as_one_error(data: st.DataObject):
     content = encode_stream(visible(20, degree=1), [5, 20]).content
@@ -226,9 +226,9 @@ def test_damage_ends_as_one_error(data: st.DataObject):
         decode_stream(damage(content, data))
 
 
-def test_thousands_of_mutations_are_errors_or_gaussians():
+def test_a_thousand_mutations_are_errors_or_gaussians():
     rng, read = Random(0), 0
-    contents = [base64.b64decode(case["content"]) for case in cases()]
+    contents = sorted((base64.b64decode(case["content"]) for case in cases()), key=len)[:4]
     for i in range(1000):
         content = contents[i % len(contents)]
         for _ in range(rng.randint(1, 3)):
