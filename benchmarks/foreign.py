@@ -39,6 +39,7 @@ EXCEPTIONS: dict[str, str] = {
     "download.scenes:read_registry": OURS,
     "formats.increments:write_increments": _WROTE,
     "formats.sog_write:write_sog": _WROTE,
+    "formats.stream:encode_stream": _WROTE,
     "formats.levels:select_level": "columns of a level that read_level has read",
     "formats.ply:select_ply": "rows of a PLY that read_ply_splat has read",
     "io.lock:_exclusive": _HASHED,

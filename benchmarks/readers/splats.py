@@ -15,6 +15,7 @@ from sagesplat.formats.increments import read_increments, read_index, totals
 from sagesplat.formats.levels import check_level, read_level, write_level, write_set
 from sagesplat.formats.ply import read_ply, write_ply
 from sagesplat.formats.spz import encode_spz, read_spz
+from sagesplat.formats.stream import decode_stream, encode_stream
 from sagesplat.scene.scene import Camera, Lens, Points, Scene, View
 from sagesplat.scene.stored import read_scene, write_scene
 from sagesplat.segment.lift import LiftedLabels
@@ -35,6 +36,12 @@ def _spz(folder: Path, size: int) -> list[bytes]:
     if size > 1:  # the best that gzip can do: nothing but zeros
         return [encode_spz(_equal(3 * size))]
     return [encode_spz(splats()), encode_spz(splats(bases=0), coarse=True)]
+
+
+def _streams(folder: Path, size: int) -> list[bytes]:
+    if size > 1:  # the best that the coder can do: nothing but the likeliest symbols
+        return [encode_stream(_equal(3 * size), [size, 3 * size]).content]
+    return [encode_stream(splats(5, bases), [1, 3, 5]).content for bases in (0, 3, 15)]
 
 
 def _equal(count: int) -> Gaussians:
@@ -128,6 +135,7 @@ def _stored(folder: Path, size: int) -> list[bytes]:
 READERS = (
     Reader("ply-splats", ".ply", _ply, file("g.ply", read_ply)),
     Reader("spz", ".spz", _spz, file("g.spz", read_spz), 10_000),
+    Reader("stream", ".sgst", _streams, lambda folder, content: decode_stream(content), 10_000),
     Reader("chunks", ".json", _index, file("index.json", _read_index)),
     Reader("checkpoint", ".npz", _checkpoints, file("c.npz", _read_checkpoint)),
     Reader("level", ".npz", _levels, file("000007.npz", _read_level)),

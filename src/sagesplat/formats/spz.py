@@ -155,7 +155,7 @@ def encode_spz(
     _check(name, g)
     degree = g.sh_degree if sh_degree is None else min(sh_degree, g.sh_degree)
     means, quats, harmonics = g.means.numpy(), g.quats.numpy(), g.shN[:, : BASES[degree]].numpy()
-    means, quats, harmonics = _flip(means, quats, harmonics, frame)
+    means, quats, harmonics = flipped(means, quats, harmonics, frame)
     bits = _fractional_bits(name, means, g.log_scales.numpy(), fractional_bits, coarse)
     opacity_step, colour_step, scale_step, rotation_step = _COARSE if coarse else (1, 1, 1, 1)
     fixed = np.rint(means.astype(np.float64) * 2.0**bits).astype("<i4")
@@ -250,7 +250,7 @@ def _gaussians(packed: Packed, label_id: int, frame: Frame) -> Gaussians:
     means = (_fixed(positions) * 2.0**-packed.bits).astype(np.float32)
     quats = _first_three(rotations) if packed.version == 2 else _unpack_rotations(rotations)
     shN = (harmonics.reshape(count, harmonics.shape[1] // 3, 3).astype(np.float32) - 128) / 128
-    means, quats, shN = _flip(means, quats, shN, frame)
+    means, quats, shN = flipped(means, quats, shN, frame)
     return Gaussians(
         means=torch.from_numpy(means),
         quats=torch.from_numpy(quats),
@@ -295,7 +295,7 @@ def _enough_bits(log_scales: np.ndarray, parts: int) -> int:
     return max(1, int(np.ceil(np.log2(parts) - small / np.log(2))))
 
 
-def _flip(
+def flipped(
     means: np.ndarray, quats: np.ndarray, harmonics: np.ndarray, frame: Frame
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Means [N, 3], quaternions wxyz [N, 4] and SH coefficients [N, K, 3] between COLMAP's and other axes."""

@@ -1,0 +1,221 @@
+"""`sagesplat-stream`: the nested levels of one category as coded bytes that can be cut after any level.
+
+A header of 44 bytes, then the levels: the number of their Gaussians, the number of their bytes, and their
+columns of integers, coded by an adaptive rANS. docs/formats.md specifies all of it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import torch
+from jaxtyping import Int64
+
+from sagesplat.core.errors import DataError, short
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.formats.stream_columns import AXIS_BITS, Columns, Layout, code_columns, joined, new_tables
+from sagesplat.formats.stream_header import (
+    SIZE,
+    Precision,
+    header_of,
+    quantised,
+    read_header,
+    restored,
+    turned_round,
+)
+from sagesplat.kernels.rans import Coder, Reader, Tables, Writer
+
+MAX_COUNT = 10_000_000  # Gaussians of a stream
+_MAX_LEVELS = 255
+_FARTHEST = 1e17  # positions, world units
+_PER_BYTE = 128  # Gaussians in a byte, at most: what the least frequencies of the tables allow is 97
+_SMALLEST, _LARGEST = 4, 11  # log2 of the Gaussians of a block
+
+
+@dataclass(frozen=True, eq=False)
+class Encoded:
+    """A coded stream of nested levels."""
+
+    content: bytes
+    ends: tuple[int, ...]  # bytes up to the end of each level
+    sizes: tuple[int, ...]  # Gaussians up to the end of each level
+    rows: Int64[np.ndarray, " M"]  # of the Gaussians that were given, in the stream's order
+
+
+@dataclass(frozen=True, eq=False)
+class Decoded:
+    """What a stream, or its first levels, holds."""
+
+    gaussians: Gaussians
+    sizes: tuple[int, ...]  # Gaussians up to the end of each level
+    antialiased: bool  # how the scene was trained
+
+
+def encode_stream(
+    g: Gaussians,
+    sizes: Sequence[int],
+    *,
+    precision: Precision = Precision(),
+    antialiased: bool = False,
+    name: str = "stream",
+) -> Encoded:
+    """Encode the nested levels of N Gaussians in COLMAP's axes; labels are left out.
+
+    The Gaussians of a level come in another order. Those whose opacity is rounded to 0 are left out. The same
+    input gives the same bytes.
+
+    Args:
+        g: The Gaussians of one category in the order of their levels, on any device.
+        sizes: The number of Gaussians up to the end of each level, ascending, the last one N.
+        precision: Steps of quantisation. Finer ones than a model was trained with waste bytes.
+        antialiased: How the scene was trained; a flag for viewers.
+        name: What errors call the stream.
+
+    Returns:
+        The bytes, where each level ends in them, and which Gaussians they hold.
+
+    Raises:
+        DataError: For NaN or Inf, a quaternion of zeros, or too many Gaussians.
+        ValueError: For sizes that are no levels of N Gaussians, or a precision that the format does not have.
+
+    Example:
+        >>> import torch
+        >>> from sagesplat import Gaussians
+        >>> from sagesplat.formats.stream import decode_stream, encode_stream
+        >>> z = torch.zeros
+        >>> ids = torch.zeros(5, dtype=torch.int16)
+        >>> g = Gaussians(z(5, 3), z(5, 4) + 1, z(5, 3), z(5), z(5, 1, 3), z(5, 3, 3), ids)
+        >>> coded = encode_stream(g, [2, 5])
+        >>> len(decode_stream(coded.content[: coded.ends[0]]).gaussians)
+        2
+    """
+    g = g.detach().to("cpu")
+    _check(name, g, sizes)
+    seen = torch.round(torch.sigmoid(g.logit_opacities.double()) * (255 / precision.opacity)) > 0
+    rows = np.flatnonzero(seen.numpy())
+    g = turned_round(g.select(seen))
+    header = read_header(header_of(g, len(sizes), precision, antialiased=antialiased).pack())
+    columns = quantised(g, header)
+    ends = np.searchsorted(rows, sizes)
+    tables, content, cuts, order = Tables(new_tables(header.layout)), header.pack(), [], []
+    for low, high in pairwise((0, *ends.tolist())):
+        order.append(low + np.argsort(columns.positions[low:high], kind="stable"))
+        payload = b""
+        if high > low:
+            writer = Writer(tables)
+            _code_level(writer, header.layout, low, high - low, columns.rows(order[-1]))
+            payload = writer.payload()
+        content += _leb128(high - low) + _leb128(len(payload)) + payload
+        cuts.append(len(content))
+    return Encoded(content, tuple(cuts), tuple(ends.tolist()), rows[np.concatenate(order)])
+
+
+def decode_stream(
+    content: bytes, levels: int | None = None, *, label_id: int = -1, name: str = "stream"
+) -> Decoded:
+    """Decode the first `levels` levels of a stream, or all that are there.
+
+    Memory stays within what the levels announce, and that within what their bytes can hold.
+
+    Args:
+        content: The bytes, up to the end of any level.
+        levels: How many levels to decode, at least 1. None: those that `content` has.
+        label_id: Category of all Gaussians.
+        name: What errors call the stream.
+
+    Returns:
+        The Gaussians in COLMAP's axes, float32 on the CPU. `encode_stream` shows an example.
+
+    Raises:
+        DataError: For another format or version, a damaged stream, one that is cut within a level, or one
+            that ends before the level `levels`.
+    """
+    try:
+        header = read_header(content)
+        if levels is not None and not 1 <= levels <= header.levels:
+            raise ValueError(f"level {levels} of {header.levels}")
+        tables, at, parts, sizes = Tables(new_tables(header.layout)), SIZE, [], [0]
+        while len(sizes) <= (levels or header.levels):
+            if levels is None and at == len(content):
+                break
+            count, at = _read_leb128(content, at)
+            nbytes, at = _read_leb128(content, at)
+            if nbytes > len(content) - at or count > min(MAX_COUNT - sizes[-1], _PER_BYTE * nbytes):
+                raise ValueError(f"{count} Gaussians in {nbytes} of {len(content) - at} bytes")
+            parts += _read_level(content[at : at + nbytes], tables, header.layout, sizes[-1], count)
+            at += nbytes
+            sizes.append(sizes[-1] + count)
+        if len(sizes) == header.levels + 1 and at != len(content):
+            raise ValueError(f"{len(content) - at} bytes after the last level")
+    except ValueError as error:
+        raise DataError(f"{name}: a damaged stream ({short(error)}); copy it again") from None
+    g = restored(joined(parts, header.sh_degree), header, label_id)
+    return Decoded(g, tuple(sizes[1:]), header.antialiased)
+
+
+def _check(name: str, g: Gaussians, sizes: Sequence[int]) -> None:
+    if not 1 <= len(sizes) <= _MAX_LEVELS or list(sizes) != sorted(sizes) or sizes[0] < 0:
+        raise ValueError(f"{len(sizes)} levels; 1 to {_MAX_LEVELS} ascending sizes are needed")
+    if sizes[-1] != len(g):
+        raise ValueError(f"levels of {sizes[-1]} Gaussians, of {len(g)}")
+    if len(g) > MAX_COUNT:
+        raise DataError(f"{name}: {len(g)} Gaussians; a stream holds {MAX_COUNT}, write several")
+    for key, values in g.parameters().items():
+        if bad := int((~torch.isfinite(values)).sum()):
+            raise DataError(f"{name}: {bad} values of {key} are NaN or infinite; train the scene again")
+    if float(g.means.abs().max() if len(g) else 0) > _FARTHEST:
+        raise DataError(f"{name}: positions beyond {_FARTHEST:.0e} units; scale the scene down")
+    if bad := int((~g.quats.any(1)).sum()):
+        raise DataError(f"{name}: {bad} Gaussians have a rotation of zeros; train the scene again")
+
+
+def _read_level(payload: bytes, tables: Tables, layout: Layout, done: int, count: int) -> list[Columns]:
+    """The columns of a level, by blocks; ValueError for damaged bytes."""
+    if not count:
+        if payload:
+            raise ValueError(f"{len(payload)} bytes of no Gaussians")
+        return []
+    reader = Reader(tables, payload)
+    parts = _code_level(reader, layout, done, count, None)
+    reader.finish()
+    return parts
+
+
+def _code_level(coder: Coder, layout: Layout, done: int, count: int, given: Columns | None) -> list[Columns]:
+    """Code `count` Gaussians after `done` ones: up to the end of a block, or what the level has of it."""
+    parts, before, at = [], 0, 0
+    while at < count:
+        size = 1 << min(max((done >> 1).bit_length() - 1, _SMALLEST), _LARGEST)
+        left = size - done % size  # of the block
+        now = min(left, count - at)
+        some = None if given is None else given.rows(slice(at, at + now))
+        parts.append(code_columns(coder, layout, now, before, some))
+        if now == left:
+            coder.end_block()
+        before, at, done = int(parts[-1].positions[-1]), at + now, done + now
+        if before >> 3 * AXIS_BITS:
+            raise ValueError("a position outside the grid")
+    return parts
+
+
+def _leb128(value: int) -> bytes:
+    """Seven bits a byte, the lowest first; all bytes but the last have the highest bit set."""
+    content = bytearray()
+    while value > 127:
+        content.append(value & 127 | 128)
+        value >>= 7
+    return bytes([*content, value])
+
+
+def _read_leb128(content: bytes, at: int) -> tuple[int, int]:
+    """A number of at most 28 bits, and where it ends; ValueError where there is none."""
+    value = 0
+    for i in range(4):
+        if at + i >= len(content):
+            break
+        byte = content[at + i]
+        value |= (byte & 127) << 7 * i
+        if byte < 128:
+            return value, at + i + 1
+    raise ValueError("no number of Gaussians or bytes")

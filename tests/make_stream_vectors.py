@@ -1,0 +1,84 @@
+"""Coded streams that decoders are held to: `python tests/make_stream_vectors.py` writes them.
+
+A case of tests/data/streams.json has the bytes of a stream as base64, where each level ends in them and how
+many Gaussians there are up to it, and what they are decoded to, in right, up, back, to 1e-6: means, quats
+(w x y z), log_scales, opacities, sh0 and shN (coefficient by coefficient, red, green, blue).
+"""
+
+import base64
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.formats.stream import decode_stream, encode_stream
+from sagesplat.formats.stream_header import Precision, turned_round
+
+DATA = Path(__file__).parent / "data" / "streams.json"
+Case = dict[str, Any]
+
+
+def waves(count: int, degree: int) -> Gaussians:
+    """Gaussians of sines, which are the same everywhere; one in seven is not visible."""
+
+    def wave(speed: float, *shape: int) -> torch.Tensor:
+        at = np.arange(count * int(np.prod(shape)), dtype=np.float64)
+        return torch.from_numpy(np.sin(speed * at + 0.3).reshape(count, *shape).astype(np.float32))
+
+    logits = 3 * wave(1.7, 1)[:, 0]
+    logits[6::7] = -9
+    bases = (degree + 1) ** 2 - 1
+    return Gaussians(
+        means=2 * wave(0.9, 3),
+        quats=wave(2.3, 4),
+        log_scales=2 * wave(1.1, 3) - 4,
+        logit_opacities=logits,
+        sh0=1.5 * wave(0.7, 1, 3),
+        shN=0.6 * wave(1.9, bases, 3) * (wave(0.37, bases, 1) > 0.4),
+        label_ids=torch.full((count,), -1, dtype=torch.int16),
+    )
+
+
+def far_off(count: int) -> Gaussians:
+    """Waves with values that need escapes: far from all others in place, size and colour."""
+    g = waves(count, 1)
+    g.means[3], g.log_scales[5], g.sh0[8] = 900.0, torch.tensor([-30.0, 9.0, -3.0]), 40.0
+    g.shN[9, 1] = torch.tensor([1.0, -1.0, 0.9])
+    return g
+
+
+def cases() -> list[Case]:
+    """All cases of streams.json."""
+    return [
+        case("degree 0", waves(5, 0), [2, 5]),
+        case("degree 1, an empty level", waves(20, 1), [6, 6, 20]),
+        case("degree 2, other steps", waves(24, 2), [24], Precision(1 / 30, 3, 1.3, 0.07, (6, 5), 2.0)),
+        case("degree 3, several blocks", waves(60, 3), [1, 20, 60]),
+        case("escapes", far_off(20), [4, 20], Precision(log_scale=0.05, sh_bits=(8, 8))),
+        case("none", waves(0, 3), [0]),
+    ]
+
+
+def case(name: str, g: Gaussians, sizes: list[int], precision: Precision = Precision()) -> Case:
+    """A stream and what it decodes to."""
+    coded = encode_stream(g, sizes, precision=precision)
+    found = turned_round(decode_stream(coded.content).gaussians)
+    values = {name: value for name, value in found.parameters().items() if name != "logit_opacities"}
+    values["opacities"] = torch.sigmoid(found.logit_opacities.double())
+    return {
+        "name": name,
+        "content": base64.b64encode(coded.content).decode(),
+        "ends": coded.ends,
+        "sizes": coded.sizes,
+        "gaussians": {
+            name: np.round(value.double().numpy().ravel(), 7).tolist() for name, value in values.items()
+        },
+    }
+
+
+if __name__ == "__main__":
+    lines = [json.dumps(one, separators=(",", ":")) for one in cases()]
+    DATA.write_text("[\n" + ",\n".join(lines) + "\n]\n", encoding="utf-8")

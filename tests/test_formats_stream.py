@@ -1,0 +1,253 @@
+"""Coded streams: what comes back, cuts at every level, golden bytes, damage."""
+
+import base64
+import json
+from contextlib import suppress
+from dataclasses import replace
+from random import Random
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from make_stream_vectors import DATA, Case, cases
+
+from benchmarks.mutate import BYTES
+from sagesplat.core.errors import DataError
+from sagesplat.core.gaussians import PARAMETERS, Gaussians
+from sagesplat.formats.spz import SH_BITS
+from sagesplat.formats.stream import MAX_COUNT, decode_stream, encode_stream
+from sagesplat.formats.stream_header import SIZE, Precision
+from sagesplat.raster import rasterize
+from tests.conftest import damage, pinhole, random_gaussians
+
+SIZES = [3, 3, 40, 200]
+FINE = Precision(1 / 250, 1, 0.25, 1 / 64, (8, 8), 5.0)
+
+
+def visible(count: int = 200, **options: int) -> Gaussians:
+    return random_gaussians(count, logit=4, **options)
+
+
+def assert_equal(a: Gaussians, b: Gaussians) -> None:
+    for name in PARAMETERS:
+        torch.testing.assert_close(getattr(a, name), getattr(b, name), rtol=0, atol=0)
+
+
+def covariances(g: Gaussians) -> torch.Tensor:
+    q = torch.nn.functional.normalize(g.quats.double(), dim=1)
+    w, x, y, z = q.unbind(1)
+    rows = [
+        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], 1),
+        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], 1),
+        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1),
+    ]
+    axes = torch.stack(rows, 1) * g.log_scales.double().exp()[:, None]
+    return axes @ axes.transpose(1, 2)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_everything_comes_back_within_half_a_step(degree: int):
+    g = visible(degree=degree)
+    coded = encode_stream(g, SIZES, precision=FINE, antialiased=True)
+    found = decode_stream(coded.content, label_id=7)
+    assert found.sizes == coded.sizes == tuple(SIZES)
+    assert found.antialiased
+    assert (found.gaussians.label_ids == 7).all()
+    g, h = g.select(torch.from_numpy(coded.rows)), found.gaussians
+    step = np.median(np.sort(g.log_scales.exp().numpy(), 1)[:, 1]) / 250
+    torch.testing.assert_close(h.means, g.means, rtol=0, atol=0.51 * step)
+    error = torch.sigmoid(h.logit_opacities) - torch.sigmoid(g.logit_opacities)
+    assert error.abs().max() < 0.51 / 255
+    torch.testing.assert_close(h.sh0, g.sh0, rtol=0, atol=0.51 * 0.25 / 38.25)
+    torch.testing.assert_close(h.shN, g.shN, rtol=0, atol=0.51 / 128)
+    sizes = g.log_scales.double().exp().amax(1)[:, None, None] ** 2
+    assert ((covariances(h) - covariances(g)) / sizes).abs().max() < 0.04
+
+
+def test_the_picture_stays():
+    g, camera = visible(), pinhole()
+    coded = encode_stream(g, [200], precision=FINE)
+    pictures = [
+        rasterize(some, camera, backend="cpu").rgb for some in (g, decode_stream(coded.content).gaussians)
+    ]
+    assert (pictures[0] - pictures[1]).abs().mean() < 0.003
+
+
+def test_what_was_decoded_is_encoded_without_further_loss():
+    once = decode_stream(encode_stream(visible(), SIZES).content).gaussians
+    coded = encode_stream(once, SIZES)
+    again, once = decode_stream(coded.content).gaussians, once.select(torch.from_numpy(coded.rows))
+    torch.testing.assert_close(again.shN, once.shN, rtol=0, atol=0)
+    torch.testing.assert_close(again.log_scales, once.log_scales, rtol=0, atol=0)
+    torch.testing.assert_close(again.sh0, once.sh0, rtol=0, atol=1e-5)
+    torch.testing.assert_close(again.logit_opacities, once.logit_opacities, rtol=0, atol=1e-5)
+
+
+def test_a_cut_after_a_level_is_the_prefix():
+    coded = encode_stream(visible(), SIZES)
+    everything = decode_stream(coded.content)
+    for level, (end, size) in enumerate(zip(coded.ends, coded.sizes, strict=True), 1):
+        for found in (decode_stream(coded.content[:end]), decode_stream(coded.content, level)):
+            assert found.sizes == coded.sizes[:level]
+            assert_equal(found.gaussians, everything.gaussians.slices([slice(0, size)]))
+    assert decode_stream(coded.content[:SIZE]).sizes == ()
+
+
+def test_a_cut_within_a_level_is_an_error():
+    coded = encode_stream(visible(20, degree=1), [1, 10, 20])
+    for end in set(range(0, len(coded.content), 3)) - {SIZE, *coded.ends}:
+        with pytest.raises(DataError, match="damaged stream"):
+            decode_stream(coded.content[:end])
+    with pytest.raises(DataError):
+        decode_stream(coded.content[: coded.ends[0]], 2)
+    with pytest.raises(DataError, match="1 bytes after"):
+        decode_stream(coded.content + b"\0")
+
+
+@pytest.mark.parametrize("level", [0, 4, -1])
+def test_levels_that_a_stream_does_not_have(level: int):
+    with pytest.raises(DataError, match="of 3"):
+        decode_stream(encode_stream(visible(9), [1, 2, 9]).content, level)
+
+
+def test_invisible_gaussians_are_left_out():
+    g = visible(10, degree=0)
+    g.logit_opacities[[0, 4]] = -6.0
+    coded = encode_stream(g, [1, 5, 10])
+    assert coded.sizes == (0, 3, 8)
+    assert sorted(coded.rows.tolist()) == [1, 2, 3, 5, 6, 7, 8, 9]
+    assert len(decode_stream(coded.content).gaussians) == 8
+
+
+def test_the_same_gaussians_give_the_same_bytes():
+    assert encode_stream(visible(), SIZES).content == encode_stream(visible(), SIZES).content
+
+
+def test_a_trained_model_needs_few_bytes():
+    g = visible(3000)
+    g = replace(g, shN=g.shN * (g.shN.abs() > 0.15))
+    assert len(encode_stream(g, [3000]).content) / 3000 < 18
+
+
+@pytest.mark.parametrize("case", cases(), ids=lambda case: case["name"])
+def test_golden_streams_stay_byte_for_byte(case: Case):
+    stored = {one["name"]: one for one in json.loads(DATA.read_text(encoding="utf-8"))}[case["name"]]
+    assert case["content"] == stored["content"]
+    assert [list(case["ends"]), list(case["sizes"])] == [stored["ends"], stored["sizes"]]
+    for name, values in stored["gaussians"].items():
+        np.testing.assert_allclose(case["gaussians"][name], values, atol=1e-6)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.integers(0, 3),
+    st.lists(st.integers(0, 40), min_size=1, max_size=6).map(sorted),
+    st.floats(-12, 12),
+    st.sampled_from([1e-12, 1e-3, 1.0, 1e6, 1e16]),
+)
+def test_any_gaussians_come_back(degree: int, sizes: list[int], logit: float, extent: float):
+    g = random_gaussians(sizes[-1], degree=degree, logit=logit)
+    g = replace(g, means=g.means * extent, log_scales=g.log_scales * 6, sh0=g.sh0 * 50, shN=g.shN * 20)
+    coded = encode_stream(g, sizes)
+    found = decode_stream(coded.content)
+    assert found.sizes == coded.sizes
+    assert all(torch.isfinite(value).all() for value in found.gaussians.parameters().values())
+    kept, reach = g.means[torch.from_numpy(coded.rows)], float(g.means.abs().max()) if len(g) else 0
+    off = (found.gaussians.means - kept).abs().max() if len(kept) else 0
+    assert off <= max(1e-4 * reach, 0.1 * float(g.log_scales.exp().max()) if len(g) else 0)
+
+
+@pytest.mark.parametrize("field", PARAMETERS)
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_nan_and_infinity_are_refused(field: str, value: float):
+    g = visible(3)
+    getattr(g, field).view(-1)[0] = value
+    with pytest.raises(DataError, match=f"tree: .* {field}"):
+        encode_stream(g, [3], name="tree")
+
+
+def test_what_cannot_be_encoded():
+    g = visible(3)
+    for sizes in ([], [2], [2, 1, 3], [-1, 3], [1] * 255 + [3]):
+        with pytest.raises(ValueError, match="levels"):
+            encode_stream(g, sizes)
+    with pytest.raises(DataError, match="rotation of zeros"):
+        encode_stream(replace(g, quats=0 * g.quats), [3])
+    with pytest.raises(DataError, match="scale the scene down"):
+        encode_stream(replace(g, means=g.means * 1e20), [3])
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"opacity": 300}, {"log_scale": 0.0}, {"sh_bits": (9, 9)}, {"rotation": 10.0}, {"position": 300.0}],
+)
+def test_a_precision_that_the_format_does_not_have(wrong: dict[str, Any]):
+    with pytest.raises(ValueError, match=r"format|are there"):
+        Precision(**wrong)
+
+
+@pytest.mark.parametrize(
+    ("at", "value", "words"),
+    [
+        (0, b"X", "not a sagesplat-stream"),
+        (4, b"\2", "newer stream"),
+        (5, b"\2", "newer stream"),
+        (6, b"\4", "degree 4"),
+        (7, b"\0", "0 levels"),
+        (9, b"\x09", "degree"),
+        (24, b"\0\0\xc0\x7f", "impossible steps"),
+        (24, b"\0\0\0\0", "impossible steps"),
+        (12, b"\0\0\x80\x7f", "impossible steps"),
+    ],
+)
+def test_impossible_headers(at: int, value: bytes, words: str):
+    content = bytearray(encode_stream(visible(5), [5]).content)
+    content[at : at + len(value)] = value
+    with pytest.raises(DataError, match=words):
+        decode_stream(bytes(content), name="x.sgst")
+
+
+@pytest.mark.parametrize("count", [MAX_COUNT, 2**28 - 1, 1300])
+def test_more_gaussians_than_bytes_can_hold(count: int):
+    content = encode_stream(visible(5), [5]).content[:SIZE]
+    number = bytes([count & 127 | 128, count >> 7 & 127 | 128, count >> 14 & 127 | 128, count >> 21])
+    with pytest.raises(DataError, match=f"{count} Gaussians in 10"):
+        decode_stream(content + number + b"\x0a" + b"\x55" * 10)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.data())
+def test_damage_ends_as_one_error(data: st.DataObject):
+    content = encode_stream(visible(20, degree=1), [5, 20]).content
+    with suppress(DataError):
+        decode_stream(damage(content, data))
+
+
+def test_a_thousand_mutations_are_errors_or_gaussians():
+    rng, read = Random(0), 0
+    contents = sorted((base64.b64decode(case["content"]) for case in cases()), key=len)[:4]
+    for i in range(1000):
+        content = contents[i % len(contents)]
+        for _ in range(rng.randint(1, 3)):
+            content = rng.choice(BYTES)(content, rng)
+        with suppress(DataError):
+            found = decode_stream(content).gaussians
+            read += 1
+            assert all(torch.isfinite(value).all() for value in found.parameters().values())
+    assert read < 500
+
+
+def test_equal_gaussians_take_the_least_bytes():
+    g = visible(1, degree=0)
+    g.quats[:], g.log_scales[:] = torch.tensor([1.0, 0, 0, 0]), -3.0
+    g = g.select(torch.zeros(20_000, dtype=torch.int64))
+    coded = encode_stream(g, [20_000])
+    assert 10 < 20_000 / len(coded.content) < 97
+    assert len(decode_stream(coded.content).gaussians) == 20_000
+
+
+def test_defaults_are_the_steps_of_training():
+    assert Precision().sh_bits == SH_BITS

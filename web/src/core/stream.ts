@@ -1,0 +1,161 @@
+/** Coded streams: the nested levels of a category, decoded level by level. docs/formats.md specifies them. */
+
+import { BASES, Columns, LARGEST } from "./columns";
+import { Reader } from "./rans";
+
+const HEADER = 44;
+const MAGIC = 0x53475354;
+const MAX_COUNT = 10_000_000;
+const PER_BYTE = 128; // Gaussians in a byte, at most
+const SMALLEST = 16; // Gaussians of a block: a power of two
+const GREATEST = 1e18;
+
+/** The Gaussians of a level, in right, up, back. */
+export interface Gaussians {
+  readonly count: number;
+  readonly means: Float32Array; // [count, 3]
+  readonly quats: Float32Array; // [count, 4], w x y z
+  readonly logScales: Float32Array; // [count, 3]
+  readonly opacities: Float32Array;
+  readonly sh0: Float32Array; // [count, 3]
+  readonly shN: Float32Array; // [count, K, 3]
+}
+
+/** What a stream says of all its Gaussians. */
+export interface Header {
+  readonly antialiased: boolean;
+  readonly degree: number;
+  readonly levels: number;
+  readonly opacityStep: number; // of 1/255
+  readonly shBits: readonly [number, number];
+  readonly spread: number;
+  readonly origin: readonly [number, number, number];
+  readonly step: number;
+  readonly scaleStep: number;
+  readonly colourStep: number;
+  readonly scaleOrigin: number;
+  readonly colourOrigin: number;
+  readonly rotationOrigin: number;
+}
+
+/** The header of a stream; throws for another format. */
+export function readHeader(bytes: Uint8Array): Header {
+  const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
+  if (bytes.length < HEADER || view.getUint32(0) !== MAGIC) throw new Error("not a sagesplat-stream");
+  if (view.getUint8(4) !== 1 || view.getUint8(5) > 1 || view.getUint16(42, true)) {
+    throw new Error("a newer stream than this viewer knows");
+  }
+  const float = (at: number) => view.getFloat32(at, true);
+  const header: Header = {
+    antialiased: view.getUint8(5) === 1,
+    degree: view.getUint8(6),
+    levels: view.getUint8(7),
+    opacityStep: view.getUint8(8),
+    shBits: [view.getUint8(9), view.getUint8(10)],
+    spread: view.getUint8(11),
+    origin: [float(12), float(16), float(20)],
+    step: float(24),
+    scaleStep: float(28),
+    colourStep: float(32),
+    scaleOrigin: view.getInt16(36, true),
+    colourOrigin: view.getInt16(38, true),
+    rotationOrigin: view.getInt16(40, true),
+  };
+  const { step, scaleStep, colourStep, origin, levels, opacityStep, spread, shBits } = header;
+  const steps = [step, scaleStep, colourStep].every((s) => s >= 1 / GREATEST && s <= GREATEST);
+  const inReach = origin.every((at) => Math.abs(at) + step * 2 ** 17 <= GREATEST);
+  const bits = shBits.every((n) => n >= 1 && n <= 8);
+  if (!steps || !inReach || !bits || header.degree > 3 || !levels || !opacityStep || !spread) {
+    throw new Error("a stream with an impossible header");
+  }
+  return header;
+}
+
+/** Decodes a stream while its bytes arrive. */
+export class StreamDecoder {
+  private waiting: Uint8Array = new Uint8Array(0);
+  private header: Header | null = null;
+  private columns: Columns | null = null;
+  private done = 0; // Gaussians
+  private levels = 0;
+
+  /** Takes the next bytes of the stream; the levels that they complete. Throws for a damaged stream. */
+  push(bytes: Uint8Array): Gaussians[] {
+    this.waiting = this.waiting.length ? joined(this.waiting, bytes) : bytes;
+    if (!this.header) {
+      if (this.waiting.length < HEADER) return [];
+      this.header = readHeader(this.waiting);
+      this.columns = new Columns(this.header);
+      this.waiting = this.waiting.subarray(HEADER);
+    }
+    const found: Gaussians[] = [];
+    while (this.waiting.length) {
+      if (this.levels === this.header.levels) throw new Error("bytes after the last level");
+      const level = this.next(this.header);
+      if (!level) break;
+      found.push(level);
+    }
+    return found;
+  }
+
+  /** The next level, if all of it is here. */
+  private next(header: Header): Gaussians | null {
+    const [count, afterCount] = number(this.waiting, 0);
+    const [size, start] = number(this.waiting, afterCount);
+    if (count > Math.min(MAX_COUNT - this.done, PER_BYTE * size) || (!count && size)) {
+      throw new Error("a level with more Gaussians than fit");
+    }
+    if (Number.isNaN(size) || this.waiting.length < start + size) return null;
+    const level = empty(count, header);
+    if (count) this.decode(this.waiting.subarray(start, start + size), level);
+    this.waiting = this.waiting.subarray(start + size);
+    this.levels++;
+    return level;
+  }
+
+  private decode(payload: Uint8Array, level: Gaussians): void {
+    const reader = new Reader(payload);
+    let before = 0;
+    for (let at = 0; at < level.count; ) {
+      const block = Math.max(SMALLEST, Math.min(2 ** (30 - Math.clz32(this.done)), LARGEST));
+      const left = block - (this.done % block);
+      const count = Math.min(left, level.count - at);
+      before = (this.columns as Columns).decode(reader, level, at, count, before);
+      if (count === left) this.columns?.endBlock();
+      at += count;
+      this.done += count;
+    }
+    reader.finish();
+  }
+}
+
+/** LEB128 at an offset, and where it ends; NaN where bytes are missing. */
+function number(bytes: Uint8Array, at: number): [number, number] {
+  let value = 0;
+  for (let i = 0; i < 4; i++) {
+    const byte = bytes[at + i];
+    if (byte === undefined) return [Number.NaN, at];
+    value |= (byte & 127) << (7 * i);
+    if (byte < 128) return [value, at + i + 1];
+  }
+  throw new Error("no number of Gaussians or bytes");
+}
+
+function joined(a: Uint8Array, b: Uint8Array): Uint8Array {
+  const both = new Uint8Array(a.length + b.length);
+  both.set(a);
+  both.set(b, a.length);
+  return both;
+}
+
+function empty(count: number, { degree }: Header): Gaussians {
+  return {
+    count,
+    means: new Float32Array(3 * count),
+    quats: new Float32Array(4 * count),
+    logScales: new Float32Array(3 * count),
+    opacities: new Float32Array(count),
+    sh0: new Float32Array(3 * count),
+    shN: new Float32Array(3 * count * (BASES[degree] ?? 0)),
+  };
+}

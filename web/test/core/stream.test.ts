@@ -1,0 +1,107 @@
+/** Coded streams against those of the Python package. */
+
+import { describe, expect, test } from "vitest";
+import streams from "../../../tests/data/streams.json?raw";
+import { type Gaussians, StreamDecoder } from "../../src/core/stream";
+
+interface Case {
+  name: string;
+  content: string;
+  ends: number[];
+  sizes: number[];
+  gaussians: Record<"means" | "quats" | "log_scales" | "opacities" | "sh0" | "shN", number[]>;
+}
+
+const cases = JSON.parse(streams) as Case[];
+const bytesOf = ({ content }: Case) => Uint8Array.from(atob(content), (letter) => letter.charCodeAt(0));
+
+/** What a decoder finds in bytes that arrive in pieces. */
+function decoded(bytes: Uint8Array, piece = bytes.length || 1): Gaussians[] {
+  const decoder = new StreamDecoder();
+  const levels: Gaussians[] = [];
+  for (let at = 0; at < bytes.length; at += piece) levels.push(...decoder.push(bytes.slice(at, at + piece)));
+  return levels;
+}
+
+function together(levels: readonly Gaussians[]): Case["gaussians"] {
+  const all = (pick: (level: Gaussians) => Float32Array) => levels.flatMap((level) => [...pick(level)]);
+  return {
+    means: all((g) => g.means),
+    quats: all((g) => g.quats),
+    log_scales: all((g) => g.logScales),
+    opacities: all((g) => g.opacities),
+    sh0: all((g) => g.sh0),
+    shN: all((g) => g.shN),
+  };
+}
+
+describe.each(cases)("$name", (one) => {
+  test("is decoded to what Python decodes it to", () => {
+    const found = together(decoded(bytesOf(one)));
+    for (const [name, values] of Object.entries(one.gaussians)) {
+      const mine = found[name as keyof typeof found];
+      expect(mine.length, name).toBe(values.length);
+      const off = values.map((v, i) => Math.abs(v - (mine[i] ?? Number.NaN)) / Math.max(1, Math.abs(v)));
+      expect(Math.max(0, ...off), name).toBeLessThan(1e-6);
+    }
+  });
+
+  test.each([1, 7, 100])("is decoded as it arrives, %i bytes at a time", (piece) => {
+    expect(decoded(bytesOf(one), piece)).toEqual(decoded(bytesOf(one)));
+  });
+
+  test("gives a level as soon as its last byte is there", () => {
+    const bytes = bytesOf(one);
+    const decoder = new StreamDecoder();
+    let [at, size] = [0, 0];
+    one.ends.forEach((end, level) => {
+      expect(decoder.push(bytes.slice(at, end - 1))).toEqual([]);
+      const levels = decoder.push(bytes.slice(end - 1, end));
+      at = end;
+      size += levels.reduce((sum, { count }) => sum + count, 0);
+      expect(levels.length).toBe(1);
+      expect(size).toBe(one.sizes[level]);
+    });
+  });
+
+  test("refuses bytes after the last level", () => {
+    expect(() => decoded(Uint8Array.of(...bytesOf(one), 0))).toThrow("after the last level");
+  });
+});
+
+test.each([
+  [0, 1, "not a sagesplat-stream"],
+  [4, 2, "newer stream"],
+  [5, 2, "newer stream"],
+  [6, 4, "impossible header"],
+  [7, 0, "impossible header"],
+  [9, 9, "impossible header"],
+  [27, 0x7f, "impossible header"],
+])("refuses a header with byte %i set to %i", (at, value, words) => {
+  const bytes = bytesOf(cases[0] as Case);
+  bytes[at] = value;
+  expect(() => decoded(bytes)).toThrow(words);
+});
+
+test("damaged bytes are errors or finite Gaussians", () => {
+  let seed = 1;
+  const random = (below: number) => {
+    seed = (Math.imul(seed, 1664525) + 1013904223) >>> 0;
+    return Math.floor((seed / 2 ** 32) * below);
+  };
+  let refused = 0;
+  let finite = true;
+  for (let i = 0; i < 3000; i++) {
+    const bytes = bytesOf(cases[i % cases.length] as Case);
+    for (let k = random(3); k >= 0; k--) bytes[random(bytes.length)] = random(256);
+    try {
+      const all = decoded(bytes).flatMap((g) => [g.means, g.quats, g.logScales, g.opacities, g.sh0, g.shN]);
+      finite &&= all.every((values) => values.every(Number.isFinite));
+    } catch (error) {
+      if ((error as Error).constructor !== Error) throw error; // such as a RangeError of an array
+      refused++;
+    }
+  }
+  expect(finite).toBe(true);
+  expect(refused).toBeGreaterThan(1500);
+});
