@@ -17,6 +17,7 @@ from sagesplat.scene.track_colours import TrackColours, track_colours
 from sagesplat.scene.vignetting import CURVE, OFFSET, powers
 
 _ENOUGH = 30  # observations of a photo, on average
+_POINTS = 100  # that photos share, at least
 _PASSES = 2  # over the lens and the photos' gains, in turn
 _ROUNDS = 10  # of iteratively reweighted least squares
 _EXPLAINED = 0.03  # least share by which the lens has to bring colours of the same point together
@@ -31,7 +32,7 @@ def estimate_vignetting(scene: Scene, photos: Photos | Sequence[np.ndarray]) -> 
     """
     rows = scene.train_ids.tolist()
     seen = track_colours(scene, photos, rows)
-    if len(seen.points) < _ENOUGH * max(1, len(rows)):
+    if len(seen.points) < _ENOUGH * max(1, len(rows)) or seen.points.max(initial=-1) + 1 < _POINTS:
         return None
     points, views = seen.points, seen.views
     log, t = np.log(seen.colours + OFFSET).mean(1), _tan2_of(scene, seen, rows)
