@@ -194,7 +194,8 @@ def test_training_tells_of_a_lens_that_nobody_corrected(capture):
     "made",
     [1, [], {}, {"coefficients": [1, 2]}, {"coefficients": [1], "reach": 1}, {"coefficients": 1, "reach": 1},
      {"coefficients": [1, "2"], "reach": 1}, {"coefficients": [1, 2], "reach": 0},
-     {"coefficients": [1, 99], "reach": 1}, {"coefficients": [float("nan"), 2], "reach": 1},
+     {"coefficients": [1, 99], "reach": 1}, {"coefficients": [1, 2], "reach": 1e9},
+     {"coefficients": [1, 2], "reach": 10**400}, {"coefficients": [float("nan"), 2], "reach": 1},
      {"coefficients": [True, 2], "reach": 1}],
 )  # fmt: skip
 def test_a_damaged_record_is_refused(capture, tmp_path, made):

@@ -6,6 +6,8 @@ from jaxtyping import Float, Float32, UInt8
 from sagesplat.scene.scene import Camera, Vignetting
 
 OFFSET, CURVE = 0.055, 2.4  # sRGB: stored = 1.055 light^(1/2.4) - 0.055, but for the darkest colours
+STEEPEST = 10.0  # magnitude of a coefficient
+_WIDEST = 1e6  # reach, tan^2
 
 
 def corrected(
@@ -41,9 +43,9 @@ def parse_vignetting(made: object) -> Vignetting | None:
     if not isinstance(made, dict) or made.keys() != {"coefficients", "reach"}:
         raise ValueError("no vignetting")
     numbers = [*made["coefficients"], made["reach"]] if isinstance(made["coefficients"], list) else []
-    if len(numbers) != 3 or not all(type(x) in (float, int) and abs(x) <= 10 for x in numbers):
+    if len(numbers) != 3 or not all(type(x) in (float, int) and abs(x) <= _WIDEST for x in numbers):
         raise ValueError("vignetting without numbers")
-    if made["reach"] <= 0:
-        raise ValueError("vignetting without a reach")
     a, b, reach = map(float, numbers)
+    if not (abs(a) <= STEEPEST and abs(b) <= STEEPEST and reach > 0):
+        raise ValueError("impossible vignetting")
     return Vignetting((a, b), reach)

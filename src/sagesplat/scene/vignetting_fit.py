@@ -14,7 +14,7 @@ from sagesplat.scene.gains import log_gains, spread
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene, Vignetting
 from sagesplat.scene.track_colours import TrackColours, track_colours
-from sagesplat.scene.vignetting import CURVE, OFFSET, powers
+from sagesplat.scene.vignetting import CURVE, OFFSET, STEEPEST, powers
 
 _ENOUGH = 30  # observations of a photo, on average
 _POINTS = 100  # that photos share, at least
@@ -44,7 +44,9 @@ def estimate_vignetting(scene: Scene, photos: Photos | Sequence[np.ndarray]) -> 
         full = log - log_gains(points, views, log - basis @ found, len(rows))[views]
     a, b = (CURVE * found).tolist()
     vignetting = Vignetting((a, b), reach)
-    if vignetting.lost < _LEAST or _explained(points, plain, full, basis) < _EXPLAINED:
+    if max(abs(a), abs(b)) > STEEPEST or vignetting.lost < _LEAST:
+        return None
+    if _explained(points, plain, full, basis) < _EXPLAINED:
         return None
     return vignetting
 
