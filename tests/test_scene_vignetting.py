@@ -165,7 +165,7 @@ def test_the_scene_of_a_run_keeps_what_was_found(capture, tmp_path, monkeypatch)
     np.testing.assert_array_equal(job.photos[0], corrected(
         load_photo(replace(scene.views[0], vignetting=None)), found, scene.views[0].camera
     ))  # fmt: skip
-    assert noticed(job) == (f"vignetting of {found.lost:.0%} corrected",)
+    assert noticed(job) == (f"vignetting of {100 * found.lost:.0f} % taken out of the photos",)
     write_scene(tmp_path / "part.npz", scene)
     assert {view.vignetting for view in read_scene(tmp_path / "part.npz").views} == {found}
 

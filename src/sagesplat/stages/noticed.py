@@ -17,7 +17,7 @@ def noticed(job: Job) -> tuple[str, ...]:
     if exposure := read_exposure_figures(run.refined):
         lines.append(f"exposure varies by {exposure.range_ev:.1f} EV")
     if lens := job.given_scene.views[0].vignetting:
-        lines.append(f"vignetting of {lens.lost:.0%} corrected")
+        lines.append(f"vignetting of {100 * lens.lost:.0f} % taken out of the photos")
     if (share := _ignored(job)) >= _LEAST_SHARE:
         lines.append(f"{100 * share:.2g} % of pixels ignored")
     if run.ladder == "nested" and (floaters := read_clean_figures(run.floaters)):
