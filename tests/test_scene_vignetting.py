@@ -19,7 +19,7 @@ from sagesplat.demo.wild import Wild
 from sagesplat.run.capture import fingerprint
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
-from sagesplat.scene import describe, load_scene, vignetting_fit
+from sagesplat.scene import describe, load_scene
 from sagesplat.scene.images import Photos, load_photo
 from sagesplat.scene.scene import Camera, Points, Scene, View, Vignetting
 from sagesplat.scene.stored import read_scene, write_scene
@@ -157,7 +157,8 @@ def test_the_scene_of_a_run_keeps_what_was_found(capture, tmp_path, monkeypatch)
     job = Job(RunDir(tmp_path / "run"), lambda e: lines.extend(e.lines) if isinstance(e, StageDone) else None)
     open_scene(job, capture, SceneConfig(vignetting=True))
     assert any(line.endswith("of the light in the corners: the photos are corrected") for line in lines)
-    monkeypatch.setattr(vignetting_fit, "estimate_vignetting", None)  # not estimated again
+    monkeypatch.setattr("sagesplat.scene.estimate_vignetting", None)  # not estimated again
+    open_scene(Job(job.run, lambda _: None), capture, SceneConfig(vignetting=True))
     scene = Job(job.run, lambda _: None).given_scene
     found = scene.views[-1].vignetting
     assert found is not None

@@ -74,7 +74,7 @@ def describe(scene: Scene) -> list[tuple[str, str]]:
     kinds = (("train", scene.train_ids), ("calibration", scene.calibration_ids), ("test", scene.test_ids))
     splits = ", ".join(f"{len(ids)} {kind}" for kind, ids in kinds if len(ids) or kind != "calibration")
     low, high = offsets.min(axis=0), offsets.max(axis=0)
-    seen_by = {view.vignetting for view in views if view.vignetting}
+    falloffs = {view.vignetting for view in views if view.vignetting}
     rows = [
         ("name", scene.name),
         ("path", str(scene.path)),
@@ -88,7 +88,7 @@ def describe(scene: Scene) -> list[tuple[str, str]]:
         ("distortion", f"{', '.join(lenses)}: undistorted when loaded" if lenses else "none"),
         *(
             ("vignetting", f"{lens.lost:.0%} of the light is lost in the corners, corrected")
-            for lens in seen_by
+            for lens in falloffs
         ),
         ("points", f"{len(points.xyz):,}" + ("" if len(points.track_points) else ", without tracks")),
         ("extent", f"{scene.extent:.3g} world units"),

@@ -70,13 +70,15 @@ def open_scene(
         leaving_out = _LeavingOut(config, masks or MasksConfig(), labels or LabelsConfig())
         _find_poses(job, path, capture, poses or PosesConfig(), leaving_out)
         path = capture
-    scene = load_scene(path, **asdict(config))
+    begun = _begun(job)
+    same = begun and not job.force and begun.settings == asdict(config)
+    again = begun and same and begun.path == path.resolve()  # what was found in the photos is known
+    scene = begun.load() if begun and again else load_scene(path, **asdict(config))
     photos, found = photo_hashes(run.photo_hashes, scene), scene.views[0].vignetting
     settings = {"path": str(path.resolve()), **asdict(config), "fingerprint": fingerprint(scene)}
-    begun = _begun(job)
     if begun is None or begun.photos is not None or begun.fingerprint != settings["fingerprint"]:
         settings["photos"] = photos.digest
-    if begun and begun.photos is not None and not job.force and begun.settings == asdict(config):
+    if begun and same and begun.photos is not None:
         check_photos(scene, begun.photos, photos.sha256)
 
     def make() -> list[str]:
