@@ -9,6 +9,7 @@ from sagesplat.adapt.observe import as_unit, measure_total, render_rgb
 from sagesplat.core.config import NestConfig
 from sagesplat.core.events import Progress, Warned
 from sagesplat.core.gaussians import Gaussians
+from sagesplat.core.second_opacity import SecondOpacities
 from sagesplat.formats.increments import packed, read_increments, write_increments
 from sagesplat.formats.levels import read_header, read_level, write_set
 from sagesplat.run.job import Job
@@ -58,7 +59,9 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
                 trained = event
         counts, across = trained.gaussians.counts(), trained.boundary
         sizes = {label: nested.level_sizes(n, config, across.get(label, 0)) for label, n in counts.items()}
-        lines = write_ladder(job, trained.gaussians, sizes, config, trained.purity)
+        second = trained.second_opacities
+        second = None if second is None else SecondOpacities.of_levels(second, sizes)
+        lines = write_ladder(job, trained.gaussians, sizes, config, trained.purity, second)
         lines[0] += f", {sum(across.values()):,} of them across borders and in every level"
         remove_checkpoints(run.nest_checkpoint)
         return lines
@@ -104,11 +107,16 @@ def train_capped(job: Job, stage: str, cap: int, steps: int, seed: int) -> Gauss
 
 
 def write_ladder(
-    job: Job, g: Gaussians, sizes: dict[int, tuple[int, ...]], config: NestConfig, purity: np.ndarray
+    job: Job,
+    g: Gaussians,
+    sizes: dict[int, tuple[int, ...]],
+    config: NestConfig,
+    purity: np.ndarray,
+    second: SecondOpacities | None = None,
 ) -> list[str]:
     """Write Gaussians in their order, with levels of `sizes` by label id, as the run's ladder and increments.
 
-    `purity` [N] of `Nested` is kept beside them. Returns lines that sum it up.
+    `purity` [N] of `Nested` and `second` are kept beside them. Returns lines that sum it up.
     """
     job.run.provenance("nest").unlink(missing_ok=True)  # from here on the earlier ladder is gone
     rows = packed(g, sizes, sh_bits=config.sh_bits)
