@@ -7,7 +7,14 @@ from pathlib import Path
 from sagesplat.adapt.ladder import read_prefixes
 from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.core.errors import RunError
-from sagesplat.formats.increments import INDEX, FileFormat, Increment, read_index, write_increments
+from sagesplat.formats.increments import (
+    INDEX,
+    FileFormat,
+    Increment,
+    read_increments,
+    read_index,
+    write_increments,
+)
 from sagesplat.formats.lod_meta import LOD_META
 from sagesplat.formats.lod_meta_write import write_lod_meta
 from sagesplat.formats.splats_write import write_splat, written_as
@@ -34,8 +41,9 @@ def increment_files(job: Job, folder: Path, kind: FileFormat) -> list[Increment]
     model.
     """
     ladder, made = read_prefixes(job.run.prefixes), settings_of(job.run, "nest")
-    streams = any(one.format == "stream" for one in read_index(job.run.increments))
-    g = ladder.load(ladder.levels[-1]) if streams else ladder.gaussians
+    listed = read_index(job.run.increments)
+    streams = any(one.format == "stream" for one in listed)
+    g = read_increments(job.run.increments, listed) if streams else ladder.gaussians
     return write_increments(
         folder, g, ladder.sizes, job.names(), replaces=ladder.replaces, kind=kind,
         sh_bits=tuple(made["sh_bits"]), fine=ladder.levels if streams else (), antialiased=job.antialiased,

@@ -124,9 +124,7 @@ def write_ladder(
     )  # fmt: skip
     # what is measured, planned and written from here on is what a viewer gets
     sent, seconds = read_streams(job.run.increments, made.increments)
-    write_set(
-        job.run.prefixes, sent, config.steps, made.sizes, second=seconds, exact=True, purity=purity[made.rows]
-    )
+    write_set(job.run.prefixes, sent, config.steps, made.sizes, second=seconds, purity=purity[made.rows])
     size, n = sum(one.nbytes for one in made.increments), len(sent)
     full = replace(g, logit_opacities=second.logits) if second else g
     unrounded = _quality(job, full)
