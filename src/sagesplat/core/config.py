@@ -258,6 +258,9 @@ class NestConfig:
     sh_bits: tuple[int, int] = (5, 4)
     """Bits per SH coefficient in the increments: of degree 1, and of higher degrees. Training uses the
     rounded values."""
+    two_opacities: bool = True
+    """Give each Gaussian one opacity for the low levels and one for the full model; without it the full
+    model is worse."""
     criterion: Literal["weight", "weight-volume", "peak", "sensitivity", "opacity"] = "sensitivity"
     """Importance that orders the Gaussians of a category; docs/developers/nested.md compares them."""
     lr_multiplier: float = 4.0

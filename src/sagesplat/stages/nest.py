@@ -9,7 +9,6 @@ from sagesplat.core.config import NestConfig
 from sagesplat.core.events import Progress, Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.second_opacity import SecondOpacities
-from sagesplat.formats.increments import read_increments
 from sagesplat.formats.levels import read_header, read_level, write_set
 from sagesplat.formats.stream_increments import read_streams, write_streams
 from sagesplat.run.job import Job
@@ -59,7 +58,9 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
                 trained = event
         counts, across = trained.gaussians.counts(), trained.boundary
         sizes = {label: nested.level_sizes(n, config, across.get(label, 0)) for label, n in counts.items()}
-        lines = write_ladder(job, trained.gaussians, sizes, config, trained.purity)
+        second = trained.second_opacities
+        second = None if second is None else SecondOpacities.of_levels(second, sizes)
+        lines = write_ladder(job, trained.gaussians, sizes, config, trained.purity, second)
         lines[0] += f", {sum(across.values()):,} of them across borders and in every level"
         remove_checkpoints(run.nest_checkpoint)
         return lines
@@ -114,8 +115,8 @@ def write_ladder(
 ) -> list[str]:
     """Write Gaussians in their order, with levels of `sizes` by label id, as the run's ladder and increments.
 
-    `purity` [N] of `Nested` is kept beside them. Gaussians that are hardly to be seen are left out. Returns
-    lines that sum it up.
+    `purity` [N] of `Nested` and `second` are kept beside them. Gaussians that are hardly to be seen are left
+    out. Returns lines that sum it up.
     """
     job.run.provenance("nest").unlink(missing_ok=True)  # from here on the earlier ladder is gone
     made = write_streams(
@@ -126,9 +127,7 @@ def write_ladder(
     sent, seconds = read_streams(job.run.increments, made.increments)
     write_set(job.run.prefixes, sent, config.steps, made.sizes, second=seconds, purity=purity[made.rows])
     size, n = sum(one.nbytes for one in made.increments), len(sent)
-    full = replace(g, logit_opacities=second.logits) if second else g
-    unrounded = _quality(job, full)
-    decoded = _quality(job, read_increments(job.run.increments, made.increments))
+    decoded, unrounded = _quality(job, sent, seconds), _quality(job, g, second)
     return [
         f"{config.levels} levels, {len(g):,} Gaussians",
         f"{n:,} of them to be seen, in {len(made.sizes)} coded streams of {size / 1e6:.2f} MB, "
@@ -137,8 +136,9 @@ def write_ladder(
     ]
 
 
-def _quality(job: Job, g: Gaussians) -> float:
-    """Mean SSIM over some of the training views."""
+def _quality(job: Job, g: Gaussians, second: SecondOpacities | None) -> float:
+    """Mean SSIM of the full model over some of the training views."""
+    g = g if second is None else replace(g, logit_opacities=second.logits)
     found = []
     for row in spread(job.valid.rows(job.scene, job.scene.train_ids), VIEWS):
         view = job.scene.views[row]
