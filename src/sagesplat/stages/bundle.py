@@ -16,6 +16,7 @@ from PIL import Image
 from sagesplat.adapt.observe import large_enough
 from sagesplat.adapt.viewpoint import QualityKind, ViewModel
 from sagesplat.core.errors import RunError
+from sagesplat.core.events import Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.names import composed
 from sagesplat.core.typed import fits
@@ -132,12 +133,28 @@ def bundle(
     write = write_single_file if single_file else write_bundle
     with TemporaryDirectory() as work:
         if chunks == "spz" and _in_streams(listed):
-            folder = Path(work) / "increments"
-            contents = replace(contents, chunks=increment_files(job, folder, "spz"), folder=folder)
+            contents = _in_spz(job, contents, Path(work) / "increments")
         written = write(out, contents, viewer, _poster(g, contents))
     agreement, error = distance_error(contents)
     count = sum(chunk.count for chunk in full)
     return BundleMade(out, len(contents.categories), len(listed), count, written, agreement, error)
+
+
+def _in_spz(job: Job, contents: Contents, folder: Path) -> Contents:
+    """The contents with increments in SPZ files, written to `folder`.
+
+    SPZ has one opacity for each Gaussian. Where streams have two, the bounds of their levels would be wrong.
+    """
+    made = replace(contents, chunks=increment_files(job, folder, "spz"), folder=folder)
+    if all(one.weight is None for one in contents.chunks):
+        return made
+    job.emit(
+        Warned(
+            "SPZ has one opacity for each Gaussian, here that of the full model: lower levels look worse "
+            "than in coded streams, and the bundle has no bounds of them"
+        )
+    )
+    return replace(made, categories=[replace(one, models={}, seen={}) for one in contents.categories])
 
 
 def _in_streams(listed: Sequence[Increment]) -> bool:
