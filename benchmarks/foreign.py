@@ -68,7 +68,7 @@ EXCEPTIONS: dict[str, str] = {
     "train.memory:_cgroup_limits": MACHINE,
     "viewer.bundle:_put_up": OURS,
     "viewer.bundle:has_viewer": OURS,
-    "viewer.bundle:verified": _HASHED,
+    "viewer.bundle:verified_files": _HASHED,
     "viewer.bundle:write_documents": OURS,
     "viewer.single_file:_is_ours": _HASHED,
     "viewer.single_file:_page": OURS,
