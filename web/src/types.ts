@@ -5,7 +5,7 @@ export type Quat = readonly [number, number, number, number]; // x y z w
 export type Box = readonly [number, number, number, number, number, number]; // min x y z, max x y z
 
 /** How a file holds splats. PLY is INRIA's, its y and z opposite to the bundle's; nothing is rounded in it. */
-export const FORMATS = ["spz", "ply"] as const;
+export const FORMATS = ["spz", "ply", "stream"] as const;
 export type Format = (typeof FORMATS)[number];
 
 /** One increment: the splats that a level adds to the level below, or replaces it by. */

@@ -36,7 +36,7 @@ import {
 import type { Fetch } from "./download";
 
 /** The newest version of the format that this viewer supports. */
-export const VERSION = 3;
+export const VERSION = 4;
 const PROMISES_VERSION = 2;
 
 const vec3 = list(number, 3);

@@ -1,6 +1,6 @@
 /** Coded streams: the nested levels of a category, decoded level by level. docs/formats.md specifies them. */
 
-import { BASES, Columns, LARGEST } from "./columns";
+import { Block, Columns, LARGEST } from "./columns";
 import { Reader } from "./rans";
 
 const HEADER = 44;
@@ -10,15 +10,12 @@ const PER_BYTE = 128; // Gaussians in a byte, at most
 const SMALLEST = 16; // Gaussians of a block: a power of two
 const GREATEST = 1e18;
 
-/** The Gaussians of a level, in right, up, back. */
-export interface Gaussians {
-  readonly count: number;
-  readonly means: Float32Array; // [count, 3]
-  readonly quats: Float32Array; // [count, 4], w x y z
-  readonly logScales: Float32Array; // [count, 3]
-  readonly opacities: Float32Array;
-  readonly sh0: Float32Array; // [count, 3]
-  readonly shN: Float32Array; // [count, K, 3]
+/** Makes of a stream's Gaussians what a caller wants of a level. */
+export interface Sink<Level> {
+  /** A level to be filled. */
+  begin(header: Header, count: number): Level;
+  /** Takes the first `count` rows of a block as the rows of the level from `start` on. */
+  put(level: Level, block: Block, start: number, count: number): void;
 }
 
 /** What a stream says of all its Gaussians. */
@@ -72,15 +69,17 @@ export function readHeader(bytes: Uint8Array): Header {
 }
 
 /** Decodes a stream while its bytes arrive. */
-export class StreamDecoder {
+export class StreamDecoder<Level> {
   private waiting: Uint8Array = new Uint8Array(0);
   private header: Header | null = null;
   private columns: Columns | null = null;
   private done = 0; // Gaussians
   private levels = 0;
 
+  constructor(private readonly sink: Sink<Level>) {}
+
   /** Takes the next bytes of the stream; the levels that they complete. Throws for a damaged stream. */
-  push(bytes: Uint8Array): Gaussians[] {
+  push(bytes: Uint8Array): Level[] {
     this.waiting = this.waiting.length ? joined(this.waiting, bytes) : bytes;
     if (!this.header) {
       if (this.waiting.length < HEADER) return [];
@@ -88,7 +87,7 @@ export class StreamDecoder {
       this.columns = new Columns(this.header);
       this.waiting = this.waiting.subarray(HEADER);
     }
-    const found: Gaussians[] = [];
+    const found: Level[] = [];
     while (this.waiting.length) {
       if (this.levels === this.header.levels) throw new Error("bytes after the last level");
       const level = this.next(this.header);
@@ -99,34 +98,44 @@ export class StreamDecoder {
   }
 
   /** The next level, if all of it is here. */
-  private next(header: Header): Gaussians | null {
+  private next(header: Header): Level | null {
     const [count, afterCount] = number(this.waiting, 0);
     const [size, start] = number(this.waiting, afterCount);
     if (count > Math.min(MAX_COUNT - this.done, PER_BYTE * size) || (!count && size)) {
       throw new Error("a level with more Gaussians than fit");
     }
     if (Number.isNaN(size) || this.waiting.length < start + size) return null;
-    const level = empty(count, header);
-    if (count) this.decode(this.waiting.subarray(start, start + size), level);
+    const level = this.sink.begin(header, count);
+    if (count) this.decode(this.waiting.subarray(start, start + size), level, count, blockOf(header));
     this.waiting = this.waiting.subarray(start + size);
     this.levels++;
     return level;
   }
 
-  private decode(payload: Uint8Array, level: Gaussians): void {
+  private decode(payload: Uint8Array, level: Level, total: number, block: Block): void {
+    const columns = this.columns as Columns;
     const reader = new Reader(payload);
     let before = 0;
-    for (let at = 0; at < level.count; ) {
-      const block = Math.max(SMALLEST, Math.min(2 ** (30 - Math.clz32(this.done)), LARGEST));
-      const left = block - (this.done % block);
-      const count = Math.min(left, level.count - at);
-      before = (this.columns as Columns).decode(reader, level, at, count, before);
-      if (count === left) this.columns?.endBlock();
+    for (let at = 0; at < total; ) {
+      const size = Math.max(SMALLEST, Math.min(2 ** (30 - Math.clz32(this.done)), LARGEST));
+      const left = size - (this.done % size);
+      const count = Math.min(left, total - at);
+      before = columns.decode(reader, block, count, before);
+      this.sink.put(level, block, at, count);
+      if (count === left) columns.endBlock();
       at += count;
       this.done += count;
     }
     reader.finish();
   }
+}
+
+const blocks = new Map<number, Block>(); // by SH degree, shared by all decoders
+
+function blockOf({ degree }: Header): Block {
+  const block = blocks.get(degree) ?? new Block(degree);
+  blocks.set(degree, block);
+  return block;
 }
 
 /** LEB128 at an offset, and where it ends; NaN where bytes are missing. */
@@ -146,16 +155,4 @@ function joined(a: Uint8Array, b: Uint8Array): Uint8Array {
   both.set(a);
   both.set(b, a.length);
   return both;
-}
-
-function empty(count: number, { degree }: Header): Gaussians {
-  return {
-    count,
-    means: new Float32Array(3 * count),
-    quats: new Float32Array(4 * count),
-    logScales: new Float32Array(3 * count),
-    opacities: new Float32Array(count),
-    sh0: new Float32Array(3 * count),
-    shN: new Float32Array(3 * count * (BASES[degree] ?? 0)),
-  };
 }

@@ -2,7 +2,8 @@
 
 import { describe, expect, test } from "vitest";
 import streams from "../../../tests/data/streams.json?raw";
-import { type Gaussians, StreamDecoder } from "../../src/core/stream";
+import { StreamDecoder } from "../../src/core/stream";
+import { Floats, type Gaussians } from "../floats";
 
 interface Case {
   name: string;
@@ -17,7 +18,7 @@ const bytesOf = ({ content }: Case) => Uint8Array.from(atob(content), (letter) =
 
 /** What a decoder finds in bytes that arrive in pieces. */
 function decoded(bytes: Uint8Array, piece = bytes.length || 1): Gaussians[] {
-  const decoder = new StreamDecoder();
+  const decoder = new StreamDecoder(new Floats());
   const levels: Gaussians[] = [];
   for (let at = 0; at < bytes.length; at += piece) levels.push(...decoder.push(bytes.slice(at, at + piece)));
   return levels;
@@ -52,7 +53,7 @@ describe.each(cases)("$name", (one) => {
 
   test("gives a level as soon as its last byte is there", () => {
     const bytes = bytesOf(one);
-    const decoder = new StreamDecoder();
+    const decoder = new StreamDecoder(new Floats());
     let [at, size] = [0, 0];
     one.ends.forEach((end, level) => {
       expect(decoder.push(bytes.slice(at, end - 1))).toEqual([]);
