@@ -194,7 +194,7 @@ def test_a_precision_that_the_format_does_not_have(wrong: dict[str, Any]):
     [
         (0, b"X", "not a sagesplat-stream"),
         (4, b"\2", "newer stream"),
-        (5, b"\2", "newer stream"),
+        (5, b"\4", "newer stream"),
         (6, b"\4", "degree 4"),
         (7, b"\0", "0 levels"),
         (9, b"\x09", "degree"),
