@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int64
+from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from sagesplat.core.errors import DataError, short
@@ -45,6 +45,7 @@ class Encoded:
     content: bytes
     ends: tuple[int, ...]  # bytes up to the end of each level
     sizes: tuple[int, ...]  # Gaussians up to the end of each level
+    weights: tuple[float, ...]  # of the second opacities at each level; none without them
     rows: Int64[np.ndarray, " M"]  # of the Gaussians that were given, in the stream's order
 
 
@@ -77,14 +78,15 @@ def encode_stream(
 ) -> Encoded:
     """Encode the nested levels of N Gaussians in COLMAP's axes; labels are left out.
 
-    The Gaussians of a level come in another order. Those whose opacity is rounded to 0 at all levels are left
-    out. The same input gives the same bytes.
+    The Gaussians of a level come in another order. Those that are hardly to be seen at any level are left out
+    (`Precision.least`). The same input gives the same bytes.
 
     Args:
         g: The Gaussians of one category in the order of their levels, on any device.
         sizes: The number of Gaussians up to the end of each level, ascending, the last one N.
-        second: Their second opacities, with the weights of this one category. They are kept of levels of a
-            weight below 1, in steps of 1/255.
+        second: Their second opacities, with the weights of this one category, which are rounded to 1/255. At
+            levels of weight 1 they are the only ones. Levels that show the same Gaussians get one weight,
+            that of the last.
         precision: Steps of quantisation. Finer ones than a model was trained with waste bytes.
         antialiased: How the scene was trained; a flag for viewers.
         name: What errors call the stream.
@@ -113,25 +115,32 @@ def encode_stream(
     weights, seconds = [255] * len(sizes), g.logit_opacities
     if second:
         weights, seconds = [round(255 * w) for w in _weights(second)], second.logits.detach().to("cpu")
-    g, seen = _with_opacities(g, seconds, sizes, weights, precision.opacity)
-    rows, g = np.flatnonzero(seen.numpy()), turned_round(g.select(seen))
+    most = opacities_of(_most(g.logit_opacities, seconds, sizes, weights), precision.opacity)
+    rows = np.flatnonzero(most > precision.least)
+    g, seconds = turned_round(g.select(torch.from_numpy(rows))), seconds[torch.from_numpy(rows)]
     made = header_of(g, len(sizes), precision, antialiased=antialiased, two_opacities=second is not None)
     header = read_header(made.pack())
-    columns = quantised(g, seconds[seen], header)
+    columns = quantised(g, seconds, header)
     ends = np.searchsorted(rows, sizes)
+    weights = [weights[np.searchsorted(ends, end, "right") - 1] for end in ends]
+    one = np.repeat(weights, np.diff(ends, prepend=0)) == 255
+    columns = replace(columns, opacities=np.where(one, columns.seconds, columns.opacities))
     tables, content, cuts, order = Tables(new_tables(header.layout)), header.pack(), [], []
     for weight, (low, high) in zip(weights, pairwise((0, *ends.tolist())), strict=True):
         order.append(low + np.argsort(columns.positions[low:high], kind="stable"))
         payload = b""
         if high > low:
             writer = Writer(tables)
-            level = columns.rows(order[-1])
-            _code_level(writer, header.layout, low, high - low, weight < 255, level)
+            some = columns.rows(order[-1])
+            _code_level(writer, header.layout, low, high - low, weight < 255, some)
             payload = writer.payload()
         content += _leb128(high - low) + _leb128(len(payload))
-        content += bytes([weight] if header.two_opacities else []) + payload
+        content += bytes([weight] if second else []) + payload
         cuts.append(len(content))
-    return Encoded(content, tuple(cuts), tuple(ends.tolist()), rows[np.concatenate(order)])
+    return Encoded(
+        content, tuple(cuts), tuple(ends.tolist()), tuple(w / 255 for w in weights if second),
+        rows[np.concatenate(order)],
+    )  # fmt: skip
 
 
 def _weights(second: SecondOpacities) -> tuple[float, ...]:
@@ -142,17 +151,12 @@ def _weights(second: SecondOpacities) -> tuple[float, ...]:
     return weights
 
 
-def _with_opacities(
-    g: Gaussians, seconds: Tensor, sizes: Sequence[int], weights: Sequence[int], step: int
-) -> tuple[Gaussians, Bool[Tensor, " N"]]:
-    """Gaussians with the first opacities to encode, and which of them are ever to be seen.
-
-    At levels of weight 255 the first one is the second one.
-    """
-    weight = torch.from_numpy(np.repeat(np.array(weights) / 255, np.diff(sizes, prepend=0)))
-    firsts = torch.where(weight == 1, seconds, g.logit_opacities)
-    ends = [blended(firsts.double(), seconds.double(), w) for w in (weight, weights[-1] / 255)]
-    return replace(g, logit_opacities=firsts), torch.from_numpy(opacities_of(torch.maximum(*ends), step) > 0)
+def _most(
+    first: Tensor, second: Tensor, sizes: Sequence[int], weights: Sequence[int]
+) -> Float64[Tensor, " N"]:
+    """Logits of the largest opacities that Gaussians have at any level, from their own one on."""
+    own = torch.from_numpy(np.repeat(np.array(weights) / 255, np.diff(sizes, prepend=0)))
+    return torch.maximum(*(blended(first.double(), second.double(), w) for w in (own, weights[-1] / 255)))
 
 
 def decode_stream(

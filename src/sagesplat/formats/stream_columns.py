@@ -22,7 +22,7 @@ _SCALE, _COLOUR, _HARMONIC = 64, 80, 15  # symbol of 0
 _ROTATION = ROTATIONS[-1]
 _GAPS = 3 * AXIS_BITS + 1
 _OPACITIES = 256
-_CLASSES = 8  # of first opacities: rows of the table of second ones
+_CLASSES = 4  # of first opacities: rows of the table of second ones
 _PEAK = 512
 _FLAT = 128
 
@@ -64,7 +64,7 @@ def joined(parts: list[Columns], sh_degree: int) -> Columns:
     """Columns one after the other."""
     none = np.zeros((0, 3), np.int64)
     harmonics = np.zeros((0, BASES[sh_degree], 3), np.int64)
-    parts = [Columns(*[none[:, 0]] * 3, none, none, none, harmonics), *parts]
+    parts = [Columns(none[:, 0], none[:, 0], none[:, 0], none, none, none, harmonics), *parts]
     return Columns(
         **{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Columns)}
     )

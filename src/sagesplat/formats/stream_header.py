@@ -40,12 +40,13 @@ class Precision:
     Colours, log scales and harmonics are those that nested levels are trained with.
     """
 
-    position: float = 1 / 8  # steps, of the median of the Gaussians' middle standard deviation
-    opacity: int = 6  # steps of 1/255
+    position: float = 1 / 6  # steps, of the median of the Gaussians' middle standard deviation
+    opacity: int = 8  # steps of 1/255
     colour: float = 2.0  # steps of sh0, of SPZ's units (of a byte)
     log_scale: float = 1 / 8  # steps
     sh_bits: tuple[int, int] = (5, 4)  # steps of 2^(1 - bits): of degree 1, and of 2 and 3
-    rotation: float = 0.0  # classes finer than usual; two halve the steps
+    rotation: float = -0.75  # classes finer than usual; two halve the steps
+    least: float = 0.75  # opacity, in its steps: what never has more is left out
 
     def __post_init__(self) -> None:
         steps = (self.position, self.colour, self.log_scale)
@@ -53,6 +54,8 @@ class Precision:
             raise ValueError(f"steps {steps} and {self.opacity}/255 of opacities are not in the format")
         if not all(1 <= bits <= 8 for bits in self.sh_bits) or abs(self.rotation) > 9:
             raise ValueError(f"{self.sh_bits} bits, {self.rotation} classes; 1 to 8 and -9 to 9 are there")
+        if not 0.5 <= self.least <= 255:
+            raise ValueError(f"opacities of {self.least} steps; from 0.5 on they are in the format")
 
 
 @dataclass(frozen=True)
@@ -107,8 +110,8 @@ def read_header(content: bytes) -> Header:
     if degree > 3 or not levels or not opacity or not spread or not (1 <= low <= 8 and 1 <= high <= 8):
         raise ValueError(f"degree {degree}, {levels} levels, steps {opacity}, {low}, {high}, {spread}")
     return Header(
-        bool(flags & _ANTIALIASED), bool(flags & _TWO_OPACITIES), degree, levels, opacity, (low, high), spread,
-        (origin[0], origin[1], origin[2]), step, scale_step, colour_step, scales, colours, rotations,
+        bool(flags & _ANTIALIASED), bool(flags & _TWO_OPACITIES), degree, levels, opacity, (low, high),
+        spread, (origin[0], origin[1], origin[2]), step, scale_step, colour_step, scales, colours, rotations,
     )  # fmt: skip
 
 
@@ -145,9 +148,9 @@ def header_of(
     )
 
 
-def opacities_of(logits: Tensor, step: int) -> Int64[np.ndarray, " N"]:
-    """Opacities in steps of `step` / 255."""
-    return torch.round(torch.sigmoid(logits.double()) * (255 / step)).long().numpy()
+def opacities_of(logits: Tensor, step: int) -> Float64[np.ndarray, " N"]:
+    """Opacities in steps of `step` / 255, not rounded."""
+    return torch.sigmoid(logits.double()).numpy() * (255 / step)
 
 
 def logits_of(opacities: Int64[np.ndarray, " N"], step: int) -> Float32[Tensor, " N"]:
@@ -168,8 +171,8 @@ def quantised(g: Gaussians, seconds: Tensor, header: Header) -> Columns:
     harmonics = in_buckets(g.shN.double(), header.sh_bits).numpy() / _sh_steps(header)
     return Columns(
         spread_bits(cells.clip(0, _CELLS - 1)),
-        opacities_of(g.logit_opacities, header.opacity_step),
-        opacities_of(seconds, header.opacity_step),
+        np.rint(opacities_of(g.logit_opacities, header.opacity_step)).astype(np.int64),
+        np.rint(opacities_of(seconds, header.opacity_step)).astype(np.int64),
         scales,
         np.rint(xyz * 2**0.5 * steps).astype(np.int64).clip(-steps, steps),
         (np.rint(colours) - header.colour_origin).clip(-LARGEST, LARGEST).astype(np.int64),
