@@ -10,6 +10,7 @@ export interface Gaussians {
   readonly quats: Float32Array; // [count, 4], w x y z
   readonly logScales: Float32Array; // [count, 3]
   readonly opacities: Float32Array;
+  readonly seconds: Float32Array;
   readonly sh0: Float32Array; // [count, 3]
   readonly shN: Float32Array; // [count, K, 3]
 }
@@ -27,6 +28,7 @@ export class Floats implements Sink<Gaussians> {
       quats: floats(4),
       logScales: floats(3),
       opacities: floats(1),
+      seconds: floats(1),
       sh0: floats(3),
       shN: floats(3 * (BASES[header.degree] as number)),
     };
@@ -40,7 +42,9 @@ export class Floats implements Sink<Gaussians> {
     for (let i = 0; i < count; i++) {
       const row = start + i;
       const steps = ROTATIONS[at(block.classes, i)] as number;
-      level.opacities[row] = Math.min(at(block.opacities, i) * header.opacityStep, 254.75) / 255;
+      const opacity = (o: number) => Math.max(0.25, Math.min(o * header.opacityStep, 254.75)) / 255;
+      level.opacities[row] = opacity(at(block.opacities, i));
+      level.seconds[row] = opacity(at(block.seconds, i));
       let square = 1;
       for (const axis of [0, 1, 2] as const) {
         level.means[3 * row + axis] = header.origin[axis] + header.step * at(block.cells[axis], i);

@@ -6,7 +6,7 @@ import { Outlook } from "../src/core/outlook";
 import { Entry } from "../src/core/residency";
 import { Streamer } from "../src/core/streamer";
 import type { Manifest, Settings, Viewpoint } from "../src/types";
-import { FakeRenderer, Network, VirtualClock } from "./simulate";
+import { FakeRenderer, Network, putIncrements, VirtualClock } from "./simulate";
 import { BASE, NO_BUDGET } from "./worlds";
 
 /** The texts of a bundle; of its chunks only the sizes matter. */
@@ -50,11 +50,7 @@ function linkTo(documents: Documents, { mbit, connections }: Line) {
   network.files.set("manifest.json", text.encode(documents.manifest));
   const { fidelity } = manifest.promises;
   if (fidelity) network.files.set(fidelity.uri, text.encode(documents.promises));
-  const { pack } = manifest;
-  if (pack) network.files.set(pack.uri, new Uint8Array(pack.bytes));
-  for (const { uri, bytes } of manifest.labels.flatMap((label) => label.levels)) {
-    if (bytes) network.files.set(uri, new Uint8Array(bytes));
-  }
+  putIncrements(network, manifest);
   return { clock, network, renderer: new FakeRenderer(clock) };
 }
 
@@ -143,7 +139,9 @@ export async function fileOrder(documents: Documents, line: Line): Promise<Sampl
   const curve: Sample[] = [NOTHING];
   const worker = async (): Promise<void> => {
     for (let next = todo.shift(); next; next = todo.shift()) {
-      if (next.file.bytes) await (await network.fetch(new URL(next.file.uri, BASE).href)).text();
+      const { uri, offset, bytes: size } = next.file;
+      const headers = offset === undefined ? {} : { Range: `bytes=${offset}-${offset + size - 1}` };
+      if (size) await (await network.fetch(new URL(uri, BASE).href, { headers })).text();
       here[next.i]?.add(next.k);
       bytes += next.file.bytes;
       const levels = here.map((set) => {

@@ -9,6 +9,7 @@ export const ROTATIONS = [4, 6, 8, 11, 16, 23, 32, 45, 64, 90, 127] as const; //
 const ESCAPE_BITS = 20;
 const POSITION_BITS = 51;
 const PEAK = 512; // count of the likeliest symbol of a new table
+const CLASSES = 4; // of first opacities: rows of the table of second ones
 const FLAT = 128; // of each symbol of a new table where none is likelier
 
 const peak = (likeliest: number, half: number) => (symbol: number) =>
@@ -22,7 +23,8 @@ type Triple = readonly [Int32Array, Int32Array, Int32Array];
 /** Up to 2048 Gaussians as integers, a column for each attribute. */
 export class Block {
   readonly cells = triple(); // x, y, z of positions
-  readonly opacities = column();
+  readonly opacities = column(); // the first ones, or the only ones
+  readonly seconds = column(); // the same where there is one
   readonly scales = triple(); // the largest, the middle, the smallest
   readonly classes = column(); // of rotations
   readonly rotations = triple(); // x, y, z
@@ -72,29 +74,40 @@ const lower = column(); // coefficients of lower degrees that are not 0
 export class Columns {
   private readonly gap = new Table(1, POSITION_BITS + 1, peak(24, 4));
   private readonly opacity: Table;
+  private readonly second: Table | null;
+  private readonly largest: number; // opacity
   private readonly scale: Table;
   private readonly rotation = new Table(11, 255, (symbol, row) =>
     Math.abs(symbol - 127) <= (ROTATIONS[row] as number) ? FLAT : 0,
   );
   private readonly colour: Table;
-  private readonly bands: Tables[] = []
+  private readonly bands: Tables[] = [];
   private readonly tables: Table[];
 
   constructor(private readonly header: Header) {
-    const opacities = Math.ceil(255 / header.opacityStep);
-    this.opacity = new Table(1, 256, (symbol) => (symbol > 0 && symbol <= opacities ? FLAT : 0));
+    const [least, most] = [header.twoOpacities ? 0 : 1, Math.ceil(255 / header.opacityStep)];
+    const opacity = (symbol: number) => (symbol >= least && symbol <= most ? FLAT : 0);
+    this.opacity = new Table(1, 256, opacity);
+    this.second = header.twoOpacities ? new Table(CLASSES, 256, opacity) : null;
+    this.largest = most;
     const [large, small] = [peak(64, 12), peak(9, 6)];
     this.scale = new Table(3, 128, (symbol, row) => (row ? small : large)(symbol));
     const [green, others] = [peak(80, 12), peak(80, 4)];
     this.colour = new Table(3, 160, (symbol, row) => (row ? others : green)(symbol));
     for (let degree = 1; degree <= header.degree; degree++) this.bands.push(tablesOf(degree));
     this.tables = [this.gap, this.opacity, this.scale, this.rotation, this.colour, ...this.bands.flat()];
+    if (this.second) this.tables.push(this.second);
   }
 
-  /** Decodes `count` Gaussians into the first rows of a block; the last position, as Morton code. */
-  decode(reader: Reader, block: Block, count: number, before: number): number {
+  /**
+   * Decodes `count` Gaussians into the first rows of a block; the last position, as Morton code.
+   *
+   * @param before - the position before them in the level
+   * @param two - whether they have two opacities
+   */
+  decode(reader: Reader, block: Block, count: number, before: number, two: boolean): number {
     const last = this.decodePositions(reader, block.cells, count, before);
-    reader.ofRow(this.opacity, 0, 0, block.opacities, count);
+    this.decodeOpacities(reader, block, count, two);
     this.decodeScales(reader, block, count);
     for (const column of block.rotations) reader.ofRows(this.rotation, block.classes, 127, column, count);
     this.decodeColours(reader, block.colours, count);
@@ -131,6 +144,18 @@ export class Columns {
     return code;
   }
 
+  private decodeOpacities(reader: Reader, { opacities, seconds }: Block, count: number, two: boolean): void {
+    reader.ofRow(this.opacity, 0, 0, opacities, count);
+    if (!two || !this.second) {
+      seconds.set(opacities.subarray(0, count));
+      return;
+    }
+    for (let i = 0; i < count; i++) {
+      contexts[i] = Math.floor(((opacities[i] as number) * CLASSES) / (this.largest + 1));
+    }
+    reader.ofRows(this.second, contexts, 0, seconds, count);
+  }
+
   private decodeScales(reader: Reader, block: Block, count: number): void {
     const [largest, middle, smallest] = block.scales;
     const { classes } = block;
@@ -145,7 +170,7 @@ export class Columns {
       middle[i] = second;
       smallest[i] = least;
       const size = Math.floor((2 * most - least - rotationOrigin) / spread);
-      classes[i] = size < 0 ? 0 : size > 10 ? 10 : size;
+      classes[i] = Math.max(0, Math.min(size, ROTATIONS.length - 1));
     }
   }
 

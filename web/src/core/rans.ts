@@ -54,7 +54,9 @@ export class Table {
     const low = row * symbols;
     const high = low + symbols;
     while ((this.sums[row] as number) > MOST) this.halve(row, low, high);
-    const share = Math.floor(((TOTAL - (this.possible[row] as number)) * 2 ** 16) / (this.sums[row] as number));
+    const share = Math.floor(
+      ((TOTAL - (this.possible[row] as number)) * 2 ** 16) / (this.sums[row] as number),
+    );
     let left = TOTAL;
     let largest = low;
     let most = 0;
@@ -109,7 +111,7 @@ export class Reader {
     const { symbols, slots, index, counts } = table;
     const base = row * symbols;
     const indices = row << (BITS - PIECE);
-    const escape = base + symbols - 1;
+    const final = base + symbols - 1;
     const origin = base + zero;
     let { state, at } = this;
     let escapes = 0;
@@ -121,7 +123,7 @@ export class Reader {
       state = Math.imul(known >>> BITS, state >> BITS) + slot - (known & (TOTAL - 1));
       while (state < LOWEST) state = (state << 8) | (bytes[at++] as number);
       out[i] = place - origin;
-      if (place === escape) escapes++;
+      if (place === final) escapes++;
       counts[place] = (counts[place] as number) + COUNTED;
     }
     table.used[row] = (table.used[row] as number) + count;

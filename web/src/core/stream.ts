@@ -9,6 +9,7 @@ const MAX_COUNT = 10_000_000;
 const PER_BYTE = 128; // Gaussians in a byte, at most
 const SMALLEST = 16; // Gaussians of a block: a power of two
 const GREATEST = 1e18;
+const ALL_SECOND = 255; // weight of a level whose Gaussians have one opacity, which counts as both
 
 /** Makes of a stream's Gaussians what a caller wants of a level. */
 export interface Sink<Level> {
@@ -21,6 +22,7 @@ export interface Sink<Level> {
 /** What a stream says of all its Gaussians. */
 export interface Header {
   readonly antialiased: boolean;
+  readonly twoOpacities: boolean;
   readonly degree: number;
   readonly levels: number;
   readonly opacityStep: number; // of 1/255
@@ -39,12 +41,13 @@ export interface Header {
 export function readHeader(bytes: Uint8Array): Header {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
   if (bytes.length < HEADER || view.getUint32(0) !== MAGIC) throw new Error("not a sagesplat-stream");
-  if (view.getUint8(4) !== 1 || view.getUint8(5) > 1 || view.getUint16(42, true)) {
+  if (view.getUint8(4) !== 1 || view.getUint8(5) > 3 || view.getUint16(42, true)) {
     throw new Error("a newer stream than this viewer knows");
   }
   const float = (at: number) => view.getFloat32(at, true);
   const header: Header = {
-    antialiased: view.getUint8(5) === 1,
+    antialiased: (view.getUint8(5) & 1) > 0,
+    twoOpacities: (view.getUint8(5) & 2) > 0,
     degree: view.getUint8(6),
     levels: view.getUint8(7),
     opacityStep: view.getUint8(8),
@@ -78,6 +81,16 @@ export class StreamDecoder<Level> {
 
   constructor(private readonly sink: Sink<Level>) {}
 
+  /** Whether all levels are decoded. */
+  get isComplete(): boolean {
+    return this.levels === this.header?.levels;
+  }
+
+  /** Whether bytes are here of a level that is not complete. */
+  get isWithin(): boolean {
+    return this.waiting.length > 0;
+  }
+
   /** Takes the next bytes of the stream; the levels that they complete. Throws for a damaged stream. */
   push(bytes: Uint8Array): Level[] {
     this.waiting = this.waiting.length ? joined(this.waiting, bytes) : bytes;
@@ -100,27 +113,30 @@ export class StreamDecoder<Level> {
   /** The next level, if all of it is here. */
   private next(header: Header): Level | null {
     const [count, afterCount] = number(this.waiting, 0);
-    const [size, start] = number(this.waiting, afterCount);
+    const [size, afterSize] = number(this.waiting, afterCount);
+    const start = afterSize + Number(header.twoOpacities);
     if (count > Math.min(MAX_COUNT - this.done, PER_BYTE * size) || (!count && size)) {
       throw new Error("a level with more Gaussians than fit");
     }
     if (Number.isNaN(size) || this.waiting.length < start + size) return null;
     const level = this.sink.begin(header, count);
-    if (count) this.decode(this.waiting.subarray(start, start + size), level, count, blockOf(header));
+    const two = header.twoOpacities && (this.waiting[afterSize] as number) < ALL_SECOND;
+    if (count) this.decode(this.waiting.subarray(start, start + size), level, count, two);
     this.waiting = this.waiting.subarray(start + size);
     this.levels++;
     return level;
   }
 
-  private decode(payload: Uint8Array, level: Level, total: number, block: Block): void {
+  private decode(payload: Uint8Array, level: Level, total: number, two: boolean): void {
     const columns = this.columns as Columns;
+    const block = blockOf(this.header as Header);
     const reader = new Reader(payload);
     let before = 0;
     for (let at = 0; at < total; ) {
       const size = Math.max(SMALLEST, Math.min(2 ** (30 - Math.clz32(this.done)), LARGEST));
       const left = size - (this.done % size);
       const count = Math.min(left, total - at);
-      before = columns.decode(reader, block, count, before);
+      before = columns.decode(reader, block, count, before, two);
       this.sink.put(level, block, at, count);
       if (count === left) columns.endBlock();
       at += count;

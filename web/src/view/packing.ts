@@ -23,6 +23,7 @@ export interface Part {
   readonly count: number;
   readonly splats: Uint32Array; // [count, 4]
   readonly harmonics: ReadonlyMap<(typeof HARMONICS)[number], Uint32Array>;
+  readonly opacities: Uint8Array | null; // [count, 2] in 1/255: the first and the second one, if there are two
 }
 
 const SH_C0 = 0.28209479177387814;
@@ -56,6 +57,7 @@ export class Packing implements Sink<Part> {
   private header: Header | null = null;
   private scale = new Lookup(() => 0);
   private colour = this.scale;
+  private alpha = new Uint8Array(0); // in 1/255, by opacity
   private coefficients: readonly Lookup[] = [];
 
   begin(header: Header, count: number): Part {
@@ -63,10 +65,12 @@ export class Packing implements Sink<Part> {
     const harmonics = HARMONICS.slice(0, header.degree).map(
       (key) => [key, new Uint32Array(count * WORDS[key])] as const,
     );
-    return { count, splats: new Uint32Array(4 * count), harmonics: new Map(harmonics) };
+    const opacities = header.twoOpacities ? new Uint8Array(2 * count) : null;
+    return { count, splats: new Uint32Array(4 * count), harmonics: new Map(harmonics), opacities };
   }
 
   put(part: Part, block: Block, start: number, count: number): void {
+    if (part.opacities) this.putOpacities(part.opacities, block, start, count);
     this.putColours(part.splats, block, start, count);
     this.putPositions(part.splats, block, start, count);
     this.putShapes(part.splats, block, start, count);
@@ -79,7 +83,8 @@ export class Packing implements Sink<Part> {
 
   private prepare(header: Header): void {
     this.header = header;
-    const { scaleOrigin, scaleStep, colourOrigin, colourStep, shBits } = header;
+    const { scaleOrigin, scaleStep, colourOrigin, colourStep, shBits, opacityStep } = header;
+    this.alpha = Uint8Array.from({ length: 256 }, (_, opacity) => Math.min(opacity * opacityStep, 255));
     this.scale = new Lookup((steps) => scaleByte((steps + scaleOrigin) * scaleStep));
     this.colour = new Lookup((steps) => colourByte(((steps + colourOrigin) * colourStep - 127.5) / 38.25));
     this.coefficients = BITS.slice(0, header.degree).map((bits, i) => {
@@ -89,18 +94,25 @@ export class Packing implements Sink<Part> {
     });
   }
 
+  private putOpacities(out: Uint8Array, block: Block, start: number, count: number): void {
+    const { opacities, seconds } = block;
+    const { alpha } = this;
+    for (let i = 0, at = 2 * start; i < count; i++, at += 2) {
+      out[at] = alpha[opacities[i] as number] as number;
+      out[at + 1] = alpha[seconds[i] as number] as number;
+    }
+  }
+
   private putColours(splats: Uint32Array, block: Block, start: number, count: number): void {
     const [red, green, blue] = block.colours;
     const { opacities } = block;
-    const { colour } = this;
-    const step = (this.header as Header).opacityStep;
+    const { colour, alpha } = this;
     for (let i = 0, at = 4 * start; i < count; i++, at += 4) {
-      const alpha = (opacities[i] as number) * step;
       splats[at] =
         colour.at(red[i] as number) |
         (colour.at(green[i] as number) << 8) |
         (colour.at(blue[i] as number) << 16) |
-        ((alpha > 255 ? 255 : alpha) << 24);
+        ((alpha[opacities[i] as number] as number) << 24);
     }
   }
 
