@@ -1,8 +1,10 @@
 /** How a bundle arrives over slow links: the streamer against one file and against files in their order. */
 
+import { gzipSync } from "node:zlib";
 import { frustumOf, rotate } from "../src/core/distance";
 import { loadManifest, parsePromises } from "../src/core/manifest";
 import { Outlook } from "../src/core/outlook";
+import { ladderOf } from "../src/core/planner";
 import { Entry } from "../src/core/residency";
 import { Streamer } from "../src/core/streamer";
 import type { Manifest, Settings, Viewpoint } from "../src/types";
@@ -29,9 +31,10 @@ export interface Sample {
   readonly bytes: number;
   readonly ssim: number;
   readonly whole: boolean; // everything is there, at its smallest level at least
+  readonly takes: number; // bytes of what is planned, with the manifest
 }
 
-const NOTHING: Sample = { ms: 0, bytes: 0, ssim: 0, whole: false };
+const NOTHING: Sample = { ms: 0, bytes: 0, ssim: 0, whole: false, takes: 0 };
 const FULL: Settings = {
   mode: "full",
   quality: "fidelity",
@@ -46,10 +49,13 @@ function linkTo(documents: Documents, { mbit, connections }: Line) {
   const clock = new VirtualClock();
   const network = new Network(clock, (mbit * 1e6) / 8, LATENCY, connections);
   const manifest: Manifest = JSON.parse(documents.manifest);
-  const text = new TextEncoder();
-  network.files.set("manifest.json", text.encode(documents.manifest));
+  const put = (uri: string, text: string) => {
+    network.files.set(uri, new TextEncoder().encode(text));
+    network.packed.set(uri, gzipSync(text).length);
+  };
+  put("manifest.json", documents.manifest);
   const { fidelity } = manifest.promises;
-  if (fidelity) network.files.set(fidelity.uri, text.encode(documents.promises));
+  if (fidelity) put(fidelity.uri, documents.promises);
   putIncrements(network, manifest);
   return { clock, network, renderer: new FakeRenderer(clock) };
 }
@@ -105,7 +111,9 @@ export async function streamed(
       const { labels, bytesLoaded, status } = streamer.state;
       const levels = labels.map((label) => label.shown);
       const whole = status !== "loading";
-      curve.push({ ms: clock.now(), bytes: head + bytesLoaded, ssim: ssim(view, levels), whole });
+      const planned = labels.map(({ label, wanted }) => ladderOf(label).bytes[wanted - 1] ?? 0);
+      const takes = planned.reduce((sum, bytes) => sum + bytes, head + documents.promises.length);
+      curve.push({ ms: clock.now(), bytes: head + bytesLoaded, ssim: ssim(view, levels), whole, takes });
     };
     streamer.update(view);
     streamer.start();
@@ -123,7 +131,7 @@ export function oneFile(documents: Documents, { mbit }: Line): Sample[] {
   const ms = LATENCY + (8 * manifest.totals.bytes) / (mbit * 1000);
   const full = manifest.labels.map((label) => label.levels.length);
   const ssim = judge(manifest, documents.promises)(startView(manifest), full);
-  return [NOTHING, { ms, bytes: manifest.totals.bytes, ssim, whole: true }];
+  return [NOTHING, { ms, bytes: manifest.totals.bytes, ssim, whole: true, takes: 0 }];
 }
 
 /** SSIM over time if increments come six at a time in the order of the manifest. */
@@ -149,7 +157,8 @@ export async function fileOrder(documents: Documents, line: Line): Promise<Sampl
         while (set.has(level)) level += 1;
         return level;
       });
-      curve.push({ ms: head + clock.now(), bytes, ssim: ssim(view, levels), whole: !levels.includes(0) });
+      const whole = !levels.includes(0);
+      curve.push({ ms: head + clock.now(), bytes, ssim: ssim(view, levels), whole, takes: 0 });
     }
   };
   const workers = [1, 2, 3, 4, 5, 6].map(worker);

@@ -77,6 +77,8 @@ const PIECE = 8192; // bytes
 /** Files over a link: a round trip per request, then all downloads share the bandwidth evenly. */
 export class Network {
   readonly files = new Map<string, Uint8Array>();
+  /** By path, bytes over the link where they are fewer: with gzip. */
+  readonly packed = new Map<string, number>();
   /** By path, of each request. */
   readonly asked: string[] = [];
   aborted: string[] = [];
@@ -178,6 +180,7 @@ export class Network {
 
   private body(path: string, content: Uint8Array, fault: Fault | undefined, signal: AbortSignal | null) {
     let at = 0;
+    const share = (this.packed.get(path) ?? content.length) / content.length;
     const read = async () => {
       if (at >= content.length || (fault === "cut" && at > content.length / 2)) {
         this.close();
@@ -188,7 +191,7 @@ export class Network {
       const size = Math.min(PIECE, content.length - at);
       try {
         if (fault === "stalls" && at > content.length / 2) await this.wait(Infinity, signal, path);
-        await this.flow(size, signal, path);
+        await this.flow(size * share, signal, path);
       } catch (error) {
         this.close();
         throw error;

@@ -45,6 +45,18 @@ export class Pack {
     return this.stopped && left > 0 ? Number.NaN : left;
   }
 
+  /** Bytes that came without being wanted, and those up to the next file that is. */
+  spare(isWanted: (file: File) => boolean): number {
+    let [spare, end] = [0, 0];
+    for (const file of this.files) {
+      end += file.bytes;
+      const isNext = end > this.at;
+      if (!isWanted(file)) spare += file.bytes;
+      else if (isNext) return spare;
+    }
+    return spare;
+  }
+
   /** Whether it is received completely: the browser caches it only then. */
   get isHere(): boolean {
     return this.at >= this.file.bytes;

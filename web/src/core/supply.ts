@@ -61,6 +61,7 @@ export class Supply {
   private readonly unverified = new Set<string>(); // files of a pack whose hash could not be checked
   private readonly loads = new Map<string, Load>(); // of files that are not here yet
   private ranges: ReadonlyMap<string, readonly File[]> = new Map(); // of files, by uri
+  private planned: ReadonlySet<string> = new Set(); // files of the plan, here or not
   private sendsRanges: boolean | null = null; // whether the server does; null: it was not asked
   private readonly come = new Map<string, Uint8Array>(); // arrived files, until they are taken
   private readonly failures = new Map<string, Failure>();
@@ -205,14 +206,24 @@ export class Supply {
   }
 
   /** The wanted files that the pack does not bring, or brings late. */
-  private besides(pack: Pack, wanted: readonly File[], undecided: boolean): File[] {
+  private besides(pack: Pack, wanted: readonly File[], undecided: boolean): readonly File[] {
+    if (this.ranges.size && !pack.isHere) {
+      const spare = pack.spare((file) => this.planned.has(file.sha256) || this.loads.has(file.sha256));
+      if (spare > this.trip) {
+        pack.stop(); // ranges bring the rest without what lies between
+        return wanted;
+      }
+    }
     const brought = wanted.filter((file) => !this.loads.has(file.sha256) && pack.until(file) >= 0);
     const late = undecided ? new Set() : lateIn(pack, brought, this.trip);
     let brings = false;
+    let before = 0; // bytes of larger value that the pack brings
     const single = wanted.filter((file) => {
       const mine = pack.until(file) >= 0 && !this.loads.has(file.sha256) && !late.has(file);
       brings ||= mine;
-      return !mine && (!brings || pack.holds(file)); // other files wait for those of larger value
+      if (mine) before += file.bytes;
+      // what is asked for now comes after a round trip; files that the pack does not hold wait for larger value
+      return !mine && (!brings || (pack.holds(file) && before < this.trip));
     });
     if (!brings && !undecided && !pack.isHere) pack.stop();
     return single;
@@ -220,6 +231,7 @@ export class Supply {
 
   /** Aborts downloads that are no longer wanted, unless they are nearly complete. */
   keepOnly(wanted: ReadonlySet<string>): void {
+    this.planned = wanted;
     for (const load of this.requests) {
       const left = bytesOf(load.files) - load.got;
       if (left <= (load.isWhole ? MODEST : TINY) || load.got > 0.8 * bytesOf(load.files)) continue;
