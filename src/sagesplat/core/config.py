@@ -472,6 +472,9 @@ class BundleConfig:
     """Weights of categories in the viewer's plans, as NAME VALUE ... (default: 1 each)."""
     single_file: bool = False
     """Write one HTML page that opens from the disk, instead of a folder for a web server."""
+    chunks: Literal["stream", "spz"] | None = None
+    """Format of the increments: coded streams, or SPZ files, which other viewers read too (default: that of
+    the run)."""
 
 
 @dataclass(frozen=True)

@@ -55,6 +55,7 @@ class Decoded:
 
     gaussians: Gaussians  # with their first opacities
     second: SecondOpacities | None  # and the weights of these levels, where there are two
+    ends: tuple[int, ...]  # bytes up to the end of each level
     sizes: tuple[int, ...]  # Gaussians up to the end of each level
     antialiased: bool  # how the scene was trained
 
@@ -183,7 +184,8 @@ def decode_stream(
         header = read_header(content)
         if levels is not None and not 1 <= levels <= header.levels:
             raise ValueError(f"level {levels} of {header.levels}")
-        tables, at, parts, sizes, weights = Tables(new_tables(header.layout)), SIZE, [], [0], []
+        tables, at, parts, weights = Tables(new_tables(header.layout)), SIZE, [], []
+        ends, sizes = [], [0]
         while len(sizes) <= (levels or header.levels):
             if levels is None and at == len(content):
                 break
@@ -196,6 +198,7 @@ def decode_stream(
             payload, two = content[at : at + nbytes], weights[-1] < 255
             parts += _read_level(payload, tables, header.layout, sizes[-1], count, two)
             at += nbytes
+            ends.append(at)
             sizes.append(sizes[-1] + count)
         if len(sizes) == header.levels + 1 and at != len(content):
             raise ValueError(f"{len(content) - at} bytes after the last level")
@@ -205,7 +208,8 @@ def decode_stream(
     if header.two_opacities:
         logits = logits_of(columns.seconds, header.opacity_step)
         second = SecondOpacities(logits, {label_id: tuple(w / 255 for w in weights)})
-    return Decoded(restored(columns, header, label_id), second, tuple(sizes[1:]), header.antialiased)
+    g = restored(columns, header, label_id)
+    return Decoded(g, second, tuple(ends), tuple(sizes[1:]), header.antialiased)
 
 
 def _check(name: str, g: Gaussians, sizes: Sequence[int], second: SecondOpacities | None) -> None:

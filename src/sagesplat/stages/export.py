@@ -7,7 +7,14 @@ from pathlib import Path
 from sagesplat.adapt.ladder import read_prefixes
 from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.core.errors import RunError
-from sagesplat.formats.increments import INDEX, Format, write_increments
+from sagesplat.formats.increments import (
+    INDEX,
+    FileFormat,
+    Increment,
+    read_increments,
+    read_index,
+    write_increments,
+)
 from sagesplat.formats.lod_meta import LOD_META
 from sagesplat.formats.lod_meta_write import write_lod_meta
 from sagesplat.formats.splats_write import write_splat, written_as
@@ -18,18 +25,29 @@ from sagesplat.stages.plan import main_plan, scene_plan
 from sagesplat.stages.shared import label_named
 
 
-def export_increments(job: Job, folder: Path, kind: Format) -> int:
+def export_increments(job: Job, folder: Path, kind: FileFormat) -> int:
     """Write what each level of each category adds as files of their own; returns how many."""
     if job.run.ladder != "nested":
         raise RunError(f"{job.run.path}: snapshots have no chunks; use --ladder nested")
     if folder.exists() and not (job.force and (folder / INDEX).exists()):
         raise RunError(f"{folder}: exists; choose a new folder (--force replaces one of chunks)")
+    return len(increment_files(job, folder, kind))
+
+
+def increment_files(job: Job, folder: Path, kind: FileFormat) -> list[Increment]:
+    """Write the increments of the run's nested levels as files of their own, in the order of the ladder.
+
+    What streams hold is kept by the finest steps of SPZ. Of two opacities a Gaussian gets that of the full
+    model.
+    """
     ladder, made = read_prefixes(job.run.prefixes), settings_of(job.run, "nest")
-    chunks = write_increments(
-        folder, ladder.gaussians, ladder.sizes, job.names(), replaces=ladder.replaces, kind=kind,
-        sh_bits=tuple(made["sh_bits"]), antialiased=job.antialiased,
+    listed = read_index(job.run.increments)
+    streams = any(one.format == "stream" for one in listed)
+    g = read_increments(job.run.increments, listed) if streams else ladder.gaussians
+    return write_increments(
+        folder, g, ladder.sizes, job.names(), replaces=ladder.replaces, kind=kind,
+        sh_bits=tuple(made["sh_bits"]), fine=ladder.levels if streams else (), antialiased=job.antialiased,
     )  # fmt: skip
-    return len(chunks)
 
 
 def export_scene(

@@ -1,16 +1,17 @@
 """Makes the nested levels and their increments, from the trained Gaussians: orders them, trains prefixes."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
-import torch
 
 from sagesplat.adapt.observe import as_unit, measure_total, render_rgb
 from sagesplat.core.config import NestConfig
 from sagesplat.core.events import Progress, Warned
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.formats.increments import packed, read_increments, write_increments
+from sagesplat.core.second_opacity import SecondOpacities
+from sagesplat.formats.increments import read_increments
 from sagesplat.formats.levels import read_header, read_level, write_set
+from sagesplat.formats.stream_increments import read_streams, write_streams
 from sagesplat.run.job import Job
 from sagesplat.run.records import checkpoint_key
 from sagesplat.run.stage import run_stage
@@ -104,26 +105,34 @@ def train_capped(job: Job, stage: str, cap: int, steps: int, seed: int) -> Gauss
 
 
 def write_ladder(
-    job: Job, g: Gaussians, sizes: dict[int, tuple[int, ...]], config: NestConfig, purity: np.ndarray
+    job: Job,
+    g: Gaussians,
+    sizes: dict[int, tuple[int, ...]],
+    config: NestConfig,
+    purity: np.ndarray,
+    second: SecondOpacities | None = None,
 ) -> list[str]:
     """Write Gaussians in their order, with levels of `sizes` by label id, as the run's ladder and increments.
 
-    `purity` [N] of `Nested` is kept beside them. Returns lines that sum it up.
+    `purity` [N] of `Nested` is kept beside them. Gaussians that are hardly to be seen are left out. Returns
+    lines that sum it up.
     """
     job.run.provenance("nest").unlink(missing_ok=True)  # from here on the earlier ladder is gone
-    rows = packed(g, sizes, sh_bits=config.sh_bits)
-    ordered = g.select(torch.from_numpy(rows))
-    chunks = write_increments(
-        job.run.increments, ordered, sizes, job.names(), sh_bits=config.sh_bits, antialiased=job.antialiased
-    )
+    made = write_streams(
+        job.run.increments, g, sizes, job.names(), second=second, sh_bits=config.sh_bits,
+        antialiased=job.antialiased,
+    )  # fmt: skip
     # what is measured, planned and written from here on is what a viewer gets
-    sent = read_increments(job.run.increments, chunks)
-    write_set(job.run.prefixes, sent, config.steps, sizes, purity=purity[rows])
-    size, n = sum(chunk.nbytes for chunk in chunks), len(g)
-    unrounded, decoded = _quality(job, ordered), _quality(job, sent)
+    sent, seconds = read_streams(job.run.increments, made.increments)
+    write_set(job.run.prefixes, sent, config.steps, made.sizes, second=seconds, purity=purity[made.rows])
+    size, n = sum(one.nbytes for one in made.increments), len(sent)
+    full = replace(g, logit_opacities=second.logits) if second else g
+    unrounded = _quality(job, full)
+    decoded = _quality(job, read_increments(job.run.increments, made.increments))
     return [
-        f"{config.levels} levels, {n:,} Gaussians",
-        f"{size / 1e6:.2f} MB in {len(chunks)} SPZ files, {size / n:.1f} bytes a Gaussian; "
+        f"{config.levels} levels, {len(g):,} Gaussians",
+        f"{n:,} of them to be seen, in {len(made.sizes)} coded streams of {size / 1e6:.2f} MB, "
+        f"{size / n:.1f} bytes a Gaussian; "
         f"training views: SSIM {decoded:.4f} as decoded, {unrounded:.4f} before rounding",
     ]
 
