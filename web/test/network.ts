@@ -1,7 +1,9 @@
 /** How a bundle arrives over slow links: the streamer against one file and against files in their order. */
 
 import { gzipSync } from "node:zlib";
+import { inAdvance } from "../src/core/advance";
 import { frustumOf, rotate } from "../src/core/distance";
+import type { Fetch } from "../src/core/download";
 import { loadManifest, parsePromises } from "../src/core/manifest";
 import { Outlook } from "../src/core/outlook";
 import { ladderOf } from "../src/core/planner";
@@ -92,6 +94,12 @@ function startView(manifest: Manifest): Viewpoint {
   return { position, direction, frustum: frustumOf(position, quaternion, 0.9, 1.6) };
 }
 
+/** The page names the pack, which is asked for together with the manifest. */
+function packInAdvance({ manifest }: Documents, { fetch }: Network): Fetch {
+  const { pack }: Manifest = JSON.parse(manifest);
+  return pack ? inAdvance(fetch, new URL(pack.uri, BASE).href).fetch : fetch;
+}
+
 /** SSIM over time of the streamer, which fetches everything in the end or what a target asks for. */
 export async function streamed(
   documents: Documents,
@@ -99,7 +107,7 @@ export async function streamed(
   partial: Partial<Settings>,
 ): Promise<Sample[]> {
   const { clock, network, renderer } = linkTo(documents, line);
-  const { fetch } = network;
+  const fetch = packInAdvance(documents, network);
   const head = documents.manifest.length;
   const curve: Sample[] = [NOTHING];
   const streamers = loadManifest(BASE, fetch).then((manifest) => {

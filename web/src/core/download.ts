@@ -9,6 +9,7 @@ export interface Reply {
   readonly status: number;
   readonly headers: { get(name: string): string | null };
   readonly body: { getReader(): Reader } | null;
+  readonly isEarly?: boolean; // it was asked for before, so that its time says nothing of the link
   text(): Promise<string>;
 }
 
@@ -213,7 +214,7 @@ export async function receive(
       ...(again && { cache: "reload" as const }),
       ...(range && { headers: { Range: `bytes=${range.start}-${range.end - 1}` } }),
     });
-    link.answered(clock.now() - asked);
+    if (!reply.isEarly) link.answered(clock.now() - asked);
     if (!reply.ok) throw refused(file, reply.status);
     check?.(reply);
     await each(reply, (part) => {

@@ -202,7 +202,7 @@ export class Supply {
 
   /** Bytes per round trip of the link; NaN: unknown. */
   private get trip(): number {
-    return (this.roundTrip * this.bandwidth.rate) / 1000;
+    return this.roundTrip < Infinity ? (this.roundTrip * this.bandwidth.rate) / 1000 : Number.NaN;
   }
 
   /** The wanted files that the pack does not bring, or brings late. */

@@ -140,3 +140,43 @@ test("with a pack, ranges bring what it would bring too late", async () => {
   expect(shown(state)).toEqual(wanted(state));
   expect(state.message).toBeNull();
 });
+
+test("without promises the pack brings what is planned so far, and about a round trip more", async () => {
+  const { w } = made({ labels: 6, levels: 16, pack: true });
+  w.network.faults.set("promises-1.json", "hang");
+  w.set({ mode: "target", target: 0.5 });
+  w.network.bandwidth = 200_000;
+  w.streamer.start();
+  await w.pass(9000);
+  const { state } = w.streamer;
+  expect(shown(state)).toEqual(wanted(state));
+  expect(w.network.aborted).toContain("scene-1.pack");
+  const planned = state.labels.reduce((sum, { bytes }) => sum + bytes, 0);
+  expect(planned).toBeLessThan(w.manifest.totals.bytes / 2);
+  expect(state.bytesLoaded).toBeLessThan(planned + 2 * 20_000);
+});
+
+test("the pack stops before a long way of what nobody wants", async () => {
+  const { w } = made({ labels: 6, levels: 16, pack: true });
+  w.network.bandwidth = 200_000;
+  w.set({
+    mode: "target",
+    target: 0.8,
+    weights: new Map([
+      [0, 0],
+      [1, 0],
+      [2, 0],
+      [3, 0],
+    ]),
+  });
+  w.streamer.start();
+  await w.rest();
+  const { state } = w.streamer;
+  expect(shown(state)).toEqual(wanted(state));
+  const takes = state.labels.reduce(
+    (sum, { bytes }) => sum + bytes,
+    w.manifest.promises.fidelity?.bytes ?? 0,
+  );
+  expect(state.bytesLoaded).toBeLessThan(takes + 2 * 20_000);
+  expect(w.network.askedRanges.length).toBeGreaterThan(0);
+});
