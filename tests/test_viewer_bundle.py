@@ -28,7 +28,7 @@ from sagesplat.formats.stream_increments import write_streams
 from sagesplat.io.lock import alone
 from sagesplat.scene.scene import Camera
 from sagesplat.viewer import boxes, frames, promises
-from sagesplat.viewer.bundle import SCHEMA, is_bundle, write_bundle, write_documents
+from sagesplat.viewer.bundle import SCHEMA, has_viewer, is_bundle, write_bundle, write_documents
 from sagesplat.viewer.frames import FLIP
 from sagesplat.viewer.manifest import CameraEntry, Category, Contents, documents
 from sagesplat.viewer.pack import NEARBY, Ladder, gains_of, order_of
@@ -446,6 +446,19 @@ def test_the_pack_is_the_chunks_in_its_order(tmp_path, contents, viewer) -> None
     assert pack["uri"] == f"scene-{pack['sha256'][:12]}.pack"
     assert sorted(pack["order"]) == [[0, 1], [0, 2], [1, 1], [1, 2], [1, 3], [2, 1], [2, 2]]
     assert sorted(pack["order"][:3]) == [[0, 1], [1, 1], [2, 1]]  # the smallest of everything
+
+
+def test_the_page_names_the_pack(tmp_path, contents, viewer) -> None:
+    (viewer / "index.html").write_text("<head><!-- pack --></head>")
+    out = tmp_path / "out"
+    for _ in range(2):
+        write_bundle(out, contents, viewer)
+        pack = json.loads((out / "manifest.json").read_text())["pack"]
+        assert (
+            out / "index.html"
+        ).read_text() == f'<head><meta name="pack" content="{pack["uri"]}" /></head>'
+        assert has_viewer(out, viewer)
+        write_documents(out, contents)  # names it anew
 
 
 def test_a_live_bundle_has_no_pack(tmp_path, contents) -> None:

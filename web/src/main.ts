@@ -1,3 +1,5 @@
+import { inAdvance } from "./core/advance";
+import type { Fetch } from "./core/download";
 import { loadManifest } from "./core/manifest";
 import { bundleUrl, type Embed, type Options, parseOptions } from "./embed";
 import { sourceInside } from "./inside";
@@ -19,10 +21,11 @@ ready.catch((error: unknown) => fail(messageOf(error)));
 async function begin(): Promise<void> {
   await Promise.resolve(); // `window.sagesplat` exists before any error
   const options = parseOptions(location.search, location.hash);
-  const source = sourceInside(document) ?? {
-    base: bundleUrl(options.bundle, location.href),
-    fetch: (url: string, init?: RequestInit) => fetch(url, init),
-  };
+  const base = bundleUrl(options.bundle, location.href);
+  const name = options.bundle ? null : packNamed(document);
+  const online: Fetch = (url, init) => fetch(url, init);
+  const pack = name && inAdvance(online, new URL(name, base).href);
+  const source = sourceInside(document) ?? { base, fetch: pack ? pack.fetch : online };
   const canvas = document.getElementById("view");
   if (!(canvas instanceof HTMLCanvasElement))
     throw new Error("This page is incomplete; copy the bundle again.");
@@ -30,6 +33,7 @@ async function begin(): Promise<void> {
     throw new Error("This browser has no WebGL 2; enable hardware acceleration or use another browser.");
   }
   const manifest = await loadManifest(source.base, source.fetch);
+  if (pack && manifest.pack?.uri !== name) pack.cancel(); // the page is older than the bundle
   open(canvas, new Viewer(canvas, manifest, source, options), options);
 }
 
@@ -47,6 +51,12 @@ function open(canvas: HTMLCanvasElement, viewer: Viewer, options: Options): void
   followTraining(viewer);
   viewer.start();
   removePosterWhenDrawn(viewer, canvas);
+}
+
+/** The pack that the page of a bundle names, so that it is asked for together with the manifest. */
+function packNamed(page: ParentNode): string | null {
+  const name = page.querySelector<HTMLMetaElement>('meta[name="pack"]')?.content ?? "";
+  return /^\w[\w-]*\.pack$/.test(name) ? name : null;
 }
 
 /** Removes the poster when the scene is drawn, or at the first input. */

@@ -51,6 +51,7 @@ from sagesplat.train.boundaries import (
     around,
     boundary_views,
     interior,
+    interior_opacities,
     interior_sizes,
     read_nested,
     together,
@@ -316,7 +317,7 @@ def nest_block(
             raise RunError(f"{run.path}: no Gaussians inside the block; choose fewer with --blocks.count")
         labels, purity = full.gaussians.label_ids.numpy(), read_more(run.prefixes, "purity")
         sizes = interior_sizes(labels, inside, full.sizes, parts, number)
-        second = full.second and SecondOpacities.of_levels(full.second.logits[inside], sizes)
+        second = full.second and interior_opacities(full.second, inside, sizes, parts, number)
         write_set(run.interior, g, config.steps, sizes, second=second, purity=purity[inside])
         return [f"{len(g):,} of {len(full.gaussians):,} Gaussians are inside the block"]
 
@@ -358,7 +359,7 @@ def tune_boundaries(
         near = blocks.to_border(g.means.numpy()) < blocks.margin
         if views and near.any():
             g, logits = _tuned(job, own, near, others, views, config, seed)
-            second = None if logits is None else SecondOpacities.of_levels(logits, sizes)
+            second = second if second is None or logits is None else replace(second, logits=logits)
         purity = read_more(run.interior, "purity")
         write_set(run.tuned_interior, g, config.steps, sizes, second=second, purity=purity)
         return [f"{int(near.sum()):,} of {len(near):,} Gaussians, {len(views)} views of several blocks"]

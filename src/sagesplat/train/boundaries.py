@@ -48,6 +48,21 @@ def interior_sizes(
     return found
 
 
+def interior_opacities(
+    second: SecondOpacities,
+    inside: np.ndarray,
+    sizes: Mapping[int, tuple[int, ...]],
+    parts: BlockCategories,
+    block: int,
+) -> SecondOpacities:
+    """Second opacities of the interior (bool [N]) of a model, with the weights that it was trained with.
+
+    `sizes`: of `interior_sizes`.
+    """
+    of_parts = {int(parts.ids(np.array(label), block)): w for label, w in second.weights.items()}
+    return SecondOpacities(second.logits[torch.from_numpy(inside)], {i: of_parts[i] for i in sizes})
+
+
 @dataclass(frozen=True, eq=False)
 class Merged:
     """The nested models of all blocks."""
@@ -69,8 +84,9 @@ def together(files: Sequence[Path]) -> Merged:
     sizes = {label: n for path in files for label, n in read_sizes(path).items()}
     purity = np.concatenate([read_more(path, "purity") for path in files])
     models = [read_nested(path) for path in files]
-    logits = _second([second for _, second in models])
-    second = None if logits is None else SecondOpacities.of_levels(logits, sizes)
+    seconds = [second for _, second in models]
+    logits, weights = _second(seconds), {i: w for one in seconds if one for i, w in one.weights.items()}
+    second = None if logits is None else SecondOpacities(logits, weights)
     return Merged(concat([g for g, _ in models]), sizes, purity, second)
 
 

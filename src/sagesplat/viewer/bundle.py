@@ -14,7 +14,7 @@ from pathlib import Path
 
 from sagesplat.core.errors import DataError, RunError
 from sagesplat.io.files import atomic_folder, read_json, unwritable, write_text
-from sagesplat.viewer.built import PAGE, POSTER, check_viewer, with_poster
+from sagesplat.viewer.built import PAGE, POSTER, check_viewer, with_pack, with_poster
 from sagesplat.viewer.manifest import FORMAT, THIRD_PARTY, Contents, documents, pack_order
 from sagesplat.viewer.pack import write_pack
 from sagesplat.viewer.quality import dumped
@@ -73,12 +73,18 @@ def _put_up(folder: Path, poster: bytes) -> None:
     write_text(page, with_poster(page.read_text(encoding="utf-8")))
 
 
+def _name_pack(page: Path, uri: str) -> None:
+    """Name the pack in the page, so that no round trip passes before it is asked for."""
+    if page.is_file():
+        write_text(page, with_pack(page.read_text(encoding="utf-8"), uri))
+
+
 def has_viewer(folder: Path, viewer: Path) -> bool:
     """Whether a bundle has this viewer, by its page, which names all scripts by content hash."""
     pages = [path / PAGE for path in (folder, viewer)]
     if not all(page.is_file() for page in pages):
         return False
-    mine, page = (page.read_text(encoding="utf-8") for page in pages)
+    mine, page = (with_pack(page.read_text(encoding="utf-8"), None) for page in pages)
     return mine in (page, with_poster(page))
 
 
@@ -87,6 +93,7 @@ def write_documents(folder: Path, contents: Contents) -> BundleSizes:
     manifest, promises = documents(contents, (folder / THIRD_PARTY).exists())
     if contents.chunks and not contents.live:
         manifest["pack"] = write_pack(folder, manifest["labels"], pack_order(contents))
+        _name_pack(folder / PAGE, manifest["pack"]["uri"])
     for quality, content in promises.items():
         (folder / manifest["promises"][quality]["uri"]).write_bytes(content)
     write_text(folder / SCHEMA, files("sagesplat.viewer").joinpath(SCHEMA).read_text(encoding="utf-8"))

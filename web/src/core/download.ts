@@ -9,6 +9,7 @@ export interface Reply {
   readonly status: number;
   readonly headers: { get(name: string): string | null };
   readonly body: { getReader(): Reader } | null;
+  readonly isEarly?: boolean; // it was asked for before, so that its time says nothing of the link
   text(): Promise<string>;
 }
 
@@ -28,6 +29,7 @@ export type Digest = ((bytes: Uint8Array) => Promise<string>) | null;
 
 export interface File {
   readonly uri: string;
+  readonly offset?: number; // where a range of a larger file begins
   readonly bytes: number;
   readonly sha256: string;
 }
@@ -81,8 +83,108 @@ export async function download(
   return await intact(link, file, joined(parts, size));
 }
 
+/**
+ * Downloads and verifies consecutive ranges of a file, in one request. Rejects with a DownloadError in one
+ * line; what was taken before stays valid.
+ *
+ * @param all - all ranges of the file: a server without ranges sends all of them
+ */
+export async function downloadRanges(
+  link: Link,
+  wanted: readonly File[],
+  all: readonly File[],
+  { abort, again, answered, take, spoiled, progress }: Ranges,
+): Promise<void> {
+  const [first, last] = [wanted[0] as File, wanted.at(-1) as File];
+  const start = first.offset ?? 0;
+  const range = { start, end: (last.offset ?? 0) + last.bytes };
+  const checks: Promise<void>[] = [];
+  const cut = (file: File, content: Uint8Array) => {
+    checks.push(intact(link, file, content).then(() => take(file, content), spoiled.bind(null, file)));
+  };
+  let cutter = new Cutter(wanted, cut);
+  let name = `bytes ${start} to ${range.end - 1} of ${first.uri}`;
+  const check = (reply: Reply) => {
+    answered(reply.status === 206);
+    if (reply.status === 206) return checkRange(reply, range, name);
+    name = first.uri;
+    cutter = new Cutter(all, cut);
+  };
+  await receive(link, first, abort, { again, check, range }, (part) => {
+    cutter.add(part);
+    progress(cutter.taken);
+    return cutter.taken <= cutter.size;
+  });
+  await Promise.all(checks);
+  if (cutter.taken !== cutter.size) {
+    const is = cutter.taken < cutter.size ? `only ${cutter.taken}` : "more than";
+    throw new DamagedError(`${name}: damaged, ${is} of ${cutter.size} bytes came`, false);
+  }
+}
+
+/** What `downloadRanges` does besides. */
+export interface Ranges {
+  readonly abort: AbortController;
+  readonly again: boolean; // bypasses the browser's cache
+  readonly answered: (ranges: boolean) => void; // whether only what was asked for comes
+  /** Called for every range that is intact, in their order. */
+  readonly take: (file: File, content: Uint8Array) => void;
+  /** Called for every range that is not. */
+  readonly spoiled: (file: File, error: unknown) => void;
+  readonly progress: (bytes: number) => void;
+}
+
+/** Throws for an answer with another range than the one that was asked for. */
+function checkRange({ headers }: Reply, { start, end }: Range, name: string): void {
+  const sent = headers.get("Content-Range") ?? "nothing";
+  if (!sent.startsWith(`bytes ${start}-${end - 1}/`)) {
+    throw new DamagedError(`${name}: the server sent ${sent.slice(0, 60)} instead`, false);
+  }
+}
+
+/** Cuts what arrives into the files that it consists of. */
+export class Cutter {
+  taken = 0; // bytes
+  readonly size: number; // of all files
+  private next = 0;
+  private part: Uint8Array;
+  private filled = 0;
+
+  /** @param whole - called for every complete file */
+  constructor(
+    private readonly files: readonly File[],
+    private readonly whole: (file: File, content: Uint8Array) => void,
+  ) {
+    this.size = files.reduce((sum, file) => sum + file.bytes, 0);
+    this.part = new Uint8Array(files[0]?.bytes ?? 0);
+  }
+
+  add(piece: Uint8Array): void {
+    let used = 0;
+    for (let file = this.files[this.next]; file && used < piece.length; file = this.files[this.next]) {
+      const size = Math.min(piece.length - used, this.part.length - this.filled);
+      this.part.set(piece.subarray(used, used + size), this.filled);
+      used += size;
+      this.filled += size;
+      if (this.filled < this.part.length) break;
+      this.whole(file, this.part);
+      this.next += 1;
+      this.part = new Uint8Array(this.files[this.next]?.bytes ?? 0);
+      this.filled = 0;
+    }
+    this.taken += piece.length;
+  }
+}
+
+/** Bytes of a file, from `start` to before `end`. */
+export interface Range {
+  readonly start: number;
+  readonly end: number;
+}
+
 /** Options of `receive`. */
 export interface Manner {
+  readonly range?: Range; // all that is asked for
   readonly again?: boolean; // bypasses the browser's cache
   readonly silence?: number; // ms without data after which the download counts as failed
   readonly check?: (reply: Reply) => void; // throws for an unusable response
@@ -93,7 +195,7 @@ export async function receive(
   link: Link,
   file: File,
   signal: AbortController,
-  { again = false, silence = SILENCE, check }: Manner,
+  { again = false, silence = SILENCE, check, range }: Manner,
   take: (part: Uint8Array) => boolean,
 ): Promise<void> {
   const { fetch, clock } = link; // the browser's fetch must not be called as a method
@@ -107,8 +209,12 @@ export async function receive(
   try {
     const url = new URL(file.uri, link.base).href;
     const asked = clock.now();
-    const reply = await fetch(url, { signal: signal.signal, ...(again && { cache: "reload" as const }) });
-    link.answered(clock.now() - asked);
+    const reply = await fetch(url, {
+      signal: signal.signal,
+      ...(again && { cache: "reload" as const }),
+      ...(range && { headers: { Range: `bytes=${range.start}-${range.end - 1}` } }),
+    });
+    if (!reply.isEarly) link.answered(clock.now() - asked);
     if (!reply.ok) throw refused(file, reply.status);
     check?.(reply);
     await each(reply, (part) => {
@@ -140,18 +246,22 @@ async function each(reply: Reply, take: (part: Uint8Array) => boolean): Promise<
 }
 
 function refused(file: File, status: number): DownloadError {
+  if (status === 416)
+    return new DamagedError(`${file.uri}: the server has fewer bytes than the manifest`, false);
   const passes = status >= 500 || status === 408 || status === 429;
   return new DownloadError(`${file.uri}: the server said ${status}`, !passes);
 }
 
 /** The content if it has the size and hash in the manifest; damage may be temporary, so a retry is allowed. */
 export async function intact(link: Link, file: File, content: Uint8Array): Promise<Uint8Array> {
-  if (content.length !== file.bytes) {
-    const is = content.length < file.bytes ? `only ${content.length}` : `more than`;
-    throw new DamagedError(`${file.uri} is damaged: ${is} of ${file.bytes} bytes`, false);
+  const { uri, offset, bytes } = file;
+  const name = offset === undefined ? uri : `${uri}, ${bytes} bytes from ${offset} on,`;
+  if (content.length !== bytes) {
+    const is = content.length < bytes ? `only ${content.length}` : `more than`;
+    throw new DamagedError(`${name} is damaged: ${is} of ${bytes} bytes`, false);
   }
   if (link.digest && (await link.digest(content)) !== file.sha256) {
-    throw new DamagedError(`${file.uri} is damaged: its sha-256 is not that of the manifest`, false);
+    throw new DamagedError(`${name} is damaged: its sha-256 is not that of the manifest`, false);
   }
   return content;
 }
