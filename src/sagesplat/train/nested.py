@@ -251,7 +251,7 @@ def nest(
         PhotoLoader(scene, photos, device, valid), replace(train_config, batch=1), ActiveTiles(scene, None),
         backend, sh_bits=config.sh_bits, shell=shell,
     )  # fmt: skip
-    rates = _rates(train_config, config, scene)
+    rates = learning_rates(train_config, config, scene)
     trainable = trainable_rows(state.gaussians, {})
     if movable is not None:
         trainable &= torch.from_numpy(movable[near]).to(device)
@@ -311,7 +311,7 @@ def draw_shares(
     return np.exp(rng.uniform(np.log(config.drawn_from), 0, num_labels)).astype(np.float32)
 
 
-def _rates(
+def learning_rates(
     train_config: TrainConfig, config: NestConfig, scene: Scene
 ) -> Callable[[int], Mapping[str, float]]:
     """Learning rates by parameter name, for each step."""
