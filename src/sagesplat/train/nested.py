@@ -148,8 +148,13 @@ def with_at_most(scene: Scene, labels: np.ndarray, count: int, seed: int) -> tup
 
 
 def capped_config(config: TrainConfig, cap: int, steps: int) -> TrainConfig:
-    """3DGS-MCMC with at most `cap` Gaussians, otherwise as `config`; only the last level is recorded."""
+    """3DGS-MCMC with at most `cap` Gaussians, otherwise as `config`; only the last level is recorded.
+
+    Without its regularisers: in trainings of a few thousand steps they cost 0.2 to 1 dB
+    (docs/developers/far.md).
+    """
     mcmc = replace(config, strategy="mcmc", max_gaussians=cap, max_steps=steps, level_every=steps)
+    mcmc = replace(mcmc, mcmc_opacity=0.0, mcmc_scale=0.0)
     return replace(
         mcmc, freeze_at=None, gradient_freeze_share=0.0, poses=False, exposure="off", outliers=False
     )
