@@ -1,6 +1,7 @@
 """Ladders read from disk: how levels blend second opacities, and what damage of these says."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,10 +14,11 @@ from sagesplat.core.second_opacity import SecondOpacities, weight_at, weights_of
 from sagesplat.formats.levels import write_set
 
 SIZES = {0: (3, 10, 20), 7: (2, 9, 15)}
-SECOND = SecondOpacities(torch.linspace(-4, 4, 35), {label: weights_of(n) for label, n in SIZES.items()})
+WEIGHTS: dict[int, tuple[float, ...]] = {label: weights_of(n) for label, n in SIZES.items()}
+SECOND = SecondOpacities(torch.linspace(-4, 4, 35), WEIGHTS)
 
 
-def ladder(folder, second=SECOND, **arrays):
+def ladder(folder: Path, second: SecondOpacities | None = SECOND, **arrays):
     g = replace(
         random_gaussians(35, degree=1), label_ids=torch.tensor([0] * 20 + [7] * 15, dtype=torch.int16)
     )
@@ -59,8 +61,8 @@ def test_a_ladder_without_second_opacities(tmp_path):
         SecondOpacities(SECOND.logits[:-1], SECOND.weights),
         SecondOpacities(SECOND.logits.clone().fill_(torch.nan), SECOND.weights),
         SecondOpacities(SECOND.logits, {0: (0, 0, 1)}),
-        SecondOpacities(SECOND.logits, SECOND.weights | {7: (0, 1)}),
-        SecondOpacities(SECOND.logits, SECOND.weights | {7: (0, 1, 1.5)}),
+        SecondOpacities(SECOND.logits, WEIGHTS | {7: (0, 1)}),
+        SecondOpacities(SECOND.logits, WEIGHTS | {7: (0, 1, 1.5)}),
     ],
 )  # fmt: skip
 def test_second_opacities_that_do_not_fit_are_one_line(tmp_path, second):

@@ -180,11 +180,13 @@ def test_what_is_not_drawn_stays_as_it_is(scene: Scene, monkeypatch) -> None:
 def test_the_full_model_trains_second_opacities_and_low_levels_the_first(scene, monkeypatch, full) -> None:
     monkeypatch.setattr(nested, "_SORT_AT", ())
     monkeypatch.setattr(nested, "weight_at", lambda shares: np.float32(shares == 1))
-    start = replace(ordered(), second_opacities=torch.linspace(-1, 1, 60))
+    given = torch.linspace(-1, 1, 60)
+    start = replace(ordered(), second_opacities=given)
     config = replace(QUICK, steps=2, full_share=float(full), full_share_end=float(full))
     result = trained(scene, start, config)
     first = result.gaussians.logit_opacities != start.gaussians.logit_opacities
-    second = result.second_opacities != start.second_opacities
+    assert result.second_opacities is not None
+    second = result.second_opacities != given
     assert (second.any(), first.any()) == ((True, False) if full else (False, True))
     alone = trained(scene, start, replace(config, two_opacities=False))
     assert alone.second_opacities is None
@@ -202,6 +204,8 @@ def test_a_killed_training_goes_on_bit_for_bit(scene: Scene, tmp_path: Path, mon
     resumed = trained(scene, ordered(), QUICK, checkpoint=file, settings="a")
     for name, value in whole.gaussians.parameters().items():
         assert torch.equal(value, resumed.gaussians.parameters()[name]), name
+    assert whole.second_opacities is not None
+    assert resumed.second_opacities is not None
     assert torch.equal(whole.second_opacities, resumed.second_opacities)
     assert not torch.equal(whole.second_opacities, whole.gaussians.logit_opacities)
     with pytest.raises(RunError, match="other settings"):

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 from sagesplat.adapt.ladder import read_prefixes
 from sagesplat.adapt.viewpoint import QualityKind
@@ -20,9 +21,11 @@ from sagesplat.formats.lod_meta_write import write_lod_meta
 from sagesplat.formats.splats_write import write_splat, written_as
 from sagesplat.run.job import Job
 from sagesplat.run.records import settings_of
-from sagesplat.stages.compose import compose
+from sagesplat.stages.compose import classic, compose
 from sagesplat.stages.plan import main_plan, scene_plan
 from sagesplat.stages.shared import label_named
+
+RasterizeMode = Literal["classic", "antialiased"]  # gsplat's names
 
 
 def export_increments(job: Job, folder: Path, kind: FileFormat) -> int:
@@ -58,12 +61,18 @@ def export_scene(
     labels: Sequence[str],
     target: tuple[QualityKind, float] | None,
     levels: Sequence[int] = (),
+    rasterize_mode: RasterizeMode | None = None,
 ) -> int:
     """Write a level or a composition, whole or some categories, in the format of the path's name.
 
+    `rasterize_mode`: how the file will be drawn; None: `classic` for a PLY, else as the run was trained.
     `lod-meta.json` gets `levels`, or all there are, as levels of detail. Returns the number of Gaussians.
     """
     written = written_as(path)
+    if rasterize_mode == "antialiased" and not job.antialiased:
+        raise RunError(f"{job.run.path}: trained without antialiasing; leave out --rasterize-mode")
+    if rasterize_mode == "classic" and written == LOD_META:
+        raise RunError(f"{path}: says how it is drawn; leave out --rasterize-mode")
     if written == LOD_META:
         _check_folder(job, path.parent)
     elif path.exists() and not job.force:
@@ -78,7 +87,11 @@ def export_scene(
     else:
         plan = main_plan(job) if target is None else scene_plan(job, *target)
         g = compose(job, plan).of_labels(wanted)
-    write_splat(path, g, job.names(), antialiased=job.antialiased)
+    mode = rasterize_mode or ("classic" if written == ".ply" else "antialiased")
+    if mode == "classic":
+        write_splat(path, classic(job, g), job.names())
+    else:
+        write_splat(path, g, job.names(), antialiased=job.antialiased)
     return len(g)
 
 
