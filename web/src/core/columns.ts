@@ -70,18 +70,36 @@ const contexts = new Int32Array(LARGEST * 7);
 const masks = column();
 const lower = column(); // coefficients of lower degrees that are not 0
 
+type Tables = readonly [masks: Table, green: Table, red: Table, blue: Table];
+
+function tablesOf(degree: number): Tables {
+  const values = (rows: number) => new Table(rows, 32, peak(15, 0.5));
+  const rows = (BASES[degree - 1] as number) + 1;
+  const ofMasks = new Table(rows, 1 << (2 * degree + 1), (mask) => Math.max(1, PEAK >> (2 * ones(mask))));
+  return [ofMasks, values(1), values(7), values(15)];
+}
+
+/** What every stream begins with. */
+const NEW = {
+  gap: new Table(1, POSITION_BITS + 1, peak(24, 4)),
+  scale: new Table(3, 128, (symbol, row) => (row ? peak(9, 6) : peak(64, 12))(symbol)),
+  rotation: new Table(11, 255, (symbol, row) =>
+    Math.abs(symbol - 127) <= (ROTATIONS[row] as number) ? FLAT : 0,
+  ),
+  colour: new Table(3, 160, (symbol, row) => (row ? peak(80, 4) : peak(80, 12))(symbol)),
+  bands: [tablesOf(1), tablesOf(2), tablesOf(3)],
+};
+
 /** Decodes columns of Gaussians, and learns from them at the end of a block. */
 export class Columns {
-  private readonly gap = new Table(1, POSITION_BITS + 1, peak(24, 4));
+  private readonly gap = NEW.gap.copy();
   private readonly opacity: Table;
   private readonly second: Table | null;
   private readonly largest: number; // opacity
-  private readonly scale: Table;
-  private readonly rotation = new Table(11, 255, (symbol, row) =>
-    Math.abs(symbol - 127) <= (ROTATIONS[row] as number) ? FLAT : 0,
-  );
-  private readonly colour: Table;
-  private readonly bands: Tables[] = [];
+  private readonly scale = NEW.scale.copy();
+  private readonly rotation = NEW.rotation.copy();
+  private readonly colour = NEW.colour.copy();
+  private readonly bands: readonly Tables[];
   private readonly tables: Table[];
 
   constructor(private readonly header: Header) {
@@ -90,11 +108,9 @@ export class Columns {
     this.opacity = new Table(1, 256, opacity);
     this.second = header.twoOpacities ? new Table(CLASSES, 256, opacity) : null;
     this.largest = most;
-    const [large, small] = [peak(64, 12), peak(9, 6)];
-    this.scale = new Table(3, 128, (symbol, row) => (row ? small : large)(symbol));
-    const [green, others] = [peak(80, 12), peak(80, 4)];
-    this.colour = new Table(3, 160, (symbol, row) => (row ? others : green)(symbol));
-    for (let degree = 1; degree <= header.degree; degree++) this.bands.push(tablesOf(degree));
+    this.bands = NEW.bands.slice(0, header.degree).map(([masks, green, red, blue]) => {
+      return [masks.copy(), green.copy(), red.copy(), blue.copy()];
+    });
     this.tables = [this.gap, this.opacity, this.scale, this.rotation, this.colour, ...this.bands.flat()];
     if (this.second) this.tables.push(this.second);
   }
@@ -184,15 +200,6 @@ export class Columns {
       blue[i] = (blue[i] as number) + g;
     }
   }
-}
-
-type Tables = readonly [masks: Table, green: Table, red: Table, blue: Table];
-
-function tablesOf(degree: number): Tables {
-  const values = (rows: number) => new Table(rows, 32, peak(15, 0.5));
-  const rows = (BASES[degree - 1] as number) + 1;
-  const ofMasks = new Table(rows, 1 << (2 * degree + 1), (mask) => Math.max(1, PEAK >> (2 * ones(mask))));
-  return [ofMasks, values(1), values(7), values(15)];
 }
 
 /** Adds to `lower` what is not 0 of this degree. */

@@ -5,36 +5,62 @@ const TOTAL = 1 << BITS; // of the frequencies of a row
 const LOWEST = 2 ** 23; // state
 const COUNTED = 128; // what a symbol adds to its count
 const MOST = 2 ** 18; // sum of counts beyond which they are halved
-const PIECE = 6; // bits of a slot that the index of symbols leaves out
+const PIECE = 6; // bits of a slot that the index of symbols leaves out,
+const FEW_PIECE = 8; // and those for
+const FEW = 40; // symbols or fewer
+
+const LISTS = ["counts", "slots", "index", "used", "sums", "possible", "lows", "highs"] as const;
 
 /** Counts of symbols by row, and the frequencies that follow from them. */
 export class Table {
   readonly counts: Int32Array;
   readonly slots: Int32Array; // [rows, symbols]: the first slot of a symbol, and its frequency << 14
-  readonly index: Uint8Array; // [rows, 256]: the symbol of every 64th slot
+  readonly index: Uint8Array; // [rows, 2^(14 - piece)]: the symbol of every 2^piece-th slot
+  readonly piece: number;
   readonly used: Int32Array; // symbols of each row that were read in this block
-  private readonly sums: Int32Array; // of the counts of a row
-  private readonly possible: Int32Array; // symbols of a row that can occur
+  readonly sums: Int32Array; // of the counts of a row
+  readonly possible: Int32Array; // symbols of a row that can occur,
+  readonly lows: Int32Array; // the first of them,
+  readonly highs: Int32Array; // and where they end, in `counts`
 
+  /** @param count - of a symbol in a new table; null: `copy` fills it */
   constructor(
     readonly rows: number,
     readonly symbols: number,
-    count: (symbol: number, row: number) => number,
+    count: ((symbol: number, row: number) => number) | null,
   ) {
     const list = () => new Int32Array(rows);
-    [this.used, this.sums, this.possible] = [list(), list(), list()];
+    [this.used, this.sums, this.possible, this.lows, this.highs] = [list(), list(), list(), list(), list()];
     this.counts = new Int32Array(rows * symbols);
     this.slots = new Int32Array(rows * symbols);
-    this.index = new Uint8Array(rows << (BITS - PIECE));
-    for (let row = 0, i = 0; row < rows; row++) {
-      for (let symbol = 0; symbol < symbols; symbol++) {
-        const some = count(symbol, row);
-        this.counts[i++] = some;
-        this.sums[row] = (this.sums[row] as number) + some;
-        if (some) this.possible[row] = (this.possible[row] as number) + 1;
-      }
+    this.piece = symbols > FEW ? PIECE : FEW_PIECE;
+    this.index = new Uint8Array(rows << (BITS - this.piece));
+    for (let row = 0; count && row < rows; row++) {
+      this.begin(row, count);
       this.renew(row);
     }
+  }
+
+  /** Another table that begins as this one is. */
+  copy(): Table {
+    const copy = new Table(this.rows, this.symbols, null);
+    for (const name of LISTS) copy[name].set(this[name]);
+    return copy;
+  }
+
+  private begin(row: number, count: (symbol: number, row: number) => number): void {
+    const first = row * this.symbols;
+    let [sum, possible, low, high] = [0, 0, -1, 0];
+    for (let symbol = 0; symbol < this.symbols; symbol++) {
+      const some = count(symbol, row);
+      if (!some) continue;
+      this.counts[first + symbol] = some;
+      sum += some;
+      possible += 1;
+      if (low < 0) low = first + symbol;
+      high = first + symbol + 1;
+    }
+    [this.sums[row], this.possible[row], this.lows[row], this.highs[row]] = [sum, possible, low, high];
   }
 
   /** Renews the frequencies of the rows that were used. */
@@ -50,9 +76,9 @@ export class Table {
   }
 
   private renew(row: number): void {
-    const { symbols, counts, slots, index } = this;
-    const low = row * symbols;
-    const high = low + symbols;
+    const { symbols, counts, slots, index, piece } = this;
+    const low = this.lows[row] as number;
+    const high = this.highs[row] as number;
     while ((this.sums[row] as number) > MOST) this.halve(row, low, high);
     const share = Math.floor(
       ((TOTAL - (this.possible[row] as number)) * 2 ** 16) / (this.sums[row] as number),
@@ -62,24 +88,26 @@ export class Table {
     let most = 0;
     for (let i = low; i < high; i++) {
       const count = counts[i] as number;
-      if (!count) continue;
-      left -= (Math.imul(count, share) >> 16) + 1;
+      const frequency = count && (Math.imul(count, share) >> 16) + 1;
+      slots[i] = frequency;
+      left -= frequency;
       if (count > most) {
         most = count;
         largest = i;
       }
     }
-    let next = row << (BITS - PIECE); // of the index
-    const begin = next;
+    slots[largest] = (slots[largest] as number) + left;
+    const base = row * symbols;
+    const begin = row << (BITS - piece); // of the index
+    const whole = (1 << piece) - 1;
+    let next = begin;
     let first = 0;
     for (let i = low; i < high; i++) {
-      const count = counts[i] as number;
-      let frequency = count && (Math.imul(count, share) >> 16) + 1;
-      if (i === largest) frequency += left;
+      const frequency = slots[i] as number;
       slots[i] = (first & (TOTAL - 1)) | (frequency << BITS);
       first += frequency;
-      const end = begin + ((first + (1 << PIECE) - 1) >> PIECE);
-      while (next < end) index[next++] = i - low;
+      const end = begin + ((first + whole) >> piece);
+      while (next < end) index[next++] = i - base;
     }
   }
 
@@ -108,16 +136,16 @@ export class Reader {
   /** Symbols of one row of a table, less `zero`, into `out`; how many were the table's last symbol. */
   ofRow(table: Table, row: number, zero: number, out: Int32Array, count: number): number {
     const { bytes } = this;
-    const { symbols, slots, index, counts } = table;
+    const { symbols, slots, index, counts, piece } = table;
     const base = row * symbols;
-    const indices = row << (BITS - PIECE);
+    const indices = row << (BITS - piece);
     const final = base + symbols - 1;
     const origin = base + zero;
     let { state, at } = this;
     let escapes = 0;
     for (let i = 0; i < count; i++) {
       const slot = state & (TOTAL - 1);
-      let place = base + (index[indices | (slot >> PIECE)] as number);
+      let place = base + (index[indices | (slot >> piece)] as number);
       let known = slots[place] as number;
       while (slot >= (known & (TOTAL - 1)) + (known >>> BITS)) known = slots[++place] as number;
       state = Math.imul(known >>> BITS, state >> BITS) + slot - (known & (TOTAL - 1));
@@ -135,14 +163,14 @@ export class Reader {
   /** The same, each of its own row. */
   ofRows(table: Table, rows: Int32Array, zero: number, out: Int32Array, count: number): number {
     const { bytes } = this;
-    const { symbols, slots, index, counts, used } = table;
+    const { symbols, slots, index, counts, used, piece } = table;
     let { state, at } = this;
     let escapes = 0;
     for (let i = 0; i < count; i++) {
       const row = rows[i] as number;
       const base = row * symbols;
       const slot = state & (TOTAL - 1);
-      let place = base + (index[(row << (BITS - PIECE)) | (slot >> PIECE)] as number);
+      let place = base + (index[(row << (BITS - piece)) | (slot >> piece)] as number);
       let known = slots[place] as number;
       while (slot >= (known & (TOTAL - 1)) + (known >>> BITS)) known = slots[++place] as number;
       state = Math.imul(known >>> BITS, state >> BITS) + slot - (known & (TOTAL - 1));

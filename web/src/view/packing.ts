@@ -30,7 +30,7 @@ const SH_C0 = 0.28209479177387814;
 const LONGEST_LOG = 40;
 const NO_SCALE = -30; // logarithm below which Spark takes a scale as 0
 const BITS = [7, 8, 6] as const; // of a coefficient, by degree
-const REACH = 512; // steps on both sides of 0 that tables hold
+const REACH = 128; // steps on both sides of 0 that tables hold
 
 /** The byte of a rotation's angle by class and the sum of the squares of its x, y, z. */
 const angles = ROTATIONS.map((steps) =>
@@ -44,7 +44,8 @@ const angles = ROTATIONS.map((steps) =>
 class Lookup {
   private readonly table: Uint8Array;
   constructor(private readonly of: (value: number) => number) {
-    this.table = Uint8Array.from({ length: 2 * REACH }, (_, i) => of(i - REACH));
+    this.table = new Uint8Array(2 * REACH);
+    for (let i = 0; i < 2 * REACH; i++) this.table[i] = of(i - REACH);
   }
   at(value: number): number {
     const i = value + REACH;

@@ -99,7 +99,7 @@ test.each<[string, Fault, string]>([
   ["wrong bytes", "corrupt", "its sha-256 is not that of the manifest"],
   ["a missing file", 404, "the server said 404"],
 ])("%s, always: one line, and the others live on", async (_, fault, words) => {
-  const { w, file } = made({ bytes: 200_000 });
+  const { w, file } = made();
   w.set({ mode: "full" });
   w.network.faults.set(file(1), fault);
   w.streamer.start();
