@@ -45,14 +45,14 @@ export class Pack {
     return this.stopped && left > 0 ? Number.NaN : left;
   }
 
-  /** Bytes that came without being wanted, and those up to the next file that is. */
-  spare(isWanted: (file: File) => boolean): number {
+  /** Bytes that came without being planned, and those up to the next file that is wanted. */
+  spare(isPlanned: (file: File) => boolean, isWanted: (file: File) => boolean): number {
     let [spare, end] = [0, 0];
     for (const file of this.files) {
       end += file.bytes;
-      const isNext = end > this.at;
-      if (!isWanted(file)) spare += file.bytes;
-      else if (isNext) return spare;
+      const came = end <= this.at;
+      if (!came && isWanted(file)) return spare;
+      if (!came || !isPlanned(file)) spare += file.bytes;
     }
     return spare;
   }

@@ -208,7 +208,9 @@ export class Supply {
   /** The wanted files that the pack does not bring, or brings late. */
   private besides(pack: Pack, wanted: readonly File[], undecided: boolean): readonly File[] {
     if (this.ranges.size && !pack.isHere) {
-      const spare = pack.spare((file) => this.planned.has(file.sha256) || this.loads.has(file.sha256));
+      const isPlanned = ({ sha256 }: File) => this.planned.has(sha256);
+      const missing = new Set(wanted.filter(({ sha256 }) => !this.loads.has(sha256)));
+      const spare = pack.spare(isPlanned, (file) => missing.has(file));
       if (spare > this.trip) {
         pack.stop(); // ranges bring the rest without what lies between
         return wanted;
