@@ -1,7 +1,8 @@
 /** The pack of a bundle: its increments as one stream, each usable as soon as it is complete. */
 
 import type { Manifest } from "../types";
-import { Cutter, DamagedError, DownloadError, type File, type Link, type Reply, receive } from "./download";
+import { DamagedError, DownloadError, type File, type Link, type Reply, receive } from "./download";
+import { Cutter } from "./ranges";
 
 /** ms without data after which the files are downloaded one by one instead. */
 const SILENCE = 3000;
