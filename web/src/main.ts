@@ -2,7 +2,7 @@ import { inAdvance } from "./core/advance";
 import type { Fetch } from "./core/download";
 import { loadManifest } from "./core/manifest";
 import { bundleUrl, type Embed, type Options, parseOptions } from "./embed";
-import { sourceInside } from "./inside";
+import { type Source, sourceInside } from "./inside";
 import { fail, hideNotice, messageOf } from "./ui/notice";
 import { buildPage } from "./ui/page";
 import { colorsOf } from "./view/spark";
@@ -21,19 +21,33 @@ ready.catch((error: unknown) => fail(messageOf(error)));
 async function begin(): Promise<void> {
   await Promise.resolve(); // `window.sagesplat` exists before any error
   const options = parseOptions(location.search, location.hash);
-  const base = bundleUrl(options.bundle, location.href);
-  const name = options.bundle ? null : packNamed(document);
-  const online: Fetch = (url, init) => fetch(url, init);
-  const pack = name && inAdvance(online, new URL(name, base).href);
-  const source = sourceInside(document) ?? { base, fetch: pack ? pack.fetch : online };
   const canvas = document.getElementById("view");
   if (!(canvas instanceof HTMLCanvasElement))
     throw new Error("This page is incomplete; copy the bundle again.");
   if (!document.createElement("canvas").getContext("webgl2")) {
     throw new Error("This browser has no WebGL 2; enable hardware acceleration or use another browser.");
   }
+  const inside = sourceInside(document);
+  if (inside) await show(canvas, inside, options);
+  else await showOnline(canvas, options);
+}
+
+/** Shows a bundle of a server. The pack that the page names is asked for together with the manifest. */
+async function showOnline(canvas: HTMLCanvasElement, options: Options): Promise<void> {
+  const base = bundleUrl(options.bundle, location.href);
+  const online: Fetch = (url, init) => fetch(url, init);
+  const name = options.bundle ? null : packNamed(document);
+  if (!name) return show(canvas, { base, fetch: online }, options);
+  const pack = inAdvance(online, new URL(name, base).href);
+  try {
+    await show(canvas, { base, fetch: pack.fetch }, options);
+  } finally {
+    pack.cancel(); // an older page names an older pack; a broken bundle needs none
+  }
+}
+
+async function show(canvas: HTMLCanvasElement, source: Source, options: Options): Promise<void> {
   const manifest = await loadManifest(source.base, source.fetch);
-  if (pack && manifest.pack?.uri !== name) pack.cancel(); // the page is older than the bundle
   open(canvas, new Viewer(canvas, manifest, source, options), options);
 }
 

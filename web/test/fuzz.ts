@@ -34,11 +34,8 @@ export function fuzz(
   while (found.tried < most && found.wrong.length < 10) {
     if (found.tried % 256 === 0 && performance.now() - begun > 1000 * seconds) break;
     const stream = streams[below(streams.length)] as Uint8Array;
-    attempt(
-      damaged(stream.subarray(0, stream.length > SHORT ? 50 + below(SHORT) : undefined), below),
-      below,
-      found,
-    );
+    const piece = stream.subarray(0, 50 + below(below(50) ? SHORT : LONGER));
+    attempt(damaged(piece, below), below, found);
   }
   return found;
 }

@@ -1,7 +1,8 @@
 /** The pack of a bundle: its increments as one stream, each usable as soon as it is complete. */
 
 import type { Manifest } from "../types";
-import { Cutter, DamagedError, DownloadError, type File, type Link, type Reply, receive } from "./download";
+import { DamagedError, DownloadError, type File, type Link, type Reply, receive } from "./download";
+import { Cutter } from "./ranges";
 
 /** ms without data after which the files are downloaded one by one instead. */
 const SILENCE = 3000;
@@ -45,14 +46,14 @@ export class Pack {
     return this.stopped && left > 0 ? Number.NaN : left;
   }
 
-  /** Bytes that came without being wanted, and those up to the next file that is. */
-  spare(isWanted: (file: File) => boolean): number {
+  /** Bytes that came without being planned, and those up to the next file that is wanted. */
+  spare(isPlanned: (file: File) => boolean, isWanted: (file: File) => boolean): number {
     let [spare, end] = [0, 0];
     for (const file of this.files) {
       end += file.bytes;
-      const isNext = end > this.at;
-      if (!isWanted(file)) spare += file.bytes;
-      else if (isNext) return spare;
+      const came = end <= this.at;
+      if (!came && isWanted(file)) return spare;
+      if (!came || !isPlanned(file)) spare += file.bytes;
     }
     return spare;
   }

@@ -5,13 +5,14 @@ import {
   DamagedError,
   DownloadError,
   download,
-  downloadRanges,
   type File,
   intact,
   type Link,
   Shelf,
 } from "./download";
+import { type Load, Loads } from "./loads";
 import { lateIn, Pack } from "./pack";
+import { consecutive, downloadRanges, rangesOf } from "./ranges";
 
 /** A failed download. */
 export interface Failure {
@@ -20,17 +21,6 @@ export interface Failure {
   readonly tries: number;
   readonly until: number; // ms of the clock: earliest time of a retry
 }
-
-/** A request: a file, or consecutive ranges of one. */
-interface Load {
-  files: readonly File[];
-  readonly abort: AbortController;
-  got: number; // bytes received
-  dropped: boolean;
-  isWhole: boolean; // all ranges of a file come, from its beginning
-}
-
-const bytesOf = (files: readonly File[]): number => files.reduce((sum, { bytes }) => sum + bytes, 0);
 
 /** Tries after which a failure is shown to the user; it is still retried, but rarely. */
 export const PATIENCE = 5;
@@ -41,8 +31,6 @@ const AHEAD = 0.25; // seconds of bandwidth to keep in flight: more than a round
 const UNKNOWN = 32_768; // bytes in flight while the bandwidth is unknown
 const REQUESTS = 3; // requests that a round trip's bytes are divided between: browsers allow 6
 const SMALL = 8192; // bytes of ranges that one request brings at least, if they are wanted
-const TINY = 16_384; // remaining bytes below which a download is not aborted
-const MODEST = 2 ** 22; // the same of a file whose ranges cannot be asked for: the next time it would begin anew
 
 export interface SupplyOptions extends Omit<Link, "received" | "answered"> {
   readonly keepBytes: number; // cache of downloaded files
@@ -59,7 +47,7 @@ export class Supply {
   private damaged = 0; // damaged files of the pack
   private roundTrip = Infinity; // ms
   private readonly unverified = new Set<string>(); // files of a pack whose hash could not be checked
-  private readonly loads = new Map<string, Load>(); // of files that are not here yet
+  private readonly loads = new Loads();
   private ranges: ReadonlyMap<string, readonly File[]> = new Map(); // of files, by uri
   private planned: ReadonlySet<string> = new Set(); // files of the plan, here or not
   private sendsRanges: boolean | null = null; // whether the server does; null: it was not asked
@@ -83,21 +71,12 @@ export class Supply {
   }
 
   get running(): number {
-    return this.requests.size + (this.pack ? 1 : 0);
-  }
-
-  private get requests(): Set<Load> {
-    return new Set(this.loads.values());
+    return this.loads.all.size + (this.pack ? 1 : 0);
   }
 
   /** Names all ranges of files, in their order. */
   know(files: readonly File[]): void {
-    const ranges = new Map<string, File[]>();
-    for (const file of files) {
-      if (file.offset === undefined) continue;
-      ranges.set(file.uri, [...(ranges.get(file.uri) ?? []), file]);
-    }
-    this.ranges = ranges;
+    this.ranges = rangesOf(files);
   }
 
   /** Whether a pack is loading. */
@@ -118,7 +97,7 @@ export class Supply {
   }
 
   isComing(file: File): boolean {
-    return this.loads.has(file.sha256);
+    return this.loads.has(file);
   }
 
   isHere(file: File): boolean {
@@ -166,7 +145,7 @@ export class Supply {
     const single = this.pack ? this.besides(this.pack, wanted, undecided) : wanted;
     for (const file of single) {
       if (!this.hasRoom()) return;
-      if (this.loads.has(file.sha256) || this.rests(file) || this.mayComeWhole(file)) continue;
+      if (this.loads.has(file) || this.rests(file) || this.mayComeWhole(file)) continue;
       void this.run(this.together(file, single));
     }
   }
@@ -174,30 +153,15 @@ export class Supply {
   /** Whether a range may come with one that was asked for: from a server without ranges. */
   private mayComeWhole({ uri, offset }: File): boolean {
     if (offset === undefined || this.sendsRanges !== null) return false;
-    return [...this.requests].some(({ files }) => files[0]?.uri === uri);
+    return [...this.loads.all].some(({ files }) => files[0]?.uri === uri);
   }
 
-  /** A file, or the ranges from it on that one request brings: those that would be asked for next anyway, or few bytes. */
+  /** What is asked for together with a file: of ranges those that touch, of a server without ranges all. */
   private together(file: File, wanted: readonly File[]): readonly File[] {
     const all = this.ranges.get(file.uri);
-    if (!all) return [file];
-    if (this.sendsRanges === false) return all;
-    const missing = new Set(wanted.filter((one) => !this.loads.has(one.sha256) && !this.rests(one)));
-    const soon = new Set<File>();
-    let room = this.room();
-    for (const one of missing) {
-      room -= one.bytes;
-      if (room > 0) soon.add(one);
-    }
-    const few = Math.max(this.trip / REQUESTS, SMALL) || SMALL;
-    const start = all.indexOf(file);
-    let end = start + 1;
-    let bytes = file.bytes;
-    for (let one = all[end]; one && missing.has(one); one = all[++end]) {
-      bytes += one.bytes;
-      if (bytes > few && !soon.has(one)) break;
-    }
-    return all.slice(start, end);
+    if (!all || this.sendsRanges === false) return all ?? [file];
+    const missing = wanted.filter((one) => !this.loads.has(one) && !this.rests(one));
+    return consecutive(file, all, missing, this.room, Math.max(this.trip / REQUESTS, SMALL) || SMALL);
   }
 
   /** Bytes per round trip of the link; NaN: unknown. */
@@ -208,18 +172,20 @@ export class Supply {
   /** The wanted files that the pack does not bring, or brings late. */
   private besides(pack: Pack, wanted: readonly File[], undecided: boolean): readonly File[] {
     if (this.ranges.size && !pack.isHere) {
-      const spare = pack.spare((file) => this.planned.has(file.sha256) || this.loads.has(file.sha256));
+      const isPlanned = ({ sha256 }: File) => this.planned.has(sha256);
+      const missing = new Set(wanted.filter((file) => !this.loads.has(file)));
+      const spare = pack.spare(isPlanned, (file) => missing.has(file));
       if (spare > this.trip) {
         pack.stop(); // ranges bring the rest without what lies between
         return wanted;
       }
     }
-    const brought = wanted.filter((file) => !this.loads.has(file.sha256) && pack.until(file) >= 0);
+    const brought = wanted.filter((file) => !this.loads.has(file) && pack.until(file) >= 0);
     const late = undecided ? new Set() : lateIn(pack, brought, this.trip);
     let brings = false;
     let before = 0; // bytes of larger value that the pack brings
     const single = wanted.filter((file) => {
-      const mine = pack.until(file) >= 0 && !this.loads.has(file.sha256) && !late.has(file);
+      const mine = pack.until(file) >= 0 && !this.loads.has(file) && !late.has(file);
       brings ||= mine;
       if (mine) before += file.bytes;
       // what is asked for now comes after a round trip; files that the pack does not hold wait for larger value
@@ -232,13 +198,8 @@ export class Supply {
   /** Aborts downloads that are no longer wanted, unless they are nearly complete. */
   keepOnly(wanted: ReadonlySet<string>): void {
     this.planned = wanted;
-    for (const load of this.requests) {
-      const left = bytesOf(load.files) - load.got;
-      if (left <= (load.isWhole ? MODEST : TINY) || load.got > 0.8 * bytesOf(load.files)) continue;
-      if (!load.files.some(({ sha256 }) => wanted.has(sha256) && this.loads.get(sha256) === load)) {
-        this.drop(load);
-      }
-    }
+    this.loads.keepOnly(wanted);
+    this.rest();
     for (const key of this.come.keys()) if (!wanted.has(key)) this.come.delete(key);
   }
 
@@ -250,48 +211,31 @@ export class Supply {
   close(): void {
     this.closed = true;
     this.pack?.stop();
-    for (const load of this.requests) this.drop(load);
+    for (const load of this.loads.all) this.loads.drop(load);
+    this.rest();
     this.come.clear();
     this.shelf.clear();
   }
 
   /** Number of concurrent downloads: many for small files, to fill the link; more would only weaken the order. */
   private hasRoom(): boolean {
-    const { size } = this.requests;
+    const { size } = this.loads.all;
     if (this.closed || size >= (this.options.atOnce ?? AT_ONCE)) return false;
-    return size < 2 || this.room() > 0;
+    return size < 2 || this.room > 0;
   }
 
   /** Bytes that may be asked for. */
-  private room(): number {
-    let left = 0;
-    for (const load of this.requests) left += bytesOf(load.files) - load.got;
+  private get room(): number {
     const { rate } = this.bandwidth;
-    return (Number.isNaN(rate) ? UNKNOWN : Math.max(AHEAD * rate, UNKNOWN / 2)) - left;
-  }
-
-  /** Stops a request. */
-  private drop(load: Load): void {
-    load.dropped = true;
-    load.abort.abort();
-    this.end(load);
-  }
-
-  /** Forgets a file that has come otherwise, and its request if it brings nothing else. */
-  private forget(file: File): void {
-    const load = this.loads.get(file.sha256);
-    if (!load) return;
-    if (load.files.some(({ sha256 }) => sha256 !== file.sha256 && this.loads.get(sha256) === load)) {
-      this.loads.delete(file.sha256);
-    } else this.drop(load);
+    return (Number.isNaN(rate) ? UNKNOWN : Math.max(AHEAD * rate, UNKNOWN / 2)) - this.loads.left;
   }
 
   private begin(): void {
     if (!this.running) this.bandwidth.running(true);
   }
 
-  private end(load: Load): void {
-    for (const [key, one] of this.loads) if (one === load) this.loads.delete(key);
+  /** Stops the clock of the bandwidth where nothing is on its way. */
+  private rest(): void {
     if (!this.running) this.bandwidth.running(false);
   }
 
@@ -302,7 +246,7 @@ export class Supply {
       if (error instanceof DamagedError) this.note = `${error.message}; files are loaded one by one.`;
     }
     this.pack = null;
-    if (!this.running) this.bandwidth.running(false);
+    this.rest();
     if (!this.closed) this.options.changed();
   }
 
@@ -313,7 +257,7 @@ export class Supply {
       await intact(this.link, file, content);
       if (this.closed) return;
       if (!this.link.digest) this.unverified.add(file.sha256);
-      this.forget(file);
+      this.loads.forget(file);
       this.arrive(file, content);
     } catch (error) {
       this.damaged += 1;
@@ -330,21 +274,20 @@ export class Supply {
   }
 
   private async run(files: readonly File[]): Promise<void> {
-    const load: Load = { files, abort: new AbortController(), got: 0, dropped: false, isWhole: false };
     this.begin();
-    for (const { sha256 } of files) if (!this.loads.has(sha256)) this.loads.set(sha256, load);
+    const load = this.loads.begin(files);
     const again = files.some(({ sha256 }) => this.failures.has(sha256));
     const [file] = files as readonly [File];
     try {
       if (file.offset === undefined) await this.runFile(load, file, again);
       else await this.runRanges(load, files, again);
     } catch (error) {
-      if (load.dropped) return;
-      const missing = load.files.find(({ sha256 }) => this.loads.get(sha256) === load);
+      const missing = load.files.find((one) => this.loads.brings(load, one));
       if (missing) this.fail(missing, error);
     }
     if (load.dropped) return;
-    this.end(load);
+    this.loads.end(load);
+    this.rest();
     this.options.changed();
   }
 
@@ -360,10 +303,7 @@ export class Supply {
   private async runRanges(load: Load, files: readonly File[], again: boolean): Promise<void> {
     const all = this.ranges.get((files[0] as File).uri) ?? files;
     const came = (file: File, then: () => void) => {
-      if (load.dropped) return;
-      const mine = this.loads.get(file.sha256) === load;
-      if (mine) this.loads.delete(file.sha256);
-      if (!mine && this.isHere(file)) return;
+      if (load.dropped || (!this.loads.came(load, file) && this.isHere(file))) return;
       then();
       this.options.changed();
     };
@@ -375,7 +315,7 @@ export class Supply {
         if (ranges) return;
         load.files = all;
         load.isWhole = true;
-        for (const { sha256 } of all) if (!this.loads.has(sha256)) this.loads.set(sha256, load);
+        this.loads.claim(load, all);
       },
       take: (file, content) => {
         came(file, () => {

@@ -4,6 +4,7 @@ import { describe, expect, test } from "vitest";
 import streams from "../../../tests/data/streams.json?raw";
 import { StreamDecoder } from "../../src/core/stream";
 import { Floats, type Gaussians } from "../floats";
+import { fuzz } from "../fuzz";
 
 interface Case {
   name: string;
@@ -108,4 +109,11 @@ test("damaged bytes are errors or finite Gaussians", () => {
   }
   expect(finite).toBe(true);
   expect(refused).toBeGreaterThan(1500);
+});
+
+test("no damage does more than a plain error, takes long, or takes more memory than the bytes may hold", () => {
+  const found = fuzz(cases.map(bytesOf), 24, 60, 1500);
+  expect(found.wrong).toEqual([]);
+  expect(found.tried).toBe(1500);
+  expect(Math.min(found.decoded, found.refused)).toBeGreaterThan(100);
 });
