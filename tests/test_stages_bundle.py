@@ -270,13 +270,14 @@ def test_a_live_bundle_follows_the_training(run: Path, tmp_path: Path, viewer: P
             assert label["quality"] == {}
             assert label["boxes"]
     write_json(
-        run / "provenance" / "train.json", {"format": FORMAT, "settings": {"antialiased": True}, "inputs": {}}
+        run / "provenance" / "train.json", {"format": FORMAT, "settings": {"antialiased": False}, "inputs": {}}
     )
+    assert manifest_of(folder)["antialiased"]
     later[-1].touch()
     (viewer / "index.html").write_text("<!doctype html>of a newer package")
     assert live_bundle(job, folder, viewer)  # rewritten: a training that began again
     assert (folder / "index.html").read_bytes() == (viewer / "index.html").read_bytes()
-    assert manifest_of(folder)["antialiased"]
+    assert not manifest_of(folder)["antialiased"]
     (folder / "manifest.json").unlink()
     assert live_bundle(job, folder, viewer)  # repaired
     assert is_bundle(folder)
