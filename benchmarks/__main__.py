@@ -725,7 +725,7 @@ def size(
     from sagesplat.core.errors import SageError
 
     set_threads(threads)
-    results = {}
+    asked, results = replace(asked, vgg=asked.vgg or survey), {}
     for scene in scenes:
         begin = time.perf_counter()
         try:

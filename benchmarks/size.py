@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from benchmarks import far
@@ -28,9 +27,8 @@ from sagesplat.core.config import (
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Event, StageDone, StageSkipped, Warned
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.formats.increments import write_increments
-from sagesplat.formats.levels import read_level
-from sagesplat.formats.spz import SH_BITS
+from sagesplat.formats.levels import read_header, read_level
+from sagesplat.formats.quantisation import rounded
 from sagesplat.raster import device_of, resolve_backend
 from sagesplat.run.job import Job
 from sagesplat.run.records import seconds_of, settings_of
@@ -53,7 +51,7 @@ from sagesplat.studies.compare.run import (
     snapshot_points,
     trained_sets,
 )
-from sagesplat.studies.lpips import load_metrics
+from sagesplat.studies.lpips import NETS, load_metrics
 from sagesplat.train.early_stopping import ActiveTiles, trainable_rows
 from sagesplat.train.nested import learning_rates
 from sagesplat.train.photo_loader import PhotoLoader
@@ -92,6 +90,8 @@ class Asked:
     """Viewpoints that bytes from far away are measured at; 0: none."""
     lpips: Path | None = None
     """Folder with the LPIPS weights."""
+    vgg: bool = False
+    """LPIPS of VGG too, which takes longest of all that is measured (always for the survey)."""
     device: str = "auto"
     """cpu, cuda, or auto."""
     seed: int = 0
@@ -172,12 +172,12 @@ def measure(folder: Path, scene: str, asked: Asked, say: Say) -> Measured:
     as_one = _as_one(job, place, asked)
     baselines = [*pruned_sets(job, config, place), *mcmc_sets(job, config, place), as_one]
     contenders = [*snapshot_points(job, config), *trained_sets(job, baselines).values(), _trained(job)]
-    metrics = load_metrics(job, asked.lpips)
+    metrics = load_metrics(job, asked.lpips, NETS if asked.vgg else NETS[:1])
     points = measure_sets(job, prefixes(NestedLevels(job)), metrics, FitConfig())
     for begin in range(0, len(contenders), _TOGETHER):
         some = [_as_decoded(job, one) for one in contenders[begin : begin + _TOGETHER]]
         points += measure_sets(job, some, metrics, FitConfig())
-    raw = Contender(AS_ONE, "before encoding", as_one.step, partial(read_level, as_one.path), {})
+    raw = Contender(AS_ONE, "as in training", as_one.step, lambda: _as_trained(job, as_one.path), {})
     unencoded = measure_sets(job, [raw], {}, FitConfig())[0]
     return Measured(job.run.path.name, points, _figures(job, points, unencoded, as_one, asked))
 
@@ -190,6 +190,11 @@ def _trained(job: Job) -> Contender:
 def _as_decoded(job: Job, contender: Contender) -> Contender:
     nbytes, arrived = encode_set(job, contender.load())
     return replace(contender, load=lambda: arrived, encoded=nbytes)
+
+
+def _as_trained(job: Job, path: Path) -> Gaussians:
+    """A set that was trained with rounding, as training drew it."""
+    return rounded(read_level(path), tuple(settings_of(job.run, "nest")["sh_bits"]))
 
 
 def _as_one(job: Job, place: Path, asked: Asked) -> Baseline:
@@ -226,11 +231,15 @@ def _figures(
 ) -> dict[str, Any]:
     """What is not a point of a curve."""
     full = job.ladder.load(job.ladder.levels[-1])
+    begin = time.perf_counter()
+    encode_set(job, full)
+    took = time.perf_counter() - begin
     encoder = {one.uri.rsplit(".", 1)[-1] for one in increments_of(job)}
     encoded = next(p for p in points if p.method == AS_ONE)
     return {
         "test_views": len(job.scene.test_ids),
         "antialiased": job.antialiased,
+        "trained_gaussians": sum(read_header(job.trained).counts.values()),
         "encoder": "+".join(sorted(encoder)),
         "seconds": {
             "train": seconds_of(job.run, "train"),
@@ -238,22 +247,10 @@ def _figures(
             "nest": seconds_of(job.run, "nest"),
             "as_one": seconds_of(job.run, as_one.path.stem),
         },
-        "encoding_s_per_100k": _encoding_seconds(job) * 1e5 / len(full),
+        "encoding_s_per_100k": took * 1e5 / len(full),  # and reading it back
         "ssim_lost_by_encoding": unencoded.ssim - encoded.ssim,
         "psnr_lost_by_encoding": unencoded.psnr - encoded.psnr,
         "resolutions": far.at_resolutions(job, {"full": full})["full"],
         "farther": far.from_farther(job, {"full": full}, full)["full"],
         "bytes_from_far": far.bytes_needed(job, asked.far_views) if asked.far_views else {},
     }
-
-
-def _encoding_seconds(job: Job) -> float:
-    """To write the increments once more."""
-    ladder, bits = job.ladder, tuple(settings_of(job.run, "nest").get("sh_bits", SH_BITS))
-    whole = ladder.load(ladder.levels[-1])
-    sizes = {label: tuple(ladder.counts[label, k] for k in ladder.levels) for label in whole.counts()}
-    with TemporaryDirectory() as folder:
-        begin = time.perf_counter()
-        path = Path(folder) / "increments"
-        write_increments(path, whole, sizes, job.names(), sh_bits=bits, antialiased=job.antialiased)
-        return time.perf_counter() - begin

@@ -25,6 +25,7 @@ from sagesplat.adapt.plan import Plan, read_plans
 from sagesplat.core.config import SampleConfig
 from sagesplat.core.errors import RunError
 from sagesplat.demo.capture import make_capture
+from sagesplat.formats.splats import read_splat
 
 CONFIG = RunConfig(
     train=TrainConfig(max_steps=60, level_every=20),
@@ -47,6 +48,12 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, FinishedRun]:
     assert stages.count("train") == 1  # both ladders are of one training
     assert stages.count("plan") == 2
     return found
+
+
+def test_a_composed_scene_says_how_it_was_trained(runs):
+    run = runs["nested"]
+    assert run.antialiased is CONFIG.train.antialiased is True
+    assert read_splat(run.job.run.composed).antialiased
 
 
 @pytest.mark.parametrize("ladder", ["nested", "snapshots"])

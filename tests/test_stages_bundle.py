@@ -275,6 +275,7 @@ def test_a_live_bundle_follows_the_training(run: Path, tmp_path: Path, viewer: P
         run / "provenance" / "train.json",
         {"format": FORMAT, "settings": {"antialiased": False}, "inputs": {}},
     )
+    assert manifest_of(folder)["antialiased"]
     later[-1].touch()
     (viewer / "index.html").write_text("<!doctype html>of a newer package")
     assert live_bundle(job, folder, viewer)  # rewritten: a training that began again
