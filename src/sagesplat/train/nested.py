@@ -35,6 +35,7 @@ CLEAR = 0.8  # share of its blending weight in one category below which a Gaussi
 _VISIBLE = 0.5  # blending weight in the other categories, in pixels per view, below which that is ignored
 _SHRINK_TO = 0.05  # of the learning rates, at the end
 _SAVE_EVERY = 500
+_NEARLY_FULL, _NEARLY_FROM = 0.2, 0.4  # share of the full steps that draw less, and the least prefix of these
 _SORT_AT = 1 / 12, 1 / 6, 1 / 3, 1 / 2, 2 / 3  # of the steps
 
 
@@ -209,8 +210,8 @@ def nest(
     """Train a nested ladder: afterwards every composition of prefixes renders well.
 
     Each step draws a prefix of every category, log-uniform between `config.drawn_from` and 1, or the full
-    model (with a probability that rises from `config.full_share` to `config.full_share_end`), and compares
-    the composition with a photo. Values are rounded as the increments will hold them. Gaussians outside the
+    model (with a probability that rises from `config.full_share` to `config.full_share_end`; a fifth of these
+    steps draw prefixes between 40 and 100 %), and compares the composition with a photo. Values are rounded as the increments will hold them. Gaussians outside the
     composition, and their Adam moments, stay as they are. With `config.two_opacities` each category is drawn
     with the opacities that its prefix has, between the first and the second ones. At five steps all Gaussians
     are sorted again by importance: in each category boundary Gaussians stay first, then the base model, then
@@ -323,6 +324,8 @@ def draw_shares(
     """Prefix of each category that a step renders, as a share of it; `done`: share of the steps taken."""
     full = config.full_share + (config.full_share_end - config.full_share) * done
     if rng.random() < full:
+        if rng.random() < _NEARLY_FULL:  # else levels of more than a half are hardly trained in the end
+            return rng.uniform(_NEARLY_FROM, 1, num_labels).astype(np.float32)
         return np.ones(num_labels, np.float32)
     return np.exp(rng.uniform(np.log(config.drawn_from), 0, num_labels)).astype(np.float32)
 
