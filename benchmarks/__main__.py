@@ -18,10 +18,11 @@ from benchmarks import deeplab as segmenting
 from benchmarks import formats as formatting
 from benchmarks import freeze as freezing
 from benchmarks import fuzz as fuzzing
-from benchmarks import measure, plain, workloads
+from benchmarks import measure, plain, size_tables, workloads
 from benchmarks import plans as planning
 from benchmarks import promises as promising
 from benchmarks import segment as overlays
+from benchmarks import size as sizing
 from benchmarks import wild as disturbed
 from benchmarks.gpu import base, script
 from sagesplat.core.config import TrainConfig
@@ -701,6 +702,43 @@ def promises(
         write: keep the figures in benchmarks/results/cpu/promises.json.
     """
     _finish("promises", promising.measure(folder, scenes, views, redraws, print), write)
+
+
+@app.command
+def size(
+    folder: Path = Path("runs/size"),
+    scenes: tuple[str, ...] = tuple(sizing.SCENES),
+    asked: tyro.conf.OmitArgPrefixes[sizing.Asked] = sizing.Asked(),  # noqa: B008 - frozen
+    threads: int = 0,
+    survey: bool = False,
+    write: bool = False,
+) -> None:
+    """Bytes at equal SSIM beside sets made for one size, what nesting costs, and levels from far away.
+
+    Args:
+        folder: where runs are made; what is done already is skipped.
+        scenes: garden, dinosaur, built-in, folders of captures, or run folders with a training.
+        threads: 0: one per core.
+        survey: also write FOLDER/survey, rows as the public compression survey has them.
+        write: keep the figures in benchmarks/results/size.json.
+    """
+    from sagesplat.core.errors import SageError
+
+    set_threads(threads)
+    results = {}
+    for scene in scenes:
+        begin = time.perf_counter()
+        try:
+            found = sizing.measure(folder, scene, asked, lambda line: print(line, flush=True))
+        except SageError as error:
+            raise SystemExit(str(error)) from None
+        shown = size_tables.table(found)
+        print(f"\n{shown.title}\n\n{shown.markdown()}")
+        if survey:
+            for path in size_tables.write_survey(folder / "survey", found):
+                print(f"{path}\n{path.read_text()}")
+        results[found.scene] = size_tables.summary(found) | {"measured_in_s": time.perf_counter() - begin}
+    _finish("size", {"steps": asked.steps, "scenes": results}, write, RESULTS.parent)
 
 
 @app.command

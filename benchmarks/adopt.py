@@ -64,7 +64,7 @@ def trained(name: str, folder: Path, transform: Transform) -> Case:
     job = run_scene(capture, folder / name, case.config, force=True).job
     g = job.snapshots.load(job.snapshots.levels[-1])
     source = folder / f"{name}.ply"
-    write_ply(source, g, job.names())
+    write_ply(source, g, job.names(), antialiased=job.antialiased)
     rivals = {}
     for share in SHARES:
         out = folder / f"{name}-{share}.ply"

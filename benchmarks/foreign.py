@@ -66,6 +66,7 @@ EXCEPTIONS: dict[str, str] = {
     "segment.taxonomies:_vocabularies": OURS,
     "studies.compare.run:compare": _HASHED,
     "train.memory:_cgroup_limits": MACHINE,
+    "viewer.bundle:_name_pack": OURS,
     "viewer.bundle:_put_up": OURS,
     "viewer.bundle:has_viewer": OURS,
     "viewer.bundle:verified_files": _HASHED,

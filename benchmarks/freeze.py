@@ -63,7 +63,7 @@ def timed(capture: Capture, config: TrainConfig, backend: Backend = "auto") -> d
     seconds = time.perf_counter() - begin
     assert ended is not None
     quality = {
-        name: by_label(capture, ended, rows.tolist(), backend)
+        name: by_label(capture, ended, rows.tolist(), backend, config.antialiased)
         for name, rows in (("train", capture.scene.train_ids), ("test", capture.scene.test_ids))
     }
     return {
@@ -77,13 +77,15 @@ def timed(capture: Capture, config: TrainConfig, backend: Backend = "auto") -> d
     }
 
 
-def by_label(capture: Capture, trained: Trained, rows: list[int], backend: Backend) -> dict:  # type: ignore[type-arg]
+def by_label(
+    capture: Capture, trained: Trained, rows: list[int], backend: Backend, antialiased: bool
+) -> dict:  # type: ignore[type-arg]
     """Mean SSIM by label id over the views that show it, and SSIM and PSNR of whole images."""
     found: dict[int, dict[str, list[float]]] = {}
     gaussians = trained.gaussians.to(device_of(backend))
     for row in rows:
         view = capture.scene.views[row]
-        image = render_rgb(gaussians, view.camera, backend=backend, antialiased=False)
+        image = render_rgb(gaussians, view.camera, backend=backend, antialiased=antialiased)
         for label, values in measure(image, as_unit(capture.photos[row]), capture.masks[view]).items():
             for name in ("ssim", "psnr"):
                 found.setdefault(label, {}).setdefault(name, []).append(values[name])

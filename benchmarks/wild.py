@@ -119,7 +119,8 @@ def _measure(folder: Path, name: str, row: Row, steps: int, seed: int) -> dict[s
     if only_figures and undisturbed.levels.exists():  # its model, on the same photos and pixels
         plain = read_level(Job(undisturbed, job.emit).trained)
         result["test_undisturbed"] = _means(on_path(job, plain, capture))
-    off, by_category = off_path(g, capture, alignment(truth, job.scene) if wild.pose_shift else np.eye(4))
+    to_run = alignment(truth, job.scene) if wild.pose_shift else np.eye(4)
+    off, by_category = off_path(g, capture, to_run, job.antialiased)
     result["off_path"], result["off_path_by_category"] = _means(off), by_category
     if wild.pose_shift:
         scenes = job.given_scene, job.scene
@@ -132,12 +133,12 @@ def on_path(job: Job, g: Gaussians, capture: Path) -> Iterator[Measured]:
     for row in job.scene.test_ids.tolist():
         view = job.scene.views[row]
         counts = np.array(Image.open(capture / "truth" / "figures" / view.name)) == 0
-        image = render_rgb(g, view.camera.neutral, backend=job.backend, antialiased=False)
+        image = render_rgb(g, view.camera.neutral, backend=job.backend, antialiased=job.antialiased)
         yield _compared(image, as_unit(job.photos[row]), counts)[0]
 
 
 def off_path(
-    g: Gaussians, capture: Path, to_run: np.ndarray
+    g: Gaussians, capture: Path, to_run: np.ndarray, antialiased: bool
 ) -> tuple[list[Measured], dict[str, list[float]]]:
     """Pictures off the path, and PSNR and SSIM over the pixels of each category; `to_run`: truth to run."""
     folder = capture / "truth" / "off_path"
@@ -147,7 +148,7 @@ def off_path(
         name = view.image_path.name
         counts, label = (np.array(Image.open(folder / below / name)) for below in ("seen", "masks"))
         camera = replace(view.camera, w2c=_moved(view.camera, to_run))
-        image = render_rgb(g, camera, backend="auto", antialiased=False)
+        image = render_rgb(g, camera, backend="auto", antialiased=antialiased)
         found, errors, ssim = _compared(image, as_unit(photos[i]), counts > 0)
         rows.append(found)
         for label_id in np.unique(label[counts > 0]).tolist():

@@ -37,7 +37,7 @@ def main() -> None:
             f"{run.names[choice.label_id]:24} level {choice.level:3}  {choice.count:9,} Gaussians  "
             f"distance {choice.distance:6.2f}  at least {choice.predicted:.3f}, {choice.verdict}"
         )
-    write_ply(args.ply, run.compose(plan), run.names)
+    write_ply(args.ply, run.compose(plan), run.names, antialiased=run.antialiased)
     print(f"{args.ply}: {plan.count:,} Gaussians, {plan.transfer_bytes or 0:,} bytes to send")
 
 

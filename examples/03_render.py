@@ -22,7 +22,11 @@ def main() -> None:
     parser.add_argument("view", help="name of a photo of the capture")
     parser.add_argument("png", type=Path)
     parser.add_argument("--width", type=int, default=0, help="pixels (default: the photo's)")
-    parser.add_argument("--antialiased", action="store_true", help="for splats trained with it")
+    parser.add_argument(
+        "--antialiased",
+        action="store_true",
+        help="for splats trained with it: a comment `SplatRenderMode: mip` in the file",
+    )
     args = parser.parse_args()
 
     gaussians = read_ply(args.ply)

@@ -27,6 +27,7 @@ from sagesplat.train.parallel import train_together
 from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.strategy import schedule_of
 
+AS_GSPLAT: dict[str, Any] = {"lr_schedule": "published", "antialiased": False}  # its example's defaults
 KEPT_BACK = 0.1  # of the time, for what comes after the long runs
 WEIGHTS = {"ours": 1.0, "gsplat": 1.3, "third": 0.8, "two_thirds": 0.7, "all": 0.5}  # time of a run, guessed
 
@@ -148,7 +149,7 @@ def multi(bench: Bench) -> Outcome:
         return Outcome("skipped", "no GPU" if bench.small else "one GPU")
     steps = min(bench.asked.steps, 1000)
     config, args = (
-        TrainConfig(max_steps=steps, lr_schedule="published"),
+        TrainConfig(max_steps=steps, **AS_GSPLAT),
         (bench.scene, bench.photos, bench.labels),
     )
     seconds = {}
@@ -185,12 +186,12 @@ def _train(bench: Bench, name: str) -> Run:
     if bench.left() < KEPT_BACK * 60 * bench.asked.minutes:
         raise RuntimeError("no time left")
     if name in ("ours", "gsplat"):
-        config = TrainConfig(max_steps=steps_of(bench), lr_schedule="published")
+        config = TrainConfig(max_steps=steps_of(bench), **AS_GSPLAT)
     elif bench.masks is None:
         raise RuntimeError("no label images: nothing to freeze")
     else:
         target = targets(run_of(bench, "ours").label_ssim)[name]
-        config = TrainConfig(max_steps=steps_of(bench), lr_schedule="published", freeze_at=target)
+        config = TrainConfig(max_steps=steps_of(bench), freeze_at=target, **AS_GSPLAT)
     run = watch(bench, name, config, (gsplats if name == "gsplat" else ours)(bench, config))
     if name == "ours":
         bench.trained = run.gaussians

@@ -118,8 +118,9 @@ class TrainConfig:
     """Degree of the spherical harmonics."""
     ssim_weight: float = 0.2
     """Weight of 1 - SSIM in the loss; L1 has the rest."""
-    antialiased: bool = False
-    """Compensate opacities for the screen-space low-pass filter (Mip-Splatting)."""
+    antialiased: bool = True
+    """Compensate opacities for the screen-space low-pass filter (Mip-Splatting): Gaussians smaller than a
+    pixel then look the same at lower resolutions and from far away."""
     batch: int = 1
     """Photos per step, at least one per process. Learning rates grow with its square root; the number of
     steps stays."""

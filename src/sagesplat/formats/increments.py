@@ -121,7 +121,7 @@ def write_increments(
                     encode_spz(part, sh_bits=bits, coarse=level not in fine, antialiased=antialiased)
                 )
             else:
-                write_ply(temporary, part, names)
+                write_ply(temporary, part, names, antialiased=antialiased)
             content = temporary.read_bytes()
             digest = hashlib.sha256(content).hexdigest()
             uri = f"{stems[label]}-{level:02d}-{digest[:12]}.{suffix}"

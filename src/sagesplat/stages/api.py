@@ -126,6 +126,11 @@ class FinishedRun:
         """Category names by label id; -1 is the unlabelled one."""
         return self.job.names()
 
+    @property
+    def antialiased(self) -> bool:
+        """How the run's Gaussians are drawn: pass it to `rasterize` and to `write_ply`."""
+        return self.job.antialiased
+
     @cached_property
     def plans(self) -> tuple[Plan, ...]:
         """The scene's plans, those of the quality that leads first. RunError before `sagesplat plan`."""

@@ -150,8 +150,13 @@ def with_at_most(scene: Scene, labels: np.ndarray, count: int, seed: int) -> tup
 
 
 def capped_config(config: TrainConfig, cap: int, steps: int) -> TrainConfig:
-    """3DGS-MCMC with at most `cap` Gaussians, otherwise as `config`; only the last level is recorded."""
+    """3DGS-MCMC with at most `cap` Gaussians, otherwise as `config`; only the last level is recorded.
+
+    Without its regularisers: in trainings of a few thousand steps they cost 0.2 to 1 dB
+    (docs/developers/far.md).
+    """
     mcmc = replace(config, strategy="mcmc", max_gaussians=cap, max_steps=steps, level_every=steps)
+    mcmc = replace(mcmc, mcmc_opacity=0.0, mcmc_scale=0.0)
     return replace(
         mcmc, freeze_at=None, gradient_freeze_share=0.0, poses=False, exposure="off", outliers=False
     )
@@ -258,7 +263,7 @@ def nest(
         PhotoLoader(scene, photos, device, valid), replace(train_config, batch=1), ActiveTiles(scene, None),
         backend, sh_bits=config.sh_bits, shell=shell,
     )  # fmt: skip
-    rates = _rates(train_config, config, scene)
+    rates = learning_rates(train_config, config, scene)
     trainable = trainable_rows(state.gaussians, {})
     if movable is not None:
         trainable &= torch.from_numpy(movable[near]).to(device)
@@ -322,7 +327,7 @@ def draw_shares(
     return np.exp(rng.uniform(np.log(config.drawn_from), 0, num_labels)).astype(np.float32)
 
 
-def _rates(
+def learning_rates(
     train_config: TrainConfig, config: NestConfig, scene: Scene
 ) -> Callable[[int], Mapping[str, float]]:
     """Learning rates by parameter name, for each step."""

@@ -13,7 +13,7 @@ import numpy as np
 from sagesplat.adapt.allocate import along
 from sagesplat.adapt.observe import TOTAL, as_unit, measure, measure_total, render_rgb
 from sagesplat.adapt.plan import Plan, check_target
-from sagesplat.core.config import CompareConfig, PlanConfig
+from sagesplat.core.config import CompareConfig, FitConfig, PlanConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Progress, RunDone, TableMade
 from sagesplat.core.gaussians import Gaussians
@@ -96,17 +96,18 @@ def compare(job: Job, config: CompareConfig, copy: Path | None = None) -> list[P
     settings = json.loads(json.dumps(asdict(config) | {"targets": targets, "lpips": lpips}))
     is_done(job.run, "compare", settings, None, [file], job.force)  # refused before hours of training
     snapshots = _snapshots(job)
-    trained = _trained(job, [*_pruned(job, config, folder), *_mcmc(job, config, folder)])
+    trained = trained_sets(job, [*pruned_sets(job, config, folder), *mcmc_sets(job, config, folder)])
 
     def make() -> list[str]:
         nested, sage = NestedLevels(job), Snapshots(snapshots)
         contenders = [
-            *_snapshot_points(snapshots, config),
+            *snapshot_points(snapshots, config),
             *_sage(sage, targets, settings_of(job.run, "plan")["share"]),
             *trained.values(),
-            *_nested(nested, config),
+            *prefixes(nested),
+            *_planned(nested, config),
         ]
-        points = _measure(job, contenders, load_metrics(job, config.lpips))
+        points = measure_sets(job, contenders, load_metrics(job, config.lpips), job.fit_config)
         walks = _walks(nested, sage)
         (folder / PAGE).unlink(missing_ok=True)  # it shows what was measured before
         write_comparison(file, points, walks, scene=job.scene.name, views=len(job.scene.test_ids))
@@ -172,7 +173,7 @@ def _snapshots(job: Job) -> Job:
 
 
 @dataclass(frozen=True)
-class _Baseline:
+class Baseline:
     """A set that is trained once, and kept."""
 
     method: str
@@ -185,7 +186,7 @@ class _Baseline:
     of: Callable[[], Any]  # what `make` needs beside the job, computed when it is
 
 
-def _pruned(job: Job, config: CompareConfig, folder: Path) -> list[_Baseline]:
+def pruned_sets(job: Job, config: CompareConfig, folder: Path) -> list[Baseline]:
     """The last snapshot, pruned by LightGaussian's criterion (arXiv:2311.17245) and tuned."""
     last = job.snapshots.files[-1]
     steps = settings_of(job.run, "nest")["steps"] if config.tune_steps < 0 else config.tune_steps
@@ -197,7 +198,7 @@ def _pruned(job: Job, config: CompareConfig, folder: Path) -> list[_Baseline]:
         return importance(read_level(last.path), job.scene, views, "weight-volume", antialiased=antialiased)
 
     return [
-        _Baseline(
+        Baseline(
             PRUNED, f"{share:.0%}, {steps} steps", folder / f"pruned-{share:g}-{steps}.npz",
             last.step + steps, {"share": share, "tune_steps": steps}, [*job.run.scene_files, last.path],
             _prune, lambda share=share: (share, steps, weights()),
@@ -212,7 +213,7 @@ def _prune(job: Job, of: tuple[float, int, np.ndarray]) -> Gaussians:
     return tune_composition(job, prune_to(g, max(1, round(share * len(g))), weights), steps)
 
 
-def _mcmc(job: Job, config: CompareConfig, folder: Path) -> list[_Baseline]:
+def mcmc_sets(job: Job, config: CompareConfig, folder: Path) -> list[Baseline]:
     """3DGS-MCMC from the start, its Gaussians capped at shares of the last snapshot's."""
     run, made, found = job.run, train_config(job), []
     full, seed = job.snapshots.size(job.snapshots.levels[-1]), settings_of(job.run, "train")["seed"]
@@ -220,7 +221,7 @@ def _mcmc(job: Job, config: CompareConfig, folder: Path) -> list[_Baseline]:
         cap, path = round(share * full), folder / f"mcmc-{share:g}.npz"
         settings = {**asdict(capped_config(made, cap, made.max_steps)), "seed": seed}
         of = path.stem, cap, made.max_steps, seed
-        baseline = _Baseline(
+        baseline = Baseline(
             MCMC, f"cap {share:.0%}", path, made.max_steps, settings,
             [*run.scene_files, run.labels, *inlier_inputs(run)],
             _cap, lambda of=of: of,
@@ -233,7 +234,7 @@ def _cap(job: Job, of: tuple[str, int, int, int]) -> Gaussians:
     return train_capped(job, *of)
 
 
-def _trained(job: Job, baselines: Sequence[_Baseline]) -> dict[Path, Contender]:
+def trained_sets(job: Job, baselines: Sequence[Baseline]) -> dict[Path, Contender]:
     """The baselines by file, trained where they are missing.
 
     Each is a stage of its own, so that a killed comparison resumes with the next one.
@@ -246,7 +247,7 @@ def _trained(job: Job, baselines: Sequence[_Baseline]) -> dict[Path, Contender]:
 
 
 def _train(
-    job: Job, baselines: Sequence[_Baseline], missing: Sequence[int]
+    job: Job, baselines: Sequence[Baseline], missing: Sequence[int]
 ) -> Iterator[tuple[int, Sequence[str]]]:
     """Train those of these numbers."""
     some = [baselines[number] for number in missing]
@@ -262,7 +263,7 @@ def _keep(job: Job, part: tuple[Callable[[Job, Any], Gaussians], Any, str, int])
     return len(g)
 
 
-def _snapshot_points(snapshots: Job, config: CompareConfig) -> list[Contender]:
+def snapshot_points(snapshots: Job, config: CompareConfig) -> list[Contender]:
     """Settled snapshots, spread in size; of equal ones the latest."""
     ladder = snapshots.snapshots
     sizes = [ladder.size(level) for level in ladder.levels]
@@ -282,17 +283,24 @@ def _sage(sage: Snapshots, targets: Sequence[float], share: float) -> list[Conte
     return found
 
 
-def _nested(nested: NestedLevels, config: CompareConfig) -> list[Contender]:
-    """Prefixes of the same share of every category, and plans: within budgets, and for the run's targets."""
+def prefixes(nested: NestedLevels) -> list[Contender]:
+    """The levels, all categories at the same one: as they are sent."""
     job, costs = nested.job, nested.costs
-    made = settings_of(job.run, "plan")
     steps = job.snapshots.levels[-1] + settings_of(job.run, "nest")["steps"]
-    sent = costs.transfer_bytes.sum(0)
     found = []
     for k in range(costs.transfer_bytes.shape[1]):
         bytes_of = dict(zip(costs.labels, costs.transfer_bytes[:, k].tolist(), strict=True))
         load = partial(job.ladder.load, k + 1)
         found.append(Contender(SAME_SHARE, f"level {k + 1}", steps, load, bytes_of))
+    return found
+
+
+def _planned(nested: NestedLevels, config: CompareConfig) -> list[Contender]:
+    """Plans: within budgets, and for the run's targets."""
+    job, costs = nested.job, nested.costs
+    made = settings_of(job.run, "plan")
+    steps = job.snapshots.levels[-1] + settings_of(job.run, "nest")["steps"]
+    sent, found = costs.transfer_bytes.sum(0), []
     budgets = np.ceil(np.geomspace(sent[0], sent[-1], config.budgets)).tolist()
     main = ssim_target(job.run)
     plans: list[tuple[str, Plan]] = [
@@ -316,9 +324,11 @@ def _nested(nested: NestedLevels, config: CompareConfig) -> list[Contender]:
     return found
 
 
-def _measure(job: Job, contenders: Sequence[Contender], metrics: dict[str, Lpips]) -> list[Point]:
-    """All contenders on all test views, some at a time."""
-    labels = label_images(job, job.fit_config.masks)
+def measure_sets(
+    job: Job, contenders: Sequence[Contender], metrics: dict[str, Lpips], config: FitConfig
+) -> list[Point]:
+    """All contenders on all test views, some at a time; of `config` what categories are measured by."""
+    labels = label_images(job, config.masks)
     tests, workspace, points = job.valid.rows(job.scene, job.scene.test_ids), Workspace(), []
     done, total = 0, len(contenders) * len(tests)
 
@@ -336,14 +346,15 @@ def _measure(job: Job, contenders: Sequence[Contender], metrics: dict[str, Lpips
         found: list[list[dict[str | int, float]]] = [[] for _ in some]
         # nested levels are measured as decoded from their increments
         sent = [
-            _send(job, g) if c.encoded is None else (c.encoded, None) for c, g in zip(some, sets, strict=True)
+            encode_set(job, g) if c.encoded is None else (c.encoded, None)
+            for c, g in zip(some, sets, strict=True)
         ]
         for row in tests:
             photo, here = as_unit(job.photos[row]), labels[job.scene.views[row]]
             valid, of_photo = job.valid[job.scene.views[row]], features_of(metrics, photo)
             for g, (_, arrived), values in zip(sets, sent, found, strict=True):
                 image = image_of(g, row)
-                values.append(_values(job, image, photo, here, valid))
+                values.append(_values(config, image, photo, here, valid))
                 if valid is not None:
                     of_photo = features_of(metrics, pasted(photo, image, valid))
                 for column, metric in metrics.items():
@@ -373,11 +384,11 @@ def _corrected(
 
 
 def _values(
-    job: Job, image: np.ndarray, photo: np.ndarray, labels: np.ndarray, valid: np.ndarray | None
+    config: FitConfig, image: np.ndarray, photo: np.ndarray, labels: np.ndarray, valid: np.ndarray | None
 ) -> dict[str | int, float]:
     """What is measured of one image: of the whole by name, SSIM of its categories by label id."""
-    name = "ssim_eroded" if job.fit_config.region == "eroded" else "ssim"
-    rows, few = measure(image, photo, labels, valid=valid), job.fit_config.min_share * labels.size
+    name = "ssim_eroded" if config.region == "eroded" else "ssim"
+    rows, few = measure(image, photo, labels, valid=valid), config.min_share * labels.size
     whole = {"ssim": rows[TOTAL]["ssim"], "ssim_sent": rows[TOTAL]["ssim"], "psnr": rows[TOTAL]["psnr"]}
     return whole | {i: of[name] for i, of in rows.items() if i != TOTAL and of["num_pixels"] >= few}
 
@@ -404,7 +415,7 @@ def _point(
     )
 
 
-def _send(job: Job, g: Gaussians) -> tuple[dict[int, int], Gaussians]:
+def encode_set(job: Job, g: Gaussians) -> tuple[dict[int, int], Gaussians]:
     """Bytes by label id, one file each encoded as the run's increments are, and what a viewer decodes."""
     bits = tuple(settings_of(job.run, "nest").get("sh_bits", SH_BITS))
     streams = any(one.format == "stream" for one in read_index(job.run.increments))
@@ -436,7 +447,7 @@ def _walks(nested: NestedLevels, sage: Snapshots) -> list[Walk]:
     needed = sorted({choice for levels in theirs for choice in levels.items()})
     level_files = {
         (label, level): {
-            f"{label} at {level}": sum(_send(job, sage.job.ladder.load(level, [label]))[0].values())
+            f"{label} at {level}": sum(encode_set(job, sage.job.ladder.load(level, [label]))[0].values())
         }
         for label, level in needed
     }

@@ -1,0 +1,259 @@
+"""Nested levels beside sets of Gaussians made for one size: bytes at equal SSIM, and what nesting costs.
+
+All is encoded by the encoder of the run's increments, and measured on test views as decoded. Baselines:
+snapshots of the training, the trained model pruned and tuned, 3DGS-MCMC at fixed caps, and the trained model
+tuned as one for the time that nesting took. They lie in RUN/compare, where `sagesplat compare` has its own.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from benchmarks import far
+from benchmarks.promises import CASES
+from sagesplat.core.config import (
+    CleanConfig,
+    CompareConfig,
+    FitConfig,
+    LabelsConfig,
+    LiftConfig,
+    MasksConfig,
+    NestConfig,
+    RunConfig,
+)
+from sagesplat.core.errors import RunError
+from sagesplat.core.events import Event, StageDone, StageSkipped, Warned
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.formats.increments import write_increments
+from sagesplat.formats.levels import read_level
+from sagesplat.formats.spz import SH_BITS
+from sagesplat.raster import device_of, resolve_backend
+from sagesplat.run.job import Job
+from sagesplat.run.records import seconds_of, settings_of
+from sagesplat.run.run_dir import RunDir
+from sagesplat.stages import pipeline
+from sagesplat.stages.label import lift_labels, make_masks
+from sagesplat.stages.methods import NestedLevels
+from sagesplat.stages.results import increments_of
+from sagesplat.stages.scene import open_scene
+from sagesplat.stages.shared import inlier_inputs, sky_inputs, train_config
+from sagesplat.studies.compare.report import Point
+from sagesplat.studies.compare.run import (
+    Baseline,
+    Contender,
+    encode_set,
+    mcmc_sets,
+    measure_sets,
+    prefixes,
+    pruned_sets,
+    snapshot_points,
+    trained_sets,
+)
+from sagesplat.studies.lpips import load_metrics
+from sagesplat.train.early_stopping import ActiveTiles, trainable_rows
+from sagesplat.train.nested import learning_rates
+from sagesplat.train.photo_loader import PhotoLoader
+from sagesplat.train.state import initial_state
+from sagesplat.train.stepper import Stepper
+
+Say = Callable[[str], None]
+SCENES = {"garden": "garden", "dinosaur": "dinosaur", "built-in": "built-in-11"}  # name: of `promises.CASES`
+AS_ONE, TRAINED = "3DGS, as one", "3DGS"
+# of the steps of nesting: as many steps on the full model take as long (garden, 256 px: 3000 and 2500)
+AS_ONE_STEPS = 5 / 6
+_TOGETHER = 8  # sets in memory at a time
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is trained and measured."""
+
+    steps: int = 2000
+    """Steps of the training, and of 3DGS-MCMC."""
+    nest_steps: int = 3000
+    """Steps of nesting."""
+    base_steps: int = 3000
+    """Steps of its base model."""
+    as_one_steps: int = 0
+    """Steps of the model that is tuned as one (0: as many as take the time of nesting)."""
+    tune_steps: int = 500
+    """Steps after pruning."""
+    snapshots: int = 10
+    """Snapshots of the training, at most."""
+    shares: tuple[float, ...] = (0.05, 0.1, 0.2, 0.35, 0.5, 0.7)
+    """Sizes that the trained model is pruned to."""
+    caps: tuple[float, ...] = (0.05, 0.1, 0.2, 0.35, 0.5, 1.0)
+    """Sizes of 3DGS-MCMC."""
+    far_views: int = 12
+    """Viewpoints that bytes from far away are measured at; 0: none."""
+    lpips: Path | None = None
+    """Folder with the LPIPS weights."""
+    device: str = "auto"
+    """cpu, cuda, or auto."""
+    seed: int = 0
+    """Seed of the trainings."""
+
+    @property
+    def compare(self) -> CompareConfig:
+        """The same for `studies.compare`."""
+        return CompareConfig(
+            snapshots=self.snapshots, shares=self.shares, caps=self.caps, tune_steps=self.tune_steps,
+            lpips=self.lpips,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A capture's sets on the test views, as decoded, and what else was measured of the run."""
+
+    scene: str
+    points: list[Point]
+    figures: dict[str, Any]
+
+
+def open_job(folder: Path, scene: str, asked: Asked, say: Say) -> Job:
+    """The run of a capture, trained and nested where it is not yet.
+
+    `scene` is one of SCENES, whose run is FOLDER/NAME, a capture, or a run folder with a training.
+    """
+    given = Path(scene)
+    run = given if (given / "scene.json").exists() else folder / given.name
+    backend = resolve_backend("auto", asked.device)
+    job = Job(RunDir(run, "nested"), _told(run.name, say), backend, device=asked.device)
+    if not (run / "scene.json").exists():
+        _train(job, folder, scene, asked)
+    if not job.run.prefixes.exists():
+        config = replace(_config(scene, asked).nest, steps=asked.nest_steps, base_steps=asked.base_steps)
+        pipeline.clean(job, CleanConfig())
+        pipeline.nest(job, config, RunConfig().blocks, asked.seed)
+    return job
+
+
+def _config(scene: str, asked: Asked) -> RunConfig:
+    found = CASES[SCENES[scene]].config if scene in SCENES else RunConfig()
+    return replace(found, train=replace(found.train, max_steps=asked.steps, level_every=0), nest=NestConfig())
+
+
+def _train(job: Job, folder: Path, scene: str, asked: Asked) -> None:
+    """From the capture to the trained model."""
+    config = _config(scene, asked)
+    capture = CASES[SCENES[scene]].capture(folder / "captures" / scene) if scene in SCENES else Path(scene)
+    open_scene(job, capture, config.scene)
+    make_masks(job, MasksConfig(), LabelsConfig())
+    lift_labels(job, LiftConfig())
+    pipeline.train(job, config.train, config.blocks, asked.seed)
+
+
+def _told(name: str, say: Say) -> Callable[[Event], None]:
+    def tell(event: Event) -> None:
+        match event:
+            case StageDone(stage, seconds, lines):
+                say(f"{name}: {stage} {seconds:.0f} s; {lines[0] if lines else ''}")
+            case StageSkipped(stage):
+                say(f"{name}: {stage} is there already")
+            case Warned(text):
+                say(f"{name}: {text}")
+            case _:
+                pass
+
+    return tell
+
+
+def measure(folder: Path, scene: str, asked: Asked, say: Say) -> Measured:
+    """Train what is missing of a capture's baselines, and measure all sets."""
+    job = open_job(folder, scene, asked, say)
+    if not len(job.scene.test_ids):
+        raise RunError(f"{job.run.path}: no test views to measure on; begin a run with --test-every 8")
+    place, config = job.run.path / "compare", asked.compare
+    as_one = _as_one(job, place, asked)
+    baselines = [*pruned_sets(job, config, place), *mcmc_sets(job, config, place), as_one]
+    contenders = [*snapshot_points(job, config), *trained_sets(job, baselines).values(), _trained(job)]
+    metrics = load_metrics(job, asked.lpips)
+    points = measure_sets(job, prefixes(NestedLevels(job)), metrics, FitConfig())
+    for begin in range(0, len(contenders), _TOGETHER):
+        some = [_as_decoded(job, one) for one in contenders[begin : begin + _TOGETHER]]
+        points += measure_sets(job, some, metrics, FitConfig())
+    raw = Contender(AS_ONE, "before encoding", as_one.step, partial(read_level, as_one.path), {})
+    unencoded = measure_sets(job, [raw], {}, FitConfig())[0]
+    return Measured(job.run.path.name, points, _figures(job, points, unencoded, as_one, asked))
+
+
+def _trained(job: Job) -> Contender:
+    """The trained model as it was when nesting began."""
+    return Contender(TRAINED, "trained", job.snapshots.levels[-1], partial(read_level, job.trained))
+
+
+def _as_decoded(job: Job, contender: Contender) -> Contender:
+    nbytes, arrived = encode_set(job, contender.load())
+    return replace(contender, load=lambda: arrived, encoded=nbytes)
+
+
+def _as_one(job: Job, place: Path, asked: Asked) -> Baseline:
+    nest = settings_of(job.run, "nest")
+    steps = asked.as_one_steps or max(1, round(AS_ONE_STEPS * nest["steps"]))
+    config = NestConfig(steps=steps, lr_multiplier=nest["lr_multiplier"], sh_bits=tuple(nest["sh_bits"]))
+    run = job.run
+    return Baseline(
+        AS_ONE, f"{steps} steps more", place / f"as-one-{steps}.npz", job.snapshots.levels[-1] + steps,
+        {**asdict(config), "seed": asked.seed}, [*run.scene_files, job.trained, *inlier_inputs(run),
+        *sky_inputs(run)], train_as_one, lambda: (config, asked.seed),
+    )  # fmt: skip
+
+
+def train_as_one(job: Job, of: tuple[NestConfig, int]) -> Gaussians:
+    """The trained model, trained on in full: nesting's rounding and learning rates, no levels."""
+    config, seed = of
+    device = device_of(job.backend)
+    state = initial_state(read_level(job.trained).to(device), seed)
+    state.sort()
+    settings = replace(train_config(job), batch=1)
+    stepper = Stepper(
+        PhotoLoader(job.scene, job.photos, device, job.inliers), settings, ActiveTiles(job.scene, None),
+        job.backend, sh_bits=config.sh_bits, shell=job.sky.shell if job.sky else None,
+    )  # fmt: skip
+    rates, trainable = learning_rates(settings, config, job.scene), trainable_rows(state.gaussians, {})
+    for step in range(1, config.steps + 1):
+        stepper(state, settings.sh_degree, rates(step), trainable)
+    return state.gaussians.to("cpu")
+
+
+def _figures(
+    job: Job, points: Sequence[Point], unencoded: Point, as_one: Baseline, asked: Asked
+) -> dict[str, Any]:
+    """What is not a point of a curve."""
+    full = job.ladder.load(job.ladder.levels[-1])
+    encoder = {one.uri.rsplit(".", 1)[-1] for one in increments_of(job)}
+    encoded = next(p for p in points if p.method == AS_ONE)
+    return {
+        "test_views": len(job.scene.test_ids),
+        "antialiased": job.antialiased,
+        "encoder": "+".join(sorted(encoder)),
+        "seconds": {
+            "train": seconds_of(job.run, "train"),
+            "base": seconds_of(job.run, "base") if job.run.base_model.exists() else 0.0,
+            "nest": seconds_of(job.run, "nest"),
+            "as_one": seconds_of(job.run, as_one.path.stem),
+        },
+        "encoding_s_per_100k": _encoding_seconds(job) * 1e5 / len(full),
+        "ssim_lost_by_encoding": unencoded.ssim - encoded.ssim,
+        "psnr_lost_by_encoding": unencoded.psnr - encoded.psnr,
+        "resolutions": far.at_resolutions(job, {"full": full})["full"],
+        "farther": far.from_farther(job, {"full": full}, full)["full"],
+        "bytes_from_far": far.bytes_needed(job, asked.far_views) if asked.far_views else {},
+    }
+
+
+def _encoding_seconds(job: Job) -> float:
+    """To write the increments once more."""
+    ladder, bits = job.ladder, tuple(settings_of(job.run, "nest").get("sh_bits", SH_BITS))
+    whole = ladder.load(ladder.levels[-1])
+    sizes = {label: tuple(ladder.counts[label, k] for k in ladder.levels) for label in whole.counts()}
+    with TemporaryDirectory() as folder:
+        begin = time.perf_counter()
+        path = Path(folder) / "increments"
+        write_increments(path, whole, sizes, job.names(), sh_bits=bits, antialiased=job.antialiased)
+        return time.perf_counter() - begin
