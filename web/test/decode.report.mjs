@@ -1,12 +1,12 @@
 // How fast streams are decoded, in millions of Gaussians a second: node test/decode.report.mjs FOLDER [ROUNDS]
-// [--page PAGE.html], which writes a page that measures the same in a browser, as its title.
+// [PAGE.html], which is a page to write that measures the same in a browser, as its title.
 
 import { readdirSync, readFileSync, writeFileSync } from "node:fs";
 import { join } from "node:path";
 import { fileURLToPath } from "node:url";
 import { build } from "vite";
 
-const [folder, rounds = "100", , page] = process.argv.slice(2);
+const [folder, rounds = "100", page] = process.argv.slice(2);
 if (!folder) throw new Error("give a folder with .sgst files");
 const entry = fileURLToPath(new URL("decode.ts", import.meta.url));
 const lib = { entry, formats: ["iife"], name: "decoding" };
