@@ -30,6 +30,7 @@ export function fuzz(
   const below = (n: number) => Math.floor(random() * n);
   const found: Findings = { tried: 0, decoded: 0, refused: 0, slowest: 0, largest: 0, wrong: [] };
   const begun = performance.now();
+  const { stackTraceLimit } = Error;
   Error.stackTraceLimit = 0; // most are refused
   while (found.tried < most && found.wrong.length < 10) {
     if (found.tried % 256 === 0 && performance.now() - begun > 1000 * seconds) break;
@@ -37,6 +38,7 @@ export function fuzz(
     const piece = stream.subarray(0, 50 + below(below(50) ? SHORT : LONGER));
     attempt(damaged(piece, below), below, found);
   }
+  Error.stackTraceLimit = stackTraceLimit;
   return found;
 }
 

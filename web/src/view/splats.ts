@@ -16,13 +16,14 @@ export async function decodePart(bytes: Uint8Array, format: Format): Promise<Par
     const words = packed.extra[key];
     if (words instanceof Uint32Array) harmonics.set(key, words.slice(0, count * WORDS[key]));
   }
-  const part = { count, splats: packed.packedArray.slice(0, count * 4), harmonics, opacities: null };
+  const splats = packed.packedArray.slice(0, count * 4);
+  const part = { count, encoding: ENCODING, splats, harmonics, opacities: null };
   packed.dispose();
   return part;
 }
 
 /**
- * Concatenates parts into one set of splats. A part without harmonics gets zeros.
+ * Concatenates parts of one encoding into one set of splats. A part without harmonics gets zeros.
  *
  * @param finish - changes the words of all of them, before they are uploaded
  */
@@ -44,5 +45,10 @@ export function joined(
     start += part.count;
   }
   finish(packedArray);
-  return new PackedSplats({ packedArray, numSplats: count, extra, splatEncoding: ENCODING });
+  return new PackedSplats({
+    packedArray,
+    numSplats: count,
+    extra,
+    splatEncoding: parts[0]?.encoding ?? ENCODING,
+  });
 }

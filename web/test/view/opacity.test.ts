@@ -4,7 +4,7 @@ import { describe, expect, test } from "vitest";
 import streams from "../../../tests/data/streams.json?raw";
 import { StreamDecoder } from "../../src/core/stream";
 import { blendOpacities } from "../../src/view/opacity";
-import { Packing } from "../../src/view/packing";
+import { ENCODING, Packing } from "../../src/view/packing";
 
 interface Case {
   name: string;
@@ -50,7 +50,13 @@ describe.each(cases)("$name", (one) => {
 test("a logit is linear in the weight", () => {
   const logit = (byte: number) => Math.log(byte / (255 - byte));
   const opacities = Uint8Array.from({ length: 254 * 2 }, (_, i) => 1 + ((i * 89) % 254));
-  const part = { count: 254, splats: new Uint32Array(4 * 254), harmonics: new Map(), opacities };
+  const part = {
+    count: 254,
+    encoding: ENCODING,
+    splats: new Uint32Array(4 * 254),
+    harmonics: new Map(),
+    opacities,
+  };
   for (const weight of [0, 0.25, 0.6, 1]) {
     const words = new Uint32Array(4 * 254);
     blendOpacities(words, [part], weight);
@@ -62,7 +68,13 @@ test("a logit is linear in the weight", () => {
 });
 
 test("parts with one opacity stay as they are", () => {
-  const part = { count: 2, splats: new Uint32Array(8), harmonics: new Map(), opacities: null };
+  const part = {
+    count: 2,
+    encoding: ENCODING,
+    splats: new Uint32Array(8),
+    harmonics: new Map(),
+    opacities: null,
+  };
   const words = new Uint32Array(8).fill(0x7f123456);
   blendOpacities(words, [part], 1);
   expect([...words]).toEqual(Array(8).fill(0x7f123456));

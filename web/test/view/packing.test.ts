@@ -5,7 +5,7 @@ import { describe, expect, test } from "vitest";
 import streams from "../../../tests/data/streams.json?raw";
 import { BASES } from "../../src/core/columns";
 import { StreamDecoder } from "../../src/core/stream";
-import { ENCODING, HARMONICS, Packing, WORDS } from "../../src/view/packing";
+import { STREAM_ENCODING as ENCODING, HARMONICS, Packing, WORDS } from "../../src/view/packing";
 import { Floats, type Gaussians } from "../floats";
 
 interface Case {
