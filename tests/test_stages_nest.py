@@ -156,7 +156,8 @@ def test_they_are_sorted_again_by_what_they_have_become_worth(scene: Scene, monk
     monkeypatch.setattr(nested, "_SORT_AT", (0,))
     start, config = ordered(), replace(QUICK, steps=1)
     result = trained(scene, start, config)
-    worth = importance(start.gaussians, scene, scene.train_ids.tolist(), config.criterion)
+    views, drawn = scene.train_ids.tolist(), TrainConfig().antialiased
+    worth = importance(start.gaussians, scene, views, config.criterion, antialiased=drawn)
     rows = np.lexsort((-worth, start.ranks, start.gaussians.label_ids.numpy()))
     assert (rows != np.arange(60)).any()
     assert (result.ranks == start.ranks[rows]).all()
