@@ -238,6 +238,11 @@ def _figures(
     encoded = next(p for p in points if p.method == AS_ONE)
     return {
         "test_views": len(job.scene.test_ids),
+        "steps": {
+            "train": settings_of(job.run, "train")["max_steps"],
+            "nest": settings_of(job.run, "nest")["steps"],
+            "as_one": as_one.step - job.snapshots.levels[-1],
+        },
         "antialiased": job.antialiased,
         "trained_gaussians": sum(read_header(job.trained).counts.values()),
         "encoder": "+".join(sorted(encoder)),

@@ -270,7 +270,8 @@ def test_a_live_bundle_follows_the_training(run: Path, tmp_path: Path, viewer: P
             assert label["quality"] == {}
             assert label["boxes"]
     write_json(
-        run / "provenance" / "train.json", {"format": FORMAT, "settings": {"antialiased": False}, "inputs": {}}
+        run / "provenance" / "train.json",
+        {"format": FORMAT, "settings": {"antialiased": False}, "inputs": {}},
     )
     assert manifest_of(folder)["antialiased"]
     later[-1].touch()
