@@ -124,7 +124,7 @@ def open_job(folder: Path, scene: str, asked: Asked, say: Say) -> Job:
     run = given if (given / "scene.json").exists() else folder / given.name
     backend = resolve_backend("auto", asked.device)
     job = Job(RunDir(run, "nested"), _told(run.name, say), backend, device=asked.device)
-    if not (run / "scene.json").exists():
+    if run != given and not any(job.run.levels.glob("*.npz")):  # a killed training resumes
         _train(job, folder, scene, asked)
     if not job.run.prefixes.exists():
         config = replace(_config(scene, asked).nest, steps=asked.nest_steps, base_steps=asked.base_steps)
