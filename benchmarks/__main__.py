@@ -738,7 +738,7 @@ def size(
             for path in size_tables.write_survey(folder / "survey", found):
                 print(f"{path}\n{path.read_text()}")
         results[found.scene] = size_tables.summary(found) | {"measured_in_s": time.perf_counter() - begin}
-    _finish("size", {"steps": asked.steps, "scenes": results}, write, RESULTS.parent)
+    _finish("size", {"scenes": results}, write, RESULTS.parent)
 
 
 @app.command

@@ -124,7 +124,7 @@ def open_job(folder: Path, scene: str, asked: Asked, say: Say) -> Job:
     run = given if (given / "scene.json").exists() else folder / given.name
     backend = resolve_backend("auto", asked.device)
     job = Job(RunDir(run, "nested"), _told(run.name, say), backend, device=asked.device)
-    if not (run / "scene.json").exists():
+    if run != given and not any(job.run.levels.glob("*.npz")):  # a killed training resumes
         _train(job, folder, scene, asked)
     if not job.run.prefixes.exists():
         config = replace(_config(scene, asked).nest, steps=asked.nest_steps, base_steps=asked.base_steps)
@@ -238,6 +238,11 @@ def _figures(
     encoded = next(p for p in points if p.method == AS_ONE)
     return {
         "test_views": len(job.scene.test_ids),
+        "steps": {
+            "train": settings_of(job.run, "train")["max_steps"],
+            "nest": settings_of(job.run, "nest")["steps"],
+            "as_one": as_one.step - job.snapshots.levels[-1],
+        },
         "antialiased": job.antialiased,
         "trained_gaussians": sum(read_header(job.trained).counts.values()),
         "encoder": "+".join(sorted(encoder)),

@@ -156,7 +156,7 @@ def test_cross_view_rows_hold_together(finished):
     assert np.isnan(whole.predicted).all()
     assert len(whole) == 3 * len(job.scene.test_ids)
     parts = table.select(table.label_id != TOTAL)
-    masks = RenderedLabels(job.ladder.load(90))
+    masks = RenderedLabels(job.ladder.load(90), antialiased=job.antialiased)
     for row in range(len(parts)):
         pixels = masks[job.scene.views[parts.view[row]]] == parts.label_id[row]
         assert parts.num_pixels[row] == pixels.sum() > 0
