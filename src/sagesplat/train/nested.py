@@ -211,11 +211,11 @@ def nest(
 
     Each step draws a prefix of every category, log-uniform between `config.drawn_from` and 1, or the full
     model (with a probability that rises from `config.full_share` to `config.full_share_end`; a fifth of these
-    steps draw prefixes between 40 and 100 %), and compares the composition with a photo. Values are rounded as the increments will hold them. Gaussians outside the
-    composition, and their Adam moments, stay as they are. With `config.two_opacities` each category is drawn
-    with the opacities that its prefix has, between the first and the second ones. At five steps all Gaussians
-    are sorted again by importance: in each category boundary Gaussians stay first, then the base model, then
-    the others.
+    steps draw prefixes between 40 and 100 %), and compares the composition with a photo. Values are rounded
+    as the increments will hold them. Gaussians outside the composition, and their Adam moments, stay as they
+    are. With `config.two_opacities` each category is drawn with the opacities that its prefix has, between
+    the first and the second ones. At five steps all Gaussians are sorted again by importance: in each
+    category boundary Gaussians stay first, then the base model, then the others.
 
     Args:
         nested: The ordered model to start from (`order`).
