@@ -106,7 +106,7 @@ def compare(
     partition = read_blocks(job.run.blocks / "blocks.json")
     files = [job.run.block(number).interior for number in range(len(partition))]
     sets = {
-        "blocks, put together": together(files)[0],
+        "blocks, put together": together(files).full,
         "blocks, tuned": read_prefixes(job.run.prefixes).gaussians,
         "as one": read_prefixes(other.run.prefixes).gaussians,
     }

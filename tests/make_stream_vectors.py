@@ -2,11 +2,14 @@
 
 A case of tests/data/streams.json has the bytes of a stream as base64, where each level ends in them and how
 many Gaussians there are up to it, and what they are decoded to, in right, up, back, to 1e-6: means, quats
-(w x y z), log_scales, opacities, sh0 and shN (coefficient by coefficient, red, green, blue).
+(w x y z), log_scales, opacities, sh0 and shN (coefficient by coefficient, red, green, blue). With two
+opacities `opacities` are the first ones, `seconds` the second ones, `weights` those of the second ones at
+each level in 1/255, and `levels` the opacities of all Gaussians up to each level where it is the newest one.
 """
 
 import base64
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +17,12 @@ import numpy as np
 import torch
 
 from sagesplat.core.gaussians import Gaussians
+from sagesplat.core.second_opacity import SecondOpacities
 from sagesplat.formats.stream import decode_stream, encode_stream
 from sagesplat.formats.stream_header import Precision, turned_round
 
 DATA = Path(__file__).parent / "data" / "streams.json"
+OLD = Precision(1 / 8, 6, rotation=0.0, least=0.5)
 Case = dict[str, Any]
 
 
@@ -55,28 +60,44 @@ def cases() -> list[Case]:
     return [
         case("degree 0", waves(5, 0), [2, 5]),
         case("degree 1, an empty level", waves(20, 1), [6, 6, 20]),
-        case("degree 2, other steps", waves(24, 2), [24], Precision(1 / 30, 3, 1.3, 0.07, (6, 5), 2.0)),
+        case("degree 2, other steps", waves(24, 2), [24], Precision(1 / 30, 3, 1.3, 0.07, (6, 5), 2.0, 0.5)),
         case("degree 3, several blocks", waves(60, 3), [1, 20, 60]),
-        case("escapes", far_off(20), [4, 20], Precision(log_scale=0.05, sh_bits=(8, 8))),
+        case("escapes", far_off(20), [4, 20], replace(OLD, log_scale=0.05, sh_bits=(8, 8))),
         case("none", waves(0, 3), [0]),
+        case("two opacities", waves(60, 1), [3, 20, 45, 60], Precision(), (0.0, 0.0, 0.4, 1.0)),
+        case(
+            "two opacities, empty levels", waves(40, 0), [0, 20, 20, 40, 40], Precision(), (0, 0, 0.3, 0.7, 1)
+        ),
     ]
 
 
-def case(name: str, g: Gaussians, sizes: list[int], precision: Precision = Precision()) -> Case:
+def case(
+    name: str, g: Gaussians, sizes: list[int], precision: Precision = OLD, weights: tuple[float, ...] = ()
+) -> Case:
     """A stream and what it decodes to."""
-    coded = encode_stream(g, sizes, precision=precision)
-    found = turned_round(decode_stream(coded.content).gaussians)
+    second = SecondOpacities(g.logit_opacities.flip(0) - 1, {-1: weights}) if weights else None
+    coded = encode_stream(g, sizes, second=second, precision=precision)
+    decoded = decode_stream(coded.content)
+    found = turned_round(decoded.gaussians)
     values = {name: value for name, value in found.parameters().items() if name != "logit_opacities"}
     values["opacities"] = torch.sigmoid(found.logit_opacities.double())
-    return {
+    made: Case = {
         "name": name,
         "content": base64.b64encode(coded.content).decode(),
         "ends": coded.ends,
         "sizes": coded.sizes,
-        "gaussians": {
-            name: np.round(value.double().numpy().ravel(), 7).tolist() for name, value in values.items()
-        },
+        "gaussians": {name: _plain(value) for name, value in values.items()},
     }
+    if decoded.second:
+        made["weights"] = [round(255 * weight) for weight in coded.weights]
+        made["gaussians"]["seconds"] = _plain(torch.sigmoid(decoded.second.logits.double()))
+        newest = [decode_stream(coded.content, k).shown().logit_opacities for k in range(1, 1 + len(sizes))]
+        made["levels"] = [_plain(torch.sigmoid(logits.double())) for logits in newest]
+    return made
+
+
+def _plain(values: torch.Tensor) -> list[float]:
+    return np.round(values.double().numpy().ravel(), 7).tolist()
 
 
 if __name__ == "__main__":

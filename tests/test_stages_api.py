@@ -26,6 +26,7 @@ from sagesplat.core.config import SampleConfig
 from sagesplat.core.errors import RunError
 from sagesplat.demo.capture import make_capture
 from sagesplat.formats.splats import read_splat
+from sagesplat.stages.export import export_scene
 
 CONFIG = RunConfig(
     train=TrainConfig(max_steps=60, level_every=20),
@@ -50,10 +51,20 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, FinishedRun]:
     return found
 
 
-def test_a_composed_scene_says_how_it_was_trained(runs):
+def test_a_composed_scene_is_for_viewers_that_do_not_antialias(runs, tmp_path):
     run = runs["nested"]
     assert run.antialiased is CONFIG.train.antialiased is True
-    assert read_splat(run.job.run.composed).antialiased
+    written = read_splat(run.job.run.composed)
+    assert not written.antialiased
+    (plan,) = (plan for plan in run.plans if plan.target == 0.4)
+    assert (written.gaussians.logit_opacities <= run.compose(plan).logit_opacities + 1e-4).all()
+    for mode in ("classic", "antialiased"):
+        path = tmp_path / f"{mode}.ply"
+        export_scene(run.job, path, level=1, labels=(), target=None, rasterize_mode=mode)
+        assert read_splat(path).antialiased is (mode == "antialiased")
+    levels = tmp_path / "lod-meta.json"
+    with pytest.raises(RunError, match=r"lod-meta.json: says how it is drawn; leave out --rasterize-mode$"):
+        export_scene(run.job, levels, level=None, labels=(), target=None, rasterize_mode="classic")
 
 
 @pytest.mark.parametrize("ladder", ["nested", "snapshots"])

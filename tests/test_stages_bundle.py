@@ -23,11 +23,13 @@ from sagesplat.run.job import Job
 from sagesplat.run.records import FORMAT, checkpoint_key, input_hashes
 from sagesplat.run.run_dir import RunDir
 from sagesplat.stages.bundle import _antialiased, bundle, live_bundle
+from sagesplat.stages.export import increment_files
 from sagesplat.stages.methods import NestedLevels
 from sagesplat.stages.plan import main_target
 from sagesplat.stages.results import increments_of
 from sagesplat.stages.scene import open_scene
 from sagesplat.stages.view import run_bundle
+from sagesplat.studies.measure.levels import levels_of
 from sagesplat.train.checkpoint import write_checkpoint
 from sagesplat.train.state import initial_state
 from sagesplat.viewer.built import package_viewer
@@ -218,7 +220,7 @@ def test_bad_input_is_one_line(run: Path, tmp_path: Path, viewer: Path) -> None:
         bundle(job, out, viewer=tmp_path / "nothing")
     with pytest.raises(RunError, match="no nested/increments"):
         bundle(job_of(tmp_path / "nowhere"), out, viewer=viewer)
-    chunk = next((run / "nested" / "increments").glob("*.spz"))
+    chunk = next((run / "nested" / "increments").glob("*.sgst"))
     chunk.write_bytes(chunk.read_bytes()[:-1])
     with pytest.raises(DataError, match=f"{chunk.name}: "):
         bundle(job, out, viewer=viewer)
@@ -345,13 +347,47 @@ def test_a_run_with_levels_that_replace(run: Path, tmp_path: Path, viewer: Path)
         increments_of(job_of(run))
 
 
+def test_streams_as_files_of_spz(run: Path, tmp_path: Path, viewer: Path) -> None:
+    job = job_of(run)
+    made, listed = bundle(job, tmp_path / "spz", chunks="spz", viewer=viewer), increments_of(job)
+    assert (made.chunks, made.count) == (len(listed), sum(one.count for one in listed))
+    manifest = manifest_of(tmp_path / "spz")
+    assert (manifest["version"], manifest["promises"]) == (2, {})  # one opacity: none of lower levels holds
+    assert {path.suffix for path in (tmp_path / "spz" / "chunks").iterdir()} == {".spz"}
+    (full, *_), (wanted, *_) = levels_of(tmp_path / "spz"), levels_of(run)
+    g, streamed = full.load().gaussians, wanted.load().gaussians
+    assert torch.equal(g.shN, streamed.shN)
+    torch.testing.assert_close(g.sh0, streamed.sh0, rtol=0, atol=1e-4)
+    torch.testing.assert_close(g.log_scales, streamed.log_scales, rtol=0, atol=1e-4)
+    torch.testing.assert_close(g.logit_opacities, streamed.logit_opacities, rtol=0, atol=1e-4)
+    torch.testing.assert_close(g.means, streamed.means, rtol=0, atol=0.04)  # an eighth of their size
+
+
+def test_a_run_without_streams_has_none_to_bundle(run: Path, tmp_path: Path, viewer: Path) -> None:
+    job = job_of(run)
+    increment_files(job, tmp_path / "files", "spz")
+    shutil.rmtree(job.run.increments)
+    (tmp_path / "files").rename(job.run.increments)
+    record = run / "nested" / "provenance" / "fit.json"
+    made = json.loads(record.read_text())
+    made["inputs"] |= input_hashes(job.run, [job.run.increments / "index.json"])
+    record.write_text(json.dumps(made))
+    with pytest.raises(RunError, match="in SPZ files, not in coded streams; leave out --chunks"):
+        bundle(job, tmp_path / "out", chunks="stream", viewer=viewer)
+    made = bundle(job, tmp_path / "out", chunks="spz", viewer=viewer)  # as of a run of an earlier version
+    assert made.count == len(levels_of(run)[0].load().gaussians)
+    assert manifest_of(tmp_path / "out")["version"] == 2
+
+
 def test_a_run_as_one_page(run: Path, tmp_path: Path) -> None:
     if not (package_viewer() / "index.html").exists():
         pytest.skip("the viewer is not built")
     job, out = job_of(run), tmp_path / "scene.html"
     made = bundle(job, out, single_file=True, weights={"car": 3})
     assert made.sizes.total == out.stat().st_size > made.sizes.chunks
-    assert out.read_text().count('data-uri="chunks/') == made.chunks == len(read_index(job.run.increments))
+    listed = read_index(job.run.increments)
+    assert made.chunks == len(listed)
+    assert out.read_text().count('data-uri="chunks/') == len({one.uri for one in listed})
     with pytest.raises(RunError, match=r"name that ends in \.html"):
         bundle(job, tmp_path / "folder", single_file=True)
 

@@ -73,11 +73,15 @@ def test_everything_is_drawn_more_often_in_the_end() -> None:
     config, rng = NestConfig(full_share=0.1, full_share_end=0.9, drawn_from=0.05), np.random.default_rng(0)
     for done, share in ((0.0, 0.1), (0.5, 0.5), (1.0, 0.9)):
         drawn = np.stack([draw_shares(rng, 3, config, done) for _ in range(2000)])
-        assert (drawn == 1).all(1).mean() == pytest.approx(share, abs=0.04)
+        assert (drawn == 1).all(1).mean() == pytest.approx(0.8 * share, abs=0.04)
+        assert ((drawn >= 0.4).all(1) & (drawn < 1).all(1)).mean() > 0.15 * share
         assert drawn.min() >= 0.05 - 1e-6
         parts = np.log(drawn[(drawn < 1).any(1)])
-        assert parts.mean() == pytest.approx(np.log(0.05) / 2, abs=0.15)  # log-uniform
-        assert abs(np.corrcoef(parts.T)[0, 1]) < 0.2  # each category by itself
+        nearly = 0.2 * share / (1 - 0.8 * share)
+        mean = (1 - nearly) * np.log(0.05) / 2 + nearly * np.log(0.7)
+        assert parts.mean() == pytest.approx(mean, abs=0.15)  # log-uniform, but for these
+        if done == 0:
+            assert abs(np.corrcoef(parts.T)[0, 1]) < 0.2  # each category by itself
 
 
 @pytest.fixture
@@ -156,8 +160,13 @@ def test_they_are_sorted_again_by_what_they_have_become_worth(scene: Scene, monk
     monkeypatch.setattr(nested, "_SORT_AT", (0,))
     start, config = ordered(), replace(QUICK, steps=1)
     result = trained(scene, start, config)
-    views, drawn = scene.train_ids.tolist(), TrainConfig().antialiased
-    worth = importance(start.gaussians, scene, views, config.criterion, antialiased=drawn)
+    worth = importance(
+        start.gaussians,
+        scene,
+        scene.train_ids.tolist(),
+        config.criterion,
+        antialiased=TrainConfig().antialiased,
+    )
     rows = np.lexsort((-worth, start.ranks, start.gaussians.label_ids.numpy()))
     assert (rows != np.arange(60)).any()
     assert (result.ranks == start.ranks[rows]).all()
@@ -177,6 +186,23 @@ def test_what_is_not_drawn_stays_as_it_is(scene: Scene, monkeypatch) -> None:
     assert len(few) < 40
 
 
+@pytest.mark.parametrize("full", [True, False])
+def test_the_full_model_trains_second_opacities_and_low_levels_the_first(scene, monkeypatch, full) -> None:
+    monkeypatch.setattr(nested, "_SORT_AT", ())
+    monkeypatch.setattr(nested, "weight_at", lambda shares: np.float32(shares == 1))
+    given = torch.linspace(-1, 1, 60)
+    start = replace(ordered(), second_opacities=given)
+    config = replace(QUICK, steps=2, full_share=float(full), full_share_end=float(full))
+    result = trained(scene, start, config)
+    first = result.gaussians.logit_opacities != start.gaussians.logit_opacities
+    assert result.second_opacities is not None
+    second = result.second_opacities != given
+    assert (second.any(), first.any()) == ((True, False) if full else (False, True))
+    alone = trained(scene, start, replace(config, two_opacities=False))
+    assert alone.second_opacities is None
+    assert (alone.gaussians.logit_opacities != start.gaussians.logit_opacities).any()
+
+
 def test_a_killed_training_goes_on_bit_for_bit(scene: Scene, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(nested, "_SAVE_EVERY", 4)
     whole = trained(scene, ordered(), QUICK)
@@ -188,6 +214,10 @@ def test_a_killed_training_goes_on_bit_for_bit(scene: Scene, tmp_path: Path, mon
     resumed = trained(scene, ordered(), QUICK, checkpoint=file, settings="a")
     for name, value in whole.gaussians.parameters().items():
         assert torch.equal(value, resumed.gaussians.parameters()[name]), name
+    assert whole.second_opacities is not None
+    assert resumed.second_opacities is not None
+    assert torch.equal(whole.second_opacities, resumed.second_opacities)
+    assert not torch.equal(whole.second_opacities, whole.gaussians.logit_opacities)
     with pytest.raises(RunError, match="other settings"):
         next(iter(nest(ordered(), scene, Photos(scene.views), TrainConfig(), QUICK, checkpoint=file)))
 

@@ -6,7 +6,7 @@ import json
 import re
 import shutil
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -20,8 +20,10 @@ from browser import Opened, open_page
 from make_viewer_vectors import model
 
 from sagesplat.adapt.viewpoint import QualityKind, ViewModel
-from sagesplat.core.gaussians import Gaussians
+from sagesplat.core.gaussians import Gaussians, concat
+from sagesplat.core.second_opacity import SecondOpacities, blended
 from sagesplat.formats.increments import full_scene, read_increments, shown, write_increments
+from sagesplat.formats.stream_increments import read_streams, write_streams
 from sagesplat.raster import rasterize
 from sagesplat.scene.scene import Camera
 from sagesplat.viewer.built import package_viewer
@@ -313,6 +315,54 @@ def test_levels_that_replace_are_drawn_alone_and_change_in_one_frame(tmp_path: P
     assert min(seen)[0] < 3  # below the level that replaces, too
     assert min(sample["lit"] for sample in samples) > 0.05  # no hole
     assert max(sample["drawn"] for sample in samples) <= 150 + 200 + 150  # nothing twice
+
+
+def test_streams_are_drawn_as_the_rasterizer_draws_each_of_their_levels(browser, tmp_path) -> None:
+    """Also with two opacities, on the way up and down: what is drawn depends on the newest level."""
+    g = cloud()
+    names = {1: "brick", 2: "grass-merged", 3: "sky-other-merged"}
+    second = SecondOpacities(g.logit_opacities - 3, dict.fromkeys(names, (0.0, 0.0, 0.4, 1.0)))
+    streams = write_streams(tmp_path / "streams", g, SIZES, names, second=second)
+    contents = replace(three_walls(tmp_path), chunks=streams.increments, folder=tmp_path / "streams")
+    write_bundle(tmp_path / "bundle", contents, package_viewer())
+    ladder, kept = read_streams(contents.folder, contents.chunks)
+    assert kept is not None
+    with (
+        serve(tmp_path / "bundle") as url,
+        open_page(f"{url}?ui=0&view=photo1.jpg", browser=browser) as opened,
+    ):
+        ready(opened)
+        settled(opened)
+        opened.page.evaluate(WATCH)
+        seen = set()
+        for count in (WHOLE, BASE, 350):
+            budget = f"{{ bytes: Infinity, gpuBytes: Infinity, count: {count} }}"
+            opened.page.evaluate(f"sagesplat.set({{ mode: 'budget', budget: {budget} }})")
+            opened.wait_for("sagesplat.state().labels.every((l) => l.shown === l.wanted)")
+            picture = settled(opened)
+            levels = dict(opened.page.evaluate("sagesplat.state().labels.map((l) => [l.label.id, l.shown])"))
+            held = at_levels(ladder, kept, streams.sizes, levels)
+            wanted = rasterize(held, camera(0.2), backend="cpu", antialiased=False).rgb.clamp(0, 1).numpy()
+            assert -10 * np.log10(((picture - wanted) ** 2).mean()) > 30  # dB
+            seen.add(tuple(levels.values()))
+        samples = opened.page.evaluate("samples")
+        assert opened.complaints == []
+    assert (4, 4, 4) in seen
+    assert (1, 1, 1) in seen
+    assert min(sample["lit"] for sample in samples) > 0.05  # no hole
+
+
+def at_levels(
+    g: Gaussians, second: SecondOpacities, sizes: Mapping[int, Sequence[int]], levels: Mapping[int, int]
+) -> Gaussians:
+    """The Gaussians of some levels, with their opacities there."""
+    parts = []
+    for label, level in levels.items():
+        rows = torch.nonzero(g.label_ids == label)[: sizes[label][level - 1], 0]
+        weight = second.weights[label][level - 1]
+        logits = blended(g.logit_opacities[rows], second.logits[rows], weight)
+        parts.append(replace(g.select(rows), logit_opacities=logits))
+    return concat(parts)
 
 
 def test_a_walk_with_swaps_has_no_empty_frame_and_keeps_the_budget(viewer: Opened) -> None:

@@ -20,13 +20,15 @@ from scipy.spatial.transform import Rotation
 
 from sagesplat.adapt.viewpoint import NO_CALIBRATION, Calibration, QualityKind, ViewModel
 from sagesplat.core.errors import DataError, RunError, SageError
+from sagesplat.core.second_opacity import SecondOpacities
 from sagesplat.formats.increments import write_increments
 from sagesplat.formats.ply import read_ply
 from sagesplat.formats.spz import read_spz
+from sagesplat.formats.stream_increments import write_streams
 from sagesplat.io.lock import alone
 from sagesplat.scene.scene import Camera
 from sagesplat.viewer import boxes, frames, promises
-from sagesplat.viewer.bundle import SCHEMA, is_bundle, write_bundle, write_documents
+from sagesplat.viewer.bundle import SCHEMA, has_viewer, is_bundle, write_bundle, write_documents
 from sagesplat.viewer.frames import FLIP
 from sagesplat.viewer.manifest import CameraEntry, Category, Contents, documents
 from sagesplat.viewer.pack import NEARBY, Ladder, gains_of, order_of
@@ -446,6 +448,19 @@ def test_the_pack_is_the_chunks_in_its_order(tmp_path, contents, viewer) -> None
     assert sorted(pack["order"][:3]) == [[0, 1], [1, 1], [2, 1]]  # the smallest of everything
 
 
+def test_the_page_names_the_pack(tmp_path, contents, viewer) -> None:
+    (viewer / "index.html").write_text("<head><!-- pack --></head>")
+    out = tmp_path / "out"
+    for _ in range(2):
+        write_bundle(out, contents, viewer)
+        pack = json.loads((out / "manifest.json").read_text())["pack"]
+        assert (
+            out / "index.html"
+        ).read_text() == f'<head><meta name="pack" content="{pack["uri"]}" /></head>'
+        assert has_viewer(out, viewer)
+        write_documents(out, contents)  # names it anew
+
+
 def test_a_live_bundle_has_no_pack(tmp_path, contents) -> None:
     write_documents(tmp_path, replace(contents, live=True))
     assert manifest_of(tmp_path)["pack"] is None
@@ -477,6 +492,39 @@ def test_levels_that_replace_are_in_the_manifest_and_others_leave_it_as_it_was(
     assert written.chunks == sum(chunk.nbytes for chunk in chunks) > manifest["totals"]["bytes"]
     assert manifest["pack"]["bytes"] == written.chunks
     assert len(read_ply(tmp_path / "out" / label["levels"][2]["uri"])) == label["levels"][2]["count"] == 14
+
+
+def test_coded_streams_are_ranges_in_manifest_and_pack(tmp_path, contents, viewer) -> None:
+    labels = torch.tensor([-1] * 10 + [3] * 20 + [184] * 9, dtype=torch.int16)
+    g = replace(random_gaussians(39, degree=1, logit=3), label_ids=labels)
+    second = SecondOpacities(g.logit_opacities - 1, dict.fromkeys(SIZES, (0.0, 0.5, 1.0)))
+    made = write_streams(tmp_path / "chunks", g, SIZES, {3: "car", 184: "tree"}, second=second)
+    written = write_bundle(tmp_path / "out", replace(contents, chunks=made.increments), viewer)
+    manifest = manifest_of(tmp_path / "out")
+    assert manifest["version"] == 4
+    listed = [level for label in manifest["labels"] for level in label["levels"]]
+    assert [level["offset"] for level in listed] == [one.offset for one in made.increments]
+    assert [level["weight"] for level in listed] == [round(one.weight or 0, 6) for one in made.increments]
+    assert {level["format"] for level in listed} == {"stream"}
+    assert len(list((tmp_path / "out" / "chunks").iterdir())) == 3
+    packed, at = (tmp_path / "out" / manifest["pack"]["uri"]).read_bytes(), 0
+    for index, level in manifest["pack"]["order"]:
+        entry = manifest["labels"][index]["levels"][level - 1]
+        part = packed[at : at + entry["bytes"]]
+        assert hashlib.sha256(part).hexdigest() == entry["sha256"]
+        at += len(part)
+    assert at == len(packed) == written.chunks == manifest["totals"]["bytes"]
+
+
+@pytest.mark.parametrize("wrong", [b"", b"x", b"xx"])
+def test_a_damaged_stream_is_named(tmp_path, contents, viewer, wrong) -> None:
+    labels = torch.tensor([3] * 39, dtype=torch.int16)
+    g = replace(random_gaussians(39, degree=1, logit=3), label_ids=labels)
+    made = write_streams(tmp_path / "chunks", g, {3: (9, 39)}, {3: "car"})
+    path = tmp_path / "chunks" / made.increments[0].uri
+    path.write_bytes(path.read_bytes()[:-1] + wrong)  # cut off, changed, continued
+    with pytest.raises(DataError, match=rf"{path.name}: not the chunk that was written; .*sagesplat nest"):
+        write_bundle(tmp_path / "out", replace(contents, chunks=made.increments), viewer)
 
 
 def test_in_the_pack_what_the_first_view_skips_comes_last() -> None:

@@ -33,11 +33,13 @@ from sagesplat.viewer import connections, site
 from sagesplat.viewer.hosts import Hosts
 
 CHUNK = "chunks/grass-01-0123456789ab.spz"
+STREAM = "chunks/grass-0123456789ab.sgst"
 PROMISES = "promises-0123456789ab.json"
 FILES = {
     "manifest.json": b'{"format": "sagesplat-bundle", "labels": []}',
     "index.html": b"<!doctype html><title>viewer</title>" + b"<p>text" * 500,
     CHUNK: bytes(range(256)) * 1000,
+    STREAM: b"SGST" + bytes(range(100)),
     "scene-0123456789ab.pack": bytes(1000),
     PROMISES: b"[" + b"0.5," * 900 + b"1]",
     "assets/index-CmV_C-3Q.js": b"export const a = 1\n" * 300,
@@ -191,7 +193,7 @@ def test_text_is_packed_and_chunks_are_not(port: int):
         _, plain, _ = ask(port, "/" + name)
         status, headers, body = ask(port, "/" + name, accept_encoding="br, gzip;q=0.8")
         assert (status, int(headers["content-length"])) == (200, len(body))
-        if name.endswith((".spz", ".pack")):
+        if name.endswith((".sgst", ".spz", ".pack")):
             assert (body, headers.get("content-encoding"), headers.get("vary")) == (content, None, None)
         else:
             assert (gzip.decompress(body), headers["content-encoding"]) == (content, "gzip")
@@ -209,6 +211,15 @@ def test_a_range(port: int):
         assert headers["cache-control"].endswith("immutable")
     html = ask(port, "/index.html", range="bytes=0-3", accept_encoding="gzip")
     assert (html[0], html[2]) == (206, FILES["index.html"][:4])
+
+
+def test_a_range_of_a_coded_stream(port: int):
+    status, headers, body = ask(port, "/" + STREAM, range="bytes=44-59", accept_encoding="gzip")
+    assert (status, body) == (206, FILES[STREAM][44:60])
+    assert headers["content-range"] == "bytes 44-59/104"
+    assert headers["content-type"] == "application/octet-stream"
+    assert headers["cache-control"].endswith("immutable")
+    assert ask(port, "/" + STREAM)[1]["accept-ranges"] == "bytes"
 
 
 def test_several_ranges(port: int):

@@ -147,8 +147,10 @@ def _camera_files(folder: Path, size: int) -> list[bytes]:
 
 def _bundled(folder: Path, size: int) -> list[bytes]:
     chunk = {"uri": "chunks/a.spz", "count": 3, "bytes": 9, "gpuBytes": 9, "sha256": "0" * 64}
-    label = {"id": 2, "title": "sky", "levels": [chunk, chunk | {"refine": "REPLACE"}] * size}
-    return as_json({"format": "sagesplat-bundle", "antialiased": True, "labels": [label]})
+    files = [chunk, chunk | {"refine": "REPLACE"}] * size
+    ranges = [chunk | {"uri": "chunks/a.sgst", "offset": 9 * i, "weight": 0.5} for i in range(size)]
+    labels = [{"id": i, "title": "sky", "levels": levels} for i, levels in enumerate((files, ranges))]
+    return as_json(*({"format": "sagesplat-bundle", "antialiased": True, "labels": [one]} for one in labels))
 
 
 def _cameras(folder: Path, size: int) -> list[bytes]:

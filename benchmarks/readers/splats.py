@@ -2,7 +2,9 @@
 
 import json
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,11 +13,13 @@ from benchmarks.hostile import Reader
 from benchmarks.readers.making import PHOTOS, as_json, file, splats, written
 from sagesplat.adapt.ladder import read_ladder, read_prefixes
 from sagesplat.core.gaussians import Gaussians
+from sagesplat.core.second_opacity import SecondOpacities
 from sagesplat.formats.increments import read_increments, read_index, totals
 from sagesplat.formats.levels import check_level, read_level, write_level, write_set
 from sagesplat.formats.ply import read_ply, write_ply
 from sagesplat.formats.spz import encode_spz, read_spz
 from sagesplat.formats.stream import decode_stream, encode_stream
+from sagesplat.formats.stream_increments import read_streams
 from sagesplat.scene.scene import Camera, Lens, Points, Scene, View
 from sagesplat.scene.stored import read_scene, write_scene
 from sagesplat.segment.lift import LiftedLabels
@@ -41,7 +45,9 @@ def _spz(folder: Path, size: int) -> list[bytes]:
 def _streams(folder: Path, size: int) -> list[bytes]:
     if size > 1:  # the best that the coder can do: nothing but the likeliest symbols
         return [encode_stream(_equal(3 * size), [size, 3 * size]).content]
-    return [encode_stream(splats(5, bases), [1, 3, 5]).content for bases in (0, 3, 15)]
+    second = SecondOpacities(torch.linspace(-3, 3, 5), {2: (0.0, 0.5, 1.0)})
+    some = [encode_stream(splats(5, bases), [1, 3, 5]).content for bases in (0, 3, 15)]
+    return [*some, encode_stream(splats(5), [1, 3, 5], second=second).content]
 
 
 def _equal(count: int) -> Gaussians:
@@ -56,7 +62,22 @@ def _index(folder: Path, size: int) -> list[bytes]:
     write_ply(folder / "sky-02.ply", splats())
     replacing = chunk | {"uri": "sky-02.ply", "level": 2, "refine": "REPLACE"}
     both = {"format": "spz+ply", "chunks": [chunk, replacing]}
-    return as_json({"format": "spz", "chunks": chunks}, {"format": "spz", "chunks": [chunk, chunk]}, both)
+    streams = {"format": "stream", "chunks": _ranges(folder)}
+    return as_json(
+        {"format": "spz", "chunks": chunks}, {"format": "spz", "chunks": [chunk, chunk]}, both, streams
+    )
+
+
+def _ranges(folder: Path) -> list[dict[str, Any]]:
+    """The entries of a coded stream with two opacities, which lies in the folder."""
+    second = SecondOpacities(torch.linspace(-3, 3, 5), {2: (0.0, 0.5, 1.0)})
+    coded = encode_stream(splats(5), [1, 3, 5], second=second)
+    (folder / "sky-0.sgst").write_bytes(coded.content)
+    return [
+        CHUNK
+        | {"uri": "sky-0.sgst", "level": k, "count": k, "nbytes": high - low, "offset": low, "weight": w}
+        for k, (low, high), w in zip((1, 2), pairwise((0, *coded.ends)), coded.weights, strict=False)
+    ]
 
 
 def _read_index(path: Path) -> None:
@@ -64,6 +85,8 @@ def _read_index(path: Path) -> None:
     totals(chunks, [2, 5], 3, "nbytes")
     if len(chunks) < 10:  # what many chunks hold is not bounded by their index
         read_increments(path.parent, chunks)
+        if {chunk.format for chunk in chunks} == {"stream"}:
+            read_streams(path.parent, chunks)
 
 
 def _checkpoints(folder: Path, size: int) -> list[bytes]:

@@ -17,9 +17,13 @@ export function sourceInside(page: ParentNode): Source | null {
   const files = new Map([...elements].map((one) => [new URL(one.dataset.uri ?? "", BASE).href, one]));
   return {
     base: BASE,
-    fetch: async (url) => {
-      const element = files.get(url);
-      return element ? replyOf(bytesOf(element.textContent ?? "")) : MISSING;
+    fetch: async (url, init) => {
+      const text = files.get(url)?.textContent;
+      if (text === undefined || text === null) return MISSING;
+      const range = /^bytes=(\d+)-(\d+)$/.exec(new Headers(init?.headers).get("Range") ?? "");
+      return range
+        ? replyOf(rangeOf(text, Number(range[1]), Number(range[2])), range[0])
+        : replyOf(bytesOf(text));
     },
   };
 }
@@ -32,7 +36,16 @@ const MISSING: Reply = {
   text: async () => "",
 };
 
-function replyOf(content: Uint8Array): Reply {
+/** Bytes `start` to `end` of what base64 holds: four letters are three bytes. */
+function rangeOf(text: string, start: number, end: number): Uint8Array {
+  const first = Math.floor(start / 3);
+  return bytesOf(text.slice(4 * first, 4 * Math.floor(end / 3) + 4)).subarray(
+    start - 3 * first,
+    end + 1 - 3 * first,
+  );
+}
+
+function replyOf(content: Uint8Array, range = ""): Reply {
   let next: Uint8Array | undefined = content;
   const read = async () => {
     const value = next;
@@ -40,7 +53,9 @@ function replyOf(content: Uint8Array): Reply {
     return { done: !value, value };
   };
   const text = async () => new TextDecoder().decode(content);
-  return { ok: true, status: 200, headers: { get: () => null }, body: { getReader: () => ({ read }) }, text };
+  const said = range && `${range.replace("=", " ")}/*`;
+  const headers = { get: (name: string) => (said && name === "Content-Range" ? said : null) };
+  return { ok: true, status: range ? 206 : 200, headers, body: { getReader: () => ({ read }) }, text };
 }
 
 /** Bytes of base64, without the help of browsers older than 2025 where they lack it. */

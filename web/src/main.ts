@@ -1,6 +1,8 @@
+import { inAdvance } from "./core/advance";
+import type { Fetch } from "./core/download";
 import { loadManifest } from "./core/manifest";
 import { bundleUrl, type Embed, type Options, parseOptions } from "./embed";
-import { sourceInside } from "./inside";
+import { type Source, sourceInside } from "./inside";
 import { fail, hideNotice, messageOf } from "./ui/notice";
 import { buildPage } from "./ui/page";
 import { colorsOf } from "./view/spark";
@@ -19,16 +21,32 @@ ready.catch((error: unknown) => fail(messageOf(error)));
 async function begin(): Promise<void> {
   await Promise.resolve(); // `window.sagesplat` exists before any error
   const options = parseOptions(location.search, location.hash);
-  const source = sourceInside(document) ?? {
-    base: bundleUrl(options.bundle, location.href),
-    fetch: (url: string, init?: RequestInit) => fetch(url, init),
-  };
   const canvas = document.getElementById("view");
   if (!(canvas instanceof HTMLCanvasElement))
     throw new Error("This page is incomplete; copy the bundle again.");
   if (!document.createElement("canvas").getContext("webgl2")) {
     throw new Error("This browser has no WebGL 2; enable hardware acceleration or use another browser.");
   }
+  const inside = sourceInside(document);
+  if (inside) await show(canvas, inside, options);
+  else await showOnline(canvas, options);
+}
+
+/** Shows a bundle of a server. The pack that the page names is asked for together with the manifest. */
+async function showOnline(canvas: HTMLCanvasElement, options: Options): Promise<void> {
+  const base = bundleUrl(options.bundle, location.href);
+  const online: Fetch = (url, init) => fetch(url, init);
+  const name = options.bundle ? null : packNamed(document);
+  if (!name) return show(canvas, { base, fetch: online }, options);
+  const pack = inAdvance(online, new URL(name, base).href);
+  try {
+    await show(canvas, { base, fetch: pack.fetch }, options);
+  } finally {
+    pack.cancel(); // an older page names an older pack; a broken bundle needs none
+  }
+}
+
+async function show(canvas: HTMLCanvasElement, source: Source, options: Options): Promise<void> {
   const manifest = await loadManifest(source.base, source.fetch);
   open(canvas, new Viewer(canvas, manifest, source, options), options);
 }
@@ -47,6 +65,12 @@ function open(canvas: HTMLCanvasElement, viewer: Viewer, options: Options): void
   followTraining(viewer);
   viewer.start();
   removePosterWhenDrawn(viewer, canvas);
+}
+
+/** The pack that the page of a bundle names, so that it is asked for together with the manifest. */
+function packNamed(page: ParentNode): string | null {
+  const name = page.querySelector<HTMLMetaElement>('meta[name="pack"]')?.content ?? "";
+  return /^\w[\w-]*\.pack$/.test(name) ? name : null;
 }
 
 /** Removes the poster when the scene is drawn, or at the first input. */

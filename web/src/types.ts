@@ -4,19 +4,24 @@ export type Vec3 = readonly [number, number, number];
 export type Quat = readonly [number, number, number, number]; // x y z w
 export type Box = readonly [number, number, number, number, number, number]; // min x y z, max x y z
 
-/** How a file holds splats. PLY is INRIA's, its y and z opposite to the bundle's; nothing is rounded in it. */
-export const FORMATS = ["spz", "ply"] as const;
+/**
+ * How a file holds splats. PLY is INRIA's, its y and z opposite to the bundle's; nothing is rounded in it. A
+ * stream is one file for all levels of a label, of which each is a range (docs/formats.md).
+ */
+export const FORMATS = ["spz", "ply", "stream"] as const;
 export type Format = (typeof FORMATS)[number];
 
 /** One increment: the splats that a level adds to the level below, or replaces it by. */
 export interface Level {
   readonly uri: string;
+  readonly offset?: number; // of its first byte in a stream
   readonly format: Format;
   readonly refine?: "REPLACE"; // the level shows none of the increments below
   readonly bytes: number;
   readonly gpuBytes: number;
   readonly count: number;
   readonly sha256: string;
+  readonly weight?: number; // of the second opacities where this is the newest level shown; without: there are none
 }
 
 /** K1 exp(-g1 |d - mu1|^a1) for d < beta, K2 exp(-g2 |d - mu2|^a2) from beta on (Eq. 3). */
@@ -168,8 +173,18 @@ export interface Settings {
 
 /** Draws increments; independent of plans and networks. */
 export interface Renderer {
-  /** Decodes an increment, which is drawn after `swap` shows it. Rejects for an invalid file. */
-  decode(label: number, level: number, bytes: Uint8Array, format: Format): Promise<Handle>;
+  /**
+   * Decodes an increment, which is drawn after `swap` shows it. Rejects for an invalid file.
+   *
+   * @param below - of a stream, the increments below it
+   */
+  decode(
+    label: number,
+    level: number,
+    bytes: Uint8Array,
+    format: Format,
+    below?: readonly Uint8Array[],
+  ): Promise<Handle>;
   /** Shows some increments and hides others in one tick; hidden ones stay drawn until the next sort is done. */
   swap(show: readonly Handle[], hide: readonly Handle[]): void;
   dispose(handle: Handle): void;

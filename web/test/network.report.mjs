@@ -18,8 +18,8 @@ const round = (value, digits) => Number(value.toFixed(digits));
 
 /** Seconds, bytes and SSIM at the first sample of a kind. */
 const at = (curve, is) => {
-  const { ms, bytes, ssim } = curve.find(is) ?? curve.at(-1);
-  return { seconds: round(ms / 1000, 2), bytes, ssim: round(ssim, 3) };
+  const { ms, bytes, ssim, takes } = curve.find(is) ?? curve.at(-1);
+  return { seconds: round(ms / 1000, 2), bytes, ssim: round(ssim, 3), takes };
 };
 
 const links = {};

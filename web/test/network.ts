@@ -1,12 +1,16 @@
 /** How a bundle arrives over slow links: the streamer against one file and against files in their order. */
 
+import { gzipSync } from "node:zlib";
+import { inAdvance } from "../src/core/advance";
 import { frustumOf, rotate } from "../src/core/distance";
+import type { Fetch } from "../src/core/download";
 import { loadManifest, parsePromises } from "../src/core/manifest";
 import { Outlook } from "../src/core/outlook";
+import { ladderOf } from "../src/core/planner";
 import { Entry } from "../src/core/residency";
 import { Streamer } from "../src/core/streamer";
 import type { Manifest, Settings, Viewpoint } from "../src/types";
-import { FakeRenderer, Network, VirtualClock } from "./simulate";
+import { FakeRenderer, Network, putIncrements, VirtualClock } from "./simulate";
 import { BASE, NO_BUDGET } from "./worlds";
 
 /** The texts of a bundle; of its chunks only the sizes matter. */
@@ -29,9 +33,10 @@ export interface Sample {
   readonly bytes: number;
   readonly ssim: number;
   readonly whole: boolean; // everything is there, at its smallest level at least
+  readonly takes: number; // bytes of what is planned, with the manifest
 }
 
-const NOTHING: Sample = { ms: 0, bytes: 0, ssim: 0, whole: false };
+const NOTHING: Sample = { ms: 0, bytes: 0, ssim: 0, whole: false, takes: 0 };
 const FULL: Settings = {
   mode: "full",
   quality: "fidelity",
@@ -46,15 +51,14 @@ function linkTo(documents: Documents, { mbit, connections }: Line) {
   const clock = new VirtualClock();
   const network = new Network(clock, (mbit * 1e6) / 8, LATENCY, connections);
   const manifest: Manifest = JSON.parse(documents.manifest);
-  const text = new TextEncoder();
-  network.files.set("manifest.json", text.encode(documents.manifest));
+  const put = (uri: string, text: string) => {
+    network.files.set(uri, new TextEncoder().encode(text));
+    network.packed.set(uri, gzipSync(text).length);
+  };
+  put("manifest.json", documents.manifest);
   const { fidelity } = manifest.promises;
-  if (fidelity) network.files.set(fidelity.uri, text.encode(documents.promises));
-  const { pack } = manifest;
-  if (pack) network.files.set(pack.uri, new Uint8Array(pack.bytes));
-  for (const { uri, bytes } of manifest.labels.flatMap((label) => label.levels)) {
-    if (bytes) network.files.set(uri, new Uint8Array(bytes));
-  }
+  if (fidelity) put(fidelity.uri, documents.promises);
+  putIncrements(network, manifest);
   return { clock, network, renderer: new FakeRenderer(clock) };
 }
 
@@ -90,6 +94,12 @@ function startView(manifest: Manifest): Viewpoint {
   return { position, direction, frustum: frustumOf(position, quaternion, 0.9, 1.6) };
 }
 
+/** The page names the pack, which is asked for together with the manifest. */
+function packInAdvance({ manifest }: Documents, { fetch }: Network): Fetch {
+  const { pack }: Manifest = JSON.parse(manifest);
+  return pack ? inAdvance(fetch, new URL(pack.uri, BASE).href).fetch : fetch;
+}
+
 /** SSIM over time of the streamer, which fetches everything in the end or what a target asks for. */
 export async function streamed(
   documents: Documents,
@@ -97,7 +107,7 @@ export async function streamed(
   partial: Partial<Settings>,
 ): Promise<Sample[]> {
   const { clock, network, renderer } = linkTo(documents, line);
-  const { fetch } = network;
+  const fetch = packInAdvance(documents, network);
   const head = documents.manifest.length;
   const curve: Sample[] = [NOTHING];
   const streamers = loadManifest(BASE, fetch).then((manifest) => {
@@ -109,7 +119,9 @@ export async function streamed(
       const { labels, bytesLoaded, status } = streamer.state;
       const levels = labels.map((label) => label.shown);
       const whole = status !== "loading";
-      curve.push({ ms: clock.now(), bytes: head + bytesLoaded, ssim: ssim(view, levels), whole });
+      const planned = labels.map(({ label, wanted }) => ladderOf(label).bytes[wanted - 1] ?? 0);
+      const takes = planned.reduce((sum, bytes) => sum + bytes, head + documents.promises.length);
+      curve.push({ ms: clock.now(), bytes: head + bytesLoaded, ssim: ssim(view, levels), whole, takes });
     };
     streamer.update(view);
     streamer.start();
@@ -127,7 +139,7 @@ export function oneFile(documents: Documents, { mbit }: Line): Sample[] {
   const ms = LATENCY + (8 * manifest.totals.bytes) / (mbit * 1000);
   const full = manifest.labels.map((label) => label.levels.length);
   const ssim = judge(manifest, documents.promises)(startView(manifest), full);
-  return [NOTHING, { ms, bytes: manifest.totals.bytes, ssim, whole: true }];
+  return [NOTHING, { ms, bytes: manifest.totals.bytes, ssim, whole: true, takes: 0 }];
 }
 
 /** SSIM over time if increments come six at a time in the order of the manifest. */
@@ -143,7 +155,9 @@ export async function fileOrder(documents: Documents, line: Line): Promise<Sampl
   const curve: Sample[] = [NOTHING];
   const worker = async (): Promise<void> => {
     for (let next = todo.shift(); next; next = todo.shift()) {
-      if (next.file.bytes) await (await network.fetch(new URL(next.file.uri, BASE).href)).text();
+      const { uri, offset, bytes: size } = next.file;
+      const headers = offset === undefined ? {} : { Range: `bytes=${offset}-${offset + size - 1}` };
+      if (size) await (await network.fetch(new URL(uri, BASE).href, { headers })).text();
       here[next.i]?.add(next.k);
       bytes += next.file.bytes;
       const levels = here.map((set) => {
@@ -151,7 +165,8 @@ export async function fileOrder(documents: Documents, line: Line): Promise<Sampl
         while (set.has(level)) level += 1;
         return level;
       });
-      curve.push({ ms: head + clock.now(), bytes, ssim: ssim(view, levels), whole: !levels.includes(0) });
+      const whole = !levels.includes(0);
+      curve.push({ ms: head + clock.now(), bytes, ssim: ssim(view, levels), whole, takes: 0 });
     }
   };
   const workers = [1, 2, 3, 4, 5, 6].map(worker);

@@ -1,7 +1,7 @@
 /** A clock, a network and a renderer that tests are in charge of: nothing here waits, everything repeats. */
 
 import type { Clock, Fetch, Reply } from "../src/core/download";
-import type { Handle, Renderer } from "../src/types";
+import type { Format, Handle, Manifest, Renderer } from "../src/types";
 
 /** Random numbers from 0 to 1, the same ones for a seed (mulberry32). */
 export function seeded(seed: number): () => number {
@@ -64,6 +64,7 @@ export type Fault =
   | "bodiless"
   | "stalls"
   | "junk"
+  | "wrong range"
   | number;
 
 interface Flow {
@@ -76,6 +77,8 @@ const PIECE = 8192; // bytes
 /** Files over a link: a round trip per request, then all downloads share the bandwidth evenly. */
 export class Network {
   readonly files = new Map<string, Uint8Array>();
+  /** By path, bytes over the link where they are fewer: with gzip. */
+  readonly packed = new Map<string, number>();
   /** By path, of each request. */
   readonly asked: string[] = [];
   aborted: string[] = [];
@@ -83,6 +86,9 @@ export class Network {
   /** Faults by path, of this and all further requests; "*" is for all. A list is used up, one a request. */
   readonly faults = new Map<string, Fault | Fault[]>();
   most = 0; // downloads at once
+  ranges = true; // whether it answers with ranges
+  /** The ranges that were asked for, as PATH START-END. */
+  readonly askedRanges: string[] = [];
   private flows: Flow[] = [];
   private open = 0;
   private queue: (() => void)[] = [];
@@ -123,7 +129,20 @@ export class Network {
       this.close();
       return this.reply(200, null, tag);
     }
-    return this.reply(200, this.body(path, this.spoiled(content, fault), fault, signal), tag);
+    const range = /^bytes=(\d+)-(\d+)$/.exec(new Headers(init?.headers).get("Range") ?? "");
+    if (range) this.askedRanges.push(`${path} ${range[1]}-${range[2]}`);
+    if (!range || !this.ranges) {
+      return this.reply(200, this.body(path, this.spoiled(content, fault), fault, signal), tag);
+    }
+    const [start, end] = [Number(range[1]), Math.min(Number(range[2]), content.length - 1)];
+    if (start >= content.length) {
+      this.close();
+      return this.reply(416, null, tag);
+    }
+    const part = this.spoiled(content.subarray(start, end + 1), fault);
+    const said = fault === "wrong range" ? start + 1 : start;
+    const body = this.body(path, part, fault, signal);
+    return this.reply(206, body, tag, `bytes ${said}-${end}/${content.length}`);
   };
 
   private faultOf(path: string): Fault | undefined {
@@ -140,11 +159,11 @@ export class Network {
     return wrong;
   }
 
-  private reply(status: number, body: Reply["body"], tag: string | undefined): Reply {
+  private reply(status: number, body: Reply["body"], tag: string | undefined, range = ""): Reply {
     return {
       ok: status >= 200 && status < 300,
       status,
-      headers: { get: (name) => (name === "ETag" ? (tag ?? null) : null) },
+      headers: { get: (name) => ({ ETag: tag, "Content-Range": range })[name] || null },
       body,
       text: async () => {
         const reader = body?.getReader();
@@ -161,6 +180,7 @@ export class Network {
 
   private body(path: string, content: Uint8Array, fault: Fault | undefined, signal: AbortSignal | null) {
     let at = 0;
+    const share = (this.packed.get(path) ?? content.length) / content.length;
     const read = async () => {
       if (at >= content.length || (fault === "cut" && at > content.length / 2)) {
         this.close();
@@ -171,7 +191,7 @@ export class Network {
       const size = Math.min(PIECE, content.length - at);
       try {
         if (fault === "stalls" && at > content.length / 2) await this.wait(Infinity, signal, path);
-        await this.flow(size, signal, path);
+        await this.flow(size * share, signal, path);
       } catch (error) {
         this.close();
         throw error;
@@ -260,6 +280,15 @@ export class Network {
   }
 }
 
+/** Puts files of the right sizes there for all increments of a manifest. */
+export function putIncrements(network: Network, { labels, pack }: Manifest): void {
+  if (pack) network.files.set(pack.uri, new Uint8Array(pack.bytes));
+  for (const { uri, bytes, offset = 0 } of labels.flatMap(({ levels }) => levels)) {
+    const size = offset + bytes;
+    if (bytes && size > (network.files.get(uri)?.length ?? 0)) network.files.set(uri, new Uint8Array(size));
+  }
+}
+
 /** A short digest (FNV-1a) in place of sha-256, at once. */
 export function fnv(bytes: Uint8Array): string {
   let hash = 0x811c9dc5;
@@ -283,7 +312,14 @@ export class FakeRenderer implements Renderer {
     private readonly delay = 5, // ms to decode
   ) {}
 
-  decode(label: number, level: number, bytes: Uint8Array): Promise<Handle> {
+  decode(
+    label: number,
+    level: number,
+    bytes: Uint8Array,
+    format: Format,
+    below: readonly Uint8Array[] = [],
+  ): Promise<Handle> {
+    if (below.length !== (format === "stream" ? level - 1 : 0)) throw new Error("without what is below");
     const handle: Handle = { label, level, count: bytes.length };
     return new Promise((resolve, reject) => {
       this.clock.after(this.delay, () => {

@@ -5,7 +5,7 @@ import type { Fetch } from "../src/core/download";
 import { loadManifest } from "../src/core/manifest";
 import { Streamer } from "../src/core/streamer";
 import type { Manifest, Quat, Settings, Vec3, Viewpoint } from "../src/types";
-import { FakeRenderer, Network, seeded, VirtualClock } from "./simulate";
+import { FakeRenderer, Network, putIncrements, seeded, VirtualClock } from "./simulate";
 import { BASE, NO_BUDGET } from "./worlds";
 
 /** A file of a bundle, as a server has it. */
@@ -163,7 +163,11 @@ function recording(network: Network, clock: VirtualClock, log: Request[]): Fetch
 export function resized(manifest: Manifest, scale: number, pack: boolean): Manifest {
   const labels = manifest.labels.map((label) => ({
     ...label,
-    levels: label.levels.map((level) => ({ ...level, bytes: level.bytes * scale })),
+    levels: label.levels.map((level) => ({
+      ...level,
+      bytes: level.bytes * scale,
+      ...(level.offset !== undefined && { offset: level.offset * scale }),
+    })),
   }));
   const totals = { ...manifest.totals, bytes: manifest.totals.bytes * scale };
   const stream = manifest.pack && { ...manifest.pack, bytes: manifest.pack.bytes * scale };
@@ -172,15 +176,11 @@ export function resized(manifest: Manifest, scale: number, pack: boolean): Manif
 
 /** Everything that a manifest names, with the files of the page. */
 function serve(network: Network, manifest: Manifest, files: readonly Served[]): void {
-  const { pack } = manifest;
   for (const { uri, wire, text } of files) {
     network.files.set(uri, text === undefined ? new Uint8Array(wire) : new TextEncoder().encode(text));
   }
   network.files.set("manifest.json", new TextEncoder().encode(JSON.stringify(manifest)));
-  if (pack) network.files.set(pack.uri, new Uint8Array(pack.bytes));
-  for (const { uri, bytes } of manifest.labels.flatMap((label) => label.levels)) {
-    if (bytes) network.files.set(uri, new Uint8Array(bytes));
-  }
+  putIncrements(network, manifest);
 }
 
 /** The page as a browser loads it: HTML, then what it names, at once. */

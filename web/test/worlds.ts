@@ -42,12 +42,13 @@ export interface Options {
   readonly promises?: boolean;
   readonly pack?: boolean;
   readonly replaces?: readonly number[]; // levels that replace those below
+  readonly streams?: boolean; // each label is one file, its levels ranges of it
 }
 
 /** A bundle whose files are on a network; label i stands at x = 4 i - 8. */
 export function bundle(network: Network, options: Options = {}): Manifest {
   const { labels = 4, levels = 5, bytes = 20_000, seed = 1, live = false, promises = true } = options;
-  const { pack = false, replaces = [] } = options;
+  const { pack = false, replaces = [], streams = false } = options;
   const random = seeded(seed);
   const made = Array.from({ length: labels }, (_, id) => {
     const files = Array.from({ length: levels }, (_, k) => {
@@ -56,12 +57,12 @@ export function bundle(network: Network, options: Options = {}): Manifest {
       const file = put(network, `chunks/l${id}-${k + 1}-${seed}.spz`, size, random);
       return replaces.includes(k + 1) ? { ...file, refine: "REPLACE" as const } : file;
     });
-    return labelOf(id, files, random);
+    return labelOf(id, streams ? streamOf(network, `chunks/l${id}-${seed}.sgst`, files) : files, random);
   });
   const models = promises && labels ? promisesOf(made, random) : null;
   return {
     format: "sagesplat-bundle",
-    version: 2,
+    version: streams ? 4 : 2,
     generator: "test",
     name: "test",
     live,
@@ -82,12 +83,27 @@ export function bundle(network: Network, options: Options = {}): Manifest {
   };
 }
 
+/** Puts files one after the other into one. */
+function streamOf(network: Network, uri: string, files: readonly Level[]): Level[] {
+  const content = new Uint8Array(files.reduce((sum, { bytes }) => sum + bytes, 0));
+  let end = 0;
+  const levels = files.map((file) => {
+    content.set(network.files.get(file.uri) ?? [], end);
+    network.files.delete(file.uri);
+    end += file.bytes;
+    return { ...file, uri, format: "stream" as const, offset: end - file.bytes };
+  });
+  network.files.set(uri, content);
+  return levels;
+}
+
 /** All increments, level by level. */
 export function packOf(network: Network, labels: readonly Label[]): Pack {
   const last = Math.max(0, ...labels.map((label) => label.levels.length));
   const order = Array.from({ length: last }, (_, k) => labels.map((_label, i) => [i, k + 1] as const)).flat();
   const contents = order.flatMap(([i, level]) => {
-    return network.files.get(labels[i]?.levels[level - 1]?.uri ?? "") ?? [];
+    const { uri = "", offset = 0, bytes = 0 } = labels[i]?.levels[level - 1] ?? {};
+    return network.files.get(uri)?.subarray(offset, offset + bytes) ?? [];
   });
   const content = new Uint8Array(contents.reduce((sum, one) => sum + one.length, 0));
   let at = 0;

@@ -1,20 +1,23 @@
 """The levels of every category, snapshots or nested, read from disk on demand."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
+import torch
 
 from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import Gaussians, concat
+from sagesplat.core.second_opacity import SecondOpacities, blended
 from sagesplat.formats.levels import (
     LevelFile,
     read_header,
     read_level,
     read_replaces,
+    read_second,
     read_sizes,
     starts_of,
 )
@@ -127,6 +130,11 @@ class PrefixLadder(Ladder):
         return read_level(self.path)
 
     @cached_property
+    def second(self) -> SecondOpacities | None:
+        """Their second opacities; None where each has only one."""
+        return read_second(self.path, self.sizes)
+
+    @cached_property
     def _rows(self) -> dict[int, range]:
         """Rows of each category, which lie together, by label id in the order of the rows."""
         labels, first, counts = np.unique(
@@ -145,12 +153,20 @@ class PrefixLadder(Ladder):
             if not 1 <= level <= len(self.levels):
                 raise _unknown(level, self.levels)
         # slices are copied several times as fast as rows are gathered
-        parts = [
-            rows[self.starts[label][levels[label] - 1] : self.sizes[label][levels[label] - 1]]
+        parts = {
+            label: rows[self.starts[label][levels[label] - 1] : self.sizes[label][levels[label] - 1]]
             for label, rows in self._rows.items()
             if label in levels and label in self.sizes
-        ]
-        return self.gaussians.slices([slice(rows.start, rows.stop) for rows in parts])
+        }
+        slices = [slice(rows.start, rows.stop) for rows in parts.values()]
+        g = self.gaussians.slices(slices)
+        if self.second is None or not parts:
+            return g
+        second = torch.cat([self.second.logits[some] for some in slices])
+        counts = torch.tensor([len(rows) for rows in parts.values()])
+        weights = torch.tensor([self.second.weights[label][levels[label] - 1] for label in parts])
+        logits = blended(g.logit_opacities, second, weights.repeat_interleave(counts))
+        return replace(g, logit_opacities=logits)
 
 
 def _unknown(level: int, levels: list[int]) -> RunError:

@@ -23,7 +23,14 @@ _CHECK = "check the path, its rights and the disk"
 def main() -> None:
     """Run a command; errors that a user can cause are one line and exit code 2."""
     print_any_character()
-    name, *words = sys.argv[1:] or ["--help"]
+    try:
+        _run(*sys.argv[1:] or ["--help"])
+        sys.stdout.flush()
+    except BrokenPipeError:  # such as `| head`; Python flushes once more at its end
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _run(name: str, *words: str) -> None:
     if name in ("-h", "--help", "--version"):
         print(f"sagesplat {__version__}" if name == "--version" else _overview())
         return
@@ -33,16 +40,16 @@ def main() -> None:
     function = COMMANDS[name]
     if {"-h", "--help", "--help-all"} & set(words):
         print(help_of(name, function, everything="--help-all" in words))
-        raise SystemExit(0)
+        return
     try:
         with named_memory(f"sagesplat {name}"):
-            function(**arguments(name, function, words))
+            function(**arguments(name, function, list(words)))
     except SageError as error:
         _fail(str(error))
     except KeyboardInterrupt as error:
         signals.leave(error)
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise
     except OSError as error:
         where = error.filename or "input/output"
         _fail(f"{where}: {error.strerror or error}; {CURES.get(error.errno or 0, _CHECK)}")

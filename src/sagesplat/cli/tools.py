@@ -23,6 +23,7 @@ def export(
     target_ssim: float | None = None,
     chunks: Literal["spz", "ply"] | None = None,
     levels: tuple[int, ...] = (),
+    rasterize_mode: Literal["classic", "antialiased"] | None = None,
     ladder: Ladder = "nested",
     machine: Annotated[Compute, Flat] = Compute(),
 ) -> None:
@@ -40,6 +41,8 @@ def export(
             target)
         target_ssim: write the scene planned for this SSIM against photos
         levels: numbers of the levels that lod-meta.json gets (default: all)
+        rasterize_mode: how viewers of the file draw (default: classic for .ply, as most do and no header
+            tells them; .spz, .sog and lod-meta.json say how the run was trained)
         chunks: write the increment of each level of each category as a file of this format
     """
     from sagesplat.stages.export import export_increments, export_scene
@@ -50,8 +53,10 @@ def export(
         else:
             target = None if target_ssim is None else ("ssim", target_ssim)
             target = target if target_fidelity is None else ("fidelity", target_fidelity)
-            options = {"level": level, "labels": labels, "target": target, "levels": levels}
-            count = export_scene(job, out, **options)
+            count = export_scene(
+                job, out, level=level, labels=labels, target=target, levels=levels,
+                rasterize_mode=rasterize_mode,
+            )  # fmt: skip
     say(f"{out}: {count:,} {'chunks' if chunks else 'Gaussians'}")
 
 

@@ -259,6 +259,9 @@ class NestConfig:
     sh_bits: tuple[int, int] = (5, 4)
     """Bits per SH coefficient in the increments: of degree 1, and of higher degrees. Training uses the
     rounded values."""
+    two_opacities: bool = True
+    """Give each Gaussian one opacity for the low levels and one for the full model; without it the full
+    model is worse."""
     criterion: Literal["weight", "weight-volume", "peak", "sensitivity", "opacity"] = "sensitivity"
     """Importance that orders the Gaussians of a category; docs/developers/nested.md compares them."""
     lr_multiplier: float = 4.0
@@ -473,6 +476,9 @@ class BundleConfig:
     """Weights of categories in the viewer's plans, as NAME VALUE ... (default: 1 each)."""
     single_file: bool = False
     """Write one HTML page that opens from the disk, instead of a folder for a web server."""
+    chunks: Literal["stream", "spz"] | None = None
+    """Format of the increments: coded streams, or SPZ files, which other viewers read too (default: that of
+    the run)."""
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,11 @@ class SecondOpacities:
     logits: Float32[Tensor, " N"]
     weights: Mapping[int, tuple[float, ...]]  # of each level by label id, 0 to 1
 
+    @classmethod
+    def of_levels(cls, logits: Tensor, sizes: Mapping[int, Sequence[int]]) -> "SecondOpacities":
+        """With the usual weights of levels, given by the Gaussians up to their ends, by label id."""
+        return cls(logits, {label: weights_of(ends) for label, ends in sizes.items()})
+
     def select(self, rows: Tensor) -> "SecondOpacities":
         """Those of some Gaussians (indices or bool [N])."""
         return SecondOpacities(self.logits[rows], self.weights)

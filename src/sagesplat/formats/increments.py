@@ -1,14 +1,15 @@
-"""Increments of nested levels: one file per category and level, with the Gaussians that the level adds.
+"""Increments of nested levels: the Gaussians that a level of a category adds to the level below it.
 
-A level may replace those below it (`refine: REPLACE`, as in 3D Tiles): a category then shows the increments
-from the newest such level on, and not the ones below.
+Those of a category are ranges of one coded stream, or files of their own (SPZ, PLY). A level may replace
+those below it (`refine: REPLACE`, as in 3D Tiles): a category then shows the increments from the newest such
+level on, and not the ones below.
 """
 
 import hashlib
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from itertools import pairwise
+from dataclasses import asdict, dataclass, fields, replace
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -22,34 +23,40 @@ from sagesplat.core.names import slugs
 from sagesplat.formats.levels import starts_of
 from sagesplat.formats.ply import read_ply, write_ply
 from sagesplat.formats.spz import SH_BITS, encode_spz, packing_order, read_spz
+from sagesplat.formats.stream import Decoded, decode_stream
 from sagesplat.io.files import atomic_folder, read_json, write_json
 
-Format = Literal["spz", "ply"]
+FileFormat = Literal["spz", "ply"]  # of a file that is one increment
+Format = Literal["stream", "spz", "ply"]
 Refine = Literal["ADD", "REPLACE"]
 INDEX = "index.json"
+STREAM = ".sgst"
+_FORMATS: dict[str, Format] = {STREAM: "stream", ".ply": "ply"}  # by suffix; all others are SPZ
 _FINE_BITS = 8, 8  # of SH coefficients
 _CURE = "delete that folder and run `sagesplat nest` again"
 _URI = r"(?!\.)[A-Za-z0-9_.-]{1,200}"  # a plain file name
-_GPU_BYTES = (16, 24, 40, 56)  # per Gaussian in Spark 2.2, by SH degree
+GPU_BYTES = (16, 24, 40, 56)  # per Gaussian in Spark 2.2, by SH degree
 
 
 @dataclass(frozen=True)
 class Increment:
-    """The Gaussians that a level of a category adds to the level below it, or replaces it by, as a file."""
+    """The Gaussians that a level of a category adds to the level below it, or replaces it by, as bytes."""
 
     label_id: int
     level: int
-    uri: str  # file name in the folder of the index; it holds a hash, so it can be cached for ever
+    uri: str  # file in the folder of the index; its name holds a hash, so it can be cached for ever
     count: int  # Gaussians
     nbytes: int
     gpu_bytes: int
     sha256: str
     refine: Refine = "ADD"  # REPLACE: instead of all increments of lower levels
+    offset: int = 0  # its first byte in the file: a coded stream has all levels of a category
+    weight: float | None = None  # of second opacities where this is the newest level; None: there are none
 
     @property
     def format(self) -> Format:
         """Of the file, by its name."""
-        return "ply" if self.uri.endswith(".ply") else "spz"
+        return _FORMATS.get(Path(self.uri).suffix, "spz")
 
 
 def packed(
@@ -84,12 +91,12 @@ def write_increments(
     names: dict[int, str],
     *,
     replaces: Mapping[int, Collection[int]] | None = None,
-    kind: Format | Callable[[int, int], Format] = "spz",
+    kind: FileFormat | Callable[[int, int], FileFormat] = "spz",
     sh_bits: tuple[int, int] = SH_BITS,
     fine: Collection[int] = (),
     antialiased: bool = False,
 ) -> list[Increment]:
-    """Write the increments of nested levels and their index; `folder` is replaced.
+    """Write the increments of nested levels as files, and their index; `folder` is replaced.
 
     `sizes`: by label id, the rows up to the end of each level. `names`: label id -> category. `replaces`: by
     label id, the levels that replace those below (`formats.levels.starts_of`). `kind`: of all files, or of a
@@ -119,18 +126,19 @@ def write_increments(
             digest = hashlib.sha256(content).hexdigest()
             uri = f"{stems[label]}-{level:02d}-{digest[:12]}.{suffix}"
             temporary.rename(fresh / uri)
-            gpu = len(part) * _GPU_BYTES[part.sh_degree]
+            gpu = len(part) * GPU_BYTES[part.sh_degree]
             refine: Refine = "REPLACE" if level in replaces.get(label, ()) else "ADD"
             written.append(Increment(label, level, uri, len(part), len(content), gpu, digest, refine))
-        formats = sorted({one.format for one in written}, reverse=True)
-        write_json(fresh / INDEX, {"format": "+".join(formats), "chunks": [_entry(one) for one in written]})
+        write_index(fresh, written)
     return written
 
 
-def _entry(increment: Increment) -> dict[str, Any]:
-    """Of the index; `refine` is written where a level replaces."""
-    entry = asdict(increment)
-    return entry if increment.refine == "REPLACE" else {k: v for k, v in entry.items() if k != "refine"}
+def write_index(folder: Path, written: Sequence[Increment]) -> None:
+    """Write the index; of an increment what is as by default is left out."""
+    formats = sorted({one.format for one in written}, reverse=True)
+    usual = {field.name: field.default for field in fields(Increment)}
+    chunks = [{k: v for k, v in asdict(one).items() if v != usual[k]} for one in written]
+    write_json(folder / INDEX, {"format": "+".join(formats), "chunks": chunks})
 
 
 def read_index(folder: Path) -> list[Increment]:
@@ -158,14 +166,53 @@ def checked(increment: Increment) -> Increment:
         raise ValueError(f"{increment.sha256!r} is not a SHA-256")
     if increment.refine not in get_args(Refine):
         raise ValueError(f"refine {increment.refine!r}")
+    offset, weight = increment.offset, increment.weight
+    if type(offset) is not int or not 0 <= offset < (2**53 if increment.format == "stream" else 1):
+        raise ValueError(f"offset {offset!r}")
+    if weight is not None and not (type(weight) in (int, float) and 0 <= weight <= 1):
+        raise ValueError(f"weight {weight!r}")
     return increment
 
 
 def read_increments(folder: Path, listed: Sequence[Increment]) -> Gaussians:
-    """The Gaussians of increments, concatenated; DataError for a missing or damaged file."""
+    """The Gaussians of increments, concatenated, as the newest of them shows each category.
+
+    DataError for a missing or damaged file.
+    """
+    parts = []
+    for some in by_file(folder, listed):
+        if some[0].format == "stream":
+            decoded = stream_of(folder, some)
+            parts.append(decoded.shown().slices([_rows(folder, decoded, one) for one in some]))
+        else:
+            parts += [_read(folder, increment) for increment in some]
+    return concat(parts)
+
+
+def by_file(folder: Path, listed: Sequence[Increment]) -> list[list[Increment]]:
+    """Increments that lie one after the other in one file; DataError without any."""
     if not listed:
         raise DataError(f"{folder}: no increments; {_CURE}")
-    return concat([_read(folder, increment) for increment in listed])
+    return [list(some) for _, some in groupby(listed, key=lambda one: one.uri)]
+
+
+def stream_of(folder: Path, some: Sequence[Increment]) -> Decoded:
+    """The stream that increments are in, up to the newest of them."""
+    path, end = folder / some[0].uri, max(one.offset + one.nbytes for one in some)
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror}); {_CURE}") from None
+    return decode_stream(content[:end], label_id=some[0].label_id, name=str(path))
+
+
+def _rows(folder: Path, decoded: Decoded, one: Increment) -> slice:
+    """The rows of an increment in what its stream was decoded to."""
+    at = dict(zip((0, *decoded.ends), (0, *decoded.sizes), strict=True))
+    low, high = at.get(one.offset, -1), at.get(one.offset + one.nbytes, -1)
+    if low < 0 or high - low != one.count:
+        raise DataError(f"{folder / one.uri}: other levels than the index has; {_CURE}")
+    return slice(low, high)
 
 
 def _read(folder: Path, increment: Increment) -> Gaussians:

@@ -18,12 +18,14 @@ from jaxtyping import Bool
 
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import PARAMETERS, Gaussians, checked, concat
+from sagesplat.core.second_opacity import SecondOpacities
 from sagesplat.core.sh import num_bases
 from sagesplat.io.files import atomic_path
 from sagesplat.io.npz import Npz
 
 _DAMAGED = (OSError, KeyError, TypeError, ValueError)  # raised for truncated or damaged files
-_LADDER = (["sizes"], ["replaces"])  # arrays of a category that are no Gaussians
+_LADDER = (["sizes"], ["replaces"], ["weights"])  # arrays of a category that are no Gaussians
+_SECOND = "second_opacities"  # array of further ones
 _HALVES = ("log_scales", "logit_opacities", "sh0")
 
 
@@ -54,18 +56,23 @@ def write_set(
     sizes: Mapping[int, Sequence[int]] | None = None,
     *,
     replaces: Mapping[int, Collection[int]] | None = None,
+    second: SecondOpacities | None = None,
     exact: bool = False,
     **more: Any,
 ) -> None:
     """Write Gaussians in order, as nested levels by label id, with further arrays `more`.
 
     `sizes`: rows of the category up to the end of each level. `replaces`: levels that replace those below
-    (see `starts_of`). `exact`: as float32, identical when read.
+    (see `starts_of`). `second`: the second opacities of the Gaussians, with weights of all these levels.
+    `exact`: as float32, identical when read.
     """
     arrays = {f"{label}/sizes": np.array(n, np.int64) for label, n in (sizes or {}).items()}
     for label, levels in (replaces or {}).items():
         if levels:
             arrays[f"{label}/replaces"] = np.array(sorted(levels), np.int64)
+    if second is not None:
+        arrays |= {f"{label}/weights": np.array(w, np.float64) for label, w in second.weights.items()}
+        more |= {_SECOND: second.logits.numpy()}
     arrays |= {f"more/{name}": np.asarray(value) for name, value in more.items()}
     _write(path, LevelFile(path, step, False, g.sh_degree, g.counts()), g, arrays, exact)
 
@@ -173,6 +180,30 @@ def read_replaces(path: Path, sizes: Mapping[int, tuple[int, ...]]) -> dict[int,
         except _DAMAGED as error:
             raise DataError(f"{path}: impossible replacing levels ({short(error)}); {_again(path)}") from None
     return replaces
+
+
+def read_second(path: Path, sizes: Mapping[int, tuple[int, ...]]) -> SecondOpacities | None:
+    """The second opacities of a ladder, in the order of `read_level`; None where it has none.
+
+    `sizes`: of `read_sizes`. DataError for a damaged file, or some that do not fit its levels.
+    """
+    with _open(path) as file:
+        try:
+            if f"more/{_SECOND}" not in file:
+                return None
+            logits = torch.from_numpy(file[f"more/{_SECOND}"].astype(np.float32, copy=False))
+            weights = {label: tuple(file[f"{label}/weights"].astype(float).tolist()) for label in sizes}
+            if logits.shape != (sum(n[-1] for n in sizes.values()),):
+                raise ValueError(f"{list(logits.shape)} of them")
+            if any(len(weights[label]) != len(n) for label, n in sizes.items()):
+                raise ValueError("not a weight for each level")
+            if not all(0 <= weight <= 1 for some in weights.values() for weight in some):
+                raise ValueError("weights beyond 0 to 1")
+            if not torch.isfinite(logits).all():
+                raise ValueError("NaN or Inf")
+        except _DAMAGED as error:
+            raise DataError(f"{path}: impossible second opacities ({short(error)}); {_again(path)}") from None
+    return SecondOpacities(logits, weights)
 
 
 def _integers(file: Npz, name: str) -> tuple[int, ...]:

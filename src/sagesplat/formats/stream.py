@@ -1,24 +1,29 @@
 """`sagesplat-stream`: the nested levels of one category as coded bytes that can be cut after any level.
 
-A header of 44 bytes, then the levels: the number of their Gaussians, the number of their bytes, and their
-columns of integers, coded by an adaptive rANS. docs/formats.md specifies all of it.
+A header of 44 bytes, then the levels: the number of their Gaussians, the number of their bytes, with two
+opacities the weight of the second one, and their columns of integers, coded by an adaptive rANS.
+docs/formats.md specifies all of it.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 import torch
-from jaxtyping import Int64
+from jaxtyping import Float64, Int64
+from torch import Tensor
 
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians
+from sagesplat.core.second_opacity import SecondOpacities, blended
 from sagesplat.formats.stream_columns import AXIS_BITS, Columns, Layout, code_columns, joined, new_tables
 from sagesplat.formats.stream_header import (
     SIZE,
     Precision,
     header_of,
+    logits_of,
+    opacities_of,
     quantised,
     read_header,
     restored,
@@ -40,6 +45,7 @@ class Encoded:
     content: bytes
     ends: tuple[int, ...]  # bytes up to the end of each level
     sizes: tuple[int, ...]  # Gaussians up to the end of each level
+    weights: tuple[float, ...]  # of the second opacities at each level; none without them
     rows: Int64[np.ndarray, " M"]  # of the Gaussians that were given, in the stream's order
 
 
@@ -47,27 +53,41 @@ class Encoded:
 class Decoded:
     """What a stream, or its first levels, holds."""
 
-    gaussians: Gaussians
+    gaussians: Gaussians  # with their first opacities
+    second: SecondOpacities | None  # and the weights of these levels, where there are two
+    ends: tuple[int, ...]  # bytes up to the end of each level
     sizes: tuple[int, ...]  # Gaussians up to the end of each level
     antialiased: bool  # how the scene was trained
+
+    def shown(self) -> Gaussians:
+        """The Gaussians with their opacities at the newest of these levels."""
+        if self.second is None or not self.sizes:
+            return self.gaussians
+        weight = _weights(self.second)[-1]
+        logits = blended(self.gaussians.logit_opacities, self.second.logits, weight)
+        return replace(self.gaussians, logit_opacities=logits)
 
 
 def encode_stream(
     g: Gaussians,
     sizes: Sequence[int],
     *,
+    second: SecondOpacities | None = None,
     precision: Precision = Precision(),
     antialiased: bool = False,
     name: str = "stream",
 ) -> Encoded:
     """Encode the nested levels of N Gaussians in COLMAP's axes; labels are left out.
 
-    The Gaussians of a level come in another order. Those whose opacity is rounded to 0 are left out. The same
-    input gives the same bytes.
+    The Gaussians of a level come in another order. Those that are hardly to be seen at any level are left out
+    (`Precision.least`). The same input gives the same bytes.
 
     Args:
         g: The Gaussians of one category in the order of their levels, on any device.
         sizes: The number of Gaussians up to the end of each level, ascending, the last one N.
+        second: Their second opacities, with the weights of this one category, which are rounded to 1/255. At
+            levels of weight 1 they are the only ones. Levels that show the same Gaussians get one weight,
+            that of the last.
         precision: Steps of quantisation. Finer ones than a model was trained with waste bytes.
         antialiased: How the scene was trained; a flag for viewers.
         name: What errors call the stream.
@@ -77,7 +97,8 @@ def encode_stream(
 
     Raises:
         DataError: For NaN or Inf, a quaternion of zeros, or too many Gaussians.
-        ValueError: For sizes that are no levels of N Gaussians, or a precision that the format does not have.
+        ValueError: For sizes that are no levels of N Gaussians, second opacities of others, or a precision
+            that the format does not have.
 
     Example:
         >>> import torch
@@ -91,24 +112,52 @@ def encode_stream(
         2
     """
     g = g.detach().to("cpu")
-    _check(name, g, sizes)
-    seen = torch.round(torch.sigmoid(g.logit_opacities.double()) * (255 / precision.opacity)) > 0
-    rows = np.flatnonzero(seen.numpy())
-    g = turned_round(g.select(seen))
-    header = read_header(header_of(g, len(sizes), precision, antialiased=antialiased).pack())
-    columns = quantised(g, header)
+    _check(name, g, sizes, second)
+    weights, seconds = [255] * len(sizes), g.logit_opacities
+    if second:
+        weights, seconds = [round(255 * w) for w in _weights(second)], second.logits.detach().to("cpu")
+    most = opacities_of(_most(g.logit_opacities, seconds, sizes, weights), precision.opacity)
+    rows = np.flatnonzero(most > precision.least)
+    g, seconds = turned_round(g.select(torch.from_numpy(rows))), seconds[torch.from_numpy(rows)]
+    made = header_of(g, len(sizes), precision, antialiased=antialiased, two_opacities=second is not None)
+    header = read_header(made.pack())
+    columns = quantised(g, seconds, header)
     ends = np.searchsorted(rows, sizes)
+    weights = [weights[np.searchsorted(ends, end, "right") - 1] for end in ends]
+    one = np.repeat(weights, np.diff(ends, prepend=0)) == 255
+    columns = replace(columns, opacities=np.where(one, columns.seconds, columns.opacities))
     tables, content, cuts, order = Tables(new_tables(header.layout)), header.pack(), [], []
-    for low, high in pairwise((0, *ends.tolist())):
+    for weight, (low, high) in zip(weights, pairwise((0, *ends.tolist())), strict=True):
         order.append(low + np.argsort(columns.positions[low:high], kind="stable"))
         payload = b""
         if high > low:
             writer = Writer(tables)
-            _code_level(writer, header.layout, low, high - low, columns.rows(order[-1]))
+            some = columns.rows(order[-1])
+            _code_level(writer, header.layout, low, high - low, weight < 255, some)
             payload = writer.payload()
-        content += _leb128(high - low) + _leb128(len(payload)) + payload
+        content += _leb128(high - low) + _leb128(len(payload))
+        content += bytes([weight] if second else []) + payload
         cuts.append(len(content))
-    return Encoded(content, tuple(cuts), tuple(ends.tolist()), rows[np.concatenate(order)])
+    return Encoded(
+        content, tuple(cuts), tuple(ends.tolist()), tuple(w / 255 for w in weights if second),
+        rows[np.concatenate(order)],
+    )  # fmt: skip
+
+
+def _weights(second: SecondOpacities) -> tuple[float, ...]:
+    """Of each level; ValueError for those of several categories."""
+    if len(second.weights) != 1:
+        raise ValueError(f"weights of {len(second.weights)} categories; a stream has one")
+    (weights,) = second.weights.values()
+    return weights
+
+
+def _most(
+    first: Tensor, second: Tensor, sizes: Sequence[int], weights: Sequence[int]
+) -> Float64[Tensor, " N"]:
+    """Logits of the largest opacities that Gaussians have at any level, from their own one on."""
+    own = torch.from_numpy(np.repeat(np.array(weights) / 255, np.diff(sizes, prepend=0)))
+    return torch.maximum(*(blended(first.double(), second.double(), w) for w in (own, weights[-1] / 255)))
 
 
 def decode_stream(
@@ -135,33 +184,47 @@ def decode_stream(
         header = read_header(content)
         if levels is not None and not 1 <= levels <= header.levels:
             raise ValueError(f"level {levels} of {header.levels}")
-        tables, at, parts, sizes = Tables(new_tables(header.layout)), SIZE, [], [0]
+        tables, at, parts, weights = Tables(new_tables(header.layout)), SIZE, [], []
+        ends, sizes = [], [0]
         while len(sizes) <= (levels or header.levels):
             if levels is None and at == len(content):
                 break
             count, at = _read_leb128(content, at)
             nbytes, at = _read_leb128(content, at)
+            weights += content[at : at + 1] if header.two_opacities else [255]
+            at += header.two_opacities
             if nbytes > len(content) - at or count > min(MAX_COUNT - sizes[-1], _PER_BYTE * nbytes):
                 raise ValueError(f"{count} Gaussians in {nbytes} of {len(content) - at} bytes")
-            parts += _read_level(content[at : at + nbytes], tables, header.layout, sizes[-1], count)
+            payload, two = content[at : at + nbytes], weights[-1] < 255
+            parts += _read_level(payload, tables, header.layout, sizes[-1], count, two)
             at += nbytes
+            ends.append(at)
             sizes.append(sizes[-1] + count)
         if len(sizes) == header.levels + 1 and at != len(content):
             raise ValueError(f"{len(content) - at} bytes after the last level")
     except ValueError as error:
         raise DataError(f"{name}: a damaged stream ({short(error)}); copy it again") from None
-    g = restored(joined(parts, header.sh_degree), header, label_id)
-    return Decoded(g, tuple(sizes[1:]), header.antialiased)
+    columns, second = joined(parts, header.sh_degree), None
+    if header.two_opacities:
+        logits = logits_of(columns.seconds, header.opacity_step)
+        second = SecondOpacities(logits, {label_id: tuple(w / 255 for w in weights)})
+    g = restored(columns, header, label_id)
+    return Decoded(g, second, tuple(ends), tuple(sizes[1:]), header.antialiased)
 
 
-def _check(name: str, g: Gaussians, sizes: Sequence[int]) -> None:
+def _check(name: str, g: Gaussians, sizes: Sequence[int], second: SecondOpacities | None) -> None:
     if not 1 <= len(sizes) <= _MAX_LEVELS or list(sizes) != sorted(sizes) or sizes[0] < 0:
         raise ValueError(f"{len(sizes)} levels; 1 to {_MAX_LEVELS} ascending sizes are needed")
     if sizes[-1] != len(g):
         raise ValueError(f"levels of {sizes[-1]} Gaussians, of {len(g)}")
     if len(g) > MAX_COUNT:
         raise DataError(f"{name}: {len(g)} Gaussians; a stream holds {MAX_COUNT}, write several")
-    for key, values in g.parameters().items():
+    values_of = g.parameters()
+    if second:
+        if len(second.logits) != len(g) or len(_weights(second)) != len(sizes):
+            raise ValueError(f"{len(second.logits)} second opacities of {len(g)} Gaussians, or other levels")
+        values_of |= {"second opacities": second.logits}
+    for key, values in values_of.items():
         if bad := int((~torch.isfinite(values)).sum()):
             raise DataError(f"{name}: {bad} values of {key} are NaN or infinite; train the scene again")
     if float(g.means.abs().max() if len(g) else 0) > _FARTHEST:
@@ -170,19 +233,23 @@ def _check(name: str, g: Gaussians, sizes: Sequence[int]) -> None:
         raise DataError(f"{name}: {bad} Gaussians have a rotation of zeros; train the scene again")
 
 
-def _read_level(payload: bytes, tables: Tables, layout: Layout, done: int, count: int) -> list[Columns]:
+def _read_level(
+    payload: bytes, tables: Tables, layout: Layout, done: int, count: int, two: bool
+) -> list[Columns]:
     """The columns of a level, by blocks; ValueError for damaged bytes."""
     if not count:
         if payload:
             raise ValueError(f"{len(payload)} bytes of no Gaussians")
         return []
     reader = Reader(tables, payload)
-    parts = _code_level(reader, layout, done, count, None)
+    parts = _code_level(reader, layout, done, count, two, None)
     reader.finish()
     return parts
 
 
-def _code_level(coder: Coder, layout: Layout, done: int, count: int, given: Columns | None) -> list[Columns]:
+def _code_level(
+    coder: Coder, layout: Layout, done: int, count: int, two: bool, given: Columns | None
+) -> list[Columns]:
     """Code `count` Gaussians after `done` ones: up to the end of a block, or what the level has of it."""
     parts, before, at = [], 0, 0
     while at < count:
@@ -190,7 +257,7 @@ def _code_level(coder: Coder, layout: Layout, done: int, count: int, given: Colu
         left = size - done % size  # of the block
         now = min(left, count - at)
         some = None if given is None else given.rows(slice(at, at + now))
-        parts.append(code_columns(coder, layout, now, before, some))
+        parts.append(code_columns(coder, layout, now, before, two, some))
         if now == left:
             coder.end_block()
         before, at, done = int(parts[-1].positions[-1]), at + now, done + now

@@ -22,6 +22,7 @@ _SCALE, _COLOUR, _HARMONIC = 64, 80, 15  # symbol of 0
 _ROTATION = ROTATIONS[-1]
 _GAPS = 3 * AXIS_BITS + 1
 _OPACITIES = 256
+_CLASSES = 4  # of first opacities: rows of the table of second ones
 _PEAK = 512
 _FLAT = 128
 
@@ -31,7 +32,8 @@ class Columns:
     """N Gaussians as integers; SH coefficients of degree 0 to 3."""
 
     positions: Int64[np.ndarray, " N"]  # Morton codes, ascending
-    opacities: Int64[np.ndarray, " N"]  # at least 1
+    opacities: Int64[np.ndarray, " N"]  # the first ones, or the only ones: these are at least 1
+    seconds: Int64[np.ndarray, " N"]  # the same where there is one
     scales: Int64[np.ndarray, "N 3"]  # descending
     rotations: Int64[np.ndarray, "N 3"]  # x y z
     colours: Int64[np.ndarray, "N 3"]  # red, green, blue
@@ -47,7 +49,8 @@ class Layout:
     """What the header says of how columns are coded."""
 
     sh_degree: int
-    opacities: int  # values, from 1 on
+    opacities: int  # the largest
+    two_opacities: bool
     rotation_origin: int
     rotation_spread: int
 
@@ -61,7 +64,7 @@ def joined(parts: list[Columns], sh_degree: int) -> Columns:
     """Columns one after the other."""
     none = np.zeros((0, 3), np.int64)
     harmonics = np.zeros((0, BASES[sh_degree], 3), np.int64)
-    parts = [Columns(none[:, 0], none[:, 0], none, none, none, harmonics), *parts]
+    parts = [Columns(none[:, 0], none[:, 0], none[:, 0], none, none, none, harmonics), *parts]
     return Columns(
         **{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Columns)}
     )
@@ -70,9 +73,11 @@ def joined(parts: list[Columns], sh_degree: int) -> Columns:
 def new_tables(layout: Layout) -> dict[str, np.ndarray]:
     """Counts that a stream begins with, by name: int [contexts, symbols]."""
     opacities = np.arange(_OPACITIES)
+    possible = (opacities >= (not layout.two_opacities)) & (opacities <= layout.opacities)
     tables = {
         "gap": _peaked(_GAPS, 24, 4)[None],
-        "opacity": np.where((opacities > 0) & (opacities <= layout.opacities), _FLAT, 0)[None],
+        "opacity": np.where(possible, _FLAT, 0)[None],
+        "second opacity": np.tile(np.where(possible, _FLAT, 0), (_CLASSES, 1)),
         "scale": np.stack([_peaked(_SCALES, _SCALE, 12), *[_peaked(_SCALES, 9, 6)] * 2]),
         "rotation": np.stack([_within(steps) for steps in ROTATIONS]),
         "colour": np.stack([_peaked(_COLOURS, _COLOUR, 12), *[_peaked(_COLOURS, _COLOUR, 4)] * 2]),
@@ -102,14 +107,20 @@ def _few(bits: int) -> np.ndarray:
     return np.maximum(_PEAK >> 2 * ones, 1)
 
 
-def code_columns(coder: Coder, layout: Layout, count: int, before: int, given: Columns | None) -> Columns:
+def code_columns(
+    coder: Coder, layout: Layout, count: int, before: int, two: bool, given: Columns | None
+) -> Columns:
     """Code the columns of `count` Gaussians; a reader is given none.
 
-    `before`: the Morton code before them in the level, or 0.
+    `before`: the Morton code before them in the level, or 0. `two`: the level has second opacities.
     """
     zero = np.zeros(count, np.int64)
     gaps = _code_gaps(coder, zero, None if given is None else np.diff(given.positions, prepend=before))
     opacities = coder.symbols("opacity", zero, None if given is None else given.opacities)
+    seconds = opacities
+    if two:
+        classes = opacities * _CLASSES // (layout.opacities + 1)
+        seconds = coder.symbols("second opacity", classes, None if given is None else given.seconds)
     scales = _code_scales(coder, zero, None if given is None else given.scales)
     classes, rotations = layout.classes(scales), np.empty((count, 3), np.int64)
     for axis in range(3):
@@ -117,7 +128,7 @@ def code_columns(coder: Coder, layout: Layout, count: int, before: int, given: C
         rotations[:, axis] = coder.symbols("rotation", classes, wanted) - _ROTATION
     colours = _code_colours(coder, zero, None if given is None else given.colours)
     harmonics = _code_harmonics(coder, layout, zero, None if given is None else given.harmonics)
-    return Columns(before + gaps.cumsum(), opacities, scales, rotations, colours, harmonics)
+    return Columns(before + gaps.cumsum(), opacities, seconds, scales, rotations, colours, harmonics)
 
 
 def _code_gaps(coder: Coder, zero: np.ndarray, given: np.ndarray | None) -> np.ndarray:

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float64, Int64
+from jaxtyping import Float32, Float64, Int64
+from torch import Tensor
 
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.quantisation import PER_COLOUR, in_buckets, logits_of_bytes
@@ -15,7 +16,7 @@ from sagesplat.formats.stream_columns import AXIS_BITS, BASES, LARGEST, ROTATION
 MAGIC, VERSION = b"SGST", 1
 _HEADER = struct.Struct("<4sBBBBBBBBffffffhhhH")
 SIZE = _HEADER.size
-_ANTIALIASED = 1  # flag
+_ANTIALIASED, _TWO_OPACITIES = 1, 2  # flags
 _FRAME = "rub"  # axes: right, up, back, as in SPZ
 _CELLS = 2**AXIS_BITS
 _SMALLEST = 2**-8  # step that a precision can ask for
@@ -39,12 +40,13 @@ class Precision:
     Colours, log scales and harmonics are those that nested levels are trained with.
     """
 
-    position: float = 1 / 8  # steps, of the median of the Gaussians' middle standard deviation
-    opacity: int = 6  # steps of 1/255
+    position: float = 1 / 6  # steps, of the median of the Gaussians' middle standard deviation
+    opacity: int = 8  # steps of 1/255
     colour: float = 2.0  # steps of sh0, of SPZ's units (of a byte)
     log_scale: float = 1 / 8  # steps
     sh_bits: tuple[int, int] = (5, 4)  # steps of 2^(1 - bits): of degree 1, and of 2 and 3
-    rotation: float = 0.0  # classes finer than usual; two halve the steps
+    rotation: float = -0.75  # classes finer than usual; two halve the steps
+    least: float = 0.75  # opacity, in its steps: what never has more is left out
 
     def __post_init__(self) -> None:
         steps = (self.position, self.colour, self.log_scale)
@@ -52,6 +54,8 @@ class Precision:
             raise ValueError(f"steps {steps} and {self.opacity}/255 of opacities are not in the format")
         if not all(1 <= bits <= 8 for bits in self.sh_bits) or abs(self.rotation) > 9:
             raise ValueError(f"{self.sh_bits} bits, {self.rotation} classes; 1 to 8 and -9 to 9 are there")
+        if not 0.5 <= self.least <= 255:
+            raise ValueError(f"opacities of {self.least} steps; from 0.5 on they are in the format")
 
 
 @dataclass(frozen=True)
@@ -59,6 +63,7 @@ class Header:
     """What a stream says of all its Gaussians."""
 
     antialiased: bool
+    two_opacities: bool  # of each Gaussian, one for the low levels and one for the full model
     sh_degree: int
     levels: int
     opacity_step: int  # of 1/255
@@ -76,12 +81,15 @@ class Header:
     def layout(self) -> Layout:
         """What it says of the columns."""
         opacities = -(-255 // self.opacity_step)
-        return Layout(self.sh_degree, opacities, self.rotation_origin, self.rotation_spread)
+        return Layout(
+            self.sh_degree, opacities, self.two_opacities, self.rotation_origin, self.rotation_spread
+        )
 
     def pack(self) -> bytes:
         """Its bytes."""
+        flags = _ANTIALIASED * self.antialiased | _TWO_OPACITIES * self.two_opacities
         return _HEADER.pack(
-            MAGIC, VERSION, _ANTIALIASED * self.antialiased, self.sh_degree, self.levels, self.opacity_step,
+            MAGIC, VERSION, flags, self.sh_degree, self.levels, self.opacity_step,
             *self.sh_bits, self.rotation_spread, *self.origin, self.step, self.scale_step, self.colour_step,
             self.scale_origin, self.colour_origin, self.rotation_origin, 0,
         )  # fmt: skip
@@ -93,7 +101,7 @@ def read_header(content: bytes) -> Header:
         raise ValueError("not a sagesplat-stream")
     _, version, flags, degree, levels, opacity, low, high, spread, *rest = _HEADER.unpack_from(content)
     *origin, step, scale_step, colour_step, scales, colours, rotations, reserved = rest
-    if version != VERSION or flags & ~_ANTIALIASED or reserved:
+    if version != VERSION or flags & ~(_ANTIALIASED | _TWO_OPACITIES) or reserved:
         raise ValueError(f"version {version}, flags {flags}: a newer stream than this reader knows")
     steps = np.array([step, scale_step, colour_step])
     reach = np.abs(origin) + step * _CELLS
@@ -102,12 +110,14 @@ def read_header(content: bytes) -> Header:
     if degree > 3 or not levels or not opacity or not spread or not (1 <= low <= 8 and 1 <= high <= 8):
         raise ValueError(f"degree {degree}, {levels} levels, steps {opacity}, {low}, {high}, {spread}")
     return Header(
-        bool(flags), degree, levels, opacity, (low, high), spread, (origin[0], origin[1], origin[2]),
-        step, scale_step, colour_step, scales, colours, rotations,
+        bool(flags & _ANTIALIASED), bool(flags & _TWO_OPACITIES), degree, levels, opacity, (low, high),
+        spread, (origin[0], origin[1], origin[2]), step, scale_step, colour_step, scales, colours, rotations,
     )  # fmt: skip
 
 
-def header_of(g: Gaussians, levels: int, precision: Precision, *, antialiased: bool) -> Header:
+def header_of(
+    g: Gaussians, levels: int, precision: Precision, *, antialiased: bool, two_opacities: bool
+) -> Header:
     """The header of a stream of these Gaussians, in right, up, back."""
     means, logs = g.means.double().numpy(), np.sort(g.log_scales.double().numpy(), axis=1)
     if not len(means):
@@ -122,6 +132,7 @@ def header_of(g: Gaussians, levels: int, precision: Precision, *, antialiased: b
     usual = int(np.median(2 * scales[:, 2] - scales[:, 0])) - origin
     return Header(
         antialiased,
+        two_opacities,
         g.sh_degree,
         levels,
         precision.opacity,
@@ -137,10 +148,19 @@ def header_of(g: Gaussians, levels: int, precision: Precision, *, antialiased: b
     )
 
 
-def quantised(g: Gaussians, header: Header) -> Columns:
-    """The columns of Gaussians in right, up, back, row by row."""
+def opacities_of(logits: Tensor, step: int) -> Float64[np.ndarray, " N"]:
+    """Opacities in steps of `step` / 255, not rounded."""
+    return torch.sigmoid(logits.double()).numpy() * (255 / step)
+
+
+def logits_of(opacities: Int64[np.ndarray, " N"], step: int) -> Float32[Tensor, " N"]:
+    """The logits of opacities in steps of `step` / 255."""
+    return torch.from_numpy(logits_of_bytes(opacities * float(step)))
+
+
+def quantised(g: Gaussians, seconds: Tensor, header: Header) -> Columns:
+    """The columns of Gaussians in right, up, back; `seconds`: logits of their second opacities."""
     cells = np.rint((g.means.double().numpy() - header.origin) / header.step).astype(np.int64)
-    opacities = torch.sigmoid(g.logit_opacities.double()).numpy() * (255 / header.opacity_step)
     logs = g.log_scales.double().numpy().clip(-_LONGEST_LOG, _LONGEST_LOG)
     axes = np.argsort(-logs, axis=1, kind="stable")
     scales = np.rint(np.take_along_axis(logs, axes, 1) / header.scale_step).astype(np.int64)
@@ -151,7 +171,8 @@ def quantised(g: Gaussians, header: Header) -> Columns:
     harmonics = in_buckets(g.shN.double(), header.sh_bits).numpy() / _sh_steps(header)
     return Columns(
         spread_bits(cells.clip(0, _CELLS - 1)),
-        np.rint(opacities).astype(np.int64),
+        np.rint(opacities_of(g.logit_opacities, header.opacity_step)).astype(np.int64),
+        np.rint(opacities_of(seconds, header.opacity_step)).astype(np.int64),
         scales,
         np.rint(xyz * 2**0.5 * steps).astype(np.int64).clip(-steps, steps),
         (np.rint(colours) - header.colour_origin).clip(-LARGEST, LARGEST).astype(np.int64),
@@ -173,7 +194,7 @@ def restored(columns: Columns, header: Header, label_id: int) -> Gaussians:
         means=torch.from_numpy(means),
         quats=torch.from_numpy(quats),
         log_scales=torch.from_numpy(logs.clip(-_LONGEST_LOG, _LONGEST_LOG).astype(np.float32)),
-        logit_opacities=torch.from_numpy(logits_of_bytes(columns.opacities * float(header.opacity_step))),
+        logit_opacities=logits_of(columns.opacities, header.opacity_step),
         sh0=torch.from_numpy(sh0[:, None].astype(np.float32)),
         shN=torch.from_numpy(shN),
         label_ids=torch.full((len(means),), label_id, dtype=torch.int16),

@@ -41,7 +41,7 @@ def _still(values: Tensor, trainable: Tensor) -> Tensor:
     return torch.where(trainable.view(-1, *[1] * (values.ndim - 1)), values, values.detach())
 
 
-def _world_to_camera(camera: Camera, pose: Tensor | None) -> Tensor:
+def world_to_camera(camera: Camera, pose: Tensor | None) -> Tensor:
     """The camera's matrix [4, 4] in float64, moved by a rotation vector and a translation."""
     w2c = torch.tensor(camera.w2c).double()
     if pose is None:
@@ -52,7 +52,7 @@ def _world_to_camera(camera: Camera, pose: Tensor | None) -> Tensor:
     return torch.cat([top, w2c.new_tensor([[0, 0, 0, 1]])]) @ w2c
 
 
-def _project(g: Gaussians, camera: Camera, w2c: Tensor, antialiased: bool):
+def projected(g: Gaussians, camera: Camera, w2c: Tensor, antialiased: bool):
     """Depths, 2D means, 2D covariances and opacities (EWA splatting as 3DGS uses it)."""
     K = torch.tensor(camera.K).double()
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
@@ -111,8 +111,8 @@ def render(
     if trainable is not None:
         parts = {name: _still(getattr(g, name), trainable) for name in PARAMETERS}
         g, features = replace(g, **parts), None if features is None else _still(features, trainable)
-    w2c = _world_to_camera(camera, pose)
-    z, means2d, cov, opacity = _project(g, camera, w2c, antialiased)
+    w2c = world_to_camera(camera, pose)
+    z, means2d, cov, opacity = projected(g, camera, w2c, antialiased)
     watched = means2d.detach().requires_grad_(means2d.requires_grad)
     if watched.requires_grad and trainable is not None:
         watched.register_hook(lambda grad: torch.where(trainable[:, None], grad, 0.0))

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from sagesplat.adapt.ladder import read_ladder, read_prefixes
 from sagesplat.adapt.observe import RenderedLabels
@@ -18,6 +19,7 @@ from sagesplat.core.config import BlocksConfig, NestConfig, TrainConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit, Progress, named
 from sagesplat.core.gaussians import Gaussians, concat
+from sagesplat.core.second_opacity import SecondOpacities
 from sagesplat.formats.levels import read_level, read_more, read_sizes, write_level, write_set
 from sagesplat.io.files import link, write_json
 from sagesplat.run.capture import Hashes, fingerprint, photo_hashes
@@ -45,7 +47,15 @@ from sagesplat.stages.nest import nest_levels, write_ladder
 from sagesplat.stages.shared import label_image_inputs, train_config
 from sagesplat.stages.train import read_frozen, train_inputs, train_levels, write_frozen
 from sagesplat.train import memory, nested
-from sagesplat.train.boundaries import around, boundary_views, interior, interior_sizes, together
+from sagesplat.train.boundaries import (
+    around,
+    boundary_views,
+    interior,
+    interior_opacities,
+    interior_sizes,
+    read_nested,
+    together,
+)
 from sagesplat.train.nested import Nested, NestStep
 
 _SEEN = 0.01  # share of a photo's visible points from which on it sees a block
@@ -282,8 +292,8 @@ def nest_blocks(job: Job, config: BlocksConfig, nest: NestConfig, seed: int) -> 
         else:  # the table of blocks would show the seconds of an earlier tuning
             for number in every:
                 run.block(number).provenance("boundaries").unlink(missing_ok=True)
-        g, sizes, purity = together(files)
-        lines = write_ladder(job, g, sizes, nest, purity)
+        merged = together(files)
+        lines = write_ladder(job, merged.gaussians, merged.sizes, nest, merged.purity, merged.second)
         return [*lines, f"{len(blocks)} blocks, {config.boundary_steps} steps of boundary tuning each"]
 
     inputs = [run.scene, run.labels, run.levels, run.provenance("train"), *label_image_inputs(run), file]
@@ -307,7 +317,8 @@ def nest_block(
             raise RunError(f"{run.path}: no Gaussians inside the block; choose fewer with --blocks.count")
         labels, purity = full.gaussians.label_ids.numpy(), read_more(run.prefixes, "purity")
         sizes = interior_sizes(labels, inside, full.sizes, parts, number)
-        write_set(run.interior, g, config.steps, sizes, purity=purity[inside])
+        second = full.second and interior_opacities(full.second, inside, sizes, parts, number)
+        write_set(run.interior, g, config.steps, sizes, second=second, purity=purity[inside])
         return [f"{len(g):,} of {len(full.gaussians):,} Gaussians are inside the block"]
 
     inputs = [run.prefixes, run.masks / "labels.json", partition]
@@ -342,15 +353,16 @@ def tune_boundaries(
     settings = {**asdict(config), "seed": seed}
 
     def make() -> list[str]:
-        blocks, own = read_blocks(partition), read_level(run.interior)
+        blocks, sizes = read_blocks(partition), read_sizes(run.interior)
+        g, second = own = read_nested(run.interior)
         views = boundary_views(job.scene, blocks, number)
-        near = blocks.to_border(own.means.numpy()) < blocks.margin
-        tuned = own
+        near = blocks.to_border(g.means.numpy()) < blocks.margin
         if views and near.any():
-            tuned = _tuned(job, own, near, others, views, config, seed)
+            g, logits = _tuned(job, own, near, others, views, config, seed)
+            second = second if second is None or logits is None else replace(second, logits=logits)
         purity = read_more(run.interior, "purity")
-        write_set(run.tuned_interior, tuned, config.steps, read_sizes(run.interior), purity=purity)
-        return [f"{int(near.sum()):,} of {len(own):,} Gaussians, {len(views)} views of several blocks"]
+        write_set(run.tuned_interior, g, config.steps, sizes, second=second, purity=purity)
+        return [f"{int(near.sum()):,} of {len(near):,} Gaussians, {len(views)} views of several blocks"]
 
     inputs = [run.scene, run.provenance("train"), run.interior, partition, *others]
     run_stage(job, "boundaries", settings, inputs, [run.tuned_interior], make)
@@ -358,20 +370,21 @@ def tune_boundaries(
 
 def _tuned(
     job: Job,
-    own: Gaussians,
+    own: tuple[Gaussians, SecondOpacities | None],
     near: np.ndarray,
     others: list[Path],
     views: list[int],
     config: NestConfig,
     seed: int,
-) -> Gaussians:
+) -> tuple[Gaussians, Tensor | None]:
+    """The block's Gaussians after the training, and their second opacities."""
     scene = job.scene
-    g = around(own, (read_level(path) for path in others), scene, views)
+    g, second = around(own, others, scene, views)
     n = len(g)
     movable = np.concatenate([near, np.zeros(n - len(near), bool)])
     kept = frozenset(view.name for row, view in enumerate(scene.views) if row not in set(views))
     narrowed = replace(scene, test_names=kept)
-    ladder = Nested(g, np.ones(n, np.float32), np.zeros(n, np.int8))
+    ladder = Nested(g, np.ones(n, np.float32), np.zeros(n, np.int8), second)
     for event in nested.nest(
         ladder, narrowed, job.photos, train_config(job), config,
         valid=job.valid, seed=seed, backend=job.backend, movable=movable,
@@ -379,6 +392,7 @@ def _tuned(
         if isinstance(event, NestStep):
             job.emit(Progress("boundaries", event.step, config.steps, f"loss {event.loss:.3f}"))
         elif isinstance(event, Nested):
-            mine = torch.isin(event.gaussians.label_ids, torch.unique(own.label_ids))
-            return event.gaussians.select(mine)
+            mine = torch.isin(event.gaussians.label_ids, torch.unique(own[0].label_ids))
+            second = event.second_opacities
+            return event.gaussians.select(mine), None if second is None else second[mine]
     raise AssertionError("training ends with a Nested event")

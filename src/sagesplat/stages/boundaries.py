@@ -32,7 +32,7 @@ def measure_borders(job: Job) -> None:
     def make() -> list[str]:
         blocks = read_blocks(file)
         files = [run.block(number).interior for number in range(len(blocks))]
-        sets = {"merged": together(files)[0], "tuned": job.ladder.load(job.ladder.levels[-1])}
+        sets = {"merged": together(files).full, "tuned": job.ladder.load(job.ladder.levels[-1])}
         tables = [balance_table(job, blocks), border_table(job, blocks, sets)]
         for table in tables:
             job.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))

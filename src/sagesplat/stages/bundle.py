@@ -6,7 +6,8 @@ import shutil
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -15,10 +16,11 @@ from PIL import Image
 from sagesplat.adapt.observe import large_enough
 from sagesplat.adapt.viewpoint import QualityKind, ViewModel
 from sagesplat.core.errors import RunError
+from sagesplat.core.events import Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.names import composed
 from sagesplat.core.typed import fits
-from sagesplat.formats.increments import INDEX, full_scene, read_increments, write_increments
+from sagesplat.formats.increments import INDEX, Increment, full_scene, read_increments, write_increments
 from sagesplat.formats.levels import read_level
 from sagesplat.io.files import read_json, write_json
 from sagesplat.io.lock import alone
@@ -30,6 +32,7 @@ from sagesplat.scene import read_scene
 from sagesplat.segment.block_categories import split_name
 from sagesplat.segment.display_names import title_of
 from sagesplat.segment.masks import UNLABELLED
+from sagesplat.stages.export import increment_files
 from sagesplat.stages.plan import main_target
 from sagesplat.stages.results import (
     fidelity_of,
@@ -89,6 +92,7 @@ def bundle(
     always: Collection[str] = (),
     weights: Mapping[str, float] | None = None,
     single_file: bool = False,
+    chunks: Literal["stream", "spz"] | None = None,
     viewer: Path | None = None,
 ) -> BundleMade:
     """Write a finished run as a bundle into `out`: a new or empty folder, or an earlier bundle.
@@ -97,9 +101,11 @@ def bundle(
 
     `meters_per_unit`: scale of the scene; by default guessed from the cameras' height. `always`: categories
     shipped in full. `weights`: by category, 1 for the others. In a scene in blocks, a category's name stands
-    for all its per-block categories, and `name@block` for one of them. `viewer`: the built viewer; by default
-    the package's own. RunError for a run without nested levels or bounds, another folder, unknown names or an
-    impossible number; DataError for a damaged increment; SageError without a viewer.
+    for all its per-block categories, and `name@block` for one of them. `chunks`: format of the increments; by
+    default that of the run. `viewer`: the built viewer; by default the package's own.
+
+    RunError for a run without nested levels or bounds, or without streams, another folder, unknown names or
+    an impossible number; DataError for a damaged increment; SageError without a viewer.
     """
     always = [composed(name) for name in always]
     weights = {composed(name): weight for name, weight in (weights or {}).items()}
@@ -108,12 +114,16 @@ def bundle(
     viewer = viewer or package_viewer()
     (check_page if single_file else check_target)(out)
     check_viewer(viewer)
-    chunks = increments_of(job)
-    full = full_scene(chunks)
+    listed = increments_of(job)
+    if chunks == "stream" and not _in_streams(listed):
+        raise RunError(
+            f"{job.run.increments}: increments in SPZ files, not in coded streams; leave out --chunks"
+        )
+    full = full_scene(listed)
     g, drawn = read_increments(job.run.increments, full), viewpoints_of(job)
     contents = replace(
         _contents(job, g, job.antialiased),
-        chunks=chunks,
+        chunks=listed,
         meters_per_unit=meters_per_unit,
         drawn=[drawn.cameras[row] for row in drawn.rows("fit")],
         target=_target(job),
@@ -121,10 +131,34 @@ def bundle(
     contents = replace(contents, categories=_with_quality(job, contents.categories, always, weights))
     contents = with_corrections(contents)
     write = write_single_file if single_file else write_bundle
-    written = write(out, contents, viewer, _poster(g, contents))
+    with TemporaryDirectory() as work:
+        if chunks == "spz" and _in_streams(listed):
+            contents = _in_spz(job, contents, Path(work) / "increments")
+        written = write(out, contents, viewer, _poster(g, contents))
     agreement, error = distance_error(contents)
     count = sum(chunk.count for chunk in full)
-    return BundleMade(out, len(contents.categories), len(chunks), count, written, agreement, error)
+    return BundleMade(out, len(contents.categories), len(listed), count, written, agreement, error)
+
+
+def _in_spz(job: Job, contents: Contents, folder: Path) -> Contents:
+    """The contents with increments in SPZ files, written to `folder`.
+
+    SPZ has one opacity for each Gaussian. Where streams have two, the bounds of their levels would be wrong.
+    """
+    made = replace(contents, chunks=increment_files(job, folder, "spz"), folder=folder)
+    if all(one.weight is None for one in contents.chunks):
+        return made
+    job.emit(
+        Warned(
+            "SPZ has one opacity for each Gaussian, here that of the full model: lower levels look worse "
+            "than in coded streams, and the bundle has no bounds of them"
+        )
+    )
+    return replace(made, categories=[replace(one, models={}, seen={}) for one in contents.categories])
+
+
+def _in_streams(listed: Sequence[Increment]) -> bool:
+    return any(one.format == "stream" for one in listed)
 
 
 def _without_capture(job: Job) -> Job:

@@ -5,13 +5,17 @@ from pathlib import Path
 from sagesplat.adapt.plan import Plan
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.ply import write_ply
+from sagesplat.raster.classic import for_classic
 from sagesplat.run.job import Job
 from sagesplat.run.records import settings_of
 from sagesplat.run.stage import run_stage
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.plan import main_plan
 from sagesplat.stages.shared import label_image_inputs, train_config
+from sagesplat.train.early_stopping import spread
 from sagesplat.train.stepper import tune
+
+_VIEWS = 32  # training views that tell how Gaussians are drawn
 
 
 def tune_composition(job: Job, g: Gaussians, steps: int) -> Gaussians:
@@ -32,14 +36,22 @@ def compose(job: Job, plan: Plan) -> Gaussians:
     return tune_composition(job, job.ladder.compose(plan.levels), steps)
 
 
+def classic(job: Job, g: Gaussians) -> Gaussians:
+    """`g` for viewers that draw without antialiasing, whatever the run was trained with."""
+    if not job.antialiased:
+        return g
+    rows = spread(job.scene.train_ids.tolist(), _VIEWS)
+    return for_classic(g, (job.scene.views[row].camera for row in rows))
+
+
 def compose_plan(job: Job) -> None:
-    """Write the scene that the plan chose."""
+    """Write the scene that the plan chose, for the usual viewers of PLY files: they do not antialias."""
     run = job.run
 
     def make() -> list[str]:
         plan = main_plan(job)
         g = compose(job, plan)
-        write_ply(run.composed, g, job.names(), antialiased=job.antialiased)
+        write_ply(run.composed, classic(job, g), job.names())
         transfer_bytes = (
             "" if plan.transfer_bytes is None else f", {plan.transfer_bytes / 1e6:.2f} MB to send"
         )

@@ -3,33 +3,54 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 from sagesplat.adapt.ladder import read_prefixes
 from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.core.errors import RunError
-from sagesplat.formats.increments import INDEX, Format, write_increments
+from sagesplat.formats.increments import (
+    INDEX,
+    FileFormat,
+    Increment,
+    read_increments,
+    read_index,
+    write_increments,
+)
 from sagesplat.formats.lod_meta import LOD_META
 from sagesplat.formats.lod_meta_write import write_lod_meta
 from sagesplat.formats.splats_write import write_splat, written_as
 from sagesplat.run.job import Job
 from sagesplat.run.records import settings_of
-from sagesplat.stages.compose import compose
+from sagesplat.stages.compose import classic, compose
 from sagesplat.stages.plan import main_plan, scene_plan
 from sagesplat.stages.shared import label_named
 
+RasterizeMode = Literal["classic", "antialiased"]  # gsplat's names
 
-def export_increments(job: Job, folder: Path, kind: Format) -> int:
+
+def export_increments(job: Job, folder: Path, kind: FileFormat) -> int:
     """Write what each level of each category adds as files of their own; returns how many."""
     if job.run.ladder != "nested":
         raise RunError(f"{job.run.path}: snapshots have no chunks; use --ladder nested")
     if folder.exists() and not (job.force and (folder / INDEX).exists()):
         raise RunError(f"{folder}: exists; choose a new folder (--force replaces one of chunks)")
+    return len(increment_files(job, folder, kind))
+
+
+def increment_files(job: Job, folder: Path, kind: FileFormat) -> list[Increment]:
+    """Write the increments of the run's nested levels as files of their own, in the order of the ladder.
+
+    What streams hold is kept by the finest steps of SPZ. Of two opacities a Gaussian gets that of the full
+    model.
+    """
     ladder, made = read_prefixes(job.run.prefixes), settings_of(job.run, "nest")
-    chunks = write_increments(
-        folder, ladder.gaussians, ladder.sizes, job.names(), replaces=ladder.replaces, kind=kind,
-        sh_bits=tuple(made["sh_bits"]), antialiased=job.antialiased,
+    listed = read_index(job.run.increments)
+    streams = any(one.format == "stream" for one in listed)
+    g = read_increments(job.run.increments, listed) if streams else ladder.gaussians
+    return write_increments(
+        folder, g, ladder.sizes, job.names(), replaces=ladder.replaces, kind=kind,
+        sh_bits=tuple(made["sh_bits"]), fine=ladder.levels if streams else (), antialiased=job.antialiased,
     )  # fmt: skip
-    return len(chunks)
 
 
 def export_scene(
@@ -40,12 +61,18 @@ def export_scene(
     labels: Sequence[str],
     target: tuple[QualityKind, float] | None,
     levels: Sequence[int] = (),
+    rasterize_mode: RasterizeMode | None = None,
 ) -> int:
     """Write a level or a composition, whole or some categories, in the format of the path's name.
 
+    `rasterize_mode`: how the file will be drawn; None: `classic` for a PLY, else as the run was trained.
     `lod-meta.json` gets `levels`, or all there are, as levels of detail. Returns the number of Gaussians.
     """
     written = written_as(path)
+    if rasterize_mode == "antialiased" and not job.antialiased:
+        raise RunError(f"{job.run.path}: trained without antialiasing; leave out --rasterize-mode")
+    if rasterize_mode == "classic" and written == LOD_META:
+        raise RunError(f"{path}: says how it is drawn; leave out --rasterize-mode")
     if written == LOD_META:
         _check_folder(job, path.parent)
     elif path.exists() and not job.force:
@@ -60,7 +87,11 @@ def export_scene(
     else:
         plan = main_plan(job) if target is None else scene_plan(job, *target)
         g = compose(job, plan).of_labels(wanted)
-    write_splat(path, g, job.names(), antialiased=job.antialiased)
+    mode = rasterize_mode or ("classic" if written == ".ply" else "antialiased")
+    if mode == "classic":
+        write_splat(path, classic(job, g), job.names())
+    else:
+        write_splat(path, g, job.names(), antialiased=job.antialiased)
     return len(g)
 
 

@@ -1,16 +1,16 @@
 """Makes the nested levels and their increments, from the trained Gaussians: orders them, trains prefixes."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
-import torch
 
 from sagesplat.adapt.observe import as_unit, measure_total, render_rgb
 from sagesplat.core.config import NestConfig
 from sagesplat.core.events import Progress, Warned
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.formats.increments import packed, read_increments, write_increments
+from sagesplat.core.second_opacity import SecondOpacities
 from sagesplat.formats.levels import read_header, read_level, write_set
+from sagesplat.formats.stream_increments import read_streams, write_streams
 from sagesplat.run.job import Job
 from sagesplat.run.records import checkpoint_key
 from sagesplat.run.stage import run_stage
@@ -58,7 +58,9 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
                 trained = event
         counts, across = trained.gaussians.counts(), trained.boundary
         sizes = {label: nested.level_sizes(n, config, across.get(label, 0)) for label, n in counts.items()}
-        lines = write_ladder(job, trained.gaussians, sizes, config, trained.purity)
+        second = trained.second_opacities
+        second = None if second is None else SecondOpacities.of_levels(second, sizes)
+        lines = write_ladder(job, trained.gaussians, sizes, config, trained.purity, second)
         lines[0] += f", {sum(across.values()):,} of them across borders and in every level"
         remove_checkpoints(run.nest_checkpoint)
         return lines
@@ -104,32 +106,39 @@ def train_capped(job: Job, stage: str, cap: int, steps: int, seed: int) -> Gauss
 
 
 def write_ladder(
-    job: Job, g: Gaussians, sizes: dict[int, tuple[int, ...]], config: NestConfig, purity: np.ndarray
+    job: Job,
+    g: Gaussians,
+    sizes: dict[int, tuple[int, ...]],
+    config: NestConfig,
+    purity: np.ndarray,
+    second: SecondOpacities | None = None,
 ) -> list[str]:
     """Write Gaussians in their order, with levels of `sizes` by label id, as the run's ladder and increments.
 
-    `purity` [N] of `Nested` is kept beside them. Returns lines that sum it up.
+    `purity` [N] of `Nested` and `second` are kept beside them. Gaussians that are hardly to be seen are left
+    out. Returns lines that sum it up.
     """
     job.run.provenance("nest").unlink(missing_ok=True)  # from here on the earlier ladder is gone
-    rows = packed(g, sizes, sh_bits=config.sh_bits)
-    ordered = g.select(torch.from_numpy(rows))
-    chunks = write_increments(
-        job.run.increments, ordered, sizes, job.names(), sh_bits=config.sh_bits, antialiased=job.antialiased
-    )
+    made = write_streams(
+        job.run.increments, g, sizes, job.names(), second=second, sh_bits=config.sh_bits,
+        antialiased=job.antialiased,
+    )  # fmt: skip
     # what is measured, planned and written from here on is what a viewer gets
-    sent = read_increments(job.run.increments, chunks)
-    write_set(job.run.prefixes, sent, config.steps, sizes, purity=purity[rows])
-    size, n = sum(chunk.nbytes for chunk in chunks), len(g)
-    unrounded, decoded = _quality(job, ordered), _quality(job, sent)
+    sent, seconds = read_streams(job.run.increments, made.increments)
+    write_set(job.run.prefixes, sent, config.steps, made.sizes, second=seconds, purity=purity[made.rows])
+    size, n = sum(one.nbytes for one in made.increments), len(sent)
+    decoded, unrounded = _quality(job, sent, seconds), _quality(job, g, second)
     return [
-        f"{config.levels} levels, {n:,} Gaussians",
-        f"{size / 1e6:.2f} MB in {len(chunks)} SPZ files, {size / n:.1f} bytes a Gaussian; "
+        f"{config.levels} levels, {len(g):,} Gaussians",
+        f"{n:,} of them to be seen, in {len(made.sizes)} coded streams of {size / 1e6:.2f} MB, "
+        f"{size / n:.1f} bytes a Gaussian; "
         f"training views: SSIM {decoded:.4f} as decoded, {unrounded:.4f} before rounding",
     ]
 
 
-def _quality(job: Job, g: Gaussians) -> float:
-    """Mean SSIM over some of the training views."""
+def _quality(job: Job, g: Gaussians, second: SecondOpacities | None) -> float:
+    """Mean SSIM of the full model over some of the training views."""
+    g = g if second is None else replace(g, logit_opacities=second.logits)
     found = []
     for row in spread(job.valid.rows(job.scene, job.scene.train_ids), VIEWS):
         view = job.scene.views[row]

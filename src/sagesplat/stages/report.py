@@ -19,9 +19,10 @@ def make_report(job: Job) -> None:
 
     def make() -> list[str]:
         quality, target = main_target(run)
-        # the page leads with a target: what was composed for a budget is not what it is about
-        within_budget = budget_plan_of(job) is not None
-        composed = compose(job, scene_plan(job, quality, target)) if within_budget else read_ply(run.composed)
+        # the page leads with a target: what was composed for a budget is not what it is about; and what was
+        # written for other viewers is not drawn as the run draws
+        other = budget_plan_of(job) is not None or job.antialiased
+        composed = compose(job, scene_plan(job, quality, target)) if other else read_ply(run.composed)
         write_report(run.report, report_data(job, composed, quality, target, found))
         return []
 

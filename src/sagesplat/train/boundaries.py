@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Bool
+from torch import Tensor
 
 from sagesplat.core import geometry
 from sagesplat.core.gaussians import Gaussians, concat
-from sagesplat.formats.levels import read_level, read_more, read_sizes
+from sagesplat.core.second_opacity import SecondOpacities
+from sagesplat.formats.levels import read_level, read_more, read_second, read_sizes
 from sagesplat.metrics.image import psnr
 from sagesplat.scene.blocks import Blocks, visible_shares
 from sagesplat.scene.scene import Scene
@@ -46,11 +48,57 @@ def interior_sizes(
     return found
 
 
-def together(files: Sequence[Path]) -> tuple[Gaussians, dict[int, tuple[int, ...]], np.ndarray]:
-    """The nested models of all blocks, merged: Gaussians, level sizes by label id, label purity."""
+def interior_opacities(
+    second: SecondOpacities,
+    inside: np.ndarray,
+    sizes: Mapping[int, tuple[int, ...]],
+    parts: BlockCategories,
+    block: int,
+) -> SecondOpacities:
+    """Second opacities of the interior (bool [N]) of a model, with the weights that it was trained with.
+
+    `sizes`: of `interior_sizes`.
+    """
+    of_parts = {int(parts.ids(np.array(label), block)): w for label, w in second.weights.items()}
+    return SecondOpacities(second.logits[torch.from_numpy(inside)], {i: of_parts[i] for i in sizes})
+
+
+@dataclass(frozen=True, eq=False)
+class Merged:
+    """The nested models of all blocks."""
+
+    gaussians: Gaussians
+    sizes: dict[int, tuple[int, ...]]  # of levels, by label id
+    purity: np.ndarray  # [N]
+    second: SecondOpacities | None
+
+    @property
+    def full(self) -> Gaussians:
+        """The full model, with the opacities that it has."""
+        g, second = self.gaussians, self.second
+        return g if second is None else replace(g, logit_opacities=second.logits)
+
+
+def together(files: Sequence[Path]) -> Merged:
+    """The nested models of all blocks, merged; their categories differ."""
     sizes = {label: n for path in files for label, n in read_sizes(path).items()}
     purity = np.concatenate([read_more(path, "purity") for path in files])
-    return concat([read_level(path) for path in files]), sizes, purity
+    models = [read_nested(path) for path in files]
+    seconds = [second for _, second in models]
+    logits, weights = _second(seconds), {i: w for one in seconds if one for i, w in one.weights.items()}
+    second = None if logits is None else SecondOpacities(logits, weights)
+    return Merged(concat([g for g, _ in models]), sizes, purity, second)
+
+
+def read_nested(path: Path) -> tuple[Gaussians, SecondOpacities | None]:
+    """All Gaussians of a nested ladder, and their second opacities."""
+    return read_level(path), read_second(path, read_sizes(path))
+
+
+def _second(parts: Sequence[SecondOpacities | None]) -> Tensor | None:
+    """Their logits in one row; None where a part has none."""
+    logits = [part.logits for part in parts if part is not None]
+    return torch.cat(logits) if len(logits) == len(parts) else None
 
 
 def boundary_views(scene: Scene, blocks: Blocks, block: int) -> list[int]:
@@ -70,10 +118,23 @@ def in_sight(g: Gaussians, scene: Scene, views: Sequence[int]) -> Bool[np.ndarra
     return seen
 
 
-def around(own: Gaussians, others: Iterable[Gaussians], scene: Scene, views: Sequence[int]) -> Gaussians:
-    """A block's Gaussians, then those of other blocks that its views see; `others` is read one by one."""
-    seen = [g.select(torch.from_numpy(in_sight(g, scene, views))) for g in others]
-    return concat([own, *seen])
+def around(
+    own: tuple[Gaussians, SecondOpacities | None],
+    others: Iterable[Path],
+    scene: Scene,
+    views: Sequence[int],
+) -> tuple[Gaussians, Tensor | None]:
+    """A block's Gaussians, then those of other blocks that its views see, and the second opacities of all.
+
+    The files of `others` are read one by one.
+    """
+    parts, seconds = [own[0]], [own[1]]
+    for path in others:
+        g, second = read_nested(path)
+        seen = torch.from_numpy(in_sight(g, scene, views))
+        parts.append(g.select(seen))
+        seconds.append(second and second.select(seen))
+    return concat(parts), _second(seconds)
 
 
 @dataclass(frozen=True)

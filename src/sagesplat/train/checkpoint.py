@@ -19,7 +19,7 @@ from sagesplat.core.errors import RunError, short
 from sagesplat.core.gaussians import PARAMETERS, Gaussians, checked
 from sagesplat.io.files import atomic_path, sync_files
 from sagesplat.io.npz import Npz
-from sagesplat.train.state import TrainState
+from sagesplat.train.state import SECOND, TrainState
 from sagesplat.train.view_parameters import ViewParameters
 
 _VERSION = 3
@@ -61,8 +61,10 @@ def write_checkpoint(path: Path, state: TrainState, settings: str) -> None:
     state = state.to(torch.device("cpu"))
     g = state.gaussians
     arrays = {name: p.numpy() for name, p in g.parameters().items()}
-    arrays |= {f"exp_avg/{name}": state.exp_avg[name].numpy() for name in PARAMETERS}
-    arrays |= {f"exp_avg_sq/{name}": state.exp_avg_sq[name].numpy() for name in PARAMETERS}
+    arrays |= {f"exp_avg/{name}": moment.numpy() for name, moment in state.exp_avg.items()}
+    arrays |= {f"exp_avg_sq/{name}": moment.numpy() for name, moment in state.exp_avg_sq.items()}
+    if state.second_opacities is not None:
+        arrays[SECOND] = state.second_opacities.numpy()
     if state.order_share is not None:
         arrays["order_share"] = state.order_share.numpy()
     arrays |= {"label_ids": g.label_ids.numpy(), "grad_sum": state.grad_sum.numpy()}
@@ -176,11 +178,11 @@ def _state(found: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> TrainSta
     rng = np.random.default_rng()
     rng.bit_generator.state = meta["rng"]
     gaussians = checked(Gaussians(**{n: arrays[n] for n in PARAMETERS}, label_ids=arrays["label_ids"]))
-    shapes = {
-        f"{kind}/{n}": p.shape
-        for kind in ("exp_avg", "exp_avg_sq")
-        for n, p in gaussians.parameters().items()
-    }
+    parameters = {name: p.shape for name, p in gaussians.parameters().items()}
+    if SECOND in arrays:
+        parameters[SECOND] = gaussians.logit_opacities.shape
+    shapes = {f"{kind}/{n}": s for kind in ("exp_avg", "exp_avg_sq") for n, s in parameters.items()}
+    shapes |= {SECOND: parameters[SECOND]} if SECOND in arrays else {}
     shapes |= dict.fromkeys(("grad_sum", "grad_count"), gaussians.logit_opacities.shape)
     shapes |= {"order_share": gaussians.logit_opacities.shape} if "order_share" in arrays else {}
     if wrong := [n for n, s in shapes.items() if arrays[n].shape != s or not arrays[n].is_floating_point()]:
@@ -190,8 +192,8 @@ def _state(found: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> TrainSta
         raise ValueError("steps or views that are none")
     return TrainState(
         gaussians=gaussians,
-        exp_avg={n: arrays[f"exp_avg/{n}"] for n in PARAMETERS},
-        exp_avg_sq={n: arrays[f"exp_avg_sq/{n}"] for n in PARAMETERS},
+        exp_avg={n: arrays[f"exp_avg/{n}"] for n in parameters},
+        exp_avg_sq={n: arrays[f"exp_avg_sq/{n}"] for n in parameters},
         grad_sum=arrays["grad_sum"],
         grad_count=arrays["grad_count"],
         rng=rng,
@@ -201,6 +203,7 @@ def _state(found: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> TrainSta
         frozen={int(label): int(step) for label, step in meta.get("frozen", ())},
         withheld=int(meta.get("withheld", 0)),
         order_share=arrays.get("order_share"),
+        second_opacities=arrays.get(SECOND),
         per_view=_per_view(arrays),
     )
 

@@ -13,6 +13,7 @@ from sagesplat.core import geometry
 from sagesplat.core.config import NestConfig, TrainConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import Gaussians, concat
+from sagesplat.core.second_opacity import weight_at
 from sagesplat.raster import Backend, device_of
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Points, Scene
@@ -34,6 +35,7 @@ CLEAR = 0.8  # share of its blending weight in one category below which a Gaussi
 _VISIBLE = 0.5  # blending weight in the other categories, in pixels per view, below which that is ignored
 _SHRINK_TO = 0.05  # of the learning rates, at the end
 _SAVE_EVERY = 500
+_NEARLY_FULL, _NEARLY_FROM = 0.2, 0.4  # share of the full steps that draw less, and the least prefix of these
 _SORT_AT = 1 / 12, 1 / 6, 1 / 3, 1 / 2, 2 / 3  # of the steps
 
 
@@ -44,6 +46,7 @@ class Nested:
     gaussians: Gaussians
     purity: Float32[np.ndarray, " N"]  # share of a Gaussian's blending weight in its own category; 1 unseen
     ranks: Int8[np.ndarray, " N"]  # order in a category: 0 boundary Gaussians, 1 base model, 2 others
+    second_opacities: Tensor | None = None  # [N] logits; see `core.second_opacity`
 
     @property
     def boundary(self) -> dict[int, int]:
@@ -207,10 +210,12 @@ def nest(
     """Train a nested ladder: afterwards every composition of prefixes renders well.
 
     Each step draws a prefix of every category, log-uniform between `config.drawn_from` and 1, or the full
-    model (with a probability that rises from `config.full_share` to `config.full_share_end`), and compares
-    the composition with a photo. Values are rounded as the increments will hold them. Gaussians outside the
-    composition, and their Adam moments, stay as they are. At five steps all Gaussians are sorted again by
-    importance: in each category boundary Gaussians stay first, then the base model, then the others.
+    model (with a probability that rises from `config.full_share` to `config.full_share_end`; a fifth of these
+    steps draw prefixes between 40 and 100 %), and compares the composition with a photo. Values are rounded as the increments will hold them. Gaussians outside the
+    composition, and their Adam moments, stay as they are. With `config.two_opacities` each category is drawn
+    with the opacities that its prefix has, between the first and the second ones. At five steps all Gaussians
+    are sorted again by importance: in each category boundary Gaussians stay first, then the base model, then
+    the others.
 
     Args:
         nested: The ordered model to start from (`order`).
@@ -239,6 +244,9 @@ def nest(
     labels, ranks = nested.gaussians.label_ids.numpy()[near], nested.ranks[near]
     state = initial_state(nested.gaussians.select(torch.from_numpy(near)), seed)
     state.order_share = torch.from_numpy(spans.order[near]) if spans else order_shares(labels, ranks, -near)
+    if config.two_opacities and spans is None:
+        given = nested.second_opacities
+        state.add_second_opacities(None if given is None else given[torch.from_numpy(near)])
     if checkpoint and checkpoint.exists():
         state, damage = latest_checkpoint(checkpoint, settings)
         if damage:
@@ -269,20 +277,23 @@ def nest(
                     valid=valid, antialiased=train_config.antialiased,
                 )  # fmt: skip
                 state.order_share = order_shares(labels, ranks, importances).to(device)
-            rows = None
+            rows = weights = None
             if spans is None or edges is None:
                 prefix = draw_shares(state.rng, len(categories), config, state.step / config.steps)
                 if (prefix < 1).any():
                     assert state.order_share is not None
                     shown = state.order_share < torch.from_numpy(prefix).to(device)[column]
                     rows = torch.nonzero(shown)[:, 0]
+                if state.second_opacities is not None:
+                    weights = torch.from_numpy(weight_at(prefix)).to(device)[column]
             else:
                 levels = torch.from_numpy(state.rng.integers(spans.levels, size=len(categories)))
                 level = levels.to(device)[column]
                 rows = torch.nonzero((edges[0] <= level) & (level <= edges[1]))[:, 0]
             loss = stepper(
-                state, nested.gaussians.sh_degree, rates(state.step + 1), trainable, drawn_rows=rows
-            )
+                state, nested.gaussians.sh_degree, rates(state.step + 1), trainable,
+                drawn_rows=rows, second_weights=weights,
+            )  # fmt: skip
             saves = state.step % _SAVE_EVERY == 0
             if device.type == "cpu" or saves or state.step % LOOK_EVERY == 0:  # looking waits for a GPU
                 value = finite(loss, state.step)
@@ -292,9 +303,10 @@ def nest(
     assert state.order_share is not None
     sets = np.zeros(len(labels)) if spans is None else spans.last[near]
     rows = np.lexsort((state.order_share.cpu().numpy(), sets, labels))
-    yield Nested(
-        state.gaussians.to("cpu").select(torch.from_numpy(rows)), nested.purity[near][rows], ranks[rows]
-    )
+    state = state.to(torch.device("cpu"))
+    g, second = state.gaussians.select(torch.from_numpy(rows)), state.second_opacities
+    second = None if second is None else second[torch.from_numpy(rows)]
+    yield Nested(g, nested.purity[near][rows], ranks[rows], second)
 
 
 def order_shares(labels: np.ndarray, ranks: np.ndarray, importances: np.ndarray) -> Tensor:
@@ -312,6 +324,8 @@ def draw_shares(
     """Prefix of each category that a step renders, as a share of it; `done`: share of the steps taken."""
     full = config.full_share + (config.full_share_end - config.full_share) * done
     if rng.random() < full:
+        if rng.random() < _NEARLY_FULL:  # else levels of more than a half are hardly trained in the end
+            return rng.uniform(_NEARLY_FROM, 1, num_labels).astype(np.float32)
         return np.ones(num_labels, np.float32)
     return np.exp(rng.uniform(np.log(config.drawn_from), 0, num_labels)).astype(np.float32)
 

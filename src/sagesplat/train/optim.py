@@ -9,7 +9,7 @@ from torch import Tensor
 from sagesplat.core.gaussians import PARAMETERS
 from sagesplat.core.sh import num_bases
 from sagesplat.kernels.jit import njit
-from sagesplat.train.state import TrainState
+from sagesplat.train.state import SECOND, TrainState
 
 _BETA1, _BETA2, _EPS = 0.9, 0.999, 1e-15
 _CHUNK = 4096
@@ -80,19 +80,35 @@ def update(
     rates: Mapping[str, float],
     degree: int,
     trainable: Tensor,
+    second_weights: Tensor | None = None,
 ) -> None:
-    """Adam's step number `state.step` on all parameters, on the device that they are on."""
-    for name in PARAMETERS:
-        tensors = getattr(state.gaussians, name), grads[name], state.exp_avg[name], state.exp_avg_sq[name]
-        how = {
-            "lr": rates[name],
-            "step": state.step,
-            "columns": 3 * (num_bases(degree) - 1) if name == "shN" else None,
-        }
-        if trainable.is_cuda:
-            from sagesplat.train import adam_triton
+    """Adam's step number `state.step` on all parameters, on the device that they are on.
 
-            adam_triton.adam_step(*tensors, trainable=trainable, **how)
-        else:
-            parameter, grad, exp_avg, exp_avg_sq = (t.detach().numpy() for t in tensors)
-            adam_step(parameter, grad, exp_avg, exp_avg_sq, trainable=trainable.numpy(), **how)
+    `second_weights`: [N], of the second opacities in what was drawn; where 0, these stay as they are.
+    """
+    for name in PARAMETERS:
+        columns = 3 * (num_bases(degree) - 1) if name == "shN" else None
+        _update_one(state, name, getattr(state.gaussians, name), grads, rates[name], trainable, columns)
+    if state.second_opacities is not None and second_weights is not None:
+        drawn = trainable & (second_weights > 0)
+        _update_one(state, SECOND, state.second_opacities, grads, rates["logit_opacities"], drawn, None)
+
+
+def _update_one(
+    state: TrainState,
+    name: str,
+    parameter: Tensor,
+    grads: Mapping[str, Tensor],
+    lr: float,
+    trainable: Tensor,
+    columns: int | None,
+) -> None:
+    tensors = parameter, grads[name], state.exp_avg[name], state.exp_avg_sq[name]
+    how = {"lr": lr, "step": state.step, "columns": columns}
+    if trainable.is_cuda:
+        from sagesplat.train import adam_triton
+
+        adam_triton.adam_step(*tensors, trainable=trainable, **how)
+    else:
+        arrays = (t.detach().numpy() for t in tensors)
+        adam_step(*arrays, trainable=trainable.numpy(), **how)

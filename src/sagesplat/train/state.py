@@ -14,6 +14,7 @@ from sagesplat.segment.lift import IGNORED
 from sagesplat.train.view_parameters import ViewParameters
 
 INITIAL_OPACITY = 0.1
+SECOND = "second_opacities"  # name of these logits among Adam's moments and gradients
 
 
 @dataclass(eq=False)
@@ -32,6 +33,7 @@ class TrainState:
     frozen: dict[int, int] = field(default_factory=dict)  # label id -> step from which on it stays as it is
     withheld: int = 0  # Gaussians that stopped categories did not get
     order_share: Tensor | None = None  # [N] of a nested model: share of its category that comes before it
+    second_opacities: Tensor | None = None  # [N] logits, of a nested model; moments under SECOND
     per_view: dict[str, ViewParameters] = field(default_factory=dict)  # "pose" and "exposure", if refined
 
     def replace_rows(self, keep: Tensor, new: Gaussians) -> None:
@@ -58,6 +60,12 @@ class TrainState:
         if self.order_share is not None:
             self.order_share = self.order_share[order]
 
+    def add_second_opacities(self, logits: Tensor | None = None) -> None:
+        """Give every Gaussian a second opacity; None: to begin with its first one."""
+        self.second_opacities = self.gaussians.logit_opacities.clone() if logits is None else logits
+        for moments in (self.exp_avg, self.exp_avg_sq):
+            moments[SECOND] = torch.zeros_like(self.second_opacities)
+
     def clear_statistics(self) -> None:
         """Reset the densification statistics to zero."""
         self.grad_sum = self.gaussians.means.new_zeros(len(self.gaussians))
@@ -72,6 +80,7 @@ class TrainState:
             self, gaussians=self.gaussians.to(device), exp_avg=exp_avg, exp_avg_sq=exp_avg_sq,
             grad_sum=self.grad_sum.to(device), grad_count=self.grad_count.to(device),
             order_share=None if self.order_share is None else self.order_share.to(device),
+            second_opacities=None if self.second_opacities is None else self.second_opacities.to(device),
             per_view={name: parameters.to(device) for name, parameters in self.per_view.items()},
         )  # fmt: skip
 

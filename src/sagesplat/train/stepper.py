@@ -9,6 +9,7 @@ from torch import Tensor
 
 from sagesplat.core.config import TrainConfig
 from sagesplat.core.gaussians import Gaussians
+from sagesplat.core.second_opacity import blended
 from sagesplat.formats.quantisation import rounded
 from sagesplat.metrics.image import photometric_loss
 from sagesplat.raster import Backend, Render, Workspace, device_of, expose, rasterize
@@ -25,7 +26,7 @@ from sagesplat.train.outliers import OutlierSchedule, inliers
 from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.poses import PoseUpdate, moved_camera
 from sagesplat.train.sky import Shell
-from sagesplat.train.state import TrainState, initial_state
+from sagesplat.train.state import SECOND, TrainState, initial_state
 from sagesplat.train.strategy import Strategy
 from sagesplat.train.view_parameters import ViewGradients, ViewUpdate
 
@@ -58,6 +59,7 @@ class Stepper:
         trainable: Tensor,
         factor: int = 1,
         drawn_rows: Tensor | None = None,
+        second_weights: Tensor | None = None,
     ) -> Tensor:
         """Take one step; returns its loss (a scalar on the device, mean over the batch).
 
@@ -68,6 +70,7 @@ class Stepper:
             trainable: Bool [N]; the other rows keep every bit.
             factor: Train on photos this many times smaller.
             drawn_rows: Indices of the Gaussians to render; the others take no part in this step.
+            second_weights: [N], of `state.second_opacities` in this step's opacities; None: 0.
         """
         batch = max(self.config.batch, self.group.size)
         of_batch = [self._next_view(state) for _ in range(batch)]
@@ -79,6 +82,8 @@ class Stepper:
         shown = state.gaussians if drawn_rows is None else state.gaussians.select(drawn_rows)
         leaves = {name: p.detach().requires_grad_() for name, p in shown.parameters().items()}
         moving = replace(shown, **leaves)
+        if second_weights is not None:
+            moving = _with_second(moving, leaves, state, second_weights, drawn_rows)
         if self.sh_bits:
             moving = rounded(moving, self.sh_bits)
         losses: list[Tensor] = []
@@ -111,7 +116,7 @@ class Stepper:
         self.strategy.step_pre_update(state, grads, trainable)
         scaled = {name: rate * math.sqrt(batch) for name, rate in learning_rates.items()}
         sky, before = self._on_shell(state, trainable)
-        optim.update(state, grads, scaled, degree, trainable)
+        optim.update(state, grads, scaled, degree, trainable, second_weights)
         of_views.update(self.view_updates, state.step)
         self.strategy.step_post_update(state, trainable)
         if self.shell:
@@ -196,6 +201,16 @@ def _exposure(own: Mapping[str, Tensor], camera: Camera, device: torch.device) -
     if "exposure" in own:
         return transform(own["exposure"])
     return None if camera.exposure is None else torch.from_numpy(camera.exposure).to(device)
+
+
+def _with_second(
+    g: Gaussians, leaves: dict[str, Tensor], state: TrainState, weights: Tensor, rows: Tensor | None
+) -> Gaussians:
+    """`g`, the rows of a state, with opacities blended with the second ones, which join the leaves."""
+    assert state.second_opacities is not None
+    second, weights = (t if rows is None else t[rows] for t in (state.second_opacities, weights))
+    leaves[SECOND] = second.detach().requires_grad_()
+    return replace(g, logit_opacities=blended(g.logit_opacities, leaves[SECOND], weights))
 
 
 def _spread(grads: Mapping[str, Tensor], rows: Tensor, trainable: Tensor) -> tuple[dict[str, Tensor], Tensor]:

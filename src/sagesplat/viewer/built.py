@@ -1,11 +1,13 @@
 """The built viewer of this package: its folder and its page."""
 
+import re
 from importlib.resources import files
 from pathlib import Path
 
 from sagesplat.core.errors import SageError
 
 PAGE, POSTER = "index.html", "poster.jpg"
+_PACK = re.compile(r'<!-- pack -->|<meta name="pack" content="[^"]*" />')
 
 
 def package_viewer() -> Path:
@@ -22,3 +24,9 @@ def check_viewer(viewer: Path) -> None:
 def with_poster(page: str) -> str:
     """The page with a picture that is shown until its scripts are loaded."""
     return page.replace("<!-- poster -->", f'<img id="poster" src="{POSTER}" alt="" />')
+
+
+def with_pack(page: str, uri: str | None) -> str:
+    """The page with the name of the bundle's pack, which it then asks for together with the manifest."""
+    named = "<!-- pack -->" if uri is None else f'<meta name="pack" content="{uri}" />'
+    return _PACK.sub(lambda _: named, page, count=1)

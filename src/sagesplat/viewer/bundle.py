@@ -6,18 +6,20 @@ describe them (`viewer.manifest`). The same contents give the same bytes.
 
 import hashlib
 import shutil
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.resources import files
+from itertools import groupby
 from pathlib import Path
 
 from sagesplat.core.errors import DataError, RunError
-from sagesplat.formats.increments import Increment
 from sagesplat.io.files import atomic_folder, read_json, unwritable, write_text
-from sagesplat.viewer.built import PAGE, POSTER, check_viewer, with_poster
+from sagesplat.viewer.built import PAGE, POSTER, check_viewer, with_pack, with_poster
 from sagesplat.viewer.manifest import FORMAT, THIRD_PARTY, Contents, documents, pack_order
 from sagesplat.viewer.pack import write_pack
 from sagesplat.viewer.quality import dumped
 
+_CURE = "delete that folder and run `sagesplat nest` again"
 MANIFEST, SCHEMA = "manifest.json", "manifest.schema.json"
 LICENSES = """\
 The viewer in this folder is part of sagesplat, licensed under the Apache License, Version 2.0
@@ -55,8 +57,8 @@ def write_bundle(out: Path, contents: Contents, viewer: Path, poster: bytes | No
         with atomic_folder(out) as fresh:
             shutil.copytree(viewer, fresh, dirs_exist_ok=True)
             (fresh / "chunks").mkdir()
-            for chunk in contents.chunks:
-                (fresh / "chunks" / chunk.uri).write_bytes(verified(contents.folder, chunk))
+            for uri, content in verified_files(contents):
+                (fresh / "chunks" / uri).write_bytes(content)
             if poster is not None:
                 _put_up(fresh, poster)
             return write_documents(fresh, contents)
@@ -71,12 +73,18 @@ def _put_up(folder: Path, poster: bytes) -> None:
     write_text(page, with_poster(page.read_text(encoding="utf-8")))
 
 
+def _name_pack(page: Path, uri: str) -> None:
+    """Name the pack in the page, so that no round trip passes before it is asked for."""
+    if page.is_file():
+        write_text(page, with_pack(page.read_text(encoding="utf-8"), uri))
+
+
 def has_viewer(folder: Path, viewer: Path) -> bool:
     """Whether a bundle has this viewer, by its page, which names all scripts by content hash."""
     pages = [path / PAGE for path in (folder, viewer)]
     if not all(page.is_file() for page in pages):
         return False
-    mine, page = (page.read_text(encoding="utf-8") for page in pages)
+    mine, page = (with_pack(page.read_text(encoding="utf-8"), None) for page in pages)
     return mine in (page, with_poster(page))
 
 
@@ -85,6 +93,7 @@ def write_documents(folder: Path, contents: Contents) -> BundleSizes:
     manifest, promises = documents(contents, (folder / THIRD_PARTY).exists())
     if contents.chunks and not contents.live:
         manifest["pack"] = write_pack(folder, manifest["labels"], pack_order(contents))
+        _name_pack(folder / PAGE, manifest["pack"]["uri"])
     for quality, content in promises.items():
         (folder / manifest["promises"][quality]["uri"]).write_bytes(content)
     write_text(folder / SCHEMA, files("sagesplat.viewer").joinpath(SCHEMA).read_text(encoding="utf-8"))
@@ -112,18 +121,22 @@ def is_bundle(folder: Path) -> bool:
         return False
 
 
-def verified(folder: Path, chunk: Increment) -> bytes:
-    """The content of an increment; DataError where it is missing or not what the index says."""
-    try:
-        content = (folder / chunk.uri).read_bytes()
-    except OSError as error:
-        raise DataError(
-            f"{folder / chunk.uri}: cannot be read ({error.strerror}); delete that folder and run "
-            "`sagesplat nest` again"
-        ) from None
-    if hashlib.sha256(content).hexdigest() != chunk.sha256:
-        raise DataError(
-            f"{folder / chunk.uri}: not the chunk that was written; delete that folder and run "
-            "`sagesplat nest` again"
-        )
-    return content
+def verified_files(contents: Contents) -> Iterator[tuple[str, bytes]]:
+    """The name and the content of each file that increments are in.
+
+    DataError where one is missing or not what the index says: the increments in it, one after the other.
+    """
+    for uri, some in groupby(contents.chunks, key=lambda chunk: chunk.uri):
+        path, at = contents.folder / uri, 0
+        try:
+            content = path.read_bytes()
+        except OSError as error:
+            raise DataError(f"{path}: cannot be read ({error.strerror}); {_CURE}") from None
+        for chunk in some:
+            part = content[at : at + chunk.nbytes]
+            if chunk.offset != at or hashlib.sha256(part).hexdigest() != chunk.sha256:
+                raise DataError(f"{path}: not the chunk that was written; {_CURE}")
+            at += len(part)
+        if at != len(content):
+            raise DataError(f"{path}: not the chunk that was written; {_CURE}")
+        yield uri, content

@@ -27,6 +27,7 @@ from sagesplat.viewer.quality import decimals_of, dumped, of_files, quality_entr
 
 FORMAT, VERSION = "sagesplat-bundle", 2
 REPLACING = 3  # version of a bundle with levels that replace, or PLY files: older viewers refuse it
+STREAMS = 4  # version of a bundle with coded streams
 QUALITIES: tuple[QualityKind, ...] = get_args(QualityKind)
 TARGETS: dict[QualityKind, float] = {"fidelity": 0.95, "ssim": 0.7}  # where no plan says one
 THIRD_PARTY = "THIRD_PARTY_LICENSES.txt"  # of the built viewer
@@ -105,7 +106,7 @@ def documents(
     }
     manifest = {
         "format": FORMAT,
-        "version": REPLACING if any(map(_is_new, contents.chunks)) else VERSION,
+        "version": max(map(_version, contents.chunks), default=VERSION),
         "generator": f"sagesplat {__version__}",
         "name": contents.name,
         "live": contents.live,
@@ -133,8 +134,11 @@ def documents(
     return manifest, promises
 
 
-def _is_new(chunk: Increment) -> bool:
-    return chunk.refine == "REPLACE" or chunk.format != "spz"
+def _version(chunk: Increment) -> int:
+    """The version of bundles from which on there are such increments."""
+    if chunk.format == "stream":
+        return STREAMS
+    return REPLACING if chunk.refine == "REPLACE" or chunk.format != "spz" else VERSION
 
 
 def _models(contents: Contents, quality: QualityKind) -> dict[int, ViewModel]:
@@ -214,6 +218,8 @@ def _label(
                 "uri": f"chunks/{chunk.uri}",
                 "format": chunk.format,
                 **({"refine": "REPLACE"} if chunk.refine == "REPLACE" else {}),
+                **({"offset": chunk.offset} if chunk.format == "stream" else {}),
+                **({} if chunk.weight is None else {"weight": round(chunk.weight, 6)}),
                 "bytes": chunk.nbytes,
                 "gpuBytes": chunk.gpu_bytes,
                 "count": chunk.count,

@@ -1,6 +1,6 @@
 """The pack: all increments of a bundle in one file, for the first load without a round trip per increment.
 
-It is a concatenation of the files, in the order of their benefit for the first view: level 1 of all
+It is a concatenation of the increments, in the order of their benefit for the first view: level 1 of all
 visible and nearby labels, then increments by their gain of expected quality x pixel share per byte.
 Levels of a label must come in order. So an increment counts with the slope of the concave hull of quality
 over bytes. The viewer has the same rules (web/src/core/order.ts).
@@ -108,11 +108,14 @@ def gains_of(ssim: Float[np.ndarray, " K"], total: Float[np.ndarray, " K"]) -> F
 def write_pack(
     folder: Path, labels: Sequence[dict[str, Any]], order: Sequence[tuple[int, int]]
 ) -> dict[str, Any]:
-    """Write the files of a manifest's labels, which are in `folder`, as one pack; its manifest entry."""
+    """Write the increments of a manifest's labels, which are in `folder`, as one pack; its manifest entry."""
     unnamed, digest, size = folder / "scene.pack", hashlib.sha256(), 0
     with unnamed.open("wb") as file:
         for index, level in order:
-            content = (folder / labels[index]["levels"][level - 1]["uri"]).read_bytes()
+            entry = labels[index]["levels"][level - 1]
+            with (folder / entry["uri"]).open("rb") as source:
+                source.seek(entry.get("offset", 0))
+                content = source.read(entry["bytes"])
             digest.update(content)
             size += file.write(content)
     uri = f"scene-{digest.hexdigest()[:12]}.pack"

@@ -13,7 +13,7 @@ from pathlib import Path
 from sagesplat.core.errors import RunError, SageError
 from sagesplat.io.files import atomic_path, unwritable
 from sagesplat.viewer.built import PAGE, POSTER, check_viewer, with_poster
-from sagesplat.viewer.bundle import LICENSES, MANIFEST, BundleSizes, verified
+from sagesplat.viewer.bundle import LICENSES, MANIFEST, BundleSizes, verified_files
 from sagesplat.viewer.manifest import THIRD_PARTY, Contents, documents
 from sagesplat.viewer.quality import dumped
 
@@ -59,8 +59,8 @@ def write_single_file(
             file.write(before)
             for uri, content in small.items():
                 file.write(_element(uri, content))
-            for chunk in contents.chunks:
-                file.write(_element(f"chunks/{chunk.uri}", verified(contents.folder, chunk)))
+            for uri, content in verified_files(contents):
+                file.write(_element(f"chunks/{uri}", content))
             file.write(after)
     except OSError as error:
         raise RunError(unwritable(out, error)) from error

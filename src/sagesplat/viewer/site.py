@@ -37,7 +37,7 @@ HEADERS = {
 }
 _FOREVER = "public, max-age=31536000, immutable"
 _HASHED = re.compile(
-    r"chunks/.+-[0-9a-f]{12}\.(spz|ply)|scene-[0-9a-f]{12}\.pack|promises-[0-9a-f]{12}\.json|assets/.+-[\w-]{8}\.\w+"
+    r"chunks/.+-[0-9a-f]{12}\.(sgst|spz|ply)|scene-[0-9a-f]{12}\.pack|promises-[0-9a-f]{12}\.json|assets/.+-[\w-]{8}\.\w+"
 )
 # set here, as the system's table differs between machines
 _TYPES = {
@@ -64,7 +64,7 @@ _packing = threading.Lock()
 _PIECE = 64 * 1024  # bytes that are sent at once
 _TLS_PIECE = 32 * 1024  # the same of a file over TLS, which keeps three copies for a slow reader
 # of a bundle: what no browser runs, whatever is in it
-_DATA = {".jpeg", ".jpg", ".json", ".md", ".pack", ".ply", ".png", ".spz", ".txt", ".webp"}
+_DATA = {".jpeg", ".jpg", ".json", ".md", ".pack", ".ply", ".png", ".sgst", ".spz", ".txt", ".webp"}
 _WAITING = "<!doctype html><title>sagesplat</title><p>{}</p><p>This page tries again by itself.</p>"
 
 

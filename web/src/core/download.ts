@@ -9,6 +9,7 @@ export interface Reply {
   readonly status: number;
   readonly headers: { get(name: string): string | null };
   readonly body: { getReader(): Reader } | null;
+  readonly isEarly?: boolean; // it was asked for before, so that its time says nothing of the link
   text(): Promise<string>;
 }
 
@@ -28,6 +29,7 @@ export type Digest = ((bytes: Uint8Array) => Promise<string>) | null;
 
 export interface File {
   readonly uri: string;
+  readonly offset?: number; // where a range of a larger file begins
   readonly bytes: number;
   readonly sha256: string;
 }
@@ -81,8 +83,15 @@ export async function download(
   return await intact(link, file, joined(parts, size));
 }
 
+/** Bytes of a file, from `start` to before `end`. */
+export interface Range {
+  readonly start: number;
+  readonly end: number;
+}
+
 /** Options of `receive`. */
 export interface Manner {
+  readonly range?: Range; // all that is asked for
   readonly again?: boolean; // bypasses the browser's cache
   readonly silence?: number; // ms without data after which the download counts as failed
   readonly check?: (reply: Reply) => void; // throws for an unusable response
@@ -93,7 +102,7 @@ export async function receive(
   link: Link,
   file: File,
   signal: AbortController,
-  { again = false, silence = SILENCE, check }: Manner,
+  { again = false, silence = SILENCE, check, range }: Manner,
   take: (part: Uint8Array) => boolean,
 ): Promise<void> {
   const { fetch, clock } = link; // the browser's fetch must not be called as a method
@@ -107,8 +116,12 @@ export async function receive(
   try {
     const url = new URL(file.uri, link.base).href;
     const asked = clock.now();
-    const reply = await fetch(url, { signal: signal.signal, ...(again && { cache: "reload" as const }) });
-    link.answered(clock.now() - asked);
+    const reply = await fetch(url, {
+      signal: signal.signal,
+      ...(again && { cache: "reload" as const }),
+      ...(range && { headers: { Range: `bytes=${range.start}-${range.end - 1}` } }),
+    });
+    if (!reply.isEarly) link.answered(clock.now() - asked);
     if (!reply.ok) throw refused(file, reply.status);
     check?.(reply);
     await each(reply, (part) => {
@@ -140,18 +153,22 @@ async function each(reply: Reply, take: (part: Uint8Array) => boolean): Promise<
 }
 
 function refused(file: File, status: number): DownloadError {
+  if (status === 416)
+    return new DamagedError(`${file.uri}: the server has fewer bytes than the manifest`, false);
   const passes = status >= 500 || status === 408 || status === 429;
   return new DownloadError(`${file.uri}: the server said ${status}`, !passes);
 }
 
 /** The content if it has the size and hash in the manifest; damage may be temporary, so a retry is allowed. */
 export async function intact(link: Link, file: File, content: Uint8Array): Promise<Uint8Array> {
-  if (content.length !== file.bytes) {
-    const is = content.length < file.bytes ? `only ${content.length}` : `more than`;
-    throw new DamagedError(`${file.uri} is damaged: ${is} of ${file.bytes} bytes`, false);
+  const { uri, offset, bytes } = file;
+  const name = offset === undefined ? uri : `${uri}, ${bytes} bytes from ${offset} on,`;
+  if (content.length !== bytes) {
+    const is = content.length < bytes ? `only ${content.length}` : `more than`;
+    throw new DamagedError(`${name} is damaged: ${is} of ${bytes} bytes`, false);
   }
   if (link.digest && (await link.digest(content)) !== file.sha256) {
-    throw new DamagedError(`${file.uri} is damaged: its sha-256 is not that of the manifest`, false);
+    throw new DamagedError(`${name} is damaged: its sha-256 is not that of the manifest`, false);
   }
   return content;
 }

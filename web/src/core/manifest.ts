@@ -36,7 +36,8 @@ import {
 import type { Fetch } from "./download";
 
 /** The newest version of the format that this viewer supports. */
-export const VERSION = 3;
+export const VERSION = 4;
+const STREAMS_FROM = 4; // version
 const PROMISES_VERSION = 2;
 
 const vec3 = list(number, 3);
@@ -51,10 +52,12 @@ const increment: Check = (value, path, wrong) => {
   object({
     ...file,
     format: oneOf(...FORMATS),
+    offset: optional(amount),
     refine: optional(oneOf("REPLACE")),
     bytes: amount,
     gpuBytes: amount,
     count: amount,
+    weight: optional(share),
   })(value, path, wrong);
 };
 const byQuality = (check: Check): Check =>
@@ -126,7 +129,7 @@ export function parseManifest(json: string, file = "manifest.json"): Manifest {
     );
   }
   const found = checked<Manifest>(upgraded(value), manifest, file);
-  refuse([...found.labels.flatMap(oddities), ...oddPack(found)], file);
+  refuse([...found.labels.flatMap(oddities), ...oddStreams(found), ...oddPack(found)], file);
   const ids = found.labels.map((l) => l.id);
   refuse(new Set(ids).size < ids.length ? ["labels have the same id twice"] : [], file);
   return found;
@@ -175,6 +178,36 @@ function oddities(one: Label, i: number): string[] {
     }
   }
   return wrong;
+}
+
+/** Streams have one file a label, whose levels are ranges without gaps. */
+function oddStreams({ labels, version }: Manifest): string[] {
+  const uris = new Set<string>();
+  return labels.flatMap((one, i) => {
+    const path = `labels[${i}].levels`;
+    const files = one.levels.filter(({ count }) => count);
+    const streams = files.filter(({ format }) => format === "stream");
+    const odd = (what: string) => [`${path} ${what}`];
+    if (!streams.length) {
+      const is = files.some(({ offset, weight }) => offset !== undefined || weight !== undefined);
+      return is ? odd("have offsets or weights, which only streams have") : [];
+    }
+    const uri = streams[0]?.uri ?? "";
+    if (version < STREAMS_FROM) return odd(`have streams, which version ${version} does not have`);
+    if (files.some((file) => file.uri !== uri || file.format !== "stream" || file.refine) || uris.has(uri)) {
+      return odd("must be one stream of their own");
+    }
+    uris.add(uri);
+    let end = 0;
+    const touch = files.every(({ offset, bytes }) => {
+      const starts = offset === end && bytes > 0;
+      end += bytes;
+      return starts;
+    });
+    if (!touch) return odd("must be ranges of their stream without gaps, from byte 0 on");
+    const weights = files.filter(({ weight }) => weight !== undefined).length;
+    return weights && weights < files.length ? odd("must all have a weight, or none") : [];
+  });
 }
 
 function oddPack({ pack, labels }: Manifest): string[] {

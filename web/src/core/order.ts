@@ -92,7 +92,7 @@ export function inOrder(
     const files = entry.path;
     const first = files[0]?.level ?? 0;
     const isHere = ({ file, level }: { file: File; level: number }) =>
-      entry.decoded[level - 1] !== undefined || entry.decoding === level || supply.isHere(file);
+      entry.has(level) || entry.decoding === level || supply.isHere(file);
     const have = files.findIndex((one) => !isHere(one));
     const lowest = entry.label.levels[0];
     if (!candidate || !lowest || !first) continue;

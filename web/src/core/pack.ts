@@ -2,6 +2,7 @@
 
 import type { Manifest } from "../types";
 import { DamagedError, DownloadError, type File, type Link, type Reply, receive } from "./download";
+import { Cutter } from "./ranges";
 
 /** ms without data after which the files are downloaded one by one instead. */
 const SILENCE = 3000;
@@ -45,6 +46,18 @@ export class Pack {
     return this.stopped && left > 0 ? Number.NaN : left;
   }
 
+  /** Bytes that came without being planned, and those up to the next file that is wanted. */
+  spare(isPlanned: (file: File) => boolean, isWanted: (file: File) => boolean): number {
+    let [spare, end] = [0, 0];
+    for (const file of this.files) {
+      end += file.bytes;
+      const came = end <= this.at;
+      if (!came && isWanted(file)) return spare;
+      if (!came || !isPlanned(file)) spare += file.bytes;
+    }
+    return spare;
+  }
+
   /** Whether it is received completely: the browser caches it only then. */
   get isHere(): boolean {
     return this.at >= this.file.bytes;
@@ -61,25 +74,12 @@ export class Pack {
    */
   async read(link: Link, take: (file: File, content: Uint8Array) => Promise<void>): Promise<void> {
     const checks: Promise<void>[] = [];
-    let part = new Uint8Array(this.files[0]?.bytes ?? 0);
-    let filled = 0;
-    let next = 0;
-    const whole = (file: File, content: Uint8Array) =>
-      take(file, content).finally(() => this.ends.delete(file.sha256));
+    const cutter = new Cutter(this.files, (file, content) => {
+      checks.push(take(file, content).finally(() => this.ends.delete(file.sha256)));
+    });
     const add = (piece: Uint8Array): boolean => {
-      let used = 0;
-      for (let file = this.files[next]; file && used < piece.length; file = this.files[next]) {
-        const size = Math.min(piece.length - used, part.length - filled);
-        part.set(piece.subarray(used, used + size), filled);
-        used += size;
-        filled += size;
-        if (filled < part.length) break;
-        checks.push(whole(file, part));
-        next += 1;
-        part = new Uint8Array(this.files[next]?.bytes ?? 0);
-        filled = 0;
-      }
-      this.at += piece.length;
+      cutter.add(piece);
+      this.at = cutter.taken;
       return this.at <= this.file.bytes && !this.stopped;
     };
     try {

@@ -5,73 +5,121 @@ const TOTAL = 1 << BITS; // of the frequencies of a row
 const LOWEST = 2 ** 23; // state
 const COUNTED = 128; // what a symbol adds to its count
 const MOST = 2 ** 18; // sum of counts beyond which they are halved
-const PIECE = 6; // bits of a slot that the index of symbols leaves out
+const PIECE = 6; // bits of a slot that the index of symbols leaves out,
+const FEW_PIECE = 8; // and those for
+const FEW = 40; // symbols or fewer
+
+const LISTS = ["counts", "slots", "index", "used", "sums", "possible", "lows", "highs"] as const;
 
 /** Counts of symbols by row, and the frequencies that follow from them. */
 export class Table {
   readonly counts: Int32Array;
-  readonly firsts: Uint16Array; // [rows, symbols + 1]
-  readonly index: Uint8Array; // [rows, 256]: the symbol of every 64th slot
-  readonly used: Uint8Array; // rows with symbols in this block
+  readonly slots: Int32Array; // [rows, symbols]: the first slot of a symbol, and its frequency << 14
+  readonly index: Uint8Array; // [rows, 2^(14 - piece)]: the symbol of every 2^piece-th slot
+  readonly piece: number;
+  readonly used: Int32Array; // symbols of each row that were read in this block
+  readonly sums: Int32Array; // of the counts of a row
+  readonly possible: Int32Array; // symbols of a row that can occur,
+  readonly lows: Int32Array; // the first of them,
+  readonly highs: Int32Array; // and where they end, in `counts`
 
+  /** @param count - of a symbol in a new table; null: `copy` fills it */
   constructor(
     readonly rows: number,
     readonly symbols: number,
-    count: (symbol: number, row: number) => number,
+    count: ((symbol: number, row: number) => number) | null,
   ) {
+    const list = () => new Int32Array(rows);
+    [this.used, this.sums, this.possible, this.lows, this.highs] = [list(), list(), list(), list(), list()];
     this.counts = new Int32Array(rows * symbols);
-    for (let row = 0, i = 0; row < rows; row++) {
-      for (let symbol = 0; symbol < symbols; symbol++) this.counts[i++] = count(symbol, row);
+    this.slots = new Int32Array(rows * symbols);
+    this.piece = symbols > FEW ? PIECE : FEW_PIECE;
+    this.index = new Uint8Array(rows << (BITS - this.piece));
+    for (let row = 0; count && row < rows; row++) {
+      this.begin(row, count);
+      this.renew(row);
     }
-    this.firsts = new Uint16Array(rows * (symbols + 1));
-    this.index = new Uint8Array(rows << (BITS - PIECE));
-    this.used = new Uint8Array(rows).fill(1);
-    this.endBlock();
+  }
+
+  /** Another table that begins as this one is. */
+  copy(): Table {
+    const copy = new Table(this.rows, this.symbols, null);
+    for (const name of LISTS) copy[name].set(this[name]);
+    return copy;
+  }
+
+  private begin(row: number, count: (symbol: number, row: number) => number): void {
+    const first = row * this.symbols;
+    let [sum, possible, low, high] = [0, 0, -1, 0];
+    for (let symbol = 0; symbol < this.symbols; symbol++) {
+      const some = count(symbol, row);
+      if (!some) continue;
+      this.counts[first + symbol] = some;
+      sum += some;
+      possible += 1;
+      if (low < 0) low = first + symbol;
+      high = first + symbol + 1;
+    }
+    [this.sums[row], this.possible[row], this.lows[row], this.highs[row]] = [sum, possible, low, high];
   }
 
   /** Renews the frequencies of the rows that were used. */
   endBlock(): void {
-    for (let row = 0; row < this.rows; row++) {
-      if (!this.used[row]) continue;
-      this.used[row] = 0;
+    const { used, sums, rows } = this;
+    for (let row = 0; row < rows; row++) {
+      const more = used[row] as number;
+      if (!more) continue;
+      used[row] = 0;
+      sums[row] = (sums[row] as number) + COUNTED * more;
       this.renew(row);
     }
   }
 
   private renew(row: number): void {
-    const { symbols, counts, firsts, index } = this;
-    const low = row * symbols;
-    const high = low + symbols;
-    let [sum, possible] = [0, 0];
+    const { symbols, counts, slots, index, piece } = this;
+    const low = this.lows[row] as number;
+    const high = this.highs[row] as number;
+    while ((this.sums[row] as number) > MOST) this.halve(row, low, high);
+    const share = Math.floor(
+      ((TOTAL - (this.possible[row] as number)) * 2 ** 16) / (this.sums[row] as number),
+    );
+    let left = TOTAL;
+    let largest = low;
+    let most = 0;
     for (let i = low; i < high; i++) {
       const count = counts[i] as number;
-      sum += count;
-      if (count > 0) possible++;
-    }
-    while (sum > MOST) {
-      sum = 0;
-      for (let i = low; i < high; i++) {
-        counts[i] = ((counts[i] as number) + 1) >> 1;
-        sum += counts[i] as number;
+      const frequency = count && (Math.imul(count, share) >> 16) + 1;
+      slots[i] = frequency;
+      left -= frequency;
+      if (count > most) {
+        most = count;
+        largest = i;
       }
     }
-    const share = Math.floor(((TOTAL - possible) * 2 ** 16) / sum);
-    let [left, largest] = [TOTAL, low];
+    slots[largest] = (slots[largest] as number) + left;
+    const base = row * symbols;
+    const begin = row << (BITS - piece); // of the index
+    const whole = (1 << piece) - 1;
+    let next = begin;
+    let first = 0;
     for (let i = low; i < high; i++) {
-      const count = counts[i] as number;
-      if (count > 0) left -= (Math.imul(count, share) >> 16) + 1;
-      if (count > (counts[largest] as number)) largest = i;
+      const frequency = slots[i] as number;
+      slots[i] = (first & (TOTAL - 1)) | (frequency << BITS);
+      first += frequency;
+      const end = begin + ((first + whole) >> piece);
+      while (next < end) index[next++] = i - base;
     }
-    const end = (row + 1) << (BITS - PIECE);
-    let next = row << (BITS - PIECE); // of the index
-    for (let i = low, first = 0, at = low + row; i < high; i++, at++) {
-      const count = counts[i] as number;
-      if (count > 0) first += (Math.imul(count, share) >> 16) + 1;
-      if (i === largest) first += left;
-      firsts[at + 1] = first;
-      const until = (end << PIECE) - TOTAL + first;
-      for (; next << PIECE < until; next++) index[next] = i - low;
+  }
+
+  private halve(row: number, low: number, high: number): void {
+    const { counts } = this;
+    let sum = 0;
+    for (let i = low; i < high; i++) {
+      const half = ((counts[i] as number) + 1) >> 1;
+      counts[i] = half;
+      sum += half;
     }
+    this.sums[row] = sum;
   }
 }
 
@@ -85,64 +133,57 @@ export class Reader {
     if (this.state < LOWEST || this.state >= LOWEST * 256) throw new Error("an impossible first state");
   }
 
-  /**
-   * Symbols less `zero` into `out`: all of one row, or each of its own.
-   * How many were the table's last symbol.
-   */
-  symbols(table: Table, rows: number | Int32Array, zero: number, out: Int32Array, count: number): number {
-    return typeof rows === "number"
-      ? this.ofRow(table, rows, zero, out, count)
-      : this.ofRows(table, rows, zero, out, count);
-  }
-
-  private ofRow(table: Table, row: number, zero: number, out: Int32Array, count: number): number {
+  /** Symbols of one row of a table, less `zero`, into `out`; how many were the table's last symbol. */
+  ofRow(table: Table, row: number, zero: number, out: Int32Array, count: number): number {
     const { bytes } = this;
-    const { symbols, firsts, index, counts } = table;
-    const [start, base, indices] = [row * (symbols + 1), row * symbols, row << (BITS - PIECE)];
+    const { symbols, slots, index, counts, piece } = table;
+    const base = row * symbols;
+    const indices = row << (BITS - piece);
+    const final = base + symbols - 1;
+    const origin = base + zero;
     let { state, at } = this;
-    let last = 0;
+    let escapes = 0;
     for (let i = 0; i < count; i++) {
       const slot = state & (TOTAL - 1);
-      let symbol = index[indices | (slot >> PIECE)] as number;
-      let end = firsts[start + symbol + 1] as number;
-      while (end <= slot) end = firsts[start + ++symbol + 1] as number;
-      const first = firsts[start + symbol] as number;
-      state = Math.imul(end - first, state >> BITS) + slot - first;
+      let place = base + (index[indices | (slot >> piece)] as number);
+      let known = slots[place] as number;
+      while (slot >= (known & (TOTAL - 1)) + (known >>> BITS)) known = slots[++place] as number;
+      state = Math.imul(known >>> BITS, state >> BITS) + slot - (known & (TOTAL - 1));
       while (state < LOWEST) state = (state << 8) | (bytes[at++] as number);
-      out[i] = symbol - zero;
-      if (symbol === symbols - 1) last++;
-      counts[base + symbol] = (counts[base + symbol] as number) + COUNTED;
+      out[i] = place - origin;
+      if (place === final) escapes++;
+      counts[place] = (counts[place] as number) + COUNTED;
     }
-    if (count) table.used[row] = 1;
+    table.used[row] = (table.used[row] as number) + count;
     this.state = state;
     this.goOn(at);
-    return last;
+    return escapes;
   }
 
-  private ofRows(table: Table, rows: Int32Array, zero: number, out: Int32Array, count: number): number {
+  /** The same, each of its own row. */
+  ofRows(table: Table, rows: Int32Array, zero: number, out: Int32Array, count: number): number {
     const { bytes } = this;
-    const { symbols, firsts, index, counts, used } = table;
+    const { symbols, slots, index, counts, used, piece } = table;
     let { state, at } = this;
-    let last = 0;
+    let escapes = 0;
     for (let i = 0; i < count; i++) {
       const row = rows[i] as number;
+      const base = row * symbols;
       const slot = state & (TOTAL - 1);
-      let symbol = index[(row << (BITS - PIECE)) | (slot >> PIECE)] as number;
-      const start = row * (symbols + 1);
-      let end = firsts[start + symbol + 1] as number;
-      while (end <= slot) end = firsts[start + ++symbol + 1] as number;
-      const first = firsts[start + symbol] as number;
-      state = Math.imul(end - first, state >> BITS) + slot - first;
+      let place = base + (index[(row << (BITS - piece)) | (slot >> piece)] as number);
+      let known = slots[place] as number;
+      while (slot >= (known & (TOTAL - 1)) + (known >>> BITS)) known = slots[++place] as number;
+      state = Math.imul(known >>> BITS, state >> BITS) + slot - (known & (TOTAL - 1));
       while (state < LOWEST) state = (state << 8) | (bytes[at++] as number);
+      const symbol = place - base;
       out[i] = symbol - zero;
-      if (symbol === symbols - 1) last++;
-      const place = row * symbols + symbol;
+      if (symbol === symbols - 1) escapes++;
       counts[place] = (counts[place] as number) + COUNTED;
-      used[row] = 1;
+      used[row] = (used[row] as number) + 1;
     }
     this.state = state;
     this.goOn(at);
-    return last;
+    return escapes;
   }
 
   /** Appends `widths` bits to each of `values`: 14 to all that have as many left, then the next. */

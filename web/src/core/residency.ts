@@ -11,6 +11,8 @@ export class Entry {
   readonly ladder: Ladder;
   readonly replaces: boolean; // whether any level replaces those below
   readonly decoded: (Handle | null | undefined)[]; // by increment; null: an empty one
+  /** Of a stream, the increments that were decoded, as they came: those that are disposed of are decoded again. */
+  readonly contents: (Uint8Array | undefined)[] = [];
   wanted = 0;
   shown = 0;
   decoding = 0; // level being decoded, 0: none
@@ -32,6 +34,11 @@ export class Entry {
     if (!this.replaces) return 0;
     for (let k = level; k > 1; k--) if (this.label.levels[k - 1]?.refine) return k - 1;
     return 0;
+  }
+
+  /** Whether nothing needs to be downloaded for an increment. */
+  has(level: number): boolean {
+    return this.decoded[level - 1] !== undefined || this.contents[level - 1] !== undefined;
   }
 
   /** Whether all increments of a level are decoded. */

@@ -1,6 +1,6 @@
 /** Coded streams: the nested levels of a category, decoded level by level. docs/formats.md specifies them. */
 
-import { BASES, Columns, LARGEST } from "./columns";
+import { Block, Columns, LARGEST } from "./columns";
 import { Reader } from "./rans";
 
 const HEADER = 44;
@@ -9,21 +9,20 @@ const MAX_COUNT = 10_000_000;
 const PER_BYTE = 128; // Gaussians in a byte, at most
 const SMALLEST = 16; // Gaussians of a block: a power of two
 const GREATEST = 1e18;
+const ALL_SECOND = 255; // weight of a level whose Gaussians have one opacity, which counts as both
 
-/** The Gaussians of a level, in right, up, back. */
-export interface Gaussians {
-  readonly count: number;
-  readonly means: Float32Array; // [count, 3]
-  readonly quats: Float32Array; // [count, 4], w x y z
-  readonly logScales: Float32Array; // [count, 3]
-  readonly opacities: Float32Array;
-  readonly sh0: Float32Array; // [count, 3]
-  readonly shN: Float32Array; // [count, K, 3]
+/** Makes of a stream's Gaussians what a caller wants of a level. */
+export interface Sink<Level> {
+  /** A level to be filled. */
+  begin(header: Header, count: number): Level;
+  /** Takes the first `count` rows of a block as the rows of the level from `start` on. */
+  put(level: Level, block: Block, start: number, count: number): void;
 }
 
 /** What a stream says of all its Gaussians. */
 export interface Header {
   readonly antialiased: boolean;
+  readonly twoOpacities: boolean;
   readonly degree: number;
   readonly levels: number;
   readonly opacityStep: number; // of 1/255
@@ -42,12 +41,13 @@ export interface Header {
 export function readHeader(bytes: Uint8Array): Header {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
   if (bytes.length < HEADER || view.getUint32(0) !== MAGIC) throw new Error("not a sagesplat-stream");
-  if (view.getUint8(4) !== 1 || view.getUint8(5) > 1 || view.getUint16(42, true)) {
+  if (view.getUint8(4) !== 1 || view.getUint8(5) > 3 || view.getUint16(42, true)) {
     throw new Error("a newer stream than this viewer knows");
   }
   const float = (at: number) => view.getFloat32(at, true);
   const header: Header = {
-    antialiased: view.getUint8(5) === 1,
+    antialiased: (view.getUint8(5) & 1) > 0,
+    twoOpacities: (view.getUint8(5) & 2) > 0,
     degree: view.getUint8(6),
     levels: view.getUint8(7),
     opacityStep: view.getUint8(8),
@@ -72,15 +72,27 @@ export function readHeader(bytes: Uint8Array): Header {
 }
 
 /** Decodes a stream while its bytes arrive. */
-export class StreamDecoder {
+export class StreamDecoder<Level> {
   private waiting: Uint8Array = new Uint8Array(0);
   private header: Header | null = null;
   private columns: Columns | null = null;
   private done = 0; // Gaussians
   private levels = 0;
 
+  constructor(private readonly sink: Sink<Level>) {}
+
+  /** Whether all levels are decoded. */
+  get isComplete(): boolean {
+    return this.levels === this.header?.levels;
+  }
+
+  /** Whether bytes are here of a level that is not complete. */
+  get isWithin(): boolean {
+    return this.waiting.length > 0;
+  }
+
   /** Takes the next bytes of the stream; the levels that they complete. Throws for a damaged stream. */
-  push(bytes: Uint8Array): Gaussians[] {
+  push(bytes: Uint8Array): Level[] {
     this.waiting = this.waiting.length ? joined(this.waiting, bytes) : bytes;
     if (!this.header) {
       if (this.waiting.length < HEADER) return [];
@@ -88,7 +100,7 @@ export class StreamDecoder {
       this.columns = new Columns(this.header);
       this.waiting = this.waiting.subarray(HEADER);
     }
-    const found: Gaussians[] = [];
+    const found: Level[] = [];
     while (this.waiting.length) {
       if (this.levels === this.header.levels) throw new Error("bytes after the last level");
       const level = this.next(this.header);
@@ -99,34 +111,47 @@ export class StreamDecoder {
   }
 
   /** The next level, if all of it is here. */
-  private next(header: Header): Gaussians | null {
+  private next(header: Header): Level | null {
     const [count, afterCount] = number(this.waiting, 0);
-    const [size, start] = number(this.waiting, afterCount);
+    const [size, afterSize] = number(this.waiting, afterCount);
+    const start = afterSize + Number(header.twoOpacities);
     if (count > Math.min(MAX_COUNT - this.done, PER_BYTE * size) || (!count && size)) {
       throw new Error("a level with more Gaussians than fit");
     }
     if (Number.isNaN(size) || this.waiting.length < start + size) return null;
-    const level = empty(count, header);
-    if (count) this.decode(this.waiting.subarray(start, start + size), level);
+    const level = this.sink.begin(header, count);
+    const two = header.twoOpacities && (this.waiting[afterSize] as number) < ALL_SECOND;
+    if (count) this.decode(this.waiting.subarray(start, start + size), level, count, two);
     this.waiting = this.waiting.subarray(start + size);
     this.levels++;
     return level;
   }
 
-  private decode(payload: Uint8Array, level: Gaussians): void {
+  private decode(payload: Uint8Array, level: Level, total: number, two: boolean): void {
+    const columns = this.columns as Columns;
+    const block = blockOf(this.header as Header);
     const reader = new Reader(payload);
     let before = 0;
-    for (let at = 0; at < level.count; ) {
-      const block = Math.max(SMALLEST, Math.min(2 ** (30 - Math.clz32(this.done)), LARGEST));
-      const left = block - (this.done % block);
-      const count = Math.min(left, level.count - at);
-      before = (this.columns as Columns).decode(reader, level, at, count, before);
-      if (count === left) this.columns?.endBlock();
+    for (let at = 0; at < total; ) {
+      const size = Math.max(SMALLEST, Math.min(2 ** (30 - Math.clz32(this.done)), LARGEST));
+      const left = size - (this.done % size);
+      const count = Math.min(left, total - at);
+      before = columns.decode(reader, block, count, before, two);
+      this.sink.put(level, block, at, count);
+      if (count === left) columns.endBlock();
       at += count;
       this.done += count;
     }
     reader.finish();
   }
+}
+
+const blocks = new Map<number, Block>(); // by SH degree, shared by all decoders
+
+function blockOf({ degree }: Header): Block {
+  const block = blocks.get(degree) ?? new Block(degree);
+  blocks.set(degree, block);
+  return block;
 }
 
 /** LEB128 at an offset, and where it ends; NaN where bytes are missing. */
@@ -146,16 +171,4 @@ function joined(a: Uint8Array, b: Uint8Array): Uint8Array {
   both.set(a);
   both.set(b, a.length);
   return both;
-}
-
-function empty(count: number, { degree }: Header): Gaussians {
-  return {
-    count,
-    means: new Float32Array(3 * count),
-    quats: new Float32Array(4 * count),
-    logScales: new Float32Array(3 * count),
-    opacities: new Float32Array(count),
-    sh0: new Float32Array(3 * count),
-    shN: new Float32Array(3 * count * (BASES[degree] ?? 0)),
-  };
 }

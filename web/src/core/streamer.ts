@@ -84,6 +84,7 @@ export class Streamer {
       changed: () => this.arrived(),
       ...(options.downloads && { atOnce: options.downloads }),
     });
+    this.supply.know(manifest.labels.flatMap(({ levels }) => levels.filter(({ count }) => count)));
     const { position, quaternion } = manifest.start;
     this.viewpoint = { position, direction: rotate(quaternion, [0, 0, -1]), frustum: [] };
   }
@@ -258,7 +259,7 @@ export class Streamer {
   /** Files of all planned increments that are not decoded. */
   private wantedFiles(): File[] {
     return this.entries.flatMap((entry) => {
-      return entry.path.flatMap(({ file, level }) => (entry.decoded[level - 1] === undefined ? file : []));
+      return entry.path.flatMap(({ file, level }) => (entry.has(level) ? [] : file));
     });
   }
 
@@ -274,7 +275,7 @@ export class Streamer {
     const file = entry.label.levels[level - 1];
     if (!file || entry.decoding || this.decodes >= DECODES) return;
     if (this.supply.failure(file)?.lasting) return;
-    const content = this.supply.take(file);
+    const content = entry.contents[level - 1] ?? this.supply.take(file);
     if (content) void this.decode(entry, file, level, content);
   }
 
@@ -283,7 +284,10 @@ export class Streamer {
     this.decodes += 1;
     let handle: Handle | undefined;
     try {
-      handle = await this.renderer.decode(entry.label.id, level, content, file.format);
+      const below =
+        file.format === "stream" ? entry.contents.slice(0, level - 1).flatMap((one) => one ?? []) : [];
+      handle = await this.renderer.decode(entry.label.id, level, content, file.format, below);
+      if (file.format === "stream") entry.contents[level - 1] = content;
     } catch {
       this.supply.spoil(file, `${file.uri} cannot be decoded`);
     }
@@ -347,6 +351,7 @@ export class Streamer {
     this.outlooks.clear();
     this.content = manifest;
     this.lens = widestLens(manifest.cameras);
+    this.supply.know(manifest.labels.flatMap(({ levels }) => levels.filter(({ count }) => count)));
     this.trouble = null;
     this.supply.forgive();
     this.plan();

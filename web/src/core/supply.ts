@@ -10,7 +10,9 @@ import {
   type Link,
   Shelf,
 } from "./download";
+import { type Load, Loads } from "./loads";
 import { lateIn, Pack } from "./pack";
+import { consecutive, downloadRanges, rangesOf } from "./ranges";
 
 /** A failed download. */
 export interface Failure {
@@ -20,13 +22,6 @@ export interface Failure {
   readonly until: number; // ms of the clock: earliest time of a retry
 }
 
-interface Load {
-  readonly file: File;
-  readonly abort: AbortController;
-  got: number; // bytes received
-  dropped: boolean;
-}
-
 /** Tries after which a failure is shown to the user; it is still retried, but rarely. */
 export const PATIENCE = 5;
 const FIRST_WAIT = 500; // ms, doubled with each try
@@ -34,7 +29,8 @@ const LONGEST_WAIT = 15_000;
 const AT_ONCE = 16; // concurrent downloads; browsers allow only 6 without HTTP/2
 const AHEAD = 0.25; // seconds of bandwidth to keep in flight: more than a round trip
 const UNKNOWN = 32_768; // bytes in flight while the bandwidth is unknown
-const TINY = 16_384; // remaining bytes below which a download is not aborted
+const REQUESTS = 3; // requests that a round trip's bytes are divided between: browsers allow 6
+const SMALL = 8192; // bytes of ranges that one request brings at least, if they are wanted
 
 export interface SupplyOptions extends Omit<Link, "received" | "answered"> {
   readonly keepBytes: number; // cache of downloaded files
@@ -51,7 +47,10 @@ export class Supply {
   private damaged = 0; // damaged files of the pack
   private roundTrip = Infinity; // ms
   private readonly unverified = new Set<string>(); // files of a pack whose hash could not be checked
-  private readonly loads = new Map<string, Load>();
+  private readonly loads = new Loads();
+  private ranges: ReadonlyMap<string, readonly File[]> = new Map(); // of files, by uri
+  private planned: ReadonlySet<string> = new Set(); // files of the plan, here or not
+  private sendsRanges: boolean | null = null; // whether the server does; null: it was not asked
   private readonly come = new Map<string, Uint8Array>(); // arrived files, until they are taken
   private readonly failures = new Map<string, Failure>();
   private readonly shelf: Shelf;
@@ -72,7 +71,12 @@ export class Supply {
   }
 
   get running(): number {
-    return this.loads.size + (this.pack ? 1 : 0);
+    return this.loads.all.size + (this.pack ? 1 : 0);
+  }
+
+  /** Names all ranges of files, in their order. */
+  know(files: readonly File[]): void {
+    this.ranges = rangesOf(files);
   }
 
   /** Whether a pack is loading. */
@@ -93,7 +97,7 @@ export class Supply {
   }
 
   isComing(file: File): boolean {
-    return this.loads.has(file.sha256);
+    return this.loads.has(file);
   }
 
   isHere(file: File): boolean {
@@ -141,19 +145,51 @@ export class Supply {
     const single = this.pack ? this.besides(this.pack, wanted, undecided) : wanted;
     for (const file of single) {
       if (!this.hasRoom()) return;
-      if (!this.loads.has(file.sha256) && !this.rests(file)) void this.run(file);
+      if (this.loads.has(file) || this.rests(file) || this.mayComeWhole(file)) continue;
+      void this.run(this.together(file, single));
     }
   }
 
+  /** Whether a range may come with one that was asked for: from a server without ranges. */
+  private mayComeWhole({ uri, offset }: File): boolean {
+    if (offset === undefined || this.sendsRanges !== null) return false;
+    return [...this.loads.all].some(({ files }) => files[0]?.uri === uri);
+  }
+
+  /** What is asked for together with a file: of ranges those that touch, of a server without ranges all. */
+  private together(file: File, wanted: readonly File[]): readonly File[] {
+    const all = this.ranges.get(file.uri);
+    if (!all || this.sendsRanges === false) return all ?? [file];
+    const missing = wanted.filter((one) => !this.loads.has(one) && !this.rests(one));
+    return consecutive(file, all, missing, this.room, Math.max(this.trip / REQUESTS, SMALL) || SMALL);
+  }
+
+  /** Bytes per round trip of the link; NaN: unknown. */
+  private get trip(): number {
+    return this.roundTrip < Infinity ? (this.roundTrip * this.bandwidth.rate) / 1000 : Number.NaN;
+  }
+
   /** The wanted files that the pack does not bring, or brings late. */
-  private besides(pack: Pack, wanted: readonly File[], undecided: boolean): File[] {
-    const brought = wanted.filter((file) => !this.loads.has(file.sha256) && pack.until(file) >= 0);
-    const late = undecided ? new Set() : lateIn(pack, brought, (this.roundTrip * this.bandwidth.rate) / 1000);
+  private besides(pack: Pack, wanted: readonly File[], undecided: boolean): readonly File[] {
+    if (this.ranges.size && !pack.isHere) {
+      const isPlanned = ({ sha256 }: File) => this.planned.has(sha256);
+      const missing = new Set(wanted.filter((file) => !this.loads.has(file)));
+      const spare = pack.spare(isPlanned, (file) => missing.has(file));
+      if (spare > this.trip) {
+        pack.stop(); // ranges bring the rest without what lies between
+        return wanted;
+      }
+    }
+    const brought = wanted.filter((file) => !this.loads.has(file) && pack.until(file) >= 0);
+    const late = undecided ? new Set() : lateIn(pack, brought, this.trip);
     let brings = false;
+    let before = 0; // bytes of larger value that the pack brings
     const single = wanted.filter((file) => {
-      const mine = pack.until(file) >= 0 && !this.loads.has(file.sha256) && !late.has(file);
+      const mine = pack.until(file) >= 0 && !this.loads.has(file) && !late.has(file);
       brings ||= mine;
-      return !mine && (!brings || pack.holds(file)); // other files wait for those of larger value
+      if (mine) before += file.bytes;
+      // what is asked for now comes after a round trip; files that the pack does not hold wait for larger value
+      return !mine && (!brings || (pack.holds(file) && before < this.trip));
     });
     if (!brings && !undecided && !pack.isHere) pack.stop();
     return single;
@@ -161,11 +197,9 @@ export class Supply {
 
   /** Aborts downloads that are no longer wanted, unless they are nearly complete. */
   keepOnly(wanted: ReadonlySet<string>): void {
-    for (const [key, load] of this.loads) {
-      const left = load.file.bytes - load.got;
-      if (wanted.has(key) || left <= TINY || load.got > 0.8 * load.file.bytes) continue;
-      this.drop(key, load);
-    }
+    this.planned = wanted;
+    this.loads.keepOnly(wanted);
+    this.rest();
     for (const key of this.come.keys()) if (!wanted.has(key)) this.come.delete(key);
   }
 
@@ -177,33 +211,31 @@ export class Supply {
   close(): void {
     this.closed = true;
     this.pack?.stop();
-    for (const [key, load] of this.loads) this.drop(key, load);
+    for (const load of this.loads.all) this.loads.drop(load);
+    this.rest();
     this.come.clear();
     this.shelf.clear();
   }
 
   /** Number of concurrent downloads: many for small files, to fill the link; more would only weaken the order. */
   private hasRoom(): boolean {
-    if (this.closed || this.loads.size >= (this.options.atOnce ?? AT_ONCE)) return false;
-    if (this.loads.size < 2) return true;
-    let left = 0;
-    for (const load of this.loads.values()) left += load.file.bytes - load.got;
-    const { rate } = this.bandwidth;
-    return left < (Number.isNaN(rate) ? UNKNOWN : Math.max(AHEAD * rate, UNKNOWN / 2));
+    const { size } = this.loads.all;
+    if (this.closed || size >= (this.options.atOnce ?? AT_ONCE)) return false;
+    return size < 2 || this.room > 0;
   }
 
-  private drop(key: string, load: Load): void {
-    load.dropped = true;
-    load.abort.abort();
-    this.end(key);
+  /** Bytes that may be asked for. */
+  private get room(): number {
+    const { rate } = this.bandwidth;
+    return (Number.isNaN(rate) ? UNKNOWN : Math.max(AHEAD * rate, UNKNOWN / 2)) - this.loads.left;
   }
 
   private begin(): void {
     if (!this.running) this.bandwidth.running(true);
   }
 
-  private end(key: string): void {
-    this.loads.delete(key);
+  /** Stops the clock of the bandwidth where nothing is on its way. */
+  private rest(): void {
     if (!this.running) this.bandwidth.running(false);
   }
 
@@ -214,7 +246,7 @@ export class Supply {
       if (error instanceof DamagedError) this.note = `${error.message}; files are loaded one by one.`;
     }
     this.pack = null;
-    if (!this.running) this.bandwidth.running(false);
+    this.rest();
     if (!this.closed) this.options.changed();
   }
 
@@ -225,8 +257,7 @@ export class Supply {
       await intact(this.link, file, content);
       if (this.closed) return;
       if (!this.link.digest) this.unverified.add(file.sha256);
-      const load = this.loads.get(file.sha256);
-      if (load) this.drop(file.sha256, load);
+      this.loads.forget(file);
       this.arrive(file, content);
     } catch (error) {
       this.damaged += 1;
@@ -242,25 +273,61 @@ export class Supply {
     this.shelf.put(file.sha256, content);
   }
 
-  private async run(file: File): Promise<void> {
-    const key = file.sha256;
-    const load: Load = { file, abort: new AbortController(), got: 0, dropped: false };
+  private async run(files: readonly File[]): Promise<void> {
     this.begin();
-    this.loads.set(key, load);
+    const load = this.loads.begin(files);
+    const again = files.some(({ sha256 }) => this.failures.has(sha256));
+    const [file] = files as readonly [File];
     try {
-      const again = this.failures.has(key);
-      const content = await download(this.link, file, load.abort, again, (got) => {
-        load.got = got;
-      });
-      if (load.dropped) return;
-      this.unverified.delete(key);
-      this.arrive(file, content);
+      if (file.offset === undefined) await this.runFile(load, file, again);
+      else await this.runRanges(load, files, again);
     } catch (error) {
-      if (load.dropped) return;
-      this.fail(file, error);
+      const missing = load.files.find((one) => this.loads.brings(load, one));
+      if (missing) this.fail(missing, error);
     }
-    this.end(key);
+    if (load.dropped) return;
+    this.loads.end(load);
+    this.rest();
     this.options.changed();
+  }
+
+  private async runFile(load: Load, file: File, again: boolean): Promise<void> {
+    const content = await download(this.link, file, load.abort, again, (got) => {
+      load.got = got;
+    });
+    if (load.dropped) return;
+    this.unverified.delete(file.sha256);
+    this.arrive(file, content);
+  }
+
+  private async runRanges(load: Load, files: readonly File[], again: boolean): Promise<void> {
+    const all = this.ranges.get((files[0] as File).uri) ?? files;
+    const came = (file: File, then: () => void) => {
+      if (load.dropped || (!this.loads.came(load, file) && this.isHere(file))) return;
+      then();
+      this.options.changed();
+    };
+    await downloadRanges(this.link, files, all, {
+      abort: load.abort,
+      again,
+      answered: (ranges) => {
+        this.sendsRanges = ranges;
+        if (ranges) return;
+        load.files = all;
+        load.isWhole = true;
+        this.loads.claim(load, all);
+      },
+      take: (file, content) => {
+        came(file, () => {
+          this.unverified.delete(file.sha256);
+          this.arrive(file, content);
+        });
+      },
+      spoiled: (file, error) => came(file, () => this.fail(file, error)),
+      progress: (got) => {
+        load.got = got;
+      },
+    });
   }
 
   private fail(file: File, error: unknown): void {

@@ -1,8 +1,12 @@
 import { dyno, type PackedSplats, SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
 import { Group, type Matrix4, Scene, Vector3, type WebGLRenderer } from "three";
 import type { Format, Handle, Manifest, Renderer } from "../types";
+import { type Answer, Decoders } from "./decoding";
+import StreamWorker from "./decoding.worker?worker&inline";
 import { rootMatrix } from "./frame";
-import { decodePart, joined, type Part } from "./splats";
+import { blendOpacities } from "./opacity";
+import type { Part } from "./packing";
+import { decodePart, joined } from "./splats";
 
 type Color = InstanceType<typeof dyno.DynoVec3<Vector3>>;
 
@@ -21,6 +25,7 @@ interface Column {
   readonly color: Color;
   shown: readonly Increment[];
   stored: readonly Increment[];
+  weight: number; // of the second opacities in what is stored
 }
 
 /** A view of the shown prefix of the stored splats: going down a level needs no upload. */
@@ -44,6 +49,8 @@ export class SparkLayer implements Renderer {
   readonly spark: SparkRenderer;
   readonly #columns = new Map<number, Column>();
   readonly #colors = new Map<number, string>();
+  readonly #weights: ReadonlyMap<number, readonly (number | undefined)[]>; // of second opacities, by label and level
+  readonly #decoders = new Decoders(startWorker);
   readonly #tint = new dyno.DynoFloat({ value: 0 });
   readonly #dirty: () => void;
 
@@ -62,6 +69,7 @@ export class SparkLayer implements Renderer {
       preBlurAmount: manifest.antialiased ? 0 : 0.3,
       blurAmount: manifest.antialiased ? 0.3 : 0,
     });
+    this.#weights = new Map(manifest.labels.map(({ id, levels }) => [id, levels.map((one) => one.weight)]));
     this.place(rootMatrix(manifest.frame));
     this.scene.add(this.spark, this.root);
     this.setColors(colorsOf(manifest));
@@ -89,8 +97,17 @@ export class SparkLayer implements Renderer {
     }
   }
 
-  async decode(label: number, level: number, bytes: Uint8Array, format: Format): Promise<Increment> {
-    const part = await decodePart(bytes, format);
+  async decode(
+    label: number,
+    level: number,
+    bytes: Uint8Array,
+    format: Format,
+    below: readonly Uint8Array[] = [],
+  ): Promise<Increment> {
+    const part =
+      format === "stream"
+        ? await this.#decoders.decode(label, [...below, bytes])
+        : await decodePart(bytes, format);
     return { label, level, count: part.count, part };
   }
 
@@ -134,6 +151,7 @@ export class SparkLayer implements Renderer {
       source.dispose();
     }
     this.#columns.clear();
+    this.#decoders.close();
     this.spark.dispose();
   }
 
@@ -145,26 +163,61 @@ export class SparkLayer implements Renderer {
     const mesh = new SplatMesh({ splats: source, worldModifier: tinted(color, this.#tint) });
     mesh.raycastable = false;
     this.root.add(mesh);
-    const column = { mesh, source, color, shown: [], stored: [] };
+    const column = { mesh, source, color, shown: [], stored: [], weight: 0 };
     this.#columns.set(label, column);
     return column;
   }
 
   #arrange(column: Column): void {
-    const { shown, stored, source } = column;
-    if (!shown.every((part, i) => part === stored[i])) this.#store(column);
-    else source.count = total(shown);
+    const { shown, stored, source, mesh } = column;
+    if (!shown.every((part, i) => part === stored[i])) {
+      this.#store(column);
+      return;
+    }
+    source.count = total(shown);
+    if (!shown.length || this.#weight(column) === column.weight) return;
+    // the previous image stays until one of the new opacities is made
+    const words = source.splats.packedArray;
+    if (words) this.#blend(column, words);
+    source.splats.needsUpdate = true;
+    mesh.updateVersion();
   }
 
   #store(column: Column): void {
     const { mesh, source, shown } = column;
     source.dispose();
-    source.splats = joined(shown.map((increment) => increment.part));
-    source.count = total(shown);
     column.stored = shown;
+    source.splats = joined(
+      shown.map((increment) => increment.part),
+      (words) => this.#blend(column, words),
+    );
+    source.count = total(shown);
     mesh.updateGenerator();
     mesh.updateMappingVersion(); // the previous image stays until the new one is sorted
   }
+
+  /** Weight of the second opacities at the level that is shown. */
+  #weight({ shown }: Column): number {
+    const newest = shown.at(-1);
+    return (newest && this.#weights.get(newest.label)?.[newest.level - 1]) ?? 0;
+  }
+
+  /** Sets the opacities of what is stored. */
+  #blend(column: Column, words: Uint32Array): void {
+    column.weight = this.#weight(column);
+    blendOpacities(
+      words,
+      column.stored.map(({ part }) => part),
+      column.weight,
+    );
+  }
+}
+
+function startWorker(answered: (answer: Answer) => void, failed: () => void): Worker {
+  const worker = new StreamWorker();
+  worker.onmessage = ({ data }) => answered(data);
+  worker.onerror = failed;
+  return worker;
 }
 
 const total = (parts: readonly Handle[]) => parts.reduce((sum, part) => sum + part.count, 0);

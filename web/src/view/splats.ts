@@ -1,31 +1,10 @@
 import { PackedSplats } from "@sparkjsdev/spark";
 import type { Format } from "../types";
+import { ENCODING, HARMONICS, type Part, WORDS } from "./packing";
 import { flipped } from "./ply";
 
 const ROW = 2048; // splats per row of Spark's textures: arrays hold complete rows
-const HARMONICS = ["sh1", "sh2", "sh3"] as const;
-const WORDS = { sh1: 2, sh2: 4, sh3: 4 } as const; // uint32 words per splat
-
-// the full range of SPZ: colours below 0 and above 1 can become visible with the harmonics
-const ENCODING = {
-  rgbMin: -0.45,
-  rgbMax: 1.45,
-  lnScaleMin: -12,
-  lnScaleMax: 9,
-  sh1Max: 1,
-  sh2Max: 1,
-  sh3Max: 1,
-  lodOpacity: false,
-};
-
-/** A decoded increment in main memory: Spark's packed encoding, trimmed to `count` splats. */
-export interface Part {
-  readonly count: number;
-  readonly splats: Uint32Array; // [count, 4]
-  readonly harmonics: ReadonlyMap<(typeof HARMONICS)[number], Uint32Array>;
-}
-
-/** Decodes a file in Spark's worker; rejects for an invalid one. */
+/** Decodes a file of splats in Spark's worker; rejects for an invalid one. */
 export async function decodePart(bytes: Uint8Array, format: Format): Promise<Part> {
   const fileBytes = format === "ply" ? flipped(bytes) : bytes;
   const packed = new PackedSplats({ fileBytes, splatEncoding: ENCODING });
@@ -37,17 +16,20 @@ export async function decodePart(bytes: Uint8Array, format: Format): Promise<Par
     const words = packed.extra[key];
     if (words instanceof Uint32Array) harmonics.set(key, words.slice(0, count * WORDS[key]));
   }
-  const part = {
-    count,
-    splats: packed.packedArray.slice(0, count * 4),
-    harmonics,
-  };
+  const part = { count, splats: packed.packedArray.slice(0, count * 4), harmonics, opacities: null };
   packed.dispose();
   return part;
 }
 
-/** Concatenates parts into one set of splats. A part without harmonics gets zeros. */
-export function joined(parts: readonly Part[]): PackedSplats {
+/**
+ * Concatenates parts into one set of splats. A part without harmonics gets zeros.
+ *
+ * @param finish - changes the words of all of them, before they are uploaded
+ */
+export function joined(
+  parts: readonly Part[],
+  finish: (words: Uint32Array) => void = () => {},
+): PackedSplats {
   const count = parts.reduce((sum, part) => sum + part.count, 0);
   const rows = Math.max(1, Math.ceil(count / ROW)) * ROW;
   const packedArray = new Uint32Array(rows * 4);
@@ -61,5 +43,6 @@ export function joined(parts: readonly Part[]): PackedSplats {
     }
     start += part.count;
   }
+  finish(packedArray);
   return new PackedSplats({ packedArray, numSplats: count, extra, splatEncoding: ENCODING });
 }

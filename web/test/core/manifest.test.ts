@@ -3,7 +3,7 @@
 import { describe, expect, test } from "vitest";
 import { BundleError } from "../../src/core/check";
 import { loadManifest, parseManifest, parsePromises, VERSION } from "../../src/core/manifest";
-import type { Manifest } from "../../src/types";
+import type { Level, Manifest } from "../../src/types";
 import { Network, VirtualClock } from "../simulate";
 import { BASE, bundle } from "../worlds";
 
@@ -65,6 +65,56 @@ test("a pack, none, or an older bundle", () => {
 test("a level that adds nothing needs no file", () => {
   const empty = { uri: "", format: "spz", bytes: 0, gpuBytes: 0, count: 0, sha256: "" };
   expect(parseManifest(with_(good(), "labels.0.levels.1", empty)).labels[0]?.levels[1]?.count).toBe(0);
+});
+
+test("levels of a stream are ranges of one file", () => {
+  const made = bundle(network, { labels: 2, levels: 3, bytes: 100, streams: true });
+  const whole = (): Json => JSON.parse(JSON.stringify(made));
+  expect(parseManifest(JSON.stringify(made))).toEqual(made);
+  const [first, second] = (made.labels[0]?.levels ?? []) as [Level, Level];
+  const other = made.labels[1]?.levels[0]?.uri;
+  const levels = "labels.0.levels";
+  const touch = "labels[0].levels must be ranges of their stream without gaps, from byte 0 on";
+  const alone = "labels[0].levels must be one stream of their own";
+  for (const [path, value, message] of [
+    ["version", 3, "labels[0].levels have streams, which version 3 does not have"],
+    [`${levels}.0.offset`, undefined, touch],
+    [`${levels}.0.offset`, 1, touch],
+    [`${levels}.1.offset`, (second.offset ?? 0) + 1, touch],
+    [`${levels}.1.offset`, (second.offset ?? 0) - 1, touch],
+    [`${levels}.1.offset`, -1, "levels[1].offset must be a whole number from 0 on"],
+    [`${levels}.1.offset`, 0.5, "levels[1].offset must be"],
+    [`${levels}.1.offset`, null, "levels[1].offset must be"],
+    [`${levels}.0.bytes`, first.bytes - 1, touch],
+    [`${levels}.1.uri`, "chunks/other.sgst", alone],
+    [`${levels}.1.format`, "spz", alone],
+    [`${levels}.1.refine`, "REPLACE", alone],
+    [`${levels}.1.weight`, 0.5, "labels[0].levels must all have a weight, or none"],
+    [`${levels}.1.weight`, 1.5, "levels[1].weight must be a number from 0 to 1"],
+    [`${levels}.1.weight`, null, "levels[1].weight must be"],
+  ] as const) {
+    expect(complaint(() => parseManifest(with_(whole(), path, value)))).toContain(message);
+  }
+  const twice = whole();
+  for (let k = 0; k < 3; k++) with_(twice, `labels.1.levels.${k}.uri`, first.uri);
+  const same = complaint(() => parseManifest(JSON.stringify(twice)));
+  expect(same).toContain("labels[1].levels must be one stream of their own");
+  expect(other).not.toBe(first.uri);
+  const plain = with_(good(), "labels.0.levels.1.offset", 0);
+  expect(complaint(() => parseManifest(plain))).toContain("have offsets or weights, which only streams have");
+});
+
+test("levels of a stream may have weights, and add nothing", () => {
+  const document = JSON.parse(
+    JSON.stringify(bundle(network, { labels: 1, levels: 3, bytes: 100, streams: true })),
+  );
+  for (const [k, weight] of [0, 0.2, 1].entries()) with_(document, `labels.0.levels.${k}.weight`, weight);
+  expect(parseManifest(JSON.stringify(document)).labels[0]?.levels[1]?.weight).toBe(0.2);
+  const empty = { format: "stream", bytes: 0, gpuBytes: 0, count: 0, weight: 1 };
+  const { levels } = document.labels[0];
+  expect(parseManifest(with_(document, "labels.0.levels", [...levels, empty])).labels[0]?.levels.length).toBe(
+    4,
+  );
 });
 
 test("a level may replace those below, if there are any", () => {

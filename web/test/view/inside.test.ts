@@ -36,6 +36,28 @@ test("its files are found by their address in the bundle, and nothing else is", 
   expect(await source.fetch(url("chunks/b-01.spz"))).toMatchObject({ ok: false, status: 404 });
 });
 
+test("a range of a file", async () => {
+  const content = Uint8Array.from({ length: 100 }, (_, i) => i);
+  const source = sourceInside(page({ "chunks/a.sgst": content }));
+  if (!source) throw new Error("none");
+  for (const [start, end] of [
+    [0, 99],
+    [0, 0],
+    [1, 5],
+    [2, 2],
+    [33, 98],
+    [99, 99],
+  ] as const) {
+    const headers = { Range: `bytes=${start}-${end}` };
+    const reply = await source.fetch(new URL("chunks/a.sgst", source.base).href, { headers });
+    expect(reply.status).toBe(206);
+    expect(reply.headers.get("Content-Range")).toBe(`bytes ${start}-${end}/*`);
+    expect([...((await reply.body?.getReader().read())?.value ?? [])]).toEqual([
+      ...content.slice(start, end + 1),
+    ]);
+  }
+});
+
 test("base64 with and without the browser's help", () => {
   const bytes = Uint8Array.from({ length: 256 }, (_, i) => i);
   const text = Buffer.from(bytes).toString("base64");

@@ -29,7 +29,7 @@ MEASURES = {"ssim": "SSIM", "psnr": "PSNR (dB)", "lpips_alex": "LPIPS (alex)", "
 # the same, colour-corrected: measured where photos have an exposure of their own
 MEASURES |= {f"cc_{name}": f"cc_{title}" for name, title in MEASURES.items()}
 FILE, PAGE = "compare.json", "compare.md"
-_MB = "raw MB: 248 bytes a Gaussian; MB: encoded, all SPZ files with the same settings."
+_MB = "raw MB: 248 bytes a Gaussian; MB: encoded, all with the same settings."
 _HOW = (
     "between: interpolated between two neighbouring points of our curve, SSIM over log bytes; smallest: our "
     "smallest set is better already; dash: our curve does not reach that SSIM."
@@ -70,7 +70,7 @@ class Point:
     target: float  # SSIM that it was planned for; NaN: none
     budget: float  # bytes that it was planned for; NaN: none
     count: int
-    encoded: int  # bytes of its SPZ files
+    encoded: int  # bytes of its files
     steps: int  # training steps that it took, from the start
     ssim: float
     ssim_sent: float  # of what a viewer decodes from the files

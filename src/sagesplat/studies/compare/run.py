@@ -17,9 +17,10 @@ from sagesplat.core.config import CompareConfig, FitConfig, PlanConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Progress, RunDone, TableMade
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.formats.increments import INDEX, read_increments, shown, write_increments
+from sagesplat.formats.increments import INDEX, read_increments, read_index, shown, write_increments
 from sagesplat.formats.levels import read_level, write_set
 from sagesplat.formats.spz import SH_BITS
+from sagesplat.formats.stream_increments import write_streams
 from sagesplat.io.files import read_json, write_json
 from sagesplat.metrics.color_correct import color_correct_affine
 from sagesplat.metrics.image import pasted
@@ -415,12 +416,17 @@ def _point(
 
 
 def encode_set(job: Job, g: Gaussians) -> tuple[dict[int, int], Gaussians]:
-    """Bytes by label id, one file each encoded as increments are, and what a viewer decodes from them."""
+    """Bytes by label id, one file each encoded as the run's increments are, and what a viewer decodes."""
     bits = tuple(settings_of(job.run, "nest").get("sh_bits", SH_BITS))
+    streams = any(one.format == "stream" for one in read_index(job.run.increments))
     whole = {label: (count,) for label, count in g.counts().items()}
     with TemporaryDirectory() as folder:
         path = Path(folder) / "increments"
-        increments = write_increments(path, g, whole, job.names(), sh_bits=bits, antialiased=job.antialiased)
+        given = {"sh_bits": bits, "antialiased": job.antialiased}
+        if streams:
+            increments = write_streams(path, g, whole, job.names(), **given).increments
+        else:
+            increments = write_increments(path, g, whole, job.names(), **given)
         arrived = read_increments(path, increments) if increments else g
     return {c.label_id: c.nbytes for c in increments}, arrived
 
@@ -433,7 +439,7 @@ def _walks(nested: NestedLevels, sage: Snapshots) -> list[Walk]:
     ours = [dict(zip(costs.labels, levels.tolist(), strict=True)) for levels in chosen]
     increments = increments_of(job)
     increment_files = {
-        (label, k + 1): {c.uri: c.nbytes for c in shown(increments, label, k + 1)}
+        (label, k + 1): {f"{c.uri} {c.level}": c.nbytes for c in shown(increments, label, k + 1)}
         for label in costs.labels
         for k in range(costs.transfer_bytes.shape[1])
     }

@@ -112,8 +112,8 @@ def _chunk(label_id: int, number: int, level: Mapping[str, Any]) -> Increment:
     if not isinstance(uri, str) or not uri.startswith("chunks/"):
         raise ValueError(f"uri {uri!r:.60}")
     sizes = level["count"], level["bytes"], level["gpuBytes"]
-    refine = level.get("refine", "ADD")
-    return checked(Increment(label_id, number, uri[len("chunks/") :], *sizes, level["sha256"], refine))
+    more = {key: level[key] for key in ("refine", "offset", "weight") if key in level}
+    return checked(Increment(label_id, number, uri[len("chunks/") :], *sizes, level["sha256"], **more))
 
 
 def _of_run(path: Path, name: str) -> list[Level]:

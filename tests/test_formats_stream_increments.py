@@ -1,0 +1,157 @@
+"""Increments as ranges of coded streams: what is written, listed and read back."""
+
+import hashlib
+import json
+from dataclasses import asdict, replace
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import random_gaussians
+
+from sagesplat.core.errors import DataError
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.core.second_opacity import SecondOpacities, blended
+from sagesplat.formats.increments import (
+    Increment,
+    checked,
+    full_scene,
+    read_increments,
+    read_index,
+    shown,
+    totals,
+)
+from sagesplat.formats.stream_increments import Streams, read_streams, write_streams
+
+SIZES = {0: (3, 3, 10, 20, 20), 2: (0, 4, 6, 6, 15), 5: (1, 2, 2, 2, 2)}
+NAMES = {0: "grass", 2: "car", 5: "sky"}
+WEIGHTS = (0.0, 0.0, 0.2, 0.6, 1.0)
+
+
+def some() -> tuple[Gaussians, SecondOpacities]:
+    labels = torch.tensor([0] * 20 + [2] * 15 + [5] * 2, dtype=torch.int16)
+    g = replace(random_gaussians(37, degree=1, logit=3), label_ids=labels)
+    g.logit_opacities[[1, 36]] = -9.0
+    seconds = g.logit_opacities - 1
+    seconds[[2, 36]] = -9.0
+    seconds[1] = 2.0
+    return g, SecondOpacities(seconds, dict.fromkeys(SIZES, WEIGHTS))
+
+
+@pytest.fixture
+def written(tmp_path: Path) -> Streams:
+    g, second = some()
+    return write_streams(tmp_path, g, SIZES, NAMES, second=second)
+
+
+def test_increments_are_ranges_that_fill_the_file_of_their_category(tmp_path, written):
+    assert read_index(tmp_path) == written.increments
+    assert {one.format for one in written.increments} == {"stream"}
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
+        {"index.json", *(one.uri for one in written.increments)}
+    )
+    assert [(one.label_id, one.level, one.count) for one in written.increments] == [
+        (0, 1, 3), (0, 3, 7), (0, 4, 10), (2, 2, 4), (2, 3, 2), (2, 5, 9), (5, 1, 1),
+    ]  # fmt: skip
+    assert written.sizes == {0: SIZES[0], 2: SIZES[2], 5: (1, 1, 1, 1, 1)}  # one of the sky is not to be seen
+    assert sorted(written.rows.tolist()) == list(range(36))
+    for label in SIZES:
+        mine = shown(written.increments, label, 5)
+        content = (tmp_path / mine[0].uri).read_bytes()
+        assert mine[0].uri.startswith(f"{NAMES[label]}-{hashlib.sha256(content).hexdigest()[:12]}.sgst")
+        ends = [0, *(one.offset + one.nbytes for one in mine)]
+        assert [one.offset for one in mine] == ends[:-1]
+        assert ends[-1] == len(content)
+        parts = [content[low:high] for low, high in pairwise(ends)]
+        assert [hashlib.sha256(part).hexdigest() for part in parts] == [one.sha256 for one in mine]
+    assert totals(written.increments, [0, 2, 5], 5, "count").tolist() == [
+        list(n) for n in written.sizes.values()
+    ]
+
+
+def test_the_newest_increment_says_how_its_category_looks(tmp_path, written):
+    g, second = some()
+    for label, level, weight in (
+        (0, 1, 0.0),
+        (0, 2, 0.0),
+        (0, 4, 1.0),
+        (0, 5, 1.0),
+        (2, 3, 0.6),
+        (2, 5, 1.0),
+    ):
+        mine = shown(written.increments, label, level)
+        assert mine[-1].weight == pytest.approx(weight, abs=1e-9)
+        found = read_increments(tmp_path, mine)
+        rows = torch.from_numpy(written.rows)
+        rows = rows[(g.label_ids == label)[rows]][: len(found)]
+        wanted = torch.sigmoid(blended(g.logit_opacities[rows], second.logits[rows], weight))
+        assert (torch.sigmoid(found.logit_opacities) - wanted).abs().max() < 0.06  # bytes are blended
+        assert (found.label_ids == label).all()
+        assert (found.means - g.means[rows]).abs().max() < 0.1
+    (last,) = read_increments(tmp_path, written.increments[2:3]).counts().items()
+    assert last == (0, 10)  # of a level alone
+
+
+def test_the_ladder_has_both_opacities_of_what_was_written(tmp_path, written):
+    g, second = read_streams(tmp_path, written.increments)
+    assert second is not None
+    assert len(second.logits) == len(g) == 36
+    assert list(second.weights[2]) == pytest.approx((0.0, 0.0, 0.6, 0.6, 1.0))
+    assert list(second.weights[5]) == [1.0] * 5  # of what all levels show
+    full = read_increments(tmp_path, full_scene(written.increments))
+    assert torch.equal(full.logit_opacities, second.logits)
+    assert torch.equal(full.means, g.means)
+
+
+def test_without_second_opacities_the_index_has_no_weights(tmp_path):
+    g, _ = some()
+    made = write_streams(tmp_path, g, SIZES, NAMES)
+    index = json.loads((tmp_path / "index.json").read_text())
+    assert index["format"] == "stream"
+    usual = {"label_id", "level", "uri", "count", "nbytes", "gpu_bytes", "sha256"}
+    assert [set(one) - usual for one in index["chunks"][:2]] == [set(), {"offset"}]
+    assert read_streams(tmp_path, made.increments)[1] is None
+    assert write_streams(tmp_path, g, SIZES, NAMES).increments == made.increments
+    assert 5 in made.sizes
+
+
+def test_a_category_that_nobody_sees_has_no_stream(tmp_path):
+    g, _ = some()
+    g.logit_opacities[g.label_ids == 2] = -9.0
+    made = write_streams(tmp_path, g, SIZES, NAMES)
+    assert set(made.sizes) == {0, 5}
+    assert not list(tmp_path.glob("car*"))
+
+
+def test_damage_is_one_line(tmp_path, written):
+    one = written.increments[1]
+    path = tmp_path / one.uri
+    for wrong in (
+        replace(one, offset=one.offset + 1),
+        replace(one, nbytes=one.nbytes + 9),
+        replace(one, count=1),
+    ):
+        with pytest.raises(DataError, match=rf"{one.uri}: (other levels|a damaged stream)"):
+            read_increments(tmp_path, [wrong])
+    path.write_bytes(path.read_bytes()[:-1])
+    assert len(read_increments(tmp_path, written.increments[:2])) == 10  # what is there is read
+    with pytest.raises(DataError, match=f"{one.uri}: a damaged stream"):
+        read_increments(tmp_path, written.increments[:3])
+    path.unlink()
+    with pytest.raises(
+        DataError, match=rf"{one.uri}: cannot be read .*; delete that folder and run `sagesplat nest`"
+    ):
+        read_streams(tmp_path, written.increments)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"offset": -1}, {"offset": 2**53}, {"offset": 1.0}, {"offset": True}, {"weight": 1.1}, {"weight": "1"},
+     {"weight": float("nan")}, {"weight": True}, {"uri": "a-01-x.spz", "offset": 4}],
+)  # fmt: skip
+def test_impossible_entries(wrong):
+    good = Increment(0, 1, "a-x.sgst", 3, 40, 120, "0" * 64, offset=4, weight=0.5)
+    assert checked(good) == good
+    with pytest.raises(ValueError, match=r"offset|weight"):
+        checked(Increment(**{**asdict(good), **wrong}))

@@ -1,0 +1,84 @@
+/** The requests that are on their way, and the files that they bring. */
+
+import type { File } from "./download";
+
+/** A request: a file, or consecutive ranges of one. */
+export interface Load {
+  files: readonly File[];
+  readonly abort: AbortController;
+  got: number; // bytes received
+  dropped: boolean;
+  isWhole: boolean; // all ranges of a file come, from its beginning
+}
+
+const TINY = 16_384; // remaining bytes below which a download is not aborted
+const MODEST = 2 ** 22; // the same of a file whose ranges cannot be asked for: the next time it would begin anew
+
+const bytesOf = (files: readonly File[]): number => files.reduce((sum, { bytes }) => sum + bytes, 0);
+
+export class Loads {
+  private readonly byKey = new Map<string, Load>(); // of files that are not here yet, by sha-256
+
+  get all(): Set<Load> {
+    return new Set(this.byKey.values());
+  }
+
+  /** Bytes that are still to come. */
+  get left(): number {
+    let left = 0;
+    for (const load of this.all) left += bytesOf(load.files) - load.got;
+    return left;
+  }
+
+  has({ sha256 }: File): boolean {
+    return this.byKey.has(sha256);
+  }
+
+  begin(files: readonly File[]): Load {
+    const load: Load = { files, abort: new AbortController(), got: 0, dropped: false, isWhole: false };
+    this.claim(load, files);
+    return load;
+  }
+
+  /** Files that no other request brings are this one's. */
+  claim(load: Load, files: readonly File[]): void {
+    for (const { sha256 } of files) if (!this.byKey.has(sha256)) this.byKey.set(sha256, load);
+  }
+
+  brings(load: Load, { sha256 }: File): boolean {
+    return this.byKey.get(sha256) === load;
+  }
+
+  /** Takes note that a file of a request has come; whether the request was to bring it. */
+  came(load: Load, file: File): boolean {
+    return this.brings(load, file) && this.byKey.delete(file.sha256);
+  }
+
+  end(load: Load): void {
+    for (const [key, one] of this.byKey) if (one === load) this.byKey.delete(key);
+  }
+
+  /** Stops a request. */
+  drop(load: Load): void {
+    load.dropped = true;
+    load.abort.abort();
+    this.end(load);
+  }
+
+  /** Forgets a file that has come otherwise, and its request if it brings nothing else. */
+  forget(file: File): void {
+    const load = this.byKey.get(file.sha256);
+    if (!load) return;
+    if (load.files.some((one) => one.sha256 !== file.sha256 && this.brings(load, one))) this.came(load, file);
+    else this.drop(load);
+  }
+
+  /** Stops what brings nothing that is wanted, unless it is nearly complete. */
+  keepOnly(wanted: ReadonlySet<string>): void {
+    for (const load of this.all) {
+      const size = bytesOf(load.files);
+      if (size - load.got <= (load.isWhole ? MODEST : TINY) || load.got > 0.8 * size) continue;
+      if (!load.files.some((file) => wanted.has(file.sha256) && this.brings(load, file))) this.drop(load);
+    }
+  }
+}

@@ -1,0 +1,134 @@
+/** Decodes coded streams in a worker, or on the page's own thread where there is none. */
+
+import { StreamDecoder } from "../core/stream";
+import { Packing, type Part } from "./packing";
+
+/** Increments of a stream to decode, in their order; the last one is asked for. */
+export interface Job {
+  readonly id: number;
+  readonly stream: number;
+  readonly from: number; // increments that were decoded before; 0: the stream begins anew
+  readonly increments: readonly Uint8Array[];
+}
+
+/** The answer to a job. */
+export interface Answer {
+  readonly id: number;
+  readonly part: Part | null; // null: the stream is damaged
+}
+
+/** The streams that are being decoded, each where it was left. */
+export class Streams {
+  private readonly decoders = new Map<number, StreamDecoder<Part>>();
+
+  /** Decodes the increments of a job; a part for the last one. */
+  answer({ id, stream, from, increments }: Job): Answer {
+    try {
+      const decoder = from ? this.decoders.get(stream) : new StreamDecoder(new Packing());
+      if (!decoder) throw new Error("a stream that was not begun");
+      this.decoders.set(stream, decoder);
+      let parts: Part[] = [];
+      for (const bytes of increments) parts = decoder.push(bytes).filter(({ count }) => count > 0);
+      const [part, ...others] = parts;
+      if (!part || others.length || decoder.isWithin) throw new Error("not one level");
+      if (decoder.isComplete) this.decoders.delete(stream);
+      return { id, part };
+    } catch {
+      this.decoders.delete(stream);
+      return { id, part: null };
+    }
+  }
+}
+
+/** The subset of `Worker` that is used here. */
+export interface Peer {
+  postMessage(message: Job): void;
+  terminate(): void;
+}
+
+/** Starts a worker; throws where none can be had. */
+export type Start = (answered: (answer: Answer) => void, failed: () => void) => Peer;
+
+interface Waiting {
+  readonly stream: number;
+  readonly increments: readonly Uint8Array[]; // all from the first one on
+  readonly done: (part: Part | null) => void;
+}
+
+/** Decodes the levels of several streams. */
+export class Decoders {
+  private peer: Peer | null = null;
+  private own: Streams | null = null; // where no worker can be had
+  private jobs = 0;
+  private readonly waiting = new Map<number, Waiting>();
+  private readonly done = new Map<number, number>(); // increments decoded, by stream
+
+  constructor(private readonly start: Start) {}
+
+  /**
+   * Decodes the newest of the increments; rejects for a damaged stream.
+   *
+   * @param stream - a number of the caller's
+   * @param increments - of the stream, from the first one to the one that is asked for
+   */
+  decode(stream: number, increments: readonly Uint8Array[]): Promise<Part> {
+    return new Promise((resolve, reject) => {
+      const done = (part: Part | null) => {
+        if (part) return resolve(part);
+        this.done.delete(stream);
+        reject(new Error("a damaged stream"));
+      };
+      const id = ++this.jobs;
+      this.waiting.set(id, { stream, increments, done });
+      this.send(id, this.done.get(stream) ?? 0);
+    });
+  }
+
+  close(): void {
+    this.peer?.terminate();
+    this.peer = null;
+    this.own = null;
+    this.waiting.clear();
+    this.done.clear();
+  }
+
+  private send(id: number, decoded: number): void {
+    const job = this.waiting.get(id);
+    if (!job) return;
+    const { stream, increments } = job;
+    const from = decoded < increments.length ? decoded : 0; // an earlier one: from the beginning
+    this.done.set(stream, increments.length);
+    const message: Job = { id, stream, from, increments: increments.slice(from) };
+    const peer = this.worker();
+    if (peer) peer.postMessage(message);
+    else if (this.own) this.take(this.own.answer(message));
+  }
+
+  private take({ id, part }: Answer): void {
+    const job = this.waiting.get(id);
+    this.waiting.delete(id);
+    job?.done(part);
+  }
+
+  private worker(): Peer | null {
+    if (this.peer || this.own) return this.peer;
+    try {
+      this.peer = this.start(
+        (answer) => this.take(answer),
+        () => this.fallBack(),
+      );
+    } catch {
+      this.own = new Streams();
+    }
+    return this.peer;
+  }
+
+  /** Goes on without the worker: what it had not answered begins anew here. */
+  private fallBack(): void {
+    this.peer?.terminate();
+    this.peer = null;
+    this.own = new Streams();
+    this.done.clear();
+    for (const id of [...this.waiting.keys()]) this.send(id, 0);
+  }
+}
