@@ -26,7 +26,7 @@ from sagesplat.train.importance import importance
 from sagesplat.train.lr_schedule import LrSchedule
 from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.sky import Shell, Sky
-from sagesplat.train.state import initial_state
+from sagesplat.train.state import TrainState, initial_state
 from sagesplat.train.stepper import Stepper
 from sagesplat.train.trainer import LOOK_EVERY, finite, named_failures, train
 from sagesplat.train.votes import label_weights, winners
@@ -277,19 +277,11 @@ def nest(
                     valid=valid, antialiased=train_config.antialiased,
                 )  # fmt: skip
                 state.order_share = order_shares(labels, ranks, importances).to(device)
-            rows = weights = None
-            if spans is None or edges is None:
-                prefix = draw_shares(state.rng, len(categories), config, state.step / config.steps)
-                if (prefix < 1).any():
-                    assert state.order_share is not None
-                    shown = state.order_share < torch.from_numpy(prefix).to(device)[column]
-                    rows = torch.nonzero(shown)[:, 0]
-                if state.second_opacities is not None:
-                    weights = torch.from_numpy(weight_at(prefix)).to(device)[column]
+            if edges is None:
+                rows, weights = _draw_prefixes(state, column, len(categories), config)
             else:
-                levels = torch.from_numpy(state.rng.integers(spans.levels, size=len(categories)))
-                level = levels.to(device)[column]
-                rows = torch.nonzero((edges[0] <= level) & (level <= edges[1]))[:, 0]
+                assert spans is not None
+                rows, weights = _draw_levels(state, column, len(categories), edges, spans.levels), None
             loss = stepper(
                 state, nested.gaussians.sh_degree, rates(state.step + 1), trainable,
                 drawn_rows=rows, second_weights=weights,
@@ -307,6 +299,31 @@ def nest(
     g, second = state.gaussians.select(torch.from_numpy(rows)), state.second_opacities
     second = None if second is None else second[torch.from_numpy(rows)]
     yield Nested(g, nested.purity[near][rows], ranks[rows], second)
+
+
+def _draw_prefixes(
+    state: TrainState, column: Tensor, num_labels: int, config: NestConfig
+) -> tuple[Tensor | None, Tensor | None]:
+    """Indices of the Gaussians that a step draws (None: all), and weights [N] of second opacities, if any.
+
+    `column` [N]: of each Gaussian's category.
+    """
+    prefix = draw_shares(state.rng, num_labels, config, state.step / config.steps)
+    rows = weights = None
+    if (prefix < 1).any():
+        assert state.order_share is not None
+        shown = state.order_share < torch.from_numpy(prefix).to(column.device)[column]
+        rows = torch.nonzero(shown)[:, 0]
+    if state.second_opacities is not None:
+        weights = torch.from_numpy(weight_at(prefix)).to(column.device)[column]
+    return rows, weights
+
+
+def _draw_levels(state: TrainState, column: Tensor, num_labels: int, edges: Tensor, levels: int) -> Tensor:
+    """Indices of the Gaussians of a level of each category; `edges` [2, N]: its first and last level."""
+    drawn = torch.from_numpy(state.rng.integers(levels, size=num_labels))
+    level = drawn.to(column.device)[column]
+    return torch.nonzero((edges[0] <= level) & (level <= edges[1]))[:, 0]
 
 
 def order_shares(labels: np.ndarray, ranks: np.ndarray, importances: np.ndarray) -> Tensor:
