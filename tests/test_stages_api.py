@@ -26,7 +26,7 @@ from sagesplat.core.config import SampleConfig
 from sagesplat.core.errors import RunError
 from sagesplat.demo.capture import make_capture
 from sagesplat.formats.splats import read_splat
-from sagesplat.stages.export import export_scene
+from sagesplat.stages.export import export_increments, export_scene
 
 CONFIG = RunConfig(
     train=TrainConfig(max_steps=60, level_every=20),
@@ -62,6 +62,8 @@ def test_a_composed_scene_is_for_viewers_that_do_not_antialias(runs, tmp_path):
         path = tmp_path / f"{mode}.ply"
         export_scene(run.job, path, level=1, labels=(), target=None, rasterize_mode=mode)
         assert read_splat(path).antialiased is (mode == "antialiased")
+    export_increments(run.job, tmp_path / "chunks", "ply")
+    assert not any(read_splat(path).antialiased for path in (tmp_path / "chunks").glob("*.ply"))
     levels = tmp_path / "lod-meta.json"
     with pytest.raises(RunError, match=r"lod-meta.json: says how it is drawn; leave out --rasterize-mode$"):
         export_scene(run.job, levels, level=None, labels=(), target=None, rasterize_mode="classic")

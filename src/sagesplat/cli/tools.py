@@ -47,6 +47,8 @@ def export(
     """
     from sagesplat.stages.export import export_increments, export_scene
 
+    if chunks and rasterize_mode:
+        raise RunError(f"{out}: --rasterize-mode is for one scene; leave it out with --chunks")
     with open_job(run, machine, ladder) as job:
         if chunks:
             count = export_increments(job, out, chunks)

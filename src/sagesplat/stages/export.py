@@ -41,15 +41,17 @@ def increment_files(job: Job, folder: Path, kind: FileFormat) -> list[Increment]
     """Write the increments of the run's nested levels as files of their own, in the order of the ladder.
 
     What streams hold is kept by the finest steps of SPZ. Of two opacities a Gaussian gets that of the full
-    model.
+    model. PLY files are for viewers that do not antialias.
     """
     ladder, made = read_prefixes(job.run.prefixes), settings_of(job.run, "nest")
     listed = read_index(job.run.increments)
     streams = any(one.format == "stream" for one in listed)
     g = read_increments(job.run.increments, listed) if streams else ladder.gaussians
+    antialiased = job.antialiased and kind != "ply"
     return write_increments(
-        folder, g, ladder.sizes, job.names(), replaces=ladder.replaces, kind=kind,
-        sh_bits=tuple(made["sh_bits"]), fine=ladder.levels if streams else (), antialiased=job.antialiased,
+        folder, classic(job, g) if kind == "ply" else g, ladder.sizes, job.names(), replaces=ladder.replaces,
+        kind=kind, sh_bits=tuple(made["sh_bits"]), fine=ladder.levels if streams else (),
+        antialiased=antialiased,
     )  # fmt: skip
 
 
