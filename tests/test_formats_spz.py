@@ -15,7 +15,15 @@ from hypothesis import strategies as st
 
 from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import PARAMETERS, Gaussians
-from sagesplat.formats.quantisation import rounded
+from sagesplat.formats.quantisation import (
+    COLOUR_STEP,
+    PER_COLOUR,
+    PER_LOG_SCALE,
+    SCALE_STEP,
+    in_buckets,
+    in_steps,
+    rounded,
+)
 from sagesplat.formats.spz import (
     MAX_COUNT,
     decode_spz,
@@ -196,14 +204,18 @@ def test_coarse_files_hold_what_training_draws_and_are_smaller():
     assert (back.means - g.means).abs().max() <= half_a_step
 
 
-def test_gradients_pass_rounding_as_if_it_were_not_there():
-    g = random_gaussians(20, degree=3)
-    leaves = {name: p.requires_grad_() for name, p in g.parameters().items()}
-    drawn = rounded(g, (5, 4))
-    grads = torch.autograd.grad(
-        torch.cat([p.flatten() for p in drawn.parameters().values()]).sum(), [*leaves.values()]
-    )
-    assert all(torch.equal(grad, torch.ones_like(grad)) for grad in grads)
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_rounding_some_rows_is_rounding_all_of_them_bit_for_bit(degree):
+    g = random_gaussians(500, degree=degree)
+    g = replace(g, shN=3 * g.shN)  # some beyond what buckets hold
+    rows = torch.from_numpy(np.random.default_rng(0).permutation(500)[:200])
+    whole, some = rounded(g, (5, 4)), rounded(g, (5, 4), rows)
+    for name, value in whole.select(rows).parameters().items():
+        assert torch.equal(getattr(some, name), value), name
+    assert torch.equal(whole.shN, in_buckets(g.shN, (5, 4)))
+    assert torch.equal(whole.log_scales, in_steps(g.log_scales, SCALE_STEP / PER_LOG_SCALE))
+    assert torch.equal(whole.sh0, (in_steps(g.sh0 * PER_COLOUR + 127.5, COLOUR_STEP) - 127.5) / PER_COLOUR)
+    assert torch.equal(some.label_ids, g.label_ids[rows])
 
 
 @pytest.mark.parametrize("sh_bits", [(5, 4), (8, 8), (1, 1), (6, 5)])

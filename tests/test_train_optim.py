@@ -57,6 +57,23 @@ def test_frozen_rows_keep_every_bit_and_the_others_do_not_notice(pattern):
         assert (after[trainable] != before[trainable]).all(-1).all()
 
 
+@pytest.mark.parametrize("columns", [None, 3])
+def test_gradients_of_drawn_rows_alone_do_what_a_mask_does(columns):
+    n = 5000
+    rng = np.random.default_rng(3)
+    drawn = np.flatnonzero(rng.random(n) < 0.9)
+    trainable = rng.random(n) < 0.7
+    start = [rng.random((n, 2, 3)).astype(np.float32) for _ in range(3)]
+    masked, rows = [a.copy() for a in start], [a.copy() for a in start]
+    there = trainable & np.isin(np.arange(n), drawn)
+    for step, grad in enumerate(gradients((n, 2, 3), 3), start=10):
+        how = {"lr": 0.01, "step": step, "columns": columns}
+        adam_step(masked[0], grad, *masked[1:], trainable=there, **how)
+        adam_step(rows[0], grad[drawn], *rows[1:], trainable=trainable, drawn=drawn, **how)
+    for expected, actual in zip(masked, rows, strict=True):
+        np.testing.assert_array_equal(actual, expected)
+
+
 def test_columns_without_gradient_can_be_left_out():
     """As the harmonics that are not in use yet."""
     n, in_use = 5000, 9

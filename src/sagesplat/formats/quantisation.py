@@ -4,9 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from numba import prange
 from torch import Tensor
 
 from sagesplat.core.gaussians import Gaussians
+from sagesplat.kernels.jit import njit
 
 PER_COLOUR = 0.15 * 255  # SPZ units (of a byte) per unit of sh0
 PER_LOG_SCALE = 16  # SPZ units per unit of log scale
@@ -42,15 +44,47 @@ def in_buckets(shN: Tensor, bits: tuple[int, int]) -> Tensor:
     return torch.round(shN.clamp(-1, 1) / steps) * steps
 
 
-def rounded(g: Gaussians, sh_bits: tuple[int, int]) -> Gaussians:
-    """`g` with sh0, log scales and shN quantised as in coarse SPZ files (straight-through gradients).
+def rounded(g: Gaussians, sh_bits: tuple[int, int], rows: Tensor | None = None) -> Gaussians:
+    """`g`, or those of some `rows` (indices), with sh0, log scales and shN quantised as in coarse SPZ files.
 
-    Positions, opacities and rotations stay as they are: their quantisation costs almost no quality.
+    Positions, opacities and rotations stay as they are: their quantisation costs almost no quality. The
+    result has no graph: training takes gradients by the rounded values (straight-through estimator).
     """
-    quantised = {
-        "sh0": (in_steps(g.sh0 * PER_COLOUR + 127.5, COLOUR_STEP) - 127.5) / PER_COLOUR,
-        "log_scales": in_steps(g.log_scales, SCALE_STEP / PER_LOG_SCALE),
-        "shN": in_buckets(g.shN, sh_bits),
-    }
-    now = g.parameters()
-    return replace(g, **{name: now[name] + (value - now[name]).detach() for name, value in quantised.items()})
+    g = g.detach()
+    if g.means.is_cuda:
+        g = g if rows is None else g.select(rows)
+        sh0 = (in_steps(g.sh0 * PER_COLOUR + 127.5, COLOUR_STEP) - 127.5) / PER_COLOUR
+        log_scales, shN = in_steps(g.log_scales, SCALE_STEP / PER_LOG_SCALE), in_buckets(g.shN, sh_bits)
+        return replace(g, sh0=sh0, log_scales=log_scales, shN=shN)
+    index = np.arange(len(g)) if rows is None else rows.numpy()
+    found = _rounded_rows(g.sh0.numpy(), g.log_scales.numpy(), g.shN.numpy(), index, *sh_bits)
+    sh0, log_scales, shN = map(torch.from_numpy, found)
+    if rows is None:
+        return replace(g, sh0=sh0, log_scales=log_scales, shN=shN)
+    others = {name: getattr(g, name)[rows] for name in ("means", "quats", "logit_opacities", "label_ids")}
+    return Gaussians(**others, sh0=sh0, log_scales=log_scales, shN=shN)
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def _rounded_rows(sh0, log_scales, shN, rows, first_bits, other_bits):
+    """Gathered and rounded in one pass over memory; the same bits as `in_steps` and `in_buckets`."""
+    n, bases = len(rows), shN.shape[1]
+    colours = np.empty((n, 1, 3), np.float32)
+    scales = np.empty((n, 3), np.float32)
+    harmonics = np.empty((n, bases, 3), np.float32)
+    per, half = np.float32(PER_COLOUR), np.float32(127.5)
+    colour_step, scale_step = np.float32(COLOUR_STEP), np.float32(SCALE_STEP / PER_LOG_SCALE)
+    first, other = np.float32(2.0 ** (1 - first_bits)), np.float32(2.0 ** (1 - other_bits))
+    one = np.float32(1)
+    for i in prange(n):
+        row = rows[i]
+        for c in range(3):
+            in_units = np.rint((sh0[row, 0, c] * per + half) / colour_step) * colour_step
+            colours[i, 0, c] = (in_units - half) / per
+            scales[i, c] = np.rint(log_scales[row, c] / scale_step) * scale_step
+        for k in range(bases):
+            step = first if k < 3 else other
+            for c in range(3):
+                value = min(max(shN[row, k, c], -one), one)
+                harmonics[i, k, c] = np.rint(value / step) * step
+    return colours, scales, harmonics

@@ -14,6 +14,7 @@ from sagesplat.core.config import NestConfig, TrainConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import Gaussians, concat
 from sagesplat.core.second_opacity import weight_at
+from sagesplat.kernels.jit import njit
 from sagesplat.raster import Backend, device_of
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Points, Scene
@@ -312,11 +313,26 @@ def _draw_prefixes(
     rows = weights = None
     if (prefix < 1).any():
         assert state.order_share is not None
-        shown = state.order_share < torch.from_numpy(prefix).to(column.device)[column]
-        rows = torch.nonzero(shown)[:, 0]
+        rows = _rows_before(state.order_share, column, prefix)
     if state.second_opacities is not None:
         weights = torch.from_numpy(weight_at(prefix)).to(column.device)[column]
     return rows, weights
+
+
+def _rows_before(order_share: Tensor, column: Tensor, prefix: Float32[np.ndarray, " L"]) -> Tensor:
+    """Indices, ascending, of the Gaussians in the prefixes of their categories."""
+    if order_share.is_cuda:
+        return torch.nonzero(order_share < torch.from_numpy(prefix).to(column.device)[column])[:, 0]
+    return torch.from_numpy(_below(order_share.numpy(), column.numpy(), prefix))
+
+
+@njit(cache=True)
+def _below(order_share, column, prefix):
+    rows, count = np.empty(len(column), np.int64), 0
+    for row in range(len(column)):
+        rows[count] = row
+        count += order_share[row] < prefix[column[row]]
+    return rows[:count]
 
 
 def _draw_levels(state: TrainState, column: Tensor, num_labels: int, edges: Tensor, levels: int) -> Tensor:

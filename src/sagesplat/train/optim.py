@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 import numpy as np
+import torch
 from numba import prange
 from torch import Tensor
 
@@ -49,9 +50,21 @@ def _update_rows(parameter, grad, exp_avg, exp_avg_sq, rate, correction, trainab
             row = stop + 1
 
 
+@njit(parallel=True, cache=True)
+def _update_drawn(parameter, grad, exp_avg, exp_avg_sq, rate, correction, trainable, columns, drawn):
+    """The same for the rows `drawn` alone, of which `grad` has one each."""
+    width = len(parameter) // len(trainable)
+    for chunk in prange((len(drawn) + _CHUNK - 1) // _CHUNK):
+        for i in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(drawn))):
+            if trainable[drawn[i]]:
+                a, b, c = drawn[i] * width, drawn[i] * width + columns, i * width
+                own = grad[c : c + columns]
+                _update(parameter[a:b], own, exp_avg[a:b], exp_avg_sq[a:b], rate, correction)
+
+
 def adam_step(
     parameter: np.ndarray,  # [N, ...] float32, changed in place
-    grad: np.ndarray,
+    grad: np.ndarray,  # the same, or [M, ...] of the rows `drawn`
     exp_avg: np.ndarray,  # moments, changed in place
     exp_avg_sq: np.ndarray,
     *,
@@ -59,19 +72,25 @@ def adam_step(
     step: int,  # 1 for the first
     trainable: np.ndarray,  # bool [N]
     columns: int | None = None,
+    drawn: np.ndarray | None = None,  # indices of M rows
 ) -> None:
     """One Adam step (Kingma and Ba, betas 0.9 and 0.999, eps 1e-15 as 3DGS).
 
     `columns`: update only this many values at the start of each row; the others never had a gradient.
+    `drawn`: the other rows keep parameter and moments, as those that are not `trainable`.
     """
-    if parameter.size and columns != 0:
-        rate = np.float32(lr / (1 - _BETA1**step))
-        correction = np.float32((1 - _BETA2**step) ** -0.5)
-        _update_rows(
-            parameter.reshape(-1), np.ascontiguousarray(grad).reshape(-1), exp_avg.reshape(-1),
-            exp_avg_sq.reshape(-1),
-            rate, correction, trainable, parameter.size if columns is None else columns,
-        )  # fmt: skip
+    if not parameter.size or columns == 0:
+        return
+    rate = np.float32(lr / (1 - _BETA1**step))
+    correction = np.float32((1 - _BETA2**step) ** -0.5)
+    grad = np.ascontiguousarray(grad).reshape(-1)
+    flat = parameter.reshape(-1), grad, exp_avg.reshape(-1), exp_avg_sq.reshape(-1), rate, correction
+    width = parameter.size // len(parameter)
+    columns = width if columns is None else columns
+    if drawn is None:
+        _update_rows(*flat, trainable, columns)
+    else:
+        _update_drawn(*flat, trainable, columns, drawn)
 
 
 def update(
@@ -81,17 +100,20 @@ def update(
     degree: int,
     trainable: Tensor,
     second_weights: Tensor | None = None,
+    drawn: Tensor | None = None,
 ) -> None:
     """Adam's step number `state.step` on all parameters, on the device that they are on.
 
     `second_weights`: [N], of the second opacities in what was drawn; where 0, these stay as they are.
+    `drawn`: indices of the rows that the gradients are of; the others stay as they are. None: all.
     """
     for name in PARAMETERS:
         columns = 3 * (num_bases(degree) - 1) if name == "shN" else None
-        _update_one(state, name, getattr(state.gaussians, name), grads, rates[name], trainable, columns)
+        own = getattr(state.gaussians, name)
+        _update_one(state, name, own, grads, rates[name], trainable, columns, drawn)
     if state.second_opacities is not None and second_weights is not None:
-        drawn = trainable & (second_weights > 0)
-        _update_one(state, SECOND, state.second_opacities, grads, rates["logit_opacities"], drawn, None)
+        own, rows = state.second_opacities, trainable & (second_weights > 0)
+        _update_one(state, SECOND, own, grads, rates["logit_opacities"], rows, None, drawn)
 
 
 def _update_one(
@@ -102,13 +124,26 @@ def _update_one(
     lr: float,
     trainable: Tensor,
     columns: int | None,
+    drawn: Tensor | None,
 ) -> None:
-    tensors = parameter, grads[name], state.exp_avg[name], state.exp_avg_sq[name]
+    grad, moments = grads[name], (state.exp_avg[name], state.exp_avg_sq[name])
     how = {"lr": lr, "step": state.step, "columns": columns}
     if trainable.is_cuda:
         from sagesplat.train import adam_triton
 
-        adam_triton.adam_step(*tensors, trainable=trainable, **how)
+        if drawn is not None:
+            grad, trainable = _spread(grad, drawn, trainable)
+        adam_triton.adam_step(parameter, grad, *moments, trainable=trainable, **how)
     else:
-        arrays = (t.detach().numpy() for t in tensors)
-        adam_step(*arrays, trainable=trainable.numpy(), **how)
+        arrays = (t.detach().numpy() for t in (parameter, grad, *moments))
+        rows = None if drawn is None else drawn.numpy()
+        adam_step(*arrays, trainable=trainable.numpy(), drawn=rows, **how)
+
+
+def _spread(grad: Tensor, rows: Tensor, trainable: Tensor) -> tuple[Tensor, Tensor]:
+    """The gradient of some rows among zeros for all, and the trainable ones among these rows."""
+    spread = grad.new_zeros(len(trainable), *grad.shape[1:])
+    spread[rows] = grad
+    there = torch.zeros_like(trainable)
+    there[rows] = trainable[rows]
+    return spread, there

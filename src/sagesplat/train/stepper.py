@@ -69,7 +69,8 @@ class Stepper:
             learning_rates: Adam's, by parameter name.
             trainable: Bool [N]; the other rows keep every bit.
             factor: Train on photos this many times smaller.
-            drawn_rows: Indices of the Gaussians to render; the others take no part in this step.
+            drawn_rows: Indices of the Gaussians to render, in a fixed set; the others take no part in this
+                step.
             second_weights: [N], of `state.second_opacities` in this step's opacities; None: 0.
         """
         batch = max(self.config.batch, self.group.size)
@@ -79,13 +80,11 @@ class Stepper:
         of_views = ViewGradients({name: state.per_view[name] for name in refined}, of_batch)
         if state.queue:
             self.photo_loader.expect(state.queue[-1 - self.group.rank % len(state.queue)], factor)
-        shown = state.gaussians if drawn_rows is None else state.gaussians.select(drawn_rows)
+        shown = self._shown(state.gaussians, drawn_rows)
         leaves = {name: p.detach().requires_grad_() for name, p in shown.parameters().items()}
         moving = replace(shown, **leaves)
         if second_weights is not None:
             moving = _with_second(moving, leaves, state, second_weights, drawn_rows)
-        if self.sh_bits:
-            moving = rounded(moving, self.sh_bits)
         losses: list[Tensor] = []
         self.drawn = 0.0
         grads: dict[str, Tensor] = {}
@@ -108,15 +107,13 @@ class Stepper:
         if batch > 1:
             self.group.add(total, *grads.values(), *of_views.grads.values())
             grads = {name: grad / batch for name, grad in grads.items()}
-        if drawn_rows is not None:
-            grads, trainable = _spread(grads, drawn_rows, trainable)
         if self.gradient_freezing:
             self.gradient_freezing.watch(grads)
         state.step += 1
         self.strategy.step_pre_update(state, grads, trainable)
         scaled = {name: rate * math.sqrt(batch) for name, rate in learning_rates.items()}
-        sky, before = self._on_shell(state, trainable)
-        optim.update(state, grads, scaled, degree, trainable, second_weights)
+        sky, before = self._on_shell(state, trainable, drawn_rows)
+        optim.update(state, grads, scaled, degree, trainable, second_weights, drawn_rows)
         of_views.update(self.view_updates, state.step)
         self.strategy.step_post_update(state, trainable)
         if self.shell:
@@ -138,12 +135,21 @@ class Stepper:
         if len(frozen) > len(self.active_tiles.frozen):
             self.active_tiles = replace(self.active_tiles, frozen=frozenset(frozen))
 
-    def _on_shell(self, state: TrainState, trainable: Tensor) -> tuple[Tensor, Tensor]:
+    def _shown(self, g: Gaussians, rows: Tensor | None) -> Gaussians:
+        """The Gaussians that a step renders, with the values that it renders."""
+        if self.sh_bits:
+            return rounded(g, self.sh_bits, rows)
+        return g if rows is None else g.select(rows)
+
+    def _on_shell(self, state: TrainState, trainable: Tensor, drawn: Tensor | None) -> tuple[Tensor, Tensor]:
         """Indices of the Gaussians of the sky that a step may move, and their means before it."""
         means = state.gaussians.means
         if not self.shell:
             return trainable.new_zeros(0, dtype=torch.int64), means[:0]
-        rows = torch.nonzero(self.shell.holds(means) & trainable)[:, 0]
+        if drawn is None:
+            rows = torch.nonzero(self.shell.holds(means) & trainable)[:, 0]
+        else:
+            rows = drawn[self.shell.holds(means[drawn]) & trainable[drawn]]
         return rows, means[rows]
 
     def _draw(
@@ -211,17 +217,6 @@ def _with_second(
     second, weights = (t if rows is None else t[rows] for t in (state.second_opacities, weights))
     leaves[SECOND] = second.detach().requires_grad_()
     return replace(g, logit_opacities=blended(g.logit_opacities, leaves[SECOND], weights))
-
-
-def _spread(grads: Mapping[str, Tensor], rows: Tensor, trainable: Tensor) -> tuple[dict[str, Tensor], Tensor]:
-    """Gradients of some rows among zeros for all, and the trainable ones among these rows."""
-    spread = {}
-    for name, grad in grads.items():
-        spread[name] = grad.new_zeros(len(trainable), *grad.shape[1:])
-        spread[name][rows] = grad
-    there = torch.zeros_like(trainable)
-    there[rows] = trainable[rows]
-    return spread, there
 
 
 def tune(
