@@ -6,11 +6,13 @@ tuned as one for the time that nesting took. They lie in RUN/compare, where `sag
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from benchmarks import far
 from benchmarks.promises import CASES
@@ -23,6 +25,7 @@ from sagesplat.core.config import (
     MasksConfig,
     NestConfig,
     RunConfig,
+    SampleConfig,
 )
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Event, StageDone, StageSkipped, Warned
@@ -37,6 +40,7 @@ from sagesplat.stages import pipeline
 from sagesplat.stages.label import lift_labels, make_masks
 from sagesplat.stages.methods import NestedLevels
 from sagesplat.stages.results import increments_of
+from sagesplat.stages.sample import sample_levels
 from sagesplat.stages.scene import open_scene
 from sagesplat.stages.shared import inlier_inputs, sky_inputs, train_config
 from sagesplat.studies.compare.report import Point
@@ -46,14 +50,16 @@ from sagesplat.studies.compare.run import (
     encode_set,
     mcmc_sets,
     measure_sets,
+    planned_within,
     prefixes,
     pruned_sets,
     snapshot_points,
     trained_sets,
 )
 from sagesplat.studies.lpips import NETS, load_metrics
+from sagesplat.train import nested
 from sagesplat.train.early_stopping import ActiveTiles, trainable_rows
-from sagesplat.train.nested import learning_rates
+from sagesplat.train.importance import importance
 from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.state import initial_state
 from sagesplat.train.stepper import Stepper
@@ -61,9 +67,8 @@ from sagesplat.train.stepper import Stepper
 Say = Callable[[str], None]
 SCENES = {"garden": "garden", "dinosaur": "dinosaur", "built-in": "built-in-11"}  # name: of `promises.CASES`
 AS_ONE, TRAINED = "3DGS, as one", "3DGS"
-# of the steps of nesting: as many steps on the full model take as long (garden, 256 px: 3000 and 2500)
-AS_ONE_STEPS = 5 / 6
 _TOGETHER = 8  # sets in memory at a time
+_TIMED = 100  # steps of nesting, and on the full model, whose CPU time decides how many take as long
 
 
 @dataclass(frozen=True)
@@ -77,7 +82,7 @@ class Asked:
     base_steps: int = 3000
     """Steps of its base model."""
     as_one_steps: int = 0
-    """Steps of the model that is tuned as one (0: as many as take the time of nesting)."""
+    """Steps of the model that is tuned as one (0: as many as take the CPU time of nesting, measured)."""
     tune_steps: int = 500
     """Steps after pruning."""
     snapshots: int = 10
@@ -86,6 +91,8 @@ class Asked:
     """Sizes that the trained model is pruned to."""
     caps: tuple[float, ...] = (0.05, 0.1, 0.2, 0.35, 0.5, 1.0)
     """Sizes of 3DGS-MCMC."""
+    plan_views: int = 80
+    """Viewpoints at which levels are measured for plans within budgets."""
     far_views: int = 12
     """Viewpoints that bytes from far away are measured at; 0: none."""
     lpips: Path | None = None
@@ -174,12 +181,22 @@ def measure(folder: Path, scene: str, asked: Asked, say: Say) -> Measured:
     contenders = [*snapshot_points(job, config), *trained_sets(job, baselines).values(), _trained(job)]
     metrics = load_metrics(job, asked.lpips, NETS if asked.vgg else NETS[:1])
     points = measure_sets(job, prefixes(NestedLevels(job)), metrics, FitConfig())
+    points += measure_sets(job, _planned(job, asked), metrics, FitConfig())
     for begin in range(0, len(contenders), _TOGETHER):
         some = [_as_decoded(job, one) for one in contenders[begin : begin + _TOGETHER]]
         points += measure_sets(job, some, metrics, FitConfig())
     raw = Contender(AS_ONE, "as in training", as_one.step, lambda: _as_trained(job, as_one.path), {})
     unencoded = measure_sets(job, [raw], {}, FitConfig())[0]
     return Measured(job.run.path.name, points, _figures(job, points, unencoded, as_one, asked))
+
+
+def _planned(job: Job, asked: Asked) -> list[Contender]:
+    """Plans within the bytes of each level of the same share: most expected fidelity."""
+    sampling = SampleConfig(views=asked.plan_views, calibration_views=1)
+    sample_levels(job, sampling, FitConfig())
+    levels = NestedLevels(job)
+    budgets = levels.costs.transfer_bytes.sum(0).tolist()
+    return planned_within(levels, [(f"as level {k}", float(n)) for k, n in enumerate(budgets, 1)])
 
 
 def _trained(job: Job) -> Contender:
@@ -199,18 +216,55 @@ def _as_trained(job: Job, path: Path) -> Gaussians:
 
 def _as_one(job: Job, place: Path, asked: Asked) -> Baseline:
     nest = settings_of(job.run, "nest")
-    steps = asked.as_one_steps or max(1, round(AS_ONE_STEPS * nest["steps"]))
-    config = NestConfig(steps=steps, lr_multiplier=nest["lr_multiplier"], sh_bits=tuple(nest["sh_bits"]))
+    config = NestConfig(
+        steps=nest["steps"], lr_multiplier=nest["lr_multiplier"], sh_bits=tuple(nest["sh_bits"]),
+        two_opacities=nest["two_opacities"],
+    )  # fmt: skip
+    there = sorted(place.glob("as-one-*.npz"))
+    before = int(there[0].stem.rpartition("-")[2]) if there else 0
+    config = replace(config, steps=asked.as_one_steps or before or _steps_as_long(job, config))
     run = job.run
     return Baseline(
-        AS_ONE, f"{steps} steps more", place / f"as-one-{steps}.npz", job.snapshots.levels[-1] + steps,
-        {**asdict(config), "seed": asked.seed}, [*run.scene_files, job.trained, *inlier_inputs(run),
-        *sky_inputs(run)], train_as_one, lambda: (config, asked.seed),
+        AS_ONE, f"{config.steps} steps more", place / f"as-one-{config.steps}.npz",
+        job.snapshots.levels[-1] + config.steps, {**asdict(config), "seed": asked.seed},
+        [*run.scene_files, job.trained, *inlier_inputs(run), *sky_inputs(run)], train_as_one,
+        lambda: (config, asked.seed),
     )  # fmt: skip
+
+
+def _steps_as_long(job: Job, config: NestConfig) -> int:
+    """Steps on the full model that take the CPU time of nesting, by timing a few of both, in turns."""
+    g, train = read_level(job.trained), train_config(job)
+    views = job.scene.train_ids.tolist()
+    begin = time.process_time()
+    importance(g, job.scene, views, config.criterion, valid=job.inliers, antialiased=job.antialiased)
+    sorting = len(nested.SORT_AT) * (time.process_time() - begin)
+    unordered = nested.Nested(g, np.zeros(len(g), bool))
+    few = replace(config, steps=_TIMED)
+    events = nested.nest(
+        unordered, job.scene, job.photos, train, few, valid=job.inliers, backend=job.backend,
+        movable=np.ones(len(g), bool), shell=job.sky.shell if job.sky else None,
+    )  # fmt: skip
+    steps, took = _full_steps(job, (few, 0)), {"nested": list[float](), "full": list[float]()}
+    for _ in range(_TIMED):
+        for name, one in (("nested", events), ("full", steps)):
+            begin = time.process_time()
+            next(one)
+            took[name].append(time.process_time() - begin)
+    # the first steps load photos and compile; the share of full draws rises over the steps
+    each = {name: float(np.mean(times[_TIMED // 10 :])) for name, times in took.items()}
+    return max(1, round((config.steps * each["nested"] + sorting) / each["full"]))
 
 
 def train_as_one(job: Job, of: tuple[NestConfig, int]) -> Gaussians:
     """The trained model, trained on in full: nesting's rounding and learning rates, no levels."""
+    g = read_level(job.trained)
+    for after in _full_steps(job, of):
+        g = after
+    return g.to("cpu")
+
+
+def _full_steps(job: Job, of: tuple[NestConfig, int]) -> Iterator[Gaussians]:
     config, seed = of
     device = device_of(job.backend)
     state = initial_state(read_level(job.trained).to(device), seed)
@@ -220,10 +274,10 @@ def train_as_one(job: Job, of: tuple[NestConfig, int]) -> Gaussians:
         PhotoLoader(job.scene, job.photos, device, job.inliers), settings, ActiveTiles(job.scene, None),
         job.backend, sh_bits=config.sh_bits, shell=job.sky.shell if job.sky else None,
     )  # fmt: skip
-    rates, trainable = learning_rates(settings, config, job.scene), trainable_rows(state.gaussians, {})
+    rates, trainable = nested.learning_rates(settings, config, job.scene), trainable_rows(state.gaussians, {})
     for step in range(1, config.steps + 1):
         stepper(state, settings.sh_degree, rates(step), trainable)
-    return state.gaussians.to("cpu")
+        yield state.gaussians
 
 
 def _figures(

@@ -9,7 +9,7 @@ from typing import Any
 from benchmarks.size import AS_ONE, TRAINED, Measured
 from sagesplat.io.files import atomic_path
 from sagesplat.output.tables import MB, Table
-from sagesplat.studies.compare.report import MCMC, PRUNED, SAME_SHARE, SNAPSHOTS, Point, least
+from sagesplat.studies.compare.report import MCMC, PLANNED, PRUNED, SAME_SHARE, SNAPSHOTS, Point, least
 
 BASELINES = (SNAPSHOTS, PRUNED, MCMC)
 OUTSIDE = "above our top"  # a baseline whose SSIM none of our levels reaches
@@ -36,7 +36,9 @@ def summary(measured: Measured) -> dict[str, Any]:
     points, figures = measured.points, measured.figures
     ours = sorted(_of(points, SAME_SHARE), key=lambda p: p.encoded)
     full, as_one = ours[-1], _of(points, AS_ONE)[0]
-    ratios = {name: _ratios(ours, _of(points, name)) for name in BASELINES}
+    planned = sorted(_of(points, PLANNED), key=lambda p: p.encoded)
+    ratios = {name: _ratios(planned, _of(points, name)) for name in BASELINES}
+    same_share = {name: _ratios(ours, _of(points, name)) for name in BASELINES}
     return {
         **figures,
         "gaussians": full.count,
@@ -50,7 +52,8 @@ def summary(measured: Measured) -> dict[str, Any]:
             "level 1": _each(ours[0]),
             f"levels 1 to {_LOW}": _each(ours[min(_LOW, len(ours)) - 1]),
         },
-        "bytes_ratio": ratios,
+        "bytes_ratio": ratios,  # of plans within a budget
+        "bytes_ratio_same_share": same_share,
         "worst_ratio": {name: _worst(rows) for name, rows in ratios.items() if rows},
         "far_bytes_ratio": _far(figures["bytes_from_far"]),
         "bars": bars(full, as_one, ratios, figures),
@@ -113,20 +116,27 @@ def _each(point: Point) -> float:
 
 
 def table(measured: Measured) -> Table:
-    """All sets of a capture; ours / theirs at their SSIM."""
+    """All sets of a capture; ours / theirs at their SSIM, planned and with the same share of everything."""
     points = measured.points
-    ours, body, marks = _of(points, SAME_SHARE), [], {}
+    planned, same, body, marks = _of(points, PLANNED), _of(points, SAME_SHARE), [], {}
     for point in points:
-        value, how = ratio(ours, point) if point.method in BASELINES else (math.nan, "")
-        if how:
-            marks[len(body), 9] = how
+        values = []
+        for column, ours in ((9, planned), (10, same)):
+            value, how = ratio(ours, point) if point.method in BASELINES else (math.nan, "")
+            values.append(value)
+            if how:
+                marks[len(body), column] = how
         lpips = point.lpips_alex, point.lpips_vgg
         size = point.count, point.encoded / MB, _each(point)
-        body.append((point.method, point.name, *size, point.psnr, point.ssim, *lpips, value))
+        body.append((point.method, point.name, *size, point.psnr, point.ssim, *lpips, *values))
     header = ("method", "which", "Gaussians", "MB", "bytes each", "PSNR", "SSIM", "LPIPS alex", "LPIPS vgg")
-    formats = ("", "", ",d", ".3f", ".1f", ".2f", ".4f", ".4f", ".4f", ".2f")
+    formats = ("", "", ",d", ".3f", ".1f", ".2f", ".4f", ".4f", ".4f", ".2f", ".2f")
     return Table(
-        f"{measured.scene}: test views, as decoded", (*header, "ours : it"), formats, body, marks=marks
+        f"{measured.scene}: test views, as decoded",
+        (*header, "planned : it", "same share : it"),
+        formats,
+        body,
+        marks=marks,
     )
 
 

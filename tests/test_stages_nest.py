@@ -44,29 +44,24 @@ from sagesplat.studies.paper.cross_view import read_cross_view
 from sagesplat.studies.paper.run import cross_views
 from sagesplat.train import nested
 from sagesplat.train.importance import importance
-from sagesplat.train.nested import Nested, NestStep, draw_shares, is_boundary, level_sizes, nest, order
+from sagesplat.train.nested import Nested, NestStep, draw_shares, level_sizes, nest, order
 
 QUICK = NestConfig(steps=12, levels=4, smallest=0.1, drawn_from=0.1)
 
 
-@given(st.integers(0, 5000), st.integers(1, 20), st.floats(0.01, 1), st.integers(0, 6000))
-def test_level_sizes_rise_to_everything(count: int, levels: int, smallest: float, boundary: int) -> None:
-    sizes = level_sizes(count, NestConfig(levels=levels, smallest=smallest), boundary)
+@given(st.integers(0, 5000), st.integers(1, 20), st.floats(0.01, 1))
+def test_level_sizes_rise_to_everything(count: int, levels: int, smallest: float) -> None:
+    sizes = level_sizes(count, NestConfig(levels=levels, smallest=smallest))
     assert len(sizes) == levels
     assert sizes[-1] == count
     assert list(sizes) == sorted(sizes)
     if count:
-        assert sizes[0] >= min(max(1, boundary), count)
+        assert sizes[0] >= 1
 
 
 def test_sizes_are_geometric() -> None:
     sizes = np.array(level_sizes(10_000, NestConfig(levels=5, smallest=0.01)))
     np.testing.assert_allclose(sizes[1:] / sizes[:-1], 100**0.25, rtol=1e-2)
-
-
-def test_a_gaussian_straddles_if_it_shows_on_both_sides() -> None:
-    weights = np.array([[90, 10], [60, 40], [0.6, 0.4], [0, 0]], np.float32)
-    assert is_boundary(weights, num_views=10).tolist() == [False, True, False, False]
 
 
 def test_everything_is_drawn_more_often_in_the_end() -> None:
@@ -124,9 +119,8 @@ def test_sensitivity_is_the_change_when_a_gaussian_fades(seen) -> None:
 def ordered(count: int = 60) -> Nested:
     g = random_gaussians(count, degree=1)
     labels = torch.sort(torch.arange(count) % 3).values.to(torch.int16)
-    ranks = np.full(count, 2, np.int8)
-    ranks[20:22] = 0  # the first two of category 1
-    return Nested(replace(g, label_ids=labels), np.ones(count, np.float32), ranks)
+    of_base = np.isin(np.arange(count), [20, 21])  # the first two of category 1
+    return Nested(replace(g, label_ids=labels), of_base)
 
 
 def trained(scene: Scene, start: Nested, config: NestConfig, **options) -> Nested:
@@ -142,7 +136,7 @@ def scene(tmp_path: Path) -> Scene:
 
 
 def test_training_lowers_the_loss_of_prefixes_and_keeps_the_order(scene: Scene, monkeypatch) -> None:
-    monkeypatch.setattr(nested, "_SORT_AT", ())
+    monkeypatch.setattr(nested, "SORT_AT", ())
     start = ordered()
     config = NestConfig(steps=40, levels=3, drawn_from=0.2)
     events = list(nest(start, scene, Photos(scene.views), TrainConfig(), config))
@@ -157,7 +151,7 @@ def test_training_lowers_the_loss_of_prefixes_and_keeps_the_order(scene: Scene, 
 
 
 def test_they_are_sorted_again_by_what_they_have_become_worth(scene: Scene, monkeypatch) -> None:
-    monkeypatch.setattr(nested, "_SORT_AT", (0,))
+    monkeypatch.setattr(nested, "SORT_AT", (0,))
     start, config = ordered(), replace(QUICK, steps=1)
     result = trained(scene, start, config)
     worth = importance(
@@ -167,15 +161,15 @@ def test_they_are_sorted_again_by_what_they_have_become_worth(scene: Scene, monk
         config.criterion,
         antialiased=TrainConfig().antialiased,
     )
-    rows = np.lexsort((-worth, start.ranks, start.gaussians.label_ids.numpy()))
+    rows = np.lexsort((-worth, ~start.of_base, start.gaussians.label_ids.numpy()))
     assert (rows != np.arange(60)).any()
-    assert (result.ranks == start.ranks[rows]).all()
+    assert (result.of_base == start.of_base[rows]).all()
     assert torch.allclose(result.gaussians.means, start.gaussians.means[torch.from_numpy(rows)], atol=1e-2)
 
 
 def test_what_is_not_drawn_stays_as_it_is(scene: Scene, monkeypatch) -> None:
     """With the smallest prefix drawn only (a share that rounds to one Gaussian), no other row moves."""
-    monkeypatch.setattr(nested, "_SORT_AT", ())
+    monkeypatch.setattr(nested, "SORT_AT", ())
     start = ordered()
     config = replace(QUICK, steps=3, drawn_from=1e-9, full_share=0.0, full_share_end=0.0)
     result = trained(scene, start, config, seed=1)
@@ -188,7 +182,7 @@ def test_what_is_not_drawn_stays_as_it_is(scene: Scene, monkeypatch) -> None:
 
 @pytest.mark.parametrize("full", [True, False])
 def test_the_full_model_trains_second_opacities_and_low_levels_the_first(scene, monkeypatch, full) -> None:
-    monkeypatch.setattr(nested, "_SORT_AT", ())
+    monkeypatch.setattr(nested, "SORT_AT", ())
     monkeypatch.setattr(nested, "weight_at", lambda shares: np.float32(shares == 1))
     given = torch.linspace(-1, 1, 60)
     start = replace(ordered(), second_opacities=given)
@@ -253,7 +247,7 @@ def test_harmonics_in_buckets_are_multiples_and_zero_stays_zero() -> None:
 def ladder(tmp_path: Path) -> PrefixLadder:
     start = ordered()
     sizes = {0: (1, 5, 20), 1: (2, 2, 20), 2: (20, 20, 20)}
-    write_set(tmp_path / "ladder.npz", start.gaussians, 12, sizes, purity=start.purity)
+    write_set(tmp_path / "ladder.npz", start.gaussians, 12, sizes)
     return read_prefixes(tmp_path / "ladder.npz")
 
 
@@ -513,7 +507,6 @@ def test_seeds_come_first_and_take_the_place_of_the_least_worthy(scene: Scene) -
     base = random_gaussians(8, seed=4)
     found = order(g, scene, OneLabel(), QUICK, base=base)  # type: ignore[arg-type]
     assert len(found.gaussians) == 50
-    assert found.boundary == {3: 0}
     assert sorted(found.gaussians.means[:8].tolist()) == sorted(base.means.tolist())
     worth = importance(g, scene, scene.train_ids.tolist(), QUICK.criterion)
     worthiest = g.means[torch.from_numpy(np.argsort(-worth, kind="stable")[:42].copy())]

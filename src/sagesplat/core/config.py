@@ -244,7 +244,7 @@ class NestConfig:
     """Levels per category; their sizes grow geometrically."""
     smallest: float = 0.01
     """Size of the lowest level, as a fraction of the category's Gaussians."""
-    drawn_from: float = 0.05
+    drawn_from: float = 0.04
     """Size of the smallest prefix that training samples, as a fraction of the category's Gaussians. Smaller
     values favour categories that are easy to represent."""
     base_share: float = 0.2
@@ -259,6 +259,9 @@ class NestConfig:
     sh_bits: tuple[int, int] = (5, 4)
     """Bits per SH coefficient in the increments: of degree 1, and of higher degrees. Training uses the
     rounded values."""
+    rate_weight: float = 6e-4
+    """Loss per bit that the SH coefficients of a Gaussian take in a coded stream, on average; 0: only how it
+    looks counts."""
     two_opacities: bool = True
     """Give each Gaussian one opacity for the low levels and one for the full model; without it the full
     model is worse."""

@@ -38,9 +38,14 @@ def in_steps(values: Tensor, step: float) -> Tensor:
     return torch.round(values / step) * step
 
 
+def sh_steps(shN: Tensor, bits: tuple[int, int]) -> Tensor:
+    """Steps [K, 1] that SH coefficients [N, K, 3] are rounded to; `bits` for degree 1, and for 2 and 3."""
+    return shN.new_tensor([2.0 ** (1 - bits[0])] * 3 + [2.0 ** (1 - bits[1])] * 12)[: shN.shape[1], None]
+
+
 def in_buckets(shN: Tensor, bits: tuple[int, int]) -> Tensor:
-    """SH coefficients [N, K, 3] in multiples of 2^(1 - bits); `bits` for degree 1, and for 2 and 3."""
-    steps = shN.new_tensor([2.0 ** (1 - bits[0])] * 3 + [2.0 ** (1 - bits[1])] * 12)[: shN.shape[1], None]
+    """SH coefficients [N, K, 3] in multiples of 2^(1 - bits); see `sh_steps`."""
+    steps = sh_steps(shN, bits)
     return torch.round(shN.clamp(-1, 1) / steps) * steps
 
 

@@ -59,7 +59,7 @@ def make_levels(job: Job, config: AdoptConfig) -> None:
     g = job.snapshots.load(job.snapshots.levels[-1])
     shares = usable_shares(config.shares, len(g))
     steps = config.steps if config.fit == "renders" else 0
-    settings = asdict(NestConfig(steps=steps, levels=len(shares), base_share=0))
+    settings = asdict(NestConfig(steps=steps, levels=len(shares), base_share=0, rate_weight=0.0))
     settings |= {"fit": config.fit, "shares": shares, "lossless": config.lossless, "seed": config.seed}
     inputs = [run.scene, run.labels, run.levels, run.provenance("train"), *label_image_inputs(run)]
 
@@ -156,8 +156,9 @@ def _trained(
         for one in sets
     ]
     trained, spans = joined(sets, ranks)
+    settings = NestConfig(steps=config.steps, rate_weight=0.0)
     for event in nested.nest(
-        trained, job.scene, targets, train_config(job), NestConfig(steps=config.steps), seed=config.seed,
+        trained, job.scene, targets, train_config(job), settings, seed=config.seed,
         backend=job.backend, checkpoint=job.run.nest_checkpoint, settings=key, spans=spans,
     ):  # fmt: skip
         if isinstance(event, NestStep):
@@ -191,10 +192,7 @@ def _write(
         fine=range(coarse + 1, levels + 1), antialiased=job.antialiased,
     )  # fmt: skip
     sent = read_increments(run.increments, chunks)
-    ones = np.ones(len(sent), np.float32)  # no Gaussian is told to lie on a border
-    write_set(
-        run.prefixes, sent, settings["steps"], ladder.sizes, replaces=ladder.replaces, exact=True, purity=ones
-    )
+    write_set(run.prefixes, sent, settings["steps"], ladder.sizes, replaces=ladder.replaces, exact=True)
     size, total = sum(chunk.nbytes for chunk in chunks), len(sent)
     top = read_prefixes(run.prefixes).load(levels)
     return [

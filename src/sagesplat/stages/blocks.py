@@ -20,7 +20,7 @@ from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit, Progress, named
 from sagesplat.core.gaussians import Gaussians, concat
 from sagesplat.core.second_opacity import SecondOpacities
-from sagesplat.formats.levels import read_level, read_more, read_sizes, write_level, write_set
+from sagesplat.formats.levels import read_level, read_sizes, write_level, write_set
 from sagesplat.io.files import link, write_json
 from sagesplat.run.capture import Hashes, fingerprint, photo_hashes
 from sagesplat.run.executor import Task, results
@@ -293,7 +293,7 @@ def nest_blocks(job: Job, config: BlocksConfig, nest: NestConfig, seed: int) -> 
             for number in every:
                 run.block(number).provenance("boundaries").unlink(missing_ok=True)
         merged = together(files)
-        lines = write_ladder(job, merged.gaussians, merged.sizes, nest, merged.purity, merged.second)
+        lines = write_ladder(job, merged.gaussians, merged.sizes, nest, merged.second)
         return [*lines, f"{len(blocks)} blocks, {config.boundary_steps} steps of boundary tuning each"]
 
     inputs = [run.scene, run.labels, run.levels, run.provenance("train"), *label_image_inputs(run), file]
@@ -315,10 +315,9 @@ def nest_block(
         g, inside = interior(full.gaussians, blocks, parts, number)
         if not len(g):
             raise RunError(f"{run.path}: no Gaussians inside the block; choose fewer with --blocks.count")
-        labels, purity = full.gaussians.label_ids.numpy(), read_more(run.prefixes, "purity")
-        sizes = interior_sizes(labels, inside, full.sizes, parts, number)
+        sizes = interior_sizes(full.gaussians.label_ids.numpy(), inside, full.sizes, parts, number)
         second = full.second and interior_opacities(full.second, inside, sizes, parts, number)
-        write_set(run.interior, g, config.steps, sizes, second=second, purity=purity[inside])
+        write_set(run.interior, g, config.steps, sizes, second=second)
         return [f"{len(g):,} of {len(full.gaussians):,} Gaussians are inside the block"]
 
     inputs = [run.prefixes, run.masks / "labels.json", partition]
@@ -360,8 +359,7 @@ def tune_boundaries(
         if views and near.any():
             g, logits = _tuned(job, own, near, others, views, config, seed)
             second = second if second is None or logits is None else replace(second, logits=logits)
-        purity = read_more(run.interior, "purity")
-        write_set(run.tuned_interior, g, config.steps, sizes, second=second, purity=purity)
+        write_set(run.tuned_interior, g, config.steps, sizes, second=second)
         return [f"{int(near.sum()):,} of {len(near):,} Gaussians, {len(views)} views of several blocks"]
 
     inputs = [run.scene, run.provenance("train"), run.interior, partition, *others]
@@ -384,7 +382,7 @@ def _tuned(
     movable = np.concatenate([near, np.zeros(n - len(near), bool)])
     kept = frozenset(view.name for row, view in enumerate(scene.views) if row not in set(views))
     narrowed = replace(scene, test_names=kept)
-    ladder = Nested(g, np.ones(n, np.float32), np.zeros(n, np.int8), second)
+    ladder = Nested(g, np.zeros(n, bool), second)
     for event in nested.nest(
         ladder, narrowed, job.photos, train_config(job), config,
         valid=job.valid, seed=seed, backend=job.backend, movable=movable,

@@ -22,6 +22,7 @@ from sagesplat.core.config import FitConfig, PlanConfig
 from sagesplat.core.errors import RunError
 from sagesplat.formats.increments import INDEX, totals
 from sagesplat.run.job import Job
+from sagesplat.run.records import settings_of
 from sagesplat.scene.scene import Camera
 from sagesplat.segment.masks import UNLABELLED
 from sagesplat.stages.fidelity import compositions_at, fit_drawn
@@ -208,7 +209,7 @@ class NestedLevels(Method):
         at = {label: i for i, label in enumerate(found.labels)}
         rows = [-1 if label == UNLABELLED else at.get(label, -1) for label in self.costs.labels]
         # unlabelled pixels have no target, and stay in full
-        known = (np.array(rows) >= 0) & found.shown(self.job.fit_config.min_share)[:, rows]
+        known = (np.array(rows) >= 0) & found.shown(settings_of(self.job.run, "sample")["min_share"])[:, rows]
         fidelity = np.where(known[..., None], found.fidelity[:, rows].astype(np.float64), np.nan)
         return fidelity, np.where(known, found.pixels[:, rows], 0).astype(np.float64)
 

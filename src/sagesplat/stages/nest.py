@@ -56,12 +56,10 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
                 job.emit(Warned(f"resuming from step {event.step}, {before}"))
             else:
                 trained = event
-        counts, across = trained.gaussians.counts(), trained.boundary
-        sizes = {label: nested.level_sizes(n, config, across.get(label, 0)) for label, n in counts.items()}
+        sizes = {label: nested.level_sizes(n, config) for label, n in trained.gaussians.counts().items()}
         second = trained.second_opacities
         second = None if second is None else SecondOpacities.of_levels(second, sizes)
-        lines = write_ladder(job, trained.gaussians, sizes, config, trained.purity, second)
-        lines[0] += f", {sum(across.values()):,} of them across borders and in every level"
+        lines = write_ladder(job, trained.gaussians, sizes, config, second)
         remove_checkpoints(run.nest_checkpoint)
         return lines
 
@@ -110,13 +108,12 @@ def write_ladder(
     g: Gaussians,
     sizes: dict[int, tuple[int, ...]],
     config: NestConfig,
-    purity: np.ndarray,
     second: SecondOpacities | None = None,
 ) -> list[str]:
     """Write Gaussians in their order, with levels of `sizes` by label id, as the run's ladder and increments.
 
-    `purity` [N] of `Nested` and `second` are kept beside them. Gaussians that are hardly to be seen are left
-    out. Returns lines that sum it up.
+    `second` is kept beside them. Gaussians that are hardly to be seen are left out. Returns lines that sum
+    it up.
     """
     job.run.provenance("nest").unlink(missing_ok=True)  # from here on the earlier ladder is gone
     made = write_streams(
@@ -125,7 +122,7 @@ def write_ladder(
     )  # fmt: skip
     # what is measured, planned and written from here on is what a viewer gets
     sent, seconds = read_streams(job.run.increments, made.increments)
-    write_set(job.run.prefixes, sent, config.steps, made.sizes, second=seconds, purity=purity[made.rows])
+    write_set(job.run.prefixes, sent, config.steps, made.sizes, second=seconds)
     size, n = sum(one.nbytes for one in made.increments), len(sent)
     decoded, unrounded = _quality(job, sent, seconds), _quality(job, g, second)
     return [

@@ -12,7 +12,7 @@ from torch import Tensor
 from sagesplat.core import geometry
 from sagesplat.core.gaussians import Gaussians, concat
 from sagesplat.core.second_opacity import SecondOpacities
-from sagesplat.formats.levels import read_level, read_more, read_second, read_sizes
+from sagesplat.formats.levels import read_level, read_second, read_sizes
 from sagesplat.metrics.image import psnr
 from sagesplat.scene.blocks import Blocks, visible_shares
 from sagesplat.scene.scene import Scene
@@ -69,7 +69,6 @@ class Merged:
 
     gaussians: Gaussians
     sizes: dict[int, tuple[int, ...]]  # of levels, by label id
-    purity: np.ndarray  # [N]
     second: SecondOpacities | None
 
     @property
@@ -82,12 +81,11 @@ class Merged:
 def together(files: Sequence[Path]) -> Merged:
     """The nested models of all blocks, merged; their categories differ."""
     sizes = {label: n for path in files for label, n in read_sizes(path).items()}
-    purity = np.concatenate([read_more(path, "purity") for path in files])
     models = [read_nested(path) for path in files]
     seconds = [second for _, second in models]
     logits, weights = _second(seconds), {i: w for one in seconds if one for i, w in one.weights.items()}
     second = None if logits is None else SecondOpacities(logits, weights)
-    return Merged(concat([g for g, _ in models]), sizes, purity, second)
+    return Merged(concat([g for g, _ in models]), sizes, second)
 
 
 def read_nested(path: Path) -> tuple[Gaussians, SecondOpacities | None]:

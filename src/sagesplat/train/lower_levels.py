@@ -116,7 +116,7 @@ def joined(sets: Sequence[Set], importances: Sequence[np.ndarray]) -> tuple[Nest
         level += len(one.levels)
         last.append(np.full(len(place), level - 1, np.int8))
     g = concat([one.gaussians for one in sets])
-    nested = Nested(g, np.ones(len(g), np.float32), np.full(len(g), 2, np.int8))
+    nested = Nested(g, np.zeros(len(g), bool))
     return nested, Spans(np.concatenate(order), np.concatenate(first), np.concatenate(last), level)
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Int8
+from jaxtyping import Bool, Float32, Int8
 from torch import Tensor
 
 from sagesplat.core import geometry
@@ -32,12 +32,10 @@ from sagesplat.train.stepper import Stepper
 from sagesplat.train.trainer import LOOK_EVERY, finite, named_failures, train
 from sagesplat.train.votes import label_weights, winners
 
-CLEAR = 0.8  # share of its blending weight in one category below which a Gaussian is a boundary Gaussian
-_VISIBLE = 0.5  # blending weight in the other categories, in pixels per view, below which that is ignored
 _SHRINK_TO = 0.05  # of the learning rates, at the end
 _SAVE_EVERY = 500
 _NEARLY_FULL, _NEARLY_FROM = 0.2, 0.4  # share of the full steps that draw less, and the least prefix of these
-_SORT_AT = 1 / 12, 1 / 6, 1 / 3, 1 / 2, 2 / 3  # of the steps
+SORT_AT = 1 / 12, 1 / 6, 1 / 3, 1 / 2, 2 / 3  # of the steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,15 +43,8 @@ class Nested:
     """Gaussians in the order in which they are sent: by category, the most important first."""
 
     gaussians: Gaussians
-    purity: Float32[np.ndarray, " N"]  # share of a Gaussian's blending weight in its own category; 1 unseen
-    ranks: Int8[np.ndarray, " N"]  # order in a category: 0 boundary Gaussians, 1 base model, 2 others
+    of_base: Bool[np.ndarray, " N"]  # of the base model, which comes first in each category
     second_opacities: Tensor | None = None  # [N] logits; see `core.second_opacity`
-
-    @property
-    def boundary(self) -> dict[int, int]:
-        """Number of boundary Gaussians by label id."""
-        labels = self.gaussians.label_ids.numpy()
-        return {label: int((self.ranks[labels == label] == 0).sum()) for label in self.gaussians.counts()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,13 +68,12 @@ class NestStep:
     loss: float
 
 
-def level_sizes(count: int, config: NestConfig, boundary: int = 0) -> tuple[int, ...]:
+def level_sizes(count: int, config: NestConfig) -> tuple[int, ...]:
     """Gaussians at each level of a category of `count`: ascending, geometric, at least one.
 
-    The lowest level holds all `boundary` Gaussians. In a small category several levels have the same size.
+    In a small category several levels have the same size.
     """
-    smallest = max(config.smallest, min(boundary, count) / max(count, 1))
-    shares = smallest ** np.linspace(0, 1, config.levels)[::-1]
+    shares = config.smallest ** np.linspace(0, 1, config.levels)[::-1]
     return tuple(int(n) for n in np.ceil(shares * count - 1e-9))
 
 
@@ -102,29 +92,21 @@ def order(
 
     `base`, a small model of the same scene, replaces as many of the least important Gaussians and is ordered
     before the others: a model trained small makes better low levels than the most important part of a large
-    one. Boundary Gaussians come first in their category, so that every composition has them. Splitting them
-    does not help: nine in ten of the halves are boundary Gaussians too. Those on the `shell`,
-    and no others, are of the sky.
+    one. Gaussians on the `shell`, and no others, are of the sky.
     """
     views = scene.train_ids.tolist()
     importances = importance(g, scene, views, config.criterion, valid=valid, antialiased=antialiased)
-    ranks = np.full(len(g), 2, np.int8)
+    of_base = np.zeros(len(g), bool)
     if base is not None and len(base):
         kept = np.sort(np.argsort(-importances, kind="stable")[: max(len(g) - len(base), 0)])
-        of_base = importance(base, scene, views, config.criterion, valid=valid, antialiased=antialiased)
+        own = importance(base, scene, views, config.criterion, valid=valid, antialiased=antialiased)
         g = concat([base, g.select(torch.from_numpy(kept))])
-        importances = np.concatenate([of_base, importances[kept]])
-        ranks = np.repeat(np.array([1, 2], np.int8), [len(base), len(kept)])
+        importances = np.concatenate([own, importances[kept]])
+        of_base = np.arange(len(g)) < len(base)
     ids, weights = label_weights(g, scene, masks, views, antialiased=antialiased)
     g = replace(g, label_ids=_labels(g, ids, weights, shell))
-    total = weights.sum(1)
-    labels = g.label_ids.numpy()
-    column = np.searchsorted(ids, labels).clip(0, max(len(ids) - 1, 0))
-    mine = weights[np.arange(len(g)), column] if len(ids) else total
-    purity = np.where(total > 0, mine / np.maximum(total, 1e-12), 1).astype(np.float32)
-    ranks[is_boundary(weights, len(views))] = 0  # whichever side is there needs them
-    rows = np.lexsort((-importances, ranks, labels))  # the last key decides first
-    return Nested(g.select(torch.from_numpy(rows)), purity[rows], ranks[rows])
+    rows = np.lexsort((-importances, ~of_base, g.label_ids.numpy()))  # the last key decides first
+    return Nested(g.select(torch.from_numpy(rows)), of_base[rows])
 
 
 def _labels(
@@ -186,12 +168,6 @@ def train_capped(
     yield from train(some, photos, labels, capped, valid=valid, seed=seed, backend=backend, shell=shell)
 
 
-def is_boundary(weights: Float32[np.ndarray, "N L"], num_views: int) -> np.ndarray:
-    """Boundary Gaussians (bool [N]): no category has 80 % of their weight, the others a visible part."""
-    total, top = weights.sum(1), weights.max(1, initial=0)
-    return (top < CLEAR * total) & (total - top > _VISIBLE * num_views)
-
-
 def nest(
     nested: Nested,
     scene: Scene,
@@ -216,7 +192,7 @@ def nest(
     as the increments will hold them. Gaussians outside the composition, and their Adam moments, stay as they
     are. With `config.two_opacities` each category is drawn with the opacities that its prefix has, between
     the first and the second ones. At five steps all Gaussians are sorted again by importance: in each
-    category boundary Gaussians stay first, then the base model, then the others.
+    category the base model stays first.
 
     Args:
         nested: The ordered model to start from (`order`).
@@ -242,9 +218,9 @@ def nest(
     check(config)
     device = device_of(backend)
     near = geometry.morton_order(nested.gaussians.means.numpy())  # neighbours in space are rendered together
-    labels, ranks = nested.gaussians.label_ids.numpy()[near], nested.ranks[near]
+    labels, of_base = nested.gaussians.label_ids.numpy()[near], nested.of_base[near]
     state = initial_state(nested.gaussians.select(torch.from_numpy(near)), seed)
-    state.order_share = torch.from_numpy(spans.order[near]) if spans else order_shares(labels, ranks, -near)
+    state.order_share = torch.from_numpy(spans.order[near]) if spans else order_shares(labels, of_base, -near)
     if config.two_opacities and spans is None:
         given = nested.second_opacities
         state.add_second_opacities(None if given is None else given[torch.from_numpy(near)])
@@ -257,13 +233,13 @@ def nest(
     column = torch.from_numpy(column).to(device)
     views = scene.train_ids.tolist()
     stays = movable is not None or spans is not None
-    sort_at = set() if stays else {round(part * config.steps) for part in _SORT_AT}
+    sort_at = set() if stays else {round(part * config.steps) for part in SORT_AT}
     edges = None
     if spans is not None:
         edges = torch.from_numpy(np.stack([spans.first, spans.last])[:, near]).to(device)
     stepper = Stepper(
         PhotoLoader(scene, photos, device, valid), replace(train_config, batch=1), ActiveTiles(scene, None),
-        backend, sh_bits=config.sh_bits, shell=shell,
+        backend, sh_bits=config.sh_bits, rate_weight=config.rate_weight, shell=shell,
     )  # fmt: skip
     rates = learning_rates(train_config, config, scene)
     trainable = trainable_rows(state.gaussians, {})
@@ -277,7 +253,7 @@ def nest(
                     state.gaussians, scene, views, config.criterion,
                     valid=valid, antialiased=train_config.antialiased,
                 )  # fmt: skip
-                state.order_share = order_shares(labels, ranks, importances).to(device)
+                state.order_share = order_shares(labels, of_base, importances).to(device)
             if edges is None:
                 rows, weights = _draw_prefixes(state, column, len(categories), config)
             else:
@@ -299,7 +275,7 @@ def nest(
     state = state.to(torch.device("cpu"))
     g, second = state.gaussians.select(torch.from_numpy(rows)), state.second_opacities
     second = None if second is None else second[torch.from_numpy(rows)]
-    yield Nested(g, nested.purity[near][rows], ranks[rows], second)
+    yield Nested(g, of_base[rows], second)
 
 
 def _draw_prefixes(
@@ -342,12 +318,12 @@ def _draw_levels(state: TrainState, column: Tensor, num_labels: int, edges: Tens
     return torch.nonzero((edges[0] <= level) & (level <= edges[1]))[:, 0]
 
 
-def order_shares(labels: np.ndarray, ranks: np.ndarray, importances: np.ndarray) -> Tensor:
-    """Share of its category ordered before each Gaussian (float32 [N]): by rank, then by importance."""
-    rows = np.lexsort((-importances, ranks, labels))
-    _, first, counts = np.unique(labels[rows], return_index=True, return_counts=True)
+def order_shares(labels: np.ndarray, first: np.ndarray, importances: np.ndarray) -> Tensor:
+    """Share of its category ordered before each Gaussian (float32 [N]): those `first`, then by importance."""
+    rows = np.lexsort((-importances, ~first, labels))
+    _, begins, counts = np.unique(labels[rows], return_index=True, return_counts=True)
     found = np.empty(len(rows), np.float32)
-    found[rows] = (np.arange(len(rows)) - np.repeat(first, counts)) / np.repeat(counts, counts)
+    found[rows] = (np.arange(len(rows)) - np.repeat(begins, counts)) / np.repeat(counts, counts)
     return torch.from_numpy(found)
 
 
@@ -388,6 +364,7 @@ def check(config: NestConfig) -> None:
         ("full-share", config.full_share, 0 <= config.full_share <= 1, "a share such as 0.1"),
         ("full-share-end", config.full_share_end, 0 <= config.full_share_end <= 1, "a share such as 0.9"),
         ("sh-bits", config.sh_bits, all(1 <= b <= 8 for b in config.sh_bits), "1 to 8, such as 5 4"),
+        ("rate-weight", config.rate_weight, config.rate_weight >= 0, "a number such as 0.0006, or 0"),
         ("base-share", config.base_share, 0 <= config.base_share < 1, "a share such as 0.1, or 0"),
         ("base-steps", config.base_steps, config.base_steps >= 1, "1 or more"),
         ("lr-multiplier", config.lr_multiplier, config.lr_multiplier > 0, "a number such as 4"),

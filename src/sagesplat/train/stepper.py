@@ -16,7 +16,7 @@ from sagesplat.raster import Backend, Render, Workspace, device_of, expose, rast
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene
 from sagesplat.segment.valid import ALL_VALID, ValidPixels
-from sagesplat.train import optim
+from sagesplat.train import optim, rate
 from sagesplat.train.early_stopping import ActiveTiles, trainable_rows
 from sagesplat.train.exposure import transform
 from sagesplat.train.gradient_freezing import GradientFreezing
@@ -45,6 +45,7 @@ class Stepper:
     strategy: Strategy = field(default_factory=Strategy)  # without one the set of Gaussians is fixed
     gradient_freezing: GradientFreezing | None = None
     sh_bits: tuple[int, int] | None = None  # render Gaussians rounded as SPZ files will store them
+    rate_weight: float = 0.0  # loss per bit that the harmonics of a Gaussian take, rounded so
     view_updates: Mapping[str, ViewUpdate] = field(default_factory=dict)  # of `TrainState.per_view`
     outliers: OutlierSchedule | None = None  # when those of the photos are left out; None: never
     shell: Shell | None = None  # that Gaussians of the sky stay on
@@ -107,6 +108,8 @@ class Stepper:
         if batch > 1:
             self.group.add(total, *grads.values(), *of_views.grads.values())
             grads = {name: grad / batch for name, grad in grads.items()}
+        if self.sh_bits and self.rate_weight:
+            rate.add_gradient(grads["shN"], state.gaussians.shN, self.sh_bits, self.rate_weight, drawn_rows)
         if self.gradient_freezing:
             self.gradient_freezing.watch(grads)
         state.step += 1

@@ -297,31 +297,45 @@ def prefixes(nested: NestedLevels) -> list[Contender]:
 
 def _planned(nested: NestedLevels, config: CompareConfig) -> list[Contender]:
     """Plans: within budgets, and for the run's targets."""
-    job, costs = nested.job, nested.costs
+    job, sent = nested.job, nested.costs.transfer_bytes.sum(0)
     made = settings_of(job.run, "plan")
-    steps = job.snapshots.levels[-1] + settings_of(job.run, "nest")["steps"]
-    sent, found = costs.transfer_bytes.sum(0), []
     budgets = np.ceil(np.geomspace(sent[0], sent[-1], config.budgets)).tolist()
-    main = ssim_target(job.run)
-    plans: list[tuple[str, Plan]] = [
-        (f"{b / 1e6:.3g} MB", nested.plan_budget(PlanConfig(target_ssim=main, budget=b))) for b in budgets
-    ]
+    found = planned_within(nested, [(f"{b / 1e6:.3g} MB", b) for b in budgets], ssim_target(job.run))
     for target in ssim_targets(job.run):
         plan = nested.plan_scene(target, made["share"])
-        plans.append((f"SSIM {target:g}, {plan.status}", plan))
-    seen = []
-    for name, plan in plans:
-        if plan.levels in seen and plan.budget is not None:
-            continue  # as a smaller budget's
-        seen.append(plan.levels)
-        found.append(
-            Contender(
-                PLANNED, name, steps, partial(job.ladder.compose, plan.levels),
-                {choice.label_id: choice.transfer_bytes or 0 for choice in plan.choices}, plan.target,
-                np.nan if plan.budget is None else plan.budget,
-            )
-        )  # fmt: skip
+        found.append(_of_plan(nested, f"SSIM {target:g}, {plan.status}", plan))
     return found
+
+
+def planned_within(
+    nested: NestedLevels, budgets: Sequence[tuple[str, float]], target_ssim: float | None = None
+) -> list[Contender]:
+    """Plans within budgets (name, bytes), without those of a smaller budget: most expected quality.
+
+    Of SSIM against photos where there is a target of it, else of fidelity.
+    """
+    found, seen = [], []
+    for name, nbytes in budgets:
+        config = (
+            PlanConfig(budget=nbytes)
+            if target_ssim is None
+            else PlanConfig(target_ssim=target_ssim, budget=nbytes)
+        )
+        plan = nested.plan_budget(config)
+        if plan.levels not in seen:
+            seen.append(plan.levels)
+            found.append(_of_plan(nested, name, plan))
+    return found
+
+
+def _of_plan(nested: NestedLevels, name: str, plan: Plan) -> Contender:
+    job = nested.job
+    steps = job.snapshots.levels[-1] + settings_of(job.run, "nest")["steps"]
+    return Contender(
+        PLANNED, name, steps, partial(job.ladder.compose, plan.levels),
+        {choice.label_id: choice.transfer_bytes or 0 for choice in plan.choices}, plan.target,
+        np.nan if plan.budget is None else plan.budget,
+    )  # fmt: skip
 
 
 def measure_sets(
