@@ -2,16 +2,17 @@
 
 The cheapest level of each category that keeps a target serves the lowest category well and the whole image
 badly: bytes go to what is hard, not to what is large. So the upgrades of most gain per byte are added, until
-the image as a whole is no worse than with all categories at one level, at equal bytes. The rule, exactly, as
-a second implementation must have it (tests/data/plans.json, mode "fill"):
+the image as a whole is at most `SLACK` worse than with all categories at one level, at equal bytes. (Without
+the slack a hard category of few pixels, all of which has to be sent, drew half of the scene along.) The rule,
+exactly, as a second implementation must have it (tests/data/plans.json, mode "fill"):
 
 - W(levels) = sum weight * mean / sum weight, B(levels) = sum cost. The uniform curve has the points
   (B(all at k), W(all at k)), k = 1 to K, linear between; below the first it is W(all at 1), above the last
-  W(all at K). Nothing is added if W(levels) >= curve(B(levels)) - 1e-9.
+  W(all at K). Nothing is added if W(levels) >= curve(B(levels)) - SLACK.
 - The upgrades of a label are the segments of the upper concave hull of (cost, weight * mean) from its level
   on. From a vertex the next one is the level above of the largest slope = gain / bytes; a gain without bytes
   has an infinite slope. Of equal slopes the one of fewer bytes, then of more gain, then the lower level.
-- All segments, by falling slope, then by label, are added one after another until W >= curve(B) - 1e-9.
+- All segments, by falling slope, then by label, are added one after another until W >= curve(B) - SLACK.
   Slopes fall along a label, so each step takes the steepest of the labels' next segments.
 - A label of weight 0, or with a mean that is NaN, stays; it has no part in W, its bytes count.
 
@@ -25,7 +26,7 @@ from jaxtyping import Float, Int
 from sagesplat.core.errors import RunError
 from sagesplat.kernels.jit import njit
 
-TOLERANCE = 1e-9  # of W
+SLACK = 0.004  # of W
 
 
 def fill(
@@ -35,7 +36,7 @@ def fill(
     weight: Float[np.ndarray, "L"],
     lowest: float = np.inf,
 ) -> Int[np.ndarray, "L"]:
-    """Add upgrades until the composition is no worse than equal levels of the same cost (the module's rule).
+    """Add upgrades until the composition is hardly worse than equal levels of the same cost (module's rule).
 
     Args:
         levels: [L], columns of `quality` to begin with; they are the least that each label gets.
@@ -104,7 +105,7 @@ def _fill(levels, value, cost, weight, lowest):
             if tops[low] >= 0 and least < _at(nbytes, uniform_bytes, uniform_lowest) - lowest:
                 label = low
         if label < 0:
-            if worth / total >= _at(nbytes, uniform_bytes, uniform) / total - TOLERANCE:
+            if worth / total >= _at(nbytes, uniform_bytes, uniform) / total - SLACK:
                 break
             label = int(slopes.argmax())  # of equal slopes the lower label
             if tops[label] < 0:

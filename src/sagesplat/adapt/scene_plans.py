@@ -39,8 +39,8 @@ def plan_for_scene(
 ) -> Plan:
     """Choose the cheapest level of each category that reaches a target in a share of the viewpoints.
 
-    A plan for fidelity is then filled (`adapt.fill`), so that all images together are no worse than with all
-    categories at one level, at equal bytes, and so that the lowest category is not either (up to `LOWEST`).
+    A plan for fidelity is then filled (`adapt.fill`): all images together are at most `fill.SLACK` worse than
+    with all categories at one level, at equal bytes, and the lowest category is at most `LOWEST` worse.
 
     Args:
         measured: [V, L, K], quality of each category and level; NaN where the view shows too little of it.

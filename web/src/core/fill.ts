@@ -5,7 +5,7 @@
 
 import type { Table } from "./allocate";
 
-const TOLERANCE = 1e-9;
+const SLACK = 0.004;
 
 interface Upgrade {
   readonly label: number;
@@ -14,7 +14,7 @@ interface Upgrade {
 }
 
 /**
- * Adds upgrades until the composition is no worse than equal levels of the same cost.
+ * Adds upgrades until the composition is hardly worse than equal levels of the same cost.
  *
  * @param levels - from 0, the least that each label gets
  * @param quality - mean quality by label and level, never falling; NaN: unknown, the label stays
@@ -90,7 +90,7 @@ function reached(
   const curve = from
     ? from.value + ((bytes - from.bytes) / (to.bytes - from.bytes)) * (to.value - from.value)
     : to.value;
-  return value / total >= curve / total - TOLERANCE;
+  return value / total >= curve / total - SLACK;
 }
 
 /** The segments of the upper concave hull of value over cost, from a level on. */
