@@ -47,6 +47,7 @@ def make_plan(job: Job, config: PlanConfig) -> None:
 
     inputs = [*run.scene_files, run.labels, *label_image_inputs(run), *method.files, run.observations]
     inputs += [run.provenance("observe"), run.provenance("fit")]
+    inputs += [run.provenance("sample")] if method.sample_files else []
     settings = asdict(config) | {"targets": config.targets}
     run_stage(job, "plan", settings, inputs, [run.plan], make)
 
