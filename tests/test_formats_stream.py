@@ -152,12 +152,18 @@ def test_both_opacities_come_back_and_are_blended_by_level():
         assert_equal(cut.gaussians, found.gaussians.slices([slice(0, count)]))
 
 
-def test_second_opacities_cost_little_and_none_where_they_are_the_only_ones():
+def test_second_opacities_cost_little_and_are_sent_with_the_first_level_that_needs_them():
+    g = visible(3000, degree=0)
+    one = encode_stream(g, [500, 1000, 2000, 3000])
+    weights = {0: (0.0, 0.0, 0.5, 1.0)}
+    two = encode_stream(g, [500, 1000, 2000, 3000], second=SecondOpacities(g.logit_opacities, weights))
+    sizes, more = (np.diff(coded.ends, prepend=0) for coded in (one, two))
+    assert (np.abs(more - sizes)[[0, 1, 3]] < 30).all()
+    assert 0 < more[2] - sizes[2] < 2000 * 5 / 8 + 20
+
+
+def test_a_second_opacity_that_is_the_only_one_costs_nothing():
     g = visible(2000, degree=0)
-    one = encode_stream(g, [1000, 2000])
-    two = encode_stream(g, [1000, 2000], second=SecondOpacities(g.logit_opacities, {0: (0.0, 1.0)}))
-    assert two.ends[0] - one.ends[0] < 1000 * 5 / 8 + 20
-    assert abs((two.ends[1] - two.ends[0]) - (one.ends[1] - one.ends[0])) < 20
     same = encode_stream(g, [2000], second=SecondOpacities(g.logit_opacities, {0: (1.0,)}))
     assert len(same.content) - len(encode_stream(g, [2000]).content) < 5
 
@@ -276,8 +282,9 @@ def test_a_precision_that_the_format_does_not_have(wrong: dict[str, Any]):
     ("at", "value", "words"),
     [
         (0, b"X", "not a sagesplat-stream"),
-        (4, b"\2", "newer stream"),
-        (5, b"\4", "newer stream"),
+        (4, b"\1", "a stream of version 1, and not 2; repeat `sagesplat nest"),
+        (4, b"\3", "a stream of version 3"),
+        (5, b"\4", "unknown flags 4"),
         (6, b"\4", "degree 4"),
         (7, b"\0", "0 levels"),
         (9, b"\x09", "degree"),

@@ -11,6 +11,7 @@ export interface Gaussians {
   readonly logScales: Float32Array; // [count, 3]
   readonly opacities: Float32Array;
   readonly seconds: Float32Array;
+  readonly earlier: Float32Array; // second opacities of Gaussians of the levels before it
   readonly sh0: Float32Array; // [count, 3]
   readonly shN: Float32Array; // [count, K, 3]
 }
@@ -19,7 +20,7 @@ export interface Gaussians {
 export class Floats implements Sink<Gaussians> {
   private header: Header | null = null;
 
-  begin(header: Header, count: number): Gaussians {
+  begin(header: Header, count: number, owed: number): Gaussians {
     this.header = header;
     const floats = (each: number) => new Float32Array(each * count);
     return {
@@ -29,9 +30,19 @@ export class Floats implements Sink<Gaussians> {
       logScales: floats(3),
       opacities: floats(1),
       seconds: floats(1),
+      earlier: new Float32Array(owed),
       sh0: floats(3),
       shN: floats(3 * (BASES[header.degree] as number)),
     };
+  }
+
+  putSeconds(level: Gaussians, block: Block, start: number, count: number): void {
+    for (let i = 0; i < count; i++) level.earlier[start + i] = this.opacity(block.seconds[i] as number);
+  }
+
+  private opacity(steps: number): number {
+    const { opacityStep } = this.header as Header;
+    return Math.max(0.25, Math.min(steps * opacityStep, 254.75)) / 255;
   }
 
   put(level: Gaussians, block: Block, start: number, count: number): void {
@@ -42,9 +53,8 @@ export class Floats implements Sink<Gaussians> {
     for (let i = 0; i < count; i++) {
       const row = start + i;
       const steps = ROTATIONS[at(block.classes, i)] as number;
-      const opacity = (o: number) => Math.max(0.25, Math.min(o * header.opacityStep, 254.75)) / 255;
-      level.opacities[row] = opacity(at(block.opacities, i));
-      level.seconds[row] = opacity(at(block.seconds, i));
+      level.opacities[row] = this.opacity(at(block.opacities, i));
+      level.seconds[row] = this.opacity(at(block.seconds, i));
       let square = 1;
       for (const axis of [0, 1, 2] as const) {
         level.means[3 * row + axis] = header.origin[axis] + header.step * at(block.cells[axis], i);

@@ -15,7 +15,7 @@ export interface Findings {
 }
 
 const PER_BYTE = 128; // Gaussians in a byte, at most
-const WORDS = 56 + 2; // bytes of a Gaussian of degree 3, with two opacities
+const WORDS = 56 + 2 + 1; // bytes of a Gaussian of degree 3, with two opacities, the second one sent later
 const LONG = 1000; // ms
 const [SHORT, LONGER] = [900, 20_000]; // bytes of a piece of a longer stream, usually and now and then
 
@@ -81,7 +81,7 @@ function attempt(bytes: Uint8Array, below: (n: number) => number, found: Finding
   if (size > 1) found.wrong.push(line("more than its bytes may hold"));
 }
 
-function sizeOf({ splats, harmonics, opacities }: Part): number {
+function sizeOf({ splats, harmonics, opacities, earlier }: Part): number {
   const words = [...harmonics.values()].reduce((sum, { byteLength }) => sum + byteLength, splats.byteLength);
-  return words + (opacities?.byteLength ?? 0);
+  return words + (opacities?.byteLength ?? 0) + (earlier?.byteLength ?? 0);
 }

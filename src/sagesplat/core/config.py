@@ -244,7 +244,7 @@ class NestConfig:
     """Levels per category; their sizes grow geometrically."""
     smallest: float = 0.01
     """Size of the lowest level, as a fraction of the category's Gaussians."""
-    drawn_from: float = 0.04
+    drawn_from: float = 0.03
     """Size of the smallest prefix that training samples, as a fraction of the category's Gaussians. Smaller
     values favour categories that are easy to represent."""
     base_share: float = 0.2

@@ -1,7 +1,8 @@
 """`sagesplat-stream`: the nested levels of one category as coded bytes that can be cut after any level.
 
 A header of 44 bytes, then the levels: the number of their Gaussians, the number of their bytes, with two
-opacities the weight of the second one, and their columns of integers, coded by an adaptive rANS.
+opacities the weight of the second one, and their columns of integers, coded by an adaptive rANS. The second
+opacities of levels of weight 0 come with the first level that needs them.
 docs/formats.md specifies all of it.
 """
 
@@ -17,9 +18,18 @@ from torch import Tensor
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.second_opacity import SecondOpacities, blended
-from sagesplat.formats.stream_columns import AXIS_BITS, Columns, Layout, code_columns, joined, new_tables
+from sagesplat.formats.stream_columns import (
+    AXIS_BITS,
+    Columns,
+    Layout,
+    code_columns,
+    code_seconds,
+    joined,
+    new_tables,
+)
 from sagesplat.formats.stream_header import (
     SIZE,
+    OtherVersionError,
     Precision,
     header_of,
     logits_of,
@@ -127,13 +137,16 @@ def encode_stream(
     one = np.repeat(weights, np.diff(ends, prepend=0)) == 255
     columns = replace(columns, opacities=np.where(one, columns.seconds, columns.opacities))
     tables, content, cuts, order = Tables(new_tables(header.layout)), header.pack(), [], []
+    owed: list[Columns] = []
     for weight, (low, high) in zip(weights, pairwise((0, *ends.tolist())), strict=True):
         order.append(low + np.argsort(columns.positions[low:high], kind="stable"))
-        payload = b""
+        some, payload = columns.rows(order[-1]), b""
         if high > low:
             writer = Writer(tables)
-            some = columns.rows(order[-1])
-            _code_level(writer, header.layout, low, high - low, weight < 255, some)
+            if weight:
+                _code_owed(writer, header.layout, owed, given=True)
+            _code_level(writer, header.layout, low, high - low, 0 < weight < 255, some)
+            owed = [] if weight else [*owed, some]
             payload = writer.payload()
         content += _leb128(high - low) + _leb128(len(payload))
         content += bytes([weight] if second else []) + payload
@@ -185,7 +198,7 @@ def decode_stream(
         if levels is not None and not 1 <= levels <= header.levels:
             raise ValueError(f"level {levels} of {header.levels}")
         tables, at, parts, weights = Tables(new_tables(header.layout)), SIZE, [], []
-        ends, sizes = [], [0]
+        ends, sizes, owed = [], [0], 0  # parts from this one on are still without second opacities
         while len(sizes) <= (levels or header.levels):
             if levels is None and at == len(content):
                 break
@@ -195,13 +208,24 @@ def decode_stream(
             at += header.two_opacities
             if nbytes > len(content) - at or count > min(MAX_COUNT - sizes[-1], _PER_BYTE * nbytes):
                 raise ValueError(f"{count} Gaussians in {nbytes} of {len(content) - at} bytes")
-            payload, two = content[at : at + nbytes], weights[-1] < 255
-            parts += _read_level(payload, tables, header.layout, sizes[-1], count, two)
+            reader = _reader(tables, content[at : at + nbytes], count)
+            if reader:
+                if weights[-1]:
+                    parts[owed:] = _code_owed(reader, header.layout, parts[owed:], given=False)
+                two = 0 < weights[-1] < 255
+                parts += _code_level(reader, header.layout, sizes[-1], count, two, None)
+                owed = len(parts) if weights[-1] else owed
+                reader.finish()
             at += nbytes
             ends.append(at)
             sizes.append(sizes[-1] + count)
         if len(sizes) == header.levels + 1 and at != len(content):
             raise ValueError(f"{len(content) - at} bytes after the last level")
+    except OtherVersionError as error:
+        raise DataError(
+            f"{name}: {error}; use the version of sagesplat that wrote it, or repeat the run from "
+            "`sagesplat nest RUN --force` on"
+        ) from None
     except ValueError as error:
         raise DataError(f"{name}: a damaged stream ({short(error)}); copy it again") from None
     columns, second = joined(parts, header.sh_degree), None
@@ -233,18 +257,27 @@ def _check(name: str, g: Gaussians, sizes: Sequence[int], second: SecondOpacitie
         raise DataError(f"{name}: {bad} Gaussians have a rotation of zeros; train the scene again")
 
 
-def _read_level(
-    payload: bytes, tables: Tables, layout: Layout, done: int, count: int, two: bool
-) -> list[Columns]:
-    """The columns of a level, by blocks; ValueError for damaged bytes."""
-    if not count:
-        if payload:
-            raise ValueError(f"{len(payload)} bytes of no Gaussians")
+def _reader(tables: Tables, payload: bytes, count: int) -> Reader | None:
+    """Of a level of `count` Gaussians; None where it has none. ValueError for damaged bytes."""
+    if not count and payload:
+        raise ValueError(f"{len(payload)} bytes of no Gaussians")
+    return Reader(tables, payload) if count else None
+
+
+def _code_owed(coder: Coder, layout: Layout, parts: list[Columns], *, given: bool) -> list[Columns]:
+    """Code second opacities of Gaussians whose other columns were sent before; the parts with them."""
+    if not parts:
         return []
-    reader = Reader(tables, payload)
-    parts = _code_level(reader, layout, done, count, two, None)
-    reader.finish()
-    return parts
+    firsts = np.concatenate([part.opacities for part in parts])
+    wanted = np.concatenate([part.seconds for part in parts]) if given else None
+    found, at = np.empty_like(firsts), 0
+    while at < len(firsts):
+        piece = slice(at, at + min(_left(at), len(firsts) - at))
+        found[piece] = code_seconds(coder, layout, firsts[piece], None if wanted is None else wanted[piece])
+        coder.end_block()
+        at = piece.stop
+    ends = np.cumsum([len(part.opacities) for part in parts])
+    return [replace(part, seconds=own) for part, own in zip(parts, np.split(found, ends[:-1]), strict=True)]
 
 
 def _code_level(
@@ -253,8 +286,7 @@ def _code_level(
     """Code `count` Gaussians after `done` ones: up to the end of a block, or what the level has of it."""
     parts, before, at = [], 0, 0
     while at < count:
-        size = 1 << min(max((done >> 1).bit_length() - 1, _SMALLEST), _LARGEST)
-        left = size - done % size  # of the block
+        left = _left(done)
         now = min(left, count - at)
         some = None if given is None else given.rows(slice(at, at + now))
         parts.append(code_columns(coder, layout, now, before, two, some))
@@ -264,6 +296,12 @@ def _code_level(
         if before >> 3 * AXIS_BITS:
             raise ValueError("a position outside the grid")
     return parts
+
+
+def _left(done: int) -> int:
+    """Gaussians until the block ends, after `done` of them."""
+    size = 1 << min(max((done >> 1).bit_length() - 1, _SMALLEST), _LARGEST)
+    return size - done % size
 
 
 def _leb128(value: int) -> bytes:

@@ -112,15 +112,14 @@ def code_columns(
 ) -> Columns:
     """Code the columns of `count` Gaussians; a reader is given none.
 
-    `before`: the Morton code before them in the level, or 0. `two`: the level has second opacities.
+    `before`: the Morton code before them in the level, or 0. `two`: second opacities are among them.
     """
     zero = np.zeros(count, np.int64)
     gaps = _code_gaps(coder, zero, None if given is None else np.diff(given.positions, prepend=before))
     opacities = coder.symbols("opacity", zero, None if given is None else given.opacities)
     seconds = opacities
     if two:
-        classes = opacities * _CLASSES // (layout.opacities + 1)
-        seconds = coder.symbols("second opacity", classes, None if given is None else given.seconds)
+        seconds = code_seconds(coder, layout, opacities, None if given is None else given.seconds)
     scales = _code_scales(coder, zero, None if given is None else given.scales)
     classes, rotations = layout.classes(scales), np.empty((count, 3), np.int64)
     for axis in range(3):
@@ -129,6 +128,12 @@ def code_columns(
     colours = _code_colours(coder, zero, None if given is None else given.colours)
     harmonics = _code_harmonics(coder, layout, zero, None if given is None else given.harmonics)
     return Columns(before + gaps.cumsum(), opacities, seconds, scales, rotations, colours, harmonics)
+
+
+def code_seconds(coder: Coder, layout: Layout, opacities: np.ndarray, given: np.ndarray | None) -> np.ndarray:
+    """Code the second opacities of Gaussians by their first ones."""
+    classes = opacities * _CLASSES // (layout.opacities + 1)
+    return coder.symbols("second opacity", classes, given)
 
 
 def _code_gaps(coder: Coder, zero: np.ndarray, given: np.ndarray | None) -> np.ndarray:

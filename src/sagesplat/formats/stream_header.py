@@ -13,7 +13,7 @@ from sagesplat.formats.quantisation import PER_COLOUR, in_buckets, logits_of_byt
 from sagesplat.formats.spz import flipped
 from sagesplat.formats.stream_columns import AXIS_BITS, BASES, LARGEST, ROTATIONS, Columns, Layout
 
-MAGIC, VERSION = b"SGST", 1
+MAGIC, VERSION = b"SGST", 2
 _HEADER = struct.Struct("<4sBBBBBBBBffffffhhhH")
 SIZE = _HEADER.size
 _ANTIALIASED, _TWO_OPACITIES = 1, 2  # flags
@@ -95,14 +95,23 @@ class Header:
         )  # fmt: skip
 
 
+class OtherVersionError(ValueError):
+    """A stream that another version of sagesplat wrote."""
+
+
 def read_header(content: bytes) -> Header:
-    """The header that a stream begins with; ValueError for another format or version, or damage."""
+    """The header that a stream begins with; ValueError for another format or damage.
+
+    Raises `OtherVersionError` for another version.
+    """
     if len(content) < SIZE or content[:4] != MAGIC:
         raise ValueError("not a sagesplat-stream")
     _, version, flags, degree, levels, opacity, low, high, spread, *rest = _HEADER.unpack_from(content)
     *origin, step, scale_step, colour_step, scales, colours, rotations, reserved = rest
-    if version != VERSION or flags & ~(_ANTIALIASED | _TWO_OPACITIES) or reserved:
-        raise ValueError(f"version {version}, flags {flags}: a newer stream than this reader knows")
+    if version != VERSION:
+        raise OtherVersionError(f"a stream of version {version}, and not {VERSION}")
+    if flags & ~(_ANTIALIASED | _TWO_OPACITIES) or reserved:
+        raise ValueError(f"unknown flags {flags}")
     steps = np.array([step, scale_step, colour_step])
     reach = np.abs(origin) + step * _CELLS
     if not (steps >= 1e-18).all() or not (steps <= _RANGE).all() or not (reach <= _RANGE).all():

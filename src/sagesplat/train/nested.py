@@ -34,6 +34,7 @@ from sagesplat.train.votes import label_weights, winners
 
 _SHRINK_TO = 0.05  # of the learning rates, at the end
 _SAVE_EVERY = 500
+_AVERAGE_EVERY = 5
 _NEARLY_FULL, _NEARLY_FROM = 0.2, 0.4  # share of the full steps that draw less, and the least prefix of these
 SORT_AT = 1 / 12, 1 / 6, 1 / 3, 1 / 2, 2 / 3  # of the steps
 
@@ -189,7 +190,8 @@ def nest(
     Each step draws a prefix of every category, log-uniform between `config.drawn_from` and 1, or the full
     model (with a probability that rises from `config.full_share` to `config.full_share_end`; a fifth of these
     steps draw prefixes between 40 and 100 %), and compares the composition with a photo. Values are rounded
-    as the increments will hold them. Gaussians outside the composition, and their Adam moments, stay as they
+    as the increments will hold them. The result is the mean of the last steps' values (at most 500 steps, or
+    a fifth): prefixes pull in different directions to the end. Gaussians outside the composition, and their Adam moments, stay as they
     are. With `config.two_opacities` each category is drawn with the opacities that its prefix has, between
     the first and the second ones. At five steps all Gaussians are sorted again by importance: in each
     category the base model stays first.
@@ -245,7 +247,7 @@ def nest(
     trainable = trainable_rows(state.gaussians, {})
     if movable is not None:
         trainable &= torch.from_numpy(movable[near]).to(device)
-    value = 0.0
+    value, mean = 0.0, _Mean(_averaged_from(config.steps), config.steps)
     with named_failures(lambda: f"training on compositions stopped at step {state.step}"):
         while state.step < config.steps:
             if state.step in sort_at:
@@ -263,6 +265,7 @@ def nest(
                 state, nested.gaussians.sh_degree, rates(state.step + 1), trainable,
                 drawn_rows=rows, second_weights=weights,
             )  # fmt: skip
+            mean.add(state)
             saves = state.step % _SAVE_EVERY == 0
             if device.type == "cpu" or saves or state.step % LOOK_EVERY == 0:  # looking waits for a GPU
                 value = finite(loss, state.step)
@@ -276,6 +279,37 @@ def nest(
     g, second = state.gaussians.select(torch.from_numpy(rows)), state.second_opacities
     second = None if second is None else second[torch.from_numpy(rows)]
     yield Nested(g, of_base[rows], second)
+
+
+def _averaged_from(steps: int) -> int:
+    """The step after which values are averaged: there is no checkpoint between it and the last step."""
+    return max((steps - 1) // _SAVE_EVERY * _SAVE_EVERY, steps * 4 // 5)
+
+
+class _Mean:
+    """The mean of all values of a training from a step on, at every fifth and the last one.
+
+    Polyak and Juditsky, "Acceleration of stochastic approximation by averaging", 1992.
+    """
+
+    def __init__(self, start: int, end: int) -> None:
+        self._start, self._end, self._count = start, end, 0
+        self._means: list[Tensor] = []
+
+    def add(self, state: TrainState) -> None:
+        """Take the values of a step; at the last one they become the mean."""
+        if state.step <= self._start or ((self._end - state.step) % _AVERAGE_EVERY):
+            return
+        values = [*state.gaussians.parameters().values()]
+        if state.second_opacities is not None:
+            values.append(state.second_opacities)
+        self._count += 1
+        if not self._means:
+            self._means = [value.detach().clone() for value in values]
+        for mean, value in zip(self._means, values, strict=True):
+            mean.lerp_(value.detach(), 1 / self._count)
+            if state.step == self._end:
+                value.detach().copy_(mean)
 
 
 def _draw_prefixes(

@@ -94,7 +94,7 @@ const NEW = {
 export class Columns {
   private readonly gap = NEW.gap.copy();
   private readonly opacity: Table;
-  private readonly second: Table | null;
+  private readonly second: Table;
   private readonly largest: number; // opacity
   private readonly scale = NEW.scale.copy();
   private readonly rotation = NEW.rotation.copy();
@@ -106,13 +106,13 @@ export class Columns {
     const [least, most] = [header.twoOpacities ? 0 : 1, Math.ceil(255 / header.opacityStep)];
     const opacity = (symbol: number) => (symbol >= least && symbol <= most ? FLAT : 0);
     this.opacity = new Table(1, 256, opacity);
-    this.second = header.twoOpacities ? new Table(CLASSES, 256, opacity) : null;
+    this.second = new Table(CLASSES, 256, opacity);
     this.largest = most;
     this.bands = NEW.bands.slice(0, header.degree).map(([masks, green, red, blue]) => {
       return [masks.copy(), green.copy(), red.copy(), blue.copy()];
     });
-    this.tables = [this.gap, this.opacity, this.scale, this.rotation, this.colour, ...this.bands.flat()];
-    if (this.second) this.tables.push(this.second);
+    const { gap, second, scale, rotation, colour, bands } = this;
+    this.tables = [gap, this.opacity, second, scale, rotation, colour, ...bands.flat()];
   }
 
   /**
@@ -160,12 +160,14 @@ export class Columns {
     return code;
   }
 
-  private decodeOpacities(reader: Reader, { opacities, seconds }: Block, count: number, two: boolean): void {
-    reader.ofRow(this.opacity, 0, 0, opacities, count);
-    if (!two || !this.second) {
-      seconds.set(opacities.subarray(0, count));
-      return;
-    }
+  private decodeOpacities(reader: Reader, block: Block, count: number, two: boolean): void {
+    reader.ofRow(this.opacity, 0, 0, block.opacities, count);
+    if (two) this.decodeSeconds(reader, block, count);
+    else block.seconds.set(block.opacities.subarray(0, count));
+  }
+
+  /** Decodes second opacities of Gaussians whose first ones are in the first rows of a block. */
+  decodeSeconds(reader: Reader, { opacities, seconds }: Block, count: number): void {
     for (let i = 0; i < count; i++) {
       contexts[i] = Math.floor(((opacities[i] as number) * CLASSES) / (this.largest + 1));
     }

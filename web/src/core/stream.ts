@@ -9,14 +9,17 @@ const MAX_COUNT = 10_000_000;
 const PER_BYTE = 128; // Gaussians in a byte, at most
 const SMALLEST = 16; // Gaussians of a block: a power of two
 const GREATEST = 1e18;
+const VERSION = 2;
 const ALL_SECOND = 255; // weight of a level whose Gaussians have one opacity, which counts as both
 
 /** Makes of a stream's Gaussians what a caller wants of a level. */
 export interface Sink<Level> {
-  /** A level to be filled. */
-  begin(header: Header, count: number): Level;
+  /** A level to be filled; with it come second opacities of the `owed` Gaussians before it. */
+  begin(header: Header, count: number, owed: number): Level;
   /** Takes the first `count` rows of a block as the rows of the level from `start` on. */
   put(level: Level, block: Block, start: number, count: number): void;
+  /** Takes the second opacities of a block as those of the owed Gaussians from `start` on. */
+  putSeconds(level: Level, block: Block, start: number, count: number): void;
 }
 
 /** What a stream says of all its Gaussians. */
@@ -41,9 +44,8 @@ export interface Header {
 export function readHeader(bytes: Uint8Array): Header {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
   if (bytes.length < HEADER || view.getUint32(0) !== MAGIC) throw new Error("not a sagesplat-stream");
-  if (view.getUint8(4) !== 1 || view.getUint8(5) > 3 || view.getUint16(42, true)) {
-    throw new Error("a newer stream than this viewer knows");
-  }
+  if (view.getUint8(4) !== VERSION) throw new Error("a stream of another version");
+  if (view.getUint8(5) > 3 || view.getUint16(42, true)) throw new Error("a stream with unknown flags");
   const float = (at: number) => view.getFloat32(at, true);
   const header: Header = {
     antialiased: (view.getUint8(5) & 1) > 0,
@@ -77,6 +79,7 @@ export class StreamDecoder<Level> {
   private header: Header | null = null;
   private columns: Columns | null = null;
   private done = 0; // Gaussians
+  private owed = new Uint8Array(0); // first opacities of the newest Gaussians, those without second ones
   private levels = 0;
 
   constructor(private readonly sink: Sink<Level>) {}
@@ -119,31 +122,55 @@ export class StreamDecoder<Level> {
       throw new Error("a level with more Gaussians than fit");
     }
     if (Number.isNaN(size) || this.waiting.length < start + size) return null;
-    const level = this.sink.begin(header, count);
-    const two = header.twoOpacities && (this.waiting[afterSize] as number) < ALL_SECOND;
-    if (count) this.decode(this.waiting.subarray(start, start + size), level, count, two);
+    const weight = header.twoOpacities ? (this.waiting[afterSize] as number) : ALL_SECOND;
+    const level = this.sink.begin(header, count, count && weight ? this.owed.length : 0);
+    if (count) this.decode(this.waiting.subarray(start, start + size), level, count, weight);
     this.waiting = this.waiting.subarray(start + size);
     this.levels++;
     return level;
   }
 
-  private decode(payload: Uint8Array, level: Level, total: number, two: boolean): void {
+  private decode(payload: Uint8Array, level: Level, total: number, weight: number): void {
     const columns = this.columns as Columns;
     const block = blockOf(this.header as Header);
     const reader = new Reader(payload);
+    if (weight) this.decodeOwed(reader, level);
+    const owed = new Uint8Array(weight ? 0 : this.owed.length + total);
+    owed.set(this.owed);
     let before = 0;
     for (let at = 0; at < total; ) {
-      const size = Math.max(SMALLEST, Math.min(2 ** (30 - Math.clz32(this.done)), LARGEST));
-      const left = size - (this.done % size);
+      const left = untilEnd(this.done);
       const count = Math.min(left, total - at);
-      before = columns.decode(reader, block, count, before, two);
+      before = columns.decode(reader, block, count, before, weight > 0 && weight < ALL_SECOND);
       this.sink.put(level, block, at, count);
+      if (!weight) owed.set(block.opacities.subarray(0, count), this.owed.length + at);
       if (count === left) columns.endBlock();
       at += count;
       this.done += count;
     }
+    this.owed = owed;
     reader.finish();
   }
+
+  private decodeOwed(reader: Reader, level: Level): void {
+    const columns = this.columns as Columns;
+    const block = blockOf(this.header as Header);
+    for (let at = 0; at < this.owed.length; ) {
+      const count = Math.min(untilEnd(at), this.owed.length - at);
+      block.opacities.set(this.owed.subarray(at, at + count));
+      columns.decodeSeconds(reader, block, count);
+      columns.endBlock();
+      this.sink.putSeconds(level, block, at, count);
+      at += count;
+    }
+    this.owed = new Uint8Array(0);
+  }
+}
+
+/** Gaussians until the block ends, after `done` of them. */
+function untilEnd(done: number): number {
+  const size = Math.max(SMALLEST, Math.min(2 ** (30 - Math.clz32(done)), LARGEST));
+  return size - (done % size);
 }
 
 const blocks = new Map<number, Block>(); // by SH degree, shared by all decoders

@@ -24,9 +24,25 @@ function logit(byte: number): number {
   return Math.log(opacity / (1 - opacity));
 }
 
+/** Enters the second opacities that have come with a later part. */
+function enterEarlier(parts: readonly Part[]): void {
+  parts.forEach(({ earlier }, i) => {
+    let end = earlier?.length ?? 0;
+    for (let k = i - 1; k >= 0 && end > 0; k--) {
+      const { count, opacities } = parts[k] as Part;
+      const start = end - count;
+      for (let row = Math.max(0, -start); opacities && row < count; row++) {
+        opacities[2 * row + 1] = earlier?.[start + row] as number;
+      }
+      end = start;
+    }
+  });
+}
+
 /** Sets the opacities of parts, which lie one after the other in `words`, for a weight of the second ones. */
 export function blendOpacities(words: Uint32Array, parts: readonly Part[], weight: number): void {
   const blend = new Blend(weight);
+  enterEarlier(parts);
   let start = 0;
   for (const { count, opacities } of parts) {
     for (let i = 0, at = 4 * start; opacities && i < count; i++, at += 4) {

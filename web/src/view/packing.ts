@@ -28,6 +28,7 @@ export interface Part {
   readonly splats: Uint32Array; // [count, 4]
   readonly harmonics: ReadonlyMap<(typeof HARMONICS)[number], Uint32Array>;
   readonly opacities: Uint8Array | null; // [count, 2] in 1/255: the first and the second one, if there are two
+  readonly earlier?: Uint8Array; // second opacities of the splats before it, which have come with it
 }
 
 const SH_C0 = 0.28209479177387814;
@@ -65,14 +66,15 @@ export class Packing implements Sink<Part> {
   private alpha = new Uint8Array(0); // in 1/255, by opacity
   private coefficients: readonly Lookup[] = [];
 
-  begin(header: Header, count: number): Part {
+  begin(header: Header, count: number, owed: number): Part {
     if (header !== this.header) this.prepare(header);
     const harmonics = HARMONICS.slice(0, header.degree).map(
       (key) => [key, new Uint32Array(count * WORDS[key])] as const,
     );
     const opacities = header.twoOpacities ? new Uint8Array(2 * count) : null;
     const splats = new Uint32Array(4 * count);
-    return { count, encoding: STREAM_ENCODING, splats, harmonics: new Map(harmonics), opacities };
+    const part = { count, encoding: STREAM_ENCODING, splats, harmonics: new Map(harmonics), opacities };
+    return owed ? { ...part, earlier: new Uint8Array(owed) } : part;
   }
 
   put(part: Part, block: Block, start: number, count: number): void {
@@ -85,6 +87,11 @@ export class Packing implements Sink<Part> {
       const words = part.harmonics.get(key) as Uint32Array;
       putHarmonics(words, WORDS[key], BITS[i] as number, this.coefficients[i] as Lookup, harmonics, start);
     });
+  }
+
+  putSeconds(part: Part, { seconds }: Block, start: number, count: number): void {
+    const out = part.earlier as Uint8Array;
+    for (let i = 0; i < count; i++) out[start + i] = this.alpha[seconds[i] as number] as number;
   }
 
   private prepare(header: Header): void {
