@@ -191,10 +191,10 @@ def nest(
     model (with a probability that rises from `config.full_share` to `config.full_share_end`; a fifth of these
     steps draw prefixes between 40 and 100 %), and compares the composition with a photo. Values are rounded
     as the increments will hold them. The result is the mean of the last steps' values (at most 500 steps, or
-    a fifth): prefixes pull in different directions to the end. Gaussians outside the composition, and their Adam moments, stay as they
-    are. With `config.two_opacities` each category is drawn with the opacities that its prefix has, between
-    the first and the second ones. At five steps all Gaussians are sorted again by importance: in each
-    category the base model stays first.
+    a fifth): prefixes pull in different directions to the end. Gaussians outside the composition, and their
+    Adam moments, stay as they are. With `config.two_opacities` each category is drawn with the opacities that
+    its prefix has, between the first and the second ones. At five steps all Gaussians are sorted again by
+    importance: in each category the base model stays first.
 
     Args:
         nested: The ordered model to start from (`order`).
