@@ -257,7 +257,7 @@ def _steps_as_long(job: Job, config: NestConfig) -> int:
 
 
 def train_as_one(job: Job, of: tuple[NestConfig, int]) -> Gaussians:
-    """The trained model, trained on in full: nesting's rounding and learning rates, no levels."""
+    """The trained model, trained on in full: nesting's rounding, learning rates and tail average, no levels."""
     g = read_level(job.trained)
     for after in _full_steps(job, of):
         g = after
@@ -275,8 +275,10 @@ def _full_steps(job: Job, of: tuple[NestConfig, int]) -> Iterator[Gaussians]:
         job.backend, sh_bits=config.sh_bits, shell=job.sky.shell if job.sky else None,
     )  # fmt: skip
     rates, trainable = nested.learning_rates(settings, config, job.scene), trainable_rows(state.gaussians, {})
+    tail = nested.TailAverage(config.steps)
     for step in range(1, config.steps + 1):
         stepper(state, settings.sh_degree, rates(step), trainable)
+        tail.add(state)
         yield state.gaussians
 
 

@@ -218,10 +218,10 @@ def test_a_killed_training_goes_on_bit_for_bit(scene: Scene, tmp_path: Path, mon
 
 def test_the_end_of_a_training_is_averaged(scene: Scene, monkeypatch) -> None:
     """The last step's values are the mean of those of the 9th, 10th, 11th and 12th step."""
-    monkeypatch.setattr(nested, "_averaged_from", lambda steps: 8)
+    monkeypatch.setattr(nested, "tail_start", lambda steps: 8)
     monkeypatch.setattr(nested, "_AVERAGE_EVERY", 1)
     seen: list[np.ndarray] = []
-    real = nested._Mean.add
+    real = nested.TailAverage.add
 
     def watched(self, state) -> None:
         seen.append(torch.cat([state.gaussians.means, state.second_opacities[:, None]], 1).detach().numpy())
@@ -229,7 +229,7 @@ def test_the_end_of_a_training_is_averaged(scene: Scene, monkeypatch) -> None:
         real(self, state)
         seen.append(torch.cat([state.gaussians.means, state.second_opacities[:, None]], 1).detach().numpy())
 
-    monkeypatch.setattr(nested._Mean, "add", watched)
+    monkeypatch.setattr(nested.TailAverage, "add", watched)
     trained(scene, ordered(), QUICK)
     before, after = seen[::2], seen[1::2]
     for step in range(11):
@@ -242,7 +242,7 @@ def test_the_end_of_a_training_is_averaged(scene: Scene, monkeypatch) -> None:
     ("steps", "start"), [(0, 0), (1, 0), (12, 9), (500, 400), (600, 500), (3000, 2500), (3001, 3000)]
 )
 def test_no_checkpoint_lies_among_the_steps_that_are_averaged(steps: int, start: int) -> None:
-    assert nested._averaged_from(steps) == start
+    assert nested.tail_start(steps) == start
 
 
 @pytest.mark.parametrize(

@@ -247,7 +247,7 @@ def nest(
     trainable = trainable_rows(state.gaussians, {})
     if movable is not None:
         trainable &= torch.from_numpy(movable[near]).to(device)
-    value, mean = 0.0, _Mean(_averaged_from(config.steps), config.steps)
+    value, tail = 0.0, TailAverage(config.steps)
     with named_failures(lambda: f"training on compositions stopped at step {state.step}"):
         while state.step < config.steps:
             if state.step in sort_at:
@@ -265,7 +265,7 @@ def nest(
                 state, nested.gaussians.sh_degree, rates(state.step + 1), trainable,
                 drawn_rows=rows, second_weights=weights,
             )  # fmt: skip
-            mean.add(state)
+            tail.add(state)
             saves = state.step % _SAVE_EVERY == 0
             if device.type == "cpu" or saves or state.step % LOOK_EVERY == 0:  # looking waits for a GPU
                 value = finite(loss, state.step)
@@ -281,19 +281,19 @@ def nest(
     yield Nested(g, of_base[rows], second)
 
 
-def _averaged_from(steps: int) -> int:
+def tail_start(steps: int) -> int:
     """The step after which values are averaged: there is no checkpoint between it and the last step."""
     return max((steps - 1) // _SAVE_EVERY * _SAVE_EVERY, steps * 4 // 5)
 
 
-class _Mean:
-    """The mean of all values of a training from a step on, at every fifth and the last one.
+class TailAverage:
+    """The mean of a training's values over its last steps, at every fifth of them and the last one.
 
     Polyak and Juditsky, "Acceleration of stochastic approximation by averaging", 1992.
     """
 
-    def __init__(self, start: int, end: int) -> None:
-        self._start, self._end, self._count = start, end, 0
+    def __init__(self, steps: int) -> None:
+        self._start, self._end, self._count = tail_start(steps), steps, 0
         self._means: list[Tensor] = []
 
     def add(self, state: TrainState) -> None:
