@@ -257,7 +257,7 @@ def _steps_as_long(job: Job, config: NestConfig) -> int:
 
 
 def train_as_one(job: Job, of: tuple[NestConfig, int]) -> Gaussians:
-    """The trained model, trained on in full: nesting's rounding, learning rates and tail average, no levels."""
+    """The trained model, trained on in full: nesting's rounding, rates and tail average, no levels."""
     g = read_level(job.trained)
     for after in _full_steps(job, of):
         g = after
