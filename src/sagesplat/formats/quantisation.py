@@ -62,8 +62,11 @@ def rounded(g: Gaussians, sh_bits: tuple[int, int], rows: Tensor | None = None) 
         log_scales, shN = in_steps(g.log_scales, SCALE_STEP / PER_LOG_SCALE), in_buckets(g.shN, sh_bits)
         return replace(g, sh0=sh0, log_scales=log_scales, shN=shN)
     index = np.arange(len(g)) if rows is None else rows.numpy()
-    found = _rounded_rows(g.sh0.numpy(), g.log_scales.numpy(), g.shN.numpy(), index, *sh_bits)
+    steps = np.repeat(sh_steps(g.shN, sh_bits)[:, 0].numpy(), 3)
+    flat = (g.sh0.flatten(1), g.log_scales, g.shN.flatten(1))
+    found = _rounded_rows(*(values.numpy() for values in flat), index, steps)
     sh0, log_scales, shN = map(torch.from_numpy, found)
+    sh0, shN = sh0[:, None], shN.reshape(len(index), *g.shN.shape[1:])
     if rows is None:
         return replace(g, sh0=sh0, log_scales=log_scales, shN=shN)
     others = {name: getattr(g, name)[rows] for name in ("means", "quats", "logit_opacities", "label_ids")}
@@ -71,25 +74,23 @@ def rounded(g: Gaussians, sh_bits: tuple[int, int], rows: Tensor | None = None) 
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
-def _rounded_rows(sh0, log_scales, shN, rows, first_bits, other_bits):
+def _rounded_rows(sh0, log_scales, shN, rows, steps):
     """Gathered and rounded in one pass over memory; the same bits as `in_steps` and `in_buckets`."""
-    n, bases = len(rows), shN.shape[1]
-    colours = np.empty((n, 1, 3), np.float32)
+    n = len(rows)
+    colours = np.empty((n, 3), np.float32)
     scales = np.empty((n, 3), np.float32)
-    harmonics = np.empty((n, bases, 3), np.float32)
+    harmonics = np.empty((n, len(steps)), np.float32)
     per, half = np.float32(PER_COLOUR), np.float32(127.5)
     colour_step, scale_step = np.float32(COLOUR_STEP), np.float32(SCALE_STEP / PER_LOG_SCALE)
-    first, other = np.float32(2.0 ** (1 - first_bits)), np.float32(2.0 ** (1 - other_bits))
     one = np.float32(1)
+    inverse = one / steps  # exact: powers of two
     for i in prange(n):
         row = rows[i]
         for c in range(3):
-            in_units = np.rint((sh0[row, 0, c] * per + half) / colour_step) * colour_step
-            colours[i, 0, c] = (in_units - half) / per
+            in_units = np.rint((sh0[row, c] * per + half) / colour_step) * colour_step
+            colours[i, c] = (in_units - half) / per
             scales[i, c] = np.rint(log_scales[row, c] / scale_step) * scale_step
-        for k in range(bases):
-            step = first if k < 3 else other
-            for c in range(3):
-                value = min(max(shN[row, k, c], -one), one)
-                harmonics[i, k, c] = np.rint(value / step) * step
+        values = shN[row]
+        for k in range(len(steps)):
+            harmonics[i, k] = np.rint(min(max(values[k], -one), one) * inverse[k]) * steps[k]
     return colours, scales, harmonics

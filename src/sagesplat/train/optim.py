@@ -52,14 +52,21 @@ def _update_rows(parameter, grad, exp_avg, exp_avg_sq, rate, correction, trainab
 
 @njit(parallel=True, cache=True)
 def _update_drawn(parameter, grad, exp_avg, exp_avg_sq, rate, correction, trainable, columns, drawn):
-    """The same for the rows `drawn` alone, of which `grad` has one each."""
+    """The same for the rows `drawn` alone, ascending, of which `grad` has one each."""
     width = len(parameter) // len(trainable)
     for chunk in prange((len(drawn) + _CHUNK - 1) // _CHUNK):
-        for i in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(drawn))):
-            if trainable[drawn[i]]:
-                a, b, c = drawn[i] * width, drawn[i] * width + columns, i * width
-                own = grad[c : c + columns]
-                _update(parameter[a:b], own, exp_avg[a:b], exp_avg_sq[a:b], rate, correction)
+        i, end = chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(drawn))
+        while i < end:
+            begin, row = i, drawn[i]
+            i += 1
+            if not trainable[row]:
+                continue
+            if columns == width:  # rows that follow each other are updated together
+                while i < end and drawn[i] == row + i - begin and trainable[drawn[i]]:
+                    i += 1
+            a, b = row * width, (row + i - begin - 1) * width + columns
+            own = grad[begin * width : begin * width + b - a]
+            _update(parameter[a:b], own, exp_avg[a:b], exp_avg_sq[a:b], rate, correction)
 
 
 def adam_step(

@@ -40,17 +40,17 @@ def add_gradient(
         grad += weight * own.sign() / (sh_steps(own, sh_bits) + own.abs())
         return
     index = np.arange(len(grad)) if rows is None else rows.numpy()
-    steps = sh_steps(shN, sh_bits)[:, 0].numpy()
-    _add(grad.numpy(), shN.detach().numpy(), steps, np.float32(weight), index)
+    steps = np.repeat(sh_steps(shN, sh_bits)[:, 0].numpy(), 3)
+    grads, values = (a.detach().numpy().reshape(len(a), len(steps)) for a in (grad, shN))
+    _add(grads, values, steps, np.float32(weight), index)
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
-def _add(grad, shN, steps, weight, rows):
+def _add(grad, values, steps, weight, rows):
+    zero = np.float32(0)
     for i in prange(len(rows)):
-        for k in range(len(steps)):
-            for c in range(3):
-                value = shN[rows[i], k, c]
-                if value > 0:
-                    grad[i, k, c] += weight / (steps[k] + value)
-                elif value < 0:
-                    grad[i, k, c] -= weight / (steps[k] - value)
+        row = values[rows[i]]
+        for k in range(len(steps)):  # without branches: vectors
+            value = row[k]
+            slope = weight / (steps[k] + abs(value))
+            grad[i, k] += slope if value > zero else (-slope if value < zero else zero)
