@@ -39,7 +39,6 @@ from sagesplat.train.events import Step
 from sagesplat.train.trainer import train
 
 RESULTS = Path(__file__).parent / "results" / "cpu"
-OPENSPLAT_STEP_MS = 1830  # its CPU path (1.1.5) on garden at 512 px from 42,599 points, on a two-core machine
 
 app = tyro.extras.SubcommandApp()
 
@@ -169,8 +168,6 @@ def garden(
         events = train(capture, Photos(capture.views), labels, config)
         result["step_ms"] = measure.milliseconds(lambda: next(e for e in events if isinstance(e, Step)), 40)
     result |= measure.blending(g, camera, repeats) | {"peak_mib": measure.peak_mib()}
-    if (capture.name, camera.width, len(g)) == ("garden", 512, 42_599):
-        result["times_faster_than_opensplat_cpu"] = OPENSPLAT_STEP_MS / result["step_ms"]
     for name, value in result.items():
         print(f"{name:32} {value:,.4g}" if isinstance(value, float) else f"{name:32} {value}")
     _finish(f"{capture.name}_{camera.width}_{steps}", result, write)

@@ -25,6 +25,18 @@ def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *w
     return 0, capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("given", "found"), [(None, "PASSIVE"), ("ACTIVE", "ACTIVE")])
+def test_idle_threads_sleep_unless_the_environment_says_otherwise(given: str | None, found: str) -> None:
+    code = (
+        "import os, sys; from sagesplat.__main__ import program; sys.argv = ['sagesplat', '--version']\n"
+        "try: program()\nfinally: print(os.environ['OMP_WAIT_POLICY'])"
+    )
+    env = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    env |= {} if given is None else {"OMP_WAIT_POLICY": given}
+    done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=False)
+    assert done.stdout.split()[-1] == found
+
+
 @pytest.mark.parametrize(
     ("words", "says"),
     [
