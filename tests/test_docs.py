@@ -22,6 +22,7 @@ FOREIGN = {  # flags of other tools
     *("--only-binary", "--constraint", "--dest", "--require-hashes"),  # pip
     "--fix", "--address", "--generate", "--no-index", "--find-links", "--revision", "--extra", "--upgrade",
     "--decimate",  # splat-transform
+    "--densify-until", "--no-masks",  # OpenSplat
 }  # fmt: skip
 
 FOREIGN_FILES = {"stages/NAME.py", "simple_trainer.py"}  # a placeholder; gsplat's
