@@ -31,8 +31,10 @@ _ROUNDS = 2  # after one, categories whose neighbours moved much would seem to b
 def fit_drawn(job: Job, config: FitConfig) -> dict[int, ViewModel]:
     """Models of fidelity by label id, calibrated at viewpoints that nothing was fitted to."""
     drawn, sampled, confidence = viewpoints_of(job), sampled_of(job), config.confidence
-    fit, bias, calibration = (
-        [drawn.cameras[row] for row in drawn.rows(name)] for name in ("fit", "bias", "calibration")
+    fit = [drawn.cameras[row] for row in drawn.rows("fit")]
+    bias, calibration = (
+        _Compositions(job, [drawn.cameras[row] for row in drawn.rows(name)])
+        for name in ("bias", "calibration")
     )
     models = fit_fidelity(sampled, fit, job.scene.scale, config.min_share, confidence)
     models.pop(UNLABELLED, None)  # has no target and stays in full
@@ -51,14 +53,44 @@ def _trial(
     config: FitConfig,
     models: Mapping[int, ViewModel],
     labels: Sequence[int],
-    cameras: Sequence[Camera],
+    compositions: "_Compositions",
 ) -> Trial:
     """Compositions planned with the models at viewpoints, measured."""
+    cameras = compositions.cameras
     distance = distances_at(job.scene, job.point_labels, cameras, labels, config.distance)
     planned = plan_nominal(models, labels, len(job.ladder.levels), distance, cameras, NOMINAL)
-    fidelity, pixels = compositions_at(job, cameras, planned, "fit")
+    fidelity, pixels = compositions.measure(planned)
     shown = shown_enough(pixels, cameras, config.min_share)
     return Trial(labels, cameras, distance, shown, planned, fidelity)
+
+
+class _Compositions:
+    """Measures compositions at viewpoints, none of them twice: rounds of calibration plan many again."""
+
+    def __init__(self, job: Job, cameras: Sequence[Camera]) -> None:
+        self.cameras = cameras
+        self._job = job
+        self._known: list[dict[tuple[int, ...], np.ndarray]] = [{} for _ in cameras]
+        self._pixels = np.zeros((len(cameras), 0), np.int32)
+
+    def measure(self, planned: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """As `compositions_at`; all calls have the same labels."""
+        wanted = [list(map(tuple, of_view.tolist())) for of_view in planned]
+        new = [sorted(set(some) - set(known)) for some, known in zip(wanted, self._known, strict=True)]
+        rows = [row for row, some in enumerate(new) if some]
+        if rows:
+            most = max(len(new[row]) for row in rows)
+            # what is asked for twice is measured once: filled up to one length
+            asked = np.array([new[row] + new[row][:1] * (most - len(new[row])) for row in rows])
+            cameras = [self.cameras[row] for row in rows]
+            fidelity, pixels = compositions_at(self._job, cameras, asked, "fit")
+            for row, values in zip(rows, fidelity, strict=True):
+                self._known[row] |= dict(zip(new[row], values, strict=False))
+            if not self._pixels.size:  # the first time all are new
+                self._pixels = pixels
+        found = [[known[one] for one in some] for known, some in zip(self._known, wanted, strict=True)]
+        V, J, L = planned.shape
+        return np.array(found, np.float32).reshape(V, J, L + 1), self._pixels
 
 
 def compositions_at(
