@@ -61,5 +61,5 @@ def test_blending_ends_with_one_line_of_json():
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     result = json.loads(done.stdout.splitlines()[-1])
     assert result["threads_1"]["pairs"] > 10_000
-    assert 0 < result["threads_1"]["share_of_peak_forward"] < 1
+    assert result["threads_1"]["share_of_peak_forward"] > 0  # above 1 where another process takes the core
     assert torch.isfinite(torch.tensor(result["scaling_forward"]))

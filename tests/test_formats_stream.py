@@ -282,7 +282,7 @@ def test_a_precision_that_the_format_does_not_have(wrong: dict[str, Any]):
     ("at", "value", "words"),
     [
         (0, b"X", "not a sagesplat-stream"),
-        (4, b"\1", "a stream of version 1, and not 2; repeat `sagesplat nest"),
+        (4, b"\1", "a stream of version 1, and not 2; use the version of sagesplat that wrote it"),
         (4, b"\3", "a stream of version 3"),
         (5, b"\4", "unknown flags 4"),
         (6, b"\4", "degree 4"),
