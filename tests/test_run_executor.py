@@ -182,9 +182,11 @@ def test_observations_and_fits_are_the_same_bit_for_bit(finished: Path, tmp_path
     observe_levels(job, CONFIG.fit)
     sample_levels(job, CONFIG.sample, CONFIG.fit)
     fit_ladder(job, CONFIG.fit)
-    trials = 3 * 4 + 2 * 6  # of compositions, at 4 viewpoints and at 20
+    trials = 3 * 4 + 2 * 6  # of compositions, at 4 viewpoints and at 20, less what is known already
     assert executor.names[:12] == ["observe"] * 6 + ["sample"] * 6
-    assert executor.names[12:] == ["fit"] * (6 + len(job.scene.calibration_ids) + trials)
+    others = 6 + len(job.scene.calibration_ids)
+    assert set(executor.names[12:]) == {"fit"}
+    assert others + 4 + 6 <= len(executor.names[12:]) <= others + trials
     before = RunDir(finished)
     for name in ("observations", "models", "promises", "viewpoints", "sampled", "fidelity"):
         assert getattr(job.run, name).read_bytes() == getattr(before, name).read_bytes(), name
