@@ -223,8 +223,8 @@ def decode_stream(
             raise ValueError(f"{len(content) - at} bytes after the last level")
     except OtherVersionError as error:
         raise DataError(
-            f"{name}: {error}; use the version of sagesplat that wrote it, or delete its folder and repeat the "
-            "run from `sagesplat nest RUN` on"
+            f"{name}: {error}; use the version of sagesplat that wrote it, or delete its folder and repeat "
+            "the run from `sagesplat nest RUN` on"
         ) from None
     except ValueError as error:
         raise DataError(f"{name}: a damaged stream ({short(error)}); copy it again") from None
