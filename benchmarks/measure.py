@@ -58,7 +58,7 @@ def peak_gflops() -> float:
 @njit(cache=True)
 def _count_pairs(records, starts, ends, ids, tiles_x):
     """Pairs of a pixel and a Gaussian that blending evaluates."""
-    batch, rows = np.zeros((16, blend.RECORD), np.float32), np.empty((2, 16), np.float32)
+    batch, rows = np.zeros((16, blend.BATCHED), np.float32), np.empty((2, 16), np.float32)
     pairs = 0
     for tile in range(len(ends)):
         x0, y0 = np.float32(tile % tiles_x * blend.TILE), np.float32(tile // tiles_x * blend.TILE)

@@ -19,6 +19,7 @@ from sagesplat.kernels.simd import (
     load16,
     maximum,
     minimum,
+    scatter,
     splat16,
     spread16,
     sqrt,
@@ -33,15 +34,19 @@ PIXELS = TILE * TILE
 _BATCH = 16  # intersections between two looks whether a tile is opaque
 _CHUNK = 256  # Gaussians that a thread takes at a time
 RECORD = 11
+BATCHED = RECORD + 1  # of a batch: rows of a stretch (see `_first_row`)
 SUMS = 9  # per intersection: colour r, g, b, then gq times 1, dx, dy, dx^2, dx dy, dy^2
 
 _F = np.float32
 _LOG2_ALPHA_MIN = _F(np.log2(ALPHA_MIN))
-_ALPHA_MAX = _F(ALPHA_MAX)
+_ALPHA_MIN, _ALPHA_MAX = _F(ALPHA_MIN), _F(ALPHA_MAX)
 _T_MIN = _F(TRANSMITTANCE_MIN)
 _ONE, _ZERO, _HALF = _F(1), _F(0), _F(0.5)
 _TO_CONIC = _F(-2.0 / np.log2(np.e))  # of the exponent factors A, C, B / 2
 _CENTRES = np.arange(TILE, dtype=np.float32) + _HALF
+_FAR = _F(-100)  # log2 alpha from which no row of a stretch is seen
+_STRETCH = _F(7.1)  # times 1 / sqrt(-C): so many rows raise log2 alpha from -100 to less than -8
+_LONGEST = _F(8)  # rows of a stretch: more would add to the error
 _SHARED = 6 * PIXELS  # where a Gaussian's values that depend on the row alone lie
 
 
@@ -55,15 +60,16 @@ def gather_batch(records, ids, first, last, x0, y0, batch, rows):
         for value in range(RECORD):
             batch[j, value] = records[ids[first + j], value]
     for j in range(0, _BATCH, 8):
-        at = j * RECORD
-        mx, my = gather(batch, at, RECORD), gather(batch, at + 1, RECORD)
-        a, b, c = gather(batch, at + 2, RECORD), gather(batch, at + 3, RECORD), gather(batch, at + 4, RECORD)
-        width, height = gather(batch, at + 9, RECORD), gather(batch, at + 10, RECORD)
+        at, step = j * BATCHED, BATCHED
+        mx, my = gather(batch, at, step), gather(batch, at + 1, step)
+        a, b, c = gather(batch, at + 2, step), gather(batch, at + 3, step), gather(batch, at + 4, step)
+        width, height = gather(batch, at + 9, step), gather(batch, at + 10, step)
+        scatter(batch, at + RECORD, step, maximum(minimum(floor(_STRETCH / sqrt(-c)), _LONGEST), _ONE))
         left = x0 + _HALF - mx
         right = left + (TILE - 1)
         top = -b * height / (a + a)
         high, low = minimum(maximum(top, left), right), minimum(maximum(-top, left), right)
-        steep = (gather(batch, at + 5, RECORD) - _LOG2_ALPHA_MIN + 1e-3) / -c
+        steep = (gather(batch, at + 5, step) - _LOG2_ALPHA_MIN + 1e-3) / -c
         slack = 0.01 + 1e-3 * sqrt(steep)  # rounding, several times over
         high_part, low_part = high / width, low / width
         up = sqrt(maximum(steep * (_ONE - high_part * high_part), _ZERO)) + slack
@@ -90,27 +96,48 @@ def _most(s):
     return largest(most)
 
 
+@njit(forceinline=True, cache=True)
+def _share_rows(s, lines, my, c):
+    """What all columns have in common: 2^(C k^2) of the k-th row of a stretch, and dy of each row."""
+    k = load16(_CENTRES, 0) - _HALF
+    store(s, _SHARED, exp2(k * k * c))
+    store(s, _SHARED + TILE, lines - my)
+
+
+@njit(forceinline=True, cache=True)
+def _first_row(s, row, dx, a, b, c, log_opacity):
+    """Alpha in the first row of a stretch, and the power p with which it goes on.
+
+    k rows below, alpha is that times p^k 2^(C k^2): no exponential for each row. Columns in which no row of
+    the stretch is seen have 0, so that nothing overflows.
+    """
+    dy = s[_SHARED + TILE + row]
+    q = dx * (dx * a + dy * b) + (dy * dy * c + log_opacity)
+    slope = dx * b + (c + c) * dy
+    lowest = where(slope > _ZERO, splat16(_FAR), splat16(_LOG2_ALPHA_MIN))
+    return where(q >= lowest, exp2(q), _ZERO), exp2(slope)
+
+
 @njit(error_model="numpy", cache=True)
-def _blend(s, lo, hi, columns, lines, mx, my, a, b, c, log_opacity, red, green, blue):
+def _blend(s, lo, hi, columns, lines, mx, my, a, b, c, log_opacity, red, green, blue, stretch):
     """Blend one Gaussian into rows lo..hi of a tile; planes of s: T, r, g, b, what rows share."""
     dx = columns - mx
-    adx = dx * a
-    dy = lines - my
-    store(s, _SHARED, dy * b)
-    store(s, _SHARED + TILE, dy * dy * c + log_opacity)
-    q = dx * (adx + spread16(s, _SHARED + lo)) + spread16(s, _SHARED + TILE + lo)
-    raw = exp2(q)
-    for row in range(lo, hi):
-        p = row * TILE
-        left = load16(s, p)
-        seen = (q >= _LOG2_ALPHA_MIN) & (left >= _T_MIN)
-        weight = where(seen, minimum(raw, _ALPHA_MAX) * left, _ZERO)
-        q = dx * (adx + spread16(s, _SHARED + 1 + row)) + spread16(s, _SHARED + TILE + 1 + row)
-        raw = exp2(q)
-        store(s, p, left - weight)
-        store(s, p + PIXELS, load16(s, p + PIXELS) + weight * red)
-        store(s, p + 2 * PIXELS, load16(s, p + 2 * PIXELS) + weight * green)
-        store(s, p + 3 * PIXELS, load16(s, p + 3 * PIXELS) + weight * blue)
+    _share_rows(s, lines, my, c)
+    while lo < hi:
+        power, ratio = _first_row(s, lo, dx, a, b, c, log_opacity)
+        end = min(lo + int(stretch), hi)
+        for row in range(lo, end):
+            p = row * TILE
+            left = load16(s, p)
+            raw = power * spread16(s, _SHARED + row - lo)
+            seen = (raw >= _ALPHA_MIN) & (left >= _T_MIN)
+            weight = where(seen, minimum(raw, _ALPHA_MAX) * left, _ZERO)
+            power = power * ratio
+            store(s, p, left - weight)
+            store(s, p + PIXELS, load16(s, p + PIXELS) + weight * red)
+            store(s, p + 2 * PIXELS, load16(s, p + 2 * PIXELS) + weight * green)
+            store(s, p + 3 * PIXELS, load16(s, p + 3 * PIXELS) + weight * blue)
+        lo = end
 
 
 @njit(parallel=True, cache=True)
@@ -123,7 +150,7 @@ def forward(records, starts, ids, row_order, width, height, background, image, l
     tiles_x = (width + TILE - 1) // TILE
     for r in prange(len(row_order)):
         state = _scratch()
-        batch, rows = np.zeros((_BATCH, RECORD), np.float32), np.empty((2, _BATCH), np.float32)
+        batch, rows = np.zeros((_BATCH, BATCHED), np.float32), np.empty((2, _BATCH), np.float32)
         for column in range(tiles_x):
             tile, row0, column0 = row_order[r] * tiles_x + column, row_order[r] * TILE, column * TILE
             x0, y0 = _F(column0), _F(row0)
@@ -140,6 +167,7 @@ def forward(records, starts, ids, row_order, width, height, background, image, l
                         _blend(
                             state, lo, hi, columns, lines, batch[j, 0], batch[j, 1], batch[j, 2],
                             batch[j, 3], batch[j, 4], batch[j, 5], batch[j, 6], batch[j, 7], batch[j, 8],
+                            batch[j, RECORD],
                         )  # fmt: skip
             ends[tile] = end
             for y in range(row0, min(row0 + TILE, height)):
@@ -152,30 +180,30 @@ def forward(records, starts, ids, row_order, width, height, background, image, l
 
 
 @njit(error_model="numpy", cache=True)
-def _pass(s, lo, hi, columns, lines, mx, my, a, b, c, log_opacity, red, green, blue):
+def _pass(s, lo, hi, columns, lines, mx, my, a, b, c, log_opacity, red, green, blue, stretch):
     """What `_gradient` does to the planes, for a Gaussian whose own gradient nobody asks for."""
     dx = columns - mx
-    adx = dx * a
-    dy = lines - my
-    store(s, _SHARED, dy * b)
-    store(s, _SHARED + TILE, dy * dy * c + log_opacity)
-    q = dx * (adx + spread16(s, _SHARED + lo)) + spread16(s, _SHARED + TILE + lo)
-    raw = exp2(q)
-    for row in range(lo, hi):
-        p = row * TILE
-        left = load16(s, p)
-        weight = where((q >= _LOG2_ALPHA_MIN) & (left >= _T_MIN), minimum(raw, _ALPHA_MAX) * left, _ZERO)
-        g0, g1, g2 = load16(s, p + 2 * PIXELS), load16(s, p + 3 * PIXELS), load16(s, p + 4 * PIXELS)
-        value = g0 * red + g1 * green + g2 * blue + load16(s, p + 5 * PIXELS)
-        store(s, p + PIXELS, load16(s, p + PIXELS) - weight * value)
-        store(s, p, left - weight)
-        q = dx * (adx + spread16(s, _SHARED + 1 + row)) + spread16(s, _SHARED + TILE + 1 + row)
-        raw = exp2(q)
+    _share_rows(s, lines, my, c)
+    while lo < hi:
+        power, ratio = _first_row(s, lo, dx, a, b, c, log_opacity)
+        end = min(lo + int(stretch), hi)
+        for row in range(lo, end):
+            p = row * TILE
+            left = load16(s, p)
+            raw = power * spread16(s, _SHARED + row - lo)
+            seen = (raw >= _ALPHA_MIN) & (left >= _T_MIN)
+            weight = where(seen, minimum(raw, _ALPHA_MAX) * left, _ZERO)
+            power = power * ratio
+            g0, g1, g2 = load16(s, p + 2 * PIXELS), load16(s, p + 3 * PIXELS), load16(s, p + 4 * PIXELS)
+            value = g0 * red + g1 * green + g2 * blue + load16(s, p + 5 * PIXELS)
+            store(s, p + PIXELS, load16(s, p + PIXELS) - weight * value)
+            store(s, p, left - weight)
+        lo = end
 
 
 @njit(error_model="numpy", cache=True)
 def _gradient(
-    s, lo, hi, columns, lines, mx, my, a, b, c, log_opacity, red, green, blue, sums, absolute, slot
+    s, lo, hi, columns, lines, mx, my, a, b, c, log_opacity, red, green, blue, stretch, sums, absolute, slot
 ):
     """One Gaussian's gradient sums over rows lo..hi; walks front to back.
 
@@ -183,40 +211,38 @@ def _gradient(
     (or None) receives the sums of |dL/d mean|.
     """
     dx = columns - mx
-    adx = dx * a
-    dy = lines - my
-    store(s, _SHARED, dy * b)
-    store(s, _SHARED + TILE, dy * dy * c + log_opacity)
-    store(s, _SHARED + 2 * TILE, dy)
+    _share_rows(s, lines, my, c)
     s0 = s1 = s2 = r0 = r1 = r2 = across = up = splat16(_ZERO)
-    q = dx * (adx + spread16(s, _SHARED + lo)) + spread16(s, _SHARED + TILE + lo)
-    raw = exp2(q)
-    for row in range(lo, hi):
-        p = row * TILE
-        left = load16(s, p)
-        # lanes that are not seen may hold any value, also ones that are slow to compute with
-        alpha = where((q >= _LOG2_ALPHA_MIN) & (left >= _T_MIN), minimum(raw, _ALPHA_MAX), _ZERO)
-        weight = alpha * left
-        g0, g1, g2 = load16(s, p + 2 * PIXELS), load16(s, p + 3 * PIXELS), load16(s, p + 4 * PIXELS)
-        value = g0 * red + g1 * green + g2 * blue + load16(s, p + 5 * PIXELS)
-        rest = load16(s, p + PIXELS) - weight * value
-        store(s, p + PIXELS, rest)
-        store(s, p, left - weight)
-        gq = where(raw < _ALPHA_MAX, alpha * (left * value - rest / (_ONE - alpha)), _ZERO)
-        q = dx * (adx + spread16(s, _SHARED + 1 + row)) + spread16(s, _SHARED + TILE + 1 + row)
-        raw = exp2(q)
-        s0 = s0 + weight * g0
-        s1 = s1 + weight * g1
-        s2 = s2 + weight * g2
-        r0 = r0 + gq
-        down = spread16(s, _SHARED + 2 * TILE + row)
-        along = gq * down
-        r1 = r1 + along
-        r2 = r2 + along * down
-        if absolute is not None:
-            by_x, by_y = (dx * a + down * (b * _HALF)) * gq, (dx * (b * _HALF) + down * c) * gq
-            across = across + maximum(by_x, -by_x)
-            up = up + maximum(by_y, -by_y)
+    while lo < hi:
+        power, ratio = _first_row(s, lo, dx, a, b, c, log_opacity)
+        end = min(lo + int(stretch), hi)
+        for row in range(lo, end):
+            p = row * TILE
+            left = load16(s, p)
+            raw = power * spread16(s, _SHARED + row - lo)
+            # lanes that are not seen may hold any value, also ones that are slow to compute with
+            alpha = where((raw >= _ALPHA_MIN) & (left >= _T_MIN), minimum(raw, _ALPHA_MAX), _ZERO)
+            power = power * ratio
+            weight = alpha * left
+            g0, g1, g2 = load16(s, p + 2 * PIXELS), load16(s, p + 3 * PIXELS), load16(s, p + 4 * PIXELS)
+            value = g0 * red + g1 * green + g2 * blue + load16(s, p + 5 * PIXELS)
+            rest = load16(s, p + PIXELS) - weight * value
+            store(s, p + PIXELS, rest)
+            store(s, p, left - weight)
+            gq = where(raw < _ALPHA_MAX, alpha * (left * value - rest / (_ONE - alpha)), _ZERO)
+            s0 = s0 + weight * g0
+            s1 = s1 + weight * g1
+            s2 = s2 + weight * g2
+            r0 = r0 + gq
+            down = spread16(s, _SHARED + TILE + row)
+            along = gq * down
+            r1 = r1 + along
+            r2 = r2 + along * down
+            if absolute is not None:
+                by_x, by_y = (dx * a + down * (b * _HALF)) * gq, (dx * (b * _HALF) + down * c) * gq
+                across = across + maximum(by_x, -by_x)
+                up = up + maximum(by_y, -by_y)
+        lo = end
     if absolute is not None:
         absolute[slot, 0], absolute[slot, 1] = total(across) * -_TO_CONIC, total(up) * -_TO_CONIC
     rdx = r0 * dx
@@ -237,7 +263,7 @@ def backward(
     tiles_x = (width + TILE - 1) // TILE
     for r in prange(len(row_order)):
         state = _scratch()
-        batch, rows = np.zeros((_BATCH, RECORD), np.float32), np.empty((2, _BATCH), np.float32)
+        batch, rows = np.zeros((_BATCH, BATCHED), np.float32), np.empty((2, _BATCH), np.float32)
         for column in range(tiles_x):
             tile, row0, column0 = row_order[r] * tiles_x + column, row_order[r] * TILE, column * TILE
             for k in range(ends[tile], starts[tile + 1]):
@@ -269,12 +295,13 @@ def backward(
                         _gradient(
                             state, lo, hi, columns, lines, batch[j, 0], batch[j, 1], batch[j, 2],
                             batch[j, 3], batch[j, 4], batch[j, 5], batch[j, 6], batch[j, 7], batch[j, 8],
-                            sums, absolute, slot,
+                            batch[j, RECORD], sums, absolute, slot,
                         )  # fmt: skip
                     elif lo < hi:
                         _pass(
                             state, lo, hi, columns, lines, batch[j, 0], batch[j, 1], batch[j, 2],
                             batch[j, 3], batch[j, 4], batch[j, 5], batch[j, 6], batch[j, 7], batch[j, 8],
+                            batch[j, RECORD],
                         )  # fmt: skip
                     else:
                         sums[slot] = _ZERO
@@ -291,7 +318,7 @@ def weigh(records, starts, ids, slots, row_order, width, height, columns_of, sum
     tiles_x, num_columns = (width + TILE - 1) // TILE, sums.shape[1]
     for r in prange(len(row_order)):
         state, masks = _scratch(), np.zeros(num_columns * PIXELS, np.float32)
-        batch, rows = np.zeros((_BATCH, RECORD), np.float32), np.empty((2, _BATCH), np.float32)
+        batch, rows = np.zeros((_BATCH, BATCHED), np.float32), np.empty((2, _BATCH), np.float32)
         present = np.zeros(num_columns, np.bool_)
         for column in range(tiles_x):
             tile, row0, column0 = row_order[r] * tiles_x + column, row_order[r] * TILE, column * TILE
@@ -318,7 +345,7 @@ def weigh(records, starts, ids, slots, row_order, width, height, columns_of, sum
                     if lo < hi:
                         _blend(
                             state, lo, hi, columns, lines, batch[j, 0], batch[j, 1], batch[j, 2],
-                            batch[j, 3], batch[j, 4], batch[j, 5], _ONE, _ZERO, _ZERO,
+                            batch[j, 3], batch[j, 4], batch[j, 5], _ONE, _ZERO, _ZERO, batch[j, RECORD],
                         )  # fmt: skip
                     for of in range(num_columns):
                         added = splat16(_ZERO)
