@@ -23,6 +23,7 @@ from benchmarks import plans as planning
 from benchmarks import promises as promising
 from benchmarks import segment as overlays
 from benchmarks import size as sizing
+from benchmarks import whole as whole_runs
 from benchmarks import wild as disturbed
 from benchmarks.gpu import base, script
 from sagesplat.core.config import TrainConfig
@@ -171,6 +172,37 @@ def garden(
     for name, value in result.items():
         print(f"{name:32} {value:,.4g}" if isinstance(value, float) else f"{name:32} {value}")
     _finish(f"{capture.name}_{camera.width}_{steps}", result, write)
+
+
+@app.command
+def whole(
+    scene: Path,
+    out: Path | None = None,
+    downscale: int = 1,
+    steps: int = 3000,
+    threads: int = 0,
+    sources: tuple[Path, ...] = (whole_runs.HERE,),
+    repeats: int = 1,
+    write: bool = False,
+) -> None:
+    """Seconds of `sagesplat run` by stage.
+
+    Args:
+        scene: capture.
+        out: folder for the runs; what is done is not done again (default: one that is removed afterwards).
+        downscale: of the photos.
+        steps: of training.
+        threads: 0: one per core.
+        sources: checkouts of the package, which take turns (`git worktree add`).
+        repeats: of each.
+        write: keep the results.
+    """
+    options = ["--downscale", str(downscale), "--train.max-steps", str(steps), "--threads", str(threads)]
+    with tempfile.TemporaryDirectory() as folder:
+        found = whole_runs.measure(scene.resolve(), out or Path(folder), sources, repeats, options)
+    print(*whole_runs.table(found), sep="\n")
+    result = {"scene": scene.name, "downscale": downscale, "steps": steps, "threads": threads, "runs": found}
+    _finish(f"whole_{scene.name}", result, write)
 
 
 @app.command
