@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float32, Int, Int16, Int32
 
 from sagesplat.adapt.ladder import Ladder
 from sagesplat.adapt.observe import PERCENTILE, RenderedLabels, distances_in_views, render_rgb
+from sagesplat.adapt.seen import Sight
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.files import atomic_path
@@ -20,6 +21,8 @@ from sagesplat.io.npz import Npz
 from sagesplat.metrics.image import means_by_label, ssim_map
 from sagesplat.raster import Backend, Workspace, device_of
 from sagesplat.scene.scene import Camera, Scene, View
+
+_FEW = 5  # compositions at a viewpoint
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,16 +71,17 @@ def measure_levels(
         fidelity of the whole image [V, K].
     """
     labels = sorted({label for label, _ in ladder.counts})
-    levels = [ladder.load(level).to(device_of(backend)) for level in ladder.levels]
-    probe = _Probe(levels[-1], labels, backend, antialiased)
-    found = np.full((len(cameras), len(labels), len(levels)), np.nan, np.float32)
+    probe = _Probe(ladder, labels, backend, antialiased)
+    found = np.full((len(cameras), len(labels), len(ladder.levels)), np.nan, np.float32)
     pixels = np.zeros(found.shape[:2], np.int32)
-    whole = np.ones((len(cameras), len(levels)), np.float32)
+    whole = np.ones((len(cameras), len(ladder.levels)), np.float32)
     for row, camera in enumerate(cameras):
         full, label_ids = probe.reference(camera)
         pixels[row] = [(label_ids == label).sum() for label in labels]
         found[row, pixels[row] > 0, -1] = 1.0
-        for column, g in enumerate(levels[:-1]):
+        sight = probe.sight.of(camera)
+        for column, level in enumerate(ladder.levels[:-1]):
+            g = sight.compose(dict.fromkeys(labels, level))
             found[row, :, column], whole[row, column] = probe.compare(g, camera, full, label_ids)
         if progress:
             progress(row + 1, len(cameras))
@@ -99,19 +103,21 @@ def measure_compositions(
     then come the pixels of each category. The other arguments are those of `measure_levels`.
     """
     labels = sorted({label for label, _ in ladder.counts})
-    probe = _Probe(ladder.load(ladder.levels[-1]).to(device_of(backend)), labels, backend, antialiased)
+    probe = _Probe(ladder, labels, backend, antialiased)
     found = np.full((*planned.shape[:2], len(labels) + 1), np.nan, np.float32)
     pixels = np.zeros((len(cameras), len(labels)), np.int32)
     for row, camera in enumerate(cameras):
         full, label_ids = probe.reference(camera)
         pixels[row] = [(label_ids == label).sum() for label in labels]
-        known: dict[tuple[int, ...], int] = {}
+        # fewer are composed in the time that it takes to find what is in sight
+        few = len(set(map(tuple, planned[row].tolist()))) < _FEW
+        sight, known = ladder if few else probe.sight.of(camera), {}
         for column, levels in enumerate(map(tuple, planned[row].tolist())):
             if levels in known:
                 found[row, column] = found[row, known[levels]]
                 continue
             known[levels] = column
-            g = ladder.compose(dict(zip(labels, levels, strict=True))).to(device_of(backend))
+            g = sight.compose(dict(zip(labels, levels, strict=True)))
             found[row, column, :-1], found[row, column, -1] = probe.compare(g, camera, full, label_ids)
         if progress:
             progress(row + 1, len(cameras))
@@ -121,10 +127,12 @@ def measure_compositions(
 class _Probe:
     """Compares compositions with the full model."""
 
-    def __init__(self, full: Gaussians, labels: Sequence[int], backend: Backend, antialiased: bool):
+    def __init__(self, ladder: Ladder, labels: Sequence[int], backend: Backend, antialiased: bool):
         self.labels, self.antialiased = labels, antialiased
         self.backend: Backend = backend
+        full = ladder.load(ladder.levels[-1]).to(device_of(backend))
         self.painted = RenderedLabels(full, backend, antialiased)
+        self.sight = Sight(ladder, backend, antialiased)
         self.workspace = Workspace()
 
     def reference(self, camera: Camera) -> tuple[Float32[np.ndarray, "H W 3"], Int16[np.ndarray, "H W"]]:
