@@ -8,10 +8,10 @@ import torch
 from conftest import pinhole, random_gaussians
 
 from sagesplat.adapt.ladder import PrefixLadder
-from sagesplat.adapt.seen import SeenLevels, Sight
+from sagesplat.adapt.seen import seen_from
 from sagesplat.core.second_opacity import SecondOpacities
 from sagesplat.formats.levels import write_set
-from sagesplat.raster import rasterize
+from sagesplat.raster import Workspace, in_sight, most_painted, rasterize
 
 
 @pytest.mark.parametrize("two", [False, True])
@@ -24,9 +24,8 @@ def test_compositions_render_alike(tmp_path, two, antialiased):
     write_set(tmp_path / "ladder.npz", g, 1, sizes, second=second)
     ladder = PrefixLadder(tmp_path / "ladder.npz", sizes)
     camera = pinhole(70, 50)
-    seen = Sight(ladder, "cpu", antialiased).of(camera)
-    assert isinstance(seen, SeenLevels)
-    assert len(seen.gaussians) < 300
+    seen = seen_from(ladder, camera, backend="cpu", antialiased=antialiased, workspace=Workspace())
+    assert 0 < seen.nbytes == 60 * len(seen.gaussians) < 60 * 300
     assert seen.gaussians.sh_degree == 0 < g.sh_degree
     for levels in ({3: 1, 7: 1}, {3: 3, 7: 2}, {7: 3, 3: 2}, {3: 3, 7: 3}, {7: 1}):
         expected, actual = (
@@ -34,3 +33,22 @@ def test_compositions_render_alike(tmp_path, two, antialiased):
         )
         np.testing.assert_allclose(actual, expected, atol=2e-6)
         assert len(seen.compose(levels)) <= len(ladder.compose(levels))
+
+
+def test_what_is_in_sight_is_what_has_a_radius():
+    g, camera = random_gaussians(200), pinhole(40, 30)
+    seen = in_sight(g, camera)
+    assert (seen == (rasterize(g, camera).radii > 0)).all()
+    assert 0 < seen.sum() < 200
+
+
+@pytest.mark.parametrize("size", [(40, 30), (33, 47)])
+def test_labels_that_paint_most_are_those_of_features(size):
+    g, columns = random_gaussians(150, logit=2.0), torch.arange(150) % 5
+    painted = most_painted(g, pinhole(*size), columns, 6)
+    expected = most_painted(g, pinhole(*size), columns, 6, backend="reference")
+    assert painted.shape == expected.shape == size[::-1]
+    assert (painted == expected).mean() > 0.999  # what is equal but for rounding
+    assert len(np.unique(painted)) == 5
+    nothing = most_painted(g.select(torch.zeros(150, dtype=torch.bool)), pinhole(*size), columns[:0], 6)
+    assert (nothing == 0).all()

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Int16, Int32
 
-from sagesplat.adapt.ladder import Ladder
+from sagesplat.adapt.ladder import Ladder, PrefixLadder
 from sagesplat.adapt.observe import PERCENTILE, RenderedLabels, distances_in_views, render_rgb
-from sagesplat.adapt.seen import Sight
+from sagesplat.adapt.seen import SeenLevels, seen_from
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.files import atomic_path
@@ -22,7 +22,7 @@ from sagesplat.metrics.image import means_by_label, ssim_map
 from sagesplat.raster import Backend, Workspace, device_of
 from sagesplat.scene.scene import Camera, Scene, View
 
-_FEW = 5  # compositions at a viewpoint
+_KEEP = 10**9  # bytes of references that are kept
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,19 +70,18 @@ def measure_levels(
         fidelity [V, L, K] of the labels in ascending order, NaN where one is not in sight; pixels [V, L];
         fidelity of the whole image [V, K].
     """
-    labels = sorted({label for label, _ in ladder.counts})
-    probe = _Probe(ladder, labels, backend, antialiased)
+    references = References(ladder, backend, antialiased, keep=0)
+    labels = references.labels
     found = np.full((len(cameras), len(labels), len(ladder.levels)), np.nan, np.float32)
     pixels = np.zeros(found.shape[:2], np.int32)
     whole = np.ones((len(cameras), len(ladder.levels)), np.float32)
     for row, camera in enumerate(cameras):
-        full, label_ids = probe.reference(camera)
-        pixels[row] = [(label_ids == label).sum() for label in labels]
+        at = references.at(camera)
+        pixels[row] = at.pixels
         found[row, pixels[row] > 0, -1] = 1.0
-        sight = probe.sight.of(camera)
         for column, level in enumerate(ladder.levels[:-1]):
-            g = sight.compose(dict.fromkeys(labels, level))
-            found[row, :, column], whole[row, column] = probe.compare(g, camera, full, label_ids)
+            g = at.levels.compose(dict.fromkeys(labels, level))
+            found[row, :, column], whole[row, column] = references.compare(g, camera, at)
         if progress:
             progress(row + 1, len(cameras))
     return found, pixels, whole
@@ -96,58 +95,87 @@ def measure_compositions(
     backend: Backend = "auto",
     antialiased: bool = False,
     progress: Callable[[int, int], None] | None = None,
+    references: "References | None" = None,
 ) -> tuple[Float32[np.ndarray, "V J L+1"], Int32[np.ndarray, "V L"]]:
     """Measure the fidelity of each category in J compositions at each of V viewpoints.
 
     `planned`: level (1 to K) of each label, ascending by id. The result's last column is the whole image;
-    then come the pixels of each category. The other arguments are those of `measure_levels`.
+    then come the pixels of each category. `references` are kept from call to call. The other arguments are
+    those of `measure_levels`.
     """
-    labels = sorted({label for label, _ in ladder.counts})
-    probe = _Probe(ladder, labels, backend, antialiased)
+    references = references or References(ladder, backend, antialiased)
+    labels = references.labels
     found = np.full((*planned.shape[:2], len(labels) + 1), np.nan, np.float32)
     pixels = np.zeros((len(cameras), len(labels)), np.int32)
     for row, camera in enumerate(cameras):
-        full, label_ids = probe.reference(camera)
-        pixels[row] = [(label_ids == label).sum() for label in labels]
-        # fewer are composed in the time that it takes to find what is in sight
-        few = len(set(map(tuple, planned[row].tolist()))) < _FEW
-        sight, known = ladder if few else probe.sight.of(camera), {}
+        at, known = references.at(camera), {}
+        pixels[row] = at.pixels
         for column, levels in enumerate(map(tuple, planned[row].tolist())):
             if levels in known:
                 found[row, column] = found[row, known[levels]]
                 continue
             known[levels] = column
-            g = sight.compose(dict(zip(labels, levels, strict=True)))
-            found[row, column, :-1], found[row, column, -1] = probe.compare(g, camera, full, label_ids)
+            g = at.levels.compose(dict(zip(labels, levels, strict=True)))
+            found[row, column, :-1], found[row, column, -1] = references.compare(g, camera, at)
         if progress:
             progress(row + 1, len(cameras))
     return found, pixels
 
 
-class _Probe:
-    """Compares compositions with the full model."""
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """The full model from one viewpoint, and what its levels are composed of there."""
 
-    def __init__(self, ladder: Ladder, labels: Sequence[int], backend: Backend, antialiased: bool):
-        self.labels, self.antialiased = labels, antialiased
-        self.backend: Backend = backend
+    image: Float32[np.ndarray, "H W 3"]
+    label_ids: Int16[np.ndarray, "H W"]
+    pixels: Int32[np.ndarray, " L"]  # of each label, ascending
+    levels: Ladder | SeenLevels
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that it holds, about."""
+        seen = self.levels.nbytes if isinstance(self.levels, SeenLevels) else 0
+        return self.image.nbytes + self.label_ids.nbytes + seen
+
+
+class References:
+    """Compares compositions with the full model; what a viewpoint needs is kept as far as memory allows."""
+
+    def __init__(self, ladder: Ladder, backend: Backend, antialiased: bool, keep: int = _KEEP):
+        """`antialiased`: how the model was trained; `keep`: bytes."""
+        self.labels = sorted({label for label, _ in ladder.counts})
+        self._ladder, self._antialiased, self._left = ladder, antialiased, keep
+        self._backend: Backend = backend
         full = ladder.load(ladder.levels[-1]).to(device_of(backend))
-        self.painted = RenderedLabels(full, backend, antialiased)
-        self.sight = Sight(ladder, backend, antialiased)
-        self.workspace = Workspace()
+        self._painted = RenderedLabels(full, backend, antialiased)
+        self._workspace, self._kept = Workspace(), {}
 
-    def reference(self, camera: Camera) -> tuple[Float32[np.ndarray, "H W 3"], Int16[np.ndarray, "H W"]]:
-        """The full model's image and label image."""
-        return self.painted.paint(camera)
+    def at(self, camera: Camera) -> Reference:
+        """The full model's image and label image, and its levels, from a viewpoint."""
+        key = camera.w2c.tobytes(), camera.K.tobytes(), camera.width, camera.height, camera.background
+        if key in self._kept:
+            return self._kept[key]
+        image, label_ids = self._painted.paint(camera)
+        pixels = np.array([(label_ids == label).sum() for label in self.labels], np.int32)
+        levels: Ladder | SeenLevels = self._ladder
+        if isinstance(self._ladder, PrefixLadder):
+            levels = seen_from(
+                self._ladder, camera, backend=self._backend, antialiased=self._antialiased,
+                workspace=self._workspace,
+            )  # fmt: skip
+        found = Reference(image, label_ids, pixels, levels)
+        if found.nbytes <= self._left:
+            self._left -= found.nbytes
+            self._kept[key] = found
+        return found
 
-    def compare(
-        self, g: Gaussians, camera: Camera, full: np.ndarray, label_ids: np.ndarray
-    ) -> tuple[Float32[np.ndarray, " L"], float]:
+    def compare(self, g: Gaussians, camera: Camera, at: Reference) -> tuple[Float32[np.ndarray, " L"], float]:
         """Fidelity by label, NaN where one is not in sight, and of the whole image."""
         image = render_rgb(
-            g, camera, backend=self.backend, antialiased=self.antialiased, workspace=self.workspace
+            g, camera, backend=self._backend, antialiased=self._antialiased, workspace=self._workspace
         )
-        quality = ssim_map(image, full)
-        means = means_by_label(quality, label_ids)
+        quality = ssim_map(image, at.image)
+        means = means_by_label(quality, at.label_ids)
         by_label = [means[label][0] if label in means else np.nan for label in self.labels]
         return np.array(by_label, np.float32), float(quality.mean())
 

@@ -18,7 +18,7 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.columns import from_rows, read_columns, write_columns
 from sagesplat.metrics.color_correct import color_correct_affine
 from sagesplat.metrics.image import means_by_label, pasted, psnr, squared_error_map, ssim_map
-from sagesplat.raster import Backend, Workspace, device_of, rasterize
+from sagesplat.raster import Backend, Workspace, device_of, most_painted, rasterize
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene, View
 from sagesplat.segment.masks import UNLABELLED
@@ -145,6 +145,7 @@ class RenderedLabels:
     backend: Backend = "auto"
     antialiased: bool = False
     _kept: dict[str, Int16[np.ndarray, "H W"]] = field(default_factory=dict)
+    _workspace: Workspace = field(default_factory=Workspace)
 
     def __getitem__(self, view: View) -> Int16[np.ndarray, "H W"]:
         """Per pixel the category that paints most of it; -1 where more shines through than that."""
@@ -158,24 +159,19 @@ class RenderedLabels:
 
     def paint(self, camera: Camera) -> tuple[Float32[np.ndarray, "H W 3"], Int16[np.ndarray, "H W"]]:
         """An image as of `render_rgb`, and the label image, in one pass."""
-        ids, one_hot = self._one_hot
+        ids, columns = self._columns
         g = self.gaussians.to(device_of(self.backend))
-        with torch.no_grad():
-            render = rasterize(
-                g, camera, features=one_hot, backend=self.backend, antialiased=self.antialiased
-            )
-        assert render.features is not None
-        painted = render.features.float().cpu().numpy().copy()
-        painted[..., 0] += 1 - render.alpha.float().cpu().numpy()
-        return render.rgb.clamp(0, 1).float().cpu().numpy(), ids[painted.argmax(-1)]
+        how = {"antialiased": self.antialiased, "backend": self.backend, "workspace": self._workspace}
+        image = render_rgb(g, camera, **how)
+        return image, ids[most_painted(g, camera, columns, len(ids), **how)]
 
     @cached_property
-    def _one_hot(self) -> tuple[Int16[np.ndarray, " L"], Tensor]:
-        """The labels, and which Gaussian has which [N, L]."""
+    def _columns(self) -> tuple[Int16[np.ndarray, " L"], Tensor]:
+        """The labels, unlabelled first, and the number of each Gaussian's among them [N]."""
         ids = sorted({UNLABELLED, *self.gaussians.counts()})
         g = self.gaussians.to(device_of(self.backend))
-        one_hot = (g.label_ids[:, None] == torch.tensor(ids, device=g.label_ids.device)).float()
-        return np.array(ids, np.int16), one_hot
+        known = torch.tensor(ids, device=g.label_ids.device, dtype=g.label_ids.dtype)
+        return np.array(ids, np.int16), torch.searchsorted(known, g.label_ids)
 
 
 def as_unit(photo: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W 3"]:

@@ -2,16 +2,15 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 
+import numpy as np
 import torch
-from torch import Tensor
 
-from sagesplat.adapt.ladder import Ladder, PrefixLadder, composed
+from sagesplat.adapt.ladder import PrefixLadder, composed
 from sagesplat.core import sh
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.second_opacity import SecondOpacities
-from sagesplat.raster import Backend, Workspace, device_of, rasterize
+from sagesplat.raster import Backend, Workspace, device_of, in_sight
 from sagesplat.scene.scene import Camera
 
 
@@ -26,45 +25,34 @@ class SeenLevels:
     second: SecondOpacities | None
     ranges: Mapping[int, tuple[tuple[int, int], ...]]  # first row and last + 1 of each level, by label id
 
+    @property
+    def nbytes(self) -> int:
+        """Memory that they take, about: 15 float32 values of each Gaussian."""
+        return 60 * len(self.gaussians)
+
     def compose(self, levels: Mapping[int, int]) -> Gaussians:
         """The union over categories of the Gaussians of each at its level (label id -> level, 1 to K)."""
         return composed(self.gaussians, self.second, self.ranges, levels)
 
 
-class Sight:
-    """Composes levels for one camera after the other; snapshots are composed as they are."""
-
-    def __init__(self, ladder: Ladder, backend: Backend, antialiased: bool) -> None:
-        self._ladder, self._antialiased = ladder, antialiased
-        self._backend: Backend = backend
-        self._workspace = Workspace()
-
-    def of(self, camera: Camera) -> Ladder | SeenLevels:
-        """What composes the levels that are to be rendered from `camera`."""
-        if not isinstance(self._ladder, PrefixLadder):
-            return self._ladder
-        g, second = self._whole
-        most = g if second is None else replace(g, logit_opacities=g.logit_opacities.maximum(second))
-        with torch.no_grad():
-            radii = rasterize(
-                most, camera, sh_degree=0, backend=self._backend, antialiased=self._antialiased,
-                workspace=self._workspace,
-            ).radii  # fmt: skip
-        seen = torch.nonzero(radii > 0)[:, 0]
-        ends = torch.nn.functional.pad((radii > 0).cumsum(0), (1, 0)).tolist()
-        ranges = {
-            label: tuple((ends[first], ends[last]) for first, last in of_level)
-            for label, of_level in self._ladder.ranges.items()
-        }
-        few = _as_seen(g.select(seen), camera)
-        weights = self._ladder.second.weights if self._ladder.second else {}
-        return SeenLevels(few, None if second is None else SecondOpacities(second[seen], weights), ranges)
-
-    @cached_property
-    def _whole(self) -> tuple[Gaussians, Tensor | None]:
-        assert isinstance(self._ladder, PrefixLadder)
-        device, second = device_of(self._backend), self._ladder.second
-        return self._ladder.gaussians.to(device), None if second is None else second.logits.to(device)
+def seen_from(
+    ladder: PrefixLadder, camera: Camera, *, backend: Backend, antialiased: bool, workspace: Workspace
+) -> SeenLevels:
+    """The levels of a ladder as `camera` sees them; `antialiased`: how the model was trained."""
+    device = device_of(backend)
+    g, second = ladder.gaussians.to(device), ladder.second
+    most = g
+    if second is not None:
+        second = SecondOpacities(second.logits.to(device), second.weights)
+        most = replace(g, logit_opacities=g.logit_opacities.maximum(second.logits))
+    seen = in_sight(most, camera, antialiased=antialiased, backend=backend, workspace=workspace)
+    before = np.concatenate([[0], seen.cpu().numpy().cumsum()])
+    ranges = {
+        label: tuple((int(before[first]), int(before[last])) for first, last in of_level)
+        for label, of_level in ladder.ranges.items()
+    }
+    rows = torch.nonzero(seen)[:, 0]
+    return SeenLevels(_as_seen(g.select(rows), camera), second.select(rows) if second else None, ranges)
 
 
 def _as_seen(g: Gaussians, camera: Camera) -> Gaussians:

@@ -6,7 +6,7 @@ from typing import Literal
 import numba
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int64
+from jaxtyping import Bool, Float, Float32, Int, Int64
 from numba.core import config as numba_config
 from torch import Tensor
 
@@ -171,6 +171,55 @@ def rasterize(
         return render
     exposure = torch.from_numpy(camera.exposure).to(render.rgb.device)
     return replace(render, rgb=expose(render.rgb, exposure))
+
+
+def in_sight(
+    gaussians: Gaussians,
+    camera: Camera,
+    *,
+    antialiased: bool = False,
+    backend: Backend = "auto",
+    workspace: Workspace | None = None,
+) -> Bool[Tensor, " N"]:
+    """Whether each Gaussian is drawn in a view, hidden behind others or not. Arguments as of `rasterize`."""
+    if resolve_backend(backend) == "cpu":
+        from sagesplat.raster import cpu
+
+        radii = cpu.radii_of(gaussians, camera, antialiased, workspace or Workspace())
+        return torch.from_numpy(radii > 0)
+    with torch.no_grad():
+        return rasterize(gaussians, camera, sh_degree=0, antialiased=antialiased, backend=backend).radii > 0
+
+
+def most_painted(
+    gaussians: Gaussians,
+    camera: Camera,
+    columns_of: Int[Tensor, " N"],
+    num_columns: int,
+    *,
+    antialiased: bool = False,
+    backend: Backend = "auto",
+    workspace: Workspace | None = None,
+) -> Int64[np.ndarray, "H W"]:
+    """Which column's Gaussians paint most of each pixel, as by their blending weights.
+
+    What shines through between them counts for column 0. `columns_of`: of each Gaussian, 0 to
+    `num_columns` - 1. The other arguments are those of `rasterize`.
+    """
+    if resolve_backend(backend) == "cpu":
+        from sagesplat.raster import cpu
+
+        space = workspace or Workspace()
+        return cpu.most_painted(gaussians, camera, columns_of.numpy(), num_columns, antialiased, space)
+    one_hot = torch.nn.functional.one_hot(columns_of.long(), num_columns).float()
+    with torch.no_grad():
+        render = rasterize(
+            gaussians, camera, features=one_hot, sh_degree=0, antialiased=antialiased, backend=backend
+        )
+    assert render.features is not None
+    painted = render.features.float().cpu().numpy().copy()
+    painted[..., 0] += 1 - render.alpha.float().cpu().numpy()
+    return painted.argmax(-1)
 
 
 def _check(

@@ -358,6 +358,66 @@ def weigh(records, starts, ids, slots, row_order, width, height, columns_of, sum
                 sums[slots[k]] = _ZERO
 
 
+@njit(error_model="numpy", cache=True)
+def _cover(s, plane, lo, hi, columns, lines, mx, my, a, b, c, log_opacity, stretch):
+    """What `_blend` does, with one channel of 1 that lies at `plane`."""
+    dx = columns - mx
+    _share_rows(s, lines, my, c)
+    while lo < hi:
+        power, ratio = _first_row(s, lo, dx, a, b, c, log_opacity)
+        end = min(lo + int(stretch), hi)
+        for row in range(lo, end):
+            p = row * TILE
+            left = load16(s, p)
+            raw = power * spread16(s, _SHARED + row - lo)
+            seen = (raw >= _ALPHA_MIN) & (left >= _T_MIN)
+            weight = where(seen, minimum(raw, _ALPHA_MAX) * left, _ZERO)
+            power = power * ratio
+            store(s, p, left - weight)
+            store(s, plane + p, load16(s, plane + p) + weight)
+        lo = end
+
+
+@njit(parallel=True, cache=True)
+def most(records, starts, ids, row_order, width, height, columns_of, num_columns, out):
+    """The column of which most is painted in each pixel, into out [H, W]; columns_of [N]: of each Gaussian.
+
+    What remains of the transmittance counts for column 0; of equals the first is taken.
+    """
+    tiles_x, planes = (width + TILE - 1) // TILE, 7 * PIXELS
+    for r in prange(len(row_order)):
+        state = np.zeros(planes + num_columns * PIXELS, np.float32)
+        batch, rows = np.zeros((_BATCH, BATCHED), np.float32), np.empty((2, _BATCH), np.float32)
+        for column in range(tiles_x):
+            tile, row0, column0 = row_order[r] * tiles_x + column, row_order[r] * TILE, column * TILE
+            x0, y0 = _F(column0), _F(row0)
+            columns, lines = load16(_CENTRES, 0) + x0, load16(_CENTRES, 0) + y0
+            state[:PIXELS] = _ONE
+            state[planes:] = _ZERO
+            end = starts[tile]
+            while end < starts[tile + 1] and _most(state) >= _T_MIN:
+                first, end = end, min(end + _BATCH, starts[tile + 1])
+                gather_batch(records, ids, first, end, x0, y0, batch, rows)
+                for j in range(end - first):
+                    lo, hi = int(rows[0, j]), int(rows[1, j])
+                    if lo < hi:
+                        _cover(
+                            state, planes + columns_of[ids[first + j]] * PIXELS, lo, hi, columns, lines,
+                            batch[j, 0], batch[j, 1], batch[j, 2], batch[j, 3], batch[j, 4], batch[j, 5],
+                            batch[j, RECORD],
+                        )  # fmt: skip
+            for p in range(PIXELS):
+                state[planes + p] += state[p]
+            for y in range(row0, min(row0 + TILE, height)):
+                for x in range(column0, min(column0 + TILE, width)):
+                    at = planes + (y - row0) * TILE + x - column0
+                    best = 0
+                    for of in range(1, num_columns):
+                        if state[at + of * PIXELS] > state[at + best * PIXELS]:
+                            best = of
+                    out[y, x] = best
+
+
 @njit(parallel=True, cache=True)
 def add_by_gaussian(offsets, sums, out):
     """Add the sums [I, columns] of each Gaussian's intersections to its row of out [N, columns]."""

@@ -230,6 +230,12 @@ def render(
     return Render(rgb, alpha, None if features is None else painted, means2d, radii)
 
 
+def radii_of(g: Gaussians, camera: Camera, antialiased: bool, workspace: Workspace) -> np.ndarray:
+    """Radii [N] px, as `Render` has them; they hold until the next call with the same `workspace`."""
+    options = _Options(camera, 0, antialiased, None, workspace)
+    return _project(options, _arrays([getattr(g, name) for name in PARAMETERS]))[2]
+
+
 def intersections(
     g: Gaussians, camera: Camera, workspace: Workspace, *, antialiased: bool = False
 ) -> tuple[np.ndarray, np.ndarray, tiles.Intersections]:
@@ -240,6 +246,24 @@ def intersections(
     options = _Options(camera, 0, antialiased, None, workspace)
     records, depths, radii = _project(options, _arrays([getattr(g, name) for name in PARAMETERS]))
     return records, radii, _intersections(options, records, depths, radii)
+
+
+def most_painted(
+    g: Gaussians,
+    camera: Camera,
+    columns_of: np.ndarray,
+    num_columns: int,
+    antialiased: bool,
+    space: Workspace,
+) -> np.ndarray:
+    """See `sagesplat.raster.most_painted`."""
+    records, _, found = intersections(g, camera, space, antialiased=antialiased)
+    out = np.zeros((camera.height, camera.width), np.int64)
+    blend.most(
+        records, found.starts, found.ids, found.row_order, camera.width, camera.height,
+        np.ascontiguousarray(columns_of, np.int64), num_columns, out,
+    )  # fmt: skip
+    return out
 
 
 def add_weights(

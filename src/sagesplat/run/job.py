@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sagesplat.adapt.fidelity import References
 from sagesplat.adapt.ladder import Ladder, SnapshotLadder, read_ladder, read_prefixes
 from sagesplat.core.config import FitConfig
 from sagesplat.core.errors import RunError
@@ -201,6 +202,11 @@ class Job:
         path = self.run.prefixes if nested else self.run.levels
         self.check_named(path, sorted({label for label, _ in ladder.counts}))
         return ladder
+
+    @cached_property
+    def references(self) -> References:
+        """What compositions of the ladder's levels are compared with."""
+        return References(self.ladder, self.backend, self.antialiased)
 
     def check_named(self, path: Path, label_ids: Iterable[int]) -> None:
         """RunError for an id that the run's labels.json does not name."""

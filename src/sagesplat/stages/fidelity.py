@@ -108,5 +108,5 @@ def _measure_some(job: Job, part: tuple[Sequence[Camera], np.ndarray, str]) -> t
     cameras, planned, stage = part
     return measure_compositions(
         job.ladder, cameras, planned, backend=job.backend, antialiased=job.antialiased,
-        progress=lambda done, total: job.emit(Progress(stage, done, total)),
+        progress=lambda done, total: job.emit(Progress(stage, done, total)), references=job.references,
     )  # fmt: skip
