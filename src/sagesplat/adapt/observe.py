@@ -1,6 +1,6 @@
 """Observations: the quality of each category at each level, view by view."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -12,7 +12,8 @@ from jaxtyping import Bool, Float32, Int16, Int32, UInt8
 from scipy.ndimage import maximum_filter, minimum_filter
 from torch import Tensor
 
-from sagesplat.adapt.ladder import Ladder
+from sagesplat.adapt.ladder import Ladder, PrefixLadder
+from sagesplat.adapt.seen import seen_from
 from sagesplat.core import geometry
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.columns import from_rows, read_columns, write_columns
@@ -303,21 +304,35 @@ def observe(
     rows: list[dict[str, float]] = []
     views = valid.rows(scene, range(len(scene.views)) if views is None else views)
     inner = {row: erode(masks[scene.views[row]]) for row in views}
-    done, total = 0, len(ladder.levels) * len(views)
+    total, workspace = len(ladder.levels) * len(views), Workspace()
+    for done, (level, row, g) in enumerate(_sets(ladder, scene, views, backend, antialiased), 1):
+        view = scene.views[row]
+        image = render_rgb(g, view.camera, backend=backend, antialiased=antialiased, workspace=workspace)
+        found = measure(image, as_unit(photos[row]), masks[view], inner[row], valid[view])
+        for label, values in found.items():
+            distance = distances[label][row] if label in distances else np.nan
+            rows.append({"label_id": label, "level": level, "view": row, "distance": distance, **values})
+        if progress:
+            progress(done, total)
+    table = from_rows(Observations, rows)
+    return table.select(np.argsort(table.level, kind="stable"))
+
+
+def _sets(
+    ladder: Ladder, scene: Scene, views: Sequence[int], backend: Backend, antialiased: bool
+) -> Iterator[tuple[int, int, Gaussians]]:
+    """Level, view and Gaussians to render: view by view where levels share theirs, else level by level."""
+    if not isinstance(ladder, PrefixLadder):
+        for level in ladder.levels:
+            g = ladder.load(level).to(device_of(backend))
+            yield from ((level, row, g) for row in views)
+        return
     workspace = Workspace()
-    for level in ladder.levels:
-        g = ladder.load(level).to(device_of(backend))
-        for row in views:
-            view = scene.views[row]
-            image = render_rgb(g, view.camera, backend=backend, antialiased=antialiased, workspace=workspace)
-            found = measure(image, as_unit(photos[row]), masks[view], inner[row], valid[view])
-            for label, values in found.items():
-                distance = distances[label][row] if label in distances else np.nan
-                rows.append({"label_id": label, "level": level, "view": row, "distance": distance, **values})
-            done += 1
-            if progress:
-                progress(done, total)
-    return from_rows(Observations, rows)
+    for row in views:
+        camera = scene.views[row].camera
+        seen = seen_from(ladder, camera, backend=backend, antialiased=antialiased, workspace=workspace)
+        for level in ladder.levels:
+            yield level, row, seen.compose(dict.fromkeys(ladder.sizes, level))
 
 
 def merge(parts: Sequence[Observations]) -> Observations:
