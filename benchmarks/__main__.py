@@ -665,6 +665,24 @@ def adopt(
 
 
 @app.command
+def start(scene: Path | None = None, downscale: int = 1, repeats: int = 5, write: bool = False) -> None:
+    """Seconds until help is printed and until the first training step of a run whose kernels are cached.
+
+    Args:
+        scene: capture (default: the built-in one).
+        downscale: of its photos.
+        repeats: times that each is measured; the best counts.
+        write: keep the figures in benchmarks/results/cpu.
+    """
+    from benchmarks import start as starting
+
+    result = starting.measure(scene or cached_capture(), ["--downscale", str(downscale)], repeats)
+    for name, value in result.items():
+        print(f"{name:20} {value}")
+    _finish("start", result, write)
+
+
+@app.command
 def structure(src: tuple[Path, ...] = (Path("src/sagesplat"),), write: bool = False) -> None:
     """How the package is built: entries, imports between them, cycles, lengths; of several checkouts in turn.
 
