@@ -19,6 +19,7 @@ from sagesplat.io.files import read_json
 # the program, which says on SIGUSR1 where it is
 _PROGRAM = (
     "import faulthandler, signal, sys; faulthandler.register(signal.SIGUSR1, all_threads=False)\n"
+    "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a shell's background jobs ignore it
     "sys.argv[0] = 'sagesplat'; from sagesplat.__main__ import program; program()"
 )
 ANSWER = 0.5  # seconds within which Ctrl-C is to be answered
