@@ -697,6 +697,53 @@ def adopt(
 
 
 @app.command
+def start(scene: Path | None = None, downscale: int = 1, repeats: int = 5, write: bool = False) -> None:
+    """Seconds until help is printed and until the first training step of a run whose kernels are cached.
+
+    Args:
+        scene: capture (default: the built-in one).
+        downscale: of its photos.
+        repeats: times that each is measured; the best counts.
+        write: keep the figures in benchmarks/results/cpu.
+    """
+    from benchmarks import start as starting
+
+    result = starting.measure(scene or cached_capture(), ["--downscale", str(downscale)], repeats)
+    for name, value in result.items():
+        print(f"{name:20} {value}")
+    _finish("start", result, write)
+
+
+@app.command
+def interrupts(
+    run: Path,
+    /,
+    *,
+    commands: tuple[str, ...] = (),
+    moments: int = 4,
+    seed: int = 0,
+    write: bool = False,
+) -> None:
+    """Ctrl-C at several moments of every command that makes part of a run: seconds until it answers and ends.
+
+    Args:
+        run: finished run folder, such as one of `sagesplat demo`; copies of it are worked on.
+        commands: some of them (default: all).
+        moments: interrupts of each.
+        seed: of the moments.
+        write: keep the figures in benchmarks/results/cpu.
+    """
+    from benchmarks import interrupts as interrupting
+
+    unknown = [name for name in commands if name not in interrupting.CASES]
+    if unknown:
+        raise SystemExit(f"no command {unknown[0]!r}; choose from {', '.join(interrupting.CASES)}")
+    names = commands or tuple(interrupting.CASES)
+    result = interrupting.measure(run, names, moments, seed, lambda line: print(line, flush=True))
+    _finish("interrupts", result, write)
+
+
+@app.command
 def structure(src: tuple[Path, ...] = (Path("src/sagesplat"),), write: bool = False) -> None:
     """How the package is built: entries, imports between them, cycles, lengths; of several checkouts in turn.
 

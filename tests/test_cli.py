@@ -12,6 +12,7 @@ from conftest import random_gaussians, write_capture
 
 from sagesplat import cli
 from sagesplat.cli import help
+from sagesplat.cli.overview import summaries
 from sagesplat.core.names import visible
 
 
@@ -147,8 +148,22 @@ def test_processes_are_counted(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
 
 
 def test_help_imports_no_torch() -> None:
-    code = "import sys, sagesplat.cli; sys.exit(any(m in sys.modules for m in ('torch', 'numba', 'numpy')))"
+    code = "import sys; from sagesplat.cli import commands; commands(); sys.exit('numpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_the_overview_loads_no_command() -> None:
+    code = (
+        "import sys; from sagesplat.cli import main; sys.argv = ['sagesplat', '--help']; main()\n"
+        "sys.exit(any(m in sys.modules for m in ('tyro', 'sagesplat.cli.stages', 'inspect', 'numpy')))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True)
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
+def test_the_overview_is_of_the_commands_that_there_are() -> None:
+    first = {name: (function.__doc__ or "").splitlines()[0] for name, function in cli.commands().items()}
+    assert list(summaries()) == list(first.items())
 
 
 def test_help_lists_every_command(
@@ -157,8 +172,8 @@ def test_help_lists_every_command(
     monkeypatch.setattr(sys, "argv", ["sagesplat", "--help"])
     cli.main()
     text = capsys.readouterr().out
-    assert all(f"  {name} " in text for name in cli.COMMANDS)
-    for name in cli.COMMANDS:
+    assert all(f"  {name} " in text for name in cli.commands())
+    for name in cli.commands():
         monkeypatch.setattr(sys, "argv", ["sagesplat", name, "--help"])
         cli.main()
         assert f"sagesplat {name}" in capsys.readouterr().out
@@ -189,7 +204,7 @@ def test_help_of_run_shows_first_what_most_people_need(
     shown = [line.split()[0] for line in short.splitlines() if line.startswith("  --")]
     assert set(shown) == help._COMMON
     assert "--help-all" in short
-    everything = {flag.name for flag in help.flags_of(cli.COMMANDS["run"]) if flag.name.startswith("--")}
+    everything = {flag.name for flag in help.flags_of(cli.commands()["run"]) if flag.name.startswith("--")}
     assert {line.split()[0] for line in full.splitlines() if line.startswith("  --")} == everything
     for text in (short, full):
         assert "SCENE" in text
@@ -197,7 +212,7 @@ def test_help_of_run_shows_first_what_most_people_need(
 
 
 def test_every_argument_of_every_command_has_help() -> None:
-    for name, function in cli.COMMANDS.items():
+    for name, function in cli.commands().items():
         flags = list(help.flags_of(function))
         assert len({flag.name for flag in flags}) == len(flags), name
         assert [f.name for f in flags if not f.help] == [], name
@@ -214,7 +229,7 @@ def test_every_argument_of_every_command_has_help() -> None:
     ],
 )
 def test_a_command_has_the_flags_that_it_uses(command: str, absent: list[str]) -> None:
-    names = {flag.name for flag in help.flags_of(cli.COMMANDS[command])}
+    names = {flag.name for flag in help.flags_of(cli.commands()[command])}
     assert not names & set(absent)
 
 

@@ -46,7 +46,7 @@ def flags() -> set[str]:
     measured = [f for f in measured if f.__module__ == measuring.__name__]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # tyro has no other way to its parsers yet
-        waiting = list(map(tyro.extras.get_parser, [*cli.COMMANDS.values(), *measured]))
+        waiting = list(map(tyro.extras.get_parser, [*cli.commands().values(), *measured]))
     while waiting:
         for action in waiting.pop()._actions:
             found.update(action.option_strings)
@@ -116,7 +116,7 @@ def test_commands_and_flags_exist(path):
             group = any(each.startswith(f"{flag}.") for each in flags())  # `--train`: all of its flags
             gone += [] if group or flag in flags() | FOREIGN else [flag]
         found = re.match(r"\s*(?:\.venv/bin/)?sagesplat ([a-z][\w-]*)", word)
-        gone += [found[0]] if found and found[1] not in cli.COMMANDS else []
+        gone += [found[0]] if found and found[1] not in cli.commands() else []
     assert gone == []
 
 

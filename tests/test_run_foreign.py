@@ -18,8 +18,7 @@ import numpy as np
 import pytest
 from conftest import SMALL_RUN
 
-from sagesplat.cli import parse
-from sagesplat.cli.base import COMMANDS
+from sagesplat.cli import commands, parse
 from sagesplat.core.config import FitConfig
 from sagesplat.core.errors import RunError, SageError
 from sagesplat.io.files import read_json, write_json
@@ -69,7 +68,7 @@ def settings(run: Path) -> None:
     """What every command does first."""
     with redirect_stderr(StringIO()):
         for name in ("fit", "plan", "nest", "train", "lift"):
-            parse.arguments(name, COMMANDS[name], [str(run)])
+            parse.arguments(name, commands()[name], [str(run)])
     stage_seconds(RunDir(run))
 
 
@@ -331,7 +330,7 @@ def test_links_out_of_a_run_folder_are_refused(run: Path, tmp_path: Path) -> Non
             with pytest.raises(RunError, match=rf"{name}: a link out of the run folder"):
                 act()
         with pytest.raises(RunError, match="a link out of the run folder"):
-            parse.arguments("plan", COMMANDS["plan"], [str(run)])
+            parse.arguments("plan", commands()["plan"], [str(run)])
         (run / name).unlink()
     link = tmp_path / "link"
     link.symlink_to(run)  # the folder itself may be named by a link

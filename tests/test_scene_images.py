@@ -125,3 +125,21 @@ def test_a_photo_that_changes_while_a_command_works_is_noticed(tmp_path: Path) -
         _ = photos[2]
     (tmp_path / "away").rename(tmp_path / "capture")
     assert photos[2].shape == first.shape
+
+
+def test_photos_are_fetched_side_by_side_as_many_as_are_kept(tmp_path: Path) -> None:
+    scene = write_capture(tmp_path / "capture", random_gaussians(30, degree=0), views=5)
+    alone = [load_photo(view) for view in scene.views]
+    photos, told = Photos(scene.views, 3 * alone[0].nbytes), list[tuple[int, int]]()
+    photos.fetch([4, 0, 2, 1], 2, lambda done, total: told.append((done, total)))
+    assert told == [(1, 3), (2, 3), (3, 3)]
+    assert sorted(photos._cache) == [0, 2, 4]
+    assert all(np.array_equal(photos[row], alone[row]) for row in range(5))
+
+
+def test_fetching_names_a_photo_that_is_gone(tmp_path: Path) -> None:
+    scene = write_capture(tmp_path / "capture", random_gaussians(30, degree=0), views=3)
+    photos = Photos(scene.views)
+    scene.views[1].image_path.unlink()
+    with pytest.raises(SceneError, match="gone since this command began"):
+        photos.fetch(range(3), 2)

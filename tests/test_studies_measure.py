@@ -16,7 +16,7 @@ from test_cli import call
 from benchmarks.readers.foreign_splats import put_sog, sog, streamed
 from sagesplat.adapt.observe import TOTAL
 from sagesplat.adapt.viewpoints import Rule, Viewpoints, write_viewpoints
-from sagesplat.cli import COMMANDS
+from sagesplat.cli import commands
 from sagesplat.cli.parse import arguments
 from sagesplat.core.config import MeasureConfig
 from sagesplat.core.errors import DataError, RunError, SageError
@@ -246,7 +246,7 @@ def test_the_command(files, monkeypatch, capsys):
 
 @pytest.mark.parametrize("words", [["--up", "-z"], ["--up=-z"], ["--up", "z"]])
 def test_a_direction_with_a_minus_is_a_value(words):
-    values = arguments("measure", COMMANDS["measure"], ["a.ply", "b.ply", *words])
+    values = arguments("measure", commands()["measure"], ["a.ply", "b.ply", *words])
     assert values["measure"].up == words[-1].removeprefix("--up=")
     assert values["levels"] == (Path("b.ply"),)
 

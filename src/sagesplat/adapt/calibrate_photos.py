@@ -31,7 +31,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.optimize import nnls
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from sagesplat.adapt.calibrate import fewest_views
 from sagesplat.adapt.viewpoint import Calibration
@@ -218,7 +218,7 @@ def _multipliers(
     counted_in = 1 if heldout.sum() >= fewest else FEW
     if len(rows) < counted_in * fewest:  # too few for any proof: a Gaussian view to come, twice as far
         n = len(rows)
-        wide = 2 * float(student.ppf(confidence, n - 1)) * np.sqrt(1 + 1 / n) if n > 1 else np.inf
+        wide = 2 * float(stdtrit(n - 1, confidence)) * np.sqrt(1 + 1 / n) if n > 1 else np.inf
         return np.full(len(TARGETS), max(wide, 0.0))
     found = np.full(len(TARGETS), np.inf)
     for g in range(len(TARGETS)):

@@ -16,7 +16,6 @@ from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.stats import binomtest
 
 from sagesplat.adapt.allocate import choose
 from sagesplat.adapt.bound_plans import Costs, make_choices, pooled
@@ -141,6 +140,8 @@ def reached(held: Bool[np.ndarray, " n"]) -> Reached | None:
     """The share of views in which something holds, with its interval; None without any view."""
     if not len(held):
         return None
+    from scipy.stats import binomtest  # slow to load, and no training waits for it
+
     found = binomtest(int(held.sum()), len(held)).proportion_ci(0.95, "exact")
     return Reached(float(held.mean()), float(found.low), float(found.high), len(held))
 

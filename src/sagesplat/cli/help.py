@@ -4,6 +4,7 @@ import ast
 import inspect
 import re
 import shutil
+import sys
 import textwrap
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, is_dataclass
@@ -142,14 +143,20 @@ def _field_help(kind: Any) -> dict[str, str]:
     """The docstrings under the fields of a dataclass, and of those it inherits from."""
     found: dict[str, str] = {}
     for base in reversed(kind.__mro__[:-1]):
-        body = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0]
-        assert isinstance(body, ast.ClassDef)
+        body = _classes(base.__module__)[base.__name__]
         for field, below in zip(body.body, body.body[1:], strict=False):
             if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr):
                 assert isinstance(field.target, ast.Name)
                 assert isinstance(below.value, ast.Constant)
                 found[field.target.id] = " ".join(str(below.value.value).split())
     return found
+
+
+@cache
+def _classes(module: str) -> dict[str, ast.ClassDef]:
+    """The classes of a module; one parse of its file, where `inspect.getsource` needs one a class."""
+    body = ast.parse(Path(str(sys.modules[module].__file__)).read_bytes()).body
+    return {node.name: node for node in body if isinstance(node, ast.ClassDef)}
 
 
 def _described(doc: str) -> dict[str, str]:

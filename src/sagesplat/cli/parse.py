@@ -29,6 +29,7 @@ OLD_FLAGS = {
 }
 _DIRECTIONS = {"-x", "-y", "-z"}
 _TARGETS = {"--target-fidelity", "--target-ssim"}  # of a plan: one given, the recorded ones are gone
+_AS_THEY_ARE = "--downscale", 1  # what most runs record; what they were given is 0, for the run to choose
 _SOURCES = {"--segmenter", "--masks", "--model", "--classes"}  # of label images: one given, all are anew
 
 
@@ -175,7 +176,9 @@ def _recorded(
     changed = [
         _typed(flag, now)
         for flag in flags_of(function)
-        if flag.name not in given and (now := _now(flag, known, flag.default)) != flag.default
+        if flag.name not in given
+        and (now := _now(flag, known, flag.default)) != flag.default
+        and (flag.name, now) != _AS_THEY_ARE
     ]
     if changed:
         _say(f"settings of {path}: {' '.join(changed)}")

@@ -1,6 +1,6 @@
 """The main job and its stages."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -49,7 +49,8 @@ def info(scene: Scene, scene_config: Annotated[SceneConfig, Flat] = SceneConfig(
     """Print what a capture holds."""
     from sagesplat.scene import describe, load_scene
 
-    rows = describe(load_scene(scene, **asdict(scene_config)))
+    as_it_is = replace(scene_config, downscale=scene_config.downscale or 1)
+    rows = describe(load_scene(scene, **asdict(as_it_is)))
     width = max(len(name) for name, _ in rows)
     for name, value in rows:
         say(f"{name:{width}}  {value}")

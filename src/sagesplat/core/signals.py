@@ -33,6 +33,10 @@ class Stopped(KeyboardInterrupt):
         super().__init__(signal.Signals(number).name)
 
 
+class Left(SystemExit):
+    """The program was stopped: the line that says so is printed, and nothing is left to be done."""
+
+
 class _Stop:
     """The handler of all signals."""
 
@@ -71,8 +75,9 @@ _stop = _Stop()
 def handled() -> Iterator[None]:
     """Raise `Stopped` for signals in the block; after it they change nothing.
 
-    For the main thread of a program whose last block this is. Signals that are ignored stay so, as those
-    of a process that `nohup` or a shell in the background started.
+    For the main thread of a program whose last block this is: where it was stopped, the process ends with
+    it. Signals that are ignored stay so, as those of a process that `nohup` or a shell in the background
+    started.
     """
     for number in _HANDLED:
         if signal.getsignal(number) is not signal.SIG_IGN:
@@ -80,8 +85,21 @@ def handled() -> Iterator[None]:
     sys.unraisablehook = _raising_again(sys.unraisablehook)
     try:
         yield
+    except Left as left:
+        _stop.end()
+        _exit_at_once(left)
     finally:
         _stop.end()
+
+
+def _exit_at_once(left: Left) -> NoReturn:
+    """End the process without the interpreter's own end: freeing torch and joining threads takes a second."""
+    with suppress(Exception):
+        atexit._run_exitfuncs()  # those of libraries that clean up: Ray's, multiprocessing's
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(left.code if isinstance(left.code, int) else 1)
 
 
 def _raising_again(before: Any) -> Any:
@@ -131,7 +149,7 @@ def leave(error: KeyboardInterrupt) -> NoReturn:
         line += " (its terminal was closed; nohup or tmux keeps a run)"
     with suppress(OSError):  # the terminal that was closed
         print(f"sagesplat: {line}; {_KEPT}", file=sys.stderr, flush=True)
-    raise SystemExit(_exit_code(number))
+    raise Left(_exit_code(number))
 
 
 def _exit_code(number: int) -> int:

@@ -1,6 +1,7 @@
 """Reads photos as 8-bit RGB, at the size of their view's camera."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -121,6 +122,28 @@ class Photos:
             self._cache[index] = photo
             self._used += photo.nbytes
         return photo
+
+    def fetch(
+        self, rows: Sequence[int], threads: int, on_photo: Callable[[int, int], None] = lambda *_: None
+    ) -> None:
+        """Load photos side by side ahead of their use, as many as are kept; `on_photo(done, total)`.
+
+        Raises SceneError as access does.
+        """
+        coming, used = list[int](), self._used
+        for row in rows:
+            camera = self.views[row].camera
+            used += 3 * camera.width * camera.height
+            if row not in self._cache and used <= self.cache_bytes:
+                coming.append(row)
+        pool = ThreadPoolExecutor(max(1, threads))
+        try:
+            for done, (row, photo) in enumerate(zip(coming, pool.map(self._unchanged, coming), strict=True)):
+                self._cache[row] = photo
+                self._used += photo.nbytes
+                on_photo(done + 1, len(coming))
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)  # Ctrl-C does not wait for photos
 
     def check(self) -> None:
         """SceneError if a photo was changed or removed since this was made."""

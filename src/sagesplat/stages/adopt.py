@@ -21,7 +21,6 @@ from sagesplat.core.names import repaired
 from sagesplat.core.sh import sh0_to_rgb
 from sagesplat.formats.levels import read_header, read_level, read_more, write_level, write_set
 from sagesplat.formats.splats import Splat, num_lods, read_splat
-from sagesplat.output.contact_sheet import contact_sheet
 from sagesplat.run.job import Job
 from sagesplat.run.records import file_hash, is_done
 from sagesplat.run.run_dir import RunDir
@@ -56,6 +55,7 @@ def open_splat(
     A splat without any is one category, "scene".
     """
     segmented = masks.segmenter != "auto" or masks.masks is not None or masks.model is not None
+    scene = replace(scene, downscale=scene.downscale or 1)  # nothing is trained on the photos
     check_folder(job.run)
     _check_run(job.run, config)
     check_shares(config.shares)
@@ -113,6 +113,9 @@ def _make_capture(
             views = _views(own, cameras)
             _write_model(own / "sparse" / "0", g, views, _points(g, config.seed))
         _write_pictures(job, own, splat, views, labelled=labelled, photos=photos)
+        # loads matplotlib, for which no training has to wait
+        from sagesplat.output.contact_sheet import contact_sheet
+
         contact_sheet(
             run.contact_sheet, g, cameras, up, [f"{source.name}: {len(g):,} Gaussians{left_out}", how],
             antialiased=splat.antialiased, backend=job.backend,

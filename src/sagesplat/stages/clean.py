@@ -10,7 +10,6 @@ from sagesplat.core.events import Progress
 from sagesplat.core.typed import check_fields, types_of
 from sagesplat.formats.levels import read_level, select_level
 from sagesplat.io.files import read_json, write_json
-from sagesplat.output.before_after import before_after
 from sagesplat.raster import device_of
 from sagesplat.run.job import Job
 from sagesplat.run.stage import run_stage
@@ -73,6 +72,9 @@ def _clean(job: Job, last: Path, config: CleanConfig) -> Cleaned:
         kinds=kinds, valid=job.inliers, antialiased=job.antialiased, backend=job.backend,
     )  # fmt: skip
     if not cleaned.keep.all():
+        # loads matplotlib, for which no training has to wait
+        from sagesplat.output.before_after import before_after
+
         cameras = [view.camera for view in scene.views]
         before_after(
             job.run.floaters_picture, g, cleaned.keep, cameras, clean_lines(figures_of(cleaned))[0],

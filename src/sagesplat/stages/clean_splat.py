@@ -20,7 +20,6 @@ from sagesplat.formats.ply import read_ply_splat, select_ply
 from sagesplat.formats.splat import Splat, undrawable
 from sagesplat.formats.splats import read_splat
 from sagesplat.formats.splats_write import write_splat, written_as
-from sagesplat.output.before_after import before_after
 from sagesplat.raster import Backend, device_of
 from sagesplat.scene import load_scene
 from sagesplat.scene.cameras import read_camera_file
@@ -81,6 +80,8 @@ def clean_splat(
     figures = figures_of(cleaned)
     lines = clean_lines(figures)[: 2 if real else 1]  # renders have no PSNR to lose
     if picture:
+        from sagesplat.output.before_after import before_after
+
         before_after(
             picture, g, cleaned.keep, [view.camera for view in scene.views], f"{source.name}: {lines[0]}",
             antialiased=filtered, backend=backend,

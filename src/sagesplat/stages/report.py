@@ -2,19 +2,21 @@
 
 from sagesplat.core.events import RunDone
 from sagesplat.formats.ply import read_ply
-from sagesplat.output.report import write_report
 from sagesplat.run.job import Job
 from sagesplat.run.stage import run_stage
 from sagesplat.stages.compose import compose
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.noticed import noticed
 from sagesplat.stages.plan import main_target, scene_plan
-from sagesplat.stages.report_data import report_data, stage_records
 from sagesplat.stages.results import budget_plan_of
 
 
 def make_report(job: Job) -> None:
     """Write the report."""
+    # loads matplotlib, for which no training has to wait
+    from sagesplat.output.report import write_report
+    from sagesplat.stages.report_data import report_data, stage_records
+
     run, found = job.run, noticed(job)
 
     def make() -> list[str]:

@@ -32,6 +32,9 @@ from sagesplat.scene.stored import write_scene
 from sagesplat.segment.edit import ignored_ids, parse_ignore, parse_merge
 from sagesplat.segment.masks import label_images_of
 
+_CPU_PIXELS = 1.25e6  # of a photo: a training step's time and the cap of Gaussians grow with them
+_SHARES = {1: "all", 2: "half", 4: "a quarter", 8: "an eighth"}  # of a photo's width
+
 
 def check_folder(run: RunDir) -> None:
     """RunError for a folder that holds something else than a run."""
@@ -71,6 +74,8 @@ def open_scene(
         _find_poses(job, path, capture, poses or PosesConfig(), leaving_out)
         path = capture
     begun = _begun(job)
+    if not config.downscale:
+        config = replace(config, downscale=_downscale(job, path, begun))
     same = begun and not job.force and begun.settings == asdict(config)
     again = begun and same and begun.path == path.resolve()  # what was found in the photos is known
     scene = begun.load() if begun and again else load_scene(path, **asdict(config))
@@ -119,6 +124,30 @@ def open_scene(
     photos.keep()
     if not run.geometry.exists():  # the run began before it was kept
         _write_geometry(run.geometry, scene)
+
+
+def _downscale(job: Job, path: Path, begun: Capture | None) -> int:
+    """The factor for a capture where none was asked for: that of the run, or what the machine can do."""
+    if begun and "downscale" in begun.settings:
+        return int(begun.settings["downscale"])
+    if "cuda" in (job.backend, job.executor.backend) or detect(path) == "stored":
+        return 1
+    cameras = [view.camera for view in load_scene(path).views]
+    factor = cpu_downscale(float(np.median([camera.width * camera.height for camera in cameras])))
+    if factor > 1:
+        size = f"{cameras[0].width} x {cameras[0].height}"
+        job.emit(
+            Warned(
+                f"photos of {size} px: trained at {_SHARES[factor]} of that on a CPU"
+                " (--downscale 1 keeps their size)"
+            )
+        )
+    return factor
+
+
+def cpu_downscale(pixels: float) -> int:
+    """The least power of two, up to 8, that brings photos of so many pixels to what a CPU trains on."""
+    return next((n for n in _SHARES if pixels <= _CPU_PIXELS * n**2), max(_SHARES))
 
 
 def _of_lens(found: Vignetting | None) -> str:

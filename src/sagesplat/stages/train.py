@@ -11,7 +11,7 @@ import numpy as np
 
 from sagesplat.core.config import TrainConfig
 from sagesplat.core.errors import RunError
-from sagesplat.core.events import Training, Warned
+from sagesplat.core.events import Progress, Training, Warned
 from sagesplat.core.typed import fits
 from sagesplat.io.files import read_json, write_json
 from sagesplat.run.job import Job
@@ -42,6 +42,10 @@ def train_levels(job: Job, config: TrainConfig, seed: int) -> None:
     def make() -> list[str]:
         key = checkpoint_key(run, settings, inputs)
         place = _place(job, key)
+        rows = job.given_scene.train_ids.tolist()
+        job.photos.fetch(
+            rows, job.threads, lambda done, total: job.emit(Progress("train", done, total, "photos"))
+        )
         resuming = place.checkpoint.exists() and (not job.force or can_resume(place.checkpoint, key))
         sky, scene, label_ids = _with_sky(job, config)
         fitted, cap = _fit_memory(job, scene, place, config, resuming)  # before anything is given up
