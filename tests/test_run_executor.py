@@ -31,7 +31,6 @@ from sagesplat.run.stage import Stage, run_stages
 from sagesplat.segment import hf
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.segment.segmenters import Segmented
-from sagesplat.stages import report
 from sagesplat.stages.fit import fit_ladder
 from sagesplat.stages.label import make_masks
 from sagesplat.stages.observe import observe_levels
@@ -100,7 +99,10 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def plain_report() -> Iterator[None]:
     """Figures take most of the time of so small a run, and have their own tests."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(report, "write_report", lambda folder, _: write_text(folder / "index.html", "report"))
+        patch.setattr(
+            "sagesplat.output.report.write_report",
+            lambda folder, _: write_text(folder / "index.html", "report"),
+        )
         patch.setattr(
             compare_report, "write_report", lambda folder, *_: write_text(folder / "compare.md", "")
         )

@@ -232,8 +232,7 @@ def check_variants(
     run: Path, tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch, every: bool
 ) -> None:
     monkeypatch.setattr(
-        report,
-        "write_report",
+        "sagesplat.output.report.write_report",
         lambda folder, data: (folder.mkdir(exist_ok=True), (folder / "index.html").touch()),
     )
     monkeypatch.setattr("sagesplat.stages.bundle._poster", lambda *_: b"")

@@ -30,12 +30,13 @@ from sagesplat.run import stage
 from sagesplat.run.job import Job
 from sagesplat.run.records import FORMAT, file_hash, input_hashes, is_done, is_made_from, record, settings_of
 from sagesplat.run.run_dir import RunDir
-from sagesplat.stages import pipeline, report
+from sagesplat.stages import pipeline
 from sagesplat.stages.fit import fit_ladder
 from sagesplat.stages.label import fuse_masks, make_masks
 from sagesplat.stages.nest import nest_levels
 from sagesplat.stages.observe import observe_levels
 from sagesplat.stages.pipeline import run_all
+from sagesplat.stages.report_data import stage_records
 from sagesplat.stages.train import train_levels
 from sagesplat.studies.paper.run import paper_report
 from sagesplat.train import nested
@@ -54,7 +55,10 @@ BLOCKS = BlocksConfig(count=2, boundary_steps=5)
 def plain_report() -> Iterator[None]:
     """Figures take most of the time of so small a run, and have their own tests."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(report, "write_report", lambda folder, _: write_text(folder / "index.html", "report"))
+        patch.setattr(
+            "sagesplat.output.report.write_report",
+            lambda folder, _: write_text(folder / "index.html", "report"),
+        )
         yield
 
 
@@ -323,7 +327,7 @@ def test_deleting_fused_label_images_is_noticed(copy: Path, capture: Path) -> No
         work(copy, capture)
     again = done(work(copy, capture, force=True))
     assert {"nest", "observe", "fit", "report"} <= set(again)
-    assert "fuse" not in (path.stem for path in report.stage_records(RunDir(copy)))
+    assert "fuse" not in (path.stem for path in stage_records(RunDir(copy)))
 
 
 def test_other_label_images_are_noticed_though_points_keep_their_labels(copy: Path) -> None:

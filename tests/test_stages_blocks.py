@@ -44,7 +44,6 @@ from sagesplat.scene.scene import Camera, Lens, Points, Scene, View
 from sagesplat.scene.stored import read_scene, write_scene
 from sagesplat.segment.block_categories import BlockCategories, category_of, split_name
 from sagesplat.segment.masks import Masks, Taxonomy
-from sagesplat.stages import report
 from sagesplat.stages.blocks import check
 from sagesplat.stages.pipeline import run_all
 from sagesplat.train import boundaries
@@ -322,7 +321,10 @@ def run_in_blocks(capture: Path, run: Path, config: RunConfig = CONFIG, **option
 def plain_report() -> Iterator[None]:
     """Figures take most of the time of so small a run, and have their own tests."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(report, "write_report", lambda folder, _: write_text(folder / "index.html", "report"))
+        patch.setattr(
+            "sagesplat.output.report.write_report",
+            lambda folder, _: write_text(folder / "index.html", "report"),
+        )
         yield
 
 

@@ -71,7 +71,7 @@ def test_each_is_told_in_a_few_words(job: Job) -> None:
 def test_the_console_and_the_page_get_it(job: Job, monkeypatch: pytest.MonkeyPatch) -> None:
     disturb(job)
     events, pages = list[Event](), list[ReportData]()
-    monkeypatch.setattr(report, "write_report", lambda folder, data: pages.append(data))
+    monkeypatch.setattr("sagesplat.output.report.write_report", lambda folder, data: pages.append(data))
     job.run.provenance("report").unlink()
     report.make_report(Job(job.run, events.append, "cpu"))
     report.make_report(Job(job.run, events.append, "cpu"))  # there already, and yet it is told

@@ -21,7 +21,6 @@ from sagesplat.io.files import link, write_text
 from sagesplat.run.records import settings_of
 from sagesplat.run.run_dir import RunDir
 from sagesplat.segment import hf
-from sagesplat.stages import report
 from sagesplat.studies.sweep import run
 from sagesplat.studies.sweep.file import read_sweep
 from sagesplat.studies.sweep.report import MEASURES, Row, readable, summarise
@@ -66,7 +65,10 @@ def rows_of(path: Path) -> list[dict[str, str]]:
 def plain_report() -> Iterator[None]:
     """Figures take most of the time of so small a run, and have their own tests."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(report, "write_report", lambda folder, _: write_text(folder / "index.html", "report"))
+        patch.setattr(
+            "sagesplat.output.report.write_report",
+            lambda folder, _: write_text(folder / "index.html", "report"),
+        )
         yield
 
 
