@@ -13,6 +13,7 @@ from rich.text import Text
 from sagesplat.cli.layout import duration, fitted
 from sagesplat.core.events import (
     Event,
+    Noted,
     RunDone,
     StageDone,
     StageSkipped,
@@ -104,6 +105,8 @@ class Console:
                 self._advance("train", step, total, text)
             case Warned(text):
                 self.say(f"! {text}", style="yellow")
+            case Noted(text):
+                self.note(text)
             case StageDone(name, seconds, lines):
                 if self._task is not None:
                     self._bar.remove_task(self._task)

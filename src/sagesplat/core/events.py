@@ -48,6 +48,13 @@ class Warned:
 
 
 @dataclass(frozen=True)
+class Noted:
+    """Something to know before it happens."""
+
+    text: str
+
+
+@dataclass(frozen=True)
 class StageDone:
     """A stage ended; `lines` summarise its result."""
 
@@ -74,7 +81,7 @@ class RunDone:
     noticed: tuple[str, ...] = ()  # what the run noticed, and dealt with, in words
 
 
-Event = StageStarted | StageSkipped | Progress | Training | Warned | StageDone | TableMade | RunDone
+Event = StageStarted | StageSkipped | Progress | Training | Warned | Noted | StageDone | TableMade | RunDone
 Emit = Callable[[Event], None]
 
 

@@ -30,6 +30,7 @@ from sagesplat.stages.adopt_levels import make_levels
 from sagesplat.stages.boundaries import measure_borders
 from sagesplat.stages.clean import clean_levels
 from sagesplat.stages.compose import compose_plan
+from sagesplat.stages.estimate import tell_duration
 from sagesplat.stages.evaluate import evaluate_plans
 from sagesplat.stages.fit import fit_ladder
 from sagesplat.stages.label import fuse_masks, lift_labels, make_masks
@@ -86,6 +87,7 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
         check_training(job, config.train)
     make_masks(job, config.masks, config.labels)
     lift_labels(job, config.lift)
+    tell_duration(job, config)
     train(job, config.train, config.blocks, config.seed)
     if config.fuse:
         fuse_masks(job)
