@@ -14,6 +14,7 @@ from sagesplat.cli.doctor import Finding, print_findings
 from sagesplat.cli.layout import fitted
 from sagesplat.core.events import (
     Event,
+    Noted,
     Progress,
     RunDone,
     StageDone,
@@ -41,6 +42,7 @@ def events_of(text: str) -> dict[str, Event]:
     return {
         "skipped": StageSkipped(text),
         "warned": Warned(text),
+        "noted": Noted(text),
         "done": StageDone(text, 1.0, (text, text)),
         "table": TableMade(text, ("category", text), ((text, "1"), ("b", text))),
         "report": RunDone(Path("/runs") / visible(text).replace("/", "_"), Path("/runs")),
@@ -57,7 +59,7 @@ def test_whatever_events_hold_is_shown(text: str) -> None:
 
 
 @pytest.mark.parametrize("text", ["[/red]", "/runs/[old]/x", ":car:", "[bold]a[/]", "\\[a]", "日本語"])
-@pytest.mark.parametrize("kind", ["skipped", "warned", "done", "table"])
+@pytest.mark.parametrize("kind", ["skipped", "warned", "noted", "done", "table"])
 def test_brackets_and_codes_are_kept(kind: str, text: str) -> None:
     assert text in printed(events_of(text)[kind])
 
