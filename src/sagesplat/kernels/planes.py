@@ -44,6 +44,24 @@ def to_planes(image: Tensor, space: Workspace, name: str) -> np.ndarray:
     return planes
 
 
+def from_bytes(photo: Tensor) -> Tensor:
+    """A uint8 photo [H, W, 3] as float32 in [0, 1], in planes where these are whole vectors."""
+    height, width, channels = photo.shape
+    if width % LANES:
+        return photo.float() / 255
+    planes = np.empty((channels, height, width), np.float32)
+    _from_bytes(photo.contiguous().numpy(), planes)
+    return to_image(planes, width)
+
+
+@njit(parallel=True, cache=True)
+def _from_bytes(photo, planes):
+    for y in prange(len(photo)):
+        for channel in range(3):
+            for x in range(photo.shape[1]):
+                planes[channel, y, x] = np.float32(photo[y, x, channel]) / np.float32(255)
+
+
 @njit(parallel=True, cache=True)
 def _take_apart(image, planes):
     height, width, _ = image.shape
