@@ -14,6 +14,7 @@ from numba import njit, prange
 from sagesplat.core.config import TrainConfig
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.sh import num_bases
+from sagesplat.kernels.planes import padded
 from sagesplat.kernels.simd import fma, splat16, total
 from sagesplat.metrics.image import photometric_loss
 from sagesplat.raster import Workspace, blend, cpu, rasterize
@@ -58,7 +59,7 @@ def peak_gflops() -> float:
 @njit(cache=True)
 def _count_pairs(records, starts, ends, ids, tiles_x):
     """Pairs of a pixel and a Gaussian that blending evaluates."""
-    batch, rows = np.zeros((16, blend.BATCHED), np.float32), np.empty((2, 16), np.float32)
+    batch, rows = blend.new_batch()  # pyright: ignore[reportCallIssue]
     pairs = 0
     for tile in range(len(ends)):
         x0, y0 = np.float32(tile % tiles_x * blend.TILE), np.float32(tile // tiles_x * blend.TILE)
@@ -66,18 +67,21 @@ def _count_pairs(records, starts, ends, ids, tiles_x):
             last = min(first + 16, ends[tile])
             blend.gather_batch(records, ids, first, last, x0, y0, batch, rows)  # pyright: ignore[reportCallIssue]
             for j in range(last - first):
-                pairs += max(0, int(rows[1, j]) - int(rows[0, j])) * blend.TILE
+                for band in range(blend.BANDS):
+                    pairs += max(0, int(rows[band, 1, j]) - int(rows[band, 0, j])) * blend.LANES
     return pairs
 
 
 def blending(g: Gaussians, camera: Camera, repeats: int) -> dict[str, float]:
     """The two blending loops alone: milliseconds, and pairs a second."""
     records, radii, found = cpu.intersections(g, camera, Workspace())
-    size, num = (camera.height, camera.width), len(found.starts) - 1
-    image, left, ends = np.zeros((*size, 3), np.float32), np.zeros(size, np.float32), np.zeros(num, np.int64)
-    black, sums = np.zeros(3, np.float32), np.zeros((len(found.ids), blend.SUMS), np.float32)
+    num = len(found.starts) - 1
+    ends, black, rows = np.zeros(num, np.int64), np.zeros(3, np.float32), len(found.ids)
+    left = np.zeros((camera.height, padded(camera.width)), np.float32)
+    image, none = np.zeros((3, *left.shape), np.float32), left[:0]
     grad = np.random.default_rng(0).normal(size=image.shape).astype(np.float32)
-    none = np.zeros(size, np.float32)
+    grad[..., camera.width :] = 0
+    sums, reached = np.zeros((rows, blend.SUMS), np.float32), np.zeros(rows, np.bool_)
     forward = milliseconds(
         lambda: blend.forward(
             records, found.starts, found.ids, found.row_order, camera.width, camera.height, black, image,
@@ -88,7 +92,7 @@ def blending(g: Gaussians, camera: Camera, repeats: int) -> dict[str, float]:
     backward = milliseconds(
         lambda: blend.backward(
             records, radii, found.starts, ends, found.ids, found.slots, found.row_order, camera.width,
-            camera.height, image, left, grad, none, sums, None,
+            image, left, grad, none, reached, sums, None,
         ),
         repeats, best=True,
     )  # fmt: skip

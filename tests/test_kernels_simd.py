@@ -1,6 +1,7 @@
 """Vectors in kernels against numpy."""
 
 import numpy as np
+import pytest
 from numba import njit
 
 from sagesplat.kernels import simd
@@ -21,6 +22,7 @@ from sagesplat.kernels.simd import (
     log2,
     maximum,
     minimum,
+    prefetch,
     scatter,
     single,
     splat16,
@@ -124,8 +126,27 @@ def _sums(x, out):
     )  # fmt: skip
 
 
-def test_eight_sums_at_once():
-    x, out = RNG.normal(size=128).astype(np.float32), np.zeros(10, np.float32)
-    _sums(x, out)
-    np.testing.assert_allclose(out[1:9], x.reshape(8, 16).sum(1), rtol=1e-5, atol=1e-5)
+@njit
+def _sums_of_eight(x, out):
+    store_totals(
+        out, 1, load8(x, 0), load8(x, 8), load8(x, 16), load8(x, 24), load8(x, 32), load8(x, 40),
+        load8(x, 48), load8(x, 56),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("sums", "lanes"), [(_sums, 16), (_sums_of_eight, 8)])
+def test_eight_sums_at_once(sums, lanes):
+    x, out = RNG.normal(size=8 * lanes).astype(np.float32), np.zeros(10, np.float32)
+    sums(x, out)
+    np.testing.assert_allclose(out[1:9], x.reshape(8, lanes).sum(1), rtol=1e-5, atol=1e-5)
     assert out[0] == out[9] == 0
+
+
+@njit
+def _prefetched(x):
+    prefetch(x, len(x) // 2)
+    return x.sum()
+
+
+def test_prefetching_changes_nothing():
+    assert _prefetched(np.ones(100, np.float32)) == 100

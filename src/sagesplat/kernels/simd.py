@@ -8,9 +8,11 @@ Memory is addressed flat, in elements, and never checked.
 
 import math
 import operator
+import os
 from collections.abc import Callable
 from typing import Any
 
+import llvmlite.binding
 import numba.extending
 import numpy as np
 from llvmlite import ir
@@ -63,6 +65,8 @@ class Mask(types.Type):
 
 
 f16, f8, d8 = Vector(types.float32, 16), Vector(types.float32, 8), Vector(types.float64, 8)
+_WIDE = llvmlite.binding.get_host_cpu_features().get("avx512f", False)
+LANES = int(os.environ.get("SAGESPLAT_LANES", 16 if _WIDE else 8))  # the variable is for tests
 
 
 @register_model(Vector)
@@ -280,18 +284,21 @@ single = _function(lambda builder, kind, a: builder.fptrunc(a, f8.llvm), lambda 
 
 @intrinsic
 def fma(typing_context, a, b, c):  # type: ignore[no-untyped-def]
-    """a b + c of three f16, rounded once."""
+    """a b + c of three vectors, rounded once."""
     return a(a, b, c), lambda context, builder, sig, values: _fma(builder, a, *values)
 
 
-@intrinsic
-def splat16(typing_context, value):  # type: ignore[no-untyped-def]
-    """A number in all lanes of an f16."""
+def _splat(vector: Vector) -> Any:
+    @intrinsic
+    def splat(typing_context: Any, value: Any) -> Any:
+        return vector(value), lambda context, builder, sig, values: _in_all_lanes(
+            context, builder, values[0], value, vector
+        )
 
-    def generate(context: Any, builder: Any, sig: Any, values: Any) -> Any:
-        return _in_all_lanes(context, builder, values[0], value, f16)
+    return splat
 
-    return f16(value), generate
+
+splat16, splat8 = _splat(f16), _splat(f8)  # a number in all lanes
 
 
 # Memory --------------------------------------------------------------------------------------------------
@@ -330,7 +337,8 @@ def _spread(context: Any, builder: Any, vector: Vector, array: Any, *values: Any
 
 
 load16, load8 = _reader(f16, _load), _reader(f8, _load)  # array[index : index + lanes]
-spread16 = _reader(f16, _spread)  # array[index] in all lanes
+spread16, spread8 = _reader(f16, _spread), _reader(f8, _spread)  # array[index] in all lanes
+load, spread, splat = (load16, spread16, splat16) if LANES == 16 else (load8, spread8, splat8)
 
 
 def _channel_reader(channel: int) -> Any:
@@ -365,6 +373,20 @@ def store(typing_context, array, index, vector):  # type: ignore[no-untyped-def]
         return context.get_dummy_value()
 
     return types.void(array, types.int64, vector), generate
+
+
+@intrinsic
+def prefetch(typing_context, array, index):  # type: ignore[no-untyped-def]
+    """Fetch array[index] into the cache: a later access need not wait for it."""
+
+    def generate(context: Any, builder: Any, sig: Any, values: Any) -> Any:
+        address = _address(context, builder, array, *values)
+        address = builder.bitcast(address, ir.IntType(8).as_pointer())
+        options = [ir.Constant(_INT, option) for option in (0, 3, 1)]  # to read, to keep, data
+        _call(builder, "llvm.prefetch.p0", ir.VoidType(), address, *options)
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64), generate
 
 
 @intrinsic
@@ -408,19 +430,26 @@ def _folded(builder: Any, a: Any, b: Any, group: int) -> Any:
 
 @intrinsic
 def store_totals(typing_context, array, index, v0, v1, v2, v3, v4, v5, v6, v7):  # type: ignore[no-untyped-def]
-    """array[index : index + 8] = the sums of the lanes of eight f16, added as one tree."""
+    """array[index : index + 8] = the sums of the lanes of eight f16 or eight f8, added as one tree."""
+    if v0 not in (f16, f8):
+        return None
 
     def generate(context: Any, builder: Any, sig: Any, values: Any) -> Any:
-        vectors, group = list(values[2:]), f16.lanes
+        vectors, group = list(values[2:]), v0.lanes
         while len(vectors) > 1:
             pairs = zip(vectors[::2], vectors[1::2], strict=True)
             vectors = [_folded(builder, *pair, group) for pair in pairs]
             group //= 2
-        none = ir.Constant(f16.llvm, ir.Undefined)
-        orders = (ir.Constant(ir.VectorType(_INT, 8), [2 * k + shift for k in range(8)]) for shift in (0, 1))
-        parts = (builder.shuffle_vector(vectors[0], none, order) for order in orders)
+        sums = vectors[0]
+        if group > 1:  # of f16 two lanes each are left
+            none = ir.Constant(f16.llvm, ir.Undefined)
+            orders = (
+                ir.Constant(ir.VectorType(_INT, 8), [2 * k + shift for k in range(8)]) for shift in (0, 1)
+            )
+            parts = (builder.shuffle_vector(sums, none, order) for order in orders)
+            sums = builder.fadd(*parts, flags=_FLAGS)
         address = _address(context, builder, array, values[0], values[1], f8.llvm)
-        builder.store(builder.fadd(*parts, flags=_FLAGS), address, align=4)
+        builder.store(sums, address, align=4)
         return context.get_dummy_value()
 
-    return types.void(array, types.int64, *[f16] * 8), generate
+    return types.void(array, types.int64, *[v0] * 8), generate

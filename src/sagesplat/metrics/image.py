@@ -5,30 +5,34 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Int, UInt8
-from numba import get_num_threads
 from torch import Tensor
 
+from sagesplat.kernels.planes import to_image, to_planes
 from sagesplat.kernels.workspace import Workspace
 from sagesplat.metrics import ssim_cpu
 
 SSIM_WEIGHT = 0.2  # of the published 3DGS loss: 0.8 L1 + 0.2 (1 - SSIM)
 
 
-def _scratch(width: int, space: Workspace) -> np.ndarray:
-    return space.take("ssim scratch", get_num_threads(), ssim_cpu.scratch_size(width))
-
-
 def _maps(
-    x: np.ndarray, y: np.ndarray, tile_mask: np.ndarray | None, space: Workspace
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """SSIM [C, H, W], its derivatives, the tiles that count, and the sum over those by the size of all."""
-    height, width, channels = x.shape
-    wide, sums = ssim_cpu.padded(width), np.empty((channels, ssim_cpu.strips(height)))
-    values = space.take("ssim", channels, height, wide)
-    derivatives = space.take("ssim derivatives", 3, channels, height, wide)
+    x: np.ndarray,
+    y: np.ndarray,
+    width: int,
+    tile_mask: np.ndarray | None,
+    space: Workspace,
+    values: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """SSIM of planes [3, H, W'] into `values`; its derivatives, the tiles that count, and the sum over those
+    by the size of all.
+    """
+    channels, height, _ = x.shape
+    sums, derivatives = (
+        np.empty((channels, ssim_cpu.strips(height))),
+        space.take("ssim derivatives", 3, *x.shape),
+    )
     tiles = ssim_cpu.all_tiles(height, width) if tile_mask is None else tile_mask
-    ssim_cpu.compare(x, y, tiles, _scratch(width, space), values, derivatives, sums)
-    return values[..., :width], derivatives, tiles, float(sums.sum()) / x.size
+    ssim_cpu.compare(x, y, tiles, width, values, derivatives, sums)
+    return derivatives, tiles, float(sums.sum()) / (channels * height * width)
 
 
 def ssim_map(
@@ -58,8 +62,13 @@ def ssim_map(
         >>> bool(np.allclose(ssim_map(photo, photo), 1, atol=1e-5)), ssim_map(photo, 1 - photo).shape
         (True, (32, 48))
     """
-    values, *_ = _maps(np.ascontiguousarray(x), np.ascontiguousarray(y), tile_mask, Workspace())
-    return values.mean(0)
+    space, width = Workspace(), x.shape[1]
+    one, other = (
+        to_planes(torch.from_numpy(np.ascontiguousarray(i)), space, name) for i, name in ((x, "x"), (y, "y"))
+    )
+    values = np.zeros_like(one)
+    _maps(one, other, width, tile_mask, space, values)
+    return values[..., :width].mean(0)
 
 
 def squared_error_map(
@@ -114,19 +123,20 @@ class _PhotometricLoss(torch.autograd.Function):
         tile_mask: np.ndarray | None,
         space: Workspace,
     ) -> Tensor:
-        x, y = rgb.detach().contiguous().numpy(), photo.contiguous().numpy()
-        height, width, channels = x.shape
-        _, derivatives, tiles, quality = _maps(x, y, tile_mask, space)
+        x, y = to_planes(rgb, space, "ssim x"), to_planes(photo, space, "ssim y")
+        height, width, channels = rgb.shape
+        derivatives, tiles, quality = _maps(x, y, width, tile_mask, space, x[:0])
         grad, errors = space.take("ssim gradient", *x.shape), np.empty((channels, ssim_cpu.strips(height)))
-        scales = np.float32(-ssim_weight / x.size), np.float32((1 - ssim_weight) / x.size)
-        ssim_cpu.gradient(x, y, tiles, _scratch(width, space), derivatives, *scales, grad, errors)
-        ctx.grad = torch.from_numpy(grad)
-        l1, share = float(errors.sum()) / x.size, ssim_cpu.covered(tiles, height, width)
+        scales = np.float32(-ssim_weight / rgb.numel()), np.float32((1 - ssim_weight) / rgb.numel())
+        ssim_cpu.gradient(x, y, tiles, derivatives, *scales, grad, errors)
+        ctx.grad = to_image(grad, width)
+        l1, share = float(errors.sum()) / rgb.numel(), ssim_cpu.covered(tiles, height, width)
         return torch.tensor((1 - ssim_weight) * l1 + ssim_weight * (share - quality))
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor):
-        return ctx.grad * grads[0], None, None, None, None
+        grad = ctx.grad if grads[0] == 1 else ctx.grad * grads[0]
+        return grad, None, None, None, None
 
 
 def photometric_loss(

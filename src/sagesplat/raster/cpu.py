@@ -11,8 +11,9 @@ from torch import Tensor
 from sagesplat.core import sh
 from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import PARAMETERS, Gaussians
+from sagesplat.kernels.planes import padded, to_image, to_planes
 from sagesplat.kernels.workspace import Workspace
-from sagesplat.raster import blend, project, tiles
+from sagesplat.raster import blend, project, sums, tiles, weights
 from sagesplat.raster.render import Render
 from sagesplat.scene.scene import Camera
 
@@ -96,10 +97,10 @@ class _Rasterize(torch.autograd.Function):
         camera = options.camera
         arrays = _arrays(parameters)
         records, depths, radii = _project(options, arrays)
-        blend.copy_means(records, radii, means2d.detach().numpy())
+        sums.copy_means(records, radii, means2d.detach().numpy())
         width, height, take = camera.width, camera.height, options.workspace.take
         found = _intersections(options, records, depths, radii)
-        left = take("left", height, width)
+        left = take("left", height, padded(width))
         ends = np.empty(len(found.starts) - 1, np.int64)
         passes = [(records, _array(background))] + [
             (_with_colors(records, chunk), np.zeros(_CHUNK, np.float32))
@@ -107,45 +108,48 @@ class _Rasterize(torch.autograd.Function):
         ]
         images = []
         for index, (painted, behind) in enumerate(passes):
-            image = take(f"image {index}", height, width, 3)
+            image = take(f"image {index}", 3, height, padded(width))
             blend.forward(
                 painted, found.starts, found.ids, found.row_order, width, height, behind, image, left, ends
             )
             images.append(image)
         ctx.save_for_backward(*parameters)
+        ctx.set_materialize_grads(False)
         ctx.kept = options, [p for p, _ in passes], radii, found, ends, images, left, features.shape[1]
-        extra = np.concatenate([images[0][..., :0], *images[1:]], -1)[..., : features.shape[1]]
+        extra = np.concatenate([images[0][:0], *images[1:]])[: features.shape[1]]
         ctx.mark_non_differentiable(out_radii := torch.from_numpy(radii))
-        return torch.from_numpy(images[0]), torch.from_numpy(1 - left), torch.from_numpy(extra), out_radii
+        alpha = torch.from_numpy(1 - left[:, :width])
+        return to_image(images[0], width), alpha, to_image(extra, width), out_radii
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor):
         options, painted, radii, found, ends, images, left, num_features = ctx.kept
         arrays = _arrays(ctx.saved_tensors)
-        g_rgb, g_alpha, g_extra = (_array(g) for g in grads[:3])
+        g_rgb, g_alpha, g_extra = grads[:3]
         n, camera, space = len(radii), options.camera, options.workspace
         g_mean2d, g_conic = space.zeros("g_mean2d", n, 2), space.zeros("g_conic", n, 3)
         g_opacity, g_color = space.zeros("g_opacity", n), space.zeros("g_color", n, 3)
         g_features = np.zeros((n, num_features), np.float32)
-        sums = space.take("sums", len(found.ids), blend.SUMS)
+        rows, reached = space.take("sums", len(found.ids), blend.SUMS), _unreached(found, space)
         absolute = space.take("absolute", len(found.ids), 2) if options.absgrad else None
         g_absolute = np.zeros((n, 2), np.float32) if options.absgrad else g_mean2d
         to_pose = ctx.needs_input_grad[4]  # all Gaussians that are drawn have their share in it
         masked = options.trainable is not None and not to_pose
         moved = radii * options.trainable if masked else radii
-        no_alpha = np.zeros_like(g_alpha)
+        g_left, no_left = _gradient_of_left(g_alpha, left, space), left[:0]
         for index, (records, image) in enumerate(zip(painted, images, strict=True)):
             first = index == 0
-            g_image = g_rgb if first else _padded(g_extra, _CHUNK * (index - 1))
+            g_image = g_rgb if first else _chunk(g_extra, index - 1)
             blend.backward(
-                records, moved, found.starts, ends, found.ids, found.slots, found.row_order, camera.width,
-                camera.height,
-                image, left, g_image, -g_alpha if first else no_alpha, sums, absolute,
+                records, moved if masked else radii[:0], found.starts, ends, found.ids, found.slots,
+                found.row_order, camera.width, image, left, _planes(g_image, left, space),
+                g_left if first else no_left, reached, rows, absolute,
             )  # fmt: skip
             g_channels = g_color if first else np.zeros((n, 3), np.float32)
-            blend.reduce(records, moved, found.offsets, sums, g_mean2d, g_conic, g_opacity, g_channels)
+            found_of = records, moved, found.offsets, reached, rows
+            sums.reduce(*found_of, g_mean2d, g_conic, g_opacity, g_channels)
             if absolute is not None:
-                blend.add_by_gaussian(found.offsets, absolute, g_absolute)
+                sums.add_by_gaussian(found.offsets, reached, absolute, g_absolute)
             if not first:
                 part = g_features[:, _CHUNK * (index - 1) : _CHUNK * index]
                 part[:] = g_channels[:, : part.shape[1]]
@@ -172,6 +176,31 @@ class _Rasterize(torch.autograd.Function):
         )  # fmt: skip
 
 
+def _unreached(found: tiles.Intersections, space: Workspace) -> np.ndarray:
+    """Which intersections blending reaches, before it begins."""
+    reached = space.take("reached", len(found.ids), dtype=np.bool_)
+    reached.fill(False)
+    return reached
+
+
+def _gradient_of_left(g_alpha: Tensor | None, left: np.ndarray, space: Workspace) -> np.ndarray:
+    """dL/d(remaining transmittance) [H, W'], with zeros beyond W; no rows where alpha has no gradient."""
+    if g_alpha is None:
+        return left[:0]
+    gradient = space.zeros("g_left", *left.shape)
+    gradient[:, : g_alpha.shape[1]] = -g_alpha.numpy()
+    return gradient
+
+
+def _planes(g_image: Tensor | None, left: np.ndarray, space: Workspace) -> np.ndarray:
+    """The gradient of up to three channels as planes [3, H, W']."""
+    if g_image is None:
+        return space.zeros("g_image", 3, *left.shape)
+    if g_image.shape[-1] < _CHUNK:
+        g_image = torch.nn.functional.pad(g_image, (0, _CHUNK - g_image.shape[-1]))
+    return to_planes(g_image, space, "g_image")
+
+
 def _of_pose(camera: Camera, d_means: np.ndarray, d_turns: np.ndarray) -> Tensor:
     """Gradient [6] of the camera's rotation and translation: to move it is to move all means."""
     translation = camera.w2c[:3, :3].astype(np.float64) @ d_means.sum(0, dtype=np.float64)
@@ -181,6 +210,10 @@ def _of_pose(camera: Camera, d_means: np.ndarray, d_turns: np.ndarray) -> Tensor
 
 def _chunks(features: np.ndarray) -> list[np.ndarray]:
     return [_padded(features, at) for at in range(0, features.shape[-1], _CHUNK)]
+
+
+def _chunk(values: Tensor | None, index: int) -> Tensor | None:
+    return None if values is None else values[..., _CHUNK * index : _CHUNK * (index + 1)]
 
 
 def _padded(values: np.ndarray, at: int) -> np.ndarray:
@@ -259,7 +292,7 @@ def most_painted(
     """See `sagesplat.raster.most_painted`."""
     records, _, found = intersections(g, camera, space, antialiased=antialiased)
     out = np.zeros((camera.height, camera.width), np.int64)
-    blend.most(
+    weights.most(
         records, found.starts, found.ids, found.row_order, camera.width, camera.height,
         np.ascontiguousarray(columns_of, np.int64), num_columns, out,
     )  # fmt: skip
@@ -278,9 +311,9 @@ def add_weights(
     """See `sagesplat.raster.add_weights`."""
     workspace = workspace or Workspace()
     records, _, found = intersections(g, camera, workspace, antialiased=antialiased)
-    sums = workspace.take("weights", len(found.ids), out.shape[1])
-    blend.weigh(
+    rows, reached = workspace.take("weights", len(found.ids), out.shape[1]), _unreached(found, workspace)
+    weights.weigh(
         records, found.starts, found.ids, found.slots, found.row_order, camera.width, camera.height,
-        columns_of, sums,
+        columns_of, reached, rows,
     )  # fmt: skip
-    blend.add_by_gaussian(found.offsets, sums, out)
+    sums.add_by_gaussian(found.offsets, reached, rows, out)

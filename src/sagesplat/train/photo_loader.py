@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sagesplat.kernels.planes import from_bytes
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene
 from sagesplat.segment.valid import ALL_VALID, ValidPixels
@@ -52,7 +53,7 @@ class PhotoLoader:
             return self._kept[key]
         photo, camera = self._coming.pop(key).result() if key in self._coming else self._load(row, factor)
         if self.device.type == "cpu":
-            return photo.float() / 255, camera
+            return from_bytes(photo), camera
         photo = photo.to(self.device, non_blocking=True)
         if self._used + photo.nbytes <= self.limit:
             self._kept[key] = photo, camera
