@@ -8,7 +8,7 @@ import torch
 from conftest import pinhole, random_gaussians
 
 from sagesplat.adapt.ladder import PrefixLadder
-from sagesplat.adapt.seen import seen_from
+from sagesplat.adapt.seen import SeenRecords, seen_from, seen_levels
 from sagesplat.core.second_opacity import SecondOpacities
 from sagesplat.formats.levels import write_set
 from sagesplat.raster import Workspace, in_sight, most_painted, rasterize
@@ -24,7 +24,10 @@ def test_compositions_render_alike(tmp_path, two, antialiased):
     write_set(tmp_path / "ladder.npz", g, 1, sizes, second=second)
     ladder = PrefixLadder(tmp_path / "ladder.npz", sizes)
     camera = pinhole(70, 50)
-    seen = seen_from(ladder, camera, backend="cpu", antialiased=antialiased, workspace=Workspace())
+    how = {"backend": "cpu", "antialiased": antialiased, "workspace": Workspace()}
+    seen, fast = seen_levels(ladder, camera, **how), seen_from(ladder, camera, **how)
+    assert isinstance(fast, SeenRecords)
+    assert fast.nbytes == seen.nbytes
     assert 0 < seen.nbytes == 60 * len(seen.gaussians) < 60 * 300
     assert seen.gaussians.sh_degree == 0 < g.sh_degree
     for levels in ({3: 1, 7: 1}, {3: 3, 7: 2}, {7: 3, 3: 2}, {3: 3, 7: 3}, {7: 1}):
@@ -32,6 +35,8 @@ def test_compositions_render_alike(tmp_path, two, antialiased):
             rasterize(one.compose(levels), camera, antialiased=antialiased).rgb for one in (ladder, seen)
         )
         np.testing.assert_allclose(actual, expected, atol=2e-6)
+        np.testing.assert_allclose(seen.render(levels), expected.clamp(0, 1), atol=2e-6)
+        np.testing.assert_allclose(fast.render(levels), expected.clamp(0, 1), atol=5e-6)
         assert len(seen.compose(levels)) <= len(ladder.compose(levels))
 
 

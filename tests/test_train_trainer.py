@@ -141,6 +141,29 @@ def test_a_killed_run_ends_where_it_would_have(scene, undisturbed, tmp_path, kil
     assert_identical(final(finished), final(events))
 
 
+def test_large_states_are_saved_less_often(scene, undisturbed, tmp_path, monkeypatch):
+    """Every other level here; the end is always saved, and a killed run ends where it would have."""
+    events, _ = undisturbed
+    monkeypatch.setattr(trainer, "_SMALL", 0)
+    monkeypatch.setattr(trainer, "_SAVE_EVERY", 20)
+    for event in run(scene, BUSY, folder=tmp_path, settings="s"):
+        if isinstance(event, Step) and event.step == 47:
+            break
+    resumed = list(run(scene, BUSY, folder=tmp_path, settings="s"))
+    assert resumed[0] == Resumed(24)
+    assert_identical(final(resumed), final(events))
+    assert next(run(scene, BUSY, folder=tmp_path, settings="s")) == Resumed(60)
+
+
+def test_training_begins_with_given_gaussians(scene):
+    start = random_gaussians(40, seed=3, degree=3)
+    config = replace(BUSY, max_steps=1, strategy="mcmc")
+    found = final(list(run(scene, config, start=start)))
+    assert len(found) == 40
+    near = torch.cdist(found.means, start.means).min(1).values
+    assert float(near.max()) < 0.1 < float(torch.pdist(start.means).median())
+
+
 def test_a_checkpoint_of_other_settings_is_refused(scene, undisturbed):
     _, folder = undisturbed
     with pytest.raises(RunError, match=r"made with other settings"):

@@ -4,7 +4,7 @@ It needs no photo, so it can be measured at any number of viewpoints (`adapt.vie
 category are those that its Gaussians paint in the full model. In the full model itself it is 1.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,9 +13,8 @@ from jaxtyping import Bool, Float32, Int, Int16, Int32
 
 from sagesplat.adapt.ladder import Ladder, PrefixLadder
 from sagesplat.adapt.observe import PERCENTILE, RenderedLabels, distances_in_views, render_rgb
-from sagesplat.adapt.seen import SeenLevels, seen_from
+from sagesplat.adapt.seen import Seen, seen_from
 from sagesplat.core.errors import DataError, short
-from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.files import atomic_path
 from sagesplat.io.npz import Npz
 from sagesplat.metrics.image import means_by_label, ssim_map
@@ -80,8 +79,8 @@ def measure_levels(
         pixels[row] = at.pixels
         found[row, pixels[row] > 0, -1] = 1.0
         for column, level in enumerate(ladder.levels[:-1]):
-            g = at.levels.compose(dict.fromkeys(labels, level))
-            found[row, :, column], whole[row, column] = references.compare(g, camera, at)
+            of_level = dict.fromkeys(labels, level)
+            found[row, :, column], whole[row, column] = references.compare(of_level, camera, at)
         if progress:
             progress(row + 1, len(cameras))
     return found, pixels, whole
@@ -115,8 +114,8 @@ def measure_compositions(
                 found[row, column] = found[row, known[levels]]
                 continue
             known[levels] = column
-            g = at.levels.compose(dict(zip(labels, levels, strict=True)))
-            found[row, column, :-1], found[row, column, -1] = references.compare(g, camera, at)
+            planned_here = dict(zip(labels, levels, strict=True))
+            found[row, column, :-1], found[row, column, -1] = references.compare(planned_here, camera, at)
         if progress:
             progress(row + 1, len(cameras))
     return found, pixels
@@ -129,12 +128,12 @@ class Reference:
     image: Float32[np.ndarray, "H W 3"]
     label_ids: Int16[np.ndarray, "H W"]
     pixels: Int32[np.ndarray, " L"]  # of each label, ascending
-    levels: Ladder | SeenLevels
+    levels: Seen | None  # None: those of the ladder
 
     @property
     def nbytes(self) -> int:
         """Memory that it holds, about."""
-        seen = self.levels.nbytes if isinstance(self.levels, SeenLevels) else 0
+        seen = self.levels.nbytes if self.levels else 0
         return self.image.nbytes + self.label_ids.nbytes + seen
 
 
@@ -157,7 +156,7 @@ class References:
             return self._kept[key]
         image, label_ids = self._painted.paint(camera)
         pixels = np.array([(label_ids == label).sum() for label in self.labels], np.int32)
-        levels: Ladder | SeenLevels = self._ladder
+        levels: Seen | None = None
         if isinstance(self._ladder, PrefixLadder):
             levels = seen_from(
                 self._ladder, camera, backend=self._backend, antialiased=self._antialiased,
@@ -169,11 +168,17 @@ class References:
             self._kept[key] = found
         return found
 
-    def compare(self, g: Gaussians, camera: Camera, at: Reference) -> tuple[Float32[np.ndarray, " L"], float]:
-        """Fidelity by label, NaN where one is not in sight, and of the whole image."""
-        image = render_rgb(
-            g, camera, backend=self._backend, antialiased=self._antialiased, workspace=self._workspace
-        )
+    def compare(
+        self, levels: Mapping[int, int], camera: Camera, at: Reference
+    ) -> tuple[Float32[np.ndarray, " L"], float]:
+        """Fidelity of a composition by label, NaN where one is not in sight, and of the whole image."""
+        if at.levels:
+            image = at.levels.render(levels)
+        else:
+            image = render_rgb(
+                self._ladder.compose(levels), camera, backend=self._backend, antialiased=self._antialiased,
+                workspace=self._workspace,
+            )  # fmt: skip
         quality = ssim_map(image, at.image)
         means = means_by_label(quality, at.label_ids)
         by_label = [means[label][0] if label in means else np.nan for label in self.labels]

@@ -304,10 +304,9 @@ def observe(
     rows: list[dict[str, float]] = []
     views = valid.rows(scene, range(len(scene.views)) if views is None else views)
     inner = {row: erode(masks[scene.views[row]]) for row in views}
-    total, workspace = len(ladder.levels) * len(views), Workspace()
-    for done, (level, row, g) in enumerate(_sets(ladder, scene, views, backend, antialiased), 1):
+    total = len(ladder.levels) * len(views)
+    for done, (level, row, image) in enumerate(_images(ladder, scene, views, backend, antialiased), 1):
         view = scene.views[row]
-        image = render_rgb(g, view.camera, backend=backend, antialiased=antialiased, workspace=workspace)
         found = measure(image, as_unit(photos[row]), masks[view], inner[row], valid[view])
         for label, values in found.items():
             distance = distances[label][row] if label in distances else np.nan
@@ -318,21 +317,20 @@ def observe(
     return table.select(np.argsort(table.level, kind="stable"))
 
 
-def _sets(
+def _images(
     ladder: Ladder, scene: Scene, views: Sequence[int], backend: Backend, antialiased: bool
-) -> Iterator[tuple[int, int, Gaussians]]:
-    """Level, view and Gaussians to render: view by view where levels share theirs, else level by level."""
+) -> Iterator[tuple[int, int, Float32[np.ndarray, "H W 3"]]]:
+    """Level, view and image of it: view by view where levels share Gaussians, else level by level."""
+    how = {"backend": backend, "antialiased": antialiased, "workspace": Workspace()}
     if not isinstance(ladder, PrefixLadder):
         for level in ladder.levels:
             g = ladder.load(level).to(device_of(backend))
-            yield from ((level, row, g) for row in views)
+            yield from ((level, row, render_rgb(g, scene.views[row].camera, **how)) for row in views)
         return
-    workspace = Workspace()
     for row in views:
-        camera = scene.views[row].camera
-        seen = seen_from(ladder, camera, backend=backend, antialiased=antialiased, workspace=workspace)
+        seen = seen_from(ladder, scene.views[row].camera, **how)
         for level in ladder.levels:
-            yield level, row, seen.compose(dict.fromkeys(ladder.sizes, level))
+            yield level, row, seen.render(dict.fromkeys(ladder.sizes, level))
 
 
 def merge(parts: Sequence[Observations]) -> Observations:

@@ -2,16 +2,59 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 import torch
+from jaxtyping import Float32
 
 from sagesplat.adapt.ladder import PrefixLadder, composed
+from sagesplat.adapt.seen_cpu import Drawn, drawn_from
 from sagesplat.core import sh
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.second_opacity import SecondOpacities
-from sagesplat.raster import Backend, Workspace, device_of, in_sight
+from sagesplat.raster import Backend, Workspace, device_of, in_sight, rasterize
 from sagesplat.scene.scene import Camera
+
+Ranges = Mapping[int, tuple[tuple[int, int], ...]]  # first row and last + 1 of each level, by label id
+
+
+class Seen(Protocol):
+    """The levels of a nested ladder from one camera."""
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that they take, about."""
+        ...
+
+    def render(self, levels: Mapping[int, int]) -> Float32[np.ndarray, "H W 3"]:
+        """An image in [0, 1] of each category at its level (label id -> level, 1 to K).
+
+        It may be overwritten when the next one is rendered.
+        """
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class SeenRecords:
+    """The same on a CPU: what does not depend on the levels was projected once."""
+
+    drawn: Drawn
+    ranges: Ranges
+
+    @property
+    def nbytes(self) -> int:
+        """See `Seen`."""
+        return self.drawn.nbytes
+
+    def render(self, levels: Mapping[int, int]) -> Float32[np.ndarray, "H W 3"]:
+        """See `Seen`."""
+        parts = [
+            (*of_level[levels[label] - 1], self.drawn.weights[label][levels[label] - 1])
+            for label, of_level in self.ranges.items()
+            if label in levels
+        ]
+        return self.drawn.render(parts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +66,10 @@ class SeenLevels:
 
     gaussians: Gaussians
     second: SecondOpacities | None
-    ranges: Mapping[int, tuple[tuple[int, int], ...]]  # first row and last + 1 of each level, by label id
+    ranges: Ranges
+    camera: Camera
+    backend: Backend
+    antialiased: bool
 
     @property
     def nbytes(self) -> int:
@@ -34,11 +80,33 @@ class SeenLevels:
         """The union over categories of the Gaussians of each at its level (label id -> level, 1 to K)."""
         return composed(self.gaussians, self.second, self.ranges, levels)
 
+    def render(self, levels: Mapping[int, int]) -> Float32[np.ndarray, "H W 3"]:
+        """See `Seen`."""
+        how = {"antialiased": self.antialiased, "backend": self.backend}
+        with torch.no_grad():
+            return rasterize(self.compose(levels), self.camera, **how).rgb.clamp(0, 1).float().cpu().numpy()
+
 
 def seen_from(
     ladder: PrefixLadder, camera: Camera, *, backend: Backend, antialiased: bool, workspace: Workspace
+) -> Seen:
+    """The levels of a ladder as `camera` sees them; `antialiased`: how the model was trained.
+
+    On a CPU all that have the same workspace render into the same memory.
+    """
+    found = seen_levels(ladder, camera, backend=backend, antialiased=antialiased, workspace=workspace)
+    if backend not in ("auto", "cpu") or camera.exposure is not None or not len(found.gaussians):
+        return found
+    weights = found.second.weights if found.second else {k: (0.0,) * len(v) for k, v in found.ranges.items()}
+    second = found.second.logits if found.second else None
+    drawn = drawn_from(found.gaussians, second, weights, camera, antialiased, workspace)
+    return SeenRecords(drawn, found.ranges)
+
+
+def seen_levels(
+    ladder: PrefixLadder, camera: Camera, *, backend: Backend, antialiased: bool, workspace: Workspace
 ) -> SeenLevels:
-    """The levels of a ladder as `camera` sees them; `antialiased`: how the model was trained."""
+    """The same as Gaussians, on any device."""
     device = device_of(backend)
     g, second = ladder.gaussians.to(device), ladder.second
     most = g
@@ -52,7 +120,8 @@ def seen_from(
         for label, of_level in ladder.ranges.items()
     }
     rows = torch.nonzero(seen)[:, 0]
-    return SeenLevels(_as_seen(g.select(rows), camera), second.select(rows) if second else None, ranges)
+    second = second.select(rows) if second else None
+    return SeenLevels(_as_seen(g.select(rows), camera), second, ranges, camera, backend, antialiased)
 
 
 def _as_seen(g: Gaussians, camera: Camera) -> Gaussians:

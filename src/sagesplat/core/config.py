@@ -251,8 +251,8 @@ class NestConfig:
     base_share: float = 0.2
     """Size of the base model, as a fraction of all Gaussians; it is a small 3DGS-MCMC model that forms the
     lowest levels; 0: none."""
-    base_steps: int = 3000
-    """Training steps of the base model."""
+    base_steps: int = 800
+    """Training steps of the base model, which begins with the trained model, merged to that size."""
     full_share: float = 0.1
     """Fraction of the first steps that sample the full model; changes linearly to --nest.full-share-end."""
     full_share_end: float = 0.9

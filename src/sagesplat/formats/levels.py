@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool
+from numba import prange
 
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import PARAMETERS, Gaussians, checked, concat
@@ -22,6 +23,7 @@ from sagesplat.core.second_opacity import SecondOpacities
 from sagesplat.core.sh import num_bases
 from sagesplat.io.files import atomic_path
 from sagesplat.io.npz import Npz
+from sagesplat.kernels.jit import njit
 
 _DAMAGED = (OSError, KeyError, TypeError, ValueError)  # raised for truncated or damaged files
 _LADDER = (["sizes"], ["replaces"], ["weights"])  # arrays of a category that are no Gaussians
@@ -120,10 +122,12 @@ def _write(path: Path, header: LevelFile, g: Gaussians, more: dict[str, Any], ex
     meta = np.array([header.step, header.recovering, header.sh_degree], np.int64)
     arrays: dict[str, np.ndarray] = {"meta": meta, **more}
     columns_of = _exact if exact else _encoded
+    whole = {name: p.detach().cpu().numpy() for name, p in g.parameters().items()}
+    whole["shN"] = whole["shN"][:, : num_bases(header.sh_degree) - 1]
+    label_ids = g.label_ids.cpu().numpy()
     for label in header.counts:
-        part = g.of_labels([label])
-        values = {name: p.detach().cpu().numpy() for name, p in part.parameters().items()}
-        values["shN"] = values["shN"][:, : num_bases(header.sh_degree) - 1]
+        rows = np.flatnonzero(label_ids == label)
+        values = {name: value[rows] for name, value in whole.items()}
         arrays |= {f"{label}/{name}": column for name, column in columns_of(values).items()}
     with atomic_path(path, nbytes=sum(a.nbytes for a in arrays.values())) as temporary:
         np.savez(temporary, allow_pickle=False, **arrays)
@@ -135,15 +139,27 @@ def _exact(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 def _encoded(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     quats = values["quats"] / np.linalg.norm(values["quats"], axis=1, keepdims=True)
-    scale = np.abs(values["shN"]).max(axis=0, initial=0)
-    share = values["shN"] / np.where(scale > 0, scale, 1)
+    shN = values["shN"]
+    scale = np.maximum(shN.max(axis=0, initial=0), -shN.min(axis=0, initial=0))
     return {
         "means": values["means"],
         "quats": np.round(quats * 32767).astype(np.int16),
         **{name: values[name].astype(np.float16) for name in _HALVES},
-        "shN": np.round(np.sign(share) * np.sqrt(np.abs(share)) * 127).astype(np.int8),
+        "shN": _roots(shN.reshape(len(shN), -1), np.where(scale > 0, scale, 1).ravel()).reshape(shN.shape),
         "shN_scale": scale.astype(np.float32),
     }
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def _roots(values, scale):
+    """127 times the square roots of `values` [N, K] over `scale` [K], with their signs, as int8."""
+    found = np.empty(values.shape, np.int8)
+    for i in prange(len(values)):
+        for k in range(len(scale)):
+            share = values[i, k] / scale[k]
+            root = np.rint(np.sqrt(abs(share)) * np.float32(127))
+            found[i, k] = np.int8(root if share >= 0 else -root)
+    return found
 
 
 def read_sizes(path: Path) -> dict[int, tuple[int, ...]]:

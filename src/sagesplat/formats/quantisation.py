@@ -66,11 +66,30 @@ def rounded(g: Gaussians, sh_bits: tuple[int, int], rows: Tensor | None = None) 
     flat = (g.sh0.flatten(1), g.log_scales, g.shN.flatten(1))
     found = _rounded_rows(*(values.numpy() for values in flat), index, steps)
     sh0, log_scales, shN = map(torch.from_numpy, found)
-    sh0, shN = sh0[:, None], shN.reshape(len(index), *g.shN.shape[1:])
-    if rows is None:
-        return replace(g, sh0=sh0, log_scales=log_scales, shN=shN)
-    others = {name: getattr(g, name)[rows] for name in ("means", "quats", "logit_opacities", "label_ids")}
-    return Gaussians(**others, sh0=sh0, log_scales=log_scales, shN=shN)
+    values = {"sh0": sh0[:, None], "log_scales": log_scales}
+    values["shN"] = shN.reshape(len(index), *g.shN.shape[1:])
+    if rows is not None:
+        others = (g.means, g.quats, g.logit_opacities, g.label_ids)
+        gathered = map(torch.from_numpy, _gathered(*(t.numpy() for t in others), index))
+        values |= zip(("means", "quats", "logit_opacities", "label_ids"), gathered, strict=True)
+    return replace(g, **values)
+
+
+@njit(parallel=True, cache=True)
+def _gathered(means, quats, logits, labels, rows):
+    """The rows of each: one pass, where torch gathers each by itself."""
+    n = len(rows)
+    to_means, to_quats = np.empty((n, 3), means.dtype), np.empty((n, 4), quats.dtype)
+    to_logits, to_labels = np.empty(n, logits.dtype), np.empty(n, labels.dtype)
+    for i in prange(n):
+        row = rows[i]
+        for k in range(3):
+            to_means[i, k] = means[row, k]
+        for k in range(4):
+            to_quats[i, k] = quats[row, k]
+        to_logits[i] = logits[row]
+        to_labels[i] = labels[row]
+    return to_means, to_quats, to_logits, to_labels
 
 
 @njit(parallel=True, cache=True, error_model="numpy")

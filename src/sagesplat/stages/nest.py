@@ -17,6 +17,7 @@ from sagesplat.run.stage import run_stage
 from sagesplat.stages.memory import check_nest
 from sagesplat.stages.shared import inlier_inputs, label_image_inputs, sky_inputs, train_config
 from sagesplat.train import nested
+from sagesplat.train.base_model import merged_start
 from sagesplat.train.checkpoint import can_resume, remove_checkpoints
 from sagesplat.train.early_stopping import VIEWS, spread
 from sagesplat.train.events import Resumed, Step, Trained
@@ -75,25 +76,36 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
 def _make_base_model(job: Job, config: NestConfig, seed: int) -> None:
     """Train the small model that the ladder begins with: a stage, so that a killed run has it already."""
     run, made = job.run, train_config(job)
-    full = job.snapshots.size(job.snapshots.levels[-1])  # floaters included: it is trained the same
+    full = job.snapshots.size(job.snapshots.levels[-1])  # with floaters: the size is that of what is trained
     cap = max(1, round(config.base_share * full))
-    settings = {**asdict(nested.capped_config(made, cap, config.base_steps)), "seed": seed}
+    settings = {**asdict(nested.capped_config(made, cap, config.base_steps)), "seed": seed, "start": "merged"}
 
-    inputs = [*run.scene_files, run.labels, *inlier_inputs(run), *sky_inputs(run)]
+    cleaned = [run.cleaned] if run.cleaned.exists() else []
+    inputs = [*run.scene_files, run.labels, run.levels, *cleaned, *inlier_inputs(run), *sky_inputs(run)]
 
     def make() -> list[str]:
-        g = train_capped(job, "base", cap, config.base_steps, seed)
+        views = job.inliers.rows(job.scene, job.scene.train_ids)
+        start = merged_start(
+            read_level(job.trained), job.scene, views, cap,
+            antialiased=job.antialiased, shell=job.sky.shell if job.sky else None,
+        )  # fmt: skip
+        g = train_capped(job, "base", cap, config.base_steps, seed, start)
         write_set(run.base_model, g, config.base_steps)
         return [f"{len(g):,} Gaussians"]
 
     run_stage(job, "base", settings, inputs, [run.base_model], make)
 
 
-def train_capped(job: Job, stage: str, cap: int, steps: int, seed: int) -> Gaussians:
-    """3DGS-MCMC of at most `cap` Gaussians, otherwise trained as the run; progress goes to `stage`."""
+def train_capped(
+    job: Job, stage: str, cap: int, steps: int, seed: int, start: Gaussians | None = None
+) -> Gaussians:
+    """3DGS-MCMC of at most `cap` Gaussians, otherwise trained as the run; progress goes to `stage`.
+
+    It begins with the Gaussians `start`; None: with the SfM points.
+    """
     for event in nested.train_capped(
         job.scene, job.photos, job.initial_labels, train_config(job), cap, steps,
-        valid=job.inliers, seed=seed, backend=job.backend, sky=job.sky,
+        valid=job.inliers, seed=seed, backend=job.backend, sky=job.sky, start=start,
     ):  # fmt: skip
         if isinstance(event, Step):
             text = f"loss {event.loss:.3f}, {event.num_gaussians:,} Gaussians"

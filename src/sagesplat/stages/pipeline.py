@@ -49,7 +49,7 @@ from sagesplat.train.clean import check as check_clean
 # the built-in capture, within minutes on two cores
 DEMO = RunConfig(
     train=TrainConfig(max_steps=1200, level_every=60),
-    nest=NestConfig(steps=600, levels=12, base_steps=600),
+    nest=NestConfig(steps=600, levels=12, base_steps=250, full_share=0.3),
     plan=PlanConfig(target_fidelity=0.9),
 )
 WILD_DEMO = replace(

@@ -37,6 +37,7 @@ _SAVE_EVERY = 500
 _AVERAGE_EVERY = 5
 _NEARLY_FULL, _NEARLY_FROM = 0.2, 0.4  # share of the full steps that draw less, and the least prefix of these
 SORT_AT = 1 / 12, 1 / 6, 1 / 3, 1 / 2, 2 / 3  # of the steps
+_SORT_BY, _FEWEST = 3, 20  # each time another third of the views says how to sort, or as many as these
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,14 +160,19 @@ def train_capped(
     seed: int = 0,
     backend: Backend = "auto",
     sky: Sky | None = None,
+    start: Gaussians | None = None,
 ) -> Iterator[Event]:
-    """The events of a training of `capped_config`, from `cap` of the points where there are more."""
+    """The events of a training of `capped_config`, from `cap` of the points where there are more.
+
+    With `start` it begins with these Gaussians.
+    """
     if sky:
         scene, point_labels = sky.begin(scene, point_labels)
     some, labels = with_at_most(scene, point_labels, cap, seed)
-    capped = capped_config(config, cap, steps)
-    shell = sky.shell if sky else None
-    yield from train(some, photos, labels, capped, valid=valid, seed=seed, backend=backend, shell=shell)
+    yield from train(
+        some, photos, labels, capped_config(config, cap, steps),
+        valid=valid, seed=seed, backend=backend, shell=sky.shell if sky else None, start=start,
+    )  # fmt: skip
 
 
 def nest(
@@ -235,13 +241,14 @@ def nest(
     column = torch.from_numpy(column).to(device)
     views = scene.train_ids.tolist()
     stays = movable is not None or spans is not None
-    sort_at = set() if stays else {round(part * config.steps) for part in SORT_AT}
+    sort_at = [] if stays else [round(part * config.steps) for part in SORT_AT]
     edges = None
     if spans is not None:
         edges = torch.from_numpy(np.stack([spans.first, spans.last])[:, near]).to(device)
     stepper = Stepper(
         PhotoLoader(scene, photos, device, valid), replace(train_config, batch=1), ActiveTiles(scene, None),
         backend, sh_bits=config.sh_bits, rate_weight=config.rate_weight, shell=shell,
+        sky=shell.holds(state.gaussians.means) if shell else None,
     )  # fmt: skip
     rates = learning_rates(train_config, config, scene)
     trainable = trainable_rows(state.gaussians, {})
@@ -252,7 +259,7 @@ def nest(
         while state.step < config.steps:
             if state.step in sort_at:
                 importances = importance(
-                    state.gaussians, scene, views, config.criterion,
+                    state.gaussians, scene, _sorting(views, sort_at.index(state.step)), config.criterion,
                     valid=valid, antialiased=train_config.antialiased,
                 )  # fmt: skip
                 state.order_share = order_shares(labels, of_base, importances).to(device)
@@ -279,6 +286,12 @@ def nest(
     g, second = state.gaussians.select(torch.from_numpy(rows)), state.second_opacities
     second = None if second is None else second[torch.from_numpy(rows)]
     yield Nested(g, of_base[rows], second)
+
+
+def _sorting(views: list[int], number: int) -> list[int]:
+    """The views by which Gaussians are sorted again for this time, evenly spread."""
+    parts = min(max(len(views) // _FEWEST, 1), _SORT_BY)
+    return views[number % parts :: parts]
 
 
 def tail_start(steps: int) -> int:

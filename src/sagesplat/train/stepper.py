@@ -49,6 +49,7 @@ class Stepper:
     view_updates: Mapping[str, ViewUpdate] = field(default_factory=dict)  # of `TrainState.per_view`
     outliers: OutlierSchedule | None = None  # when those of the photos are left out; None: never
     shell: Shell | None = None  # that Gaussians of the sky stay on
+    sky: Tensor | None = None  # bool [N], which do, of a fixed set; None: looked up in each step
     drawn: float = 1.0  # share of the tiles that the last step drew
     workspace: Workspace = field(default_factory=Workspace)
 
@@ -150,9 +151,11 @@ class Stepper:
         if not self.shell:
             return trainable.new_zeros(0, dtype=torch.int64), means[:0]
         if drawn is None:
-            rows = torch.nonzero(self.shell.holds(means) & trainable)[:, 0]
+            sky = self.shell.holds(means) if self.sky is None else self.sky
+            rows = torch.nonzero(sky & trainable)[:, 0]
         else:
-            rows = drawn[self.shell.holds(means[drawn]) & trainable[drawn]]
+            sky = self.shell.holds(means[drawn]) if self.sky is None else self.sky[drawn]
+            rows = drawn[sky & trainable[drawn]]
         return rows, means[rows]
 
     def _draw(

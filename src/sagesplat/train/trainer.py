@@ -13,6 +13,7 @@ from torch import Tensor
 
 from sagesplat.core.config import TrainConfig
 from sagesplat.core.errors import DataError, OutOfMemory, RunError
+from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.memory import ran_out
 from sagesplat.formats.levels import check_level, write_level
 from sagesplat.raster import Backend, device_of
@@ -40,6 +41,7 @@ from sagesplat.train.view_parameters import ViewParameters, ViewUpdate
 CHECKPOINT = "checkpoint.npz"
 _LESS = "lower --train.max-gaussians, or begin a run with --downscale 2"
 LOOK_EVERY = 100  # steps between two checks of the loss on a GPU
+_SAVE_EVERY, _SMALL = 500, 10_000  # steps between two checkpoints, unless of so few Gaussians: always
 
 
 def train(
@@ -56,6 +58,7 @@ def train(
     settings: str = "",
     group: Group = ALONE,
     shell: Shell | None = None,
+    start: Gaussians | None = None,
 ) -> Iterator[Event]:
     """Train 3D Gaussians on the training views of a scene: a generator of events.
 
@@ -78,6 +81,7 @@ def train(
         settings: A checkpoint in `folder` is resumed if it was written with the same text.
         group: Processes that train one model together. All call this with the same arguments.
         shell: Gaussians that lie on it stay on it (see `train.sky`).
+        start: Gaussians to begin with; None: one at each SfM point.
 
     Yields:
         `Resumed` first where a checkpoint was found, `Found`, `Step` at every step, `LevelSaved`,
@@ -102,7 +106,7 @@ def train(
         training = begin(
             scene, photos, label_ids, config,
             masks=masks, valid=valid, seed=seed, backend=backend, folder=folder, settings=settings,
-            group=group, shell=shell,
+            group=group, shell=shell, start=start,
         )  # fmt: skip
         yield from training.run()
 
@@ -160,6 +164,7 @@ class Training:
         self.trainable = trainable_rows(self.state.gaussians, self.state.frozen)
         self.active = self.trainable  # of those, the ones whose gradients are not frozen
         self.unfinished = bool(self.trainable.any())
+        self._saved = self.state.step
 
     def run(self) -> Iterator[Event]:
         """Train to the end; the events of `train`."""
@@ -203,8 +208,7 @@ class Training:
             yield self._save_level()
         if records:
             self.stepper.group.collect(self.state.grad_sum, self.state.grad_count)
-            if self.folder:
-                write_checkpoint(self.folder / CHECKPOINT, self.state, self.settings)
+            self._save_checkpoint()
 
     def _records(self, step: int) -> bool:
         """Whether a level is recorded after a step."""
@@ -227,6 +231,15 @@ class Training:
                 recovering=recovering, sh_degree=self._sh_degree(state.step),
             )  # fmt: skip
         return LevelSaved(state.step, path, state.gaussians.counts(), recovering)
+
+    def _save_checkpoint(self) -> None:
+        """Save the state, unless it is large and was saved not long ago: that takes as long as some steps."""
+        state = self.state
+        ends = state.step == self.config.max_steps or not self.unfinished
+        small = len(state.gaussians) <= _SMALL
+        if self.folder and (ends or small or state.step - self._saved >= _SAVE_EVERY):
+            write_checkpoint(self.folder / CHECKPOINT, state, self.settings)
+            self._saved = state.step
 
     def _stop_categories(self, target: float) -> Iterator[LabelFrozen]:
         """Early stopping: measure the categories and stop those that have reached the target SSIM."""
@@ -261,6 +274,7 @@ def begin(
     settings: str = "",
     group: Group = ALONE,
     shell: Shell | None = None,
+    start: Gaussians | None = None,
 ) -> Training:
     """A training at its start, or at the checkpoint in `folder`; the arguments are those of `train`."""
     rows = scene.train_ids[:: max(1, len(scene.train_ids) // 8)]
@@ -269,7 +283,7 @@ def begin(
     )
     device = device_of(backend, group.rank)
     strategy = make_strategy(config, scene, rates, group, shell)
-    g = from_points(
+    g = start or from_points(
         scene.points, label_ids, config.sh_degree, strategy.initial_opacity, strategy.initial_scale
     )
     batched = replace(config, batch=max(config.batch, group.size))
