@@ -13,7 +13,8 @@ from PIL import Image
 
 from sagesplat.core.errors import BackendUnavailable, LabelError, OutOfMemory
 from sagesplat.segment import coco
-from sagesplat.segment.hf import HfSegmenter, class_ids, torch_device
+from sagesplat.segment.hf import HfSegmenter, class_ids
+from sagesplat.segment.hub import torch_device
 from sagesplat.segment.segmenters import Segmenter
 
 transformers: Any = pytest.importorskip("transformers", reason="needs sagesplat[hf]")

@@ -35,6 +35,7 @@ from sagesplat.segment.masks import Taxonomy
 from sagesplat.stages import bundle, label, view
 from sagesplat.stages.boundaries import _seconds
 from sagesplat.stages.clean import read_clean_figures
+from sagesplat.stages.prompts import read_scores
 from sagesplat.stages.refine import read_pose_figures
 from sagesplat.stages.refine_exposure import read_exposure_figures
 from sagesplat.stages.train import read_cap, read_frozen
@@ -366,6 +367,10 @@ def _read_network(path: Path) -> None:
     label._is(path, NETWORK)
 
 
+def _scores(folder: Path, size: int) -> list[bytes]:
+    return as_json({"best": {f"prompt {i}": 0.5 for i in range(size)}, "threshold": 0.3}, {"best": []})
+
+
 def _live(folder: Path, size: int) -> list[bytes]:
     return as_json({"of": {"level": "1.npz", "written": 9}, "kept": [["chunks/a.spz"] * size]})
 
@@ -408,6 +413,7 @@ READERS = (
     Reader("frozen", ".json", _frozen, file("frozen.json", read_frozen), 3000),
     Reader("edits", ".json", _edits, file("edit.json", _read_edits), 10_000),
     Reader("segmenting", ".json", _networks, file(".network.json", _read_network), 3000),
+    Reader("prompts", ".json", _scores, file(".prompts-0.json", read_scores), 3000),
     Reader("live", ".json", _live, file("live.json", bundle._read_live), 3000),
     Reader("lock", ".json", _lock, file("lock", lock._holder), 3000),
 )

@@ -18,7 +18,7 @@ from tyro.conf import Positional
 _POSITIONAL = get_args(Positional[int])[1]
 _MANY = 25  # flags: a command with more shows only the common ones first
 _COMMON = {
-    "--downscale", "--segmenter", "--model", "--labels.merge", "--train.max-steps", "--fuse",
+    "--downscale", "--segmenter", "--prompts", "--model", "--labels.merge", "--train.max-steps", "--fuse",
     "--blocks.count", "--ladder", "--target-fidelity", "--target-ssim", "--budget", "--device", "--seed",
     "--force", "--yes",
 }  # fmt: skip

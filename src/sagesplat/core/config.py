@@ -55,15 +55,27 @@ class PosesConfig:
 class MasksConfig:
     """Where label images come from."""
 
-    segmenter: Literal["auto", "masks", "hf", "onnx", "deeplabv2"] = "auto"
+    segmenter: Literal["auto", "masks", "hf", "onnx", "deeplabv2", "text"] = "auto"
     """Source of the label images. masks: image files; hf: a network of Hugging Face; onnx: a network in ONNX
-    format; deeplabv2: the network of the paper; auto: masks if the capture has them, else by the suffix
-    of --model."""
+    format; deeplabv2: the network of the paper; text: networks that find --prompts; auto: text with
+    --prompts, else masks if the capture has them, else by the suffix of --model."""
+    prompts: str = ""
+    """Categories in your own words, e.g. "stone fountain; ivy; wooden bench". With --segmenter hf, onnx or
+    deeplabv2 they are painted over the categories of that network."""
     masks: Path | None = None
     """Folder of label images (default: SCENE/masks)."""
     model: str | None = None
-    """Network: a name on huggingface.co or a folder (hf; default: EoMT small), a .onnx file, or a checkpoint
-    (deeplabv2)."""
+    """Network: a name on huggingface.co or a folder (hf; default: EoMT small), a .onnx file, a checkpoint
+    (deeplabv2), or the network for --prompts (text; default: Grounding DINO tiny)."""
+    prompt_model: str | None = None
+    """Network for --prompts where --model is that of another segmenter: Grounding DINO, OWLv2, CLIPSeg or
+    SAM 3, a name on huggingface.co or a folder."""
+    mask_model: str | None = None
+    """Network that makes masks of the boxes of Grounding DINO and OWLv2: SAM 2 or SAM (default: SAM 2.1
+    tiny)."""
+    prompt_threshold: float = 0.0
+    """Score from which on a prompt counts as found (0: 0.3 for Grounding DINO, 0.2 for OWLv2, 0.4 for
+    CLIPSeg, 0.5 for SAM 3)."""
     classes: Path | None = None
     """JSON file with the class names of an ONNX network and their category ids."""
     head: Literal["coco-stuff", "voc"] = "coco-stuff"

@@ -6,9 +6,7 @@ so that instances and panoptic merging are not needed.
 """
 
 import re
-import textwrap
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,22 +18,32 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from sagesplat.core.config import MasksConfig
-from sagesplat.core.errors import BackendUnavailable, LabelError, OutOfMemory, short
-from sagesplat.core.memory import ran_out
+from sagesplat.core.errors import LabelError, short
 from sagesplat.segment import coco
+from sagesplat.segment.hub import (
+    computing,
+    first_line,
+    folder_of,
+    load_image_processor,
+    load_model,
+    load_tokenizer,
+    loading,
+    package,
+    quiet,
+    read_config,
+    torch_device,
+)
 from sagesplat.segment.masks import UNLABELLED, Taxonomy
 from sagesplat.segment.segmenters import (
     Segmented,
     SegmenterFactory,
     answer,
     group_classes,
-    parse_device,
 )
 
 DEFAULT_MODEL = "tue-mps/coco_panoptic_eomt_small_640_2x"
 FAMILIES = ("detr", "eomt", "eomt_dinov3", "mask2former", "maskformer", "oneformer")
 _MASK2FORMER_SIZE = (384, 384)  # where its own post-processing adds up masks, whatever the input's size
-_FILES = ["*.json", "*.txt", "model*.safetensors"]  # of a repository: never pickles, never code
 
 
 class HfSegmenter:
@@ -59,9 +67,9 @@ class HfSegmenter:
         self._device = torch_device(device)
         if threads is not None:
             torch.set_num_threads(threads)
-        with _quiet():
-            folder = _folder(model, revision)
-            self._config = _config(folder, self._name)
+        with quiet():
+            folder = folder_of(model, revision)
+            self._config = read_config(folder, self._name, FAMILIES, "universal segmentation")
             self._processor, self._task, self._model = _load(folder, self._name, self._config)
         self._model.to(self._device).eval()
         self.revision = None if folder == Path(model) else folder.name
@@ -75,15 +83,8 @@ class HfSegmenter:
         """Label images and probabilities; photos of one size are computed together."""
         if len({photo.shape for photo in photos}) > 1:
             return [found for photo in photos for found in self([photo])]
-        try:
+        with computing(self._name, self._device, len(photos)):
             return self._segment(photos) if photos else []
-        except (RuntimeError, MemoryError) as error:  # of a GPU's too
-            if not (isinstance(error, torch.cuda.OutOfMemoryError) or ran_out(error)):
-                raise
-            raise OutOfMemory(
-                f"{self._name}: no memory on {self._device} for {len(photos)} photos at once; "
-                f"take fewer, smaller photos{'' if self._device.type == 'cpu' else ' or --device cpu'}"
-            ) from None
 
     @torch.inference_mode()
     def _segment(self, photos: Sequence[UInt8[np.ndarray, "H W 3"]]) -> list[Segmented]:
@@ -104,7 +105,7 @@ class HfSegmenter:
         except (ValueError, ZeroDivisionError) as error:
             height, width = photos[0].shape[:2]
             raise LabelError(
-                f"{self._name}: cannot take a photo of {width} x {height} pixels ({_first_line(error)}); "
+                f"{self._name}: cannot take a photo of {width} x {height} pixels ({first_line(error)}); "
                 "leave such photos out"
             ) from None
 
@@ -191,17 +192,6 @@ class HfSegmenter:
         return answer(scores.cpu().numpy(), probabilities, self._ids, height, width)
 
 
-def torch_device(device: str) -> torch.device:
-    """The device of a name; `auto` is a GPU where there is one. Raises BackendUnavailable."""
-    kind, index = parse_device(device)
-    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    if kind == "cpu" or (kind == "auto" and not count):
-        return torch.device("cpu")
-    if index >= count:
-        raise BackendUnavailable(f"device {device}: this machine has {count} CUDA devices; use --device cpu")
-    return torch.device("cuda", index)
-
-
 def class_ids(names: Sequence[str], family: str, model: str) -> tuple[list[int | None], str | None]:
     """The COCO panoptic id of each class of a network, and a note where its names were not what decided.
 
@@ -231,111 +221,24 @@ def _plain(name: str) -> str:
     return " ".join(re.split(r"[\s_-]+", name.strip().lower()))
 
 
-def _folder(model: str | Path, revision: str | None) -> Path:
-    """The folder of a network: the one given, or that of the cache after a download where needed."""
-    name = str(model)
-    if name and Path(name).is_dir():
-        return Path(name)
-    if isinstance(model, Path) or re.fullmatch(r"[\w-][\w.-]*(/[\w-][\w.-]*)?", name) is None:
-        raise LabelError(f"{name}: no such folder; name one with config.json, or a network as owner/name")
-    huggingface_hub = _import("huggingface_hub")
-    try:
-        return Path(huggingface_hub.snapshot_download(name, revision=revision, allow_patterns=_FILES))
-    except Exception as error:  # of the hub's client, of its HTTP library or of the disk
-        version = f" --revision {revision}" if revision else ""
-        raise BackendUnavailable(
-            f"{name}: no folder, not in Hugging Face's cache, and no download ({_first_line(error)}); "
-            f"where there is a network: hf download {name}{version}, then set HF_HUB_OFFLINE=1"
-        ) from None
-
-
-def _config(folder: Path, name: str) -> Any:
-    transformers = _import("transformers")
-    try:
-        config = transformers.AutoConfig.from_pretrained(folder, trust_remote_code=False)
-    except Exception as error:  # many kinds for what may be in the file
-        if ran_out(error):
-            raise
-        raise LabelError(
-            f"{name}: no network of transformers ({_first_line(error)}); name one for universal segmentation"
-        ) from None
-    if config.model_type not in FAMILIES:
-        kind = short(config.model_type)
-        raise LabelError(f"{name}: a network of kind {kind}; take one of {', '.join(FAMILIES)}")
-    return config
-
-
 def _load(folder: Path, name: str, config: Any) -> tuple[Any, Int64[Tensor, "1 T"] | None, Any]:
     """Image processor, OneFormer's task as tokens (else None), and the model."""
-    transformers = _import("transformers")
+    oneformer = config.model_type == "oneformer"
     # class_info_file would be downloaded, and serves training alone
-    alone = {"class_info_file": None} if config.model_type == "oneformer" else {}
-    try:
-        processor = transformers.AutoImageProcessor.from_pretrained(
-            folder, backend="pil", trust_remote_code=False, **alone
-        )
-        task = _task_tokens(folder, config) if config.model_type == "oneformer" else None
-        model, info = transformers.AutoModelForUniversalSegmentation.from_pretrained(
-            folder,
-            config=config,
-            use_safetensors=True,
-            dtype=torch.float32,
-            output_loading_info=True,
-        )
-    except ImportError as error:
-        raise BackendUnavailable(
-            f"{name}: needs another package ({_first_line(error)}); install it"
-        ) from None
-    except Exception as error:  # of many kinds for files that are missing, damaged or do not fit
-        if ran_out(error):
-            raise
-        raise LabelError(
-            f"{name}: cannot be loaded ({_first_line(error)}); it needs config.json, "
-            "preprocessor_config.json and model.safetensors that belong together"
-        ) from None
-    absent = sorted(set(info["missing_keys"]) & {key for key, _ in model.named_parameters()})
-    if absent:
-        raise LabelError(
-            f"{name}: weights lack {len(absent)} parameters ({absent[0]}, ...); take a trained network"
-        )
-    return processor, task, model
+    alone = {"class_info_file": None} if oneformer else {}
+    with loading(name):
+        processor = load_image_processor(folder, **alone)
+        task = _task_tokens(folder, config) if oneformer else None
+        kind = package("transformers").AutoModelForUniversalSegmentation
+        return processor, task, load_model(kind, folder, name, config)
 
 
 def _task_tokens(folder: Path, config: Any) -> Int64[Tensor, "1 T"]:
     """What OneFormer is asked for, padded with 0 as in its training."""
-    tokenizer = _import("transformers").AutoTokenizer.from_pretrained(folder, trust_remote_code=False)
-    length = config.task_seq_len
-    tokens = tokenizer(["the task is semantic"], padding="max_length", max_length=length, truncation=True)
+    tokens = load_tokenizer(folder)(
+        ["the task is semantic"], padding="max_length", max_length=config.task_seq_len, truncation=True
+    )
     return torch.tensor(tokens["input_ids"]) * torch.tensor(tokens["attention_mask"])
-
-
-def _import(name: str) -> Any:
-    try:
-        return __import__(name)
-    except ImportError:
-        raise BackendUnavailable(
-            "segmentation by a network of Hugging Face needs transformers; pip install 'sagesplat[hf]'"
-        ) from None
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """No log lines and progress bars of transformers: what matters becomes an error."""
-    logging = _import("transformers").utils.logging
-    verbosity, bars = logging.get_verbosity(), logging.is_progress_bar_enabled()
-    logging.set_verbosity(logging.CRITICAL)
-    logging.disable_progress_bar()
-    try:
-        yield
-    finally:
-        logging.set_verbosity(verbosity)
-        if bars:
-            logging.enable_progress_bar()
-
-
-def _first_line(error: Exception) -> str:
-    """What an error says, without the lists and advice that transformers adds."""
-    return textwrap.shorten(str(error).strip().partition("\n")[0], 200, placeholder=" ...")
 
 
 def _settings(config: MasksConfig) -> dict[str, Any]:

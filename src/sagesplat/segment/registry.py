@@ -2,13 +2,14 @@
 
 from pathlib import Path
 
-from sagesplat.segment import deeplabv2, hf, onnx
+from sagesplat.segment import deeplabv2, hf, onnx, text
 from sagesplat.segment.segmenters import SegmenterFactory
 
 SEGMENTERS: dict[str, SegmenterFactory] = {
     "hf": hf.FACTORY,
     "onnx": onnx.FACTORY,
     "deeplabv2": deeplabv2.FACTORY,
+    "text": text.FACTORY,
 }
 DEFAULT = "hf"
 

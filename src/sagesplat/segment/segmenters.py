@@ -30,6 +30,7 @@ class Segmented:
     label_ids: Int16[np.ndarray, "H W"]  # category id of each pixel, -1 where it has none
     probabilities: Float32[np.ndarray, "C h w"] | None  # 0 ... 1, at most 1 in sum; covers the whole photo
     ids: Int16[np.ndarray, " C"]  # category id of each row of probabilities; others are negligible
+    instances: Int16[np.ndarray, "H W"] | None = None  # number within this photo, -1 where there is none
 
 
 class Segmenter(Protocol):

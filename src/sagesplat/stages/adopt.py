@@ -55,6 +55,7 @@ def open_splat(
     A splat without any is one category, "scene".
     """
     segmented = masks.segmenter != "auto" or masks.masks is not None or masks.model is not None
+    segmented = segmented or bool(masks.prompts)
     scene = replace(scene, downscale=scene.downscale or 1)  # nothing is trained on the photos
     check_folder(job.run)
     _check_run(job.run, config)

@@ -32,11 +32,12 @@ from sagesplat.segment.edit import (
 )
 from sagesplat.segment.lift import agreement_in, lift
 from sagesplat.segment.masks import MAX_LABEL_ID, UNLABELLED, Masks, Taxonomy, import_masks, write_labels
-from sagesplat.segment.registry import SEGMENTERS, segmenter_for
+from sagesplat.segment.registry import segmenter_for
 from sagesplat.segment.segmenters import segment_some
 from sagesplat.segment.soft import read_soft, soft_path
 from sagesplat.segment.valid import ValidPixels, write_valid
 from sagesplat.stages.memory import check_network
+from sagesplat.stages.prompts import Scores, Timed, load, prompt_lines, settings_of
 from sagesplat.train.fuse import Soft, fuse
 
 _MARKER = ".network.json"
@@ -48,6 +49,8 @@ def make_masks(job: Job, config: MasksConfig, labels: LabelsConfig = LabelsConfi
     run, kind = job.run, segmenter_kind(job.scene.path, config)
     merge, keep, ignore = parse_merge(labels.merge), parse_keep(labels.keep), parse_ignore(labels.ignore)
     if kind == "masks":
+        if config.prompts:
+            raise RunError("--prompts: not over given label images; name a network by --segmenter")
         _import(job, config)
     else:
         _segment(job, config, kind)
@@ -112,6 +115,8 @@ def segmenter_kind(capture: Path, config: MasksConfig) -> str:
     """The segmenter that was asked for, or with "auto" the one that the settings and the capture imply."""
     if config.segmenter != "auto":
         return config.segmenter
+    if config.prompts and not (config.model or config.masks):
+        return "text"
     if not config.model and (config.masks or (capture / "masks").is_dir()):
         return "masks"
     return segmenter_for(config.model)
@@ -120,7 +125,7 @@ def segmenter_kind(capture: Path, config: MasksConfig) -> str:
 def _note_options(job: Job, config: MasksConfig) -> None:
     """Keep how the label images were asked for, paths absolute: the defaults of the next command."""
     options = asdict(config)
-    for name in ("masks", "model", "classes"):
+    for name in ("masks", "model", "prompt_model", "mask_model", "classes"):
         if options[name] is not None and Path(options[name]).exists():
             options[name] = str(Path(options[name]).resolve())
     write_json(job.run.segmentation, {k: str(v) if isinstance(v, Path) else v for k, v in options.items()})
@@ -147,7 +152,7 @@ def _import(job: Job, config: MasksConfig) -> None:
 def _segment(job: Job, config: MasksConfig, kind: str) -> None:
     """Segment the photos; images of an interrupted attempt with the same network are kept."""
     run = job.run
-    own = SEGMENTERS[kind].settings(config)
+    own = settings_of(kind, config)
     hashed = {name: file_hash(v) if isinstance(v, Path) else v for name, v in own.items()}
     settings = {"segmenter": kind, "soft": config.soft, **hashed}
 
@@ -163,9 +168,11 @@ def _segment(job: Job, config: MasksConfig, kind: str) -> None:
         taxonomy = found[0][0]
         if any(other != taxonomy for other, _ in found):
             raise LabelError(f"{run.segmented}: the nodes' networks have other categories; make them alike")
-        write_labels(run.segmented, taxonomy, set().union(*(ids for _, ids in found)))
+        occurring = set[int]().union(*(ids for _, ids in found))
+        lines = prompt_lines(run.segmented, taxonomy, occurring, lambda text: job.emit(Warned(text)))
+        write_labels(run.segmented, taxonomy, occurring)
         _note_options(job, config)
-        return []
+        return lines
 
     run_stage(job, "segment", settings, [run.scene], [run.segmented / "labels.json"], make)
 
@@ -182,11 +189,18 @@ def _segment_some(job: Job, part: tuple[Sequence[int], MasksConfig, str]) -> tup
     """Segment some views (rows, settings, kind of segmenter): all its categories, and the ids that occur."""
     rows, config, kind = part
     run, warn = job.run, lambda text: job.emit(Warned(text))
-    segmenter = SEGMENTERS[kind].load(config, job.device, job.threads, warn)
+    segmenter = load(kind, config, job.device, job.threads, warn)
+    scores, remaining = Scores(run.segmented, rows[0] if rows else 0, segmenter), len(rows)
+
+    def on_view(done: int, total: int) -> None:
+        nonlocal remaining
+        remaining = total - done
+        scores.keep()
+        job.emit(Progress("segment", done, total))
+
     occurring = segment_some(
-        job.scene, job.photos, segmenter, run.segmented, rows,
-        batch=config.batch, soft=run.soft if config.soft else None,
-        on_view=lambda done, total: job.emit(Progress("segment", done, total)),
+        job.scene, job.photos, Timed(segmenter, lambda: remaining, warn), run.segmented, rows,
+        batch=config.batch, soft=run.soft if config.soft else None, on_view=on_view,
     )  # fmt: skip
     return segmenter.taxonomy, occurring
 

@@ -7,6 +7,7 @@ from sagesplat.core.errors import RunError
 from sagesplat.core.events import Warned
 from sagesplat.run.job import Job
 from sagesplat.segment.hf import DEFAULT_MODEL
+from sagesplat.segment.text import DEFAULT_DETECTOR, DEFAULT_MASK_MODEL
 from sagesplat.train import memory
 from sagesplat.train.memory import GIB
 
@@ -15,8 +16,13 @@ from sagesplat.train.memory import GIB
 _NEST = 250e6  # bytes of nesting besides those of training as many Gaussians
 _RUNTIME = 330e6  # the interpreter with torch and onnxruntime
 _PIXEL = 22  # bytes of a photo's pixel: the label image and what it is chosen from
-_DEFAULT_WEIGHTS = 96e6  # bytes of the default network's, which may not be on this machine yet
+_DEFAULT_WEIGHTS = {  # bytes of the default networks', which may not be on this machine yet
+    DEFAULT_MODEL: 96e6,
+    DEFAULT_DETECTOR: 689e6,
+    DEFAULT_MASK_MODEL: 156e6,
+}
 _ONNX = 50e6  # bytes that a small network computes with
+_TEXT = 0.6e9  # bytes that SAM 2 computes with; Grounding DINO takes more
 _HF = 12, 1.1e9  # the same of transformers' networks: times the weights, at most
 
 
@@ -47,6 +53,11 @@ def check_network(job: Job, kind: str, settings: dict[str, Any], batch: int) -> 
     limit = job.memory_limit or memory.default_limit()
     largest = max(view.camera.width * view.camera.height for view in job.scene.views)
     needed = network_memory(kind, weights(model), largest, batch)
+    if kind == "text":
+        needed += _masks_weights(model, settings["mask_model"])
+    elif "over_model" in settings:  # both are in memory, and compute one after the other
+        needed += weights(settings["over_model"])
+        needed += _masks_weights(settings["over_model"], settings["over_mask_model"])
     if needed > limit:
         raise RunError(
             f"{model}: segmenting photos of {largest / 1e6:.1f} megapixels needs at least about "
@@ -57,9 +68,15 @@ def check_network(job: Job, kind: str, settings: dict[str, Any], batch: int) -> 
 
 def network_memory(kind: str, weights: float, pixels: int, batch: int = 1) -> float:
     """Bytes that a network needs at least, by those of its weights and the pixels of a photo."""
-    computes = {"onnx": _ONNX, "hf": min(_HF[0] * weights, _HF[1])}.get(kind, 0.0)
+    computes = {"onnx": _ONNX, "hf": min(_HF[0] * weights, _HF[1]), "text": _TEXT}.get(kind, 0.0)
     # files are read into memory, and become parameters before they are released
     return _RUNTIME + max(2 * weights, weights + computes) + pixels * (_PIXEL + 3 * batch)
+
+
+def _masks_weights(detector: Path | str, masks: Path | str) -> float:
+    """Bytes of the network that makes masks of boxes; the usual one is not loaded beside all detectors."""
+    certain = masks != DEFAULT_MASK_MODEL or detector == DEFAULT_DETECTOR
+    return weights(masks) if certain else 0.0
 
 
 def weights(model: Path | str) -> float:
@@ -69,4 +86,4 @@ def weights(model: Path | str) -> float:
         return float(sum(file.stat().st_size for file in path.glob("model*.safetensors")))
     if path.is_file():
         return float(path.stat().st_size)
-    return _DEFAULT_WEIGHTS if model == DEFAULT_MODEL else 0.0
+    return _DEFAULT_WEIGHTS.get(str(model), 0.0)

@@ -9,8 +9,8 @@ from sagesplat.core.events import Warned
 from sagesplat.run.executor import Local
 from sagesplat.run.job import Job
 from sagesplat.scene.detect import detect
-from sagesplat.segment.registry import SEGMENTERS
 from sagesplat.stages.label import segmenter_kind
+from sagesplat.stages.prompts import load, settings_of
 from sagesplat.train import memory
 from sagesplat.train.strategy import schedule_of
 
@@ -30,9 +30,9 @@ def check_segmenter(job: Job, path: Path, config: MasksConfig) -> None:
     kind = segmenter_kind(job.run.capture / path.resolve().stem, config)
     if kind == "masks":
         return
-    SEGMENTERS[kind].settings(config)
+    settings_of(kind, config)
     if isinstance(job.executor, Local):  # else the nodes load it
-        SEGMENTERS[kind].load(config, job.device, job.threads, lambda text: job.emit(Warned(text)))
+        load(kind, config, job.device, job.threads, lambda text: job.emit(Warned(text)))
 
 
 def check_training(job: Job, config: TrainConfig) -> None:

@@ -1,0 +1,186 @@
+"""Networks that find boxes by text: Grounding DINO and OWLv2."""
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, UInt8
+from PIL import Image
+from torch import Tensor
+
+from sagesplat.core.errors import LabelError
+from sagesplat.segment.detections import Boxes, without_duplicates
+from sagesplat.segment.hub import first_line, load_image_processor, load_model, load_tokenizer, package
+
+_SEPARATORS = "[CLS]", "[SEP]", ".", "?"  # tokens at which Grounding DINO ends a phrase
+_MOST = 300  # boxes of a photo, those with the highest scores
+DETECTORS = {"grounding-dino": 0.3, "mm-grounding-dino": 0.3, "owlv2": 0.2}  # family: usual threshold
+
+
+class _Detector:
+    """What detectors share: a network, its image processor and tokenizer, and the words that it looks for."""
+
+    def __init__(
+        self,
+        folder: Path,
+        name: str,
+        config: Any,
+        device: torch.device,
+        words: Sequence[str],
+        warn: Callable[[str], None],
+    ):
+        self.name, self._device, self._words = name, device, words
+        self._processor, self._tokenizer = load_image_processor(folder), load_tokenizer(folder)
+        kind = package("transformers").AutoModelForZeroShotObjectDetection
+        self._model = load_model(kind, folder, name, config).to(device).eval()
+        self._prepare(config, warn)
+
+    def _prepare(self, config: Any, warn: Callable[[str], None]) -> None:
+        """Make tokens of the words."""
+        raise NotImplementedError
+
+    def _detect(self, inputs: Any) -> tuple[Float32[Tensor, "Q P"], Float32[Tensor, "Q 4"]]:
+        """Scores for each prompt; boxes as centre, width and height, as parts of the network's input."""
+        raise NotImplementedError
+
+    def _extent(self, width: int, height: int) -> tuple[int, int]:
+        """Width and height, pixels of the photo, of what boxes are parts of."""
+        return width, height
+
+    @torch.inference_mode()
+    def __call__(self, photo: UInt8[np.ndarray, "H W 3"], threshold: float) -> Boxes:
+        height, width = photo.shape[:2]
+        scores, parts = self._detect(prepared(self._processor, photo, self.name).to(self._device))
+        scores, parts = finite(scores, self.name), finite(parts, self.name)
+        best = scores.max(0)
+        corners = np.concatenate([parts[:, :2] - parts[:, 2:] / 2, parts[:, :2] + parts[:, 2:] / 2], 1)
+        corners = corners * np.tile(np.array(self._extent(width, height), np.float32), 2)
+        corners = corners.clip(0, np.array([width, height, width, height], np.float32))
+        extended = np.all(corners[:, 2:] > corners[:, :2], axis=1)
+        boxes, prompts = np.nonzero((scores >= threshold) & extended[:, None])
+        reached = scores[boxes, prompts]
+        order = np.argsort(-reached, kind="stable")[:_MOST]
+        return without_duplicates(Boxes(prompts[order], reached[order], corners[boxes[order]], best))
+
+
+class GroundingDino(_Detector):
+    """Grounding DINO (Liu et al. 2023, arXiv:2303.05499): all prompts are one text, with "." between them.
+
+    As in its authors' evaluation, the score of a prompt is the mean of those of its tokens. Prompts that do
+    not fit into one text are looked for in several passes.
+    """
+
+    def _prepare(self, config: Any, warn: Callable[[str], None]) -> None:
+        find = self._tokenizer.convert_tokens_to_ids
+        self._begin, self._end, self._stop, _ = separators = [find(token) for token in _SEPARATORS]
+        self._longest, unknown = config.max_text_len, self._tokenizer.unk_token_id
+        self._tokens = []
+        for words in self._words:
+            plain = re.sub(r"[.?]+", " ", words.lower())
+            tokens = self._tokenizer(plain, add_special_tokens=False)["input_ids"]
+            tokens = [token for token in tokens if token not in separators]
+            if all(token == unknown for token in tokens):
+                warn(f"{self.name}: knows none of the words of {words!r}; it was trained on English")
+            self._tokens.append(fitting(tokens, self._longest - 3, words, self.name, warn))
+
+    def _passes(self) -> Iterator[list[int]]:
+        """Rows of the prompts of each text."""
+        rows: list[int] = []
+        length = 2
+        for row, tokens in enumerate(self._tokens):
+            if length + len(tokens) + 1 > self._longest:
+                yield rows
+                rows, length = [], 2
+            rows.append(row)
+            length += len(tokens) + 1
+        yield rows
+
+    def _detect(self, inputs: Any) -> tuple[Float32[Tensor, "Q P"], Float32[Tensor, "Q 4"]]:
+        scores, boxes = [], []
+        for rows in self._passes():
+            ids, spans = [self._begin], []
+            for row in rows:
+                spans.append(slice(len(ids), len(ids) + len(self._tokens[row])))
+                ids += [*self._tokens[row], self._stop]
+            text = torch.tensor([[*ids, self._end]], device=self._device)
+            output = self._model(
+                **inputs, input_ids=text, token_type_ids=torch.zeros_like(text),
+                attention_mask=torch.ones_like(text),
+            )  # fmt: skip
+            found = output.logits[0].sigmoid()
+            here = torch.zeros(len(found), len(self._words), device=found.device)
+            here[:, rows] = torch.stack([found[:, span].mean(1) for span in spans], 1)
+            scores.append(here)
+            boxes.append(output.pred_boxes[0])
+        return torch.cat(scores), torch.cat(boxes)
+
+
+class Owlv2(_Detector):
+    """OWLv2 (Minderer et al. 2023, arXiv:2306.09683): each prompt is a query of its own."""
+
+    def _prepare(self, config: Any, warn: Callable[[str], None]) -> None:
+        length = config.text_config.max_position_embeddings
+        self._text = padded_tokens(self._tokenizer, self._words, length, self.name, warn).to(self._device)
+
+    def _detect(self, inputs: Any) -> tuple[Float32[Tensor, "Q P"], Float32[Tensor, "Q 4"]]:
+        output = self._model(pixel_values=inputs["pixel_values"], **self._text)
+        return output.logits[0].sigmoid(), output.pred_boxes[0]
+
+    def _extent(self, width: int, height: int) -> tuple[int, int]:
+        side = max(width, height)  # the photo is padded to a square
+        return side, side
+
+
+def detector(
+    folder: Path,
+    name: str,
+    config: Any,
+    device: torch.device,
+    words: Sequence[str],
+    warn: Callable[[str], None],
+) -> _Detector:
+    """The detector of a folder, for these words."""
+    kind = Owlv2 if config.model_type == "owlv2" else GroundingDino
+    return kind(folder, name, config, device, words, warn)
+
+
+def prepared(processor: Any, photo: UInt8[np.ndarray, "H W 3"], name: str) -> Any:
+    """A photo as a network's input, by its own image processor; LabelError where that cannot take it."""
+    try:
+        return processor(images=[Image.fromarray(photo)], return_tensors="pt")
+    except (ValueError, ZeroDivisionError) as error:
+        height, width = photo.shape[:2]
+        raise LabelError(
+            f"{name}: cannot take a photo of {width} x {height} pixels ({first_line(error)}); "
+            "leave such photos out"
+        ) from None
+
+
+def padded_tokens(
+    tokenizer: Any, words: Sequence[str], length: int, name: str, warn: Callable[[str], None]
+) -> Any:
+    """The words as tokens [P, length] with their attention mask."""
+    for each in words:
+        fitting(tokenizer(each)["input_ids"], length, each, name, warn)
+    return tokenizer(
+        list(words), padding="max_length", truncation=True, max_length=length, return_attention_mask=True,
+        return_token_type_ids=False, return_tensors="pt",
+    )  # fmt: skip
+
+
+def fitting(tokens: list[int], most: int, words: str, name: str, warn: Callable[[str], None]) -> list[int]:
+    """As many tokens as a network reads; warns of others."""
+    if len(tokens) > most:
+        warn(f"{name}: reads {most} of the {len(tokens)} tokens of {words!r}; shorten it")
+    return tokens[:most]
+
+
+def finite(values: Float[Tensor, "*S"], name: str) -> Float32[np.ndarray, "*S"]:
+    """A network's output as numpy; LabelError where it holds what is no number."""
+    found = values.float().cpu().numpy()
+    if not np.isfinite(found).all():
+        raise LabelError(f"{name}: scores that are not finite; try --device cpu or another network")
+    return found

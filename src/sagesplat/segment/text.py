@@ -1,0 +1,146 @@
+"""Segmentation by text: the user's own words become categories, alone or over those of another segmenter.
+
+Grounding DINO or OWLv2 find boxes and SAM 2 makes masks of them; CLIPSeg and SAM 3 make masks of words.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+
+from sagesplat.core.config import MasksConfig
+from sagesplat.core.errors import LabelError, RunError
+from sagesplat.segment.detections import Finder, painted_over, segmented
+from sagesplat.segment.detectors import DETECTORS, detector
+from sagesplat.segment.display_names import title_of
+from sagesplat.segment.hub import computing, folder_of, loading, quiet, read_config, torch_device
+from sagesplat.segment.mask_networks import BOX_FAMILIES, WORD_FAMILIES, BoxFinder, BoxMasks, ClipSeg, Sam3
+from sagesplat.segment.masks import Taxonomy
+from sagesplat.segment.prompts import Prompt, parse_prompts, prompts_of
+from sagesplat.segment.segmenters import Segmented, Segmenter, SegmenterFactory
+
+DEFAULT_DETECTOR = "IDEA-Research/grounding-dino-tiny"
+DEFAULT_MASK_MODEL = "facebook/sam2.1-hiera-tiny"
+_THRESHOLDS = DETECTORS | WORD_FAMILIES
+_NEEDS = (
+    "config.json, preprocessor_config.json, model.safetensors and the tokenizer's files that belong together"
+)
+
+
+class TextSegmenter:
+    """Labels what a network finds for the prompts; all other pixels are unlabelled.
+
+    `best` has the highest score of each prompt, by the category's name, in the photos so far.
+    """
+
+    def __init__(self, finder: Finder, prompts: Sequence[Prompt], device: torch.device | None = None):
+        self._finder, self._prompts = finder, prompts
+        self._device = device or torch.device("cpu")
+        self.threshold = finder.threshold
+        self.taxonomy = Taxonomy(dict(sorted((p.label_id, p.name) for p in prompts)))
+        self.best = dict.fromkeys((p.name for p in prompts), 0.0)
+
+    def __call__(self, photos: Sequence[UInt8[np.ndarray, "H W 3"]], /) -> list[Segmented]:
+        """One photo after the other: what is found in each decides how much there is to compute."""
+        return [self._segment(photo) for photo in photos]
+
+    def _segment(self, photo: UInt8[np.ndarray, "H W 3"]) -> Segmented:
+        with computing("segmentation by text", self._device, 1):
+            found = self._finder(photo)
+        for prompt, score in zip(self._prompts, found.best.tolist(), strict=True):
+            self.best[prompt.name] = max(self.best[prompt.name], score)
+        ids = [prompt.label_id for prompt in self._prompts]
+        return segmented(found, ids, self.threshold, (photo.shape[0], photo.shape[1]))
+
+
+class TextOver:
+    """What prompts find, painted over the label images of another segmenter."""
+
+    def __init__(self, base: Segmenter, text: TextSegmenter):
+        self._base, self._text = base, text
+        self.threshold, self.best = text.threshold, text.best
+        self.taxonomy = Taxonomy(dict(sorted((base.taxonomy.names | text.taxonomy.names).items())))
+
+    def __call__(self, photos: Sequence[UInt8[np.ndarray, "H W 3"]], /) -> list[Segmented]:
+        """Both for each photo."""
+        pairs = zip(self._base(photos), self._text(photos), strict=True)
+        return [painted_over(below, above) for below, above in pairs]
+
+
+def settings(config: MasksConfig) -> dict[str, Any]:
+    """What segmentation by text depends on; LabelError or RunError for settings that cannot be."""
+    if not config.prompts.strip():
+        raise RunError('--segmenter text needs --prompts "stone fountain; ivy; wooden bench"')
+    if not 0 <= config.prompt_threshold < 1:
+        raise RunError(f"--prompt-threshold {config.prompt_threshold:g}: give a score from 0 to below 1")
+    if config.segmenter == "text" and config.model and config.prompt_model:
+        raise RunError("--model and --prompt-model name the same network here; leave one of them")
+    return {
+        "model": _named(detector_of(config)),
+        "mask_model": _named(config.mask_model or DEFAULT_MASK_MODEL),
+        "prompts": list(parse_prompts(config.prompts)),
+        "prompt_threshold": config.prompt_threshold,
+    }
+
+
+def detector_of(config: MasksConfig) -> str:
+    """The network that is asked for the prompts: --model is one of another segmenter where there is one."""
+    own = config.model if config.segmenter == "text" else None
+    return config.prompt_model or own or DEFAULT_DETECTOR
+
+
+def _named(model: str) -> Path | str:
+    return Path(model) if Path(model).is_dir() else model
+
+
+def load_text(
+    config: MasksConfig, device: str, threads: int, warn: Callable[[str], None], base: Mapping[int, str]
+) -> TextSegmenter:
+    """The segmenter for the prompts; `base`: names by id of the categories that they stand beside."""
+    settings(config)
+    prompts = prompts_of(parse_prompts(config.prompts), base)
+    torch.set_num_threads(threads)
+    where = torch_device(device)
+    with quiet():
+        finder = _finder(config, [title_of(prompt.words) for prompt in prompts], where, warn)
+    return TextSegmenter(finder, prompts, where)
+
+
+def _finder(
+    config: MasksConfig, words: Sequence[str], device: torch.device, warn: Callable[[str], None]
+) -> Finder:
+    """The networks that are asked for, loaded."""
+    name = detector_of(config)
+    warn(f"network {name}; if it is not on this machine yet, it is downloaded from huggingface.co")
+    folder = folder_of(name)
+    about = read_config(folder, name, _THRESHOLDS, "segmentation by text")
+    family = about.model_type
+    threshold = config.prompt_threshold or _THRESHOLDS[family]
+    if family in WORD_FAMILIES and config.mask_model:
+        raise LabelError(f"{name}: a network of kind {family} makes masks itself; leave out --mask-model")
+    with loading(name, _NEEDS):
+        if family == "clipseg":
+            return ClipSeg(folder, name, about, device, words, threshold, warn)
+        if family in WORD_FAMILIES:
+            return Sam3(folder, name, device, words, threshold, warn)
+        detect = detector(folder, name, about, device, words, warn)
+    return BoxFinder(detect, _box_masks(config, device, warn), threshold)
+
+
+def _box_masks(config: MasksConfig, device: torch.device, warn: Callable[[str], None]) -> BoxMasks:
+    name = config.mask_model or DEFAULT_MASK_MODEL
+    warn(f"network {name}; if it is not on this machine yet, it is downloaded from huggingface.co")
+    folder = folder_of(name)
+    about = read_config(folder, name, BOX_FAMILIES, "masks of boxes")
+    with loading(name):
+        return BoxMasks(folder, name, about, device)
+
+
+def _load(config: MasksConfig, device: str, threads: int, warn: Callable[[str], None]) -> TextSegmenter:
+    return load_text(config, device, threads, warn, {})
+
+
+FACTORY = SegmenterFactory(settings, _load)

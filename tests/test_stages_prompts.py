@@ -1,0 +1,192 @@
+"""Segmentation by text as a stage: it resumes, says how long it takes, and what was found nowhere."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sagesplat.core.config import MasksConfig, SceneConfig
+from sagesplat.core.errors import LabelError, RunError
+from sagesplat.core.events import Event, StageDone, Warned
+from sagesplat.demo.capture import make_capture
+from sagesplat.run.job import Job
+from sagesplat.run.run_dir import RunDir
+from sagesplat.segment import text
+from sagesplat.segment.detections import Found
+from sagesplat.segment.masks import Taxonomy
+from sagesplat.segment.segmenters import Segmented
+from sagesplat.stages import prompts
+from sagesplat.stages.label import make_masks, segmenter_kind
+from sagesplat.stages.memory import check_network
+from sagesplat.stages.prompts import Timed, read_scores
+from sagesplat.stages.scene import open_scene
+
+CONFIG = MasksConfig(segmenter="text", prompts="stone fountain; ivy; tree")
+
+
+class Left:
+    """Finds the first prompt in the left half of a photo, and the others nowhere."""
+
+    threshold = 0.3
+    calls = 0
+    killed_after: int | None = None
+
+    def __init__(self, words: list[str]):
+        self.words = words
+
+    def __call__(self, photo: np.ndarray, /) -> Found:
+        if Left.calls == Left.killed_after:
+            raise KeyboardInterrupt
+        Left.calls += 1
+        mask = np.full((1, *photo.shape[:2]), -20, np.float32)
+        mask[:, :, : photo.shape[1] // 2] = 20
+        best = np.full(len(self.words), 0.125, np.float32)
+        best[0] = 0.65
+        if self.words[0] == "nothing":
+            return Found(np.zeros(0, int), best[:0], mask[:0], best / 4)
+        return Found(np.zeros(1, int), best[:1], mask, best)
+
+
+@pytest.fixture(autouse=True)
+def fake(monkeypatch: pytest.MonkeyPatch) -> None:
+    def finder(config: MasksConfig, words: list[str], device: Any, warn: Callable[[str], None]) -> Left:
+        return Left(words)
+
+    monkeypatch.setattr(text, "_finder", finder)
+    monkeypatch.setattr(Left, "calls", 0)
+    monkeypatch.setattr(Left, "killed_after", None)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("demo") / "capture"
+    make_capture(folder, views=6, width=64, height=48)
+    return folder
+
+
+def begun(run: Path, capture: Path, **options: Any) -> tuple[Job, list[Event]]:
+    events: list[Event] = []
+    job = Job(RunDir(run), events.append, **options)
+    open_scene(job, capture, SceneConfig(calibrate_every=0))
+    return job, events
+
+
+def warnings(events: list[Event]) -> list[str]:
+    return [event.text for event in events if isinstance(event, Warned)]
+
+
+def test_words_become_categories_and_what_is_found_nowhere_is_said(capture: Path, tmp_path: Path) -> None:
+    job, events = begun(tmp_path / "run", capture)
+    make_masks(job, CONFIG)
+    assert job.taxonomy.names == {201: "stone fountain"}
+    label_ids = job.masks[job.scene.views[0]]
+    assert (label_ids[:, :32] == 201).all()
+    assert (label_ids[:, 32:] == -1).all()
+    said = warnings(events)
+    for name in ("ivy", "tree-merged"):
+        assert (
+            f"prompt '{name}': found in no photo; its best score is 0.12 and 0.3 is needed: describe it in "
+            "other words, or lower --prompt-threshold" in said
+        )
+    lines = next(event.lines for event in events if isinstance(event, StageDone) and event.name == "segment")
+    assert lines == ("best scores: stone fountain 0.65, ivy 0.12, tree-merged 0.12",)
+    (time,) = [line for line in said if "takes about" in line]
+    assert time == "segmentation takes about 1 s for 6 photos on this machine"
+    make_masks(job, CONFIG)  # done
+    assert Left.calls == 6
+    with pytest.raises(RunError, match="prompts"):
+        make_masks(job, MasksConfig(segmenter="text", prompts="stone fountain"))
+
+
+def test_a_killed_segmentation_goes_on(capture: Path, tmp_path: Path) -> None:
+    Left.killed_after = 4
+    job, _ = begun(tmp_path / "run", capture)
+    with pytest.raises(KeyboardInterrupt):
+        make_masks(job, CONFIG)
+    best, threshold = read_scores(job.run.segmented / ".prompts-0.json")
+    assert (best["ivy"], threshold) == (pytest.approx(0.125), 0.3)
+    Left.killed_after = None
+    job, events = begun(tmp_path / "run", capture)
+    make_masks(job, CONFIG)
+    assert Left.calls == 6
+    assert any("for 2 photos" in line for line in warnings(events))
+    other = MasksConfig(segmenter="text", prompts="wooden bench", prompt_threshold=0.4)
+    job, _ = begun(tmp_path / "run", capture, force=True)
+    make_masks(job, other)
+    assert Left.calls == 12
+    assert job.taxonomy.names == {201: "wooden bench"}
+
+
+def test_nothing_found_at_all_is_one_line(capture: Path, tmp_path: Path) -> None:
+    job, _ = begun(tmp_path / "run", capture)
+    with pytest.raises(
+        LabelError, match=r"prompt 'nothing': found in no photo; its best score is 0\.16"
+    ) as e:
+        make_masks(job, MasksConfig(segmenter="text", prompts="nothing; ivy"))
+    assert "prompt 'ivy'" in str(e.value)
+    assert "\n" not in str(e.value)
+
+
+class Grass:
+    """All is grass."""
+
+    taxonomy = Taxonomy({193: "grass-merged"})
+    note = None
+
+    def __init__(self, *_: Any, **__: Any) -> None:
+        pass
+
+    def __call__(self, photos: Any) -> list[Segmented]:
+        ids = np.array([193], np.int16)
+        shapes = [photo.shape[:2] for photo in photos]
+        return [Segmented(np.full(s, 193, np.int16), np.ones((1, *s), np.float32), ids) for s in shapes]
+
+
+def test_words_over_a_network_s_categories(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from sagesplat.segment import hf
+
+    monkeypatch.setattr(hf, "HfSegmenter", Grass)
+    job, _ = begun(tmp_path / "run", capture)
+    make_masks(job, MasksConfig(segmenter="hf", model="a/b", prompts="stone fountain", soft=True, batch=4))
+    assert job.taxonomy.names == {193: "grass-merged", 201: "stone fountain"}
+    label_ids = job.masks[job.scene.views[0]]
+    assert (label_ids == np.where(np.arange(64) < 32, 201, 193)).all()
+    with pytest.raises(RunError, match="over_prompts"):
+        make_masks(job, MasksConfig(segmenter="hf", model="a/b", prompts="ivy", soft=True))
+
+
+def test_prompts_imply_the_segmenter_unless_another_source_is_named(tmp_path: Path) -> None:
+    (tmp_path / "masks").mkdir()
+    assert segmenter_kind(tmp_path, MasksConfig()) == "masks"
+    assert segmenter_kind(tmp_path, MasksConfig(prompts="ivy")) == "text"
+    assert segmenter_kind(tmp_path, MasksConfig(prompts="ivy", model="n.onnx")) == "onnx"
+
+
+def test_words_over_given_label_images_are_refused(capture: Path, tmp_path: Path) -> None:
+    job, _ = begun(tmp_path / "run", capture)
+    with pytest.raises(RunError, match="--prompts: not over given label images"):
+        make_masks(job, MasksConfig(segmenter="masks", prompts="ivy"))
+
+
+def test_times_are_told_as_people_tell_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter([0.0, 5.0])
+    monkeypatch.setattr(prompts.time, "perf_counter", lambda: next(clock))
+    said: list[str] = []
+    timed = Timed(Grass(), lambda: 185, said.append)
+    for _ in range(2):
+        if not said:
+            timed([np.zeros((2, 2, 3), np.uint8)])
+    assert said == ["segmentation takes about 15 min for 185 photos on this machine"]
+    assert [prompts._duration(s) for s in (0.2, 80, 840, 9000)] == ["1 s", "80 s", "14 min", "2.5 h"]
+
+
+def test_networks_that_do_not_fit_are_refused_before_they_are_loaded(capture: Path, tmp_path: Path) -> None:
+    job, _ = begun(tmp_path / "run", capture, memory_limit=2**30)
+    with pytest.raises(RunError, match=r"needs at least about 1\.7 GiB"):
+        check_network(job, "text", text.settings(CONFIG), 1)
+    light = MasksConfig(segmenter="text", prompts="ivy", model="CIDAS/clipseg-rd64-refined")
+    check_network(job, "text", text.settings(light), 1)
