@@ -8,7 +8,8 @@ from rich.console import Console as RichConsole
 
 from sagesplat.cli import console
 from sagesplat.cli.console import Console, Remaining
-from sagesplat.cli.layout import duration, fitted
+from sagesplat.cli.layout import fitted
+from sagesplat.core.durations import duration
 from sagesplat.core.events import Progress, StageDone, StageStarted, TableMade
 
 HEADER = ("category", "level", "Gaussians", "share", "promised", "test", "all", "status")

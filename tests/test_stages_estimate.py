@@ -14,7 +14,7 @@ from sagesplat.demo.capture import make_capture
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.stages import estimate
-from sagesplat.stages.estimate import grown, spoken, step_seconds, tell_duration
+from sagesplat.stages.estimate import grown, step_seconds, tell_duration
 from sagesplat.stages.label import lift_labels, make_masks
 from sagesplat.stages.scene import open_scene
 
@@ -39,13 +39,6 @@ def said(job: Job, config: RunConfig = CONFIG) -> list[str]:
     events: list[Event] = []
     tell_duration(Job(job.run, events.append, job.backend), config)
     return [event.text for event in events if isinstance(event, Noted)]
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"), [(3, "10 s"), (84, "80 s"), (100, "2 min"), (1234, "21 min"), (9000, "2.5 h")]
-)
-def test_estimates_are_told_with_the_digits_that_are_known(seconds: float, text: str) -> None:
-    assert spoken(seconds) == text
 
 
 def test_a_grown_model_covers_as_much_as_what_it_grew_from() -> None:

@@ -112,7 +112,7 @@ def open_job(run: Path, options: Redo | Device, ladder: LadderKind = "nested") -
 
 def _approval(run: "RunDir", console: "Console", yes: bool) -> Callable[[str, str], None]:
     """Says once what --force redoes, and how long that took; on a terminal it is asked whether to."""
-    from sagesplat.cli.layout import duration
+    from sagesplat.core.durations import duration
     from sagesplat.run.recorded import stage_seconds
     from sagesplat.run.stage import following
 

@@ -10,7 +10,8 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn
 from rich.table import Table
 from rich.text import Text
 
-from sagesplat.cli.layout import duration, fitted
+from sagesplat.cli.layout import fitted
+from sagesplat.core.durations import duration
 from sagesplat.core.events import (
     Event,
     Noted,

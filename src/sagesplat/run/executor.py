@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Literal, Protocol, TypeVar
 
-from sagesplat.core.events import Emit, Event, Progress, Training, Warned
+from sagesplat.core.events import Emit, Event, Noted, Progress, Training, Warned
 
 Item = TypeVar("Item")
 
@@ -108,9 +108,9 @@ class ProgressAggregator:
                 self._add(name, number, done, total, text)
             case Training(step, total, loss):
                 self._add(name, number, step, total, f"loss {loss:.3f}")
-            case Warned(text) if (name, text) in self._warned:
+            case Warned(text) | Noted(text) if (name, text) in self._warned:
                 pass
-            case Warned(text):
+            case Warned(text) | Noted(text):
                 self._warned.add((name, text))
                 self._emit(event)
             case _:

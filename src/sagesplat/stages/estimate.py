@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from sagesplat.core.config import NestConfig, RunConfig, TrainConfig
+from sagesplat.core.durations import duration
 from sagesplat.core.events import Noted
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.run.executor import Local
@@ -47,15 +48,8 @@ def tell_duration(job: Job, config: RunConfig) -> None:
         parts["levels"] = _levels_seconds(job.given_scene, nested, fixed, each * fitted.lowered)
     parts["measuring"] = _measuring_seconds(job.given_scene, config, fixed + each * fitted.lowered)
     if (total := sum(parts.values())) >= _WORTH_TELLING:
-        each_part = ", ".join(f"{name} {spoken(seconds)}" for name, seconds in parts.items())
-        job.emit(Noted(f"from here on about {spoken(total)} on this machine: {each_part}"))
-
-
-def spoken(seconds: float) -> str:
-    """Seconds as an estimate is told: no more digits than are known."""
-    if seconds < 90:
-        return f"{max(10, round(seconds, -1)):.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+        each_part = ", ".join(f"{name} {duration(round(seconds, -1))}" for name, seconds in parts.items())
+        job.emit(Noted(f"from here on about {duration(total)} on this machine: {each_part}"))
 
 
 def step_seconds(job: Job, config: TrainConfig, most: int) -> tuple[float, float]:

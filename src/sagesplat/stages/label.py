@@ -12,7 +12,7 @@ from jaxtyping import Float32, Int16
 
 from sagesplat.core.config import LabelsConfig, LiftConfig, MasksConfig
 from sagesplat.core.errors import LabelError, RunError
-from sagesplat.core.events import Progress, Warned
+from sagesplat.core.events import Noted, Progress, Warned
 from sagesplat.core.typed import fits
 from sagesplat.io.files import read_json, write_json
 from sagesplat.run.executor import split
@@ -188,7 +188,7 @@ def _is(marker: Path, key: dict[str, Any]) -> bool:
 def _segment_some(job: Job, part: tuple[Sequence[int], MasksConfig, str]) -> tuple[Taxonomy, set[int]]:
     """Segment some views (rows, settings, kind of segmenter): all its categories, and the ids that occur."""
     rows, config, kind = part
-    run, warn = job.run, lambda text: job.emit(Warned(text))
+    run, warn, note = job.run, lambda text: job.emit(Warned(text)), lambda text: job.emit(Noted(text))
     segmenter = load(kind, config, job.device, job.threads, warn)
     scores, remaining = Scores(run.segmented, rows[0] if rows else 0, segmenter), len(rows)
 
@@ -199,7 +199,7 @@ def _segment_some(job: Job, part: tuple[Sequence[int], MasksConfig, str]) -> tup
         job.emit(Progress("segment", done, total))
 
     occurring = segment_some(
-        job.scene, job.photos, Timed(segmenter, lambda: remaining, warn), run.segmented, rows,
+        job.scene, job.photos, Timed(segmenter, lambda: remaining, note), run.segmented, rows,
         batch=config.batch, soft=run.soft if config.soft else None, on_view=on_view,
     )  # fmt: skip
     return segmenter.taxonomy, occurring

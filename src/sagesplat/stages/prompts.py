@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from sagesplat.core.config import MasksConfig
+from sagesplat.core.durations import duration
 from sagesplat.core.errors import LabelError
 from sagesplat.core.typed import fits
 from sagesplat.io.files import read_object, write_json
@@ -51,14 +52,10 @@ class Timed:
         if not self._told and photos:
             self._told, left = True, self._remaining()
             seconds = (time.perf_counter() - start) / len(photos) * left
-            self._tell(f"segmentation takes about {_duration(seconds)} for {left} photos on this machine")
+            self._tell(
+                f"segmentation takes about {duration(max(seconds, 1))} for {left} photos on this machine"
+            )
         return found
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 90:
-        return f"{max(round(seconds), 1)} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 class Scores:
