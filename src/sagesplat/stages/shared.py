@@ -33,6 +33,8 @@ def train_config(job: Job) -> TrainConfig:
 def label_image_inputs(run: RunDir) -> list[Path]:
     """What decides the label images that stages after training look at: the records of who made them."""
     made = [("masks", run.masks), ("fuse", run.fused), ("block_categories", run.block_categories)]
+    if run.ladder == "nested":
+        made.append(("instances", run.instances))
     return [run.provenance(stage) for stage, folder in made if (folder / "labels.json").exists()]
 
 
