@@ -104,13 +104,13 @@ def wild(
 
 @app.command
 def labels(
-    out: Path | None = None, /, *, steps: int = 600, seed: int = 0, threads: int = 2, write: bool = False
+    out: Path | None = None, /, *, steps: int = 1000, seed: int = 0, threads: int = 2, write: bool = False
 ) -> None:
     """3D instances of the built-in garden against the modelled objects, and the speed of lifting labels.
 
     Args:
         out: folder for the run; a training in it is used again (default: a temporary one).
-        steps: of its training, on photos of half the size.
+        steps: of its training.
         seed: of the corruption of masks.
         threads: 0: one per core.
         write: keep the results in benchmarks/results/labels.json, with the command, commit and date.

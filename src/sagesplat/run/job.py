@@ -162,6 +162,11 @@ class Job:
         return ValidPixels(self.run.inliers) if self.run.inliers.exists() else self.valid
 
     @property
+    def parents_by_id(self) -> dict[int, str]:
+        """The category of each instance, by the instance's id."""
+        return {i: self.parents[name] for i, name in self.names().items() if name in self.parents}
+
+    @property
     def whole_masks(self) -> Masks:
         """The label images of the scene as one: with its instances, if they were asked for."""
         instances = self.run.instances

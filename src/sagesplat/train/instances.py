@@ -24,7 +24,7 @@ PhotoInstances = Callable[[View], Int16[np.ndarray, "H W"] | None]
 
 LEAST_WEIGHT = 0.02  # pixels of a view that have to show a Gaussian
 LEAST_PIXELS = 16  # of a 2D instance
-LEAST_SHARE = 0.25  # of what views see of a Gaussian's category: what has to be in its instance
+LEAST_SHARE = 0.1  # of what views see of a Gaussian's category: what has to be in its instance
 _ROUNDS, _REACH = 8, 3.0  # of spreading to neighbours; times their median distance
 
 
@@ -107,7 +107,7 @@ def label(
     """Join the 2D instances, and give each Gaussian the 3D instance that views see it in.
 
     A Gaussian has the category of its largest weight, or its own where no view sees it. It has an instance of
-    that category if at least a quarter of the category's weight is in it. Gaussians that no view sees get the
+    that category if at least a tenth of the category's weight is in it. Gaussians that no view sees get the
     instance of their neighbours. Instances are numbered by their weight, the largest first: "chair 1".
 
     Args:

@@ -26,8 +26,8 @@ class ConsensusOptions:
     seen: float = 0.3  # of an instance: what a view has to see of it to have a say
     covered: float = 0.5  # of what it sees: what has to be in some instance
     contained: float = 0.8  # of that: what has to be in one instance
-    cut: float = 0.5  # of the views with a say: where more than these cut it, it is taken for several objects
-    agree: float = 0.5  # of the views that see both: those that see them as one
+    cut: float = 0.7  # of the views with a say: where more than these cut it, it is taken for several objects
+    agree: float = 0.4  # of the views that see both: those that see them as one
 
 
 @dataclass(frozen=True, eq=False)
