@@ -120,8 +120,8 @@ def corrupted(instances: np.ndarray, rng: np.random.Generator, share: float = 0.
         erode, dilate, split, drop = rng.random(4) < share
         if drop or not mask.any():
             continue
-        mask = binary_erosion(mask, disc) if erode else mask
-        mask = binary_dilation(mask, disc) if dilate else mask
+        mask = np.asarray(binary_erosion(mask, disc) if erode else mask, bool)
+        mask = np.asarray(binary_dilation(mask, disc) if dilate else mask, bool)
         result[mask] = count
         if split and mask.any():
             v, u = np.nonzero(mask)
