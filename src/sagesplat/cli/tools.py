@@ -63,7 +63,7 @@ def export(
             target = None if target_ssim is None else ("ssim", target_ssim)
             target = target if target_fidelity is None else ("fidelity", target_fidelity)
             count = export_scene(
-                job, out, level=level, labels=[*labels, *parse_keep(only)], target=target, levels=levels,
+                job, out, level=level, labels=(*labels, *parse_keep(only)), target=target, levels=levels,
                 rasterize_mode=rasterize_mode, without=parse_keep(without),
             )  # fmt: skip
     say(f"{out}: {count:,} {'chunks' if chunks else 'Gaussians'}")
