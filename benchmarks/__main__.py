@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import subprocess
 import tempfile
 import time
 from dataclasses import replace
@@ -18,6 +19,7 @@ from benchmarks import deeplab as segmenting
 from benchmarks import formats as formatting
 from benchmarks import freeze as freezing
 from benchmarks import fuzz as fuzzing
+from benchmarks import labels as labelling
 from benchmarks import measure, plain, size_tables, workloads
 from benchmarks import plans as planning
 from benchmarks import promises as promising
@@ -98,6 +100,30 @@ def wild(
         raise SystemExit(f"wild: no row {unknown[0]!r}; choose from {', '.join(disturbed.ROWS)}")
     found = disturbed.measure(out, rows or tuple(disturbed.ROWS), steps, seed, print)
     _finish("wild", {"steps": steps, "seed": seed, "rows": found}, write, RESULTS.parent)
+
+
+@app.command
+def labels(
+    out: Path | None = None, /, *, steps: int = 1000, seed: int = 0, threads: int = 2, write: bool = False
+) -> None:
+    """3D instances of the built-in garden against the modelled objects, and the speed of lifting labels.
+
+    Args:
+        out: folder for the run; a training in it is used again (default: a temporary one).
+        steps: of its training.
+        seed: of the corruption of masks.
+        threads: 0: one per core.
+        write: keep the results in benchmarks/results/labels.json, with the command, commit and date.
+    """
+    set_threads(threads)
+    with tempfile.TemporaryDirectory() as folder:
+        found = labelling.measure(out or Path(folder) / "run", steps, seed)
+    for name, value in found.items():
+        print(f"{name:24} {value:.4g}")
+    command = f"python -m benchmarks labels --steps {steps} --seed {seed} --threads {threads}"
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout
+    made = {"command": command, "commit": commit.strip(), "date": date.today().isoformat()}
+    _finish("labels", {**made, **found}, write, RESULTS.parent)
 
 
 @app.command

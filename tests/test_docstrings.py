@@ -14,7 +14,8 @@ import sagesplat
 MODULES = (
     "adapt.allocate", "adapt.fill", "adapt.observe", "adapt.photo_models", "adapt.plan", "adapt.viewpoint",
     "formats.levels", "formats.ply", "formats.splats", "formats.spz", "formats.stream",
-    "metrics.color_correct", "metrics.image", "raster", "scene", "segment.masks", "stages.api",
+    "metrics.color_correct", "metrics.image", "raster", "scene", "segment.masks", "segment.select",
+    "stages.api",
     "train.trainer",
 )  # fmt: skip
 CALLED_BY_MANY = (

@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from sagesplat.core.errors import BackendUnavailable, LabelError, OutOfMemory
-from sagesplat.segment import coco
+from sagesplat.segment import coco, panoptic
 from sagesplat.segment.hf import HfSegmenter, class_ids
 from sagesplat.segment.hub import torch_device
 from sagesplat.segment.segmenters import Segmenter
@@ -385,3 +385,32 @@ def test_devices(folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> N
     segmenter._model = full_machine
     with pytest.raises(OutOfMemory, match=r"on cpu for 1 photos at once; take fewer, smaller photos$"):
         segmenter([noise(8, 8)])
+
+
+@pytest.mark.parametrize("kind", ["crops", "mask2former", "detr"])
+def test_instances_only_where_they_are_asked_for(
+    folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    monkeypatch.setattr(panoptic, "LEAST_SCORE", 0.0)  # an untrained network is sure of nothing
+    monkeypatch.setattr(panoptic, "LEAST_OVERLAP", 0.0)
+    segmenter = HfSegmenter(folders[kind], device="cpu")
+    photo = noise(120, 180)
+    (without,) = segmenter([photo])
+    segmenter.instances = True
+    (found,) = segmenter([photo])
+    assert without.instances is None
+    assert found.instances is not None
+    assert found.instances.shape == photo.shape[:2]
+    assert (found.label_ids == without.label_ids).all()
+
+
+def test_queries_that_others_hide_are_no_instances() -> None:
+    logits = torch.full((3, 4, 8), -9.0)
+    logits[0, :, :4] = logits[1, :, 4:] = 9
+    logits[2, :, :3] = 9  # the first query has all of it
+    weights = torch.tensor([[0.9, 0.0], [0.8, 0.1], [0.7, 0.0]])
+    found = panoptic.instances_of([(weights, logits)], [np.s_[0:4, 0:8]], np.array([True, False]), (4, 8))
+    assert found[0].tolist() == [0, 0, 0, 0, 1, 1, 1, 1]
+    assert (
+        panoptic.instances_of([(weights, logits)], [np.s_[0:4, 0:8]], np.zeros(2, bool), (4, 8)) == -1
+    ).all()

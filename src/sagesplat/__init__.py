@@ -12,6 +12,8 @@ neither torch nor numba. The examples in `examples/` import from here alone.
     train_gaussians                            the training loop, as a generator of events
     Plan, ViewModel, read_plans, read_promises    plans and the SSIM models behind them
     Taxonomy, HfSegmenter, OnnxSegmenter, label_image      label images
+    select, select_mask                        Gaussians by the names of categories and instances
+    read_splat, Splat                          splat files of any tool, with their names
     SageError                                  what a user can cause
 
 No name here is that of a subpackage. `sagesplat.run` and `sagesplat.train` are folders of modules: a function
@@ -32,6 +34,8 @@ if TYPE_CHECKING:
     from sagesplat.core.events import Event, StageDone, StageSkipped, Warned
     from sagesplat.core.gaussians import Gaussians
     from sagesplat.formats.ply import read_ply, write_ply
+    from sagesplat.formats.splat import Splat
+    from sagesplat.formats.splats import read_splat
     from sagesplat.formats.spz import read_spz, write_spz
     from sagesplat.output.figures import label_image
     from sagesplat.raster import Render, rasterize, set_threads
@@ -40,15 +44,17 @@ if TYPE_CHECKING:
     from sagesplat.segment.hf import HfSegmenter
     from sagesplat.segment.masks import Taxonomy
     from sagesplat.segment.onnx import OnnxSegmenter
+    from sagesplat.segment.select import select, select_mask
     from sagesplat.stages.api import FinishedRun, open_run, run_scene
     from sagesplat.train.trainer import train as train_gaussians
 
 __all__ = [
     "Camera", "Event", "FinishedRun", "Gaussians", "HfSegmenter", "NestConfig", "OnnxSegmenter", "Plan",
-    "PlanConfig", "Render", "RunConfig", "SageError", "Scene", "SceneConfig", "StageDone", "StageSkipped",
-    "Taxonomy", "TrainConfig", "View", "ViewModel", "Warned", "label_image", "load_scene", "open_run",
-    "rasterize", "read_plans", "read_ply", "read_promises", "read_spz", "run_scene", "set_threads",
-    "train_gaussians", "write_ply", "write_spz",
+    "PlanConfig", "Render", "RunConfig", "SageError", "Scene", "SceneConfig", "Splat", "StageDone",
+    "StageSkipped", "Taxonomy", "TrainConfig", "View", "ViewModel", "Warned", "label_image",
+    "load_scene", "open_run", "rasterize", "read_plans", "read_ply", "read_promises", "read_splat",
+    "read_spz", "run_scene", "select", "select_mask", "set_threads", "train_gaussians", "write_ply",
+    "write_spz",
 ]  # fmt: skip
 
 # by module, below sagesplat
@@ -60,6 +66,8 @@ _EXPORTS = {
     "core.events": "Event StageDone StageSkipped Warned",
     "core.gaussians": "Gaussians",
     "formats.ply": "read_ply write_ply",
+    "formats.splat": "Splat",
+    "formats.splats": "read_splat",
     "formats.spz": "read_spz write_spz",
     "output.figures": "label_image",
     "raster": "Render rasterize set_threads",
@@ -68,6 +76,7 @@ _EXPORTS = {
     "segment.hf": "HfSegmenter",
     "segment.masks": "Taxonomy",
     "segment.onnx": "OnnxSegmenter",
+    "segment.select": "select select_mask",
     "stages.api": "FinishedRun open_run run_scene",
     "train.trainer": "train_gaussians",
 }

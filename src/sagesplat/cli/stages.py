@@ -41,6 +41,9 @@ from sagesplat.core.config import (
 from sagesplat.core.errors import RunError
 
 _SPLAT = "splat: PLY, compressed PLY, SPZ, SOG, lod-meta.json, .splat or glTF"
+_INSTANCES = (
+    'categories, such as "chair,car"; things: all that can be counted; *: all; "": fold instances back'
+)
 _FUSE = "Fuse the label images of all views through the trained Gaussians, before the levels are made."
 
 
@@ -191,6 +194,22 @@ def fuse(run: Run, machine: Annotated[Compute, Flat] = Compute()) -> None:
     with open_job(run, machine) as job:
         check_not_adopted(job.run)
         fuse_masks(job)
+
+
+@command
+def instances(
+    run: Run,
+    categories: Positional[Annotated[str, arg(metavar="CATEGORIES", help=_INSTANCES)]] = "things",
+    machine: Annotated[Compute, Flat] = Compute(),
+) -> None:
+    """Tell the instances of categories apart: each becomes a category of its own, "chair 1", "chair 2"."""
+    from sagesplat.run.recorded import recorded_settings
+    from sagesplat.stages import pipeline
+
+    with open_job(run, machine) as job:
+        known = recorded_settings(job.run)
+        labels = replace(known.get("labels", LabelsConfig()), instances=categories)
+        pipeline.instances(job, labels, known.get("masks", MasksConfig()))
 
 
 @command

@@ -19,6 +19,8 @@ def export(
     out: Positional[Annotated[Path, arg(metavar="OUT")]],
     level: int | None = None,
     labels: tuple[str, ...] = (),
+    only: str = "",
+    without: str = "",
     target_fidelity: float | None = None,
     target_ssim: float | None = None,
     chunks: Literal["spz", "ply"] | None = None,
@@ -37,6 +39,8 @@ def export(
         out: file to write, or with --chunks a folder
         level: number of a level (of snapshots: its training step) to write instead of the planned scene
         labels: names of the categories to write (default: all)
+        only: the same as one text, such as "chair 2,vase"; a category means all its instances
+        without: categories or instances to leave out, such as "person,chair 1"; says how large the holes are
         target_fidelity: write the scene planned for this fidelity (default: for the budget, else the main
             target)
         target_ssim: write the scene planned for this SSIM against photos
@@ -45,8 +49,11 @@ def export(
             tells them; .spz, .sog and lod-meta.json say how the run was trained)
         chunks: write the increment of each level of each category as a file of this format
     """
+    from sagesplat.segment.edit import parse_keep
     from sagesplat.stages.export import export_increments, export_scene
 
+    if chunks and (only or without):
+        raise RunError(f"{out}: --only and --without are for one scene; leave them out with --chunks")
     if chunks and rasterize_mode:
         raise RunError(f"{out}: --rasterize-mode is for one scene; leave it out with --chunks")
     with open_job(run, machine, ladder) as job:
@@ -56,8 +63,8 @@ def export(
             target = None if target_ssim is None else ("ssim", target_ssim)
             target = target if target_fidelity is None else ("fidelity", target_fidelity)
             count = export_scene(
-                job, out, level=level, labels=labels, target=target, levels=levels,
-                rasterize_mode=rasterize_mode,
+                job, out, level=level, labels=(*labels, *parse_keep(only)), target=target, levels=levels,
+                rasterize_mode=rasterize_mode, without=parse_keep(without),
             )  # fmt: skip
     say(f"{out}: {count:,} {'chunks' if chunks else 'Gaussians'}")
 

@@ -105,6 +105,10 @@ class LabelsConfig:
     measured and have no vote."""
     ignore_dilation: int = 3
     """Grow ignored regions by this many pixels of the training photos, whatever they were ignored for."""
+    instances: str = ""
+    """Tell instances of these categories apart, e.g. "chair,car" (things: of all that can be counted; *: of
+    all). Each becomes a category of its own, "chair 1", "chair 2"; --labels.merge "chair 1=chair" folds one
+    back."""
 
 
 @dataclass(frozen=True)

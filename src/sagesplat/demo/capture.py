@@ -14,6 +14,8 @@ from sagesplat import __version__
 from sagesplat.core.errors import SceneError
 from sagesplat.demo.cameras import demo_cameras, grid_cameras
 from sagesplat.demo.figures import PERSON
+from sagesplat.demo.foliage import NO_OBJECT
+from sagesplat.demo.objects import render_objects
 from sagesplat.demo.off_path import off_path_pictures, write_pictures, write_transforms
 from sagesplat.demo.points import Taken, write_points
 from sagesplat.demo.render import lit_world, threads_map
@@ -36,6 +38,8 @@ def make_capture(
     on_view: Callable[[int, int], None] | None = None,
 ) -> None:
     """Render the garden into `folder`: images/*.png, masks/*.png with labels.json, sparse/0/*.bin.
+
+    A single courtyard has instances/*.png too: the object that each pixel shows, 65535 for none.
 
     `places` (nx, ny) makes a large capture: a grid of different courtyards, with photos from orbits in each
     and, a fifth of them, from the ways in between. With disturbances (`wild`) truth/ has what they are
@@ -144,6 +148,8 @@ def _write(
         Image.fromarray(shot.label).save(folder / "masks" / names[i])
         if on_view:
             on_view(i + 1, len(cameras))
+    if places == (1, 1):
+        _write_objects(folder / "instances", names, cameras, shots, seed)
     people = {PERSON: "person"} if wild.figures and wild.figure_masks else {}
     write_taxonomy(folder, people | LABELS)
     photos, labels = np.stack([s.true_photo for s in shots]), np.stack([s.true_label for s in shots])
@@ -153,6 +159,16 @@ def _write(
         taken = Taken(noisy_cameras(wild, cameras, seed), photo, hidden)
         _write_truth(folder / "truth", names, cameras, shots, seed, wild)
     write_points(folder / "sparse" / "0", names, cameras, photos, labels, seed, places, taken)
+
+
+def _write_objects(
+    folder: Path, names: list[str], cameras: list[Camera], shots: list[Shot], seed: int
+) -> None:
+    """Number of the object at each pixel, in the photos as they were taken: none where a figure stands."""
+    folder.mkdir()
+    for name, camera, shot in zip(names, cameras, shots, strict=True):
+        objects = np.where(shot.hidden, NO_OBJECT, render_objects(camera, seed)[0])
+        Image.fromarray(objects.astype(np.uint16)).save(folder / name)
 
 
 def _write_truth(

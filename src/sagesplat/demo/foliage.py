@@ -6,14 +6,16 @@ import numpy as np
 
 UP = np.array([0.0, 0.0, 1.0])
 POTTED_PLANT, TREE = 64, 184  # labels
+NO_OBJECT = -1  # what is modelled as a crowd: grass, the wood, the sky
 PETALS = ((0.75, 0.10, 0.28), (0.85, 0.80, 0.75), (0.85, 0.45, 0.05))
 
 
 class Foliage:
-    """Leaves as pointed discs, each with a pose, a colour and a label."""
+    """Leaves as pointed discs, each with a pose, a colour, a label and the number of its object."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.rng = rng
+        self.object = NO_OBJECT  # that the leaves to come belong to
         self.parts: list[tuple[np.ndarray, ...]] = []
 
     def add(
@@ -39,7 +41,7 @@ class Foliage:
         colour = rgb * rng.lognormal(0.0, 0.22, (n, 1)) * rng.lognormal(0.0, 0.06, (n, 3))
         frame = np.concatenate([centre, normal, u / (size[0] * scale), v / (size[1] * scale)], 1)
         reach = np.sqrt((size[0] * scale * u) ** 2 + (size[1] * scale * v) ** 2)
-        self.parts.append((frame, reach, colour, np.full(n, label)))
+        self.parts.append((frame, reach, colour, np.full(n, label), np.full(n, self.object)))
 
     def crown(
         self,

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sagesplat.demo.foliage import PETALS, POTTED_PLANT, Foliage
+from sagesplat.demo.foliage import NO_OBJECT, PETALS, POTTED_PLANT, Foliage
 from sagesplat.demo.world import (
     BARK,
     BRICK,
@@ -89,6 +89,8 @@ def build_places(seed: int, places: tuple[int, int]) -> World:
         body_place=np.array(body_place + [0] * len(hedges)),
         places=np.stack([np.column_stack([p.turn.T, -p.turn.T @ p.centre]) for p in layout]),
         tints=tints,
+        solid_object=np.full(len(solids), NO_OBJECT, np.int16),
+        body_object=np.full(len(bodies) + len(hedges), NO_OBJECT, np.int16),
     )
 
 
@@ -171,12 +173,12 @@ def _around(turn: float, half: np.ndarray, away: float) -> np.ndarray:
 
 
 def _moved_leaves(part: tuple[np.ndarray, ...], place: Place) -> tuple[np.ndarray, ...]:
-    frame, reach, rgb, label = part
+    frame, reach, *rest = part
     frame, reach = frame.reshape(-1, 4, 3).copy(), reach.copy()
     frame[:, :, :2] = frame[:, :, :2] @ place.turn.T
     frame[:, 0, :2] += place.centre
     reach[:, :2] = reach[:, :2] @ np.abs(place.turn).T
-    return frame.reshape(-1, 12), reach, rgb, label
+    return frame.reshape(-1, 12), reach, *rest
 
 
 def _moved_solid(row: list[float], place: Place) -> list[float]:

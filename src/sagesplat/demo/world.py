@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Float64, Int16, Int64
 
-from sagesplat.demo.foliage import POTTED_PLANT, Foliage
+from sagesplat.demo.foliage import NO_OBJECT, POTTED_PLANT, Foliage
 
 # Materials. Leaves (LEAF) have a label each; every other material has one label.
 SKY, GRASS, PAVING, WOOD, GLAZE, CLAY, BARK, BRICK, ROOF, CORE, LEAF = range(11)
@@ -24,6 +24,10 @@ LABELS = {
     197: "building-other-merged",
 }
 LABEL_OF = np.array([187, 193, 191, 67, 86, 64, 184, 197, 197, 184, -1], np.int16)  # by material
+
+# Objects: what a person would count. The hedges and the trees of the garden follow these.
+TABLE, VASE, HOUSE, BOUQUET, PLANT, HEDGE = 0, 1, 2, 3, 4, 6
+TREE = HEDGE + 5
 
 BIN = 4  # leaves per box at the bottom of the tree
 PLOT = 8.0  # half the side of the square of one courtyard
@@ -41,6 +45,7 @@ class World(NamedTuple):
     leaf_rgb: Float32[np.ndarray, "L 3"]  # linear albedo
     leaf_light: Float32[np.ndarray, "L 2"]  # baked: visible shares of the sun and of the sky
     leaf_label: Int16[np.ndarray, " L"]
+    leaf_object: Int16[np.ndarray, " L"]  # NO_OBJECT for the wood
     solids: Float64[np.ndarray, "S 9"]  # x, y, bottom, height, r0, r1, belly, waist; largest radius
     solid_material: Int64[np.ndarray, " S"]
     bodies: Float64[np.ndarray, "B 7 4"]  # planes: outward normal n and c; inside is n.p <= c
@@ -53,6 +58,8 @@ class World(NamedTuple):
     body_place: Int64[np.ndarray, " B"]
     places: Float64[np.ndarray, "P 2 3"]  # world to courtyard, in the ground plane
     tints: Float64[np.ndarray, "P 11 3"]  # colour factors of a material in a courtyard
+    solid_object: Int16[np.ndarray, " S"]
+    body_object: Int16[np.ndarray, " B"]
 
 
 def build_world(seed: int) -> World:
@@ -75,6 +82,8 @@ def build_world(seed: int) -> World:
         body_place=np.zeros(len(bodies), np.int64),
         places=np.eye(2, 3)[None],
         tints=np.ones((1, 11, 3)),
+        solid_object=np.array([TABLE] * 3 + [VASE, PLANT, PLANT + 1, *range(TREE, TREE + 4)], np.int16),
+        body_object=np.array([HOUSE] * 3 + [*range(HEDGE, TREE)], np.int16),
     )
 
 
@@ -86,7 +95,7 @@ def assemble(
     **rest: np.ndarray,
 ) -> World:
     """A world without light from `Foliage.parts`, solids and bodies with materials; `rest`: other fields."""
-    frame, reach, rgb, label = (np.concatenate(c) for c in zip(*leaves, strict=True))
+    frame, reach, rgb, label, number = (np.concatenate(c) for c in zip(*leaves, strict=True))
     cells = round(2 * plot * LIGHT_CELLS) + 1
     order, boxes, axes = _box_tree(frame[:, :3], reach)
     return World(
@@ -96,6 +105,7 @@ def assemble(
         leaf_rgb=rgb[order].astype(np.float32),
         leaf_light=np.zeros((len(order), 2), np.float32),
         leaf_label=label[order].astype(np.int16),
+        leaf_object=number[order].astype(np.int16),
         solids=np.array([row for row, _ in solids]),
         solid_material=np.array([m for _, m in solids]),
         bodies=np.array([planes for planes, _ in bodies]),
@@ -146,23 +156,31 @@ def box(low: Sequence[float], high: Sequence[float]) -> np.ndarray:
 def _plant(foliage: Foliage, solids: list, bodies: list) -> None:
     """Add bouquet, shrubs, hedges and trees."""
     rng = foliage.rng
+    foliage.object = BOUQUET
     foliage.bouquet([0.06, -0.03, 1.13])
+    foliage.object = PLANT
     foliage.crown([1.75, 1.2, 0.62], 0.34, 700, (0.05, 0.02), [0.05, 0.14, 0.04], POTTED_PLANT)
+    foliage.object = PLANT + 1
     foliage.crown([-1.7, 1.45, 0.50], 0.28, 600, (0.04, 0.022), [0.13, 0.17, 0.03], POTTED_PLANT)
-    for x0, y0, x1, y1 in (
+    hedges = (
         (-7.2, -7.2, -6.5, 6.4),
         (6.5, -7.2, 7.2, 6.4),
         (-6.5, -7.2, 6.5, -6.5),
         (-7.2, 6.5, -4.6, 7.2),
         (4.6, 6.5, 7.2, 7.2),
-    ):
+    )
+    for number, (x0, y0, x1, y1) in enumerate(hedges, HEDGE):
+        foliage.object = number
         top = rng.uniform(1.45, 1.6)
         bodies.append((box([x0 + 0.1, y0 + 0.1, 0], [x1 - 0.1, y1 - 0.1, top - 0.1]), CORE))
         foliage.hedge([x0, y0, 0.05], [x1, y1, top], 150)
     greens = ([0.07, 0.17, 0.03], [0.12, 0.18, 0.03], [0.05, 0.13, 0.04], [0.17, 0.15, 0.03])
-    for (x, y), rgb in zip(((-4.9, -4.7), (5.1, -4.3), (5.4, 3.7), (-5.3, 4.3)), greens, strict=True):
+    trunks = ((-4.9, -4.7), (5.1, -4.3), (5.4, 3.7), (-5.3, 4.3))
+    for number, ((x, y), rgb) in enumerate(zip(trunks, greens, strict=True), TREE):
+        foliage.object = number
         solids.append((solid(x, y, 0, 2.4, 0.11, 0.06), BARK))
         foliage.crown([x, y, 2.8], 1.35, 3400, (0.075, 0.04), rgb)
+    foliage.object = NO_OBJECT
     for i in range(11):  # behind the hedge, which hides the trunks
         angle = -0.5 * np.pi + (i - 5) * 0.43
         x, y = rng.uniform(10, 13) * np.array([np.cos(angle), np.sin(angle)])

@@ -1,15 +1,17 @@
-"""Labels beside a splat file of a format that holds none: FILE.labels.json.
+"""Labels beside a splat file: FILE.labels.json.
 
-    {"format": "sagesplat-labels", "version": 1, "names": {"184": "tree-merged"},
-     "counts": {"184": 1200, "-1": 3}, "runs": [[184, 1200], [-1, 3]]}
+    {"format": "sagesplat-labels", "version": 1, "names": {"62": "chair", "201": "chair 1"},
+     "parents": {"201": "chair"}, "counts": {"201": 1200, "-1": 3}, "runs": [[201, 1200], [-1, 3]]}
 
-`runs` are label ids and how many rows of the file in turn have them.
+`runs` are label ids and how many rows of the file in turn have them; without `runs` the labels are those of
+the file itself, and this is a dictionary of their names. `parents` are the categories of instances, by id.
 """
 
 import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -23,6 +25,7 @@ from sagesplat.formats.splat import Splat
 from sagesplat.io.files import atomic_path, loads_json, regular
 
 _FORMAT = "sagesplat-labels"
+NO_PARENTS: Mapping[int, str] = MappingProxyType({})
 
 
 def sidecar(path: Path) -> Path:
@@ -30,23 +33,42 @@ def sidecar(path: Path) -> Path:
     return path.with_name(path.name + ".labels.json")
 
 
-def write_labels(path: Path, label_ids: Int16[Tensor, " N"], names: Mapping[int, str]) -> Path:
-    """Write the labels of the rows of the splat file `path` beside it; the path of what was written."""
-    content = as_json(label_ids, names)
+def write_labels(
+    path: Path,
+    label_ids: Int16[Tensor, " N"],
+    names: Mapping[int, str],
+    parents: Mapping[int, str] = NO_PARENTS,
+    *,
+    runs: bool = True,
+) -> Path:
+    """Write the labels of the rows of the splat file `path` beside it; the path of what was written.
+
+    Without `runs` it is a dictionary of names for a file that has the labels itself.
+    """
+    content = as_json(label_ids, names, parents, runs=runs)
     with atomic_path(sidecar(path), nbytes=len(content)) as temporary:
         temporary.write_bytes(content)
     return sidecar(path)
 
 
-def as_json(label_ids: Int16[Tensor, " N"], names: Mapping[int, str]) -> bytes:
-    """The labels of rows, and the names of those that occur."""
+def as_json(
+    label_ids: Int16[Tensor, " N"],
+    names: Mapping[int, str],
+    parents: Mapping[int, str] = NO_PARENTS,
+    *,
+    runs: bool = True,
+) -> bytes:
+    """The labels of rows, the names of those that occur, and the categories of the instances among them."""
     labels, sizes = (v.tolist() for v in torch.unique_consecutive(label_ids, return_counts=True))
     counts: dict[int, int] = {}
     for label, size in zip(labels, sizes, strict=True):
         counts[label] = counts.get(label, 0) + size
     named = {i: repaired(names[i], f"category {i}") for i in sorted(counts) if i in names}
-    runs = list(zip(labels, sizes, strict=True))
-    document = {"format": _FORMAT, "version": 1, "names": named, "counts": counts, "runs": runs}
+    document: dict[str, Any] = {"format": _FORMAT, "version": 1, "names": named, "counts": counts}
+    if of := {i: repaired(parents[i], f"category of {i}") for i in named if i in parents}:
+        document["parents"] = of
+    if runs:
+        document["runs"] = list(zip(labels, sizes, strict=True))
     return json.dumps(document, ensure_ascii=False).encode()
 
 
@@ -71,11 +93,14 @@ def labelled(splat: Splat, content: bytes) -> Splat:
         document = loads_json(content)
         if document["format"] != _FORMAT or document["version"] != 1:
             raise ValueError(f"format {document['format']!r:.40}, version {document['version']!r:.20}")
-        labels = _labels(document["runs"], len(splat.gaussians))
-        names = _names(document["names"])
+        labels = splat.gaussians.label_ids
+        if "runs" in document:
+            labels = _labels(document["runs"], len(splat.gaussians))
+        names, parents = _names(document["names"]), _names(document.get("parents", {}))
     except (TypeError, KeyError, AttributeError) as error:
         raise ValueError(repr(error)) from None
-    return replace(splat, gaussians=replace(splat.gaussians, label_ids=labels), names=splat.names | names)
+    g = replace(splat.gaussians, label_ids=labels)
+    return replace(splat, gaussians=g, names=splat.names | names, parents=splat.parents | parents)
 
 
 def _labels(runs: Any, count: int) -> Int16[Tensor, " N"]:

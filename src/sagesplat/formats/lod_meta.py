@@ -51,12 +51,13 @@ def read_lod_meta(path: Path, lod: int = 0) -> Splat:
         parts.append(_read(path, environment))
     if not parts:
         raise DataError(f"{path}: level {lod} has no Gaussians; choose another one")
-    names: dict[int, str] = {}
+    names, parents = dict[int, str](), dict[int, str]()
     for part in parts:
         names |= part.names
+        parents |= part.parents
     g = parts[0].gaussians if len(parts) == 1 else concat([part.gaussians for part in parts])
     antialiased = any(part.antialiased for part in parts)
-    return Splat(g, f"streamed {parts[0].kind}", names, antialiased)
+    return Splat(g, f"streamed {parts[0].kind}", names, antialiased, parents=parents)
 
 
 def count_levels(path: Path) -> int:

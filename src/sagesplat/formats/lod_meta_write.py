@@ -23,6 +23,7 @@ def write_lod_meta(
     levels: Sequence[Gaussians],
     names: Mapping[int, str] | None = None,
     *,
+    parents: Mapping[int, str] | None = None,
     antialiased: bool = False,
     leaf: int = LEAF,
 ) -> int:
@@ -35,6 +36,7 @@ def write_lod_meta(
         folder: Where to write.
         levels: Gaussians of each level, the finest first; on any device.
         names: Category names by label id, for the sidecars.
+        parents: Names of the categories that instances are of, by the instance's label id; likewise.
         antialiased: How the scene was trained.
         leaf: Gaussians of the finest level in a part.
 
@@ -60,7 +62,7 @@ def write_lod_meta(
                 inside = g.select(torch.from_numpy(rows))
                 (fresh / name).mkdir()
                 made = sog_files(inside, name=f"{folder / name}", antialiased=antialiased)
-                put_sog(fresh / name, made, inside, names or {})
+                put_sog(fresh / name, made, inside, names or {}, parents or {})
                 files.append(f"{name}/meta.json")
         _bounds(tree, [_extents(g) for g in levels], {id(node): rows for node, rows in leaves})
         write_json(fresh / LOD_META, _document(levels, files, tree))

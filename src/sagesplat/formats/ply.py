@@ -25,7 +25,12 @@ BASES = (0, 3, 8, 15)  # SH coefficients beyond the constant one, by degree 0 to
 
 
 def write_ply(
-    path: Path, gaussians: Gaussians, names: Mapping[int, str] | None = None, *, antialiased: bool = False
+    path: Path,
+    gaussians: Gaussians,
+    names: Mapping[int, str] | None = None,
+    *,
+    parents: Mapping[int, str] | None = None,
+    antialiased: bool = False,
 ) -> None:
     """Write a labelled scene as a binary splat PLY in INRIA's layout, atomically.
 
@@ -35,6 +40,7 @@ def write_ply(
         path: The .ply file; replaced if it is there.
         gaussians: N Gaussians on any device.
         names: Category names by label id; they go into the header as comments.
+        parents: Names of the categories that instances are of, by the instance's label id; likewise.
         antialiased: Whether the scene was trained so; a comment as Brush writes it.
 
     Raises:
@@ -58,9 +64,9 @@ def write_ply(
     dtype = np.dtype([("values", "<f4", len(properties)), ("label", "<i2")])
     comments = [f"sagesplat {__version__}"]
     comments += ["SplatRenderMode: mip"] if antialiased else []
-    comments += [
-        f"label {i} {' '.join(repaired(name, '?').split())}" for i, name in sorted((names or {}).items())
-    ]
+    for word, by_id in (("label", names), ("parent", parents)):
+        lines = sorted((by_id or {}).items())
+        comments += [f"{word} {i} {' '.join(repaired(name, '?').split())}" for i, name in lines]
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
     header += [f"element vertex {len(gaussians)}", *(f"property float {name}" for name in properties)]
     header += ["property short label", "end_header", ""]
@@ -103,7 +109,8 @@ def read_ply_splat(path: Path) -> Splat:
     Category names are those of comments such as `label 184 tree-merged`. DataError for other defects.
     """
     columns, labels, _, comments = _read(path)
-    return Splat(_gaussians(columns, labels), "PLY", _names(comments), is_antialiased(comments))
+    names, parents = (_names(comments, word) for word in ("label", "parent"))
+    return Splat(_gaussians(columns, labels), "PLY", names, is_antialiased(comments), parents=parents)
 
 
 def select_ply(source: Path, target: Path, keep: Bool[np.ndarray, " N"]) -> None:
@@ -152,12 +159,14 @@ def is_antialiased(comments: Iterable[str]) -> bool:
     return said
 
 
-def _names(comments: Iterable[str]) -> dict[int, str]:
-    """Category names by label id, as `write_ply` writes them."""
+def _names(comments: Iterable[str], word: str) -> dict[int, str]:
+    """Names by label id, as `write_ply` writes them behind a word."""
     names = {}
     for comment in comments:
         match comment.split(maxsplit=2):
-            case ["label", label, name] if label.isdecimal() and len(label) <= 5 and int(label) < 2**15:
+            case [first, label, name] if (
+                first == word and label.isdecimal() and len(label) <= 5 and int(label) < 2**15
+            ):
                 names[int(label)] = repaired(name, f"category {label}")
     return names
 

@@ -23,7 +23,7 @@ from sagesplat import __version__
 from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.geometry import morton_order
-from sagesplat.formats.labels import as_json, sidecar
+from sagesplat.formats.labels import NO_PARENTS, as_json, sidecar
 from sagesplat.formats.ply import BASES
 from sagesplat.formats.quantisation import OTHERS
 from sagesplat.formats.sog import META
@@ -40,7 +40,12 @@ _BLOCK = 2**14  # Gaussians whose distances are computed at a time
 
 
 def write_sog(
-    path: Path, g: Gaussians, names: Mapping[int, str] | None = None, *, antialiased: bool = False
+    path: Path,
+    g: Gaussians,
+    names: Mapping[int, str] | None = None,
+    *,
+    parents: Mapping[int, str] | None = None,
+    antialiased: bool = False,
 ) -> int:
     """Write Gaussians as a SOG: an archive, or for a path `.../meta.json` its folder, which is replaced.
 
@@ -51,6 +56,7 @@ def write_sog(
         path: The .sog file or meta.json to write.
         g: N Gaussians in COLMAP's axes, on any device.
         names: Category names by label id, for the sidecar.
+        parents: Names of the categories that instances are of, by the instance's label id; likewise.
         antialiased: How the scene was trained; a flag for viewers.
 
     Returns:
@@ -64,29 +70,35 @@ def write_sog(
     files = sog_files(g, name=str(path), antialiased=antialiased)
     if path.name == META:
         with atomic_folder(path.parent) as fresh:
-            put_sog(fresh, files, g, names or {})
+            put_sog(fresh, files, g, names or {}, parents or {})
         return sum(map(len, files.values()))
     with atomic_path(path) as temporary:
         with zipfile.ZipFile(temporary, "w") as archive:
             for name, content in files.items():
                 archive.writestr(zipfile.ZipInfo(name), content)  # of 1980: no time stamp
         nbytes = temporary.stat().st_size
-        _put_labels(path, g, names or {})
+        _put_labels(path, g, names or {}, parents or {})
     return nbytes
 
 
-def put_sog(folder: Path, files: Mapping[str, bytes], g: Gaussians, names: Mapping[int, str]) -> None:
+def put_sog(
+    folder: Path,
+    files: Mapping[str, bytes],
+    g: Gaussians,
+    names: Mapping[int, str],
+    parents: Mapping[int, str] = NO_PARENTS,
+) -> None:
     """Put the files of a SOG scene into a folder, with the labels beside."""
     for name, content in files.items():
         (folder / name).write_bytes(content)
-    _put_labels(folder / META, g, names)
+    _put_labels(folder / META, g, names, parents)
 
 
-def _put_labels(path: Path, g: Gaussians, names: Mapping[int, str]) -> None:
+def _put_labels(path: Path, g: Gaussians, names: Mapping[int, str], parents: Mapping[int, str]) -> None:
     """Write the labels beside, or remove those of an earlier file."""
     if bool((g.label_ids >= 0).any()):
         with atomic_path(sidecar(path)) as temporary:
-            temporary.write_bytes(as_json(g.label_ids, names))
+            temporary.write_bytes(as_json(g.label_ids, names, parents))
     else:
         sidecar(path).unlink(missing_ok=True)
 

@@ -21,6 +21,7 @@ class Splat:
     antialiased: bool = False  # trained with an antialiasing filter, if the file says so
     announced: int = -1  # Gaussians in the file; -1: as many as there are
     dropped: dict[str, int] = field(default_factory=dict)  # reason -> Gaussians that were left out
+    parents: dict[int, str] = field(default_factory=dict)  # by label id of an instance: its category's name
 
 
 def cleaned(splat: Splat, name: str) -> Splat:

@@ -76,6 +76,7 @@ def write_spz(
     frame: Frame = "rub",
     version: Literal[3, 4] = 3,
     names: Mapping[int, str] | None = None,
+    parents: Mapping[int, str] | None = None,
 ) -> int:
     """Write an SPZ file atomically. Arguments and errors are those of `encode_spz`.
 
@@ -92,6 +93,7 @@ def write_spz(
         frame=frame,
         version=version,
         names=names,
+        parents=parents,
         name=str(path),
     )
     with atomic_path(path) as temporary:
@@ -110,6 +112,7 @@ def encode_spz(
     frame: Frame = "rub",
     version: Literal[3, 4] = 3,
     names: Mapping[int, str] | None = None,
+    parents: Mapping[int, str] | None = None,
     name: str = "SPZ",
 ) -> bytes:
     """Encode N Gaussians in COLMAP's axes as SPZ (Niantic). Version 3 leaves labels out.
@@ -132,6 +135,7 @@ def encode_spz(
         version: 3 (gzip) or 4 (zstd). With `names`, version 4 keeps the labels as an extension record, which
             other readers skip.
         names: Category names by label id, for version 4.
+        parents: Names of the categories that instances are of, by the instance's label id; likewise.
         name: What errors call the file.
 
     Returns:
@@ -170,7 +174,7 @@ def encode_spz(
     flags = ANTIALIASED if antialiased else 0
     if version == 3:
         return gzipped(len(g), degree, bits, flags, attributes)
-    records = {} if names is None else {_LABELS: as_json(g.label_ids, names)}
+    records = {} if names is None else {_LABELS: as_json(g.label_ids, names, parents or {})}
     if frame != "rub":
         records[_AXES] = _FRAMES.index(frame, 1).to_bytes(4, "little")
     return zstd_packed(len(g), degree, bits, flags, attributes, records)

@@ -23,6 +23,7 @@ from sagesplat.scene.refined import read_refined, with_cameras
 from sagesplat.scene.scene import Scene
 from sagesplat.segment.lift import LiftedLabels
 from sagesplat.segment.masks import Masks, Taxonomy
+from sagesplat.segment.parents import read_parents
 from sagesplat.segment.valid import ValidPixels
 from sagesplat.train import memory
 from sagesplat.train.sky import Sky, read_sky
@@ -131,7 +132,19 @@ class Job:
 
     @property
     def _labels(self) -> Path:
-        return (self.run.block_categories if self.has_block_categories else self.run.masks) / "labels.json"
+        if self.has_block_categories:
+            return self.run.block_categories / "labels.json"
+        return (self.run.instances if self.has_instances else self.run.masks) / "labels.json"
+
+    @property
+    def has_instances(self) -> bool:
+        """Whether instances are categories of their own: in the nested levels, not in snapshots."""
+        return self.run.ladder == "nested" and (self.run.instances / "labels.json").exists()
+
+    @cached_property
+    def parents(self) -> dict[str, str]:
+        """The category of each instance, by name."""
+        return read_parents(self.run.parents) if self.run.ladder == "nested" else {}
 
     @cached_property
     def masks(self) -> Masks:
@@ -149,7 +162,18 @@ class Job:
         return ValidPixels(self.run.inliers) if self.run.inliers.exists() else self.valid
 
     @property
+    def parents_by_id(self) -> dict[int, str]:
+        """The category of each instance, by the instance's id."""
+        return {i: self.parents[name] for i, name in self.names().items() if name in self.parents}
+
+    @property
     def whole_masks(self) -> Masks:
+        """The label images of the scene as one: with its instances, if they were asked for."""
+        instances = self.run.instances
+        return Masks(instances, self.taxonomy) if self.has_instances else self.category_masks
+
+    @property
+    def category_masks(self) -> Masks:
         """The label images that all views agreed on, if they were asked to."""
         fused = self.run.fused
         return Masks(fused, self.masks.taxonomy) if (fused / "labels.json").exists() else self.masks
@@ -169,16 +193,15 @@ class Job:
     @property
     def point_labels(self) -> np.ndarray:
         """Category of each SfM point."""
-        return self._lifted.label_ids
+        return self._lifted(self.run.instance_labels if self.has_instances else self.run.labels).label_ids
 
     @property
     def initial_labels(self) -> np.ndarray:
         """Category of the Gaussian that begins at each SfM point; `lift.IGNORED` where none does."""
-        return self._lifted.initial_ids
+        return self._lifted(self.run.labels).initial_ids
 
-    @property
-    def _lifted(self) -> LiftedLabels:
-        path = self.run.block_category_labels if self.has_block_categories else self.run.labels
+    def _lifted(self, path: Path) -> LiftedLabels:
+        path = self.run.block_category_labels if self.has_block_categories else path
         lifted = LiftedLabels.read(path, len(self.scene.points.xyz))
         ids = np.flatnonzero(np.bincount(lifted.label_ids.astype(np.int64) + 1)) - 1
         self.check_named(path, ids)

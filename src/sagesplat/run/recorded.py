@@ -52,7 +52,7 @@ def recorded_settings(run: RunDir, of: str = "run") -> dict[str, Any]:
         "scene_config": _config(SceneConfig, read_object(run.scene).get("settings")),
         "poses": _config(PosesConfig, _made(run, "poses")),
         "masks": _config(MasksConfig, label_images),
-        "labels": _config(LabelsConfig, _made(run, "masks")),
+        "labels": _config(LabelsConfig, _labels(run)),
         "lift": _config(LiftConfig, _made(run, "lift")),
         "train": _config(TrainConfig, train),
         "clean": _config(CleanConfig, _made(run, "clean")),
@@ -65,6 +65,15 @@ def recorded_settings(run: RunDir, of: str = "run") -> dict[str, Any]:
         "fuse": True if run.provenance("fuse").exists() else None,
     }
     return {name: value for name, value in known.items() if value is not None}
+
+
+def _labels(run: RunDir) -> dict[str, Any]:
+    """The settings of the categories: those of the label images, then those of the instances."""
+    made, later = _made(run, "masks"), _made(run, "instances")
+    if not later:
+        return made
+    merge = ",".join(str(text) for text in (made.get("merge"), later.get("merge")) if text)
+    return {**made, "merge": merge, "instances": later.get("instances")}
 
 
 def _levels_of_adopted(nest: dict[str, Any]) -> dict[str, Any]:

@@ -20,6 +20,8 @@ _BEFORE_LADDERS = (
     "train",
     "clean",
     "fuse",
+    "photo_instances",
+    "instances",
     "block_categories",
 )
 
@@ -146,6 +148,26 @@ class RunDir:
     def fused(self) -> Path:
         """Label images on which all views agree."""
         return self.path / "fused"
+
+    @property
+    def photo_instances(self) -> Path:
+        """Instances of single photos, whose numbers mean nothing in another photo."""
+        return self.path / "photo_instances"
+
+    @property
+    def instances(self) -> Path:
+        """Label images in which each 3D instance is a category of its own, with labels.json."""
+        return self.path / "instances"
+
+    @property
+    def instance_labels(self) -> Path:
+        """Instances of the SfM points."""
+        return self.instances / "labels.npz"
+
+    @property
+    def parents(self) -> Path:
+        """The categories that instances are of, by their names."""
+        return self.path / "parents.json"
 
     @property
     def labels(self) -> Path:

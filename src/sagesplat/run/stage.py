@@ -22,9 +22,9 @@ _CLOCK_STEP = 2.0  # seconds: some disks keep no finer time
 _DERIVED = {"observe", "sample", "fit", "plan", "crossview", "same_size", "paper"}
 _OF_PLAN = {"compose", "evaluate", "report"}
 _ORDER = (
-    "adopt", "poses", "scene", "segment", "masks", "lift", "blocks", "train", "clean", "fuse",
-    "block_categories", "base", "nest", "observe", "sample", "fit", "plan", "compose", "evaluate", "report",
-    "crossview", "same_size", "paper",
+    "adopt", "poses", "scene", "segment", "masks", "photo_instances", "lift", "blocks", "train", "clean",
+    "fuse", "instances", "block_categories", "base", "nest", "observe", "sample", "fit", "plan", "compose",
+    "evaluate", "report", "crossview", "same_size", "paper",
 )  # fmt: skip
 
 

@@ -115,9 +115,10 @@ def painted_over(base: Segmented, top: Segmented) -> Segmented:
     has = top.label_ids != UNLABELLED
     label_ids = np.where(has, top.label_ids, base.label_ids)
     instances = top.instances
-    if base.instances is not None and instances is not None:
-        below = np.where(base.instances < 0, -1, base.instances + instances.max() + 1)
-        instances = _renumbered(np.where(has, instances, below).astype(np.int16))
+    if base.instances is not None:
+        above = np.full_like(base.instances, -1) if instances is None else instances
+        below = np.where(base.instances < 0, -1, base.instances + above.max() + 1)
+        instances = _renumbered(np.where(has, above, below).astype(np.int16))
     if base.probabilities is None or top.probabilities is None:
         return Segmented(label_ids, None, base.ids[:0], instances)
     height, width = base.probabilities.shape[1:]

@@ -9,7 +9,13 @@ _SUFFIXES = ("-merged", "-other", "-stuff")  # of COCO's panoptic names
 
 
 def title_of(name: str) -> str:
-    """A category's name for people: grass for grass-merged; the name itself where nothing else is left."""
+    """A category's name for people: grass for grass-merged; the name itself where nothing else is left.
+
+    An instance keeps its number: tree 2 for tree-merged 2.
+    """
+    title, _, number = name.rpartition(" ")
+    if title and number.isdecimal():
+        return f"{title_of(title)} {number}"
     title = name
     for suffix in _SUFFIXES:
         title = title.removesuffix(suffix)

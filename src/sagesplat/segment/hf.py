@@ -1,18 +1,19 @@
 """Universal segmentation networks of Hugging Face: EoMT, Mask2Former, MaskFormer, OneFormer and DETR.
 
 Such a network answers with queries: a distribution over classes and a mask each. `HfSegmenter` makes scores
-per category of them, the semantic inference of MaskFormer (Cheng et al. 2021, arXiv:2107.06278, section 3.4),
-so that instances and panoptic merging are not needed.
+per category of them, the semantic inference of MaskFormer (Cheng et al. 2021, arXiv:2107.06278, section 3.4);
+where instances are asked for, it finds those of things among the queries (`panoptic.instances_of`).
 """
 
 import re
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Int64, UInt8
+from jaxtyping import Float, Float32, Int16, Int64, UInt8
 from PIL import Image
 from torch import Tensor
 from torch.nn.functional import interpolate
@@ -33,9 +34,12 @@ from sagesplat.segment.hub import (
     read_config,
     torch_device,
 )
+from sagesplat.segment.instances import is_thing
 from sagesplat.segment.masks import UNLABELLED, Taxonomy
+from sagesplat.segment.panoptic import instances_of
 from sagesplat.segment.segmenters import (
     Segmented,
+    Segmenter,
     SegmenterFactory,
     answer,
     group_classes,
@@ -78,6 +82,9 @@ class HfSegmenter:
         self._ids, group = group_classes(label_ids)
         self._members = torch.eye(len(self._ids))[torch.as_tensor(group)].to(self._device)  # [C, K]
         self.taxonomy = Taxonomy({i: coco.NAMES[i] for i in self._ids.tolist() if i != UNLABELLED})
+        self.instances = False  # whether answers have instances too
+        things = [i != UNLABELLED and is_thing(i, coco.NAMES[i]) for i in self._ids.tolist()]
+        self._things = np.array(things, bool)
 
     def __call__(self, photos: Sequence[UInt8[np.ndarray, "H W 3"]], /) -> list[Segmented]:
         """Label images and probabilities; photos of one size are computed together."""
@@ -96,7 +103,38 @@ class HfSegmenter:
             images = self._merged(weights, masks, inputs, size, len(photos))
         else:
             images = (self._cropped(*of_photo, inputs, size) for of_photo in zip(weights, masks, strict=True))
-        return [self._answer(scores, height, width) for scores in images]
+        found = [self._answer(scores, height, width) for scores in images]
+        if not self.instances:
+            return found
+        return [
+            replace(answer, instances=self._instances(photo, weights, masks, inputs, size, height, width))
+            for photo, answer in enumerate(found)
+        ]
+
+    def _instances(
+        self,
+        photo: int,
+        weights: Float32[Tensor, "B Q K"],
+        masks: Float[Tensor, "B Q h w"],
+        inputs: Any,
+        size: tuple[int, int],
+        height: int,
+        width: int,
+    ) -> Int16[np.ndarray, "H W"]:
+        """Instances of things in one photo, of all crops that it was cut into."""
+        if not inputs.get("patch_offsets"):
+            full, of = inputs["pixel_values"].shape[-2:], masks.shape[-2:]
+            h, w = (max(1, round(o * s / f)) for o, s, f in zip(of, size, full, strict=True))
+            crops, places = [(weights[photo], masks[photo][:, :h, :w])], [np.s_[0:height, 0:width]]
+            return instances_of(crops, places, self._things, (height, width))
+        crops, places = [], []
+        tall, scale = size[0] > size[1], (height / size[0] if size[0] > size[1] else width / size[1])
+        for row, (of_photo, start, end) in enumerate(torch.stack(inputs["patch_offsets"]).tolist()):
+            if of_photo == photo:
+                begin, stop = round(start * scale), round(end * scale)
+                crops.append((weights[row], masks[row]))
+                places.append(np.s_[begin:stop, 0:width] if tall else np.s_[0:height, begin:stop])
+        return instances_of(crops, places, self._things, (height, width))
 
     def _prepare(self, photos: Sequence[UInt8[np.ndarray, "H W 3"]]) -> Any:
         """The network's input by its own image processor. PIL images: arrays 3 pixels high are ambiguous."""
@@ -257,4 +295,9 @@ def _load_segmenter(
     return segmenter
 
 
-FACTORY = SegmenterFactory(_settings, _load_segmenter)
+def _ask_for_instances(segmenter: Segmenter) -> None:
+    assert isinstance(segmenter, HfSegmenter)
+    segmenter.instances = True
+
+
+FACTORY = SegmenterFactory(_settings, _load_segmenter, instances=_ask_for_instances)

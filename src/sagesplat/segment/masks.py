@@ -277,6 +277,28 @@ def _panoptic_source(folder: Path) -> tuple[Taxonomy, _Find]:
     return taxonomy, find
 
 
+def panoptic_segments(
+    folder: Path,
+) -> Callable[[str], tuple[Path, Integer[np.ndarray, "h w"]] | None] | None:
+    """What reads the segments of a photo (its file, and their numbers; 0 = none) from COCO panoptic PNGs.
+
+    None for a folder of other label images. LabelError as of `import_masks`.
+    """
+    if not folder.is_dir() or (folder / "labels.json").exists():
+        return None
+    panoptic = coco.read_panoptic(folder)
+    if panoptic is None:
+        return None
+
+    def read(name: str) -> tuple[Path, Integer[np.ndarray, "h w"]] | None:
+        path = panoptic.pngs.get(str(PurePosixPath(name).with_suffix("")))
+        if path is None or not path.exists():
+            return None
+        return path, _read_png(path, 4 * FREE_PIXELS, segments=True)
+
+    return read
+
+
 def _read_labels(path: Path, length: int = LENGTH) -> tuple[Taxonomy, int | None]:
     """The taxonomy of a labels.json, and the value of unlabelled pixels if it is stated.
 

@@ -16,6 +16,7 @@ from sagesplat.core.errors import BackendUnavailable, LabelError, RunError
 from sagesplat.io.files import read_json, write_json
 from sagesplat.io.lock import locked
 from sagesplat.scene.scene import Scene, View
+from sagesplat.segment.instances import instance_path, write_instances
 from sagesplat.segment.masks import UNLABELLED, Taxonomy, prepare_folder, read_mask, write_labels, write_mask
 from sagesplat.segment.soft import soft_path, write_soft
 
@@ -30,7 +31,8 @@ class Segmented:
     label_ids: Int16[np.ndarray, "H W"]  # category id of each pixel, -1 where it has none
     probabilities: Float32[np.ndarray, "C h w"] | None  # 0 ... 1, at most 1 in sum; covers the whole photo
     ids: Int16[np.ndarray, " C"]  # category id of each row of probabilities; others are negligible
-    instances: Int16[np.ndarray, "H W"] | None = None  # number within this photo, -1 where there is none
+    instances: Int16[np.ndarray, "H W"] | None = None
+    """Number of each pixel's instance in this photo, -1 for none; an instance lies within one category."""
 
 
 class Segmenter(Protocol):
@@ -56,6 +58,8 @@ class SegmenterFactory:
     """(settings, device, threads, warn) -> the segmenter; `warn` takes lines for the user."""
     suffixes: tuple[str, ...] = ()
     """Of `--model`, with `--segmenter auto`."""
+    instances: Callable[[Segmenter], None] | None = None
+    """Tells a segmenter to answer with instances too; None: it always does, or never."""
 
 
 def existing_file(path: str | Path | None, needs: str) -> Path:
@@ -111,6 +115,7 @@ def segment_some(
     *,
     batch: int = 1,
     soft: Path | None = None,
+    instances: Path | None = None,
     on_view: Callable[[int, int], None] | None = None,
 ) -> set[int]:
     """Write the label images of some views (rows of Scene.views); the ids that occur in them come back.
@@ -118,7 +123,8 @@ def segment_some(
     Several processes may do so with other views and the same network: the first one begins the folder.
 
     Up to `batch` photos of equal size are given to the segmenter at once. With `soft`, the probabilities of
-    each view are kept there too (`soft.read_soft`). A finished label image in `target` is kept, and a
+    each view are kept there too (`soft.read_soft`), and in the folder `instances` those of the answers that
+    have some (`instances.read_instances`). A finished label image in `target` is kept, and a
     killed run resumes, unless it is of other categories: empty the folder before using another
     model of the same ones. `on_view(done, total)` is called after each view, `total` being that of `rows`.
     Raises LabelError.
@@ -152,6 +158,8 @@ def segment_some(
             finish(label_ids)
     for some in _batches(scene.views, missing, batch):
         for row, found in zip(some, segmenter([photos[row] for row in some]), strict=True):
+            if instances is not None and found.instances is not None:
+                write_instances(instance_path(instances, scene.views[row]), found.instances)
             _write(found, paths[row], softs[row], taxonomy)
             finish(found.label_ids)
     return occurring

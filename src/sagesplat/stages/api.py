@@ -126,6 +126,11 @@ class FinishedRun:
         """Category names by label id; -1 is the unlabelled one."""
         return self.job.names()
 
+    @cached_property
+    def parents(self) -> dict[int, str]:
+        """Of the label ids that are instances, the names of their categories: "chair" for chair 1."""
+        return self.job.parents_by_id
+
     @property
     def antialiased(self) -> bool:
         """How the run's Gaussians are drawn: pass it to `rasterize` and to `write_ply`."""

@@ -292,6 +292,7 @@ def _contents(job: Job, g: Gaussians, antialiased: bool) -> Contents:
                 colors[category],
                 boxes.split_boxes(places[i] * FLIP),
                 block=block,
+                parent=job.parents.get(category),
             )
             for i, (category, block) in split_names.items()
         ],
@@ -310,11 +311,11 @@ def category_and_block(job: Job, name: str) -> tuple[str, int | None]:
 
 
 def _title(job: Job, category: str) -> str:
-    return title_of(category) if category != job.masks.taxonomy.name(UNLABELLED) else "everything else"
+    return title_of(category) if category != job.whole_masks.taxonomy.name(UNLABELLED) else "everything else"
 
 
 def _colors(job: Job, categories: Collection[str]) -> dict[str, str]:
-    taxonomy = job.masks.taxonomy
+    taxonomy = job.whole_masks.taxonomy
     ids = [i for i in (UNLABELLED, *taxonomy.names) if taxonomy.name(i) in categories]
     colors = colors_of({i: taxonomy.color(i) for i in ids})
     return {taxonomy.name(i): colors[i] for i in ids}

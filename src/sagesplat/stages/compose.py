@@ -51,7 +51,7 @@ def compose_plan(job: Job) -> None:
     def make() -> list[str]:
         plan = main_plan(job)
         g = compose(job, plan)
-        write_ply(run.composed, classic(job, g), job.names())
+        write_ply(run.composed, classic(job, g), job.names(), parents=job.parents_by_id)
         transfer_bytes = (
             "" if plan.transfer_bytes is None else f", {plan.transfer_bytes / 1e6:.2f} MB to send"
         )

@@ -5,9 +5,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
+import torch
+from torch import Tensor
+
 from sagesplat.adapt.ladder import read_prefixes
 from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.core.errors import RunError
+from sagesplat.core.events import Warned
+from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.increments import (
     INDEX,
     FileFormat,
@@ -19,12 +24,16 @@ from sagesplat.formats.increments import (
 from sagesplat.formats.lod_meta import LOD_META
 from sagesplat.formats.lod_meta_write import write_lod_meta
 from sagesplat.formats.splats_write import write_splat, written_as
+from sagesplat.raster import device_of, rasterize
 from sagesplat.run.job import Job
 from sagesplat.run.records import settings_of
+from sagesplat.scene.scene import Camera
 from sagesplat.stages.compose import classic, compose
 from sagesplat.stages.plan import main_plan, scene_plan
-from sagesplat.stages.shared import label_named
+from sagesplat.stages.shared import labels_named
+from sagesplat.train.early_stopping import spread
 
+_HOLE_VIEWS = 16  # training views in which holes are counted
 RasterizeMode = Literal["classic", "antialiased"]  # gsplat's names
 
 
@@ -64,8 +73,12 @@ def export_scene(
     target: tuple[QualityKind, float] | None,
     levels: Sequence[int] = (),
     rasterize_mode: RasterizeMode | None = None,
+    without: Sequence[str] = (),
 ) -> int:
     """Write a level or a composition, whole or some categories, in the format of the path's name.
+
+    `labels` (none: all) and `without` name categories or instances; a category means its instances too. What
+    is left out leaves holes, which an event names.
 
     `rasterize_mode`: how the file will be drawn; None: `classic` for a PLY, else as the run was trained.
     `lod-meta.json` gets `levels`, or all there are, as levels of detail. Returns the number of Gaussians.
@@ -79,22 +92,50 @@ def export_scene(
         _check_folder(job, path.parent)
     elif path.exists() and not job.force:
         raise RunError(f"{path}: exists; add --force to replace it")
-    wanted = [label_named(job, name) for name in labels] or list(job.names())
+    wanted = labels_named(job, labels) or list(job.names())
+    gone = labels_named(job, without)
+    wanted = [label for label in wanted if label not in gone]
+    if not wanted:
+        raise RunError(f"{path}: no category is left; leave out some of --without")
     if written == LOD_META:
         return _export_levels(job, path.parent, levels, wanted)
     if levels:
         raise RunError(f"{path}: levels are for {LOD_META}; name one with --level")
     if level is not None:
-        g = job.ladder.load(level, wanted)
+        whole = job.ladder.load(level)
     else:
-        plan = main_plan(job) if target is None else scene_plan(job, *target)
-        g = compose(job, plan).of_labels(wanted)
+        whole = compose(job, main_plan(job) if target is None else scene_plan(job, *target))
+    g = whole.of_labels(wanted)
+    if gone:
+        job.emit(Warned(_holes(job, whole, g, without)))
     mode = rasterize_mode or ("classic" if written == ".ply" else "antialiased")
     if mode == "classic":
-        write_splat(path, classic(job, g), job.names())
+        write_splat(path, classic(job, g), job.names(), parents=job.parents_by_id)
     else:
-        write_splat(path, g, job.names(), antialiased=job.antialiased)
+        write_splat(path, g, job.names(), parents=job.parents_by_id, antialiased=job.antialiased)
     return len(g)
+
+
+def _holes(job: Job, whole: Gaussians, g: Gaussians, without: Sequence[str]) -> str:
+    """How much of what photos show is a hole now: nothing was seen behind what is left out."""
+    opaque, holes = 0, 0
+    for row in spread(job.scene.train_ids.tolist(), _HOLE_VIEWS):
+        camera = job.scene.views[row].camera
+        before, after = (_alpha(job, some, camera) >= 0.5 for some in (whole, g))
+        opaque += int(before.sum())
+        holes += int((before & ~after).sum())
+    return (
+        f"without {', '.join(without)}, {holes / max(opaque, 1):.1%} of what the photos show is a hole: "
+        "no photo saw what is behind"
+    )
+
+
+def _alpha(job: Job, g: Gaussians, camera: Camera) -> Tensor:
+    if not len(g):
+        return torch.zeros(camera.height, camera.width)
+    with torch.no_grad():
+        g = g.to(device_of(job.backend))
+        return rasterize(g, camera, sh_degree=0, antialiased=job.antialiased, backend=job.backend).alpha.cpu()
 
 
 def _check_folder(job: Job, folder: Path) -> None:
@@ -109,5 +150,5 @@ def _export_levels(job: Job, folder: Path, levels: Sequence[int], wanted: Sequen
     chosen = sorted(set(levels) or job.ladder.levels, reverse=True)  # the finest is level of detail 0
     sets = [job.ladder.load(level, wanted) for level in chosen]
     sets = [g for i, g in enumerate(sets) if len(g) and (i == 0 or len(g) < len(sets[i - 1]))]
-    write_lod_meta(folder, sets, job.names(), antialiased=job.antialiased)
+    write_lod_meta(folder, sets, job.names(), parents=job.parents_by_id, antialiased=job.antialiased)
     return len(sets[0]) if sets else 0

@@ -3,7 +3,7 @@
 import json
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,7 @@ from sagesplat.segment.edit import (
 )
 from sagesplat.segment.lift import agreement_in, lift
 from sagesplat.segment.masks import MAX_LABEL_ID, UNLABELLED, Masks, Taxonomy, import_masks, write_labels
-from sagesplat.segment.registry import segmenter_for
+from sagesplat.segment.registry import SEGMENTERS, segmenter_for
 from sagesplat.segment.segmenters import segment_some
 from sagesplat.segment.soft import read_soft, soft_path
 from sagesplat.segment.valid import ValidPixels, write_valid
@@ -47,13 +47,15 @@ _EDIT = "edit.json"
 def make_masks(job: Job, config: MasksConfig, labels: LabelsConfig = LabelsConfig()) -> None:
     """Import label images or segment the photos, find the pixels that count, merge and drop categories."""
     run, kind = job.run, segmenter_kind(job.scene.path, config)
-    merge, keep, ignore = parse_merge(labels.merge), parse_keep(labels.keep), parse_ignore(labels.ignore)
+    parse_merge(labels.merge)  # what is wrong with it is said before a network begins
     if kind == "masks":
         if config.prompts:
             raise RunError("--prompts: not over given label images; name a network by --segmenter")
         _import(job, config)
     else:
-        _segment(job, config, kind)
+        _segment(job, config, kind, instances=bool(labels.instances))
+    labels = replace(labels, merge=_of_categories(run, labels))
+    merge, keep, ignore = parse_merge(labels.merge), parse_keep(labels.keep), parse_ignore(labels.ignore)
 
     def make() -> list[str]:
         shutil.rmtree(run.masks, ignore_errors=True)
@@ -66,12 +68,29 @@ def make_masks(job: Job, config: MasksConfig, labels: LabelsConfig = LabelsConfi
         write_json(run.masks / _EDIT, {**edited.record, "table": edited.table.tolist()})
         return [*_lines(edited), *_ignored_lines(ignored)]
 
-    settings = asdict(labels)
+    settings = {name: value for name, value in asdict(labels).items() if name != "instances"}
     if (given := job.scene.path / VALID_FOLDER).is_dir():
         settings["valid"] = file_hash(given)
     inputs = [run.provenance("segment"), run.segmented / "labels.json"]
     inputs += {view.valid_path: None for view in job.scene.views if view.valid_path}
     run_stage(job, "masks", settings, inputs, [run.masks / "labels.json"], make)
+
+
+def _of_categories(run: RunDir, labels: LabelsConfig) -> str:
+    """The pairs of --labels.merge that are of categories; those of instances are for later (`instances`)."""
+    later = later_merges(run, labels)
+    if not later:
+        return labels.merge
+    pairs = labels.merge.split(",")
+    return ",".join(pair for pair in pairs if pair.partition("=")[0].strip() not in later)
+
+
+def later_merges(run: RunDir, labels: LabelsConfig) -> dict[str, str]:
+    """The pairs of --labels.merge that are of instances: what they merge is no category of the photos."""
+    if not labels.instances:
+        return {}
+    known = Taxonomy.read(run.segmented / "labels.json").names.values()
+    return {old: new for old, new in parse_merge(labels.merge).items() if old not in known}
 
 
 def _find_valid(
@@ -149,22 +168,25 @@ def _import(job: Job, config: MasksConfig) -> None:
     run_stage(job, "segment", settings, [run.scene], [run.segmented / "labels.json"], make)
 
 
-def _segment(job: Job, config: MasksConfig, kind: str) -> None:
+def _segment(job: Job, config: MasksConfig, kind: str, *, instances: bool = False) -> None:
     """Segment the photos; images of an interrupted attempt with the same network are kept."""
     run = job.run
     own = settings_of(kind, config)
     hashed = {name: file_hash(v) if isinstance(v, Path) else v for name, v in own.items()}
     settings = {"segmenter": kind, "soft": config.soft, **hashed}
+    if instances and SEGMENTERS[kind].instances is not None:
+        settings["instances"] = True  # only then: earlier runs know of no such setting
 
     def make() -> list[str]:
         marker, key = run.segmented / _MARKER, {**settings, "scene": file_hash(run.scene)}
         if not _is(marker, key):
             shutil.rmtree(run.segmented, ignore_errors=True)
             shutil.rmtree(run.soft, ignore_errors=True)
+            shutil.rmtree(run.photo_instances, ignore_errors=True)
         write_json(marker, key)
         check_network(job, kind, own, config.batch)
         some = split(range(len(job.scene.views)), job.executor.parallel)  # each loads the network
-        found = work_all(job, "segment", _segment_some, [(rows, config, kind) for rows in some])
+        found = work_all(job, "segment", _segment_some, [(rows, config, kind, instances) for rows in some])
         taxonomy = found[0][0]
         if any(other != taxonomy for other, _ in found):
             raise LabelError(f"{run.segmented}: the nodes' networks have other categories; make them alike")
@@ -185,11 +207,14 @@ def _is(marker: Path, key: dict[str, Any]) -> bool:
         return False
 
 
-def _segment_some(job: Job, part: tuple[Sequence[int], MasksConfig, str]) -> tuple[Taxonomy, set[int]]:
-    """Segment some views (rows, settings, kind of segmenter): all its categories, and the ids that occur."""
-    rows, config, kind = part
+def _segment_some(job: Job, part: tuple[Sequence[int], MasksConfig, str, bool]) -> tuple[Taxonomy, set[int]]:
+    """Segment some views: all categories of the network, and the ids that occur.
+
+    `part`: rows, settings, kind of segmenter, and whether instances are wanted.
+    """
+    rows, config, kind, instances = part
     run, warn, note = job.run, lambda text: job.emit(Warned(text)), lambda text: job.emit(Noted(text))
-    segmenter = load(kind, config, job.device, job.threads, warn)
+    segmenter = load(kind, config, job.device, job.threads, warn, instances=instances)
     scores, remaining = Scores(run.segmented, rows[0] if rows else 0, segmenter), len(rows)
 
     def on_view(done: int, total: int) -> None:
@@ -200,7 +225,8 @@ def _segment_some(job: Job, part: tuple[Sequence[int], MasksConfig, str]) -> tup
 
     occurring = segment_some(
         job.scene, job.photos, Timed(segmenter, lambda: remaining, note), run.segmented, rows,
-        batch=config.batch, soft=run.soft if config.soft else None, on_view=on_view,
+        batch=config.batch, soft=run.soft if config.soft else None, instances=run.photo_instances,
+        on_view=on_view,
     )  # fmt: skip
     return segmenter.taxonomy, occurring
 
@@ -241,7 +267,7 @@ def fuse_masks(job: Job) -> None:
             soft=soft, valid=job.valid, antialiased=job.antialiased, backend=job.backend,
             on_view=lambda done, total: job.emit(Progress("fuse", done, total)),
         )  # fmt: skip
-        before, after = (_agreement(job, masks) for masks in (job.masks, job.whole_masks))
+        before, after = (_agreement(job, masks) for masks in (job.masks, job.category_masks))
         write_json(run.fused / "fused.json", {**fused.record, "agreement": [before, after]})
         return [
             f"{fused.changed.mean():.1%} of the pixels changed; views that had no vote agree with the points "

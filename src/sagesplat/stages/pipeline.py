@@ -12,6 +12,7 @@ from sagesplat.core.config import (
     CleanConfig,
     FitConfig,
     LabelsConfig,
+    MasksConfig,
     NestConfig,
     PlanConfig,
     RunConfig,
@@ -33,6 +34,7 @@ from sagesplat.stages.compose import compose_plan
 from sagesplat.stages.estimate import tell_duration
 from sagesplat.stages.evaluate import evaluate_plans
 from sagesplat.stages.fit import fit_ladder
+from sagesplat.stages.instances import find_photo_instances, fold_back, make_instances
 from sagesplat.stages.label import fuse_masks, lift_labels, make_masks
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.nest import nest_levels
@@ -80,12 +82,15 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
     check_targets(config.plan, config.ladder)  # before hours of training
     nested.check(config.nest)
     check_clean(config.clean)
+    check_instances(config)
     blocks.check(config.blocks, config.train)
     check_segmenter(job, scene, config.masks)
     open_scene(job, scene, config.scene, config.poses, config.masks, config.labels)
     if config.blocks.count == 1:
         check_training(job, config.train)
     make_masks(job, config.masks, config.labels)
+    if config.labels.instances:
+        find_photo_instances(job, config.masks, config.labels)
     lift_labels(job, config.lift)
     tell_duration(job, config)
     train(job, config.train, config.blocks, config.seed)
@@ -93,6 +98,7 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
         fuse_masks(job)
     elif job.run.fused.exists():
         raise RunError(f"{job.run.fused}: label images were fused; add --fuse, or delete that folder")
+    instances(job, config.labels, config.masks)
     if job.has_blocks:
         blocks.label_block_categories(job)
     if job.run.ladder == "nested":
@@ -168,6 +174,28 @@ def train(job: Job, config: TrainConfig, of_blocks: BlocksConfig, seed: int) -> 
         raise RunError(f"{job.run.blocks}: this run is in blocks; add --blocks.count, or begin another run")
     else:
         train_levels(job, config, seed)
+
+
+def instances(job: Job, labels: LabelsConfig, masks: MasksConfig) -> None:
+    """Tell instances apart, or make those of an earlier command parts of their categories again."""
+    check_not_adopted(job.run)
+    if labels.instances:
+        find_photo_instances(job, masks, labels)
+        make_instances(job, labels)
+    else:
+        fold_back(job)
+
+
+def check_instances(config: RunConfig) -> None:
+    """RunError for settings that instances cannot be told apart with."""
+    if not config.labels.instances:
+        return
+    if config.ladder == "snapshots":
+        raise RunError("--labels.instances: snapshots have no instances; use --ladder nested")
+    if config.blocks.count > 1:
+        raise RunError(
+            "--labels.instances: instances are not told apart in a scene in blocks; leave out one of both"
+        )
 
 
 def clean(job: Job, config: CleanConfig) -> None:

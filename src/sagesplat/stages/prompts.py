@@ -29,9 +29,19 @@ def settings_of(kind: str, config: MasksConfig) -> dict[str, Any]:
     return own | {f"over_{name}": value for name, value in text.settings(config).items()}
 
 
-def load(kind: str, config: MasksConfig, device: str, threads: int, warn: Callable[[str], None]) -> Segmenter:
-    """The segmenter, with the prompts over it where there are some."""
+def load(
+    kind: str,
+    config: MasksConfig,
+    device: str,
+    threads: int,
+    warn: Callable[[str], None],
+    *,
+    instances: bool = False,
+) -> Segmenter:
+    """The segmenter, with the prompts over it where there are some; `instances`: whether they are wanted."""
     segmenter = SEGMENTERS[kind].load(config, device, threads, warn)
+    if instances and (ask := SEGMENTERS[kind].instances) is not None:
+        ask(segmenter)
     if kind == "text" or not config.prompts:
         return segmenter
     return text.TextOver(segmenter, text.load_text(config, device, threads, warn, segmenter.taxonomy.names))

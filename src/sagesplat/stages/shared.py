@@ -1,5 +1,6 @@
 """Helpers that several stages share: settings, label images and distances of a run."""
 
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from sagesplat.output.tables import Table
 from sagesplat.run.job import Job
 from sagesplat.run.records import settings_of
 from sagesplat.run.run_dir import RunDir
+from sagesplat.segment.parents import with_instances
 from sagesplat.stages.results import observations_of
 
 
@@ -33,6 +35,8 @@ def train_config(job: Job) -> TrainConfig:
 def label_image_inputs(run: RunDir) -> list[Path]:
     """What decides the label images that stages after training look at: the records of who made them."""
     made = [("masks", run.masks), ("fuse", run.fused), ("block_categories", run.block_categories)]
+    if run.ladder == "nested":
+        made.append(("instances", run.instances))
     return [run.provenance(stage) for stage, folder in made if (folder / "labels.json").exists()]
 
 
@@ -72,6 +76,20 @@ def observed(job: Job, config: FitConfig) -> Observations:
 
 def _show(job: Job, table: Table) -> None:
     job.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
+
+
+def labels_named(job: Job, names: Sequence[str]) -> list[int]:
+    """The ids of categories and instances, those of a category with all its instances.
+
+    RunError for a name that the run does not have.
+    """
+    known, found = job.names(), list[int]()
+    for name in names:
+        ids = with_instances(known, job.parents, composed(name))
+        if not ids:
+            raise RunError(f"{job.run.path}: no category {name!r}; there are {', '.join(known.values())}")
+        found += [i for i in ids if i not in found]
+    return found
 
 
 def label_named(job: Job, name: str) -> int:

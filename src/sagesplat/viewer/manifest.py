@@ -56,6 +56,7 @@ class Category:
     models: Mapping[QualityKind, ViewModel] = field(default_factory=dict)  # with the ladder's levels
     seen: Mapping[QualityKind, Seen] = field(default_factory=dict)  # in the quality's viewpoints
     block: int | None = None  # in a scene in blocks; else None
+    parent: str | None = None  # of an instance: its category
 
     @property
     def category(self) -> str:
@@ -208,6 +209,7 @@ def _label(
         "id": category.label_id,
         "name": category.name,
         **({} if category.block is None else {"category": category.category, "block": category.block}),
+        **({} if category.parent is None else {"parent": category.parent}),
         "title": category.title,
         "color": category.color,
         "weight": significant(category.weight),

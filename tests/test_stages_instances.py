@@ -1,0 +1,92 @@
+"""Instances of a small capture, from its own 2D instances to label images, names and parents."""
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from sagesplat.core.config import LabelsConfig, LiftConfig, MasksConfig, PosesConfig, SceneConfig, TrainConfig
+from sagesplat.core.errors import LabelError, RunError
+from sagesplat.core.events import StageDone, StageSkipped
+from sagesplat.demo.capture import make_capture
+from sagesplat.run.job import Job
+from sagesplat.run.run_dir import RunDir
+from sagesplat.segment.masks import Taxonomy
+from sagesplat.stages.label import lift_labels, make_masks
+from sagesplat.stages.pipeline import instances
+from sagesplat.stages.scene import open_scene
+from sagesplat.stages.train import train_levels
+
+PLANTS = LabelsConfig(instances="potted plant,vase")
+
+
+def job_on(run: Path, events: list, *, force: bool = False) -> Job:
+    return Job(RunDir(run), events.append, force=force)
+
+
+def stages(events: Sequence[object], kind: type = StageDone) -> list[str]:
+    return [event.name for event in events if isinstance(event, kind)]  # type: ignore[attr-defined]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("instances")
+    make_capture(folder / "capture", views=12, width=80, height=60)
+    job = job_on(folder / "run", [])
+    open_scene(job, folder / "capture", SceneConfig(), PosesConfig(), MasksConfig(), LabelsConfig())
+    make_masks(job, MasksConfig())
+    lift_labels(job, LiftConfig())
+    train_levels(job, TrainConfig(max_steps=60, level_every=60), 0)
+    return folder / "run"
+
+
+@pytest.fixture
+def run(trained: Path, tmp_path: Path) -> Path:
+    shutil.copytree(trained, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def test_instances_are_categories_of_their_own_and_can_be_folded_back(run: Path) -> None:
+    events: list[object] = []
+    job = job_on(run, events)
+    before = job.names()
+    instances(job, PLANTS, MasksConfig())
+    assert stages(events) == ["photo_instances", "instances"]
+    names = set(job.names().values())
+    assert {"potted plant 1", "vase 1"} <= names
+    assert set(before.values()) <= names
+    assert job.parents["vase 1"] == "vase"
+    assert "vase 1" in {job.names()[int(i)] for i in set(job.point_labels.tolist())}
+    assert set(job.initial_labels.tolist()) <= set(before)
+    assert Job(RunDir(run, "snapshots"), print).names() == before
+    view = job.scene.views[int(job.scene.test_ids[0])]
+    assert set(job.best_masks[view].ravel().tolist()) <= set(job.names())
+    instances(job, PLANTS, MasksConfig())
+    assert stages(events, StageSkipped) == ["photo_instances", "instances"]
+    with pytest.raises(RunError, match="add --force to fold them back"):
+        instances(job, LabelsConfig(), MasksConfig())
+    again = job_on(run, [], force=True)
+    merged = replace(PLANTS, merge="vase 1=vase,potted plant 1=fern")
+    instances(again, merged, MasksConfig())
+    assert "vase 1" not in again.names().values()
+    assert again.parents["fern"] == "potted plant"
+    instances(again, LabelsConfig(), MasksConfig())
+    assert job_on(run, []).names() == before
+    assert not again.run.parents.exists()
+
+
+def test_what_cannot_be_told_apart_is_one_line_with_a_cure(run: Path, trained: Path) -> None:
+    job = job_on(run, [])
+    with pytest.raises(LabelError, match="no category 'sofa'; there are building"):
+        instances(job, LabelsConfig(instances="sofa"), MasksConfig())
+    given = trained.parent / "capture" / "instances"
+    given.rename(given.with_name("elsewhere"))
+    try:
+        with pytest.raises(LabelError, match=r"instances: no instances of any photo; put PNGs there"):
+            instances(job, PLANTS, MasksConfig())
+    finally:
+        given.with_name("elsewhere").rename(given)
+    instances(job, PLANTS, MasksConfig())
+    assert Taxonomy.read(job.run.instances / "labels.json").names
