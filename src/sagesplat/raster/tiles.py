@@ -6,11 +6,13 @@ import numpy as np
 from numba import prange
 
 from sagesplat.kernels.jit import njit
+from sagesplat.kernels.simd import prefetch
 from sagesplat.kernels.workspace import Workspace
-from sagesplat.raster.blend import TILE
+from sagesplat.raster.blend import RECORD, TILE
 from sagesplat.raster.project import tile_box
 from sagesplat.raster.render import ALPHA_MIN
 
+_AHEAD = 16  # Gaussians that are fetched before their turn: in order of depth they lie anywhere
 _CHUNKS = 16  # fixed, so that the result does not depend on the number of threads
 
 
@@ -84,7 +86,9 @@ def _count(records, order, tiles_x, tiles_y, tile_mask, threshold, per_tile, per
     """Counts; for `_place` each Gaussian's box of tiles, and a bit for each of its first 64 that it meets."""
     for chunk in prange(_CHUNKS):
         for k in range(chunk * len(order) // _CHUNKS, (chunk + 1) * len(order) // _CHUNKS):
-            i = order[k]
+            i, ahead = order[k], np.int64(order[min(k + _AHEAD, len(order) - 1)])
+            prefetch(records, ahead * RECORD)
+            prefetch(records, ahead * RECORD + RECORD - 1)
             x0, x1, y0, y1 = tile_box(
                 records[i, 0], records[i, 1], records[i, 9], records[i, 10], tiles_x, tiles_y
             )
@@ -106,6 +110,7 @@ def _place(records, order, tiles_x, tile_mask, threshold, boxes, met, cursor, of
     for chunk in prange(_CHUNKS):
         for k in range(chunk * len(order) // _CHUNKS, (chunk + 1) * len(order) // _CHUNKS):
             i = order[k]
+            prefetch(offsets, np.int64(order[min(k + _AHEAD, len(order) - 1)]))
             slot, bits = offsets[i], met[k]
             x0, x1, y0, y1 = boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3]
             small = (x1 - x0) * (y1 - y0) <= 64
