@@ -123,7 +123,7 @@ def edit_table(
     ids = {name: label_id for label_id, name in taxonomy.names.items()} | {UNLABELLED_NAME: UNLABELLED}
     for new in merge.values():
         if new not in ids:
-            ids[new] = _free_id(new, set(ids.values()))
+            ids[new] = free_id(new, set(ids.values()))
     names = {i: n for n, i in ids.items() if n not in merge and i != UNLABELLED}
     kept = {i: n for i, n in sorted(names.items()) if n not in ignore}
     if keep:
@@ -270,7 +270,7 @@ def _listed(taxonomy: Taxonomy) -> str:
     return ", ".join(sorted(set(taxonomy.names.values())))
 
 
-def _free_id(name: str, taken: set[int]) -> int:
+def free_id(name: str, taken: set[int]) -> int:
     """COCO's id of this name, else one that neither COCO nor 8-bit files (255) have a meaning for."""
     own = next((i for i, n in coco.NAMES.items() if n == name), None)
     if own is not None and own not in taken:
