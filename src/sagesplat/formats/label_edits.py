@@ -117,7 +117,7 @@ def parse_edits(content: bytes, name: str = FILE) -> LabelEdits:
             found.append(_operation(entry))
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             why = f"no {error.args[0]}" if isinstance(error, KeyError) else str(error)
-            raise LabelError(f"{name}: operation {number}: {short(why)}") from None
+            raise LabelError(f"{name}: operation {number}: {why}") from None
     return LabelEdits(ladder, tuple(found))
 
 
@@ -226,6 +226,6 @@ _KINDS: dict[str, Callable[[dict[str, Any]], Operation]] = {
 
 
 def ladder_hash(increments: Sequence[Increment], names: Mapping[int, str]) -> str:
-    """What tells the levels of one run from another: SHA-256 of all increments and of the categories' names."""
+    """What tells the levels of one run from another: SHA-256 of all increments and category names."""
     listed = [[one.label_id, names[one.label_id], one.level, one.count, one.sha256] for one in increments]
     return hashlib.sha256(json.dumps(sorted(listed)).encode()).hexdigest()

@@ -26,8 +26,8 @@ _TOKEN = "x-sagesplat-token"
 class EditSite:
     """A `Site` that also reads and writes one file of label edits.
 
-    `ladder`: hash of the levels that are shown (`ladder_hash`), asked for at each request: edits of others are
-    refused.
+    `ladder`: hash of the levels that are shown (`ladder_hash`), asked for at each request. Edits of other
+    levels are refused.
     """
 
     def __init__(self, site: Site, path: Path, ladder: Callable[[], str]):

@@ -23,7 +23,6 @@ export function buildPage(app: HTMLElement, viewer: Viewer): void {
   const editor = new EditorCard(viewer.editor, viewer.token, () => update());
   const tools = toolbar(viewer, { split, help, editor, say });
   app.append(bar, title, split.element, tools.element, panel.element, editor.element, editor.cross, help);
-  if (viewer.token !== null) void editor.resume();
   viewer.stage.canvas.setAttribute(
     "aria-label",
     `${manifest.name}, a 3D scene. W A S D move, arrow keys turn, question mark for help.`,
@@ -58,6 +57,7 @@ export function buildPage(app: HTMLElement, viewer: Viewer): void {
   viewer.streamer.onChange(update);
   setInterval(update, REFRESH);
   update();
+  if (viewer.token !== null) void editor.resume();
 }
 
 function sentence(viewer: Viewer, done: boolean): string {
