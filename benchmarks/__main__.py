@@ -503,6 +503,15 @@ def viewer(bundle: Path, write: bool = False) -> None:
 
 
 @app.command
+def label_edits(run: Path, views: int = 60, split: bool = False, write: bool = False) -> None:
+    """Ten edits of labels applied to a finished run: seconds, promises before and after, clicks."""
+    from benchmarks import label_edits as editing
+
+    set_threads(0)
+    _finish("label-edits", editing.measure(run, views, split), write)
+
+
+@app.command
 def server(idle: int = 1000, slow: int = 1000, honest: int = 200, write: bool = False) -> None:
     """`sagesplat view` with idle, slow and honest clients at once, plain and over TLS."""
     from benchmarks import server as serving

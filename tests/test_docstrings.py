@@ -14,9 +14,8 @@ import sagesplat
 MODULES = (
     "adapt.allocate", "adapt.fill", "adapt.observe", "adapt.photo_models", "adapt.plan", "adapt.viewpoint",
     "formats.levels", "formats.ply", "formats.splats", "formats.spz", "formats.stream",
-    "metrics.color_correct", "metrics.image", "raster", "scene", "segment.masks", "segment.select",
-    "stages.api",
-    "train.trainer",
+    "metrics.color_correct", "metrics.image", "raster", "scene", "segment.masks", "segment.relabel",
+    "segment.select", "stages.api", "stages.label_edits", "train.trainer",
 )  # fmt: skip
 CALLED_BY_MANY = (
     "adapt.allocate:best_within", "adapt.allocate:cheapest", "adapt.scene_plans:plan_for_scene",

@@ -24,7 +24,7 @@ def test_no_composition_is_measured_twice(monkeypatch: pytest.MonkeyPatch) -> No
 
     monkeypatch.setattr(fidelity, "compositions_at", compositions_at)
     cameras: Any = [10, 20, 30]
-    compositions = fidelity._Compositions(None, cameras)  # pyright: ignore[reportArgumentType]
+    compositions = fidelity.Compositions(None, cameras)  # pyright: ignore[reportArgumentType]
     rng = np.random.default_rng(0)
     rounds = [rng.integers(1, 4, (3, 13, 2)) for _ in range(4)]
     for planned in [*rounds, rounds[0]]:
@@ -41,7 +41,7 @@ def test_no_composition_is_measured_twice(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_no_viewpoints_are_no_measurements() -> None:
-    compositions = fidelity._Compositions(None, [])  # pyright: ignore[reportArgumentType]
+    compositions = fidelity.Compositions(None, [])  # pyright: ignore[reportArgumentType]
     values, pixels = compositions.measure(np.zeros((0, 13, 2), np.int64))
     assert values.shape == (0, 13, 3)
     assert len(pixels) == 0

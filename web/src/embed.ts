@@ -38,6 +38,7 @@ export interface Options {
   readonly budget: number | null; // MB
   readonly ui: boolean;
   readonly bundle: string; // folder, relative to the page
+  readonly edit: string | null; // what the server takes edits of labels with
 }
 
 /** Reads `?view=NAME&quality=ssim&target=0.7&budget=MB&ui=0&bundle=path/`, from the query and the fragment. Throws. */
@@ -50,6 +51,7 @@ export function parseOptions(search: string, hash: string): Options {
     budget: numeric(given, "budget", 0, 1e6),
     ui: given.get("ui") !== "0",
     bundle: bundlePath(given.get("bundle") ?? ""),
+    edit: given.get("edit"),
   };
 }
 

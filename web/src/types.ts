@@ -57,6 +57,8 @@ export interface Label {
   readonly color: string; // #rrggbb
   readonly weight: number;
   readonly always: boolean; // shipped in full whatever the plan says
+  readonly hidden?: boolean; // not shown to begin with
+  readonly parent?: string; // of an instance: the name of its category
   readonly boxes: readonly Box[];
   readonly levels: readonly Level[]; // level k consists of increments up to k, from the newest REPLACE on
   readonly quality: Readonly<Partial<Record<Quality, LabelQuality>>>;
@@ -92,6 +94,7 @@ export interface Manifest {
   readonly background: Vec3; // 0..1
   /** Of the full scene: every label at its last level. */
   readonly totals: { readonly count: number; readonly bytes: number; readonly gpuBytes: number };
+  readonly ladder?: string; // SHA-256 of the run's levels, which edits of labels are of
   readonly labels: readonly Label[];
   readonly promises: Readonly<Partial<Record<Quality, Reference>>>;
   readonly target: { readonly quality: Quality; readonly value: number }; // to begin with
@@ -168,6 +171,7 @@ export interface Settings {
   readonly target: number;
   readonly budget: Budget; // kept in every mode
   readonly weights: ReadonlyMap<number, number>; // by label id
+  readonly always?: ReadonlyMap<number, boolean>; // by label id, where it is not as in the manifest
   readonly cacheBytes: number; // of decoded increments that are not shown
 }
 

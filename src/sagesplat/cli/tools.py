@@ -160,6 +160,32 @@ def bundle(
 
 
 @command
+def labels(
+    action: Positional[Annotated[Literal["apply"], arg(metavar="apply")]],
+    run: Run,
+    edits: Positional[Annotated[Path | None, arg(metavar="EDITS")]] = None,
+    out: Positional[Annotated[Path | None, arg(metavar="OUT")]] = None,
+    machine: Annotated[Device, Flat] = Device(),
+) -> None:
+    """Apply label edits made in the viewer to a finished run: a new run with its bundle, without training.
+
+    The run stays as it is. Names, merged categories and settings are exact; the parts of a split category are
+    measured. Promises are calibrated again.
+
+    Args:
+        action: apply
+        run: run folder, finished with the nested levels
+        edits: the file that the viewer saved (default: labels.edit.json in the run folder)
+        out: new run folder, or an earlier edited one, which is replaced (default: RUN-edited)
+    """
+    from sagesplat.stages.label_edits import apply_labels
+
+    with open_job(run, machine) as job:
+        made = apply_labels(job, edits, out)
+    say(f"{made.path}: {len(made.categories)} categories; `sagesplat view {made.path}` shows them")
+
+
+@command
 def view(
     path: Positional[Annotated[Path, arg(metavar="RUN|BUNDLE")]],
     port: int | None = None,
@@ -168,6 +194,7 @@ def view(
     ssl_keyfile: Path | None = None,
     browser: bool = True,
     follow: bool = False,
+    edit: bool = False,
 ) -> None:
     """Show a run or a bundle in the browser; with --follow a training in progress.
 
@@ -179,6 +206,8 @@ def view(
         ssl_keyfile: key of the certificate, if it is a separate file
         browser: open the browser
         follow: show the newest snapshot of a training in progress
+        edit: edit labels in the viewer and save them in the run folder, for `sagesplat labels apply`; on this
+            machine only
     """
     from sagesplat.cli.console import Console
     from sagesplat.stages.view import show
@@ -186,7 +215,7 @@ def view(
     certificate = {"ssl_certfile": ssl_certfile, "ssl_keyfile": ssl_keyfile}
     with (
         Console() as console,
-        show(path, console, port=port, host=host, follow=follow, **certificate) as shown,
+        show(path, console, port=port, host=host, follow=follow, edit=edit, **certificate) as shown,
     ):
         say(*shown.urls, shown.hint, "Ctrl-C ends it")
         shown.run(browser)

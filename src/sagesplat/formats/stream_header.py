@@ -1,6 +1,7 @@
 """The header of a coded stream, and the steps by which it turns Gaussians into integers and back."""
 
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,6 +48,7 @@ class Precision:
     sh_bits: tuple[int, int] = (5, 4)  # steps of 2^(1 - bits): of degree 1, and of 2 and 3
     rotation: float = -0.75  # classes finer than usual; two halve the steps
     least: float = 0.75  # opacity, in its steps: what never has more is left out
+    grid: "Grid | None" = None  # instead of `position` and `rotation`: that of streams which were decoded
 
     def __post_init__(self) -> None:
         steps = (self.position, self.colour, self.log_scale)
@@ -56,6 +58,21 @@ class Precision:
             raise ValueError(f"{self.sh_bits} bits, {self.rotation} classes; 1 to 8 and -9 to 9 are there")
         if not 0.5 <= self.least <= 255:
             raise ValueError(f"opacities of {self.least} steps; from 0.5 on they are in the format")
+
+
+@dataclass(frozen=True)
+class Grid:
+    """What a stream rounds positions and rotations to: the same again rounds to what is there."""
+
+    step: float  # of positions, world units
+    rotation_origin: int  # steps of log scales
+
+    @classmethod
+    def finest(cls, headers: Sequence["Header"]) -> "Grid":
+        """The finest of several streams'."""
+        return cls(
+            min(one.step for one in headers), min(one.rotation_origin + one.scale_origin for one in headers)
+        )
 
 
 @dataclass(frozen=True)
@@ -139,6 +156,10 @@ def header_of(
     origin = int(np.median(scales[:, 2]))
     spread = int(np.clip(round(_CLASS / precision.log_scale), 1, 255))
     usual = int(np.median(2 * scales[:, 2] - scales[:, 0])) - origin
+    rotation_origin = usual - round((_MIDDLE + precision.rotation) * spread)
+    step = precision.position * middle
+    if precision.grid:
+        step, rotation_origin = precision.grid.step, precision.grid.rotation_origin - origin
     return Header(
         antialiased,
         two_opacities,
@@ -148,12 +169,12 @@ def header_of(
         precision.sh_bits,
         spread,
         (float(low[0]), float(low[1]), float(low[2])),
-        max(precision.position * middle, widest, 1e-18),
+        max(step, widest, 1e-18),
         precision.log_scale,
         precision.colour,
         origin,
         int(np.median(colours).clip(-_FARTHEST, _FARTHEST)) if len(g) else 0,
-        int(np.clip(usual - round((_MIDDLE + precision.rotation) * spread), -_FARTHEST, _FARTHEST)),
+        int(np.clip(rotation_origin, -_FARTHEST, _FARTHEST)),
     )
 
 

@@ -16,7 +16,7 @@ from sagesplat.core.second_opacity import SecondOpacities
 from sagesplat.formats.increments import GPU_BYTES, STREAM, Increment, by_file, stream_of, write_index
 from sagesplat.formats.spz import SH_BITS
 from sagesplat.formats.stream import Encoded, encode_stream
-from sagesplat.formats.stream_header import Precision
+from sagesplat.formats.stream_header import Grid, Precision
 from sagesplat.io.files import atomic_folder
 
 
@@ -38,20 +38,23 @@ def write_streams(
     second: SecondOpacities | None = None,
     sh_bits: tuple[int, int] = SH_BITS,
     antialiased: bool = False,
+    grids: Mapping[int, Grid] | None = None,
 ) -> Streams:
     """Write the increments of nested levels as a coded stream for each category, and their index.
 
     `folder` is replaced. `sizes` and `names` as in `write_increments`; `second`: second opacities of the
-    Gaussians, with weights of all categories. What is hardly to be seen is left out (see `encode_stream`,
+    Gaussians, with weights of all categories. `grids`: by label id, of Gaussians that were decoded before,
+    what they are rounded to already. What is hardly to be seen is left out (see `encode_stream`,
     whose errors are raised), and with it a category that has nothing else.
     """
     stems = slugs({label: names.get(label, str(label)) for label in sizes})
-    labels, precision = g.label_ids.cpu().numpy(), Precision(sh_bits=sh_bits)
+    labels = g.label_ids.cpu().numpy()
     written, left, order = list[Increment](), dict[int, tuple[int, ...]](), [np.arange(0)]
     with atomic_folder(folder) as fresh:
         for label in sorted(sizes):
             rows = torch.from_numpy(np.flatnonzero(labels == label))
             own = second and SecondOpacities(second.logits[rows], {label: second.weights[label]})
+            precision = Precision(sh_bits=sh_bits, grid=(grids or {}).get(label))
             coded = encode_stream(
                 g.select(rows), sizes[label], second=own, precision=precision, antialiased=antialiased,
                 name=stems[label],

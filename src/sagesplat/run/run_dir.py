@@ -125,6 +125,11 @@ class RunDir:
         return self.path / "adopted.npz"
 
     @property
+    def edited(self) -> Path:
+        """Of a run made by editing the labels of another one: which edits, and settings of its categories."""
+        return self.path / "edited.json"
+
+    @property
     def contact_sheet(self) -> Path:
         """Pictures from the viewpoints that an adopted splat is looked at from."""
         return self.path / "viewpoints.png"

@@ -32,6 +32,7 @@ from sagesplat.scene.scene import Camera, View
 from sagesplat.segment.edit import apply
 from sagesplat.segment.lift import LiftedLabels
 from sagesplat.segment.masks import UNLABELLED, Taxonomy, prepare_folder, write_labels, write_mask
+from sagesplat.stages.edited import check_not_edited
 from sagesplat.stages.label import edit_of, make_masks
 from sagesplat.stages.scene import check_folder, open_scene
 from sagesplat.train.lower_levels import check_shares
@@ -72,6 +73,7 @@ def open_splat(
 
 def _check_run(run: RunDir, config: AdoptConfig) -> None:
     """RunError where adopting would overwrite what it reads, or a run that was trained here."""
+    check_not_edited(run)
     if run.scene.exists() and not run.adopted.exists():
         raise RunError(f"{run.path}: holds a run of its own; choose a new folder for the splat")
     if config.cameras is not None and config.cameras.resolve().is_relative_to(run.path.resolve()):

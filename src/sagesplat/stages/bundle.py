@@ -21,6 +21,7 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.names import composed
 from sagesplat.core.typed import fits
 from sagesplat.formats.increments import INDEX, Increment, full_scene, read_increments, write_increments
+from sagesplat.formats.label_edits import ladder_hash
 from sagesplat.formats.levels import read_level
 from sagesplat.io.files import read_json, write_json
 from sagesplat.io.lock import alone
@@ -32,6 +33,7 @@ from sagesplat.scene import read_scene
 from sagesplat.segment.block_categories import split_name
 from sagesplat.segment.display_names import title_of
 from sagesplat.segment.masks import UNLABELLED
+from sagesplat.stages.edited import label_settings
 from sagesplat.stages.export import increment_files
 from sagesplat.stages.plan import main_target
 from sagesplat.stages.results import (
@@ -100,15 +102,17 @@ def bundle(
     With `single_file`, `out` is one HTML page.
 
     `meters_per_unit`: scale of the scene; by default guessed from the cameras' height. `always`: categories
-    shipped in full. `weights`: by category, 1 for the others. In a scene in blocks, a category's name stands
+    shipped in full. `weights`: by category, 1 for the others. An edited run has settings of its own
+    (`stages.edited`), to which these are added. In a scene in blocks, a category's name stands
     for all its per-block categories, and `name@block` for one of them. `chunks`: format of the increments; by
     default that of the run. `viewer`: the built viewer; by default the package's own.
 
     RunError for a run without nested levels or bounds, or without streams, another folder, unknown names or
     an impossible number; DataError for a damaged increment; SageError without a viewer.
     """
-    always = [composed(name) for name in always]
-    weights = {composed(name): weight for name, weight in (weights or {}).items()}
+    edited = label_settings(job.run)
+    always = [*edited.always, *(composed(name) for name in always)]
+    weights = edited.weights | {composed(name): weight for name, weight in (weights or {}).items()}
     job = _without_capture(replace(job, run=replace(job.run, ladder="nested")))
     _check(job, meters_per_unit, always, weights)
     viewer = viewer or package_viewer()
@@ -127,6 +131,8 @@ def bundle(
         meters_per_unit=meters_per_unit,
         drawn=[drawn.cameras[row] for row in drawn.rows("fit")],
         target=_target(job),
+        ladder=ladder_hash(listed, job.names()),
+        hidden=edited.hidden,
     )
     contents = replace(contents, categories=_with_quality(job, contents.categories, always, weights))
     contents = with_corrections(contents)

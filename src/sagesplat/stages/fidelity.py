@@ -33,27 +33,27 @@ def fit_drawn(job: Job, config: FitConfig) -> dict[int, ViewModel]:
     drawn, sampled, confidence = viewpoints_of(job), sampled_of(job), config.confidence
     fit = [drawn.cameras[row] for row in drawn.rows("fit")]
     bias, calibration = (
-        _Compositions(job, [drawn.cameras[row] for row in drawn.rows(name)])
+        Compositions(job, [drawn.cameras[row] for row in drawn.rows(name)])
         for name in ("bias", "calibration")
     )
     models = fit_fidelity(sampled, fit, job.scene.scale, config.min_share, confidence)
     models.pop(UNLABELLED, None)  # has no target and stays in full
     for _ in range(_ROUNDS):
-        models = recentred(models, _trial(job, config, models, sampled.labels, bias), confidence)
-    models, held = settled(models, _trial(job, config, models, sampled.labels, bias), confidence)
+        models = recentred(models, trial(job, config, models, sampled.labels, bias), confidence)
+    models, held = settled(models, trial(job, config, models, sampled.labels, bias), confidence)
     for lowered in (held, EVERYTHING_HELD):  # what calibration moved moves the neighbours: then only up
         models = calibrated(
-            models, _trial(job, config, models, sampled.labels, calibration), confidence, lowered
+            models, trial(job, config, models, sampled.labels, calibration), confidence, lowered
         )
     return models
 
 
-def _trial(
+def trial(
     job: Job,
     config: FitConfig,
     models: Mapping[int, ViewModel],
     labels: Sequence[int],
-    compositions: "_Compositions",
+    compositions: "Compositions",
 ) -> Trial:
     """Compositions planned with the models at viewpoints, measured."""
     cameras = compositions.cameras
@@ -64,7 +64,7 @@ def _trial(
     return Trial(labels, cameras, distance, shown, planned, fidelity)
 
 
-class _Compositions:
+class Compositions:
     """Measures compositions at viewpoints, none of them twice: rounds of calibration plan many again."""
 
     def __init__(self, job: Job, cameras: Sequence[Camera]) -> None:

@@ -31,6 +31,7 @@ from sagesplat.scene.scene import Scene, Vignetting
 from sagesplat.scene.stored import write_scene
 from sagesplat.segment.edit import ignored_ids, parse_ignore, parse_merge
 from sagesplat.segment.masks import label_images_of
+from sagesplat.stages.edited import check_not_edited
 
 _CPU_PIXELS = 1.25e6  # of a photo: a training step's time and the cap of Gaussians grow with them
 _SHARES = {1: "all", 2: "half", 4: "a quarter", 8: "an eighth"}  # of a photo's width
@@ -46,7 +47,11 @@ def check_folder(run: RunDir) -> None:
 
 
 def check_not_adopted(run: RunDir) -> None:
-    """RunError for a run of a splat that somebody else trained: labels and training came with the splat."""
+    """RunError for a run of a splat that somebody else trained: labels and training came with the splat.
+
+    And for a run made by editing the labels of another one (`check_not_edited`).
+    """
+    check_not_edited(run)
     if run.adopted.exists():
         raise RunError(
             f"{run.path}: a splat that was trained elsewhere; to change this run, repeat `sagesplat adopt` "

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any
 from sagesplat.core.errors import BackendUnavailable, RunError, SageError
 from sagesplat.core.events import Emit, Warned
 from sagesplat.core.names import visible
+from sagesplat.formats.label_edits import FILE
 from sagesplat.io.files import read_json
 from sagesplat.run.records import check_format
 from sagesplat.run.run_dir import RunDir, check_links
 from sagesplat.viewer.built import check_viewer, package_viewer
-from sagesplat.viewer.hosts import Hosts
+from sagesplat.viewer.hosts import Hosts, is_loopback
 from sagesplat.viewer.server import _NO_SERVER, MANIFEST, View, _check_certificate, _hint, _urls, bind
 
 if TYPE_CHECKING:
@@ -34,20 +35,25 @@ def show(
     ssl_certfile: Path | None = None,
     ssl_keyfile: Path | None = None,
     follow: bool = False,
+    edit: bool = False,
 ) -> View:
     """A server for a bundle, or for a run folder, whose bundle is made if it is missing or out of date.
 
     The viewer is this package's; of a bundle only the data is served. Without a host only this machine gets
     in; without a port the first free one from 8000 on is taken. With `follow` the run's training is shown as
-    it goes on, then its bundle. SageError: a folder that is neither, a run that is not ready, a port or
+    it goes on, then its bundle. With `edit` the page can write RUN/labels.edit.json: only this machine's, and
+    by the token in the address. SageError: a folder that is neither, a run that is not ready, a port or
     certificate of no use, no extra `view`, no built viewer.
     """
     try:
         from sagesplat.viewer.connections import make_server
+        from sagesplat.viewer.edit_site import EditSite
         from sagesplat.viewer.site import Site
     except ImportError:
         raise BackendUnavailable(_NO_SERVER) from None
     _check_certificate(ssl_certfile, ssl_keyfile)
+    if edit:
+        _check_edit(path, host, follow)
     check_viewer(package_viewer())
     site = Site(hosts=Hosts(host, certificate=ssl_certfile is not None))
     listener = bind(host or "127.0.0.1", port)  # first: making a bundle takes its time
@@ -56,10 +62,29 @@ def show(
     except BaseException:
         listener.close()
         raise
-    server = make_server(site, ssl_certfile, ssl_keyfile)
+    editing = EditSite(site, path / FILE, lambda: _ladder_of(site.folder)) if edit else None
+    server = make_server(editing or site, ssl_certfile, ssl_keyfile)
     secure = ssl_certfile is not None
     urls = _urls(listener, secure)
+    if editing:
+        urls = tuple(f"{url}#edit={editing.token}" for url in urls)
     return View(urls, _hint(urls, secure, host), server, listener, keep)
+
+
+def _check_edit(path: Path, host: str | None, follow: bool) -> None:
+    """RunError where labels cannot be edited."""
+    if host is not None and not is_loopback(host):
+        raise RunError(f"--host {host}: labels are edited on this machine only; leave out --host or --edit")
+    if follow:
+        raise RunError(f"{path}: labels are edited when training has ended; leave out --follow or --edit")
+    if is_bundle(path):
+        raise RunError(f"{path}: a bundle; give its run folder to --edit, or save the edits as a download")
+
+
+def _ladder_of(folder: Path | None) -> str:
+    """The hash of the levels that a bundle shows."""
+    manifest: Any = read_json(folder / MANIFEST) if folder else {}
+    return str(manifest.get("ladder", ""))
 
 
 def _fill(site: "Site", path: Path, emit: Emit, follow: bool) -> Callable[[threading.Event], None] | None:
@@ -136,7 +161,7 @@ def _is_current(run: RunDir, folder: Path) -> bool:
         return False
     made = (folder / MANIFEST).stat().st_mtime
     newer = (path for path in (run.fidelity, run.promises, run.plan) if path.exists())
-    return held == chunks and all(path.stat().st_mtime <= made for path in newer)
+    return "ladder" in manifest and held == chunks and all(path.stat().st_mtime <= made for path in newer)
 
 
 def _follow(job: "Job", site: "Site", stop: threading.Event) -> None:

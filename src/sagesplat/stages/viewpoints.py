@@ -1,6 +1,7 @@
 """Makes the models of SSIM against photos of nested levels, from the observations and from compositions."""
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 import numpy as np
 
@@ -31,6 +32,7 @@ def fit_viewpoints(
     table: Observations,
     config: FitConfig,
     curves: Mapping[tuple[int, int], SsimModel],
+    known: Mapping[int, ViewModel] = MappingProxyType({}),
 ) -> dict[int, ViewModel]:
     """A model of SSIM against photos of every category but the unlabelled pixels, which stay in full.
 
@@ -38,12 +40,14 @@ def fit_viewpoints(
     Eq. 3 of them. Observations have all categories at the same level. What a category gains or loses in
     composition, beside others at other levels, is measured on compositions planned for the calibration views
     (some training views where there are none), by models that are calibrated without.
+
+    `known`: models of categories that are not fitted; they are returned as they are.
     """
-    table = table.select(table.label_id != UNLABELLED)
+    table = table.select(~np.isin(table.label_id, [UNLABELLED, *known]))
     fits = fit_photos(table, job.scene, curves)
     far = distances(job, config.distance)
     cameras = [view.camera for view in job.scene.views]
-    quality = quality_at(costs, calibrated(fits, config.confidence), far, cameras)
+    quality = quality_at(costs, {**known, **calibrated(fits, config.confidence)}, far, cameras)
     planned: list[_Planned] = []
     for row in job.scene.calibration_ids.tolist() or spread(job.scene.train_ids.tolist(), VIEWS):
         compositions: dict[tuple, list[int]] = {}
@@ -53,7 +57,8 @@ def fit_viewpoints(
         planned.append((row, [(targets, dict(levels)) for levels, targets in compositions.items()]))
     parts = [(some, config) for some in split(planned, job.pieces)]
     measured = [one for some in work_all(job, "fit", _measure_compositions, parts) for one in some]
-    return calibrated(in_composition(fits, _changes(table, measured)), config.confidence)
+    found = calibrated(in_composition(fits, _changes(table, measured)), config.confidence)
+    return dict(sorted({**known, **found}.items()))
 
 
 def _changes(

@@ -5,7 +5,7 @@ models of one quality, which are not needed for the first frame. All are determi
 """
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, get_args
@@ -82,6 +82,8 @@ class Contents:
     live: bool = False  # training still runs
     drawn: Sequence[Camera] = ()  # viewpoints at which fidelity was sampled
     target: tuple[QualityKind, float] | None = None  # of the run's plan; None: a usual one
+    ladder: str | None = None  # `formats.label_edits.ladder_hash`; None: labels cannot be edited
+    hidden: Collection[str] = ()  # names of categories that are not shown to begin with
 
     def viewpoints(self, quality: QualityKind) -> list[Camera]:
         """The viewpoints that the models of a quality were fitted at, and maybe others."""
@@ -120,8 +122,9 @@ def documents(
             "bytes": sum(chunk.nbytes for chunk in full),
             "gpuBytes": sum(chunk.gpu_bytes for chunk in full),
         },
+        **({} if contents.ladder is None else {"ladder": contents.ladder}),
         "labels": [
-            _label(c, by_label[c.label_id], models, contents.extent)
+            _label(c, by_label[c.label_id], models, contents.extent, c.name in contents.hidden)
             for c in contents.categories
             if by_label.get(c.label_id)
         ],
@@ -204,6 +207,7 @@ def _label(
     chunks: Sequence[Increment],
     models: Mapping[QualityKind, Mapping[int, ViewModel]],
     extent: float,
+    hidden: bool,
 ) -> dict[str, Any]:
     return {
         "id": category.label_id,
@@ -214,6 +218,7 @@ def _label(
         "color": category.color,
         "weight": significant(category.weight),
         "always": category.always,
+        **({"hidden": True} if hidden else {}),
         "boxes": np.round(category.boxes, decimals_of(extent, 3)).tolist(),
         "levels": [
             {

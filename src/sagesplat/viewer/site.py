@@ -111,9 +111,13 @@ class Site:
                 pass
             group.cancel_scope.cancel()
 
+    def answers_to(self, host: str) -> bool:
+        """Whether a Host header names this server."""
+        return host in self._hosts
+
     def _answer(self, scope: Scope) -> Response:
         headers = Headers(scope=scope)
-        if headers.get("host", "") not in self._hosts:
+        if not self.answers_to(headers.get("host", "")):
             text = "this server does not answer to this name; start it with --host to change that"
             return PlainTextResponse(text, 403)
         if scope["method"] not in ("GET", "HEAD"):

@@ -54,10 +54,16 @@ export class Outlook {
   }
 
   /** The planner's input for a label. */
-  candidate(entry: Entry, weights: Settings["weights"], highest: number): Candidate {
+  candidate(
+    entry: Entry,
+    { weights, always }: Pick<Settings, "weights" | "always">,
+    highest: number,
+  ): Candidate {
+    const full = always?.get(entry.label.id);
     const { label, ladder, prediction, sight, share, wanted } = entry;
     return {
       label,
+      ...(full === undefined ? {} : { always: full }),
       ladder,
       highest,
       mean: prediction.mean,

@@ -7,6 +7,7 @@ import { fill } from "./fill";
 /** The planner's input for one label. */
 export interface Candidate {
   readonly label: Label;
+  readonly always?: boolean; // instead of the label\'s
   readonly ladder: Ladder;
   readonly highest: number; // highest available level; lower if an increment is damaged
   readonly mean: readonly number[]; // by level, quality; NaN: unknown
@@ -52,14 +53,16 @@ export const visibleWeight = (c: Candidate): number => (c.visible ? potentialWei
 /** The same, as if the label were in sight. */
 export const potentialWeight = (c: Candidate): number => c.weight * Math.max(c.share, LEAST_SHARE);
 
+const isAlways = (c: Candidate): boolean => c.always ?? c.label.always;
+
 /** The planned levels, within the budget in all units; the smallest composition if nothing fits. */
 export function makePlan(candidates: readonly Candidate[], settings: Settings): Plan {
   const there = withoutFar(
     candidates.filter((c) => c.highest > 0),
     settings.budget,
   );
-  const fixed = there.filter((c) => c.label.always);
-  const free = there.filter((c) => !c.label.always);
+  const fixed = there.filter((c) => isAlways(c));
+  const free = there.filter((c) => !isAlways(c));
   const left = lessen(settings.budget, fixed);
   const found = free.length ? choose(free, settings, left) : { levels: [], status: statusOf(left) };
   const levels = new Map(free.map((c, i) => [c, (found.levels[i] ?? 0) + 1]));
@@ -72,12 +75,12 @@ export function makePlan(candidates: readonly Candidate[], settings: Settings): 
  * Labels in sight stay, as do all labels of a scene without blocks.
  */
 function withoutFar(all: readonly Candidate[], budget: Budget): readonly Candidate[] {
-  const least = (c: Candidate) => (c.label.always ? c.highest : 1) - 1;
+  const least = (c: Candidate) => (isAlways(c) ? c.highest : 1) - 1;
   const over = { ...budget };
   for (const unit of UNITS) for (const c of all) over[unit] -= c.ladder[unit][least(c)] ?? 0;
   const lacks = () => UNITS.some((unit) => over[unit] < 0);
   if (!lacks()) return all;
-  const far = all.filter((c) => c.label.block !== undefined && !c.visible && !c.label.always);
+  const far = all.filter((c) => c.label.block !== undefined && !c.visible && !isAlways(c));
   const out = new Set<Candidate>();
   for (const c of far.sort((a, b) => potentialWeight(a) - potentialWeight(b))) {
     if (!lacks()) break;

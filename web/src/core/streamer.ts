@@ -175,7 +175,7 @@ export class Streamer {
     const photo = photoFrustum(this.viewpoint, this.lens);
     for (const entry of this.entries) this.outlook.see(entry, this.viewpoint, photo);
     const candidates = this.entries.map((entry) => {
-      return this.outlook.candidate(entry, this.settings.weights, this.highest(entry));
+      return this.outlook.candidate(entry, this.settings, this.highest(entry));
     });
     const { wanted, status } = makePlan(candidates, this.settings);
     this.planned = status;

@@ -1,9 +1,10 @@
 import { ladderOf } from "../core/planner";
 import type { LabelState, Trust } from "../types";
 
-/** The labels of one category: a single label, or its per-block categories in a scene in blocks. */
+/** The labels of one category: a single label, its instances, or its per-block categories in a scene in blocks. */
 export interface Group {
   readonly key: string;
+  readonly title: string;
   readonly states: readonly LabelState[]; // sorted by block
   readonly splats: number; // of the last level
 }
@@ -24,18 +25,33 @@ export interface Summary {
   readonly error: string | null;
 }
 
-/** The labels grouped by category, largest first. */
+/** The labels grouped by category, with all of its instances and blocks, largest first. */
 export function grouped(states: readonly LabelState[]): Group[] {
+  const parents = new Set(states.map(({ label }) => label.parent));
+  return groupedBy(states, ({ label }) => {
+    const name = label.category ?? label.name;
+    // what has no instance of its own beside those that have: "chair" beside "chair 1"
+    if (label.parent !== undefined || parents.has(name)) return label.parent ?? name;
+    return label.block === undefined ? `#${label.id}` : name;
+  });
+}
+
+/** The labels of a category grouped by instance, largest first. */
+export function instances(states: readonly LabelState[]): Group[] {
+  return groupedBy(states, ({ label }) => label.category ?? label.name);
+}
+
+function groupedBy(states: readonly LabelState[], keyOf: (state: LabelState) => string): Group[] {
   const byCategory = new Map<string, LabelState[]>();
   for (const state of states) {
-    const { label } = state;
-    const key = label.block === undefined ? `#${label.id}` : (label.category ?? label.name);
+    const key = keyOf(state);
     const known = byCategory.get(key);
     if (known) known.push(state);
     else byCategory.set(key, [state]);
   }
   const groups = [...byCategory].map(([key, parts]) => ({
     key,
+    title: parts.some(({ label }) => label.parent === key) ? key : (parts[0]?.label.title ?? key),
     states: parts.sort((a, b) => (a.label.block ?? 0) - (b.label.block ?? 0)),
     splats: parts.reduce((sum, { label }) => sum + (ladderOf(label).count.at(-1) ?? 0), 0),
   }));

@@ -10,6 +10,8 @@ const HELP: readonly (readonly [string, string])[] = [
   ["[ and ]", "previous photo, next photo"],
   ["C", "compare with the full scene"],
   ["T", "colour by category, or by block in a scene in blocks"],
+  ["L", "edit labels: click, or aim with the cross and press Enter; again for more or less of it"],
+  ["H, F, + and -", "while editing: hide, always in full, more or less alike; Ctrl Z undoes"],
   ["P", "open or close the panel"],
   ["Gamepad", "left stick moves, right stick turns"],
   ["Headset", "left stick moves, right stick turns"],

@@ -2,7 +2,7 @@ import type { LabelState, Trust } from "../types";
 import type { Viewer } from "../view/viewer";
 import { h, iconButton, setIcon, setText } from "./dom";
 import { formatBytes, formatCount, formatDistance, formatSsim, nameOf } from "./format";
-import { blockColor, grouped, summary } from "./groups";
+import { blockColor, grouped, instances, summary } from "./groups";
 
 const WEIGHTS = [0.25, 0.5, 1, 2, 4];
 const MEANING: Readonly<Record<Trust, string>> = {
@@ -32,10 +32,10 @@ export class LabelTable {
 
   update(states: readonly LabelState[]): void {
     const groups = grouped(states);
-    for (const { key, states: labels } of groups) {
+    for (const { key, title, states: labels } of groups) {
       let row = this.#rows.get(key);
       if (!row) {
-        row = labelRow(this.viewer, labels);
+        row = labelRow(this.viewer, labels, title);
         this.#rows.set(key, row);
         this.element.append(row.element);
       }
@@ -48,17 +48,21 @@ export class LabelTable {
   }
 }
 
-/** The row of a category; in a scene in blocks it can be expanded to one row per block. */
-function labelRow(viewer: Viewer, states: readonly LabelState[]): Row {
+/** The row of a category, which can be expanded to its instances; in a scene in blocks to one row per block. */
+function labelRow(viewer: Viewer, states: readonly LabelState[], title: string): Row {
   const label = states[0]?.label;
-  const title = label?.title ?? "";
+  const isFamily = instances(states).length > 1;
   let latest = states;
   const ids = () => latest.map((state) => state.label.id);
   const isHidden = () => ids().every((id) => viewer.isHidden(id));
   const eye = iconButton("eye", "", () => viewer.setHidden(ids(), !isHidden()));
   const facts = factsRow(viewer, title, label?.category ?? label?.name ?? "", label?.color ?? "");
   facts.element.append(eye, weightSelect(viewer, ids, title));
-  const parts = label?.block === undefined ? null : partList(viewer, facts.element, title);
+  const parts = isFamily
+    ? partList(facts.element, `${title} by instance`, "instance", instanceRows(viewer))
+    : label?.block === undefined
+      ? null
+      : partList(facts.element, `${title} by block`, "block", blockRows(viewer));
   return {
     element: facts.element,
     update: (now) => {
@@ -70,10 +74,32 @@ function labelRow(viewer: Viewer, states: readonly LabelState[]): Row {
   };
 }
 
-/** The expandable list of a category's blocks. */
-function partList(viewer: Viewer, parent: HTMLElement, title: string): Pick<Row, "update"> {
-  const rows = new Map<number, Row>();
-  const list = h("ul", { class: "parts", "aria-label": `${title} by block`, hidden: true });
+/** The parts of a category, each with a key of its own, what it has, and how its row is made. */
+type Parts = (
+  states: readonly LabelState[],
+) => { key: string; states: readonly LabelState[]; make: () => Row }[];
+
+const instanceRows =
+  (viewer: Viewer): Parts =>
+  (states) =>
+    instances(states).map((group) => ({
+      ...group,
+      make: () => labelRow(viewer, group.states, group.title),
+    }));
+
+const blockRows =
+  (viewer: Viewer): Parts =>
+  (states) =>
+    states.map((state) => {
+      const { id, block = 0, name } = state.label;
+      const make = () => factsRow(viewer, `block ${block}`, name, blockColor(block));
+      return { key: String(id), states: [state], make };
+    });
+
+/** The expandable list of a category's instances or blocks. */
+function partList(parent: HTMLElement, title: string, what: string, partsOf: Parts): Pick<Row, "update"> {
+  const rows = new Map<string, Row>();
+  const list = h("ul", { class: "parts", "aria-label": title, hidden: true });
   const more = h("button", { type: "button", class: "blocks", "aria-expanded": "false" });
   let latest: readonly LabelState[] = [];
   more.addEventListener("click", () => {
@@ -86,17 +112,17 @@ function partList(viewer: Viewer, parent: HTMLElement, title: string): Pick<Row,
 
   function update(states: readonly LabelState[]): void {
     latest = states;
-    setText(more, states.length === 1 ? "1 block" : `${states.length} blocks`);
+    const parts = partsOf(states);
+    setText(more, parts.length === 1 ? `1 ${what}` : `${parts.length} ${what}s`);
     if (list.hidden) return;
-    for (const state of states) {
-      const { id, block = 0, name } = state.label;
-      let row = rows.get(id);
+    for (const { key, states: own, make } of parts) {
+      let row = rows.get(key);
       if (!row) {
-        row = factsRow(viewer, `block ${block}`, name, blockColor(block));
-        rows.set(id, row);
+        row = make();
+        rows.set(key, row);
         list.append(row.element);
       }
-      row.update([state]);
+      row.update(own);
     }
   }
   return { update };

@@ -1,6 +1,7 @@
 import type { LabelState, Settings, State } from "../types";
 import type { Viewer } from "../view/viewer";
 import { h, setText } from "./dom";
+import { EditorCard } from "./editor";
 import { nameOf } from "./format";
 import { helpDialog } from "./help";
 import { Panel } from "./panel";
@@ -19,8 +20,9 @@ export function buildPage(app: HTMLElement, viewer: Viewer): void {
   const bar = h("div", { class: "progress", role: "progressbar", "aria-label": "Loading" }, h("i"));
   const status = h("span", { class: "status", role: "status" });
   const title = h("header", { class: "title card" }, h("h1", {}, manifest.name), status);
-  const tools = toolbar(viewer, { split, help, say });
-  app.append(bar, title, split.element, tools.element, panel.element, help);
+  const editor = new EditorCard(viewer.editor, viewer.token, () => update());
+  const tools = toolbar(viewer, { split, help, editor, say });
+  app.append(bar, title, split.element, tools.element, panel.element, editor.element, editor.cross, help);
   viewer.stage.canvas.setAttribute(
     "aria-label",
     `${manifest.name}, a 3D scene. W A S D move, arrow keys turn, question mark for help.`,
@@ -55,6 +57,7 @@ export function buildPage(app: HTMLElement, viewer: Viewer): void {
   viewer.streamer.onChange(update);
   setInterval(update, REFRESH);
   update();
+  if (viewer.token !== null) void editor.resume();
 }
 
 function sentence(viewer: Viewer, done: boolean): string {

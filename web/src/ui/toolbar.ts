@@ -1,6 +1,7 @@
 import type { Viewer } from "../view/viewer";
 import { offered, type XrMode } from "../view/xr";
 import { h, iconButton, setIcon } from "./dom";
+import type { EditorCard } from "./editor";
 import { blockColor } from "./groups";
 import { messageOf } from "./notice";
 import type { Split } from "./split";
@@ -11,6 +12,7 @@ const TINT = 0.75; // share of the label colour
 interface Parts {
   readonly split: Split;
   readonly help: HTMLDialogElement;
+  readonly editor: EditorCard;
   readonly say: (message: string) => void;
 }
 
@@ -34,15 +36,17 @@ export function toolbar(viewer: Viewer, parts: Parts): { element: HTMLElement; u
   });
   const help = iconButton("help", "Help (?)", () => parts.help.showModal());
   const theme = iconButton("theme", "Light or dark", () => parts.say(`Theme: ${nextTheme()}`));
+  const edit = iconButton("edit", "Edit labels (L)", () => parts.editor.toggle());
   const photos = photoPicker(viewer);
   const element = h("nav", { class: "toolbar card", "aria-label": "View" });
-  element.append(mode, ...photos.elements, compare, tint, help, theme);
+  element.append(mode, ...photos.elements, compare, tint, edit, help, theme);
   void addHeadsets(element, viewer, parts.say);
 
   const keys: Record<string, () => void> = {
     o: () => mode.click(),
     c: () => compare.click(),
     t: () => tint.click(),
+    l: () => edit.click(),
     "?": () => help.click(),
     "[": () => photos.step(-1),
     "]": () => photos.step(1),
@@ -58,6 +62,7 @@ export function toolbar(viewer: Viewer, parts: Parts): { element: HTMLElement; u
     update: () => {
       compare.setAttribute("aria-pressed", String(viewer.compare.on));
       tint.setAttribute("aria-pressed", String(tinted > 0));
+      edit.setAttribute("aria-pressed", String(parts.editor.editor.isOpen));
       photos.update();
     },
   };

@@ -1,11 +1,12 @@
 import { dyno, type PackedSplats, SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
 import { Group, type Matrix4, Scene, Vector3, type WebGLRenderer } from "three";
+import type { Encoding, Packed } from "../core/pick";
 import type { Format, Handle, Manifest, Renderer } from "../types";
 import { type Answer, Decoders } from "./decoding";
 import StreamWorker from "./decoding.worker?worker&inline";
 import { rootMatrix } from "./frame";
 import { blendOpacities } from "./opacity";
-import type { Part } from "./packing";
+import { ENCODING, type Part } from "./packing";
 import { decodePart, joined } from "./splats";
 
 type Color = InstanceType<typeof dyno.DynoVec3<Vector3>>;
@@ -26,7 +27,13 @@ interface Column {
   shown: readonly Increment[];
   stored: readonly Increment[];
   weight: number; // of the second opacities in what is stored
+  marks: Uint8Array | null; // by splat, one of `Mark`
 }
+
+/** How a splat is drawn while labels are edited. */
+export const Mark = { plain: 0, lit: 1, hidden: 2 } as const;
+const LIT = [255, 190, 40] as const; // colour that lit splats are mixed with
+const LIT_SHARE = 0.65;
 
 /** A view of the shown prefix of the stored splats: going down a level needs no upload. */
 class Source {
@@ -137,6 +144,47 @@ export class SparkLayer implements Renderer {
     this.#dirty();
   }
 
+  /** The shown splats of a label, in the order of its levels. */
+  splatsOf(label: number): Packed | null {
+    const column = this.#columns.get(label);
+    const words = column?.source.splats.packedArray;
+    if (!column || !words || !column.mesh.visible) return null;
+    const { marks, source } = column;
+    return {
+      label,
+      words,
+      count: source.count,
+      ...(marks && { hidden: marks.map((m) => +(m === Mark.hidden)) }),
+    };
+  }
+
+  /** The words of the splats of a label in their own colours. */
+  plainWords(label: number): Uint32Array | null {
+    const column = this.#columns.get(label);
+    if (!column?.stored.length) return null;
+    const words = new Uint32Array(4 * total(column.stored));
+    let start = 0;
+    for (const { part } of column.stored) {
+      words.set(part.splats, 4 * start);
+      start += part.count;
+    }
+    return words;
+  }
+
+  /** The encoding of the words of `splatsOf`. */
+  encodingOf(label: number): Encoding {
+    return this.#columns.get(label)?.stored[0]?.part.encoding ?? ENCODING;
+  }
+
+  /** Lights or hides splats of a label, by rank; null: all are as they come. */
+  setMarks(label: number, marks: Uint8Array | null): void {
+    const column = this.#column(label);
+    if (column.marks === marks) return;
+    column.marks = marks;
+    this.#store(column);
+    this.#dirty();
+  }
+
   /** Sets the share of the label colours that is mixed in, 0 to 1. */
   setTint(amount: number): void {
     this.#tint.value = amount;
@@ -163,7 +211,7 @@ export class SparkLayer implements Renderer {
     const mesh = new SplatMesh({ splats: source, worldModifier: tinted(color, this.#tint) });
     mesh.raycastable = false;
     this.root.add(mesh);
-    const column = { mesh, source, color, shown: [], stored: [], weight: 0 };
+    const column = { mesh, source, color, shown: [], stored: [], weight: 0, marks: null };
     this.#columns.set(label, column);
     return column;
   }
@@ -176,6 +224,10 @@ export class SparkLayer implements Renderer {
     }
     source.count = total(shown);
     if (!shown.length || this.#weight(column) === column.weight) return;
+    if (column.marks) {
+      this.#store(column);
+      return;
+    }
     // the previous image stays until one of the new opacities is made
     const words = source.splats.packedArray;
     if (words) this.#blend(column, words);
@@ -210,7 +262,28 @@ export class SparkLayer implements Renderer {
       column.stored.map(({ part }) => part),
       column.weight,
     );
+    if (column.marks) applyMarks(words, column.marks, total(column.stored));
   }
+}
+
+/** Changes the colours of lit splats and the opacities of hidden ones. */
+function applyMarks(words: Uint32Array, marks: Uint8Array, count: number): void {
+  for (let i = 0, at = 0; i < Math.min(count, marks.length); i++, at += 4) {
+    const word = words[at] as number;
+    if (marks[i] === Mark.hidden) words[at] = word & 0xffffff;
+    else if (marks[i] === Mark.lit) words[at] = lit(word);
+  }
+}
+
+function lit(word: number): number {
+  let mixed = word & 0xff000000;
+  LIT.forEach((value, i) => {
+    // the highlight's own 0 to 255 is less than the range of packed colours
+    const packed = 51 + 0.4 * value;
+    const own = (word >>> (8 * i)) & 255;
+    mixed |= Math.round(own + (packed - own) * LIT_SHARE) << (8 * i);
+  });
+  return mixed >>> 0;
 }
 
 function startWorker(answered: (answer: Answer) => void, failed: () => void): Worker {

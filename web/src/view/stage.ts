@@ -1,4 +1,13 @@
-import { Color, type Matrix4, PerspectiveCamera, SRGBColorSpace, Vector2, WebGLRenderer } from "three";
+import {
+  Color,
+  type Matrix4,
+  PerspectiveCamera,
+  SRGBColorSpace,
+  Vector2,
+  Vector3,
+  WebGLRenderer,
+} from "three";
+import type { Ray } from "../core/pick";
 import type { Camera, Manifest, Viewpoint } from "../types";
 import { lens, type Pose, quat, rootMatrix, transformPose, vec3, viewpoint } from "./frame";
 import { orientation, type Rig } from "./motion";
@@ -77,6 +86,20 @@ export class Stage {
     const fovY = 2 * Math.atan(1 / (projectionMatrix.elements[5] || 1));
     const pose = { position: vec3(position), quaternion: quat(quaternion), fovY };
     return transformPose(pose, this.root.clone().invert());
+  }
+
+  /** The ray through a point of the canvas (px from its corner), in the bundle's frame. */
+  ray(x: number, y: number): Ray {
+    const { camera, canvas } = this;
+    camera.updateMatrixWorld();
+    const inverse = this.root.clone().invert();
+    const at = new Vector3((2 * x) / canvas.clientWidth - 1, 1 - (2 * y) / canvas.clientHeight, 0.5);
+    const origin = camera.position.clone().applyMatrix4(inverse);
+    const direction = at.unproject(camera).applyMatrix4(inverse).sub(origin).normalize();
+    const forward = new Vector3(0, 0, -1).transformDirection(camera.matrixWorld).transformDirection(inverse);
+    const pixels = this.renderer.getDrawingBufferSize(new Vector2()).y;
+    const pixel = 2 / ((camera.projectionMatrix.elements[5] || 1) * Math.max(pixels, 1));
+    return { origin: vec3(origin), direction: vec3(direction), forward: vec3(forward), pixel };
   }
 
   viewpoint(): Viewpoint {

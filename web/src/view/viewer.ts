@@ -6,6 +6,7 @@ import type { Source } from "../inside";
 import type { Budget, Manifest, Quality, Settings, State } from "../types";
 import { Compare } from "./compare";
 import { Controls } from "./controls";
+import { Editor } from "./editor";
 import { type Pose, quat, transformPose, vec3 } from "./frame";
 import { type Rig, rigAt } from "./motion";
 import { colorsOf } from "./spark";
@@ -23,6 +24,8 @@ export class Viewer {
   readonly streamer: Streamer;
   readonly headset: Headset;
   readonly compare: Compare;
+  readonly editor: Editor;
+  readonly token: string | null; // with which the server takes edits
   settings: Settings;
   frameMs = Number.NaN; // smoothed; NaN while nothing moves
   photo = -1; // index of the current photo, -1: none
@@ -55,7 +58,11 @@ export class Viewer {
       () => this.settings.budget.count,
       (cap) => this.#capped(cap),
     );
+    this.editor = new Editor(this);
+    this.token = options.edit;
     this.stage.place(this.controls.rig);
+    const hidden = manifest.labels.flatMap((label) => (label.hidden ? [label.id] : []));
+    if (hidden.length) this.setHidden(hidden, true);
     if (options.view !== null) this.goTo(options.view);
   }
 

@@ -12,6 +12,7 @@ test("options come from the query and the fragment", () => {
     budget: 1.5,
     ui: false,
     bundle: "",
+    edit: null,
   });
   expect(parseOptions("", "").ui).toBe(true);
   expect(parseOptions("?quality=ssim&target=0.7", "")).toMatchObject({ quality: "ssim", target: 0.7 });

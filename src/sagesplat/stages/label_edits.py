@@ -1,0 +1,207 @@
+"""Applies edits of labels to a finished run: a new run folder with other categories, without training again.
+
+Renaming and settings move nothing. Merged categories are measured by what was measured of their parts
+(`adapt.regroup`); where one is split, its parts are measured. Then the models are fitted and calibrated, in
+compositions of the new levels, for the categories that changed, and the plan and the bundle made.
+"""
+
+import shutil
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from sagesplat.adapt.ladder import read_prefixes
+from sagesplat.core.config import FitConfig, PlanConfig, SampleConfig
+from sagesplat.core.errors import LabelError, RunError
+from sagesplat.core.events import StageDone, StageStarted
+from sagesplat.formats.label_edits import FILE, LabelEdits, dump_edits, ladder_hash, read_edits
+from sagesplat.io.files import atomic_folder, loads_json
+from sagesplat.run.job import Job
+from sagesplat.run.recorded import recorded_settings
+from sagesplat.run.records import read_record, record
+from sagesplat.run.run_dir import RunDir
+from sagesplat.segment.relabel import Relabelled, relabelled
+from sagesplat.stages.bundle import BundleMade, bundle
+from sagesplat.stages.edited import LabelSettings, label_settings, write_edited
+from sagesplat.stages.observe import observe_levels
+from sagesplat.stages.plan import make_plan
+from sagesplat.stages.refit import refit
+from sagesplat.stages.regroup import measure, move_labels, move_levels
+from sagesplat.stages.results import increments_of
+from sagesplat.stages.sample import sample_levels
+from sagesplat.stages.view import _is_finished
+
+# what a run begins with, as it is; label images, point labels and levels are written anew
+_KEPT = (
+    "scene.json", "photos.json", "source.json", "geometry.npz", "cameras.npz", "refined.json", "sky.npz",
+    "valid", "inliers", "adopted.npz", "viewpoints.png", "floaters.json", "floaters.png", "frozen.json",
+    "masks", "fused", "labels.npz", "provenance",
+)  # fmt: skip
+_OF_LADDER = (
+    "ladder.npz", "increments", "observations.csv", "viewpoints.json", "fidelity.npz", "fidelity.json",
+    "models.json", "promises.json", "plan.json", "provenance",
+)  # fmt: skip
+_MEASURED = ("nest", "observe", "sample", "fit", "plan")  # stages in their order, each recorded again
+_LATER = ("compose", "evaluate", "report", "crossview", "same_size", "paper", "base")
+
+
+@dataclass(frozen=True)
+class LabelsApplied:
+    """An edited run and its bundle."""
+
+    path: Path
+    bundle: BundleMade
+    trained: bool  # whether anything had to be trained or measured by rendering levels again
+    categories: tuple[str, ...]
+
+
+def apply_labels(
+    job: Job, edits: Path | None = None, out: Path | None = None, *, viewer: Path | None = None
+) -> LabelsApplied:
+    """Make a new run of a finished one, with edited categories, and its bundle. The run stays as it is.
+
+    Args:
+        job: The run, finished with nested levels in coded streams.
+        edits: labels.edit.json; by default that of the run folder, where `sagesplat view --edit` puts it.
+        out: The new run folder; by default RUN-edited. An earlier edited run is replaced as a whole.
+        viewer: The built viewer; by default the package's own.
+
+    Returns:
+        What was made.
+
+    Raises:
+        LabelError: For edits that are damaged, of another run, or that cannot be applied.
+        RunError: For a run that is not finished, is in blocks or has levels that replace those below, and for
+            an `out` that holds something else.
+
+    Example:
+        >>> from sagesplat.run.job import Job
+        >>> from sagesplat.run.run_dir import RunDir
+        >>> from sagesplat.stages.label_edits import apply_labels
+        >>> job = Job(RunDir(Path("runs/garden")), print)  # doctest: +SKIP
+        >>> apply_labels(job, Path("labels.edit.json")).path  # doctest: +SKIP
+    """
+    path = edits or job.run.path / FILE
+    out = (out or job.run.path.resolve().with_name(f"{job.run.path.resolve().name}-edited")).resolve()
+    job = replace(job, run=replace(job.run, ladder="nested"), locks=None)
+    if not _is_finished(job.run):
+        raise RunError(f"{job.run.path}: not finished; run `sagesplat run` again, then apply the edits")
+    found = read_edits(path)
+    made = _checked(job, found, path)
+    _check_out(job.run, out)
+    begin = time.perf_counter()
+    job.emit(StageStarted("labels"))
+    with atomic_folder(out) as fresh:
+        new = _begin(job, fresh, found, made)
+        measured = _make(job, new, made)
+        job.emit(StageDone("labels", time.perf_counter() - begin, _lines(made, measured)))
+        written = bundle(new, fresh / "bundle", viewer=viewer)
+    names = tuple(made.names.values())
+    return LabelsApplied(out, replace(written, path=out / "bundle"), measured, names)
+
+
+def _checked(job: Job, edits: LabelEdits, path: Path) -> Relabelled:
+    """The categories after the edits; LabelError or RunError where they cannot be applied."""
+    increments, names = increments_of(job), job.names()
+    if ladder_hash(increments, names) != edits.ladder:
+        raise LabelError(
+            f"{path}: edits of another run than {job.run.path}, or of its earlier levels; open that run with "
+            "`sagesplat view RUN --edit` and edit it"
+        )
+    if not edits.operations:
+        raise LabelError(f"{path}: no operations; there is nothing to apply")
+    ladder = read_prefixes(job.run.prefixes)
+    counts = {label: sizes[-1] for label, sizes in ladder.sizes.items()}
+    try:
+        made = relabelled(
+            {label: names[label] for label in counts}, counts, edits.operations,
+            **vars(label_settings(job.run)),
+        )  # fmt: skip
+    except LabelError as error:
+        raise LabelError(f"{path}: {error}") from None
+    if job.has_block_categories and (made.changed or made.names != {i: names[i] for i in counts}):
+        raise RunError(
+            f"{job.run.path}: a scene in blocks; its categories can be hidden, weighed and kept in full, but "
+            "not renamed, merged or split"
+        )
+    if made.changed and (ladder.replaces or any(one.format != "stream" for one in increments)):
+        raise RunError(
+            f"{job.run.path}: levels that replace those below, or SPZ files; its categories can be renamed, "
+            "hidden, weighed and kept in full, but not merged or split"
+        )
+    return made
+
+
+def _check_out(run: RunDir, out: Path) -> None:
+    if out == run.path.resolve():
+        raise RunError(f"{out}: the run itself; name another folder for the edited run")
+    if out.is_dir() and any(out.iterdir()) and not RunDir(out).edited.exists():
+        raise RunError(f"{out}: neither empty nor an edited run; name a new folder")
+
+
+def _begin(job: Job, fresh: Path, edits: LabelEdits, made: Relabelled) -> Job:
+    """Copy what stays to the new folder; the job on it."""
+    new = replace(job.run, path=fresh)
+    for names, source, target in ((_KEPT, job.run.path, fresh), (_OF_LADDER, job.run.adapted, new.adapted)):
+        target.mkdir(exist_ok=True)
+        for name in names:
+            if (source / name).is_dir():
+                shutil.copytree(source / name, target / name, dirs_exist_ok=True)
+            elif (source / name).exists():
+                shutil.copy2(source / name, target / name)
+    for stage in _LATER:
+        new.provenance(stage).unlink(missing_ok=True)
+    settings = LabelSettings(made.weights, made.hidden, made.always)
+    write_edited(new, job.run.path.name, loads_json(dump_edits(edits)), settings)
+    return Job(
+        new, job.emit, job.backend, job.threads, device=job.device, memory_limit=job.memory_limit,
+        executor=job.executor, source=job,
+    )  # fmt: skip
+
+
+def _make(job: Job, new: Job, made: Relabelled) -> bool:
+    """Levels, measurements, models and plan of the new categories; whether levels were rendered again."""
+    split = sorted(old for old in made.new_ids if made.moved(old) is None)
+    if made.changed:
+        move_levels(job, new, made)
+    move_labels(job, new, made)
+    _sign(new.run, "masks", [new.run.edited])
+    known = recorded_settings(new.run)
+    fit: FitConfig = known["fit"]
+    if not made.changed:
+        for stage in _MEASURED:
+            _sign(new.run, stage)
+        return False
+    _sign(new.run, "nest")
+    exact = measure(job, new, made, fit)
+    if exact:
+        _sign(new.run, "observe")
+        _sign(new.run, "sample")
+    else:
+        observe_levels(new, fit)
+        sample_levels(new, known.get("sample", SampleConfig()), fit)
+    refit(job, new, fit, made.changed)
+    _sign(new.run, "fit")
+    make_plan(new, _weighed(known.get("plan", PlanConfig()), made))
+    return not exact or bool(split)
+
+
+def _weighed(plan: PlanConfig, made: Relabelled) -> PlanConfig:
+    """The plan's settings with the weights that the edited run has; only a budget uses them."""
+    return replace(plan, weights=made.weights if plan.budget else {})
+
+
+def _sign(run: RunDir, stage: str, more: Sequence[Path] = ()) -> None:
+    """Record a stage's result as made from its inputs as they are in this folder now."""
+    path = run.provenance(stage)
+    if not path.exists():
+        return
+    made = read_record(path)
+    inputs = [run.path / name for name in made["inputs"]]
+    record(run, stage, made["settings"], [one for one in [*inputs, *more] if one.exists()], made["seconds"])
+
+
+def _lines(made: Relabelled, rendered: bool) -> tuple[str, ...]:
+    how = "rendered again to measure what changed" if rendered else "nothing trained or rendered again"
+    return (f"{len(made.names)} categories, {len(made.changed)} of other Gaussians than before; {how}",)

@@ -1,0 +1,189 @@
+"""Moves the files of a run to other categories: levels, label images, point labels, measurements."""
+
+import shutil
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import torch
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial import KDTree
+
+from sagesplat.adapt.fidelity import distances_at, write_sampled
+from sagesplat.adapt.ladder import PrefixLadder
+from sagesplat.adapt.observe import RenderedLabels
+from sagesplat.adapt.regroup import regrouped, regrouped_observations, regrouped_samples
+from sagesplat.core.config import FitConfig
+from sagesplat.core.events import Progress
+from sagesplat.core.gaussians import Gaussians, concat
+from sagesplat.core.second_opacity import SecondOpacities
+from sagesplat.formats.increments import INDEX, Increment, read_index, write_index
+from sagesplat.formats.levels import read_header, write_set
+from sagesplat.formats.stream_header import SIZE, Grid, Header
+from sagesplat.formats.stream_header import read_header as read_stream_header
+from sagesplat.formats.stream_increments import read_streams, write_streams
+from sagesplat.run.job import Job
+from sagesplat.run.records import settings_of
+from sagesplat.segment.lift import LiftedLabels
+from sagesplat.segment.masks import UNLABELLED, Masks, Taxonomy, mask_path, write_mask
+from sagesplat.segment.relabel import Relabelled
+from sagesplat.stages.results import observations_of, sampled_of, viewpoints_of
+from sagesplat.stages.shared import distances
+
+
+def move_levels(job: Job, new: Job, made: Relabelled) -> None:
+    """Write ladder and increments of the new categories; those that did not change keep their files."""
+    ladder = job.ladder
+    assert isinstance(ladder, PrefixLadder)
+    changed = sorted(made.changed)
+    g, sizes, second = regrouped(ladder, made.new_ids, changed)
+    sh_bits = tuple(settings_of(job.run, "nest").get("sh_bits", (5, 4)))
+    folder = new.run.increments
+    kept = [one for one in read_index(folder) if one.label_id in made.names and one.label_id not in changed]
+    headers = _headers(job.run.increments)
+    grids = {
+        new: Grid.finest([headers[old] for old in sources if old in headers])
+        for new, sources in made.sources.items()
+        if new in changed
+    }
+    with TemporaryDirectory(dir=new.run.adapted) as work:
+        written = write_streams(
+            Path(work) / "streams", g, sizes, made.names, second=second, sh_bits=sh_bits,
+            antialiased=job.antialiased, grids=grids,
+        )  # fmt: skip
+        decoded, seconds = read_streams(Path(work) / "streams", written.increments)
+        for one in {one.uri for one in read_index(folder)} - {one.uri for one in kept}:
+            (folder / one).unlink()
+        for one in {one.uri for one in written.increments}:
+            shutil.move(Path(work) / "streams" / one, folder / one)
+    write_index(folder, sorted([*kept, *written.increments], key=lambda one: (one.label_id, one.level)))
+    _write_ladder(job, new, kept, (decoded, written.sizes, seconds))
+    assert (folder / INDEX).exists()
+
+
+def _headers(folder: Path) -> dict[int, Header]:
+    """The header of each category's stream, by label id."""
+    found = {}
+    for one in read_index(folder):
+        if one.label_id not in found:
+            with (folder / one.uri).open("rb") as file:
+                found[one.label_id] = read_stream_header(file.read(SIZE))
+    return found
+
+
+def _write_ladder(
+    job: Job,
+    new: Job,
+    kept: list[Increment],
+    changed: tuple[Gaussians, dict[int, tuple[int, ...]], SecondOpacities | None],
+) -> None:
+    """Write ladder.npz: categories that did not change as they were, and the others as decoded."""
+    ladder = job.ladder
+    assert isinstance(ladder, PrefixLadder)
+    labels = sorted({one.label_id for one in kept})
+    rows = [slice(ladder.ranges[label][0][0], ladder.ranges[label][-1][1]) for label in labels]
+    g, sizes, second = changed
+    both = concat([ladder.gaussians.slices(rows), g])
+    order = torch.argsort(both.label_ids, stable=True)
+    all_sizes = {**{label: ladder.sizes[label] for label in labels}, **sizes}
+    opacities = None
+    if ladder.second is not None and second is not None:
+        logits = torch.cat([*(ladder.second.logits[part] for part in rows), second.logits])
+        weights = {**{label: ladder.second.weights[label] for label in labels}, **second.weights}
+        opacities = SecondOpacities(logits[order], weights)
+    step = read_header(job.run.prefixes).step
+    write_set(new.run.prefixes, both.select(order), step, all_sizes, second=opacities)
+
+
+def move_labels(job: Job, new: Job, made: Relabelled) -> None:
+    """Write label images, their labels.json and the labels of points of the new categories."""
+    if job.has_block_categories:
+        return
+    names = {label: name for label, name in made.names.items() if label != UNLABELLED}
+    before = job.taxonomy.names
+    # categories without Gaussians that are to be seen stay in the label images
+    rest = {label: name for label, name in before.items() if label not in made.new_ids and label not in names}
+    taxonomy = Taxonomy(dict(sorted({**names, **rest}.items())))
+    for folder in (new.run.masks, new.run.fused):
+        if (folder / "labels.json").exists():
+            taxonomy.write(folder / "labels.json")
+    if made.changed or set(taxonomy.names) != set(before):
+        _move_pixels(job, new, made, taxonomy)
+        _move_points(job, new, made)
+
+
+def _move_pixels(job: Job, new: Job, made: Relabelled, taxonomy: Taxonomy) -> None:
+    table = np.arange(-1, max([*job.taxonomy.names, *made.new_ids, 0]) + 1, dtype=np.int16)
+    split = {}  # new ids by old one
+    for old in made.new_ids:
+        moved = made.moved(old)
+        if moved is None:
+            split[old] = np.unique(made.new_ids[old])
+        else:
+            table[old + 1] = moved
+    painted = _painted(new) if split else None
+    for source, target in ((job.run.masks, new.run.masks), (job.run.fused, new.run.fused)):
+        if not (source / "labels.json").exists():
+            continue
+        masks = Masks(source, Taxonomy.read(source / "labels.json"))
+        for done, view in enumerate(job.scene.views):
+            ids = masks[view]
+            pixels = table[ids + 1]
+            for old, parts in split.items():
+                if painted is not None and (mine := ids == old).any():
+                    pixels[mine] = _nearest(painted[view], mine, parts)
+            write_mask(mask_path(target, view), pixels, taxonomy)
+            job.emit(Progress("labels", done + 1, len(job.scene.views)))
+
+
+def _painted(new: Job) -> RenderedLabels:
+    ladder = new.ladder
+    return RenderedLabels(ladder.load(ladder.levels[-1]), new.backend, new.antialiased)
+
+
+def _nearest(painted: np.ndarray, mine: np.ndarray, parts: np.ndarray) -> np.ndarray:
+    """For pixels of a split category: the part that paints most there, or at the nearest of its pixels."""
+    known = mine & np.isin(painted, parts)
+    if not known.any():
+        return np.full(int(mine.sum()), parts[0], np.int16)
+    rows, columns = np.asarray(distance_transform_edt(~known, return_distances=False, return_indices=True))
+    return painted[rows, columns][mine]
+
+
+def _move_points(job: Job, new: Job, made: Relabelled) -> None:
+    """Points of a split category get the part of its nearest Gaussian."""
+    ladder = job.ladder
+    assert isinstance(ladder, PrefixLadder)
+    points = job.scene.points.xyz
+    lifted = LiftedLabels.read(job.run.labels, len(points))
+    ids = lifted.label_ids.copy()
+    for old, new_ids in made.new_ids.items():
+        mine = lifted.label_ids == old
+        if (moved := made.moved(old)) is not None:
+            ids[mine] = moved
+        elif mine.any():
+            first, last = ladder.ranges[old][0][0], ladder.ranges[old][-1][1]
+            means = ladder.gaussians.means[first:last].numpy()
+            ids[mine] = new_ids[KDTree(means).query(points[mine])[1]]
+    LiftedLabels(ids, lifted.num_votes, lifted.num_agreeing, lifted.ignored).write(new.run.labels)
+
+
+def measure(job: Job, new: Job, made: Relabelled, fit: FitConfig) -> bool:
+    """Write observations and samples of merged categories from those of their parts.
+
+    Returns whether that is possible: not of split categories, nor of eroded masks or rendered label images.
+    """
+    moved = {old: made.moved(old) for old in made.new_ids}
+    if None in moved.values() or fit.region == "eroded" or fit.masks != "given":
+        return False
+    if new.run.observations.exists():
+        # rows of categories without Gaussians keep their label
+        table = observations_of(job)
+        rest = {label: label for label in np.unique(table.label_id).tolist() if label not in moved}
+        far = distances(new, fit.distance)
+        regrouped_observations(table, {**rest, **moved}, far).write_csv(new.run.observations)
+    drawn, labels = viewpoints_of(job), sorted(made.names)
+    cameras = [drawn.cameras[row] for row in drawn.rows("fit")]
+    far = distances_at(job.scene, new.point_labels, cameras, labels, fit.distance)
+    write_sampled(new.run.sampled, regrouped_samples(sampled_of(job), moved, far, labels))
+    return True

@@ -1,0 +1,219 @@
+"""Edits of labels applied to a finished run."""
+
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from sagesplat.adapt.ladder import PrefixLadder
+from sagesplat.adapt.observe import TOTAL
+from sagesplat.core.config import RunConfig
+from sagesplat.core.errors import LabelError, RunError
+from sagesplat.core.events import Event, StageSkipped, StageStarted
+from sagesplat.formats.label_edits import (
+    Full,
+    Hide,
+    LabelEdits,
+    Merge,
+    Operation,
+    Rename,
+    Split,
+    Weigh,
+    ladder_hash,
+    write_edits,
+)
+from sagesplat.run.job import Job
+from sagesplat.run.run_dir import RunDir
+from sagesplat.stages import pipeline
+from sagesplat.stages.label_edits import LabelsApplied, apply_labels
+from sagesplat.stages.results import fidelity_of, increments_of, observations_of, sampled_of
+
+CAR, TREE = "car", "tree-merged"
+
+
+def job_of(path: Path, emit=lambda event: None) -> Job:
+    return Job(RunDir(path), emit, "cpu")
+
+
+@pytest.fixture
+def run(finished_run: Path, tmp_path: Path) -> Path:
+    shutil.copytree(finished_run, tmp_path / "run")
+    return tmp_path / "run"
+
+
+@pytest.fixture
+def viewer(tmp_path: Path) -> Path:
+    folder = tmp_path / "viewer"
+    folder.mkdir()
+    (folder / "index.html").write_text("<!-- pack --><!-- poster -->")
+    return folder
+
+
+def edited(run: Path, viewer: Path, *operations: Operation) -> LabelsApplied:
+    job = job_of(run)
+    write_edits(
+        run / "labels.edit.json", LabelEdits(ladder_hash(increments_of(job), job.names()), operations)
+    )
+    return apply_labels(job, viewer=viewer)
+
+
+def ladder_of(path: Path) -> PrefixLadder:
+    ladder = job_of(path).ladder
+    assert isinstance(ladder, PrefixLadder)
+    return ladder
+
+
+def manifest_of(made: LabelsApplied) -> dict:
+    return json.loads((made.bundle.path / "manifest.json").read_text())
+
+
+def later_commands(path: Path) -> list[tuple[str, str]]:
+    """What the commands from observe on do with a run: the stage, and whether it is skipped or begun."""
+    told: list[Event] = []
+    pipeline._promise(job_of(path, told.append), recorded(path))
+    return [(type(e).__name__, e.name) for e in told if isinstance(e, StageStarted | StageSkipped)]
+
+
+def recorded(path: Path) -> RunConfig:
+    from sagesplat.run.recorded import recorded_settings
+
+    known = recorded_settings(RunDir(path))
+    return replace(RunConfig(), **{name: known[name] for name in ("fit", "sample", "plan")})
+
+
+def test_names_and_settings_move_no_gaussian(run: Path, viewer: Path) -> None:
+    made = edited(
+        run, viewer, Rename(CAR, "Ma voiture"), Hide("Ma voiture", True), Weigh(TREE, 3), Full(TREE, True)
+    )
+    assert not made.trained
+    assert set(made.categories) == {"Ma voiture", TREE}
+    for name in ("ladder.npz", "fidelity.json", "promises.json", "observations.csv", "plan.json"):
+        assert (made.path / "nested" / name).read_bytes() == (run / "nested" / name).read_bytes()
+    labels = {one["name"]: one for one in manifest_of(made)["labels"]}
+    assert labels["Ma voiture"]["hidden"]
+    assert "hidden" not in labels[TREE]
+    assert labels[TREE]["weight"] == 3
+    assert labels[TREE]["always"]
+
+
+def test_later_commands_find_the_edited_run_done(run: Path, viewer: Path) -> None:
+    made = edited(run, viewer, Rename(CAR, "auto"), Merge(TREE, "auto"))
+    done = later_commands(made.path)
+    assert [("StageSkipped", stage) for stage in ("observe", "sample", "fit", "plan")] == done[:4]
+    with pytest.raises(RunError, match="made by editing"):
+        pipeline.nest(job_of(made.path), RunConfig().nest, RunConfig().blocks, 0)
+
+
+def test_a_merged_category_has_the_levels_of_its_parts(run: Path, viewer: Path) -> None:
+    made = edited(run, viewer, Merge(TREE, CAR))
+    assert not made.trained
+    before, after = ladder_of(run), ladder_of(made.path)
+    assert set(after.sizes) == {3}
+    for level in before.levels:
+        assert after.counts[3, level] == before.counts[3, level] + before.counts[184, level]
+        # a stream of its own rounds positions within half a step: the levels show the same Gaussians
+        old = np.sort(before.load(level, [3, 184]).means.numpy(), axis=0)
+        new = np.sort(after.load(level, [3]).means.numpy(), axis=0)
+        assert np.abs(old - new).max() < 0.1
+    assert [one["id"] for one in manifest_of(made)["labels"]] == [3]
+
+
+def test_merged_observations_are_those_that_rendering_measures(run: Path, viewer: Path) -> None:
+    from sagesplat.adapt.observe import distances_in_views, observe
+
+    made = edited(run, viewer, Merge(TREE, CAR))
+    job = job_of(made.path)
+    told = observations_of(job)
+    far = distances_in_views(job.scene, job.point_labels)
+    measured = observe(job.scene, job.photos, job.best_masks, job.ladder, far, valid=job.valid, backend="cpu")
+    key = lambda t: np.lexsort((t.label_id, t.view, t.level))  # noqa: E731
+    told, measured = told.select(key(told)), measured.select(key(measured))
+    for name in ("label_id", "level", "view", "num_pixels", "distance"):
+        np.testing.assert_array_equal(getattr(told, name), getattr(measured, name))
+    # but for the rounding of a stream of its own
+    np.testing.assert_allclose(told.ssim, measured.ssim, atol=5e-3)
+    np.testing.assert_allclose(told.psnr, measured.psnr, atol=0.5)
+    assert (told.label_id == TOTAL).any()
+    assert 184 not in told.label_id
+
+
+def test_a_split_is_exact(run: Path, viewer: Path) -> None:
+    before = ladder_of(run)
+    sizes = before.sizes[3]
+    chosen = [0, 2, *range(sizes[0], sizes[0] + 3), sizes[-1] - 1]
+    runs = ((0, 1), (2, 1), (sizes[0], 3), (sizes[-1] - 1, 1))
+    made = edited(run, viewer, Split(CAR, "left car", {CAR: runs}))
+    assert made.trained
+    after = ladder_of(made.path)
+    (new,) = set(after.sizes) - set(before.sizes)
+    assert job_of(made.path).names()[new] == "left car"
+    old = before.load(before.levels[-1], [3]).means.numpy()
+    part = after.load(after.levels[-1], [new]).means.numpy()
+    np.testing.assert_allclose(np.sort(part, 0), np.sort(old[chosen], 0), atol=1e-5)
+    for level, size in enumerate(sizes, 1):
+        assert after.counts[new, level] == sum(rank < size for rank in chosen)
+        assert after.counts[new, level] + after.counts[3, level] == size
+    assert torch.equal(before.load(1, [184]).means, after.load(1, [184]).means)  # its file is the same
+    sampled = sampled_of(job_of(made.path))
+    assert new in sampled.labels
+
+
+def test_ranks_stay_those_of_the_run_after_a_merge(run: Path, viewer: Path) -> None:
+    operations: Sequence[Operation] = (
+        Merge(CAR, TREE), Split(TREE, "both", {CAR: ((0, 40),), TREE: ((1, 2),)}), Rename("both", "mixed"),
+    )  # fmt: skip
+    made = edited(run, viewer, *operations)
+    after = ladder_of(made.path)
+    (new,) = set(after.sizes) - {184}
+    assert after.sizes[new][-1] == 42
+    assert job_of(made.path).names()[new] == "mixed"
+    assert fidelity_of(job_of(made.path))
+
+
+def test_an_edited_run_is_edited_again(run: Path, viewer: Path) -> None:
+    first = edited(run, viewer, Rename(CAR, "auto"), Weigh("auto", 2))
+    second = edited(first.path, viewer, Merge("auto", TREE), Weigh(TREE, 4))
+    assert second.path.name == "run-edited-edited"
+    assert {one["name"]: one["weight"] for one in manifest_of(second)["labels"]}[TREE] == 4
+
+
+@pytest.mark.parametrize(
+    ("operations", "why"),
+    [
+        ([Rename("cart", "auto")], "no category 'cart'; did you mean car?"),
+        ([Rename(CAR, TREE)], "is taken"),
+        ([Merge(CAR, CAR)], "with itself"),
+        ([Merge(CAR, "unlabelled"), Merge(TREE, "unlabelled")], "leave no category"),
+        ([Split(CAR, "all", {CAR: ((0, 10**6),)})], "has .* Gaussians"),
+        ([Split(CAR, "x", {TREE: ((0, 2),)})], "not of 'car'"),
+        ([Split(CAR, "x", {"cart": ((0, 2),)})], "no category 'cart' in the run"),
+        ([], "no operations"),
+    ],
+)
+def test_impossible_edits_are_one_line(
+    run: Path, viewer: Path, operations: list[Operation], why: str
+) -> None:
+    with pytest.raises(LabelError, match=why) as error:
+        edited(run, viewer, *operations)
+    assert "\n" not in str(error.value)
+    assert not (run.parent / "run-edited").exists()
+
+
+def test_edits_of_another_run(run: Path, viewer: Path) -> None:
+    write_edits(run / "labels.edit.json", LabelEdits("0" * 64, (Rename(CAR, "auto"),)))
+    with pytest.raises(LabelError, match="edits of another run"):
+        apply_labels(job_of(run), viewer=viewer)
+
+
+def test_other_folders_are_left_alone(run: Path, viewer: Path, tmp_path: Path) -> None:
+    (tmp_path / "run-edited").mkdir()
+    (tmp_path / "run-edited" / "mine.txt").write_text("mine")
+    with pytest.raises(RunError, match="neither empty nor an edited run"):
+        edited(run, viewer, Rename(CAR, "auto"))
+    with pytest.raises(RunError, match="the run itself"):
+        apply_labels(job_of(run), out=run, viewer=viewer)

@@ -1,0 +1,321 @@
+/** Selects what is pointed at, and edits labels. What it does to the view is undone when it is closed. */
+
+import { type Category, Edits, type Operation, type Origin, type Ranks, runsOf } from "../core/edits";
+import { grow, type Packed, type Picked, pick } from "../core/pick";
+import type { Label } from "../types";
+import { Mark } from "./spark";
+import type { Viewer } from "./viewer";
+
+/** What is selected around a point: an instance, the whole category, or what is connected and of like colour. */
+export const SCOPES = ["instance", "category", "alike"] as const;
+export type Scope = (typeof SCOPES)[number];
+
+const TOLERANCES = [0.06, 0.1, 0.16, 0.25, 0.4, 0.63]; // in colour, of what is alike
+const USUAL = 2;
+const SAME = 6; // px between clicks that are taken for one place
+
+export interface Selection {
+  readonly scope: Scope;
+  readonly category: number; // number in `Edits.categories`
+  readonly masks: ReadonlyMap<number, Uint8Array>; // splats by label id and rank
+  readonly count: number;
+}
+
+interface Seed extends Picked {
+  readonly x: number;
+  readonly y: number;
+}
+
+export class Editor {
+  readonly edits: Edits;
+  selection: Selection | null = null;
+  isOpen = false;
+  isWaiting = false; // for the rest of a label, of which a region is to be selected
+  pickMs = Number.NaN; // of the last pick
+  private seed: Seed | null = null;
+  private width = USUAL; // index of TOLERANCES
+  private readonly listeners = new Set<() => void>();
+  private readonly weighed = new Set<number>(); // labels whose weight edits have set
+  private readonly hid = new Set<number>(); // the same of being shown or not
+  private readonly labels: ReadonlyMap<number, Label>;
+
+  constructor(readonly viewer: Viewer) {
+    const { labels, ladder = null } = viewer.manifest;
+    this.labels = new Map(labels.map((label) => [label.id, label]));
+    this.edits = new Edits(labels.map(originOf), ladder, () => {
+      this.clear();
+      this.show();
+    });
+    viewer.streamer.onChange(() => {
+      if (this.isWaiting && this.seed) this.choose(this.seed, "alike");
+    });
+  }
+
+  /** Why labels of this scene cannot be edited; null: they can. */
+  get obstacle(): string | null {
+    const { ladder, live } = this.viewer.manifest;
+    if (live) return "Labels are edited when training has ended.";
+    return ladder
+      ? null
+      : "This bundle does not say which run it is of; bundle the run again to edit labels.";
+  }
+
+  onChange(callback: () => void): () => void {
+    this.listeners.add(callback);
+    return () => this.listeners.delete(callback);
+  }
+
+  open(open: boolean): void {
+    this.isOpen = open;
+    if (!open) this.clear();
+    this.show();
+  }
+
+  /** Selects what is at a point of the canvas; the same point again: the next scope. */
+  pick(x: number, y: number): void {
+    const begun = performance.now();
+    const seed = this.seed;
+    if (seed && this.selection && Math.hypot(seed.x - x, seed.y - y) <= SAME) {
+      this.cycle();
+    } else {
+      const found = this.meet(x, y);
+      this.clear();
+      if (found) this.choose({ ...found, x, y }, this.scopes(found)[0] ?? "category");
+    }
+    this.pickMs = performance.now() - begun;
+    this.notify();
+  }
+
+  /** The next scope around the same point. */
+  cycle(): void {
+    const { seed, selection } = this;
+    if (!seed) return;
+    const scopes = this.scopes(seed);
+    const next = scopes[(scopes.indexOf(selection?.scope ?? "alike") + 1) % scopes.length];
+    if (next) this.choose(seed, next);
+  }
+
+  setScope(scope: Scope): void {
+    if (this.seed) this.choose(this.seed, scope);
+  }
+
+  /** Scopes that there are around the selected point. */
+  get available(): readonly Scope[] {
+    return this.seed ? this.scopes(this.seed) : [];
+  }
+
+  /** Takes more, or less, for alike. */
+  widen(by: number): void {
+    this.width = Math.max(0, Math.min(TOLERANCES.length - 1, this.width + by));
+    if (this.seed) this.choose(this.seed, "alike");
+  }
+
+  /** Selects categories of the list. */
+  selectCategories(numbers: readonly number[]): void {
+    this.seed = null;
+    this.isWaiting = false;
+    const [first] = numbers;
+    if (first === undefined) this.clear();
+    else
+      this.select(
+        "category",
+        first,
+        this.masksOf((owner) => numbers.includes(owner)),
+      );
+  }
+
+  clear(): void {
+    this.seed = null;
+    this.isWaiting = false;
+    this.selection = null;
+    this.show();
+  }
+
+  get selected(): Category | null {
+    return this.selection ? (this.edits.categories.list[this.selection.category] ?? null) : null;
+  }
+
+  /** Why categories of this scene cannot be renamed, merged or split; null: they can. */
+  get fixed(): string | null {
+    const labels = [...this.labels.values()];
+    if (labels.some(({ block }) => block !== undefined)) return "Not in a scene in blocks.";
+    const replaces = labels.some(({ levels }) => levels.some(({ refine }) => refine));
+    return replaces ? "Not where levels replace those below." : null;
+  }
+
+  /** Applies operations, and selects what they leave; throws where one cannot be. */
+  apply(...operations: readonly Operation[]): void {
+    const before = this.selectedNumbers;
+    for (const operation of operations) this.edits.apply(operation);
+    const { list, present } = this.edits.categories;
+    const last = operations.at(-1);
+    if (last?.op === "merge" || last?.op === "split") {
+      const name = last.op === "merge" ? last.into : last.to.normalize("NFC");
+      this.selectCategories(present.filter((number) => list[number]?.name === name));
+    } else this.selectCategories(before);
+  }
+
+  /** The numbers of the categories that the selection has splats of. */
+  get selectedNumbers(): number[] {
+    const found = new Set<number>();
+    for (const [id, mask] of this.selection?.masks ?? []) {
+      this.edits.categories.owner.get(id)?.forEach((number, rank) => {
+        if (mask[rank]) found.add(number);
+      });
+    }
+    return [...found].sort((a, b) => a - b);
+  }
+
+  get selectedCategories(): Category[] {
+    return this.selectedNumbers.flatMap((number) => this.edits.categories.list[number] ?? []);
+  }
+
+  /** Makes the selection a category of its own. */
+  split(to: string): void {
+    const { selection, selected } = this;
+    if (!selection || !selected) throw new Error("Nothing is selected.");
+    if (this.isWaiting) throw new Error("The rest of it is still loading.");
+    const gaussians: Record<string, readonly number[]> = {};
+    for (const [id, mask] of selection.masks) {
+      const label = this.labels.get(id);
+      const runs = runsOf(mask);
+      if (label && runs.length) gaussians[label.name] = runs;
+    }
+    this.apply({ op: "split", category: selected.name, to, gaussians: gaussians as Ranks });
+  }
+
+  private meet(x: number, y: number): Picked | null {
+    const { layer } = this.viewer.stage;
+    const ray = this.viewer.stage.ray(x, y);
+    const clouds = [...this.labels.keys()].flatMap((id) => layer.splatsOf(id) ?? []);
+    return pick(clouds, layer.encodingOf(clouds[0]?.label ?? 0), ray);
+  }
+
+  private categoryAt({ label, rank }: Picked): number {
+    return this.edits.categories.owner.get(label)?.[rank] ?? 0;
+  }
+
+  private scopes(found: Picked): Scope[] {
+    const hasParent = this.family(this.categoryAt(found)).length > 1;
+    const alike: Scope[] = this.labels.get(found.label)?.levels.some(({ refine }) => refine) ? [] : ["alike"];
+    return [...(hasParent ? (["instance"] as const) : []), "category", ...alike];
+  }
+
+  /** The categories of one parent: all instances of "chair", and what is "chair" without being one of them. */
+  private family(number: number): number[] {
+    const { list, present } = this.edits.categories;
+    const parent = list[number]?.parent ?? list[number]?.name;
+    return present.filter((i) => i === number || list[i]?.parent === parent || list[i]?.name === parent);
+  }
+
+  private choose(seed: Seed, scope: Scope): void {
+    this.seed = seed;
+    this.isWaiting = false;
+    const category = this.categoryAt(seed);
+    const family = scope === "category" ? this.family(category) : [category];
+    if (scope === "alike") {
+      const region = this.region(seed, category);
+      this.isWaiting = region === null;
+      if (region) this.select(scope, category, new Map([[seed.label, region]]));
+      else this.show();
+      return;
+    }
+    this.select(
+      scope,
+      category,
+      this.masksOf((owner) => family.includes(owner)),
+    );
+  }
+
+  /** What is alike around the seed; null until all splats of its label are there. */
+  private region(seed: Seed, category: number): Uint8Array | null {
+    const { layer } = this.viewer.stage;
+    const owner = this.edits.categories.owner.get(seed.label);
+    const cloud: Packed | null = layer.splatsOf(seed.label);
+    if (!cloud || !owner || cloud.count < owner.length) return null;
+    const among = Uint8Array.from(owner, (number) => +(number === category));
+    const tolerance = TOLERANCES[this.width] ?? 0.16;
+    // the lit colours of an earlier selection would not be alike
+    const plain = layer.plainWords(seed.label) ?? cloud.words;
+    return grow({ ...cloud, words: plain }, layer.encodingOf(seed.label), seed.rank, tolerance, among);
+  }
+
+  private masksOf(isIn: (owner: number) => boolean): Map<number, Uint8Array> {
+    const masks = new Map<number, Uint8Array>();
+    for (const [id, owner] of this.edits.categories.owner) {
+      const mask = Uint8Array.from(owner, (number) => +isIn(number));
+      if (mask.includes(1)) masks.set(id, mask);
+    }
+    return masks;
+  }
+
+  private select(scope: Scope, category: number, masks: ReadonlyMap<number, Uint8Array>): void {
+    const count = [...masks.values()].reduce((sum, mask) => sum + mask.reduce((a, b) => a + b, 0), 0);
+    this.selection = { scope, category, masks, count };
+    this.show();
+  }
+
+  /** Shows the edits and the selection: marks, hidden labels, weights, what is in full. */
+  private show(): void {
+    const { viewer } = this;
+    const { list, owner } = this.edits.categories;
+    const weights = new Map(viewer.settings.weights);
+    const always = new Map<number, boolean>();
+    for (const [id, numbers] of owner) {
+      const label = this.labels.get(id) as Label;
+      const own = [...new Set(numbers)].flatMap((number) => list[number] ?? []);
+      const weight = Math.max(...own.map((one) => one.weight));
+      const hidden = own.every((one) => one.hidden);
+      // what edits do not touch stays as the panel set it
+      if (this.touches(this.weighed, id, weight !== label.weight)) weights.set(id, weight);
+      if (this.touches(this.hid, id, hidden !== (label.hidden ?? false))) this.hide(id, hidden);
+      const waits = this.isWaiting && this.seed?.label === id;
+      const full = waits || own.some((one) => one.always);
+      if (full !== label.always) always.set(id, full);
+      viewer.stage.layer.setMarks(id, this.marksOf(id, numbers));
+    }
+    viewer.set({ weights, always });
+    this.notify();
+  }
+
+  /** Whether a label is, or was until now, other than the manifest has it. */
+  private touches(touched: Set<number>, id: number, differs: boolean): boolean {
+    if (differs) touched.add(id);
+    return differs || touched.delete(id);
+  }
+
+  private hide(id: number, hidden: boolean): void {
+    if (this.viewer.isHidden(id) !== hidden) this.viewer.setHidden([id], hidden);
+  }
+
+  private marksOf(id: number, numbers: Int32Array): Uint8Array | null {
+    const { list } = this.edits.categories;
+    const selected = this.isOpen ? this.selection?.masks.get(id) : undefined;
+    const partly = new Set(numbers).size > 1 && [...numbers].some((number) => list[number]?.hidden);
+    if (!selected && !partly) return null;
+    return Uint8Array.from(numbers, (number, rank) => {
+      if (partly && list[number]?.hidden) return Mark.hidden;
+      return selected?.[rank] ? Mark.lit : Mark.plain;
+    });
+  }
+
+  private notify(): void {
+    for (const callback of this.listeners) callback();
+  }
+}
+
+const originOf = (label: Label): Origin => ({
+  id: label.id,
+  name: label.name,
+  title: label.block === undefined ? label.title : `${label.title}, block ${label.block}`,
+  ...parentOf(label),
+  count: label.levels.reduce((sum, { count }) => sum + count, 0),
+  weight: label.weight,
+  always: label.always,
+  hidden: label.hidden ?? false,
+});
+
+const parentOf = ({ parent, category }: Label): { parent?: string } => {
+  const above = parent ?? category;
+  return above === undefined ? {} : { parent: above };
+};
