@@ -9,12 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from conftest import SMALL_RUN
 
 from sagesplat.adapt.ladder import PrefixLadder
 from sagesplat.adapt.observe import TOTAL
-from sagesplat.core.config import RunConfig
+from sagesplat.core.config import LabelsConfig, RunConfig, TrainConfig
 from sagesplat.core.errors import LabelError, RunError
 from sagesplat.core.events import Event, StageSkipped, StageStarted
+from sagesplat.demo.capture import make_capture
 from sagesplat.formats.label_edits import (
     Full,
     Hide,
@@ -29,6 +31,7 @@ from sagesplat.formats.label_edits import (
 )
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
+from sagesplat.segment.relabel import relabelled
 from sagesplat.stages import pipeline
 from sagesplat.stages.label_edits import LabelsApplied, apply_labels
 from sagesplat.stages.results import fidelity_of, increments_of, observations_of, sampled_of
@@ -136,7 +139,8 @@ def test_merged_observations_are_those_that_rendering_measures(run: Path, viewer
     for name in ("label_id", "level", "view", "num_pixels", "distance"):
         np.testing.assert_array_equal(getattr(told, name), getattr(measured, name))
     # but for the rounding of a stream of its own
-    np.testing.assert_allclose(told.ssim, measured.ssim, atol=5e-3)
+    np.testing.assert_allclose(told.ssim, measured.ssim, atol=1e-2)
+    assert np.abs(told.ssim - measured.ssim).mean() < 1e-3
     np.testing.assert_allclose(told.psnr, measured.psnr, atol=0.5)
     assert (told.label_id == TOTAL).any()
     assert 184 not in told.label_id
@@ -217,3 +221,47 @@ def test_other_folders_are_left_alone(run: Path, viewer: Path, tmp_path: Path) -
         edited(run, viewer, Rename(CAR, "auto"))
     with pytest.raises(RunError, match="the run itself"):
         apply_labels(job_of(run), out=run, viewer=viewer)
+
+
+def test_instances_keep_their_category_through_edits(tmp_path: Path, viewer: Path) -> None:
+    make_capture(tmp_path / "capture", views=16, width=80, height=60)
+    config = replace(
+        SMALL_RUN,
+        labels=LabelsConfig(instances="potted plant,vase"),
+        train=TrainConfig(max_steps=60, level_every=60),
+    )
+    run = tmp_path / "run"
+    pipeline.run_all(job_of(run), tmp_path / "capture", config)
+    before = job_of(run)
+    plants = sorted(name for name, parent in before.parents.items() if parent == "potted plant")
+    made = edited(run, viewer, Rename("vase 1", "urn"), Hide("urn", True), Merge(plants[1], plants[0]))
+    after = job_of(made.path)
+    assert not after.has_instances  # its label images are those of the instances
+    assert after.parents["urn"] == "vase"
+    assert after.parents[plants[0]] == "potted plant"
+    assert plants[1] not in {*after.parents, *after.names().values()}
+    labels = {one["name"]: one.get("parent") for one in manifest_of(made)["labels"]}
+    assert (labels["urn"], labels[plants[0]]) == ("vase", "potted plant")
+    ids = {name: i for i, name in after.names().items()}
+    view = before.scene.views[0]
+    old = {name: i for i, name in before.names().items()}
+    mine = np.isin(before.best_masks[view], [old[name] for name in plants[:2]])
+    assert np.array_equal(after.best_masks[view] == ids[plants[0]], mine)
+    assert [("StageSkipped", stage) for stage in ("observe", "sample", "fit", "plan")] == later_commands(
+        made.path
+    )[:4]
+
+
+def test_the_parents_of_edited_names() -> None:
+    names = {1: "chair", 2: "chair 1", 3: "chair 2", 4: "table 1"}
+    before = {"chair 1": "chair", "chair 2": "chair", "table 1": "table"}
+    counts = dict.fromkeys(names, 4)
+
+    def parents(*operations: Operation) -> dict[str, str]:
+        return relabelled(names, counts, operations).parents(before, names)
+
+    assert parents(Rename("chair 1", "throne")) == {"throne": "chair", "chair 2": "chair", "table 1": "table"}
+    assert parents(Rename("chair", "seat"))["chair 1"] == "seat"
+    assert parents(Merge("chair 2", "chair 1")) == {"chair 1": "chair", "table 1": "table"}
+    assert parents(Merge("table 1", "chair 1")) == {"chair 2": "chair"}
+    assert parents(Merge("chair 1", "chair")) == {"chair 2": "chair", "table 1": "table"}

@@ -193,7 +193,12 @@ class Job:
     @property
     def point_labels(self) -> np.ndarray:
         """Category of each SfM point."""
-        return self._lifted(self.run.instance_labels if self.has_instances else self.run.labels).label_ids
+        return self._lifted(self.point_label_file).label_ids
+
+    @property
+    def point_label_file(self) -> Path:
+        """Where the categories of SfM points are, those of instances if they were asked for."""
+        return self.run.instance_labels if self.has_instances else self.run.labels
 
     @property
     def initial_labels(self) -> np.ndarray:

@@ -47,6 +47,20 @@ class Relabelled:
                 found.setdefault(new, []).append(old)
         return found
 
+    def parents(self, before: Mapping[str, str], names: Mapping[int, str]) -> dict[str, str]:
+        """The category that each instance is of, by their names now.
+
+        `before`: the same before the edits; `names`: the categories then, by id. What was merged of several
+        is an instance of the one that all of them were of.
+        """
+        moved = {names[old]: self.names[new] for old in self.new_ids if (new := self.moved(old)) is not None}
+        found = {}
+        for new, sources in self.sources.items():
+            of = {before.get(names[old]) for old in sources}
+            if len(of) == 1 and (parent := of.pop()) is not None and new in self.names:
+                found[self.names[new]] = moved.get(parent, parent)
+        return {name: parent for name, parent in found.items() if parent not in found and parent != name}
+
     @property
     def changed(self) -> list[int]:
         """The new categories whose Gaussians are not exactly those of the old category of their id."""

@@ -21,6 +21,7 @@ from sagesplat.run.job import Job
 from sagesplat.run.recorded import recorded_settings
 from sagesplat.run.records import read_record, record
 from sagesplat.run.run_dir import RunDir
+from sagesplat.segment.parents import write_parents
 from sagesplat.segment.relabel import Relabelled, relabelled
 from sagesplat.stages.bundle import BundleMade, bundle
 from sagesplat.stages.edited import LabelSettings, label_settings, write_edited
@@ -152,12 +153,25 @@ def _begin(job: Job, fresh: Path, edits: LabelEdits, made: Relabelled) -> Job:
                 shutil.copy2(source / name, target / name)
     for stage in _LATER:
         new.provenance(stage).unlink(missing_ok=True)
+    if job.has_instances:
+        _keep_instances_alone(job.run, new)
+    write_parents(new.parents, made.parents(job.parents, job.names()))
     settings = LabelSettings(made.weights, made.hidden, made.always)
     write_edited(new, job.run.path.name, loads_json(dump_edits(edits)), settings)
     return Job(
         new, job.emit, job.backend, job.threads, device=job.device, memory_limit=job.memory_limit,
         executor=job.executor, source=job,
     )  # fmt: skip
+
+
+def _keep_instances_alone(run: RunDir, new: RunDir) -> None:
+    """Label images of instances become those of the edited run; what they were made of stays behind."""
+    for folder in (new.masks, new.fused):
+        shutil.rmtree(folder, ignore_errors=True)
+    shutil.copytree(run.instances, new.masks)
+    shutil.move(new.masks / run.instance_labels.name, new.labels)
+    for stage in ("fuse", "instances", "photo_instances"):
+        new.provenance(stage).unlink(missing_ok=True)
 
 
 def _make(job: Job, new: Job, made: Relabelled) -> bool:

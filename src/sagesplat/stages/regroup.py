@@ -104,12 +104,19 @@ def move_labels(job: Job, new: Job, made: Relabelled) -> None:
     # categories without Gaussians that are to be seen stay in the label images
     rest = {label: name for label, name in before.items() if label not in made.new_ids and label not in names}
     taxonomy = Taxonomy(dict(sorted({**names, **rest}.items())))
-    for folder in (new.run.masks, new.run.fused):
-        if (folder / "labels.json").exists():
-            taxonomy.write(folder / "labels.json")
+    for _, folder in _label_folders(job, new):
+        taxonomy.write(folder / "labels.json")
     if made.changed or set(taxonomy.names) != set(before):
         _move_pixels(job, new, made, taxonomy)
         _move_points(job, new, made)
+
+
+def _label_folders(job: Job, new: Job) -> list[tuple[Path, Path]]:
+    """Folders of label images and where they go: those of instances are the only ones of an edited run."""
+    if job.has_instances:
+        return [(job.run.instances, new.run.masks)]
+    both = [(job.run.masks, new.run.masks), (job.run.fused, new.run.fused)]
+    return [(source, target) for source, target in both if (source / "labels.json").exists()]
 
 
 def _move_pixels(job: Job, new: Job, made: Relabelled, taxonomy: Taxonomy) -> None:
@@ -122,9 +129,7 @@ def _move_pixels(job: Job, new: Job, made: Relabelled, taxonomy: Taxonomy) -> No
         else:
             table[old + 1] = moved
     painted = _painted(new) if split else None
-    for source, target in ((job.run.masks, new.run.masks), (job.run.fused, new.run.fused)):
-        if not (source / "labels.json").exists():
-            continue
+    for source, target in _label_folders(job, new):
         masks = Masks(source, Taxonomy.read(source / "labels.json"))
         for done, view in enumerate(job.scene.views):
             ids = masks[view]
@@ -155,7 +160,7 @@ def _move_points(job: Job, new: Job, made: Relabelled) -> None:
     ladder = job.ladder
     assert isinstance(ladder, PrefixLadder)
     points = job.scene.points.xyz
-    lifted = LiftedLabels.read(job.run.labels, len(points))
+    lifted = LiftedLabels.read(job.point_label_file, len(points))
     ids = lifted.label_ids.copy()
     for old, new_ids in made.new_ids.items():
         mine = lifted.label_ids == old
