@@ -38,7 +38,7 @@ def masks(folder):
 def test_same_seed_same_bytes(workspace, tmp_path):
     small(tmp_path / "again")
     files = [path.relative_to(workspace) for path in sorted(workspace.rglob("*")) if path.is_file()]
-    assert len(files) == 12 + 12 + 1 + 3
+    assert len(files) == 3 * 12 + 1 + 3  # photos, label images, instances; labels.json, sparse/0
     assert all((tmp_path / "again" / path).read_bytes() == (workspace / path).read_bytes() for path in files)
 
 

@@ -753,7 +753,9 @@ class Bundling(types.ModuleType):
             {"sha256": c["sha256"]}
             for c in json.loads((job.run.increments / "index.json").read_text())["chunks"]
         ]
-        manifest = {"format": "sagesplat-bundle", "live": False, "labels": [{"levels": levels}]}
+        manifest = {
+            "format": "sagesplat-bundle", "live": False, "labels": [{"levels": levels}], "ladder": "aa",
+        }  # fmt: skip
         page = self.viewer["index.html"].replace(
             b"<!-- poster -->", b'<img id="poster" src="poster.jpg" alt="" />'
         )

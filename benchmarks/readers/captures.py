@@ -23,6 +23,7 @@ from sagesplat.scene.nerfstudio import load_transforms
 from sagesplat.scene.points import read_points
 from sagesplat.scene.scene import Camera, View
 from sagesplat.segment.coco import read_panoptic
+from sagesplat.segment.instances import read_instances, write_instances
 from sagesplat.segment.masks import Taxonomy, import_masks, read_mask, write_mask
 
 NAMES = {"unlabelled": 255, "labels": {"184": "tree-merged", "7": "sky"}}
@@ -133,6 +134,12 @@ def _write_mask(ids: np.ndarray, taxonomy: Taxonomy, path: Path) -> None:
     write_mask(path, ids, taxonomy)
 
 
+def _instances(folder: Path, size: int) -> list[bytes]:
+    numbers = np.zeros((3 * size, 4 * size), np.int16)
+    numbers[:2, :3] = [[1, 2, -1], [2, 2, 1]]
+    return [written(folder / "i.png", lambda path: write_instances(path, numbers))]
+
+
 def _valid(folder: Path, size: int) -> list[bytes]:
     """Masks of pixels that count, of all modes of PNG that have other rows in memory."""
     return [_picture(mode, size, format="PNG") for mode in ("1", "L", "LA", "RGB", "RGBA", "I;16", "P")]
@@ -238,6 +245,7 @@ READERS = (
         _masks,
         file("m.png", lambda path: read_mask(path, Taxonomy({1: "sky", 2: "tree"}))),
     ),
+    Reader("instances", ".png", _instances, file("i.png", read_instances)),
     Reader("label-image", ".png", _masks, _import),
     Reader("valid", ".png", _valid, file("v.png", lambda path: read_black(path, 192)), 100, 16 * MIB),
     Reader("labels", ".json", _labels, file("labels.json", Taxonomy.read), 1000),

@@ -15,6 +15,7 @@ from sagesplat.adapt import eq3, fidelity, plan, viewpoint, viewpoints
 from sagesplat.adapt.evaluate import Evaluation, read_evaluation
 from sagesplat.adapt.observe import Observations, read_observations
 from sagesplat.core.events import Event
+from sagesplat.formats import label_edits
 from sagesplat.io import lock
 from sagesplat.io.columns import write_columns
 from sagesplat.io.files import read_json
@@ -32,9 +33,11 @@ from sagesplat.scene.refined import RefinedCameras, read_refined, write_refined
 from sagesplat.scene.scene import Camera
 from sagesplat.segment import segmenters
 from sagesplat.segment.masks import Taxonomy
+from sagesplat.segment.parents import read_parents, write_parents
 from sagesplat.stages import bundle, label, view
 from sagesplat.stages.boundaries import _seconds
 from sagesplat.stages.clean import read_clean_figures
+from sagesplat.stages.edited import LabelSettings, label_settings, write_edited
 from sagesplat.stages.prompts import read_scores
 from sagesplat.stages.refine import read_pose_figures
 from sagesplat.stages.refine_exposure import read_exposure_figures
@@ -356,6 +359,31 @@ def _read_edits(path: Path) -> None:
     label.read_edit_table(path, Taxonomy({0: "sky", 2: "tree"}))
 
 
+def _label_edits(folder: Path, size: int) -> list[bytes]:
+    listed = [label_edits.Rename("sky", f"sky {i}") for i in range(size)]
+    more = (
+        label_edits.Merge("car", "sky"), label_edits.Split("sky", "sun", {"sky": ((0, 3), (7, 2))}),
+        label_edits.Hide("sky", True), label_edits.Weigh("sky", 2.0), label_edits.Full("sky", False),
+    )  # fmt: skip
+    return [label_edits.dump_edits(label_edits.LabelEdits("0" * 64, (*listed, *more)))]
+
+
+def _parents(folder: Path, size: int) -> list[bytes]:
+    parents = {f"chair {i}": "chair" for i in range(size)}
+    return [written(folder / "p.json", lambda path: write_parents(path, parents))]
+
+
+def _edited(folder: Path, size: int) -> list[bytes]:
+    settings = LabelSettings({f"sky {i}": 2.0 for i in range(size)}, ("sky",), ("tree",))
+    return [
+        written(folder / "edited.json", lambda path: write_edited(RunDir(path.parent), "r", [], settings))
+    ]
+
+
+def _read_edited(path: Path) -> None:
+    label_settings(RunDir(path.parent))
+
+
 NETWORK = {"segmenter": "onnx", "soft": True, "model": "0" * 64}
 
 
@@ -412,6 +440,9 @@ READERS = (
     Reader("photo-hashes", ".json", _hashes, file("photos.json", _read_hashes), 1000),
     Reader("frozen", ".json", _frozen, file("frozen.json", read_frozen), 3000),
     Reader("edits", ".json", _edits, file("edit.json", _read_edits), 10_000),
+    Reader("label-edits", ".json", _label_edits, file("labels.edit.json", label_edits.read_edits), 1000),
+    Reader("parents", ".json", _parents, file("parents.json", read_parents), 3000),
+    Reader("edited", ".json", _edited, file("edited.json", _read_edited), 3000),
     Reader("segmenting", ".json", _networks, file(".network.json", _read_network), 3000),
     Reader("prompts", ".json", _scores, file(".prompts-0.json", read_scores), 3000),
     Reader("live", ".json", _live, file("live.json", bundle._read_live), 3000),

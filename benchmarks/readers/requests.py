@@ -12,8 +12,11 @@ import h11
 from benchmarks.hostile import Reader
 from sagesplat.cli import parse
 from sagesplat.cli.base import COMMANDS
+from sagesplat.formats.label_edits import FILE, LabelEdits, Rename, dump_edits
+from sagesplat.viewer.edit_site import EditSite
 from sagesplat.viewer.site import Site
 
+_TOKEN = "a-token"
 SECRET = b"not in the folder that is served"
 
 
@@ -69,6 +72,42 @@ def _answer(folder: Path, content: bytes) -> None:
     assert not any(SECRET[:9] in message.get("body", b"") for message in sent)
 
 
+def _edit_requests(folder: Path, size: int) -> list[bytes]:
+    (folder / FILE).write_bytes(b"{}")
+    body = dump_edits(LabelEdits("0" * 64, (Rename("sky", "heaven"),) * size))
+    head = f"Host: localhost:8000\r\nOrigin: http://localhost:8000\r\nX-Sagesplat-Token: {_TOKEN}\r\n"
+    return [
+        f"GET /{FILE} HTTP/1.1\r\n{head}\r\n".encode(),
+        f"PUT /{FILE} HTTP/1.1\r\n{head}Content-Length: {len(body)}\r\n\r\n".encode() + body,
+    ]
+
+
+def _answer_edit(folder: Path, content: bytes) -> None:
+    """A request that reads or writes edits of labels; AssertionError where it gets by without the token."""
+    head, _, body = content.partition(b"\r\n\r\n")
+    lines = [line.split(b":", 1) for line in head.split(b"\r\n")[1:]]
+    headers = [(line[0].strip().lower(), line[1].strip()) for line in lines if len(line) == 2]
+    scope = {
+        "type": "http", "method": head.split(b" ", 1)[0].decode("latin-1"), "path": f"/{FILE}",
+        "headers": headers, "scheme": "http", "client": ("127.0.0.1", 9),
+    }  # fmt: skip
+    sent: list[Any] = []
+
+    async def receive() -> Any:
+        return {"type": "http.request", "body": body}
+
+    async def send(message: Any) -> None:
+        sent.append(message)
+
+    site = EditSite(Site(folder, viewer=folder), folder / FILE, lambda: "0" * 64)
+    site.token = _TOKEN
+    before = (folder / FILE).read_bytes()
+    _loop().run_until_complete(site(scope, receive, send))
+    (folder / FILE).write_bytes(before)
+    if (b"x-sagesplat-token", _TOKEN.encode()) not in headers:
+        assert sent[0]["status"] == 403, sent[0]
+
+
 def _words(folder: Path, size: int) -> list[bytes]:
     return ["\n".join(["run", "SCENE", "RUN", *["--target-ssim", "0.5"] * size]).encode(),
             b"plan\nRUN\n--target-ssim\n0.9\n--ladder\nsnapshots"]  # fmt: skip
@@ -85,5 +124,6 @@ def _parse(folder: Path, content: bytes) -> None:
 
 READERS = (
     Reader("request", ".http", _requests, _answer, 300),
+    Reader("edit-request", ".http", _edit_requests, _answer_edit, 300),
     Reader("command-line", ".txt", _words, _parse, 300),
 )

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.kernels.jit import njit
+from sagesplat.kernels.planes import padded, to_image
 from sagesplat.raster import Workspace, blend, cpu, tiles
 from sagesplat.raster.render import ALPHA_MIN
 from sagesplat.scene.scene import Camera
@@ -58,13 +59,13 @@ class Drawn:
             at = to.stop
         every = np.ones(-(-width // tiles.TILE) * -(-height // tiles.TILE), bool)
         found = tiles.intersect(records, depths, radii, width, height, every, self.workspace)
-        image, left = take("image 0", height, width, 3), take("left", height, width)
+        image, left = take("image 0", 3, height, padded(width)), take("left", height, padded(width))
         ends = np.empty(len(found.starts) - 1, np.int64)
         behind = np.array(camera.background, np.float32) / 255
         blend.forward(
             records, found.starts, found.ids, found.row_order, width, height, behind, image, left, ends
         )
-        return np.clip(image, 0, 1, out=image)
+        return to_image(np.clip(image, 0, 1, out=image), width).numpy()
 
 
 def drawn_from(

@@ -7,18 +7,21 @@ list do not move them. docs/formats.md specifies the file.
 
 import hashlib
 import json
+import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sagesplat.core.errors import LabelError, RunError, short
 from sagesplat.core.names import RULE, checked
-from sagesplat.formats.increments import Increment
 from sagesplat.io.files import loads_json, regular, unwritable, write_text
+
+if TYPE_CHECKING:  # loads torch, which `view` does without
+    from sagesplat.formats.increments import Increment
 
 FILE = "labels.edit.json"
 FORMAT, VERSION = "sagesplat-label-edits", 1
@@ -125,7 +128,8 @@ def read_edits(path: Path) -> LabelEdits:
     """The edits in a file; LabelError as of `parse_edits`, and for a file that cannot be read."""
     try:
         with regular(path).open("rb") as file:
-            content = file.read(MAX_BYTES + 1)
+            size = os.fstat(file.fileno()).st_size  # read(n) takes n bytes of memory, whatever there is
+            content = file.read(min(size, MAX_BYTES) + 1)
     except OSError as error:
         raise LabelError(f"{path}: cannot be read ({error.strerror}); {_CURE}") from None
     return parse_edits(content, str(path))
@@ -225,7 +229,7 @@ _KINDS: dict[str, Callable[[dict[str, Any]], Operation]] = {
 }
 
 
-def ladder_hash(increments: Sequence[Increment], names: Mapping[int, str]) -> str:
+def ladder_hash(increments: Sequence["Increment"], names: Mapping[int, str]) -> str:
     """What tells the levels of one run from another: SHA-256 of all increments and category names."""
     listed = [[one.label_id, names[one.label_id], one.level, one.count, one.sha256] for one in increments]
     return hashlib.sha256(json.dumps(sorted(listed)).encode()).hexdigest()

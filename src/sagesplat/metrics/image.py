@@ -63,9 +63,7 @@ def ssim_map(
         (True, (32, 48))
     """
     space, width = Workspace(), x.shape[1]
-    one, other = (
-        to_planes(torch.from_numpy(np.ascontiguousarray(i)), space, name) for i, name in ((x, "x"), (y, "y"))
-    )
+    one, other = (to_planes(torch.from_numpy(i), space, name) for i, name in ((x, "x"), (y, "y")))
     values = np.zeros_like(one)
     _maps(one, other, width, tile_mask, space, values)
     return values[..., :width].mean(0)

@@ -83,8 +83,8 @@ def _check_edit(path: Path, host: str | None, follow: bool) -> None:
 
 def _ladder_of(folder: Path | None) -> str:
     """The hash of the levels that a bundle shows."""
-    manifest: Any = read_json(folder / MANIFEST) if folder else {}
-    return str(manifest.get("ladder", ""))
+    manifest: Any = read_json(folder / MANIFEST) if folder else None
+    return str(manifest.get("ladder", "")) if isinstance(manifest, dict) else ""
 
 
 def _fill(site: "Site", path: Path, emit: Emit, follow: bool) -> Callable[[threading.Event], None] | None:
