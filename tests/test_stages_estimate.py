@@ -80,3 +80,18 @@ def test_nothing_is_said_of_what_is_short_begun_or_not_done_here(
     assert np.isfinite(estimate.training_seconds(job, CONFIG.train, 100, 1.0, 0.0))
     job.run.checkpoint.touch()
     assert said(job) == []
+
+
+def test_snapshots_are_not_measured_at_drawn_viewpoints(job: Job, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(estimate, "step_seconds", lambda *_: (1.0, 0.0))
+    events: list[Event] = []
+    tell_duration(Job(RunDir(job.run.path, "snapshots"), events.append, "cpu"), CONFIG)
+    (text,) = [event.text for event in events if isinstance(event, Noted)]
+    assert "levels" not in text
+    assert "measuring 40 s" in text  # 29 levels in 6 views, a quarter of a second each
+
+
+def test_nothing_is_timed_where_no_pixel_counts(job: Job, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(estimate, "step_seconds", lambda *_: (1.0, 0.0))
+    monkeypatch.setattr(type(job.valid), "rows", lambda *_: [])
+    assert said(job) == []

@@ -37,8 +37,9 @@ def tell_duration(job: Job, config: RunConfig) -> None:
     begun = job.run.checkpoint.exists() or job.run.provenance("train").exists()
     if begun or job.backend == "cuda" or config.blocks.count > 1 or not isinstance(job.executor, Local):
         return
-    if not len(job.given_scene.train_ids) or not (job.initial_labels != IGNORED).any():
-        return  # training says so
+    rows = job.valid.rows(job.given_scene, job.given_scene.train_ids)
+    if not len(rows) or not (job.initial_labels != IGNORED).any():
+        return  # nothing to learn from: training says so
     fitted = memory.fit(job.given_scene, config.train, job.memory_limit, processes=job.processes)
     fixed, each = step_seconds(job, fitted.config, fitted.lowered)
     train = training_seconds(job, fitted.config, fitted.lowered, fixed, each)
@@ -46,7 +47,8 @@ def tell_duration(job: Job, config: RunConfig) -> None:
     parts = {"training": train}
     if nested:
         parts["levels"] = _levels_seconds(job.given_scene, nested, fixed, each * fitted.lowered)
-    parts["measuring"] = _measuring_seconds(job.given_scene, config, fixed + each * fitted.lowered)
+    step = fixed + each * fitted.lowered
+    parts["measuring"] = _measuring_seconds(job.given_scene, config.train, nested, step)
     if (total := sum(parts.values())) >= _WORTH_TELLING:
         each_part = ", ".join(f"{name} {duration(round(seconds, -1))}" for name, seconds in parts.items())
         job.emit(Noted(f"from here on about {duration(total)} on this machine: {each_part}"))
@@ -110,8 +112,10 @@ def _levels_seconds(scene: Scene, config: NestConfig, fixed: float, full: float)
     return base + passes + config.steps * _NESTED * (fixed + full)
 
 
-def _measuring_seconds(scene: Scene, config: RunConfig, step: float) -> float:
-    """Seconds of observing levels in photos and at drawn viewpoints, and of calibrating."""
-    renders = len(scene.views) * config.nest.levels
-    renders += _DRAWN * (config.train.max_steps + config.nest.steps + config.nest.base_steps)
+def _measuring_seconds(scene: Scene, train: TrainConfig, nested: NestConfig | None, step: float) -> float:
+    """Seconds of observing levels in photos and, of nested ones, at drawn viewpoints, and of calibrating."""
+    if nested is None:
+        return len(scene.views) * (train.max_steps // schedule_of(train).level_every) * _RENDER * step
+    renders = len(scene.views) * nested.levels
+    renders += _DRAWN * (train.max_steps + nested.steps + nested.base_steps)
     return renders * _RENDER * step
