@@ -10,26 +10,54 @@ from torch import Tensor
 from sagesplat.core.gaussians import PARAMETERS
 from sagesplat.core.sh import num_bases
 from sagesplat.kernels.jit import njit
+from sagesplat.kernels.simd import LANES, load, sqrt, store
 from sagesplat.train.state import SECOND, TrainState
 
 _BETA1, _BETA2, _EPS = 0.9, 0.999, 1e-15
 _CHUNK = 4096
 
 
-@njit(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", cache=True)
-def _update(parameter, grad, exp_avg, exp_avg_sq, rate, correction):
-    b1, b2, eps = np.float32(_BETA1), np.float32(_BETA2), np.float32(_EPS)
+@njit(error_model="numpy", forceinline=True, cache=True)
+def _new_moments(grad, g_at, exp_avg, exp_avg_sq, at):
+    b1, b2 = np.float32(_BETA1), np.float32(_BETA2)
     new1, new2 = np.float32(1 - _BETA1), np.float32(1 - _BETA2)
-    for i in range(np.uint64(len(parameter))):
-        g = grad[i]
-        m = b1 * exp_avg[i] + new1 * g
-        v = b2 * exp_avg_sq[i] + new2 * g * g
-        exp_avg[i] = m
-        exp_avg_sq[i] = v
-        parameter[i] -= rate * m / (np.sqrt(v) * correction + eps)
+    g = load(grad, g_at)
+    return b1 * load(exp_avg, at) + new1 * g, b2 * load(exp_avg_sq, at) + new2 * g * g
 
 
-@njit(parallel=True, cache=True)
+@njit(error_model="numpy", forceinline=True, cache=True)
+def _moved(parameter, at, m, v, rate, correction):
+    return load(parameter, at) - rate * m / (sqrt(v) * correction + np.float32(_EPS))
+
+
+@njit(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", forceinline=True, cache=True)
+def _update(parameter, at, grad, g_at, exp_avg, exp_avg_sq, rate, correction, length):
+    """Values from `at` on, by their gradients from `g_at` on."""
+    if length < LANES:
+        b1, b2, eps = np.float32(_BETA1), np.float32(_BETA2), np.float32(_EPS)
+        new1, new2 = np.float32(1 - _BETA1), np.float32(1 - _BETA2)
+        for k in range(length):
+            g = grad[g_at + k]
+            m = b1 * exp_avg[at + k] + new1 * g
+            v = b2 * exp_avg_sq[at + k] + new2 * g * g
+            exp_avg[at + k] = m
+            exp_avg_sq[at + k] = v
+            parameter[at + k] -= rate * m / (np.sqrt(v) * correction + eps)
+        return
+    last = length - LANES  # the last vector overlaps the one before: read first, written last
+    m_last, v_last = _new_moments(grad, g_at + last, exp_avg, exp_avg_sq, at + last)
+    p_last = _moved(parameter, at + last, m_last, v_last, rate, correction)
+    for k in range(0, last, LANES):
+        m, v = _new_moments(grad, g_at + k, exp_avg, exp_avg_sq, at + k)
+        store(parameter, at + k, _moved(parameter, at + k, m, v, rate, correction))
+        store(exp_avg, at + k, m)
+        store(exp_avg_sq, at + k, v)
+    store(parameter, at + last, p_last)
+    store(exp_avg, at + last, m_last)
+    store(exp_avg_sq, at + last, v_last)
+
+
+@njit(parallel=True, error_model="numpy", cache=True)
 def _update_rows(parameter, grad, exp_avg, exp_avg_sq, rate, correction, trainable, columns):
     """Flat arrays of N * width values; runs of trainable rows are updated together."""
     n = len(trainable)
@@ -42,31 +70,22 @@ def _update_rows(parameter, grad, exp_avg, exp_avg_sq, rate, correction, trainab
                 stop += 1
             if columns < width:
                 for r in range(row, stop):
-                    a, b = r * width, r * width + columns
-                    _update(parameter[a:b], grad[a:b], exp_avg[a:b], exp_avg_sq[a:b], rate, correction)
+                    at = r * width
+                    _update(parameter, at, grad, at, exp_avg, exp_avg_sq, rate, correction, columns)
             elif stop > row:
-                a, b = row * width, stop * width
-                _update(parameter[a:b], grad[a:b], exp_avg[a:b], exp_avg_sq[a:b], rate, correction)
+                at, length = row * width, (stop - row) * width
+                _update(parameter, at, grad, at, exp_avg, exp_avg_sq, rate, correction, length)
             row = stop + 1
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, error_model="numpy", cache=True)
 def _update_drawn(parameter, grad, exp_avg, exp_avg_sq, rate, correction, trainable, columns, drawn):
-    """The same for the rows `drawn` alone, ascending, of which `grad` has one each."""
+    """The same for the rows `drawn` alone, of which `grad` has one each."""
     width = len(parameter) // len(trainable)
-    for chunk in prange((len(drawn) + _CHUNK - 1) // _CHUNK):
-        i, end = chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(drawn))
-        while i < end:
-            begin, row = i, drawn[i]
-            i += 1
-            if not trainable[row]:
-                continue
-            if columns == width:  # rows that follow each other are updated together
-                while i < end and drawn[i] == row + i - begin and trainable[drawn[i]]:
-                    i += 1
-            a, b = row * width, (row + i - begin - 1) * width + columns
-            own = grad[begin * width : begin * width + b - a]
-            _update(parameter[a:b], own, exp_avg[a:b], exp_avg_sq[a:b], rate, correction)
+    for i in prange(len(drawn)):
+        if trainable[drawn[i]]:
+            at = drawn[i] * width
+            _update(parameter, at, grad, i * width, exp_avg, exp_avg_sq, rate, correction, columns)
 
 
 def adam_step(

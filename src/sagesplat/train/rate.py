@@ -14,6 +14,7 @@ from torch import Tensor
 
 from sagesplat.formats.quantisation import sh_steps
 from sagesplat.kernels.jit import njit
+from sagesplat.kernels.simd import LANES, load, maximum, splat, store, where
 
 _LOG_2 = math.log(2)
 
@@ -41,16 +42,32 @@ def add_gradient(
         return
     index = np.arange(len(grad)) if rows is None else rows.numpy()
     steps = np.repeat(sh_steps(shN, sh_bits)[:, 0].numpy(), 3)
-    grads, values = (a.detach().numpy().reshape(len(a), len(steps)) for a in (grad, shN))
+    grads, values = (a.detach().numpy().reshape(-1) for a in (grad, shN))
     _add(grads, values, steps, np.float32(weight), index)
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def _add(grad, values, steps, weight, rows):
-    zero = np.float32(0)
+    """Flat arrays of rows of `len(steps)` values, LANES at a time; 0 where a value is 0."""
+    width = len(steps)
+    last = width - LANES
     for i in prange(len(rows)):
-        row = values[rows[i]]
-        for k in range(len(steps)):  # without branches: vectors
-            value = row[k]
-            slope = weight / (steps[k] + abs(value))
-            grad[i, k] += slope if value > zero else (-slope if value < zero else zero)
+        at, to = rows[i] * width, i * width
+        if last < 0:
+            for k in range(width):
+                value = values[at + k]
+                slope = weight / (steps[k] + abs(value))
+                grad[to + k] += slope if value > 0 else (-slope if value < 0 else np.float32(0))
+            continue
+        # the last vector overlaps the one before: read first, written last
+        at_end = _with_slope(grad, to + last, values, at + last, steps, last, weight)
+        for k in range(0, last, LANES):
+            store(grad, to + k, _with_slope(grad, to + k, values, at + k, steps, k, weight))
+        store(grad, to + last, at_end)
+
+
+@njit(error_model="numpy", forceinline=True, cache=True)
+def _with_slope(grad, to, values, at, steps, k, weight):
+    value, zero = load(values, at), np.float32(0)
+    slope = splat(weight) / (load(steps, k) + maximum(value, -value))
+    return load(grad, to) + where(value > zero, slope, where(value < zero, -slope, zero))
