@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int, Int16, Int32
 
 from sagesplat.adapt.ladder import Ladder, PrefixLadder
-from sagesplat.adapt.observe import PERCENTILE, RenderedLabels, distances_in_views, render_rgb
+from sagesplat.adapt.observe import PERCENTILE, RenderedLabels, distances_in_views, each_view, render_rgb
 from sagesplat.adapt.seen import Seen, seen_from
 from sagesplat.core.errors import DataError, short
 from sagesplat.io.files import atomic_path
@@ -74,15 +74,19 @@ def measure_levels(
     found = np.full((len(cameras), len(labels), len(ladder.levels)), np.nan, np.float32)
     pixels = np.zeros(found.shape[:2], np.int32)
     whole = np.ones((len(cameras), len(ladder.levels)), np.float32)
-    for row, camera in enumerate(cameras):
+
+    def at_viewpoint(row: int) -> None:
+        camera = cameras[row]
         at = references.at(camera)
         pixels[row] = at.pixels
         found[row, pixels[row] > 0, -1] = 1.0
         for column, level in enumerate(ladder.levels[:-1]):
             of_level = dict.fromkeys(labels, level)
             found[row, :, column], whole[row, column] = references.compare(of_level, camera, at)
+
+    for done, _ in enumerate(each_view(at_viewpoint, range(len(cameras)), backend), 1):
         if progress:
-            progress(row + 1, len(cameras))
+            progress(done, len(cameras))
     return found, pixels, whole
 
 
@@ -106,8 +110,10 @@ def measure_compositions(
     labels = references.labels
     found = np.full((*planned.shape[:2], len(labels) + 1), np.nan, np.float32)
     pixels = np.zeros((len(cameras), len(labels)), np.int32)
-    for row, camera in enumerate(cameras):
-        at, known = references.at(camera), {}
+
+    def at_viewpoint(row: int) -> None:
+        camera, known = cameras[row], {}
+        at = references.at(camera)
         pixels[row] = at.pixels
         for column, levels in enumerate(map(tuple, planned[row].tolist())):
             if levels in known:
@@ -116,8 +122,10 @@ def measure_compositions(
             known[levels] = column
             planned_here = dict(zip(labels, levels, strict=True))
             found[row, column, :-1], found[row, column, -1] = references.compare(planned_here, camera, at)
+
+    for done, _ in enumerate(each_view(at_viewpoint, range(len(cameras)), backend), 1):
         if progress:
-            progress(row + 1, len(cameras))
+            progress(done, len(cameras))
     return found, pixels
 
 

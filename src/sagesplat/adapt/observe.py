@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from sagesplat.adapt.seen import seen_from
 from sagesplat.core import geometry
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.columns import from_rows, read_columns, write_columns
+from sagesplat.kernels.threads import side_by_side
 from sagesplat.metrics.color_correct import color_correct_affine
 from sagesplat.metrics.image import means_by_label, pasted, psnr, squared_error_map, ssim_map
 from sagesplat.raster import Backend, Workspace, device_of, most_painted, rasterize
@@ -24,6 +25,9 @@ from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene, View
 from sagesplat.segment.masks import UNLABELLED
 from sagesplat.segment.valid import ALL_VALID, ValidPixels
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 TOTAL = -2  # label id of the rows that average over all pixels of the image
 
@@ -113,6 +117,14 @@ def within_lens(camera: Camera, lens: tuple[float, float]) -> Camera:
         K[i, 2] if old <= new else new / 2 for i, (old, new) in enumerate(zip(size, most, strict=True))
     )
     return replace(camera, K=K, width=width, height=height)
+
+
+def each_view(
+    function: Callable[[Item], Result], views: Sequence[Item], backend: Backend
+) -> Iterator[Result]:
+    """The results of a function of each view, in their order; on a CPU several views are rendered at once."""
+    on_gpu = device_of(backend).type == "cuda"
+    return map(function, views) if on_gpu else side_by_side(function, views)
 
 
 def render_rgb(
@@ -304,33 +316,58 @@ def observe(
     rows: list[dict[str, float]] = []
     views = valid.rows(scene, range(len(scene.views)) if views is None else views)
     inner = {row: erode(masks[scene.views[row]]) for row in views}
-    total = len(ladder.levels) * len(views)
-    for done, (level, row, image) in enumerate(_images(ladder, scene, views, backend, antialiased), 1):
+    done, total = 0, len(ladder.levels) * len(views)
+
+    def compare(level: int, row: int, image: Float32[np.ndarray, "H W 3"]) -> list[dict[str, float]]:
         view = scene.views[row]
         found = measure(image, as_unit(photos[row]), masks[view], inner[row], valid[view])
-        for label, values in found.items():
-            distance = distances[label][row] if label in distances else np.nan
-            rows.append({"label_id": label, "level": level, "view": row, "distance": distance, **values})
+        of_level = {"level": level, "view": row}
+        return [
+            {"label_id": label, **of_level, "distance": _at(distances, label, row), **values}
+            for label, values in found.items()
+        ]
+
+    for images, found in _each_image(compare, ladder, scene, views, backend, antialiased):
+        rows += found
+        done += images
         if progress:
             progress(done, total)
     table = from_rows(Observations, rows)
     return table.select(np.argsort(table.level, kind="stable"))
 
 
-def _images(
-    ladder: Ladder, scene: Scene, views: Sequence[int], backend: Backend, antialiased: bool
-) -> Iterator[tuple[int, int, Float32[np.ndarray, "H W 3"]]]:
-    """Level, view and image of it: view by view where levels share Gaussians, else level by level."""
+def _at(distances: Mapping[int, Float32[np.ndarray, " V"]], label: int, row: int) -> float:
+    return distances[label][row] if label in distances else np.nan
+
+
+def _each_image(
+    compare: Callable[[int, int, np.ndarray], list[dict[str, float]]],
+    ladder: Ladder,
+    scene: Scene,
+    views: Sequence[int],
+    backend: Backend,
+    antialiased: bool,
+) -> Iterator[tuple[int, list[dict[str, float]]]]:
+    """Call `compare` with level, view and image: view by view where levels share Gaussians, else level by
+    level. Yields how many images there were, and what was returned.
+    """
     how = {"backend": backend, "antialiased": antialiased, "workspace": Workspace()}
-    if not isinstance(ladder, PrefixLadder):
-        for level in ladder.levels:
-            g = ladder.load(level).to(device_of(backend))
-            yield from ((level, row, render_rgb(g, scene.views[row].camera, **how)) for row in views)
+    if isinstance(ladder, PrefixLadder):
+
+        def in_view(row: int) -> list[dict[str, float]]:
+            seen = seen_from(ladder, scene.views[row].camera, **how)
+            images = ((level, seen.render(dict.fromkeys(ladder.sizes, level))) for level in ladder.levels)
+            return [found for level, image in images for found in compare(level, row, image)]
+
+        yield from ((len(ladder.levels), found) for found in each_view(in_view, views, backend))
         return
-    for row in views:
-        seen = seen_from(ladder, scene.views[row].camera, **how)
-        for level in ladder.levels:
-            yield level, row, seen.render(dict.fromkeys(ladder.sizes, level))
+    for level in ladder.levels:
+        g = ladder.load(level).to(device_of(backend))
+
+        def at_level(row: int, level: int = level, g: Gaussians = g) -> list[dict[str, float]]:
+            return compare(level, row, render_rgb(g, scene.views[row].camera, **how))
+
+        yield from ((1, found) for found in each_view(at_level, views, backend))
 
 
 def merge(parts: Sequence[Observations]) -> Observations:

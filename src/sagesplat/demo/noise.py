@@ -7,7 +7,7 @@ from jaxtyping import Float64
 
 from sagesplat.kernels.jit import njit
 
-jit = njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+jit = njit(cache=True, fastmath=True, error_model="numpy")
 
 
 def dice(i, j):

@@ -32,7 +32,7 @@ def njit(function: Callable[..., Any] | None = None, *, cache: bool = False, **o
     """
     if function is None:
         return partial(njit, cache=cache, **options)
-    kernel: Any = numba.njit(**options)(function)
+    kernel: Any = numba.njit(nogil=True, **options)(function)  # see `kernels.threads`
     if cache:
         with suppress(RuntimeError):  # numba finds no folder that it can write
             setattr(kernel, "_cache", _KernelCache(function))  # noqa: B010 - of numba's dispatcher
@@ -65,7 +65,7 @@ def _used(function: Any, seen: set[Any]) -> Iterator[str]:
     if function in seen:
         return
     seen.add(function)
-    yield _file_hash(function.__code__.co_filename)
+    yield from (_file_hash(name) for name in (function.__code__.co_filename, __file__))
     package = function.__module__.partition(".")[0]
     for name in sorted(_names(function.__code__)):
         value = function.__globals__.get(name)

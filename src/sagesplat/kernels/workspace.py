@@ -1,15 +1,17 @@
 """Arrays that calls of the `cpu` backend reuse."""
 
 import math
+import threading
 from typing import Any
 
 import numpy as np
 
 
-class Workspace:
+class Workspace(threading.local):
     """Named arrays that successive calls reuse: a call overwrites what the one before returned.
 
-    Fresh arrays of these sizes come from the system page by page, which takes as long as filling them.
+    Each thread has its own. Fresh arrays of these sizes come from the system page by page, which takes as
+    long as filling them.
     """
 
     def __init__(self) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from sagesplat.adapt.bound_plans import Costs, plan_for_view, quality_at
 from sagesplat.adapt.calibrate_photos import TARGETS
 from sagesplat.adapt.eq3 import SsimModel
-from sagesplat.adapt.observe import Observations, as_unit, measure, render_rgb
+from sagesplat.adapt.observe import Observations, as_unit, each_view, measure, render_rgb
 from sagesplat.adapt.photo_models import calibrated, fit_photos, in_composition
 from sagesplat.adapt.viewpoint import ViewModel
 from sagesplat.core.config import FitConfig
@@ -81,18 +81,24 @@ def _measure_compositions(
     """(label id, its level, row, numbers of targets, SSIM) of compositions in some views."""
     planned, config = part
     name = "ssim_eroded" if config.region == "eroded" else "ssim"
-    masks, workspace = label_images(job, config.masks), Workspace()
-    rows = []
-    for done, (row, compositions) in enumerate(planned, 1):
-        view = job.scene.views[row]
+    masks, workspace, ladder = label_images(job, config.masks), Workspace(), job.ladder
+
+    def in_view(of_view: _Planned) -> list[tuple[int, int, int, list[int], float]]:
+        row, compositions = of_view
+        view, rows = job.scene.views[row], []
         for targets, levels in compositions:
             image = render_rgb(
-                job.ladder.compose(levels), view.camera,
+                ladder.compose(levels), view.camera,
                 backend=job.backend, antialiased=job.antialiased, workspace=workspace,
             )  # fmt: skip
             found = measure(image, as_unit(job.photos[row]), masks[view], valid=job.valid[view])
             rows += [
                 (label, levels.get(label, -1), row, targets, values[name]) for label, values in found.items()
             ]
+        return rows
+
+    rows = []
+    for done, found in enumerate(each_view(in_view, planned, job.backend), 1):
+        rows += found
         job.emit(Progress("fit", done, len(planned)))
     return rows

@@ -1,0 +1,50 @@
+"""Independent items side by side, each in a thread whose kernels take that thread alone.
+
+A view's image is small: kernels that divide it among threads wait for each other, and what is between them
+runs on one core. Kernels release the GIL (see `jit`) and a `Workspace` is another in each thread.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+import numba
+import torch
+from numba.np.ufunc import parallel
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def side_by_side(function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
+    """The results of `function`, in the order of the items, as they come; the first failure ends it.
+
+    It takes as many threads as kernels otherwise would. `function` must not change what other calls read.
+    """
+    threads = min(numba.get_num_threads(), max(len(items) - 1, 1))
+    if items:
+        yield function(items[0])  # by itself: kernels are compiled, and numba starts its threads
+    if threads == 1 or not _concurrent():
+        yield from map(function, items[1:])
+        return
+    of_torch = torch.get_num_threads()
+    pool = ThreadPoolExecutor(threads, initializer=_alone)
+    try:
+        yield from pool.map(function, items[1:])
+    finally:
+        pool.shutdown(cancel_futures=True)
+        torch.set_num_threads(of_torch)  # what later threads begin with
+
+
+def _alone() -> None:
+    """Kernels and torch take one thread when this one calls them."""
+    numba.set_num_threads(1)
+    torch.set_num_threads(1)
+
+
+def _concurrent() -> bool:
+    """Whether several threads may call parallel kernels at once: numba's own thread pool ends the process."""
+    try:
+        return parallel.threading_layer() != "workqueue"
+    except ValueError:  # no kernel has run
+        return False

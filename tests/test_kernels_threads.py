@@ -1,0 +1,72 @@
+"""Items side by side: order, failures, threads, and the same bits as one after the other."""
+
+import threading
+
+import numba
+import numpy as np
+import pytest
+import torch
+from sagesplat.kernels import threads
+from sagesplat.kernels.threads import side_by_side
+from sagesplat.kernels.workspace import Workspace
+from sagesplat.metrics.image import ssim_map
+
+
+@pytest.fixture
+def two_threads():
+    if numba.config.NUMBA_NUM_THREADS < 2:  # pyright: ignore[reportAttributeAccessIssue]
+        pytest.skip("numba was started with one thread: `pytest -m threads` has two")
+    before = numba.get_num_threads(), torch.get_num_threads()
+    numba.set_num_threads(2)
+    torch.set_num_threads(2)
+    yield
+    numba.set_num_threads(before[0])
+    torch.set_num_threads(before[1])
+
+
+def test_results_come_in_order_and_none_are_lost():
+    assert list(side_by_side(lambda x: x * x, range(20))) == [x * x for x in range(20)]
+    assert list(side_by_side(str, [])) == []
+    assert list(side_by_side(str, [3])) == ["3"]
+
+
+def test_a_failure_ends_it():
+    with pytest.raises(ZeroDivisionError):
+        list(side_by_side(lambda x: 1 // (x - 5), range(100)))
+
+
+@pytest.mark.threads
+def test_images_are_compared_at_once_with_the_same_bits(two_threads):
+    rng = np.random.default_rng(0)
+    pairs = [rng.random((2, 150, 200, 3), np.float32) for _ in range(12)]
+    alone = [ssim_map(*pair) for pair in pairs]
+    names, counts = set(), set()
+
+    def compare(pair):
+        names.add(threading.get_ident())
+        counts.add(numba.get_num_threads())
+        return ssim_map(*pair)
+
+    found = list(side_by_side(compare, pairs))
+    assert all(np.array_equal(a, b) for a, b in zip(alone, found, strict=True))
+    assert len(names) > 1, "all in one thread"
+    assert counts == {1, 2}, "the first alone with both threads, the others with one each"
+    assert numba.get_num_threads() == 2
+    assert torch.get_num_threads() == 2
+
+
+@pytest.mark.threads
+def test_a_thread_pool_that_cannot_be_shared_is_not(two_threads, monkeypatch):
+    monkeypatch.setattr(threads.parallel, "threading_layer", lambda: "workqueue")
+    found = set(side_by_side(lambda _: threading.get_ident(), range(8)))
+    assert found == {threading.get_ident()}
+
+
+def test_each_thread_has_its_own_workspace():
+    space, arrays = Workspace(), []
+    mine = space.take("a", 3)
+    other = threading.Thread(target=lambda: arrays.append(space.take("a", 3)))
+    other.start()
+    other.join()
+    assert not np.shares_memory(mine, arrays[0])
+    assert np.shares_memory(mine, space.take("a", 3))
