@@ -28,7 +28,7 @@ from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.columns import from_rows, read_columns, write_columns
 from sagesplat.metrics.image import means_by_label, ssim_map
-from sagesplat.raster import Backend, Workspace, device_of
+from sagesplat.raster import Backend, Workspace, device_of, each_view
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene
 from sagesplat.segment.valid import ALL_VALID, ValidPixels
@@ -155,9 +155,11 @@ def evaluate(
         return render_rgb(g, camera, backend=backend, antialiased=antialiased, workspace=workspace)
 
     def measure_all(g: Gaussians):
-        nonlocal done, size
+        nonlocal done
         g = g.to(device_of(backend))
-        for row in views:
+
+        def in_view(row: int):
+            nonlocal size
             view, photo = scene.views[row], as_unit(photos[row])
             neutral = view.camera.neutral  # fidelity is promised of pictures without a photo's exposure
             if row not in kept:
@@ -175,7 +177,10 @@ def evaluate(
                 image = render(g, view.camera)
             measured = measure(image, photo, masks[view], inner[row], valid[view])
             measured[TOTAL] |= colours
-            yield row, measured, alike
+            return row, measured, alike
+
+        for found in each_view(in_view, views, device_of(backend)):
+            yield found
             done += 1
             if progress:
                 progress(done, total)

@@ -12,13 +12,13 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int, Int16, Int32
 
 from sagesplat.adapt.ladder import Ladder, PrefixLadder
-from sagesplat.adapt.observe import PERCENTILE, RenderedLabels, distances_in_views, each_view, render_rgb
+from sagesplat.adapt.observe import PERCENTILE, RenderedLabels, distances_in_views, render_rgb
 from sagesplat.adapt.seen import Seen, seen_from
 from sagesplat.core.errors import DataError, short
 from sagesplat.io.files import atomic_path
 from sagesplat.io.npz import Npz
 from sagesplat.metrics.image import means_by_label, ssim_map
-from sagesplat.raster import Backend, Workspace, device_of
+from sagesplat.raster import Backend, Workspace, device_of, each_view
 from sagesplat.scene.scene import Camera, Scene, View
 
 _KEEP = 10**9  # bytes of references that are kept
@@ -84,7 +84,7 @@ def measure_levels(
             of_level = dict.fromkeys(labels, level)
             found[row, :, column], whole[row, column] = references.compare(of_level, camera, at)
 
-    for done, _ in enumerate(each_view(at_viewpoint, range(len(cameras)), backend), 1):
+    for done, _ in enumerate(each_view(at_viewpoint, range(len(cameras)), device_of(backend)), 1):
         if progress:
             progress(done, len(cameras))
     return found, pixels, whole
@@ -123,7 +123,7 @@ def measure_compositions(
             planned_here = dict(zip(labels, levels, strict=True))
             found[row, column, :-1], found[row, column, -1] = references.compare(planned_here, camera, at)
 
-    for done, _ in enumerate(each_view(at_viewpoint, range(len(cameras)), backend), 1):
+    for done, _ in enumerate(each_view(at_viewpoint, range(len(cameras)), device_of(backend)), 1):
         if progress:
             progress(done, len(cameras))
     return found, pixels

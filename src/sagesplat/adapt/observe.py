@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -17,17 +17,13 @@ from sagesplat.adapt.seen import seen_from
 from sagesplat.core import geometry
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.columns import from_rows, read_columns, write_columns
-from sagesplat.kernels.threads import side_by_side
 from sagesplat.metrics.color_correct import color_correct_affine
 from sagesplat.metrics.image import means_by_label, pasted, psnr, squared_error_map, ssim_map
-from sagesplat.raster import Backend, Workspace, device_of, most_painted, rasterize
+from sagesplat.raster import Backend, Workspace, device_of, each_view, most_painted, rasterize
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene, View
 from sagesplat.segment.masks import UNLABELLED
 from sagesplat.segment.valid import ALL_VALID, ValidPixels
-
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 
 TOTAL = -2  # label id of the rows that average over all pixels of the image
 
@@ -117,14 +113,6 @@ def within_lens(camera: Camera, lens: tuple[float, float]) -> Camera:
         K[i, 2] if old <= new else new / 2 for i, (old, new) in enumerate(zip(size, most, strict=True))
     )
     return replace(camera, K=K, width=width, height=height)
-
-
-def each_view(
-    function: Callable[[Item], Result], views: Sequence[Item], backend: Backend
-) -> Iterator[Result]:
-    """The results of a function of each view, in their order; on a CPU several views are rendered at once."""
-    on_gpu = device_of(backend).type == "cuda"
-    return map(function, views) if on_gpu else side_by_side(function, views)
 
 
 def render_rgb(
@@ -359,7 +347,7 @@ def _each_image(
             images = ((level, seen.render(dict.fromkeys(ladder.sizes, level))) for level in ladder.levels)
             return [found for level, image in images for found in compare(level, row, image)]
 
-        yield from ((len(ladder.levels), found) for found in each_view(in_view, views, backend))
+        yield from ((len(ladder.levels), found) for found in each_view(in_view, views, device_of(backend)))
         return
     for level in ladder.levels:
         g = ladder.load(level).to(device_of(backend))
@@ -367,7 +355,7 @@ def _each_image(
         def at_level(row: int, level: int = level, g: Gaussians = g) -> list[dict[str, float]]:
             return compare(level, row, render_rgb(g, scene.views[row].camera, **how))
 
-        yield from ((1, found) for found in each_view(at_level, views, backend))
+        yield from ((1, found) for found in each_view(at_level, views, device_of(backend)))
 
 
 def merge(parts: Sequence[Observations]) -> Observations:

@@ -1,7 +1,8 @@
 """Rasterising Gaussians: one function, several backends."""
 
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numba
 import numpy as np
@@ -12,16 +13,19 @@ from torch import Tensor
 
 from sagesplat.core.errors import BackendUnavailable, DataError
 from sagesplat.core.gaussians import PARAMETERS, Gaussians
+from sagesplat.kernels.threads import side_by_side
 from sagesplat.kernels.workspace import Workspace
 from sagesplat.raster.exposure import expose
 from sagesplat.raster.render import TILE, Render
 from sagesplat.scene.scene import Camera
 
 __all__ = [
-    "TILE", "Backend", "Render", "Workspace", "add_weights", "device_of", "expose", "rasterize",
-    "resolve_backend", "set_threads",
+    "TILE", "Backend", "Render", "Workspace", "add_weights", "device_of", "each_view", "expose",
+    "rasterize", "resolve_backend", "set_threads",
 ]  # fmt: skip
 
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 Backend = Literal["auto", "cpu", "cuda", "reference"]
 
 
@@ -51,6 +55,13 @@ def resolve_backend(backend: Backend, device: str = "auto") -> Backend:
 def device_of(backend: Backend, rank: int = 0) -> torch.device:
     """Where a backend computes; with several GPUs, the one of a process."""
     return torch.device("cuda", rank) if backend == "cuda" else torch.device("cpu")
+
+
+def each_view(
+    function: Callable[[Item], Result], views: Sequence[Item], device: torch.device
+) -> Iterator[Result]:
+    """The results of a function that renders a view, in the order of `views`; on a CPU several at once."""
+    return map(function, views) if device.type == "cuda" else side_by_side(function, views)
 
 
 def set_threads(threads: int = 0) -> int:

@@ -8,12 +8,12 @@ import numpy as np
 from sagesplat.adapt.bound_plans import Costs, plan_for_view, quality_at
 from sagesplat.adapt.calibrate_photos import TARGETS
 from sagesplat.adapt.eq3 import SsimModel
-from sagesplat.adapt.observe import Observations, as_unit, each_view, measure, render_rgb
+from sagesplat.adapt.observe import Observations, as_unit, measure, render_rgb
 from sagesplat.adapt.photo_models import calibrated, fit_photos, in_composition
 from sagesplat.adapt.viewpoint import ViewModel
 from sagesplat.core.config import FitConfig
 from sagesplat.core.events import Progress
-from sagesplat.raster import Workspace
+from sagesplat.raster import Workspace, device_of, each_view
 from sagesplat.run.executor import split
 from sagesplat.run.job import Job
 from sagesplat.run.remote import work_all
@@ -98,7 +98,7 @@ def _measure_compositions(
         return rows
 
     rows = []
-    for done, found in enumerate(each_view(in_view, planned, job.backend), 1):
+    for done, found in enumerate(each_view(in_view, planned, device_of(job.backend)), 1):
         rows += found
         job.emit(Progress("fit", done, len(planned)))
     return rows

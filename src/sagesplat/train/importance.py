@@ -7,9 +7,10 @@ from typing import Literal
 import numpy as np
 import torch
 from jaxtyping import Float32
+from torch import Tensor
 
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.raster import Workspace, add_weights, rasterize
+from sagesplat.raster import Workspace, add_weights, each_view, rasterize
 from sagesplat.scene.scene import Scene
 from sagesplat.segment.valid import ALL_VALID, ValidPixels
 
@@ -60,17 +61,20 @@ def _sensitivity(
     g: Gaussians, scene: Scene, views: Collection[int], valid: ValidPixels, antialiased: bool, seed: int
 ) -> Float32[np.ndarray, " N"]:
     total, workspace = torch.zeros(len(g), device=g.means.device), Workspace()
-    signs = torch.Generator().manual_seed(seed)
     opacity = torch.sigmoid(g.logit_opacities.detach())
-    for row in views:
-        camera = scene.views[row].camera
+
+    def in_view(row: int) -> Tensor:
         logits = g.logit_opacities.detach().clone().requires_grad_()
         fading = replace(g.detach(), logit_opacities=logits)
-        image = rasterize(fading, camera, antialiased=antialiased, workspace=workspace).rgb
+        image = rasterize(fading, scene.views[row].camera, antialiased=antialiased, workspace=workspace).rgb
+        signs = torch.Generator().manual_seed(seed * len(scene.views) + row)
         probe = torch.randint(0, 2, image.shape, generator=signs).float().mul_(2).sub_(1)
         if (counts := valid[scene.views[row]]) is not None:
             probe *= torch.from_numpy(counts)[..., None]
         (grad,) = torch.autograd.grad(image, logits, probe.to(image.device))
         # by the logarithm of the opacity: what is left when all of it goes
-        total += (grad / (1 - opacity).clamp_min(1e-6)) ** 2
+        return (grad / (1 - opacity).clamp_min(1e-6)) ** 2
+
+    for of_view in each_view(in_view, list(views), g.means.device):
+        total += of_view
     return total.cpu().numpy()
