@@ -212,10 +212,11 @@ def _write_pictures(
     for done, view in enumerate(views):
         if photos and not labelled:
             break
-        rgb, ids = paint.paint(view.camera)
         if not photos:
+            rgb = paint.paint(view.camera)
             Image.fromarray((rgb * 255).round().astype(np.uint8)).save(view.image_path)
         if labelled:
+            ids = paint.render(view.camera)
             write_mask(paths[done], ids, taxonomy)
             occurring.update(np.unique(ids).tolist())
         job.emit(Progress("adopt", done + 1, len(views)))
