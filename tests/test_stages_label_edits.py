@@ -11,6 +11,7 @@ import pytest
 import torch
 from conftest import SMALL_RUN
 
+import sagesplat
 from sagesplat.adapt.ladder import PrefixLadder
 from sagesplat.adapt.observe import TOTAL, Observations, distances_in_views, observe
 from sagesplat.core.config import FitConfig, LabelsConfig, RunConfig, TrainConfig
@@ -204,6 +205,21 @@ def test_ranks_stay_those_of_the_run_after_a_merge(run: Path, viewer: Path) -> N
     assert after.sizes[new][-1] == 42
     assert job_of(made.path).names()[new] == "mixed"
     assert fidelity_of(job_of(made.path))
+
+
+def test_scripts_apply_edits(run: Path, tmp_path: Path) -> None:
+    job = job_of(run)
+    ladder = ladder_hash(increments_of(job), job.names())
+    write_edits(tmp_path / "mine.json", LabelEdits(ladder, (Rename(CAR, "auto"),)))
+    told: list[Event] = []
+    made = sagesplat.apply_labels(
+        str(run), tmp_path / "mine.json", tmp_path / "out", on_event=told.append, backend="cpu", threads=1
+    )
+    assert made.names[3] == "auto"
+    assert (made.job.run.path / "bundle" / "manifest.json").exists()
+    assert told
+    with pytest.raises(LabelError, match=r"none\.json: cannot be read"):
+        sagesplat.apply_labels(run, tmp_path / "none.json")
 
 
 def test_an_edited_run_is_edited_again(run: Path, viewer: Path) -> None:
