@@ -54,8 +54,8 @@ __all__ = [
     "PlanConfig", "Render", "RunConfig", "SageError", "Scene", "SceneConfig", "Splat", "StageDone",
     "StageSkipped", "Taxonomy", "TrainConfig", "View", "ViewModel", "Warned", "apply_labels",
     "label_image", "load_scene", "open_run", "rasterize", "read_plans", "read_ply", "read_promises",
-    "read_splat", "read_spz", "run_scene", "select", "select_mask", "set_threads", "train_gaussians", "write_ply",
-    "write_spz",
+    "read_splat", "read_spz", "run_scene", "select", "select_mask", "set_threads", "train_gaussians",
+    "write_ply", "write_spz",
 ]  # fmt: skip
 
 # by module, below sagesplat
