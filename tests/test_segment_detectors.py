@@ -30,7 +30,7 @@ def loaded(folder: Path, words: list[str], said: list[str] | None = None) -> Any
 def test_grounding_dino_is_asked_as_its_own_processor_asks(folders: dict[str, Path]) -> None:
     words = ["Stone Fountain", "ivy", "wooden bench"]
     detect = loaded(folders["dino"], words)
-    assert isinstance(detect, GroundingDino)
+    assert isinstance(detect.score, GroundingDino)
     processor = transformers.GroundingDinoProcessor(
         load_image_processor(folders["dino"]), load_tokenizer(folders["dino"])
     )
@@ -93,7 +93,7 @@ def test_owlv2_finds_what_its_own_post_processing_finds(
 ) -> None:
     words = ["fountain", "ivy"]
     detect = loaded(folders["owlv2"], words)
-    assert isinstance(detect, Owlv2)
+    assert isinstance(detect.score, Owlv2)
     tokenizer, processor = load_tokenizer(folders["owlv2"]), load_image_processor(folders["owlv2"])
     inputs = tokenizer(words, padding="max_length", max_length=16, return_tensors="pt")
     inputs |= processor(images=photo(*size), return_tensors="pt")
