@@ -30,13 +30,13 @@ def loaded(folder: Path, words: list[str], said: list[str] | None = None) -> Any
 def test_grounding_dino_is_asked_as_its_own_processor_asks(folders: dict[str, Path]) -> None:
     words = ["Stone Fountain", "ivy", "wooden bench"]
     detect = loaded(folders["dino"], words)
-    assert isinstance(detect, GroundingDino)
+    assert isinstance(detect.score, GroundingDino)
     processor = transformers.GroundingDinoProcessor(
         load_image_processor(folders["dino"]), load_tokenizer(folders["dino"])
     )
     inputs = processor(images=photo(), text=words, return_tensors="pt")
     with torch.inference_mode():
-        output = detect._model(**inputs)
+        output = detect.score.model(**inputs)
     p = output.logits[0].sigmoid().numpy()
     expected = np.stack([p[:, 1:3].mean(1), p[:, 4], p[:, 6:8].mean(1)], 1)
     (boxes,) = processor.post_process_grounded_object_detection(
@@ -57,11 +57,11 @@ def test_grounding_dino_is_asked_as_its_own_processor_asks(folders: dict[str, Pa
 def test_more_prompts_than_a_text_holds_are_asked_for_in_several_passes(folders: dict[str, Path]) -> None:
     words = ["stone fountain", "ivy", "wooden bench", "tree", "chair", "stone bench"]
     together = loaded(folders["dino"], words)
-    assert list(together._passes()) == [[0, 1, 2, 3], [4, 5]]  # of up to 12 tokens
+    assert list(together.score.passes()) == [[0, 1, 2, 3], [4, 5]]  # of up to 12 tokens
     best = together(photo(), 0.5).best
     for some in (slice(0, 4), slice(4, 6)):
         alone = loaded(folders["dino"], words[some])
-        assert len(list(alone._passes())) == 1
+        assert len(list(alone.score.passes())) == 1
         np.testing.assert_allclose(best[some], alone(photo(), 0.5).best, atol=1e-5)
     assert set(together(photo(), 0.01).prompts.tolist()) == set(range(6))
 
@@ -70,7 +70,7 @@ def test_separators_in_a_prompt_do_not_split_it(folders: dict[str, Path]) -> Non
     said: list[str] = []
     plain = loaded(folders["dino"], ["stone fountain", "ivy"], said)
     dotted = loaded(folders["dino"], ["stone. fountain?", "..ivy."], said)
-    assert dotted._tokens == plain._tokens
+    assert dotted.score.tokens == plain.score.tokens
     assert not said
 
 
@@ -93,12 +93,12 @@ def test_owlv2_finds_what_its_own_post_processing_finds(
 ) -> None:
     words = ["fountain", "ivy"]
     detect = loaded(folders["owlv2"], words)
-    assert isinstance(detect, Owlv2)
+    assert isinstance(detect.score, Owlv2)
     tokenizer, processor = load_tokenizer(folders["owlv2"]), load_image_processor(folders["owlv2"])
     inputs = tokenizer(words, padding="max_length", max_length=16, return_tensors="pt")
     inputs |= processor(images=photo(*size), return_tensors="pt")
     with torch.inference_mode():
-        output = detect._model(
+        output = detect.score.model(
             inputs["input_ids"], inputs["pixel_values"], attention_mask=inputs["attention_mask"]
         )
     (own,) = processor.post_process_object_detection(output, threshold=0, target_sizes=[size])
@@ -116,6 +116,6 @@ def test_owlv2_finds_what_its_own_post_processing_finds(
 def test_scores_that_are_no_numbers(folders: dict[str, Path]) -> None:
     detect = loaded(folders["owlv2"], ["ivy"])
     with torch.no_grad():
-        detect._model.class_head.logit_scale.weight.fill_(float("nan"))
+        detect.score.model.class_head.logit_scale.weight.fill_(float("nan"))
     with pytest.raises(LabelError, match="tiny: scores that are not finite"):
         detect(photo(), 0.1)

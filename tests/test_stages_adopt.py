@@ -25,6 +25,8 @@ from sagesplat.core.events import Event, StageDone, Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.increments import read_index
 from sagesplat.formats.ply import read_ply, write_ply
+from sagesplat.formats.splats import read_splat
+from sagesplat.formats.splats_write import write_splat
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.stages import pipeline
@@ -32,6 +34,7 @@ from sagesplat.stages.adopt import open_splat
 from sagesplat.stages.adopt_levels import make_levels
 from sagesplat.stages.api import open_run
 from sagesplat.stages.bundle import bundle
+from sagesplat.stages.export import export_scene
 from sagesplat.stages.results import promises_of
 
 SMALL = AdoptConfig(fit="none", views=14, size=(48, 36), shares=(0.2, 0.4, 0.7, 1.0), kind="object")
@@ -68,7 +71,10 @@ def _levels(
 def adopted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run of a labelled PLY, without training; the PLY is beside it."""
     folder = tmp_path_factory.mktemp("adopted")
-    write_ply(folder / "ball.ply", _ball(), {3: "car", 184: "tree-merged"})
+    g = _ball()
+    ids = torch.where((g.label_ids == 3) & (g.means[:, 0] > 0), 201, g.label_ids).to(torch.int16)
+    names, parents = {3: "car", 184: "tree-merged", 201: "car 1"}, {201: "car"}
+    write_ply(folder / "ball.ply", replace(g, label_ids=ids), names, parents=parents)
     _adopt(folder, folder / "ball.ply", SMALL)
     return folder / "run"
 
@@ -101,6 +107,9 @@ def test_it_bundles(adopted: Path, tmp_path: Path) -> None:
     made = bundle(Job(RunDir(adopted), lambda event: None, "cpu"), tmp_path / "bundle")
     manifest = json.loads((made.path / "manifest.json").read_text())
     assert list(manifest["promises"]) == ["fidelity"]
+    parents = {one["name"]: one.get("parent") for one in manifest["labels"]}
+    assert {name: of for name, of in parents.items() if of} == {"car 1": "car"}
+    assert "car" in parents
     refine = [level.get("refine") for label in manifest["labels"] for level in label["levels"]]
     assert "REPLACE" in refine
     assert (adopted / "viewpoints.png").read_bytes().startswith(b"\x89PNG")
@@ -179,6 +188,32 @@ def test_labels_of_the_file_are_merged_and_left_out(
     assert set(counts) == left
     assert sum(counts.values()) == len(g)
     assert set(job.point_labels.tolist()) <= left
+
+
+@pytest.mark.parametrize("name", ["ball.ply", "ball.spz", "ball.sog"])
+def test_instances_come_in_and_go_out_with_their_category(tmp_path: Path, name: str) -> None:
+    ids = torch.tensor([62, 201, 202, 202], dtype=torch.int16).repeat(100)
+    names, parents = {62: "chair", 201: "chair 1", 202: "chair 2"}, {201: "chair", 202: "chair"}
+    write_splat(tmp_path / name, replace(_ball(), label_ids=ids), names, parents=parents)
+    job, _ = _levels(tmp_path, tmp_path / name, SMALL)
+    assert job.names() == {**names, -1: "unlabelled"}
+    assert job.parents == {"chair 1": "chair", "chair 2": "chair"}
+    export_scene(job, tmp_path / "out" / name, level=4, labels=(), target=None)
+    out = read_splat(tmp_path / "out" / name)
+    assert (out.names, out.parents) == (names, parents)
+    assert out.gaussians.counts() == {62: 100, 201: 100, 202: 200}
+    export_scene(job, tmp_path / name.replace("ball", "chairs"), level=4, labels=["chair 2"], target=None)
+    assert len(read_splat(tmp_path / name.replace("ball", "chairs")).gaussians) == 200
+
+
+def test_merged_categories_take_their_instances_along(tmp_path: Path) -> None:
+    ids = torch.tensor([62, 201, 202, 202], dtype=torch.int16).repeat(100)
+    names, parents = {62: "chair", 201: "chair 1", 202: "chair 2"}, {201: "chair", 202: "chair"}
+    write_splat(tmp_path / "ball.ply", replace(_ball(), label_ids=ids), names, parents=parents)
+    job = Job(RunDir(tmp_path / "run"), lambda event: None, "cpu")
+    labels = LabelsConfig(merge="chair=seat,chair 1=seat")
+    open_splat(job, tmp_path / "ball.ply", SMALL, SceneConfig(), MasksConfig(), labels)
+    assert job.parents == {"chair 2": "seat"}
 
 
 def test_a_category_that_nothing_shows_is_unlabelled_and_said(tmp_path: Path) -> None:

@@ -46,6 +46,11 @@ class Left:
         best[0] = 0.65
         if self.words[0] == "nothing":
             return Found(np.zeros(0, int), best[:0], mask[:0], best / 4)
+        if "basin" in self.words:  # the same but for a column
+            both = np.concatenate([mask, mask])
+            both[1, :, 0] = -20
+            rows = np.array([0, self.words.index("basin")])
+            return Found(rows, np.array([0.65, 0.6], np.float32), both, best)
         return Found(np.zeros(1, int), best[:1], mask, best)
 
 
@@ -105,8 +110,9 @@ def test_a_killed_segmentation_goes_on(capture: Path, tmp_path: Path) -> None:
     job, _ = begun(tmp_path / "run", capture)
     with pytest.raises(KeyboardInterrupt):
         make_masks(job, CONFIG)
-    best, threshold = read_scores(job.run.segmented / ".prompts-0.json")
-    assert (best["ivy"], threshold) == (pytest.approx(0.125), 0.3)
+    known = read_scores(job.run.segmented / ".prompts-0.json")
+    assert (known.best["ivy"], known.threshold) == (pytest.approx(0.125), 0.3)
+    assert known.shared == {"stone fountain=stone fountain": 2.0}
     Left.killed_after = None
     job, events = begun(tmp_path / "run", capture)
     make_masks(job, CONFIG)
@@ -162,14 +168,52 @@ def test_words_over_a_network_s_categories(
 def test_prompts_imply_the_segmenter_unless_another_source_is_named(tmp_path: Path) -> None:
     (tmp_path / "masks").mkdir()
     assert segmenter_kind(tmp_path, MasksConfig()) == "masks"
-    assert segmenter_kind(tmp_path, MasksConfig(prompts="ivy")) == "text"
+    assert segmenter_kind(tmp_path, MasksConfig(prompts="ivy")) == "masks"
+    assert segmenter_kind(tmp_path, MasksConfig(prompts="ivy", segmenter="text")) == "text"
+    assert segmenter_kind(tmp_path / "other", MasksConfig(prompts="ivy")) == "text"
     assert segmenter_kind(tmp_path, MasksConfig(prompts="ivy", model="n.onnx")) == "onnx"
 
 
-def test_words_over_given_label_images_are_refused(capture: Path, tmp_path: Path) -> None:
+def test_words_over_given_label_images(capture: Path, tmp_path: Path) -> None:
+    job, _ = begun(tmp_path / "plain", capture)
+    make_masks(job, MasksConfig())
+    plain = {view.name: job.masks[view] for view in job.scene.views}
+    Left.killed_after = 4
+    job, events = begun(tmp_path / "run", capture)
+    config = MasksConfig(prompts="stone fountain; ivy")
+    with pytest.raises(KeyboardInterrupt):
+        make_masks(job, config)
+    Left.killed_after = None
+    job, events = begun(tmp_path / "run", capture)
+    make_masks(job, config)
+    assert Left.calls == 6
+    (fountain,) = (i for i, name in job.taxonomy.names.items() if name == "stone fountain")
+    for view in job.scene.views:
+        left = np.arange(64) < 32
+        assert np.array_equal(job.masks[view], np.where(left, fountain, plain[view.name]))
+    assert any("prompt 'ivy': found in no photo" in line for line in warnings(events))
+    make_masks(job, config)
+    assert Left.calls == 6
+    with pytest.raises(RunError, match="--soft: given label images have no probabilities"):
+        make_masks(job, MasksConfig(prompts="ivy", soft=True))
+
+
+def test_a_word_for_a_given_category_is_that_one(capture: Path, tmp_path: Path) -> None:
     job, _ = begun(tmp_path / "run", capture)
-    with pytest.raises(RunError, match="--prompts: not over given label images"):
-        make_masks(job, MasksConfig(segmenter="masks", prompts="ivy"))
+    before = Taxonomy.read(capture / "masks" / "labels.json").names
+    label, name = next(iter(before.items()))
+    make_masks(job, MasksConfig(prompts=name))
+    assert (job.masks[job.scene.views[0]][:, :32] == label).all()
+    assert set(job.taxonomy.names) <= set(before)
+
+
+def test_two_words_for_the_same_masks_are_said(capture: Path, tmp_path: Path) -> None:
+    job, events = begun(tmp_path / "run", capture)
+    make_masks(job, MasksConfig(segmenter="text", prompts="stone fountain; ivy; basin; wooden bench"))
+    assert [line for line in warnings(events) if "the same for both" in line] == [
+        "prompts 'stone fountain' and 'basin': the network finds the same for both (their masks overlap by "
+        '97%); leave one of them, or add --labels.merge "basin=stone fountain"'
+    ]
 
 
 def test_times_are_told_as_people_tell_them(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,6 +4,7 @@ Everything that a script needs is here, and is loaded when it is first used: `im
 neither torch nor numba. The examples in `examples/` import from here alone.
 
     run_scene, open_run, FinishedRun           the whole pipeline; a finished run
+    apply_labels                               categories of a finished run, edited in the viewer
     RunConfig, SceneConfig, TrainConfig, NestConfig, PlanConfig    settings
     Event, StageDone, StageSkipped, Warned     what `run_scene` tells its caller
     load_scene, Scene, View, Camera            captures
@@ -45,16 +46,16 @@ if TYPE_CHECKING:
     from sagesplat.segment.masks import Taxonomy
     from sagesplat.segment.onnx import OnnxSegmenter
     from sagesplat.segment.select import select, select_mask
-    from sagesplat.stages.api import FinishedRun, open_run, run_scene
+    from sagesplat.stages.api import FinishedRun, apply_labels, open_run, run_scene
     from sagesplat.train.trainer import train as train_gaussians
 
 __all__ = [
     "Camera", "Event", "FinishedRun", "Gaussians", "HfSegmenter", "NestConfig", "OnnxSegmenter", "Plan",
     "PlanConfig", "Render", "RunConfig", "SageError", "Scene", "SceneConfig", "Splat", "StageDone",
-    "StageSkipped", "Taxonomy", "TrainConfig", "View", "ViewModel", "Warned", "label_image",
-    "load_scene", "open_run", "rasterize", "read_plans", "read_ply", "read_promises", "read_splat",
-    "read_spz", "run_scene", "select", "select_mask", "set_threads", "train_gaussians", "write_ply",
-    "write_spz",
+    "StageSkipped", "Taxonomy", "TrainConfig", "View", "ViewModel", "Warned", "apply_labels",
+    "label_image", "load_scene", "open_run", "rasterize", "read_plans", "read_ply", "read_promises",
+    "read_splat", "read_spz", "run_scene", "select", "select_mask", "set_threads", "train_gaussians",
+    "write_ply", "write_spz",
 ]  # fmt: skip
 
 # by module, below sagesplat
@@ -77,7 +78,7 @@ _EXPORTS = {
     "segment.masks": "Taxonomy",
     "segment.onnx": "OnnxSegmenter",
     "segment.select": "select select_mask",
-    "stages.api": "FinishedRun open_run run_scene",
+    "stages.api": "FinishedRun apply_labels open_run run_scene",
     "train.trainer": "train_gaussians",
 }
 _MODULE_OF = {name: module for module, names in _EXPORTS.items() for name in names.split()}

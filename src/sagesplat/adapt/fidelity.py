@@ -4,7 +4,7 @@ It needs no photo, so it can be measured at any number of viewpoints (`adapt.vie
 category are those that its Gaussians paint in the full model. In the full model itself it is 1.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from sagesplat.adapt.seen import Seen, seen_from
 from sagesplat.core.errors import DataError, short
 from sagesplat.io.files import atomic_path
 from sagesplat.io.npz import Npz
-from sagesplat.metrics.image import means_by_label, ssim_map
+from sagesplat.metrics.image import box_of, means_by_label, ssim_map, tiles_around
 from sagesplat.raster import Backend, Workspace, device_of, each_view
 from sagesplat.scene.scene import Camera, Scene, View
 
@@ -52,6 +52,7 @@ def measure_levels(
     ladder: Ladder,
     cameras: Sequence[Camera],
     *,
+    only: Collection[int] | None = None,
     backend: Backend = "auto",
     antialiased: bool = False,
     progress: Callable[[int, int], None] | None = None,
@@ -61,15 +62,16 @@ def measure_levels(
     Args:
         ladder: The levels.
         cameras: V viewpoints.
+        only: Ids of the categories to measure, by rendering the parts of images that show them; None: all.
         backend: Rasteriser; decides the device.
         antialiased: How the model was trained.
         progress: Called with (viewpoints measured, viewpoints in all).
 
     Returns:
-        fidelity [V, L, K] of the labels in ascending order, NaN where one is not in sight; pixels [V, L];
-        fidelity of the whole image [V, K].
+        fidelity [V, L, K] of the labels in ascending order, NaN where one is not in sight or not measured;
+        pixels [V, L]; fidelity of the whole image [V, K], NaN below the last level unless all are measured.
     """
-    references = References(ladder, backend, antialiased, keep=0)
+    references = References(ladder, backend, antialiased, keep=0, only=only)
     labels = references.labels
     found = np.full((len(cameras), len(labels), len(ladder.levels)), np.nan, np.float32)
     pixels = np.zeros(found.shape[:2], np.int32)
@@ -79,7 +81,7 @@ def measure_levels(
         camera = cameras[row]
         at = references.at(camera)
         pixels[row] = at.pixels
-        found[row, pixels[row] > 0, -1] = 1.0
+        found[row, (pixels[row] > 0) & references.wanted, -1] = 1.0
         for column, level in enumerate(ladder.levels[:-1]):
             of_level = dict.fromkeys(labels, level)
             found[row, :, column], whole[row, column] = references.compare(of_level, camera, at)
@@ -97,16 +99,17 @@ def measure_compositions(
     *,
     backend: Backend = "auto",
     antialiased: bool = False,
+    only: Collection[int] | None = None,
     progress: Callable[[int, int], None] | None = None,
     references: "References | None" = None,
 ) -> tuple[Float32[np.ndarray, "V J L+1"], Int32[np.ndarray, "V L"]]:
     """Measure the fidelity of each category in J compositions at each of V viewpoints.
 
     `planned`: level (1 to K) of each label, ascending by id. The result's last column is the whole image;
-    then come the pixels of each category. `references` are kept from call to call. The other arguments are
-    those of `measure_levels`.
+    then come the pixels of each category. `references` are kept from call to call, and decide what is wanted.
+    The other arguments are those of `measure_levels`.
     """
-    references = references or References(ladder, backend, antialiased)
+    references = references or References(ladder, backend, antialiased, only=only)
     labels = references.labels
     found = np.full((*planned.shape[:2], len(labels) + 1), np.nan, np.float32)
     pixels = np.zeros((len(cameras), len(labels)), np.int32)
@@ -137,6 +140,7 @@ class Reference:
     label_ids: Int16[np.ndarray, "H W"]
     pixels: Int32[np.ndarray, " L"]  # of each label, ascending
     levels: Seen | None  # None: those of the ladder
+    tile_mask: Bool[np.ndarray, "h w"] | None  # where wanted categories are; None: all are wanted
 
     @property
     def nbytes(self) -> int:
@@ -148,9 +152,17 @@ class Reference:
 class References:
     """Compares compositions with the full model; what a viewpoint needs is kept as far as memory allows."""
 
-    def __init__(self, ladder: Ladder, backend: Backend, antialiased: bool, keep: int = _KEEP):
-        """`antialiased`: how the model was trained; `keep`: bytes."""
+    def __init__(
+        self,
+        ladder: Ladder,
+        backend: Backend,
+        antialiased: bool,
+        keep: int = _KEEP,
+        only: Collection[int] | None = None,
+    ):
+        """`antialiased`: how the model was trained; `keep`: bytes; `only`: ids that are wanted, None: all."""
         self.labels = sorted({label for label, _ in ladder.counts})
+        self.wanted = np.array([only is None or label in only for label in self.labels])
         self._ladder, self._antialiased, self._left = ladder, antialiased, keep
         self._backend: Backend = backend
         full = ladder.load(ladder.levels[-1]).to(device_of(backend))
@@ -162,15 +174,19 @@ class References:
         key = camera.w2c.tobytes(), camera.K.tobytes(), camera.width, camera.height, camera.background
         if key in self._kept:
             return self._kept[key]
-        image, label_ids = self._painted.paint(camera)
+        label_ids = self._painted.render(camera)
         pixels = np.array([(label_ids == label).sum() for label in self.labels], np.int32)
+        tile_mask = None
+        if not self.wanted.all():
+            tile_mask = tiles_around(np.isin(label_ids, np.array(self.labels)[self.wanted]))
+        image = self._painted.paint(camera, tile_mask)
         levels: Seen | None = None
         if isinstance(self._ladder, PrefixLadder):
             levels = seen_from(
                 self._ladder, camera, backend=self._backend, antialiased=self._antialiased,
-                workspace=self._workspace,
+                workspace=self._workspace, tile_mask=tile_mask,
             )  # fmt: skip
-        found = Reference(image, label_ids, pixels, levels)
+        found = Reference(image, label_ids, pixels, levels, tile_mask)
         if found.nbytes <= self._left:
             self._left -= found.nbytes
             self._kept[key] = found
@@ -179,7 +195,11 @@ class References:
     def compare(
         self, levels: Mapping[int, int], camera: Camera, at: Reference
     ) -> tuple[Float32[np.ndarray, " L"], float]:
-        """Fidelity of a composition by label, NaN where one is not in sight, and of the whole image."""
+        """Fidelity of a composition by label, NaN where one is not in sight or not wanted, and of the whole
+        image, NaN unless all are wanted.
+        """
+        if at.tile_mask is not None and not at.tile_mask.any():
+            return np.full(len(self.labels), np.nan, np.float32), np.nan
         if at.levels:
             image = at.levels.render(levels)
         else:
@@ -187,10 +207,14 @@ class References:
                 self._ladder.compose(levels), camera, backend=self._backend, antialiased=self._antialiased,
                 workspace=self._workspace,
             )  # fmt: skip
-        quality = ssim_map(image, at.image)
-        means = means_by_label(quality, at.label_ids)
-        by_label = [means[label][0] if label in means else np.nan for label in self.labels]
-        return np.array(by_label, np.float32), float(quality.mean())
+        box = (slice(None), slice(None)) if at.tile_mask is None else box_of(at.tile_mask)
+        quality = ssim_map(image[box], at.image[box])
+        means = means_by_label(quality, at.label_ids[box])
+        by_label = [
+            means[label][0] if label in means and wanted else np.nan
+            for label, wanted in zip(self.labels, self.wanted, strict=True)
+        ]
+        return np.array(by_label, np.float32), float(quality.mean()) if at.tile_mask is None else np.nan
 
 
 def distances_at(

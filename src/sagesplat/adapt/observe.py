@@ -1,10 +1,10 @@
 """Observations: the quality of each category at each level, view by view."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -18,7 +18,15 @@ from sagesplat.core import geometry
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.columns import from_rows, read_columns, write_columns
 from sagesplat.metrics.color_correct import color_correct_affine
-from sagesplat.metrics.image import means_by_label, pasted, psnr, squared_error_map, ssim_map
+from sagesplat.metrics.image import (
+    box_of,
+    means_by_label,
+    pasted,
+    psnr,
+    squared_error_map,
+    ssim_map,
+    tiles_around,
+)
 from sagesplat.raster import Backend, Workspace, device_of, each_view, most_painted, rasterize
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene, View
@@ -122,11 +130,12 @@ def render_rgb(
     backend: Backend,
     antialiased: bool,
     workspace: Workspace | None = None,
+    tile_mask: Bool[np.ndarray, "h w"] | None = None,
 ) -> Float32[np.ndarray, "H W 3"]:
     """An image in [0, 1], as quality is measured on it; calls may share a `workspace`, images do not."""
+    how = {"backend": backend, "antialiased": antialiased, "workspace": workspace}
     with torch.no_grad():
-        g = g.to(device_of(backend))
-        render = rasterize(g, camera, backend=backend, antialiased=antialiased, workspace=workspace)
+        render = rasterize(g.to(device_of(backend)), camera, tile_mask=tile_mask, **how)
         return render.rgb.clamp(0, 1).float().cpu().numpy()
 
 
@@ -154,17 +163,23 @@ class RenderedLabels:
             self._kept[view.name] = self.render(view.camera)
         return self._kept[view.name]
 
-    def render(self, camera: Camera) -> Int16[np.ndarray, "H W"]:
-        """The same at any camera."""
-        return self.paint(camera)[1]
-
-    def paint(self, camera: Camera) -> tuple[Float32[np.ndarray, "H W 3"], Int16[np.ndarray, "H W"]]:
-        """An image as of `render_rgb`, and the label image, in one pass."""
+    def render(
+        self, camera: Camera, tile_mask: Bool[np.ndarray, "h w"] | None = None
+    ) -> Int16[np.ndarray, "H W"]:
+        """The same at any camera; -1 in tiles of 16 x 16 px that are masked."""
         ids, columns = self._columns
         g = self.gaussians.to(device_of(self.backend))
-        how = {"antialiased": self.antialiased, "backend": self.backend, "workspace": self._workspace}
-        image = render_rgb(g, camera, **how)
-        return image, ids[most_painted(g, camera, columns, len(ids), **how)]
+        return ids[most_painted(g, camera, columns, len(ids), tile_mask=tile_mask, **self._how)]
+
+    def paint(
+        self, camera: Camera, tile_mask: Bool[np.ndarray, "h w"] | None = None
+    ) -> Float32[np.ndarray, "H W 3"]:
+        """An image of the Gaussians, as of `render_rgb`."""
+        return render_rgb(self.gaussians, camera, tile_mask=tile_mask, **self._how)
+
+    @property
+    def _how(self) -> dict[str, Any]:
+        return {"antialiased": self.antialiased, "backend": self.backend, "workspace": self._workspace}
 
     @cached_property
     def _columns(self) -> tuple[Int16[np.ndarray, " L"], Tensor]:
@@ -197,14 +212,21 @@ def measure(
     label_ids: Int16[np.ndarray, "H W"],
     inner_ids: Int16[np.ndarray, "H W"] | None = None,
     valid: Bool[np.ndarray, "H W"] | None = None,
+    tile_mask: Bool[np.ndarray, "h w"] | None = None,
 ) -> dict[int, dict[str, float]]:
     """SSIM, eroded SSIM, PSNR and pixels by label id, and under TOTAL those of the whole image.
 
     `inner_ids`: the eroded label image, where it is at hand. `valid`: the pixels that count; windows of SSIM
-    that reach into others see the image there, and not the photo.
+    that reach into others see the image there, and not the photo. `tile_mask`: what was rendered, as
+    `tiles_around` has it for the labels that are wanted; values of others then mean nothing.
     """
+    inner_ids = erode(label_ids) if inner_ids is None else inner_ids
+    if tile_mask is not None:
+        box = box_of(tile_mask)
+        valid = None if valid is None else valid[box]
+        image, photo, label_ids, inner_ids = image[box], photo[box], label_ids[box], inner_ids[box]
     quality, error = _maps(image, photo, valid)
-    inner = means_by_label(quality, erode(label_ids) if inner_ids is None else inner_ids, valid)
+    inner = means_by_label(quality, inner_ids, valid)
     errors = means_by_label(error, label_ids, valid)
     rows = {
         label: {
@@ -270,6 +292,7 @@ def observe(
     *,
     views: Sequence[int] | None = None,
     valid: ValidPixels = ALL_VALID,
+    labels: Collection[int] | None = None,
     backend: Backend = "auto",
     antialiased: bool = False,
     progress: Callable[[int, int], None] | None = None,
@@ -287,12 +310,15 @@ def observe(
         distances: d_min by label id, float32 [V] in world units (`distances_in_views`); NaN: not in sight.
         views: Rows of `scene.views`; None: all. Those without a pixel that counts are left out.
         valid: The pixels that count.
+        labels: Ids of the categories to measure: only the parts of images that show them are rendered, and
+            views without them are not. None: all, and the full image.
         backend: Rasteriser; decides the device.
         antialiased: How the model was trained.
         progress: Called with (images measured, images in all).
 
     Returns:
-        One row per (category, level, view), and one for the full image with label id `TOTAL`.
+        One row per (category, level, view), and with all categories one for the full image with label id
+        `TOTAL`.
 
     Example:
         >>> from sagesplat import open_run
@@ -303,19 +329,24 @@ def observe(
     """
     rows: list[dict[str, float]] = []
     views = valid.rows(scene, range(len(scene.views)) if views is None else views)
-    inner = {row: erode(masks[scene.views[row]]) for row in views}
-    done, total = 0, len(ladder.levels) * len(views)
+    tiles: dict[int, np.ndarray | None] = dict.fromkeys(views)
+    if labels is not None:
+        shown = {row: np.isin(masks[scene.views[row]], list(labels)) for row in views}
+        tiles = {row: tiles_around(mine) for row, mine in shown.items() if mine.any()}
+    inner = {row: erode(masks[scene.views[row]]) for row in tiles}
+    done, total = 0, len(ladder.levels) * len(tiles)
 
     def compare(level: int, row: int, image: Float32[np.ndarray, "H W 3"]) -> list[dict[str, float]]:
         view = scene.views[row]
-        found = measure(image, as_unit(photos[row]), masks[view], inner[row], valid[view])
+        found = measure(image, as_unit(photos[row]), masks[view], inner[row], valid[view], tiles[row])
         of_level = {"level": level, "view": row}
         return [
             {"label_id": label, **of_level, "distance": _at(distances, label, row), **values}
             for label, values in found.items()
+            if labels is None or label in labels
         ]
 
-    for images, found in _each_image(compare, ladder, scene, views, backend, antialiased):
+    for images, found in _each_image(compare, ladder, scene, tiles, backend, antialiased):
         rows += found
         done += images
         if progress:
@@ -332,22 +363,26 @@ def _each_image(
     compare: Callable[[int, int, np.ndarray], list[dict[str, float]]],
     ladder: Ladder,
     scene: Scene,
-    views: Sequence[int],
+    views: Mapping[int, np.ndarray | None],
     backend: Backend,
     antialiased: bool,
 ) -> Iterator[tuple[int, list[dict[str, float]]]]:
     """Call `compare` with level, view and image: view by view where levels share Gaussians, else level by
     level. Yields how many images there were, and what was returned.
+
+    `views`: by row the tiles that are wanted at least; None: all.
     """
     how = {"backend": backend, "antialiased": antialiased, "workspace": Workspace()}
     if isinstance(ladder, PrefixLadder):
 
         def in_view(row: int) -> list[dict[str, float]]:
-            seen = seen_from(ladder, scene.views[row].camera, **how)
+            seen = seen_from(ladder, scene.views[row].camera, tile_mask=views[row], **how)
             images = ((level, seen.render(dict.fromkeys(ladder.sizes, level))) for level in ladder.levels)
             return [found for level, image in images for found in compare(level, row, image)]
 
-        yield from ((len(ladder.levels), found) for found in each_view(in_view, views, device_of(backend)))
+        yield from (
+            (len(ladder.levels), found) for found in each_view(in_view, list(views), device_of(backend))
+        )
         return
     for level in ladder.levels:
         g = ladder.load(level).to(device_of(backend))
@@ -355,7 +390,7 @@ def _each_image(
         def at_level(row: int, level: int = level, g: Gaussians = g) -> list[dict[str, float]]:
             return compare(level, row, render_rgb(g, scene.views[row].camera, **how))
 
-        yield from ((1, found) for found in each_view(at_level, views, device_of(backend)))
+        yield from ((1, found) for found in each_view(at_level, list(views), device_of(backend)))
 
 
 def merge(parts: Sequence[Observations]) -> Observations:

@@ -116,18 +116,21 @@ def _means(values: np.ndarray, weights: np.ndarray, group: np.ndarray, n: int) -
 def regrouped_samples(
     sampled: SampledFidelity, moved: Mapping[int, int | None], distance: np.ndarray, labels: Sequence[int]
 ) -> SampledFidelity:
-    """Sampled fidelity of merged categories, weighted by pixels. None of the old ones may be split.
+    """Sampled fidelity of merged categories, weighted by pixels; NaN for those that `moved` is None of.
 
     Exact but for pixels at borders: in the label image of the full model two parts together can paint most of
     a pixel that neither painted most of.
 
-    `distance`: d_min of the new categories `labels` (ascending) at the viewpoints, [V, L].
+    `moved`: by old id the new one; None for one that was split. `distance`: d_min of the new categories
+    `labels` (ascending) at the viewpoints, [V, L].
     """
     V, _, K = sampled.fidelity.shape
     total = np.zeros((V, len(labels), K))
     pixels = np.zeros((V, len(labels)), np.int64)
     for column, old in enumerate(sampled.labels):
-        at = labels.index(moved[old])
+        if (to := moved[old]) is None:
+            continue
+        at = labels.index(to)
         mine = sampled.pixels[:, column]
         pixels[:, at] += mine
         total[:, at] += (

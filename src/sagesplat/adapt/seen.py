@@ -6,7 +6,7 @@ from typing import Protocol
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32
 
 from sagesplat.adapt.ladder import PrefixLadder, composed
 from sagesplat.adapt.seen_cpu import Drawn, drawn_from
@@ -70,6 +70,7 @@ class SeenLevels:
     camera: Camera
     backend: Backend
     antialiased: bool
+    tile_mask: Bool[np.ndarray, "h w"] | None = None  # the others show the background; None: all are drawn
 
     @property
     def nbytes(self) -> int:
@@ -82,29 +83,43 @@ class SeenLevels:
 
     def render(self, levels: Mapping[int, int]) -> Float32[np.ndarray, "H W 3"]:
         """See `Seen`."""
-        how = {"antialiased": self.antialiased, "backend": self.backend}
+        how = {"antialiased": self.antialiased, "backend": self.backend, "tile_mask": self.tile_mask}
         with torch.no_grad():
             return rasterize(self.compose(levels), self.camera, **how).rgb.clamp(0, 1).float().cpu().numpy()
 
 
 def seen_from(
-    ladder: PrefixLadder, camera: Camera, *, backend: Backend, antialiased: bool, workspace: Workspace
+    ladder: PrefixLadder,
+    camera: Camera,
+    *,
+    backend: Backend,
+    antialiased: bool,
+    workspace: Workspace,
+    tile_mask: Bool[np.ndarray, "h w"] | None = None,
 ) -> Seen:
     """The levels of a ladder as `camera` sees them; `antialiased`: how the model was trained.
 
-    On a CPU all that have the same workspace render into the same memory.
+    On a CPU all that have the same workspace render into the same memory. `tile_mask`: tiles of 16 x 16 px
+    that images are wanted in.
     """
-    found = seen_levels(ladder, camera, backend=backend, antialiased=antialiased, workspace=workspace)
+    how = {"backend": backend, "antialiased": antialiased, "workspace": workspace, "tile_mask": tile_mask}
+    found = seen_levels(ladder, camera, **how)
     if backend not in ("auto", "cpu") or camera.exposure is not None or not len(found.gaussians):
         return found
     weights = found.second.weights if found.second else {k: (0.0,) * len(v) for k, v in found.ranges.items()}
     second = found.second.logits if found.second else None
-    drawn = drawn_from(found.gaussians, second, weights, camera, antialiased, workspace)
+    drawn = drawn_from(found.gaussians, second, weights, camera, antialiased, workspace, tile_mask)
     return SeenRecords(drawn, found.ranges)
 
 
 def seen_levels(
-    ladder: PrefixLadder, camera: Camera, *, backend: Backend, antialiased: bool, workspace: Workspace
+    ladder: PrefixLadder,
+    camera: Camera,
+    *,
+    backend: Backend,
+    antialiased: bool,
+    workspace: Workspace,
+    tile_mask: Bool[np.ndarray, "h w"] | None = None,
 ) -> SeenLevels:
     """The same as Gaussians, on any device."""
     device = device_of(backend)
@@ -113,7 +128,8 @@ def seen_levels(
     if second is not None:
         second = SecondOpacities(second.logits.to(device), second.weights)
         most = replace(g, logit_opacities=g.logit_opacities.maximum(second.logits))
-    seen = in_sight(most, camera, antialiased=antialiased, backend=backend, workspace=workspace)
+    how = {"antialiased": antialiased, "backend": backend, "workspace": workspace}
+    seen = in_sight(most, camera, tile_mask=tile_mask, **how)
     before = np.concatenate([[0], seen.cpu().numpy().cumsum()])
     ranges = {
         label: tuple((int(before[first]), int(before[last])) for first, last in of_level)
@@ -121,7 +137,9 @@ def seen_levels(
     }
     rows = torch.nonzero(seen)[:, 0]
     second = second.select(rows) if second else None
-    return SeenLevels(_as_seen(g.select(rows), camera), second, ranges, camera, backend, antialiased)
+    return SeenLevels(
+        _as_seen(g.select(rows), camera), second, ranges, camera, backend, antialiased, tile_mask
+    )
 
 
 def _as_seen(g: Gaussians, camera: Camera) -> Gaussians:

@@ -4,13 +4,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32
 from numba import prange
 from torch import Tensor
 
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.kernels.jit import njit
 from sagesplat.kernels.planes import padded, to_image
+from sagesplat.metrics.ssim_cpu import all_tiles
 from sagesplat.raster import Workspace, blend, cpu, tiles
 from sagesplat.raster.render import ALPHA_MIN
 from sagesplat.scene.scene import Camera
@@ -31,6 +32,7 @@ class Drawn:
     weights: Mapping[int, Sequence[float]]  # of the second opacity, by label id and level
     camera: Camera
     workspace: Workspace
+    tile_mask: Bool[np.ndarray, "h w"] | None = None  # the others show the background; None: all are drawn
 
     @property
     def nbytes(self) -> int:
@@ -57,8 +59,8 @@ class Drawn:
                 records[to], depths[to], radii[to], width, height,
             )  # fmt: skip
             at = to.stop
-        every = np.ones(-(-width // tiles.TILE) * -(-height // tiles.TILE), bool)
-        found = tiles.intersect(records, depths, radii, width, height, every, self.workspace)
+        drawn = all_tiles(height, width) if self.tile_mask is None else self.tile_mask
+        found = tiles.intersect(records, depths, radii, width, height, drawn.ravel(), self.workspace)
         image, left = take("image 0", 3, height, padded(width)), take("left", height, padded(width))
         ends = np.empty(len(found.starts) - 1, np.int64)
         behind = np.array(camera.background, np.float32) / 255
@@ -75,6 +77,7 @@ def drawn_from(
     camera: Camera,
     antialiased: bool,
     workspace: Workspace,
+    tile_mask: Bool[np.ndarray, "h w"] | None = None,
 ) -> Drawn:
     """Gaussians without harmonics that `camera` sees, with their `second` opacities (logits [N]), if any."""
     first = g.logit_opacities
@@ -88,7 +91,7 @@ def drawn_from(
     opacities = 1 / (1 + np.exp(-most.double().numpy()))
     depths = g.means.double().numpy() @ camera.w2c[2, :3].astype(np.float64) + np.float64(camera.w2c[2, 3])
     filtered = (records[:, 5] - np.log2(opacities)).astype(np.float32)
-    return Drawn(records, depths.astype(np.float32), logits, filtered, weights, camera, workspace)
+    return Drawn(records, depths.astype(np.float32), logits, filtered, weights, camera, workspace, tile_mask)
 
 
 @njit(parallel=True, error_model="numpy", cache=True)

@@ -57,11 +57,11 @@ class MasksConfig:
 
     segmenter: Literal["auto", "masks", "hf", "onnx", "deeplabv2", "text"] = "auto"
     """Source of the label images. masks: image files; hf: a network of Hugging Face; onnx: a network in ONNX
-    format; deeplabv2: the network of the paper; text: networks that find --prompts; auto: text with
-    --prompts, else masks if the capture has them, else by the suffix of --model."""
+    format; deeplabv2: the network of the paper; text: networks that find --prompts; auto: masks if the
+    capture has them, else text with --prompts, else by the suffix of --model."""
     prompts: str = ""
-    """Categories in your own words, e.g. "stone fountain; ivy; wooden bench". With --segmenter hf, onnx or
-    deeplabv2 they are painted over the categories of that network."""
+    """Categories in your own words, e.g. "stone fountain; ivy; wooden bench". With --segmenter hf, onnx,
+    deeplabv2 or masks they are painted over the categories of that network or of the label images."""
     masks: Path | None = None
     """Folder of label images (default: SCENE/masks)."""
     model: str | None = None

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Int, UInt8
+from scipy.ndimage import maximum_filter
 from torch import Tensor
 
 from sagesplat.kernels.planes import to_image, to_planes
@@ -67,6 +68,24 @@ def ssim_map(
     values = np.zeros_like(one)
     _maps(one, other, width, tile_mask, space, values)
     return values[..., :width].mean(0)
+
+
+def tiles_around(shown: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "h w"]:
+    """The tiles of 16 x 16 pixels that SSIM of the `shown` pixels depends on: those within its window."""
+    height, width = shown.shape
+    rows, columns = ssim_cpu.all_tiles(height, width).shape
+    near = np.zeros((rows * ssim_cpu.TILE, columns * ssim_cpu.TILE), bool)
+    near[:height, :width] = maximum_filter(shown, 2 * ssim_cpu.RADIUS + 1)
+    return np.asarray(near.reshape(rows, ssim_cpu.TILE, columns, ssim_cpu.TILE).any((1, 3)))
+
+
+def box_of(tile_mask: Bool[np.ndarray, "h w"]) -> tuple[slice, slice]:
+    """Rows and columns of pixels from the first to the last of some tiles; there is at least one."""
+    spans = []
+    for axis in (1, 0):
+        there = np.flatnonzero(tile_mask.any(axis)) * ssim_cpu.TILE
+        spans.append(slice(int(there[0]), int(there[-1]) + ssim_cpu.TILE))
+    return spans[0], spans[1]
 
 
 def squared_error_map(

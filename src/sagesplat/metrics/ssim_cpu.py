@@ -12,15 +12,15 @@ from sagesplat.kernels.simd import LANES, load, load8, maximum, splat, splat8, s
 
 WINDOW = 11
 TILE = 16  # columns and rows of what a mask of tiles takes together
-_RADIUS = WINDOW // 2
+RADIUS = WINDOW // 2
 _CHUNK = 64  # columns that are blurred at a time: what is needed of them fits into the nearest cache
 _MARGIN = 8  # columns on either side
-_ROWS, _LINE = TILE + 2 * _RADIUS, _CHUNK + 2 * _MARGIN
+_ROWS, _LINE = TILE + 2 * RADIUS, _CHUNK + 2 * _MARGIN
 _PATCH = _ROWS * _LINE  # floats of a plane that the blurs of a chunk take
 _F = np.float32
 _C1, _C2, _ONE, _TWO, _ZERO = _F(0.01**2), _F(0.03**2), _F(1), _F(2), _F(0)
-_taps = np.exp(-((np.arange(WINDOW) - _RADIUS) ** 2) / (2 * 1.5**2))
-_K0, _K1, _K2, _K3, _K4, _K5 = (_F(t) for t in (_taps / _taps.sum())[: _RADIUS + 1])
+_taps = np.exp(-((np.arange(WINDOW) - RADIUS) ** 2) / (2 * 1.5**2))
+_K0, _K1, _K2, _K3, _K4, _K5 = (_F(t) for t in (_taps / _taps.sum())[: RADIUS + 1])
 _COLUMNS = np.arange(LANES, dtype=np.float32)
 
 
@@ -44,7 +44,7 @@ def covered(tiles: np.ndarray, height: int, width: int) -> float:
 @njit(forceinline=True, cache=True)
 def _blur(values, at, step=1):
     """Window over neighbours of `step`, of the vector at values[at]."""
-    first = at - _RADIUS * step
+    first = at - RADIUS * step
     return (
         (load(values, first) + load(values, first + 10 * step)) * _K0
         + (load(values, first + step) + load(values, first + 9 * step)) * _K1
@@ -94,7 +94,7 @@ def _take(values, hidden, tiles, start, strip, left, height, wide, patch, to):
     Tiles that do not count are taken from the plane `hidden`.
     """
     for r in range(_ROWS):
-        row = strip * TILE - _RADIUS + r
+        row = strip * TILE - RADIUS + r
         for c in range(0, _LINE, _MARGIN):
             w, piece = left - _MARGIN + c, splat8(_ZERO)
             if 0 <= row < height and 0 <= w < wide:
@@ -124,7 +124,7 @@ def compare(x, y, tiles, width, ssim, derivatives, sums):
                 _take(y, y, tiles, start, strip, left, height, wide, area, _PATCH)
             for r in range(min(TILE, height - strip * TILE)):
                 for c in range(0, _LINE if some else 0, LANES):
-                    mx, my, squares, product = _four_blurs(area, (r + _RADIUS) * _LINE + c)
+                    mx, my, squares, product = _four_blurs(area, (r + RADIUS) * _LINE + c)
                     store(rows, c, mx)
                     store(rows, _LINE + c, my)
                     store(rows, 2 * _LINE + c, squares)
@@ -169,7 +169,7 @@ def gradient(x, y, tiles, derivatives, scale, l1_scale, out, sums):
             for r in range(min(TILE, height - strip * TILE)):
                 for k in range(3 if some else 0):
                     for c in range(0, _LINE, LANES):
-                        down = _blur(area, k * _PATCH + (r + _RADIUS) * _LINE + c, _LINE)
+                        down = _blur(area, k * _PATCH + (r + RADIUS) * _LINE + c, _LINE)
                         store(rows, k * _LINE + c, down)
                 error, first = splat(_ZERO), start + (strip * TILE + r) * wide + left
                 for c in range(0, min(_CHUNK, wide - left), LANES):

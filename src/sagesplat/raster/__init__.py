@@ -189,14 +189,18 @@ def in_sight(
     camera: Camera,
     *,
     antialiased: bool = False,
+    tile_mask: Bool[np.ndarray, "tiles_y tiles_x"] | None = None,
     backend: Backend = "auto",
     workspace: Workspace | None = None,
 ) -> Bool[Tensor, " N"]:
-    """Whether each Gaussian is drawn in a view, hidden behind others or not. Arguments as of `rasterize`."""
+    """Whether each Gaussian is drawn in a view, hidden behind others or not. Arguments as of `rasterize`.
+
+    With a `tile_mask` those that reach none of its tiles may be said not to be.
+    """
     if resolve_backend(backend) == "cpu":
         from sagesplat.raster import cpu
 
-        radii = cpu.radii_of(gaussians, camera, antialiased, workspace or Workspace())
+        radii = cpu.radii_of(gaussians, camera, antialiased, workspace or Workspace(), tile_mask)
         return torch.from_numpy(radii > 0)
     with torch.no_grad():
         return rasterize(gaussians, camera, sh_degree=0, antialiased=antialiased, backend=backend).radii > 0
@@ -209,24 +213,27 @@ def most_painted(
     num_columns: int,
     *,
     antialiased: bool = False,
+    tile_mask: Bool[np.ndarray, "tiles_y tiles_x"] | None = None,
     backend: Backend = "auto",
     workspace: Workspace | None = None,
 ) -> Int64[np.ndarray, "H W"]:
     """Which column's Gaussians paint most of each pixel, as by their blending weights.
 
-    What shines through between them counts for column 0. `columns_of`: of each Gaussian, 0 to
-    `num_columns` - 1. The other arguments are those of `rasterize`.
+    What shines through between them counts for column 0, and so does all of a tile that is masked.
+    `columns_of`: of each Gaussian, 0 to `num_columns` - 1. The other arguments are those of `rasterize`.
     """
     if resolve_backend(backend) == "cpu":
         from sagesplat.raster import cpu
 
         space = workspace or Workspace()
-        return cpu.most_painted(gaussians, camera, columns_of.numpy(), num_columns, antialiased, space)
+        columns = columns_of.numpy()
+        return cpu.most_painted(gaussians, camera, columns, num_columns, antialiased, space, tile_mask)
     one_hot = torch.nn.functional.one_hot(columns_of.long(), num_columns).float()
     with torch.no_grad():
         render = rasterize(
-            gaussians, camera, features=one_hot, sh_degree=0, antialiased=antialiased, backend=backend
-        )
+            gaussians, camera,
+            features=one_hot, sh_degree=0, antialiased=antialiased, tile_mask=tile_mask, backend=backend,
+        )  # fmt: skip
     assert render.features is not None
     painted = render.features.float().cpu().numpy().copy()
     painted[..., 0] += 1 - render.alpha.float().cpu().numpy()

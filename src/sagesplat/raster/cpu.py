@@ -263,20 +263,31 @@ def render(
     return Render(rgb, alpha, None if features is None else painted, means2d, radii)
 
 
-def radii_of(g: Gaussians, camera: Camera, antialiased: bool, workspace: Workspace) -> np.ndarray:
+def radii_of(
+    g: Gaussians,
+    camera: Camera,
+    antialiased: bool,
+    workspace: Workspace,
+    tile_mask: np.ndarray | None = None,
+) -> np.ndarray:
     """Radii [N] px, as `Render` has them; they hold until the next call with the same `workspace`."""
-    options = _Options(camera, 0, antialiased, None, workspace)
+    options = _Options(camera, 0, antialiased, tile_mask, workspace)
     return _project(options, _arrays([getattr(g, name) for name in PARAMETERS]))[2]
 
 
 def intersections(
-    g: Gaussians, camera: Camera, workspace: Workspace, *, antialiased: bool = False
+    g: Gaussians,
+    camera: Camera,
+    workspace: Workspace,
+    *,
+    antialiased: bool = False,
+    tile_mask: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, tiles.Intersections]:
     """What the blending kernels take of a view: records [N, 11] (see `blend`), radii [N] px, tile lists.
 
     All three hold until the next call with the same `workspace`. Raises `DataError` for NaN or Inf.
     """
-    options = _Options(camera, 0, antialiased, None, workspace)
+    options = _Options(camera, 0, antialiased, tile_mask, workspace)
     records, depths, radii = _project(options, _arrays([getattr(g, name) for name in PARAMETERS]))
     return records, radii, _intersections(options, records, depths, radii)
 
@@ -288,9 +299,10 @@ def most_painted(
     num_columns: int,
     antialiased: bool,
     space: Workspace,
+    tile_mask: np.ndarray | None = None,
 ) -> np.ndarray:
     """See `sagesplat.raster.most_painted`."""
-    records, _, found = intersections(g, camera, space, antialiased=antialiased)
+    records, _, found = intersections(g, camera, space, antialiased=antialiased, tile_mask=tile_mask)
     out = np.zeros((camera.height, camera.width), np.int64)
     weights.most(
         records, found.starts, found.ids, found.row_order, camera.width, camera.height,

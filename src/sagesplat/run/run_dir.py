@@ -13,6 +13,7 @@ _BEFORE_LADDERS = (
     "adopt",
     "poses",
     "scene",
+    "given",
     "segment",
     "masks",
     "lift",
@@ -138,6 +139,11 @@ class RunDir:
     def segmented(self) -> Path:
         """Label images as they came, before categories were merged or left out."""
         return self.path / "segmented"
+
+    @property
+    def given(self) -> Path:
+        """Label images that were given, where prompts are painted over them."""
+        return self.path / "given"
 
     @property
     def segmentation(self) -> Path:

@@ -98,6 +98,15 @@ def segmented(found: Found, label_ids: Sequence[int], threshold: float, size: tu
     return Segmented(ids[winner], planes, names, instances)
 
 
+def shared_areas(found: Found, prompts: int) -> Float32[np.ndarray, "P P"]:
+    """The share of the photo that the masks of two prompts have in common, and of one with itself."""
+    pixels = np.zeros((prompts, *found.masks.shape[1:]), bool)
+    for prompt, mask in zip(found.prompts.tolist(), found.masks, strict=True):
+        pixels[prompt] |= mask > 0
+    flat = pixels.reshape(prompts, -1).astype(np.float32)
+    return flat @ flat.T / max(flat.shape[1], 1)
+
+
 def _planes(
     found: Found, sure: Float32[np.ndarray, " N"], label_ids: Sequence[int]
 ) -> tuple[Int16[np.ndarray, " C"], Float32[np.ndarray, "C h w"]]:

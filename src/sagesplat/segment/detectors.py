@@ -2,8 +2,9 @@
 
 import re
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -20,44 +21,33 @@ _MOST = 300  # boxes of a photo, those with the highest scores
 DETECTORS = {"grounding-dino": 0.3, "mm-grounding-dino": 0.3, "owlv2": 0.2}  # family: usual threshold
 
 
-class _Detector:
-    """What detectors share: a network, its image processor and tokenizer, and the words that it looks for."""
+class Scorer(Protocol):
+    """A network that looks for the words that it was made for."""
 
-    def __init__(
-        self,
-        folder: Path,
-        name: str,
-        config: Any,
-        device: torch.device,
-        words: Sequence[str],
-        warn: Callable[[str], None],
-    ):
-        self.name, self._device, self._words = name, device, words
-        self._processor, self._tokenizer = load_image_processor(folder), load_tokenizer(folder)
-        kind = package("transformers").AutoModelForZeroShotObjectDetection
-        self._model = load_model(kind, folder, name, config).to(device).eval()
-        self._prepare(config, warn)
-
-    def _prepare(self, config: Any, warn: Callable[[str], None]) -> None:
-        """Make tokens of the words."""
-        raise NotImplementedError
-
-    def _detect(self, inputs: Any) -> tuple[Float32[Tensor, "Q P"], Float32[Tensor, "Q 4"]]:
+    def __call__(self, inputs: Any, /) -> tuple[Float32[Tensor, "Q P"], Float32[Tensor, "Q 4"]]:
         """Scores for each prompt; boxes as centre, width and height, as parts of the network's input."""
-        raise NotImplementedError
+        ...
 
-    def _extent(self, width: int, height: int) -> tuple[int, int]:
-        """Width and height, pixels of the photo, of what boxes are parts of."""
-        return width, height
+
+@dataclass(frozen=True, eq=False)
+class Detector:
+    """A network with its image processor: finds boxes in photos."""
+
+    name: str
+    device: torch.device
+    processor: Any
+    score: Scorer
+    pads: bool  # photos to a square, which boxes are then parts of
 
     @torch.inference_mode()
     def __call__(self, photo: UInt8[np.ndarray, "H W 3"], threshold: float) -> Boxes:
+        """The boxes with a score of at least the threshold."""
         height, width = photo.shape[:2]
-        scores, parts = self._detect(prepared(self._processor, photo, self.name).to(self._device))
+        scores, parts = self.score(prepared(self.processor, photo, self.name).to(self.device))
         scores, parts = finite(scores, self.name), finite(parts, self.name)
-        best = scores.max(0)
+        best, side = scores.max(0), max(width, height)
         corners = np.concatenate([parts[:, :2] - parts[:, 2:] / 2, parts[:, :2] + parts[:, 2:] / 2], 1)
-        corners = corners * np.tile(np.array(self._extent(width, height), np.float32), 2)
+        corners = corners * np.tile(np.array([side, side] if self.pads else [width, height], np.float32), 2)
         corners = corners.clip(0, np.array([width, height, width, height], np.float32))
         extended = np.all(corners[:, 2:] > corners[:, :2], axis=1)
         boxes, prompts = np.nonzero((scores >= threshold) & extended[:, None])
@@ -66,31 +56,34 @@ class _Detector:
         return without_duplicates(Boxes(prompts[order], reached[order], corners[boxes[order]], best))
 
 
-class GroundingDino(_Detector):
+class GroundingDino:
     """Grounding DINO (Liu et al. 2023, arXiv:2303.05499): all prompts are one text, with "." between them.
 
     As in its authors' evaluation, the score of a prompt is the mean of those of its tokens. Prompts that do
     not fit into one text are looked for in several passes.
     """
 
-    def _prepare(self, config: Any, warn: Callable[[str], None]) -> None:
-        find = self._tokenizer.convert_tokens_to_ids
+    def __init__(
+        self, model: Any, tokenizer: Any, words: Sequence[str], name: str, warn: Callable[[str], None]
+    ):
+        self.model = model
+        find = tokenizer.convert_tokens_to_ids
         self._begin, self._end, self._stop, _ = separators = [find(token) for token in _SEPARATORS]
-        self._longest, unknown = config.max_text_len, self._tokenizer.unk_token_id
-        self._tokens = []
-        for words in self._words:
-            plain = re.sub(r"[.?]+", " ", words.lower())
-            tokens = self._tokenizer(plain, add_special_tokens=False)["input_ids"]
+        self._longest, unknown = model.config.max_text_len, tokenizer.unk_token_id
+        self.tokens = []
+        for each in words:
+            plain = re.sub(r"[.?]+", " ", each.lower())
+            tokens = tokenizer(plain, add_special_tokens=False)["input_ids"]
             tokens = [token for token in tokens if token not in separators]
             if all(token == unknown for token in tokens):
-                warn(f"{self.name}: knows none of the words of {words!r}; it was trained on English")
-            self._tokens.append(fitting(tokens, self._longest - 3, words, self.name, warn))
+                warn(f"{name}: knows none of the words of {each!r}; it was trained on English")
+            self.tokens.append(fitting(tokens, self._longest - 3, each, name, warn))
 
-    def _passes(self) -> Iterator[list[int]]:
+    def passes(self) -> Iterator[list[int]]:
         """Rows of the prompts of each text."""
         rows: list[int] = []
         length = 2
-        for row, tokens in enumerate(self._tokens):
+        for row, tokens in enumerate(self.tokens):
             if length + len(tokens) + 1 > self._longest:
                 yield rows
                 rows, length = [], 2
@@ -98,40 +91,41 @@ class GroundingDino(_Detector):
             length += len(tokens) + 1
         yield rows
 
-    def _detect(self, inputs: Any) -> tuple[Float32[Tensor, "Q P"], Float32[Tensor, "Q 4"]]:
+    def __call__(self, inputs: Any, /) -> tuple[Float32[Tensor, "Q P"], Float32[Tensor, "Q 4"]]:
+        """See `Scorer`."""
         scores, boxes = [], []
-        for rows in self._passes():
+        for rows in self.passes():
             ids, spans = [self._begin], []
             for row in rows:
-                spans.append(slice(len(ids), len(ids) + len(self._tokens[row])))
-                ids += [*self._tokens[row], self._stop]
-            text = torch.tensor([[*ids, self._end]], device=self._device)
-            output = self._model(
+                spans.append(slice(len(ids), len(ids) + len(self.tokens[row])))
+                ids += [*self.tokens[row], self._stop]
+            text = torch.tensor([[*ids, self._end]], device=self.model.device)
+            output = self.model(
                 **inputs, input_ids=text, token_type_ids=torch.zeros_like(text),
                 attention_mask=torch.ones_like(text),
             )  # fmt: skip
             found = output.logits[0].sigmoid()
-            here = torch.zeros(len(found), len(self._words), device=found.device)
+            here = torch.zeros(len(found), len(self.tokens), device=found.device)
             here[:, rows] = torch.stack([found[:, span].mean(1) for span in spans], 1)
             scores.append(here)
             boxes.append(output.pred_boxes[0])
         return torch.cat(scores), torch.cat(boxes)
 
 
-class Owlv2(_Detector):
+class Owlv2:
     """OWLv2 (Minderer et al. 2023, arXiv:2306.09683): each prompt is a query of its own."""
 
-    def _prepare(self, config: Any, warn: Callable[[str], None]) -> None:
-        length = config.text_config.max_position_embeddings
-        self._text = padded_tokens(self._tokenizer, self._words, length, self.name, warn).to(self._device)
+    def __init__(
+        self, model: Any, tokenizer: Any, words: Sequence[str], name: str, warn: Callable[[str], None]
+    ):
+        self.model = model
+        length = model.config.text_config.max_position_embeddings
+        self._text = padded_tokens(tokenizer, words, length, name, warn).to(model.device)
 
-    def _detect(self, inputs: Any) -> tuple[Float32[Tensor, "Q P"], Float32[Tensor, "Q 4"]]:
-        output = self._model(pixel_values=inputs["pixel_values"], **self._text)
+    def __call__(self, inputs: Any, /) -> tuple[Float32[Tensor, "Q P"], Float32[Tensor, "Q 4"]]:
+        """See `Scorer`."""
+        output = self.model(pixel_values=inputs["pixel_values"], **self._text)
         return output.logits[0].sigmoid(), output.pred_boxes[0]
-
-    def _extent(self, width: int, height: int) -> tuple[int, int]:
-        side = max(width, height)  # the photo is padded to a square
-        return side, side
 
 
 def detector(
@@ -141,10 +135,14 @@ def detector(
     device: torch.device,
     words: Sequence[str],
     warn: Callable[[str], None],
-) -> _Detector:
+) -> Detector:
     """The detector of a folder, for these words."""
-    kind = Owlv2 if config.model_type == "owlv2" else GroundingDino
-    return kind(folder, name, config, device, words, warn)
+    processor, tokenizer = load_image_processor(folder), load_tokenizer(folder)
+    kind = package("transformers").AutoModelForZeroShotObjectDetection
+    model = load_model(kind, folder, name, config).to(device).eval()
+    pads = config.model_type == "owlv2"
+    score = (Owlv2 if pads else GroundingDino)(model, tokenizer, words, name, warn)
+    return Detector(name, device, processor, score, pads)
 
 
 def prepared(processor: Any, photo: UInt8[np.ndarray, "H W 3"], name: str) -> Any:

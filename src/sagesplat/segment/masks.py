@@ -58,6 +58,10 @@ class Taxonomy:
         r, g, b = (round(255 * c) for c in colorsys.hsv_to_rgb(hue, saturation, value))
         return r, g, b
 
+    def __or__(self, other: "Taxonomy") -> "Taxonomy":
+        """The categories of both; an id that both have is named as the other names it."""
+        return Taxonomy(dict(sorted((self.names | other.names).items())))
+
     def write(self, path: Path) -> None:
         """Write labels.json."""
         write_json(path, {"labels": {str(label_id): name for label_id, name in self.names.items()}})

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any, Protocol
@@ -17,7 +17,15 @@ from sagesplat.io.files import read_json, write_json
 from sagesplat.io.lock import locked
 from sagesplat.scene.scene import Scene, View
 from sagesplat.segment.instances import instance_path, write_instances
-from sagesplat.segment.masks import UNLABELLED, Taxonomy, prepare_folder, read_mask, write_labels, write_mask
+from sagesplat.segment.masks import (
+    UNLABELLED,
+    Masks,
+    Taxonomy,
+    prepare_folder,
+    read_mask,
+    write_labels,
+    write_mask,
+)
 from sagesplat.segment.soft import soft_path, write_soft
 
 _BEGINS = 60.0  # seconds that another process may take to begin a folder
@@ -116,6 +124,7 @@ def segment_some(
     batch: int = 1,
     soft: Path | None = None,
     instances: Path | None = None,
+    below: Masks | None = None,
     on_view: Callable[[int, int], None] | None = None,
 ) -> set[int]:
     """Write the label images of some views (rows of Scene.views); the ids that occur in them come back.
@@ -126,12 +135,12 @@ def segment_some(
     each view are kept there too (`soft.read_soft`), and in the folder `instances` those of the answers that
     have some (`instances.read_instances`). A finished label image in `target` is kept, and a
     killed run resumes, unless it is of other categories: empty the folder before using another
-    model of the same ones. `on_view(done, total)` is called after each view, `total` being that of `rows`.
-    Raises LabelError.
+    model of the same ones. `below`: label images that the answers are painted over. `on_view(done, total)` is
+    called after each view, `total` being that of `rows`. Raises LabelError.
     """
     if not scene.views:
         raise LabelError(f"{scene.path}: a scene without views; there is no photo to segment")
-    taxonomy, total = segmenter.taxonomy, len(rows)
+    taxonomy, total = segmenter.taxonomy if below is None else below.taxonomy | segmenter.taxonomy, len(rows)
     softs = [None if soft is None else soft_path(soft, view) for view in scene.views]
     with locked(target, _BEGINS):
         paths = prepare_folder(target, scene.views)
@@ -158,6 +167,10 @@ def segment_some(
             finish(label_ids)
     for some in _batches(scene.views, missing, batch):
         for row, found in zip(some, segmenter([photos[row] for row in some]), strict=True):
+            if below is not None:
+                has = found.label_ids != UNLABELLED
+                label_ids = np.where(has, found.label_ids, below[scene.views[row]])
+                found = replace(found, label_ids=label_ids, probabilities=None)
             if instances is not None and found.instances is not None:
                 write_instances(instance_path(instances, scene.views[row]), found.instances)
             _write(found, paths[row], softs[row], taxonomy)

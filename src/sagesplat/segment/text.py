@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 
 from sagesplat.core.config import MasksConfig
 from sagesplat.core.errors import LabelError, RunError
-from sagesplat.segment.detections import Finder, painted_over, segmented
+from sagesplat.segment.detections import Finder, painted_over, segmented, shared_areas
 from sagesplat.segment.detectors import DETECTORS, detector
 from sagesplat.segment.display_names import title_of
 from sagesplat.segment.hub import computing, folder_of, loading, quiet, read_config, torch_device
@@ -33,7 +33,8 @@ _NEEDS = (
 class TextSegmenter:
     """Labels what a network finds for the prompts; all other pixels are unlabelled.
 
-    `best` has the highest score of each prompt, by the category's name, in the photos so far.
+    `best` has the highest score of each prompt, by the category's name, in the photos so far; `shared` what
+    two prompts' masks have in common, "ivy=vine", and one's own, "ivy=ivy", in photos' areas.
     """
 
     def __init__(self, finder: Finder, prompts: Sequence[Prompt], device: torch.device | None = None):
@@ -42,6 +43,7 @@ class TextSegmenter:
         self.threshold = finder.threshold
         self.taxonomy = Taxonomy(dict(sorted((p.label_id, p.name) for p in prompts)))
         self.best = dict.fromkeys((p.name for p in prompts), 0.0)
+        self.shared: dict[str, float] = {}
 
     def __call__(self, photos: Sequence[UInt8[np.ndarray, "H W 3"]], /) -> list[Segmented]:
         """One photo after the other: what is found in each decides how much there is to compute."""
@@ -52,6 +54,11 @@ class TextSegmenter:
             found = self._finder(photo)
         for prompt, score in zip(self._prompts, found.best.tolist(), strict=True):
             self.best[prompt.name] = max(self.best[prompt.name], score)
+        names = [prompt.name for prompt in self._prompts]
+        common = shared_areas(found, len(names))
+        for one, other in zip(*np.nonzero(np.triu(common)), strict=True):
+            pair = f"{names[one]}={names[other]}"
+            self.shared[pair] = self.shared.get(pair, 0.0) + float(common[one, other])
         ids = [prompt.label_id for prompt in self._prompts]
         return segmented(found, ids, self.threshold, (photo.shape[0], photo.shape[1]))
 
@@ -61,8 +68,8 @@ class TextOver:
 
     def __init__(self, base: Segmenter, text: TextSegmenter):
         self._base, self._text = base, text
-        self.threshold, self.best = text.threshold, text.best
-        self.taxonomy = Taxonomy(dict(sorted((base.taxonomy.names | text.taxonomy.names).items())))
+        self.threshold, self.best, self.shared = text.threshold, text.best, text.shared
+        self.taxonomy = base.taxonomy | text.taxonomy
 
     def __call__(self, photos: Sequence[UInt8[np.ndarray, "H W 3"]], /) -> list[Segmented]:
         """Both for each photo."""

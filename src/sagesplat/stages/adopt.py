@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -29,9 +29,17 @@ from sagesplat.scene import load_scene
 from sagesplat.scene.cameras import NamedCamera, read_camera_file
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage, write_model
 from sagesplat.scene.scene import Camera, View
-from sagesplat.segment.edit import apply
+from sagesplat.segment.edit import apply, parse_merge
 from sagesplat.segment.lift import LiftedLabels
-from sagesplat.segment.masks import UNLABELLED, Taxonomy, prepare_folder, write_labels, write_mask
+from sagesplat.segment.masks import (
+    UNLABELLED,
+    UNLABELLED_NAME,
+    Taxonomy,
+    prepare_folder,
+    write_labels,
+    write_mask,
+)
+from sagesplat.segment.parents import read_parents, write_parents
 from sagesplat.stages.edited import check_not_edited
 from sagesplat.stages.label import edit_of, make_masks
 from sagesplat.stages.scene import check_folder, open_scene
@@ -44,6 +52,7 @@ _WHOLE = {0: "scene"}  # the one category of a splat without labels
 _POINTS = 50_000  # means that stand for the points of a capture
 _OPAQUE = 0.1  # their least opacity, as far as there are such
 _STEPS = 1500  # of a training, whose time the sampling of fidelity may take a part of
+_PARENTS = "parents.json"  # in the capture's folder: of the file's instances
 _LEVEL = 1  # number of the one level that a splat from elsewhere has
 
 
@@ -68,7 +77,7 @@ def open_splat(
     if not segmented:
         masks = replace(masks, masks=own / "masks")
     make_masks(job, masks, labels)
-    _label(job, voted=segmented)
+    _label(job, None if segmented else own / _PARENTS, parse_merge(labels.merge))
 
 
 def _check_run(run: RunDir, config: AdoptConfig) -> None:
@@ -116,6 +125,10 @@ def _make_capture(
             views = _views(own, cameras)
             _write_model(own / "sparse" / "0", g, views, _points(g, config.seed))
         _write_pictures(job, own, splat, views, labelled=labelled, photos=photos)
+        parents = {
+            splat.names[label]: parent for label, parent in splat.parents.items() if label in splat.names
+        }
+        write_parents(own / _PARENTS, parents if labelled else {})
         # loads matplotlib, for which no training has to wait
         from sagesplat.output.contact_sheet import contact_sheet
 
@@ -199,10 +212,11 @@ def _write_pictures(
     for done, view in enumerate(views):
         if photos and not labelled:
             break
-        rgb, ids = paint.paint(view.camera)
         if not photos:
+            rgb = paint.paint(view.camera)
             Image.fromarray((rgb * 255).round().astype(np.uint8)).save(view.image_path)
         if labelled:
+            ids = paint.render(view.camera)
             write_mask(paths[done], ids, taxonomy)
             occurring.update(np.unique(ids).tolist())
         job.emit(Progress("adopt", done + 1, len(views)))
@@ -248,9 +262,19 @@ def _edited(job: Job, g: Gaussians) -> Gaussians:
     return replace(g, label_ids=torch.from_numpy(apply(ids, edit_of(job.run))))
 
 
-def _label(job: Job, *, voted: bool) -> None:
-    """Label all Gaussians, by the file or by votes of the label images: the one level that was trained."""
-    run = job.run
+def _parents(job: Job, path: Path, merge: Mapping[str, str]) -> dict[str, str]:
+    """The category of each instance of the file that is left, as `merge` names it."""
+    names = job.names().values()
+    found = {name: merge.get(of, of) for name, of in read_parents(path).items() if name in names}
+    return {name: of for name, of in found.items() if of not in found and of != UNLABELLED_NAME}
+
+
+def _label(job: Job, of_file: Path | None, merge: Mapping[str, str]) -> None:
+    """Label all Gaussians, by the file or by votes of the label images: the one level that was trained.
+
+    `of_file`: the categories of the file's instances; None where label images vote. `merge`: of categories.
+    """
+    run, voted = job.run, of_file is None
     antialiased = bool(read_more(run.adopted, "antialiased"))
 
     def make() -> list[str]:
@@ -266,12 +290,14 @@ def _label(job: Job, *, voted: bool) -> None:
         ids = g.label_ids.numpy()[rows[KDTree(g.means.numpy()[rows]).query(points)[1]]]
         one = np.ones(len(points), np.int32)
         LiftedLabels(ids, one, one).write(run.labels)
+        write_parents(run.parents, _parents(job, of_file, merge) if of_file else {})
         shutil.rmtree(run.levels, ignore_errors=True)
         run.levels.mkdir()
         write_level(run.levels, _LEVEL, g, recovering=False, sh_degree=g.sh_degree, exact=True)
         return [f"{len(g):,} Gaussians of {len(g.counts())} categories"]
 
     inputs = [run.scene, run.adopted, run.provenance("masks"), run.masks / "labels.json"]
+    inputs += [of_file] if of_file and of_file.exists() else []
     run_stage(job, "lift", {"voted": voted}, inputs, [run.labels, run.levels], make)
     # what later stages ask of the training
     config = TrainConfig(

@@ -23,7 +23,7 @@ from sagesplat.raster import Backend, cuda, resolve_backend, set_threads
 from sagesplat.run.job import NO_RUN, Job
 from sagesplat.run.run_dir import LadderKind, RunDir, check_links
 from sagesplat.scene.scene import Camera, Scene, View
-from sagesplat.stages import pipeline
+from sagesplat.stages import label_edits, pipeline
 from sagesplat.stages.methods import NestedLevels
 from sagesplat.stages.plan import check_targets
 from sagesplat.stages.results import fidelity_of, models_of, plans_of, promises_of
@@ -108,6 +108,49 @@ def open_run(folder: Path | str, ladder: LadderKind = "nested") -> "FinishedRun"
     if not run.scene.exists():
         raise RunError(f"{run.path}: {NO_RUN}")
     return FinishedRun(Job(run, ignore))
+
+
+def apply_labels(
+    folder: Path | str,
+    edits: Path | str | None = None,
+    out: Path | str | None = None,
+    *,
+    on_event: Emit = ignore,
+    backend: Backend = "auto",
+    threads: int = 0,
+) -> "FinishedRun":
+    """Apply edits of labels to a finished run: what the command `sagesplat labels apply` does.
+
+    Nothing is trained; parts of split categories are measured, what changed is calibrated again. The run
+    stays as it is.
+
+    Args:
+        folder: The run folder, finished with nested levels.
+        edits: The file that the viewer saved; None: labels.edit.json of the run folder.
+        out: The new run folder; an earlier edited run there is replaced. None: beside the run, as RUN-edited.
+        on_event: Called with each event (`StageDone`, `Warned`, ...). Nothing is printed otherwise.
+        backend: Rasteriser: "auto", "cpu", "cuda" or "reference".
+        threads: CPU threads; 0: one per core. Set for the whole process.
+
+    Returns:
+        The new run, with its bundle in `out`/bundle.
+
+    Raises:
+        LabelError: For edits that are damaged, of another run, or that cannot be applied.
+        RunError: For a run that is not finished or cannot be edited so, and an `out` that holds something
+            else.
+
+    Example:
+        >>> from sagesplat import apply_labels
+        >>> run = apply_labels("runs/garden", "labels.edit.json")  # doctest: +SKIP
+        >>> sorted(run.names.values())  # doctest: +SKIP
+    """
+    run = RunDir(Path(folder))
+    check_links(run.path)
+    backend, threads = resolve_backend(backend, "auto"), set_threads(threads)
+    given = None if edits is None else Path(edits)
+    job = Job(run, on_event, backend, threads)
+    return open_run(label_edits.apply_labels(job, given, None if out is None else Path(out)).path)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,6 @@
 """Makes the fidelity models of nested levels, from drawn viewpoints; compositions calibrate them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -65,11 +65,14 @@ def trial(
 
 
 class Compositions:
-    """Measures compositions at viewpoints, none of them twice: rounds of calibration plan many again."""
+    """Measures compositions at viewpoints, none of them twice: rounds of calibration plan many again.
 
-    def __init__(self, job: Job, cameras: Sequence[Camera]) -> None:
+    `only`: ids of the categories that are wanted; what is measured of others is NaN. None: all.
+    """
+
+    def __init__(self, job: Job, cameras: Sequence[Camera], only: Collection[int] | None = None) -> None:
         self.cameras = cameras
-        self._job = job
+        self._job, self._only = job, only
         self._known: list[dict[tuple[int, ...], np.ndarray]] = [{} for _ in cameras]
         self._pixels = np.zeros((len(cameras), 0), np.int32)
 
@@ -83,7 +86,7 @@ class Compositions:
             # what is asked for twice is measured once: filled up to one length
             asked = np.array([new[row] + new[row][:1] * (most - len(new[row])) for row in rows])
             cameras = [self.cameras[row] for row in rows]
-            fidelity, pixels = compositions_at(self._job, cameras, asked, "fit")
+            fidelity, pixels = compositions_at(self._job, cameras, asked, "fit", self._only)
             for row, values in zip(rows, fidelity, strict=True):
                 self._known[row] |= dict(zip(new[row], values, strict=False))
             if not self._pixels.size:  # the first time all are new
@@ -94,19 +97,29 @@ class Compositions:
 
 
 def compositions_at(
-    job: Job, cameras: Sequence[Camera], planned: np.ndarray, stage: str
+    job: Job,
+    cameras: Sequence[Camera],
+    planned: np.ndarray,
+    stage: str,
+    only: Collection[int] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fidelity [V, J, L + 1] of compositions (levels [V, J, L]) and pixels [V, L], divided among all."""
+    """Fidelity [V, J, L + 1] of compositions (levels [V, J, L]) and pixels [V, L], divided among all.
+
+    `only`: ids of the categories that are measured; the others are NaN. None: all.
+    """
     rows = split(range(len(cameras)), job.pieces)
-    parts = [([cameras[row] for row in some], planned[list(some)], stage) for some in rows]
+    parts = [([cameras[row] for row in some], planned[list(some)], stage, only) for some in rows]
     found = work_all(job, stage, _measure_some, parts)
     fidelity, pixels = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
     return fidelity, pixels
 
 
-def _measure_some(job: Job, part: tuple[Sequence[Camera], np.ndarray, str]) -> tuple[np.ndarray, np.ndarray]:
-    cameras, planned, stage = part
+def _measure_some(
+    job: Job, part: tuple[Sequence[Camera], np.ndarray, str, Collection[int] | None]
+) -> tuple[np.ndarray, np.ndarray]:
+    cameras, planned, stage, only = part
     return measure_compositions(
-        job.ladder, cameras, planned, backend=job.backend, antialiased=job.antialiased,
-        progress=lambda done, total: job.emit(Progress(stage, done, total)), references=job.references,
+        job.ladder, cameras, planned, only=only, backend=job.backend, antialiased=job.antialiased,
+        progress=lambda done, total: job.emit(Progress(stage, done, total)),
+        references=job.references if only is None else None,
     )  # fmt: skip

@@ -37,7 +37,7 @@ from sagesplat.segment.segmenters import segment_some
 from sagesplat.segment.soft import read_soft, soft_path
 from sagesplat.segment.valid import ValidPixels, write_valid
 from sagesplat.stages.memory import check_network
-from sagesplat.stages.prompts import Scores, Timed, load, prompt_lines, settings_of
+from sagesplat.stages.prompts import MASKS, Scores, Timed, load, prompt_lines, settings_of
 from sagesplat.train.fuse import Soft, fuse
 
 _MARKER = ".network.json"
@@ -48,10 +48,8 @@ def make_masks(job: Job, config: MasksConfig, labels: LabelsConfig = LabelsConfi
     """Import label images or segment the photos, find the pixels that count, merge and drop categories."""
     run, kind = job.run, segmenter_kind(job.scene.path, config)
     parse_merge(labels.merge)  # what is wrong with it is said before a network begins
-    if kind == "masks":
-        if config.prompts:
-            raise RunError("--prompts: not over given label images; name a network by --segmenter")
-        _import(job, config)
+    if kind == MASKS and not config.prompts:
+        _import(job, config, run.segmented, "segment")
     else:
         _segment(job, config, kind, instances=bool(labels.instances))
     labels = replace(labels, merge=_of_categories(run, labels))
@@ -134,11 +132,9 @@ def segmenter_kind(capture: Path, config: MasksConfig) -> str:
     """The segmenter that was asked for, or with "auto" the one that the settings and the capture imply."""
     if config.segmenter != "auto":
         return config.segmenter
-    if config.prompts and not (config.model or config.masks):
-        return "text"
     if not config.model and (config.masks or (capture / "masks").is_dir()):
-        return "masks"
-    return segmenter_for(config.model)
+        return MASKS
+    return "text" if config.prompts and not config.model else segmenter_for(config.model)
 
 
 def _note_options(job: Job, config: MasksConfig) -> None:
@@ -150,31 +146,39 @@ def _note_options(job: Job, config: MasksConfig) -> None:
     write_json(job.run.segmentation, {k: str(v) if isinstance(v, Path) else v for k, v in options.items()})
 
 
-def _import(job: Job, config: MasksConfig) -> None:
-    """Import existing label images."""
+def _import(job: Job, config: MasksConfig, target: Path, stage: str) -> None:
+    """Import existing label images into a folder of the run."""
     run, source = job.run, config.masks or job.scene.path / "masks"
     settings = {"segmenter": "masks", "source": file_hash(source) if source.is_dir() else str(source)}
 
     def make() -> list[str]:
-        shutil.rmtree(run.segmented, ignore_errors=True)
-        shutil.rmtree(run.soft, ignore_errors=True)  # a network's, and these are not its label images
-        missing = import_masks(job.scene, source, run.segmented)
+        shutil.rmtree(target, ignore_errors=True)
+        if target == run.segmented:
+            shutil.rmtree(run.soft, ignore_errors=True)  # a network's, and these are not its label images
+        missing = import_masks(job.scene, source, target)
         if missing:
             names = ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
             job.emit(Warned(f"{len(missing)} of {len(job.scene.views)} views have no label image: {names}"))
-        _note_options(job, config)
+        if target == run.segmented:
+            _note_options(job, config)
         return []
 
-    run_stage(job, "segment", settings, [run.scene], [run.segmented / "labels.json"], make)
+    run_stage(job, stage, settings, [run.scene], [target / "labels.json"], make)
 
 
 def _segment(job: Job, config: MasksConfig, kind: str, *, instances: bool = False) -> None:
     """Segment the photos; images of an interrupted attempt with the same network are kept."""
-    run = job.run
+    run, inputs = job.run, [job.run.scene]
     own = settings_of(kind, config)
     hashed = {name: file_hash(v) if isinstance(v, Path) else v for name, v in own.items()}
     settings = {"segmenter": kind, "soft": config.soft, **hashed}
-    if instances and SEGMENTERS[kind].instances is not None:
+    if kind == MASKS:  # prompts over them
+        if config.soft:
+            raise RunError("--soft: given label images have no probabilities; leave it out")
+        _import(job, config, run.given, "given")
+        settings["given"] = file_hash(run.given)
+        inputs.append(run.given / "labels.json")
+    elif instances and SEGMENTERS[kind].instances is not None:
         settings["instances"] = True  # only then: earlier runs know of no such setting
 
     def make() -> list[str]:
@@ -184,7 +188,7 @@ def _segment(job: Job, config: MasksConfig, kind: str, *, instances: bool = Fals
             shutil.rmtree(run.soft, ignore_errors=True)
             shutil.rmtree(run.photo_instances, ignore_errors=True)
         write_json(marker, key)
-        check_network(job, kind, own, config.batch)
+        check_network(job, "text" if kind == MASKS else kind, own, config.batch)
         some = split(range(len(job.scene.views)), job.executor.parallel)  # each loads the network
         found = work_all(job, "segment", _segment_some, [(rows, config, kind, instances) for rows in some])
         taxonomy = found[0][0]
@@ -196,7 +200,7 @@ def _segment(job: Job, config: MasksConfig, kind: str, *, instances: bool = Fals
         _note_options(job, config)
         return lines
 
-    run_stage(job, "segment", settings, [run.scene], [run.segmented / "labels.json"], make)
+    run_stage(job, "segment", settings, inputs, [run.segmented / "labels.json"], make)
 
 
 def _is(marker: Path, key: dict[str, Any]) -> bool:
@@ -214,7 +218,9 @@ def _segment_some(job: Job, part: tuple[Sequence[int], MasksConfig, str, bool]) 
     """
     rows, config, kind, instances = part
     run, warn, note = job.run, lambda text: job.emit(Warned(text)), lambda text: job.emit(Noted(text))
-    segmenter = load(kind, config, job.device, job.threads, warn, instances=instances)
+    given = Masks(run.given, Taxonomy.read(run.given / "labels.json")) if kind == MASKS else None
+    below = None if given is None else given.taxonomy
+    segmenter = load(kind, config, job.device, job.threads, warn, instances=instances, given=below)
     scores, remaining = Scores(run.segmented, rows[0] if rows else 0, segmenter), len(rows)
 
     def on_view(done: int, total: int) -> None:
@@ -225,10 +231,10 @@ def _segment_some(job: Job, part: tuple[Sequence[int], MasksConfig, str, bool]) 
 
     occurring = segment_some(
         job.scene, job.photos, Timed(segmenter, lambda: remaining, note), run.segmented, rows,
-        batch=config.batch, soft=run.soft if config.soft else None, instances=run.photo_instances,
-        on_view=on_view,
+        batch=config.batch, soft=run.soft if config.soft else None, below=given,
+        instances=None if kind == MASKS else run.photo_instances, on_view=on_view,
     )  # fmt: skip
-    return segmenter.taxonomy, occurring
+    return segmenter.taxonomy if below is None else below | segmenter.taxonomy, occurring
 
 
 def lift_labels(job: Job, config: LiftConfig) -> None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sagesplat.adapt.ladder import read_prefixes
-from sagesplat.core.config import FitConfig, PlanConfig, SampleConfig
+from sagesplat.core.config import FitConfig, PlanConfig
 from sagesplat.core.errors import LabelError, RunError
 from sagesplat.core.events import StageDone, StageStarted
 from sagesplat.formats.label_edits import FILE, LabelEdits, dump_edits, ladder_hash, read_edits
@@ -25,12 +25,10 @@ from sagesplat.segment.parents import write_parents
 from sagesplat.segment.relabel import Relabelled, relabelled
 from sagesplat.stages.bundle import BundleMade, bundle
 from sagesplat.stages.edited import LabelSettings, label_settings, write_edited
-from sagesplat.stages.observe import observe_levels
 from sagesplat.stages.plan import make_plan
 from sagesplat.stages.refit import refit
 from sagesplat.stages.regroup import measure, move_labels, move_levels
 from sagesplat.stages.results import increments_of
-from sagesplat.stages.sample import sample_levels
 from sagesplat.stages.view import _is_finished
 
 # what a run begins with, as it is; label images, point labels and levels are written anew
@@ -176,7 +174,6 @@ def _keep_instances_alone(run: RunDir, new: RunDir) -> None:
 
 def _make(job: Job, new: Job, made: Relabelled) -> bool:
     """Levels, measurements, models and plan of the new categories; whether levels were rendered again."""
-    split = sorted(old for old in made.new_ids if made.moved(old) is None)
     if made.changed:
         move_levels(job, new, made)
     move_labels(job, new, made)
@@ -188,17 +185,13 @@ def _make(job: Job, new: Job, made: Relabelled) -> bool:
             _sign(new.run, stage)
         return False
     _sign(new.run, "nest")
-    exact = measure(job, new, made, fit)
-    if exact:
-        _sign(new.run, "observe")
-        _sign(new.run, "sample")
-    else:
-        observe_levels(new, fit)
-        sample_levels(new, known.get("sample", SampleConfig()), fit)
+    rendered = measure(job, new, made, fit)
+    _sign(new.run, "observe")
+    _sign(new.run, "sample")
     refit(job, new, fit, made.changed)
     _sign(new.run, "fit")
     make_plan(new, _weighed(known.get("plan", PlanConfig()), made))
-    return not exact or bool(split)
+    return rendered
 
 
 def _weighed(plan: PlanConfig, made: Relabelled) -> PlanConfig:

@@ -1,6 +1,6 @@
 """Makes the observations: the quality of every category at every level in every view, from renders."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -22,9 +22,7 @@ def observe_levels(job: Job, config: FitConfig) -> None:
     run = job.run
 
     def make() -> list[str]:
-        far = distances(job, config.distance)
-        parts = [(rows, config.masks, far) for rows in split(range(len(job.scene.views)), job.pieces)]
-        table = merge(work_all(job, "observe", _observe_views, parts))
+        table = observed_views(job, config)
         table.write_csv(run.observations)
         seen = table.select(np.isin(table.view, job.scene.train_ids))
         _show(job, tables.ladder_table(seen, job.ladder.counts, job.ladder.recovering, titles(job.names())))
@@ -41,11 +39,20 @@ def observe_levels(job: Job, config: FitConfig) -> None:
     run_stage(job, "observe", settings, inputs, [run.observations], make)
 
 
-def _observe_views(job: Job, part: tuple[Sequence[int], str, dict[int, np.ndarray]]) -> Observations:
-    """The observations of some views (rows, source of label images, distances in all views)."""
-    rows, masks, far = part
+def observed_views(job: Job, config: FitConfig, labels: Collection[int] | None = None) -> Observations:
+    """The observations of all categories in all views, or of some alone (ids), divided among who compute."""
+    far = distances(job, config.distance)
+    parts = [(rows, config.masks, far, labels) for rows in split(range(len(job.scene.views)), job.pieces)]
+    return merge(work_all(job, "observe", _observe_views, parts))
+
+
+def _observe_views(
+    job: Job, part: tuple[Sequence[int], str, dict[int, np.ndarray], Collection[int] | None]
+) -> Observations:
+    """The observations of some views (rows, source of label images, distances in all views, categories)."""
+    rows, masks, far, labels = part
     return observe(
         job.scene, job.photos, label_images(job, masks), job.ladder, far,
-        views=rows, valid=job.valid, backend=job.backend, antialiased=job.antialiased,
+        views=rows, valid=job.valid, labels=labels, backend=job.backend, antialiased=job.antialiased,
         progress=lambda done, total: job.emit(Progress("observe", done, total)),
     )  # fmt: skip

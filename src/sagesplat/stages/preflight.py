@@ -10,7 +10,7 @@ from sagesplat.run.executor import Local
 from sagesplat.run.job import Job
 from sagesplat.scene.detect import detect
 from sagesplat.stages.label import segmenter_kind
-from sagesplat.stages.prompts import load, settings_of
+from sagesplat.stages.prompts import MASKS, load, settings_of
 from sagesplat.train import memory
 from sagesplat.train.strategy import schedule_of
 
@@ -28,7 +28,7 @@ def check_segmenter(job: Job, path: Path, config: MasksConfig) -> None:
     if detect(path) not in ("photos", "video") or job.run.scene.exists():
         return
     kind = segmenter_kind(job.run.capture / path.resolve().stem, config)
-    if kind == "masks":
+    if kind == MASKS and not config.prompts:
         return
     settings_of(kind, config)
     if isinstance(job.executor, Local):  # else the nodes load it

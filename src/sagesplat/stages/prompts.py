@@ -1,7 +1,9 @@
 """What segmentation tells while it runs: how long it will take, and what prompts found."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,7 @@ from jaxtyping import UInt8
 from sagesplat.core.config import MasksConfig
 from sagesplat.core.durations import duration
 from sagesplat.core.errors import LabelError
-from sagesplat.core.typed import fits
+from sagesplat.core.typed import fits, types_of
 from sagesplat.io.files import read_object, write_json
 from sagesplat.segment import text
 from sagesplat.segment.masks import Taxonomy
@@ -19,10 +21,17 @@ from sagesplat.segment.registry import SEGMENTERS
 from sagesplat.segment.segmenters import Segmented, Segmenter
 
 _SCORES = ".prompts-*.json"  # a file for each task
+MASKS = "masks"  # label images that were given: no network, but for the prompts over them
+_SAME = 0.9  # intersection over union of all masks of two prompts, from which on they mean the same
 
 
 def settings_of(kind: str, config: MasksConfig) -> dict[str, Any]:
-    """What the label images depend on: the segmenter's settings, and those of prompts over it."""
+    """What the label images depend on: the segmenter's settings, and those of prompts over it.
+
+    Of `MASKS` those of the prompts alone.
+    """
+    if kind == MASKS:
+        return text.settings(replace(config, segmenter="text"))
     own = SEGMENTERS[kind].settings(config)
     if kind == "text" or not config.prompts:
         return own
@@ -37,8 +46,15 @@ def load(
     warn: Callable[[str], None],
     *,
     instances: bool = False,
+    given: Taxonomy | None = None,
 ) -> Segmenter:
-    """The segmenter, with the prompts over it where there are some; `instances`: whether they are wanted."""
+    """The segmenter, with the prompts over it where there are some; `instances`: whether they are wanted.
+
+    Of `MASKS` the one for the prompts; `given`: the categories of the label images.
+    """
+    if kind == MASKS:
+        base = {} if given is None else given.names
+        return text.load_text(replace(config, segmenter="text"), device, threads, warn, base)
     segmenter = SEGMENTERS[kind].load(config, device, threads, warn)
     if instances and (ask := SEGMENTERS[kind].instances) is not None:
         ask(segmenter)
@@ -69,7 +85,7 @@ class Timed:
 
 
 class Scores:
-    """The highest score of each prompt so far, kept in the folder of label images: a killed run goes on.
+    """Scores and masks' areas of prompts so far, kept in the folder of label images: a killed run goes on.
 
     `part` tells tasks apart that segment other photos.
     """
@@ -78,24 +94,33 @@ class Scores:
         self._path = folder / _SCORES.replace("*", str(part))
         self._text = segmenter if isinstance(segmenter, text.TextSegmenter | text.TextOver) else None
         if self._text is not None:
-            _add(read_scores(self._path)[0], self._text.best)
+            known = read_scores(self._path)
+            _add(known.best, self._text.best)
+            for pair, area in known.shared.items():
+                self._text.shared[pair] = self._text.shared.get(pair, 0.0) + area
 
     def keep(self) -> None:
         """Write them; called after each photo."""
         if self._text is not None:
-            write_json(self._path, {"best": self._text.best, "threshold": self._text.threshold})
+            names = {f.name for f in fields(KnownScores)}
+            write_json(self._path, {name: getattr(self._text, name) for name in sorted(names)})
 
 
-def read_scores(path: Path) -> tuple[dict[str, float], float]:
-    """The scores in a file of `Scores`, by the category's name, and the least that counts.
+@dataclass(frozen=True)
+class KnownScores:
+    """What a file of `Scores` holds."""
 
-    None of them, and 0, where it is not there or damaged.
-    """
-    content = read_object(path)
-    best, threshold = content.get("best"), content.get("threshold")
-    if not (isinstance(best, dict) and fits(best, dict[str, float]) and isinstance(threshold, float)):
-        return {}, 0.0
-    return best, threshold
+    best: dict[str, float] = field(default_factory=dict)  # highest score, by the category's name
+    shared: dict[str, float] = field(default_factory=dict)  # areas, by pair of names: see `TextSegmenter`
+    threshold: float = 0.0  # least score that counts
+
+
+def read_scores(path: Path) -> KnownScores:
+    """What is in a file of `Scores`; nothing where it is not there or damaged."""
+    content, types = read_object(path), types_of(KnownScores)
+    if not all(fits(content.get(name), kind) for name, kind in types.items()):
+        return KnownScores()
+    return KnownScores(**{name: content[name] for name in types})
 
 
 def _add(scores: Mapping[str, float], best: dict[str, float]) -> None:
@@ -106,14 +131,17 @@ def _add(scores: Mapping[str, float], best: dict[str, float]) -> None:
 def prompt_lines(
     folder: Path, taxonomy: Taxonomy, occurring: set[int], warn: Callable[[str], None]
 ) -> list[str]:
-    """A line with the highest score of each prompt; warns of those that no photo has.
+    """A line with the highest score of each prompt; warns of those that no photo has, or that mean the same.
 
     LabelError, with the scores, where no pixel of any photo has a label.
     """
-    best, threshold = dict[str, float](), 0.0
+    best, shared, threshold = dict[str, float](), Counter[str](), 0.0
     for path in sorted(folder.glob(_SCORES)):
-        scores, threshold = read_scores(path)
-        _add(scores, best)
+        known = read_scores(path)
+        threshold = known.threshold
+        _add(known.best, best)
+        for pair, area in known.shared.items():
+            shared[pair] += area
     names = [name for label_id, name in taxonomy.names.items() if label_id in occurring]
     missing = [
         f"prompt {name!r}: found in no photo; its best score is {score:.2f} and {threshold:g} is needed: "
@@ -123,7 +151,19 @@ def prompt_lines(
     ]
     if missing and not names:
         raise LabelError(f"{folder}: {'; '.join(missing)}")
-    for line in missing:
+    for line in (*missing, *_synonyms(shared)):
         warn(line)
     listed = ", ".join(f"{name} {score:.2f}" for name, score in best.items())
     return [f"best scores: {listed}"] if best else []
+
+
+def _synonyms(shared: Mapping[str, float]) -> Iterator[str]:
+    """A line for each two prompts whose masks are the same nearly everywhere."""
+    for pair, common in shared.items():
+        one, _, other = pair.partition("=")
+        either = shared.get(f"{one}={one}", 0) + shared.get(f"{other}={other}", 0) - common
+        if one != other and common > 0 and (overlap := common / max(either, common)) >= _SAME:
+            yield (
+                f"prompts {one!r} and {other!r}: the network finds the same for both (their masks overlap by "
+                f'{overlap:.0%}); leave one of them, or add --labels.merge "{other}={one}"'
+            )

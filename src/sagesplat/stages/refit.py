@@ -68,7 +68,9 @@ def _fit_drawn(
     models = fit_fidelity(mine, fit, job.scene.scale, config.min_share, confidence)
     for name, step in (("bias", recentred), ("calibration", calibrated)):
         cameras = _some([drawn.cameras[row] for row in drawn.rows(name)], _MOST[name])
-        measured = trial(job, config, {**known, **models}, sampled.labels, Compositions(job, cameras))
+        measured = trial(
+            job, config, {**known, **models}, sampled.labels, Compositions(job, cameras, changed)
+        )
         models = step(models, measured, confidence)
     return dict(sorted({**known, **models}.items()))
 

@@ -1,6 +1,7 @@
 """Moves the files of a run to other categories: levels, label images, point labels, measurements."""
 
 import shutil
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -11,7 +12,7 @@ from scipy.spatial import KDTree
 
 from sagesplat.adapt.fidelity import distances_at, write_sampled
 from sagesplat.adapt.ladder import PrefixLadder
-from sagesplat.adapt.observe import RenderedLabels
+from sagesplat.adapt.observe import RenderedLabels, merge
 from sagesplat.adapt.regroup import regrouped, regrouped_observations, regrouped_samples
 from sagesplat.core.config import FitConfig
 from sagesplat.core.events import Progress
@@ -22,12 +23,15 @@ from sagesplat.formats.levels import read_header, write_set
 from sagesplat.formats.stream_header import SIZE, Grid, Header
 from sagesplat.formats.stream_header import read_header as read_stream_header
 from sagesplat.formats.stream_increments import read_streams, write_streams
+from sagesplat.metrics.image import tiles_around
 from sagesplat.run.job import Job
 from sagesplat.run.records import settings_of
 from sagesplat.segment.lift import LiftedLabels
 from sagesplat.segment.masks import UNLABELLED, Masks, Taxonomy, mask_path, write_mask
 from sagesplat.segment.relabel import Relabelled
+from sagesplat.stages.observe import observed_views
 from sagesplat.stages.results import observations_of, sampled_of, viewpoints_of
+from sagesplat.stages.sample import measured_levels
 from sagesplat.stages.shared import distances
 
 
@@ -134,9 +138,12 @@ def _move_pixels(job: Job, new: Job, made: Relabelled, taxonomy: Taxonomy) -> No
         for done, view in enumerate(job.scene.views):
             ids = masks[view]
             pixels = table[ids + 1]
-            for old, parts in split.items():
-                if painted is not None and (mine := ids == old).any():
-                    pixels[mine] = _nearest(painted[view], mine, parts)
+            of_split = np.isin(ids, list(split))
+            if painted is not None and of_split.any():
+                shown = painted.render(view.camera, tiles_around(of_split))
+                for old, parts in split.items():
+                    if (mine := ids == old).any():
+                        pixels[mine] = _nearest(shown, mine, parts)
             write_mask(mask_path(target, view), pixels, taxonomy)
             job.emit(Progress("labels", done + 1, len(job.scene.views)))
 
@@ -174,21 +181,47 @@ def _move_points(job: Job, new: Job, made: Relabelled) -> None:
 
 
 def measure(job: Job, new: Job, made: Relabelled, fit: FitConfig) -> bool:
-    """Write observations and samples of merged categories from those of their parts.
+    """Write observations and samples: of merged categories from those of their parts, of parts by rendering.
 
-    Returns whether that is possible: not of split categories, nor of eroded masks or rendered label images.
+    With all categories at one level images are those of before, so what did not change is not measured again.
+    Returns whether anything was rendered.
     """
-    moved = {old: made.moved(old) for old in made.new_ids}
-    if None in moved.values() or fit.region == "eroded" or fit.masks != "given":
-        return False
+    fresh = {one for old, ids in made.new_ids.items() if made.moved(old) is None for one in set(ids.tolist())}
+    moved = {old: None if (to := made.moved(old)) in fresh else to for old in made.new_ids}
     if new.run.observations.exists():
-        # rows of categories without Gaussians keep their label
-        table = observations_of(job)
-        rest = {label: label for label in np.unique(table.label_id).tolist() if label not in moved}
-        far = distances(new, fit.distance)
-        regrouped_observations(table, {**rest, **moved}, far).write_csv(new.run.observations)
+        _observe(job, new, made, fit, moved, fresh)
     drawn, labels = viewpoints_of(job), sorted(made.names)
     cameras = [drawn.cameras[row] for row in drawn.rows("fit")]
     far = distances_at(job.scene, new.point_labels, cameras, labels, fit.distance)
-    write_sampled(new.run.sampled, regrouped_samples(sampled_of(job), moved, far, labels))
-    return True
+    sampled = regrouped_samples(sampled_of(job), moved, far, labels)
+    if fresh:
+        found, columns = measured_levels(new, cameras, fit, fresh), [labels.index(one) for one in fresh]
+        sampled.fidelity[:, columns] = found.fidelity[:, columns]
+        sampled.pixels[:, columns] = found.pixels[:, columns]
+    write_sampled(new.run.sampled, sampled)
+    return bool(fresh)
+
+
+def _observe(
+    job: Job,
+    new: Job,
+    made: Relabelled,
+    fit: FitConfig,
+    moved: Mapping[int, int | None],
+    fresh: Collection[int],
+) -> None:
+    """Write the observations. Borders move in label images that are rendered, and so all is measured there;
+    merging moves those of eroded masks.
+    """
+    if fit.masks != "given":
+        observed_views(new, fit).write_csv(new.run.observations)
+        return
+    if fit.region == "eroded":
+        fresh = {*fresh, *made.changed}
+        moved = {old: None if to in fresh else to for old, to in moved.items()}
+    table = observations_of(job)
+    # rows of categories without Gaussians keep their label
+    rest = {label: label for label in np.unique(table.label_id).tolist() if label not in moved}
+    known = regrouped_observations(table, {**rest, **moved}, distances(new, fit.distance))
+    parts = [known, observed_views(new, fit, fresh)] if fresh else [known]
+    merge(parts).write_csv(new.run.observations)

@@ -1,6 +1,6 @@
 """Makes the samples of fidelity: every level at drawn viewpoints, measured against the full model."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -126,7 +126,7 @@ def _until_it_stops_shrinking(
     table, errors = None, []
     for stop in stops:
         start = 0 if table is None else len(table.fidelity)
-        more = _measured(job, cameras[start:stop], fit)
+        more = measured_levels(job, cameras[start:stop], fit)
         table = more if table is None else _joined(table, more)
         if stop == stops[-1]:
             break
@@ -143,9 +143,14 @@ def _until_it_stops_shrinking(
     return table, len(table.fidelity)
 
 
-def _measured(job: Job, cameras: Sequence[Camera], fit: FitConfig) -> SampledFidelity:
-    """Fidelity of the levels at some viewpoints, divided among those who compute."""
-    parts = [list(part) for part in split(cameras, job.pieces)]
+def measured_levels(
+    job: Job, cameras: Sequence[Camera], fit: FitConfig, only: Collection[int] | None = None
+) -> SampledFidelity:
+    """Fidelity of the levels at some viewpoints, divided among those who compute.
+
+    `only`: ids of the categories that are measured; the others, and the whole image, are NaN. None: all.
+    """
+    parts = [(list(part), only) for part in split(cameras, job.pieces)]
     found = work_all(job, "sample", _measure_some, parts)
     fidelity, pixels, whole = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
     labels = tuple(sorted({label for label, _ in job.ladder.counts}))
@@ -154,9 +159,12 @@ def _measured(job: Job, cameras: Sequence[Camera], fit: FitConfig) -> SampledFid
     return SampledFidelity(labels, fidelity, pixels, image, whole, distance)
 
 
-def _measure_some(job: Job, cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _measure_some(
+    job: Job, part: tuple[Sequence[Camera], Collection[int] | None]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    cameras, only = part
     return measure_levels(
-        job.ladder, cameras, backend=job.backend, antialiased=job.antialiased,
+        job.ladder, cameras, only=only, backend=job.backend, antialiased=job.antialiased,
         progress=lambda done, total: job.emit(Progress("sample", done, total)),
     )  # fmt: skip
 

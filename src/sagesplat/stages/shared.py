@@ -63,9 +63,14 @@ def label_images(job: Job, source: str) -> LabelImages:
 
 
 def distances(job: Job, distance: str) -> dict[int, np.ndarray]:
-    """d_min of each category in each view, as `FitConfig.distance` says."""
+    """d_min of each category in each view, as `FitConfig.distance` says; kept, as several stages ask."""
     percentile = PERCENTILE if distance == "percentile" else 0.0
-    return distances_in_views(job.scene, job.point_labels, percentile)
+    scene, labels = job.scene, job.point_labels
+    kept = job.__dict__.get("_distances")
+    if kept is None or kept[0] is not scene or kept[1] != percentile or not np.array_equal(kept[2], labels):
+        found = distances_in_views(scene, labels, percentile)
+        kept = job.__dict__["_distances"] = scene, percentile, labels, found
+    return kept[3]
 
 
 def observed(job: Job, config: FitConfig) -> Observations:

@@ -8,11 +8,14 @@ import numpy as np
 from sagesplat.adapt.bound_plans import Costs, plan_for_view, quality_at
 from sagesplat.adapt.calibrate_photos import TARGETS
 from sagesplat.adapt.eq3 import SsimModel
-from sagesplat.adapt.observe import Observations, as_unit, measure, render_rgb
+from sagesplat.adapt.ladder import PrefixLadder
+from sagesplat.adapt.observe import Observations, as_unit, erode, measure
 from sagesplat.adapt.photo_models import calibrated, fit_photos, in_composition
+from sagesplat.adapt.seen import seen_from
 from sagesplat.adapt.viewpoint import ViewModel
 from sagesplat.core.config import FitConfig
 from sagesplat.core.events import Progress
+from sagesplat.metrics.image import tiles_around
 from sagesplat.raster import Workspace, device_of, each_view
 from sagesplat.run.executor import split
 from sagesplat.run.job import Job
@@ -55,7 +58,8 @@ def fit_viewpoints(
             plan = plan_for_view(quality, costs, float(TARGETS[number]), row)
             compositions.setdefault(tuple(plan.levels.items()), []).append(number)
         planned.append((row, [(targets, dict(levels)) for levels, targets in compositions.items()]))
-    parts = [(some, config) for some in split(planned, job.pieces)]
+    wanted = sorted(set(table.label_id.tolist())) if known else None
+    parts = [(some, config, wanted) for some in split(planned, job.pieces)]
     measured = [one for some in work_all(job, "fit", _measure_compositions, parts) for one in some]
     found = calibrated(in_composition(fits, _changes(table, measured)), config.confidence)
     return dict(sorted({**known, **found}.items()))
@@ -76,24 +80,35 @@ def _changes(
 
 
 def _measure_compositions(
-    job: Job, part: tuple[Sequence[_Planned], FitConfig]
+    job: Job, part: tuple[Sequence[_Planned], FitConfig, Sequence[int] | None]
 ) -> list[tuple[int, int, int, list[int], float]]:
-    """(label id, its level, row, numbers of targets, SSIM) of compositions in some views."""
-    planned, config = part
+    """(label id, its level, row, numbers of targets, SSIM) of compositions in some views.
+
+    Of the categories that are wanted (ids), by rendering the parts of images that show them; None: of all.
+    """
+    planned, config, wanted = part
+    ladder = job.ladder
+    assert isinstance(ladder, PrefixLadder)
     name = "ssim_eroded" if config.region == "eroded" else "ssim"
-    masks, workspace, ladder = label_images(job, config.masks), Workspace(), job.ladder
+    masks, workspace = label_images(job, config.masks), Workspace()
 
     def in_view(of_view: _Planned) -> list[tuple[int, int, int, list[int], float]]:
         row, compositions = of_view
         view, rows = job.scene.views[row], []
+        tiles = None if wanted is None else tiles_around(np.isin(masks[view], wanted))
+        if tiles is not None and not tiles.any():
+            return rows
+        seen = seen_from(
+            ladder, view.camera,
+            backend=job.backend, antialiased=job.antialiased, workspace=workspace, tile_mask=tiles,
+        )  # fmt: skip
+        inner, photo = erode(masks[view]), as_unit(job.photos[row])
         for targets, levels in compositions:
-            image = render_rgb(
-                ladder.compose(levels), view.camera,
-                backend=job.backend, antialiased=job.antialiased, workspace=workspace,
-            )  # fmt: skip
-            found = measure(image, as_unit(job.photos[row]), masks[view], valid=job.valid[view])
+            found = measure(seen.render(levels), photo, masks[view], inner, job.valid[view], tiles)
             rows += [
-                (label, levels.get(label, -1), row, targets, values[name]) for label, values in found.items()
+                (label, levels.get(label, -1), row, targets, values[name])
+                for label, values in found.items()
+                if wanted is None or label in wanted
             ]
         return rows
 

@@ -54,7 +54,7 @@ export function positionOf(words: Uint32Array, rank: number): [number, number, n
   return [half(xy), half(xy >>> 16), half(z)];
 }
 
-const scalesOf = ({ lnScaleMin, lnScaleMax }: Encoding): Float64Array =>
+export const scalesOf = ({ lnScaleMin, lnScaleMax }: Encoding): Float64Array =>
   Float64Array.from({ length: 256 }, (_, byte) =>
     byte ? Math.exp(lnScaleMin + ((byte - 1) * (lnScaleMax - lnScaleMin)) / 254) : 0,
   );
@@ -82,6 +82,21 @@ function rotationOf(words: Uint32Array, rank: number): number[] {
     2 * (j * k + i * w),
     1 - 2 * (i * i + j * j),
   ];
+}
+
+/** The axes of a splat, each as long as its standard deviation, the longest first. */
+export function axesOf(
+  words: Uint32Array,
+  rank: number,
+  scales: Float64Array,
+): [number[], number[], number[]] {
+  const [rotation, sizes] = [rotationOf(words, rank), words[4 * rank + 3] as number];
+  const axes = [0, 1, 2].map((axis) => {
+    const scale = scales[(sizes >>> (8 * axis)) & 255] as number;
+    return { scale, along: [0, 3, 6].map((row) => scale * (rotation[row + axis] as number)) };
+  });
+  const [a, b, c] = axes.sort((one, other) => other.scale - one.scale).map(({ along }) => along);
+  return [a, b, c] as [number[], number[], number[]];
 }
 
 interface Hit {
@@ -162,105 +177,4 @@ function response(
     qq += q * q;
   }
   return Math.exp(-0.5 * Math.max(pp - (pq * pq) / qq, 0));
-}
-
-/** How far apart neighbours of a region may be, in medians of the splats' largest standard deviation. */
-const REACH = 2.5;
-const FAINT = 25; // in 1/255: fainter splats join no others
-
-/**
- * The splats of a label that are connected to one of them and of the colour around it, as a mask by rank.
- *
- * @param tolerance - distance from its colour, in 1 for each of red, green and blue
- * @param among - splats that may be taken, by rank; not 0: yes
- */
-export function grow(
-  { words, count }: Packed,
-  encoding: Encoding,
-  seed: number,
-  tolerance: number,
-  among?: Uint8Array,
-): Uint8Array {
-  const reach = REACH * medianScale(words, count, encoding);
-  const cellOf = (rank: number, to: readonly number[] = [0, 0, 0]): string =>
-    positionOf(words, rank)
-      .map((value, axis) => Math.floor(value / reach) + (to[axis] ?? 0))
-      .join();
-  const colour = colourAround(words, count, seed, reach, among);
-  const steps = (tolerance * 255) / (encoding.rgbMax - encoding.rgbMin);
-  const cells = new Map<string, number[]>();
-  for (let rank = 0; rank < count; rank++) {
-    if ((among && !among[rank]) || !isAlike(words[4 * rank] as number, colour, steps)) continue;
-    const key = cellOf(rank);
-    const known = cells.get(key);
-    if (known) known.push(rank);
-    else cells.set(key, [rank]);
-  }
-  const mask = new Uint8Array(count);
-  mask[seed] = 1;
-  const queue = [seed];
-  for (let next = queue.pop(); next !== undefined; next = queue.pop()) {
-    const here = positionOf(words, next);
-    for (const to of AROUND) {
-      const key = cellOf(next, to);
-      const left: number[] = [];
-      for (const rank of cells.get(key) ?? []) {
-        if (mask[rank]) continue;
-        const there = positionOf(words, rank);
-        if (Math.hypot(there[0] - here[0], there[1] - here[1], there[2] - here[2]) > reach) left.push(rank);
-        else {
-          mask[rank] = 1;
-          queue.push(rank);
-        }
-      }
-      if (cells.has(key)) cells.set(key, left);
-    }
-  }
-  return mask;
-}
-
-const AROUND = Array.from({ length: 27 }, (_, i) => [
-  (i % 3) - 1,
-  (Math.floor(i / 3) % 3) - 1,
-  Math.floor(i / 9) - 1,
-]);
-
-/** The mean colour of what is as near to a splat as its neighbours, in bytes, weighted by opacity. */
-function colourAround(
-  words: Uint32Array,
-  count: number,
-  seed: number,
-  reach: number,
-  among?: Uint8Array,
-): readonly number[] {
-  const here = positionOf(words, seed);
-  const sums = [0, 0, 0];
-  let total = 0;
-  for (let rank = 0; rank < count; rank++) {
-    const there = positionOf(words, rank);
-    const isNear = Math.hypot(there[0] - here[0], there[1] - here[1], there[2] - here[2]) <= reach;
-    if (!isNear || (among && !among[rank])) continue;
-    const word = words[4 * rank] as number;
-    const opacity = (word >>> 24) + 1;
-    total += opacity;
-    for (const axis of [0, 1, 2]) sums[axis] = (sums[axis] ?? 0) + opacity * ((word >>> (8 * axis)) & 255);
-  }
-  return sums.map((sum) => sum / Math.max(total, 1));
-}
-
-function isAlike(word: number, colour: readonly number[], steps: number): boolean {
-  if (word >>> 24 < FAINT) return false;
-  let sum = 0;
-  for (const axis of [0, 1, 2]) sum += (((word >>> (8 * axis)) & 255) - (colour[axis] ?? 0)) ** 2;
-  return sum <= steps * steps;
-}
-
-function medianScale(words: Uint32Array, count: number, encoding: Encoding): number {
-  const scales = scalesOf(encoding);
-  const largest = new Float64Array(count);
-  for (let rank = 0; rank < count; rank++) {
-    const sizes = words[4 * rank + 3] as number;
-    largest[rank] = scales[Math.max(sizes & 255, (sizes >>> 8) & 255, (sizes >>> 16) & 255)] as number;
-  }
-  return largest.sort()[count >> 1] || 1e-6;
 }

@@ -6,10 +6,10 @@ import { messageOf } from "./notice";
 import { save, saved } from "./saving";
 
 const HINT = "Click what you mean, or turn until the cross is on it and press Enter";
-const TITLES: Readonly<Record<Scope, string>> = {
-  instance: "This one",
-  category: "Category",
-  alike: "Alike, joined",
+const TITLES: Readonly<Record<Scope, readonly [string, string]>> = {
+  instance: ["This one", "The instance"],
+  category: ["Category", "The whole category"],
+  alike: ["Alike", "What is joined to it and of like colour"],
 };
 const WEIGHTS = [0, 0.25, 0.5, 1, 2, 4];
 const STILL = 5; // px that a pointer may move in a click
@@ -53,13 +53,11 @@ export class EditorCard {
     private readonly token: string | null,
     private readonly onToggle: (open: boolean) => void,
   ) {
-    this.scopes = SCOPES.map((scope) =>
-      h(
-        "button",
-        { type: "button", "aria-pressed": "false", click: () => editor.setScope(scope) },
-        TITLES[scope],
-      ),
-    );
+    this.scopes = SCOPES.map((scope) => {
+      const [text, title] = TITLES[scope];
+      const click = () => editor.setScope(scope);
+      return h("button", { type: "button", "aria-pressed": "false", title, click }, text);
+    });
     this.weight.append(...WEIGHTS.map((w) => h("option", { value: w }, `× ${w}`)));
     this.actions = {
       rename: button("Rename", "Rename the category", () => this.rename()),

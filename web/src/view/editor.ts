@@ -1,7 +1,8 @@
 /** Selects what is pointed at, and edits labels. What it does to the view is undone when it is closed. */
 
 import { type Category, Edits, type Operation, type Origin, type Ranks, runsOf } from "../core/edits";
-import { grow, type Packed, type Picked, pick } from "../core/pick";
+import { grow } from "../core/grow";
+import { type Packed, type Picked, pick } from "../core/pick";
 import type { Label } from "../types";
 import { Mark } from "./spark";
 import type { Viewer } from "./viewer";
@@ -10,8 +11,8 @@ import type { Viewer } from "./viewer";
 export const SCOPES = ["instance", "category", "alike"] as const;
 export type Scope = (typeof SCOPES)[number];
 
-const TOLERANCES = [0.06, 0.1, 0.16, 0.25, 0.4, 0.63]; // in colour, of what is alike
-const USUAL = 2;
+const TOLERANCES = [0.1, 0.16, 0.22, 0.3, 0.4, 0.55]; // in colour, of what is alike
+const USUAL = 3;
 const SAME = 6; // px between clicks that are taken for one place
 
 export interface Selection {
@@ -234,7 +235,7 @@ export class Editor {
     const cloud: Packed | null = layer.splatsOf(seed.label);
     if (!cloud || !owner || cloud.count < owner.length) return null;
     const among = Uint8Array.from(owner, (number) => +(number === category));
-    const tolerance = TOLERANCES[this.width] ?? 0.16;
+    const tolerance = TOLERANCES[this.width] ?? 0.3;
     // the lit colours of an earlier selection would not be alike
     const plain = layer.plainWords(seed.label) ?? cloud.words;
     return grow({ ...cloud, words: plain }, layer.encodingOf(seed.label), seed.rank, tolerance, among);

@@ -1,5 +1,6 @@
 import { describe, expect, it } from "vitest";
-import { grow, type Packed, pick, positionOf, type Ray } from "../../src/core/pick";
+import { grow } from "../../src/core/grow";
+import { type Packed, pick, positionOf, type Ray } from "../../src/core/pick";
 import type { Vec3 } from "../../src/types";
 import { ENCODING } from "../../src/view/packing";
 
@@ -83,10 +84,23 @@ describe("grow", () => {
   });
 
   it("takes more with more tolerance, and only what may be taken", () => {
-    const all = cloud(1, [...row(0, 5), ...row(5, 5, [120, 100, 100])]);
+    const all = cloud(1, [...row(0, 5), ...row(5, 5, [140, 100, 100])]);
     expect(grow(all, ENCODING, 0, 0.05).reduce((a, b) => a + b)).toBe(5);
     expect(grow(all, ENCODING, 0, 0.3).reduce((a, b) => a + b)).toBe(10);
     const among = Uint8Array.of(1, 1, 1, 0, 1, 1, 1, 1, 1, 1);
     expect([...grow(all, ENCODING, 0, 0.3, among)].slice(0, 4)).toEqual([1, 1, 1, 0]);
+  });
+
+  it("takes a surface of light and dark splats, faint ones too, and not what is behind a gap", () => {
+    const plank = row(0, 30).map((one, i) => ({ ...one, rgb: [100 + 40 * (i % 2), 90, 80] as const }));
+    const veiled = plank.map((one, i) => (i === 7 ? { ...one, alpha: 10 } : one));
+    const mask = grow(cloud(1, [...veiled, ...row(40, 5, [100, 90, 80])]), ENCODING, 3, 0.1);
+    expect([...mask]).toEqual([...Array(30).fill(1), ...Array(5).fill(0)]);
+  });
+
+  it("reaches far along large splats", () => {
+    const large: Splat = { at: [3, 0, -3], scale: 0.6 };
+    const mask = grow(cloud(1, [...row(0, 9), large, ...row(20, 9)]), ENCODING, 0, 0.2);
+    expect(mask.reduce((a, b) => a + b)).toBe(19);
   });
 });
