@@ -138,7 +138,7 @@ def test_exposures_of_the_photos_are_said(tmp_path):
         data, exposed=True, noticed=("exposure varies by 0.8 EV", "3 floaters removed")
     )
     page = write_report(tmp_path / "b", more).read_text("utf-8")
-    assert "Noticed in this capture: exposure varies by 0.8 EV; 3 floaters removed." in page
+    assert "Noticed in this capture, and dealt with: exposure varies by 0.8 EV; 3 floaters removed." in page
     said = page.split("<h2>")[0]
     assert "The photos differ in exposure" in said
     assert "cc_ssim 0.750 and cc_psnr 0.75 dB" in said
@@ -246,7 +246,7 @@ def test_the_first_page_leads_with_fidelity(tmp_path):
     assert (
         f"{(plan.transfer_bytes or 0) / 1e6:.2f} MB of {full / 1e6:.2f} MB looks like the full model" in first
     )
-    assert "fidelity ≥ 0.95 in every category for 95 % of viewpoints" in first
+    assert "Fidelity ≥ 0.95 in every category for 95 % of viewpoints" in first
     assert "at least 97 % of the viewpoints" in first
     assert "fidelity 0.955" in first
     assert "3 of 6 measurements there" in first  # not of the category without a promise
@@ -256,7 +256,7 @@ def test_the_first_page_leads_with_fidelity(tmp_path):
     assert "97 % (94 to 99, n 240)" in table
     assert table.count("no promise") == 1
     assert table.count("infeasible") == 0
-    beside = words[words.index("A second plan, for SSIM ≥ 0.6") : words.index("Size and quality")]
+    beside = words[words.index("A second plan, for SSIM ≥ 0.6") : words.index("What each target costs")]
     assert "infeasible, uncalibrated" in beside
     assert "ok, uncalibrated" in beside
     assert "nan" not in words.lower().split()
@@ -320,7 +320,7 @@ def test_a_scene_in_blocks_is_shown_by_category(tmp_path: Path) -> None:
     names = {3: "grass@0", 7: "grass@1", 9: "vase@1"}
     path = write_report(tmp_path, dataclasses.replace(data, names=names, categories={3: 3, 7: 3, 9: 9}))
     page = Page(path)
-    head = page.text[page.text.index("What each category gets") : page.text.index("Size and quality")]
+    head = page.text[page.text.index("What each category gets") : page.text.index("What each target costs")]
     assert "grass" in head
     assert "@" not in head
     plan = (tmp_path / "tables" / "plan.csv").read_text()
