@@ -8,14 +8,14 @@ _MISSING = "a QR code needs segno; pip install 'sagesplat[view]'"
 
 
 def qr_text(url: str) -> str:
-    """A QR code for a terminal, of block characters.
+    """A QR code for a terminal with a dark background, of block characters.
 
     Raises:
         BackendUnavailable: Without the package segno.
     """
     out = io.StringIO()
     _code(url).terminal(out, border=2, compact=True)
-    return out.getvalue()
+    return out.getvalue().rstrip("\n")
 
 
 def qr_address(url: str) -> str:
