@@ -1,4 +1,4 @@
-"""What a page has to keep for everybody, after axe and WCAG 2.2 AA: contrast, names, sizes, keyboard, narrow windows."""
+"""What a page has to keep for everybody, after axe and WCAG 2.2 AA: contrast, names, sizes, keyboard."""
 
 from typing import Any
 
@@ -72,14 +72,15 @@ RULES = r"""() => {
     const by = document.getElementById(element.getAttribute("aria-labelledby"))?.textContent;
     const pictures = [...element.querySelectorAll("img[alt]")].map((image) => image.alt).join("");
     const own = element.matches("select, input") ? "" : element.textContent;
-    const name = element.getAttribute("aria-label") || by || labels || own.trim() || pictures || element.title;
-    if (!name) wrong.push(`no name: ${named(element)}`);
+    const name = element.getAttribute("aria-label") || by || labels || own.trim() || pictures;
+    if (!name && !element.title) wrong.push(`no name: ${named(element)}`);
     const box = element.getBoundingClientRect();
     const inline = getComputedStyle(element).display === "inline";
     const small = Math.min(box.width, box.height) < 24;
     const slider = element.type === "range" && box.height >= 20; // its thumb is what is dragged
     if (element.matches("button, input, select") && small && !inline && !slider) {
-      wrong.push(`smaller than 24 px (${Math.round(box.width)} x ${Math.round(box.height)}): ${named(element)}`);
+      const size = `${Math.round(box.width)} x ${Math.round(box.height)}`;
+      wrong.push(`smaller than 24 px (${size}): ${named(element)}`);
     }
   }
   for (const image of document.images) {

@@ -70,6 +70,17 @@ def test_a_path_is_printed_whole() -> None:
     assert "view /runs/[/red]\n" in shown
 
 
+def test_a_run_ends_in_three_lines_with_the_next_command() -> None:
+    done = RunDone(
+        Path("/runs/a b/report/index.html"), Path("/runs/a b"), outcome="0.46 MB of 0.91 MB; SSIM 0.8"
+    )
+    assert printed(done).splitlines() == [
+        "Result: 0.46 MB of 0.91 MB; SSIM 0.8",
+        "Report: /runs/a b/report/index.html",
+        "Next:   sagesplat view '/runs/a b'",
+    ]
+
+
 def test_the_bar_shows_names_as_they_are() -> None:
     began, counts = StageStarted("[/red]\x07"), {"[/b]": 3, "\x1b[2J": 4}
     shown = printed(began, Progress("[/red]", 2, 2, "[old] \x1b[31m"), terminal=True)

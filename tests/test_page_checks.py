@@ -24,7 +24,7 @@ BROKEN = {
     '<p style="color:#888;font-size:18px"> nearly large</p>': "contrast 3.54",
     "<button><svg></svg></button>": "no name",
     "<input>": "no name",
-    '<button style="min-width:0;width:18px;height:30px;padding:0" aria-label="x"></button>': "smaller than 24 px",
+    '<button style="min-width:0;width:9px;padding:0" title="x"></button>': "smaller than 24 px",
     '<img src="data:,">': "no alt",
     '<p id="a">1</p><p id="a">2</p>': "id twice",
     "<h4>Four</h4>": "heading jumps",
