@@ -575,6 +575,27 @@ def viewer_figure(curves: Path, out: Path) -> None:
 
 
 @app.command
+def pictures(run: Path, out: Path, name: str = "", photo: str = "", press: str = "", column: int = 0) -> None:
+    """Pictures of README and docs/images from a finished run: the viewer's screenshots, and its result.
+
+    Args:
+        run: finished run folder.
+        out: folder for viewer.png, viewer-phone.png and demo.png.
+        name: file name, without suffix, of a single screenshot instead.
+        photo: name of the photo at whose viewpoint the phone, or the single screenshot, stands (default:
+            where the viewer begins).
+        press: selector of something to click first, such as ".labels .blocks".
+        column: number of the test view in demo.png, of those in the report.
+    """
+    from benchmarks import pictures as made
+
+    for path in made.screenshots(run, out, name=name, photo=photo, press=press):
+        print(path)
+    if not name:
+        made.result(run, out / "demo.png", column)
+
+
+@app.command
 def scaling(
     bundles: tyro.conf.Positional[tuple[Path, ...]] = (),
     *,

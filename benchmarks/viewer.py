@@ -17,11 +17,11 @@ from tests.browser import Opened, launch, open_page
 NETWORKS = (2.0, 10.0, 50.0)  # Mbit/s
 LATENCY = 100.0  # ms
 TARGETS = (0.8, 0.9, 0.95)  # of fidelity
-WAYS = {
-    "streamed": ("#2f6f56", "-"),
-    "fidelity 0.95": ("#d6a10b", "-"),
-    "file order": ("#8a94a3", "--"),
-    "one file": ("#e5484d", ":"),
+WAYS = {  # in curve.csv: what they are called, colour, line, width
+    "streamed": ("streams, best first", "#2f7458", "-", 2.2),
+    "fidelity 0.95": ("streams, until fidelity 0.95", "#d1780b", "-", 2.2),
+    "file order": ("streams, category by category", "#5b6bf0", "--", 1.5),
+    "one file": ("everything in one file", "#e5484d", ":", 2.0),
 }
 _QUIET = 1.5  # seconds without a change after which nothing more comes
 _STATE = """() => {
@@ -139,14 +139,25 @@ def figure(curves: Path, out: Path) -> None:
         rows = list(csv.DictReader(file))
     links = sorted({float(row["mbit"]) for row in rows})
     with rc_context(STYLE):
-        picture = Figure(figsize=(11, 3.2), layout="constrained")
+        picture = Figure(figsize=(10, 3.4), layout="constrained")
         for axes, link in zip(picture.subplots(1, len(links), sharey=True), links, strict=True):
-            for way, (color, line) in WAYS.items():
+            end = 0.0
+            for way, (title, color, line, width) in WAYS.items():
                 mine = [r for r in rows if (float(r["mbit"]), r["connections"], r["way"]) == (link, "6", way)]
                 time, ssim = ([float(r[name]) for r in mine] for name in ("seconds", "ssim"))
-                axes.step(time, ssim, line, where="post", color=color, label=way)
-            axes.set(title=f"{link:g} Mbit/s, 100 ms", xlabel="seconds", ylim=(0, None), xlim=(0, None))
-            axes.grid(True, alpha=0.3)
+                axes.step(time, ssim, line, where="post", color=color, lw=width, label=title)
+                end = max(end, *time) if way != "file order" else end
+            axes.set(
+                title=f"{link:g} Mbit/s",
+                xlabel="seconds after the page",
+                xlim=(0, 1.2 * end),
+                ylim=(0, 1.03),
+            )
         picture.axes[0].set_ylabel("expected fidelity")
-        picture.axes[0].legend()
-        picture.savefig(out, dpi=110)
+        picture.legend(
+            *picture.axes[0].get_legend_handles_labels(),
+            loc="outside upper center",
+            ncols=len(WAYS),
+            fontsize=10,
+        )
+        picture.savefig(out, dpi=120, pil_kwargs={"optimize": True})

@@ -67,7 +67,18 @@ def test_brackets_and_codes_are_kept(kind: str, text: str) -> None:
 def test_a_path_is_printed_whole() -> None:
     shown = printed(RunDone(Path("/runs/[old]/caf\udce9/report"), Path("/runs/[/red]")))
     assert "/runs/[old]/caf\\xe9/report" in shown
-    assert "view /runs/[/red]\n" in shown
+    assert "view '/runs/[/red]'\n" in shown  # as a shell takes it
+
+
+def test_a_run_ends_in_three_lines_with_the_next_command() -> None:
+    done = RunDone(
+        Path("/runs/a b/report/index.html"), Path("/runs/a b"), outcome="0.46 MB of 0.91 MB; SSIM 0.8"
+    )
+    assert printed(done).splitlines() == [
+        "Result: 0.46 MB of 0.91 MB; SSIM 0.8",
+        "Report: /runs/a b/report/index.html",
+        "Next:   sagesplat view '/runs/a b'",
+    ]
 
 
 def test_the_bar_shows_names_as_they_are() -> None:

@@ -6,6 +6,7 @@ import numba
 import numpy as np
 import pytest
 import torch
+
 from sagesplat.kernels import threads
 from sagesplat.kernels.threads import side_by_side
 from sagesplat.kernels.workspace import Workspace

@@ -6,8 +6,11 @@ from html.parser import HTMLParser
 from pathlib import Path
 from xml.etree import ElementTree
 
+import browser as chromium
 import numpy as np
 import pytest
+from browser import open_page
+from page_checks import wrong_with, wrong_with_keyboard
 from PIL import Image
 
 from sagesplat.adapt.eq3 import fit_models
@@ -18,7 +21,9 @@ from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.io.columns import cell_text
 from sagesplat.output import figures
 from sagesplat.output.by_category import merged
-from sagesplat.output.report import Panel, ReportData, write_report
+from sagesplat.output.next_steps import Commands, next_steps, view_quality, worst_view
+from sagesplat.output.place_figures import Place
+from sagesplat.output.report import Panel, PromiseFacts, ReportData, write_report
 
 NAMES = {3: "vase", 7: "dining table", 9: "$x^2$ <b>&amp; _odd"}
 COLOURS = {3: (250, 250, 10), 7: (0, 160, 180), 9: (90, 10, 200), -1: (128, 128, 128)}
@@ -133,13 +138,13 @@ def test_every_category_is_on_it(written):
 
 def test_exposures_of_the_photos_are_said(tmp_path):
     data = make()
-    assert "cc_psnr" not in write_report(tmp_path / "a", data).read_text("utf-8").split("<h2>")[0]
+    assert "cc_psnr" not in write_report(tmp_path / "a", data).read_text("utf-8").split("All numbers")[0]
     more = dataclasses.replace(
         data, exposed=True, noticed=("exposure varies by 0.8 EV", "3 floaters removed")
     )
     page = write_report(tmp_path / "b", more).read_text("utf-8")
-    assert "Noticed in this capture: exposure varies by 0.8 EV; 3 floaters removed." in page
-    said = page.split("<h2>")[0]
+    assert "Noticed in this capture, and dealt with: exposure varies by 0.8 EV; 3 floaters removed." in page
+    said = page.split("<h2>What each category gets</h2>")[1].split("<table>")[0]
     assert "The photos differ in exposure" in said
     assert "cc_ssim 0.750 and cc_psnr 0.75 dB" in said
 
@@ -246,17 +251,18 @@ def test_the_first_page_leads_with_fidelity(tmp_path):
     assert (
         f"{(plan.transfer_bytes or 0) / 1e6:.2f} MB of {full / 1e6:.2f} MB looks like the full model" in first
     )
-    assert "fidelity ≥ 0.95 in every category for 95 % of viewpoints" in first
-    assert "at least 97 % of the viewpoints" in first
-    assert "fidelity 0.955" in first
-    assert "3 of 6 measurements there" in first  # not of the category without a promise
+    assert "Fidelity ≥ 0.95 in every category for 95 % of viewpoints" in first
+    words_of_plan = words[words.index("What each category gets") : words.index("Bars: length")]
+    assert "at least 97 % of the viewpoints" in words_of_plan
+    assert "fidelity 0.955" in words_of_plan
+    assert "3 of 6 measurements there" in words_of_plan  # not of the category without a promise
     for word in ("infeasible", "uncalibrated", "cannot reach"):
         assert word not in first
     table = words[words.index("What each category gets") : words.index("SSIM against photos")]
     assert "97 % (94 to 99, n 240)" in table
     assert table.count("no promise") == 1
     assert table.count("infeasible") == 0
-    beside = words[words.index("A second plan, for SSIM ≥ 0.6") : words.index("Size and quality")]
+    beside = words[words.index("A second plan, for SSIM ≥ 0.6") : words.index("What each target costs")]
     assert "infeasible, uncalibrated" in beside
     assert "ok, uncalibrated" in beside
     assert "nan" not in words.lower().split()
@@ -265,6 +271,128 @@ def test_the_first_page_leads_with_fidelity(tmp_path):
     assert {(row["quality"], row["target"]) for row in rows} == {
         ("fidelity", "0.9"), ("fidelity", "0.95"), ("SSIM", "0.6"),
     }  # fmt: skip
+
+
+def whole_page() -> ReportData:
+    """With everything that a finished run has: commands, a map, drawn viewpoints, what else was made."""
+    draw = np.random.default_rng(1)
+    directions = draw.normal(size=(VIEWS, 2))
+    place = Place(draw.normal(size=(300, 2)), draw.random((300, 3)), 3 * directions, -directions)
+    drawn = {label: np.sort(draw.random((12, len(LEVELS))), axis=1).astype(np.float32) for label in LABELS}
+    return dataclasses.replace(
+        led_by_fidelity(panels=2),
+        commands=Commands("'/runs/a place'", "/photos", 1000),
+        can_view=True,
+        links=[("Its bundle", "../../bundle/index.html"), ("The paper's tables", "paper/index.html")],
+        place=place,
+        drawn=drawn,
+        promise=PromiseFacts(0.95, 57, 27, 83),
+        settings=[("train.max_steps", "1000")],
+        provenance=[("sha256 of scene.json", "f" * 64)],
+    )
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    return write_report(tmp_path_factory.mktemp("whole"), whole_page())
+
+
+def test_what_a_newcomer_wants_to_know_comes_first(whole):
+    path, tmp_path, data = whole, whole.parent, whole_page()
+    plan = data.plans[1]
+    words = " ".join(Page(path).text.split())
+    first = words[words.index("a <scene>") : words.index("What to do next")]
+    for said in (
+        "looks like the full model", f"{(plan.transfer_bytes or 0) / 1e6:.2f} MB to send, of",
+        "0.955 fidelity at 2 unseen viewpoints", "SSIM 0.700 on unseen photos",
+        "of 6 promises kept at unseen viewpoints", "sagesplat view '/runs/a place'",
+        "sagesplat view --lan '/runs/a place'",
+    ):  # fmt: skip
+        assert said.replace(" ", "") in first.replace(" ", "").replace("\xa0", ""), said
+    assert "Gaussians" not in first
+    html = path.read_text("utf-8")
+    assert html.index('id="stage"') < html.index("What to do next")
+    assert 'href="../../bundle/index.html" data-served hidden' in html
+    assert 'href="paper/index.html">The paper&#39;s tables' in html
+    for folded in ("train.max_steps", "f" * 64):
+        assert html.rindex("<details>", 0, html.index(folded)) > html.rindex(
+            "</details>", 0, html.index(folded)
+        )
+    rest = words[words.index("What the promises rest on") : words.index("Beside this page")]
+    assert "rendered at 57 viewpoints drawn between the photos" in rest
+    assert "calibrated at 83 further viewpoints" in rest
+    assert "holds in 95 of 100 draws" in rest
+    assert "3 of 6 measurements reach the target (50.0%)" in rest
+    assert (tmp_path / "figures" / "cameras.svg").exists()
+    assert (tmp_path / "figures" / "fidelity_by_size.svg").exists()
+    sizes = list(csv.DictReader((tmp_path / "tables" / "size_by_target.csv").read_text("utf-8").splitlines()))
+    assert float(sizes[-1]["full model MB to send"]) * 248 == pytest.approx(
+        30 * 1e-6 * 248 * full_count(data)
+    )
+
+
+def full_count(data: ReportData) -> int:
+    return sum(n for (_, level), n in data.counts.items() if level == LEVELS[-1])
+
+
+def test_an_address_is_a_qr_code_only_where_there_is_one(whole, tmp_path, monkeypatch):
+    assert "QR code of" not in whole.read_text("utf-8")
+    monkeypatch.setattr(figures, "save_figure", lambda figure, path: b"")  # which takes seconds
+    data = dataclasses.replace(whole_page(), url="https://example.org/x/")
+    page = write_report(tmp_path, data).read_text("utf-8")
+    assert '<a href="https://example.org/x/">' in page
+    assert re.search(r'<img class="qr" src="data:image/svg\+xml[^"]{400,}" alt="QR code of https', page)
+
+
+def test_the_next_step_is_what_was_measured():
+    data = whole_page()
+    rows, names = data.observations, ("a", "b", "c", "d", "e", "f", "g", "h", "i", "j")
+
+    def steps(seen: np.ndarray, commands: Commands) -> list:
+        of = dataclasses.replace(rows, ssim=seen.astype(np.float32))
+        return next_steps(of, data.train_views, TEST, names, NAMES, data.plans[1], commands)
+
+    typed = Commands("run", "/photos", 1000)
+    unseen = np.isin(rows.view, TEST)
+    worse = np.where(unseen, 0.7, 0.95) - 0.2 * (unseen & (rows.label_id == 7)) - 0.1 * (rows.view == 5)
+    found = steps(worse, typed)
+    assert [step.title for step in found] == ["More photos", "Measure at more viewpoints"]
+    assert "SSIM 0.950, unseen ones 0.650" in found[0].why
+    assert "largest for dining table" in found[0].why
+    assert "in f (0.600; see the map)" in found[0].why
+    assert "show unlabelled to" in found[1].why
+    pale = steps(np.full(len(rows), 0.8), typed)
+    assert [step.title for step in pale] == ["Train longer", "Measure at more viewpoints"]
+    assert pale[0].command == "sagesplat run /photos run --train.max-steps 2000 --force"
+    assert steps(np.full(len(rows), 0.97), typed)[0].command.startswith("sagesplat sample run ")
+    assert [step.title for step in steps(worse, Commands("run"))] == ["Measure at more viewpoints"]
+
+
+def test_the_view_that_measures_least():
+    rows = make(0).observations
+    found = view_quality(rows, VIEWS + 1)
+    assert np.isnan(found[VIEWS])
+    assert found[:VIEWS] == pytest.approx([quality(TOTAL, 3000, view) for view in range(VIEWS)])
+    assert worst_view(found, TEST) == 5
+    assert worst_view(found, TEST[:0]) is None
+    assert worst_view(found, np.array([VIEWS])) is None
+
+
+@pytest.mark.skipif(chromium.missing() is not None, reason=chromium.missing() or "")
+def test_the_page_is_for_everybody(whole):
+    for size, scheme in (((1280, 800), "light"), ((360, 740), "dark")):
+        with open_page(whole.as_uri(), size, scheme=scheme) as opened:
+            page = opened.page
+            page.evaluate("for (const part of document.querySelectorAll('details')) part.open = true")
+            assert wrong_with(page) == []
+            assert wrong_with_keyboard(page) == []
+            page.get_by_role("button", name="view_1.jpg", exact=True).click()
+            assert page.locator(".view:visible img").first.get_attribute("alt").startswith("view_1.jpg")
+            page.evaluate("navigator.clipboard.writeText = async (text) => { window.copied = text }")
+            page.get_by_role("button", name="Copy").first.click()
+            assert page.evaluate("copied") == "sagesplat view '/runs/a place'"
+            assert page.locator("[data-served]").is_hidden()  # a bundle needs a server
+            assert opened.complaints == []
 
 
 def test_plans_for_fidelity_are_compared_with_equal_levels_at_the_same_views():
@@ -320,7 +448,7 @@ def test_a_scene_in_blocks_is_shown_by_category(tmp_path: Path) -> None:
     names = {3: "grass@0", 7: "grass@1", 9: "vase@1"}
     path = write_report(tmp_path, dataclasses.replace(data, names=names, categories={3: 3, 7: 3, 9: 9}))
     page = Page(path)
-    head = page.text[page.text.index("What each category gets") : page.text.index("Size and quality")]
+    head = page.text[page.text.index("What each category gets") : page.text.index("What each target costs")]
     assert "grass" in head
     assert "@" not in head
     plan = (tmp_path / "tables" / "plan.csv").read_text()

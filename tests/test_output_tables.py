@@ -82,7 +82,7 @@ def test_plan_and_targets(tmp_path):
     assert [row["category"] for row in rows] == ["dining, table", "vase", "unlabelled"]
     assert [row["status"] for row in rows] == ["infeasible", "ok", "no model"]
     assert float(rows[1]["of full model"]) == 0.25
-    assert float(rows[1]["MB"]) == 10 * 248 / 1e6
+    assert float(rows[1]["MB as floats"]) == 10 * 248 / 1e6
     assert rows[2]["promised SSIM"] == ""
     rows = as_text(tables.targets_table([plan, plan], COUNTS, LABELS, NAMES), tmp_path / "t.csv")
     assert rows[-1]["full model Gaussians"] == "105"

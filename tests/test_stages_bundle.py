@@ -22,6 +22,7 @@ from sagesplat.raster import rasterize
 from sagesplat.run.job import Job
 from sagesplat.run.records import FORMAT, checkpoint_key, input_hashes
 from sagesplat.run.run_dir import RunDir
+from sagesplat.segment.display_colors import colors_of
 from sagesplat.stages.bundle import _antialiased, bundle, live_bundle
 from sagesplat.stages.export import increment_files
 from sagesplat.stages.methods import NestedLevels
@@ -34,7 +35,6 @@ from sagesplat.train.checkpoint import write_checkpoint
 from sagesplat.train.state import initial_state
 from sagesplat.viewer.built import package_viewer
 from sagesplat.viewer.bundle import is_bundle
-from sagesplat.viewer.display_names import colors_of
 from sagesplat.viewer.frames import camera_at
 from sagesplat.viewer.promises import allowed, read_model
 

@@ -82,8 +82,8 @@ def test_the_console_and_the_page_get_it(job: Job, monkeypatch: pytest.MonkeyPat
     console = Console(RichConsole(file=printed, width=300))
     console(done[0])
     console(RunDone(Path("report")))
-    assert printed.getvalue().splitlines()[0] == f"Noticed: {'; '.join(WORDS)}"
-    assert printed.getvalue().count("Noticed") == 1
+    assert printed.getvalue().splitlines()[0] == f"· noticed: {'; '.join(WORDS)}"
+    assert printed.getvalue().count("noticed") == 1
 
 
 def test_a_damaged_file_is_one_line(job: Job) -> None:

@@ -18,6 +18,7 @@ import pytest
 import torch
 from browser import Opened, open_page
 from make_viewer_vectors import model
+from page_checks import wrong_with, wrong_with_keyboard
 
 from sagesplat.adapt.viewpoint import QualityKind, ViewModel
 from sagesplat.core.gaussians import Gaussians, concat
@@ -466,6 +467,38 @@ def test_the_keyboard_is_enough(site: str, browser: Any) -> None:
         assert page.evaluate("sagesplat.settings().mode") == "budget"
         page.get_by_role("button", name="Hide brick").press("Enter")
         opened.wait_for("document.querySelector('[aria-label=\"Show brick\"]')")
+        assert opened.complaints == []
+
+
+@pytest.mark.parametrize(("size", "scheme"), [((900, 560), "light"), ((360, 640), "dark")])
+def test_the_first_minute(promised: str, browser: Any, size: tuple[int, int], scheme: Any) -> None:
+    """What a newcomer sees says what it is, how to move and how good it is, for everybody; then it goes."""
+    phone = size[0] < 640
+    with open_page(promised, size, browser=browser, scheme=scheme, touch=phone) as opened:
+        ready(opened, BASE)
+        page = opened.page
+        opened.wait_for("document.querySelector('.summary').textContent.includes('fidelity')")
+        assert re.fullmatch(r"\S+ k?B of \S+ k?B · fidelity ≥ [01]\.\d\d", page.inner_text(".summary"))
+        assert page.inner_text(".title h1") == "three walls"
+        assert ("pinch" if phone else "scroll") in page.inner_text(".welcome")
+        assert page.is_visible("input[aria-label='Keep quality at']")
+        assert wrong_with(page) == []
+        assert wrong_with_keyboard(page) == []
+        for key, part in (
+            ("p", ".panel .labels" if phone else ".panel .head"),
+            ("l", ".editor"),
+            ("?", "dialog"),
+        ):
+            page.keyboard.press(key)
+            assert page.is_visible(part)
+            assert wrong_with(page) == [], part
+        page.keyboard.press("Escape")
+        page.locator("#view").dispatch_event("wheel")
+        assert page.locator(".welcome").count() == 0
+        page.reload()
+        ready(opened, BASE)
+        assert page.is_visible(".title h1")
+        assert page.locator(".welcome").count() == 0
         assert opened.complaints == []
 
 

@@ -1,5 +1,6 @@
 """Events as progress bars and tables."""
 
+import shlex
 import sys
 import time
 from pathlib import Path
@@ -117,12 +118,14 @@ class Console:
                     self.say(f"{'':21}{line}")
             case TableMade(title, header, rows):
                 self._show_table(title, header, rows)
-            case RunDone(report, run, noticed):
+            case RunDone(report, run, noticed, outcome):
                 if noticed:
-                    self.say(f"Noticed: {'; '.join(noticed)}")
+                    self.note(f"noticed: {'; '.join(noticed)}")
+                if outcome:
+                    self.say(f"Result: {outcome}", style="bold")
                 self.say(f"Report: {report.resolve()}")
                 if run:
-                    self.say(f"Walk through it: {_program()} view {run}")
+                    self.say(f"Next:   {_program()} view {shlex.quote(str(run))}")
 
     def say(self, text: str, style: str = "", mark: tuple[str, str] = ("", "")) -> None:
         """Print a line in a style, after a mark (text, style) of another."""

@@ -373,6 +373,7 @@ def evaluate(run: Run, ladder: Ladder = "nested", machine: Annotated[Compute, Fl
 def report(
     run: Run,
     paper: bool = False,
+    url: str = "",
     settings: Annotated[PaperConfig, Flat] = PaperConfig(),
     ladder: Ladder = "nested",
     machine: Annotated[Parallel, Flat] = Parallel(),
@@ -383,6 +384,8 @@ def report(
         run: run folder
         paper: evaluate as in the paper (cross-view, equal model size), with the training snapshots as levels;
             their stages are run first where they are missing
+        url: address at which the bundle was published: the report links to it, and shows it as a QR code
+            for phones
     """
     from sagesplat.stages import pipeline
     from sagesplat.stages.report import make_report
@@ -396,4 +399,4 @@ def report(
             pipeline.adapt_snapshots(job)
             paper_report(job, settings)
         else:
-            make_report(job)
+            make_report(job, url)

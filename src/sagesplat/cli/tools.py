@@ -190,6 +190,7 @@ def view(
     path: Positional[Annotated[Path, arg(metavar="RUN|BUNDLE")]],
     port: int | None = None,
     host: str | None = None,
+    lan: bool = False,
     ssl_certfile: Path | None = None,
     ssl_keyfile: Path | None = None,
     browser: bool = True,
@@ -202,6 +203,7 @@ def view(
         path: run folder (its bundle is made if it is missing or out of date), or a bundle
         port: port to listen on (default: the first free one from 8000)
         host: address to listen on; 0.0.0.0 serves the whole network (default: this machine only)
+        lan: serve the whole network, and show the address as a QR code for phones
         ssl_certfile: certificate (PEM) for https, which headsets require
         ssl_keyfile: key of the certificate, if it is a separate file
         browser: open the browser
@@ -210,12 +212,18 @@ def view(
             machine only
     """
     from sagesplat.cli.console import Console
+    from sagesplat.core.qr import qr_text
     from sagesplat.stages.view import show
 
+    if lan and host:
+        raise RunError(f"--lan and --host {host}: give one of them; --lan is --host 0.0.0.0")
+    host = "0.0.0.0" if lan else host
     certificate = {"ssl_certfile": ssl_certfile, "ssl_keyfile": ssl_keyfile}
     with (
         Console() as console,
         show(path, console, port=port, host=host, follow=follow, edit=edit, **certificate) as shown,
     ):
+        if lan and len(shown.urls) > 1 and "utf" in (sys.stdout.encoding or "").lower():
+            say(*qr_text(shown.urls[-1]).splitlines())
         say(*shown.urls, shown.hint, "Ctrl-C ends it")
         shown.run(browser)

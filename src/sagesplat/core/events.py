@@ -79,6 +79,7 @@ class RunDone:
     report: Path
     run: Path | None = None  # run folder, if `sagesplat view` can show it
     noticed: tuple[str, ...] = ()  # what the run noticed, and dealt with, in words
+    outcome: str = ""  # the run in one line: its size and its quality
 
 
 Event = StageStarted | StageSkipped | Progress | Training | Warned | Noted | StageDone | TableMade | RunDone

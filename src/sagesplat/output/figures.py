@@ -18,10 +18,10 @@ from matplotlib.patches import Patch
 from sagesplat.adapt.eq3 import SsimModel
 from sagesplat.adapt.evaluate import QUALITIES, Evaluation
 from sagesplat.adapt.observe import TOTAL, Observations
-from sagesplat.adapt.plan import Choice, Plan, quality_title
+from sagesplat.adapt.plan import Plan, quality_title
 from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.io.files import atomic_path
-from sagesplat.output.tables import MB, last_counts, name_of, view_mean
+from sagesplat.output.tables import MB, bytes_of, last_counts, name_of, view_mean
 
 Colours = Mapping[int, tuple[int, int, int]]  # label id -> RGB, 0..255
 Sizes = Mapping[tuple[int, int], int]  # bytes of each (label id, level)
@@ -82,11 +82,6 @@ def caption(label_id: int, names: Mapping[int, str]) -> str:
 def shortened(text: str) -> str:
     """A text cut to the length that a legend or a title has room for."""
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
-
-
-def bytes_of(choice: Choice) -> int:
-    """What a choice costs: bytes to send, of snapshots 248 a Gaussian."""
-    return choice.nbytes if choice.transfer_bytes is None else choice.transfer_bytes
 
 
 def _columns(usual: int, of_long: int, labels: Sequence[int], names: Mapping[int, str]) -> int:
@@ -224,7 +219,9 @@ def size_by_target(
             colour = ink(label_id, colours)
             axes.barh(row, width, 0.72, left=left, color=colour, hatch=hatch, edgecolor="white", lw=0.6)
             left += width
-        note = f" {left:,.1f} MB" + (f" · {sum(nbytes.values()) / whole:.0%}" if row else "")
+        note = f" {left:,.{2 if whole < 10 * MB else 1}f} MB" + (
+            f" · {sum(nbytes.values()) / whole:.0%}" if row else ""
+        )
         axes.text(left, row, note, va="center", fontsize=9, fontweight="bold")
     axes.set_yticks(range(len(bars)), [bar[0] for bar in bars])
     axes.invert_yaxis()

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float32, UInt8
 from jinja2 import Environment, StrictUndefined, Template
 from PIL import Image
 
@@ -19,11 +19,14 @@ from sagesplat.adapt.observe import TOTAL, Observations
 from sagesplat.adapt.plan import Choice, Counts, Plan, quality_title
 from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.core.gaussians import BYTES_PER_GAUSSIAN
+from sagesplat.core.qr import qr_address
 from sagesplat.io.files import write_text
-from sagesplat.output import figures, tables
+from sagesplat.output import figures, place_figures, tables
 from sagesplat.output.by_category import Categories, merged, merged_counts, merged_plan, relabelled
 from sagesplat.output.figures import Colours, Panel, Sizes
-from sagesplat.output.tables import MB, Table, name_of
+from sagesplat.output.next_steps import Commands, next_steps, view_quality, worst_view
+from sagesplat.output.place_figures import Place
+from sagesplat.output.tables import MB, Table, bytes_of, name_of
 from sagesplat.segment.block_categories import category_of
 
 PICTURE_WIDTH = 1400  # pixels of a picture inside the page; the files beside it keep their size
@@ -32,6 +35,16 @@ FIT_LABELS = 9  # labels drawn there, the largest
 TABLE_ROWS = 200  # of a table inside the page; the file beside it has all
 
 Facts = Sequence[tuple[str, str]]
+
+
+@dataclass(frozen=True)
+class PromiseFacts:
+    """What lower bounds of fidelity were made from."""
+
+    confidence: float
+    fitted: int  # drawn viewpoints that the models were fitted to
+    composed: int  # further ones, at which plans were composed and measured
+    calibration: int  # further ones, at which the bounds were calibrated
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +78,14 @@ class ReportData:
     viewpoints: UInt8[np.ndarray, "H W 3"] | None = None  # what its viewpoints see
     categories: Categories = field(default_factory=dict)  # of per-block categories
     noticed: Sequence[str] = ()  # what the run noticed, and dealt with, in words
+    commands: Commands | None = None  # what commands on the run name
+    can_view: bool = False  # whether `sagesplat view` shows the run
+    links: Facts = ()  # what else was made of the run: title, address relative to the page
+    url: str = ""  # where the run's bundle was published
+    place: Place | None = None  # the capture from above
+    promise: PromiseFacts | None = None
+    drawn: Mapping[int, Float32[np.ndarray, "V K"]] = field(default_factory=dict)
+    """Fidelity by label id: of each level, at the drawn viewpoints that show the category."""
 
 
 def write_report(folder: Path, data: ReportData) -> Path:
@@ -99,6 +120,9 @@ def write_report(folder: Path, data: ReportData) -> Path:
         num_parts=len(per_block.categories),
         table_rows=TABLE_ROWS,
         plots={name: (title, image) for name, title, image in plots},
+        steps=_next_steps(data),
+        bundle=next((at for _, at in data.links if at.split("/")[-2:-1] == ["bundle"]), ""),
+        qr=qr_address(data.url) if data.url else "",
         sheets=sheets,
         viewpoints=None if data.viewpoints is None else _picture(data.viewpoints, "JPEG"),
         panels=[_pictures(panel, data.colours, data.photos) for panel in data.panels],
@@ -120,8 +144,17 @@ def by_category(data: ReportData) -> ReportData:
         sizes=None if data.sizes is None else merged_counts(data.sizes, to),
         plans=[merged_plan(plan, to) for plan in data.plans],
         evaluation=_merged_evaluation(data.evaluation, to),
+        drawn=_pooled(data.drawn, to),
         names={label: category_of(name) if label in to else name for label, name in data.names.items()},
     )
+
+
+def _pooled(drawn: Mapping[int, np.ndarray], to: Categories) -> dict[int, np.ndarray]:
+    """By category what all its blocks measure."""
+    found: dict[int, list[np.ndarray]] = {}
+    for label, values in drawn.items():
+        found.setdefault(to.get(label, label), []).append(values)
+    return {label: np.concatenate(parts) for label, parts in found.items()}
 
 
 def _merged_evaluation(rows: Evaluation, to: Categories) -> Evaluation:
@@ -161,7 +194,7 @@ def _headline(data: ReportData, promises: Evaluation) -> dict:
     rows = data.evaluation.of(plan)
     whole = rows.select(rows.label_id == TOTAL)
     mb, full_mb = (
-        sum(map(figures.bytes_of, plan.choices)) / MB,
+        sum(map(bytes_of, plan.choices)) / MB,
         sum(tables.last_counts(_sizes(data)).values()) / MB,
     )
     saved = 1 - mb / full_mb if full_mb else 0.0
@@ -214,8 +247,8 @@ def _categories(data: ReportData, plan: Plan, labels: Sequence[int], promises: E
                 "name": name_of(label_id, data.names),
                 "colour": _css(data.colours.get(label_id, (128, 128, 128))),
                 "choice": choice,
-                "mb": figures.bytes_of(choice) / MB if choice else math.nan,
-                "share": figures.bytes_of(choice) / full if choice and full else math.nan,
+                "mb": bytes_of(choice) / MB if choice else math.nan,
+                "share": bytes_of(choice) / full if choice and full else math.nan,
                 "of_scene": full / max(1, *sizes.values()),
                 "fidelity": tables.mean(rows.fidelity),
                 "measured": tables.mean(rows.ssim),
@@ -224,6 +257,24 @@ def _categories(data: ReportData, plan: Plan, labels: Sequence[int], promises: E
             }
         )
     return lines
+
+
+def _next_steps(data: ReportData):
+    if data.commands is None:
+        return []
+    return next_steps(
+        data.observations, data.train_views, data.test_views, data.view_names, data.names, main_plan(data),
+        data.commands,
+    )  # fmt: skip
+
+
+def _camera_map(data: ReportData, place: Place) -> figures.Figure:
+    quality = view_quality(data.observations, len(data.view_names))
+    test = np.isin(np.arange(len(quality)), data.test_views)
+    asked = any(step.title == "More photos" for step in _next_steps(data))
+    return place_figures.camera_map(
+        place, quality, test, worst_view(quality, data.test_views) if asked else None
+    )
 
 
 def _figures(data: ReportData, labels: Sequence[int], per_block: ReportData, promises: Evaluation):
@@ -235,6 +286,17 @@ def _figures(data: ReportData, labels: Sequence[int], per_block: ReportData, pro
         "Model size by target and category",
         figures.size_by_target(data.plans, _sizes(data), labels, names, colours, unit),
     )
+    if data.place is not None:
+        yield "cameras", "Map of the cameras", _camera_map(data, data.place)
+    if data.drawn and data.sizes:
+        levels = sorted({level for _, level in data.counts})
+        yield (
+            "fidelity_by_size",
+            "Fidelity of each category by its size",
+            place_figures.fidelity_by_size(
+                data.drawn, levels, data.sizes, main_plan(data), labels, names, colours
+            ),
+        )
     if len(data.evaluation):
         yield (
             "quality_over_size",
@@ -288,7 +350,7 @@ def _tables(data: ReportData, labels: Sequence[int], per_block: ReportData, prom
     if data.ssim_target is not None:
         beside = _nearest(per_block, "ssim", data.ssim_target)
         yield "plan_ssim", tables.plan_table(beside, per_block.counts, per_block.names)
-    yield "size_by_target", tables.targets_table(data.plans, data.counts, labels, names)
+    yield "size_by_target", tables.targets_table(data.plans, data.counts, labels, names, data.sizes)
     if len(data.evaluation):
         yield "evaluation", tables.evaluation_table(promises, labels, names)
     yield "gaussians_by_level", tables.counts_table(data.counts, labels, names)

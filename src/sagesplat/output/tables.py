@@ -13,7 +13,7 @@ import numpy as np
 from sagesplat.adapt.eq3 import SsimModel
 from sagesplat.adapt.evaluate import QUALITIES, Evaluation
 from sagesplat.adapt.observe import TOTAL, Observations
-from sagesplat.adapt.plan import Counts, Plan, quality_title
+from sagesplat.adapt.plan import Choice, Counts, Plan, quality_title
 from sagesplat.core.gaussians import BYTES_PER_GAUSSIAN
 from sagesplat.io.columns import text_cell
 from sagesplat.io.files import atomic_path, write_text
@@ -140,6 +140,11 @@ def name_of(label_id: int, names: Mapping[int, str]) -> str:
     return special.get(label_id) or names.get(label_id, f"category {label_id}")
 
 
+def bytes_of(choice: Choice) -> int:
+    """What a choice costs: bytes to send, of snapshots 248 a Gaussian."""
+    return choice.nbytes if choice.transfer_bytes is None else choice.transfer_bytes
+
+
 def by_size(counts: Counts) -> list[int]:
     """Label ids, the one with the most Gaussians at its last level first."""
     last = last_counts(counts)
@@ -240,46 +245,55 @@ def plan_table(plan: Plan, counts: Counts, names: Mapping[int, str]) -> Table:
             choice.level,
             choice.count,
             share,
-            choice.nbytes / MB,
             sent,
+            choice.nbytes / MB,
             choice.distance,
             choice.predicted,
         )
         of = choice.reached
         views = (of.share, of.low, of.high, of.num_views) if of else (math.nan,) * 4
         body.append((name_of(choice.label_id, names), *cells, *views, choice.verdict))
-    header = ("category", "level", "Gaussians", "of full model", "MB", "MB to send", "distance")
+    header = ("category", "level", "Gaussians", "of full model", "MB to send", "MB as floats", "distance")
     header += (f"promised {quality_title(plan.quality)}", "reached in", "from", "to", "views", "status")
-    formats = ("", ",d", ",d", ".1%", ".2f", ".3f", ".3f", ".3f", ".0%", ".0%", ".0%", ",d", "")
+    formats = ("", ",d", ",d", ".1%", ".3f", ".2f", ".3f", ".3f", ".0%", ".0%", ".0%", ",d", "")
     note = "reached in: share of the views that measure the target at this level or above, 95 % interval"
     return Table(f"Plan for {plan.asked}", header, formats, body, notes=(f"{note} from, to.",))
 
 
 def targets_table(
-    plans: Sequence[Plan], counts: Counts, labels: Sequence[int], names: Mapping[int, str]
+    plans: Sequence[Plan],
+    counts: Counts,
+    labels: Sequence[int],
+    names: Mapping[int, str],
+    sizes: Mapping[tuple[int, int], int] | None = None,
 ) -> Table:
-    """Table III: Gaussians, bytes and status of every label for the full model and for each target."""
+    """Table III: Gaussians, bytes and status of every label for the full model and for each target.
+
+    `sizes`: bytes to send of each (label id, level); without, a Gaussian has 248 bytes, as in the paper.
+    """
     full = last_counts(counts)
-    header = ["category", "full model Gaussians", "full model MB"]
+    most = last_counts(sizes) if sizes else {label: n * BYTES_PER_GAUSSIAN for label, n in full.items()}
+    unit = "MB to send" if sizes else "MB"
+    header = ["category", "full model Gaussians", f"full model {unit}"]
     for plan in plans:
-        header += [f"{plan.asked} {column}" for column in ("level", "Gaussians", "MB", "status")]
+        header += [f"{plan.asked} {column}" for column in ("level", "Gaussians", unit, "status")]
     chosen = [{choice.label_id: choice for choice in plan.choices} for plan in plans]
+
+    def nbytes(choice: Choice) -> int:
+        return bytes_of(choice) if sizes else choice.nbytes
+
     body = []
     for label_id in labels:
-        row = [
-            name_of(label_id, names),
-            full.get(label_id, 0),
-            full.get(label_id, 0) * BYTES_PER_GAUSSIAN / MB,
-        ]
+        row = [name_of(label_id, names), full.get(label_id, 0), most.get(label_id, 0) / MB]
         for choices in chosen:
             if choice := choices.get(label_id):
-                row += [choice.level, choice.count, choice.nbytes / MB, choice.verdict]
+                row += [choice.level, choice.count, nbytes(choice) / MB, choice.verdict]
             else:
                 row += [math.nan, 0, 0.0, ""]
         body.append(tuple(row))
-    total = ["all", sum(full.values()), sum(full.values()) * BYTES_PER_GAUSSIAN / MB]
+    total = ["all", sum(full.values()), sum(most.values()) / MB]
     for plan in plans:
-        total += [math.nan, plan.count, plan.nbytes / MB, plan.verdict]
+        total += [math.nan, plan.count, sum(map(nbytes, plan.choices)) / MB, plan.verdict]
     formats = ("", ",d", ".2f", *(",d", ",d", ".2f", "") * len(plans))
     return Table("Size by target", tuple(header), formats, [*body, tuple(total)])
 

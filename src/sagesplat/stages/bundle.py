@@ -30,7 +30,6 @@ from sagesplat.raster import rasterize
 from sagesplat.run.job import Job
 from sagesplat.run.records import is_made_from, settings_of
 from sagesplat.scene import read_scene
-from sagesplat.segment.block_categories import split_name
 from sagesplat.segment.display_names import title_of
 from sagesplat.segment.masks import UNLABELLED
 from sagesplat.stages.edited import label_settings
@@ -45,7 +44,7 @@ from sagesplat.stages.results import (
     sampled_of,
     viewpoints_of,
 )
-from sagesplat.stages.shared import distances
+from sagesplat.stages.shared import category_and_block, category_colors, distances
 from sagesplat.viewer import boxes
 from sagesplat.viewer.built import check_viewer, package_viewer
 from sagesplat.viewer.bundle import (
@@ -57,7 +56,6 @@ from sagesplat.viewer.bundle import (
     write_documents,
 )
 from sagesplat.viewer.corrections import distance_error, with_corrections
-from sagesplat.viewer.display_names import colors_of
 from sagesplat.viewer.frames import FLIP, camera_at
 from sagesplat.viewer.manifest import CameraEntry, Category, Contents, start_of
 from sagesplat.viewer.pack import ASPECT, FOV_Y
@@ -281,7 +279,7 @@ def _contents(job: Job, g: Gaussians, antialiased: bool) -> Contents:
     labels = sorted(g.counts())
     job.check_named(job.run.levels, labels)
     split_names = {i: category_and_block(job, names[i]) for i in labels}
-    colors = _colors(job, {category for category, _ in split_names.values()})
+    colors = category_colors(job, {category for category, _ in split_names.values()})
     ground = [i for i in labels if _GROUND & set(_title(job, split_names[i][0]).split())]
     places = _places(job, g)
     return Contents(
@@ -311,20 +309,8 @@ def _contents(job: Job, g: Gaussians, antialiased: bool) -> Contents:
     )
 
 
-def category_and_block(job: Job, name: str) -> tuple[str, int | None]:
-    """The category and block of a label's name; block None unless the scene is in blocks."""
-    return split_name(name) if job.has_block_categories else (name, None)
-
-
 def _title(job: Job, category: str) -> str:
     return title_of(category) if category != job.whole_masks.taxonomy.name(UNLABELLED) else "everything else"
-
-
-def _colors(job: Job, categories: Collection[str]) -> dict[str, str]:
-    taxonomy = job.whole_masks.taxonomy
-    ids = [i for i in (UNLABELLED, *taxonomy.names) if taxonomy.name(i) in categories]
-    colors = colors_of({i: taxonomy.color(i) for i in ids})
-    return {taxonomy.name(i): colors[i] for i in ids}
 
 
 def _places(job: Job, g: Gaussians) -> dict[int, np.ndarray]:

@@ -52,10 +52,10 @@ def compose_plan(job: Job) -> None:
         plan = main_plan(job)
         g = compose(job, plan)
         write_ply(run.composed, classic(job, g), job.names(), parents=job.parents_by_id)
-        transfer_bytes = (
-            "" if plan.transfer_bytes is None else f", {plan.transfer_bytes / 1e6:.2f} MB to send"
-        )
-        return [f"{len(g):,} Gaussians, {plan.nbytes / 1e6:.1f} MB at 248 bytes each{transfer_bytes}"]
+        size = f"{plan.nbytes / 1e6:.1f} MB at 248 bytes each"
+        if plan.transfer_bytes is not None:
+            size = f"{plan.transfer_bytes / 1e6:.2f} MB to send ({run.composed.name}: {size})"
+        return [f"{len(g):,} Gaussians, {size}"]
 
     settings = {"tune_steps": settings_of(run, "plan").get("tune_steps", 0)}
     run_stage(job, "compose", settings, compose_inputs(job), [run.composed], make)

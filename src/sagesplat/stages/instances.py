@@ -20,6 +20,7 @@ from sagesplat.run.job import Job
 from sagesplat.run.records import file_hash
 from sagesplat.run.stage import run_stage
 from sagesplat.scene.scene import View
+from sagesplat.segment.display_names import title_of
 from sagesplat.segment.edit import apply, edit_table
 from sagesplat.segment.instances import (
     FOLDER,
@@ -130,19 +131,19 @@ def _find(job: Job, g: Gaussians, masks: Masks, ids: list[int]) -> Instances:
     )  # fmt: skip
     found = label(g, sightings, masks.taxonomy)
     for category, count in found.alone.items():
-        name = masks.taxonomy.name(category)
+        name = title_of(masks.taxonomy.name(category))
         job.emit(
             Warned(f"{count} instances of {name} in single photos are left to {name}: no other view agrees")
         )
     missing = sorted(set(ids) - set(found.parents.values()))
     if not found.parents:
-        names = ", ".join(masks.taxonomy.name(i) for i in ids)
+        names = ", ".join(title_of(masks.taxonomy.name(i)) for i in ids)
         raise LabelError(
             f"{job.run.photo_instances}: no instance of {names} is seen in two training photos; name other "
             "categories, or leave out --labels.instances"
         )
     if missing:
-        job.emit(Warned(f"no instances of {', '.join(masks.taxonomy.name(i) for i in missing)}"))
+        job.emit(Warned(f"no instances of {', '.join(title_of(masks.taxonomy.name(i)) for i in missing)}"))
     return found
 
 
@@ -180,6 +181,6 @@ def _within(label_ids: np.ndarray, before: np.ndarray, parents: Mapping[int, int
 
 
 def _line(label_ids: np.ndarray, taxonomy: Taxonomy, parents: Mapping[int, int]) -> str:
-    names = [f"{taxonomy.names[i]} ({(label_ids == i).sum():,})" for i in sorted(parents)]
+    names = [f"{title_of(taxonomy.names[i])} ({(label_ids == i).sum():,})" for i in sorted(parents)]
     more = ", ..." if len(names) > _LISTED else ""
     return f"{len(names)} instances (Gaussians): {', '.join(names[:_LISTED])}{more}"

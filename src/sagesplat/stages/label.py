@@ -22,6 +22,7 @@ from sagesplat.run.remote import work_all
 from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
 from sagesplat.scene.detect import VALID_FOLDER
+from sagesplat.segment.display_names import title_of, titles
 from sagesplat.segment.edit import (
     Edited,
     edit_labels,
@@ -120,9 +121,10 @@ def _ignored_lines(shares: Float32[np.ndarray, " V"]) -> list[str]:
 
 
 def _lines(edited: Edited) -> list[str]:
-    lines = [f"{len(edited.taxonomy.names)} categories: {', '.join(edited.taxonomy.names.values())}"]
+    shown = titles(edited.taxonomy.names)
+    lines = [f"{len(shown)} categories: {', '.join(shown.values())}"]
     for what, gone in (("left out", edited.dropped), ("too small", edited.folded)):
-        named = ", ".join(f"{name} ({share:.1%})" for name, share in gone.items() if share)
+        named = ", ".join(f"{title_of(name)} ({share:.1%})" for name, share in gone.items() if share)
         if named:
             lines.append(f"{what}: {named}")
     return lines

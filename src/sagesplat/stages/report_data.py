@@ -2,29 +2,47 @@
 
 import json
 import math
+import os
 import platform
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from sagesplat import __version__
+from sagesplat.adapt.free_poses import level_axes
 from sagesplat.adapt.ladder import PrefixLadder
 from sagesplat.adapt.observe import as_unit, measure_total, render_rgb
 from sagesplat.adapt.viewpoint import QualityKind
+from sagesplat.adapt.viewpoints import SETS
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.pictures import open_picture
-from sagesplat.output.figures import Colours, Panel
-from sagesplat.output.report import ReportData
+from sagesplat.output.figures import Panel
+from sagesplat.output.next_steps import Commands
+from sagesplat.output.place_figures import Place
+from sagesplat.output.report import PromiseFacts, ReportData
+from sagesplat.run.capture import read_capture
 from sagesplat.run.job import Job
 from sagesplat.run.records import read_record, settings_of
 from sagesplat.run.run_dir import RunDir
 from sagesplat.scene import describe
 from sagesplat.segment.block_categories import category_of
 from sagesplat.segment.display_names import titles
-from sagesplat.segment.masks import UNLABELLED, UNLABELLED_COLOR, Taxonomy
+from sagesplat.segment.masks import UNLABELLED
 from sagesplat.stages.methods import method_of
-from sagesplat.stages.results import evaluation_of, has_photos, models_of, observations_of, plans_of
+from sagesplat.stages.results import (
+    evaluation_of,
+    fidelity_of,
+    has_photos,
+    models_of,
+    observations_of,
+    plans_of,
+    sampled_of,
+    viewpoints_of,
+)
+from sagesplat.stages.shared import label_colors
+from sagesplat.viewer.frames import FLIP, upward
 
 PANELS = 3  # views shown in pictures
 STAGES = (
@@ -34,12 +52,20 @@ STAGES = (
 
 
 def report_data(
-    job: Job, composed: Gaussians, quality: QualityKind, target: float, noticed: Sequence[str] = ()
+    job: Job,
+    composed: Gaussians,
+    quality: QualityKind,
+    target: float,
+    noticed: Sequence[str] = (),
+    url: str = "",
 ) -> ReportData:
-    """Everything that the report shows; it leads with the plan for `target`, whose scene is `composed`."""
+    """Everything that the report shows; it leads with the plan for `target`, whose scene is `composed`.
+
+    `url`: where the bundle was published.
+    """
     run, scene, masks, ladder = job.run, job.scene, job.best_masks, job.ladder
     names = {**masks.taxonomy.names, UNLABELLED: masks.taxonomy.name(UNLABELLED)}
-    categories, colours = _parts(run, names)
+    promise, drawn = _promise(job)
     beside = settings_of(run, "plan").get("target_ssim") if quality == "fidelity" else None
     records = {path.stem: read_record(path) for path in stage_records(run)}
     return ReportData(
@@ -49,7 +75,7 @@ def report_data(
         ssim_target=beside,
         sizes=method_of(job).bytes_to_send,
         names=titles(names),
-        colours=colours or {label: masks.taxonomy.color(label) for label in names},
+        colours=label_colors(job),
         observations=observations_of(job),
         train_views=scene.train_ids,
         test_views=scene.test_ids,
@@ -64,12 +90,19 @@ def report_data(
         settings=_settings(records),
         timings=[(stage, float(made.get("seconds", math.nan))) for stage, made in records.items()],
         provenance=_provenance(records),
-        categories=categories,
+        categories=_parts(run, names),
         exposed=any(scene.views[row].camera.exposure is not None for row in scene.test_ids),
         photos=has_photos(run),
         adopted=_adopted(job, ladder) if run.adopted.exists() and isinstance(ladder, PrefixLadder) else (),
         viewpoints=_viewpoints(run),
         noticed=noticed,
+        commands=_commands(job),
+        can_view=method_of(job).streams,
+        links=links(run),
+        url=url,
+        place=_place(job),
+        promise=promise,
+        drawn=drawn,
     )
 
 
@@ -85,7 +118,8 @@ def _adopted(job: Job, ladder: PrefixLadder) -> list[tuple[str, str]]:
     """How a splat that somebody else trained was looked at, and how its levels were made."""
     made, nest = settings_of(job.run, "adopt"), settings_of(job.run, "nest")
     trained = f"trained on renders of the splat, {nest['steps']:,} steps"
-    first = {job.names()[label]: max(levels) for label, levels in ladder.replaces.items() if levels}
+    names = titles(job.names())
+    first = {names[label]: max(levels) for label, levels in ladder.replaces.items() if levels}
     originals = ", ".join(f"{titled} {level}" for titled, level in first.items())
     return [
         ("file", Path(made["source"]).name),
@@ -111,18 +145,64 @@ def stage_records(run: RunDir) -> list[Path]:
     return [path for s in STAGES if s not in without and (path := run.provenance(s)).exists()]
 
 
-def _parts(run: RunDir, names: dict[int, str]) -> tuple[dict[int, int], Colours]:
-    """Of a scene in blocks: the label of each per-block category's category, and its colour; else nothing."""
+def _parts(run: RunDir, names: dict[int, str]) -> dict[int, int]:
+    """Of a scene in blocks: the label of each per-block category's category; else nothing."""
     if not (run.block_categories / "labels.json").exists():
-        return {}, {}
-    taxonomy = Taxonomy.read(run.masks / "labels.json")
-    by_name = {taxonomy.name(i): taxonomy.color(i) for i in (UNLABELLED, *taxonomy.names)}
+        return {}
     of = {label: category_of(name) for label, name in sorted(names.items())}
     stands: dict[str, int] = {}
     for label, category in of.items():
         stands.setdefault(category, label)
-    colours = {label: by_name.get(category, UNLABELLED_COLOR) for label, category in of.items()}
-    return {label: stands[category] for label, category in of.items() if label != UNLABELLED}, colours
+    return {label: stands[category] for label, category in of.items() if label != UNLABELLED}
+
+
+def _commands(job: Job) -> Commands:
+    """What is typed to go on with a run."""
+    run = job.run
+    where = shlex.quote(str(run.path.resolve()))
+    if run.adopted.exists():
+        return Commands(where)
+    posed = run.provenance("poses").exists()
+    capture = settings_of(run, "poses")["source"] if posed else str(read_capture(run.scene).path)
+    steps = settings_of(run, "train").get("max_steps", 0) if run.provenance("train").exists() else 0
+    return Commands(where, shlex.quote(capture), int(steps))
+
+
+def links(run: RunDir) -> list[tuple[str, str]]:
+    """What else was made of a run, by title: addresses relative to its report."""
+    pages = [
+        ("Its bundle, for any static web server", run.path / "bundle"),
+        ("The paper's tables and figures, of training snapshots", RunDir(run.path, "snapshots").paper),
+        ("The paper's tables and figures, of nested levels", RunDir(run.path, "nested").paper),
+    ]
+    found = [(title, folder / "index.html") for title, folder in pages]
+    return [(title, os.path.relpath(path, run.report)) for title, path in found if path.is_file()]
+
+
+def _place(job: Job) -> Place:
+    """The capture from above."""
+    scene = job.scene
+    cameras = [view.camera for view in scene.views]
+    plane = np.stack(level_axes(upward(cameras) * FLIP), axis=1)
+    return Place(
+        points=scene.points.xyz @ plane,
+        colours=scene.points.rgb / 255,
+        at=np.stack([camera.position for camera in cameras]) @ plane,
+        towards=np.stack([camera.direction for camera in cameras]) @ plane,
+    )
+
+
+def _promise(job: Job) -> tuple[PromiseFacts | None, dict[int, np.ndarray]]:
+    """What bounds of fidelity were made from, and the fidelity at drawn viewpoints by label id."""
+    run = job.run
+    if not (run.ladder == "nested" and run.sampled.exists() and run.fidelity.exists()):
+        return None, {}
+    models, sets, sampled = fidelity_of(job), viewpoints_of(job), sampled_of(job)
+    confidence = min((model.confidence for model in models.values()), default=0.0)
+    facts = PromiseFacts(confidence, *(len(sets.rows(name)) for name in SETS))
+    shown = sampled.shown(job.fit_config.min_share)
+    drawn = {label: sampled.fidelity[shown[:, column], column] for column, label in enumerate(sampled.labels)}
+    return facts, {label: values for label, values in drawn.items() if len(values)}
 
 
 def _panels(job: Job, composed: Gaussians) -> list[Panel]:

@@ -1,6 +1,6 @@
 """Helpers that several stages share: settings, label images and distances of a run."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -22,6 +22,9 @@ from sagesplat.output.tables import Table
 from sagesplat.run.job import Job
 from sagesplat.run.records import settings_of
 from sagesplat.run.run_dir import RunDir
+from sagesplat.segment.block_categories import split_name
+from sagesplat.segment.display_colors import colors_of, rgb_of
+from sagesplat.segment.masks import UNLABELLED
 from sagesplat.segment.parents import with_instances
 from sagesplat.stages.results import observations_of
 
@@ -103,3 +106,28 @@ def label_named(job: Job, name: str) -> int:
     if composed(name) not in ids:
         raise RunError(f"{job.run.path}: no category {name!r}; there are {', '.join(ids)}")
     return ids[composed(name)]
+
+
+def category_and_block(job: Job, name: str) -> tuple[str, int | None]:
+    """The category and block of a label's name; block None unless the scene is in blocks."""
+    return split_name(name) if job.has_block_categories else (name, None)
+
+
+def category_colors(job: Job, categories: Collection[str]) -> dict[str, str]:
+    """A colour such as "#e5484d" for each category by name: that of the viewer, the report and its figures.
+
+    All categories that have Gaussians are to be given: colours are chosen together.
+    """
+    taxonomy = job.whole_masks.taxonomy
+    ids = [i for i in (UNLABELLED, *taxonomy.names) if taxonomy.name(i) in categories]
+    colors = colors_of({i: taxonomy.color(i) for i in ids})
+    return {taxonomy.name(i): colors[i] for i in ids}
+
+
+def label_colors(job: Job) -> dict[int, tuple[int, int, int]]:
+    """RGB, 0 to 255, of each label id: `category_colors`, of parts of blocks that of their category."""
+    names = job.names()
+    drawn = {names[label] for (label, _), count in job.ladder.counts.items() if count}
+    colors = category_colors(job, {category_and_block(job, name)[0] for name in drawn})
+    of = {label: category_and_block(job, name)[0] for label, name in names.items()}
+    return {label: rgb_of(colors[category]) for label, category in of.items() if category in colors}

@@ -8,6 +8,7 @@ import { Panel } from "./panel";
 import { splitSlider } from "./split";
 import { toolbar } from "./toolbar";
 import "./theme";
+import { welcome } from "./welcome";
 
 const REFRESH = 250; // ms between updates of the numbers
 
@@ -20,9 +21,12 @@ export function buildPage(app: HTMLElement, viewer: Viewer): void {
   const bar = h("div", { class: "progress", role: "progressbar", "aria-label": "Loading" }, h("i"));
   const status = h("span", { class: "status", role: "status" });
   const title = h("header", { class: "title card" }, h("h1", {}, manifest.name), status);
+  const greeting = welcome(viewer.stage.canvas);
+  if (greeting) title.append(greeting);
   const editor = new EditorCard(viewer.editor, viewer.token, () => update());
   const tools = toolbar(viewer, { split, help, editor, say });
   app.append(bar, title, split.element, tools.element, panel.element, editor.element, editor.cross, help);
+  viewer.stage.canvas.setAttribute("role", "application");
   viewer.stage.canvas.setAttribute(
     "aria-label",
     `${manifest.name}, a 3D scene. W A S D move, arrow keys turn, question mark for help.`,

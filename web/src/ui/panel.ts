@@ -31,13 +31,16 @@ export class Panel {
         title,
       ),
     );
-    this.#sliders = [targetSlider(viewer), ...qualityChoice(viewer), ...budgetSliders(viewer)];
+    const target = targetSlider(viewer);
+    const others = [...qualityChoice(viewer), ...budgetSliders(viewer)];
+    this.#sliders = [target, ...others];
     const toggle = iconButton("chevron", "Panel (P)", () => this.toggle());
     this.element = h(
       "aside",
       { class: "panel card", "aria-label": "Levels of detail" },
       h("div", { class: "head" }, this.#summary, toggle),
       this.#meter,
+      target.element, // there in a closed panel too: the one thing to set
       h(
         "div",
         { class: "body" },
@@ -51,7 +54,7 @@ export class Panel {
           },
           ...this.#modes,
         ),
-        ...this.#sliders.map(({ element }) => element),
+        ...others.map(({ element }) => element),
         this.#facts,
         this.#table.element,
       ),
@@ -73,7 +76,11 @@ export class Panel {
     const { state, settings, streamer, frameMs } = this.viewer;
     const { totals } = streamer.manifest; // grows while training runs
     const bytes = `${formatBytes(state.bytesShown)} of ${formatBytes(totals.bytes)}`;
-    setText(this.#summary, bytes);
+    const promised = state.labels.filter(({ visible }) => visible).map((label) => label.promised);
+    const least = Math.min(...promised.filter(Number.isFinite));
+    const quality = nameOf(settings.quality);
+    setText(this.#summary, Number.isFinite(least) ? `${bytes} · ${quality} ≥ ${formatSsim(least)}` : bytes);
+    this.#summary.title = `Size of what is shown, and the least ${quality} promised of what is in sight; 1 is no difference`;
     this.#meter.style.setProperty("--value", String(state.bytesShown / Math.max(totals.bytes, 1)));
     for (const button of this.#modes) {
       const chosen = button.dataset.mode === settings.mode;

@@ -21,7 +21,7 @@ from sagesplat.stages.compose import compose_inputs, tune_composition
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.plan import ssim_targets
 from sagesplat.stages.results import has_photos, models_of, observations_of, plans_of
-from sagesplat.stages.shared import distances, observed
+from sagesplat.stages.shared import distances, label_colors, observed
 from sagesplat.studies.lpips import load_metrics, lpips_hashes
 from sagesplat.studies.paper.cross_view import NONE, cross_view, read_cross_view
 from sagesplat.studies.paper.report import PaperData, Picture, four_levels, take_pictures, write_paper
@@ -165,7 +165,7 @@ def tables_and_figures(job: Job, config: PaperConfig) -> None:
     view = _view(job, config)
 
     def make() -> list[str]:
-        ladder, taxonomy = job.ladder, job.taxonomy
+        ladder = job.ladder
         view_plans = _view_plans(job, view)
         reduced = {"min": 0.0, "5 %": 5.0, "mean": None}
         by_statistic = {
@@ -175,7 +175,7 @@ def tables_and_figures(job: Job, config: PaperConfig) -> None:
         data = PaperData(
             title=job.scene.name,
             names=titles(job.names()),
-            colours={label: taxonomy.color(label) for label in job.names()},
+            colours=label_colors(job),
             observations=observations_of(job),
             fitted=observed(job, job.fit_config),
             train_views=job.scene.train_ids,
