@@ -15,6 +15,7 @@ from typing import Any
 
 from sagesplat.core.config import PosesConfig
 from sagesplat.core.errors import BackendUnavailable, SceneError
+from sagesplat.core.extras import install
 from sagesplat.core.typed import check_fields, types_of
 from sagesplat.io.files import read_object, write_json
 from sagesplat.scene._prepare import PreparedPhoto, prepare_photos
@@ -133,7 +134,7 @@ def _reconstruction(
 def _check(source: Path, workspace: Path, config: PosesConfig) -> None:
     """SceneError or BackendUnavailable for what can be rejected before any work."""
     if importlib.util.find_spec("pycolmap") is None:
-        raise BackendUnavailable("poses from photos need pycolmap; pip install 'sagesplat[poses]'")
+        raise BackendUnavailable(f"poses from photos need pycolmap; {install('sagesplat[poses]')}")
     if not source.exists():
         raise SceneError(f"{source}: no such file or folder; name a folder of photos or a video")
     if config.model not in _MODELS:
