@@ -52,8 +52,11 @@ def test_types_format_and_unit_tests(npm: Npm) -> None:
 
 def test_the_built_viewer_is_current(npm: Npm, tmp_path: Path) -> None:
     fresh = tmp_path / "static"
-    built = npm("run", "build", "--", "--outDir", str(fresh))
+    built = npm("run", "build", "--", "--outDir", str(fresh), "--sourcemap", "hidden")
     assert built.returncode == 0, built.stdout + built.stderr
+    maps = [json.loads(path.read_text("utf-8")) for path in fresh.rglob("*.map")]
+    for path in fresh.rglob("*.map"):
+        path.unlink()
 
     def content(folder: Path) -> dict[str, bytes]:
         return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
@@ -62,7 +65,18 @@ def test_the_built_viewer_is_current(npm: Npm, tmp_path: Path) -> None:
     assert sorted(now) == sorted(committed), "run `make web` and commit src/sagesplat/viewer/static"
     different = [name for name in now if now[name] != committed[name]]
     assert not different, "run `make web` and commit src/sagesplat/viewer/static"
-    shutil.rmtree(fresh)
+    # each npm package whose modules are in it has its notice, with the text of its licence
+    bundled = {
+        name
+        for made in maps
+        for source in made["sources"]
+        for name in re.findall(r"node_modules/((?:@[^/]+/)?[^/]+)/", source)
+    }
+    assert {"three", "@sparkjsdev/spark"} <= bundled
+    notices = (STATIC / "THIRD_PARTY_LICENSES.txt").read_text("utf-8")
+    for name in bundled:
+        text = re.search(rf"^{re.escape(name)} [\d.]+\nLicence: (.+)\n\n(.+)", notices, re.MULTILINE)
+        assert text, f"{name} has no notice with a licence's text"
 
 
 @pytest.fixture(scope="module")
