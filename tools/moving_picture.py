@@ -33,7 +33,7 @@ def frames(bundle: Path, size: tuple[int, int]) -> list[Image.Image]:
     pictures = []
 
     class Quiet(SimpleHTTPRequestHandler):
-        def log_message(self, *_: object) -> None:
+        def log_message(self, format: str, *args: object) -> None:
             pass
 
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(bundle))) as server:

@@ -260,7 +260,7 @@ def _run(work: Path, on_progress: OnProgress) -> dict[str, Any]:
 
 
 def _ending(code: int, log: Path) -> str:
-    if code == -signal.SIGKILL:
+    if code == -getattr(signal, "SIGKILL", 9):  # Windows has none, and no negative codes
         return "was killed (often for lack of memory: take a smaller max_size)"
     if code < 0:
         return f"crashed ({signal.Signals(-code).name})"
