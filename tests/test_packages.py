@@ -1,7 +1,11 @@
-"""The versions of packages: what users may have, and what the tests ran with."""
+"""The versions of packages: what users may have, what the tests ran with; and what the wheel holds."""
 
 import re
+import subprocess
+import sys
+import tarfile
 import tomllib
+import zipfile
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -56,3 +60,47 @@ def test_minimum_versions_have_no_known_holes(name: str) -> None:
         assert Version(version(name)) >= minimum
     except PackageNotFoundError:
         pytest.skip(f"{name} is not installed")
+
+
+def test_sdist_and_wheel_hold_everything(tmp_path: Path) -> None:
+    """The wheel is built from the sdist, and so proves that one too."""
+    pytest.importorskip("hatchling", reason="needs the extra dev")
+
+    def build(kind: str, source: Path) -> Path:
+        command = [sys.executable, "-m", "hatchling", "build", "--target", kind, "--directory", str(tmp_path)]
+        done = subprocess.run(command, cwd=source, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        (made,) = tmp_path.glob("*.tar.gz" if kind == "sdist" else "*.whl")
+        return made
+
+    with tarfile.open(build("sdist", ROOT)) as tar:
+        tar.extractall(tmp_path, filter="data")
+    (unpacked,) = (path for path in tmp_path.iterdir() if path.is_dir())
+    with zipfile.ZipFile(build("wheel", unpacked)) as wheel:
+        names = set(wheel.namelist())
+        about = next(wheel.read(name).decode() for name in names if name.endswith(".dist-info/METADATA"))
+    source = ROOT / "src"
+    here = {path.relative_to(source).as_posix() for path in source.rglob("*") if path.is_file()}
+    here = {
+        name for name in here if "__pycache__" not in name and not name.endswith((".pyc", ".nbi", ".nbc"))
+    }
+    assert {name for name in names if ".dist-info/" not in name} == here
+    for part in (
+        "sagesplat/py.typed",
+        "sagesplat/viewer/static/index.html",
+        "sagesplat/output/report.html.j2",
+    ):
+        assert part in names
+    for notice in ("LICENSE", "THIRD_PARTY.md", "THIRD_PARTY_LICENSES.txt"):
+        assert any(".dist-info/licenses/" in name and name.endswith(f"/{notice}") for name in names), notice
+    for extra in PROJECT["optional-dependencies"]:
+        assert f"Provides-Extra: {extra}\n" in about
+    for name in (
+        "Makefile",
+        "constraints.txt",
+        "README.md",
+        "examples",
+        "tests/conftest.py",
+        "web/package.json",
+    ):
+        assert (unpacked / name).exists(), name

@@ -14,6 +14,7 @@ from conftest import pinhole, random_gaussians, render_with_gradients
 from test_raster_cpu import assert_agree, backend  # noqa: F401
 
 from sagesplat.core.errors import BackendUnavailable, DataError, OutOfMemory
+from sagesplat.core.extras import install
 from sagesplat.raster import TILE, add_weights, blend, cuda, rasterize, resolve_backend
 
 BACKGROUND = torch.tensor([0.2, 0.3, 0.4])
@@ -284,10 +285,10 @@ def test_every_gap_is_one_line_with_its_cure(able, monkeypatch):
     for version in ("1.4.0", "1.5.2", "1.7.0", "2.0"):
         with monkeypatch.context() as patch:
             patch.setattr(cuda, "gsplat_version", lambda version=version: version)
-            assert gap() == f"gsplat {version} is not supported; pip install 'gsplat>=1.5.3,<1.7'"
+            assert gap() == f"gsplat {version} is not supported; {install('gsplat>=1.5.3,<1.7')}"
     with monkeypatch.context() as patch:
         patch.setattr(cuda, "gsplat_version", lambda: None)
-        assert gap() == "the cuda backend needs gsplat; pip install 'sagesplat[cuda]'"
+        assert gap() == f"the cuda backend needs gsplat; {install('sagesplat[cuda]')}"
     with monkeypatch.context() as patch:
         patch.setattr(torch.cuda, "is_available", lambda: False)
         assert "finds no CUDA device or driver; check nvidia-smi or use --device cpu" in gap()

@@ -8,8 +8,10 @@ neither torch nor numba. The examples in `examples/` import from here alone.
     RunConfig, SceneConfig, TrainConfig, NestConfig, PlanConfig    settings
     Event, StageDone, StageSkipped, Warned     what `run_scene` tells its caller
     load_scene, Scene, View, Camera            captures
+    make_demo_capture                          the built-in capture, of any size
     Gaussians, read_ply, write_ply, read_spz, write_spz    splat files
     rasterize, Render, set_threads             rendering, with gradients
+    ssim_map                                   SSIM at every pixel, as everything here measures it
     train_gaussians                            the training loop, as a generator of events
     Plan, ViewModel, read_plans, read_promises    plans and the SSIM models behind them
     Taxonomy, HfSegmenter, OnnxSegmenter, label_image      label images
@@ -34,10 +36,12 @@ if TYPE_CHECKING:
     from sagesplat.core.errors import SageError
     from sagesplat.core.events import Event, StageDone, StageSkipped, Warned
     from sagesplat.core.gaussians import Gaussians
+    from sagesplat.demo.capture import make_capture as make_demo_capture
     from sagesplat.formats.ply import read_ply, write_ply
     from sagesplat.formats.splat import Splat
     from sagesplat.formats.splats import read_splat
     from sagesplat.formats.spz import read_spz, write_spz
+    from sagesplat.metrics.image import ssim_map
     from sagesplat.output.figures import label_image
     from sagesplat.raster import Render, rasterize, set_threads
     from sagesplat.scene import load_scene
@@ -53,9 +57,9 @@ __all__ = [
     "Camera", "Event", "FinishedRun", "Gaussians", "HfSegmenter", "NestConfig", "OnnxSegmenter", "Plan",
     "PlanConfig", "Render", "RunConfig", "SageError", "Scene", "SceneConfig", "Splat", "StageDone",
     "StageSkipped", "Taxonomy", "TrainConfig", "View", "ViewModel", "Warned", "apply_labels",
-    "label_image", "load_scene", "open_run", "rasterize", "read_plans", "read_ply", "read_promises",
-    "read_splat", "read_spz", "run_scene", "select", "select_mask", "set_threads", "train_gaussians",
-    "write_ply", "write_spz",
+    "label_image", "load_scene", "make_demo_capture", "open_run", "rasterize", "read_plans", "read_ply",
+    "read_promises", "read_splat", "read_spz", "run_scene", "select", "select_mask", "set_threads",
+    "ssim_map", "train_gaussians", "write_ply", "write_spz",
 ]  # fmt: skip
 
 # by module, below sagesplat
@@ -66,10 +70,12 @@ _EXPORTS = {
     "core.errors": "SageError",
     "core.events": "Event StageDone StageSkipped Warned",
     "core.gaussians": "Gaussians",
+    "demo.capture": "make_demo_capture",
     "formats.ply": "read_ply write_ply",
     "formats.splat": "Splat",
     "formats.splats": "read_splat",
     "formats.spz": "read_spz write_spz",
+    "metrics.image": "ssim_map",
     "output.figures": "label_image",
     "raster": "Render rasterize set_threads",
     "scene": "load_scene",
@@ -82,7 +88,7 @@ _EXPORTS = {
     "train.trainer": "train_gaussians",
 }
 _MODULE_OF = {name: module for module, names in _EXPORTS.items() for name in names.split()}
-_NAME_THERE = {"train_gaussians": "train"}
+_NAME_THERE = {"make_demo_capture": "make_capture", "train_gaussians": "train"}
 
 
 def __getattr__(name: str) -> Any:

@@ -1,5 +1,4 @@
-import { type Camera, QUALITIES, type Quality, type Settings, type State } from "./types";
-import type { Pose } from "./view/frame";
+import { type Camera, type Pose, QUALITIES, type Quality, type Settings, type State } from "./types";
 
 /** One drawn frame. */
 export interface Sample {
@@ -13,11 +12,9 @@ export interface Sample {
   readonly state: State;
 }
 
-/** The interface for pages that embed the viewer: `window.sagesplat`. Poses are in the bundle's frame. */
+/** What scripts can do with a viewer: of `createViewer`, and of `window.sagesplat`. Poses are in the bundle's frame. */
 export interface Embed {
-  /** Resolves when the manifest is read and all else is usable; rejects with the message on the page. */
-  readonly ready: Promise<void>;
-  readonly version: string;
+  readonly version: string; // of the sagesplat that made the bundle
   readonly cameras: readonly Camera[];
   state(): State;
   settings(): Settings;
@@ -28,6 +25,8 @@ export interface Embed {
   goTo(photo: string | number): void;
   /** Requests a frame, and calls back after every drawn one, while the canvas is readable. Returns how to stop. */
   onSample(callback: (sample: Sample) => void): () => void;
+  /** Stops it, frees its memory and takes it off the page. */
+  destroy(): void;
 }
 
 /** The options in the page's address. */

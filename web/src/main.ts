@@ -1,16 +1,17 @@
 import { inAdvance } from "./core/advance";
 import type { Fetch } from "./core/download";
-import { loadManifest } from "./core/manifest";
 import { bundleUrl, type Embed, type Options, parseOptions } from "./embed";
 import { type Source, sourceInside } from "./inside";
 import { fail, hideNotice, messageOf } from "./ui/notice";
 import { buildPage } from "./ui/page";
+import { openViewer } from "./view/open";
 import { colorsOf } from "./view/spark";
-import { embed, Viewer } from "./view/viewer";
+import { embed, type Viewer } from "./view/viewer";
 
 declare global {
   interface Window {
-    sagesplat: Pick<Embed, "ready"> & Partial<Embed>;
+    /** The page's viewer. `ready` resolves when all else is there; it rejects with the message on the page. */
+    sagesplat: { ready: Promise<void> } & Partial<Embed>;
   }
 }
 
@@ -21,47 +22,39 @@ ready.catch((error: unknown) => fail(messageOf(error)));
 async function begin(): Promise<void> {
   await Promise.resolve(); // `window.sagesplat` exists before any error
   const options = parseOptions(location.search, location.hash);
-  const canvas = document.getElementById("view");
-  if (!(canvas instanceof HTMLCanvasElement))
-    throw new Error("This page is incomplete; copy the bundle again.");
-  if (!document.createElement("canvas").getContext("webgl2")) {
-    throw new Error("This browser has no WebGL 2; enable hardware acceleration or use another browser.");
-  }
+  const app = document.getElementById("app");
+  if (!app) throw new Error("This page is incomplete; copy the bundle again.");
   const inside = sourceInside(document);
-  if (inside) await show(canvas, inside, options);
-  else await showOnline(canvas, options);
+  if (inside) await show(app, inside, options);
+  else await showOnline(app, options);
 }
 
 /** Shows a bundle of a server. The pack that the page names is asked for together with the manifest. */
-async function showOnline(canvas: HTMLCanvasElement, options: Options): Promise<void> {
+async function showOnline(app: HTMLElement, options: Options): Promise<void> {
   const base = bundleUrl(options.bundle, location.href);
   const online: Fetch = (url, init) => fetch(url, init);
   const name = options.bundle ? null : packNamed(document);
-  if (!name) return show(canvas, { base, fetch: online }, options);
+  if (!name) return show(app, { base, fetch: online }, options);
   const pack = inAdvance(online, new URL(name, base).href);
   try {
-    await show(canvas, { base, fetch: pack.fetch }, options);
+    await show(app, { base, fetch: pack.fetch }, options);
   } finally {
     pack.cancel(); // an older page names an older pack; a broken bundle needs none
   }
 }
 
-async function show(canvas: HTMLCanvasElement, source: Source, options: Options): Promise<void> {
-  const manifest = await loadManifest(source.base, source.fetch);
-  open(canvas, new Viewer(canvas, manifest, source, options), options);
-}
-
-function open(canvas: HTMLCanvasElement, viewer: Viewer, options: Options): void {
-  const app = canvas.parentElement;
-  app?.removeAttribute("hidden");
+async function show(app: HTMLElement, source: Source, options: Options): Promise<void> {
+  const viewer = await openViewer(app, source, options, window);
+  const { canvas } = viewer.stage;
+  canvas.id = "view";
+  app.removeAttribute("hidden");
   document.title = `${viewer.manifest.name} · sagesplat`;
   hideNotice();
-  if (app && options.ui) buildPage(app, viewer);
-  window.sagesplat = Object.assign(window.sagesplat, embed(viewer, ready));
-  canvas.addEventListener("webglcontextlost", () => {
+  if (options.ui) buildPage(app, viewer);
+  window.sagesplat = Object.assign(window.sagesplat, embed(viewer));
+  viewer.onLost(() => {
     fail("The GPU context was lost, usually for lack of memory; reload the page with a smaller budget.");
   });
-  window.addEventListener("online", () => viewer.streamer.retry());
   followTraining(viewer);
   viewer.start();
   removePosterWhenDrawn(viewer, canvas);

@@ -151,6 +151,13 @@ export interface LabelPromises {
   readonly corrections: readonly number[]; // log of distance over that by boxes: differences, 1/200
 }
 
+/** A camera's pose and field of view. Position in units of its frame, `fovY` in radians. */
+export interface Pose {
+  readonly position: Vec3;
+  readonly quaternion: Quat; // camera to frame; the camera looks along its -z, y is up
+  readonly fovY?: number;
+}
+
 /** The viewer's position and view, in the bundle's frame. */
 export interface Viewpoint {
   readonly position: Vec3;

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from sagesplat.core.errors import BackendUnavailable, RunError
+from sagesplat.core.extras import install
 
 if TYPE_CHECKING:
     from sagesplat.cli.console import Console
@@ -153,7 +154,7 @@ def computing(machine: Machine, folder: Path) -> "Iterator[tuple[Backend, int, E
         yield backend, threads, LOCAL
         return
     if find_spec("ray") is None:
-        raise BackendUnavailable("--executor ray: Ray is missing; pip install 'sagesplat[ray]'")
+        raise BackendUnavailable(f"--executor ray: Ray is missing; {install('sagesplat[ray]')}")
     from sagesplat.run.ray_cluster import connected
     from sagesplat.run.ray_executor import RayExecutor
 

@@ -22,6 +22,7 @@ from rich.text import Text
 from sagesplat import __version__
 from sagesplat.cli.say import say
 from sagesplat.core.errors import SageError
+from sagesplat.core.extras import install
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.names import visible
 from sagesplat.metrics.lpips import weights_path
@@ -31,8 +32,18 @@ from sagesplat.scene.scene import Camera
 # Of a small picture and its gradients, against the float64 reference; a GPU computes with fast math.
 _TOLERANCES = {"cpu": 1e-4, "cuda": 1e-3}
 _REPAIRS = {
-    "cpu": "pip install --force-reinstall numba llvmlite; delete numba's cache (*.nbi in sagesplat's folder)",
+    "cpu": f"{install('--force-reinstall', 'numba', 'llvmlite')}; "
+    "delete numba's cache (*.nbi in sagesplat's folder)",
     "cuda": "delete gsplat_cuda in ~/.cache/torch_extensions, then sagesplat doctor --build",
+}
+EXTRAS = {  # of pyproject.toml: a package of each, and what it is for; `cuda` is checked by itself
+    "poses": ("pycolmap", "poses from photos"),
+    "hf": ("transformers", "segmentation by networks of Hugging Face"),
+    "onnx": ("onnxruntime", "segmentation by ONNX networks"),
+    "view": ("starlette", "the server of the viewer"),
+    "video": ("av", "frames of a video"),
+    "heic": ("pi-heif", "photos of iPhones"),
+    "ray": ("ray", "clusters"),
 }
 
 _MARKS = {"fine": ("✓", "green"), "gap": ("·", "yellow"), "broken": ("✗", "red")}
@@ -52,7 +63,7 @@ def examine(build: bool = False) -> list[Finding]:
     """Run all checks; with `build`, gsplat's kernels are compiled first."""
     return [
         Finding("python", "fine", f"{platform.python_version()} on {platform.system()} {platform.machine()}"),
-        Finding("sagesplat", "fine", f"{__version__} in {Path(__file__).parent}"),
+        Finding("sagesplat", "fine", f"{__version__} in {Path(__file__).parents[1]}"),
         Finding("torch", "fine", f"{torch.__version__}, CUDA {torch.version.cuda or 'not built in'}"),
         processor(),
         memory(),
@@ -61,7 +72,7 @@ def examine(build: bool = False) -> list[Finding]:
         compiler(),
         gsplat(),
         gsplat_kernels(build),
-        extra("onnx", "onnxruntime", "segmentation by a network"),
+        *(extra(name, *package) for name, package in EXTRAS.items()),
         lpips(),
     ]
 
@@ -221,7 +232,7 @@ def extra(name: str, package: str, use: str) -> Finding:
     try:
         return Finding(name, "fine", f"{package} {importlib.metadata.version(package)}")
     except importlib.metadata.PackageNotFoundError:
-        return Finding(name, "gap", f"no {package}, for {use}", f"pip install 'sagesplat[{name}]'")
+        return Finding(name, "gap", f"no {package}, for {use}", install(f"sagesplat[{name}]"))
 
 
 def lpips() -> Finding:

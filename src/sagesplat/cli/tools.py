@@ -160,6 +160,21 @@ def bundle(
 
 
 @command
+def completion(shell: Positional[Literal["bash", "zsh", "fish"]]) -> None:
+    """Print the script that completes commands and flags in a shell.
+
+    bash: `source <(sagesplat completion bash)` in ~/.bashrc. zsh: the same with zsh in ~/.zshrc. fish:
+    `sagesplat completion fish > ~/.config/fish/completions/sagesplat.fish`.
+
+    Args:
+        shell: bash, zsh or fish
+    """
+    from sagesplat.cli.completion import script
+
+    print(script(shell))
+
+
+@command
 def labels(
     action: Positional[Annotated[Literal["apply"], arg(metavar="apply")]],
     run: Run,

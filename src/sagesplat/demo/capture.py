@@ -39,16 +39,25 @@ def make_capture(
 ) -> None:
     """Render the garden into `folder`: images/*.png, masks/*.png with labels.json, sparse/0/*.bin.
 
-    A single courtyard has instances/*.png too: the object that each pixel shows, 65535 for none.
+    A single courtyard has instances/*.png too: the object that each pixel shows, 65535 for none. The files
+    depend on the arguments only. The folder is written atomically.
 
-    `places` (nx, ny) makes a large capture: a grid of different courtyards, with photos from orbits in each
-    and, a fifth of them, from the ways in between. With disturbances (`wild`) truth/ has what they are
-    measured against: exact poses and undisturbed photos of the same views (transforms.json, images/), where
-    figures stand (figures/*.png, 255) and `off_path` viewpoints (off_path/, see `off_path.write_pictures`).
+    Args:
+        folder: The capture to make; it must not exist.
+        views: Photos, at least 3; 10 for each place of a grid.
+        width: Of the photos, in pixels.
+        height: Of the photos, in pixels.
+        seed: Of what grows and lies where.
+        places: (nx, ny) courtyards: a large capture, with photos from orbits in each and, a fifth of them,
+            from the ways in between.
+        wild: Disturbances. truth/ then has what they are measured against: exact poses and undisturbed photos
+            of the same views (transforms.json, images/), where figures stand (figures/*.png, 255) and
+            `off_path` viewpoints (off_path/, see `off_path.write_pictures`).
+        on_view: Called after each photo with how many are done, and how many there are.
 
-    The files depend on the arguments only. The folder is written atomically. `on_view(done, views)` is called
-    after each photo. SceneError if `folder` exists or cannot be written, `places` or `views` are too few, or
-    a grid is to be disturbed.
+    Raises:
+        SceneError: If `folder` exists or cannot be written, `places` or `views` are too few, or a grid is to
+            be disturbed.
     """
     if views < 3:
         raise SceneError(f"{folder}: {views} views; a capture needs at least 3")

@@ -17,6 +17,7 @@ from pathlib import Path
 from PIL import Image, ImageFile, UnidentifiedImageError
 
 from sagesplat.core.errors import short
+from sagesplat.core.extras import install
 
 PHOTO_FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "AVIF", "HEIF")
 FREE_PIXELS = 2**24  # a picture may have as many, however small its file is
@@ -156,7 +157,7 @@ def _checked_format(file: BufferedReader, formats: Sequence[str]) -> str:
         # Or Pillow would import all of its plugins to find this one.
         importlib.import_module(f"PIL.{_PLUGINS[kind]}ImagePlugin")
     if kind == "AVIF" and not _has_avif():
-        raise PictureError("this Pillow cannot read AVIF", "pip install --upgrade pillow")
+        raise PictureError("this Pillow cannot read AVIF", install("pillow", "--upgrade"))
     return kind
 
 
@@ -184,7 +185,7 @@ def _register_heif() -> None:
     try:
         import pi_heif
     except ImportError:
-        raise PictureError("HEIC needs an extra", "pip install 'sagesplat[heic]'") from None
+        raise PictureError("HEIC needs an extra", install("sagesplat[heic]")) from None
     if "HEIF" not in Image.OPEN:
         pi_heif.register_heif_opener()
 

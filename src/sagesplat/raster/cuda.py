@@ -35,6 +35,7 @@ from torch.nn.functional import pad
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from sagesplat.core.errors import BackendUnavailable, DataError, OutOfMemory
+from sagesplat.core.extras import install
 from sagesplat.core.gaussians import PARAMETERS, Gaussians
 from sagesplat.core.sh import num_bases
 from sagesplat.raster.render import BLUR, NEAR, TILE, Render
@@ -112,10 +113,10 @@ def version_gap() -> str | None:
     """What is wrong with the installed gsplat, and the cure."""
     version = gsplat_version()
     if version is None:
-        return "the cuda backend needs gsplat; pip install 'sagesplat[cuda]'"
+        return f"the cuda backend needs gsplat; {install('sagesplat[cuda]')}"
     numbers = tuple(map(int, re.findall(r"\d+", version.partition("+")[0])[:3]))
     if not VERSIONS[0] <= numbers < VERSIONS[1]:
-        return f"gsplat {version} is not supported; pip install 'gsplat>=1.5.3,<1.7'"
+        return f"gsplat {version} is not supported; {install('gsplat>=1.5.3,<1.7')}"
     return None
 
 

@@ -15,6 +15,7 @@ from typing import Any
 
 from sagesplat.core.config import PosesConfig
 from sagesplat.core.errors import BackendUnavailable, SceneError
+from sagesplat.core.extras import install
 from sagesplat.core.typed import check_fields, types_of
 from sagesplat.io.files import read_object, write_json
 from sagesplat.scene._prepare import PreparedPhoto, prepare_photos
@@ -133,7 +134,7 @@ def _reconstruction(
 def _check(source: Path, workspace: Path, config: PosesConfig) -> None:
     """SceneError or BackendUnavailable for what can be rejected before any work."""
     if importlib.util.find_spec("pycolmap") is None:
-        raise BackendUnavailable("poses from photos need pycolmap; pip install 'sagesplat[poses]'")
+        raise BackendUnavailable(f"poses from photos need pycolmap; {install('sagesplat[poses]')}")
     if not source.exists():
         raise SceneError(f"{source}: no such file or folder; name a folder of photos or a video")
     if config.model not in _MODELS:
@@ -259,7 +260,7 @@ def _run(work: Path, on_progress: OnProgress) -> dict[str, Any]:
 
 
 def _ending(code: int, log: Path) -> str:
-    if code == -signal.SIGKILL:
+    if code == -getattr(signal, "SIGKILL", 9):  # Windows has none, and no negative codes
         return "was killed (often for lack of memory: take a smaller max_size)"
     if code < 0:
         return f"crashed ({signal.Signals(-code).name})"

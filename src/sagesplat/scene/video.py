@@ -10,6 +10,7 @@ from jaxtyping import Float32, UInt8
 from PIL import Image
 
 from sagesplat.core.errors import BackendUnavailable, RunError, SceneError, short
+from sagesplat.core.extras import install
 from sagesplat.io.files import atomic_path, read_json, write_json
 
 _GREY_WIDTH = 640  # px, of the copies that sharpness is measured on
@@ -44,7 +45,7 @@ def extract_frames(
     try:
         from av.error import FFmpegError
     except ImportError:
-        raise BackendUnavailable("frames of a video need PyAV; pip install 'sagesplat[video]'") from None
+        raise BackendUnavailable(f"frames of a video need PyAV; {install('sagesplat[video]')}") from None
     if max_frames < 1:
         raise SceneError(f"{path}: max_frames {max_frames} leaves nothing; take 1 or more")
     if not path.is_file():

@@ -26,6 +26,7 @@ from torch.nn import functional as F
 
 from sagesplat.core.config import MasksConfig
 from sagesplat.core.errors import BackendUnavailable, LabelError
+from sagesplat.core.extras import install
 from sagesplat.core.memory import ran_out
 from sagesplat.io.tensors import read_tensors
 from sagesplat.segment import coco
@@ -239,7 +240,7 @@ def _read_safetensors(path: Path) -> Any:
     try:
         from safetensors.torch import load_file
     except ImportError:
-        raise BackendUnavailable(f"{path.name} needs safetensors; pip install 'sagesplat[hf]'") from None
+        raise BackendUnavailable(f"{path.name} needs safetensors; {install('sagesplat[hf]')}") from None
     if not path.is_file():
         raise FileNotFoundError(path)
     return load_file(path)

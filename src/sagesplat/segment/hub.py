@@ -13,6 +13,7 @@ from typing import Any
 import torch
 
 from sagesplat.core.errors import BackendUnavailable, LabelError, OutOfMemory, SageError, short
+from sagesplat.core.extras import install
 from sagesplat.core.memory import ran_out
 from sagesplat.segment.segmenters import parse_device
 
@@ -117,7 +118,7 @@ def package(name: str) -> Any:
         return __import__(name)
     except ImportError:
         raise BackendUnavailable(
-            "segmentation by a network of Hugging Face needs transformers; pip install 'sagesplat[hf]'"
+            f"segmentation by a network of Hugging Face needs transformers; {install('sagesplat[hf]')}"
         ) from None
 
 

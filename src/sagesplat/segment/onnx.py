@@ -13,6 +13,7 @@ from PIL import Image
 
 from sagesplat.core.config import MasksConfig
 from sagesplat.core.errors import BackendUnavailable, LabelError, RunError, short
+from sagesplat.core.extras import install
 from sagesplat.core.memory import ran_out
 from sagesplat.io.files import read_json
 from sagesplat.segment import coco
@@ -214,14 +215,14 @@ def open_session(model: Path, threads: int, device: str = "cpu") -> Any:
         import onnxruntime
     except ImportError:
         raise BackendUnavailable(
-            "segmentation by a network needs onnxruntime; pip install 'sagesplat[onnx]'"
+            f"segmentation by a network needs onnxruntime; {install('sagesplat[onnx]')}"
         ) from None
     if not model.is_file():
         raise LabelError(f"{model}: no such file; name an ONNX model")
     kind, index = parse_device(device)
     on_gpu = kind != "cpu" and "CUDAExecutionProvider" in onnxruntime.get_available_providers()
     unavailable = BackendUnavailable(
-        f"device {device}: onnxruntime finds no CUDA here; pip install onnxruntime-gpu, or use --device cpu"
+        f"device {device}: onnxruntime finds no CUDA here; {install('onnxruntime-gpu')}, or use --device cpu"
     )
     if kind == "cuda" and not on_gpu:
         raise unavailable

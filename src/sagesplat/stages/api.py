@@ -24,6 +24,7 @@ from sagesplat.run.job import NO_RUN, Job
 from sagesplat.run.run_dir import LadderKind, RunDir, check_links
 from sagesplat.scene.scene import Camera, Scene, View
 from sagesplat.stages import label_edits, pipeline
+from sagesplat.stages.bundle import BundleMade, bundle
 from sagesplat.stages.methods import NestedLevels
 from sagesplat.stages.plan import check_targets
 from sagesplat.stages.results import fidelity_of, models_of, plans_of, promises_of
@@ -245,6 +246,21 @@ class FinishedRun:
         ladder, models = self.job.ladder, models_of(self.job)
         near = {label: float(np.float64(d[0])) for label, d in distances.items()}
         return plan_view(models, ladder.counts, near, target, None, recovering=ladder.recovering)
+
+    def bundle(self, out: Path | str, *, single_file: bool = False) -> BundleMade:
+        """Write the run for browsers: levels, promises and the viewer, as static files.
+
+        Args:
+            out: A new or empty folder, or an earlier bundle, which is replaced.
+            single_file: Write one HTML page instead, which opens from the disk.
+
+        Returns:
+            What it holds, and how large it is.
+
+        Raises:
+            RunError: For a run without nested levels, or an `out` that is something else.
+        """
+        return bundle(self.job, Path(out), single_file=single_file)
 
     def _pixels(self, camera: Camera) -> np.ndarray:
         """Pixels of each category that a camera sees, as the full model paints them; float64 [L]."""

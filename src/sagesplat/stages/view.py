@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from sagesplat.core.errors import BackendUnavailable, RunError, SageError
 from sagesplat.core.events import Emit, Warned
+from sagesplat.core.extras import install
 from sagesplat.core.names import visible
 from sagesplat.formats.label_edits import FILE
 from sagesplat.io.files import read_json
@@ -15,7 +16,7 @@ from sagesplat.run.records import check_format
 from sagesplat.run.run_dir import RunDir, check_links
 from sagesplat.viewer.built import check_viewer, package_viewer
 from sagesplat.viewer.hosts import Hosts, is_loopback
-from sagesplat.viewer.server import _NO_SERVER, MANIFEST, View, _check_certificate, _hint, _urls, bind
+from sagesplat.viewer.server import MANIFEST, View, _check_certificate, _hint, _urls, bind
 
 if TYPE_CHECKING:
     from sagesplat.run.job import Job
@@ -50,7 +51,9 @@ def show(
         from sagesplat.viewer.edit_site import EditSite
         from sagesplat.viewer.site import Site
     except ImportError:
-        raise BackendUnavailable(_NO_SERVER) from None
+        raise BackendUnavailable(
+            f"showing a bundle needs starlette and uvicorn; {install('sagesplat[view]')}"
+        ) from None
     _check_certificate(ssl_certfile, ssl_keyfile)
     if edit:
         _check_edit(path, host, follow)

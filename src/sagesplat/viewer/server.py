@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 MANIFEST = "manifest.json"
 PORT = 8000
 _TRIED = 100  # ports from PORT on, if none is given
-_NO_SERVER = "showing a bundle needs starlette and uvicorn; pip install 'sagesplat[view]'"
 
 
 @dataclass(frozen=True)

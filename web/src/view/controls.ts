@@ -32,22 +32,27 @@ export class Controls {
   readonly #pointers = new Map<number, { x: number; y: number; button: number }>();
   #travel: { from: Rig; to: Rig; start: number } | null = null;
 
-  /** @param onMove - called when the user or an animation moved the camera */
+  /**
+   * @param onMove - called when the user or an animation moved the camera
+   * @param keys - what hears the keys
+   * @param signal - ends all of it
+   */
   constructor(
     readonly canvas: HTMLElement,
     public rig: Rig,
     readonly onMove: (rig: Rig, byUser: boolean) => void,
+    { keys, signal }: { readonly keys: EventTarget; readonly signal: AbortSignal },
   ) {
-    canvas.addEventListener("pointerdown", (event) => this.#down(event));
-    canvas.addEventListener("pointermove", (event) => this.#drag(event));
+    canvas.addEventListener("pointerdown", (event) => this.#down(event), { signal });
+    canvas.addEventListener("pointermove", (event) => this.#drag(event), { signal });
     for (const name of ["pointerup", "pointercancel", "lostpointercapture"] as const) {
-      canvas.addEventListener(name, (event) => this.#pointers.delete(event.pointerId));
+      canvas.addEventListener(name, (event) => this.#pointers.delete(event.pointerId), { signal });
     }
-    canvas.addEventListener("wheel", (event) => this.#wheel(event), { passive: false });
-    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
-    window.addEventListener("keydown", (event) => this.#key(event));
-    window.addEventListener("keyup", (event) => this.#keys.delete(event.code));
-    window.addEventListener("blur", () => this.#keys.clear());
+    canvas.addEventListener("wheel", (event) => this.#wheel(event), { passive: false, signal });
+    canvas.addEventListener("contextmenu", (event) => event.preventDefault(), { signal });
+    keys.addEventListener("keydown", (event) => this.#key(event as KeyboardEvent), { signal });
+    window.addEventListener("keyup", (event) => this.#keys.delete(event.code), { signal });
+    window.addEventListener("blur", () => this.#keys.clear(), { signal });
   }
 
   /** Moves the camera: immediately, or animated unless the user prefers reduced motion. */

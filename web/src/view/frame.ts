@@ -1,12 +1,5 @@
 import { Euler, Matrix4, Quaternion, Vector3 } from "three";
-import type { Camera, Manifest, Quat, Vec3, Viewpoint } from "../types";
-
-/** A camera's pose and field of view. Position in units of its frame, `fovY` in radians. */
-export interface Pose {
-  readonly position: Vec3;
-  readonly quaternion: Quat; // camera to frame; the camera looks along its -z, y is up
-  readonly fovY?: number;
-}
+import type { Camera, Manifest, Pose, Quat, Vec3, Viewpoint } from "../types";
 
 /**
  * From the bundle's frame to three's world: metres, y up, the ground at y = 0.

@@ -8,8 +8,8 @@ import {
   WebGLRenderer,
 } from "three";
 import type { Ray } from "../core/pick";
-import type { Camera, Manifest, Viewpoint } from "../types";
-import { lens, type Pose, quat, rootMatrix, transformPose, vec3, viewpoint } from "./frame";
+import type { Camera, Manifest, Pose, Viewpoint } from "../types";
+import { lens, quat, rootMatrix, transformPose, vec3, viewpoint } from "./frame";
 import { orientation, type Rig } from "./motion";
 import { SparkLayer } from "./spark";
 
@@ -105,6 +105,14 @@ export class Stage {
   viewpoint(): Viewpoint {
     this.camera.updateMatrixWorld();
     return viewpoint(this.root, this.camera.matrixWorld, this.camera.projectionMatrix);
+  }
+
+  /** Frees the GPU, also what the browser keeps for the canvas. */
+  free(): void {
+    this.renderer.setAnimationLoop(null);
+    this.layer.free();
+    this.renderer.dispose();
+    this.renderer.forceContextLoss();
   }
 
   draw(): void {

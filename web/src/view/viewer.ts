@@ -3,11 +3,11 @@ import { qualitiesOf } from "../core/manifest";
 import { Streamer } from "../core/streamer";
 import type { Embed, Options, Sample } from "../embed";
 import type { Source } from "../inside";
-import type { Budget, Manifest, Quality, Settings, State } from "../types";
+import type { Budget, Manifest, Pose, Quality, Settings, State } from "../types";
 import { Compare } from "./compare";
 import { Controls } from "./controls";
 import { Editor } from "./editor";
-import { type Pose, quat, transformPose, vec3 } from "./frame";
+import { quat, transformPose, vec3 } from "./frame";
 import { type Rig, rigAt } from "./motion";
 import { colorsOf } from "./spark";
 import { Stage } from "./stage";
@@ -29,6 +29,7 @@ export class Viewer {
   settings: Settings;
   frameMs = Number.NaN; // smoothed; NaN while nothing moves
   photo = -1; // index of the current photo, -1: none
+  readonly #life = new AbortController(); // ends with the viewer
   readonly #hidden = new Set<number>();
   readonly #samples = new Set<(sample: Sample) => void>();
   #cap: number | null = null; // splat limit of the headset
@@ -36,16 +37,22 @@ export class Viewer {
   #colors: ReadonlyMap<number, string> = new Map();
   #last = 0;
 
-  /** Throws without WebGL 2. */
+  /**
+   * Throws without WebGL 2.
+   *
+   * @param keys - what hears the keys that move the camera: the canvas, or the window where the page is the viewer's
+   */
   constructor(
     canvas: HTMLCanvasElement,
     readonly manifest: Manifest,
     source: Source,
     options: Options,
+    keys: EventTarget,
   ) {
     this.stage = new Stage(canvas, manifest);
     this.settings = startSettings(manifest, options);
-    this.controls = new Controls(canvas, this.#start(), (rig, byUser) => this.#moved(rig, byUser));
+    const moved = (rig: Rig, byUser: boolean) => this.#moved(rig, byUser);
+    this.controls = new Controls(canvas, this.#start(), moved, { keys, signal: this.#life.signal });
     this.streamer = new Streamer({
       manifest,
       ...source,
@@ -70,11 +77,33 @@ export class Viewer {
     const { canvas, renderer } = this.stage;
     const resize = () =>
       this.stage.resize(canvas.clientWidth, canvas.clientHeight, Math.min(devicePixelRatio, SHARPEST));
-    new ResizeObserver(resize).observe(canvas);
+    const watch = new ResizeObserver(resize);
+    watch.observe(canvas);
     resize();
+    const { signal } = this.#life;
+    signal.addEventListener("abort", () => watch.disconnect());
+    window.addEventListener("online", () => this.streamer.retry(), { signal });
     this.streamer.update(this.stage.viewpoint());
     this.streamer.start();
     renderer.setAnimationLoop((now) => this.#frame(now));
+  }
+
+  /** Stops drawing and downloads, frees the memory and removes the canvas. It is of no use afterwards. */
+  destroy(): void {
+    if (this.#life.signal.aborted) return;
+    this.#life.abort();
+    this.#samples.clear();
+    void this.headset.leave();
+    this.compare.stop();
+    this.streamer.dispose();
+    this.stage.free();
+    this.stage.canvas.remove();
+  }
+
+  /** Calls back when the browser takes the GPU away, usually for lack of memory. */
+  onLost(callback: () => void): void {
+    const { signal } = this.#life;
+    this.stage.canvas.addEventListener("webglcontextlost", callback, { signal });
   }
 
   get state(): State {
@@ -239,9 +268,8 @@ function startSettings(manifest: Manifest, options: Options): Settings {
 }
 
 /** The viewer's interface for other scripts on the page. */
-export function embed(viewer: Viewer, ready: Promise<void>): Embed {
+export function embed(viewer: Viewer): Embed {
   return {
-    ready,
     version: viewer.manifest.generator,
     cameras: viewer.manifest.cameras,
     state: () => viewer.state,
@@ -251,5 +279,6 @@ export function embed(viewer: Viewer, ready: Promise<void>): Embed {
     setPose: (pose) => viewer.setPose(pose),
     goTo: (photo) => viewer.goTo(photo),
     onSample: (callback) => viewer.onSample(callback),
+    destroy: () => viewer.destroy(),
   };
 }

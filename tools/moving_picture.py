@@ -1,0 +1,75 @@
+"""Make the README's moving picture: the viewer changing levels, photographed in headless Chromium.
+
+    sagesplat bundle runs/demo site
+    python tools/moving_picture.py site docs/images/levels.webp
+
+Each frame is the viewer, settled, at one target of fidelity. Needs the extra `dev`, and Chromium on PATH.
+"""
+
+import argparse
+import io
+import sys
+import threading
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+from PIL import Image
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from tests.browser import open_page
+
+TARGETS = (0.3, 0.5, 0.7, 0.8, 0.85, 0.9, 0.93, 0.96, 0.98)
+HOLD, LAST = 650, 1800  # ms that a frame stays; the ends stay longer
+SETTLED = """() => {
+  const { labels, pending } = window.sagesplat.state();
+  return !pending && labels.every(({ wanted, shown }) => wanted === shown);
+}"""
+
+
+def frames(bundle: Path, size: tuple[int, int]) -> list[Image.Image]:
+    """The viewer at each target, low to high."""
+    pictures = []
+
+    class Quiet(SimpleHTTPRequestHandler):
+        def log_message(self, format: str, *args: object) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(bundle))) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        with open_page(f"http://127.0.0.1:{server.server_port}/", size) as opened:
+            opened.wait_for("window.sagesplat.ready.then(() => true)")
+            for target in TARGETS:
+                opened.page.evaluate(
+                    f"window.sagesplat.set({{ mode: 'target', quality: 'fidelity', target: {target} }})"
+                )
+                opened.page.wait_for_timeout(500)  # the plan, then the downloads
+                opened.wait_for(f"({SETTLED})()", seconds=60)
+                opened.page.wait_for_timeout(4000)  # the sort, the numbers, the marks of what changed
+                pictures.append(Image.open(io.BytesIO(opened.page.screenshot())).convert("RGB"))
+            if opened.complaints:
+                raise SystemExit(f"the page complains: {opened.complaints}")
+        server.shutdown()
+    return pictures
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("bundle", type=Path, help="of `sagesplat bundle`")
+    parser.add_argument("out", type=Path, help="a .webp")
+    parser.add_argument("--size", type=int, nargs=2, default=(960, 620), help="pixels")
+    args = parser.parse_args()
+    up = frames(args.bundle, tuple(args.size))
+    loop = [*up, *up[-2:0:-2]]
+    times = [LAST if picture in (up[0], up[-1]) else HOLD for picture in loop]
+    loop[0].save(
+        args.out, save_all=True, append_images=loop[1:], duration=times, loop=0, quality=80, method=6
+    )
+    print(f"{args.out}: {len(loop)} frames, {args.out.stat().st_size / 1e6:.2f} MB")
+
+
+if __name__ == "__main__":
+    main()
