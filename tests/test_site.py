@@ -12,6 +12,7 @@ from urllib.parse import unquote, urlsplit
 import pytest
 
 import sagesplat
+from benchmarks import doc_tables
 from sagesplat import cli
 from sagesplat.cli.parse import arguments
 
@@ -116,3 +117,14 @@ def test_error_messages_are_those_of_the_code():
     for message in messages:
         for part in (part.strip(" .:;,()") for part in message.split("…")):
             assert part in code, f"{message}: no {part!r}"
+
+
+def test_measured_tables_say_when_on_which_commit_and_how():
+    found = list(doc_tables.tables(DOCS))
+    assert len(found) > 60
+    unsaid = [
+        f"{table.page}:{table.line}"
+        for table in found
+        if not (table.measured and table.commit and (table.command or table.page.startswith("developers/")))
+    ]
+    assert unsaid == [], "`python -m benchmarks tables` lists them"
