@@ -4,17 +4,26 @@ import re
 import shlex
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
-from html.parser import HTMLParser
+from functools import partial
+from html import unescape
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import TYPE_CHECKING
 from urllib.parse import unquote, urlsplit
 
+import browser as chromium
 import pytest
+from browser import open_page
 
 import sagesplat
 from benchmarks import doc_tables
 from sagesplat import cli
 from sagesplat.cli.parse import arguments
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -22,21 +31,12 @@ PAGES = sorted(DOCS.rglob("*.md"))
 PLACEHOLDER = re.compile(r"…|\.\.\.|\bK\b")  # lines that leave something out, or stand for several
 
 
-class Page(HTMLParser):
+class Page:
     """The anchors of a page, and where its links and pictures lead."""
 
     def __init__(self, text: str) -> None:
-        super().__init__()
-        self.anchors: set[str] = set()
-        self.targets: set[str] = set()
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        for key, value in attrs:
-            if key in ("id", "name"):
-                self.anchors.add(value or "")
-            elif key in ("href", "src") and value:
-                self.targets.add(value)
+        self.anchors = {unescape(name) for name in re.findall(r'\s(?:id|name)="([^"]+)"', text)}
+        self.targets = {unescape(target) for target in re.findall(r'\s(?:href|src)="([^"]+)"', text)}
 
 
 @pytest.fixture(scope="module")
@@ -128,3 +128,72 @@ def test_measured_tables_say_when_on_which_commit_and_how():
         if not (table.measured and table.commit and (table.command or table.page.startswith("developers/")))
     ]
     assert unsaid == [], "`python -m benchmarks tables` lists them"
+
+
+# contrast of text with the nearest background behind it, by WCAG 2; 4.5 is enough, 3 for large letters
+CONTRAST = """() => {
+  const rgb = (text) => (text.match(/[\\d.]+/g) || []).map(Number);
+  const light = ([r, g, b]) => [r, g, b].map((v) => v / 255)
+    .map((v) => (v <= 0.03928 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4))
+    .reduce((sum, v, i) => sum + v * [0.2126, 0.7152, 0.0722][i], 0);
+  const poor = [];
+  const walker = document.createTreeWalker(document.querySelector("article"), NodeFilter.SHOW_TEXT);
+  while (walker.nextNode()) {
+    const at = walker.currentNode.parentElement;
+    if (!walker.currentNode.data.trim() || at.closest("iframe, .headerlink") || !at.offsetParent) continue;
+    const fill = (element) => rgb(getComputedStyle(element).backgroundColor);
+    let behind = at;
+    while (behind.parentElement && (fill(behind)[3] ?? 1) === 0) behind = behind.parentElement;
+    const pair = [rgb(getComputedStyle(at).color), fill(behind)];
+    const [high, low] = pair.map(light).sort((a, b) => b - a);
+    const ratio = (high + 0.05) / (low + 0.05);
+    const large = parseFloat(getComputedStyle(at).fontSize) >= 24;
+    const words = walker.currentNode.data.trim().slice(0, 30);
+    if (ratio < (large ? 3 : 4.5)) poor.push(`${words}: ${ratio.toFixed(2)}`);
+  }
+  return [...new Set(poor)];
+}"""
+
+
+@pytest.fixture(scope="module")
+def browser(site: Path) -> Iterator["Browser"]:
+    if reason := chromium.missing():
+        pytest.skip(reason)
+    with chromium.launch() as launched:
+        yield launched
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_pages_are_sound_on_a_phone(site, browser, scheme):
+    """From the disk, at 360 px: nothing wider than the screen, no complaint, contrast, pictures described."""
+    for name in ("index", "reference/cli", "reference/python", "help/errors"):
+        address = (site / f"{name}.html").as_uri()
+        with open_page(address, (360, 740), browser=browser, scheme=scheme) as opened:
+            page = opened.page
+            assert page.evaluate("document.documentElement.scrollWidth") <= 360, name
+            assert page.evaluate("[...document.images].every((image) => image.alt)"), name
+            assert page.evaluate(CONTRAST) == [], name
+            assert opened.complaints == [], name
+
+
+def test_search_finds_a_flag_from_the_disk(site, browser):
+    address = f"{(site / 'search.html').as_uri()}?q=gradient-freeze-share"
+    with open_page(address, browser=browser) as opened:
+        found = opened.wait_for("document.querySelectorAll('#search-results li a').length")
+        assert found > 0
+        assert opened.complaints == []
+
+
+def test_scenes_of_the_gallery_are_live(site, browser):
+    if not any((site / "gallery").glob("*.html")):
+        pytest.skip("no scenes in build/gallery; `make gallery` makes one")
+    handler = partial(SimpleHTTPRequestHandler, directory=str(site))
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        address = f"http://127.0.0.1:{server.server_port}/gallery.html"
+        with open_page(address, (700, 500), browser=browser) as opened:
+            inside = "document.querySelector('iframe.bundle').contentWindow.sagesplat"
+            opened.page.evaluate("document.querySelector('iframe.bundle').scrollIntoView()")
+            assert opened.wait_for(f"{inside} && {inside}.ready.then(() => {inside}.state().count > 0)", 60)
+            assert opened.complaints == []
+        server.shutdown()
