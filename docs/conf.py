@@ -22,6 +22,7 @@ default_role = "code"  # docstrings have Markdown's backticks
 myst_enable_extensions = ["colon_fence", "deflist", "attrs_block", "attrs_inline"]
 myst_heading_anchors = 4  # links to titles, as GitHub has them
 highlight_language = "text"
+smartquotes = False  # of "--flag" it makes a dash
 
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"

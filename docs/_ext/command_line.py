@@ -3,14 +3,17 @@
 A page holds a line `<!-- commands -->` or `<!-- names: A B -->`, which is replaced when the page is read.
 """
 
+import ast
 import inspect
 import re
+import textwrap
 from collections.abc import Callable, Iterator
+from dataclasses import is_dataclass
 from typing import Any
 
 import sagesplat
 from sagesplat.cli import commands
-from sagesplat.cli.help import Flag, flags_of
+from sagesplat.cli.help import Flag, field_help, flags_of
 from sagesplat.core.errors import SageError
 
 _PAGES = ["reference/cli", "reference/python"]
@@ -25,6 +28,7 @@ def setup(app: Any) -> dict[str, bool]:
     """Called by Sphinx."""
     app.connect("source-read", _fill)
     app.connect("env-get-outdated", lambda *_: _PAGES)
+    app.connect("autodoc-process-docstring", _keep_colons, priority=600)  # after napoleon's
     return {"parallel_read_safe": True}
 
 
@@ -39,8 +43,21 @@ def _names(names: list[str]) -> str:
     return "\n\n".join(map(_name, names))
 
 
+def _keep_colons(app: Any, what: str, name: str, value: object, options: Any, lines: list[str]) -> None:
+    """Napoleon takes what stands before a colon in the first line of a property or a field for its type."""
+    get = getattr(value, "fget", None) or getattr(value, "func", None)  # of a cached property
+    if what == "property" and get:
+        lines[:] = (inspect.getdoc(get) or "").splitlines()
+    elif what == "attribute":
+        kind, field = name.split(".")[-2:]
+        lines[:] = [_marked(field_help(getattr(sagesplat, kind)).get(field, ""))]
+
+
 def _name(name: str) -> str:
     value = getattr(sagesplat, name)
+    if name == "Event":
+        kinds = ", ".join(f"`{kind.__name__}`" for kind in value.__args__)
+        return f"````{{eval-rst}}\n.. py:data:: sagesplat.Event\n\n   Any of {kinds}.\n````"
     if not inspect.isclass(value):
         kind, options = "autofunction" if callable(value) else "autodata", []
     elif issubclass(value, SageError):
@@ -48,7 +65,30 @@ def _name(name: str) -> str:
     else:
         kind, options = "autoclass", [":members:", ":exclude-members: __init__, __new__"]
     directive = "\n   ".join([f".. {kind}:: sagesplat.{name}", *options])
-    return f"```{{eval-rst}}\n{directive}\n```"
+    return f"```{{eval-rst}}\n{directive}\n```\n\n{_fields(value) if is_dataclass(value) else ''}"
+
+
+def _fields(kind: Any) -> str:
+    """The fields of a dataclass, with the comments beside them."""
+    source = textwrap.dedent(inspect.getsource(kind))
+    lines, rows = source.splitlines(), []
+    (body,) = ast.parse(source).body
+    assert isinstance(body, ast.ClassDef)
+    for node in body.body:
+        if isinstance(node, ast.AnnAssign) and not ast.unparse(node.target).startswith("_"):
+            text = "\n".join(lines[node.lineno - 1 : node.end_lineno])
+            comment = re.search(r"#\s*(.*)", text)
+            told = re.sub(r"([*_<>\[\]|])", r"\\\1", comment[1]) if comment else ""
+            hint = ast.unparse(node.annotation).replace("|", "\\|")
+            rows.append((f"| `{ast.unparse(node.target)}` | `{hint}` | {told} |", told))
+    if not any(told for _, told in rows):  # their docstrings are shown already
+        return ""
+    return "\n".join(["| field | type | |", "|---|---|---|", *(row for row, _ in rows)])
+
+
+def _marked(text: str) -> str:
+    """A text with its flags set as code."""
+    return re.sub(r"(?<![\w`-])(--[a-z][\w.-]*\w)", r"`\1`", text)
 
 
 def _commands() -> Iterator[str]:
@@ -79,7 +119,7 @@ def _command(name: str, function: Callable[..., None]) -> Iterator[str]:
 
 def _help(flag: Flag) -> str:
     """The help of a flag and its default, with what Markdown would take for markup escaped."""
-    text = re.sub(r"([*_<>\[\]|])", r"\\\1", flag.help)
+    text = _marked(re.sub(r"([*_<>\[\]|])", r"\\\1", flag.help))
     default = flag.default
     if isinstance(default, bool) or default in (None, "", (), {}):
         return f"{text} (default: on)" if default is True else text
