@@ -1,6 +1,7 @@
 """Reference pages that are written from the code: the command line and the names of `sagesplat`.
 
-A page holds a line `<!-- commands -->` or `<!-- names: A B -->`, which is replaced when the page is read.
+A page holds a line `<!-- commands -->` or `<!-- names: A B -->`, which is replaced when the page is read;
+`<!-- other names -->` are those of `sagesplat` that no line lists.
 """
 
 import ast
@@ -17,6 +18,7 @@ from sagesplat.cli.help import Flag, field_help, flags_of
 from sagesplat.core.errors import SageError
 
 _PAGES = ["reference/cli", "reference/python"]
+_LISTED = r"<!-- names: ([\w ]+?) -->"
 _PARTS = {
     "stages": "The main job and its stages",
     "studies": "Studies of finished runs",
@@ -35,7 +37,10 @@ def setup(app: Any) -> dict[str, bool]:
 def _fill(app: Any, page: str, source: list[str]) -> None:
     if page in _PAGES:
         text = source[0].replace("<!-- commands -->", "\n".join(_commands()))
-        source[0] = re.sub(r"<!-- names: ([\w ]+?) -->", lambda m: _names(m[1].split()), text)
+        listed = {name for names in re.findall(_LISTED, text) for name in names.split()}
+        others = [name for name in sagesplat.__all__ if page == "reference/python" and name not in listed]
+        text = text.replace("<!-- other names -->", f"## More\n\n{_names(others)}" if others else "")
+        source[0] = re.sub(_LISTED, lambda m: _names(m[1].split()), text)
 
 
 def _names(names: list[str]) -> str:
