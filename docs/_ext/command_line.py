@@ -30,6 +30,7 @@ def setup(app: Any) -> dict[str, bool]:
     """Called by Sphinx."""
     app.connect("source-read", _fill)
     app.connect("env-get-outdated", lambda *_: _PAGES)
+    app.connect("autodoc-process-docstring", _keep_asterisks, priority=400)
     app.connect("autodoc-process-docstring", _keep_colons, priority=600)  # after napoleon's
     return {"parallel_read_safe": True}
 
@@ -46,6 +47,13 @@ def _fill(app: Any, page: str, source: list[str]) -> None:
 def _names(names: list[str]) -> str:
     """Functions and classes, documented by their docstrings."""
     return "\n\n".join(map(_name, names))
+
+
+def _keep_asterisks(app: Any, what: str, name: str, value: object, options: Any, lines: list[str]) -> None:
+    """Docstrings are plain text: an asterisk outside of code is no markup."""
+    for i, line in enumerate(lines):
+        if not line.lstrip().startswith((">>>", "...")):
+            lines[i] = re.sub(r"(`[^`]*`)|\*", lambda m: m[1] or r"\*", line)
 
 
 def _keep_colons(app: Any, what: str, name: str, value: object, options: Any, lines: list[str]) -> None:
