@@ -33,8 +33,19 @@ $(INSTALLED): pyproject.toml constraints.txt
 	  { echo "sagesplat needs Python 3.11 or newer: make PYTHON=python3.12 ..."; exit 2; }
 	@$(PYTHON) -m venv $(VENV) || $(PYTHON) -m virtualenv $(VENV) || \
 	  { echo "no venv module: apt install python3-venv, then make again"; exit 2; }
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,onnx,hf,poses,video,heic,view,ray]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,docs,onnx,hf,poses,video,heic,view,ray]'
 	touch $@
+
+.PHONY: docs gallery
+# the site, in build/site; strict: a link that leads nowhere is an error
+docs: $(INSTALLED)
+	$(BIN)/python -m sphinx -q -W --keep-going -b html docs build/site
+	@echo build/site/index.html
+
+# the built-in scene as a live page of the site; about two minutes
+gallery: $(INSTALLED)
+	$(BIN)/sagesplat demo build/courtyard
+	$(BIN)/sagesplat bundle build/courtyard build/gallery/courtyard.html --single-file
 
 # builds the viewer into the package; the tests check that what is committed is current
 web: $(INSTALLED)

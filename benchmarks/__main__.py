@@ -817,6 +817,14 @@ def structure(src: tuple[Path, ...] = (Path("src/sagesplat"),), write: bool = Fa
 
 
 @app.command
+def tables() -> None:
+    """Measured tables of the documents, the oldest first, with the commits to the code since."""
+    from benchmarks import doc_tables
+
+    print(doc_tables.ages(Path("docs"), date.today()))
+
+
+@app.command
 def promises(
     folder: Path = Path("runs/promises"),
     scenes: tuple[str, ...] = tuple(promising.CASES),

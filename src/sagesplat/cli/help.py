@@ -57,7 +57,7 @@ def flags_of(function: Callable[..., None]) -> Iterator[Flag]:
             for field in fields(hint):
                 yield Flag(
                     f"--{prefix}{field.name.replace('_', '-')}", _first_line(_home(hint, field.name)),
-                    _values(get_type_hints(hint)[field.name]), _field_help(hint).get(field.name, ""),
+                    _values(get_type_hints(hint)[field.name]), field_help(hint).get(field.name, ""),
                     getattr(default, field.name), (name, field.name),
                 )  # fmt: skip
         else:
@@ -139,7 +139,7 @@ def _first_line(kind: Any) -> str:
 
 
 @cache
-def _field_help(kind: Any) -> dict[str, str]:
+def field_help(kind: Any) -> dict[str, str]:
     """The docstrings under the fields of a dataclass, and of those it inherits from."""
     found: dict[str, str] = {}
     for base in reversed(kind.__mro__[:-1]):

@@ -1,0 +1,199 @@
+"""The documentation site: builds without a warning, links lead somewhere, command lines are accepted."""
+
+import re
+import shlex
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from functools import partial
+from html import unescape
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.parse import unquote, urlsplit
+
+import browser as chromium
+import pytest
+from browser import open_page
+
+import sagesplat
+from benchmarks import doc_tables
+from sagesplat import cli
+from sagesplat.cli.parse import arguments
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = sorted(DOCS.rglob("*.md"))
+PLACEHOLDER = re.compile(r"…|\.\.\.|\bK\b")  # lines that leave something out, or stand for several
+
+
+class Page:
+    """The anchors of a page, and where its links and pictures lead."""
+
+    def __init__(self, text: str) -> None:
+        self.anchors = {unescape(name) for name in re.findall(r'\s(?:id|name)="([^"]+)"', text)}
+        self.targets = {unescape(target) for target in re.findall(r'\s(?:href|src)="([^"]+)"', text)}
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("sphinx", reason="Sphinx is missing: pip install '.[docs]'")
+    out = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-b", "html", "-d", out / "trees"]
+    done = subprocess.run([*command, DOCS, out / "html"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return out / "html"
+
+
+def test_links_pictures_and_anchors_lead_somewhere(site):
+    pages = {path: Page(path.read_text()) for path in site.rglob("*.html")}
+    assert len(pages) > 40
+    gone = []
+    for path, page in pages.items():
+        for target in page.targets:
+            link = urlsplit(target)
+            if link.scheme or link.netloc:
+                continue
+            there = (path.parent / unquote(link.path)).resolve() if link.path else path
+            found = there.exists() and there.is_relative_to(site)
+            anchor = unquote(link.fragment)
+            if found and anchor and there in pages:
+                found = anchor in pages[there].anchors
+            gone += [] if found else [f"{path.relative_to(site)}: {target}"]
+    assert gone == []
+
+
+def test_nothing_is_loaded_from_elsewhere(site):
+    """The site works offline: scripts, styles and pictures are its own."""
+    for path in site.rglob("*.html"):
+        loaded = re.findall(
+            r'<(?:script|img|link|iframe)\b[^>]*(?:src|href)="(https?:[^"]+)"', path.read_text()
+        )
+        assert loaded == [], path.name
+
+
+def test_every_command_and_public_name_is_in_the_reference(site):
+    commands = Page((site / "reference/cli.html").read_text()).anchors
+    assert {f"sagesplat-{name}" for name in cli.commands()} <= commands
+    names = Page((site / "reference/python.html").read_text()).anchors
+    assert {f"sagesplat.{name}" for name in sagesplat.__all__} <= names
+
+
+def command_lines(path: Path) -> Iterator[str]:
+    """What begins with `sagesplat` in code blocks and between backticks, without comments."""
+    text = re.sub(r"\\\n\s*", "", path.read_text())
+    fenced = re.findall(r"^```(?:sh|)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    indented = re.findall(r"^ {4,}(\S.*)$", text, re.MULTILINE)
+    for line in ["\n".join(fenced), "\n".join(indented)]:
+        yield from re.findall(r"^\s*(?:\$ )?(?:\.venv/bin/)?(sagesplat [a-z-]+ .*?)(?:\s+#.*)?$", line, re.M)
+    for line in re.findall(r"`(sagesplat [a-z-]+ [^`]*)`", text.replace("\n", " ")):
+        yield line if " -" in line else ""  # in a sentence, arguments may be left out
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(DOCS)))
+def test_command_lines_are_accepted(path, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # no run folders whose settings would be read
+    for line in dict.fromkeys(command_lines(path)):
+        if not line or PLACEHOLDER.search(line) or "--help" in line:
+            continue
+        words = shlex.split(line.rstrip(","))[1:]
+        assert words[0] in cli.commands(), line
+        arguments(words[0], cli.commands()[words[0]], words[1:])
+
+
+def test_error_messages_are_those_of_the_code():
+    """Each message of the page, cut where something stands for a path or a number, is in the sources."""
+    files = [*(ROOT / "src").rglob("*.py"), *(ROOT / "web/src").rglob("*.ts")]
+    code = "".join(path.read_text() for path in files)
+    code = re.sub(r'"\s*\n\s*f?"', "", code)  # a message over several lines
+    code = re.sub(r"\$?\{[^{}\n]*\}", "…", code)
+    tables = "".join((DOCS / "help" / name).read_text() for name in ("errors.md", "troubleshooting.md"))
+    messages = re.findall(r"^\| `(?!RUN|infeas|uncal|lift|unlab)([^`]{12,})` \|", tables, re.MULTILINE)
+    assert len(messages) > 25
+    for message in messages:
+        for part in (part.strip(" .:;,()") for part in message.split("…")):
+            assert part in code, f"{message}: no {part!r}"
+
+
+def test_measured_tables_say_when_on_which_commit_and_how():
+    found = list(doc_tables.tables(DOCS))
+    assert len(found) > 60
+    unsaid = [
+        f"{table.page}:{table.line}"
+        for table in found
+        if not (table.measured and table.commit and (table.command or table.page.startswith("developers/")))
+    ]
+    assert unsaid == [], "`python -m benchmarks tables` lists them"
+
+
+# contrast of text with the nearest background behind it, by WCAG 2; 4.5 is enough, 3 for large letters
+CONTRAST = """() => {
+  const rgb = (text) => (text.match(/[\\d.]+/g) || []).map(Number);
+  const light = ([r, g, b]) => [r, g, b].map((v) => v / 255)
+    .map((v) => (v <= 0.03928 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4))
+    .reduce((sum, v, i) => sum + v * [0.2126, 0.7152, 0.0722][i], 0);
+  const poor = [];
+  const walker = document.createTreeWalker(document.querySelector("article"), NodeFilter.SHOW_TEXT);
+  while (walker.nextNode()) {
+    const at = walker.currentNode.parentElement;
+    if (!walker.currentNode.data.trim() || at.closest("iframe, .headerlink") || !at.offsetParent) continue;
+    const fill = (element) => rgb(getComputedStyle(element).backgroundColor);
+    let behind = at;
+    while (behind.parentElement && (fill(behind)[3] ?? 1) === 0) behind = behind.parentElement;
+    const pair = [rgb(getComputedStyle(at).color), fill(behind)];
+    const [high, low] = pair.map(light).sort((a, b) => b - a);
+    const ratio = (high + 0.05) / (low + 0.05);
+    const large = parseFloat(getComputedStyle(at).fontSize) >= 24;
+    const words = walker.currentNode.data.trim().slice(0, 30);
+    if (ratio < (large ? 3 : 4.5)) poor.push(`${words}: ${ratio.toFixed(2)}`);
+  }
+  return [...new Set(poor)];
+}"""
+
+
+@pytest.fixture(scope="module")
+def browser(site: Path) -> Iterator["Browser"]:
+    if reason := chromium.missing():
+        pytest.skip(reason)
+    with chromium.launch() as launched:
+        yield launched
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_pages_are_sound_on_a_phone(site, browser, scheme):
+    """From the disk, at 360 px: nothing wider than the screen, no complaint, contrast, pictures described."""
+    for name in ("index", "reference/cli", "reference/python", "help/errors"):
+        address = (site / f"{name}.html").as_uri()
+        with open_page(address, (360, 740), browser=browser, scheme=scheme) as opened:
+            page = opened.page
+            assert page.evaluate("document.documentElement.scrollWidth") <= 360, name
+            assert page.evaluate("[...document.images].every((image) => image.alt)"), name
+            assert page.evaluate(CONTRAST) == [], name
+            assert opened.complaints == [], name
+
+
+def test_search_finds_a_flag_from_the_disk(site, browser):
+    address = f"{(site / 'search.html').as_uri()}?q=gradient-freeze-share"
+    with open_page(address, browser=browser) as opened:
+        found = opened.wait_for("document.querySelectorAll('#search-results li a').length")
+        assert found > 0
+        assert opened.complaints == []
+
+
+def test_scenes_of_the_gallery_are_live(site, browser):
+    if not any((site / "gallery").glob("*.html")):
+        pytest.skip("no scenes in build/gallery; `make gallery` makes one")
+    handler = partial(SimpleHTTPRequestHandler, directory=str(site))
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        address = f"http://127.0.0.1:{server.server_port}/gallery.html"
+        with open_page(address, (700, 500), browser=browser) as opened:
+            inside = "document.querySelector('iframe.bundle').contentWindow.sagesplat"
+            opened.page.evaluate("document.querySelector('iframe.bundle').scrollIntoView()")
+            assert opened.wait_for(f"{inside} && {inside}.ready.then(() => {inside}.state().count > 0)", 60)
+            assert opened.complaints == []
+        server.shutdown()
