@@ -3,7 +3,7 @@
 import pytest
 
 from sagesplat.segment.coco import NAMES
-from sagesplat.segment.display_names import title_of, titles
+from sagesplat.segment.display_names import meant, title_of, titles
 
 
 @pytest.mark.parametrize(
@@ -34,3 +34,12 @@ def test_no_two_of_cocos_share_a_title() -> None:
 
 def test_a_name_of_suffixes_alone_is_its_own_title() -> None:
     assert [title_of(name) for name in ("-merged", "-", "a-stuff")] == ["-merged", "-", "a"]
+
+
+def test_what_is_typed_is_a_name_or_its_title() -> None:
+    names = ("grass-merged", "wall-other-merged", "wall", "wall-wood", "wall wood")
+    assert meant("grass-merged", names) == "grass-merged"
+    assert meant("grass", names) == "grass-merged"
+    assert meant("wall", names) == "wall"
+    assert meant("sky", names) == "sky"
+    assert meant("floor", ("floor-wood", "floor-merged", "floor-stuff")) == "floor"  # of two, none

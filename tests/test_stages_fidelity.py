@@ -14,7 +14,7 @@ def test_no_composition_is_measured_twice(monkeypatch: pytest.MonkeyPatch) -> No
     measured: Counter[tuple[int, ...]] = Counter()
 
     def compositions_at(
-        job: Any, cameras: Sequence[Any], planned: np.ndarray, stage: str
+        job: Any, cameras: Sequence[Any], planned: np.ndarray, stage: str, only: Any = None
     ) -> tuple[np.ndarray, np.ndarray]:
         for camera, of_view in zip(cameras, planned, strict=True):
             measured.update({(camera, *levels) for levels in of_view.tolist()})

@@ -13,7 +13,7 @@ from sagesplat.cli.console import Console
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Event, RunDone
 from sagesplat.io.files import write_json
-from sagesplat.output.report import ReportData
+from sagesplat.output.report_data import ReportData
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.segment.masks import mask_path

@@ -130,9 +130,19 @@ def fidelity_by_size(
         axes.plot(kilobytes, middle, color=colour, lw=1)
         axes.plot(kilobytes, low, color=colour, lw=2, marker=".", ms=5)
         axes.axhline(plan.target, color=FAINT, lw=1, ls="--")
-        if label in chosen:
-            at = levels.index(chosen[label].level)
-            axes.plot(bytes_of(chosen[label]) / 1e3, low[at], "o", ms=9, mfc="none", mec=ACCENT, mew=2)
+        if choice := chosen.get(label):
+            promised = choice.predicted if np.isfinite(choice.predicted) else low[levels.index(choice.level)]
+            axes.plot(
+                bytes_of(choice) / 1e3,
+                promised,
+                "o",
+                ms=9,
+                mfc="none",
+                mec=ACCENT,
+                mew=2,
+                clip_on=False,
+                zorder=4,
+            )
         axes.set_title(caption(label, names), loc="left", color=colour, fontweight="bold")
         axes.set_ylim(max(0.0, float(min(d[:, 0].min() for d in drawn.values())) - 0.05), 1.02)
     for axes in grid[len(shown) :]:
@@ -143,7 +153,9 @@ def fidelity_by_size(
         Line2D([], [], color=INK, lw=2, marker=".", label="95 % of viewpoints reach this"),
         Line2D([], [], color=INK, lw=1, label="half of them reach this"),
         Line2D([], [], color=FAINT, ls="--", label=f"target {plan.target:g}"),
-        Line2D([], [], marker="o", ls="", ms=9, mfc="none", mec=ACCENT, mew=2, label="level of the plan"),
+        Line2D(
+            [], [], marker="o", ls="", ms=9, mfc="none", mec=ACCENT, mew=2, label="plan, and what it promises"
+        ),
     ]
     figure.legend(handles=handles, loc="outside upper center", ncols=2 if columns < 3 else 4)
     return figure

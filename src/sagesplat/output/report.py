@@ -4,88 +4,29 @@ import base64
 import io
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, UInt8
 from jinja2 import Environment, StrictUndefined, Template
 from PIL import Image
 
 from sagesplat import __version__
-from sagesplat.adapt.eq3 import SsimModel
 from sagesplat.adapt.evaluate import COLOURS, UNIFORM, Evaluation
-from sagesplat.adapt.observe import TOTAL, Observations
-from sagesplat.adapt.plan import Choice, Counts, Plan, quality_title
-from sagesplat.adapt.viewpoint import QualityKind
-from sagesplat.core.gaussians import BYTES_PER_GAUSSIAN
+from sagesplat.adapt.observe import TOTAL
+from sagesplat.adapt.plan import Choice, Plan, quality_title
 from sagesplat.core.qr import qr_address
 from sagesplat.io.files import write_text
-from sagesplat.output import figures, place_figures, tables
+from sagesplat.output import figures, tables
 from sagesplat.output.by_category import Categories, merged, merged_counts, merged_plan, relabelled
-from sagesplat.output.figures import Colours, Panel, Sizes
-from sagesplat.output.next_steps import Commands, next_steps, view_quality, worst_view
-from sagesplat.output.place_figures import Place
+from sagesplat.output.figures import Colours, Panel
+from sagesplat.output.report_data import ReportData, main_plan, nearest, sizes_of, steps_of
+from sagesplat.output.report_figures import report_figures
 from sagesplat.output.tables import MB, Table, bytes_of, name_of
 from sagesplat.segment.block_categories import category_of
 
 PICTURE_WIDTH = 1400  # pixels of a picture inside the page; the files beside it keep their size
-FIT_LEVELS = 4  # levels drawn in the figure of SSIM over distance
-FIT_LABELS = 9  # labels drawn there, the largest
 TABLE_ROWS = 200  # of a table inside the page; the file beside it has all
-
-Facts = Sequence[tuple[str, str]]
-
-
-@dataclass(frozen=True)
-class PromiseFacts:
-    """What lower bounds of fidelity were made from."""
-
-    confidence: float
-    fitted: int  # drawn viewpoints that the models were fitted to
-    composed: int  # further ones, at which plans were composed and measured
-    calibration: int  # further ones, at which the bounds were calibrated
-
-
-@dataclass(frozen=True, eq=False)
-class ReportData:
-    """Everything the page shows, wherever it comes from. Views are rows of `view_names`."""
-
-    title: str
-    target: float  # of the plan that the page leads with; one of `plans` has it
-    names: Mapping[int, str]  # label id -> name
-    colours: Colours  # label id -> RGB, 0..255
-    observations: Observations
-    train_views: np.ndarray
-    test_views: np.ndarray  # unseen by training and fitting
-    view_names: Sequence[str]
-    counts: Counts  # (label id, level) -> Gaussians, every level of the ladder
-    recovering: frozenset[int]  # levels taken shortly after an opacity reset
-    models: Mapping[tuple[int, int], SsimModel]  # by (label id, level)
-    plans: Sequence[Plan]  # of the scene, one per quality and target
-    evaluation: Evaluation
-    quality: QualityKind = "ssim"  # of the plan that the page leads with
-    ssim_target: float | None = None  # of the plan for SSIM beside one for fidelity
-    sizes: Sizes | None = None  # bytes to send of each (label id, level); None: 248 a Gaussian
-    panels: Sequence[Panel] = ()  # at the page's target
-    scene_facts: Facts = ()
-    settings: Facts = ()
-    timings: Sequence[tuple[str, float]] = ()  # stage, seconds
-    provenance: Facts = ()  # versions, hashes of the inputs
-    exposed: bool = False  # views are rendered with the exposure of their photos, fitted where held out
-    photos: bool = True  # False: renders of a splat that somebody else trained
-    adopted: Facts = ()  # how such a splat was looked at, and how its levels were made
-    viewpoints: UInt8[np.ndarray, "H W 3"] | None = None  # what its viewpoints see
-    categories: Categories = field(default_factory=dict)  # of per-block categories
-    noticed: Sequence[str] = ()  # what the run noticed, and dealt with, in words
-    commands: Commands | None = None  # what commands on the run name
-    can_view: bool = False  # whether `sagesplat view` shows the run
-    links: Facts = ()  # what else was made of the run: title, address relative to the page
-    url: str = ""  # where the run's bundle was published
-    place: Place | None = None  # the capture from above
-    promise: PromiseFacts | None = None
-    drawn: Mapping[int, Float32[np.ndarray, "V K"]] = field(default_factory=dict)
-    """Fidelity by label id: of each level, at the drawn viewpoints that show the category."""
 
 
 def write_report(folder: Path, data: ReportData) -> Path:
@@ -99,8 +40,8 @@ def write_report(folder: Path, data: ReportData) -> Path:
     per_block = replace(data, evaluation=data.evaluation.select(unseen))
     data, promises = by_category(per_block), relabelled(per_block.evaluation, per_block.categories)
     labels = tables.by_size(data.counts)
-    beside = None if data.ssim_target is None else _nearest(data, "ssim", data.ssim_target)
-    drawn = _figures(data, labels, per_block, promises)
+    beside = None if data.ssim_target is None else nearest(data, "ssim", data.ssim_target)
+    drawn = report_figures(data, labels, per_block, promises)
     plots = [(name, title, _save(figure, folder, name)) for name, title, figure in drawn]
     sheets = dict(_tables(data, labels, per_block, promises))
     for name, table in sheets.items():
@@ -120,7 +61,7 @@ def write_report(folder: Path, data: ReportData) -> Path:
         num_parts=len(per_block.categories),
         table_rows=TABLE_ROWS,
         plots={name: (title, image) for name, title, image in plots},
-        steps=_next_steps(data),
+        steps=steps_of(data),
         bundle=next((at for _, at in data.links if at.split("/")[-2:-1] == ["bundle"]), ""),
         qr=qr_address(data.url) if data.url else "",
         sheets=sheets,
@@ -173,20 +114,6 @@ def template(path: Path) -> Template:
     return environment.from_string(path.read_text("utf-8"))
 
 
-def main_plan(data: ReportData) -> Plan:
-    """The plan that the page leads with: of its quality, the one whose target is nearest to `data.target`."""
-    return _nearest(data, data.quality, data.target)
-
-
-def _nearest(data: ReportData, quality: QualityKind, target: float) -> Plan:
-    return min(data.plans, key=lambda plan: (plan.quality != quality, abs(plan.target - target)))
-
-
-def _sizes(data: ReportData) -> Sizes:
-    """Bytes of each (label id, level), as the page counts them."""
-    return data.sizes or {key: count * BYTES_PER_GAUSSIAN for key, count in data.counts.items()}
-
-
 def _headline(data: ReportData, promises: Evaluation) -> dict:
     """The figures at the top of the page, all measured."""
     plan = main_plan(data)
@@ -195,7 +122,7 @@ def _headline(data: ReportData, promises: Evaluation) -> dict:
     whole = rows.select(rows.label_id == TOTAL)
     mb, full_mb = (
         sum(map(bytes_of, plan.choices)) / MB,
-        sum(tables.last_counts(_sizes(data)).values()) / MB,
+        sum(tables.last_counts(sizes_of(data)).values()) / MB,
     )
     saved = 1 - mb / full_mb if full_mb else 0.0
     shares = [c.reached for c in plan.choices if c.reached]
@@ -235,7 +162,7 @@ def _kept(plan: Plan, rows: Evaluation) -> tables.Kept:
 
 def _categories(data: ReportData, plan: Plan, labels: Sequence[int], promises: Evaluation) -> list[dict]:
     """A line of one of the page's tables of categories per label, the largest first."""
-    sizes = tables.last_counts(_sizes(data))
+    sizes = tables.last_counts(sizes_of(data))
     chosen: dict[int, Choice] = {choice.label_id: choice for choice in plan.choices}
     at_target, promised = data.evaluation.of(plan), promises.of(plan)
     lines = []
@@ -259,96 +186,12 @@ def _categories(data: ReportData, plan: Plan, labels: Sequence[int], promises: E
     return lines
 
 
-def _next_steps(data: ReportData):
-    if data.commands is None:
-        return []
-    return next_steps(
-        data.observations, data.train_views, data.test_views, data.view_names, data.names, main_plan(data),
-        data.commands,
-    )  # fmt: skip
-
-
-def _camera_map(data: ReportData, place: Place) -> figures.Figure:
-    quality = view_quality(data.observations, len(data.view_names))
-    test = np.isin(np.arange(len(quality)), data.test_views)
-    asked = any(step.title == "More photos" for step in _next_steps(data))
-    return place_figures.camera_map(
-        place, quality, test, worst_view(quality, data.test_views) if asked else None
-    )
-
-
-def _figures(data: ReportData, labels: Sequence[int], per_block: ReportData, promises: Evaluation):
-    """(file name, title, Figure) of every plot that the data allow."""
-    names, colours, seen, quality = data.names, data.colours, data.observations, data.quality
-    unit = "bytes to send (MB)" if data.sizes else figures.RAW
-    yield (
-        "size_by_target",
-        "Model size by target and category",
-        figures.size_by_target(data.plans, _sizes(data), labels, names, colours, unit),
-    )
-    if data.place is not None:
-        yield "cameras", "Map of the cameras", _camera_map(data, data.place)
-    if data.drawn and data.sizes:
-        levels = sorted({level for _, level in data.counts})
-        yield (
-            "fidelity_by_size",
-            "Fidelity of each category by its size",
-            place_figures.fidelity_by_size(
-                data.drawn, levels, data.sizes, main_plan(data), labels, names, colours
-            ),
-        )
-    if len(data.evaluation):
-        yield (
-            "quality_over_size",
-            "Quality over size on unseen views",
-            figures.quality_over_size(
-                _uniform(data), _sizes(data), data.plans, data.evaluation, quality, unit
-            ),
-        )
-        yield (
-            "promised_and_measured",
-            f"Promised and measured {quality_title(quality)} on unseen views",
-            figures.promised_and_measured(promises, labels, names, colours, quality),
-        )
-    if len(seen):
-        yield (
-            "ssim_over_levels",
-            "SSIM of each category by level",
-            figures.ssim_over_levels(
-                seen, data.train_views, data.test_views, labels, names, colours, data.recovering
-            ),
-        )
-    if data.models:
-        levels = sorted({level for _, level in data.models if level not in data.recovering})
-        picked = np.geomspace(1, max(len(levels), 1), FIT_LEVELS).round().astype(int) - 1
-        shown = [levels[i] for i in np.unique(picked)] if levels else []
-        fitted = tables.by_size(per_block.counts)
-        few = fitted[:FIT_LABELS]
-        most = f", the {len(few)} largest of {len(fitted)}" if len(few) < len(fitted) else ""
-        yield (
-            "ssim_over_distance",
-            f"SSIM over distance and its model{most}",
-            figures.ssim_over_distance(
-                per_block.observations, data.train_views, few, per_block.names, colours, data.models, shown
-            ),
-        )
-
-
-def _uniform(data: ReportData) -> dict[int, float]:
-    """Quality of the whole image on unseen views by level, all categories at one: what plans compare with."""
-    if data.quality == "fidelity":
-        return data.evaluation.uniform("fidelity")
-    rows = data.observations.select(np.isin(data.observations.view, data.test_views))
-    levels = [level for level in np.unique(rows.level).tolist() if level not in data.recovering]
-    return {level: tables.view_mean(rows, TOTAL, level) for level in levels}
-
-
 def _tables(data: ReportData, labels: Sequence[int], per_block: ReportData, promises: Evaluation):
     """(file name, Table) of every table that the data allow."""
     names = data.names
     yield "plan", tables.plan_table(main_plan(per_block), per_block.counts, per_block.names)
     if data.ssim_target is not None:
-        beside = _nearest(per_block, "ssim", data.ssim_target)
+        beside = nearest(per_block, "ssim", data.ssim_target)
         yield "plan_ssim", tables.plan_table(beside, per_block.counts, per_block.names)
     yield "size_by_target", tables.targets_table(data.plans, data.counts, labels, names, data.sizes)
     if len(data.evaluation):

@@ -1,7 +1,7 @@
 """Names of categories, for people."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 from sagesplat.segment.block_categories import split_name
 
@@ -20,6 +20,14 @@ def title_of(name: str) -> str:
     for suffix in _SUFFIXES:
         title = title.removesuffix(suffix)
     return title.replace("-", " ").strip() or name
+
+
+def meant(typed: str, names: Collection[str]) -> str:
+    """The name that was typed: it itself, or the only one whose title it is; else what was typed."""
+    if typed in names:
+        return typed
+    found = [name for name in names if title_of(name) == typed]
+    return found[0] if len(found) == 1 else typed
 
 
 def titles(names: Mapping[int, str]) -> dict[int, str]:

@@ -30,7 +30,7 @@ from sagesplat.raster import rasterize
 from sagesplat.run.job import Job
 from sagesplat.run.records import is_made_from, settings_of
 from sagesplat.scene import read_scene
-from sagesplat.segment.display_names import title_of
+from sagesplat.segment.display_names import meant, title_of
 from sagesplat.segment.masks import UNLABELLED
 from sagesplat.stages.edited import label_settings
 from sagesplat.stages.export import increment_files
@@ -109,10 +109,14 @@ def bundle(
     an impossible number; DataError for a damaged increment; SageError without a viewer.
     """
     edited = label_settings(job.run)
-    always = [*edited.always, *(composed(name) for name in always)]
-    weights = edited.weights | {composed(name): weight for name, weight in (weights or {}).items()}
     job = _without_capture(replace(job, run=replace(job.run, ladder="nested")))
-    _check(job, meters_per_unit, always, weights)
+    _check_made(job)
+    names = set(job.names().values())
+    names |= {category_and_block(job, name)[0] for name in names}
+    always = [*edited.always, *(meant(composed(name), names) for name in always)]
+    given = {meant(composed(name), names): weight for name, weight in (weights or {}).items()}
+    weights = edited.weights | given
+    _check_asked(job, meters_per_unit, always, weights)
     viewer = viewer or package_viewer()
     (check_page if single_file else check_target)(out)
     check_viewer(viewer)
@@ -241,9 +245,7 @@ def _read_live(path: Path) -> dict[str, Any]:
     return made if usable else {}
 
 
-def _check(
-    job: Job, meters_per_unit: float | None, always: Collection[str], weights: Mapping[str, float]
-) -> None:
+def _check_made(job: Job) -> None:
     run = job.run
     against_photos = (("observe", run.observations), ("fit", run.promises)) if has_photos(run) else ()
     for stage, path in (
@@ -259,6 +261,11 @@ def _check(
             )
     if not is_made_from(run, "fit", run.increments / INDEX):
         raise RunError(f"{run.fidelity}: fitted to other increments; run `sagesplat fit` again with --force")
+
+
+def _check_asked(
+    job: Job, meters_per_unit: float | None, always: Collection[str], weights: Mapping[str, float]
+) -> None:
     if meters_per_unit is not None and not 1e-6 <= meters_per_unit <= 1e6:
         raise RunError(f"{meters_per_unit} metres per unit are impossible; give a number such as 0.5")
     names = set(job.names().values())

@@ -21,7 +21,7 @@ from sagesplat.io.pictures import open_picture
 from sagesplat.output.figures import Panel
 from sagesplat.output.next_steps import Commands
 from sagesplat.output.place_figures import Place
-from sagesplat.output.report import PromiseFacts, ReportData
+from sagesplat.output.report_data import PromiseFacts, ReportData
 from sagesplat.run.capture import read_capture
 from sagesplat.run.job import Job
 from sagesplat.run.records import read_record, settings_of

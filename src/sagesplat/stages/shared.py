@@ -24,6 +24,7 @@ from sagesplat.run.records import settings_of
 from sagesplat.run.run_dir import RunDir
 from sagesplat.segment.block_categories import split_name
 from sagesplat.segment.display_colors import colors_of, rgb_of
+from sagesplat.segment.display_names import meant
 from sagesplat.segment.masks import UNLABELLED
 from sagesplat.segment.parents import with_instances
 from sagesplat.stages.results import observations_of
@@ -89,11 +90,13 @@ def _show(job: Job, table: Table) -> None:
 def labels_named(job: Job, names: Sequence[str]) -> list[int]:
     """The ids of categories and instances, those of a category with all its instances.
 
-    RunError for a name that the run does not have.
+    Names are those of the run, or as people are shown them (grass for grass-merged). RunError for a name that
+    the run does not have.
     """
     known, found = job.names(), list[int]()
+    all_names = {*known.values(), *job.parents.values()}
     for name in names:
-        ids = with_instances(known, job.parents, composed(name))
+        ids = with_instances(known, job.parents, meant(composed(name), all_names))
         if not ids:
             raise RunError(f"{job.run.path}: no category {name!r}; there are {', '.join(known.values())}")
         found += [i for i in ids if i not in found]
@@ -103,9 +106,10 @@ def labels_named(job: Job, names: Sequence[str]) -> list[int]:
 def label_named(job: Job, name: str) -> int:
     """The id of a category of the run; RunError for a name that it does not have."""
     ids = {name: label for label, name in job.names().items()}
-    if composed(name) not in ids:
+    stored = meant(composed(name), ids)
+    if stored not in ids:
         raise RunError(f"{job.run.path}: no category {name!r}; there are {', '.join(ids)}")
-    return ids[composed(name)]
+    return ids[stored]
 
 
 def category_and_block(job: Job, name: str) -> tuple[str, int | None]:

@@ -1,0 +1,96 @@
+"""What the report of a run is made from."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from sagesplat.adapt.eq3 import SsimModel
+from sagesplat.adapt.evaluate import Evaluation
+from sagesplat.adapt.observe import Observations
+from sagesplat.adapt.plan import Counts, Plan
+from sagesplat.adapt.viewpoint import QualityKind
+from sagesplat.core.gaussians import BYTES_PER_GAUSSIAN
+from sagesplat.output.by_category import Categories
+from sagesplat.output.figures import Colours, Panel, Sizes
+from sagesplat.output.next_steps import Commands, NextStep, next_steps
+from sagesplat.output.place_figures import Place
+
+Facts = Sequence[tuple[str, str]]
+
+
+@dataclass(frozen=True)
+class PromiseFacts:
+    """What lower bounds of fidelity were made from."""
+
+    confidence: float
+    fitted: int  # drawn viewpoints that the models were fitted to
+    composed: int  # further ones, at which plans were composed and measured
+    calibration: int  # further ones, at which the bounds were calibrated
+
+
+@dataclass(frozen=True, eq=False)
+class ReportData:
+    """Everything the page shows, wherever it comes from. Views are rows of `view_names`."""
+
+    title: str
+    target: float  # of the plan that the page leads with; one of `plans` has it
+    names: Mapping[int, str]  # label id -> name
+    colours: Colours  # label id -> RGB, 0..255
+    observations: Observations
+    train_views: np.ndarray
+    test_views: np.ndarray  # unseen by training and fitting
+    view_names: Sequence[str]
+    counts: Counts  # (label id, level) -> Gaussians, every level of the ladder
+    recovering: frozenset[int]  # levels taken shortly after an opacity reset
+    models: Mapping[tuple[int, int], SsimModel]  # by (label id, level)
+    plans: Sequence[Plan]  # of the scene, one per quality and target
+    evaluation: Evaluation
+    quality: QualityKind = "ssim"  # of the plan that the page leads with
+    ssim_target: float | None = None  # of the plan for SSIM beside one for fidelity
+    sizes: Sizes | None = None  # bytes to send of each (label id, level); None: 248 a Gaussian
+    panels: Sequence[Panel] = ()  # at the page's target
+    scene_facts: Facts = ()
+    settings: Facts = ()
+    timings: Sequence[tuple[str, float]] = ()  # stage, seconds
+    provenance: Facts = ()  # versions, hashes of the inputs
+    exposed: bool = False  # views are rendered with the exposure of their photos, fitted where held out
+    photos: bool = True  # False: renders of a splat that somebody else trained
+    adopted: Facts = ()  # how such a splat was looked at, and how its levels were made
+    viewpoints: UInt8[np.ndarray, "H W 3"] | None = None  # what its viewpoints see
+    categories: Categories = field(default_factory=dict)  # of per-block categories
+    noticed: Sequence[str] = ()  # what the run noticed, and dealt with, in words
+    commands: Commands | None = None  # what commands on the run name
+    can_view: bool = False  # whether `sagesplat view` shows the run
+    links: Facts = ()  # what else was made of the run: title, address relative to the page
+    url: str = ""  # where the run's bundle was published
+    place: Place | None = None  # the capture from above
+    promise: PromiseFacts | None = None
+    drawn: Mapping[int, Float32[np.ndarray, "V K"]] = field(default_factory=dict)
+    """Fidelity by label id: of each level, at the drawn viewpoints that show the category."""
+
+
+def main_plan(data: ReportData) -> Plan:
+    """The plan that the page leads with: of its quality, the one whose target is nearest to `data.target`."""
+    return nearest(data, data.quality, data.target)
+
+
+def nearest(data: ReportData, quality: QualityKind, target: float) -> Plan:
+    """The plan of a quality whose target is nearest to one."""
+    return min(data.plans, key=lambda plan: (plan.quality != quality, abs(plan.target - target)))
+
+
+def sizes_of(data: ReportData) -> Sizes:
+    """Bytes of each (label id, level), as the page counts them."""
+    return data.sizes or {key: count * BYTES_PER_GAUSSIAN for key, count in data.counts.items()}
+
+
+def steps_of(data: ReportData) -> list[NextStep]:
+    """What to do next with the run."""
+    if data.commands is None:
+        return []
+    return next_steps(
+        data.observations, data.train_views, data.test_views, data.view_names, data.names, main_plan(data),
+        data.commands,
+    )  # fmt: skip
