@@ -1,7 +1,6 @@
 """What segmentation tells while it runs: how long it will take, and what prompts found."""
 
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -135,13 +134,13 @@ def prompt_lines(
 
     LabelError, with the scores, where no pixel of any photo has a label.
     """
-    best, shared, threshold = dict[str, float](), Counter[str](), 0.0
+    best, shared, threshold = dict[str, float](), dict[str, float](), 0.0
     for path in sorted(folder.glob(_SCORES)):
         known = read_scores(path)
         threshold = known.threshold
         _add(known.best, best)
         for pair, area in known.shared.items():
-            shared[pair] += area
+            shared[pair] = shared.get(pair, 0.0) + area
     names = [name for label_id, name in taxonomy.names.items() if label_id in occurring]
     missing = [
         f"prompt {name!r}: found in no photo; its best score is {score:.2f} and {threshold:g} is needed: "

@@ -7,7 +7,8 @@ const EDGE = 4; // of a cell, in medians of the splats' largest standard deviati
 const EXTENT = 1.5; // standard deviations that a splat fills
 const MOST = 4; // points of a splat beside its centre, along an axis in one direction
 const FAINT = 25; // in 1/255: fainter splats fill no cells
-const OWN = 2.5; // tolerances that the colour of a single splat may be off: theirs scatter
+const SHARED = 0.1; // of a neighbour's colours that count for a cell
+const OWN = 2.25; // tolerances that the colour of a single splat may be off: theirs scatter
 const CLOSINGS = 2; // rounds in which a cell joins that most of its neighbours are in
 
 const AROUND = Array.from(
@@ -87,13 +88,13 @@ class Cells {
       }
   }
 
-  /** The mean colour of each cell and its neighbours, in bytes, weighted by opacity. */
+  /** The mean colour of each cell, and less of its neighbours', in bytes, weighted by opacity. */
   colours(): Float64Array {
     const found = new Float64Array(3 * this.numbers.size);
     for (let cell = 0; cell < this.numbers.size; cell++) {
       const [sum, rgb] = [this.sums.slice(4 * cell, 4 * cell + 4), [0, 1, 2]];
       for (const other of this.neighbours(cell))
-        for (let i = 0; i < 4; i++) sum[i] = (sum[i] ?? 0) + (this.sums[4 * other + i] ?? 0);
+        for (let i = 0; i < 4; i++) sum[i] = (sum[i] ?? 0) + SHARED * (this.sums[4 * other + i] ?? 0);
       for (const axis of rgb) found[3 * cell + axis] = (sum[axis + 1] ?? 0) / (sum[0] ?? 1);
     }
     return found;

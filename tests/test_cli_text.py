@@ -1,0 +1,139 @@
+"""Segmentation by text as typed, with tiny networks of random weights: masks, run, adopt."""
+
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import random_gaussians
+from text_networks import save
+
+from sagesplat.demo.capture import make_capture
+from sagesplat.formats.ply import write_ply
+
+Call = Callable[..., tuple[int, str]]
+PROMPTS = "stone fountain; ivy; wooden bench"
+SMALL = (
+    "--train.max-steps", "40", "--nest.steps", "12", "--nest.levels", "3", "--nest.base-steps", "6",
+    "--sample.views", "6", "--sample.calibration-views", "6", "--target-fidelity", "0.6", "--threads", "1",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A capture, and networks in folders of their own."""
+    folder = tmp_path_factory.mktemp("text")
+    make_capture(folder / "capture", views=8, width=64, height=48)
+    for kind in ("dino", "sam2", "clipseg"):
+        (folder / kind).mkdir()
+        save(folder / kind, kind)
+    return folder
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Call:
+    def typed(*words: str | Path) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["sagesplat", *map(str, words)])
+        code = 0
+        try:
+            from sagesplat import cli
+
+            cli.main()
+        except SystemExit as end:
+            code = int(end.code or 0)
+        out = capsys.readouterr()
+        return code, out.out + out.err
+
+    return typed
+
+
+def names_of(path: Path) -> list[str]:
+    return list(json.loads((path / "labels.json").read_text())["labels"].values())
+
+
+def test_a_run_by_text(folder: Path, tmp_path: Path, command: Call) -> None:
+    networks = ("--model", folder / "dino", "--mask-model", folder / "sam2", "--prompt-threshold", "0.01")
+    words = ("--segmenter", "text", "--prompts", PROMPTS, *networks)
+    code, said = command("run", folder / "capture", tmp_path / "run", *words, *SMALL)
+    assert code == 0, said
+    assert "best scores: " in said
+    assert "stone fountain 0." in said
+    assert set(names_of(tmp_path / "run" / "masks")) <= set(PROMPTS.split("; "))
+    assert (tmp_path / "run" / "nested" / "report" / "index.html").exists()
+
+
+def test_masks_over_those_of_the_capture(folder: Path, tmp_path: Path, command: Call) -> None:
+    words = ("--prompts", "ivy", "--prompt-model", folder / "clipseg", "--prompt-threshold", "0.01")
+    code, said = command("masks", folder / "capture", tmp_path / "run", *words)
+    assert code == 0, said
+    before = names_of(folder / "capture" / "masks")
+    assert "ivy" in names_of(tmp_path / "run" / "masks")
+    assert set(names_of(tmp_path / "run" / "masks")) <= {"ivy", *before}
+
+
+def test_a_splat_by_text(folder: Path, tmp_path: Path, command: Call) -> None:
+    g = random_gaussians(300, degree=1, logit=2.0)
+    write_ply(tmp_path / "ball.ply", replace(g, label_ids=torch.full_like(g.label_ids, -1)))
+    words = ("--prompts", PROMPTS, "--prompt-model", folder / "clipseg", "--prompt-threshold", "0.01")
+    small = (
+        "--fit",
+        "none",
+        "--views",
+        "14",
+        "--size",
+        "48",
+        "36",
+        "--shares",
+        "0.3",
+        "1",
+        "--kind",
+        "object",
+    )
+    code, said = command("adopt", tmp_path / "ball.ply", tmp_path / "run", *words, *small, *SMALL[8:])
+    assert code == 0, said
+    assert set(names_of(tmp_path / "run" / "masks")) <= set(PROMPTS.split("; "))
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (("--prompts", "ivy; Ivy"), "prompts: 'ivy' and 'Ivy' mean the same; leave one of them"),
+        (("--prompts", "tree; the trees"), "prompts: 'tree' and 'the trees' mean the same"),
+        (("--prompts", "ivy;; bench"), "one is empty; write --prompts"),
+        (("--prompts", "a,b"), "',' cannot be part of a category; separate prompts by ;"),
+        (("--prompts", "x" * 300), "a name has 1 to 100 printable characters"),
+        (("--prompts", "ivy\nbench"), "a name has 1 to 100 printable characters"),
+        (("--segmenter", "text"), "--segmenter text needs --prompts"),
+        (("--prompts", "ivy", "--labels.instances", "chair 7"), "chair 7"),
+    ],
+)
+def test_bad_words_are_one_line(
+    folder: Path, tmp_path: Path, command: Call, words: tuple[str, ...], line: str
+) -> None:
+    network = ("--prompt-model", folder / "clipseg", "--segmenter", "text")
+    code, said = command("run", folder / "capture", tmp_path / "run", *network, *words)
+    assert code == 2, said
+    assert "Traceback" not in said
+    last = said.splitlines()[-1]
+    assert last.startswith("sagesplat: ")
+    assert line in last
+
+
+@pytest.mark.parametrize("name", ["<b>bold</b>", "喷泉 & <script>", "ش" * 100])
+def test_names_of_any_script_and_with_markup(folder: Path, tmp_path: Path, command: Call, name: str) -> None:
+    words = (
+        "--segmenter",
+        "text",
+        "--prompts",
+        name,
+        "--model",
+        folder / "clipseg",
+        "--prompt-threshold",
+        "0.01",
+    )
+    code, said = command("masks", folder / "capture", tmp_path / "run", *words)
+    assert code == 0, said
+    assert names_of(tmp_path / "run" / "masks") == [name]
