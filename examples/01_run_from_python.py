@@ -55,7 +55,7 @@ def main() -> None:
     for plan in run.plans:
         print(f"\n{plan.asked}: {plan.count:,} Gaussians, {plan.nbytes / 1e6:.1f} MB, {plan.verdict}")
         for choice in plan.choices:
-            name = run.names[choice.label_id]
+            name = run.titles[choice.label_id]
             print(f"  {name:24} level {choice.level:6}  {choice.count:9,}  {choice.verdict}")
 
 

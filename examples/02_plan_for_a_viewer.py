@@ -34,7 +34,7 @@ def main() -> None:
     plan = run.plan_camera(viewer, target_fidelity=args.target_fidelity, target_ssim=args.target_ssim)
     for choice in plan.choices:
         print(
-            f"{run.names[choice.label_id]:24} level {choice.level:3}  {choice.count:9,} Gaussians  "
+            f"{run.titles[choice.label_id]:24} level {choice.level:3}  {choice.count:9,} Gaussians  "
             f"distance {choice.distance:6.2f}  at least {choice.predicted:.3f}, {choice.verdict}"
         )
     write_ply(args.ply, run.compose(plan), run.names, antialiased=run.antialiased)

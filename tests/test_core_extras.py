@@ -23,12 +23,15 @@ def test_the_command_fits_the_environment(tmp_path: Path, monkeypatch: pytest.Mo
     assert install("sagesplat[hf]") == "pip install 'sagesplat[hf]'"
     monkeypatch.setattr(extras, "find_spec", lambda name: None)  # an environment of uv's
     monkeypatch.setattr(sys, "executable", "/a tool/bin/python")
+    monkeypatch.setattr(sys, "prefix", str(tmp_path))
     assert install("--upgrade", "pillow") == "uv pip install --python '/a tool/bin/python' --upgrade pillow"
+    (tmp_path / "pipx_metadata.json").touch()
+    assert install("sagesplat[view]") == "pipx runpip sagesplat install 'sagesplat[view]'"
 
 
 def test_the_doctor_knows_every_extra() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     named = project["optional-dependencies"]
-    assert set(EXTRAS) == set(named) - {"cuda", "dev"}
+    assert set(EXTRAS) == set(named) - {"cuda", "dev", "docs"}
     for extra, (package, _) in EXTRAS.items():
         assert any(line.startswith(package) for line in named[extra])

@@ -134,7 +134,7 @@ def test_the_notebook_of_promises(finished, tmp_path, monkeypatch):
 def test_a_notebook_shows_what_it_printed_and_drew(path):
     cells = [cell for cell in notebook(path.name)["cells"] if cell["cell_type"] == "code"]
     assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1)), "tools/notebooks.py"
-    assert any("image/png" in out.get("data", {}) for cell in cells for out in cell["outputs"])
+    assert any("image/jpeg" in out.get("data", {}) for cell in cells for out in cell["outputs"])
     source = "".join(line for cell in cells for line in cell["source"])
     imported = {line.split()[1] for line in source.splitlines() if line.startswith("from sagesplat")}
     assert imported == {"sagesplat"}

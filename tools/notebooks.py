@@ -39,10 +39,10 @@ def execute(notebook: dict[str, Any], settings: str | None = None) -> dict[str, 
         text = printed.getvalue().splitlines(keepends=True)
         cell["outputs"] = [{"output_type": "stream", "name": "stdout", "text": text}] if text else []
         for figure in pyplot.get_fignums():
-            png = io.BytesIO()
-            pyplot.figure(figure).savefig(png, dpi=80, bbox_inches="tight")
-            picture = base64.b64encode(png.getvalue()).decode()
-            output = {"output_type": "display_data", "metadata": {}, "data": {"image/png": picture}}
+            jpeg = io.BytesIO()
+            pyplot.figure(figure).savefig(jpeg, format="jpeg", dpi=80, bbox_inches="tight")
+            picture = base64.b64encode(jpeg.getvalue()).decode()
+            output = {"output_type": "display_data", "metadata": {}, "data": {"image/jpeg": picture}}
             cell["outputs"].append(output)
         pyplot.close("all")
     return names

@@ -18,11 +18,13 @@ def install(*words: str) -> str:
         words: packages, extras such as "sagesplat[hf]", options of pip
 
     Returns:
-        `pip install ...` where that reaches this environment, else with its interpreter's path; with uv where
-        the environment has no pip (`uv tool install`, `uv venv`).
+        `pip install ...` where that reaches this environment, else with its Python in full; with pipx
+        where that made it, and with uv where there is no pip (`uv tool install`, `uv venv`).
     """
     quoted = " ".join(f'"{word}"' if os.name == "nt" else shlex.quote(word) for word in words)
     python = Path(sys.executable)
+    if (Path(sys.prefix) / "pipx_metadata.json").exists():
+        return f"pipx runpip sagesplat install {quoted}"
     if find_spec("pip") is None:
         return f"uv pip install --python {_typed(python)} {quoted}"
     pip = shutil.which("pip")

@@ -23,6 +23,7 @@ from sagesplat.raster import Backend, cuda, resolve_backend, set_threads
 from sagesplat.run.job import NO_RUN, Job
 from sagesplat.run.run_dir import LadderKind, RunDir, check_links
 from sagesplat.scene.scene import Camera, Scene, View
+from sagesplat.segment.display_names import titles
 from sagesplat.stages import label_edits, pipeline
 from sagesplat.stages.bundle import BundleMade, bundle
 from sagesplat.stages.methods import NestedLevels
@@ -169,6 +170,11 @@ class FinishedRun:
     def names(self) -> dict[int, str]:
         """Category names by label id; -1 is the unlabelled one."""
         return self.job.names()
+
+    @cached_property
+    def titles(self) -> dict[int, str]:
+        """Category names for people by label id: "grass" for COCO's grass-merged."""
+        return titles(self.names)
 
     @cached_property
     def parents(self) -> dict[int, str]:
