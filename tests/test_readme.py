@@ -36,7 +36,7 @@ def words_of(line: str) -> list[str]:
 
 def test_every_block_is_tested() -> None:
     assert {kind for kind, _ in BLOCKS} == {"sh", "python"}
-    assert {words_of(line)[0] for line in LINES} == {"pip", "sagesplat"}
+    assert {words_of(line)[0] for line in LINES} == {"make", "pip", "sagesplat"}
     assert len(README.split()) < 1000, "a README is one screen and some; the rest belongs in docs/"
 
 
@@ -44,7 +44,9 @@ def test_every_block_is_tested() -> None:
 def test_a_line_is_one_that_the_program_understands(line, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     program, command, *words = words_of(line)
-    if program == "pip":
+    if program == "make":
+        assert re.search(rf"^{command}:", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    elif program == "pip":
         project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
         extras = re.fullmatch(r"\.\[([\w,]+)\]", words[0])
         assert command == "install"
@@ -117,6 +119,8 @@ def test_everything_as_typed(tmp_path: Path) -> None:
         )
 
     for line in LINES:
+        if words_of(line)[0] == "make":  # of which this test is a part
+            continue
         if words_of(line)[1] == "view":
             assert_it_serves(words_of(line), checkout, env)
             continue
