@@ -15,17 +15,24 @@ demo: $(INSTALLED)
 
 # two processes of one thread each: the tests are small, and idle threads would spin in each other's way;
 # a file stays in one process, which makes its fixtures once
-test: lint browser
+# before them, what does not need the same: packages beside Chromium, types beside style
+test:
+	@$(MAKE) --no-print-directory -j 2 lint browser
 	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m 'not slow and not threads'
 	NUMBA_NUM_THREADS=2 $(BIN)/pytest -q -m threads
 
 test-slow: $(INSTALLED)
 	$(BIN)/pytest -q -m slow
 
-lint: $(INSTALLED)
+.PHONY: types style
+lint: types style
+
+types: $(INSTALLED)
+	$(BIN)/pyright
+
+style: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/pyright
 	$(BIN)/lint-imports
 
 $(INSTALLED): pyproject.toml constraints.txt

@@ -1,5 +1,6 @@
 """Small labelled Gaussians, cameras and a capture on disk that several tests share."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,7 @@ from sagesplat.stages.pipeline import run_all
 LABELS = (-1, 3, 184)
 SMALL_RUN = RunConfig(  # of `finished_run`
     scene=SceneConfig(test_every=4, calibrate_every=3),
-    train=TrainConfig(max_steps=6, level_every=2),
+    train=TrainConfig(max_steps=6, level_every=2, sh_degree=1),
     nest=NestConfig(steps=2, levels=4, smallest=0.1, base_share=0),
     plan=PlanConfig(target_ssim=0.4, other_targets=()),
 )
@@ -42,6 +43,14 @@ _LONG = ("test_run_stage", "test_viewer_browser", "test_stages_nest", "test_stag
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: item.path.stem not in _LONG)
+
+
+@pytest.fixture(scope="module")
+def no_figures() -> Iterator[None]:
+    """Reports without figures, which take most of the time of a small run, and have their own tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sagesplat.output.figures.save_figure", lambda figure, path: b"<svg/>")
+        yield
 
 
 @pytest.fixture

@@ -12,6 +12,9 @@ import pytest
 from conftest import random_gaussians
 
 from sagesplat.formats.ply import read_ply, write_ply
+from sagesplat.stages import pipeline
+
+pytestmark = pytest.mark.usefixtures("no_figures")
 
 Call = Callable[..., tuple[int, str]]
 SMALL = ("--fit", "none", "--views", "14", "--size", "48", "36", "--shares", "0.3", "1", "--kind", "object")
@@ -33,6 +36,12 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
         return code, out.out + out.err
 
     return typed
+
+
+@pytest.fixture
+def up_to_levels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What follows the levels takes most of the time, and is the same for all of them."""
+    monkeypatch.setattr(pipeline, "_promise", lambda job, config: None)
 
 
 @pytest.fixture(scope="module")
@@ -84,6 +93,7 @@ def test_its_report_speaks_of_renders(finished: Path) -> None:
         assert text not in page
 
 
+@pytest.mark.usefixtures("up_to_levels")
 def test_another_splat_replaces_it_only_with_force(finished: Path, tmp_path: Path, command: Call) -> None:
     run = Path(shutil.copytree(finished, tmp_path / "run"))
     before = _files(run)
@@ -132,6 +142,7 @@ def test_a_run_of_a_capture_is_kept(finished_run: Path, finished: Path, command:
     assert _files(finished_run) == before
 
 
+@pytest.mark.usefixtures("up_to_levels")
 def test_ssim_needs_photos_which_is_told_before_levels_are_made(
     finished: Path, tmp_path: Path, command: Call
 ) -> None:
@@ -167,6 +178,7 @@ def test_bad_files_are_one_line_and_make_nothing(finished: Path, tmp_path: Path,
         assert not (tmp_path / "run" / "levels").exists()
 
 
+@pytest.mark.usefixtures("up_to_levels")
 def test_a_file_of_another_format_is_read_as_what_it_is(
     finished: Path, tmp_path: Path, command: Call
 ) -> None:
@@ -176,6 +188,7 @@ def test_a_file_of_another_format_is_read_as_what_it_is(
     assert "400 Gaussians (PLY)" in said
 
 
+@pytest.mark.usefixtures("up_to_levels")
 def test_cameras_that_look_elsewhere_are_told(finished: Path, tmp_path: Path, command: Call) -> None:
     away = [
         {
@@ -208,6 +221,7 @@ def test_a_splat_before_the_near_plane_is_refused(
         assert f"small.ply --scale {factors[factor]} larger.ply" in said
 
 
+@pytest.mark.usefixtures("up_to_levels")
 def test_a_killed_one_resumes_with_the_same_command(
     finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Call
 ) -> None:

@@ -1,10 +1,15 @@
 """Kernels with vectors of the width that other machines use."""
 
 import os
+import shutil
 import subprocess
 import sys
+from pathlib import Path
+from types import FunctionType
 
-from sagesplat.kernels.simd import LANES
+import sagesplat
+from sagesplat.kernels.jit import fingerprint
+from sagesplat.kernels.simd import LANES, load8, load16
 
 TESTS = (
     "test_raster_cpu.py::test_agrees_with_the_oracle",
@@ -13,11 +18,26 @@ TESTS = (
 
 
 def test_the_other_width_agrees_with_the_oracle(tmp_path, request):
-    other = {8: "16", 16: "8"}[LANES]
-    environment = {**os.environ, "SAGESPLAT_LANES": other, "NUMBA_CACHE_DIR": str(tmp_path)}
+    """In a copy of the package and its cache: only kernels with vectors of that width are compiled."""
+    unfinished = shutil.ignore_patterns("static", "*.tmp.*")
+    shutil.copytree(Path(sagesplat.__file__).parent, tmp_path / "sagesplat", ignore=unfinished)
+    environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+    environment["SAGESPLAT_LANES"] = {8: "16", 16: "8"}[LANES]
+    environment["PYTHONPATH"] = os.pathsep.join([str(tmp_path), *sys.path])
     command = [sys.executable, "-m", "pytest", "-q", "-k", "not stand-in and not device", *TESTS]
     done = subprocess.run(
         command, env=environment, cwd=request.path.parent, capture_output=True, text=True, timeout=600
     )
     assert done.returncode == 0, done.stdout
     assert " passed" in done.stdout
+
+
+def test_a_kernel_of_another_width_has_another_fingerprint() -> None:
+    def kernel(x):
+        return load(x, 0)
+
+    eight, sixteen = (
+        fingerprint(FunctionType(kernel.__code__, {"load": load, "__name__": "sagesplat.kernel"}))
+        for load in (load8, load16)
+    )
+    assert eight != sixteen

@@ -37,13 +37,13 @@ from sagesplat.stages.observe import observe_levels
 from sagesplat.stages.pipeline import run_all
 from sagesplat.stages.sample import sample_levels
 from sagesplat.stages.scene import open_scene
-from sagesplat.studies.compare import report as compare_report
+from sagesplat.studies.compare import run as compare_study
 from sagesplat.studies.compare.run import compare
 from sagesplat.studies.sweep.file import read_sweep
 from sagesplat.studies.sweep.run import run_sweep
 
 CONFIG = RunConfig(
-    train=TrainConfig(max_steps=40, level_every=20),
+    train=TrainConfig(max_steps=40, level_every=20, sh_degree=1),
     nest=NestConfig(steps=6, levels=3, base_steps=10),
     sample=SampleConfig(views=8, calibration_views=8),
     plan=PlanConfig(target_ssim=0.4),
@@ -103,9 +103,7 @@ def plain_report() -> Iterator[None]:
             "sagesplat.output.report.write_report",
             lambda folder, _: write_text(folder / "index.html", "report"),
         )
-        patch.setattr(
-            compare_report, "write_report", lambda folder, *_: write_text(folder / "compare.md", "")
-        )
+        patch.setattr(compare_study, "write_report", lambda folder, *_: write_text(folder / "compare.md", ""))
         yield
 
 
@@ -286,7 +284,7 @@ SWEEP = """
 targets = [0.4]
 seeds = [0]
 settings.ladder = "snapshots"
-settings.train = { max_steps = 20, level_every = 10 }
+settings.train = { max_steps = 20, level_every = 10, sh_degree = 1 }
 scenes.plot = "capture"
 variants.a = {}
 variants.b.fit.distance = "minimum"

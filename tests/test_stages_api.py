@@ -28,8 +28,10 @@ from sagesplat.demo.capture import make_capture
 from sagesplat.formats.splats import read_splat
 from sagesplat.stages.export import export_increments, export_scene
 
+pytestmark = pytest.mark.usefixtures("no_figures")
+
 CONFIG = RunConfig(
-    train=TrainConfig(max_steps=60, level_every=20),
+    train=TrainConfig(max_steps=60, level_every=20, sh_degree=1),
     nest=NestConfig(steps=20, levels=4, base_steps=20),
     sample=SampleConfig(views=8, calibration_views=8),
     plan=PlanConfig(target_ssim=0.4),

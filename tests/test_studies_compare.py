@@ -174,10 +174,10 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Job:
     open_scene(job, folder / "capture", SceneConfig())
     make_masks(job, MasksConfig())
     lift_labels(job, LiftConfig())
-    train_levels(job, TrainConfig(max_steps=60, level_every=20, refine_every=5), 0)
+    train_levels(job, TrainConfig(max_steps=60, level_every=20, refine_every=5, sh_degree=1), 0)
     nest_levels(job, NestConfig(steps=20, levels=4, base_steps=20), 0)
     observe_levels(job, FitConfig())
-    sample_levels(job, SampleConfig(), FitConfig())
+    sample_levels(job, SampleConfig(views=8, calibration_views=8), FitConfig())
     fit_ladder(job, FitConfig())
     make_plan(job, PlanConfig(target_ssim=0.4))
     return job

@@ -31,7 +31,7 @@ TEXT = """
 targets = [0.4, 0.3]
 seeds = [0, 5]
 settings.ladder = "snapshots"
-settings.train = { max_steps = 60, level_every = 20, refine_every = 5 }
+settings.train = { max_steps = 60, level_every = 20, refine_every = 5, sh_degree = 1 }
 scenes.plot = "capture"
 variants.track = {}
 variants.projection.lift.votes = "projection"

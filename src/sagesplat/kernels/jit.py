@@ -56,7 +56,8 @@ def fingerprint(function: Any) -> str:
     """SHA-256 of what a kernel's machine code follows from, besides numba and the processor.
 
     That is, of the kernel and all kernels that it calls: their files, the values of global constants that
-    their code names, and the files of the package's other functions, intrinsics and modules that it names.
+    their code names, the files of the package's other functions, intrinsics and modules that it names, and
+    the types that intrinsics are made for: a vector's is that of the machine, or `SAGESPLAT_LANES` wide.
     """
     return hashlib.sha256("\n".join(_used(function, set())).encode()).hexdigest()
 
@@ -80,6 +81,9 @@ def _used(function: Any, seen: set[Any]) -> Iterator[str]:
             yield f"{name} {value!r}"
         elif ours and (path := getattr(sys.modules.get(str(module)), "__file__", None)):
             yield _file_hash(path)
+            cells = getattr(getattr(value, "_defn", None), "__closure__", None) or ()  # of an intrinsic
+            kinds = [cell.cell_contents for cell in cells]
+            yield from (f"{name} {kind}" for kind in kinds if isinstance(kind, numba.types.Type))
 
 
 def _names(code: CodeType) -> set[str]:
