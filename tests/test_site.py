@@ -36,7 +36,7 @@ class Page:
 
     def __init__(self, text: str) -> None:
         self.anchors = {unescape(name) for name in re.findall(r'\s(?:id|name)="([^"]+)"', text)}
-        self.targets = {unescape(target) for target in re.findall(r'\s(?:href|src)="([^"]+)"', text)}
+        self.targets = {unescape(target) for target in re.findall(r'<\w[^<>]*\s(?:href|src)="([^"<>]+)"', text)}
 
 
 @pytest.fixture(scope="module")
