@@ -99,7 +99,7 @@ def test_files_and_modules_exist(path):
     gone = []
     for word in words(path):
         for file in re.findall(r"(?<![\w.*])[\w./-]+\.(?:py|ts|mjs)\b", word):
-            known = any(each.endswith(f"/{file.removeprefix('./')}") for each in tracked())
+            known = any(each.endswith(f"/{file.lstrip('./')}") for each in tracked())
             if not known and file not in FOREIGN_FILES:
                 gone.append(file)
         for name in re.findall(r"\bsagesplat((?:\.\w+)+)", word):

@@ -35,8 +35,8 @@ class Page:
     """The anchors of a page, and where its links and pictures lead."""
 
     def __init__(self, text: str) -> None:
-        self.anchors = {unescape(name) for name in re.findall(r'\s(?:id|name)="([^"]+)"', text)}
-        self.targets = {unescape(target) for target in re.findall(r'<\w[^<>]*\s(?:href|src)="([^"<>]+)"', text)}
+        self.anchors = {unescape(name) for name in re.findall(r'<[^>]*?\s(?:id|name)="([^"]+)"', text)}
+        self.targets = {unescape(target) for target in re.findall(r'<[^>]*?\s(?:href|src)="([^"]+)"', text)}
 
 
 @pytest.fixture(scope="module")
