@@ -59,8 +59,7 @@ def test_a_run_by_text(folder: Path, tmp_path: Path, command: Call) -> None:
     words = ("--segmenter", "text", "--prompts", PROMPTS, *networks)
     code, said = command("run", folder / "capture", tmp_path / "run", *words, *SMALL)
     assert code == 0, said
-    assert "best scores: " in said
-    assert "stone fountain 0." in said
+    assert "best scores: stone fountain 1.00, ivy 1.00" in " ".join(said.split())  # of random weights
     assert set(names_of(tmp_path / "run" / "masks")) <= set(PROMPTS.split("; "))
     assert (tmp_path / "run" / "nested" / "report" / "index.html").exists()
 
