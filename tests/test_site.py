@@ -166,7 +166,7 @@ def browser(site: Path) -> Iterator["Browser"]:
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_pages_are_sound_on_a_phone(site, browser, scheme):
     """From the disk, at 360 px: nothing wider than the screen, no complaint, contrast, pictures described."""
-    for name in ("index", "reference/cli", "reference/python", "help/errors"):
+    for name in ("index", "help/errors", "start/first-scene"):
         address = (site / f"{name}.html").as_uri()
         with open_page(address, (360, 740), browser=browser, scheme=scheme) as opened:
             page = opened.page
