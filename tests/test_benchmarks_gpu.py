@@ -1,8 +1,6 @@
 """The GPU script end to end on a CPU, its small functions, and gsplat's recipe over our rasteriser."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,8 +20,6 @@ from sagesplat.raster import cuda, rasterize
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera
 from sagesplat.train.state import from_points
-
-ROOT = Path(__file__).parents[1]
 
 
 def test_a_trial_of_the_whole_script(tmp_path, capsys):
@@ -48,15 +44,13 @@ def test_a_trial_of_the_whole_script(tmp_path, capsys):
     assert set(figures["split"]["figures"]["kernels"]) == {*(name for name, _ in split.KERNELS), "rest"}
 
 
-def test_a_machine_without_a_gpu_says_so_in_one_line():
+def test_a_machine_without_a_gpu_says_so_in_one_line(capsys):
     if cuda.missing() is None:
         pytest.skip("there is one")
-    done = subprocess.run(
-        [sys.executable, "-m", "benchmarks", "gpu"], cwd=ROOT, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 2
-    assert done.stdout == ""
-    (line,) = done.stderr.splitlines()
+    assert script.main(base.Asked(Path("nowhere"), device="cuda")) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    (line,) = err.splitlines()
     assert "; " in line or " or use --device cpu" in line
 
 

@@ -9,7 +9,7 @@ from types import FunctionType
 
 import sagesplat
 from sagesplat.kernels.jit import fingerprint
-from sagesplat.kernels.simd import LANES, load8, load16
+from sagesplat.kernels.simd import LANES, load, load8, load16
 
 TESTS = (
     "test_raster_cpu.py::test_agrees_with_the_oracle",
@@ -37,7 +37,7 @@ def test_a_kernel_of_another_width_has_another_fingerprint() -> None:
         return load(x, 0)
 
     eight, sixteen = (
-        fingerprint(FunctionType(kernel.__code__, {"load": load, "__name__": "sagesplat.kernel"}))
-        for load in (load8, load16)
+        fingerprint(FunctionType(kernel.__code__, {"load": other, "__name__": "sagesplat.kernel"}))
+        for other in (load8, load16)
     )
     assert eight != sixteen

@@ -43,7 +43,7 @@ from sagesplat.train import nested
 
 CONFIG = RunConfig(
     scene=SceneConfig(calibrate_every=4),
-    train=TrainConfig(max_steps=20, level_every=10),
+    train=TrainConfig(max_steps=20, level_every=10, sh_degree=1),
     nest=NestConfig(steps=12, levels=3, smallest=0.1, base_steps=10),
     sample=SampleConfig(views=8, calibration_views=8),
     plan=PlanConfig(target_ssim=0.4),

@@ -302,7 +302,7 @@ def test_bands_are_measured_apart() -> None:
 
 CONFIG = RunConfig(
     scene=SceneConfig(calibrate_every=4),
-    train=TrainConfig(max_steps=40, level_every=20),
+    train=TrainConfig(max_steps=40, level_every=20, sh_degree=1),
     blocks=BlocksConfig(count=2, boundary_steps=20),
     nest=NestConfig(steps=30, levels=4, smallest=0.1, base_steps=30),
     fit=FitConfig(),

@@ -46,7 +46,7 @@ PATCHES = {  # categories painted over others: in which views, where
 TRAINED_ONLY, SEEN_ONCE = 197, 193  # of the capture's own: in no held-out view; in one training view only
 CONFIG = RunConfig(
     scene=SceneConfig(calibrate_every=4),
-    train=TrainConfig(max_steps=30, level_every=10),
+    train=TrainConfig(max_steps=30, level_every=10, sh_degree=1),
     nest=NestConfig(steps=4, levels=3, smallest=0.2, base_share=0.0),
     sample=SampleConfig(views=8, calibration_views=8),
     plan=PlanConfig(target_ssim=0.3),
