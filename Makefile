@@ -13,6 +13,9 @@ NPM = cd web && PATH="$(NODE)/bin:$$PATH" node $(NODE)/lib/node_modules/npm/bin/
 demo: $(INSTALLED)
 	$(BIN)/sagesplat demo
 
+# many tests start programs, which would compile all modules anew where this is set
+unexport PYTHONDONTWRITEBYTECODE
+
 # two processes of one thread each: the tests are small, and idle threads would spin in each other's way;
 # a file stays in one process, which makes its fixtures once
 # before them, what does not need the same: packages beside Chromium, types beside style

@@ -156,7 +156,7 @@ def bundle(
     with open_job(run, machine) as job:
         made = write(job, out, **asdict(config))
     megabytes = f"{made.sizes.chunks / 1e6:.1f} MB of {made.sizes.total / 1e6:.1f} MB"
-    say(f"{out}: {made.labels} categor{"y" if made.labels == 1 else "ies"}, {made.chunks} chunks, {made.count:,} Gaussians, {megabytes}")
+    say(f"{out}: {made.labels} categories, {made.chunks} chunks, {made.count:,} Gaussians, {megabytes}")
 
 
 @command
