@@ -22,7 +22,7 @@ from sagesplat.segment.display_names import titles
 from sagesplat.stages.compose import compose
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.plan import main_target, scene_plan
-from sagesplat.stages.report_data import _panels
+from sagesplat.stages.report_data import picture_panels
 from sagesplat.stages.shared import label_colors
 from sagesplat.stages.view import show
 from tests.browser import Opened, launch, open_page
@@ -68,7 +68,7 @@ def result(run: Path, path: Path, column: int = 0) -> None:
     job = Job(RunDir(run), lambda event: None)
     plan = scene_plan(job, *main_target(job.run))
     composed = compose(job, plan) if job.antialiased else read_ply(job.run.composed)
-    panel = _panels(job, composed)[column]
+    panel = picture_panels(job, composed)[column]
     sizes = method_of(job).bytes_to_send or {}
     full = sum(last_counts(sizes).values()) / MB
     figure = _result(panel, plan, full, label_colors(job), titles(job.names()))

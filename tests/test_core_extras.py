@@ -16,12 +16,12 @@ ROOT = Path(__file__).parents[1]
 def test_the_command_fits_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "executable", str(tmp_path / ".venv" / "bin" / "python"))
-    monkeypatch.setattr(extras, "find_spec", lambda name: object())
+    monkeypatch.setattr(extras, "distributions", lambda name: iter([name]))
     monkeypatch.setattr(extras.shutil, "which", lambda name: "/usr/bin/pip")  # another Python's
     assert install("sagesplat[hf]") == ".venv/bin/python -m pip install 'sagesplat[hf]'"
     monkeypatch.setattr(extras.shutil, "which", lambda name: str(tmp_path / ".venv" / "bin" / "pip"))
     assert install("sagesplat[hf]") == "pip install 'sagesplat[hf]'"
-    monkeypatch.setattr(extras, "find_spec", lambda name: None)  # an environment of uv's
+    monkeypatch.setattr(extras, "distributions", lambda name: iter([]))  # an environment of uv's
     monkeypatch.setattr(sys, "executable", "/a tool/bin/python")
     monkeypatch.setattr(sys, "prefix", str(tmp_path))
     assert install("--upgrade", "pillow") == "uv pip install --python '/a tool/bin/python' --upgrade pillow"

@@ -307,6 +307,7 @@ def test_backends_and_devices_that_do_not_go_together():
             resolve_backend(name, device)  # type: ignore[arg-type]
 
 
+@pytest.mark.filterwarnings("ignore:The distutils package")  # setuptools, where nothing imported it before
 def test_the_installed_gsplat_is_found(monkeypatch, tmp_path):
     assert cuda.gsplat_version() == "1.5.3"
     monkeypatch.setenv("TORCH_EXTENSIONS_DIR", str(tmp_path))

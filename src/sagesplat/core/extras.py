@@ -4,7 +4,7 @@ import os
 import shlex
 import shutil
 import sys
-from importlib.util import find_spec
+from importlib.metadata import distributions
 from pathlib import Path
 
 
@@ -25,7 +25,7 @@ def install(*words: str) -> str:
     python = Path(sys.executable)
     if (Path(sys.prefix) / "pipx_metadata.json").exists():
         return f"pipx runpip sagesplat install {quoted}"
-    if find_spec("pip") is None:
+    if not any(distributions(name="pip")):  # finding the module may import setuptools
         return f"uv pip install --python {_typed(python)} {quoted}"
     pip = shutil.which("pip")
     if pip is not None and Path(pip).parent == python.parent:

@@ -85,7 +85,7 @@ def report_data(
         models=models_of(job),
         plans=list(plans_of(job)),
         evaluation=evaluation_of(job),
-        panels=_panels(job, composed),
+        panels=picture_panels(job, composed),
         scene_facts=describe(scene),
         settings=_settings(records),
         timings=[(stage, float(made.get("seconds", math.nan))) for stage, made in records.items()],
@@ -205,7 +205,7 @@ def _promise(job: Job) -> tuple[PromiseFacts | None, dict[int, np.ndarray]]:
     return facts, {label: values for label, values in drawn.items() if len(values)}
 
 
-def _panels(job: Job, composed: Gaussians) -> list[Panel]:
+def picture_panels(job: Job, composed: Gaussians) -> list[Panel]:
     """A few test views, spread over the capture, in pictures."""
     scene, photos, masks, ladder = job.scene, job.photos, job.best_masks, job.ladder
     tests = np.array(job.valid.rows(scene, scene.test_ids), int)
