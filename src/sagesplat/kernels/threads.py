@@ -1,4 +1,4 @@
-"""Independent items side by side, each in a thread whose kernels take that thread alone.
+"""Independent items side by side, each in a thread whose kernels take its share of the threads.
 
 A view's image is small: kernels that divide it among threads wait for each other, and what is between them
 runs on one core. Kernels release the GIL (see `jit`) and a `Workspace` is another in each thread.
@@ -28,7 +28,7 @@ def side_by_side(function: Callable[[Item], Result], items: Sequence[Item]) -> I
         yield from map(function, items[1:])
         return
     of_torch = torch.get_num_threads()
-    pool = ThreadPoolExecutor(threads, initializer=_alone)
+    pool = ThreadPoolExecutor(threads, initializer=_limit, initargs=(numba.get_num_threads() // threads,))
     try:
         yield from pool.map(function, items[1:])
     finally:
@@ -36,10 +36,10 @@ def side_by_side(function: Callable[[Item], Result], items: Sequence[Item]) -> I
         torch.set_num_threads(of_torch)  # what later threads begin with
 
 
-def _alone() -> None:
-    """Kernels and torch take one thread when this one calls them."""
-    numba.set_num_threads(1)
-    torch.set_num_threads(1)
+def _limit(threads: int) -> None:
+    """Kernels and torch take so many threads when this one calls them."""
+    numba.set_num_threads(threads)
+    torch.set_num_threads(threads)
 
 
 def _concurrent() -> bool:
