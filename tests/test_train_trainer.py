@@ -24,7 +24,8 @@ from sagesplat.segment.valid import ValidPixels
 from sagesplat.train import stepper, trainer
 from sagesplat.train.events import Event, LevelSaved, Resumed, Step, Trained
 from sagesplat.train.photo_loader import PhotoLoader
-from sagesplat.train.state import from_points, initial_state
+from sagesplat.train.sky import Shell
+from sagesplat.train.state import LARGEST_ANGLE, from_points, initial_state, largest_scales
 from sagesplat.train.trainer import train
 
 LABEL_IDS = np.array([-1, 3, 184], np.int16)[np.arange(60) % 3]
@@ -359,3 +360,41 @@ def test_no_gaussian_begins_at_an_ignored_point(scene):
     assert len(g) == 51
     assert (g.label_ids.numpy() == LABEL_IDS[9:]).all()
     np.testing.assert_array_equal(g.means.numpy(), scene.points.xyz[9:])
+
+
+def test_initial_scales_have_a_limit_in_angle(scene):
+    largest = largest_scales(scene)
+    cameras = np.stack([scene.views[row].camera.position for row in scene.train_ids])
+    nearest = np.linalg.norm(scene.points.xyz[:, None] - cameras, axis=2).min(1)
+    np.testing.assert_allclose(largest, LARGEST_ANGLE * nearest, rtol=1e-5)
+    labels = np.full(len(largest), -1, np.int16)
+    free = from_points(scene.points, labels, 0)
+    limited = from_points(scene.points, labels, 0, largest=largest)
+    scales = np.minimum(np.exp(free.log_scales[:, 0].numpy()), largest)
+    np.testing.assert_allclose(np.exp(limited.log_scales.numpy()), scales[:, None].repeat(3, 1), rtol=1e-5)
+
+
+def test_a_point_in_a_camera_begins_finite(scene):
+    xyz = scene.points.xyz.copy()
+    xyz[0] = scene.views[scene.train_ids[0]].camera.position
+    there = replace(scene, points=replace(scene.points, xyz=xyz))
+    labels = np.full(len(xyz), -1, np.int16)
+    assert from_points(there.points, labels, 0, largest=largest_scales(there)).log_scales.isfinite().all()
+
+
+def test_neither_the_sky_nor_published_rates_have_that_limit(scene):
+    labels = np.full(len(scene.points.xyz), -1, np.int16)
+    distances = np.linalg.norm(scene.points.xyz, axis=1)
+    shell = Shell(np.zeros(3, np.float32), float(np.median(distances)) / 0.97, 1.0, (0,))
+    free = from_points(scene.points, labels, 0).log_scales[:, 0].numpy()
+    limited = np.minimum(free, np.log(largest_scales(scene)))
+    sky = shell.holds(torch.from_numpy(scene.points.xyz)).numpy()
+    assert (limited < free).all() and 0 < sky.sum() < len(sky)
+
+    def began(lr_schedule) -> np.ndarray:
+        config = TrainConfig(max_steps=10, lr_schedule=lr_schedule)
+        g = trainer.begin(scene, Photos(scene.views), labels, config, shell=shell).state.gaussians
+        return np.sort(g.log_scales[:, 0].numpy())
+
+    np.testing.assert_allclose(began("fast"), np.sort(np.where(sky, free, limited)), rtol=1e-5)
+    np.testing.assert_allclose(began("published"), np.sort(free), rtol=1e-5)

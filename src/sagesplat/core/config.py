@@ -127,8 +127,8 @@ class TrainConfig:
     max_steps: int = 7000
     """Training steps."""
     lr_schedule: Literal["fast", "published"] = "fast"
-    """Learning rates. fast: larger at first, on downscaled photos where those have the same detail;
-    published: as in 3DGS."""
+    """Learning rates. fast: larger at first, on downscaled photos where those have the same detail, from
+    Gaussians that begin small; published: as in 3DGS."""
     level_every: int = 0
     """Steps between two snapshots, not scaled (0: a thirtieth of --train.max-steps)."""
     sh_degree: int = 3

@@ -4,16 +4,19 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
+from jaxtyping import Float32
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from sagesplat.core import geometry
 from sagesplat.core.gaussians import PARAMETERS, Gaussians, concat
 from sagesplat.core.sh import num_bases, rgb_to_sh0
-from sagesplat.scene.scene import Points
+from sagesplat.scene.scene import Points, Scene
 from sagesplat.segment.lift import IGNORED
 from sagesplat.train.view_parameters import ViewParameters
 
 INITIAL_OPACITY = 0.1
+LARGEST_ANGLE = 0.015  # of an initial scale, seen from the nearest training camera, radians
 SECOND = "second_opacities"  # name of these logits among Adam's moments and gradients
 
 
@@ -91,15 +94,19 @@ def from_points(
     sh_degree: int,
     opacity: float = INITIAL_OPACITY,
     scale: float = 1.0,
+    largest: Float32[np.ndarray, " P"] | None = None,
 ) -> Gaussians:
     """Gaussians at the SfM points: isotropic, scale `scale` times the mean distance to three neighbours.
 
-    There is none at the points labelled `IGNORED`, which show what does not belong to the scene.
+    With `largest` at most so large. There is none at the points labelled `IGNORED`, which show what does not
+    belong to the scene.
     """
     kept = label_ids != IGNORED
     xyz, label_ids = points.xyz[kept], label_ids[kept]
     n = len(xyz)
     scales = scale * geometry.mean_neighbour_distance(xyz)
+    if largest is not None:
+        scales = np.minimum(scales, largest[kept])
     quats = torch.zeros(n, 4)
     quats[:, 0] = 1
     rgb = torch.from_numpy(points.rgb[kept].astype(np.float32) / 255)
@@ -112,6 +119,17 @@ def from_points(
         shN=torch.zeros(n, num_bases(sh_degree) - 1, 3),
         label_ids=torch.from_numpy(label_ids.astype(np.int16)),
     )
+
+
+def largest_scales(scene: Scene) -> Float32[np.ndarray, " P"]:
+    """Limit of the initial scale at each SfM point, world units: `LARGEST_ANGLE` from the nearest camera.
+
+    A point far from its neighbours would begin as a Gaussian that covers much of the image, costs most of a
+    step and is slow to shrink.
+    """
+    cameras = np.stack([scene.views[row].camera.position for row in scene.train_ids])
+    distances, _ = KDTree(cameras).query(scene.points.xyz)
+    return np.maximum(LARGEST_ANGLE * distances, 1e-7).astype(np.float32)
 
 
 def initial_state(gaussians: Gaussians, seed: int) -> TrainState:

@@ -33,7 +33,7 @@ from sagesplat.train.outliers import OutlierSchedule
 from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.poses import pose_update
 from sagesplat.train.sky import Shell
-from sagesplat.train.state import TrainState, from_points, initial_state
+from sagesplat.train.state import TrainState, from_points, initial_state, largest_scales
 from sagesplat.train.stepper import Stepper
 from sagesplat.train.strategy import Densification, make_strategy
 from sagesplat.train.view_parameters import ViewParameters, ViewUpdate
@@ -260,6 +260,14 @@ class Training:
         self.unfinished = bool(self.trainable.any())
 
 
+def _largest_scales(scene: Scene, shell: Shell | None) -> np.ndarray:
+    """As `largest_scales`, without a limit for the points of the sky: they lie as far apart as they should."""
+    largest = largest_scales(scene)
+    if shell:
+        largest[shell.holds(torch.from_numpy(scene.points.xyz)).numpy()] = np.inf
+    return largest
+
+
 def begin(
     scene: Scene,
     photos: Photos,
@@ -284,8 +292,9 @@ def begin(
     device = device_of(backend, group.rank)
     strategy = make_strategy(config, scene, rates, group, shell)
     g = start or from_points(
-        scene.points, label_ids, config.sh_degree, strategy.initial_opacity, strategy.initial_scale
-    )
+        scene.points, label_ids, config.sh_degree, strategy.initial_opacity, strategy.initial_scale,
+        _largest_scales(scene, shell) if config.lr_schedule == "fast" else None,
+    )  # fmt: skip
     batched = replace(config, batch=max(config.batch, group.size))
     updates, found = view_updates(scene, photos, batched)
     state, resumed = initial_state(g, seed).to(device), None
