@@ -10,7 +10,7 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene
 from sagesplat.train.events import Trained
-from sagesplat.train.state import from_points
+from sagesplat.train.state import from_points, largest_scales
 from sagesplat.train.trainer import train
 
 GARDEN = Path(__file__).parents[2] / "shared" / "scenes" / "garden"
@@ -47,9 +47,10 @@ def cloud(count: int, overlap: str, view: Camera, degree: int = 3, seed: int = 0
     )
 
 
-def initial(scene: Scene) -> Gaussians:
-    """What training begins with."""
-    return from_points(scene.points, np.full(len(scene.points.xyz), -1, np.int16), 3)
+def initial(scene: Scene, published: bool = True) -> Gaussians:
+    """What training begins with, as in 3DGS or as with fast rates."""
+    largest = None if published else largest_scales(scene)
+    return from_points(scene.points, np.full(len(scene.points.xyz), -1, np.int16), 3, largest=largest)
 
 
 def trained(scene: Scene, steps: int) -> Gaussians:
