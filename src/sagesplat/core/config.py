@@ -255,7 +255,7 @@ class BlocksConfig:
 class NestConfig:
     """Nested levels: prefixes of one ordered model."""
 
-    steps: int = 2400
+    steps: int = 3000
     """Training steps on random compositions of levels."""
     levels: int = 16
     """Levels per category; their sizes grow geometrically."""
