@@ -49,7 +49,7 @@ def cloud(count: int, overlap: str, view: Camera, degree: int = 3, seed: int = 0
 
 def initial(scene: Scene, published: bool = True) -> Gaussians:
     """What training begins with, as in 3DGS or as with fast rates."""
-    largest = None if published else largest_scales(scene)
+    largest = None if published else largest_scales(scene, 3000)
     return from_points(scene.points, np.full(len(scene.points.xyz), -1, np.int16), 3, largest=largest)
 
 

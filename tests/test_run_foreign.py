@@ -40,7 +40,7 @@ from sagesplat.stages.label import read_edit_table
 from sagesplat.stages.nest import nest_levels
 from sagesplat.stages.pipeline import run_all
 from sagesplat.stages.plan import make_plan
-from sagesplat.stages.train import read_cap, read_frozen
+from sagesplat.stages.train import read_cap, read_frozen, train_levels
 from sagesplat.viewer.site import Site
 
 pytestmark = pytest.mark.usefixtures("no_figures")
@@ -94,13 +94,16 @@ COMMAND = {
     "fit": lambda run: redone("fit", run, lambda job: fit_ladder(job, FitConfig())),
     "run": lambda run: run_all(job_of(run), run.parent / "capture", SMALL_RUN),
     "nest": lambda run: redone("nest", run, lambda job: nest_levels(job, SMALL_RUN.nest, 0)),
+    "train": lambda run: redone(
+        "train", run, lambda job: train_levels(replace(job, force=True), SMALL_RUN.train, 0)
+    ),
     "clean": lambda run: redone("clean", run, lambda job: clean_levels(job, SMALL_RUN.clean)),
     "resume": resume,
 }
 READERS = {  # the commands that read a document
     "scene.json": ("settings", "view", "plan", "run"),
     "photos.json": ("plan", "run"),
-    "cap.json": ("settings", "resume"),
+    "cap.json": ("settings", "train"),
     "segmented/options.json": ("settings",),
     "segmented/labels.json": ("resume",),
     "masks/labels.json": ("bundle", "compose", "plan", "report", "live"),
@@ -121,7 +124,7 @@ READERS = {  # the commands that read a document
     "labels.npz": ("plan", "bundle", "fit", "resume"),
     "nested/ladder.npz": ("compose", "plan", "bundle", "evaluate"),
     "levels/000006.npz": ("nest", "live"),
-    "checkpoint.npz": ("resume",),
+    "checkpoint.npz": ("train",),
 }
 
 

@@ -363,10 +363,11 @@ def test_no_gaussian_begins_at_an_ignored_point(scene):
 
 
 def test_initial_scales_have_a_limit_in_angle(scene):
-    largest = largest_scales(scene)
+    largest = largest_scales(scene, 3000)
     cameras = np.stack([scene.views[row].camera.position for row in scene.train_ids])
     nearest = np.linalg.norm(scene.points.xyz[:, None] - cameras, axis=2).min(1)
     np.testing.assert_allclose(largest, LARGEST_ANGLE * nearest, rtol=1e-5)
+    np.testing.assert_allclose(largest_scales(scene, 500), 4 * LARGEST_ANGLE * nearest, rtol=1e-5)
     labels = np.full(len(largest), -1, np.int16)
     free = from_points(scene.points, labels, 0)
     limited = from_points(scene.points, labels, 0, largest=largest)
@@ -379,7 +380,9 @@ def test_a_point_in_a_camera_begins_finite(scene):
     xyz[0] = scene.views[scene.train_ids[0]].camera.position
     there = replace(scene, points=replace(scene.points, xyz=xyz))
     labels = np.full(len(xyz), -1, np.int16)
-    assert from_points(there.points, labels, 0, largest=largest_scales(there)).log_scales.isfinite().all()
+    assert (
+        from_points(there.points, labels, 0, largest=largest_scales(there, 3000)).log_scales.isfinite().all()
+    )
 
 
 def test_neither_the_sky_nor_published_rates_have_that_limit(scene):
@@ -387,12 +390,12 @@ def test_neither_the_sky_nor_published_rates_have_that_limit(scene):
     distances = np.linalg.norm(scene.points.xyz, axis=1)
     shell = Shell(np.zeros(3, np.float32), float(np.median(distances)) / 0.97, 1.0, (0,))
     free = from_points(scene.points, labels, 0).log_scales[:, 0].numpy()
-    limited = np.minimum(free, np.log(largest_scales(scene)))
+    limited = np.minimum(free, np.log(largest_scales(scene, 3000)))
     sky = shell.holds(torch.from_numpy(scene.points.xyz)).numpy()
     assert (limited < free).all() and 0 < sky.sum() < len(sky)
 
     def began(lr_schedule) -> np.ndarray:
-        config = TrainConfig(max_steps=10, lr_schedule=lr_schedule)
+        config = TrainConfig(max_steps=3000, lr_schedule=lr_schedule)
         g = trainer.begin(scene, Photos(scene.views), labels, config, shell=shell).state.gaussians
         return np.sort(g.log_scales[:, 0].numpy())
 

@@ -255,7 +255,7 @@ class BlocksConfig:
 class NestConfig:
     """Nested levels: prefixes of one ordered model."""
 
-    steps: int = 3000
+    steps: int = 2400
     """Training steps on random compositions of levels."""
     levels: int = 16
     """Levels per category; their sizes grow geometrically."""
@@ -267,7 +267,7 @@ class NestConfig:
     base_share: float = 0.2
     """Size of the base model, as a fraction of all Gaussians; it is a small 3DGS-MCMC model that forms the
     lowest levels; 0: none."""
-    base_steps: int = 800
+    base_steps: int = 1600
     """Training steps of the base model, which begins with the trained model, merged to that size."""
     full_share: float = 0.1
     """Fraction of the first steps that sample the full model; changes linearly to --nest.full-share-end."""
