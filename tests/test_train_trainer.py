@@ -392,7 +392,8 @@ def test_neither_the_sky_nor_published_rates_have_that_limit(scene):
     free = from_points(scene.points, labels, 0).log_scales[:, 0].numpy()
     limited = np.minimum(free, np.log(largest_scales(scene, 3000)))
     sky = shell.holds(torch.from_numpy(scene.points.xyz)).numpy()
-    assert (limited < free).all() and 0 < sky.sum() < len(sky)
+    assert (limited < free).all()
+    assert 0 < sky.sum() < len(sky)
 
     def began(lr_schedule) -> np.ndarray:
         config = TrainConfig(max_steps=3000, lr_schedule=lr_schedule)

@@ -261,7 +261,7 @@ class Training:
 
 
 def _largest_scales(scene: Scene, steps: int, shell: Shell | None) -> np.ndarray:
-    """As `largest_scales`, without a limit for the points of the sky: they lie as far apart as they should."""
+    """As `largest_scales`, without a limit for the points of the sky: they lie as far apart as wanted."""
     largest = largest_scales(scene, steps)
     if shell:
         largest[shell.holds(torch.from_numpy(scene.points.xyz)).numpy()] = np.inf
