@@ -193,14 +193,11 @@ def garden(
     if not steps:  # the trainer's own step, photo, statistics and all
         labels = np.full(len(g), -1, np.int16)
         config = TrainConfig(max_steps=30_000, level_every=30_000, lr_schedule="published")
-        for name, start in (
-            ("step_ms", g),
-            ("step_small_start_ms", workloads.initial(capture, published=False)),
-        ):
+        small = workloads.initial(capture, published=False)  # what fast rates begin with
+        for name, start in (("step_ms", g), ("step_small_start_ms", small)):
             events = train(capture, Photos(capture.views), labels, config, start=start)
-            result[name] = measure.milliseconds(
-                lambda it=events: next(e for e in it if isinstance(e, Step)), 40
-            )
+            step = partial(next, (event for event in events if isinstance(event, Step)))
+            result[name] = measure.milliseconds(step, 40)
     result |= measure.blending(g, camera, repeats) | {"peak_mib": measure.peak_mib()}
     for name, value in result.items():
         print(f"{name:32} {value:,.4g}" if isinstance(value, float) else f"{name:32} {value}")
