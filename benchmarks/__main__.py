@@ -193,8 +193,7 @@ def garden(
     if not steps:  # the trainer's own step, photo, statistics and all
         labels = np.full(len(g), -1, np.int16)
         config = TrainConfig(max_steps=30_000, level_every=30_000, lr_schedule="published")
-        small = workloads.initial(capture, published=False)  # what fast rates begin with
-        for name, start in (("step_ms", g), ("step_small_start_ms", small)):
+        for name, start in (("step_ms", g), ("step_initial_angle_ms", workloads.initial(capture, 0.015))):
             events = train(capture, Photos(capture.views), labels, config, start=start)
             step = partial(next, (event for event in events if isinstance(event, Step)))
             result[name] = measure.milliseconds(step, 40)

@@ -47,9 +47,9 @@ def cloud(count: int, overlap: str, view: Camera, degree: int = 3, seed: int = 0
     )
 
 
-def initial(scene: Scene, published: bool = True) -> Gaussians:
-    """What training begins with, as in 3DGS or as with fast rates."""
-    largest = None if published else largest_scales(scene, 3000)
+def initial(scene: Scene, angle: float = 0.0) -> Gaussians:
+    """What training begins with, by `TrainConfig.initial_angle`."""
+    largest = largest_scales(scene, angle) if angle else None
     return from_points(scene.points, np.full(len(scene.points.xyz), -1, np.int16), 3, largest=largest)
 
 

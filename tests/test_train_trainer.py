@@ -25,9 +25,10 @@ from sagesplat.train import stepper, trainer
 from sagesplat.train.events import Event, LevelSaved, Resumed, Step, Trained
 from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.sky import Shell
-from sagesplat.train.state import LARGEST_ANGLE, from_points, initial_state, largest_scales
+from sagesplat.train.state import from_points, initial_state, largest_scales
 from sagesplat.train.trainer import train
 
+ANGLE = 0.015  # radians
 LABEL_IDS = np.array([-1, 3, 184], np.int16)[np.arange(60) % 3]
 # 8 views, of which 7 train; densification from step 12 to 29, a reset after step 20, levels every 12 steps
 BUSY = TrainConfig(max_steps=60, level_every=12, refine_every=7, reset_every=20, lr_schedule="published")
@@ -363,11 +364,10 @@ def test_no_gaussian_begins_at_an_ignored_point(scene):
 
 
 def test_initial_scales_have_a_limit_in_angle(scene):
-    largest = largest_scales(scene, 3000)
+    largest = largest_scales(scene, ANGLE)
     cameras = np.stack([scene.views[row].camera.position for row in scene.train_ids])
     nearest = np.linalg.norm(scene.points.xyz[:, None] - cameras, axis=2).min(1)
-    np.testing.assert_allclose(largest, LARGEST_ANGLE * nearest, rtol=1e-5)
-    np.testing.assert_allclose(largest_scales(scene, 500), 4 * LARGEST_ANGLE * nearest, rtol=1e-5)
+    np.testing.assert_allclose(largest, ANGLE * nearest, rtol=1e-5)
     labels = np.full(len(largest), -1, np.int16)
     free = from_points(scene.points, labels, 0)
     limited = from_points(scene.points, labels, 0, largest=largest)
@@ -381,24 +381,24 @@ def test_a_point_in_a_camera_begins_finite(scene):
     there = replace(scene, points=replace(scene.points, xyz=xyz))
     labels = np.full(len(xyz), -1, np.int16)
     assert (
-        from_points(there.points, labels, 0, largest=largest_scales(there, 3000)).log_scales.isfinite().all()
+        from_points(there.points, labels, 0, largest=largest_scales(there, ANGLE)).log_scales.isfinite().all()
     )
 
 
-def test_neither_the_sky_nor_published_rates_have_that_limit(scene):
+def test_the_sky_has_no_such_limit_and_nothing_by_default(scene):
     labels = np.full(len(scene.points.xyz), -1, np.int16)
     distances = np.linalg.norm(scene.points.xyz, axis=1)
     shell = Shell(np.zeros(3, np.float32), float(np.median(distances)) / 0.97, 1.0, (0,))
     free = from_points(scene.points, labels, 0).log_scales[:, 0].numpy()
-    limited = np.minimum(free, np.log(largest_scales(scene, 3000)))
+    limited = np.minimum(free, np.log(largest_scales(scene, ANGLE)))
     sky = shell.holds(torch.from_numpy(scene.points.xyz)).numpy()
     assert (limited < free).all()
     assert 0 < sky.sum() < len(sky)
 
-    def began(lr_schedule) -> np.ndarray:
-        config = TrainConfig(max_steps=3000, lr_schedule=lr_schedule)
+    def began(**options) -> np.ndarray:
+        config = TrainConfig(max_steps=10, **options)
         g = trainer.begin(scene, Photos(scene.views), labels, config, shell=shell).state.gaussians
         return np.sort(g.log_scales[:, 0].numpy())
 
-    np.testing.assert_allclose(began("fast"), np.sort(np.where(sky, free, limited)), rtol=1e-5)
-    np.testing.assert_allclose(began("published"), np.sort(free), rtol=1e-5)
+    np.testing.assert_allclose(began(initial_angle=ANGLE), np.sort(np.where(sky, free, limited)), rtol=1e-5)
+    np.testing.assert_allclose(began(), np.sort(free), rtol=1e-5)

@@ -57,7 +57,7 @@ def tell_duration(job: Job, config: RunConfig) -> None:
 def step_seconds(job: Job, config: TrainConfig, most: int) -> tuple[float, float]:
     """Seconds of a training step on full-size photos: a part that is fixed, and one for each Gaussian."""
     scene = job.given_scene
-    largest = largest_scales(scene, config.max_steps) if config.lr_schedule == "fast" else None
+    largest = largest_scales(scene, config.initial_angle) if config.initial_angle else None
     points = from_points(scene.points, job.initial_labels, config.sh_degree, largest=largest)
     count = max(min(most, _MOST_TIMED), 2 * len(points))
     few = _timed(job, config, points, degree=0)

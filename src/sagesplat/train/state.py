@@ -16,8 +16,6 @@ from sagesplat.segment.lift import IGNORED
 from sagesplat.train.view_parameters import ViewParameters
 
 INITIAL_OPACITY = 0.1
-LARGEST_ANGLE = 0.015  # of an initial scale, seen from the nearest training camera, radians
-_ENOUGH_STEPS = 2000  # to close the holes that this limit leaves; shorter trainings have a larger one
 SECOND = "second_opacities"  # name of these logits among Adam's moments and gradients
 
 
@@ -122,14 +120,12 @@ def from_points(
     )
 
 
-def largest_scales(scene: Scene, steps: int) -> Float32[np.ndarray, " P"]:
-    """Limit of the initial scale at each SfM point, world units, in a training of `steps`.
+def largest_scales(scene: Scene, angle: float) -> Float32[np.ndarray, " P"]:
+    """The scale at each SfM point, world units, that the nearest training camera sees at an angle (radians).
 
-    It is `LARGEST_ANGLE` from the nearest training camera, in short trainings more. A point far from its
-    neighbours would begin as a Gaussian that covers much of the image, costs most of a step and is slow to
-    shrink.
+    As a limit of initial scales: a point far from its neighbours begins as a Gaussian that covers much of the
+    image, costs most of a step and is slow to shrink.
     """
-    angle = LARGEST_ANGLE * max(1.0, _ENOUGH_STEPS / steps)
     cameras = np.stack([scene.views[row].camera.position for row in scene.train_ids])
     distances, _ = KDTree(cameras).query(scene.points.xyz)
     return np.maximum(angle * distances, 1e-7).astype(np.float32)

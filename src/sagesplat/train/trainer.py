@@ -260,9 +260,9 @@ class Training:
         self.unfinished = bool(self.trainable.any())
 
 
-def _largest_scales(scene: Scene, steps: int, shell: Shell | None) -> np.ndarray:
+def _largest_scales(scene: Scene, angle: float, shell: Shell | None) -> np.ndarray:
     """As `largest_scales`, without a limit for the points of the sky: they lie as far apart as wanted."""
-    largest = largest_scales(scene, steps)
+    largest = largest_scales(scene, angle)
     if shell:
         largest[shell.holds(torch.from_numpy(scene.points.xyz)).numpy()] = np.inf
     return largest
@@ -293,7 +293,7 @@ def begin(
     strategy = make_strategy(config, scene, rates, group, shell)
     g = start or from_points(
         scene.points, label_ids, config.sh_degree, strategy.initial_opacity, strategy.initial_scale,
-        _largest_scales(scene, config.max_steps, shell) if config.lr_schedule == "fast" else None,
+        _largest_scales(scene, config.initial_angle, shell) if config.initial_angle else None,
     )  # fmt: skip
     batched = replace(config, batch=max(config.batch, group.size))
     updates, found = view_updates(scene, photos, batched)
