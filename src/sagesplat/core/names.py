@@ -67,7 +67,10 @@ def _check_characters(name: str) -> None:
 
 
 def repaired(name: str, otherwise: str = "scene") -> str:
-    """A name that may be, for what is only shown or for a file of our own: `_` for what is wrong in it."""
+    """A name that may be, for what is only shown or for a file of our own: `_` for what is wrong in it.
+
+    Names of nothing but dots, which would be folders, become `otherwise`.
+    """
     name = cleaned(composed(name[: 4 * LENGTH]))
     name = clipped(name[:LENGTH], _PART_BYTES).strip()
     return name if name.strip(".") else otherwise
