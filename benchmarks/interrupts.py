@@ -177,6 +177,7 @@ def _interrupt(found: Found, words: list[str], after: float) -> None:
         code, took = process.wait(), time.perf_counter() - begin
     where = _place(text)
     rest = [line for line in text.splitlines() if line.startswith(("Traceback", "sagesplat:", "Exception"))]
+    rest = [line for line in rest if not line.startswith("sagesplat: settings of ")]  # said at its start
     if code == 0:
         return  # it was about to end
     if code != 2 or answered is None or len(rest) != 1:
