@@ -103,7 +103,7 @@ COMMAND = {
 READERS = {  # the commands that read a document
     "scene.json": ("settings", "view", "plan", "run"),
     "photos.json": ("plan", "run"),
-    "cap.json": ("settings", "train"),
+    "cap.json": ("settings", "train", "resume"),
     "segmented/options.json": ("settings",),
     "segmented/labels.json": ("resume",),
     "masks/labels.json": ("bundle", "compose", "plan", "report", "live"),
@@ -124,7 +124,7 @@ READERS = {  # the commands that read a document
     "labels.npz": ("plan", "bundle", "fit", "resume"),
     "nested/ladder.npz": ("compose", "plan", "bundle", "evaluate"),
     "levels/000006.npz": ("nest", "live"),
-    "checkpoint.npz": ("train",),
+    "checkpoint.npz": ("train", "resume"),
 }
 
 

@@ -402,3 +402,11 @@ def test_the_sky_has_no_such_limit_and_nothing_by_default(scene):
 
     np.testing.assert_allclose(began(initial_angle=ANGLE), np.sort(np.where(sky, free, limited)), rtol=1e-5)
     np.testing.assert_allclose(began(), np.sort(free), rtol=1e-5)
+
+
+@pytest.mark.parametrize("angle", [-0.1, 4.0, float("nan"), float("inf")])
+def test_impossible_initial_angles_are_refused(scene, angle):
+    with pytest.raises(
+        RunError, match=r"--train\.initial-angle .* is impossible; choose an angle in radians"
+    ):
+        list(run(scene, replace(BUSY, initial_angle=angle)))

@@ -374,6 +374,11 @@ def _check(config: TrainConfig, masks: Masks | None) -> None:
             raise RunError(
                 f"--train.{name.replace('_', '-')} {value} is impossible; choose {low} to {high:,}"
             )
+    if not 0 <= config.initial_angle <= 3:
+        raise RunError(
+            f"--train.initial-angle {config.initial_angle} is impossible; choose an angle in radians, such as "
+            "0.015, or 0 for no limit"
+        )
     target = config.freeze_at
     if target is not None and not 0 < target <= 1:
         raise RunError(f"--train.freeze-at {target} is no SSIM to reach; choose a number such as 0.8")
