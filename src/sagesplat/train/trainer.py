@@ -376,8 +376,8 @@ def _check(config: TrainConfig, masks: Masks | None) -> None:
             )
     if not 0 <= config.initial_angle <= 3:
         raise RunError(
-            f"--train.initial-angle {config.initial_angle} is impossible; choose an angle in radians, such as "
-            "0.015, or 0 for no limit"
+            f"--train.initial-angle {config.initial_angle} is impossible; choose an angle in radians, such "
+            "as 0.015, or 0 for no limit"
         )
     target = config.freeze_at
     if target is not None and not 0 < target <= 1:
