@@ -57,7 +57,7 @@ def trial(
 ) -> Trial:
     """Compositions planned with the models at viewpoints, measured."""
     cameras = compositions.cameras
-    distance = distances_at(job.scene, job.point_labels, cameras, labels, config.distance)
+    distance = compositions.distances(labels, config.distance)
     planned = plan_nominal(models, labels, len(job.ladder.levels), distance, cameras, NOMINAL)
     fidelity, pixels = compositions.measure(planned)
     shown = shown_enough(pixels, cameras, config.min_share)
@@ -75,6 +75,15 @@ class Compositions:
         self._job, self._only = job, only
         self._known: list[dict[tuple[int, ...], np.ndarray]] = [{} for _ in cameras]
         self._pixels = np.zeros((len(cameras), 0), np.int32)
+        self._distances: np.ndarray | None = None
+
+    def distances(self, labels: Sequence[int], method: str) -> np.ndarray:
+        """As `distances_at`; all calls have the same labels and method."""
+        if self._distances is None:
+            self._distances = distances_at(
+                self._job.scene, self._job.point_labels, self.cameras, labels, method
+            )
+        return self._distances
 
     def measure(self, planned: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """As `compositions_at`; all calls have the same labels."""

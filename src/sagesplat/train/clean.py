@@ -27,7 +27,7 @@ from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.geometry import project, weighted_quantile
 from sagesplat.metrics.image import psnr, squared_error_map
-from sagesplat.raster import Backend, Workspace, add_weights, device_of, rasterize
+from sagesplat.raster import Backend, Workspace, add_weights, device_of, each_view, rasterize
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene, View
 from sagesplat.segment.masks import UNLABELLED
@@ -107,22 +107,26 @@ def find_floaters(
         label_image = None
     xyz, space, most = g.means.cpu().numpy(), Workspace(), np.zeros(n, np.float32)
     breadth = g.log_scales.exp().sort(dim=1).values[:, 1:].prod(1)
-    for done, row in enumerate(views, 1):
+
+    def of_view(row: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | bool, np.ndarray | float]:
         view, counts = scene.views[row], valid[scene.views[row]]
         columns = _columns(view, counts, ids, label_image)
         weights = np.zeros((n, 1 if label_image is None else len(ids)), np.float32)
         add_weights(g, view.camera, columns, weights, antialiased=antialiased, workspace=space)
-        total = weights.sum(1)
+        depth = xyz @ view.camera.w2c[2, :3] + view.camera.w2c[2, 3]
+        near: np.ndarray | bool = False
+        if config.content_depth:
+            near = depth < config.content_depth * _content(g, scene, row, depth, antialiased, space)
+        against = _contradicting(weights[:, 1:], depth, config.category_depth) if label_image else 0.0
+        return weights.sum(1), _most_pixels(g, breadth, view.camera), near, against
+
+    for done, (total, pixels, near, against) in enumerate(each_view(of_view, list(views), g.means.device), 1):
         supports = total >= config.min_weight
         weight += total
         supported += supports
-        most = np.maximum(most, _most_pixels(g, breadth, view.camera))
-        depth = xyz @ view.camera.w2c[2, :3] + view.camera.w2c[2, 3]
-        if config.content_depth:
-            content = _content(g, scene, row, depth, antialiased, space)
-            in_front += supports & (depth < config.content_depth * content)
-        if label_image is not None:
-            contradicting += _contradicting(weights[:, 1:], depth, config.category_depth)
+        most = np.maximum(most, pixels)
+        in_front += supports & near
+        contradicting += against
         if on_view:
             on_view(done)
     found = {
