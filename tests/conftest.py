@@ -45,11 +45,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: item.path.stem not in _LONG)
 
 
-@pytest.fixture(scope="module")
-def no_figures() -> Iterator[None]:
+# the files whose tests look at the figures of reports
+_FIGURES = ("test_output_report", "test_studies_paper", "test_pipeline")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_figures(request: pytest.FixtureRequest) -> Iterator[None]:
     """Reports without figures, which take most of the time of a small run, and have their own tests."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sagesplat.output.figures.save_figure", lambda figure, path: b"<svg/>")
+        if request.path.stem not in _FIGURES:
+            patch.setattr("sagesplat.output.figures.save_figure", lambda figure, path: b"<svg/>")
         yield
 
 

@@ -8,11 +8,13 @@ import inspect
 import os
 import re
 from collections.abc import Callable, Iterable
+from contextlib import nullcontext
 from functools import wraps
 from pathlib import Path
 from types import UnionType
 from typing import Any, Union, get_args, get_origin
 
+import jaxtyping
 from jaxtyping import AbstractArray, install_import_hook
 
 SOURCE = Path(__file__).parents[1] / "src" / "sagesplat"
@@ -22,41 +24,86 @@ EXCEPT = {
     "sagesplat.demo.world",  # `demo.raycast` compiles a function of it
 }  # fmt: skip
 
+_NO_AXES = nullcontext()
 
-def check(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Check the arrays among the arguments and in the result: a type checker for `jaxtyping.jaxtyped`."""
+
+def check(function: Callable[..., Any], *, axes: Any = _NO_AXES) -> Callable[..., Any]:
+    """Check the arrays among the arguments and in the result: a type checker for `jaxtyping.jaxtyped`.
+
+    `axes`: context in which axes of one name have one length.
+    """
     signature = inspect.signature(function)
-    hints = {name: p.annotation for name, p in signature.parameters.items() if _has_arrays(p.annotation)}
-    result = signature.return_annotation
+    hints = [
+        (place, name, p.annotation, fits)
+        for place, (name, p) in enumerate(signature.parameters.items())
+        if (fits := checker(p.annotation))
+    ]
+    of_result = checker(signature.return_annotation)
+    if not hints and of_result is None:
+        return function
 
     @wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
-        given = signature.bind(*args, **kwargs).arguments
-        for name, hint in hints.items():
-            if name in given and not fits(given[name], hint):
-                raise TypeError(f"{name} is not {hint}")
-        found = function(*args, **kwargs)
-        if _has_arrays(result) and not fits(found, result):
-            raise TypeError(f"the result is not {result}")
-        return found
+        if jaxtyping.config.jaxtyping_disable:
+            return function(*args, **kwargs)
+        with axes:
+            for place, name, hint, fits in hints:
+                if place < len(args):
+                    value = args[place]
+                elif name in kwargs:
+                    value = kwargs[name]
+                else:
+                    continue
+                if not fits(value):
+                    raise jaxtyping.TypeCheckError(f"{function.__qualname__}: {name} is not {hint}")
+            found = function(*args, **kwargs)
+            if of_result and not of_result(found):
+                raise jaxtyping.TypeCheckError(
+                    f"{function.__qualname__}: the result is not {signature.return_annotation}"
+                )
+            return found
 
-    return wrapper if hints or _has_arrays(result) else function
+    return wrapper
 
 
-def fits(value: Any, hint: Any) -> bool:
-    """Whether a value has the shapes and dtypes of a hint, whose parts without arrays are not checked."""
-    origin, inner = get_origin(hint), get_args(hint)
-    if origin in (Union, UnionType):
-        return any(value is None if h is type(None) else fits(value, h) for h in inner)
+def decorator(*, typechecker: Callable[..., Any]) -> Callable[..., Any]:
+    """What the import hook puts on functions and classes.
+
+    jaxtyping's own binds the arguments of every function three times, whether it has arrays or not: that
+    took a third of the time of tests that make runs.
+    """
+    of_class, axes = _of_jaxtyping(typechecker=typechecker), _of_jaxtyping("context")  # has no state
+
+    def decorate(decorated: Any) -> Any:
+        if inspect.isfunction(decorated):
+            return check(decorated, axes=axes)
+        return of_class(decorated)
+
+    return decorate
+
+
+def checker(hint: Any) -> Callable[[Any], bool] | None:
+    """Tells whether a value has the shapes and dtypes of a hint; None for a hint without arrays."""
     if not _has_arrays(hint):
-        return True
+        return None
+    origin, inner = get_origin(hint), get_args(hint)
+    parts = [checker(one) for one in inner if not isinstance(one, list)]
+    if origin in (Union, UnionType):
+        optional = type(None) in inner
+        known = [part or _anything for part, one in zip(parts, inner, strict=True) if one is not type(None)]
+        return lambda value: optional if value is None else any(part(value) for part in known)
     if origin is tuple and Ellipsis not in inner:
-        return len(value) == len(inner) and all(map(fits, value, inner))
+        each = [part or _anything for part in parts]
+        return lambda value: len(value) == len(each) and all(map(lambda f, v: f(v), each, value))
     if origin in (tuple, list):
-        return all(fits(part, inner[0]) for part in value)
+        return lambda value: all(map(parts[0] or _anything, value))
     if origin is dict:
-        return all(fits(part, inner[1]) for part in value.values())
-    return not inspect.isclass(hint) or isinstance(value, hint)
+        return lambda value: all(map(parts[1] or _anything, value.values()))
+    return (lambda value: isinstance(value, hint)) if inspect.isclass(hint) else _anything
+
+
+def _anything(_value: Any) -> bool:
+    return True
 
 
 def _has_arrays(hint: Any) -> bool:
@@ -80,6 +127,9 @@ def checked_modules() -> set[str]:
     return found - EXCEPT
 
 
+_of_jaxtyping: Any = jaxtyping.jaxtyped
+
 if os.environ.get("CHECK_SHAPES", "1") != "0":
+    jaxtyping.jaxtyped = decorator  # pyright: ignore[reportAttributeAccessIssue]
     _finder: Any = install_import_hook("sagesplat", "shapes.check").hook
     _finder.should_instrument = checked_modules().__contains__  # by whole name; its own rule goes by prefix

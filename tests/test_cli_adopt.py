@@ -14,8 +14,6 @@ from conftest import random_gaussians
 from sagesplat.formats.ply import read_ply, write_ply
 from sagesplat.stages import pipeline
 
-pytestmark = pytest.mark.usefixtures("no_figures")
-
 Call = Callable[..., tuple[int, str]]
 SMALL = ("--fit", "none", "--views", "14", "--size", "48", "36", "--shares", "0.3", "1", "--kind", "object")
 FEW = ("--sample.views", "6", "--sample.calibration-views", "6", "--target-fidelity", "0.6")

@@ -27,8 +27,6 @@ from sagesplat.stages import plan as plan_stage
 from sagesplat.stages.nest import nest_levels
 from sagesplat.stages.train import train_levels
 
-pytestmark = pytest.mark.usefixtures("no_figures")
-
 SETTINGS = "--train.max-steps 60 --train.level-every 30 --ladder snapshots --target-ssim 0.4 --test-every 6"
 Call = Callable[..., tuple[int, str]]
 

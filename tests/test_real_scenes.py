@@ -13,8 +13,6 @@ from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.stages.pipeline import run_all
 
-pytestmark = pytest.mark.usefixtures("no_figures")
-
 SCENES = Path(__file__).resolve().parents[2] / "shared" / "scenes"
 
 

@@ -43,8 +43,6 @@ from sagesplat.stages.plan import make_plan
 from sagesplat.stages.train import read_cap, read_frozen, train_levels
 from sagesplat.viewer.site import Site
 
-pytestmark = pytest.mark.usefixtures("no_figures")
-
 VALUES = [
     None, True, -1, 0, 7, 2**70, 10**400, 1e308, float("nan"), float("inf"), "x", "\0", "a" * 5000, "\ud800",
     [], {}, [[]], "../../etc", "/etc/passwd",

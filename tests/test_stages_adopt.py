@@ -37,8 +37,6 @@ from sagesplat.stages.bundle import bundle
 from sagesplat.stages.export import export_scene
 from sagesplat.stages.results import promises_of
 
-pytestmark = pytest.mark.usefixtures("no_figures")
-
 SMALL = AdoptConfig(fit="none", views=14, size=(48, 36), shares=(0.2, 0.4, 0.7, 1.0), kind="object")
 REST = RunConfig(
     sample=SampleConfig(views=6, calibration_views=6), plan=PlanConfig(target_fidelity=0.6, other_targets=())

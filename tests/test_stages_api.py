@@ -26,8 +26,6 @@ from sagesplat.demo.capture import make_capture
 from sagesplat.formats.splats import read_splat
 from sagesplat.stages.export import export_increments, export_scene
 
-pytestmark = pytest.mark.usefixtures("no_figures")
-
 CONFIG = RunConfig(
     train=TrainConfig(max_steps=60, level_every=20),
     nest=NestConfig(steps=20, levels=4, base_steps=20),

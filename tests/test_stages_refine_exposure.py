@@ -21,8 +21,6 @@ from sagesplat.stages.pipeline import run_all, train
 from sagesplat.stages.refine_exposure import ExposureFigures, exposure_lines, read_exposure_figures
 from sagesplat.stages.results import evaluation_of
 
-pytestmark = pytest.mark.usefixtures("no_figures")
-
 CONFIG = replace(SMALL_RUN, train=replace(SMALL_RUN.train, exposure="affine"))
 FIGURES = ExposureFigures(
     1.4, {"plain": 20.0, "exposed": 24.0, "cc": 23.5}, {"plain": 0.7, "exposed": 0.75, "cc": 0.74}
