@@ -307,7 +307,7 @@ def test_what_a_newcomer_wants_to_know_comes_first(whole):
     for said in (
         "looks like the full model", f"{(plan.transfer_bytes or 0) / 1e6:.2f} MB to send, of",
         "0.955 fidelity at 2 unseen viewpoints", "SSIM 0.700 on unseen photos",
-        "of 6 promises kept at unseen viewpoints", "sagesplat view '/runs/a place'",
+        "of 6 measurements at unseen viewpoints reach 0.95", "sagesplat view '/runs/a place'",
         "sagesplat view --lan '/runs/a place'",
     ):  # fmt: skip
         assert said.replace(" ", "") in first.replace(" ", "").replace("\xa0", ""), said
