@@ -11,7 +11,7 @@ from torch import Tensor
 from sagesplat.core.config import CleanConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import Gaussians, concat
-from sagesplat.raster import rasterize
+from sagesplat.raster import rasterize, set_threads
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene, View
 from sagesplat.train.clean import CRITERIA, Floaters, clean, find_floaters
@@ -94,6 +94,20 @@ def test_blobs_before_the_cameras_are_in_front_and_little_else(truth: Gaussians,
     assert not cleaned.keep[N:].any()
     assert cleaned.keep[:N].sum() >= N - 2
     assert cleaned.after["train"] > cleaned.before["train"] + 1
+
+
+@pytest.mark.threads
+def test_views_side_by_side_and_one_by_one_find_the_same(
+    truth: Gaussians, scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    g = concat([truth, blobs(before_cameras(8, 0.2), size=0.02)])
+    set_threads(2)
+    together = find(g, scene)
+    monkeypatch.setattr("sagesplat.train.clean._SIDE_BY_SIDE", 0)
+    alone = find(g, scene)
+    assert any(rows.any() for rows in alone.found.values())
+    assert np.array_equal(together.weight, alone.weight)
+    assert all(np.array_equal(together.found[name], rows) for name, rows in alone.found.items())
 
 
 def test_without_tracks_content_is_what_the_gaussians_show(truth: Gaussians, scene: Scene) -> None:

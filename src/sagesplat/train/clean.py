@@ -43,6 +43,7 @@ _TRACKED = 20  # points in a view at least
 _WINDOW = 3  # px of half the size, around a Gaussian's centre; the nearest content there counts
 _COVERED = 0.5  # alpha of pixels that show content
 _GUARDS = 12  # views of a kind that are rendered before and after
+_SIDE_BY_SIDE = 2**24  # blending weights, by Gaussian and category: of views with more, one at a time
 _TRIES = 5  # of how much may go of what a criterion found
 _UNKNOWN_ERROR = 1e-3  # mean squared error of a splat without photos: 30 dB
 
@@ -107,20 +108,25 @@ def find_floaters(
         label_image = None
     xyz, space, most = g.means.cpu().numpy(), Workspace(), np.zeros(n, np.float32)
     breadth = g.log_scales.exp().sort(dim=1).values[:, 1:].prod(1)
+    width = 1 if label_image is None else len(ids)
 
     def of_view(row: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | bool, np.ndarray | float]:
         view, counts = scene.views[row], valid[scene.views[row]]
         columns = _columns(view, counts, ids, label_image)
-        weights = np.zeros((n, 1 if label_image is None else len(ids)), np.float32)
+        weights = np.zeros((n, width), np.float32)
         add_weights(g, view.camera, columns, weights, antialiased=antialiased, workspace=space)
         depth = xyz @ view.camera.w2c[2, :3] + view.camera.w2c[2, 3]
         near: np.ndarray | bool = False
         if config.content_depth:
             near = depth < config.content_depth * _content(g, scene, row, depth, antialiased, space)
-        against = _contradicting(weights[:, 1:], depth, config.category_depth) if label_image else 0.0
+        against: np.ndarray | float = 0.0
+        if label_image is not None:
+            against = _contradicting(weights[:, 1:], depth, config.category_depth)
         return weights.sum(1), _most_pixels(g, breadth, view.camera), near, against
 
-    for done, (total, pixels, near, against) in enumerate(each_view(of_view, list(views), g.means.device), 1):
+    rows = list(views)
+    in_views = each_view(of_view, rows, g.means.device) if n * width <= _SIDE_BY_SIDE else map(of_view, rows)
+    for done, (total, pixels, near, against) in enumerate(in_views, 1):
         supports = total >= config.min_weight
         weight += total
         supported += supports
