@@ -45,8 +45,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: item.path.stem not in _LONG)
 
 
-# the files whose tests look at the figures of reports
-_FIGURES = ("test_output_report", "test_studies_paper", "test_pipeline")
+# the files whose tests look at the figures of reports, or make them of what is hard to draw
+_FIGURES = (
+    "test_output_report", "test_studies_paper", "test_pipeline",
+    "test_studies_sparse_categories", "test_stages_blocks", "test_stages_nest",
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -110,22 +110,21 @@ def find_floaters(
     breadth = g.log_scales.exp().sort(dim=1).values[:, 1:].prod(1)
     width = 1 if label_image is None else len(ids)
 
-    def of_view(row: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | bool, np.ndarray | float]:
+    def of_view(row: int) -> tuple[np.ndarray, ...]:
         view, counts = scene.views[row], valid[scene.views[row]]
         columns = _columns(view, counts, ids, label_image)
         weights = np.zeros((n, width), np.float32)
         add_weights(g, view.camera, columns, weights, antialiased=antialiased, workspace=space)
         depth = xyz @ view.camera.w2c[2, :3] + view.camera.w2c[2, 3]
-        near: np.ndarray | bool = False
+        near, against = np.zeros(n, bool), np.zeros(n, np.float32)
         if config.content_depth:
             near = depth < config.content_depth * _content(g, scene, row, depth, antialiased, space)
-        against: np.ndarray | float = 0.0
         if label_image is not None:
             against = _contradicting(weights[:, 1:], depth, config.category_depth)
         return weights.sum(1), _most_pixels(g, breadth, view.camera), near, against
 
-    rows = list(views)
-    in_views = each_view(of_view, rows, g.means.device) if n * width <= _SIDE_BY_SIDE else map(of_view, rows)
+    small = n * width <= _SIDE_BY_SIDE
+    in_views = each_view(of_view, list(views), g.means.device) if small else map(of_view, views)
     for done, (total, pixels, near, against) in enumerate(in_views, 1):
         supports = total >= config.min_weight
         weight += total
