@@ -24,6 +24,7 @@ from benchmarks import labels as labelling
 from benchmarks import measure, plain, size_tables, workloads
 from benchmarks import plans as planning
 from benchmarks import promises as promising
+from benchmarks import quality as qualities
 from benchmarks import segment as overlays
 from benchmarks import size as sizing
 from benchmarks import whole as whole_runs
@@ -232,6 +233,31 @@ def whole(
     print(*whole_runs.table(found), sep="\n")
     result = {"scene": scene.name, "downscale": downscale, "steps": steps, "threads": threads, "runs": found}
     _finish(f"whole_{scene.name}", result, write)
+
+
+@app.command
+def quality(
+    scene: Path = workloads.GARDEN,
+    downscale: int = 2,
+    sources: tuple[Path, ...] = (whole_runs.HERE,),
+    steps: tuple[int, ...] = (1000,),
+    repeats: int = 1,
+    write: bool = False,
+) -> None:
+    """Time to quality: seconds of training, and PSNR and SSIM on test views.
+
+    Args:
+        scene: capture.
+        downscale: of its photos.
+        sources: checkouts of the package, which take turns (`git worktree add`).
+        steps: of training, one number for each checkout.
+        repeats: of each.
+        write: keep the results.
+    """
+    found = qualities.measure(scene.resolve(), downscale, sources, steps, repeats)
+    for name, run in found.items():
+        print(f"{name}: {run['seconds']:.1f} s, {run['psnr']:.2f} dB, {run['ssim']:.4f}")
+    _finish(f"quality_{scene.name}", {"scene": scene.name, "downscale": downscale, "runs": found}, write)
 
 
 @app.command

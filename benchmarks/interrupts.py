@@ -8,7 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ _LONGEST = 60.0  # seconds after which a process that was interrupted counts as 
 _LINE = re.compile(r"^sagesplat: interrupted; [^\n]+$", re.MULTILINE)
 _AT = re.compile(r'^  File "(?:.*/)?([^"/]+/[^"/]+)", line (\d+) in (\w+)$', re.MULTILINE)
 _QUIET = (".lock", "photos.json")
+_NESTED = ("nested/ladder.npz", "nested/increments", "nested/checkpoint*")
 
 
 @dataclass(frozen=True)
@@ -63,8 +64,9 @@ CASES = {
     "lift": _stage("lift", "labels.npz"),
     "train": _stage("train", "levels", "checkpoint*"),
     "clean": _stage("clean", "cleaned.npz"),
-    "base": _stage("base", "nested/base.npz", "nested/provenance/nest.json", command="nest"),
-    "nest": _stage("nest", "nested/ladder.npz", "nested/increments", "nested/checkpoint*"),
+    # without the record the settings would be the defaults
+    "base": Case(("nest", "RUN"), ("nested/base.npz", *_NESTED)),
+    "nest": Case(("nest", "RUN"), _NESTED),
     "observe": _stage("observe", "nested/observations.csv"),
     "sample": _stage("sample", "nested/fidelity.npz"),
     "fit": _stage("fit", "nested/models.json", "nested/promises.json"),
@@ -143,12 +145,16 @@ def _interrupted(
 
 
 def _begin(finished: Path, run: Path, case: Case) -> None:
-    """A copy of the finished run without what the command makes."""
-    shutil.rmtree(run, ignore_errors=True)
+    """A copy of the finished run without what the command makes, and nothing beside it."""
+    _remove(run.parent.iterdir())
     shutil.copytree(finished, run)
     for pattern in case.removed:
-        for path in list(run.glob(pattern)):
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        _remove(run.glob(pattern))
+
+
+def _remove(paths: Iterable[Path]) -> None:
+    for path in list(paths):
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 def _digests(run: Path) -> dict[str, str]:

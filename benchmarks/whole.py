@@ -26,7 +26,7 @@ def measure(
     for repeat in range(repeats):
         for number, source in enumerate(sources):
             folder = out / f"{number}-{source.name}-{repeat}"
-            name = f"{source.resolve()} {_commit(source)}"
+            name = f"{source.resolve()} {commit(source)}"
             if not (folder / "whole.json").exists():
                 shutil.rmtree(folder, ignore_errors=True)
                 folder.mkdir(parents=True)
@@ -62,7 +62,8 @@ def _medians(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return plain | {"stages": stages}
 
 
-def _commit(source: Path) -> str:
+def commit(source: Path) -> str:
+    """The commit of a checkout."""
     done = subprocess.run(
         ["git", "-C", str(source), "rev-parse", "--short", "HEAD"],
         capture_output=True,

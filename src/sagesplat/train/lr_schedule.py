@@ -15,10 +15,11 @@ from sagesplat.core.config import TrainConfig
 from sagesplat.core.gaussians import PARAMETERS
 from sagesplat.scene.scene import Camera
 
-# Of the fast schedule: multiplier of the published learning rates at the start (the means have their own),
-# share of the run from which on the others shrink, and to how much of what they began with.
-_GAIN, _MEANS_GAIN, _SHRINK_FROM, _SHRINK_TO = 4.0, 4.0, 0.3, 0.1
-_MEANS_SHRINK_TO = 0.01  # of the published schedule too
+# Of the fast schedule: multiplier of the published learning rates at the start, share of the run from which
+# on those of all but the means shrink, and to how much of what they began with. Harmonics above degree 0 have
+# seen few directions when a short run ends: published, a twentieth of the rate of degree 0; here a tenth.
+_GAIN, _SHRINK_FROM, _SHRINK_TO, _SHN_GAIN = 4.0, 0.3, 0.5, 2.0
+_MEANS_SHRINK_TO = {"published": 0.01, "fast": 0.1}
 _FACTORS = (4, 2)  # how many times smaller photos may be
 _SMALLEST = 200  # pixels of the shorter side: below, the Gaussians cost more than the pixels
 _LEARNT_BY = 0.5  # share of the run after which all photos have full resolution
@@ -36,12 +37,11 @@ class LrSchedule:
         """Adam's learning rate at a step, by parameter name."""
         config, share = self.config, step / self.config.max_steps
         learning_rates = {name: getattr(config, f"{name}_lr") for name in PARAMETERS}
-        learning_rates["means"] *= self.extent * _MEANS_SHRINK_TO**share
+        learning_rates["means"] *= self.extent * _MEANS_SHRINK_TO[config.lr_schedule] ** share
         if config.lr_schedule == "fast":
             gain = _GAIN * _SHRINK_TO ** max(0.0, (share - _SHRINK_FROM) / (1 - _SHRINK_FROM))
-            learning_rates = {
-                n: rate * (_MEANS_GAIN if n == "means" else gain) for n, rate in learning_rates.items()
-            }
+            gains = dict.fromkeys(PARAMETERS, gain) | {"means": _GAIN, "shN": _SHN_GAIN * gain}
+            learning_rates = {name: rate * gains[name] for name, rate in learning_rates.items()}
         return learning_rates
 
     def sgld_noise(self, step: int) -> float:
@@ -51,7 +51,7 @@ class LrSchedule:
         return (
             self.config.mcmc_noise
             * self.config.means_lr
-            * _MEANS_SHRINK_TO ** (step / self.config.max_steps)
+            * _MEANS_SHRINK_TO["published"] ** (step / self.config.max_steps)
             / self.extent
         )
 
