@@ -153,7 +153,11 @@ def _begin(job: Job, fresh: Path, edits: LabelEdits, made: Relabelled) -> Job:
         new.provenance(stage).unlink(missing_ok=True)
     if job.has_instances:
         _keep_instances_alone(job.run, new)
-    write_parents(new.parents, made.parents(job.parents, job.names()))
+    if job.has_block_categories:  # they keep their names
+        shutil.copytree(job.run.block_labels, new.block_categories)
+        write_parents(new.parents, job.parents)
+    else:
+        write_parents(new.parents, made.parents(job.parents, job.names()))
     settings = LabelSettings(made.weights, made.hidden, made.always)
     write_edited(new, job.run.path.name, loads_json(dump_edits(edits)), settings)
     return Job(
