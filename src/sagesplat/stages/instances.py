@@ -51,6 +51,7 @@ def find_photo_instances(job: Job, masks: MasksConfig, labels: LabelsConfig) -> 
                 f"{run.photo_instances}: no instances of any photo; the network has none, or segmented the "
                 "photos without: add --force to segment them again, or leave out --labels.instances"
             )
+        _check_seen(job)
         return
     source = masks.masks or job.scene.path / "masks"
     folders = {
@@ -63,6 +64,18 @@ def find_photo_instances(job: Job, masks: MasksConfig, labels: LabelsConfig) -> 
         return [f"{found} of {len(job.scene.views)} photos have instances"]
 
     run_stage(job, "photo_instances", folders, [run.scene], [run.photo_instances], make)
+    _check_seen(job)
+
+
+def _check_seen(job: Job) -> None:
+    """RunError unless two training photos have instances: one that a single photo shows is none."""
+    views = [job.scene.views[row] for row in job.scene.train_ids.tolist()]
+    seen = sum(instance_path(job.run.photo_instances, view).exists() for view in views)
+    if seen < 2:
+        raise RunError(
+            f"{job.run.photo_instances}: instances of {seen} of {len(views)} training photos; give those of "
+            "two at least that show the same, or leave out --labels.instances"
+        )
 
 
 def make_instances(job: Job, labels: LabelsConfig) -> None:
@@ -143,9 +156,12 @@ def _find(job: Job, g: Gaussians, masks: Masks, ids: list[int]) -> Instances:
     found = label(g, sightings, masks.taxonomy)
     for category, count in found.alone.items():
         name = title_of(masks.taxonomy.name(category))
-        job.emit(
-            Warned(f"{count} instances of {name} in single photos are left to {name}: no other view agrees")
+        what = (
+            f"1 instance of {name} in a single photo is"
+            if count == 1
+            else (f"{count} instances of {name} in single photos are")
         )
+        job.emit(Warned(f"{what} left to {name}: no other view agrees"))
     missing = sorted(set(ids) - set(found.parents.values()))
     if not found.parents:
         names = ", ".join(title_of(masks.taxonomy.name(i)) for i in ids)

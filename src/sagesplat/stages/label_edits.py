@@ -119,6 +119,12 @@ def _checked(job: Job, edits: LabelEdits, path: Path) -> Relabelled:
         )  # fmt: skip
     except LabelError as error:
         raise LabelError(f"{path}: {error}") from None
+    shown = {name for label, name in job.taxonomy.names.items() if label not in counts}
+    if taken := sorted(shown & set(made.names.values())):
+        raise LabelError(
+            f"{path}: the name {taken[0]!r} is that of a category that label images show, without Gaussians; "
+            "choose another"
+        )
     if job.has_block_categories and (made.changed or made.names != {i: names[i] for i in counts}):
         raise RunError(
             f"{job.run.path}: a scene in blocks; its categories can be hidden, weighed and kept in full, but "
