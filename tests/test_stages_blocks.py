@@ -49,7 +49,7 @@ from sagesplat.scene.stored import read_scene, write_scene
 from sagesplat.segment.block_categories import BlockCategories, category_of, split_name
 from sagesplat.segment.masks import Masks, Taxonomy
 from sagesplat.stages.blocks import check
-from sagesplat.stages.bundle import _contents
+from sagesplat.stages.bundle import _contents, live_bundle
 from sagesplat.stages.label_edits import apply_labels
 from sagesplat.stages.pipeline import instances, nest, run_all
 from sagesplat.stages.results import increments_of
@@ -323,6 +323,13 @@ def job_of(path: Path, *, force: bool = False) -> Job:
     return Job(RunDir(path), lambda _: None, "cpu", force=force)
 
 
+def a_viewer(folder: Path) -> Path:
+    """A page in place of the built viewer."""
+    (folder / "viewer").mkdir()
+    write_text(folder / "viewer" / "index.html", "<!-- pack --><!-- poster -->")
+    return folder / "viewer"
+
+
 def run_in_blocks(capture: Path, run: Path, config: RunConfig = CONFIG, **options) -> list[Event]:
     events: list[Event] = []
     run_all(Job(RunDir(run, config.ladder), events.append, "cpu", **options), capture, config)
@@ -404,7 +411,7 @@ def test_instances_of_blocks(finished: Path, tmp_path: Path) -> None:
     shutil.copytree(finished, path)
     before = job_of(path).names()
     instances(job_of(path), LabelsConfig(instances="potted plant"), MasksConfig())
-    few = replace(CONFIG.nest, steps=4, levels=2, base_steps=4)
+    few = replace(CONFIG.nest, steps=4, levels=2, base_share=0.0)
     nest(job_of(path, force=True), few, BlocksConfig(count=2, boundary_steps=0), 0)
     job = job_of(path)
     names, ladder = job.names(), job.ladder
@@ -438,6 +445,9 @@ def test_instances_of_blocks(finished: Path, tmp_path: Path) -> None:
     assert {("potted plant", "potted plant 1", 0), (None, "dining table", 1)} <= tree
     # snapshots have no instances, and they can be folded back
     assert Job(RunDir(path, "snapshots"), print).names() == before
+    assert live_bundle(job_of(path), tmp_path / "live", a_viewer(tmp_path))
+    live = read_json(tmp_path / "live" / "manifest.json")["labels"]
+    assert {(one["id"], one["name"]) for one in live} <= set(before.items())
     instances(job_of(path, force=True), LabelsConfig(), MasksConfig())
     assert job_of(path).names() == before
     assert not job_of(path).run.block_instances.exists()
@@ -447,9 +457,7 @@ def test_categories_of_blocks_can_be_hidden(finished: Path, tmp_path: Path) -> N
     job = job_of(finished)
     edits = LabelEdits(ladder_hash(increments_of(job), job.names()), (Hide("dining table@0", True),))
     write_edits(tmp_path / "labels.edit.json", edits)
-    (tmp_path / "viewer").mkdir()
-    write_text(tmp_path / "viewer" / "index.html", "<!-- pack --><!-- poster -->")
-    made = apply_labels(job, tmp_path / "labels.edit.json", tmp_path / "out", viewer=tmp_path / "viewer")
+    made = apply_labels(job, tmp_path / "labels.edit.json", tmp_path / "out", viewer=a_viewer(tmp_path))
     labels = {one["name"]: one for one in read_json(made.bundle.path / "manifest.json")["labels"]}
     assert labels["dining table@0"]["hidden"]
     assert (labels["dining table@1"]["block"], labels["dining table@1"].get("hidden")) == (1, None)
