@@ -20,6 +20,7 @@ from sagesplat.segment.edit import (
     fold_table,
     parse_keep,
     parse_merge,
+    parse_names,
 )
 from sagesplat.segment.masks import Masks, Taxonomy, mask_path, write_labels, write_mask
 
@@ -259,3 +260,9 @@ def test_typed_accents_are_those_of_the_file():
     taxonomy = Taxonomy({1: "caf\u00e9", 2: "vase"})
     left, _ = edit_table(taxonomy, keep=parse_keep("cafe\u0301"), merge=parse_merge("vase=cafe\u0301"))
     assert left.names == {1: "caf\u00e9"}
+
+
+def test_names_are_checked_with_the_option_that_they_were_given_to() -> None:
+    assert parse_names("chair 2, vase", "only") == ("chair 2", "vase")
+    with pytest.raises(LabelError, match=r"^only 'x+\.\.\.x+': it has 300 characters"):
+        parse_names("x" * 300, "only")

@@ -1,6 +1,7 @@
 """Large scenes: the partition, the scene of a block, merging, and a full run in blocks."""
 
 import json
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -13,10 +14,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_run_executor import Shuffled
 
-from sagesplat.adapt.ladder import read_ladder, read_prefixes
+from sagesplat.adapt.ladder import PrefixLadder, read_ladder, read_prefixes
 from sagesplat.core.config import (
     BlocksConfig,
     FitConfig,
+    LabelsConfig,
+    MasksConfig,
     NestConfig,
     PlanConfig,
     RunConfig,
@@ -27,6 +30,7 @@ from sagesplat.core.config import (
 from sagesplat.core.errors import LabelError, RunError, SceneError
 from sagesplat.core.events import Event, StageDone, StageSkipped
 from sagesplat.demo.capture import make_capture
+from sagesplat.formats.label_edits import Hide, LabelEdits, ladder_hash, write_edits
 from sagesplat.io.files import read_json, write_text
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
@@ -45,7 +49,11 @@ from sagesplat.scene.stored import read_scene, write_scene
 from sagesplat.segment.block_categories import BlockCategories, category_of, split_name
 from sagesplat.segment.masks import Masks, Taxonomy
 from sagesplat.stages.blocks import check
-from sagesplat.stages.pipeline import run_all
+from sagesplat.stages.bundle import _contents, live_bundle
+from sagesplat.stages.label_edits import apply_labels
+from sagesplat.stages.pipeline import instances, nest, run_all
+from sagesplat.stages.results import increments_of
+from sagesplat.stages.shared import labels_named
 from sagesplat.train import boundaries
 
 
@@ -311,6 +319,17 @@ CONFIG = RunConfig(
 )
 
 
+def job_of(path: Path, *, force: bool = False) -> Job:
+    return Job(RunDir(path), lambda _: None, "cpu", force=force)
+
+
+def a_viewer(folder: Path) -> Path:
+    """A page in place of the built viewer."""
+    (folder / "viewer").mkdir()
+    write_text(folder / "viewer" / "index.html", "<!-- pack --><!-- poster -->")
+    return folder / "viewer"
+
+
 def run_in_blocks(capture: Path, run: Path, config: RunConfig = CONFIG, **options) -> list[Event]:
     events: list[Event] = []
     run_all(Job(RunDir(run, config.ladder), events.append, "cpu", **options), capture, config)
@@ -385,6 +404,64 @@ def test_blocks_are_the_same_in_any_order_and_process(finished: Path, capture: P
     assert {"block 0", "block 1", "boundaries of block 0", "boundaries of block 1"} <= set(executor.names)
     for name in ("nested/ladder.npz", "nested/observations.csv", "nested/plan.json", "nested/borders.csv"):
         assert (tmp_path / "again" / name).read_bytes() == (finished / name).read_bytes(), name
+
+
+def test_instances_of_blocks(finished: Path, tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    shutil.copytree(finished, path)
+    before = job_of(path).names()
+    instances(job_of(path), LabelsConfig(instances="potted plant"), MasksConfig())
+    few = replace(CONFIG.nest, steps=4, levels=2, base_share=0.0)
+    nest(job_of(path, force=True), few, BlocksConfig(count=2, boundary_steps=0), 0)
+    job = job_of(path)
+    names, ladder = job.names(), job.ladder
+    assert isinstance(ladder, PrefixLadder)
+    found = {split_name(names[label]) for label in ladder.sizes}
+    assert {("potted plant 1", 0), ("dining table", 0), ("dining table", 1)} <= found
+    assert {block for name, block in found if name in job.parents} == {0, 1}
+    # every Gaussian is in the block that its name says
+    blocks = read_blocks(job.run.blocks / "blocks.json")
+    means = ladder.gaussians.means.numpy()
+    of_name = np.array([split_name(names[label])[1] for label in ladder.gaussians.label_ids.tolist()])
+    beyond = blocks.to_border(means)[blocks.of(means) != of_name]
+    assert (beyond < blocks.margin / 2).all()
+    # pixels keep block and category
+    categories = Masks(job.run.block_categories, Taxonomy.read(job.run.block_categories / "labels.json"))
+    view = job.scene.views[0]
+    for was, now in zip(
+        categories[view].ravel().tolist(), job.best_masks[view].ravel().tolist(), strict=True
+    ):
+        name, block = split_name(names[now])
+        assert (job.parents.get(name, name), block) == split_name(categories.taxonomy.name(was))
+    # a category means all its instances in all blocks, an instance all its blocks
+    plants = {label for label, name in names.items() if name.startswith("potted plant")}
+    assert set(labels_named(job, ["potted plant"])) == plants
+    assert [names[i] for i in labels_named(job, ["potted plant 1"])] == [
+        "potted plant 1@0", "potted plant 1@1",
+    ]  # fmt: skip
+    assert {job.parents_by_id.get(i) for i in plants} == {None, "potted plant@0", "potted plant@1"}
+    # the viewer's tree: category, instance, block
+    tree = {(c.parent, c.category, c.block) for c in _contents(job, ladder.gaussians, False).categories}
+    assert {("potted plant", "potted plant 1", 0), (None, "dining table", 1)} <= tree
+    # snapshots have no instances, and they can be folded back
+    assert Job(RunDir(path, "snapshots"), print).names() == before
+    assert live_bundle(job_of(path), tmp_path / "live", a_viewer(tmp_path))
+    live = read_json(tmp_path / "live" / "manifest.json")["labels"]
+    assert {(one["id"], one["name"]) for one in live} <= set(before.items())
+    instances(job_of(path, force=True), LabelsConfig(), MasksConfig())
+    assert job_of(path).names() == before
+    assert not job_of(path).run.block_instances.exists()
+
+
+def test_categories_of_blocks_can_be_hidden(finished: Path, tmp_path: Path) -> None:
+    job = job_of(finished)
+    edits = LabelEdits(ladder_hash(increments_of(job), job.names()), (Hide("dining table@0", True),))
+    write_edits(tmp_path / "labels.edit.json", edits)
+    made = apply_labels(job, tmp_path / "labels.edit.json", tmp_path / "out", viewer=a_viewer(tmp_path))
+    labels = {one["name"]: one for one in read_json(made.bundle.path / "manifest.json")["labels"]}
+    assert labels["dining table@0"]["hidden"]
+    assert (labels["dining table@1"]["block"], labels["dining table@1"].get("hidden")) == (1, None)
+    assert job_of(made.path).names() == job.names()
 
 
 def test_a_run_keeps_its_blocks(finished: Path, capture: Path) -> None:

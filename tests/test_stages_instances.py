@@ -5,21 +5,24 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from sagesplat.core.config import LabelsConfig, LiftConfig, MasksConfig, PosesConfig, SceneConfig, TrainConfig
 from sagesplat.core.errors import LabelError, RunError
-from sagesplat.core.events import StageDone, StageSkipped
+from sagesplat.core.events import StageDone, StageSkipped, Warned
 from sagesplat.demo.capture import make_capture
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
-from sagesplat.segment.masks import Taxonomy
+from sagesplat.segment.instances import instance_path, read_instances, write_instances
+from sagesplat.segment.lift import LiftedLabels
 from sagesplat.stages.label import lift_labels, make_masks
 from sagesplat.stages.pipeline import instances
 from sagesplat.stages.scene import open_scene
 from sagesplat.stages.train import train_levels
 
 PLANTS = LabelsConfig(instances="potted plant,vase")
+VASE = 86  # its id
 
 
 def job_on(run: Path, events: list, *, force: bool = False) -> Job:
@@ -88,5 +91,27 @@ def test_what_cannot_be_told_apart_is_one_line_with_a_cure(run: Path, trained: P
             instances(job, PLANTS, MasksConfig())
     finally:
         given.with_name("elsewhere").rename(given)
+    one = job.scene.views[int(job.scene.train_ids[0])]
+    source = MasksConfig(masks=run.parent / "few" / "masks")  # the vase in one photo only
+    shutil.copytree(given.parent / "masks", run.parent / "few" / "masks")
+    shutil.copytree(given, run.parent / "few" / "instances")
+    for view in job.scene.views:
+        path = instance_path(run.parent / "few" / "instances", view)
+        numbers = np.where(job.masks[view] == VASE, -1, read_instances(path))
+        if view != one:
+            write_instances(path, numbers)
+    events: list[object] = []
+    with pytest.raises(LabelError, match="no instance of vase is seen in two training photos"):
+        instances(job_on(run, events, force=True), LabelsConfig(instances="vase"), source)
+    said = [event.text for event in events if isinstance(event, Warned)]
+    assert said == ["1 instance of vase in a single photo is left to vase: no other view agrees"]
+    for view in job.scene.views:
+        if view != one:
+            instance_path(run.parent / "few" / "instances", view).unlink()
+    with pytest.raises(RunError, match=r"instances of 1 of \d+ training photos; give those of two at least"):
+        instances(job_on(run, [], force=True), PLANTS, source)
+    job = job_on(run, [], force=True)
+    points = LiftedLabels.read(job.run.labels, len(job.scene.points.xyz))
+    replace(points, ignored=points.label_ids == points.label_ids[0]).write(job.run.labels)
     instances(job, PLANTS, MasksConfig())
-    assert Taxonomy.read(job.run.instances / "labels.json").names
+    assert set(job.point_labels.tolist()) <= set(job.names())  # ignored ones too

@@ -32,6 +32,7 @@ from sagesplat.formats.label_edits import (
 )
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
+from sagesplat.segment.masks import Taxonomy
 from sagesplat.segment.relabel import relabelled
 from sagesplat.stages import pipeline
 from sagesplat.stages.label_edits import LabelsApplied, apply_labels
@@ -248,6 +249,14 @@ def test_impossible_edits_are_one_line(
     with pytest.raises(LabelError, match=why) as error:
         edited(run, viewer, *operations)
     assert "\n" not in str(error.value)
+    assert not (run.parent / "run-edited").exists()
+
+
+def test_a_name_that_only_label_images_have_is_taken(run: Path, viewer: Path) -> None:
+    path = run / "masks" / "labels.json"
+    Taxonomy({**Taxonomy.read(path).names, 9: "boat"}).write(path)
+    with pytest.raises(LabelError, match=r"labels\.edit\.json: the name 'boat' is that of a category that"):
+        edited(run, viewer, Rename(CAR, "boat"))
     assert not (run.parent / "run-edited").exists()
 
 

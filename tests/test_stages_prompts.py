@@ -105,6 +105,18 @@ def test_words_become_categories_and_what_is_found_nowhere_is_said(capture: Path
         make_masks(job, MasksConfig(segmenter="text", prompts="stone fountain"))
 
 
+@pytest.mark.parametrize(
+    ("score", "line"),
+    [
+        (0.12, "its best score is 0.12 and 0.3 is needed"),
+        (0.2996, "its best score is 0.2996 and 0.3 is needed"),  # not 0.30, which would do
+        (0.65, "found with a score of up to 0.65, but other prompts have a larger probability"),
+    ],
+)
+def test_why_a_prompt_has_no_pixels(score: float, line: str) -> None:
+    assert line in prompts._missing("ivy", score, 0.3)
+
+
 def test_a_killed_segmentation_goes_on(capture: Path, tmp_path: Path) -> None:
     Left.killed_after = 4
     job, _ = begun(tmp_path / "run", capture)

@@ -1,5 +1,7 @@
 """2D instances of several views become 3D instances, whatever single views have cut, lost or mixed up."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -34,7 +36,9 @@ def seen(objects: np.ndarray, views: int, damage: float, seed: int) -> Sightings
             count += 1 + cut
         starts.append(starts[-1] + count)
     categories = np.full(starts[-1], CHAIR, np.int16)
-    return Sightings(columns, np.ones((n, views), np.float32), COLUMNS, np.array(starts), categories)
+    return Sightings(
+        columns[..., None], np.ones((n, views, 1), np.float32), COLUMNS, np.array(starts), categories
+    )
 
 
 def model(n: int, label_id: int = 62) -> Gaussians:
@@ -92,9 +96,43 @@ def test_gaussians_that_no_view_sees_follow_their_neighbours() -> None:
     assert adjusted_rand_index(objects, found.label_ids) == 1
 
 
+def test_views_that_lost_the_mask_have_no_say() -> None:
+    objects = np.repeat(np.arange(2), 30)
+    sightings = seen(objects, 8, 0.0, 0)
+    sightings.columns[objects == 0, 2:] = CHAIR  # six of eight views have no mask of it
+    sightings.columns[5, 0] = CHAIR  # beside the mask in one of the two views that have it
+    found = label(model(len(objects)), sightings, TAXONOMY)
+    assert adjusted_rand_index(objects, found.label_ids) == 1
+
+
+def test_a_gaussian_at_a_border_counts_with_both_sides() -> None:
+    objects = np.repeat(np.arange(2), 30)
+    one = seen(objects, 6, 0.0, 0)
+    both = np.concatenate([one.columns, np.full_like(one.columns, -1)], axis=2)
+    weights = np.repeat([[1.0, 0.0]], both[..., 0].size, axis=0).reshape(both.shape).astype(np.float32)
+    # row 30 paints a bit more of the other object in half of the views, and in the rest none of it
+    other, own = one.columns[0, :3, 0], one.columns[31, :3, 0]
+    both[30, :3], weights[30, :3] = np.stack([other, own], 1), (0.6, 0.5)
+    both[30, 3:, 0], weights[30, 3:, 0] = one.columns[31, 3:, 0], 0.2
+    sightings = replace(one, columns=both, weights=weights)
+    found = label(model(len(objects)), sightings, TAXONOMY)
+    assert found.label_ids[30] == found.label_ids[31]
+
+
+def test_what_views_leave_open_is_that_of_most_neighbours() -> None:
+    objects = np.repeat(np.arange(2), 30)
+    sightings = seen(objects, 6, 0.0, 0)
+    sightings.columns[[10, 45]] = CHAIR  # in no instance, though within one
+    found = label(model(len(objects)), sightings, TAXONOMY)
+    assert adjusted_rand_index(objects, found.label_ids) == 1
+    sightings.columns[45:] = CHAIR  # no longer within one
+    found = label(model(len(objects)), sightings, TAXONOMY)
+    assert (found.label_ids[50:] == 62).all()
+
+
 def test_without_instances_all_stays_as_it_was() -> None:
     sightings = Sightings(
-        np.full((4, 2), CHAIR, np.int16), np.ones((4, 2), np.float32), COLUMNS, np.zeros(3, np.int64),
+        np.full((4, 2, 1), CHAIR, np.int16), np.ones((4, 2, 1), np.float32), COLUMNS, np.zeros(3, np.int64),
         np.zeros(0, np.int16),
     )  # fmt: skip
     found = label(model(4), sightings, TAXONOMY)

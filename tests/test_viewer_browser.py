@@ -685,12 +685,16 @@ def test_a_window_without_area_waits(site: str, browser: Any) -> None:
 def in_blocks(made: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The walls as parts: the outer two are one category in two blocks."""
     out = tmp_path_factory.mktemp("blocks") / "bundle"
+    return as_parts(made, out, (("brick", 0), ("grass", 0), ("brick", 1)))
+
+
+def as_parts(made: Path, out: Path, parts: Sequence[tuple[str, int]], **more: str) -> Path:
+    """A copy of the bundle whose labels are of these categories and blocks, with `more` in their entries."""
     shutil.copytree(made, out)
     manifest = json.loads((out / "manifest.json").read_text())
-    for label, (category, block) in zip(
-        manifest["labels"], (("brick", 0), ("grass", 0), ("brick", 1)), strict=True
-    ):
+    for label, (category, block) in zip(manifest["labels"], parts, strict=True):
         label |= {"name": f"{category}@{block}", "category": category, "block": block, "title": category}
+        label |= more
     (out / "manifest.json").write_text(json.dumps(manifest))
     return out
 
@@ -714,6 +718,24 @@ def test_parts_are_listed_weighed_and_hidden_by_category(in_blocks: Path, browse
         assert np.abs(settled(opened) - before).max() > 0.2
         bricks.get_by_label("Hide brick").click()
         assert bricks.get_by_label("Show brick").count() == 1
+        assert opened.complaints == []
+
+
+def test_instances_in_blocks_are_a_tree(made: Path, tmp_path: Path, browser: Any) -> None:
+    parts = (("chair 1", 0), ("chair 2", 0), ("chair 1", 1))
+    bundle = as_parts(made, tmp_path / "bundle", parts, parent="chair")
+    with serve(bundle) as url, open_page(url, (900, 640), browser=browser) as opened:
+        ready(opened, WHOLE)
+        chairs = opened.page.locator(".labels > li")
+        assert chairs.count() == 1
+        assert "2 instances" in chairs.inner_text()
+        chairs.locator(".blocks").first.click()
+        first = chairs.locator(".parts > li", has_text="chair 1")
+        assert "2 blocks" in first.inner_text()
+        first.locator(".blocks").click()
+        assert first.locator(".parts .name").all_inner_texts() == ["block 0", "block 1"]
+        first.get_by_label("Hide chair 1").click()
+        assert chairs.get_by_label("Hide chair", exact=True).count() == 1  # chair 2 is still there
         assert opened.complaints == []
 
 

@@ -49,7 +49,7 @@ def export(
             tells them; .spz, .sog and lod-meta.json say how the run was trained)
         chunks: write the increment of each level of each category as a file of this format
     """
-    from sagesplat.segment.edit import parse_keep
+    from sagesplat.segment.edit import parse_names
     from sagesplat.stages.export import export_increments, export_scene
 
     if chunks and (only or without):
@@ -62,9 +62,10 @@ def export(
         else:
             target = None if target_ssim is None else ("ssim", target_ssim)
             target = target if target_fidelity is None else ("fidelity", target_fidelity)
+            wanted = (*labels, *parse_names(only, "only"))
             count = export_scene(
-                job, out, level=level, labels=(*labels, *parse_keep(only)), target=target, levels=levels,
-                rasterize_mode=rasterize_mode, without=parse_keep(without),
+                job, out, level=level, labels=wanted, target=target, levels=levels,
+                rasterize_mode=rasterize_mode, without=parse_names(without, "without"),
             )  # fmt: skip
     say(f"{out}: {count:,} {'chunks' if chunks else 'Gaussians'}")
 

@@ -21,6 +21,7 @@ from sagesplat.run.run_dir import RunDir
 from sagesplat.scene.images import Photos
 from sagesplat.scene.refined import read_refined, with_cameras
 from sagesplat.scene.scene import Scene
+from sagesplat.segment.block_categories import per_block_name, split_name
 from sagesplat.segment.lift import LiftedLabels
 from sagesplat.segment.masks import Masks, Taxonomy
 from sagesplat.segment.parents import read_parents
@@ -123,7 +124,7 @@ class Job:
     @property
     def has_block_categories(self) -> bool:
         """Whether each category in each block is one of its own by now."""
-        return (self.run.block_categories / "labels.json").exists()
+        return (self.run.block_labels / "labels.json").exists()
 
     @property
     def taxonomy(self) -> Taxonomy:
@@ -133,7 +134,7 @@ class Job:
     @property
     def _labels(self) -> Path:
         if self.has_block_categories:
-            return self.run.block_categories / "labels.json"
+            return self.run.block_labels / "labels.json"
         return (self.run.instances if self.has_instances else self.run.masks) / "labels.json"
 
     @property
@@ -163,14 +164,22 @@ class Job:
 
     @property
     def parents_by_id(self) -> dict[int, str]:
-        """The category of each instance, by the instance's id."""
-        return {i: self.parents[name] for i, name in self.names().items() if name in self.parents}
+        """The category of each instance, by the instance's id: in a scene in blocks that of the block."""
+        split = split_name if self.has_block_categories else lambda name: (name, None)
+        found = {}
+        for label, name in self.names().items():
+            category, block = split(name)
+            if category in self.parents:
+                found[label] = per_block_name(self.parents[category], block)
+        return found
 
     @property
     def whole_masks(self) -> Masks:
         """The label images of the scene as one: with its instances, if they were asked for."""
         instances = self.run.instances
-        return Masks(instances, self.taxonomy) if self.has_instances else self.category_masks
+        if self.has_instances:
+            return Masks(instances, Taxonomy.read(instances / "labels.json"))
+        return self.category_masks
 
     @property
     def category_masks(self) -> Masks:
@@ -181,9 +190,7 @@ class Job:
     @property
     def best_masks(self) -> Masks:
         """The same, of the parts that a scene in blocks has."""
-        return (
-            Masks(self.run.block_categories, self.taxonomy) if self.has_block_categories else self.whole_masks
-        )
+        return Masks(self.run.block_labels, self.taxonomy) if self.has_block_categories else self.whole_masks
 
     @property
     def sky(self) -> Sky | None:

@@ -250,9 +250,20 @@ class RunDir:
         return self.path / "block_categories"
 
     @property
+    def block_instances(self) -> Path:
+        """The same of instances: what nested levels are of where some were asked for."""
+        return self.path / "block_instances"
+
+    @property
+    def block_labels(self) -> Path:
+        """Which of both the levels are of. Snapshots have no instances."""
+        apart = self.ladder == "nested" and (self.instances / "labels.json").exists()
+        return self.block_instances if apart else self.block_categories
+
+    @property
     def block_category_labels(self) -> Path:
         """Part of each SfM point."""
-        return self.block_categories / "labels.npz"
+        return self.block_labels / "labels.npz"
 
     @property
     def prefixes(self) -> Path:

@@ -23,7 +23,7 @@ _DERIVED = {"observe", "sample", "fit", "plan", "crossview", "same_size", "paper
 _OF_PLAN = {"compose", "evaluate", "report"}
 _ORDER = (
     "adopt", "poses", "scene", "segment", "masks", "photo_instances", "lift", "blocks", "train", "clean",
-    "fuse", "instances", "block_categories", "base", "nest", "observe", "sample", "fit", "plan", "compose",
+    "fuse", "block_categories", "instances", "base", "nest", "observe", "sample", "fit", "plan", "compose",
     "evaluate", "report", "crossview", "same_size", "paper",
 )  # fmt: skip
 

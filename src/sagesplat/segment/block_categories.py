@@ -39,6 +39,10 @@ class BlockCategories:
         """Blocks of per-block ids."""
         return (part_ids // len(self.categories)).astype(np.int16)
 
+    def category_ids(self, part_ids: np.ndarray) -> np.ndarray:
+        """Category ids (int16) of per-block ids."""
+        return self.categories[part_ids % len(self.categories)]
+
     @property
     def names(self) -> Taxonomy:
         """The per-block categories as a taxonomy."""
@@ -46,8 +50,13 @@ class BlockCategories:
         for block in range(self.blocks):
             for column, label in enumerate(self.categories.tolist()):
                 part = block * len(self.categories) + column
-                found[part] = f"{self.taxonomy.name(label)}{_MARK}{block}"
+                found[part] = per_block_name(self.taxonomy.name(label), block)
         return Taxonomy(found)
+
+
+def per_block_name(category: str, block: int | None) -> str:
+    """The name of a (block, category) pair; block None: the category's own."""
+    return category if block is None else f"{category}{_MARK}{block}"
 
 
 def category_of(name: str) -> str:

@@ -23,10 +23,10 @@ def title_of(name: str) -> str:
 
 
 def meant(typed: str, names: Collection[str]) -> str:
-    """The name that was typed: it itself, or the only one whose title it is; else what was typed."""
+    """The name that was typed: it itself, or the only one that people see so; else what was typed."""
     if typed in names:
         return typed
-    found = [name for name in names if title_of(name) == typed]
+    found = [name for name in names if _short(name) == typed]
     return found[0] if len(found) == 1 else typed
 
 

@@ -51,10 +51,11 @@ class Edited:
 
 def parse_keep(text: str) -> tuple[str, ...]:
     """The categories in "grass-merged,tree-merged"; LabelError for what is no name."""
-    return _parse_names(text, "keep")
+    return parse_names(text, "keep")
 
 
-def _parse_names(text: str, option: str) -> tuple[str, ...]:
+def parse_names(text: str, option: str) -> tuple[str, ...]:
+    """The categories in "chair 1,vase", which `option` was given; LabelError for what is no name."""
     names = tuple(name.strip() for name in text.split(",")) if text.strip() else ()
     if "" in names:
         raise LabelError(f"{option} {short(repr(text))}: a name is empty; write NAME,NAME")
@@ -63,7 +64,7 @@ def _parse_names(text: str, option: str) -> tuple[str, ...]:
 
 def parse_ignore(text: str) -> tuple[str, ...]:
     """The categories in "person,car"; LabelError for what is no name."""
-    return _parse_names(text, "ignore")
+    return parse_names(text, "ignore")
 
 
 def parse_merge(text: str) -> dict[str, str]:

@@ -42,7 +42,7 @@ from sagesplat.scene.scene import Scene
 from sagesplat.scene.stored import write_scene
 from sagesplat.segment.block_categories import BlockCategories
 from sagesplat.segment.lift import LiftedLabels
-from sagesplat.segment.masks import mask_path, prepare_folder, write_labels, write_mask
+from sagesplat.segment.masks import Taxonomy, mask_path, prepare_folder, write_labels, write_mask
 from sagesplat.stages.nest import nest_levels, write_ladder
 from sagesplat.stages.shared import label_image_inputs, train_config
 from sagesplat.stages.train import read_frozen, train_inputs, train_levels, write_frozen
@@ -142,7 +142,11 @@ def _share_masks(job: Job, block: Job) -> None:
     Links of what the run has no more are removed: the block would take fused label images that were deleted.
     """
     of, run = job.run, block.run
-    for stage, source, target in (("masks", of.masks, run.masks), ("fuse", of.fused, run.fused)):
+    for stage, source, target in (
+        ("masks", of.masks, run.masks),
+        ("fuse", of.fused, run.fused),
+        ("instances", of.instances, run.instances),
+    ):
         shutil.rmtree(target, ignore_errors=True)
         run.provenance(stage).unlink(missing_ok=True)
         if not (source / "labels.json").exists() or not of.provenance(stage).exists():
@@ -237,7 +241,7 @@ def label_block_categories(job: Job) -> None:
     A pixel keeps its category and gets the block whose Gaussians contribute most to it.
     """
     run = job.run
-    blocks, masks = read_blocks(run.blocks / "blocks.json"), job.whole_masks
+    blocks, masks = read_blocks(run.blocks / "blocks.json"), job.category_masks
     parts = BlockCategories(masks.taxonomy, len(blocks))
 
     def make() -> list[str]:
@@ -257,7 +261,7 @@ def label_block_categories(job: Job) -> None:
             job.emit(Progress("block_categories", row + 1, len(scene.views)))
         lifted = LiftedLabels.read(run.labels, len(scene.points.xyz))
         ids = parts.ids(lifted.label_ids, blocks.of(scene.points.xyz))
-        replace(lifted, label_ids=ids).write(run.block_category_labels)
+        replace(lifted, label_ids=ids).write(run.block_categories / "labels.npz")
         write_labels(run.block_categories, names, occurring | set(np.unique(ids).tolist()))
         return [
             f"{len(occurring)} per-block categories of {len(masks.taxonomy.names)} in {len(blocks)} blocks"
@@ -267,7 +271,7 @@ def label_block_categories(job: Job) -> None:
     inputs = [run.scene, run.labels, run.levels, run.blocks / "blocks.json", run.masks / "labels.json", *made]
     if masks.folder == run.fused:
         inputs.append(run.provenance("fuse"))
-    outputs = [run.block_categories / "labels.json", run.block_category_labels]
+    outputs = [run.block_categories / "labels.json", run.block_categories / "labels.npz"]
     run_stage(job, "block_categories", {}, inputs, outputs, make)
 
 
@@ -306,11 +310,12 @@ def nest_block(
     """Make the nested levels of one block, and its interior: the Gaussians inside the block's border."""
     job = spec.open(named(emit, f"block {number}"))
     run = job.run
+    labels = (run.instances if job.has_instances else run.masks) / "labels.json"
     nest_levels(job, config, seed)
 
     def make() -> list[str]:
         blocks = read_blocks(partition)
-        parts = BlockCategories(job.masks.taxonomy, len(blocks))
+        parts = BlockCategories(Taxonomy.read(labels), len(blocks))
         full = read_prefixes(run.prefixes)
         g, inside = interior(full.gaussians, blocks, parts, number)
         if not len(g):
@@ -320,7 +325,7 @@ def nest_block(
         write_set(run.interior, g, config.steps, sizes, second=second)
         return [f"{len(g):,} of {len(full.gaussians):,} Gaussians are inside the block"]
 
-    inputs = [run.prefixes, run.masks / "labels.json", partition]
+    inputs = [run.prefixes, labels, partition]
     run_stage(job, "interior", {}, inputs, [run.interior], make)
 
 

@@ -198,6 +198,7 @@ def live_bundle(job: Job, folder: Path, viewer: Path | None = None) -> bool:
     still be loading are kept until two newer levels are written. RunError if there is no level yet, or where
     another process writes there for seconds.
     """
+    job = replace(job, run=replace(job.run, ladder="snapshots"))  # what training writes knows no instances
     with alone(folder, _OTHERS):
         return _live_bundle(job, folder, viewer or package_viewer())
 

@@ -19,7 +19,9 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.run.job import Job
 from sagesplat.run.records import file_hash
 from sagesplat.run.stage import run_stage
+from sagesplat.scene.blocks import read_blocks
 from sagesplat.scene.scene import View
+from sagesplat.segment.block_categories import BlockCategories
 from sagesplat.segment.display_names import title_of
 from sagesplat.segment.edit import apply, edit_table
 from sagesplat.segment.instances import (
@@ -30,7 +32,7 @@ from sagesplat.segment.instances import (
     read_instances,
     wanted_ids,
 )
-from sagesplat.segment.lift import lift
+from sagesplat.segment.lift import LiftedLabels, lift
 from sagesplat.segment.masks import Masks, Taxonomy, prepare_folder, write_mask
 from sagesplat.segment.parents import write_parents
 from sagesplat.stages.label import later_merges, segmenter_kind
@@ -49,6 +51,7 @@ def find_photo_instances(job: Job, masks: MasksConfig, labels: LabelsConfig) -> 
                 f"{run.photo_instances}: no instances of any photo; the network has none, or segmented the "
                 "photos without: add --force to segment them again, or leave out --labels.instances"
             )
+        _check_seen(job)
         return
     source = masks.masks or job.scene.path / "masks"
     folders = {
@@ -61,6 +64,18 @@ def find_photo_instances(job: Job, masks: MasksConfig, labels: LabelsConfig) -> 
         return [f"{found} of {len(job.scene.views)} photos have instances"]
 
     run_stage(job, "photo_instances", folders, [run.scene], [run.photo_instances], make)
+    _check_seen(job)
+
+
+def _check_seen(job: Job) -> None:
+    """RunError unless two training photos have instances: one that a single photo shows is none."""
+    views = [job.scene.views[row] for row in job.scene.train_ids.tolist()]
+    seen = sum(instance_path(job.run.photo_instances, view).exists() for view in views)
+    if seen < 2:
+        raise RunError(
+            f"{job.run.photo_instances}: instances of {seen} of {len(views)} training photos; give those of "
+            "two at least that show the same, or leave out --labels.instances"
+        )
 
 
 def make_instances(job: Job, labels: LabelsConfig) -> None:
@@ -68,32 +83,40 @@ def make_instances(job: Job, labels: LabelsConfig) -> None:
     run = job.run
     wanted = parse_instances(labels.instances)
     merge = later_merges(run, labels)
+    outputs = [run.instances / "labels.json", run.instance_labels]
+    stages = ["masks", "train", "fuse"]
     if job.has_blocks:
-        raise RunError(
-            f"{run.blocks}: instances are not told apart in a scene in blocks; leave out --labels.instances"
-        )
+        if not (run.block_categories / "labels.json").exists():
+            raise RunError(f"{run.block_categories}: not there yet; run `sagesplat block-categories`")
+        outputs.append(run.block_instances / "labels.json")
+        stages.append("block_categories")
 
     def make() -> list[str]:
         _remove(job)
         masks = job.category_masks
         ids = wanted_ids(masks.taxonomy.names, wanted)
         g = job.snapshots.load(job.snapshots.levels[-1])
+        if job.has_blocks:
+            g = replace(g, label_ids=torch.from_numpy(_parts(job, masks).category_ids(g.label_ids.numpy())))
         found = _find(job, g, masks, ids)
         taxonomy, table = edit_table(found.taxonomy, merge=merge)
         parents = {int(table[i]): p for i, p in found.parents.items() if table[i] not in masks.taxonomy.names}
         _draw(job, replace(g, label_ids=torch.from_numpy(found.label_ids)), masks, found, table, taxonomy)
         lifted = lift(job.scene, Masks(run.instances, taxonomy), views=set(job.scene.train_ids.tolist()))
-        before = job.initial_labels
-        lifted = replace(lifted, label_ids=_within(lifted.label_ids, before, parents))
+        before = LiftedLabels.read(run.labels, len(job.scene.points.xyz))
+        within = _within(lifted.label_ids, before.label_ids, parents)
+        lifted = replace(lifted, label_ids=within, ignored=before.ignored)
         lifted.write(run.instance_labels)
+        if job.has_blocks:
+            _split_by_block(job, masks, Masks(run.instances, taxonomy), lifted)
         write_parents(run.parents, {taxonomy.names[i]: taxonomy.names[p] for i, p in parents.items()})
         taxonomy.write(run.instances / "labels.json")
         return [_line(apply(found.label_ids, table), taxonomy, parents)]
 
     settings = {"instances": ",".join(wanted), "merge": ",".join(f"{a}={b}" for a, b in merge.items())}
-    made = [run.provenance(stage) for stage in ("masks", "train", "fuse") if run.provenance(stage).exists()]
+    made = [run.provenance(stage) for stage in stages if run.provenance(stage).exists()]
     inputs = [*run.scene_files, run.masks / "labels.json", run.levels, run.photo_instances, *made]
-    run_stage(job, "instances", settings, inputs, [run.instances / "labels.json", run.instance_labels], make)
+    run_stage(job, "instances", settings, inputs, outputs, make)
 
 
 def fold_back(job: Job) -> None:
@@ -112,7 +135,8 @@ def _remove(job: Job) -> None:
     run = job.run
     run.provenance("instances").unlink(missing_ok=True)
     run.parents.unlink(missing_ok=True)
-    shutil.rmtree(run.instances, ignore_errors=True)
+    for folder in (run.instances, run.block_instances):
+        shutil.rmtree(folder, ignore_errors=True)
     job.__dict__.pop("parents", None)
 
 
@@ -132,9 +156,12 @@ def _find(job: Job, g: Gaussians, masks: Masks, ids: list[int]) -> Instances:
     found = label(g, sightings, masks.taxonomy)
     for category, count in found.alone.items():
         name = title_of(masks.taxonomy.name(category))
-        job.emit(
-            Warned(f"{count} instances of {name} in single photos are left to {name}: no other view agrees")
+        what = (
+            f"1 instance of {name} in a single photo is"
+            if count == 1
+            else (f"{count} instances of {name} in single photos are")
         )
+        job.emit(Warned(f"{what} left to {name}: no other view agrees"))
     missing = sorted(set(ids) - set(found.parents.values()))
     if not found.parents:
         names = ", ".join(title_of(masks.taxonomy.name(i)) for i in ids)
@@ -172,6 +199,27 @@ def _draw(
             after = np.where(hidden & (of[behind + 1] == shown), behind, after)
         write_mask(path, apply(after, table), taxonomy)
         job.emit(Progress("instances", done + row + 1, done + len(views)))
+
+
+def _parts(job: Job, masks: Masks) -> BlockCategories:
+    """The (block, category) pairs of the categories of `masks`."""
+    return BlockCategories(masks.taxonomy, len(read_blocks(job.run.blocks / "blocks.json")))
+
+
+def _split_by_block(job: Job, before: Masks, instances: Masks, points: LiftedLabels) -> None:
+    """Write label images and point labels of (block, instance) pairs.
+
+    A pixel is of the block that its (block, category) pair is of: instances move no border of blocks.
+    """
+    run, parts, of_categories = job.run, _parts(job, instances), _parts(job, before)
+    by_block = Masks(run.block_categories, of_categories.names)
+    views = job.scene.views
+    for view, path in zip(views, prepare_folder(run.block_instances, views), strict=True):
+        write_mask(path, parts.ids(instances[view], of_categories.block_of(by_block[view])), parts.names)
+    block = read_blocks(run.blocks / "blocks.json").of(job.scene.points.xyz)
+    labels = replace(points, label_ids=parts.ids(points.label_ids, block))
+    labels.write(run.block_instances / "labels.npz")
+    parts.names.write(run.block_instances / "labels.json")
 
 
 def _within(label_ids: np.ndarray, before: np.ndarray, parents: Mapping[int, int]) -> np.ndarray:

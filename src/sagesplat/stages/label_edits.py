@@ -119,6 +119,12 @@ def _checked(job: Job, edits: LabelEdits, path: Path) -> Relabelled:
         )  # fmt: skip
     except LabelError as error:
         raise LabelError(f"{path}: {error}") from None
+    shown = {name for label, name in job.taxonomy.names.items() if label not in counts}
+    if taken := sorted(shown & set(made.names.values())):
+        raise LabelError(
+            f"{path}: the name {taken[0]!r} is that of a category that label images show, without Gaussians; "
+            "choose another"
+        )
     if job.has_block_categories and (made.changed or made.names != {i: names[i] for i in counts}):
         raise RunError(
             f"{job.run.path}: a scene in blocks; its categories can be hidden, weighed and kept in full, but "
@@ -153,7 +159,11 @@ def _begin(job: Job, fresh: Path, edits: LabelEdits, made: Relabelled) -> Job:
         new.provenance(stage).unlink(missing_ok=True)
     if job.has_instances:
         _keep_instances_alone(job.run, new)
-    write_parents(new.parents, made.parents(job.parents, job.names()))
+    if job.has_block_categories:  # they keep their names
+        shutil.copytree(job.run.block_labels, new.block_categories)
+        write_parents(new.parents, job.parents)
+    else:
+        write_parents(new.parents, made.parents(job.parents, job.names()))
     settings = LabelSettings(made.weights, made.hidden, made.always)
     write_edited(new, job.run.path.name, loads_json(dump_edits(edits)), settings)
     return Job(

@@ -98,9 +98,9 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
         fuse_masks(job)
     elif job.run.fused.exists():
         raise RunError(f"{job.run.fused}: label images were fused; add --fuse, or delete that folder")
-    instances(job, config.labels, config.masks)
     if job.has_blocks:
         blocks.label_block_categories(job)
+    instances(job, config.labels, config.masks)
     if job.run.ladder == "nested":
         if not job.has_blocks:
             clean(job, config.clean)
@@ -192,10 +192,6 @@ def check_instances(config: RunConfig) -> None:
         return
     if config.ladder == "snapshots":
         raise RunError("--labels.instances: snapshots have no instances; use --ladder nested")
-    if config.blocks.count > 1:
-        raise RunError(
-            "--labels.instances: instances are not told apart in a scene in blocks; leave out one of both"
-        )
 
 
 def clean(job: Job, config: CleanConfig) -> None:

@@ -142,18 +142,28 @@ def prompt_lines(
         for pair, area in known.shared.items():
             shared[pair] = shared.get(pair, 0.0) + area
     names = [name for label_id, name in taxonomy.names.items() if label_id in occurring]
-    missing = [
-        f"prompt {name!r}: found in no photo; its best score is {score:.2f} and {threshold:g} is needed: "
-        "describe it in other words, or lower --prompt-threshold"
-        for name, score in best.items()
-        if name not in names
-    ]
+    missing = [_missing(name, score, threshold) for name, score in best.items() if name not in names]
     if missing and not names:
         raise LabelError(f"{folder}: {'; '.join(missing)}")
     for line in (*missing, *_synonyms(shared)):
         warn(line)
     listed = ", ".join(f"{name} {score:.2f}" for name, score in best.items())
     return [f"best scores: {listed}"] if best else []
+
+
+def _missing(name: str, score: float, threshold: float) -> str:
+    """Why no pixel has a prompt's label: its best score is too low, or other prompts have them all."""
+    if score >= threshold:
+        return (
+            f"prompt {name!r}: found with a score of up to {score:.2f}, but other prompts have a larger "
+            "probability at all its pixels: describe it in other words, or leave one of them"
+        )
+    digits = (f"{score:.{n}f}" for n in (2, 3, 4))  # as many as show that it is below
+    shown = next((text for text in digits if float(text) < threshold), f"{score}")
+    return (
+        f"prompt {name!r}: found in no photo; its best score is {shown} and {threshold:g} is needed: "
+        "describe it in other words, or lower --prompt-threshold"
+    )
 
 
 def _synonyms(shared: Mapping[str, float]) -> Iterator[str]:

@@ -147,7 +147,7 @@ def stage_records(run: RunDir) -> list[Path]:
 
 def _parts(run: RunDir, names: dict[int, str]) -> dict[int, int]:
     """Of a scene in blocks: the label of each per-block category's category; else nothing."""
-    if not (run.block_categories / "labels.json").exists():
+    if not (run.block_labels / "labels.json").exists():
         return {}
     of = {label: category_of(name) for label, name in sorted(names.items())}
     stands: dict[str, int] = {}

@@ -26,7 +26,6 @@ from sagesplat.segment.block_categories import split_name
 from sagesplat.segment.display_colors import colors_of, rgb_of
 from sagesplat.segment.display_names import meant
 from sagesplat.segment.masks import UNLABELLED
-from sagesplat.segment.parents import with_instances
 from sagesplat.stages.results import observations_of
 
 
@@ -88,15 +87,17 @@ def _show(job: Job, table: Table) -> None:
 
 
 def labels_named(job: Job, names: Sequence[str]) -> list[int]:
-    """The ids of categories and instances, those of a category with all its instances.
+    """The ids of categories and instances, those of a category with all its instances and blocks.
 
     Names are those of the run, or as people are shown them (grass for grass-merged). RunError for a name that
     the run does not have.
     """
-    known, found = job.names(), list[int]()
-    all_names = {*known.values(), *job.parents.values()}
+    known, found, parents = job.names(), list[int](), job.parents
+    of = {label: category_and_block(job, name)[0] for label, name in known.items()}  # known without blocks
+    all_names = {*known.values(), *of.values(), *parents.values()}
     for name in names:
-        ids = with_instances(known, job.parents, meant(composed(name), all_names))
+        wanted = meant(composed(name), all_names)
+        ids = [label for label, one in known.items() if wanted in (one, of[label], parents.get(of[label]))]
         if not ids:
             raise RunError(f"{job.run.path}: no category {name!r}; there are {', '.join(known.values())}")
         found += [i for i in ids if i not in found]

@@ -24,8 +24,10 @@ PhotoInstances = Callable[[View], Int16[np.ndarray, "H W"] | None]
 
 LEAST_WEIGHT = 0.02  # pixels of a view that have to show a Gaussian
 LEAST_PIXELS = 16  # of a 2D instance
-LEAST_SHARE = 0.1  # of what views see of a Gaussian's category: what has to be in its instance
+LEAST_SHARE = 0.3  # of what views that show an object see of a Gaussian's category: what has to be in it
+_COLUMNS = 2  # of each view that count: at a border a Gaussian paints both sides of it
 _ROUNDS, _REACH = 8, 3.0  # of spreading to neighbours; times their median distance
+_NEIGHBOURS = 8  # most of which decide what views leave open
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,11 +56,11 @@ def gather(
 
     An instance belongs to the category that `masks` shows on most of it, and has no pixels elsewhere; those
     of other categories than `wanted`, and those of less than 16 pixels, are none. Pixels that are not
-    `valid` count nowhere. Memory: 6 bytes per Gaussian and view.
+    `valid` count nowhere. Memory: 12 bytes per Gaussian and view.
     """
     ids = np.array([UNLABELLED, *sorted(masks.taxonomy.names)], np.int16)
-    columns = np.full((len(gaussians), len(views)), -1, np.int16)
-    weights = np.zeros((len(gaussians), len(views)), np.float32)
+    columns = np.full((len(gaussians), len(views), _COLUMNS), -1, np.int16)
+    weights = np.zeros(columns.shape, np.float32)
     categories, starts, workspace = list[int](), [0], Workspace()
     for done, row in enumerate(views):
         view = scene.views[row]
@@ -67,11 +69,14 @@ def gather(
             pixels[~counts] = -1
         sums = np.zeros((len(gaussians), len(ids) + len(own)), np.float32)
         add_weights(gaussians, view.camera, pixels, sums, antialiased=antialiased, workspace=workspace)
-        best = sums.argmax(1)
-        weights[:, done] = np.take_along_axis(sums, best[:, None], 1)[:, 0]
-        seen = weights[:, done] >= LEAST_WEIGHT
-        columns[seen, done] = best[seen]
-        weights[~seen, done] = 0
+        seen = np.flatnonzero(sums.max(1) >= LEAST_WEIGHT)
+        sums = sums[seen]
+        for k in range(_COLUMNS):
+            best = sums.argmax(1)[:, None]
+            most = np.take_along_axis(sums, best, 1)
+            columns[seen, done, k] = np.where(most > 0, best, -1)[:, 0]
+            weights[seen, done, k] = most[:, 0]
+            np.put_along_axis(sums, best, 0, 1)
         categories += own
         starts.append(len(categories))
         if on_view:
@@ -106,9 +111,11 @@ def label(
 ) -> Instances:
     """Join the 2D instances, and give each Gaussian the 3D instance that views see it in.
 
-    A Gaussian has the category of its largest weight, or its own where no view sees it. It has an instance of
-    that category if at least a tenth of the category's weight is in it. Gaussians that no view sees get the
-    instance of their neighbours. Instances are numbered by their weight, the largest first: "chair 1".
+    A Gaussian has the category of its largest weight, or its own where no view sees it. It has the instance
+    of largest weight in that category, if that is at least 0.3 of the category's weight in views that show
+    the instance: a view that lost its mask has no say. Gaussians that no view sees get the instance of their
+    neighbours, and those without one that of most of their eight nearest in the category. Instances are
+    numbered by their weight, the largest first: "chair 1".
 
     Args:
         gaussians: The model, with categories as `label_ids`.
@@ -123,9 +130,11 @@ def label(
     ids = np.array([UNLABELLED, *sorted(taxonomy.names)], np.int16)
     of_object = np.full(int(objects.max(initial=-1)) + 1, -1, np.int64)  # category column
     of_object[objects[objects >= 0]] = sightings.categories[objects >= 0]
+    shows = np.zeros((len(sightings.starts) - 1, len(of_object)), bool)  # which objects each view shows
+    shows[sightings.views[objects >= 0], objects[objects >= 0]] = True
     best, category, size = _vote(
         sightings.columns, sightings.weights, len(ids), sightings.starts, sightings.categories, objects,
-        of_object, LEAST_SHARE,
+        of_object, shows, LEAST_SHARE,
     )  # fmt: skip
     own = np.searchsorted(ids, gaussians.label_ids.numpy())
     unseen = category < 0
@@ -133,6 +142,7 @@ def label(
     places = gaussians.means.detach().cpu().numpy()
     for column in np.unique(of_object):
         _spread(places, best, category == column, unseen)
+        _fill(places, best, category == column)
     new_ids, names, parents = _named(of_object, size, ids, taxonomy)
     label_ids = np.where(best >= 0, new_ids[best], ids[category]) if len(of_object) else ids[category]
     alone = ids[sightings.categories[objects < 0]]
@@ -141,24 +151,29 @@ def label(
 
 
 @njit(parallel=True, cache=True)
-def _vote(columns, weights, num_ids, starts, categories, objects, of_object, least):  # type: ignore[no-untyped-def]
+def _vote(columns, weights, num_ids, starts, categories, objects, of_object, shows, least):  # type: ignore[no-untyped-def]
     """Object (-1: none) and category column (-1: unseen) of each Gaussian, and the weight of each object."""
-    n, num_views = columns.shape
+    n, num_views, num_columns = columns.shape
     best, category = np.full(n, -1, np.int32), np.full(n, -1, np.int64)
     won = np.zeros(n, np.float32)
     for g in prange(n):
         by_category = np.zeros(num_ids, np.float32)
         by_object = np.zeros(len(of_object), np.float32)
+        possible = np.zeros(len(of_object), np.float32)  # its category's weight in views that show the object
         for v in range(num_views):
-            column = columns[g, v]
-            if column < 0:
-                continue
-            if column >= num_ids:
-                instance = starts[v] + column - num_ids
-                column = categories[instance]
-                if objects[instance] >= 0:
-                    by_object[objects[instance]] += weights[g, v]
-            by_category[column] += weights[g, v]
+            for i in range(num_columns):
+                column, weight = columns[g, v, i], weights[g, v, i]
+                if column < 0:
+                    break
+                if column >= num_ids:
+                    instance = starts[v] + column - num_ids
+                    column = categories[instance]
+                    if objects[instance] >= 0:
+                        by_object[objects[instance]] += weight
+                by_category[column] += weight
+                for k in range(len(of_object)):
+                    if shows[v, k] and of_object[k] == column:
+                        possible[k] += weight
         most = np.argmax(by_category)
         if by_category[most] <= 0:
             continue
@@ -166,7 +181,7 @@ def _vote(columns, weights, num_ids, starts, categories, objects, of_object, lea
         for k in range(len(of_object)):
             if of_object[k] == most and by_object[k] > won[g]:
                 won[g], best[g] = by_object[k], k
-        if won[g] < least * by_category[most]:
+        if best[g] >= 0 and won[g] < least * possible[best[g]]:
             best[g], won[g] = -1, 0
     size = np.zeros(len(of_object))
     for g in range(n):
@@ -197,6 +212,20 @@ def _spread(
         known, todo = np.concatenate([known, todo[close]]), todo[~close]
         if not len(todo):
             return
+
+
+def _fill(
+    places: Float32[np.ndarray, "N 3"], best: Int32[np.ndarray, " N"], mine: Bool[np.ndarray, " N"]
+) -> None:
+    """Give Gaussians of a category without an object that of most of their nearest neighbours in it."""
+    rows, open_ = np.flatnonzero(mine), np.flatnonzero(mine & (best < 0))
+    if len(rows) <= _NEIGHBOURS or not len(open_):
+        return
+    near = np.asarray(KDTree(places[rows]).query(places[open_], _NEIGHBOURS + 1)[1])[:, 1:]
+    of_near = np.sort(best[rows[near]], axis=1)
+    middle = of_near[:, _NEIGHBOURS // 2]  # what most have is in the middle
+    most = (of_near == middle[:, None]).sum(1) > _NEIGHBOURS / 2
+    best[open_[most]] = middle[most]
 
 
 def _named(

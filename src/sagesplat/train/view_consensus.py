@@ -32,14 +32,14 @@ class ConsensusOptions:
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
-    """How V views see N Gaussians: each view by the one column that shows most of the Gaussian.
+    """How V views see N Gaussians: each view by the B columns that show most of the Gaussian.
 
     The first columns of every view are the categories, for pixels without an instance; the view's instances
     follow, all instances being numbered view by view.
     """
 
-    columns: Int16[np.ndarray, "N V"]  # -1: the view does not see the Gaussian
-    weights: Float32[np.ndarray, "N V"]  # its blending weight in that column, pixels
+    columns: Int16[np.ndarray, "N V B"]  # the largest first; -1: none further, the view does not see it
+    weights: Float32[np.ndarray, "N V B"]  # its blending weight in that column, pixels
     num_categories: int
     starts: Int64[np.ndarray, " V+1"]  # number of each view's first instance, and of all
     categories: Int16[np.ndarray, " M"]  # category of each instance, as a column
@@ -76,11 +76,11 @@ def join(sightings: Sightings, options: ConsensusOptions | None = None) -> Int32
 
 def _containers(sightings: Sightings, options: ConsensusOptions) -> Int32[np.ndarray, "M V"]:
     """The instance of each view that contains each instance; _SPLIT where several do, _NO_SAY elsewhere."""
-    seen_of = (sightings.columns >= 0).sum(1).clip(1)
-    mass = (sightings.weights.sum(1) / seen_of).astype(np.float32)
+    columns, weights = sightings.columns[..., 0], sightings.weights[..., 0]
+    mass = (weights.sum(1) / (columns >= 0).sum(1).clip(1)).astype(np.float32)
     m, starts = len(sightings.categories), sightings.starts
     shared, seen = np.zeros((m, m), np.float32), np.zeros((m, len(starts) - 1), np.float32)
-    _share(sightings.columns, mass, starts, sightings.num_categories, sightings.categories, shared, seen)
+    _share(columns, mass, starts, sightings.num_categories, sightings.categories, shared, seen)
     whole = seen[np.arange(m), sightings.views] if m else np.zeros(0, np.float32)
     found = np.full(seen.shape, _NO_SAY, np.int32)
     for view, (start, end) in enumerate(pairwise(starts.tolist())):
