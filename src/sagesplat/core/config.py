@@ -151,8 +151,8 @@ class TrainConfig:
     """Sky on a far sphere. auto: Gaussians begin there where photos show a category of that name, and stay on
     it; off: the sky is trained like everything else."""
     means_lr: float = 1.6e-4
-    """Learning rate of the means, times the scene extent; decays exponentially to 1 % (fast schedule: to
-    10 %)."""
+    """Learning rate of the means, times the scene extent; decays exponentially to 1 % (with the fast
+    schedule, in runs of 1000 steps or fewer, to 10 %)."""
     quats_lr: float = 1e-3
     """Learning rate of the quaternions."""
     log_scales_lr: float = 5e-3

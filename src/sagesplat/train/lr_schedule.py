@@ -15,11 +15,13 @@ from sagesplat.core.config import TrainConfig
 from sagesplat.core.gaussians import PARAMETERS
 from sagesplat.scene.scene import Camera
 
-# Of the fast schedule: multiplier of the published learning rates at the start, share of the run from which
-# on those of all but the means shrink, and to how much of what they began with. Harmonics above degree 0 have
-# seen few directions when a short run ends: published, a twentieth of the rate of degree 0; here a tenth.
-_GAIN, _SHRINK_FROM, _SHRINK_TO, _SHN_GAIN = 4.0, 0.3, 0.5, 2.0
-_MEANS_SHRINK_TO = {"published": 0.01, "fast": 0.1}
+# Of the fast schedule: multiplier of the published learning rates at the start, and the share of the run from
+# which on those of all but the means shrink. A run of `_SHORT` steps or fewer has to learn to its end: rates
+# shrink to `_SHORT_SHRINK_TO` (means: their own), in longer runs less and less, down to the other pair. The
+# harmonics above degree 0 begin with up to twice the rate.
+_GAIN, _SHRINK_FROM, _SHORT = 4.0, 0.3, 1000
+_SHRINK_TO, _SHORT_SHRINK_TO = 0.1, 0.5
+_MEANS_SHRINK_TO, _SHORT_MEANS_SHRINK_TO = 0.01, 0.1  # the first of the published schedule too
 _FACTORS = (4, 2)  # how many times smaller photos may be
 _SMALLEST = 200  # pixels of the shorter side: below, the Gaussians cost more than the pixels
 _LEARNT_BY = 0.5  # share of the run after which all photos have full resolution
@@ -37,12 +39,17 @@ class LrSchedule:
         """Adam's learning rate at a step, by parameter name."""
         config, share = self.config, step / self.config.max_steps
         learning_rates = {name: getattr(config, f"{name}_lr") for name in PARAMETERS}
-        learning_rates["means"] *= self.extent * _MEANS_SHRINK_TO[config.lr_schedule] ** share
-        if config.lr_schedule == "fast":
-            gain = _GAIN * _SHRINK_TO ** max(0.0, (share - _SHRINK_FROM) / (1 - _SHRINK_FROM))
-            gains = dict.fromkeys(PARAMETERS, gain) | {"means": _GAIN, "shN": _SHN_GAIN * gain}
-            learning_rates = {name: rate * gains[name] for name, rate in learning_rates.items()}
-        return learning_rates
+        if config.lr_schedule == "published":
+            learning_rates["means"] *= self.extent * _MEANS_SHRINK_TO**share
+            return learning_rates
+        short = min(1.0, _SHORT / config.max_steps)
+        learning_rates["means"] *= (
+            self.extent * max(_MEANS_SHRINK_TO, short * _SHORT_MEANS_SHRINK_TO) ** share
+        )
+        shrunk = max(0.0, (share - _SHRINK_FROM) / (1 - _SHRINK_FROM))
+        gain = _GAIN * max(_SHRINK_TO, short * _SHORT_SHRINK_TO) ** shrunk
+        gains = dict.fromkeys(PARAMETERS, gain) | {"means": _GAIN, "shN": (1 + short) * gain}
+        return {name: rate * gains[name] for name, rate in learning_rates.items()}
 
     def sgld_noise(self, step: int) -> float:
         """MCMC's noise at a step, in 1 / world units: the published rate of the means times `mcmc_noise`, as
@@ -51,7 +58,7 @@ class LrSchedule:
         return (
             self.config.mcmc_noise
             * self.config.means_lr
-            * _MEANS_SHRINK_TO["published"] ** (step / self.config.max_steps)
+            * _MEANS_SHRINK_TO ** (step / self.config.max_steps)
             / self.extent
         )
 
