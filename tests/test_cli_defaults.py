@@ -1,5 +1,6 @@
 """A run's own settings as defaults, and --force, which keeps earlier results until new ones are whole."""
 
+import importlib.util
 import json
 import shutil
 import sys
@@ -309,6 +310,22 @@ def test_a_missing_network_is_told_before_structure_from_motion(
         assert code == 2
         assert says in said.splitlines()[-1]
         assert not said.strip().count("Traceback")
+
+
+def test_missing_extras_are_told_at_once_and_together(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Call
+) -> None:
+    photos = Path(shutil.copytree(capture / "images", tmp_path / "photos"))
+    found = importlib.util.find_spec
+    absent = {"pycolmap", "transformers"}
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name in absent else found(name))
+    code, said = command("run", photos, tmp_path / "out")
+    assert code == 2
+    assert f"{photos}: poses from photos need pycolmap and label images need transformers; " in said
+    assert said.strip().endswith("install 'sagesplat[poses,hf]'")
+    absent = {"pycolmap"}
+    _, said = command("run", photos, tmp_path / "out", "--masks", capture / "masks")
+    assert said.strip().endswith("install 'sagesplat[poses]'")
 
 
 def test_a_training_that_does_not_fit_is_told_before_label_images(

@@ -34,10 +34,10 @@ class Redo:
     """Earlier results."""
 
     force: bool = False
-    """Redo results that were made with other settings. Says first what is redone and how long it took, and
-    asks on a terminal."""
+    """Replace results that were made with other settings or from other inputs, and what depends on them. Says
+    first what is replaced and how long it took to make, and asks on a terminal. Results that match are kept."""
     yes: bool = False
-    """Do not ask before redoing."""
+    """Do not ask before replacing."""
 
 
 @dataclass(frozen=True)
