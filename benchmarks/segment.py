@@ -75,7 +75,7 @@ def sheet(
     page = Image.new("RGB", (width, bottom + 8 + len(legend) * (TEXT + 10)), "white")
     ink, font = ImageDraw.Draw(page), ImageFont.load_default(TEXT)
     for x, (name, images) in enumerate(columns.items()):
-        ink.text((x * (WIDTH + 4) + 2, 1), _cut(name, font), "black", font)
+        ink.text((x * (WIDTH + 4) + 2, 1), name, "black", _narrow(name))
         for y, (photo, labels) in enumerate(zip(photos, images, strict=True)):
             colours = {int(i): taxonomy.color(int(i)) for i in np.unique(labels) if i >= 0}
             mixed = (1 - blend) * photo + blend * label_image(labels, colours)
@@ -109,11 +109,10 @@ def _legend(
     return rows
 
 
-def _cut(name: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont) -> str:
-    """A name as wide as a picture at most."""
-    while font.getlength(name) > WIDTH:
-        name = f"{name.removesuffix('…')[:-1]}…"
-    return name
+def _narrow(name: str) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    """The largest letters in which a name is no wider than a picture, not below 10 px."""
+    fonts = [ImageFont.load_default(size) for size in range(TEXT, 9, -1)]
+    return next((font for font in fonts if font.getlength(name) <= WIDTH), fonts[-1])
 
 
 def fusion_sheet(job: Job, rows: Sequence[int], blend: float) -> Image.Image:

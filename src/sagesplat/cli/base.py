@@ -103,7 +103,8 @@ def open_job(run: Path, options: Redo | Device, ladder: LadderKind = "nested") -
         if backend == "cuda":
             console.note("computing on the GPU")
         if machine.executor != "local":
-            console.note(f"on a Ray cluster, {executor.parallel} tasks at once")
+            tasks = "1 task" if executor.parallel == 1 else f"{executor.parallel} tasks"
+            console.note(f"on a Ray cluster, {tasks} at once")
         folder = RunDir(run, ladder)
         yield Job(
             folder, console, backend, threads, machine.force, machine.processes, machine.device,
