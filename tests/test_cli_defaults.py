@@ -114,7 +114,7 @@ def test_a_given_target_drops_the_recorded_ones(
     assert asked(both, "--target-fidelity=0.8") == PlanConfig(0.8, None, 0.8, other_targets=(0.5,))
     assert asked(both, "--target-fidelity", "0.8", "--target-ssim", "0.5").target_ssim == 0.5
     assert asked({"target_ssim": 0.4, "other_targets": None}, "--share", "0.7") == PlanConfig(None, 0.4, 0.7)
-    budget = {"target_fidelity": 0.9, "budget": 3e5}
+    budget: dict[str, object] = {"target_fidelity": 0.9, "budget": 3e5}
     assert asked(budget).budget == 3e5
     assert asked(budget, "--target-fidelity", "0.8").budget == 0  # a quality is asked for, no longer a size
     assert asked(budget, "--target-fidelity", "0.8", "--budget", "2e5").budget == 2e5

@@ -3,7 +3,8 @@
     sagesplat bundle runs/demo site
     python tools/moving_picture.py site docs/images/levels.webp
 
-Each frame is the viewer, settled, at one target of fidelity. Needs the extras `dev` and `view`, and Chromium on PATH.
+Each frame is the viewer, settled, at one target of fidelity. Needs the extras `dev` and `view`, and
+Chromium on PATH.
 """
 
 import argparse

@@ -34,8 +34,8 @@ class Redo:
     """Earlier results."""
 
     force: bool = False
-    """Replace results that were made with other settings or from other inputs, and what depends on them. Says
-    first what is replaced and how long it took to make, and asks on a terminal. Results that match are kept."""
+    """Replace results that were made with other settings or inputs, and what depends on them; those that
+    match are kept. Says first what is replaced and how long it took to make, and asks on a terminal."""
     yes: bool = False
     """Do not ask before replacing."""
 
