@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import re
 import shutil
 import sys
 from collections.abc import Callable
@@ -129,7 +130,7 @@ def test_a_refusal_says_what_differs_and_its_cure_works(run: Path, command: Call
     assert code == 0
     assert "--force: " in said
     assert "made with other target_ssim (0.4 then, 0.5 now)" in said
-    assert "plan is redone (it took 0 s)" in said
+    assert re.search(r"plan is redone \(it took \d+ s\)", said)  # a second on a busy machine
     assert "compose, evaluate, report" in said
     assert command("compose", run)[0] == 0  # it follows the plan without --force
     assert command("evaluate", run)[0] == 0
