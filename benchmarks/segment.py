@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Int16, UInt8
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageFont
 
 from benchmarks import deeplab
 from sagesplat.output.figures import label_image
@@ -14,11 +14,15 @@ from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.segment import coco
 from sagesplat.segment.deeplabv2 import DeepLabV2Segmenter, HeadClasses
+from sagesplat.segment.display_names import titles
 from sagesplat.segment.masks import Masks, Taxonomy
 from sagesplat.segment.onnx import OnnxSegmenter
 from sagesplat.segment.segmenters import Segmenter
 
 WIDTH = 200  # px of a picture on the sheet
+TEXT = 16  # px of its letters
+LEAST = 0.003  # of the sheet's pixels that a category needs for the legend
+_MIDDLE = 110  # grey of a photo, with which the legend's colours are mixed as those of the pictures are
 SHARE = 0.01  # of the pixels that a category needs for its IoU to tell something
 
 LabelImage = Int16[np.ndarray, "H W"]
@@ -60,18 +64,55 @@ def sheet(
     taxonomy: Taxonomy,
     blend: float,
 ) -> Image.Image:
-    """One row a view, one column a segmenter, colours over `1 - blend` of the photo, names above."""
+    """One row a view, one column a segmenter, colours over `1 - blend` of the photo, names above.
+
+    Below them a legend of the categories that cover at least `LEAST` of the pictures, the largest first.
+    """
     height = round(WIDTH * photos[0].shape[0] / photos[0].shape[1])
-    page = Image.new("RGB", (len(columns) * (WIDTH + 4) - 4, 18 + len(photos) * (height + 4) - 4), "white")
-    ink = ImageDraw.Draw(page)
+    width, top = len(columns) * (WIDTH + 4) - 4, TEXT + 8
+    bottom = top + len(photos) * (height + 4)
+    legend = _legend(columns, taxonomy, width)
+    page = Image.new("RGB", (width, bottom + 8 + len(legend) * (TEXT + 10)), "white")
+    ink, font = ImageDraw.Draw(page), ImageFont.load_default(TEXT)
     for x, (name, images) in enumerate(columns.items()):
-        ink.text((x * (WIDTH + 4) + 2, 3), name, "black")
+        ink.text((x * (WIDTH + 4) + 2, 1), name, "black", _narrow(name))
         for y, (photo, labels) in enumerate(zip(photos, images, strict=True)):
             colours = {int(i): taxonomy.color(int(i)) for i in np.unique(labels) if i >= 0}
             mixed = (1 - blend) * photo + blend * label_image(labels, colours)
             picture = Image.fromarray(mixed.astype(np.uint8)).resize((WIDTH, height))
-            page.paste(picture, (x * (WIDTH + 4), 18 + y * (height + 4)))
+            page.paste(picture, (x * (WIDTH + 4), top + y * (height + 4)))
+    for row, entries in enumerate(legend):
+        y = bottom + 4 + row * (TEXT + 10)
+        for x, name, colour in entries:
+            shade = tuple(round(blend * part + (1 - blend) * _MIDDLE) for part in colour)
+            ink.rectangle((x, y + 2, x + TEXT, y + 2 + TEXT), fill=shade)
+            ink.text((x + TEXT + 6, y), name, "black", font)
     return page
+
+
+def _legend(
+    columns: Mapping[str, Sequence[LabelImage]], taxonomy: Taxonomy, width: int
+) -> list[list[tuple[int, str, tuple[int, int, int]]]]:
+    """Rows of (x, name, colour) that fit into `width` pixels."""
+    pixels = np.concatenate([labels.ravel() for images in columns.values() for labels in images])
+    ids, counts = np.unique(pixels, return_counts=True)
+    shares = {int(i): n / len(pixels) for i, n in zip(ids, counts, strict=True)}
+    shown = sorted((i for i, share in shares.items() if share >= LEAST), key=lambda i: -shares[i])
+    names = titles({i: taxonomy.name(i) for i in shown})
+    font, rows, x = ImageFont.load_default(TEXT), [[]], 2
+    for i in shown:
+        length = TEXT + 6 + round(font.getlength(names[i]))
+        if rows[-1] and x + length > width:
+            rows, x = [*rows, []], 2
+        rows[-1].append((x, names[i], taxonomy.color(i) if i >= 0 else (128, 128, 128)))
+        x += length + 18
+    return rows
+
+
+def _narrow(name: str) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    """The largest letters in which a name is no wider than a picture, not below 10 px."""
+    fonts = [ImageFont.load_default(size) for size in range(TEXT, 9, -1)]
+    return next((font for font in fonts if font.getlength(name) <= WIDTH), fonts[-1])
 
 
 def fusion_sheet(job: Job, rows: Sequence[int], blend: float) -> Image.Image:

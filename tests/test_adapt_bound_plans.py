@@ -1,6 +1,7 @@
 """Plans for a viewpoint from lower bounds: levels, statuses, the fill; plans within a budget."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -118,6 +119,7 @@ def test_within_a_budget():
     assert plan.transfer_bytes is not None
     assert plan.transfer_bytes <= 60
     assert (plan.status, plan.quality, plan.asked) == ("ok", "fidelity", "budget 60 bytes")
+    assert replace(plan, budget=4e6, unit="gpu-bytes").asked == "budget 4,000,000 bytes of GPU memory"
     assert plan_within(np.array(MEAN), COSTS, 3, "bytes", pixels).status == "over budget"
 
 

@@ -81,6 +81,20 @@ def test_a_run_ends_in_three_lines_with_the_next_command() -> None:
     ]
 
 
+def test_the_next_command_can_be_typed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = tmp_path / "my env" / "bin" / "sagesplat"
+    program.parent.mkdir(parents=True)
+    program.touch(mode=0o755)
+    monkeypatch.setattr("sys.argv", [str(program), "demo"])
+    monkeypatch.setenv("PATH", str(program.parent))  # an active environment
+    done = RunDone(Path("/runs/report/index.html"), Path("runs/demo"))
+    assert printed(done).splitlines()[-1] == "Next:   sagesplat view runs/demo"
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert printed(done).splitlines()[-1] == f"Next:   '{program}' view runs/demo"
+    monkeypatch.chdir(tmp_path)
+    assert printed(done).splitlines()[-1] == "Next:   'my env/bin/sagesplat' view runs/demo"
+
+
 def test_the_bar_shows_names_as_they_are() -> None:
     began, counts = StageStarted("[/red]\x07"), {"[/b]": 3, "\x1b[2J": 4}
     shown = printed(began, Progress("[/red]", 2, 2, "[old] \x1b[31m"), terminal=True)

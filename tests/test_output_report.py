@@ -180,6 +180,17 @@ def test_files_beside_the_page(written):
     assert set(read_evaluation(path.parent / "tables" / "evaluation_rows.csv").view) == set(TEST)
 
 
+def test_each_category_has_a_panel_of_its_ssim_over_levels():
+    data = make(panels=0)
+    figure = figures.ssim_over_levels(
+        data.observations, data.train_views, data.test_views, LABELS, data.names, COLOURS, frozenset()
+    )
+    panels = [axes for axes in figure.axes if axes.lines]
+    assert len(panels) == 1 + len(LABELS)
+    assert all(len(axes.lines) <= 3 for axes in panels)  # training, test, and the whole image to compare with
+    assert len({axes.get_ylim() for axes in panels}) == 1
+
+
 def test_without_test_views_and_pictures(tmp_path):
     data = make(panels=0)
     data = dataclasses.replace(data, test_views=TEST[:0], models={}, timings=())

@@ -128,7 +128,7 @@ def test_everything_as_typed(tmp_path: Path) -> None:
             shutil.copy(checkout / "runs/demo/nested/composed.ply", checkout / "scene.ply")
         done = run(line)
         if done.returncode and words_of(line)[:3] == ["sagesplat", "run", "photos"]:
-            assert "huggingface.co" in done.stderr, done.stderr  # no network: poses are there
+            assert "hf download" in done.stderr, done.stderr  # without a network: what to do is said
             continue
         assert done.returncode == 0, f"{line}\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}"
     (checkout / "snippet.py").write_text(SNIPPET)

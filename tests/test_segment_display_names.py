@@ -3,7 +3,7 @@
 import pytest
 
 from sagesplat.segment.coco import NAMES
-from sagesplat.segment.display_names import meant, title_of, titles
+from sagesplat.segment.display_names import categories, meant, title_of, titles
 
 
 @pytest.mark.parametrize(
@@ -15,6 +15,10 @@ from sagesplat.segment.display_names import meant, title_of, titles
 )  # fmt: skip
 def test_titles(name: str, title: str) -> None:
     assert title_of(name) == title
+
+
+def test_one_category_is_not_plural() -> None:
+    assert (categories(1), categories(8)) == ("1 category", "8 categories")
 
 
 def test_names_that_become_the_same_stay_as_they_are() -> None:

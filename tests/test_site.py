@@ -16,6 +16,7 @@ from urllib.parse import unquote, urlsplit
 import browser as chromium
 import pytest
 from browser import open_page
+from page_checks import wrong_with
 
 import sagesplat
 from benchmarks import doc_tables
@@ -130,31 +131,6 @@ def test_measured_tables_say_when_on_which_commit_and_how():
     assert unsaid == [], "`python -m benchmarks tables` lists them"
 
 
-# contrast of text with the nearest background behind it, by WCAG 2; 4.5 is enough, 3 for large letters
-CONTRAST = """() => {
-  const rgb = (text) => (text.match(/[\\d.]+/g) || []).map(Number);
-  const light = ([r, g, b]) => [r, g, b].map((v) => v / 255)
-    .map((v) => (v <= 0.03928 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4))
-    .reduce((sum, v, i) => sum + v * [0.2126, 0.7152, 0.0722][i], 0);
-  const poor = [];
-  const walker = document.createTreeWalker(document.querySelector("article"), NodeFilter.SHOW_TEXT);
-  while (walker.nextNode()) {
-    const at = walker.currentNode.parentElement;
-    if (!walker.currentNode.data.trim() || at.closest("iframe, .headerlink") || !at.offsetParent) continue;
-    const fill = (element) => rgb(getComputedStyle(element).backgroundColor);
-    let behind = at;
-    while (behind.parentElement && (fill(behind)[3] ?? 1) === 0) behind = behind.parentElement;
-    const pair = [rgb(getComputedStyle(at).color), fill(behind)];
-    const [high, low] = pair.map(light).sort((a, b) => b - a);
-    const ratio = (high + 0.05) / (low + 0.05);
-    const large = parseFloat(getComputedStyle(at).fontSize) >= 24;
-    const words = walker.currentNode.data.trim().slice(0, 30);
-    if (ratio < (large ? 3 : 4.5)) poor.push(`${words}: ${ratio.toFixed(2)}`);
-  }
-  return [...new Set(poor)];
-}"""
-
-
 @pytest.fixture(scope="module")
 def browser(site: Path) -> Iterator["Browser"]:
     if reason := chromium.missing():
@@ -165,14 +141,14 @@ def browser(site: Path) -> Iterator["Browser"]:
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_pages_are_sound_on_a_phone(site, browser, scheme):
-    """From the disk, at 360 px: nothing wider than the screen, no complaint, contrast, pictures described."""
-    for name in ("index", "help/errors", "start/first-scene"):
+    """From the disk, at 360 px: nothing wider than the screen, no complaint, contrast, names, sizes."""
+    for name in ("index", "help/errors", "start/first-scene", "guides/gpu", "labels", "viewer"):
         address = (site / f"{name}.html").as_uri()
         with open_page(address, (360, 740), browser=browser, scheme=scheme) as opened:
             page = opened.page
             assert page.evaluate("document.documentElement.scrollWidth") <= 360, name
             assert page.evaluate("[...document.images].every((image) => image.alt)"), name
-            assert page.evaluate(CONTRAST) == [], name
+            assert wrong_with(page) == [], name
             assert opened.complaints == [], name
 
 

@@ -3,25 +3,27 @@
     sagesplat bundle runs/demo site
     python tools/moving_picture.py site docs/images/levels.webp
 
-Each frame is the viewer, settled, at one target of fidelity. Needs the extra `dev`, and Chromium on PATH.
+Each frame is the viewer, settled, at one target of fidelity. Needs the extras `dev` and `view`, and
+Chromium on PATH.
 """
 
 import argparse
 import io
 import sys
 import threading
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from sagesplat.stages.view import show
 from tests.browser import open_page
 
 TARGETS = (0.3, 0.5, 0.7, 0.8, 0.85, 0.9, 0.93, 0.96, 0.98)
 HOLD, LAST = 650, 1800  # ms that a frame stays; the ends stay longer
+NETWORK = 10.0, 50.0  # Mbit/s, ms: the panel shows what such a visitor loads
+GREETED = "localStorage.setItem('sagesplat-welcome', 'seen')"
 SETTLED = """() => {
   const { labels, pending } = window.sagesplat.state();
   return !pending && labels.every(({ wanted, shown }) => wanted === shown);
@@ -32,13 +34,11 @@ def frames(bundle: Path, size: tuple[int, int]) -> list[Image.Image]:
     """The viewer at each target, low to high."""
     pictures = []
 
-    class Quiet(SimpleHTTPRequestHandler):
-        def log_message(self, format: str, *args: object) -> None:
-            pass
-
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(bundle))) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        with open_page(f"http://127.0.0.1:{server.server_port}/", size) as opened:
+    with show(bundle, print, port=0) as view:  # with ranges: no more is loaded than is shown
+        server = threading.Thread(target=view.run, args=(False,))
+        server.start()
+        begin = f"{view.urls[0]}?target={TARGETS[0]}"
+        with open_page(begin, size, script=GREETED, network=NETWORK) as opened:
             opened.wait_for("window.sagesplat.ready.then(() => true)")
             for target in TARGETS:
                 opened.page.evaluate(
@@ -47,10 +47,12 @@ def frames(bundle: Path, size: tuple[int, int]) -> list[Image.Image]:
                 opened.page.wait_for_timeout(500)  # the plan, then the downloads
                 opened.wait_for(f"({SETTLED})()", seconds=60)
                 opened.page.wait_for_timeout(4000)  # the sort, the numbers, the marks of what changed
+                opened.wait_for("document.body.innerText.includes('idle')", seconds=60)
                 pictures.append(Image.open(io.BytesIO(opened.page.screenshot())).convert("RGB"))
             if opened.complaints:
                 raise SystemExit(f"the page complains: {opened.complaints}")
-        server.shutdown()
+        view.stop()
+        server.join()
     return pictures
 
 

@@ -100,7 +100,7 @@ def installed(quick: bool) -> str:
         photo = "Image.new('RGB', (64, 48)).save(f'photos/{name}.png')"
         run(python, "-c", f"from PIL import Image\nfor name in 'abc': {photo}")
         missing = run(sagesplat, "run", "photos", "out", code=2)
-        assert "install 'sagesplat[hf]'" in missing, missing
+        assert "install 'sagesplat[poses,hf]'" in missing, missing
         if not quick:
             run(sagesplat, "demo")
             assert (folder / "runs/demo/nested/report/index.html").is_file()

@@ -20,6 +20,7 @@ from sagesplat.io.files import read_json, write_json
 Models = Mapping[tuple[int, int], SsimModel]  # by (label id, level)
 Counts = Mapping[tuple[int, int], int]  # Gaussians of each (label id, level)
 
+_UNITS = {"gpu-bytes": "bytes of GPU memory", "count": "Gaussians"}
 _CURE = "delete it and run `sagesplat plan` again"
 STATUSES = (
     "ok",  # the level is predicted, or measured, to reach the target
@@ -121,7 +122,8 @@ class Plan:
     def asked(self) -> str:
         """What it was made for, for people: "fidelity 0.95"."""
         if self.budget is not None:
-            return f"budget {self.budget:,g} {self.unit}"
+            unit = self.unit or "bytes"
+            return f"budget {self.budget:,.0f} {_UNITS.get(unit, unit)}"
         return f"{quality_title(self.quality)} {self.target:g}"
 
     @property

@@ -34,10 +34,10 @@ class Redo:
     """Earlier results."""
 
     force: bool = False
-    """Redo results that were made with other settings. Says first what is redone and how long it took, and
-    asks on a terminal."""
+    """Replace results that were made with other settings or inputs, and what depends on them; those that
+    match are kept. Says first what is replaced and how long it took to make, and asks on a terminal."""
     yes: bool = False
-    """Do not ask before redoing."""
+    """Do not ask before replacing."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,8 @@ def open_job(run: Path, options: Redo | Device, ladder: LadderKind = "nested") -
         if backend == "cuda":
             console.note("computing on the GPU")
         if machine.executor != "local":
-            console.note(f"on a Ray cluster, {executor.parallel} tasks at once")
+            tasks = "1 task" if executor.parallel == 1 else f"{executor.parallel} tasks"
+            console.note(f"on a Ray cluster, {tasks} at once")
         folder = RunDir(run, ladder)
         yield Job(
             folder, console, backend, threads, machine.force, machine.processes, machine.device,

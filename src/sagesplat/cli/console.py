@@ -1,6 +1,7 @@
 """Events as progress bars and tables."""
 
 import shlex
+import shutil
 import sys
 import time
 from pathlib import Path
@@ -178,6 +179,8 @@ class Console:
 
 
 def _program() -> str:
-    """How this program was called, to be typed again."""
-    called = Path(sys.argv[0])
-    return str(called) if called.name == "sagesplat" else "sagesplat"
+    """What to type to call this program again: its name where that finds it, else its path."""
+    called, found = Path(sys.argv[0]), shutil.which("sagesplat")
+    if called.name != "sagesplat" or (found is not None and Path(found).resolve() == called.resolve()):
+        return "sagesplat"
+    return shlex.quote(str(called.relative_to(Path.cwd()) if called.is_relative_to(Path.cwd()) else called))

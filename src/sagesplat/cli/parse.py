@@ -186,10 +186,12 @@ def _recorded(
 
 
 def _forget_targets(known: dict[str, Any], leads: str) -> None:
-    """Drop the recorded targets, as others are given; the other targets too where another quality leads."""
+    """Drop recorded targets and budget when a target is given; others too when another quality leads."""
     if isinstance(plan := known.get("plan"), PlanConfig):
         others = plan.other_targets if plan.quality == leads else None
-        known["plan"] = replace(plan, target_fidelity=None, target_ssim=None, other_targets=others)
+        known["plan"] = replace(
+            plan, target_fidelity=None, target_ssim=None, other_targets=others, budget=0.0
+        )
 
 
 def _now(flag: Flag, known: Mapping[str, Any], default: Any) -> Any:

@@ -152,12 +152,13 @@ def bundle(
         run: run folder, finished with the nested levels
         out: folder to write (new, empty, or an earlier bundle, which is replaced); with --single-file a page
     """
+    from sagesplat.segment.display_names import categories
     from sagesplat.stages.bundle import bundle as write
 
     with open_job(run, machine) as job:
         made = write(job, out, **asdict(config))
     megabytes = f"{made.sizes.chunks / 1e6:.1f} MB of {made.sizes.total / 1e6:.1f} MB"
-    say(f"{out}: {made.labels} categories, {made.chunks} chunks, {made.count:,} Gaussians, {megabytes}")
+    say(f"{out}: {categories(made.labels)}, {made.chunks} chunks, {made.count:,} Gaussians, {megabytes}")
 
 
 @command
@@ -194,11 +195,12 @@ def labels(
         edits: the file that the viewer saved (default: labels.edit.json in the run folder)
         out: new run folder, or an earlier edited one, which is replaced (default: RUN-edited)
     """
+    from sagesplat.segment.display_names import categories
     from sagesplat.stages.label_edits import apply_labels
 
     with open_job(run, machine) as job:
         made = apply_labels(job, edits, out)
-    say(f"{made.path}: {len(made.categories)} categories; `sagesplat view {made.path}` shows them")
+    say(f"{made.path}: {categories(len(made.categories))}; `sagesplat view {made.path}` shows them")
 
 
 @command

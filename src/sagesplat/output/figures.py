@@ -28,6 +28,7 @@ Sizes = Mapping[tuple[int, int], int]  # bytes of each (label id, level)
 RAW = "model size (MB, 248 bytes a Gaussian)"
 
 INK, FAINT, ACCENT = "#1d2530", "#8a94a3", "#c2410c"
+_REFERENCE, _RESET = "#b8c0cb", "#f1e4d3"  # the line to compare with; levels after a reset of opacities
 PAIR = (5.4, 4.9)  # inches, of two figures side by side
 _LONGEST = 28  # characters of a name
 _LONG = 20  # characters of a name, above which a legend has fewer columns
@@ -122,33 +123,47 @@ def ssim_over_levels(
     colours: Colours,
     recovering: frozenset[int],
 ) -> Figure:
-    """Fig. 2: mean SSIM of each label by level, training views solid, test views dashed."""
-    figure = Figure(figsize=(9, 4.6), layout="constrained")
-    axes = figure.subplots()
+    """Fig. 2: mean SSIM over the levels, a panel for the whole image and for each label.
+
+    Training views are solid, test views dashed. Each label's panel has the whole image's line too, in grey.
+    """
     levels = np.unique(observations.level)
-    last = {}
-    for views, line in ((test_views, "--"), (train_views, "-")):
-        rows = observations.select(np.isin(observations.view, views))
-        for label_id in [*labels, TOTAL]:
-            ssim = [view_mean(rows, label_id, level) for level in levels.tolist()]
-            last[label_id] = np.nan_to_num(ssim[-1:], nan=-1.0).sum()
-            colour = INK if label_id == TOTAL else ink(label_id, colours)
-            width = 2.4 if label_id == TOTAL else 1.3
-            axes.plot(levels, ssim, line, color=colour, lw=width, marker=".", ms=5)
+    lines = {
+        (label_id, line): [view_mean(rows, label_id, level) for level in levels.tolist()]
+        for views, line in ((train_views, "-"), (test_views, "--"))
+        for rows in [observations.select(np.isin(observations.view, views))]
+        for label_id in [TOTAL, *labels]
+    }
+    shown = [TOTAL, *labels]
+    columns = min(len(shown), _columns(4, 3, labels, names))
+    count = math.ceil(len(shown) / columns)
+    figure = Figure(figsize=(9.6 * columns / 4, 1.75 * count + 0.7), layout="constrained")
+    grid = figure.subplots(count, columns, squeeze=False, sharex=True, sharey=True).ravel()
     half = np.min(np.diff(levels)) / 2 if len(levels) > 1 else 0.5
-    for level in sorted(recovering & set(levels.tolist())):
-        axes.axvspan(level - half, level + half, color="#f1e4d3", lw=0, zorder=0)
-    axes.set(xlabel="level", ylabel="SSIM")
-    ordered = sorted(
-        labels, key=lambda i: -last[i]
-    )  # the legend from top to bottom, like the ends of the lines
-    handles = [Line2D([], [], color=INK, lw=2.4, label=caption(TOTAL, names))]
-    handles += [Line2D([], [], color=ink(i, colours), label=caption(i, names)) for i in ordered]
-    handles += [Line2D([], [], color=FAINT, label="training views")]
-    handles += [Line2D([], [], color=FAINT, ls="--", label="test views (unseen)")]
-    if recovering & set(levels.tolist()):
-        handles += [Patch(color="#f1e4d3", label="recovering from a reset")]
-    figure.legend(handles=handles, loc="outside right upper")
+    reset = sorted(recovering & set(levels.tolist()))
+    for at, (axes, label_id) in enumerate(zip(grid, shown, strict=False)):
+        colour = INK if label_id == TOTAL else ink(label_id, colours)
+        for level in reset:
+            axes.axvspan(level - half, level + half, color=_RESET, lw=0, zorder=0)
+        if label_id != TOTAL:
+            axes.plot(levels, lines[TOTAL, "-"], color=_REFERENCE, lw=1.2)
+        for line in ("--", "-"):
+            axes.plot(levels, lines[label_id, line], line, color=colour, lw=1.5, marker=".", ms=3.5)
+        axes.set_title(caption(label_id, names), color=colour, loc="left", fontweight="bold", fontsize=9)
+        axes.tick_params(labelbottom=at + columns >= len(shown))
+        axes.locator_params(axis="x", nbins=4)
+    for axes in grid[len(shown) :]:
+        axes.set_axis_off()
+    figure.supxlabel("level", fontsize=9)
+    figure.supylabel("SSIM", fontsize=9)
+    handles: list[Line2D | Patch] = [
+        Line2D([], [], color=INK, label="training views"),
+        Line2D([], [], color=INK, ls="--", label="test views (unseen)"),
+        Line2D([], [], color=_REFERENCE, label=f"{caption(TOTAL, names)}, training views"),
+    ]
+    if reset:
+        handles += [Patch(color=_RESET, label="recovering from a reset")]
+    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles))
     return figure
 
 

@@ -22,6 +22,11 @@ def title_of(name: str) -> str:
     return title.replace("-", " ").strip() or name
 
 
+def categories(count: int) -> str:
+    """How many categories: "1 category", "8 categories"."""
+    return f"{count} {'category' if count == 1 else 'categories'}"
+
+
 def meant(typed: str, names: Collection[str]) -> str:
     """The name that was typed: it itself, or the only one that people see so; else what was typed."""
     if typed in names:

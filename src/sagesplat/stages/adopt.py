@@ -29,6 +29,7 @@ from sagesplat.scene import load_scene
 from sagesplat.scene.cameras import NamedCamera, read_camera_file
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage, write_model
 from sagesplat.scene.scene import Camera, View
+from sagesplat.segment.display_names import categories
 from sagesplat.segment.edit import apply, parse_merge
 from sagesplat.segment.lift import LiftedLabels
 from sagesplat.segment.masks import (
@@ -294,7 +295,7 @@ def _label(job: Job, of_file: Path | None, merge: Mapping[str, str]) -> None:
         shutil.rmtree(run.levels, ignore_errors=True)
         run.levels.mkdir()
         write_level(run.levels, _LEVEL, g, recovering=False, sh_degree=g.sh_degree, exact=True)
-        return [f"{len(g):,} Gaussians of {len(g.counts())} categories"]
+        return [f"{len(g):,} Gaussians of {categories(len(g.counts()))}"]
 
     inputs = [run.scene, run.adopted, run.provenance("masks"), run.masks / "labels.json"]
     inputs += [of_file] if of_file and of_file.exists() else []

@@ -60,7 +60,8 @@ def run_scene(
         device: "auto" (a CUDA GPU where there is one that works), "cpu" or "cuda".
         backend: Rasteriser: "auto", "cpu", "cuda" or "reference".
         threads: CPU threads; 0: one per core. Set for the whole process.
-        force: Redo results that were made with other settings.
+        force: Replace results that were made with other settings or from other inputs; those that match are
+            kept.
 
     Returns:
         The finished run.

@@ -22,7 +22,7 @@ from sagesplat.run.remote import work_all
 from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
 from sagesplat.scene.detect import VALID_FOLDER
-from sagesplat.segment.display_names import title_of, titles
+from sagesplat.segment.display_names import categories, title_of, titles
 from sagesplat.segment.edit import (
     Edited,
     edit_labels,
@@ -122,7 +122,7 @@ def _ignored_lines(shares: Float32[np.ndarray, " V"]) -> list[str]:
 
 def _lines(edited: Edited) -> list[str]:
     shown = titles(edited.taxonomy.names)
-    lines = [f"{len(shown)} categories: {', '.join(shown.values())}"]
+    lines = [f"{categories(len(shown))}: {', '.join(shown.values())}"]
     for what, gone in (("left out", edited.dropped), ("too small", edited.folded)):
         named = ", ".join(f"{title_of(name)} ({share:.1%})" for name, share in gone.items() if share)
         if named:

@@ -21,6 +21,7 @@ from sagesplat.run.job import Job
 from sagesplat.run.recorded import recorded_settings
 from sagesplat.run.records import read_record, record
 from sagesplat.run.run_dir import RunDir
+from sagesplat.segment.display_names import categories
 from sagesplat.segment.parents import write_parents
 from sagesplat.segment.relabel import Relabelled, relabelled
 from sagesplat.stages.bundle import BundleMade, bundle
@@ -221,4 +222,4 @@ def _sign(run: RunDir, stage: str, more: Sequence[Path] = ()) -> None:
 
 def _lines(made: Relabelled, rendered: bool) -> tuple[str, ...]:
     how = "rendered again to measure what changed" if rendered else "nothing trained or rendered again"
-    return (f"{len(made.names)} categories, {len(made.changed)} of other Gaussians than before; {how}",)
+    return (f"{categories(len(made.names))}, {len(made.changed)} of other Gaussians than before; {how}",)

@@ -1,11 +1,13 @@
 """What a run needs, checked before anything takes hours."""
 
+import importlib.util
 import shutil
 from pathlib import Path
 
 from sagesplat.core.config import MasksConfig, TrainConfig
-from sagesplat.core.errors import RunError
+from sagesplat.core.errors import BackendUnavailable, RunError
 from sagesplat.core.events import Warned
+from sagesplat.core.extras import install
 from sagesplat.run.executor import Local
 from sagesplat.run.job import Job
 from sagesplat.scene.detect import detect
@@ -16,6 +18,11 @@ from sagesplat.train.strategy import schedule_of
 
 _GIB = 2**30
 _LEVEL_BYTES = 34, 79  # of a Gaussian in a level file, with harmonics of degree 0 and 3
+_NETWORK_PACKAGES = {  # by the kind of segmenter: the package that it needs, and the extra that brings it
+    "hf": ("transformers", "hf"),
+    "text": ("transformers", "hf"),
+    "onnx": ("onnxruntime", "onnx"),
+}
 _STATES = 6  # copies of the Gaussians in the two checkpoints: parameters and two moments each
 
 
@@ -28,11 +35,27 @@ def check_segmenter(job: Job, path: Path, config: MasksConfig) -> None:
     if detect(path) not in ("photos", "video") or job.run.scene.exists():
         return
     kind = segmenter_kind(job.run.capture / path.resolve().stem, config)
-    if kind == MASKS and not config.prompts:
-        return
-    settings_of(kind, config)
-    if isinstance(job.executor, Local):  # else the nodes load it
+    local = isinstance(job.executor, Local)  # else the nodes load the network
+    given = kind == MASKS and not config.prompts
+    if not given:
+        settings_of(kind, config)
+    _check_packages(path, *((kind, bool(config.prompts)) if local else (MASKS, False)))
+    if local and not given:
         load(kind, config, job.device, job.threads, lambda text: job.emit(Warned(text)))
+
+
+def _check_packages(path: Path, kind: str, prompts: bool) -> None:
+    """BackendUnavailable with all extras that photos or a video miss, so that one command installs them."""
+    needed = [("poses from photos", "pycolmap", "poses")]
+    if detect(path) == "video":
+        needed.append(("frames of a video", "av", "video"))
+    kinds = [kind, "text"] if prompts else [kind]
+    needed += dict.fromkeys(("label images", *_NETWORK_PACKAGES[k]) for k in kinds if k in _NETWORK_PACKAGES)
+    missing = [one for one in needed if importlib.util.find_spec(one[1]) is None]
+    if missing:
+        what = " and ".join(f"{purpose} need {package}" for purpose, package, _ in missing)
+        extras = ",".join(extra for _, _, extra in missing)
+        raise BackendUnavailable(f"{path}: {what}; {install(f'sagesplat[{extras}]')}")
 
 
 def check_training(job: Job, config: TrainConfig) -> None:
