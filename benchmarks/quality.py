@@ -43,5 +43,5 @@ def measure(
 def _train(scene: Path, downscale: int, source: Path, steps: int) -> dict[str, float]:
     command = [sys.executable, str(_PROCESS), str(scene), str(downscale), str(steps)]
     env = os.environ | {"PYTHONPATH": str(source.resolve() / "src"), "OMP_WAIT_POLICY": "PASSIVE"}
-    done = subprocess.run(command, check=True, capture_output=True, text=True, env=env)
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env=env)
     return dict(json.loads(done.stdout.splitlines()[-1]))

@@ -40,7 +40,7 @@ def main() -> None:
         shown = render.rgb.clamp(0, 1).contiguous().numpy()
         photo = photos[row].astype(np.float32) / 255
         qualities.append((psnr(np.square(shown - photo).mean()), ssim_map(shown, photo).mean()))
-    dB, ssim = np.mean(qualities, axis=0)
+    dB, ssim = np.mean(qualities, axis=0).tolist()
     print(json.dumps({"seconds": seconds, "gaussians": len(last.gaussians), "psnr": dB, "ssim": ssim}))
 
 
