@@ -27,7 +27,7 @@ from sagesplat.formats.splats import read_splat
 from sagesplat.stages.export import export_increments, export_scene
 
 CONFIG = RunConfig(
-    train=TrainConfig(max_steps=60, level_every=20),
+    train=TrainConfig(max_steps=120, level_every=40),
     nest=NestConfig(steps=20, levels=4, base_steps=20),
     sample=SampleConfig(views=8, calibration_views=8),
     plan=PlanConfig(target_ssim=0.4),

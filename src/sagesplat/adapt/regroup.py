@@ -1,7 +1,9 @@
 """Levels and measurements of other categories, made from those of the old ones without rendering.
 
 Level k of a merged category is the union of level k of its parts, and level k of a part is what it has of
-level k: with all categories at the same level the Gaussians are those of before, and so is every image. Means
+level k: with all categories at the same level the Gaussians are those of before, and so is every image (but
+where a part is complete before the last level: a stream gives levels that show the same Gaussians the last
+one's opacities; calibration measures these compositions again). Means
 over the pixels of merged categories are then means, weighted by pixels, of those that are known.
 """
 
