@@ -17,8 +17,7 @@ from sagesplat.scene.scene import Camera
 
 # Of the fast schedule: multiplier of the published learning rates at the start, and the share of the run from
 # which on those of all but the means shrink. A run of `_SHORT` steps or fewer has to learn to its end: rates
-# shrink to `_SHORT_SHRINK_TO` (means: their own), in longer runs less and less, down to the other pair. The
-# harmonics above degree 0 begin with up to twice the rate.
+# shrink to `_SHORT_SHRINK_TO` (means: their own), in longer runs less and less, down to the other pair.
 _GAIN, _SHRINK_FROM, _SHORT = 4.0, 0.3, 1000
 _SHRINK_TO, _SHORT_SHRINK_TO = 0.1, 0.5
 _MEANS_SHRINK_TO, _SHORT_MEANS_SHRINK_TO = 0.01, 0.1  # the first of the published schedule too
@@ -48,8 +47,7 @@ class LrSchedule:
         )
         shrunk = max(0.0, (share - _SHRINK_FROM) / (1 - _SHRINK_FROM))
         gain = _GAIN * max(_SHRINK_TO, short * _SHORT_SHRINK_TO) ** shrunk
-        gains = dict.fromkeys(PARAMETERS, gain) | {"means": _GAIN, "shN": (1 + short) * gain}
-        return {name: rate * gains[name] for name, rate in learning_rates.items()}
+        return {name: rate * (_GAIN if name == "means" else gain) for name, rate in learning_rates.items()}
 
     def sgld_noise(self, step: int) -> float:
         """MCMC's noise at a step, in 1 / world units: the published rate of the means times `mcmc_noise`, as
