@@ -9,7 +9,7 @@ import torch
 from numba.core import config
 
 from sagesplat.kernels import threads
-from sagesplat.kernels.threads import side_by_side
+from sagesplat.kernels.threads import dealt, side_by_side
 from sagesplat.kernels.workspace import Workspace
 from sagesplat.metrics.image import ssim_map
 
@@ -72,3 +72,17 @@ def test_each_thread_has_its_own_workspace():
     other.join()
     assert not np.shares_memory(mine, arrays[0])
     assert np.shares_memory(mine, space.take("a", 3))
+
+
+@pytest.mark.parametrize("count", [1, 2, 15, 16, 17, 31, 368, 1000])
+def test_each_item_is_dealt_once(count: int):
+    assert sorted(dealt(place, count) for place in range(count)) == list(range(count))
+
+
+def test_stretches_of_places_have_items_from_all_over():
+    count, threads = 1000, 4
+    for begin in range(0, count, count // threads):
+        items = np.sort([dealt(place, count) for place in range(begin, begin + count // threads)])
+        assert np.diff(items).max() <= 16
+        assert items[0] < 16
+        assert items[-1] >= count - 16

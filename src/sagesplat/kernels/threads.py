@@ -1,4 +1,6 @@
-"""Independent items side by side, each in a thread whose kernels take its share of the threads.
+"""How work is divided among threads.
+
+Independent items run side by side, each in a thread whose kernels take its share of the threads.
 
 A view's image is small: kernels that divide it among threads wait for each other, and what is between them
 runs on one core. Kernels release the GIL (see `jit`) and a `Workspace` is another in each thread.
@@ -12,8 +14,12 @@ import numba
 import torch
 from numba.np.ufunc import parallel
 
+from sagesplat.kernels.jit import njit
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+
+_COLUMNS = 16  # that items are dealt to, one after another
 
 
 def side_by_side(function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
@@ -48,3 +54,16 @@ def _concurrent() -> bool:
         return parallel.threading_layer() != "workqueue"
     except ValueError:  # no kernel has run
         return False
+
+
+@njit(error_model="numpy", cache=True)
+def dealt(place, count):
+    """The item at a place of a kernel's loop over `count`: each thread's stretch has some from all over.
+
+    Neighbours in the list are neighbours in space, so its stretches differ in how much a view shows of them.
+    """
+    rows, rest = count // _COLUMNS, count % _COLUMNS
+    longer = rest * (rows + 1)  # places of the columns that have one more
+    if place < longer:
+        return place % (rows + 1) * _COLUMNS + place // (rows + 1)
+    return (place - longer) % rows * _COLUMNS + rest + (place - longer) // rows

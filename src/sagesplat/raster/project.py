@@ -27,6 +27,7 @@ from sagesplat.kernels.simd import (
     store,
     where,
 )
+from sagesplat.kernels.threads import dealt
 from sagesplat.raster.blend import RECORD, TILE
 from sagesplat.raster.render import ALPHA_MIN, BLUR, FRUSTUM_MARGIN, NEAR
 from sagesplat.scene.scene import Camera
@@ -267,7 +268,9 @@ def forward(
     a Gaussian is not drawn. Empty: all tiles are active.
     """
     n = len(means)
-    for chunk in prange((n + _CHUNK - 1) // _CHUNK):
+    chunks = (n + _CHUNK - 1) // _CHUNK
+    for place in prange(chunks):
+        chunk = dealt(place, chunks)
         begin, end = chunk * _CHUNK, min((chunk + 1) * _CHUNK, n)
         scratch = np.empty(16 * LANES, np.float32)
         for start in range(begin, end, LANES):
@@ -452,7 +455,9 @@ def backward(
     axes (rotation vector, rad); with no rows it is left out.
     """
     n = len(means)
-    for chunk in prange((n + _CHUNK - 1) // _CHUNK):
+    chunks = (n + _CHUNK - 1) // _CHUNK
+    for place in prange(chunks):
+        chunk = dealt(place, chunks)
         begin, end = chunk * _CHUNK, min((chunk + 1) * _CHUNK, n)
         scratch, weights = np.empty(16 * LANES, np.float32), np.zeros(16 * LANES, np.float32)
         for start in range(begin, end, LANES):

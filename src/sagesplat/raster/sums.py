@@ -5,6 +5,7 @@ from numba import prange
 
 from sagesplat.kernels.jit import njit
 from sagesplat.kernels.simd import double, load8, splat8, store
+from sagesplat.kernels.threads import dealt
 from sagesplat.raster.blend import SUMS, TO_CONIC
 
 _CHUNK = 256  # Gaussians that a thread takes at a time
@@ -36,7 +37,9 @@ def reduce(records, radii, offsets, reached, sums, g_mean2d, g_conic, g_opacity,
     Gaussians of radius 0 are left out.
     """
     n = len(records)
-    for chunk in prange((n + _CHUNK - 1) // _CHUNK):
+    chunks = (n + _CHUNK - 1) // _CHUNK
+    for place in prange(chunks):
+        chunk = dealt(place, chunks)
         added = np.empty(8, np.float64)
         for i in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, n)):
             if offsets[i] == offsets[i + 1] or radii[i] <= 0:

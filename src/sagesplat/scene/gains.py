@@ -10,8 +10,8 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64
-from scipy.sparse import csr_array, diags_array
-from scipy.sparse.linalg import cg
+from scipy.sparse import csr_array
+from scipy.sparse.linalg import LinearOperator, cg
 
 from sagesplat.core.sh import bases
 from sagesplat.scene.exif import exposure_of
@@ -143,6 +143,17 @@ def _relative(logs: Float64[np.ndarray, "V 3"]) -> Float32[np.ndarray, "V 3"]:
     return (gain / gain.mean(0)).astype(np.float32)
 
 
+class _Eliminated(LinearOperator):
+    """diag(diagonal) - table^T diag(1 / per_point) table, not multiplied out."""
+
+    def __init__(self, table: csr_array, per_point: np.ndarray, diagonal: np.ndarray) -> None:
+        super().__init__(np.float64, (len(diagonal), len(diagonal)))
+        self._table, self._per_point, self._diagonal = table, per_point, diagonal
+
+    def _matvec(self, x: np.ndarray) -> np.ndarray:
+        return self._diagonal * x - self._table.T @ (self._table @ x / self._per_point)
+
+
 def log_gains(
     points: Int64[np.ndarray, " T"],
     views: Int64[np.ndarray, " T"],
@@ -154,16 +165,17 @@ def log_gains(
     Geman-McClure weights; the points are eliminated, so that what is solved has a row for each photo.
     """
     num = int(points.max()) + 1
+    order = np.argsort(points, kind="stable")
+    points, views, logs = points[order], views[order], logs[order]
+    begins = np.concatenate([[0], np.cumsum(np.bincount(points))])
     gain, weight = np.zeros(count), np.ones(len(logs))
     for _ in range(_ROUNDS):
-        table = csr_array((weight, (points, views)), shape=(num, count))
-        per_point = np.maximum(np.asarray(table.sum(1)).ravel(), 1e-9)
-        per_view = np.asarray(table.sum(0)).ravel()
-        point_sums, view_sums = (
-            np.bincount(of, weight * logs, n) for of, n in ((points, num), (views, count))
-        )
-        matrix = diags_array(per_view + _PRIOR) - table.T @ diags_array(1 / per_point) @ table
-        gain, _ = cg(matrix, view_sums - table.T @ (point_sums / per_point), x0=gain, rtol=1e-5)
+        table = csr_array((weight, views, begins), shape=(num, count))
+        per_point = np.maximum(np.bincount(points, weight), 1e-9)
+        per_view = np.bincount(views, weight, count)
+        point_sums, view_sums = np.bincount(points, weight * logs), np.bincount(views, weight * logs, count)
+        matrix = _Eliminated(table, per_point, per_view + _PRIOR)
+        gain, _ = cg(matrix, view_sums - table.T @ (point_sums / per_point), x0=gain, rtol=1e-4)
         colour = (point_sums - table @ gain) / per_point
         errors = logs - gain[views] - colour[points]
         scale = 2 * 1.4826 * float(np.median(np.abs(errors))) + 1e-4

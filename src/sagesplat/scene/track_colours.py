@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64, Int64, UInt8
 
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
@@ -25,28 +25,46 @@ class TrackColours:
 
 def track_colours(scene: Scene, photos: Photos | Sequence[np.ndarray], rows: Sequence[int]) -> TrackColours:
     """What some photos (rows of `scene.views`) show of points that are neither dark nor saturated there."""
-    tracks, no = scene.points, np.zeros(0, np.int64)
-    points, views, places, colours = [no], [no], [np.zeros((0, 2))], [np.zeros((0, 3))]
-    order = np.argsort(tracks.track_views, kind="stable")
-    ends = np.searchsorted(tracks.track_views[order], [(row, row + 1) for row in rows]).reshape(-1, 2)
-    for number, (row, (begin, end)) in enumerate(zip(rows, ends.tolist(), strict=True)):
-        if begin == end:
-            continue
-        mine, photo = order[begin:end], photos[row]
-        u, v = np.floor(tracks.track_uv[mine]).astype(np.int64).T
-        inside = (u >= 1) & (v >= 1) & (u < photo.shape[1] - 1) & (v < photo.shape[0] - 1)
-        mine, u, v = mine[inside], u[inside], v[inside]
-        around = [photo[v + i, u + j].astype(np.float64) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-        mean = np.mean(around, 0) if len(mine) else np.zeros((0, 3))
-        fine = ((mean > _DARK) & (mean < _BRIGHT)).all(1)
-        points.append(tracks.track_points[mine[fine]])
-        views.append(np.full(int(fine.sum()), number))
-        places.append(tracks.track_uv[mine[fine]].astype(np.float64))
-        colours.append(mean[fine] / 255)
-    _, point, seen = np.unique(np.concatenate(points), return_inverse=True, return_counts=True)
-    every = max(1, len(point) // (_PLENTY * max(1, len(rows))))
-    shared = (seen[point] > 1) & (point % every == 0) if len(point) else np.zeros(0, bool)
-    _, of = np.unique(point[shared], return_inverse=True)
-    return TrackColours(
-        of, np.concatenate(views)[shared], np.concatenate(places)[shared], np.concatenate(colours)[shared]
-    )
+    tracks = scene.points
+    place = np.full(len(scene.views), -1)
+    place[list(rows)] = np.arange(len(rows))
+    mine = _some(tracks.track_points, np.flatnonzero(place[tracks.track_views] >= 0), len(rows))
+    views = place[tracks.track_views[mine]]
+    order = np.argsort(views, kind="stable")
+    mine, views = mine[order], views[order]
+    u, v = np.floor(tracks.track_uv[mine]).astype(np.int64).T
+    mean, ends = np.zeros((len(mine), 3)), np.searchsorted(views, np.arange(len(rows) + 1))
+    for row, begin, end in zip(rows, ends[:-1].tolist(), ends[1:].tolist(), strict=True):
+        if begin < end:
+            mean[begin:end] = _around(photos[row], u[begin:end], v[begin:end])
+    fine = np.flatnonzero(((mean > _DARK) & (mean < _BRIGHT)).all(1))
+    _, points, seen = np.unique(tracks.track_points[mine[fine]], return_inverse=True, return_counts=True)
+    fine = fine[seen[points] > 1]
+    _, points = np.unique(tracks.track_points[mine[fine]], return_inverse=True)
+    return TrackColours(points, views[fine], tracks.track_uv[mine[fine]].astype(np.float64), mean[fine] / 255)
+
+
+def _some(
+    track_points: Int64[np.ndarray, " T"], candidates: Int64[np.ndarray, " C"], photos: int
+) -> Int64[np.ndarray, " S"]:
+    """Those of some observations whose points have two or more of them, of every so-manieth point."""
+    points = track_points[candidates]
+    every = max(1, len(candidates) // (_PLENTY * max(1, photos)))
+    shared = np.bincount(points) > 1
+    chosen = shared & (np.cumsum(shared) % every == 0)
+    return candidates[chosen[points]]
+
+
+def _around(
+    photo: UInt8[np.ndarray, "H W 3"], u: Int64[np.ndarray, " T"], v: Int64[np.ndarray, " T"]
+) -> Float64[np.ndarray, "T 3"]:
+    """Means of 3 x 3 pixels, of 255; 0 where they are not all in the photo."""
+    height, width = photo.shape[:2]
+    found = np.zeros((len(u), 3))
+    inside = np.flatnonzero((u >= 1) & (v >= 1) & (u < width - 1) & (v < height - 1))
+    u, v, sums = u[inside], v[inside], np.zeros((len(inside), 3), np.int64)
+    for i in (-1, 0, 1):
+        for j in (-1, 0, 1):
+            sums += photo[v + i, u + j]
+    found[inside] = sums / 9
+    return found
