@@ -83,7 +83,7 @@ def fit_process(
     """
     squares = [cdist(x[:, group], x[:, group], "sqeuclidean") for group in GROUPS]
     theta = _hyperparameters(squares, heldout, values)
-    inverse = _inverse(_terms(squares, heldout, theta)[0])
+    inverse, _ = _inverse(_terms(squares, heldout, theta)[0])
     weights = inverse @ values
     amplitudes = np.sqrt(_variances(values, weights))
     own = np.diag(inverse)[:, None]
@@ -111,8 +111,10 @@ def _terms(
     return (1 + scaled_distance) * exp_neg_r + offset + own, [*(s * exp_neg_r for s in scaled), offset, own]
 
 
-def _inverse(S: np.ndarray) -> np.ndarray:
-    return cho_solve(cho_factor(S, lower=True), np.eye(len(S)))
+def _inverse(S: np.ndarray) -> tuple[np.ndarray, float]:
+    """The inverse of S and the log of S's determinant."""
+    factor = cho_factor(S, lower=True)
+    return cho_solve(factor, np.eye(len(S))), 2 * float(np.log(factor[0].diagonal()).sum())
 
 
 def _variances(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -135,10 +137,10 @@ def _cost(
 ) -> tuple[float, np.ndarray]:
     """Negative log of the marginal likelihood, mean over levels, times the prior; and its derivatives."""
     S, slopes = _terms(squares, u, theta)
-    inverse = _inverse(S)
+    inverse, log_determinant = _inverse(S)
     weights = inverse @ values
     variances = _variances(values, weights)
     z = (theta - PRIOR) / PRIOR_WIDTH
-    value = (len(u) * np.log(variances).mean() - np.linalg.slogdet(inverse)[1] + z @ z) / 2
+    value = (len(u) * np.log(variances).mean() + log_determinant + z @ z) / 2
     slope = (inverse - (weights / variances) @ weights.T / len(variances)) / 2
     return value, np.array([(slope * s).sum() for s in slopes]) + z / PRIOR_WIDTH
