@@ -16,15 +16,23 @@ demo: $(INSTALLED)
 # many tests start programs, which would compile all modules anew where this is set
 unexport PYTHONDONTWRITEBYTECODE
 
-# two processes of one thread each: the tests are small, and idle threads would spin in each other's way;
-# a file stays in one process, which makes its fixtures once
-# packages beside Chromium, then types beside the tests, which wait for a fifth of their time
+# Chromium comes while pip works, kernels are compiled beside the types: the two processes of the tests
+# would otherwise compile the same ones at the same time
 test:
-	@$(MAKE) --no-print-directory -j 2 style browser
-	@$(MAKE) --no-print-directory -j 2 suite types
+	@$(MAKE) --no-print-directory -j 2 browser $(INSTALLED)
+	@$(MAKE) --no-print-directory -j 2 kernels types
+	@$(MAKE) --no-print-directory style suite
 	NUMBA_NUM_THREADS=2 $(BIN)/pytest -q -m threads
 
+.PHONY: kernels
+# a run of a few steps: what it needs is compiled and kept
+kernels: $(INSTALLED)
+	rm -rf build/kernels
+	$(BIN)/sagesplat demo build/kernels --train.max-steps 20 --nest.steps 10 --nest.base-steps 10 >/dev/null
+
 .PHONY: suite
+# two processes of one thread each: the tests are small, and idle threads would spin in each other's way;
+# a file stays in one process, which makes its fixtures once
 suite: $(INSTALLED)
 	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m 'not slow and not threads'
 

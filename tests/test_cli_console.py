@@ -45,7 +45,7 @@ def events_of(text: str) -> dict[str, Event]:
         "noted": Noted(text),
         "done": StageDone(text, 1.0, (text, text)),
         "table": TableMade(text, ("category", text), ((text, "1"), ("b", text))),
-        "report": RunDone(Path("/runs") / visible(text).replace("/", "_"), Path("/runs")),
+        "report": RunDone(Path("/runs") / visible(text).replace("/", "_"), ("view", "/runs")),
     }
 
 
@@ -65,14 +65,14 @@ def test_brackets_and_codes_are_kept(kind: str, text: str) -> None:
 
 
 def test_a_path_is_printed_whole() -> None:
-    shown = printed(RunDone(Path("/runs/[old]/caf\udce9/report"), Path("/runs/[/red]")))
+    shown = printed(RunDone(Path("/runs/[old]/caf\udce9/report"), ("view", "/runs/[/red]")))
     assert "/runs/[old]/caf\\xe9/report" in shown
     assert "view '/runs/[/red]'\n" in shown  # as a shell takes it
 
 
 def test_a_run_ends_in_three_lines_with_the_next_command() -> None:
     done = RunDone(
-        Path("/runs/a b/report/index.html"), Path("/runs/a b"), outcome="0.46 MB of 0.91 MB; SSIM 0.8"
+        Path("/runs/a b/report/index.html"), ("view", "/runs/a b"), outcome="0.46 MB of 0.91 MB; SSIM 0.8"
     )
     assert printed(done).splitlines() == [
         "Result: 0.46 MB of 0.91 MB; SSIM 0.8",
@@ -87,7 +87,7 @@ def test_the_next_command_can_be_typed(tmp_path: Path, monkeypatch: pytest.Monke
     program.touch(mode=0o755)
     monkeypatch.setattr("sys.argv", [str(program), "demo"])
     monkeypatch.setenv("PATH", str(program.parent))  # an active environment
-    done = RunDone(Path("/runs/report/index.html"), Path("runs/demo"))
+    done = RunDone(Path("/runs/report/index.html"), ("view", "runs/demo"))
     assert printed(done).splitlines()[-1] == "Next:   sagesplat view runs/demo"
     monkeypatch.setenv("PATH", str(tmp_path))
     assert printed(done).splitlines()[-1] == f"Next:   '{program}' view runs/demo"

@@ -165,7 +165,7 @@ def test_who_waits_for_others_says_so(executor: RayExecutor, tmp_path: Path, mon
         (tmp_path / "go").touch()
 
     assert results(executor, [Task("divide", divide, (2,))], end_others) == [0.5]
-    assert heard == [Warned("divide: waiting for 1 CPUs of the cluster")]
+    assert heard == [Warned("divide: waiting for 1 CPU of the cluster")]
     ray.get(others)
 
 
@@ -175,9 +175,9 @@ def test_what_no_node_has_is_refused(executor: RayExecutor, tmp_path: Path) -> N
         RunError, match=r"divide: no node of the cluster has 64 CPUs \(.*: 1\); use --threads 1$"
     ):
         results(wide, [Task("divide", divide, (1,))], lambda event: None)
-    with pytest.raises(RunError, match=r"has 1 CPUs, 1 GPUs .*; use --device cpu, or add a node with a GPU"):
+    with pytest.raises(RunError, match=r"has 1 CPU, 1 GPU .*; use --device cpu, or add a node with a GPU"):
         results(executor, [Task("divide", divide, (1,), gpus=1)], lambda event: None)
-    with pytest.raises(RunError, match=r"has 1 CPUs, 9313.2 GiB .*; add a larger node"):
+    with pytest.raises(RunError, match=r"has 1 CPU, 9313.2 GiB .*; add a larger node"):
         results(executor, [Task("divide", divide, (1,), memory=10**13)], lambda event: None)
 
 

@@ -119,14 +119,14 @@ class Console:
                     self.say(f"{'':21}{line}")
             case TableMade(title, header, rows):
                 self._show_table(title, header, rows)
-            case RunDone(report, run, noticed, outcome):
+            case RunDone(report, follows, noticed, outcome):
                 if noticed:
                     self.note(f"noticed: {'; '.join(noticed)}")
                 if outcome:
                     self.say(f"Result: {outcome}", style="bold")
                 self.say(f"Report: {report.resolve()}")
-                if run:
-                    self.say(f"Next:   {_program()} view {shlex.quote(str(run))}")
+                if follows:
+                    self.say(f"Next:   {_program()} {shlex.join(follows)}")
 
     def say(self, text: str, style: str = "", mark: tuple[str, str] = ("", "")) -> None:
         """Print a line in a style, after a mark (text, style) of another."""

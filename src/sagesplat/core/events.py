@@ -77,7 +77,7 @@ class RunDone:
     """The run ended, with a report."""
 
     report: Path
-    run: Path | None = None  # run folder, if `sagesplat view` can show it
+    next: tuple[str, ...] = ()  # words of the command that comes next, without the program
     noticed: tuple[str, ...] = ()  # what the run noticed, and dealt with, in words
     outcome: str = ""  # the run in one line: its size and its quality
 

@@ -173,8 +173,8 @@ class RayExecutor:
         return max(1, min(self._threads, int(max(shares, default=1))))
 
     def _asked(self, task: Task) -> str:
-        asked = f"{self._cpus(task.gpus)} CPUs"
-        asked += f", {task.gpus:g} GPUs" if task.gpus else ""
+        counts = {"CPU": self._cpus(task.gpus), "GPU": task.gpus}
+        asked = ", ".join(f"{n:g} {name}{'s' if n > 1 else ''}" for name, n in counts.items() if n)
         return asked + (f", {task.memory / 2**30:.1f} GiB" if task.memory else "")
 
     def _check_possible(self, task: Task) -> None:

@@ -47,8 +47,9 @@ def make_report(job: Job, url: str = "") -> None:
     settings = {"url": url, "links": links(run)}  # the page changes where another one appears
     inputs = [run.observations, run.models, run.plan, run.evaluation, *stage_records(run)]
     run_stage(job, "report", settings, inputs, [run.report / "index.html"], make)
-    view = run.path if method_of(job).streams else None
-    job.emit(RunDone(run.report / "index.html", view, found, _outcome(job)))
+    folder = str(run.path)
+    follows = ("view", folder) if method_of(job).streams else ("export", folder, "scene.spz")
+    job.emit(RunDone(run.report / "index.html", follows, found, _outcome(job)))
 
 
 def _outcome(job: Job) -> str:
