@@ -28,7 +28,8 @@ test:
 # a run of a few steps: what it needs is compiled and kept
 kernels: $(INSTALLED)
 	rm -rf build/kernels
-	$(BIN)/sagesplat demo build/kernels --train.max-steps 20 --nest.steps 10 --nest.base-steps 10 >/dev/null
+	$(BIN)/python -c 'from pathlib import Path; from sagesplat import make_demo_capture; make_demo_capture(Path("build/kernels/capture"), views=12, width=64, height=48)'
+	$(BIN)/sagesplat run build/kernels/capture build/kernels/run --train.max-steps 20 --nest.steps 10 --nest.base-steps 10 >/dev/null
 
 .PHONY: suite
 # two processes of one thread each: the tests are small, and idle threads would spin in each other's way;
@@ -50,12 +51,13 @@ style: $(INSTALLED)
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 
+# bytecode is written when a module is first imported: most of those installed never are
 $(INSTALLED): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "sagesplat needs Python 3.11 or newer: make PYTHON=python3.12 ..."; exit 2; }
 	@$(PYTHON) -m venv $(VENV) || $(PYTHON) -m virtualenv $(VENV) || \
 	  { echo "no venv module: apt install python3-venv, then make again"; exit 2; }
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,docs,onnx,hf,poses,video,heic,view,ray]'
+	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[dev,docs,onnx,hf,poses,video,heic,view,ray]'
 	touch $@
 
 .PHONY: docs gallery

@@ -146,6 +146,7 @@ def test_refusals(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_the_benchmark_measures_on_the_path_and_off_it(wild, tmp_path):
     (tmp_path / "captures").mkdir()
     (tmp_path / "captures" / "everything-0").symlink_to(wild)

@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 from types import FunctionType
 
+import pytest
+
 import sagesplat
 from sagesplat.kernels.jit import fingerprint
 from sagesplat.kernels.simd import LANES, load, load8, load16
@@ -17,6 +19,7 @@ TESTS = (
 )
 
 
+@pytest.mark.slow
 def test_the_other_width_agrees_with_the_oracle(tmp_path, request):
     """In a copy of the package and its cache: only kernels with vectors of that width are compiled."""
     unfinished = shutil.ignore_patterns("static", "*.tmp.*")

@@ -208,7 +208,10 @@ class Watch:
             "train": replace(CONFIG.train, poses=True),
         },
         {"ladder": "snapshots", "train": replace(CONFIG.train, freeze_at=0.5, poses=True)},
-        {"fuse": True, "blocks": BLOCKS, "train": replace(CONFIG.train, freeze_at=0.5)},
+        pytest.param(
+            {"fuse": True, "blocks": BLOCKS, "train": replace(CONFIG.train, freeze_at=0.5)},
+            marks=pytest.mark.slow,
+        ),
         {"fit": FitConfig(masks="rendered"), "train": replace(CONFIG.train, poses=True)},
     ],
     ids=["nested", "snapshots", "blocks", "rendered"],
@@ -357,6 +360,7 @@ def test_early_stopping_depends_on_label_images_and_other_training_does_not(copy
         train_levels(quiet(copy), early, 0)
 
 
+@pytest.mark.slow
 def test_blocks_lose_fused_label_images_that_the_run_lost(capture: Path, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(pipeline, "_promise", lambda *_: None)  # what follows the levels is not looked at
     run = tmp_path / "run"

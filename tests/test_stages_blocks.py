@@ -398,6 +398,7 @@ def test_a_run_in_blocks_is_done_once(finished: Path, capture: Path) -> None:
     assert sum(isinstance(e, StageSkipped) for e in events) == 16
 
 
+@pytest.mark.slow
 def test_blocks_are_the_same_in_any_order_and_process(finished: Path, capture: Path, tmp_path: Path) -> None:
     executor = Shuffled()
     run_in_blocks(capture, tmp_path / "again", executor=executor)

@@ -28,7 +28,11 @@ def run(events):
 
 @pytest.mark.parametrize(
     "config",
-    [replace(SHORT, poses=True), replace(SHORT, freeze_at=0.45), replace(SHORT, strategy="mcmc", batch=4)],
+    [
+        replace(SHORT, poses=True),
+        replace(SHORT, freeze_at=0.45),
+        pytest.param(replace(SHORT, strategy="mcmc", batch=4), marks=pytest.mark.slow),
+    ],
 )
 def test_two_processes_do_what_one_does_with_twice_the_batch(capture, tmp_path, config):  # noqa: F811
     scene, photos, masks, labels = capture

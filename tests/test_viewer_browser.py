@@ -388,6 +388,7 @@ def test_a_walk_with_swaps_has_no_empty_frame_and_keeps_the_budget(viewer: Opene
         assert min(sample["drawn"] for sample in samples) > 0
 
 
+@pytest.mark.slow
 def test_memory_stays_flat_over_fifty_swaps(viewer: Opened) -> None:
     full(viewer)
     settled(viewer)
