@@ -28,7 +28,7 @@ test:
 # a run of a few steps: what it needs is compiled and kept
 kernels: $(INSTALLED)
 	rm -rf build/kernels
-	$(BIN)/python -c 'from pathlib import Path; from sagesplat import make_demo_capture; make_demo_capture(Path("build/kernels/capture"), views=12, width=64, height=48)'
+	$(BIN)/python -c 'import sagesplat; sagesplat.make_demo_capture("build/kernels/capture", views=12, width=64, height=48)'
 	$(BIN)/sagesplat run build/kernels/capture build/kernels/run --train.max-steps 20 --nest.steps 10 --nest.base-steps 10 >/dev/null
 
 .PHONY: suite

@@ -1,11 +1,13 @@
 """`import sagesplat`: what it exports, that it loads nothing heavy, and that no name hides a subpackage."""
 
 import ast
+import inspect
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from conftest import random_gaussians, write_capture
 
 import sagesplat
 
@@ -18,6 +20,30 @@ def test_every_exported_name_is_there(name):
     value = getattr(sagesplat, name)
     assert value is getattr(sagesplat, name)
     assert (getattr(value, "__doc__", None) or "").strip()
+
+
+def test_paths_may_be_text():
+    takes_paths = [
+        (name, parameter)
+        for name in sagesplat.__all__
+        if inspect.isfunction(value := getattr(sagesplat, name)) or name.endswith("Segmenter")
+        for parameter in inspect.signature(value).parameters.values()
+        if "Path" in str(parameter.annotation)
+    ]
+    assert len(takes_paths) > 15
+    assert [(name, p.name) for name, p in takes_paths if "str" not in str(p.annotation)] == []
+
+
+def test_files_and_captures_are_found_by_text(tmp_path):
+    g, path = random_gaussians(20), str(tmp_path / "scene")
+    write_capture(tmp_path / "capture", g)
+    assert len(sagesplat.load_scene(str(tmp_path / "capture")).views) == 8
+    sagesplat.write_ply(f"{path}.ply", g)
+    sagesplat.write_spz(f"{path}.spz", g)
+    assert len(sagesplat.read_ply(f"{path}.ply")) == len(sagesplat.read_spz(f"{path}.spz")) == 20
+    assert sagesplat.read_splat(f"{path}.ply").kind == "PLY"
+    with pytest.raises(sagesplat.SageError, match=f"{path}: "):
+        sagesplat.read_splat(path)
 
 
 def test_exports_are_those_that_type_checkers_see():

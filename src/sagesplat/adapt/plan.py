@@ -304,8 +304,9 @@ def write_plans(
     write_json(path, document)
 
 
-def read_plans(path: Path) -> tuple[tuple[Plan, ...], tuple[Plan, ...]]:
+def read_plans(path: Path | str) -> tuple[tuple[Plan, ...], tuple[Plan, ...]]:
     """The scene's plans and the single views' that `write_plans` wrote; DataError for unusable content."""
+    path = Path(path)
     document = read_json(path, _CURE)
     with _usable(path):
         scene_plans = tuple(_from_json(entry) for entry in document["scene"])

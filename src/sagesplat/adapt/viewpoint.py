@@ -172,8 +172,9 @@ def write_promises(path: Path, models: Mapping[int, ViewModel]) -> None:
     write_json(path, {"promises": [_to_json(model) for model in models.values()]})
 
 
-def read_promises(path: Path) -> dict[int, ViewModel]:
+def read_promises(path: Path | str) -> dict[int, ViewModel]:
     """What `write_promises` wrote; DataError where the content cannot be used."""
+    path = Path(path)
     cure = "delete it and run `sagesplat fit` again"
     document = read_json(path, cure)
     try:

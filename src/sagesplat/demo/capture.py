@@ -27,7 +27,7 @@ from sagesplat.scene.scene import Camera
 
 
 def make_capture(
-    folder: Path,
+    folder: Path | str,
     *,
     views: int = 60,
     width: int = 320,
@@ -59,6 +59,7 @@ def make_capture(
         SceneError: If `folder` exists or cannot be written, `places` or `views` are too few, or a grid is to
             be disturbed.
     """
+    folder = Path(folder)
     if views < 3:
         raise SceneError(f"{folder}: {views} views; a capture needs at least 3")
     if min(places) < 1:

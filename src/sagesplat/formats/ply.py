@@ -25,7 +25,7 @@ BASES = (0, 3, 8, 15)  # SH coefficients beyond the constant one, by degree 0 to
 
 
 def write_ply(
-    path: Path,
+    path: Path | str,
     gaussians: Gaussians,
     names: Mapping[int, str] | None = None,
     *,
@@ -58,6 +58,7 @@ def write_ply(
         >>> len(read_ply(path)), read_ply(path).sh_degree
         (5, 1)
     """
+    path = Path(path)
     parts = _matrices(gaussians)
     properties = _properties(gaussians.shN.shape[1])
     labels = gaussians.label_ids.cpu().numpy()
@@ -80,7 +81,7 @@ def write_ply(
             block.tofile(file)
 
 
-def read_ply(path: Path) -> Gaussians:
+def read_ply(path: Path | str) -> Gaussians:
     """Read the binary splat PLY of any tool.
 
     Args:
@@ -98,6 +99,7 @@ def read_ply(path: Path) -> Gaussians:
         >>> g = read_ply(Path("runs/garden/nested/composed.ply"))  # doctest: +SKIP
         >>> g.of_labels([184]).nbytes  # doctest: +SKIP
     """
+    path = Path(path)
     columns, labels, wanted, _ = _read(path)
     _check_values(path, columns, wanted)
     return _gaussians(columns, labels)

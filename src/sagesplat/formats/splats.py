@@ -25,7 +25,7 @@ _KNOWN = "PLY, compressed PLY, SPZ, SOG, lod-meta.json, glTF, .splat"
 _LOD = "streamed SOG"
 
 
-def read_splat(path: Path, lod: int = 0, *, spz_axes: Frame = "rub") -> Splat:
+def read_splat(path: Path | str, lod: int = 0, *, spz_axes: Frame = "rub") -> Splat:
     """Read a splat of any format that is known, without the Gaussians that cannot be drawn.
 
     The content tells the format, not the name; only .splat, which has no header, needs its suffix. Labels
@@ -59,6 +59,7 @@ def read_splat(path: Path, lod: int = 0, *, spz_axes: Frame = "rub") -> Splat:
         >>> splat.kind, len(splat.gaussians), splat.dropped, splat.names
         ('PLY', 4, {'a rotation of zeros': 1}, {0: 'tree'})
     """
+    path = Path(path)
     path, kind = _found(path)
     if kind == _LOD:
         return cleaned(read_lod_meta(path, lod), str(path))

@@ -65,7 +65,7 @@ _FRAMES: tuple[Frame, ...] = ("rub", "ldb", "rdb", "lub", "rub", "ldf", "rdf", "
 
 
 def write_spz(
-    path: Path,
+    path: Path | str,
     g: Gaussians,
     *,
     sh_degree: int | None = None,
@@ -83,6 +83,7 @@ def write_spz(
     Returns:
         The size of the file in bytes.
     """
+    path = Path(path)
     content = encode_spz(
         g,
         sh_degree=sh_degree,
@@ -195,8 +196,9 @@ def packing_order(
     return np.lexsort((colours, *harmonics.reshape(len(g), 3 * BASES[degree]).T[::-1]))
 
 
-def read_spz(path: Path, label_id: int = -1, *, frame: Frame = "rub") -> Gaussians:
+def read_spz(path: Path | str, label_id: int = -1, *, frame: Frame = "rub") -> Gaussians:
     """Read an SPZ file, version 2 to 4: `decode_spz` of its content. DataError where it cannot be read."""
+    path = Path(path)
     return decode_spz(_content(path), label_id, frame=frame, name=str(path))
 
 

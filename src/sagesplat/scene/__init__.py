@@ -19,7 +19,7 @@ __all__ = ["describe", "load_scene"]
 
 
 def load_scene(
-    path: Path, *, downscale: int = 1, test_every: int = 8, calibrate_every: int = 0,
+    path: Path | str, *, downscale: int = 1, test_every: int = 8, calibrate_every: int = 0,
     alpha: Literal["auto", "background", "ignore"] = "auto", vignetting: bool = False,
 ) -> Scene:  # fmt: skip
     """Load a capture: posed photos and structure-from-motion points.
@@ -50,6 +50,7 @@ def load_scene(
         >>> scene = load_scene(Path("captures/garden"), downscale=4)  # doctest: +SKIP
         >>> scene.views[0].camera.K, scene.points.xyz.shape  # doctest: +SKIP
     """
+    path = Path(path)
     if calibrate_every < 0 or calibrate_every == 1:
         raise SceneError(f"{path}: calibrate_every {calibrate_every} leaves nothing; take 0 or >= 2")
     kind = detect(path)

@@ -90,9 +90,16 @@ class OnnxSegmenter:
     """A semantic segmentation network: RGB in, a logit per class and (coarser) pixel out, or class ids."""
 
     def __init__(
-        self, model: Path, classes: Path, *, device: str = "auto", threads: int = 1, time_limit: float = 0
+        self,
+        model: Path | str,
+        classes: Path | str,
+        *,
+        device: str = "auto",
+        threads: int = 1,
+        time_limit: float = 0,
     ):
         """`time_limit`: seconds for a photo, 0: none. LabelError for a model or classes of no use."""
+        model, classes = Path(model), Path(classes)
         self.classes = read_classes(classes)
         self.taxonomy = self.classes.taxonomy
         self._ids, self._group = group_classes(self.classes.label_ids.tolist())

@@ -54,7 +54,7 @@ def train(
     valid: ValidPixels = ALL_VALID,
     seed: int = 0,
     backend: Backend = "auto",
-    folder: Path | None = None,
+    folder: Path | str | None = None,
     settings: str = "",
     group: Group = ALONE,
     shell: Shell | None = None,
@@ -101,6 +101,7 @@ def train(
         ...     print(event)
     """
     _check(config, masks)
+    folder = None if folder is None else Path(folder)
     training: Training | None = None
     with named_failures(lambda: _where(training and training.state, folder)):
         training = begin(
