@@ -134,6 +134,14 @@ def test_a_category_selects_its_instances_too() -> None:
         select(g, "chair1", NAMES)
 
 
+def test_in_blocks_a_name_means_all_blocks_of_it() -> None:
+    names = {0: "chair@0", 1: "chair 1@0", 2: "tree@0", 3: "chair@1", 4: "chair 1@1"}
+    parents, g = {1: "chair@0", 4: "chair@1"}, gaussians([0, 1, 2, 3, 4])
+    assert select_mask(g, "chair 1", names, parents).tolist() == [False, True, False, False, True]
+    assert select_mask(g, "chair", names, parents).tolist() == [True, True, False, True, True]
+    assert select_mask(g, "chair@1", names, parents).tolist() == [False, False, False, True, True]
+
+
 def test_titles_of_instances_keep_their_number() -> None:
     assert [title_of(name) for name in ("tree-merged 2", "chair 1", "7", "grass-merged")] == [
         "tree 2", "chair 1", "7", "grass",

@@ -11,6 +11,7 @@ from sagesplat.core.errors import RunError, short
 from sagesplat.core.names import checked
 from sagesplat.core.typed import fits
 from sagesplat.io.files import read_json, write_json
+from sagesplat.segment.block_categories import category_of
 
 _FORMAT = "sagesplat-parents"
 _CURE = "delete it, and run `sagesplat instances` again with --force"
@@ -49,5 +50,13 @@ def checked_parents(parents: Any) -> dict[str, str]:
 
 
 def with_instances(names: Mapping[int, str], parents: Mapping[str, str], wanted: str) -> list[int]:
-    """Ids of a category or an instance, and of the instances of the category; empty for no such name."""
-    return [i for i, name in names.items() if wanted in (name, parents.get(name))]
+    """Ids of a category or an instance, of the instances of the category, and of all their blocks.
+
+    Empty for no such name.
+    """
+    found = []
+    for i, name in names.items():
+        of = [name, parents.get(name, name)]
+        if wanted in (*of, *map(category_of, of)):
+            found.append(i)
+    return found
