@@ -15,6 +15,7 @@ hole. So `clean` renders training and calibration views, and takes only what cos
 import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -184,7 +185,9 @@ def clean(
 
     def quality(keep: Bool[np.ndarray, " N"]) -> dict[str, float]:
         kept = on_device.select(torch.from_numpy(keep).to(on_device.means.device))
-        return {kind: float(np.mean([of_view(kept, row) for row in rows])) for kind, rows in kinds.items()}
+        every = [row for rows in kinds.values() for row in rows]
+        found = dict(zip(every, each_view(partial(of_view, kept), every, kept.means.device), strict=True))
+        return {kind: float(np.mean([found[row] for row in rows])) for kind, rows in kinds.items()}
 
     def of_view(kept: Gaussians, row: int) -> float:
         view, photo = scene.views[row], photos[row].astype(np.float32) / 255
