@@ -47,7 +47,7 @@ def track_colours(scene: Scene, photos: Photos | Sequence[np.ndarray], rows: Seq
 def _some(
     track_points: Int64[np.ndarray, " T"], candidates: Int64[np.ndarray, " C"], photos: int
 ) -> Int64[np.ndarray, " S"]:
-    """Those of some observations whose points have two or more of them, of every so-manieth point."""
+    """Observations of points that have two or more: of every n-th such point where there are plenty."""
     points = track_points[candidates]
     every = max(1, len(candidates) // (_PLENTY * max(1, photos)))
     shared = np.bincount(points) > 1
