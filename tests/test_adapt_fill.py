@@ -7,7 +7,7 @@ import time
 import make_plans
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from sagesplat.adapt.allocate import cheapest
@@ -50,14 +50,14 @@ def plainly(levels, quality, cost, weight):
     rows = np.arange(L)
 
     def lies_below():
-        curve = np.interp(cost[rows, levels].sum(), *curve_points)
+        nbytes, sizes, values = cost[rows, levels].sum(), cost.sum(0), value.sum(0)
+        fewer = int((sizes < nbytes).sum())
+        some = slice(max(fewer - 1, 0), fewer + 1)
+        # of equal bytes the first level, beyond them the last
+        curve = np.interp(nbytes, sizes[some], values[some])
         total = max((weight * known).sum(), 1e-300)
         return value[rows, levels].sum() / total < curve / total - SLACK
 
-    points = {}  # of equal bytes the first level
-    for k in range(K):
-        points.setdefault(cost[:, k].sum(), value[:, k].sum())
-    curve_points = list(points), list(points.values())
     segments = []
     for label in rows[known]:
         at = levels[label]
@@ -82,8 +82,18 @@ def plainly(levels, quality, cost, weight):
     return levels
 
 
+# two levels take as many bytes: beyond these the curve goes on from the upper one
+EQUAL_BYTES = (
+    np.array([2, 5, 2]),
+    np.array([[4, 4, 4, 4, 7, 7], [1, 5, 5, 7, 7, 7], [0, 1, 2, 2, 5, 5]]) / 8,
+    np.array([[3, 3, 3, 4, 4, 7], [2, 3, 5, 8, 8, 10], [2, 4, 5, 5, 5, 8]], np.float64),
+    np.array([3.0, 3.0, 1.0]),
+)
+
+
 @quick
 @given(problems())
+@example(EQUAL_BYTES)
 def test_it_is_the_rule(problem):
     assert fill(*problem).tolist() == plainly(*problem).tolist()
 

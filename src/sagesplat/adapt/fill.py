@@ -8,7 +8,8 @@ exactly, as a second implementation must have it (tests/data/plans.json, mode "f
 
 - W(levels) = sum weight * mean / sum weight, B(levels) = sum cost. The uniform curve has the points
   (B(all at k), W(all at k)), k = 1 to K, linear between; below the first it is W(all at 1), above the last
-  W(all at K). Nothing is added if W(levels) >= curve(B(levels)) - SLACK.
+  W(all at K); where levels take equal bytes, the first one ends what comes before and the last one begins
+  what follows. Nothing is added if W(levels) >= curve(B(levels)) - SLACK.
 - The upgrades of a label are the segments of the upper concave hull of (cost, weight * mean) from its level
   on. From a vertex the next one is the level above of the largest slope = gain / bytes; a gain without bytes
   has an infinite slope. Of equal slopes the one of fewer bytes, then of more gain, then the lower level.
