@@ -62,7 +62,7 @@ def _around(
     height, width = photo.shape[:2]
     found = np.zeros((len(u), 3))
     inside = np.flatnonzero((u >= 1) & (v >= 1) & (u < width - 1) & (v < height - 1))
-    u, v, sums = u[inside], v[inside], np.zeros((len(inside), 3), np.int64)
+    u, v, sums = u[inside], v[inside], np.zeros((len(inside), 3))
     for i in (-1, 0, 1):
         for j in (-1, 0, 1):
             sums += photo[v + i, u + j]
