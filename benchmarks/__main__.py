@@ -39,6 +39,7 @@ from sagesplat.run.run_dir import RunDir
 from sagesplat.scene import load_scene
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene
+from sagesplat.segment import coco
 from sagesplat.segment.masks import Masks, Taxonomy, import_masks
 from sagesplat.train.events import Step
 from sagesplat.train.trainer import train
@@ -138,8 +139,10 @@ def segment(
     small: bool = False,
     blend: float = 0.6,
     given: bool = True,
+    run: Path | None = None,
+    measured: int = 0,
 ) -> None:
-    """Segmenters on a few views beside the capture's own label images: a sheet of overlays, IoU.
+    """Segmenters on a few views beside the photo and the capture's own label images: a sheet, IoU.
 
     Args:
         out: PNG to write.
@@ -150,6 +153,8 @@ def segment(
         small: also a small DeepLabV2 that learns from all other views.
         blend: share of the colours; 1 shows no photo.
         given: whether the sheet shows the given label images too.
+        run: a trained run of the capture, which is drawn instead of photos that may not be passed on.
+        measured: views that the IoU is of, evenly spaced; 0: the rows of the sheet.
     """
     capture = load_scene(scene or cached_capture())
     rows = np.linspace(0, len(capture.views) - 1, views).astype(int).tolist()
@@ -159,8 +164,14 @@ def segment(
         segmenters = overlays.networks(models, classes or Path("classes.json"))
         if small:
             segmenters |= overlays.small_deeplab(masks, capture, Photos(capture.views), rows)
-        table, page = overlays.compare(capture, masks, segmenters, rows, blend, given)
-    page.save(out)
+        on = np.unique(np.linspace(0, len(capture.views) - 1, measured).astype(int)).tolist()
+        table, columns = overlays.compare(capture, masks, segmenters, rows, on)
+        if given:
+            columns = {"given": [masks[capture.views[row]] for row in rows]} | columns
+        shown = [Photos(capture.views)[row] for row in rows]
+        first = ("rendered", overlays.rendered(run, rows)) if run else ("photo", shown)
+        names = Taxonomy(dict(coco.NAMES) | dict(masks.taxonomy.names))
+        overlays.sheet(shown, columns, names, blend, first).save(out)
     for name, found in table.items():
         print(name, " ".join(f"{category} {iou:.2f}" for category, iou in found.items()))
     _finish("segment", table, False)

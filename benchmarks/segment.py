@@ -1,5 +1,6 @@
 """What segmenters find on a few views: overlays side by side, and IoU against label images that are given."""
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -8,8 +9,11 @@ from jaxtyping import Int16, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from benchmarks import deeplab
+from sagesplat.adapt.observe import render_rgb
+from sagesplat.formats.levels import read_level
 from sagesplat.output.figures import label_image
 from sagesplat.run.job import Job
+from sagesplat.run.run_dir import RunDir
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.segment import coco
@@ -19,8 +23,10 @@ from sagesplat.segment.masks import Masks, Taxonomy
 from sagesplat.segment.onnx import OnnxSegmenter
 from sagesplat.segment.segmenters import Segmenter
 
-WIDTH = 200  # px of a picture on the sheet
-TEXT = 16  # px of its letters
+WIDTH = 1000  # px of a sheet at most: a page shows it at some 740
+PICTURE = 250  # px of a picture's width at most
+TEXT = 18  # px of its letters
+GAP = 4  # px between pictures
 LEAST = 0.003  # of the sheet's pixels that a category needs for the legend
 _MIDDLE = 110  # grey of a photo, with which the legend's colours are mixed as those of the pictures are
 SHARE = 0.01  # of the pixels that a category needs for its IoU to tell something
@@ -63,24 +69,35 @@ def sheet(
     columns: Mapping[str, Sequence[LabelImage]],
     taxonomy: Taxonomy,
     blend: float,
+    first: tuple[str, Sequence[UInt8[np.ndarray, "H W 3"]]] | None = None,
 ) -> Image.Image:
     """One row a view, one column a segmenter, colours over `1 - blend` of the photo, names above.
 
-    Below them a legend of the categories that cover at least `LEAST` of the pictures, the largest first.
+    The `first` column, with its name, is shown without colours. Below all a legend of the categories that
+    cover at least `LEAST` of the pictures, the largest first.
     """
-    height = round(WIDTH * photos[0].shape[0] / photos[0].shape[1])
-    width, top = len(columns) * (WIDTH + 4) - 4, TEXT + 8
-    bottom = top + len(photos) * (height + 4)
+    shown = {first[0]: list(first[1])} if first else {}
+    for name, images in columns.items():
+        shown[name] = []
+        for photo, labels in zip(photos, images, strict=True):
+            colours = {int(i): taxonomy.color(int(i)) for i in np.unique(labels) if i >= 0}
+            mixed = (1 - blend) * photo + blend * label_image(labels, colours)
+            shown[name].append(mixed.astype(np.uint8))
+    wide = min((WIDTH + GAP) // len(shown) - GAP, PICTURE)
+    width = len(shown) * (wide + GAP) - GAP
+    high = round(wide * photos[0].shape[0] / photos[0].shape[1])
+    heads = {name: _wrapped(name, wide) for name in shown}
+    top = max(map(len, heads.values())) * (TEXT + 2) + 6
+    bottom = top + len(photos) * (high + GAP)
     legend = _legend(columns, taxonomy, width)
     page = Image.new("RGB", (width, bottom + 8 + len(legend) * (TEXT + 10)), "white")
     ink, font = ImageDraw.Draw(page), ImageFont.load_default(TEXT)
-    for x, (name, images) in enumerate(columns.items()):
-        ink.text((x * (WIDTH + 4) + 2, 1), name, "black", _narrow(name))
-        for y, (photo, labels) in enumerate(zip(photos, images, strict=True)):
-            colours = {int(i): taxonomy.color(int(i)) for i in np.unique(labels) if i >= 0}
-            mixed = (1 - blend) * photo + blend * label_image(labels, colours)
-            picture = Image.fromarray(mixed.astype(np.uint8)).resize((WIDTH, height))
-            page.paste(picture, (x * (WIDTH + 4), top + y * (height + 4)))
+    for column, (name, pictures) in enumerate(shown.items()):
+        x = column * (wide + GAP)
+        for line, text in enumerate(heads[name]):
+            ink.text((x + 2, 1 + line * (TEXT + 2)), text, "black", font)
+        for row, picture in enumerate(pictures):
+            page.paste(Image.fromarray(picture).resize((wide, high)), (x, top + row * (high + GAP)))
     for row, entries in enumerate(legend):
         y = bottom + 4 + row * (TEXT + 10)
         for x, name, colour in entries:
@@ -109,10 +126,23 @@ def _legend(
     return rows
 
 
-def _narrow(name: str) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """The largest letters in which a name is no wider than a picture, not below 10 px."""
-    fonts = [ImageFont.load_default(size) for size in range(TEXT, 9, -1)]
-    return next((font for font in fonts if font.getlength(name) <= WIDTH), fonts[-1])
+def _wrapped(name: str, width: int) -> list[str]:
+    """Lines of a name that fit into `width` pixels, broken after spaces and underscores."""
+    font, lines = ImageFont.load_default(TEXT), [""]
+    for part in re.findall(r"[^ _]*[ _]?", name):
+        if lines[-1] and font.getlength((lines[-1] + part).rstrip()) > width:
+            lines.append("")
+        lines[-1] += part
+    return lines
+
+
+def rendered(run: Path, rows: Sequence[int]) -> list[UInt8[np.ndarray, "H W 3"]]:
+    """What a trained run shows in some views: for sheets of photos that may not be passed on."""
+    job = Job(RunDir(run), lambda event: None)
+    g = read_level(job.trained)
+    cameras = [job.scene.views[row].camera.neutral for row in rows]
+    images = (render_rgb(g, camera, backend=job.backend, antialiased=job.antialiased) for camera in cameras)
+    return [(255 * image).round().astype(np.uint8) for image in images]
 
 
 def fusion_sheet(job: Job, rows: Sequence[int], blend: float) -> Image.Image:
@@ -130,17 +160,16 @@ def compare(
     masks: Masks,
     segmenters: Mapping[str, Segmenter],
     rows: Sequence[int],
-    blend: float,
-    given: bool,
-) -> tuple[dict[str, dict[str, float]], Image.Image]:
-    """IoU by segmenter and category, with their mean, on some views; and the sheet of overlays."""
-    photos = Photos(scene.views)
-    shown = [photos[row] for row in rows]
-    truth = [masks[scene.views[row]] for row in rows]
-    columns, table = {"given": truth} if given else {}, {}
+    measured: Sequence[int] = (),
+) -> tuple[dict[str, dict[str, float]], dict[str, list[LabelImage]]]:
+    """IoU by segmenter and category, with their mean, on the `measured` views; label images of `rows`."""
+    photos, measured = Photos(scene.views), measured or rows
+    truth = [masks[scene.views[row]] for row in measured]
+    columns, table = dict[str, list[LabelImage]](), {}
     for name, segmenter in segmenters.items():
-        columns[name] = [segmenter([photo])[0].label_ids for photo in shown]
-        found = {masks.taxonomy.name(i): iou for i, iou in ious(columns[name], truth).items()}
+        labels = {row: segmenter([photos[row]])[0].label_ids for row in sorted({*rows, *measured})}
+        columns[name] = [labels[row] for row in rows]
+        by_id = ious([labels[row] for row in measured], truth)
+        found = {masks.taxonomy.name(i): iou for i, iou in by_id.items()}
         table[name] = found | {"mean": float(np.mean(list(found.values())))}
-    names = Taxonomy(dict(coco.NAMES) | dict(masks.taxonomy.names))
-    return table, sheet(shown, columns, names, blend)
+    return table, columns

@@ -6,11 +6,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import torch
 from conftest import pinhole, random_gaussians
 
-from benchmarks import plain
+from benchmarks import plain, segment
 from sagesplat.raster import rasterize
+from sagesplat.segment.masks import Taxonomy
 
 ROOT = Path(__file__).parents[1]
 
@@ -63,3 +65,15 @@ def test_blending_ends_with_one_line_of_json():
     assert result["threads_1"]["pairs"] > 10_000
     assert result["threads_1"]["share_of_peak_forward"] > 0  # above 1 where another process takes the core
     assert torch.isfinite(torch.tensor(result["scaling_forward"]))
+
+
+def test_sheets_of_segmenters_show_the_photo_first_and_keep_their_width():
+    photos, labels = [np.full((30, 40, 3), 200, np.uint8)], [np.zeros((30, 40), np.int16)]
+    columns, names = {"given": labels, "a_network_of_a_rather_long_name": labels}, Taxonomy({0: "grass"})
+    two = segment.sheet(photos, columns, names, 1.0)
+    three = segment.sheet(photos, columns, names, 1.0, ("photo", photos))
+    many = segment.sheet(photos, columns | dict.fromkeys("abcdefg", labels), names, 1.0)
+    assert (two.width, three.width) == (504, 758)
+    assert many.width <= segment.WIDTH
+    assert three.getpixel((100, three.height // 2)) == (200, 200, 200)
+    assert three.getpixel((400, three.height // 2)) == names.color(0)

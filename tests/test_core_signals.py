@@ -153,6 +153,46 @@ def test_what_must_not_be_half_begun_is_finished_first(
     assert ended(process) == (143, said, LINES[signal.SIGTERM])
 
 
+WAITS = """
+import ctypes, time
+from sagesplat.core.signals import answered_at_once
+with answered_at_once():
+    pass
+with answered_at_once():
+    lock, mutex = ctypes.CDLL(None).pthread_mutex_lock, ctypes.create_string_buffer(64)
+    lock(mutex)
+    ready()
+    lock(mutex)  # for ever, and no signal cuts it off
+"""
+AFTERWARDS = """
+import time
+from sagesplat.core.signals import answered_at_once
+with answered_at_once():
+    pass
+try:
+    ready()
+    time.sleep(60)
+finally:
+    print("cleaned", flush=True)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="mutexes of other systems are not so simple")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_is_answered_while_the_main_thread_waits_in_c(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    process = started(WAITS, tmp_path)
+    process.send_signal(number)
+    assert ended(process) == (_exit_code(number), "", LINES[number])
+
+
+def test_after_a_block_that_is_answered_at_once_all_is_cleaned_up_again(tmp_path: Path) -> None:
+    process = started(AFTERWARDS, tmp_path)
+    process.send_signal(signal.SIGINT)
+    assert ended(process) == (2, "cleaned\n", LINES[signal.SIGINT])
+
+
 def test_what_nohup_and_shells_ignore_stays_ignored(tmp_path: Path) -> None:
     def ignore() -> None:
         for number in (signal.SIGHUP, signal.SIGINT):

@@ -3,6 +3,7 @@
 import logging
 import os
 import shutil
+import socket
 import subprocess
 import sys
 import threading
@@ -256,6 +257,51 @@ def test_an_executor_that_is_not_there_is_one_line(
     with pytest.raises(RunError, match=says) as raised, computing(Machine(executor=executor), tmp_path):
         pass
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("greeting", "cause"),
+    [
+        (b"", "it does not answer in time"),  # a head whose machine hangs
+        (b"HTTP/1.1 400 Bad Request\r\n", "something else than a head of Ray listens there"),
+    ],
+)
+def test_what_listens_but_is_no_head_is_one_line_soon(
+    greeting: bytes, cause: str, tmp_path: Path, monkeypatch
+) -> None:
+    """Ray itself would try for a quarter of an hour, and hear no Ctrl-C."""
+    monkeypatch.setattr(ray, "is_initialized", lambda: False)
+    monkeypatch.setattr(ray_cluster, "_GREETED", 0.3)
+    with socket.create_server(("", 0)) as server:
+        address = f"127.0.0.1:{server.getsockname()[1]}"
+
+        def answer() -> None:
+            with server.accept()[0] as connection, suppress(OSError):
+                connection.sendall(greeting)
+                while connection.recv(100):
+                    pass
+
+        answering = threading.Thread(target=answer)
+        answering.start()
+        with (
+            pytest.raises(RunError, match=rf"ray:{address}: no answer \({cause}\); name the cluster's head"),
+            computing(Machine(executor=f"ray:{address}"), tmp_path),
+        ):
+            pass
+        answering.join()
+
+
+def test_a_cluster_of_this_machine_whose_head_is_gone_is_one_line(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(ray, "is_initialized", lambda: False)
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setattr(ray_cluster.services, "canonicalize_bootstrap_address", lambda _: "127.0.0.1:1")
+    with (
+        pytest.raises(
+            RunError, match=r"no answer from 127\.0\.0\.1:1, the head .*`ray stop` here forgets it"
+        ),
+        computing(Machine(executor="ray"), tmp_path),
+    ):
+        pass
 
 
 def test_without_ray_the_cure_is_said(tmp_path: Path, monkeypatch) -> None:

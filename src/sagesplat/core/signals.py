@@ -7,7 +7,9 @@ temporary files and end child processes. Standard library only: it is imported b
 import atexit
 import os
 import signal
+import socket
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -44,9 +46,12 @@ class _Stop:
         self.number: int = signal.SIGINT  # of the newest that was not ignored
         self.ending = False  # the outcome is known: nothing is left to interrupt
         self.deferring = self.waiting = False  # see `deferred`
+        self.watched = False  # see `answered_at_once`
         self._since = -_SAME
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
+        if self.watched:
+            return
         now = time.monotonic()
         if now - self._since < _SAME:
             return
@@ -141,15 +146,54 @@ def deferred() -> Iterator[None]:
         _stop.throw()
 
 
+@contextmanager
+def answered_at_once() -> Iterator[None]:
+    """End the process on a signal of the block, even where it waits in C code and no handler would run.
+
+    For blocks that leave nothing to clean up: not even `finally` is reached. Nothing changes where signals
+    are not ours: outside of `handled`, and in other threads.
+    """
+    ours = [number for number in _HANDLED if signal.getsignal(number) is _stop]
+    if not ours or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    woken, wakes = socket.socketpair()
+    wakes.setblocking(False)
+
+    def watch() -> None:
+        while number := woken.recv(1):
+            if number[0] in ours:
+                _say(number[0])
+                os._exit(_exit_code(number[0]))
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
+    before = signal.set_wakeup_fd(wakes.fileno())
+    _stop.watched = True
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(before)
+        wakes.close()
+        watcher.join()
+        woken.close()
+        _stop.watched = False
+
+
 def leave(error: KeyboardInterrupt) -> NoReturn:
     """End the program with the line and the exit code of a signal."""
     number = error.number if isinstance(error, Stopped) else signal.SIGINT
-    line = "interrupted" if number == signal.SIGINT else f"ended by {error}"
-    if str(error) == "SIGHUP":
+    _say(number)
+    raise Left(_exit_code(number))
+
+
+def _say(number: int) -> None:
+    name = signal.Signals(number).name
+    line = "interrupted" if number == signal.SIGINT else f"ended by {name}"
+    if name == "SIGHUP":
         line += " (its terminal was closed; nohup or tmux keeps a run)"
     with suppress(OSError):  # the terminal that was closed
         print(f"sagesplat: {line}; {_KEPT}", file=sys.stderr, flush=True)
-    raise Left(_exit_code(number))
 
 
 def _exit_code(number: int) -> int:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import ray
-from ray._private import ray_constants
+from ray._private import ray_constants, services
 from ray._raylet import AuthenticationTokenLoader, Config  # pyright: ignore
 from ray.exceptions import RayError
 
@@ -28,6 +28,9 @@ from sagesplat.run.ray_task import ANSWER, checks_tokens
 _STORE = 256 * 2**20  # bytes of shared memory of a cluster of our own: results are small
 _TOKENS = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 _LOOPBACK = ray_constants.ENABLE_RAY_CLUSTERS_ENV_VAR  # 0: nodes have the address 127.0.0.1
+_GREETED = 10.0  # seconds that a head may take to greet
+_SETTINGS = b"\0\0\0\4\0\0\0\0\0"  # HTTP/2's first frame, by client and server alike (RFC 9113, 3.4)
+_GREETING = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + _SETTINGS
 _OPEN = (
     "this Ray cluster does not check tokens: whoever reaches its port can run programs as you; start it "
     "with RAY_AUTH_MODE=token (docs/pipeline.md, several machines)"
@@ -73,14 +76,18 @@ def _join(address: str) -> bool:
     if address == "local":
         return False
     named = address not in ("", "auto")
-    if named:
-        _check_answers(address)
     try:
-        _init(address=address if named else "auto")
-    except ConnectionError as error:
-        if named or str(error).startswith("Failed to connect"):  # else it found none
-            raise _no_connection(error) from None
+        head = services.canonicalize_bootstrap_address(address if named else "auto") or ""
+    except ConnectionError:  # this machine is no node of any
         return False
+    except ValueError:
+        head = ""
+    _check_answers(head, address if named else "")
+    try:
+        with signals.answered_at_once():  # Ray waits for minutes, and starts nothing here
+            _init(address=head)
+    except ConnectionError as error:
+        raise _no_connection(error) from None
     return True
 
 
@@ -190,14 +197,30 @@ def _heard(warn: _Warnings) -> Iterator[None]:
         worker.print_to_stdstream, logger.handlers[:] = printed, handlers
 
 
-def _check_answers(address: str) -> None:
-    """RunError where nobody listens: Ray itself would wait for minutes."""
-    host, _, port = address.rpartition(":")
+def _check_answers(head: str, named: str) -> None:
+    """RunError where no head answers at host:port `head`: Ray itself would wait for a quarter of an hour."""
+    host, _, port = head.rpartition(":")
     try:
-        with socket.create_connection((host.strip("[]"), int(port)), timeout=ANSWER):
-            return
-    except (OSError, ValueError, OverflowError) as error:
+        with socket.create_connection((host.strip("[]"), int(port)), timeout=ANSWER) as connection:
+            if os.environ.get("RAY_USE_TLS", "0") not in ("", "0"):
+                return
+            connection.settimeout(_GREETED)
+            connection.sendall(_GREETING)
+            if connection.recv(len(_SETTINGS))[3:4] == _SETTINGS[3:4]:
+                return
+        cause = "something else than a head of Ray listens there"
+    except TimeoutError:
+        cause = "it does not answer in time"
+    except (ValueError, OverflowError):
+        cause = "not HOST:PORT"
+    except OSError as error:
+        cause = short(error)
+    if named:
         raise RunError(
-            f"--executor ray:{address}: no answer ({short(error)}); name the cluster's head as HOST:PORT, "
+            f"--executor ray:{named}: no answer ({cause}); name the cluster's head as HOST:PORT, "
             "such as ray:10.0.0.1:6379, or start one with `ray start --head`"
-        ) from None
+        )
+    raise RunError(
+        f"--executor ray: no answer from {head}, the head of the cluster that this machine belongs to "
+        f"({cause}); `ray stop` here forgets it, or start the head again"
+    )
