@@ -453,6 +453,19 @@ def test_pictures():
     assert error[1, 1].sum() < 10
 
 
+def test_pixels_that_are_ignored_are_grey_in_the_error_and_explained(tmp_path):
+    data, said = make(panels=1), "grey: ignored, and in none of these figures"
+    (panel,) = data.panels
+    valid = np.ones(panel.photo.shape[:2], bool)
+    valid[:5, :5] = False
+    error = figures.error_image(panel.composed, panel.photo, valid)
+    assert (error[valid] == figures.error_image(panel.composed, panel.photo)[valid]).all()
+    assert len(np.unique(error[~valid])) == 1
+    assert said not in Page(write_report(tmp_path / "all", data)).text
+    data = dataclasses.replace(data, panels=[dataclasses.replace(panel, valid=valid)])
+    assert said in Page(write_report(tmp_path / "some", data)).text
+
+
 def test_line_colours_are_dark_enough():
     red, green, blue = figures.ink(3, COLOURS)
     assert 0.2126 * red**2.2 + 0.7152 * green**2.2 + 0.0722 * blue**2.2 < 0.33

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int, UInt8
+from jaxtyping import Bool, Int, UInt8
 from matplotlib import colormaps, rc_context
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -30,6 +30,7 @@ RAW = "model size (MB, 248 bytes a Gaussian)"
 INK, FAINT, ACCENT = "#1d2530", "#8a94a3", "#c2410c"
 _REFERENCE, _RESET = "#b8c0cb", "#f1e4d3"  # the line to compare with; levels after a reset of opacities
 PAIR = (5.4, 4.9)  # inches, of two figures side by side
+_IGNORED = 110  # grey of pixels that count nowhere
 _LONGEST = 28  # characters of a name
 _LONG = 20  # characters of a name, above which a legend has fewer columns
 STYLE: dict[Any, Any] = {
@@ -65,6 +66,7 @@ class Panel:
     psnr: float  # dB
     full_ssim: float
     full_psnr: float
+    valid: Bool[np.ndarray, "H W"] | None = None  # pixels that count; None: all
 
 
 def ink(label_id: int, colours: Colours) -> tuple[float, float, float]:
@@ -107,10 +109,20 @@ def label_image(label_ids: Int[np.ndarray, "H W"], colours: Colours) -> UInt8[np
     return image
 
 
-def error_image(image: UInt8[np.ndarray, "H W 3"], photo: UInt8[np.ndarray, "H W 3"]) -> np.ndarray:
-    """Mean absolute difference over RGB as uint8 [H, W, 3]: black = none, white = half the range or more."""
+def error_image(
+    image: UInt8[np.ndarray, "H W 3"],
+    photo: UInt8[np.ndarray, "H W 3"],
+    valid: Bool[np.ndarray, "H W"] | None = None,
+) -> np.ndarray:
+    """Mean absolute difference over RGB as uint8 [H, W, 3]: black = none, white = half the range or more.
+
+    Pixels that are not `valid` are grey.
+    """
     difference = np.abs(image.astype(np.float32) - photo).mean(axis=2) / 127.5
-    return colormaps["inferno"](np.clip(difference, 0, 1), bytes=True)[..., :3]
+    error = colormaps["inferno"](np.clip(difference, 0, 1), bytes=True)[..., :3].copy()
+    if valid is not None:
+        error[~valid] = _IGNORED
+    return error
 
 
 @rc_context(STYLE)
@@ -329,7 +341,7 @@ def panel_strip(panel: Panel, colours: Colours) -> Figure:
         (f"full model  {panel.full_psnr:.2f} dB / {panel.full_ssim:.3f}", panel.full),
         (f"composed  {panel.psnr:.2f} dB / {panel.ssim:.3f}", panel.composed),
         ("categories", label_image(panel.label_ids, colours)),
-        ("error of composed", error_image(panel.composed, panel.photo)),
+        ("error of composed", error_image(panel.composed, panel.photo, panel.valid)),
     ]
     height, width = panel.photo.shape[:2]
     figure = Figure(figsize=(15, 2.96 * height / width + 0.3))

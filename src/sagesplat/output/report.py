@@ -219,7 +219,7 @@ def _save(figure: figures.Figure, folder: Path, name: str) -> str:
 def _pictures(panel: Panel, colours: Colours, photos: bool) -> dict:
     """A panel with its pictures as data addresses."""
     labels = figures.label_image(panel.label_ids, colours)
-    error = figures.error_image(panel.composed, panel.photo)
+    error = figures.error_image(panel.composed, panel.photo, panel.valid)
     return {
         "panel": panel,
         "ratio": f"{panel.photo.shape[1]} / {panel.photo.shape[0]}",

@@ -236,6 +236,7 @@ def picture_panels(job: Job, composed: Gaussians) -> list[Panel]:
                 psnr=of_composed["psnr"],
                 full_ssim=of_full["ssim"],
                 full_psnr=of_full["psnr"],
+                valid=job.valid[view],
             )
         )
     return panels
