@@ -517,7 +517,6 @@ def test_coverage_is_tested_on_the_plans_that_are_made_and_costs_are_bytes(finis
     assert bound.kept.sum() > 0
 
 
-@pytest.mark.slow
 def test_without_calibration_views_a_run_still_promises(capture: Path, tmp_path: Path) -> None:
     config = replace(CONFIG, scene=SceneConfig(calibrate_every=0), train=TrainConfig(max_steps=20))
     job = quiet(tmp_path / "run")

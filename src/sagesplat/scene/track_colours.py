@@ -39,8 +39,8 @@ def track_colours(scene: Scene, photos: Photos | Sequence[np.ndarray], rows: Seq
             mean[begin:end] = _around(photos[row], u[begin:end], v[begin:end])
     fine = np.flatnonzero(((mean > _DARK) & (mean < _BRIGHT)).all(1))
     _, points, seen = np.unique(tracks.track_points[mine[fine]], return_inverse=True, return_counts=True)
-    fine = fine[seen[points] > 1]
-    _, points = np.unique(tracks.track_points[mine[fine]], return_inverse=True)
+    fine, points = fine[seen[points] > 1], points[seen[points] > 1]
+    _, points = np.unique(points, return_inverse=True)
     return TrackColours(points, views[fine], tracks.track_uv[mine[fine]].astype(np.float64), mean[fine] / 255)
 
 

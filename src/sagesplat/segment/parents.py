@@ -52,11 +52,11 @@ def checked_parents(parents: Any) -> dict[str, str]:
 def with_instances(names: Mapping[int, str], parents: Mapping[str, str], wanted: str) -> list[int]:
     """Ids of a category or an instance, of the instances of the category, and of all their blocks.
 
-    Empty for no such name.
+    `parents` by the names of instances, with their block or without. Empty for no such name.
     """
     found = []
     for i, name in names.items():
-        of = [name, parents.get(name, name)]
+        of = name, parents.get(name, parents.get(category_of(name), name))
         if wanted in (*of, *map(category_of, of)):
             found.append(i)
     return found

@@ -26,6 +26,7 @@ from sagesplat.segment.block_categories import split_name
 from sagesplat.segment.display_colors import colors_of, rgb_of
 from sagesplat.segment.display_names import meant
 from sagesplat.segment.masks import UNLABELLED
+from sagesplat.segment.parents import with_instances
 from sagesplat.stages.results import observations_of
 
 
@@ -93,11 +94,11 @@ def labels_named(job: Job, names: Sequence[str]) -> list[int]:
     the run does not have.
     """
     known, found, parents = job.names(), list[int](), job.parents
-    of = {label: category_and_block(job, name)[0] for label, name in known.items()}  # known without blocks
-    all_names = {*known.values(), *of.values(), *parents.values()}
+    without_blocks = {category_and_block(job, name)[0] for name in known.values()}
+    all_names = {*known.values(), *without_blocks, *parents.values()}
     for name in names:
         wanted = meant(composed(name), all_names)
-        ids = [label for label, one in known.items() if wanted in (one, of[label], parents.get(of[label]))]
+        ids = with_instances(known, parents, wanted)
         if not ids:
             raise RunError(f"{job.run.path}: no category {name!r}; there are {', '.join(known.values())}")
         found += [i for i in ids if i not in found]
