@@ -1,18 +1,19 @@
-"""Compositions of one camera on a CPU: only opacities differ, so each Gaussian is projected once."""
+"""Compositions of one camera on a CPU: only opacities differ, so each Gaussian is projected once and listed in
+the tiles that it meets at its largest one.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Int32, Int64
 from numba import prange
 from torch import Tensor
 
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.kernels.jit import njit
 from sagesplat.kernels.planes import padded, to_image
-from sagesplat.metrics.ssim_cpu import all_tiles
-from sagesplat.raster import Workspace, blend, cpu, tiles
+from sagesplat.raster import Workspace, blend, cpu
 from sagesplat.raster.render import ALPHA_MIN
 from sagesplat.scene.scene import Camera
 
@@ -26,18 +27,19 @@ class Drawn:
     """N Gaussians as a camera draws them, at the larger of two opacities."""
 
     records: Float32[np.ndarray, "N 11"]  # see `raster.blend`
-    depths: Float32[np.ndarray, " N"]
     logits: Float32[np.ndarray, "N 2"]  # of the first opacity, and of the second one
     filtered: Float32[np.ndarray, " N"]  # log2 of what antialiasing leaves of opacities
+    row_order: Int64[np.ndarray, " rows"]  # these three: see `raster.tiles.Intersections`
+    starts: Int64[np.ndarray, " tiles+1"]
+    ids: Int32[np.ndarray, " I"]
     weights: Mapping[int, Sequence[float]]  # of the second opacity, by label id and level
     camera: Camera
     workspace: Workspace
-    tile_mask: Bool[np.ndarray, "h w"] | None = None  # the others show the background; None: all are drawn
 
     @property
     def nbytes(self) -> int:
         """Memory that it takes, about."""
-        return 4 * 15 * len(self.records)
+        return self.records.nbytes + self.logits.nbytes + self.filtered.nbytes + self.ids.nbytes
 
     def render(self, parts: Sequence[tuple[int, int, float]]) -> Float32[np.ndarray, "H W 3"]:
         """An image in [0, 1] of some rows: of each part the first and last + 1, and the weight of the second
@@ -45,28 +47,20 @@ class Drawn:
         """
         camera, take = self.camera, self.workspace.take
         width, height = camera.width, camera.height
-        count = sum(last - first for first, last, _ in parts)
-        records, depths, radii = (
-            take("records", count, blend.RECORD),
-            take("depths", count),
-            take("radii", count),
-        )
-        at = 0
+        records, shown = take("records", *self.records.shape), take("shown", len(self.records), dtype=np.bool_)
+        shown.fill(False)
         for first, last, weight in parts:
-            rows, to = slice(first, last), slice(at, at + last - first)
+            rows = slice(first, last)
             _compose(
-                self.records[rows], self.depths[rows], self.logits[rows], self.filtered[rows], _F(weight),
-                records[to], depths[to], radii[to], width, height,
+                self.records[rows], self.logits[rows], self.filtered[rows], _F(weight), records[rows],
+                shown[rows],
             )  # fmt: skip
-            at = to.stop
-        drawn = all_tiles(height, width) if self.tile_mask is None else self.tile_mask
-        found = tiles.intersect(records, depths, radii, width, height, drawn.ravel(), self.workspace)
+        starts, ids = np.empty_like(self.starts), take("ids", len(self.ids), dtype=np.int32)
+        _list_shown(self.starts, self.ids, shown, starts, ids)
         image, left = take("image 0", 3, height, padded(width)), take("left", height, padded(width))
-        ends = np.empty(len(found.starts) - 1, np.int64)
+        ends = np.empty(len(starts) - 1, np.int64)
         behind = np.array(camera.background, np.float32) / 255
-        blend.forward(
-            records, found.starts, found.ids, found.row_order, width, height, behind, image, left, ends
-        )
+        blend.forward(records, starts, ids, self.row_order, width, height, behind, image, left, ends)
         return to_image(np.clip(image, 0, 1, out=image), width).numpy()
 
 
@@ -83,35 +77,45 @@ def drawn_from(
     first = g.logit_opacities
     second = first if second is None else second
     most = first.maximum(second)
-    found, *_ = cpu.intersections(
-        replace(g, logit_opacities=most), camera, workspace, antialiased=antialiased
+    found, _, lists = cpu.intersections(
+        replace(g, logit_opacities=most), camera, workspace, antialiased=antialiased, tile_mask=tile_mask
     )
     records = found.copy()
     logits = np.stack([first.numpy(), second.numpy()], 1)
     opacities = 1 / (1 + np.exp(-most.double().numpy()))
-    depths = g.means.double().numpy() @ camera.w2c[2, :3].astype(np.float64) + np.float64(camera.w2c[2, 3])
     filtered = (records[:, 5] - np.log2(opacities)).astype(np.float32)
-    return Drawn(records, depths.astype(np.float32), logits, filtered, weights, camera, workspace, tile_mask)
+    return Drawn(
+        records, logits, filtered, lists.row_order, lists.starts, lists.ids.copy(), weights, camera, workspace
+    )
 
 
 @njit(parallel=True, error_model="numpy", cache=True)
-def _compose(found, depths, logits, filtered, weight, records, to_depths, radii, width, height):
-    """Records at other opacities: their logarithm, and boxes, which grow with the root of what is above the
-    least that is drawn.
+def _compose(found, logits, filtered, weight, records, shown):
+    """Records at other opacities, of what these show: their logarithm, and boxes, which grow with the root of
+    what is above the least that is drawn.
     """
-    one, zero = _F(1), _F(0)
+    one = _F(1)
     for chunk in prange((len(found) + _CHUNK - 1) // _CHUNK):
         for i in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(found))):
             logit = logits[i, 0] + weight * (logits[i, 1] - logits[i, 0])
             level = filtered[i] - np.log2(one + np.exp(-logit))
             above = level - _LEAST
-            radii[i], to_depths[i] = zero, depths[i]
-            if above <= zero:
+            if above <= _F(0):
                 continue
+            shown[i] = True
             for k in range(9):
                 records[i, k] = found[i, k]
             grows = np.sqrt(above / (found[i, 5] - _LEAST))
-            x, y, wide, high = found[i, 0], found[i, 1], found[i, 9] * grows, found[i, 10] * grows
-            records[i, 5], records[i, 9], records[i, 10] = level, wide, high
-            if x + wide > zero and x - wide < width and y + high > zero and y - high < height:
-                radii[i] = max(wide, high)
+            records[i, 5], records[i, 9], records[i, 10] = level, found[i, 9] * grows, found[i, 10] * grows
+
+
+@njit(error_model="numpy", cache=True)
+def _list_shown(starts, ids, shown, new_starts, new_ids):
+    """The lists of tiles without what is not shown, in the order that they have."""
+    at = 0
+    for tile in range(len(starts) - 1):
+        new_starts[tile] = at
+        for k in range(starts[tile], starts[tile + 1]):
+            new_ids[at] = ids[k]
+            at += shown[ids[k]]
+    new_starts[-1] = at

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from scipy.ndimage import maximum_filter
 from torch import Tensor
 
+from sagesplat.kernels.jit import njit
 from sagesplat.kernels.planes import to_image, to_planes
 from sagesplat.kernels.workspace import Workspace
 from sagesplat.metrics import ssim_cpu
@@ -23,14 +24,12 @@ def _maps(
     space: Workspace,
     values: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """SSIM of planes [3, H, W'] into `values`; its derivatives, the tiles that count, and the sum over those
-    by the size of all.
+    """SSIM of planes [3, H, W'] into `values`, or its derivatives where that has no elements; these, the tiles
+    that count, and the sum over those by the size of all.
     """
     channels, height, _ = x.shape
-    sums, derivatives = (
-        np.empty((channels, ssim_cpu.strips(height))),
-        space.take("ssim derivatives", 3, *x.shape),
-    )
+    sums = np.empty((channels, ssim_cpu.strips(height)))
+    derivatives = space.take("ssim derivatives", 0 if values.size else 3, *x.shape)
     tiles = ssim_cpu.all_tiles(height, width) if tile_mask is None else tile_mask
     ssim_cpu.compare(x, y, tiles, width, values, derivatives, sums)
     return derivatives, tiles, float(sums.sum()) / (channels * height * width)
@@ -65,7 +64,7 @@ def ssim_map(
     """
     space, width = Workspace(), x.shape[1]
     one, other = (to_planes(torch.from_numpy(i), space, name) for i, name in ((x, "x"), (y, "y")))
-    values = np.zeros_like(one)
+    values = np.empty_like(one)
     _maps(one, other, width, tile_mask, space, values)
     return values[..., :width].mean(0)
 
@@ -125,11 +124,23 @@ def means_by_label(
     """Mean of a map over each label's pixels (the `valid` ones), and how many there are, by label id."""
     if valid is not None:
         values, label_ids = values[valid], label_ids[valid]
-    lowest = int(label_ids.min(initial=0))
-    shifted = label_ids.ravel().astype(np.int64) - lowest
-    counts = np.bincount(shifted)
-    sums = np.bincount(shifted, weights=values.ravel())
+    lowest, highest = int(label_ids.min(initial=0)), int(label_ids.max(initial=0))
+    sums, counts = np.zeros(highest - lowest + 1), np.zeros(highest - lowest + 1, np.int64)
+    _add_by_label(values.ravel(), label_ids.ravel(), lowest, sums, counts)
     return {int(i) + lowest: (float(sums[i] / counts[i]), int(counts[i])) for i in np.flatnonzero(counts)}
+
+
+@njit(cache=True)
+def _add_by_label(values, label_ids, lowest, sums, counts):
+    at = 0
+    while at < len(values):
+        label, first = label_ids[at], at
+        added = sums[label - lowest]  # neighbours share their label: a sum in a register
+        while at < len(values) and label_ids[at] == label:
+            added += values[at]
+            at += 1
+        sums[label - lowest] = added
+        counts[label - lowest] += at - first
 
 
 class _PhotometricLoss(torch.autograd.Function):

@@ -108,7 +108,7 @@ def compare(x, y, tiles, width, ssim, derivatives, sums):
     """SSIM of x, y [3, H, W'] into ssim, its derivatives [3, 3, H, W'], sums [3, strips].
 
     tiles [ceil(H/16), ceil(W/16)]: those that are false count nowhere, and windows see y in x's place there;
-    what is written there is zero. ssim may have no elements.
+    what is written there is zero. ssim and derivatives may have no elements.
     """
     channels, height, wide = x.shape
     strips = sums.shape[1]
@@ -141,9 +141,10 @@ def compare(x, y, tiles, width, ssim, derivatives, sums):
                     sum_of_row = sum_of_row + value
                     if ssim.size > 0:
                         store(ssim, first + c, value)
-                    store(derivatives, first + c, by_mean)
-                    store(derivatives, x.size + first + c, by_variance)
-                    store(derivatives, 2 * x.size + first + c, by_covariance)
+                    if derivatives.size > 0:
+                        store(derivatives, first + c, by_mean)
+                        store(derivatives, x.size + first + c, by_variance)
+                        store(derivatives, 2 * x.size + first + c, by_covariance)
                 added += total(sum_of_row)
         sums[channel, strip] = added
 
