@@ -10,12 +10,14 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Int16, UInt8
+from numba import prange
 from scipy.spatial import KDTree
 from torch import Tensor
 
 from sagesplat.core.errors import RunError, short
 from sagesplat.io.files import atomic_path
 from sagesplat.io.npz import Npz
+from sagesplat.kernels.jit import njit
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Points, Scene
 from sagesplat.segment.masks import Masks, Taxonomy
@@ -47,7 +49,10 @@ class Shell:
 
     def holds(self, means: Tensor) -> Bool[Tensor, " N"]:
         """Which Gaussians lie on the shell, or beyond it."""
-        return (means - means.new_tensor(self.centre)).norm(dim=1) >= self.radius * (1 - _THICKNESS)
+        least = self.radius * (1 - _THICKNESS)
+        if means.is_cuda:
+            return (means - means.new_tensor(self.centre)).norm(dim=1) >= least
+        return torch.from_numpy(_beyond(means.detach().numpy(), self.centre, np.float32(least)))
 
     def place(self, means: Float32[Tensor, "N 3"]) -> Float32[Tensor, "N 3"]:
         """The means moved to the sphere, along their directions from the centre."""
@@ -57,7 +62,38 @@ class Shell:
 
     def step(self, means: Tensor, before: Tensor, rows: Tensor) -> None:
         """Scale a training step of some rows (indices) to the shell's distance, along the shell; in place."""
-        means[rows] = self.place(before + self.scale * (means[rows] - before))
+        if means.is_cuda:
+            means[rows] = self.place(before + self.scale * (means[rows] - before))
+            return
+        sizes = np.float32(self.radius), np.float32(self.scale)
+        _step(means.numpy(), before.numpy(), rows.numpy(), self.centre, *sizes)
+
+
+# several times as fast as a dozen operations of torch, in every training step
+
+
+@njit(parallel=True, error_model="numpy", cache=True)
+def _beyond(means, centre, radius):
+    """Whether each of `means` [N, 3] is at least `radius` away from the centre."""
+    found = np.empty(len(means), np.bool_)
+    for i in prange(len(means)):
+        x, y, z = means[i, 0] - centre[0], means[i, 1] - centre[1], means[i, 2] - centre[2]
+        found[i] = x * x + y * y + z * z >= radius * radius
+    return found
+
+
+@njit(parallel=True, error_model="numpy", cache=True)
+def _step(means, before, rows, centre, radius, scale):
+    """`Shell.step`, in place; `before` has the means of `rows`."""
+    for k in prange(len(rows)):
+        i, square = rows[k], np.float32(0)
+        for axis in range(3):
+            moved = before[k, axis] + scale * (means[i, axis] - before[k, axis]) - centre[axis]
+            means[i, axis] = moved
+            square += moved * moved
+        far = radius / max(np.sqrt(square), np.float32(1e-12))
+        for axis in range(3):
+            means[i, axis] = centre[axis] + means[i, axis] * far
 
 
 @dataclass(frozen=True, eq=False)

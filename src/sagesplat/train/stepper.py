@@ -150,12 +150,8 @@ class Stepper:
         means = state.gaussians.means
         if not self.shell:
             return trainable.new_zeros(0, dtype=torch.int64), means[:0]
-        if drawn is None:
-            sky = self.shell.holds(means) if self.sky is None else self.sky
-            rows = torch.nonzero(sky & trainable)[:, 0]
-        else:
-            sky = self.shell.holds(means[drawn]) if self.sky is None else self.sky[drawn]
-            rows = drawn[sky & trainable[drawn]]
+        sky = (self.shell.holds(means) if self.sky is None else self.sky) & trainable
+        rows = torch.nonzero(sky)[:, 0] if drawn is None else drawn[sky[drawn]]
         return rows, means[rows]
 
     def _draw(
