@@ -90,8 +90,8 @@ def _step(means, before, rows, centre, radius, scale):
         for axis in range(3):
             moved = before[k, axis] + scale * (means[i, axis] - before[k, axis]) - centre[axis]
             means[i, axis] = moved
-            square += moved * moved
-        far = radius / max(np.sqrt(square), np.float32(1e-12))
+            square = np.float32(np.float64(moved) * moved + square)  # as torch rounds it
+        far = radius * (np.float32(1) / max(np.sqrt(square), np.float32(1e-12)))
         for axis in range(3):
             means[i, axis] = centre[axis] + means[i, axis] * far
 
