@@ -58,6 +58,7 @@ def no_figures(request: pytest.FixtureRequest) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         if request.path.stem not in _FIGURES:
             patch.setattr("sagesplat.output.figures.save_figure", lambda figure, path: b"<svg/>")
+            patch.setattr("sagesplat.output.figures.save_picture", lambda figure, path: None)
         yield
 
 

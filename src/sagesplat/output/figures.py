@@ -1,9 +1,10 @@
-"""The figures of a run, after the paper's Figs. 2 to 5; each is a matplotlib Figure, saved as PNG and SVG."""
+"""The figures of a run, after the paper's Figs. 2 to 5; each is a matplotlib Figure."""
 
 import io
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -358,15 +359,26 @@ def panel_strip(panel: Panel, colours: Colours) -> Figure:
 
 def save_figure(figure: Figure, path: Path) -> bytes:
     """Write `path` with the suffixes .png and .svg; the SVG is also returned."""
+    save_picture(figure, path)
     buffer = io.BytesIO()
-    with rc_context(STYLE), warnings.catch_warnings():
-        # the font has no Chinese and no emoji: names in these are boxes here, and text in the tables
-        warnings.filterwarnings("ignore", message="Glyph .* missing from font")
-        with atomic_path(path.with_suffix(".png")) as temporary:
-            # the strongest compression takes half of the report's time
-            figure.savefig(temporary, format="png", dpi=160, pil_kwargs={"compress_level": 2})
+    with _drawing():
         figure.set_layout_engine("none")  # the layout just found also holds for the SVG
         figure.savefig(buffer, format="svg", metadata={"Date": None})
     with atomic_path(path.with_suffix(".svg")) as temporary:
         temporary.write_bytes(buffer.getvalue())
     return buffer.getvalue()
+
+
+def save_picture(figure: Figure, path: Path) -> None:
+    """Write `path` with the suffix .png."""
+    with _drawing(), atomic_path(path.with_suffix(".png")) as temporary:
+        # the strongest compression takes half of the report's time
+        figure.savefig(temporary, format="png", dpi=160, pil_kwargs={"compress_level": 2})
+
+
+@contextmanager
+def _drawing() -> Iterator[None]:
+    with rc_context(STYLE), warnings.catch_warnings():
+        # the font has no Chinese and no emoji: names in these are boxes here, and text in the tables
+        warnings.filterwarnings("ignore", message="Glyph .* missing from font")
+        yield
