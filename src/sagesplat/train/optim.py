@@ -1,13 +1,12 @@
 """Adam over rows: one fused, parallel pass; rows outside the mask keep parameter and moments untouched."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
 from numba import prange
 from torch import Tensor
 
-from sagesplat.core.gaussians import PARAMETERS
 from sagesplat.core.sh import num_bases
 from sagesplat.kernels.jit import njit
 from sagesplat.kernels.simd import LANES, load, sqrt, store
@@ -57,35 +56,51 @@ def _update(parameter, at, grad, g_at, exp_avg, exp_avg_sq, rate, correction, le
     store(exp_avg_sq, at + last, v_last)
 
 
-@njit(parallel=True, error_model="numpy", cache=True)
-def _update_rows(parameter, grad, exp_avg, exp_avg_sq, rate, correction, trainable, columns):
-    """Flat arrays of N * width values; runs of trainable rows are updated together."""
-    n = len(trainable)
-    width = len(parameter) // n
-    for chunk in prange((n + _CHUNK - 1) // _CHUNK):
-        row, end = chunk * _CHUNK, min((chunk + 1) * _CHUNK, n)
-        while row < end:
-            stop = row
-            while stop < end and trainable[stop]:
-                stop += 1
-            if columns < width:
-                for r in range(row, stop):
-                    at = r * width
-                    _update(parameter, at, grad, at, exp_avg, exp_avg_sq, rate, correction, columns)
-            elif stop > row:
-                at, length = row * width, (stop - row) * width
-                _update(parameter, at, grad, at, exp_avg, exp_avg_sq, rate, correction, length)
-            row = stop + 1
-
-
-@njit(parallel=True, error_model="numpy", cache=True)
-def _update_drawn(parameter, grad, exp_avg, exp_avg_sq, rate, correction, trainable, columns, drawn):
-    """The same for the rows `drawn` alone, of which `grad` has one each."""
+@njit(error_model="numpy", cache=True)
+def _update_chunk(chunk, parameter, grad, exp_avg, exp_avg_sq, rate, correction, trainable, columns):
+    """Rows of a chunk; runs of trainable ones are updated together."""
     width = len(parameter) // len(trainable)
-    for i in prange(len(drawn)):
-        if trainable[drawn[i]]:
-            at = drawn[i] * width
-            _update(parameter, at, grad, i * width, exp_avg, exp_avg_sq, rate, correction, columns)
+    row, end = chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(trainable))
+    while row < end:
+        stop = row
+        while stop < end and trainable[stop]:
+            stop += 1
+        if columns < width:
+            for r in range(row, stop):
+                at = r * width
+                _update(parameter, at, grad, at, exp_avg, exp_avg_sq, rate, correction, columns)
+        elif stop > row:
+            at, length = row * width, (stop - row) * width
+            _update(parameter, at, grad, at, exp_avg, exp_avg_sq, rate, correction, length)
+        row = stop + 1
+
+
+@njit(parallel=True, error_model="numpy", cache=True)
+def _update_rows(parameters, grads, exp_avg, exp_avg_sq, rates, correction, trainable, columns):
+    """Tuples of flat arrays of N * width values: to start threads takes as long as a small one of them."""
+    chunks, several = (len(trainable) + _CHUNK - 1) // _CHUNK, len(parameters)
+    for job in prange(chunks * several):
+        k = job % several
+        if columns[k]:
+            _update_chunk(
+                job // several, parameters[k], grads[k], exp_avg[k], exp_avg_sq[k], rates[k], correction,
+                trainable, columns[k],
+            )  # fmt: skip
+
+
+@njit(parallel=True, error_model="numpy", cache=True)
+def _update_drawn(parameters, grads, exp_avg, exp_avg_sq, rates, correction, trainable, columns, drawn):
+    """The same for the rows `drawn` alone, of which `grads` have one each."""
+    chunks, several = (len(drawn) + _CHUNK - 1) // _CHUNK, len(parameters)
+    for job in prange(chunks * several):
+        k, chunk = job % several, job // several
+        width = len(parameters[k]) // len(trainable)
+        for i in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(drawn)) if columns[k] else 0):
+            if trainable[drawn[i]]:
+                _update(
+                    parameters[k], drawn[i] * width, grads[k], i * width, exp_avg[k], exp_avg_sq[k], rates[k],
+                    correction, columns[k],
+                )  # fmt: skip
 
 
 def adam_step(
@@ -105,18 +120,30 @@ def adam_step(
     `columns`: update only this many values at the start of each row; the others never had a gradient.
     `drawn`: the other rows keep parameter and moments, as those that are not `trainable`.
     """
-    if not parameter.size or columns == 0:
+    of_one = (parameter,), (grad,), (exp_avg,), (exp_avg_sq,)
+    _adam_steps(*of_one, rates=[lr], step=step, trainable=trainable, columns=[columns], drawn=drawn)
+
+
+def _adam_steps(
+    *arrays: Sequence[np.ndarray],
+    rates: Sequence[float],
+    step: int,
+    trainable: np.ndarray,
+    columns: Sequence[int | None],
+    drawn: np.ndarray | None,
+) -> None:
+    """`adam_step` of several parameters (`arrays`: these, their gradients and both moments)."""
+    n = len(trainable)
+    if not n:
         return
-    rate = np.float32(lr / (1 - _BETA1**step))
+    in_use = [a.size // n if c is None else c for a, c in zip(arrays[0], columns, strict=True)]
+    per_step = np.array([lr / (1 - _BETA1**step) for lr in rates], np.float32)
     correction = np.float32((1 - _BETA2**step) ** -0.5)
-    grad = np.ascontiguousarray(grad).reshape(-1)
-    flat = parameter.reshape(-1), grad, exp_avg.reshape(-1), exp_avg_sq.reshape(-1), rate, correction
-    width = parameter.size // len(parameter)
-    columns = width if columns is None else columns
+    flat = [tuple(np.ascontiguousarray(a).reshape(-1) for a in several) for several in arrays]
     if drawn is None:
-        _update_rows(*flat, trainable, columns)
+        _update_rows(*flat, per_step, correction, trainable, np.array(in_use))
     else:
-        _update_drawn(*flat, trainable, columns, drawn)
+        _update_drawn(*flat, per_step, correction, trainable, np.array(in_use), drawn)
 
 
 def update(
@@ -133,37 +160,41 @@ def update(
     `second_weights`: [N], of the second opacities in what was drawn; where 0, these stay as they are.
     `drawn`: indices of the rows that the gradients are of; the others stay as they are. None: all.
     """
-    for name in PARAMETERS:
-        columns = 3 * (num_bases(degree) - 1) if name == "shN" else None
-        own = getattr(state.gaussians, name)
-        _update_one(state, name, own, grads, rates[name], trainable, columns, drawn)
+    own = state.gaussians.parameters()
+    columns = {"shN": 3 * (num_bases(degree) - 1)}
+    _update_some(state, own, grads, rates, trainable, columns, drawn)
     if state.second_opacities is not None and second_weights is not None:
-        own, rows = state.second_opacities, trainable & (second_weights > 0)
-        _update_one(state, SECOND, own, grads, rates["logit_opacities"], rows, None, drawn)
+        own, rows = {SECOND: state.second_opacities}, trainable & (second_weights > 0)
+        _update_some(state, own, grads, {SECOND: rates["logit_opacities"]}, rows, {}, drawn)
 
 
-def _update_one(
+def _update_some(
     state: TrainState,
-    name: str,
-    parameter: Tensor,
+    parameters: Mapping[str, Tensor],
     grads: Mapping[str, Tensor],
-    lr: float,
+    rates: Mapping[str, float],
     trainable: Tensor,
-    columns: int | None,
+    columns: Mapping[str, int],
     drawn: Tensor | None,
 ) -> None:
-    grad, moments = grads[name], (state.exp_avg[name], state.exp_avg_sq[name])
-    how = {"lr": lr, "step": state.step, "columns": columns}
-    if trainable.is_cuda:
-        from sagesplat.train import adam_triton
+    tensors = parameters, grads, state.exp_avg, state.exp_avg_sq
+    if not trainable.is_cuda:
+        of_name = ([t[name].detach().numpy() for name in parameters] for t in tensors)
+        _adam_steps(
+            *of_name, rates=[rates[name] for name in parameters], step=state.step,
+            trainable=trainable.numpy(), columns=[columns.get(name) for name in parameters],
+            drawn=None if drawn is None else drawn.numpy(),
+        )  # fmt: skip
+        return
+    from sagesplat.train import adam_triton
 
+    for name in parameters:
+        parameter, grad, *moments = (t[name] for t in tensors)
+        rows = trainable
         if drawn is not None:
-            grad, trainable = _spread(grad, drawn, trainable)
-        adam_triton.adam_step(parameter, grad, *moments, trainable=trainable, **how)
-    else:
-        arrays = (t.detach().numpy() for t in (parameter, grad, *moments))
-        rows = None if drawn is None else drawn.numpy()
-        adam_step(*arrays, trainable=trainable.numpy(), drawn=rows, **how)
+            grad, rows = _spread(grad, drawn, trainable)
+        how = {"lr": rates[name], "step": state.step, "columns": columns.get(name)}
+        adam_triton.adam_step(parameter, grad, *moments, trainable=rows, **how)
 
 
 def _spread(grad: Tensor, rows: Tensor, trainable: Tensor) -> tuple[Tensor, Tensor]:
