@@ -8,7 +8,7 @@ from typing import Any
 import jaxtyping
 import numpy as np
 import pytest
-import shapes  # noqa: F401 - before sagesplat
+import shapes  # before sagesplat
 import torch
 from hypothesis import strategies as st
 from PIL import Image
@@ -66,6 +66,20 @@ def no_figures(request: pytest.FixtureRequest) -> Iterator[None]:
 def unchecked_shapes(monkeypatch: pytest.MonkeyPatch) -> None:
     """For tests that pass wrong shapes on purpose."""
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def unsynced() -> Iterator[None]:
+    """Nobody pulls the plug on a test: thousands of small files need not reach the disk."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("os.fsync", lambda handle: None)
+        yield
+
+
+@pytest.fixture(autouse=True)
+def first_calls() -> None:
+    """What each test calls first is checked, see `shapes`."""
+    shapes.begin_test()
 
 
 @pytest.fixture(autouse=True)

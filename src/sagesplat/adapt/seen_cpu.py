@@ -47,7 +47,10 @@ class Drawn:
         """
         camera, take = self.camera, self.workspace.take
         width, height = camera.width, camera.height
-        records, shown = take("records", *self.records.shape), take("shown", len(self.records), dtype=np.bool_)
+        records, shown = (
+            take("records", *self.records.shape),
+            take("shown", len(self.records), dtype=np.bool_),
+        )
         shown.fill(False)
         for first, last, weight in parts:
             rows = slice(first, last)

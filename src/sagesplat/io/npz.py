@@ -4,7 +4,7 @@ import math
 import zipfile
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -55,25 +55,29 @@ class Npz:
     def __getitem__(self, name: str) -> np.ndarray[Any, Any]:
         info = self._infos[name]
         try:
-            self._check_header(info)
-            with self._file.open(info) as member:
-                return np.lib.format.read_array(member, allow_pickle=False)
+            opened: Any = self._file.open(info)  # typeshed does not know `readinto`
+            with opened as member:
+                shape, fortran, dtype = _header(member, info.file_size)
+                raw = np.empty(info.file_size - member.tell(), np.uint8)
+                if member.readinto(raw.data) != len(raw):
+                    raise ValueError("cut short")
+            return raw.view(dtype).reshape(shape, order="F" if fortran else "C")
         except Exception as error:  # numpy and zlib raise many kinds, too
             raise ValueError(f"array {name[:40]!r} is damaged: {str(error)[:100]}") from None
 
-    def _check_header(self, info: zipfile.ZipInfo) -> None:
-        """ValueError if the member's size is not the announced one, which numpy allocates up front."""
-        with self._file.open(info) as member:
-            if np.lib.format.read_magic(member) != (1, 0):
-                raise ValueError("not version 1.0 of the format")
-            shape, _, dtype = np.lib.format.read_array_header_1_0(member)
-            if dtype.kind not in _KINDS or not dtype.itemsize:
-                raise ValueError(f"type {dtype.str}")
-            if (
-                min(shape, default=0) < 0
-                or math.prod(shape) * dtype.itemsize != info.file_size - member.tell()
-            ):
-                raise ValueError("its shape does not fit its size")
+
+def _header(member: IO[bytes], size: int) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Shape, Fortran order and dtype; ValueError if the member's size is not the announced one, which is
+    allocated up front.
+    """
+    if np.lib.format.read_magic(member) != (1, 0):
+        raise ValueError("not version 1.0 of the format")
+    shape, fortran, dtype = np.lib.format.read_array_header_1_0(member)
+    if dtype.kind not in _KINDS or not dtype.itemsize:
+        raise ValueError(f"type {dtype.str}")
+    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != size - member.tell():
+        raise ValueError("its shape does not fit its size")
+    return shape, fortran, dtype
 
 
 def _check(infos: list[zipfile.ZipInfo], most: int, packed: bool) -> None:
