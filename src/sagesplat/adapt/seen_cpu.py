@@ -1,5 +1,5 @@
-"""Compositions of one camera on a CPU: only opacities differ, so each Gaussian is projected once and listed in
-the tiles that it meets at its largest one.
+"""Compositions of one camera on a CPU: only opacities differ, so each Gaussian is projected once, and listed
+in the tiles that it meets at its largest one.
 """
 
 from collections.abc import Mapping, Sequence

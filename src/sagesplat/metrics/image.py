@@ -24,8 +24,8 @@ def _maps(
     space: Workspace,
     values: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """SSIM of planes [3, H, W'] into `values`, or its derivatives where that has no elements; these, the tiles
-    that count, and the sum over those by the size of all.
+    """SSIM of planes [3, H, W'] into `values`, or its derivatives where that has no elements; these, the
+    tiles that count, and the sum over those by the size of all.
     """
     channels, height, _ = x.shape
     sums = np.empty((channels, ssim_cpu.strips(height)))
