@@ -359,7 +359,7 @@ def panel_strip(panel: Panel, colours: Colours) -> Figure:
 
 def save_figure(figure: Figure, path: Path) -> bytes:
     """Write `path` with the suffixes .png and .svg; the SVG is also returned."""
-    save_picture(figure, path)
+    _save_png(figure, path)
     buffer = io.BytesIO()
     with _drawing():
         figure.set_layout_engine("none")  # the layout just found also holds for the SVG
@@ -371,6 +371,10 @@ def save_figure(figure: Figure, path: Path) -> bytes:
 
 def save_picture(figure: Figure, path: Path) -> None:
     """Write `path` with the suffix .png."""
+    _save_png(figure, path)
+
+
+def _save_png(figure: Figure, path: Path) -> None:
     with _drawing(), atomic_path(path.with_suffix(".png")) as temporary:
         # the strongest compression takes half of the report's time
         figure.savefig(temporary, format="png", dpi=160, pil_kwargs={"compress_level": 2})
