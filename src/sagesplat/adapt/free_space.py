@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, Float64, Int64
+from numba import prange
 from scipy.spatial.transform import Rotation
 
 from sagesplat.core.gaussians import Gaussians
@@ -131,9 +132,9 @@ def _cells(points: np.ndarray, length: np.ndarray) -> np.ndarray:
     return ((contracted + 2) / CELL).astype(np.int64).clip(0, SIDE - 1)
 
 
-@njit(cache=True)
+@njit(parallel=True, cache=True)
 def _march(depth, log_size, points, directions, distance, sizes):
-    for i in range(len(points)):
+    for i in prange(len(points)):
         for j in range(len(directions)):
             distance[i, j], sizes[i, j] = np.inf, np.nan
             t, passed, last = 0.0, 0.0, -1
@@ -141,10 +142,12 @@ def _march(depth, log_size, points, directions, distance, sizes):
                 x = points[i, 0] + t * directions[j, 0]
                 y = points[i, 1] + t * directions[j, 1]
                 z = points[i, 2] + t * directions[j, 2]
-                length = max(1.0, np.sqrt(x * x + y * y + z * z))
-                if length > _FAR:
-                    break
-                share = (2 - 1 / length) / length
+                square, length, share = x * x + y * y + z * z, 1.0, 1.0
+                if square > 1:
+                    length = np.sqrt(square)
+                    if length > _FAR:
+                        break
+                    share = (2 - 1 / length) / length
                 a, b, c = (
                     int((x * share + 2) / CELL),
                     int((y * share + 2) / CELL),
