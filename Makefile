@@ -32,10 +32,10 @@ kernels: $(INSTALLED)
 	$(BIN)/sagesplat run build/kernels/capture build/kernels/run --train.max-steps 20 --nest.steps 10 --nest.base-steps 10 >/dev/null
 
 .PHONY: suite
-# two processes of one thread each: the tests are small, and idle threads would spin in each other's way;
+# three processes of one thread each, for two cores: browsers, clusters and programs are waited for;
 # a file stays in one process, which makes its fixtures once
 suite: $(INSTALLED)
-	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m 'not slow and not threads'
+	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/pytest -q -n 3 --dist loadfile --no-loadscope-reorder -m 'not slow and not threads'
 
 test-slow: $(INSTALLED)
 	$(BIN)/pytest -q -m slow
