@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 import torch
+from conftest import random_gaussians
 
-from sagesplat.train.optim import adam_step
+from sagesplat.train.optim import adam_step, update
+from sagesplat.train.state import initial_state
 
 
 def gradients(shape: tuple[int, ...], steps: int) -> list[np.ndarray]:
@@ -89,6 +91,32 @@ def test_columns_without_gradient_can_be_left_out():
         np.testing.assert_array_equal(a, b)
     adam_step(part[0], part[1], *part[1:], lr=0.01, step=4, trainable=trainable, columns=0)
     np.testing.assert_array_equal(whole[0], part[0])
+
+
+@pytest.mark.parametrize("some", [False, True])
+def test_all_parameters_at_once_are_each_by_itself(some):
+    g = random_gaussians(5000, seed=6)
+    state, apart = initial_state(g, 0), {name: p.numpy().copy() for name, p in g.parameters().items()}
+    rng = np.random.default_rng(7)
+    drawn = torch.from_numpy(np.flatnonzero(rng.random(5000) < 0.6)) if some else None
+    trainable = torch.from_numpy(rng.random(5000) < 0.8)
+    moments = {name: [np.zeros_like(p), np.zeros_like(p)] for name, p in apart.items()}
+    rates = {name: 1e-3 * (1 + k) for k, name in enumerate(apart)}
+    for state.step in (1, 2):
+        grads = {name: torch.from_numpy(gradients(p.shape, 1)[0] * state.step) for name, p in apart.items()}
+        if drawn is not None:
+            grads = {name: grad[drawn] for name, grad in grads.items()}
+        update(state, grads, rates, 1, trainable, drawn=drawn)
+        for name, p in apart.items():
+            adam_step(
+                p, grads[name].numpy(), *moments[name], lr=rates[name], step=state.step,
+                trainable=trainable.numpy(), columns=9 if name == "shN" else None,
+                drawn=None if drawn is None else drawn.numpy(),
+            )  # fmt: skip
+    for name, p in apart.items():
+        np.testing.assert_array_equal(getattr(state.gaussians, name), p)
+        np.testing.assert_array_equal(state.exp_avg_sq[name], moments[name][1])
+    assert (state.gaussians.means.numpy() != random_gaussians(5000, seed=6).means.numpy()).any()
 
 
 def test_no_rows_and_no_columns():
