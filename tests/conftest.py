@@ -8,7 +8,7 @@ from typing import Any
 import jaxtyping
 import numpy as np
 import pytest
-import shapes  # before sagesplat
+import shapes  # noqa: F401 - before sagesplat
 import torch
 from hypothesis import strategies as st
 from PIL import Image
@@ -57,8 +57,7 @@ def no_figures(request: pytest.FixtureRequest) -> Iterator[None]:
     """Reports without figures, which take most of the time of a small run, and have their own tests."""
     with pytest.MonkeyPatch.context() as patch:
         if request.path.stem not in _FIGURES:
-            patch.setattr("sagesplat.output.figures.save_figure", lambda figure, path: b"<svg/>")
-            patch.setattr("sagesplat.output.figures.save_picture", lambda figure, path: None)
+            patch.setattr("sagesplat.output.figures.save_figure", lambda figure, path, svg=True: b"<svg/>")
         yield
 
 
@@ -74,12 +73,6 @@ def unsynced() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("os.fsync", lambda handle: None)
         yield
-
-
-@pytest.fixture(autouse=True)
-def first_calls() -> None:
-    """What each test calls first is checked, see `shapes`."""
-    shapes.begin_test()
 
 
 @pytest.fixture(autouse=True)

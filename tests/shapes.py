@@ -1,8 +1,7 @@
 """Unless CHECK_SHAPES=0, checks jaxtyping's shapes and dtypes while tests run; import it before sagesplat.
 
 Checked are all modules that use jaxtyping, but for `EXCEPT` and those with kernels: a wrapper would change
-what is compiled. Only arrays are checked: what tests pass instead of other classes is their affair. In each
-test the first calls of a function are checked, and every so many of the others.
+what is compiled. Only arrays are checked: what tests pass instead of other classes is their affair.
 """
 
 import inspect
@@ -25,10 +24,7 @@ EXCEPT = {
     "sagesplat.demo.world",  # `demo.raycast` compiles a function of it
 }  # fmt: skip
 
-FIRST, EVERY = 20, 20  # calls of a function that are checked in each test
-
 _NO_AXES = nullcontext()
-_counts: dict[Callable[..., Any], int] = {}  # calls in this test
 
 
 def check(function: Callable[..., Any], *, axes: Any = _NO_AXES) -> Callable[..., Any]:
@@ -48,8 +44,7 @@ def check(function: Callable[..., Any], *, axes: Any = _NO_AXES) -> Callable[...
 
     @wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
-        count = _counts[function] = _counts.get(function, 0) + 1
-        if jaxtyping.config.jaxtyping_disable or (count > FIRST and count % EVERY):
+        if jaxtyping.config.jaxtyping_disable:
             return function(*args, **kwargs)
         with axes:
             for place, name, hint, fits in hints:
@@ -69,11 +64,6 @@ def check(function: Callable[..., Any], *, axes: Any = _NO_AXES) -> Callable[...
             return found
 
     return wrapper
-
-
-def begin_test() -> None:
-    """From now on first calls are checked again."""
-    _counts.clear()
 
 
 def decorator(*, typechecker: Callable[..., Any]) -> Callable[..., Any]:

@@ -350,8 +350,7 @@ def full_count(data: ReportData) -> int:
 
 def test_an_address_is_a_qr_code_only_where_there_is_one(whole, tmp_path, monkeypatch):
     assert "QR code of" not in whole.read_text("utf-8")
-    monkeypatch.setattr(figures, "save_figure", lambda figure, path: b"")  # which takes seconds
-    monkeypatch.setattr(figures, "save_picture", lambda figure, path: None)
+    monkeypatch.setattr(figures, "save_figure", lambda figure, path, svg=True: b"")  # takes seconds
     data = dataclasses.replace(whole_page(), url="https://example.org/x/")
     page = write_report(tmp_path, data).read_text("utf-8")
     assert '<a href="https://example.org/x/">' in page

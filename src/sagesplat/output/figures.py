@@ -3,8 +3,7 @@
 import io
 import math
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -357,32 +356,19 @@ def panel_strip(panel: Panel, colours: Colours) -> Figure:
     return figure
 
 
-def save_figure(figure: Figure, path: Path) -> bytes:
-    """Write `path` with the suffixes .png and .svg; the SVG is also returned."""
-    _save_png(figure, path)
+def save_figure(figure: Figure, path: Path, *, svg: bool = True) -> bytes:
+    """Write `path` with the suffixes .png and, with `svg`, .svg; the SVG is also returned, else nothing."""
     buffer = io.BytesIO()
-    with _drawing():
+    with rc_context(STYLE), warnings.catch_warnings():
+        # the font has no Chinese and no emoji: names in these are boxes here, and text in the tables
+        warnings.filterwarnings("ignore", message="Glyph .* missing from font")
+        with atomic_path(path.with_suffix(".png")) as temporary:
+            # the strongest compression takes half of the report's time
+            figure.savefig(temporary, format="png", dpi=160, pil_kwargs={"compress_level": 2})
+        if not svg:
+            return b""
         figure.set_layout_engine("none")  # the layout just found also holds for the SVG
         figure.savefig(buffer, format="svg", metadata={"Date": None})
     with atomic_path(path.with_suffix(".svg")) as temporary:
         temporary.write_bytes(buffer.getvalue())
     return buffer.getvalue()
-
-
-def save_picture(figure: Figure, path: Path) -> None:
-    """Write `path` with the suffix .png."""
-    _save_png(figure, path)
-
-
-def _save_png(figure: Figure, path: Path) -> None:
-    with _drawing(), atomic_path(path.with_suffix(".png")) as temporary:
-        # the strongest compression takes half of the report's time
-        figure.savefig(temporary, format="png", dpi=160, pil_kwargs={"compress_level": 2})
-
-
-@contextmanager
-def _drawing() -> Iterator[None]:
-    with rc_context(STYLE), warnings.catch_warnings():
-        # the font has no Chinese and no emoji: names in these are boxes here, and text in the tables
-        warnings.filterwarnings("ignore", message="Glyph .* missing from font")
-        yield

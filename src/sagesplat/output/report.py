@@ -50,7 +50,7 @@ def write_report(folder: Path, data: ReportData) -> Path:
     per_block.evaluation.write_csv(folder / "tables" / "evaluation_rows.csv")
     for number, panel in enumerate(data.panels):
         strip = figures.panel_strip(panel, data.colours)
-        figures.save_picture(strip, folder / "figures" / f"panel_{number}")
+        figures.save_figure(strip, folder / "figures" / f"panel_{number}", svg=False)
     page = template(Path(__file__).with_name("report.html.j2")).render(
         data=data,
         version=__version__,

@@ -88,19 +88,30 @@ def _update_rows(parameters, grads, exp_avg, exp_avg_sq, rates, correction, trai
             )  # fmt: skip
 
 
+@njit(error_model="numpy", cache=True)
+def _update_drawn_chunk(
+    chunk, parameter, grad, exp_avg, exp_avg_sq, rate, correction, trainable, columns, drawn
+):  # fmt: skip
+    """The same for a chunk of the rows `drawn`, of which `grad` has one each."""
+    width = len(parameter) // len(trainable)
+    for i in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(drawn))):
+        if trainable[drawn[i]]:
+            at = drawn[i] * width
+            _update(parameter, at, grad, i * width, exp_avg, exp_avg_sq, rate, correction, columns)
+
+
 @njit(parallel=True, error_model="numpy", cache=True)
 def _update_drawn(parameters, grads, exp_avg, exp_avg_sq, rates, correction, trainable, columns, drawn):
-    """The same for the rows `drawn` alone, of which `grads` have one each."""
+    """`_update_rows` of the rows `drawn` alone."""
     chunks, several = (len(drawn) + _CHUNK - 1) // _CHUNK, len(parameters)
     for job in prange(chunks * several):
-        k, chunk = job % several, job // several
-        width = len(parameters[k]) // len(trainable)
-        for i in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(drawn)) if columns[k] else 0):
-            if trainable[drawn[i]]:
-                _update(
-                    parameters[k], drawn[i] * width, grads[k], i * width, exp_avg[k], exp_avg_sq[k], rates[k],
-                    correction, columns[k],
-                )  # fmt: skip
+        k = job % several
+        if columns[k]:
+            # by a function of its own: to take an array out of a tuple for each row costs as much as the row
+            _update_drawn_chunk(
+                job // several, parameters[k], grads[k], exp_avg[k], exp_avg_sq[k], rates[k], correction,
+                trainable, columns[k], drawn,
+            )  # fmt: skip
 
 
 def adam_step(
