@@ -2,6 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+CORE := $(VENV)/.core
 INSTALLED := $(VENV)/.installed
 
 # Node and npm for the viewer come with the environment (pyright brings them)
@@ -16,20 +17,21 @@ demo: $(INSTALLED)
 # many tests start programs, which would compile all modules anew where this is set
 unexport PYTHONDONTWRITEBYTECODE
 
-# Chromium comes while pip works, kernels are compiled beside the types: the two processes of the tests
-# would otherwise compile the same ones at the same time
+# Chromium comes while pip works; kernels are compiled beside the extras and the types: the processes of the
+# tests would otherwise compile the same ones at the same time
 test:
-	@$(MAKE) --no-print-directory -j 2 browser $(INSTALLED)
+	@$(MAKE) --no-print-directory -j 2 browser $(CORE)
 	@$(MAKE) --no-print-directory -j 2 kernels types
 	@$(MAKE) --no-print-directory style suite
 	NUMBA_NUM_THREADS=2 $(BIN)/pytest -q -m threads
 
 .PHONY: kernels
-# a run of a few steps: what it needs is compiled and kept
-kernels: $(INSTALLED)
+# a run of a few steps: what it needs is compiled and kept; from the sources, as pip may be at the package
+kernels: export PYTHONPATH = $(CURDIR)/src
+kernels: $(CORE)
 	rm -rf build/kernels
 	$(BIN)/python -c 'import sagesplat; sagesplat.make_demo_capture("build/kernels/capture", views=12, width=64, height=48)'
-	$(BIN)/sagesplat run build/kernels/capture build/kernels/run --train.max-steps 20 --nest.steps 10 --nest.base-steps 10 >/dev/null
+	$(BIN)/python -m sagesplat run build/kernels/capture build/kernels/run --train.max-steps 20 --nest.steps 10 --nest.base-steps 10 >/dev/null
 
 .PHONY: suite
 # three processes of one thread each, for two cores: browsers, clusters and programs are waited for;
@@ -52,12 +54,18 @@ style: $(INSTALLED)
 	$(BIN)/lint-imports
 
 # bytecode is written when a module is first imported: most of those installed never are
-$(INSTALLED): pyproject.toml constraints.txt
+INSTALL = $(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable
+
+$(CORE): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "sagesplat needs Python 3.11 or newer: make PYTHON=python3.12 ..."; exit 2; }
 	@$(PYTHON) -m venv $(VENV) || $(PYTHON) -m virtualenv $(VENV) || \
 	  { echo "no venv module: apt install python3-venv, then make again"; exit 2; }
-	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[dev,docs,onnx,hf,poses,video,heic,view,ray]'
+	$(INSTALL) .
+	touch $@
+
+$(INSTALLED): $(CORE)
+	$(INSTALL) '.[dev,docs,onnx,hf,poses,video,heic,view,ray]'
 	touch $@
 
 .PHONY: docs gallery

@@ -223,6 +223,7 @@ def test_a_capture_without_test_views(capture, tmp_path):
     assert set(read_same_size(job.run.same_size).of_view) == {6}
 
 
+@pytest.mark.slow
 def test_categories_that_hardly_occur(capture, tmp_path):
     """One in two training views only, one of a single pixel, one in test views only."""
     folder = tmp_path / "capture"

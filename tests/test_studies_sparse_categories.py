@@ -80,7 +80,7 @@ def trained(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run
 
 
-@pytest.mark.parametrize("ladder", ["nested", "snapshots"])
+@pytest.mark.parametrize("ladder", ["nested", pytest.param("snapshots", marks=pytest.mark.slow)])
 def test_every_stage_and_study_takes_them(
     ladder: LadderKind, capture: Path, trained: Path, tmp_path: Path
 ) -> None:

@@ -97,6 +97,7 @@ def test_it_trains_as_on_the_cpu(scene, on_gpu, monkeypatch, config):  # noqa: F
     np.testing.assert_allclose(losses[0][-6:], losses[1][-6:], rtol=0.1)
 
 
+@pytest.mark.slow
 def test_mcmc_and_what_was_killed(scene, on_gpu, tmp_path):  # noqa: F811
     config = replace(SHORT, strategy="mcmc", max_gaussians=100)
     whole = run(scene, config)

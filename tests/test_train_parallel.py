@@ -29,8 +29,7 @@ def run(events):
 @pytest.mark.parametrize(
     "config",
     [
-        replace(SHORT, poses=True),
-        replace(SHORT, freeze_at=0.45),
+        replace(SHORT, poses=True, freeze_at=0.45),
         pytest.param(replace(SHORT, strategy="mcmc", batch=4), marks=pytest.mark.slow),
     ],
 )
