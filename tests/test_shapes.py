@@ -1,9 +1,12 @@
 """The checker of shapes, which `CHECK_SHAPES=0` turns off."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
+from conftest import random_gaussians
 from jaxtyping import Float32, Int64, TypeCheckError, jaxtyped
 from shapes import check, checked_modules
 
@@ -29,6 +32,22 @@ def test_what_fits_passes() -> None:
 def test_other_shapes_and_dtypes_do_not(arguments: tuple[Any, ...]) -> None:
     with pytest.raises(TypeCheckError):
         _sums(*arguments)
+
+
+def test_what_passed_before_lets_nothing_else_pass() -> None:
+    for _ in range(2):
+        assert len(_sums(X, np.arange(4))[0]) == 4
+        with pytest.raises(TypeCheckError):
+            _sums(X, np.arange(4), 1)
+        with pytest.raises(TypeCheckError):
+            _sums(X, np.arange(5))
+
+
+def test_dataclasses_are_checked() -> None:
+    g = random_gaussians(3)
+    for means in (torch.zeros(3, 2), torch.zeros(4, 3), torch.zeros(3, 3, dtype=torch.int64)):
+        with pytest.raises(TypeCheckError):
+            replace(g, means=means)
 
 
 def test_modules_with_kernels_are_left_out() -> None:
