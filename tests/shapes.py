@@ -1,8 +1,7 @@
 """Unless CHECK_SHAPES=0, checks jaxtyping's shapes and dtypes while tests run; import it before sagesplat.
 
 Checked are all modules that use jaxtyping, but for `EXCEPT` and those with kernels: a wrapper would change
-what is compiled. Only arrays are checked: what tests pass instead of other classes is their affair. Shapes
-and dtypes that a function had before are not checked again.
+what is compiled. Only arrays are checked: what tests pass instead of other classes is their affair.
 """
 
 import inspect
@@ -10,7 +9,6 @@ import os
 import re
 from collections.abc import Callable, Iterable
 from contextlib import nullcontext
-from dataclasses import is_dataclass
 from functools import wraps
 from pathlib import Path
 from types import UnionType
@@ -26,7 +24,7 @@ EXCEPT = {
     "sagesplat.demo.world",  # `demo.raycast` compiles a function of it
 }  # fmt: skip
 
-_NO_AXES, _ABSENT = nullcontext(), object()
+_NO_AXES = nullcontext()
 
 
 def check(function: Callable[..., Any], *, axes: Any = _NO_AXES) -> Callable[..., Any]:
@@ -44,46 +42,28 @@ def check(function: Callable[..., Any], *, axes: Any = _NO_AXES) -> Callable[...
     if not hints and of_result is None:
         return function
 
-    passed: set[Any] = set()
-
-    def check_arguments(given: list[Any]) -> None:
-        for (_, name, hint, fits), value in zip(hints, given, strict=True):
-            if value is not _ABSENT and not fits(value):
-                raise jaxtyping.TypeCheckError(f"{function.__qualname__}: {name} is not {hint}")
-
     @wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
         if jaxtyping.config.jaxtyping_disable:
             return function(*args, **kwargs)
-        count = len(args)
-        given = [args[place] if place < count else kwargs.get(name, _ABSENT) for place, name, _, _ in hints]
-        kinds: Any = tuple(map(_kind, given))
-        if kinds not in passed:
-            with axes:
-                check_arguments(given)
-            passed.add(kinds)
-        found = function(*args, **kwargs)
-        if of_result and (kinds := (kinds, _kind(found))) not in passed:
-            with axes:
-                check_arguments(given)
-                if not of_result(found):
-                    raise jaxtyping.TypeCheckError(
-                        f"{function.__qualname__}: the result is not {signature.return_annotation}"
-                    )
-            passed.add(kinds)
-        return found
+        with axes:
+            for place, name, hint, fits in hints:
+                if place < len(args):
+                    value = args[place]
+                elif name in kwargs:
+                    value = kwargs[name]
+                else:
+                    continue
+                if not fits(value):
+                    raise jaxtyping.TypeCheckError(f"{function.__qualname__}: {name} is not {hint}")
+            found = function(*args, **kwargs)
+            if of_result and not of_result(found):
+                raise jaxtyping.TypeCheckError(
+                    f"{function.__qualname__}: the result is not {signature.return_annotation}"
+                )
+            return found
 
     return wrapper
-
-
-def _kind(value: Any) -> Any:
-    """All of a value that a check depends on."""
-    kind = type(value)
-    if kind in (tuple, list):
-        return kind, tuple(map(_kind, value))
-    if kind is dict:
-        return kind, tuple(map(_kind, value.values()))
-    return kind, getattr(value, "dtype", None), getattr(value, "shape", None)
 
 
 def decorator(*, typechecker: Callable[..., Any]) -> Callable[..., Any]:
@@ -92,16 +72,12 @@ def decorator(*, typechecker: Callable[..., Any]) -> Callable[..., Any]:
     jaxtyping's own binds the arguments of every function three times, whether it has arrays or not: that
     took a third of the time of tests that make runs.
     """
-    axes = _of_jaxtyping("context")  # has no state
+    of_class, axes = _of_jaxtyping(typechecker=typechecker), _of_jaxtyping("context")  # has no state
 
     def decorate(decorated: Any) -> Any:
         if inspect.isfunction(decorated):
             return check(decorated, axes=axes)
-        if inspect.isclass(decorated):
-            if is_dataclass(decorated):
-                decorated.__init__ = check(decorated.__init__, axes=axes)
-            return decorated
-        return _of_jaxtyping(decorated, typechecker=typechecker)  # properties and the like
+        return of_class(decorated)
 
     return decorate
 
