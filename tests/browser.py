@@ -26,6 +26,7 @@ FLAGS = (
     "--no-first-run",
 )
 _NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+LIMIT = 600e3  # milliseconds that anything may take: a busy machine is no failure
 SMALL = (320, 200)  # software draws larger canvases too slowly
 
 
@@ -43,7 +44,7 @@ class Opened:
         """All of them; a sound page has none."""
         return self.errors + self.violations + self.failed
 
-    def wait_for(self, expression: str, seconds: float = 20.0) -> Any:
+    def wait_for(self, expression: str, seconds: float = 600.0) -> Any:
         """The value of an expression as soon as it is true.
 
         Playwright's `wait_for_function` evaluates text on the page, which the viewer's policy forbids.
@@ -87,7 +88,9 @@ def launch(*flags: str) -> Iterator["Browser"]:
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=find_chromium(), args=[*FLAGS, *flags])
+        browser = playwright.chromium.launch(
+            executable_path=find_chromium(), args=[*FLAGS, *flags], timeout=LIMIT
+        )
         try:
             yield browser
         finally:
@@ -128,6 +131,7 @@ def open_page(
         viewport={"width": size[0], "height": size[1]}, device_scale_factor=1, color_scheme=scheme,
         has_touch=touch, ignore_https_errors=True,
     )  # fmt: skip
+    context.set_default_timeout(LIMIT)
     opened = Opened(context.new_page())
     _listen(opened)
     if script:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import shapes  # noqa: F401 - before sagesplat
 import torch
+from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -27,6 +28,10 @@ from sagesplat.scene import load_scene
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage, write_model
 from sagesplat.scene.scene import Camera, Scene
 from sagesplat.stages.pipeline import run_all
+
+# a busy machine is no failure
+settings.register_profile("sagesplat", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("sagesplat")
 
 LABELS = (-1, 3, 184)
 SMALL_RUN = RunConfig(  # of `finished_run`

@@ -1,7 +1,6 @@
 """Quality models: the formulas that a viewer shares, and files of them."""
 
 import json
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -154,12 +153,3 @@ def _refused(path, entry) -> None:
     with pytest.raises(DataError, match="not a file of promises") as error:
         read_promises(path)
     assert "\n" not in str(error.value)
-
-
-def test_a_thousand_viewpoints_are_quick(model):
-    rng = np.random.default_rng(0)
-    direction = rng.standard_normal((1000, 3))
-    direction /= np.linalg.norm(direction, axis=1)[:, None]
-    start = time.perf_counter()
-    model.predict(rng.uniform(1, 4, 1000), -3 * direction, direction)
-    assert time.perf_counter() - start < 0.5

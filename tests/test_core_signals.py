@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -19,20 +18,23 @@ LINES = {
     signal.SIGHUP: "sagesplat: ended by SIGHUP (its terminal was closed; nohup or tmux keeps a run); "
     f"{KEPT}\n",
 }
-# A command in the place of sagesplat's: what it does is the program's first argument.
+# A command in the place of sagesplat's: what it does is the program's first argument. `told()` returns once
+# the test has sent its signals. Whether signals are the same wish does not depend on the clock.
 PROGRAM = """
-import sys, types, weakref, time
+import sys, types
 from pathlib import Path
 from sagesplat.__main__ import program
 
 def main():
     def ready():
         print("ready", flush=True)
-    exec(sys.argv[1], {"ready": ready, "folder": Path(sys.argv[2])})
+    exec(sys.argv[1], {"ready": ready, "told": sys.stdin.read, "folder": Path(sys.argv[2])})
 
 sys.modules["sagesplat.cli"] = types.SimpleNamespace(main=main)
 program()
 """
+ONE_WISH = "import sagesplat.core.signals as s; s._SAME = 1e9\n"
+EACH_A_WISH = "import sagesplat.core.signals as s; s._SAME = 0\n"
 WRITES = """
 import time
 from sagesplat.io.files import atomic_path
@@ -41,9 +43,10 @@ with locked(folder), atomic_path(folder / "a.txt") as path:
     path.write_text("half")
     try:
         ready()
-        time.sleep(60)
+        time.sleep(3600)
     finally:
-        time.sleep(0.3)
+        ready()
+        told()
         print("cleaned", flush=True)
 """
 
@@ -59,16 +62,21 @@ def started(code: str, folder: Path, **options) -> subprocess.Popen[str]:
     here = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, sys.path))}
     process = subprocess.Popen(
         [sys.executable, "-c", PROGRAM, code, str(folder)],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=here,
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=here,
         **{"preexec_fn": hears_signals, **options},
     )  # fmt: skip
-    assert process.stdout is not None
-    assert process.stdout.readline() == "ready\n"
+    is_ready(process)
     return process
 
 
+def is_ready(process: subprocess.Popen[str]) -> None:
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+
+
 def ended(process: subprocess.Popen[str]) -> tuple[int, str, str]:
-    out, errors = process.communicate(timeout=20)
+    """Exit code and what was said, after the program was told that all signals were sent."""
+    out, errors = process.communicate(timeout=600)
     return process.returncode, out, errors
 
 
@@ -76,10 +84,11 @@ def ended(process: subprocess.Popen[str]) -> tuple[int, str, str]:
 def test_five_quick_signals_are_one_line_and_cleaning_up_is_not_cut_off(
     tmp_path: Path, number: signal.Signals
 ) -> None:
-    process = started(WRITES, tmp_path)
-    for _ in range(5):
+    process = started(ONE_WISH + WRITES, tmp_path)
+    process.send_signal(number)
+    is_ready(process)  # to clean up
+    for _ in range(4):
         process.send_signal(number)
-        time.sleep(0.05)
     assert ended(process) == (_exit_code(number), "cleaned\n", LINES[number])
     assert [path.name for path in tmp_path.iterdir()] == [".lock"]
 
@@ -88,26 +97,30 @@ def test_exit_codes_are_what_shells_report() -> None:
     assert [_exit_code(number) for number in LINES] == [2, 143, 129]
 
 
+AT_THE_END = """
+import threading, time
+def wait():
+    while threading.main_thread().is_alive():
+        time.sleep(0.01)
+    ready()
+    THEN
+threading.Thread(target=wait).start()
+"""
+
+
 @pytest.mark.parametrize(
     "code",
-    [
-        "import atexit, time; atexit.register(lambda: (ready(), time.sleep(0.5)))",
-        "import threading, time\n"
-        "threading.Thread(target=lambda: (ready(), time.sleep(0.5))).start()",  # waited for at the end
-    ],
+    ["import atexit; atexit.register(lambda: (ready(), told()))", AT_THE_END.replace("THEN", "told()")],
 )
 def test_a_signal_after_the_work_changes_nothing(tmp_path: Path, code: str) -> None:
-    process = started(code, tmp_path)
+    process = started(ONE_WISH + code, tmp_path)
     for number in LINES:
-        time.sleep(0.1)
         process.send_signal(number)
     assert ended(process) == (0, "", "")
 
 
 def test_a_program_that_hangs_at_its_end_can_still_be_ended(tmp_path: Path) -> None:
-    code = "import threading, time; threading.Thread(target=lambda: (ready(), time.sleep(60))).start()"
-    process = started(f"import sagesplat.core.signals as s; s._SAME = 0.2\n{code}", tmp_path)
-    time.sleep(0.5)
+    process = started(EACH_A_WISH + AT_THE_END.replace("THEN", "time.sleep(3600)"), tmp_path)
     process.send_signal(signal.SIGTERM)
     assert ended(process) == (143, "", "")
 
@@ -116,10 +129,10 @@ def test_a_program_that_hangs_at_its_end_can_still_be_ended(tmp_path: Path) -> N
     "code",
     [
         # a callback of the garbage collector, which drops exceptions
-        "class Slow:\n    def __del__(self):\n        ready()\n        time.sleep(0.3)\n"
-        "import time\nSlow()\ntime.sleep(60)",
+        "class Slow:\n    def __del__(self):\n        ready()\n        time.sleep(3600)\n"
+        "import time\nSlow()\ntime.sleep(3600)",
         # Python ends itself by SIGINT where a plain KeyboardInterrupt passed through an `exec`
-        "exec('ready(); import time; time.sleep(60)', globals())",
+        "exec('ready(); import time; time.sleep(3600)', globals())",
     ],
 )
 def test_no_signal_goes_astray(tmp_path: Path, code: str) -> None:
@@ -131,26 +144,31 @@ def test_no_signal_goes_astray(tmp_path: Path, code: str) -> None:
 STARTS = """
 import signal, time
 from sagesplat.core.signals import deferred
-import sagesplat.core.signals as s; s._SAME = 0.2
 with deferred():
     ready()
-    time.sleep(SECONDS)
+    while not s._stop.waiting:
+        time.sleep(0.01)
+    ready()
+    THEN
     print("begun", flush=True)
     signal.signal(signal.SIGTERM, lambda *_: exit(9))  # as libraries do
-time.sleep(60)
+time.sleep(3600)
 """
 
 
-@pytest.mark.parametrize(("seconds", "times", "said"), [(0.5, 1, "begun\n"), (60, 2, "")])
-def test_what_must_not_be_half_begun_is_finished_first(
-    tmp_path: Path, seconds: float, times: int, said: str
-) -> None:
-    """Unless the wish is repeated after a while."""
-    process = started(STARTS.replace("SECONDS", str(seconds)), tmp_path)
-    for _ in range(times):
-        process.send_signal(signal.SIGTERM)
-        time.sleep(0.3)
-    assert ended(process) == (143, said, LINES[signal.SIGTERM])
+def test_what_must_not_be_half_begun_is_finished_first(tmp_path: Path) -> None:
+    process = started(EACH_A_WISH + STARTS.replace("THEN", ""), tmp_path)
+    process.send_signal(signal.SIGTERM)
+    is_ready(process)
+    assert ended(process) == (143, "begun\n", LINES[signal.SIGTERM])
+
+
+def test_what_hangs_while_it_begins_is_ended_by_a_second_signal(tmp_path: Path) -> None:
+    process = started(EACH_A_WISH + STARTS.replace("THEN", "time.sleep(3600)"), tmp_path)
+    process.send_signal(signal.SIGTERM)
+    is_ready(process)
+    process.send_signal(signal.SIGTERM)
+    assert ended(process) == (143, "", LINES[signal.SIGTERM])
 
 
 WAITS = """
@@ -171,7 +189,7 @@ with answered_at_once():
     pass
 try:
     ready()
-    time.sleep(60)
+    time.sleep(3600)
 finally:
     print("cleaned", flush=True)
 """
@@ -198,7 +216,7 @@ def test_what_nohup_and_shells_ignore_stays_ignored(tmp_path: Path) -> None:
         for number in (signal.SIGHUP, signal.SIGINT):
             signal.signal(number, signal.SIG_IGN)
 
-    process = started("ready(); import time; time.sleep(0.5)", tmp_path, preexec_fn=ignore)
+    process = started("ready(); told()", tmp_path, preexec_fn=ignore)
     process.send_signal(signal.SIGHUP)
     process.send_signal(signal.SIGINT)
     assert ended(process) == (0, "", "")
@@ -206,14 +224,13 @@ def test_what_nohup_and_shells_ignore_stays_ignored(tmp_path: Path) -> None:
 
 def test_imports_are_interrupted_in_one_line_too(tmp_path: Path) -> None:
     """The first module that the command line imports says when."""
-    (tmp_path / "tyro.py").write_text("import time; print('ready', flush=True); time.sleep(60)")
+    (tmp_path / "tyro.py").write_text("import time; print('ready', flush=True); time.sleep(3600)")
     here = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *map(str, sys.path)])}
     with subprocess.Popen(
         [sys.executable, "-m", "sagesplat", "info", "."],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=here, preexec_fn=hears_signals,
     ) as process:  # fmt: skip
-        assert process.stdout is not None
-        assert process.stdout.readline() == "ready\n"
+        is_ready(process)
         process.send_signal(signal.SIGINT)
         assert ended(process) == (2, "", LINES[signal.SIGINT])
 

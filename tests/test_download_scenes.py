@@ -8,7 +8,6 @@ import struct
 import subprocess
 import sys
 import threading
-import time
 import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -44,7 +43,8 @@ class Site:
     cut: int | None = None  # bytes; the connection ends after so many of the archive have been sent
     location: str = ""
     content_range: str = "bytes {first}-{last}/{size}"
-    delay: float = 0.0
+    silent: bool = False  # until the test is over
+    over: threading.Event = field(default_factory=threading.Event)
     served: int = 0
     asked: list[tuple[int, int]] = field(default_factory=list)
     lock: threading.Lock = field(default_factory=threading.Lock)
@@ -54,7 +54,8 @@ class Site:
         return f"{self.base}/360_v2.zip"
 
     def answer(self, request: BaseHTTPRequestHandler) -> None:
-        time.sleep(self.delay)
+        if self.silent:
+            self.over.wait()
         size, match = len(self.archive), re.fullmatch(r"bytes=(\d+)-(\d+)", request.headers["Range"] or "")
         with self.lock:
             failing, self.failures = bool(self.code) and self.failures > 0, self.failures - 1
@@ -105,6 +106,7 @@ def site(monkeypatch) -> Iterator[Site]:
         thread = threading.Thread(target=server.serve_forever, args=(0.01,))
         thread.start()
         yield site
+        site.over.set()
         server.shutdown()
         thread.join()
 
@@ -336,7 +338,7 @@ def test_a_fault_that_stays_is_one_line(site, tmp_path):
 
 def test_servers_that_cannot_be_reached(tmp_path, site, monkeypatch):
     monkeypatch.setattr(remote_zip, "TIMEOUT", 0.05)
-    site.delay = 0.3
+    site.silent = True
     cases = {
         site.url: "timed out",
         "http://127.0.0.1:1/360_v2.zip": "refused",

@@ -536,7 +536,7 @@ def test_a_job_may_keep_its_lock_between_stages(finished: Path, tmp_path: Path) 
     with ExitStack() as locks:
         job = Job(RunDir(run, "snapshots"), lambda event: None, locks=locks)
         run_stage(job, "extra", {}, [], [run / "extra"], lambda: [])
-        code = HOLDS.replace("time.sleep(60)", "pass")
+        code = HOLDS.replace("time.sleep(3600)", "pass")
         command = [sys.executable, "-c", code, str(run)]
         assert "works on it" in subprocess.run(command, capture_output=True, text=True).stderr
     subprocess.run(command, capture_output=True, check=True)

@@ -3,10 +3,13 @@
 import ast
 import json
 import os
+import re
 import runpy
 import shutil
 import subprocess
 import sys
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +25,13 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 SCRIPTS = sorted(EXAMPLES.glob("*.py"))
 
 
-def run(name: str, *words: object, code: int = 0, **env: str) -> subprocess.CompletedProcess[str]:
+def run(name: str, *words: object) -> str:
+    """What a script prints; in this process, as one of its own begins with torch's import."""
     (script,) = EXAMPLES.glob(f"{name}_*.py")
-    command = [sys.executable, str(script), *map(str, words)]
-    done = subprocess.run(
-        command, capture_output=True, text=True, check=False, env={**os.environ, **env}, timeout=300
-    )
-    assert done.returncode == code, done.stderr
-    return done
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(StringIO()) as out:
+        patch.setattr(sys, "argv", [str(script), *map(str, words)])
+        runpy.run_path(str(script), run_name="__main__")
+    return out.getvalue()
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +45,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def finished(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     folder = tmp_path_factory.mktemp("run") / "run"
     words = ("--target-ssim", 0.4, "--max-steps", 60, "--nest-steps", 20)
-    return folder, run("01", capture, folder, *words).stdout
+    return folder, run("01", capture, folder, *words)
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
@@ -67,7 +69,7 @@ def test_a_run_from_python_shows_its_stages_and_plans(capture, finished):
     folder, text = finished
     assert "train: " in text
     assert "SSIM 0.4: " in text
-    again = run("01", capture, folder, "--target-ssim", 0.4, "--max-steps", 60, "--nest-steps", 20).stdout
+    again = run("01", capture, folder, "--target-ssim", 0.4, "--max-steps", 60, "--nest-steps", 20)
     assert "train: up to date" in again
     assert again[again.index("\n\nSSIM") :] == text[text.index("\n\nSSIM") :]
 
@@ -77,7 +79,7 @@ def test_a_plan_for_a_viewer_is_written_and_grows_with_the_target(finished, tmp_
     counts = []
     for target in (0.5, 0.95):
         ply = tmp_path / f"{target}.ply"
-        text = run("02", folder, "view_001.png", ply, "--target-fidelity", target, "--back", 0.01).stdout
+        text = run("02", folder, "view_001.png", ply, "--target-fidelity", target, "--back", 0.01)
         counts.append(int(text.splitlines()[-1].split()[1].replace(",", "")))
         assert len(read_ply(ply)) == counts[-1]
     assert 0 < counts[0] < counts[1]
@@ -112,6 +114,7 @@ def printed(notebook: dict[str, Any]) -> str:
                    for line in out.get("text", []))  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_notebook_of_a_first_scene(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     first = notebook("01_first_scene.ipynb")
@@ -121,6 +124,7 @@ def test_the_notebook_of_a_first_scene(tmp_path, monkeypatch):
     assert Path("scene.html").stat().st_size > 1e6
 
 
+@pytest.mark.slow
 def test_the_notebook_of_promises(finished, tmp_path, monkeypatch):
     shutil.copytree(finished[0], tmp_path / "runs" / "first")
     monkeypatch.chdir(tmp_path)
@@ -141,10 +145,14 @@ def test_a_notebook_shows_what_it_printed_and_drew(path):
     assert imported == {"sagesplat"}
 
 
+@pytest.mark.slow
 def test_without_a_network_a_label_image_costs_one_line(tmp_path):
     Image.new("RGB", (32, 24)).save(tmp_path / "a.jpg")
     env = {"HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "hub")}
-    error = run("04", tmp_path / "out", tmp_path / "a.jpg", code=1, **env).stderr
+    command = [sys.executable, *EXAMPLES.glob("04_*.py"), tmp_path / "out", tmp_path / "a.jpg"]
+    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, **env})
+    error = done.stderr
+    assert done.returncode == 1
     assert error.count("\n") == 1
     assert error.startswith("04_label_photos.py: ")
     assert "hf download" in error or "pip install" in error
@@ -159,14 +167,11 @@ def test_without_a_network_a_label_image_costs_one_line(tmp_path):
         ("05", ("absent", "site")),
     ],
 )
-def test_what_is_not_there_is_one_line(name, words, tmp_path, monkeypatch, capfd):
-    (script,) = EXAMPLES.glob(f"{name}_*.py")
-    paths = [tmp_path / word if word != "a.png" else word for word in words]
-    monkeypatch.setattr(sys, "argv", [str(script), *map(str, paths)])
-    with pytest.raises(SystemExit) as stopped:  # in this process: one of its own begins with torch's import
-        runpy.run_path(str(script), run_name="__main__")
+def test_what_is_not_there_is_one_line(name, words, tmp_path, capfd):
+    with pytest.raises(SystemExit) as stopped:
+        run(name, *(tmp_path / word if word != "a.png" else word for word in words))
     error = str(stopped.value)
-    assert error.startswith(f"{script.name}: ")
+    assert re.match(rf"{name}_\w+\.py: ", error)
     assert "\n" not in error
     assert str(tmp_path) in error
     assert capfd.readouterr().err == ""

@@ -22,7 +22,7 @@ from pathlib import Path
 from sagesplat.io.lock import locked
 with locked(Path(sys.argv[1])):
     print("locked", flush=True)
-    time.sleep(60)
+    time.sleep(3600)
 """
 
 
@@ -67,7 +67,7 @@ def test_one_process_may_enter_again(tmp_path: Path) -> None:
     first.enter_context(locked(tmp_path))
     second.enter_context(locked(tmp_path / "." / ".." / tmp_path.name))
     first.close()  # in any order
-    code = HOLDS.replace("time.sleep(60)", "pass")
+    code = HOLDS.replace("time.sleep(3600)", "pass")
     refused = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True)
     assert f"process {os.getpid()} on" in refused.stderr
     second.close()

@@ -112,6 +112,12 @@ class Page(HTMLParser):
         self.text += data
 
 
+@pytest.fixture
+def undrawn(monkeypatch) -> None:
+    """For tests of what is written: drawing a report's figures takes seconds."""
+    monkeypatch.setattr(figures, "save_figure", lambda figure, path, svg=True: b"<svg/>")
+
+
 @pytest.fixture(scope="module")
 def written(tmp_path_factory) -> tuple[Path, ReportData, Page]:
     folder = tmp_path_factory.mktemp("run") / "report"
@@ -138,6 +144,7 @@ def test_every_category_is_on_it(written):
     assert "nan" not in page.text.lower().split()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_exposures_of_the_photos_are_said(tmp_path):
     data = make()
     assert "cc_psnr" not in write_report(tmp_path / "a", data).read_text("utf-8").split("All numbers")[0]
@@ -201,6 +208,7 @@ def test_without_test_views_and_pictures(tmp_path):
     assert not (tmp_path / "figures" / "quality_over_size.svg").exists()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_categories_out_of_reach_are_named(tmp_path):
     data = make(panels=0)
     distances = {i: np.array([2.0]) for i in LABELS}
@@ -256,6 +264,7 @@ def led_by_fidelity(panels: int = 0) -> ReportData:
     )
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_first_page_leads_with_fidelity(tmp_path):
     data = led_by_fidelity()
     plan, full = data.plans[1], sum(n for (_, level), n in (data.sizes or {}).items() if level == LEVELS[-1])
@@ -348,9 +357,9 @@ def full_count(data: ReportData) -> int:
     return sum(n for (_, level), n in data.counts.items() if level == LEVELS[-1])
 
 
-def test_an_address_is_a_qr_code_only_where_there_is_one(whole, tmp_path, monkeypatch):
+@pytest.mark.usefixtures("undrawn")
+def test_an_address_is_a_qr_code_only_where_there_is_one(whole, tmp_path):
     assert "QR code of" not in whole.read_text("utf-8")
-    monkeypatch.setattr(figures, "save_figure", lambda figure, path, svg=True: b"")  # takes seconds
     data = dataclasses.replace(whole_page(), url="https://example.org/x/")
     page = write_report(tmp_path, data).read_text("utf-8")
     assert '<a href="https://example.org/x/">' in page
@@ -422,6 +431,7 @@ def test_plans_for_fidelity_are_compared_with_equal_levels_at_the_same_views():
     assert composed[:, 1] == pytest.approx([0.955, 0.955])  # the plan for SSIM is not in it
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_blocks_are_merged_for_both_qualities(tmp_path):
     names = {3: "grass@0", 7: "grass@1", 9: "vase@1"}
     data = dataclasses.replace(led_by_fidelity(), names=names, categories={3: 3, 7: 3, 9: 9})
@@ -453,6 +463,7 @@ def test_pictures():
     assert error[1, 1].sum() < 10
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_pixels_that_are_ignored_are_grey_in_the_error_and_explained(tmp_path):
     data, said = make(panels=1), "grey: ignored, and in none of these figures"
     (panel,) = data.panels
@@ -472,6 +483,7 @@ def test_line_colours_are_dark_enough():
     assert figures.ink(9, COLOURS) == pytest.approx((90 / 255, 10 / 255, 200 / 255))
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_scene_in_blocks_is_shown_by_category(tmp_path: Path) -> None:
     data = make(0)
     names = {3: "grass@0", 7: "grass@1", 9: "vase@1"}
@@ -504,7 +516,9 @@ AWKWARD = (
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("first", range(0, len(AWKWARD), 4))
+@pytest.mark.parametrize(
+    "first", [0, *(pytest.param(first, marks=pytest.mark.slow) for first in range(4, len(AWKWARD), 4))]
+)
 def test_awkward_names_are_drawn_and_listed_as_they_are(tmp_path: Path, first: int) -> None:
     some = (AWKWARD * 2)[first : first + 4]
     data = dataclasses.replace(make(), names=dict(zip(LABELS, some, strict=True)), title=some[0])

@@ -609,7 +609,7 @@ def test_an_error_in_the_callback_ends_the_child(tmp_path: Path, monkeypatch: py
     lines = """
 import json, os, time
 print(json.dumps({"stage": str(os.getpid()), "done": 0, "total": 1}), flush=True)
-time.sleep(60)
+time.sleep(3600)
 """
     (tmp_path / "script.py").write_text(lines)
     monkeypatch.setattr(photos, "_SCRIPT", tmp_path / "script.py")
@@ -635,11 +635,11 @@ spec.loader.exec_module(sfm)
 print(sorted(name for name in sys.modules if name.partition(".")[0] in ("PIL", "sagesplat")), flush=True)
 thread = threading.Thread(target=sfm._end_with_parent)
 thread.start()
-thread.join(60)
+thread.join(3600)
 """
     command = [sys.executable, "-P", "-c", code, str(photos._SCRIPT)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as child:
-        out, _ = child.communicate(timeout=60)  # closes standard input, as a killed parent does
+        out, _ = child.communicate(timeout=600)  # closes standard input, as a killed parent does
     assert (out.strip(), child.returncode) == ("[]", 1)
 
 

@@ -5,6 +5,7 @@ temporary files and end child processes. Standard library only: it is imported b
 """
 
 import atexit
+import math
 import os
 import signal
 import socket
@@ -47,7 +48,7 @@ class _Stop:
         self.ending = False  # the outcome is known: nothing is left to interrupt
         self.deferring = self.waiting = False  # see `deferred`
         self.watched = False  # see `answered_at_once`
-        self._since = -_SAME
+        self._since = -math.inf
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         if self.watched:
