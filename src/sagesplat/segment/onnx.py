@@ -27,6 +27,7 @@ from sagesplat.segment.segmenters import (
     parse_device,
 )
 
+_TIME_LIMIT = 300.0  # seconds that a network may take for a photo
 _PIXELS = 2**24  # of a network's input: 200 MB
 _VALUES = 2**29  # of its output: 2 GB
 _OUTPUTS = {f"tensor({kind})" for kind in ("float", "float16", "double", "int64", "int32", "uint8")}
@@ -96,9 +97,9 @@ class OnnxSegmenter:
         *,
         device: str = "auto",
         threads: int = 1,
-        time_limit: float = 0,
+        time_limit: float = _TIME_LIMIT,
     ):
-        """`time_limit`: seconds for a photo, 0: none. LabelError for a model or classes of no use."""
+        """`time_limit`: seconds for a photo. LabelError for a model or classes of no use."""
         model, classes = Path(model), Path(classes)
         self.classes = read_classes(classes)
         self.taxonomy = self.classes.taxonomy
@@ -161,8 +162,7 @@ class OnnxSegmenter:
         # a network may hold a loop that never ends; onnxruntime looks at this before each node
         timer = threading.Timer(self._time_limit, setattr, (options, "terminate", True))
         timer.daemon = True
-        if self._time_limit > 0:
-            timer.start()
+        timer.start()
         try:
             feeds = {self._input: np.ascontiguousarray(x[None])}
             output = np.asarray(self._session.run([self._output], feeds, options)[0])
@@ -171,8 +171,7 @@ class OnnxSegmenter:
                 raise
             if options.terminate:
                 raise LabelError(
-                    f"{self._model}: no answer within {self._time_limit:g} s; raise --time-limit, or take "
-                    "another network"
+                    f"{self._model}: no answer within {self._time_limit:g} s; take another network"
                 ) from None
             raise LabelError(f"{self._model}: does not run ({_first_line(error)}); export it again") from None
         finally:
@@ -278,7 +277,7 @@ def _settings(config: MasksConfig) -> dict[str, Any]:
 
 
 def _load(config: MasksConfig, device: str, threads: int, warn: Callable[[str], None]) -> OnnxSegmenter:
-    return OnnxSegmenter(**_settings(config), device=device, threads=threads, time_limit=config.time_limit)
+    return OnnxSegmenter(**_settings(config), device=device, threads=threads)
 
 
 FACTORY = SegmenterFactory(_settings, _load, (".onnx",))
