@@ -35,7 +35,7 @@ from sagesplat.segment.masks import Taxonomy
 from sagesplat.segment.segmenters import (
     Segmented,
     SegmenterFactory,
-    answer,
+    arg_max_resized,
     existing_file,
     group_classes,
     parse_device,
@@ -326,7 +326,7 @@ class DeepLabV2Segmenter:
         self._outputs = [np.array(outputs)[rows == k] for k in range(len(self._ids))]
 
     def __call__(self, photos: Sequence[UInt8[np.ndarray, "H W 3"]]) -> list[Segmented]:
-        """Label images and probabilities (at an eighth of the network's input; with `crf` at its size)."""
+        """The label image of each photo."""
         return [self._segment(photo) for photo in photos]
 
     @torch.inference_mode()
@@ -334,11 +334,11 @@ class DeepLabV2Segmenter:
         small = _to_size(photo, self.size)
         ranks = self._scores(small)
         if self.crf:
-            ranks = p = _refine(F.softmax(_resize(ranks, small.shape[:2]), 1)[0].numpy(), small)
+            ranks = _refine(F.softmax(_resize(ranks, small.shape[:2]), 1)[0].numpy(), small)
         else:
-            ranks, p = ranks[0].numpy(), F.softmax(ranks, 1)[0].numpy()
+            ranks = ranks[0].numpy()
         height, width = photo.shape[:2]
-        return answer(ranks, p, self._ids, height, width)
+        return Segmented(self._ids[arg_max_resized(ranks, height, width)])
 
     def _scores(self, photo: UInt8[np.ndarray, "H W 3"]) -> Float32[Tensor, "1 K h w"]:
         """Log of each category's probability, but for a constant: log-sum-exp of its outputs."""

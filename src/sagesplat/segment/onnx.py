@@ -21,7 +21,7 @@ from sagesplat.segment.masks import UNLABELLED, Taxonomy, taxonomy_of
 from sagesplat.segment.segmenters import (
     Segmented,
     SegmenterFactory,
-    answer,
+    arg_max_resized,
     existing_file,
     group_classes,
     parse_device,
@@ -138,7 +138,7 @@ class OnnxSegmenter:
             )
 
     def __call__(self, photos: Sequence[UInt8[np.ndarray, "H W 3"]], /) -> list[Segmented]:
-        """Label images and probabilities (softmax of the logits), one photo after the other."""
+        """Label images, one photo after the other."""
         return [self._segment(photo) for photo in photos]
 
     def _segment(self, photo: UInt8[np.ndarray, "H W 3"]) -> Segmented:
@@ -150,7 +150,7 @@ class OnnxSegmenter:
         if axis is None:
             raise self._unfit(output)
         logits = np.moveaxis(output[0], axis - 1, 0).astype(np.float32, copy=False)
-        return answer(*self._grouped(logits), self._ids, height, width)
+        return Segmented(self._ids[arg_max_resized(self._grouped(logits), height, width)])
 
     def _run(self, photo: UInt8[np.ndarray, "H W 3"]) -> np.ndarray:
         """The network's first output, [1, ...]."""
@@ -180,18 +180,15 @@ class OnnxSegmenter:
             raise self._unfit(output)
         return output
 
-    def _grouped(
-        self, logits: Float32[np.ndarray, "C h w"]
-    ) -> tuple[Float32[np.ndarray, "K h w"], Float32[np.ndarray, "K h w"]]:
-        """Log of the summed probability of each category, up to a constant per pixel; and the probability."""
+    def _grouped(self, logits: Float32[np.ndarray, "C h w"]) -> Float32[np.ndarray, "K h w"]:
+        """Log of the summed probability of each category, up to a constant per pixel."""
         if not np.isfinite(logits).all():
             raise LabelError(f"{self._model}: logits that are not finite; export it again (in 32 bits)")
         top = logits.max(0)
         members = np.eye(len(self._ids), dtype=np.float32)[:, self._group]
         sums = np.tensordot(members, np.exp(logits - top), 1)
         # Relative to the smallest float: a category far below the best is no -inf, which would spread.
-        ranks = np.log(np.maximum(sums, np.finfo(np.float32).tiny)) + top
-        return ranks, sums / sums.sum(0)
+        return np.log(np.maximum(sums, np.finfo(np.float32).tiny)) + top
 
     def _of_numbers(self, output: np.ndarray, height: int, width: int) -> Segmented:
         """Label image of a network that ends in an arg max: [1, h, w] class numbers, with axes of 1."""
@@ -205,7 +202,7 @@ class OnnxSegmenter:
             raise self._unfit(output)
         rows = ((np.arange(height) + 0.5) * numbers.shape[0] / height).astype(int)
         columns = ((np.arange(width) + 0.5) * numbers.shape[1] / width).astype(int)
-        return Segmented(self.classes.label_ids[numbers[rows[:, None], columns]], None, self._ids[:0])
+        return Segmented(self.classes.label_ids[numbers[rows[:, None], columns]])
 
     def _unfit(self, output: np.ndarray) -> LabelError:
         largest = f" up to {output.max()}" if np.issubdtype(output.dtype, np.integer) and output.size else ""

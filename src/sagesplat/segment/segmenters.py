@@ -27,7 +27,6 @@ from sagesplat.segment.masks import (
 )
 
 _BEGINS = 60.0  # seconds that another process may take to begin a folder
-NEGLIGIBLE = 0.5 / 255  # no 8-bit image of probabilities shows less
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +34,6 @@ class Segmented:
     """A segmenter's answer for a photo."""
 
     label_ids: Int16[np.ndarray, "H W"]  # category id of each pixel, -1 where it has none
-    probabilities: Float32[np.ndarray, "C h w"] | None  # 0 ... 1, at most 1 in sum; covers the whole photo
-    ids: Int16[np.ndarray, " C"]  # category id of each row of probabilities; others are negligible
     instances: Int16[np.ndarray, "H W"] | None = None
     """Number of each pixel's instance in this photo, -1 for none; an instance lies within one category."""
 
@@ -197,19 +194,6 @@ def group_classes(label_ids: Sequence[int | None]) -> tuple[Int16[np.ndarray, " 
     """
     each = np.array([UNLABELLED if i is None else i for i in label_ids], np.int16)
     return np.unique(each, return_inverse=True)
-
-
-def answer(
-    ranks: Float32[np.ndarray, "K h w"],
-    probabilities: Float32[np.ndarray, "K h w"],
-    ids: Int16[np.ndarray, " K"],
-    height: int,
-    width: int,
-) -> Segmented:
-    """Each pixel has the id of the highest rank; rows that are negligible everywhere are left out."""
-    label_ids = ids[arg_max_resized(ranks, height, width)]
-    kept = (ids != UNLABELLED) & (probabilities.max((1, 2)) >= NEGLIGIBLE)
-    return Segmented(label_ids, probabilities[kept], ids[kept])
 
 
 def arg_max_resized(
