@@ -20,7 +20,6 @@ _KINDS = {  # settings by stage; those of other stages are compared, and never u
     "scene": config.SceneConfig,
     "poses": config.PosesConfig,
     "masks": config.LabelsConfig,
-    "lift": config.LiftConfig,
     "train": config.TrainConfig,
     "base": config.TrainConfig,
     "clean": config.CleanConfig,
@@ -31,7 +30,7 @@ _KINDS = {  # settings by stage; those of other stages are compared, and never u
     "fit": config.FitConfig,
     "plan": config.PlanConfig,
 }
-_MORE: dict[str, Any] = {"seed": int, "targets": list[float], "tune_steps": int, "boundary_steps": int}
+_MORE: dict[str, Any] = {"seed": int, "targets": list[float], "boundary_steps": int}
 
 
 class Settings(dict[str, Any]):
