@@ -16,6 +16,7 @@ import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import partial
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -35,7 +36,8 @@ from sagesplat.segment.masks import UNLABELLED
 from sagesplat.segment.valid import ALL_VALID, ValidPixels
 from sagesplat.train.early_stopping import spread
 
-CRITERIA = ("few views", "hardly shown", "in front", "category")
+Criterion = Literal["few views", "hardly shown", "in front", "category"]
+CRITERIA = get_args(Criterion)
 LabelImage = Callable[[View], np.ndarray]  # a view's category ids, int16 [H, W]; -1: unlabelled
 
 _MOST = 0.5  # of the views that support a Gaussian, or of its weight
