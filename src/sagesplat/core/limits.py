@@ -35,4 +35,4 @@ LabelId = Annotated[int, Meta(ge=-1, le=2**15 - 1)]  # -1: unlabelled
 CategoryId = Annotated[int, Meta(ge=0, le=2**15 - 1)]
 
 Text = Annotated[str, Meta(max_length=4096)]
-Sha256 = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
+Sha256 = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}\Z")]

@@ -254,12 +254,3 @@ def loads_json(content: bytes | str) -> Any:
         return json.loads(content if isinstance(content, str) else content.decode("utf-8-sig"))
     except RecursionError:
         raise ValueError("JSON that is nested too deeply") from None
-
-
-def read_object(path: Path) -> dict[str, Any]:
-    """The JSON object in a file; empty where there is none that can be read."""
-    try:
-        content = read_json(path)
-    except RunError:
-        return {}
-    return content if isinstance(content, dict) else {}

@@ -56,18 +56,18 @@ def parse_json_as(content: bytes | str, kind: type[Kind]) -> Kind:
     return convert_as(loads_json(content), kind)
 
 
-def read_toml_as(path: Path, kind: type[Kind], what: str, cure: str, *, most: int) -> Kind:
-    """The content of a TOML file of up to `most` characters, checked and converted. DataError as above."""
+def read_toml(path: Path, cure: str, *, most: int) -> dict[str, Any]:
+    """The content of a TOML file of up to `most` characters. DataError as of `read_json_as`."""
     try:
         text = path.read_text(encoding="utf-8")
         dots = max(line.count(".") for line in text.split("\n"))
         if len(text) > most or dots > _MOST_DOTS:
-            raise ValueError(f"{len(text)} characters, a line with {dots} dots; write shorter lines")
-        content = tomllib.loads(text)
+            raise ValueError(
+                f"{len(text)} characters, a line with {dots} dots: too many"
+            )
+        return tomllib.loads(text)
     except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"{path}: not readable as TOML ({short(error)}); {cure}") from None
-    with refused(path, what, cure):
-        return convert_as(content, kind)
 
 
 def convert_as(value: Any, kind: type[Kind], *, strict: bool = True) -> Kind:

@@ -11,8 +11,7 @@ from typing import Any
 from sagesplat.core.config import SceneConfig
 from sagesplat.core.errors import RunError, short
 from sagesplat.io.files import write_json
-from sagesplat.io.typed import known_json, read_json_as
-from sagesplat.io.typed import convert_as
+from sagesplat.io.typed import convert_as, known_json, read_json_as
 from sagesplat.run.records import file_hash
 from sagesplat.scene import load_scene
 from sagesplat.scene.scene import Scene, Vignetting

@@ -47,8 +47,9 @@ def recorded_settings(run: RunDir, of: str = "run") -> dict[str, Any]:
     tuned = nest.get("boundary_steps")
     boundary = {} if tuned is None else {"boundary_steps": tuned}
     adopted = _made(run, "adopt")
-    label_images = {} if adopted.get("labelled") else known_json(run.segmentation, dict) or {}  # else made by adopt
-    scene = known_json(run.scene, _Made)
+    scene, label_images = known_json(run.scene, _Made), known_json(run.segmentation, dict) or {}
+    if adopted.get("labelled"):
+        label_images = {}  # made by adopt
     seeded = _config(_Seeded, nest if of == "nest" and nest else train)
     known: dict[str, Any] = {
         "adopt": _config(AdoptConfig, {**adopted, **_levels_of_adopted(nest)}) if adopted else None,

@@ -213,8 +213,8 @@ def _request(source: Path, photos: list[PreparedPhoto], config: PosesConfig) -> 
 def _resume(workspace: Path, request: dict[str, Any]) -> Reconstruction | None:
     """The finished result of the same request, if any; results of another request are removed."""
     work, report = workspace / "sfm", workspace / REPORT
-    old = known_json(work / "request.json", dict) or {}
-    if {k: v for k, v in old.items() if k not in ("min_photos", "threads")} != json.loads(json.dumps(request)):
+    request, old = json.loads(json.dumps(request)), known_json(work / "request.json", dict) or {}
+    if {k: v for k, v in old.items() if k not in ("min_photos", "threads")} != request:
         for name in ("database.db", "database.db-wal", "database.db-shm", "models.json", "seconds.json"):
             (work / name).unlink(missing_ok=True)
         report.unlink(missing_ok=True)
