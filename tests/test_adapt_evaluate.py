@@ -94,9 +94,10 @@ def test_images_of_the_full_model_take_bounded_memory(capture, monkeypatch):
     np.testing.assert_array_equal(measured(capture).fidelity, before.fidelity)
 
 
-def test_too_little_of_a_category_is_not_measured(capture):
+def test_too_little_of_a_category_is_not_measured(capture, monkeypatch):
     assert np.isfinite(measured(capture).fidelity).all()
-    table = measured(capture, min_share=0.9)
+    monkeypatch.setattr(sys.modules[module.__name__], "MIN_SHARE", 0.9)
+    table = measured(capture)
     parts = table.select((table.label_id != TOTAL) & (table.label_id != UNIFORM))
     assert np.isnan(parts.fidelity).all()
     assert np.isfinite(table.select(table.label_id == TOTAL).fidelity).all()

@@ -76,7 +76,7 @@ def trial(models, cameras: list[Camera], seed: int, spill: float = 0.0, shown=No
 
 def made(seed: int, confidence: float = 0.95, spill: float = 0.0, views=(80, 60, 120)):
     fit, bias, calibration = (viewpoints(n, 10 * seed + i) for i, n in enumerate(views))
-    models = fit_fidelity(sampled(fit, seed), fit, 2.0, 0.01, confidence)
+    models = fit_fidelity(sampled(fit, seed), fit, 2.0, confidence)
     for _ in range(2):
         models = recentred(models, trial(models, bias, 100 * seed, spill), confidence)
     models, held = settled(models, trial(models, bias, 100 * seed, spill), confidence)
@@ -185,7 +185,7 @@ def test_a_category_that_is_never_shown_has_no_model():
     table = sampled(cameras, 0)
     pixels = table.pixels.copy()
     pixels[:, 1] = 0
-    models = fit_fidelity(replace(table, pixels=pixels), cameras, 2.0, 0.01, 0.95)
+    models = fit_fidelity(replace(table, pixels=pixels), cameras, 2.0, 0.95)
     assert set(models) == {3}
     planned = plan_nominal(models, LABELS, K, np.full((30, 2), np.nan, np.float32), cameras, NOMINAL)
     assert (planned[..., 1] == K).all()
@@ -194,10 +194,10 @@ def test_a_category_that_is_never_shown_has_no_model():
 def test_one_viewpoint_and_one_level():
     cameras = viewpoints(1, 0)
     table = sampled(cameras, 0)
-    models = fit_fidelity(table, cameras, 2.0, 0.01, 0.95)
+    models = fit_fidelity(table, cameras, 2.0, 0.95)
     assert np.isfinite(models[3].weights).all()
     single = replace(table, fidelity=table.fidelity[..., -1:], whole=table.whole[:, -1:])
-    one = fit_fidelity(single, cameras, 2.0, 0.01, 0.95)[3]
+    one = fit_fidelity(single, cameras, 2.0, 0.95)[3]
     position = np.zeros((1, 3))
     assert one.predict(np.array([np.nan]), position, np.array([[0.0, 0, 1]])).bound.tolist() == [[1.0]]
 

@@ -105,7 +105,7 @@ def most_stages(job: Job, capture: Path, config: RunConfig = CONFIG) -> None:
     """A run without its report, which takes as long as all the rest."""
     open_scene(job, capture, config.scene)
     make_masks(job, config.masks, config.labels)
-    lift_labels(job, config.lift)
+    lift_labels(job)
     train_levels(job, config.train, config.seed)
     observe_levels(job, config.fit)
     fit_ladder(job, config.fit)

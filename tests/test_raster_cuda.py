@@ -298,7 +298,7 @@ def test_every_gap_is_one_line_with_its_cure(able, monkeypatch):
 
 
 def test_backends_and_devices_that_do_not_go_together():
-    with pytest.raises(BackendUnavailable, match=r"^backend 'gpu' is not known; use --backend cpu, cuda or"):
+    with pytest.raises(BackendUnavailable, match=r"^backend 'gpu' is not known; use cpu, cuda or"):
         resolve_backend("gpu")  # type: ignore[arg-type]
     with pytest.raises(BackendUnavailable, match=r"^device 'tpu' is not known; use --device cpu or cuda$"):
         resolve_backend("auto", "tpu")

@@ -92,7 +92,7 @@ def test_not_finite_is_refused_in_one_line(name, value):
 
 
 def test_unknown_backend():
-    with pytest.raises(BackendUnavailable, match=r"'gpu' is not known; use --backend cpu, cuda or reference"):
+    with pytest.raises(BackendUnavailable, match=r"'gpu' is not known; use cpu, cuda or reference"):
         resolve_backend("gpu")  # type: ignore[arg-type]
     assert resolve_backend("auto") == "cpu"
     assert resolve_backend("reference") == "reference"

@@ -251,8 +251,7 @@ class Bright:
         Bright.left -= len(photos)
         if Bright.left < 0:
             raise KeyboardInterrupt
-        ids = np.array([1, 2], np.int16)
-        return [Segmented(np.where(p[..., 0] > 127, 2, 1).astype(np.int16), None, ids) for p in photos]
+        return [Segmented(np.where(p[..., 0] > 127, 2, 1).astype(np.int16)) for p in photos]
 
 
 def segmented(run: Path, capture: Path, executor) -> dict[str, bytes]:

@@ -22,7 +22,7 @@ from ray.cluster_utils import Cluster
 from ray_tasks import die, divide, fail, hold, where
 
 from sagesplat.cli.base import Machine, computing
-from sagesplat.core.config import FitConfig, LiftConfig, MasksConfig, SceneConfig, TrainConfig
+from sagesplat.core.config import FitConfig, MasksConfig, SceneConfig, TrainConfig
 from sagesplat.core.errors import BackendUnavailable, RunError
 from sagesplat.core.events import Event, Progress, Warned
 from sagesplat.demo.capture import make_capture
@@ -330,7 +330,7 @@ def trained(tmp_path: Path) -> Path:
     job = Job(RunDir(tmp_path / "run", "snapshots"), lambda event: None)
     open_scene(job, tmp_path / "capture", SceneConfig())
     make_masks(job, MasksConfig())
-    lift_labels(job, LiftConfig())
+    lift_labels(job)
     train_levels(job, TrainConfig(max_steps=20, level_every=10), 0)
     return tmp_path / "run"
 

@@ -204,7 +204,7 @@ class Watch:
     [
         {
             "fuse": True,
-            "plan": PlanConfig(target_ssim=0.4, tune_steps=2, budget=1e4),
+            "plan": PlanConfig(target_ssim=0.4, budget=1e4),
             "train": replace(CONFIG.train, poses=True),
         },
         {"ladder": "snapshots", "train": replace(CONFIG.train, freeze_at=0.5, poses=True)},
@@ -212,9 +212,9 @@ class Watch:
             {"fuse": True, "blocks": BLOCKS, "train": replace(CONFIG.train, freeze_at=0.5)},
             marks=pytest.mark.slow,
         ),
-        {"fit": FitConfig(masks="rendered"), "train": replace(CONFIG.train, poses=True)},
+        {"fit": FitConfig(distance="minimum"), "train": replace(CONFIG.train, poses=True)},
     ],
-    ids=["nested", "snapshots", "blocks", "rendered"],
+    ids=["nested", "snapshots", "blocks", "distance"],
 )
 def test_all_that_a_stage_reads_is_among_its_inputs(
     capture: Path, tmp_path: Path, monkeypatch, changes: dict

@@ -191,7 +191,7 @@ def to_caffe(name: str) -> str:
 
 
 def load(path: Path) -> DeepLabV2:
-    return load_deeplabv2(path, head="voc", **SMALL)
+    return load_deeplabv2(path, **SMALL)
 
 
 def weights(num_classes: int = 21) -> dict[str, Tensor]:
@@ -362,21 +362,12 @@ def test_outputs_of_one_category_are_summed(crf: bool) -> None:
     (found,) = segmenter([np.full((9, 12, 3), 90, np.uint8)])
     assert (found.label_ids == 17).all()
     assert found.label_ids.dtype == np.int16
-    assert found.probabilities is not None
-    p = dict(zip(found.ids.tolist(), found.probabilities[:, 0, 0].tolist(), strict=True))
-    one, other, one_more, none = np.exp([1.0, 1.5, 1.0, 0.0])
-    whole = one + other + one_more + none
-    expected = {17: 1} if crf else {17: (one + one_more) / whole, 18: other / whole}
-    assert p == pytest.approx(expected)
 
 
 def test_background_is_unlabelled() -> None:
     segmenter = DeepLabV2Segmenter(Fixed([9.0] + [0.0] * 20), head_classes("voc"), size=None)
     (found,) = segmenter([np.zeros((8, 8, 3), np.uint8)])
     assert (found.label_ids == -1).all()
-    assert -1 not in found.ids
-    assert found.probabilities is not None
-    assert (found.probabilities.sum(0) < 0.01).all()
 
 
 @pytest.mark.parametrize("crf", [False, True])
@@ -387,9 +378,6 @@ def test_photos_of_any_size(shape: tuple[int, int], crf: bool) -> None:
     first, second = segmenter([grey, np.zeros((5, 4, 3), np.uint8)])
     assert first.label_ids.shape == shape
     assert second.label_ids.shape == (5, 4)
-    assert first.probabilities is not None
-    assert len(first.probabilities) == len(first.ids)
-    assert first.probabilities.max() <= 1
     assert set(np.unique(first.label_ids).tolist()) <= {-1, *segmenter.taxonomy.names}
 
 

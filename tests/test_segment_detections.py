@@ -1,4 +1,4 @@
-"""Masks of detections become a label image, probabilities and instances, exactly."""
+"""Masks of detections become a label image and instances, exactly."""
 
 import numpy as np
 import pytest
@@ -45,12 +45,6 @@ def test_pixels_go_to_the_surer_mask_and_the_rest_is_unlabelled() -> None:
     assert answer.instances is not None
     np.testing.assert_array_equal(answer.instances[0], [1, 1, 1, 0, 0, -1, 2, -1])
     assert answer.label_ids.dtype == answer.instances.dtype == np.int16
-    assert answer.ids.tolist() == [7, 201]
-    assert answer.probabilities is not None
-    p7, p201 = answer.probabilities[:, 0]
-    total = 0.75 + 0.875  # both claim the fourth column: scaled to 1 in sum
-    np.testing.assert_allclose(p201, [0.75, 0.75, 0.75, 0.75 / total, 0, 0, 0.625, 0], atol=1e-6)
-    np.testing.assert_allclose(p7, [0, 0, 0, 0.875 / total, 0.875, 0, 0, 0], atol=1e-6)
 
 
 def test_a_doubtful_pixel_of_a_sure_box_loses_to_a_sure_pixel() -> None:
@@ -69,8 +63,6 @@ def test_masks_are_resampled_to_the_photo() -> None:
     answer = segmented(found((0, 0.9, mask(0, 1, 2, 3))), IDS, 0.2, (40, 80))
     assert answer.label_ids.shape == (40, 80)
     np.testing.assert_array_equal(answer.label_ids[20] == 201, np.arange(80) < 40)
-    assert answer.probabilities is not None
-    assert answer.probabilities.shape == (1, 4, 8)
 
 
 def test_nothing_found() -> None:
@@ -78,9 +70,6 @@ def test_nothing_found() -> None:
     assert (answer.label_ids == -1).all()
     assert answer.instances is not None
     assert (answer.instances == -1).all()
-    assert answer.probabilities is not None
-    assert answer.probabilities.shape == (0, 4, 8)
-    assert len(answer.ids) == 0
 
 
 def test_what_is_no_thing_has_no_instances() -> None:
@@ -102,10 +91,8 @@ def base(columns: dict[int, list[int]], instances: list[int] | None = None) -> S
     label_ids = np.full((4, 8), -1, np.int16)
     for label_id, of in columns.items():
         label_ids[:, of] = label_id
-    ids = np.array(sorted(columns), np.int16)
-    probabilities = np.array([np.where(label_ids == i, 0.9, 0.05) for i in ids], np.float32)
     numbers = None if instances is None else np.tile(np.array(instances, np.int16), (4, 1))
-    return Segmented(label_ids, probabilities, ids, numbers)
+    return Segmented(label_ids, numbers)
 
 
 def test_prompts_are_painted_over_another_segmenter() -> None:
@@ -114,32 +101,10 @@ def test_prompts_are_painted_over_another_segmenter() -> None:
     np.testing.assert_array_equal(both.label_ids[0], [7, 7, 201, 201, 184, -1, 7, -1])
     assert both.instances is not None
     np.testing.assert_array_equal(both.instances[0], [2, 2, 0, 0, -1, -1, 1, -1])
-    assert both.ids.tolist() == [7, 184, 201]
-    assert both.probabilities is not None
-    p7, p184, p201 = both.probabilities[:, 0]
-    np.testing.assert_allclose(p201, [0, 0, 0.75, 0.75, 0, 0, 0, 0], atol=1e-6)
-    np.testing.assert_allclose(p184[:5], [0.05, 0.05, 0.9 * 0.25, 0.9 * 0.25, 0.9], atol=1e-6)
-    np.testing.assert_allclose(p7[[0, 3, 6]], [0.9, 0.05 * 0.25, 0.75 + 0.05 * 0.25], atol=1e-6)
-    assert both.probabilities.sum(0).max() <= 1 + 1e-6
 
 
-def test_probabilities_of_different_resolutions_are_joined() -> None:
-    top = segmented(found((0, 0.6, mask(*range(4)))), IDS, 0.2, (4, 8))
-    below = Segmented(
-        np.full((4, 8), 3, np.int16), np.full((1, 2, 2), 0.8, np.float32), np.array([3], np.int16)
-    )
-    both = painted_over(below, top)
-    assert both.probabilities is not None
-    below_left, above_left = both.probabilities[:, 0]  # resampling blurs the border between them
-    np.testing.assert_allclose(below_left, 0.8 * (1 - above_left), atol=1e-6)
-    assert above_left[0] > 0.6 > 0.2 > above_left[1] > 0
-    assert both.instances is not None
-    assert both.instances.max() == 0
-
-
-def test_without_probabilities_below_there_are_none() -> None:
+def test_instances_above_stay_where_there_are_none_below() -> None:
     top = segmented(found((0, 0.6, mask(2))), IDS, 0.2, (4, 8))
-    below = Segmented(np.full((4, 8), 3, np.int16), None, np.zeros(0, np.int16))
+    below = Segmented(np.full((4, 8), 3, np.int16))
     both = painted_over(below, top)
-    assert both.probabilities is None
     np.testing.assert_array_equal(both.label_ids[0], [3, 3, 201, 3, 3, 3, 3, 3])

@@ -138,12 +138,6 @@ def test_labels_are_those_of_the_network_s_own_post_processing(
     (expected,) = process(output, target_sizes=[size])
     assert found.label_ids.shape == size
     assert (found.label_ids == np.array(IDS)[expected.numpy()]).mean() > 0.999
-    assert found.probabilities is not None
-    (small,) = process(output, target_sizes=[found.probabilities.shape[1:]], return_segmentation_scores=True)
-    scores = small.segmentation_scores[[IDS.index(i) for i in found.ids]]
-    assert scores.std() > 0.01
-    scores = scores / small.segmentation_scores.sum(0).clamp(min=1)
-    np.testing.assert_allclose(found.probabilities, scores, atol=1e-4)
 
 
 @pytest.mark.parametrize("kind", MODELS)
@@ -155,15 +149,8 @@ def test_photos_together_are_as_alone(folders: dict[str, Path], kind: str) -> No
     for photo, found in zip(photos, together, strict=True):
         (alone,) = segmenter([photo])
         assert found.label_ids.shape == photo.shape[:2]
-        assert found.label_ids.dtype == found.ids.dtype == np.int16
+        assert found.label_ids.dtype == np.int16
         assert (found.label_ids == alone.label_ids).mean() > 0.99
-        p, q = found.probabilities, alone.probabilities
-        assert p is not None
-        assert q is not None
-        assert p.dtype == np.float32
-        np.testing.assert_allclose(p, q, atol=1e-4)
-        assert len(p) == len(found.ids)
-        assert 0 <= p.min() <= p.sum(0).max() <= 1 + 1e-5
     assert segmenter([]) == []
 
 
@@ -188,8 +175,6 @@ def test_padding_of_a_square_is_cut_off(folders: dict[str, Path]) -> None:
     segmenter._model = Stub(masks, len(NAMES))
     (found,) = segmenter([np.zeros((128, 256, 3), np.uint8)])  # becomes 32 x 64, padded to 64 x 64
     expected = np.repeat([[IDS[0]] * 64 + [IDS[1]] * 192], 128, 0)
-    assert found.probabilities is not None
-    assert found.probabilities.shape == (2 + (IDS[2] in found.ids), 32, 64)
     np.testing.assert_array_equal(found.label_ids[:112], expected[:112])
 
 

@@ -61,7 +61,7 @@ class Threshold:
 
     def __call__(self, photos: Sequence[np.ndarray], /) -> list[Segmented]:
         ids = np.array([1, 2], np.int16)
-        return [Segmented(ids[(p[..., 0] > self.level).astype(int)], None, ids[:0]) for p in photos]
+        return [Segmented(ids[(p[..., 0] > self.level).astype(int)]) for p in photos]
 
 
 def _load(config: MasksConfig, device: str, threads: int, warn: Callable[[str], None]) -> Threshold:

@@ -12,23 +12,21 @@ from PIL import Image
 from sagesplat.core.errors import BackendUnavailable, LabelError, SceneError
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Points, Scene, View
-from sagesplat.segment.masks import Masks, Taxonomy
+from sagesplat.segment.masks import Taxonomy
 from sagesplat.segment.segmenters import (
     Segmented,
     Segmenter,
-    answer,
     arg_max_resized,
     group_classes,
     parse_device,
     segment_views,
 )
-from sagesplat.segment.soft import read_soft, write_soft
 
 SKY, TREE = 187, 184
 
 
 class Bright:
-    """Sky where a photo is bright, else tree; with a probability of 0.8 at half the photo's resolution."""
+    """Sky where a photo is bright, else tree."""
 
     def __init__(self, names: dict[int, str] | None = None):
         self.taxonomy = Taxonomy(names or {TREE: "tree-merged", SKY: "sky-other-merged"})
@@ -39,9 +37,7 @@ class Bright:
         return [self.segmented(photo[..., 0] > 127) for photo in photos]
 
     def segmented(self, bright: np.ndarray) -> Segmented:
-        label_ids = np.where(bright, SKY, TREE).astype(np.int16)
-        sky = np.where(bright[::2, ::2], 0.8, 0.2).astype(np.float32)
-        return Segmented(label_ids, np.stack([1 - sky, sky]), np.array([TREE, SKY], np.int16))
+        return Segmented(np.where(bright, SKY, TREE).astype(np.int16))
 
 
 def scene_of(sizes: dict[str, tuple[int, int]], path: Path = Path("scene")) -> Scene:
@@ -68,36 +64,17 @@ SIZES = {"a.jpg": (16, 32), "b.jpg": (32, 16), "c/d.jpg": (16, 32), "e.jpg": (16
 PHOTOS = [half_bright(*size) for size in SIZES.values()]
 
 
-def test_views_of_one_size_are_segmented_together(tmp_path: Path) -> None:
-    scene, segmenter, calls = scene_of(SIZES), Bright(), []
-    segment_views(
-        scene, PHOTOS, segmenter, tmp_path, batch=2, on_view=lambda done, total: calls.append((done, total))
-    )
-    assert sorted(segmenter.sizes) == [[(16, 32)], [(16, 32), (16, 32)], [(32, 16)]]
-    assert calls == [(1, 4), (2, 4), (3, 4), (4, 4)]
-    taxonomy = Taxonomy.read(tmp_path / "labels.json")
-    assert taxonomy.names == segmenter.taxonomy.names
-    for view in scene.views:
-        label_ids, height = Masks(tmp_path, taxonomy)[view], view.camera.height
-        assert (label_ids[: height // 2] == SKY).all()
-        assert (label_ids[height // 2 :] == TREE).all()
-
-
 def test_only_what_is_missing_is_made(tmp_path: Path) -> None:
-    scene, target, soft = scene_of(SIZES), tmp_path / "masks", tmp_path / "soft"
+    scene, target = scene_of(SIZES), tmp_path / "masks"
     segment_views(scene, PHOTOS, Bright(), target)
     again = Bright()
     segment_views(scene, PHOTOS, again, target)
     assert again.sizes == []
     assert (target / "labels.json").exists()
-    segment_views(scene, PHOTOS, again, target, soft=soft)  # the label images are there, the rest is not
-    assert len(again.sizes) == 4
-    segment_views(scene, PHOTOS, again, target, soft=soft)
-    assert len(again.sizes) == 4
-    (soft / "c" / "d.npz").unlink()
+    (target / "c" / "d.png").unlink()
     (target / "a.png").write_bytes(b"damaged")
-    segment_views(scene, PHOTOS, again, target, soft=soft, batch=8)
-    assert again.sizes[4:] == [[(16, 32), (16, 32)]]
+    segment_views(scene, PHOTOS, again, target)
+    assert again.sizes == [[(16, 32)], [(16, 32)]]
 
 
 def test_a_killed_run_keeps_what_it_has(tmp_path: Path) -> None:
@@ -147,98 +124,13 @@ def test_unusable_scenes(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "a.png").exists()
 
 
-def test_one_pixel(tmp_path: Path) -> None:
-    photo = np.full((1, 1, 3), 255, np.uint8)
-    segment_views(scene_of({"a.jpg": (1, 1)}), [photo], Bright(), tmp_path / "m", soft=tmp_path / "s")
-    ids, p = read_soft(tmp_path / "s" / "a.npz")
-    assert ids.ravel().tolist() == [SKY, TREE, -1, -1]
-    np.testing.assert_allclose(p.ravel(), [0.8, 0.2, 0, 0], atol=1 / 510)
-
-
-def test_probabilities_are_stored_at_a_quarter(tmp_path: Path) -> None:
-    segment_views(scene_of(SIZES), PHOTOS, Bright(), tmp_path / "masks", soft=tmp_path / "soft")
-    ids, p = read_soft(tmp_path / "soft" / "c" / "d.npz")
-    assert (ids.dtype, p.dtype, ids.shape) == (np.int16, np.float32, (4, 4, 8))
-    assert (ids[0, :2] == SKY).all()
-    assert (ids[0, 2:] == TREE).all()
-    assert (ids[2:] == -1).all()
-    np.testing.assert_allclose(p[:2], np.broadcast_to([[[0.8]], [[0.2]]], (2, 4, 8)), atol=1 / 510)
-    # where the network is coarser than that, its pixels are kept
-    coarse = np.array([[[0.25, 0.5]]], np.float32)
-    write_soft(tmp_path / "x.npz", coarse, np.array([SKY], np.int16), (100, 200))
-    ids, p = read_soft(tmp_path / "x.npz")
-    assert p.shape == (4, 1, 2)
-    np.testing.assert_allclose(p[0], [[0.25, 0.5]], atol=1 / 510)
-
-
-@settings(max_examples=40, deadline=None)
-@given(
-    p=hnp.arrays(
-        np.float32, hnp.array_shapes(min_dims=3, max_dims=3, max_side=7), elements=st.floats(0, 1, width=32)
-    ),
-    scale=st.integers(1, 9),
-)
-def test_the_likeliest_categories_come_back(
-    p: np.ndarray, scale: int, tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    path = tmp_path_factory.mktemp("soft") / "a.npz"
-    p = p / max(1, p.sum(0).max())
-    ids = np.arange(len(p), dtype=np.int16) * 3
-    write_soft(path, p, ids, (p.shape[1] * scale, p.shape[2] * scale))
-    found_ids, found = read_soft(path)
-    assert (np.diff(found, axis=0) <= 0).all()  # the likeliest first
-    assert ((found > 0) == (found_ids >= 0)).all()
-    if scale >= 4:  # nothing was averaged
-        assert found.shape == (4, *p.shape[1:])
-        best = -np.sort(-p, axis=0)[:4]
-        np.testing.assert_allclose(found[: len(best)], best, atol=1 / 509)
-        rows, columns = np.mgrid[: p.shape[1], : p.shape[2]]
-        for of_rank, value in zip(found_ids, found, strict=True):
-            known = of_rank >= 0
-            np.testing.assert_allclose(
-                value[known], p[of_rank[known] // 3, rows[known], columns[known]], atol=1 / 509
-            )
-
-
-def test_no_probability_at_all(tmp_path: Path) -> None:
-    write_soft(tmp_path / "a.npz", np.zeros((0, 3, 5), np.float32), np.zeros(0, np.int16), (64, 64))
-    ids, p = read_soft(tmp_path / "a.npz")
-    assert ids.shape == p.shape == (4, 3, 5)
-    assert (ids == -1).all()
-    assert not p.any()
-
-
-def test_damaged_probabilities(tmp_path: Path) -> None:
-    path = tmp_path / "a.npz"
-    with pytest.raises(LabelError, match="no such file"):
-        read_soft(path)
-    path.write_bytes(b"PK damaged")
-    with pytest.raises(LabelError, match="not the probabilities"):
-        read_soft(path)
-    good = {"ids": np.zeros((4, 2, 2), np.int16), "probabilities": np.zeros((4, 2, 2), np.uint8)}
-    wrong = (
-        {"ids": good["ids"]},
-        good | {"ids": np.array([None])},
-        good | {"probabilities": np.zeros((4, 2, 3), np.uint8)},
-        good | {"probabilities": np.zeros((4, 2, 2), np.float32)},
-    )
-    for arrays in wrong:
-        np.savez(path, allow_pickle=True, **arrays)
-        with pytest.raises(LabelError, match="not the probabilities") as caught:
-            read_soft(path)
-        assert "\n" not in str(caught.value)
-
-
-def test_groups_and_answers() -> None:
+def test_groups_and_the_largest_logit() -> None:
     ids, group = group_classes([SKY, None, TREE, SKY])
     assert ids.tolist() == [-1, TREE, SKY]
     assert group.tolist() == [2, 0, 1, 2]
     p = np.array([[[0.5, 0.1]], [[0.499, 0.899]], [[0.001, 0.001]]], np.float32)
-    found = answer(p, p, ids, 2, 4)
-    assert found.label_ids.tolist() == [[-1, TREE, TREE, TREE]] * 2  # 0.4 to 0.6 a quarter of the way
-    assert found.ids.tolist() == [TREE]  # sky is less than 8 bits show
-    assert found.probabilities is not None
-    np.testing.assert_array_equal(found.probabilities, p[1:2])
+    found = ids[arg_max_resized(p, 2, 4)]
+    assert found.tolist() == [[-1, TREE, TREE, TREE]] * 2  # 0.4 to 0.6 a quarter of the way
 
 
 def test_names_of_devices() -> None:

@@ -151,5 +151,5 @@ def test_what_is_no_run_folder_is_said(tmp_path: Path):
 
 
 def test_an_impossible_backend_is_said(tmp_path: Path):
-    with pytest.raises(SageError, match="--backend"):
+    with pytest.raises(SageError, match="backend cuda does not run on cpu"):
         run_scene(tmp_path, tmp_path / "run", device="cpu", backend="cuda")

@@ -47,10 +47,10 @@ def spoil(run: RunDir) -> int:
 def test_hidden_gaussians_go_and_the_others_keep_every_bit(run: RunDir) -> None:
     hidden, events = spoil(run), list[Event]()
     before, recorded = read_level(last_level(run)), last_level(run).read_bytes()
-    clean_levels(job_of(run, events), CleanConfig(min_views=2))
+    clean_levels(job_of(run, events), CleanConfig())
     after, figures = read_level(job_of(run).trained), read_clean_figures(run.floaters)
     assert figures is not None
-    assert figures.removed["few views"] >= hidden
+    assert figures.removed["hardly shown"] >= hidden
     assert len(after) == figures.gaussians - sum(figures.removed.values()) < len(before)
     assert run.floaters_picture.exists()
     rows = set(map(tuple, before.select(before.means[:, 2] > -40).means.tolist()))
@@ -62,16 +62,16 @@ def test_hidden_gaussians_go_and_the_others_keep_every_bit(run: RunDir) -> None:
 
 def test_it_is_done_once_and_can_be_switched_off(run: RunDir) -> None:
     spoil(run)
-    clean_levels(job_of(run), CleanConfig(min_views=2))
+    clean_levels(job_of(run), CleanConfig())
     events: list[Event] = []
-    clean_levels(job_of(run, events), CleanConfig(min_views=2))
+    clean_levels(job_of(run, events), CleanConfig())
     assert [type(event) for event in events] == [StageSkipped]
     run.cleaned.unlink()
-    clean_levels(job_of(run), CleanConfig(min_views=2))
+    clean_levels(job_of(run), CleanConfig())
     assert run.cleaned.exists()
     with pytest.raises(RunError, match=r"made with other floaters .*--force"):
-        clean_levels(job_of(run), CleanConfig(floaters="keep", min_views=2))
-    clean_levels(job_of(run, force=True), CleanConfig(floaters="keep", min_views=2))
+        clean_levels(job_of(run), CleanConfig(floaters="keep"))
+    clean_levels(job_of(run, force=True), CleanConfig(floaters="keep"))
     assert not run.cleaned.exists()
     assert not run.floaters_picture.exists()
     assert job_of(run).trained == last_level(run)
@@ -82,7 +82,7 @@ def test_it_is_done_once_and_can_be_switched_off(run: RunDir) -> None:
 
 def test_nested_levels_are_made_of_what_is_left(run: RunDir) -> None:
     spoil(run)
-    clean_levels(job_of(run), CleanConfig(min_views=2))
+    clean_levels(job_of(run), CleanConfig())
     nest(job_of(run, force=True), SMALL_RUN.nest, BlocksConfig(), 0)
     job = job_of(run)
     assert job.ladder.size(job.ladder.levels[-1]) == sum(read_header(run.cleaned).counts.values())
@@ -102,10 +102,10 @@ def test_another_training_is_cleaned_anew(run: RunDir) -> None:
 def test_a_scene_in_blocks_and_an_adopted_splat_are_refused(run: RunDir) -> None:
     write_json(run.blocks / "blocks.json", {})
     with pytest.raises(RunError, match=r"blocks: floaters are not removed from a scene in blocks"):
-        clean(job_of(run), CleanConfig(min_views=2))
+        clean(job_of(run), CleanConfig())
     run.adopted.write_bytes(b"")
     with pytest.raises(RunError, match=r"a splat that was trained elsewhere"):
-        clean(job_of(run), CleanConfig(min_views=2))
+        clean(job_of(run), CleanConfig())
 
 
 def test_a_level_is_selected_as_it_is_stored(run: RunDir, tmp_path: Path) -> None:
@@ -127,7 +127,7 @@ def test_a_level_is_selected_as_it_is_stored(run: RunDir, tmp_path: Path) -> Non
     [
         "[]",
         "{}",
-        '{"gaussians": 3, "found": {"few views": 1}, "removed": {"few views": 2}, "before": {}, "after": {}}',
+        '{"gaussians": 3, "found": {"in front": 1}, "removed": {"in front": 2}, "before": {}, "after": {}}',
     ],
 )
 def test_figures_that_are_none_are_refused(tmp_path: Path, content: str) -> None:
@@ -149,10 +149,11 @@ def test_damaged_figures_are_made_again_as_their_error_says(run: RunDir) -> None
 
 def test_figures_in_words() -> None:
     figures = CleanFigures(
-        1000, {"few views": 5, "in front": 4, "category": 0}, {"few views": 5, "in front": 1, "category": 0},
+        1000,
+        {"hardly shown": 5, "in front": 4, "category": 0}, {"hardly shown": 5, "in front": 1, "category": 0},
         {"train": 20.0}, {"train": 19.99},
     )  # fmt: skip
     assert clean_lines(figures) == [
-        "6 of 1,000 Gaussians removed: 5 few views, 1 in front (of 4)",
+        "6 of 1,000 Gaussians removed: 5 hardly shown, 1 in front (of 4)",
         "train views -0.010 dB",
     ]

@@ -20,7 +20,7 @@ from sagesplat.io.ply_header import read_header
 from sagesplat.stages.clean_splat import clean_splat
 
 N = 90
-CONFIG = CleanConfig(min_views=2)
+CONFIG = CleanConfig()
 
 
 @pytest.fixture(scope="module")

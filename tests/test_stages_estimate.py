@@ -31,7 +31,7 @@ def job(tmp_path: Path) -> Job:
     job = Job(RunDir(tmp_path / "run"), lambda event: None, "cpu")
     open_scene(job, tmp_path / "capture", CONFIG.scene)
     make_masks(job, CONFIG.masks)
-    lift_labels(job, CONFIG.lift)
+    lift_labels(job)
     return job
 
 

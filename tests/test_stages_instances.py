@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sagesplat.core.config import LabelsConfig, LiftConfig, MasksConfig, PosesConfig, SceneConfig, TrainConfig
+from sagesplat.core.config import LabelsConfig, MasksConfig, PosesConfig, SceneConfig, TrainConfig
 from sagesplat.core.errors import LabelError, RunError
 from sagesplat.core.events import StageDone, StageSkipped, Warned
 from sagesplat.demo.capture import make_capture
@@ -40,7 +40,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     job = job_on(folder / "run", [])
     open_scene(job, folder / "capture", SceneConfig(), PosesConfig(), MasksConfig(), LabelsConfig())
     make_masks(job, MasksConfig())
-    lift_labels(job, LiftConfig())
+    lift_labels(job)
     train_levels(job, TrainConfig(max_steps=60, level_every=60), 0)
     return folder / "run"
 

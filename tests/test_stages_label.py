@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sagesplat.core.config import LabelsConfig, LiftConfig, MasksConfig, PosesConfig, SceneConfig, TrainConfig
+from sagesplat.core.config import LabelsConfig, MasksConfig, PosesConfig, SceneConfig, TrainConfig
 from sagesplat.core.errors import LabelError, RunError
 from sagesplat.core.events import Event, Warned
 from sagesplat.demo.capture import make_capture
@@ -20,7 +20,8 @@ from sagesplat.segment import hf
 from sagesplat.segment.lift import IGNORED
 from sagesplat.segment.masks import Taxonomy, mask_path
 from sagesplat.segment.segmenters import Segmented
-from sagesplat.stages.label import _soft, fuse_masks, lift_labels, make_masks
+from sagesplat.stages import label
+from sagesplat.stages.label import fuse_masks, lift_labels, make_masks
 from sagesplat.stages.scene import open_scene
 from sagesplat.stages.train import train_levels
 
@@ -64,7 +65,7 @@ def test_categories_are_merged_left_out_and_folded(capture: Path, tmp_path: Path
 
 
 class Halves:
-    """A network that calls the upper half of a photo sky and the rest grass, with some doubt."""
+    """A network that calls the upper half of a photo sky and the rest grass."""
 
     taxonomy = Taxonomy({187: "sky-other-merged", 193: "grass-merged"})
     note = "names were not trusted"
@@ -79,19 +80,16 @@ class Halves:
 
     def answer(self, shape) -> Segmented:
         sky = np.arange(shape[0])[:, None] < np.full(shape[1], shape[0] // 2)
-        p = np.where(sky, 0.8, 0.1).astype(np.float32)
-        return Segmented(
-            np.where(sky, 187, 193).astype(np.int16), np.stack([p, 0.9 - p]), np.array([187, 193], np.int16)
-        )
+        return Segmented(np.where(sky, 187, 193).astype(np.int16))
 
 
-def test_a_network_labels_and_its_probabilities_are_fused(
+def test_label_images_of_a_network_are_fused(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(hf, "HfSegmenter", Halves)
     monkeypatch.setattr(Halves, "calls", 0)
     job, events = begun(tmp_path / "run", capture)
-    config = MasksConfig(segmenter="hf", model="some/network", soft=True, batch=3)
+    config = MasksConfig(segmenter="hf", model="some/network")
     make_masks(job, config)
     assert Halves.calls == len(job.scene.views)
     assert Warned("names were not trusted") in events
@@ -100,20 +98,14 @@ def test_a_network_labels_and_its_probabilities_are_fused(
     assert Halves.calls == len(job.scene.views)  # other categories, the same network
     job, _ = begun(tmp_path / "run", capture)
     assert set(job.taxonomy.names.values()) == {"sky-other-merged", "ground"}
-    lift_labels(job, LiftConfig())
+    lift_labels(job)
     train_levels(job, TrainConfig(max_steps=40, level_every=40), 0)
     assert job.best_masks is job.masks
     fuse_masks(job)
     assert job.best_masks.folder == job.run.fused
     made = json.loads((job.run.fused / "fused.json").read_text())
-    assert made["soft"]
     assert 0 < made["changed"] < 0.5
     assert all(0 <= share <= 1 for share in made["agreement"])
-    ids, planes = _soft(job)(0)
-    assert set(ids.tolist()) == set(job.taxonomy.names)
-    assert planes.sum(0).max() <= 1
-    sky = planes[ids.tolist().index(187)]
-    assert sky[0].mean() == pytest.approx(0.8, abs=0.01)
 
 
 def test_what_a_segmenter_needs_is_said(capture: Path, tmp_path: Path) -> None:
@@ -160,33 +152,29 @@ def test_a_run_among_the_photos_is_refused(capture: Path) -> None:
         open_scene(job, capture / "images", SceneConfig())
 
 
-def test_given_label_images_have_no_networks_probabilities(capture: Path, tmp_path: Path) -> None:
-    job, _ = begun(tmp_path / "run", capture)
-    job.run.soft.mkdir()
-    make_masks(job, MasksConfig())
-    assert not job.run.soft.exists()
-
-
 def valid_in(job: Job) -> list[np.ndarray | None]:
     return [job.valid[view] for view in job.scene.views]
 
 
-def test_ignored_categories_have_no_pixel_no_vote_and_no_gaussian(capture: Path, tmp_path: Path) -> None:
+def test_ignored_categories_have_no_pixel_no_vote_and_no_gaussian(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(label, "_DILATION", 0)
     job, events = begun(tmp_path / "run", capture)
     make_masks(job, MasksConfig())
-    lift_labels(job, LiftConfig())
+    lift_labels(job)
     with_all, tree = job.initial_labels, next(i for i, n in job.taxonomy.names.items() if n == "tree-merged")
     trees = [job.masks[view] == tree for view in job.scene.views]
     shutil.rmtree(tmp_path / "run")
 
     job, events = begun(tmp_path / "run", capture)
-    make_masks(job, MasksConfig(), LabelsConfig(ignore="tree-merged,person", ignore_dilation=0))
+    make_masks(job, MasksConfig(), LabelsConfig(ignore="tree-merged,person"))
     assert [str(e.text) for e in events if isinstance(e, Warned)] == ["ignore: no photo shows person"]
     assert "tree-merged" not in job.taxonomy.names.values()
     for pixels, valid, view in zip(trees, valid_in(job), job.scene.views, strict=True):
         np.testing.assert_array_equal(pixels, np.zeros_like(pixels) if valid is None else ~valid)
         assert (job.masks[view][pixels] == -1).all()
-    lift_labels(job, LiftConfig())
+    lift_labels(job)
     assert (job.initial_labels[with_all == tree] == IGNORED).mean() > 0.9
     assert (job.initial_labels == IGNORED).sum() > 10
     assert job.point_labels.min() == -1
@@ -204,8 +192,9 @@ def test_ignored_categories_have_no_pixel_no_vote_and_no_gaussian(capture: Path,
 
 
 def test_masks_of_a_capture_are_found_and_photos_without_a_pixel_are_named(
-    capture: Path, tmp_path: Path
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(label, "_DILATION", 0)
     shutil.copytree(capture, tmp_path / "capture")
     job, _ = begun(tmp_path / "run", tmp_path / "capture")
     folder, first, second = tmp_path / "capture" / "masks_valid", *job.scene.views[1:3]
@@ -215,11 +204,11 @@ def test_masks_of_a_capture_are_found_and_photos_without_a_pixel_are_named(
     half.paste(255, (0, 0, 32, 48))
     half.save(mask_path(folder, second))
     job, events = begun(tmp_path / "run", tmp_path / "capture")
-    make_masks(job, MasksConfig(), LabelsConfig(ignore_dilation=0))
+    make_masks(job, MasksConfig(), LabelsConfig())
     texts = [e.text for e in events if isinstance(e, Warned)]
     assert texts == [f"1 of 8 photos have no pixel that counts: {first.name}"]
     assert job.valid.rows(job.scene, range(8)) == [0, *range(2, 8)]
-    make_masks(job, MasksConfig(), LabelsConfig(ignore_dilation=0))  # done already
+    make_masks(job, MasksConfig(), LabelsConfig())  # done already
     half.rotate(180).save(mask_path(folder, second))
     with pytest.raises(RunError, match="made with other valid"):
-        make_masks(job, MasksConfig(), LabelsConfig(ignore_dilation=0))
+        make_masks(job, MasksConfig(), LabelsConfig())

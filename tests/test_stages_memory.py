@@ -49,24 +49,23 @@ def test_nesting_needs_what_training_did(job: Job, told: list[Event]) -> None:
     assert len(told) == 1
 
 
-# megabytes: (kind, of the weights, megapixels, batch) -> peak that was measured, one thread
+# megabytes: (kind, of the weights, megapixels) -> peak that was measured, one thread
 MEASURED = {
-    ("onnx", 2.3, 0.02, 1): 465,
-    ("onnx", 2.3, 6.0, 1): 593,
-    ("onnx", 1.9, 0.02, 1): 406,
-    ("onnx", 1.9, 6.0, 1): 533,
-    ("hf", 95.9, 0.02, 1): 1634,
-    ("hf", 95.9, 0.02, 4): 2407,
-    ("hf", 95.9, 6.0, 1): 1699,
-    ("deeplabv2", 224.3, 0.02, 1): 825,
-    ("deeplabv2", 224.3, 0.48, 1): 851,
+    ("onnx", 2.3, 0.02): 465,
+    ("onnx", 2.3, 6.0): 593,
+    ("onnx", 1.9, 0.02): 406,
+    ("onnx", 1.9, 6.0): 533,
+    ("hf", 95.9, 0.02): 1634,
+    ("hf", 95.9, 6.0): 1699,
+    ("deeplabv2", 224.3, 0.02): 825,
+    ("deeplabv2", 224.3, 0.48): 851,
 }
 
 
 @pytest.mark.parametrize("case", MEASURED, ids=str)
 def test_what_is_needed_at_least_is_no_more_than_what_was_measured(case: tuple) -> None:
-    kind, megabytes, megapixels, batch = case
-    needed = network_memory(kind, megabytes * 1e6, int(megapixels * 1e6), batch) / 1e6
+    kind, megabytes, megapixels = case
+    needed = network_memory(kind, megabytes * 1e6, int(megapixels * 1e6)) / 1e6
     assert 0.6 * MEASURED[case] < needed < 1.02 * MEASURED[case]
 
 
@@ -75,14 +74,14 @@ def test_a_network_that_cannot_fit_is_one_line(job: Job, tmp_path: Path) -> None
     model.write_bytes(bytes(10**6))
     small = replace(job, memory_limit=GIB // 4)
     with pytest.raises(RunError) as caught:
-        check_network(small, "onnx", {"model": model}, 1)
+        check_network(small, "onnx", {"model": model})
     line = str(caught.value)
     assert line.startswith(
         f"{model}: segmenting photos of 0.0 megapixels needs at least about 0.4 GiB, the l"
     )
     assert "\n" not in line
-    check_network(replace(job, memory_limit=GIB), "onnx", {"model": model}, 1)
-    check_network(replace(small, backend="cuda"), "onnx", {"model": model}, 1)
+    check_network(replace(job, memory_limit=GIB), "onnx", {"model": model})
+    check_network(replace(small, backend="cuda"), "onnx", {"model": model})
 
 
 def test_the_size_of_weights(tmp_path: Path) -> None:

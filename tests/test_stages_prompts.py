@@ -157,9 +157,7 @@ class Grass:
         pass
 
     def __call__(self, photos: Any) -> list[Segmented]:
-        ids = np.array([193], np.int16)
-        shapes = [photo.shape[:2] for photo in photos]
-        return [Segmented(np.full(s, 193, np.int16), np.ones((1, *s), np.float32), ids) for s in shapes]
+        return [Segmented(np.full(photo.shape[:2], 193, np.int16)) for photo in photos]
 
 
 def test_words_over_a_network_s_categories(
@@ -169,12 +167,12 @@ def test_words_over_a_network_s_categories(
 
     monkeypatch.setattr(hf, "HfSegmenter", Grass)
     job, _ = begun(tmp_path / "run", capture)
-    make_masks(job, MasksConfig(segmenter="hf", model="a/b", prompts="stone fountain", soft=True, batch=4))
+    make_masks(job, MasksConfig(segmenter="hf", model="a/b", prompts="stone fountain"))
     assert job.taxonomy.names == {193: "grass-merged", 201: "stone fountain"}
     label_ids = job.masks[job.scene.views[0]]
     assert (label_ids == np.where(np.arange(64) < 32, 201, 193)).all()
     with pytest.raises(RunError, match="over_prompts"):
-        make_masks(job, MasksConfig(segmenter="hf", model="a/b", prompts="ivy", soft=True))
+        make_masks(job, MasksConfig(segmenter="hf", model="a/b", prompts="ivy"))
 
 
 def test_prompts_imply_the_segmenter_unless_another_source_is_named(tmp_path: Path) -> None:
@@ -206,8 +204,6 @@ def test_words_over_given_label_images(capture: Path, tmp_path: Path) -> None:
     assert any("prompt 'ivy': found in no photo" in line for line in warnings(events))
     make_masks(job, config)
     assert Left.calls == 6
-    with pytest.raises(RunError, match="--soft: given label images have no probabilities"):
-        make_masks(job, MasksConfig(prompts="ivy", soft=True))
 
 
 def test_a_word_for_a_given_category_is_that_one(capture: Path, tmp_path: Path) -> None:
@@ -242,6 +238,6 @@ def test_times_are_told_as_people_tell_them(monkeypatch: pytest.MonkeyPatch) -> 
 def test_networks_that_do_not_fit_are_refused_before_they_are_loaded(capture: Path, tmp_path: Path) -> None:
     job, _ = begun(tmp_path / "run", capture, memory_limit=2**30)
     with pytest.raises(RunError, match=r"needs at least about 1\.7 GiB"):
-        check_network(job, "text", text.settings(CONFIG), 1)
+        check_network(job, "text", text.settings(CONFIG))
     light = MasksConfig(segmenter="text", prompts="ivy", model="CIDAS/clipseg-rd64-refined")
-    check_network(job, "text", text.settings(light), 1)
+    check_network(job, "text", text.settings(light))

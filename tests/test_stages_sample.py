@@ -49,7 +49,7 @@ def test_a_finished_run_has_what_was_asked(finished_run: Path):
     assert np.isnan(table.fidelity[~seen]).all()
     assert (table.whole[:, -1] == 1).all()
     models = fidelity_of(job)
-    shown = np.flatnonzero(table.shown(job.fit_config.min_share).any(axis=0))
+    shown = np.flatnonzero(table.shown().any(axis=0))
     assert set(models) == {table.labels[i] for i in shown}
     assert all(model.status == "calibrated" for model in models.values())
 

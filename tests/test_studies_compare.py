@@ -14,7 +14,6 @@ from sagesplat import cli
 from sagesplat.core.config import (
     CompareConfig,
     FitConfig,
-    LiftConfig,
     MasksConfig,
     NestConfig,
     PlanConfig,
@@ -173,7 +172,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Job:
     job = Job(RunDir(folder / "run"), lambda event: None)
     open_scene(job, folder / "capture", SceneConfig())
     make_masks(job, MasksConfig())
-    lift_labels(job, LiftConfig())
+    lift_labels(job)
     train_levels(job, TrainConfig(max_steps=60, level_every=20, refine_every=5, sh_degree=1), 0)
     nest_levels(job, NestConfig(steps=20, levels=4, base_steps=20), 0)
     observe_levels(job, FitConfig())

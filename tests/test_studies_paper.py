@@ -14,7 +14,6 @@ from PIL import Image
 from sagesplat.adapt.ladder import read_ladder
 from sagesplat.adapt.observe import TOTAL, RenderedLabels, near_border, read_observations
 from sagesplat.core.config import (
-    FitConfig,
     PaperConfig,
     PlanConfig,
     RunConfig,
@@ -71,7 +70,7 @@ def work(run: Path, capture: Path, config: RunConfig = CONFIG, **options) -> tup
     job = Job(RunDir(run, "snapshots"), events.append, **options)
     open_scene(job, capture, config.scene)
     make_masks(job, config.masks)
-    lift_labels(job, config.lift)
+    lift_labels(job)
     train_levels(job, config.train, config.seed)
     observe_levels(job, config.fit)
     fit_ladder(job, config.fit)
@@ -269,31 +268,6 @@ def test_a_target_of_one_is_a_plan_out_of_reach(finished, tmp_path):
     make_plan(other, PlanConfig(target_ssim=1.0))
     paper_report(other, replace(PAPER, lpips=tmp_path, tune_steps=0))
     assert "; t=1: " in (other.run.paper / "table_3_view.md").read_text()
-
-
-def test_masks_from_labels_and_eroded_regions_change_what_is_measured(finished, tmp_path):
-    job, _ = finished
-    folder = tmp_path / "run"
-    shutil.copytree(job.run.path, folder)
-    other = Job(RunDir(folder, "snapshots"), lambda event: None, force=True)
-    given = read_observations(other.run.observations)
-    config = FitConfig(masks="rendered", region="eroded")
-    observe_levels(other, config)
-    rendered = read_observations(other.run.observations)
-    assert not np.array_equal(given.num_pixels, rendered.num_pixels)
-    whole, same = (t.select(t.label_id == TOTAL) for t in (given, rendered))
-    np.testing.assert_array_equal(whole.ssim, same.ssim)
-    for view in range(12):  # every pixel still belongs to one category
-        here = (rendered.view == view) & (rendered.level == 90) & (rendered.label_id != TOTAL)
-        assert rendered.num_pixels[here].sum() == 80 * 60
-    fit_ladder(other, config)
-    make_plan(other, CONFIG.plan)
-    evaluate_plans(other)
-    models = read_json(other.run.models)["models"]
-    eroded = rendered.select((rendered.label_id == 193) & (rendered.level == 90))
-    eroded = eroded.select(np.isin(eroded.view, other.scene.train_ids))
-    model = next(m for m in models if (m["label_id"], m["level"]) == (193, 90))
-    assert model["median"] == pytest.approx(np.nanmedian(eroded.ssim_eroded), abs=1e-6)
 
 
 def test_tuned_compositions_are_the_same_set_made_better(finished, tmp_path):

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from test_stages_label import Halves
 
 from sagesplat.adapt.plan import read_plans
-from sagesplat.core.config import LiftConfig, MasksConfig, PlanConfig, RunConfig, SceneConfig, TrainConfig
+from sagesplat.core.config import MasksConfig, PlanConfig, RunConfig, SceneConfig, TrainConfig
 from sagesplat.core.errors import DataError, RunError
 from sagesplat.core.events import Event, StageDone, TableMade, Training, Warned
 from sagesplat.demo.capture import make_capture
@@ -278,14 +278,13 @@ def test_settings_and_variants_become_the_configuration_of_each_cell(tmp_path: P
         [settings]
         scene.downscale = 2
         masks.masks = "labels"
-        train = { sh_degree = 1, antialiased = true, grow_scale = 1 }
+        train = { sh_degree = 1, antialiased = true, grow_grad = 1 }
         plan.share = 0.5
         [scenes]
         plot = "capture"
         garden = "demo"
         [variants.a]
         train.sh_degree = 2
-        lift.votes = "projection"
     """
     plot, garden = read_sweep(write(tmp_path, text))
     assert (plot.name, plot.capture) == ("plot-a-seed3", tmp_path / "capture")
@@ -296,13 +295,12 @@ def test_settings_and_variants_become_the_configuration_of_each_cell(tmp_path: P
         == RunConfig(
             SceneConfig(downscale=2),
             masks=MasksConfig(masks=tmp_path / "labels"),
-            lift=LiftConfig("projection"),
-            train=TrainConfig(sh_degree=2, antialiased=True, grow_scale=1.0),
+            train=TrainConfig(sh_degree=2, antialiased=True, grow_grad=1.0),
             plan=PlanConfig(target_ssim=0.9, share=0.5, other_targets=(0.5, 1.0)),
             seed=3,
         )
     )
-    assert isinstance(plot.config.train.grow_scale, float)
+    assert isinstance(plot.config.train.grow_grad, float)
     assert plot.config.plan.targets == [0.5, 0.9, 1.0]
 
 

@@ -14,9 +14,9 @@ from sagesplat.core.gaussians import Gaussians, concat
 from sagesplat.raster import rasterize, set_threads
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene, View
-from sagesplat.train.clean import CRITERIA, Floaters, clean, find_floaters
+from sagesplat.train.clean import CRITERIA, Floaters, check, clean, find_floaters
 
-CONFIG = CleanConfig(min_views=2)
+CONFIG = CleanConfig()
 N = 120
 
 
@@ -52,8 +52,8 @@ def rows_of(floaters: Floaters, name: str) -> list[int]:
     return np.flatnonzero(floaters.found[name]).tolist()
 
 
-def find(g: Gaussians, scene: Scene, config: CleanConfig = CONFIG, **options) -> Floaters:
-    return find_floaters(g, scene, scene.train_ids.tolist(), config, **options)
+def find(g: Gaussians, scene: Scene, **options) -> Floaters:
+    return find_floaters(g, scene, scene.train_ids.tolist(), **options)
 
 
 def remove(g: Gaussians, floaters: Floaters, scene: Scene, config: CleanConfig = CONFIG, **options):
@@ -61,32 +61,34 @@ def remove(g: Gaussians, floaters: Floaters, scene: Scene, config: CleanConfig =
     return clean(g, floaters, scene, Photos(scene.views), config, kinds=kinds, backend="cpu", **options)
 
 
-def test_what_no_view_shows_has_few_views(truth: Gaussians, scene: Scene) -> None:
+def test_what_no_view_shows_is_hardly_shown(truth: Gaussians, scene: Scene) -> None:
     behind = blobs(torch.tensor([[0.0, 0, -6], [0.5, 0.2, -5]]))
     floaters = find(concat([truth, behind]), scene)
     assert list(floaters.found) == list(CRITERIA)
-    assert rows_of(floaters, "few views")[-2:] == [N, N + 1]
+    assert rows_of(floaters, "hardly shown")[-2:] == [N, N + 1]
     assert floaters.weight[N:].max() == 0 < floaters.weight[:N].max()
 
 
-def test_mist_beside_the_cameras_is_hardly_shown(truth: Gaussians, scene: Scene) -> None:
+def test_mist_beside_the_cameras_is_hardly_shown(
+    truth: Gaussians, scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Photos show the rim of it only; who turned around would stand before a wall."""
     camera = scene.views[0].camera
     right = 0.5 * (camera.width - camera.K[0, 2]) / camera.K[0, 0] + 0.25  # 2.5 standard deviations outside
     beside = camera.position + right * camera.w2c[0, :3] + 0.5 * camera.w2c[2, :3]
     g = concat([truth, blobs(torch.from_numpy(beside)[None], size=0.1, logit=6.0)])
-    config = replace(CONFIG, min_views=0, content_depth=0, shown_share=0.1)  # photos are small
-    floaters = find_floaters(g, scene, [0], config)
+    monkeypatch.setattr("sagesplat.train.clean._SHOWN_SHARE", 0.1)  # photos are small
+    floaters = find_floaters(g, scene, [0])
     found = rows_of(floaters, "hardly shown")
     assert N in found
     assert floaters.weight[N] > 0
     assert np.median(floaters.weight[found]) < 0.3 * np.median(floaters.weight[:N])  # the others are hidden
-    assert not rows_of(find(g, scene, replace(config, shown_share=0)), "hardly shown")
+    assert not rows_of(find(g, scene, hardly_shown=False), "hardly shown")
 
 
 def test_blobs_before_the_cameras_are_in_front_and_little_else(truth: Gaussians, scene: Scene) -> None:
     g = concat([truth, blobs(before_cameras(8, 0.2), size=0.02)])
-    floaters = find(g, scene, replace(CONFIG, min_views=0, shown_share=0))
+    floaters = find(g, scene, hardly_shown=False)
     found = set(rows_of(floaters, "in front"))
     assert found >= set(range(N, N + 8))
     assert len(found) <= 8 + 2
@@ -117,12 +119,14 @@ def test_without_tracks_content_is_what_the_gaussians_show(truth: Gaussians, sce
         track_uv=points.track_uv[:0],
     )  # fmt: skip
     g = concat([truth, blobs(before_cameras(8, 0.2), size=0.02)])
-    found = set(rows_of(find(g, replace(scene, points=none), replace(CONFIG, min_views=0)), "in front"))
+    found = set(rows_of(find(g, replace(scene, points=none), hardly_shown=False), "in front"))
     assert found >= set(range(N, N + 8))
     assert len(found) <= 8 + 2
 
 
-def test_what_paints_a_far_category_contradicts_it(truth: Gaussians, scene: Scene) -> None:
+def test_what_paints_a_far_category_contradicts_it(
+    truth: Gaussians, scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
     x, y = np.meshgrid(np.linspace(-14, 14, 12), np.linspace(-10, 10, 9))
     wall = torch.from_numpy(np.stack([x.ravel(), y.ravel(), np.full(x.size, 24.0)], 1))
     sky = blobs(wall, size=1.6, logit=6.0, label=187)
@@ -134,24 +138,23 @@ def test_what_paints_a_far_category_contradicts_it(truth: Gaussians, scene: Scen
         alpha = rasterize(near, view.camera).alpha.numpy()
         return np.where(alpha > 0.3, 3, 187).astype(np.int16)
 
-    config = replace(CONFIG, min_views=0, content_depth=0)
-    found = rows_of(find(g, scene, config, label_image=label_image), "category")
+    monkeypatch.setattr("sagesplat.train.clean._CONTENT_DEPTH", 0)
+    found = rows_of(find(g, scene, label_image=label_image), "category")
     n = len(near) + len(sky)
     assert set(found) >= {n, n + 1, n + 2}
     assert len(found) <= 3 + 0.1 * len(near)
     assert not set(found) & set(range(len(near), n))
-    assert not rows_of(find(g, scene, config), "category")  # without label images nothing contradicts
-    assert not rows_of(find(g, scene, replace(config, category_depth=0), label_image=label_image), "category")
+    assert not rows_of(find(g, scene), "category")  # without label images nothing contradicts
 
 
 def test_what_views_would_miss_stays(truth: Gaussians, scene: Scene) -> None:
     needed = np.zeros(N, bool)
     needed[:40] = True
     weight = find(truth, scene).weight
-    floaters = Floaters({"few views": needed}, weight)
+    floaters = Floaters({"hardly shown": needed}, weight)
     cleaned = remove(truth, floaters, scene)
     gone = np.flatnonzero(~cleaned.keep)
-    assert cleaned.found == {"few views": 40}
+    assert cleaned.found == {"hardly shown": 40}
     assert len(gone) < 40
     assert all(cleaned.before[k] - cleaned.after[k] <= CONFIG.max_loss for k in ("train", "calibration"))
     stay = np.setdiff1d(np.flatnonzero(needed), gone)
@@ -166,14 +169,11 @@ def test_without_photos_what_is_seen_of_the_splat_itself_stays(truth: Gaussians,
     hidden = np.arange(N + 1) == N
     weight = find(g, scene).weight
     for rows, goes in ((shown, False), (hidden, True)):
-        cleaned = remove(g, Floaters({"few views": rows}, weight), scene, real=False)
+        cleaned = remove(g, Floaters({"hardly shown": rows}, weight), scene, real=False)
         assert cleaned.keep.all() != goes
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("shown_share", 1.5), ("content_depth", 1.5), ("min_views", -1), ("max_loss", float("nan"))],
-)
-def test_impossible_thresholds_are_refused(truth: Gaussians, scene: Scene, name: str, value: float) -> None:
-    with pytest.raises(RunError, match=rf"--clean\.{name.replace('_', '-')} .* is impossible; choose 0 to"):
-        find(truth, scene, replace(CONFIG, **{name: value}))
+@pytest.mark.parametrize("loss", [-1, float("nan")])
+def test_impossible_losses_are_refused(loss: float) -> None:
+    with pytest.raises(RunError, match=r"--clean\.max-loss .* is impossible; choose 0 to 100"):
+        check(CleanConfig(max_loss=loss))

@@ -142,7 +142,7 @@ def test_a_reset_lowers_opacities_of_trainable_rows():
     state.step = 3000
     state.gaussians.logit_opacities[1] = -7.0
     trainable = torch.tensor([True, True, True, False])
-    densify.reset_opacities(state, CONFIG, trainable)
+    densify.reset_opacities(state, trainable)
     opacities = state.gaussians.logit_opacities.sigmoid()
     expected = torch.tensor([0.01, torch.tensor(-7.0).sigmoid(), 0.01, 0.5])
     torch.testing.assert_close(opacities, expected)

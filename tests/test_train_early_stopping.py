@@ -19,7 +19,7 @@ from sagesplat.scene import load_scene
 from sagesplat.scene.images import Photos
 from sagesplat.segment.lift import lift
 from sagesplat.segment.masks import Masks, Taxonomy, import_masks
-from sagesplat.train import stepper, trainer
+from sagesplat.train import schedule, stepper, trainer
 from sagesplat.train.early_stopping import (
     ActiveTiles,
     active_tiles,
@@ -27,19 +27,21 @@ from sagesplat.train.early_stopping import (
     measured_views,
     trainable_rows,
 )
-from sagesplat.train.events import LabelFrozen, LevelSaved, Resumed, Step, Trained
+from sagesplat.train.events import LabelFrozen, Resumed, Step, Trained
 from sagesplat.train.lr_schedule import smaller
 from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.state import initial_state
 from sagesplat.train.stepper import Stepper, tune
-from sagesplat.train.strategy import schedule_of
 from sagesplat.train.trainer import train
 
 CPU = torch.device("cpu")
 # densification from step 24 to 60 every 6, resets at 40, the SH degree rises every 4 steps
-CONFIG = TrainConfig(
-    max_steps=120, level_every=10, refine_start=24, refine_every=6, reset_every=40, lr_schedule="published"
-)
+CONFIG = TrainConfig(max_steps=120, level_every=10, refine_start=24, refine_every=6, lr_schedule="published")
+
+
+@pytest.fixture(autouse=True)
+def early_resets(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(schedule, "_MIN_RESET_INTERVAL", 40)
 
 
 @pytest.fixture(scope="module")
@@ -143,23 +145,6 @@ def test_a_killed_run_keeps_what_was_frozen(capture, tmp_path):
         assert torch.equal(getattr(ends[0].gaussians, name), getattr(ends[1].gaussians, name))
     late = [e for e in whole if isinstance(e, LabelFrozen) and e.step > 40]
     assert [e for e in again if isinstance(e, LabelFrozen)] == late
-
-
-def test_levels_right_after_a_reset_are_faint(capture, levels, tmp_path):
-    scene, photos, _, labels = capture
-    config = replace(CONFIG, max_steps=60, reset_every=30, refine_stop=15_000)
-    config = replace(config, refine_stop=30_000)  # densification until the end
-    plan = schedule_of(config)
-    assert plan.refine_stop > 30
-    saved: dict[bool, LevelSaved] = {}
-    faint = {}
-    for late in (False, True):
-        events = train(scene, photos, labels, replace(config, levels_after_reset=late), folder=tmp_path)
-        at = plan.reset_every
-        saved[late] = next(e for e in events if isinstance(e, LevelSaved) and e.step == at)
-        faint[late] = float(levels[at].logit_opacities.sigmoid().max())
-    assert faint[True] < 0.011 < faint[False]
-    assert (saved[False].recovering, saved[True].recovering) == (False, True)
 
 
 @pytest.mark.parametrize("target", [0.0, -1.0, 1.5, float("nan")])

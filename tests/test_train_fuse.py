@@ -14,7 +14,7 @@ from sagesplat.core.errors import LabelError
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.scene.scene import Points, Scene, View
 from sagesplat.segment.masks import Masks, Taxonomy, mask_path, write_labels, write_mask
-from sagesplat.train.fuse import FuseOptions, Votes, draw, fuse, gather, refine, soft_pixels, thin_parts
+from sagesplat.train.fuse import FuseOptions, Votes, draw, fuse, gather, refine, thin_parts
 from sagesplat.train.votes import label_weights
 
 CAR, TREE = 3, 184
@@ -70,25 +70,6 @@ def test_hard_votes_are_the_weights_of_the_labels_in_shares(tmp_path: Path) -> N
     assert heard == [1, 2, 3]
 
 
-def test_soft_votes_of_one_category_are_hard_votes(tmp_path: Path) -> None:
-    g, scene = _scene(2)
-    images = _truth(g, scene)
-    images[1][:8] = -1
-    masks = _write(tmp_path, scene, images)
-    hard = gather(g, scene, masks, [0, 1])
-    soft = gather(g, scene, masks, [0, 1], soft=lambda row: (IDS[1:], _one_hot(images[row])))
-    np.testing.assert_allclose(soft.shares, hard.shares, atol=2e-4)
-
-
-def test_even_probabilities_give_even_shares(tmp_path: Path) -> None:
-    g, scene = _scene(2)
-    masks = _write(tmp_path, scene, _truth(g, scene))
-    planes = np.stack([np.full((4, 6), p, np.float32) for p in (0.25, 0.5, 0.125)])
-    soft = gather(g, scene, masks, [0, 1], soft=lambda row: (np.array([TREE, CAR, 7], np.int16), planes))
-    seen = soft.shares.sum(1) > 0
-    np.testing.assert_allclose(soft.shares[seen], np.tile([0.25, 0.5, 0.25], (int(seen.sum()), 1)), atol=1e-4)
-
-
 def test_views_without_labels_do_not_vote(tmp_path: Path) -> None:
     g, scene = _scene()
     images = _truth(g, scene)
@@ -97,36 +78,6 @@ def test_views_without_labels_do_not_vote(tmp_path: Path) -> None:
     np.testing.assert_array_equal(
         gather(g, scene, masks, range(4)).shares, gather(g, scene, masks, [0]).shares
     )
-
-
-def test_repeated_and_unknown_categories_and_the_rest() -> None:
-    _, scene = _scene(1)
-    camera = scene.views[0].camera
-    given = np.array([CAR, CAR, 99, -1], np.int16)
-    planes = np.stack([np.full((5, 7), p, np.float32) for p in (0.25, 0.25, 0.3, 0.2)])
-    pixels = soft_pixels(lambda row: (given, planes), 0, camera, IDS)
-    assert pixels.shape == (3, camera.height, camera.width)
-    np.testing.assert_allclose(pixels[:, 0, 0], [0.5, 0.5, 0], atol=1e-6)
-    pixels = soft_pixels(lambda row: (given[:2], 4 * planes[:2]), 0, camera, IDS)
-    np.testing.assert_allclose(pixels[:, 3, 3], [0, 1, 0], atol=1e-6)  # more than 1 is scaled down
-
-
-@pytest.mark.parametrize(
-    ("planes", "message"),
-    [
-        (np.full((1, 2, 2), np.nan, np.float32), "soft labels of view 0 hold NaN, Inf or less than 0"),
-        (np.full((1, 2, 2), np.inf, np.float32), "soft labels of view 0 hold NaN"),
-        (np.full((1, 2, 2), -0.1, np.float32), "soft labels of view 0 hold NaN"),
-        (np.zeros((2, 2, 2), np.float32), "soft labels of shape (2, 2, 2) for 1 categories"),
-        (np.zeros((2, 2), np.float32), "soft labels of shape (2, 2) for 1 categories"),
-    ],
-)
-def test_probabilities_that_are_none_are_one_line(planes: np.ndarray, message: str) -> None:
-    _, scene = _scene(1)
-    with pytest.raises(LabelError) as error:
-        soft_pixels(lambda row: (IDS[1:2], planes), 0, scene.views[0].camera, IDS)
-    assert str(error.value).startswith(message)
-    assert "\n" not in str(error.value)
 
 
 def _drawn(*shares: float) -> Float32[np.ndarray, "C 1 1"]:
@@ -199,19 +150,6 @@ def test_a_wrong_view_is_put_right_and_the_right_ones_stay(tmp_path: Path) -> No
     assert json.loads(json.dumps(fused.record)) == fused.record
     again = fuse(g, scene, masks, tmp_path / "twice", views=voters)
     np.testing.assert_array_equal(again.changed, fused.changed)  # deterministic
-
-
-def test_soft_labels_fuse_too(tmp_path: Path) -> None:
-    g, scene = _scene(6)
-    truth = _truth(g, scene)
-    masks = _write(tmp_path / "in", scene, truth)
-
-    def soft(row: int) -> tuple[Int16[np.ndarray, " K"], Float32[np.ndarray, "K H W"]]:
-        return IDS[1:], 0.1 + 0.8 * _one_hot(truth[row])
-
-    fused = fuse(g, scene, masks, tmp_path / "out", soft=soft)
-    assert fused.changed.max() < 0.02
-    assert fused.record["soft"]
 
 
 def test_the_folder_of_the_masks_is_refused(tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ from sagesplat.train.stepper import Stepper
 from sagesplat.train.trainer import train
 
 CPU = torch.device("cpu")
-SHORT = replace(BUSY, max_steps=26, level_every=12, refine_every=4, refine_start=4, reset_every=9)
+SHORT = replace(BUSY, max_steps=26, level_every=12, refine_every=4, refine_start=4)
 
 
 class Halves:
@@ -81,10 +81,9 @@ def final(events):
     "config",
     [
         replace(SHORT, max_steps=8, refine_every=50),
-        pytest.param(replace(SHORT, absgrad=True, grow_absgrad=1e-4), marks=pytest.mark.slow),
         pytest.param(replace(SHORT, batch=2), marks=pytest.mark.slow),
     ],
-    ids=["default", "absgrad", "batch"],
+    ids=["default", "batch"],
 )
 def test_it_trains_as_on_the_cpu(scene, on_gpu, monkeypatch, config):  # noqa: F811
     gpu = run(scene, config)

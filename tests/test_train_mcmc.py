@@ -17,6 +17,7 @@ from sagesplat.raster import rasterize, set_threads
 from sagesplat.raster.reference import rotation_matrices
 from sagesplat.scene.images import Photos
 from sagesplat.train import mcmc
+from sagesplat.train.densify import PRUNE_OPACITY
 from sagesplat.train.early_stopping import ActiveTiles, trainable_rows
 from sagesplat.train.lr_schedule import LrSchedule
 from sagesplat.train.photo_loader import PhotoLoader
@@ -110,7 +111,7 @@ def test_a_pile_renders_like_the_one_it_was(logit, moved, tolerance):
     state = state_of(g)
     camera = pinhole()
     before = rasterize(state.gaussians, camera).alpha.clone()
-    assert mcmc.relocate(state, CONFIG, all_of(state)) == moved
+    assert mcmc.relocate(state, all_of(state)) == moved
     after = rasterize(state.gaussians, camera).alpha
     assert float(before.max()) > 0.2
     assert float((after - before).abs().max()) < tolerance
@@ -128,7 +129,7 @@ def test_the_dead_take_everything_from_their_hosts():
     g.logit_opacities[1] = 6.0
     state = state_of(g)
     before = snapshot(state)
-    assert mcmc.relocate(state, CONFIG, all_of(state)) == 100
+    assert mcmc.relocate(state, all_of(state)) == 100
     g = state.gaussians
     dead = torch.arange(400) % 4 == 0
     assert (g.means[:, None] == before["means"][~dead]).all(-1).any(1).all()  # all are in living places
@@ -155,7 +156,7 @@ def test_hosts_are_drawn_by_opacity():
     g.logit_opacities[:] = DEAD
     g.logit_opacities[:3] = torch.logit(torch.tensor([0.1, 0.3, 0.6]))
     state = state_of(g)
-    mcmc.relocate(state, CONFIG, all_of(state))
+    mcmc.relocate(state, all_of(state))
     shares = [(state.gaussians.means == g.means[i]).all(-1).float().mean().item() for i in range(3)]
     assert shares == pytest.approx([0.1, 0.3, 0.6], abs=0.015)
 
@@ -165,8 +166,8 @@ def test_hosts_are_drawn_by_opacity():
 def test_relocation_keeps_counts_and_leaves_stopped_rows_alone(drawn):
     state, trainable = drawn
     before, withheld = snapshot(state), state.withheld
-    alive = before["logit_opacities"].sigmoid() > CONFIG.prune_opacity
-    moved = mcmc.relocate(state, CONFIG, trainable)
+    alive = before["logit_opacities"].sigmoid() > PRUNE_OPACITY
+    moved = mcmc.relocate(state, trainable)
     after = snapshot(state)
     dead = trainable & ~alive
     assert moved == (int(dead.sum()) if (trainable & alive).any() else 0)
@@ -176,7 +177,7 @@ def test_relocation_keeps_counts_and_leaves_stopped_rows_alone(drawn):
         assert torch.isfinite(tensor).all()
         assert torch.equal(tensor[~trainable], before[name][~trainable])
     if moved:  # nobody of a trainable category is dead, up to rounding
-        assert after["logit_opacities"][trainable].sigmoid().min() >= CONFIG.prune_opacity * (1 - 1e-5)
+        assert after["logit_opacities"][trainable].sigmoid().min() >= PRUNE_OPACITY * (1 - 1e-5)
         living = set(before["label_ids"][trainable & alive].tolist())
         assert set(after["label_ids"][trainable].tolist()) == living
 
@@ -189,8 +190,8 @@ def test_growth_keeps_to_the_cap_and_withholds_what_stopped(drawn, most, rounds)
     stopped = {label for label in (-1, 3, 184) if not trainable[state.gaussians.label_ids == label].all()}
     for _ in range(rounds):
         before, n, withheld = snapshot(state), len(state.gaussians), state.withheld
-        living = trainable & (state.gaussians.logit_opacities.sigmoid() > CONFIG.prune_opacity)
-        added = mcmc.add(state, CONFIG, most, trainable)
+        living = trainable & (state.gaussians.logit_opacities.sigmoid() > PRUNE_OPACITY)
+        added = mcmc.add(state, most, trainable)
         after = snapshot(state)
         free = max(0, min(most - n - withheld, math.ceil(0.05 * n)))
         given_out = round(free * float(trainable.float().mean()))
@@ -221,8 +222,8 @@ def test_chance_comes_from_the_state_alone():
     def run(seed: int) -> TrainState:
         state = state_of(random_gaussians(300, logit=-4), seed)
         for _ in range(3):
-            mcmc.relocate(state, CONFIG, all_of(state))
-            mcmc.add(state, CONFIG, 1000, all_of(state))
+            mcmc.relocate(state, all_of(state))
+            mcmc.add(state, 1000, all_of(state))
             mcmc.perturb(state, 0.1, all_of(state))
         return state
 
@@ -309,7 +310,7 @@ def test_noise_is_the_same_with_any_number_of_threads_and_for_a_seed():
 def test_nothing_is_perturbed_where_nothing_is():
     state = initial_state(random_gaussians(0), 0)
     mcmc.perturb(state, 1.0, all_of(state))
-    assert mcmc.relocate(state, CONFIG, all_of(state)) == 0
+    assert mcmc.relocate(state, all_of(state)) == 0
     assert len(state.gaussians) == 0
 
 

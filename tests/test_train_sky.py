@@ -226,9 +226,9 @@ def test_base_model_and_order(capture):
     blob = replace(
         blob, logit_opacities=torch.tensor([4.0]), label_ids=torch.tensor([TREE], dtype=torch.int16)
     )
-    ordered = order(concat([g, blob]), scene, masks, SMALL_RUN.nest, shell=found.shell).gaussians
+    ordered = order(concat([g, blob]), scene, masks, shell=found.shell).gaussians
     assert torch.equal(ordered.label_ids == SKY, found.shell.holds(ordered.means))
-    plain = order(concat([g, blob]), scene, masks, SMALL_RUN.nest).gaussians
+    plain = order(concat([g, blob]), scene, masks).gaussians
     assert not torch.equal(plain.label_ids == SKY, found.shell.holds(plain.means))
 
 
@@ -259,10 +259,10 @@ def test_a_run_with_sky(capture, tmp_path):
     job = Job(RunDir(folder), events.append, "cpu", force=True)
     open_scene(job, capture[0].path, SMALL_RUN.scene)
     make_masks(job, SMALL_RUN.masks, SMALL_RUN.labels)
-    lift_labels(job, SMALL_RUN.lift)
+    lift_labels(job)
     train(job, replace(SMALL_RUN.train, max_steps=2), BlocksConfig(), 0)
     trained = job.snapshots.load(job.snapshots.levels[-1])
-    clean_levels(job, CleanConfig(min_views=6, max_loss=9.0))
+    clean_levels(job, CleanConfig(max_loss=9.0))
     nest(job, replace(SMALL_RUN.nest, base_share=0.3, base_steps=1), BlocksConfig(), 0)
     found = job.sky
     assert found is not None

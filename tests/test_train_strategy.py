@@ -85,8 +85,11 @@ def test_statistics_are_collected_until_densification_ends(scene: Scene) -> None
         assert (state.grad_count == count).all()
 
 
-def test_opacities_are_reset_for_categories_that_still_train(scene: Scene) -> None:
-    strategy = made(scene, "default", reset_every=40, refine_stop=30_000, refine_every=1000)
+def test_opacities_are_reset_for_categories_that_still_train(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(schedule, "_MIN_RESET_INTERVAL", 40)
+    strategy = made(scene, "default", refine_stop=30_000, refine_every=1000)
     assert [step for step in range(300) if strategy.resets(step)] == [40, 80, 120, 160, 200, 240, 280]
     state = state_at(40)
     state.frozen = {3: 7}
@@ -97,7 +100,7 @@ def test_opacities_are_reset_for_categories_that_still_train(scene: Scene) -> No
     assert torch.equal(after[frozen], before[frozen])
     assert after[~frozen].sigmoid().max() <= 0.0101
     assert state.last_reset == 40
-    assert not any(made(scene, "mcmc", reset_every=40).resets(step) for step in range(300))
+    assert not any(made(scene, "mcmc").resets(step) for step in range(300))
 
 
 def test_mcmc_regularises_and_adds_noise(scene: Scene) -> None:

@@ -7,13 +7,14 @@ model rendered from the same viewpoint, over the pixels that the full model's Ga
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 from jaxtyping import Float32, Int16, Int32
 
 from sagesplat.adapt.ladder import Ladder
 from sagesplat.adapt.observe import (
+    MIN_SHARE,
     TOTAL,
     LabelImages,
     RenderedLabels,
@@ -112,8 +113,6 @@ def evaluate(
     plans: Sequence[Plan],
     predicted: Callable[[QualityKind, int, int, int], float],
     *,
-    region: Literal["mask", "eroded"] = "mask",
-    min_share: float = 0.0,
     uniform: Sequence[int] = (),
     compose: Callable[[Plan], Gaussians] | None = None,
     valid: ValidPixels = ALL_VALID,
@@ -130,8 +129,6 @@ def evaluate(
         ladder: The levels.
         plans: What to compose.
         predicted: What is expected of (quality, label id, level, row of `Scene.views`); NaN: none.
-        region: Where a category's SSIM is measured: on its mask, or on the mask eroded by 5 px.
-        min_share: Fidelity is not measured where a category covers less than this fraction of the pixels.
         uniform: Levels to measure with all categories at that level, to compare the plans with.
         compose: The Gaussians of a plan; None: its levels as they are.
         valid: The pixels of photos that count; views without any are left out.
@@ -142,7 +139,6 @@ def evaluate(
     Returns:
         One row per (plan, view, category), one per (plan, view) and one per (level, view) for the full image.
     """
-    ssim = "ssim_eroded" if region == "eroded" else "ssim"
     rows: list[dict[str, float]] = []
     views = valid.rows(scene, scene.test_ids)
     inner = {row: erode(masks[scene.views[row]]) for row in views}
@@ -170,7 +166,7 @@ def evaluate(
             else:
                 reference = kept[row]
             image = reference if g is last else render(g, neutral)
-            least = min_share * image.shape[0] * image.shape[1]
+            least = MIN_SHARE * image.shape[0] * image.shape[1]
             alike = fidelity_by_label(image, reference, labels[view], least)
             colours = measure_colours(image, photo, valid[view])
             if view.camera.exposure is not None:
@@ -192,9 +188,9 @@ def evaluate(
                 "quality": QUALITIES.index("fidelity"), "target": np.nan,
                 "view": row, "label_id": UNIFORM, "level": level,
                 "predicted": np.nan, "fidelity": alike[TOTAL],
-                "ssim": measured[TOTAL][ssim], "psnr": measured[TOTAL]["psnr"],
+                "ssim": measured[TOTAL]["ssim"], "psnr": measured[TOTAL]["psnr"],
                 "num_pixels": measured[TOTAL]["num_pixels"],
-                "full_ssim": full[row][TOTAL][ssim], "full_psnr": full[row][TOTAL]["psnr"],
+                "full_ssim": full[row][TOTAL]["ssim"], "full_psnr": full[row][TOTAL]["psnr"],
                 **_colours({}, {}),
             })  # fmt: skip
     for plan in plans:
@@ -206,8 +202,8 @@ def evaluate(
                     "view": row, "label_id": label, "level": level,
                     "predicted": predicted(plan.quality, label, level, row) if known else np.nan,
                     "fidelity": alike.get(label, np.nan),
-                    "ssim": values[ssim], "psnr": values["psnr"], "num_pixels": values["num_pixels"],
-                    "full_ssim": full[row][label][ssim], "full_psnr": full[row][label]["psnr"],
+                    "ssim": values["ssim"], "psnr": values["psnr"], "num_pixels": values["num_pixels"],
+                    "full_ssim": full[row][label]["ssim"], "full_psnr": full[row][label]["psnr"],
                     **_colours(values, full[row][label]),
                 })  # fmt: skip
     return from_rows(Evaluation, rows)

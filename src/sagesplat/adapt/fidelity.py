@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int, Int16, Int32
 
 from sagesplat.adapt.ladder import Ladder, PrefixLadder
-from sagesplat.adapt.observe import PERCENTILE, RenderedLabels, distances_in_views, render_rgb
+from sagesplat.adapt.observe import MIN_SHARE, PERCENTILE, RenderedLabels, distances_in_views, render_rgb
 from sagesplat.adapt.seen import Seen, seen_from
 from sagesplat.core.errors import DataError, short
 from sagesplat.io.files import atomic_path
@@ -35,17 +35,15 @@ class SampledFidelity:
     whole: Float32[np.ndarray, "V K"]  # over all pixels
     distance: Float32[np.ndarray, "V L"]  # d_min, world units; NaN: unknown
 
-    def shown(self, min_share: float) -> np.ndarray:
-        """Whether a category covers at least a share of the image, bool [V, L]."""
-        return (self.pixels > 0) & (self.pixels >= min_share * self.image[:, None])
+    def shown(self) -> np.ndarray:
+        """Whether a category covers at least `MIN_SHARE` of the image, bool [V, L]."""
+        return (self.pixels > 0) & (self.pixels >= MIN_SHARE * self.image[:, None])
 
 
-def shown_enough(
-    pixels: Int[np.ndarray, "V L"], cameras: Sequence[Camera], min_share: float
-) -> Bool[np.ndarray, "V L"]:
-    """Whether a category covers at least a share of the image at each viewpoint."""
+def shown_enough(pixels: Int[np.ndarray, "V L"], cameras: Sequence[Camera]) -> Bool[np.ndarray, "V L"]:
+    """Whether a category covers at least `MIN_SHARE` of the image at each viewpoint."""
     image = np.array([camera.width * camera.height for camera in cameras])
-    return (pixels > 0) & (pixels >= min_share * image[:, None])
+    return (pixels > 0) & (pixels >= MIN_SHARE * image[:, None])
 
 
 def measure_levels(

@@ -49,7 +49,6 @@ def fit_fidelity(
     sampled: SampledFidelity,
     cameras: Sequence[Camera],
     extent: float,
-    min_share: float,
     confidence: float,
 ) -> dict[int, ViewModel]:
     """Fit the expected fidelity of each category over the viewpoint, with preliminary thresholds.
@@ -58,14 +57,13 @@ def fit_fidelity(
         sampled: Measured at V viewpoints that are used for nothing else.
         cameras: The V viewpoints.
         extent: Of the scene, world units.
-        min_share: Least share of the image that a category covers in the viewpoints that count for it.
         confidence: Of the preliminary thresholds.
 
     Returns:
         Models by label id; a category that is shown in no viewpoint has none. They are not calibrated yet.
     """
     position, direction = _poses(cameras)
-    shown, models = sampled.shown(min_share), {}
+    shown, models = sampled.shown(), {}
     for column, label in enumerate(sampled.labels):
         rows = np.flatnonzero(shown[:, column])
         if not len(rows):

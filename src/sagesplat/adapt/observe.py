@@ -66,12 +66,14 @@ def read_observations(path: Path) -> Observations:
     return read_columns(path, Observations, "delete it and run `sagesplat observe` again")
 
 
-def large_enough(observations: Observations, scene: Scene, min_share: float) -> Observations:
-    """The rows whose category has at least this share of the pixels of its view."""
+def large_enough(observations: Observations, scene: Scene) -> Observations:
+    """The rows whose category has at least `MIN_SHARE` of the pixels of its view."""
     pixels = np.array([view.camera.width * view.camera.height for view in scene.views])
-    return observations.select(observations.num_pixels >= min_share * pixels[observations.view])
+    return observations.select(observations.num_pixels >= MIN_SHARE * pixels[observations.view])
 
 
+# A category that covers less of a view's pixels is not measured there: a few pixels say nothing of its level.
+MIN_SHARE = 5e-4
 ERODE = 5  # px that the inner mask keeps away from the category's border
 _BORDER = -3  # pixels of an eroded label image that belong to no category
 PERCENTILE = 5.0

@@ -48,8 +48,6 @@ class Device:
     """CPU threads (0: all cores)."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """auto: a CUDA GPU if one works (see `sagesplat doctor`), else the CPU."""
-    backend: Literal["auto", "cpu", "cuda", "reference"] = "auto"
-    """Rasteriser. auto: the one of the device; reference: float64 in PyTorch, slow."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +140,7 @@ def _approval(run: "RunDir", console: "Console", yes: bool) -> Callable[[str, st
 def computing(machine: Machine, folder: Path) -> "Iterator[tuple[Backend, int, Executor]]":
     """Backend and CPU threads of this process, and what does the tasks; `folder`: what they write into.
 
-    On a cluster with GPUs, tasks of `--device auto` and `--backend auto` use them, though this machine has
+    On a cluster with GPUs, tasks of `--device auto` use them, though this machine has
     none: what this process itself computes, it computes on its CPU then.
     """
     from sagesplat.run.executor import LOCAL
@@ -160,9 +158,8 @@ def computing(machine: Machine, folder: Path) -> "Iterator[tuple[Backend, int, E
     from sagesplat.run.ray_executor import RayExecutor
 
     with connected(address) as resources:
-        auto = (machine.device, machine.backend) == ("auto", "auto")
         elsewhere: Literal["cuda"] | None = (
-            "cuda" if auto and backend == "cpu" and resources.get("GPU") else None
+            "cuda" if machine.device == "auto" and backend == "cpu" and resources.get("GPU") else None
         )
         gpus = float("cuda" in (backend, elsewhere))
         with closing(RayExecutor(folder, threads, elsewhere, gpus)) as executor:
@@ -175,7 +172,7 @@ def prepare(machine: Machine) -> "tuple[Backend, int]":
 
     if machine.processes < 1:
         raise RunError(f"--processes {machine.processes} is impossible; choose 1 or more")
-    device, backend = machine.device, machine.backend
-    if (device, backend) == ("auto", "auto") and cuda.missing() is None:
+    device = machine.device
+    if device == "auto" and cuda.missing() is None:
         device = "cuda"
-    return resolve_backend(backend, device), set_threads(machine.threads)
+    return resolve_backend("auto", device), set_threads(machine.threads)

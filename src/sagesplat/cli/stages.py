@@ -27,7 +27,6 @@ from sagesplat.core.config import (
     CleanConfig,
     FitConfig,
     LabelsConfig,
-    LiftConfig,
     MasksConfig,
     NestConfig,
     PaperConfig,
@@ -67,7 +66,6 @@ def run(
     poses: PosesConfig = PosesConfig(),
     masks: Annotated[MasksConfig, Flat] = MasksConfig(),
     labels: LabelsConfig = LabelsConfig(),
-    lift: LiftConfig = LiftConfig(),
     train: TrainConfig = TrainConfig(),
     clean: CleanConfig = CleanConfig(),
     blocks: BlocksConfig = BlocksConfig(),
@@ -93,7 +91,6 @@ def run(
         poses,
         masks,
         labels,
-        lift,
         train,
         clean,
         blocks,
@@ -175,14 +172,14 @@ def masks(
 
 
 @command
-def lift(run: Run, lift: LiftConfig = LiftConfig(), machine: Annotated[Redo, Flat] = Redo()) -> None:
+def lift(run: Run, machine: Annotated[Redo, Flat] = Redo()) -> None:
     """Transfer the labels of the images to the 3D points of the capture."""
     from sagesplat.stages.label import lift_labels
     from sagesplat.stages.scene import check_not_adopted
 
     with open_job(run, machine) as job:
         check_not_adopted(job.run)
-        lift_labels(job, lift)
+        lift_labels(job)
 
 
 @command

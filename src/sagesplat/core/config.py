@@ -43,12 +43,6 @@ class PosesConfig:
     """Frames that are taken from a video."""
     min_registered: float = 0.5
     """Fraction of the photos that must get a pose."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Device for feature extraction and matching."""
-    threads: int = -1
-    """CPU threads (-1: all cores)."""
-    seed: int = 0
-    """Seed of RANSAC and of the mapping."""
 
 
 @dataclass(frozen=True)
@@ -78,16 +72,8 @@ class MasksConfig:
     CLIPSeg, 0.5 for SAM 3)."""
     classes: Path | None = None
     """JSON file with the class names of an ONNX network and their category ids."""
-    head: Literal["coco-stuff", "voc"] = "coco-stuff"
-    """Data set that the deeplabv2 checkpoint was trained on."""
     crf: bool = False
     """Refine the label images with a dense CRF (deeplabv2)."""
-    batch: int = 1
-    """Photos per forward pass of the network."""
-    soft: bool = False
-    """Store the class probabilities too; label fusion then uses them."""
-    time_limit: float = 300.0
-    """Time limit for an ONNX network on a photo, seconds (0: none)."""
 
 
 @dataclass(frozen=True)
@@ -103,21 +89,10 @@ class LabelsConfig:
     ignore: str = ""
     """Categories that do not belong to the scene, e.g. "person,car": their pixels are not trained on, not
     measured and have no vote."""
-    ignore_dilation: int = 3
-    """Grow ignored regions by this many pixels of the training photos, whatever they were ignored for."""
     instances: str = ""
     """Tell instances of these categories apart, e.g. "chair,car" (things: of all that can be counted; *: of
     all). Each becomes a category of its own, "chair 1", "chair 2"; --labels.merge "chair 1=chair" folds one
     back."""
-
-
-@dataclass(frozen=True)
-class LiftConfig:
-    """Label transfer from the images to the 3D points."""
-
-    votes: Literal["track", "projection"] = "track"
-    """Views that vote on the label of a point. track: those in which COLMAP observed it; projection: all
-    views that it projects into."""
 
 
 @dataclass(frozen=True)
@@ -133,11 +108,6 @@ class TrainConfig:
     """Steps between two snapshots, not scaled (0: a thirtieth of --train.max-steps)."""
     sh_degree: int = 3
     """Degree of the spherical harmonics."""
-    initial_angle: float = 0.0
-    """Largest scale that a Gaussian begins with, as an angle from the nearest training camera, radians (0: no
-    limit, as in 3DGS). 0.015: a sharper full model after 2000 steps or more, worse low levels."""
-    ssim_weight: float = 0.2
-    """Weight of 1 - SSIM in the loss; L1 has the rest."""
     antialiased: bool = True
     """Compensate opacities for the screen-space low-pass filter (Mip-Splatting): Gaussians smaller than a
     pixel then look the same at lower resolutions and from far away."""
@@ -150,19 +120,6 @@ class TrainConfig:
     sky: Literal["auto", "off"] = "auto"
     """Sky on a far sphere. auto: Gaussians begin there where photos show a category of that name, and stay on
     it; off: the sky is trained like everything else."""
-    means_lr: float = 1.6e-4
-    """Learning rate of the means, times the scene extent; decays exponentially to 1 % (with the fast
-    schedule, in runs of 1000 steps or fewer, to 10 %)."""
-    quats_lr: float = 1e-3
-    """Learning rate of the quaternions."""
-    log_scales_lr: float = 5e-3
-    """Learning rate of the log scales."""
-    logit_opacities_lr: float = 5e-2
-    """Learning rate of the opacity logits."""
-    sh0_lr: float = 2.5e-3
-    """Learning rate of the SH coefficients of degree 0."""
-    shN_lr: float = 1.25e-4
-    """Learning rate of the SH coefficients of higher degrees."""
     strategy: Literal["default", "mcmc"] = "default"
     """Densification. default: clone, split, prune and reset as 3DGS; mcmc: relocation and noise as
     3DGS-MCMC."""
@@ -172,22 +129,8 @@ class TrainConfig:
     """First step of densification, not scaled, at most a fifth of the training."""
     refine_stop: int = 15_000
     """Last step of densification."""
-    reset_every: int = 3000
-    """Steps between two opacity resets, while densification runs."""
-    raise_sh_every: int = 1000
-    """Steps between two increases of the SH degree."""
     grow_grad: float = 2e-4
     """Clone or split Gaussians whose mean screen-space gradient (in half image widths) is above this."""
-    absgrad: bool = False
-    """Densify by absolute gradients (AbsGS), with the threshold --train.grow-absgrad."""
-    grow_absgrad: float = 8e-4
-    """Threshold of the absolute gradient, in half image widths."""
-    grow_scale: float = 0.01
-    """Split Gaussians larger than this fraction of the scene extent; clone smaller ones."""
-    prune_opacity: float = 5e-3
-    """Prune Gaussians of lower opacity."""
-    prune_scale: float = 0.1
-    """After the first opacity reset, prune Gaussians larger than this fraction of the scene extent."""
     max_gaussians: int = 0
     """Maximum number of Gaussians; the limit grows linearly during densification (0: choose from the image
     size)."""
@@ -197,19 +140,10 @@ class TrainConfig:
     outliers: bool = False
     """Leave out what single photos show and the model does not, such as people that no mask names: found by
     the residual, from 30 % of the steps on and after ten visits of each view (at the latest from 60 %)."""
-    mcmc_noise: float = 5e5
-    """SGLD noise of 3DGS-MCMC, times the learning rate of the means."""
-    mcmc_opacity: float = 0.01
-    """Weight of the mean opacity in the loss (3DGS-MCMC)."""
-    mcmc_scale: float = 0.01
-    """Weight of the mean scale in the loss (3DGS-MCMC)."""
-    levels_after_reset: bool = False
-    """Record a snapshot that falls on an opacity reset after the reset, as the paper may have, not before."""
+    mcmc_regularise: bool = True
+    """With mcmc, pull opacities and scales towards 0 as published. It costs quality in short trainings."""
     freeze_at: float | None = None
     """Stop each category when its mean SSIM in the training views reaches this (Fig. 1 of the paper)."""
-    gradient_freeze_share: float = 0.0
-    """Freeze the fraction of Gaussians with the smallest gradients in alternate 100-step windows after
-    densification (GSta), as a baseline. A run that resumes is then not bit for bit the same."""
 
 
 @dataclass(frozen=True)
@@ -218,20 +152,6 @@ class CleanConfig:
 
     floaters: Literal["remove", "keep"] = "remove"
     """remove: floaters are removed before the levels are made; keep: nothing is removed."""
-    min_views: int = 0
-    """Few views: remove Gaussians that fewer training views support, e.g. 2; 0: do not look for them. Nested
-    levels make use of them, a splat as it is does not miss them."""
-    min_weight: float = 0.1
-    """A view supports a Gaussian if its blending weight there, summed over the pixels, is at least this."""
-    shown_share: float = 0.003
-    """Hardly shown: remove Gaussians whose weight in all training views together is below this fraction of
-    what they would have in the nearest camera, if it looked at them; 0: do not look for them."""
-    content_depth: float = 0.8
-    """In front: remove Gaussians that are nearer than this fraction of the depth of the content around them,
-    in most of the views that support them; 0: do not look for them."""
-    category_depth: float = 0.3
-    """Category: remove Gaussians that are nearer than this fraction of the median depth of the category whose
-    pixels they paint, by most of their weight; 0: do not look for them."""
     max_loss: float = 0.02
     """Largest loss of PSNR on the training and on the calibration views, dB. Where it would be more, fewer
     are removed."""
@@ -244,13 +164,6 @@ class BlocksConfig:
     count: int = 1
     """Ground-plane blocks that are trained independently and merged; 1: no blocks. The --train options hold
     for each block."""
-    margin: float = 0.2
-    """Width of the training margin around a block, as a fraction of the block's width."""
-    min_share: float = 0.25
-    """Assign a photo to a block if at least this fraction of the points that it sees lies in the block."""
-    far_share: float = 0.5
-    """Limit on the initial points outside the margin (the background of the photos), as a fraction of the
-    block's own points."""
     boundary_steps: int = 300
     """Boundary tuning: training steps on the Gaussians near the border of each block, after merging."""
 
@@ -265,31 +178,16 @@ class NestConfig:
     """Levels per category; their sizes grow geometrically."""
     smallest: float = 0.01
     """Size of the lowest level, as a fraction of the category's Gaussians."""
-    drawn_from: float = 0.03
-    """Size of the smallest prefix that training samples, as a fraction of the category's Gaussians. Smaller
-    values favour categories that are easy to represent."""
     base_share: float = 0.2
     """Size of the base model, as a fraction of all Gaussians; it is a small 3DGS-MCMC model that forms the
     lowest levels; 0: none."""
     base_steps: int = 1600
     """Training steps of the base model, which begins with the trained model, merged to that size."""
     full_share: float = 0.1
-    """Fraction of the first steps that sample the full model; changes linearly to --nest.full-share-end."""
-    full_share_end: float = 0.9
-    """Fraction of the last steps that sample the full model."""
-    sh_bits: tuple[int, int] = (5, 4)
-    """Bits per SH coefficient in the increments: of degree 1, and of higher degrees. Training uses the
-    rounded values."""
+    """Fraction of the first steps that sample the full model; rises linearly to 90 % of the last ones."""
     rate_weight: float = 6e-4
     """Loss per bit that the SH coefficients of a Gaussian take in a coded stream, on average; 0: only how it
     looks counts."""
-    two_opacities: bool = True
-    """Give each Gaussian one opacity for the low levels and one for the full model; without it the full
-    model is worse."""
-    criterion: Literal["weight", "weight-volume", "peak", "sensitivity", "opacity"] = "sensitivity"
-    """Importance that orders the Gaussians of a category; docs/developers/nested.md compares them."""
-    lr_multiplier: float = 4.0
-    """Initial learning rates as a multiple of 3DGS's late learning rates; they decay to 5 %."""
 
 
 @dataclass(frozen=True)
@@ -346,8 +244,6 @@ class SampleConfig:
     """Largest random shift along each axis, as a fraction of the scene extent."""
     turn: float = 0.05
     """Largest random rotation about each axis, radians."""
-    seed: int = 0
-    """Seed of the draws."""
 
 
 @dataclass(frozen=True)
@@ -357,14 +253,6 @@ class FitConfig:
     distance: Literal["percentile", "minimum"] = "percentile"
     """Distance of a category in a view. percentile: 5th percentile over its visible points; minimum: as in
     the paper."""
-    masks: Literal["given", "rendered"] = "given"
-    """Pixels of a category. given: of the label image; rendered: where its Gaussians have the largest
-    weight."""
-    region: Literal["mask", "eroded"] = "mask"
-    """Pixels that are measured. mask: all of the category; eroded: those at least 5 px from other
-    categories."""
-    min_share: float = 5e-4
-    """Ignore a category in views where it covers less than this fraction of the pixels."""
     confidence: float = 0.95
     """Target coverage of the lower confidence bounds, for views without a photo."""
 
@@ -381,8 +269,6 @@ class PlanConfig:
     (default: none, of snapshots 0.8)."""
     share: float = 0.95
     """Fraction of the viewpoints in which the level of a category must reach the target."""
-    tune_steps: int = 0
-    """Training steps on the planned scene, which adapt its categories to each other."""
     other_targets: tuple[float, ...] | None = None
     """Further targets to plan and measure, of the quality that leads (default: fidelity 0.8, 0.9 and 0.98;
     SSIM 0.1 below and above)."""
@@ -513,7 +399,6 @@ class RunConfig:
     poses: PosesConfig = field(default_factory=PosesConfig)
     masks: MasksConfig = field(default_factory=MasksConfig)
     labels: LabelsConfig = field(default_factory=LabelsConfig)
-    lift: LiftConfig = field(default_factory=LiftConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
     clean: CleanConfig = field(default_factory=CleanConfig)
     blocks: BlocksConfig = field(default_factory=BlocksConfig)

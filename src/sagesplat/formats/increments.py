@@ -66,14 +66,9 @@ class Increment:
         return _FORMATS.get(Path(self.uri).suffix, "spz")
 
 
-def packed(
-    g: Gaussians, sizes: Mapping[int, Sequence[int]], *, sh_bits: tuple[int, int] = SH_BITS
-) -> Int64[np.ndarray, " N"]:
+def packed(g: Gaussians, sizes: Mapping[int, Sequence[int]]) -> Int64[np.ndarray, " N"]:
     """Rows sorted by category and level, and within a level, where any order is valid, by `packing_order`."""
-    rows = [
-        part[packing_order(g.select(torch.from_numpy(part)), sh_bits=sh_bits)]
-        for _, _, part in increments(g, sizes)
-    ]
+    rows = [part[packing_order(g.select(torch.from_numpy(part)))] for _, _, part in increments(g, sizes)]
     return np.concatenate([*rows, np.arange(0)])
 
 
@@ -99,7 +94,6 @@ def write_increments(
     *,
     replaces: Mapping[int, Collection[int]] | None = None,
     kind: FileFormat | Callable[[int, int], FileFormat] = "spz",
-    sh_bits: tuple[int, int] = SH_BITS,
     fine: Collection[int] = (),
     antialiased: bool = False,
 ) -> list[Increment]:
@@ -107,8 +101,8 @@ def write_increments(
 
     `sizes`: by label id, the rows up to the end of each level. `names`: label id -> category. `replaces`: by
     label id, the levels that replace those below (`formats.levels.starts_of`). `kind`: of all files, or of a
-    label id and level. `sh_bits` and `antialiased` as in `encode_spz`; the levels `fine` are rounded by the
-    smallest steps of the format instead.
+    label id and level. `antialiased` as in `encode_spz`; the levels `fine` are rounded by the smallest steps
+    of the format.
 
     ValueError for levels that cannot replace.
     """
@@ -123,7 +117,7 @@ def write_increments(
             suffix = kind_of(label, level)
             temporary = fresh / f"increment.{suffix}"
             if suffix == "spz":
-                bits = _FINE_BITS if level in fine else sh_bits
+                bits = _FINE_BITS if level in fine else SH_BITS
                 temporary.write_bytes(
                     encode_spz(part, sh_bits=bits, coarse=level not in fine, antialiased=antialiased)
                 )

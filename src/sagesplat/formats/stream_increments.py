@@ -14,7 +14,6 @@ from sagesplat.core.gaussians import Gaussians, concat
 from sagesplat.core.names import slugs
 from sagesplat.core.second_opacity import SecondOpacities
 from sagesplat.formats.increments import GPU_BYTES, STREAM, Increment, by_file, stream_of, write_index
-from sagesplat.formats.spz import SH_BITS
 from sagesplat.formats.stream import Encoded, encode_stream
 from sagesplat.formats.stream_header import Grid, Precision
 from sagesplat.io.files import atomic_folder
@@ -36,7 +35,6 @@ def write_streams(
     names: dict[int, str],
     *,
     second: SecondOpacities | None = None,
-    sh_bits: tuple[int, int] = SH_BITS,
     antialiased: bool = False,
     grids: Mapping[int, Grid] | None = None,
 ) -> Streams:
@@ -54,7 +52,7 @@ def write_streams(
         for label in sorted(sizes):
             rows = torch.from_numpy(np.flatnonzero(labels == label))
             own = second and SecondOpacities(second.logits[rows], {label: second.weights[label]})
-            precision = Precision(sh_bits=sh_bits, grid=(grids or {}).get(label))
+            precision = Precision(grid=(grids or {}).get(label))
             coded = encode_stream(
                 g.select(rows), sizes[label], second=own, precision=precision, antialiased=antialiased,
                 name=stems[label],

@@ -35,15 +35,13 @@ def resolve_backend(backend: Backend, device: str = "auto") -> Backend:
     Raises `BackendUnavailable` where `cuda` is asked for and this machine does not have it.
     """
     if backend not in ("auto", "cpu", "cuda", "reference"):
-        raise BackendUnavailable(f"backend {backend!r} is not known; use --backend cpu, cuda or reference")
+        raise BackendUnavailable(f"backend {backend!r} is not known; use cpu, cuda or reference")
     if device not in ("auto", "cpu", "cuda"):
         raise BackendUnavailable(f"device {device!r} is not known; use --device cpu or cuda")
     if backend == "auto":
         backend = "cuda" if device == "cuda" else "cpu"
     if device != "auto" and (backend == "cuda") != (device == "cuda"):
-        raise BackendUnavailable(
-            f"backend {backend} does not run on {device}; leave out --backend or --device"
-        )
+        raise BackendUnavailable(f"backend {backend} does not run on {device}; leave one of them out")
     if backend == "cuda":
         from sagesplat.raster import cuda
 

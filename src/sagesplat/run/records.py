@@ -22,7 +22,6 @@ _KINDS = {  # settings by stage; those of other stages are compared, and never u
     "scene": config.SceneConfig,
     "poses": config.PosesConfig,
     "masks": config.LabelsConfig,
-    "lift": config.LiftConfig,
     "train": config.TrainConfig,
     "base": config.TrainConfig,
     "clean": config.CleanConfig,
@@ -41,7 +40,6 @@ class _More:
 
     seed: Seed = 0
     targets: list[Number] = field(default_factory=list)
-    tune_steps: int = 0
     boundary_steps: int = 0
 
 

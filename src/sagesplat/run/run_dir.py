@@ -151,11 +151,6 @@ class RunDir:
         return self.segmented / "options.json"
 
     @property
-    def soft(self) -> Path:
-        """A network's probabilities, of the categories in `segmented`."""
-        return self.path / "soft"
-
-    @property
     def fused(self) -> Path:
         """Label images on which all views agree."""
         return self.path / "fused"

@@ -24,6 +24,7 @@ FEW_FEATURES = 50  # registration needs 30 correspondences, which fewer features
 MIN_INLIERS = 15  # of a matched pair of photos; COLMAP's default
 OVERLAP = 10  # next photos that each photo is matched with in sequential matching
 KEYFRAMES = 30  # evenly spaced photos that sequential matching matches exhaustively, to close loops
+SEED = 0  # of RANSAC and of the mapping
 PAIRS_AT_A_TIME = 200
 
 Send = Callable[[dict[str, Any]], None]
@@ -123,7 +124,7 @@ class Stages:
             ]
         options = pycolmap.FeatureMatchingOptions(num_threads=self.threads)
         verification = pycolmap.TwoViewGeometryOptions(min_num_inliers=MIN_INLIERS)
-        verification.ransac.random_seed = self.request["seed"]
+        verification.ransac.random_seed = SEED
         listed = self.folder / "pairs.txt"
         for start in range(0, len(left), PAIRS_AT_A_TIME):
             on_progress(len(wanted) - len(left) + start, len(wanted))
@@ -172,8 +173,8 @@ class Stages:
         options = pycolmap.IncrementalPipelineOptions()
         options.min_model_size = 3
         options.num_threads = self.threads
-        options.random_seed = options.mapper.random_seed = self.request["seed"]
-        options.triangulation.random_seed = self.request["seed"]
+        options.random_seed = options.mapper.random_seed = SEED
+        options.triangulation.random_seed = SEED
         options.ba_refine_principal_point = self.request["refine_principal_point"]
         return options
 
@@ -262,7 +263,7 @@ def run(folder: Path, send: Send) -> None:
     if request["device"] == "cuda" and not pycolmap.has_cuda:
         send({"unavailable": "this pycolmap has no CUDA; install pycolmap-cuda12 or take device cpu"})
         return
-    pycolmap.set_random_seed(request["seed"])
+    pycolmap.set_random_seed(SEED)
     stages, times = Stages(folder, request), folder / "seconds.json"
     seconds = json.loads(times.read_text()) if times.is_file() else {}  # of earlier, killed runs
     for name in ("features", "matches", "mapping", "undistortion"):

@@ -21,6 +21,9 @@ _CURE = "delete it and run `sagesplat run` again"
 _ANGLES = np.radians(np.arange(0, 90, 7.5))  # orientations of the split; the one of least cost is taken
 _SLACK = 0.08  # of the weight by which a cut may be unbalanced, to run through a sparse region
 _TRIES = 33  # positions that are tried for a cut
+_MARGIN = 0.2  # that a block is trained on, as a share of a block's mean width within the cameras' bounds
+_MIN_SHARE = 0.25  # of a photo's visible points: as many lie in a block that trains on it
+_FAR_SHARE = 0.5  # limit on the points beyond the margin, as a share of the block's own
 _NARROW = 0.25  # least width of a scene as a share of its length, for the margin
 _LEAST_UP = 0.02  # share of the cameras' variance that is added along their mean up direction
 _MOST_SAMPLED = 200_000  # points that a split considers
@@ -68,10 +71,10 @@ class Blocks:
         return touch.all(2) & ~np.eye(len(self), dtype=bool)
 
 
-def split(scene: Scene, count: int, margin: float = 0.2) -> Blocks:
+def split(scene: Scene, count: int) -> Blocks:
     """Split a scene into `count` blocks with about equal numbers of points and of training views.
 
-    `margin`: as a share of a block's mean width within the cameras' bounds. RunError for an impossible count.
+    RunError for an impossible count.
     """
     cameras = np.stack([scene.views[i].camera.position for i in scene.train_ids]).astype(np.float64)
     xyz = scene.points.xyz.astype(np.float64)
@@ -91,7 +94,7 @@ def split(scene: Scene, count: int, margin: float = 0.2) -> Blocks:
         at_cameras = at[len(xyz) :]  # the bounds of points would include a far background
         outline = np.stack([at_cameras.min(0), at_cameras.max(0)])
         size = np.ptp(outline, axis=0)
-        reach = margin * float(np.sqrt(np.prod(np.maximum(size, _NARROW * size.max())) / count))
+        reach = _MARGIN * float(np.sqrt(np.prod(np.maximum(size, _NARROW * size.max())) / count))
         boxes: list[tuple[np.ndarray, np.ndarray]] = []
         cost = _cut(at, weights, np.full(2, -np.inf), np.full(2, np.inf), outline, count, reach, boxes)
         if best is None or cost < best[0]:
@@ -155,27 +158,27 @@ def visible_shares(scene: Scene, of_points: Int[np.ndarray, " P"], count: int) -
 
 
 def assigned_views(
-    scene: Scene, blocks: Blocks, shares: Float64[np.ndarray, "V B"], min_share: float
+    scene: Scene, blocks: Blocks, shares: Float64[np.ndarray, "V B"]
 ) -> Bool[np.ndarray, "V B"]:
     """The blocks that each view is assigned to.
 
-    These are the blocks with at least `min_share` of its visible points, the one with most, and its own.
+    These are the blocks with at least `_MIN_SHARE` of its visible points, the one with most, and its own.
     """
     own = blocks.of(np.stack([view.camera.position for view in scene.views]))
     every = np.arange(len(scene.views))
-    assigned = shares >= min_share
+    assigned = shares >= _MIN_SHARE
     assigned[every, own] = True
     assigned[every, shares.argmax(1)] = True
     return assigned
 
 
 def training_scene(
-    scene: Scene, blocks: Blocks, block: int, views: Sequence[int], far_share: float, seed: int
+    scene: Scene, blocks: Blocks, block: int, views: Sequence[int], seed: int
 ) -> tuple[Scene, Int64[np.ndarray, " Q"]]:
     """The scene that a block is trained on, with only these views, and the rows of its points.
 
     It has the points within the margin. As background it also has points beyond it that the views see, at
-    most `far_share` times as many. RunError for a block without views or points.
+    most `_FAR_SHARE` times as many. RunError for a block without views or points.
     """
     points, rows = scene.points, np.asarray(views, np.int64)
     near = blocks.within(points.xyz, block, blocks.margin)
@@ -185,7 +188,7 @@ def training_scene(
             "choose fewer blocks with --blocks.count"
         )
     far = np.flatnonzero(_seen(scene, rows) & ~near)
-    most = int(far_share * near.sum())
+    most = int(_FAR_SHARE * near.sum())
     if len(far) > most:
         far = np.random.default_rng([seed, block]).choice(far, most, replace=False)
     kept = np.sort(np.concatenate([np.flatnonzero(near), far]))

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from sagesplat.core.config import PosesConfig
 from sagesplat.core.errors import BackendUnavailable, SceneError
@@ -53,6 +53,8 @@ def reconstruct(
     config: PosesConfig = PosesConfig(),
     on_progress: OnProgress = lambda stage, done, total: None,
     *,
+    device: Literal["auto", "cpu", "cuda"] = "auto",
+    threads: int = -1,
     alpha: str = "auto",
     ignored: OfPhoto = lambda name: None,
 ) -> Reconstruction:
@@ -60,7 +62,8 @@ def reconstruct(
 
     Writes undistorted photos to images/, their COLMAP model to sparse/0, with gravity along +y, and
     poses.json. Intermediate results are kept in sfm/: a killed run resumes, unless photos or settings
-    changed. The stages of `on_progress` are prepare, features, matches, mapping and undistortion. Raises
+    changed. `device`: of features and matching; `threads`: -1 for all cores.
+    The stages of `on_progress` are prepare, features, matches, mapping and undistortion. Raises
     SceneError, and BackendUnavailable without pycolmap.
 
     There are no features in pixels that do not count: black in `masks_valid/` below the source, transparent
@@ -81,12 +84,12 @@ def reconstruct(
     if len(photos) < MIN_PHOTOS:
         raise SceneError(_too_few(source, photos, unreadable))
     masks = write_feature_masks(photos, folder, work / "masks", workspace, alpha, ignored)
-    request = _request(source, photos, config) | ({"masks": masks} if masks else {})
+    request = _request(source, photos, config) | {"device": device} | ({"masks": masks} if masks else {})
     finished = _resume(workspace, request)
     if finished and not (unreadable.keys() - finished.unregistered.keys()):
         return finished
     least = max(MIN_PHOTOS, math.ceil(config.min_registered * len(photos)))
-    write_json(work / "request.json", request | {"min_photos": least, "threads": config.threads})
+    write_json(work / "request.json", request | {"min_photos": least, "threads": threads})
     seconds = {"prepare": round(time.perf_counter() - started, 2)}
     result = _run(work, on_progress)
     reconstruction = _reconstruction(workspace, photos, unreadable, seconds, result)
@@ -145,8 +148,6 @@ def _check(source: Path, workspace: Path, config: PosesConfig) -> None:
             f"max_size {config.max_size} and min_registered {config.min_registered} cannot be used; "
             "take max_size >= 64 and min_registered between 0 and 1"
         )
-    if config.threads < 1 and config.threads != -1:
-        raise SceneError(f"threads {config.threads} cannot be used; take 1 or more, or -1 for all cores")
     inside, outside = source.resolve(), workspace.resolve()
     if inside == outside or any(inside.is_relative_to(outside / name) for name in _OWN):
         raise SceneError(f"{source}: lies where the poses would be written; name another for the poses")
@@ -205,8 +206,6 @@ def _request(source: Path, photos: list[PreparedPhoto], config: PosesConfig) -> 
         "model": config.model,
         "refine_principal_point": config.refine_principal_point,
         "max_size": config.max_size,
-        "device": config.device,
-        "seed": config.seed,
     }
 
 

@@ -35,7 +35,7 @@ from sagesplat.segment.masks import Taxonomy
 from sagesplat.segment.segmenters import (
     Segmented,
     SegmenterFactory,
-    answer,
+    arg_max_resized,
     existing_file,
     group_classes,
     parse_device,
@@ -148,15 +148,16 @@ def _resize(x: Float[Tensor, "B C h w"], size: Sequence[int]) -> Float[Tensor, "
     return F.interpolate(x, size=tuple(size), mode="bilinear", align_corners=False)
 
 
-def load_deeplabv2(path: Path, *, head: Head, blocks: Sequence[int] = BLOCKS, width: int = 64) -> DeepLabV2:
+def load_deeplabv2(path: Path, *, blocks: Sequence[int] = BLOCKS, width: int = 64) -> DeepLabV2:
     """A network with the weights of a public checkpoint, in eval mode. Raises LabelError.
 
     `path` is a state dict as torch saves it, bare or as "state_dict" or "model" of a dict, or safetensors.
-    Pickles with anything but tensors in them are refused.
+    Pickles with anything but tensors in them are refused. The number of outputs says which of `HEADS` it has.
     """
-    model = DeepLabV2(HEADS[head], blocks, width)
+    found = _renamed(path, _read_weights(path))
+    model = DeepLabV2(HEADS[_head_of(path, found)], blocks, width)
     wanted = {name: p for name, p in model.state_dict().items() if not name.endswith(_COUNTER)}
-    _check(path, found := _renamed(path, _read_weights(path)), wanted, head)
+    _check(path, found, wanted)
     model.load_state_dict({n: found[n].float() for n in wanted}, strict=False)  # but for the counters
     return model.eval()
 
@@ -246,15 +247,19 @@ def _read_safetensors(path: Path) -> Any:
     return load_file(path)
 
 
-def _check(path: Path, found: dict[str, Tensor], wanted: Mapping[str, Tensor], head: Head) -> None:
+def _head_of(path: Path, found: Mapping[str, Tensor]) -> Head:
+    """The head that has as many outputs as the weights, the larger where they do not say; else LabelError."""
+    outputs = found["aspp.0.bias"].numel() if "aspp.0.bias" in found else max(HEADS.values())
+    for head, count in HEADS.items():
+        if count == outputs:
+            return head
+    known = " or ".join(f"{count} ({head})" for head, count in HEADS.items())
+    raise LabelError(f"{path}: {outputs} outputs, but {known} are known; take another checkpoint")
+
+
+def _check(path: Path, found: dict[str, Tensor], wanted: Mapping[str, Tensor]) -> None:
     """LabelError where names or shapes differ."""
     cure = "take a checkpoint of DeepLabV2 with this ResNet"
-    outputs = found["aspp.0.bias"].numel() if "aspp.0.bias" in found else HEADS[head]
-    if outputs != HEADS[head]:
-        fitting = next(
-            (f"take head {h!r}" for h, n in HEADS.items() if n == outputs), "take another checkpoint"
-        )
-        raise LabelError(f"{path}: {outputs} outputs, but head {head!r} has {HEADS[head]}; {fitting}")
     for kind, names in (("lacks", wanted.keys() - found.keys()), ("also has", found.keys() - wanted.keys())):
         if names:
             listed = ", ".join(sorted(names)[:3]) + (", ..." if len(names) > 3 else "")
@@ -321,7 +326,7 @@ class DeepLabV2Segmenter:
         self._outputs = [np.array(outputs)[rows == k] for k in range(len(self._ids))]
 
     def __call__(self, photos: Sequence[UInt8[np.ndarray, "H W 3"]]) -> list[Segmented]:
-        """Label images and probabilities (at an eighth of the network's input; with `crf` at its size)."""
+        """The label image of each photo."""
         return [self._segment(photo) for photo in photos]
 
     @torch.inference_mode()
@@ -329,11 +334,11 @@ class DeepLabV2Segmenter:
         small = _to_size(photo, self.size)
         ranks = self._scores(small)
         if self.crf:
-            ranks = p = _refine(F.softmax(_resize(ranks, small.shape[:2]), 1)[0].numpy(), small)
+            ranks = _refine(F.softmax(_resize(ranks, small.shape[:2]), 1)[0].numpy(), small)
         else:
-            ranks, p = ranks[0].numpy(), F.softmax(ranks, 1)[0].numpy()
+            ranks = ranks[0].numpy()
         height, width = photo.shape[:2]
-        return answer(ranks, p, self._ids, height, width)
+        return Segmented(self._ids[arg_max_resized(ranks, height, width)])
 
     def _scores(self, photo: UInt8[np.ndarray, "H W 3"]) -> Float32[Tensor, "1 K h w"]:
         """Log of each category's probability, but for a constant: log-sum-exp of its outputs."""
@@ -369,12 +374,13 @@ def _refine(
 
 def _settings(config: MasksConfig) -> dict[str, Any]:
     model = existing_file(config.model, "--segmenter deeplabv2 needs --model CHECKPOINT.pth")
-    return {"model": model, "head": config.head, "crf": config.crf}
+    return {"model": model, "crf": config.crf}
 
 
 def _load(config: MasksConfig, device: str, threads: int, warn: Callable[[str], None]) -> DeepLabV2Segmenter:
-    network = load_deeplabv2(Path(config.model or ""), head=config.head)
-    return DeepLabV2Segmenter(network, head_classes(config.head), crf=config.crf, device=device)
+    network = load_deeplabv2(Path(config.model or ""))
+    head = next(head for head, outputs in HEADS.items() if outputs == network.num_classes)
+    return DeepLabV2Segmenter(network, head_classes(head), crf=config.crf, device=device)
 
 
 FACTORY = SegmenterFactory(_settings, _load, (".pth", ".pt", ".safetensors"))

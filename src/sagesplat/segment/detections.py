@@ -70,7 +70,6 @@ def confidence(scores: Float32[np.ndarray, "*S"], threshold: float) -> Float32[n
     """Scores of a network as probabilities: the threshold is 0.5, a score of 1 is 1, linear between them.
 
     A detector's score means little but whether it reaches its threshold, which differs from one to the next.
-    As probabilities scores can stand beside those of a segmentation network and vote in label fusion.
     """
     return (0.5 + 0.5 * (scores - threshold) / max(1 - threshold, 1e-6)).clip(0, 1).astype(np.float32)
 
@@ -79,8 +78,8 @@ def segmented(found: Found, label_ids: Sequence[int], threshold: float, size: tu
     """The label image (height, width) of what was found, by the id of each prompt.
 
     A pixel belongs to the mask that it is in; of several, to the one where confidence times the mask's
-    probability is largest; without any it is unlabelled. The probability of a category is the largest of
-    its masks' there. Each mask's pixels are an instance, numbered by falling score.
+    probability is largest; without any it is unlabelled. Each mask's pixels are an instance, numbered by
+    falling score.
     """
     sure = confidence(found.scores, threshold)
     height, width = size
@@ -93,9 +92,7 @@ def segmented(found: Found, label_ids: Sequence[int], threshold: float, size: tu
         wins = (logits > 0) & (value > best)
         best[wins], winner[wins] = value[wins], number
     ids = np.array([*np.array(label_ids, np.int16)[found.prompts[order]], UNLABELLED], np.int16)
-    names, planes = _planes(found, sure, label_ids)
-    instances = _renumbered(winner) if found.things else None
-    return Segmented(ids[winner], planes, names, instances)
+    return Segmented(ids[winner], _renumbered(winner) if found.things else None)
 
 
 def shared_areas(found: Found, prompts: int) -> Float32[np.ndarray, "P P"]:
@@ -107,20 +104,8 @@ def shared_areas(found: Found, prompts: int) -> Float32[np.ndarray, "P P"]:
     return flat @ flat.T / max(flat.shape[1], 1)
 
 
-def _planes(
-    found: Found, sure: Float32[np.ndarray, " N"], label_ids: Sequence[int]
-) -> tuple[Int16[np.ndarray, " C"], Float32[np.ndarray, "C h w"]]:
-    """Ids of the prompts that were found, rising, and the probability of each; at most 1 in sum."""
-    each = np.array(label_ids, np.int16)[found.prompts]
-    ids = np.unique(each)
-    planes = np.zeros((len(ids), *found.masks.shape[1:]), np.float32)
-    for row, plane in enumerate(np.searchsorted(ids, each)):
-        planes[plane] = np.maximum(planes[plane], sure[row] * _sigmoid(found.masks[row]))
-    return ids, planes / np.maximum(planes.sum(0), 1)
-
-
 def painted_over(base: Segmented, top: Segmented) -> Segmented:
-    """`top` where it has a label, else `base`. Of the probabilities, `base` gets what `top` leaves."""
+    """`top` where it has a label, else `base`."""
     has = top.label_ids != UNLABELLED
     label_ids = np.where(has, top.label_ids, base.label_ids)
     instances = top.instances
@@ -128,17 +113,7 @@ def painted_over(base: Segmented, top: Segmented) -> Segmented:
         above = np.full_like(base.instances, -1) if instances is None else instances
         below = np.where(base.instances < 0, -1, base.instances + above.max() + 1)
         instances = _renumbered(np.where(has, above, below).astype(np.int16))
-    if base.probabilities is None or top.probabilities is None:
-        return Segmented(label_ids, None, base.ids[:0], instances)
-    height, width = base.probabilities.shape[1:]
-    rows = [_resized(plane, width, height) for plane in top.probabilities]
-    above = np.array(rows, np.float32).reshape(-1, height, width)
-    left = np.maximum(1 - above.sum(0), 0)
-    ids = np.union1d(base.ids, top.ids).astype(np.int16)
-    planes = np.zeros((len(ids), height, width), np.float32)
-    planes[np.searchsorted(ids, base.ids)] = base.probabilities * left
-    planes[np.searchsorted(ids, top.ids)] += above
-    return Segmented(label_ids, planes, ids, instances)
+    return Segmented(label_ids, instances)
 
 
 def _renumbered(numbers: Int16[np.ndarray, "H W"]) -> Int16[np.ndarray, "H W"]:

@@ -41,7 +41,7 @@ from sagesplat.segment.segmenters import (
     Segmented,
     Segmenter,
     SegmenterFactory,
-    answer,
+    arg_max_resized,
     group_classes,
 )
 
@@ -87,7 +87,7 @@ class HfSegmenter:
         self._things = np.array(things, bool)
 
     def __call__(self, photos: Sequence[UInt8[np.ndarray, "H W 3"]], /) -> list[Segmented]:
-        """Label images and probabilities; photos of one size are computed together."""
+        """Label images; photos of one size are computed together."""
         if len({photo.shape for photo in photos}) > 1:
             return [found for photo in photos for found in self([photo])]
         with computing(self._name, self._device, len(photos)):
@@ -222,12 +222,10 @@ class HfSegmenter:
             yield total / count.clamp(min=1)
 
     def _answer(self, scores: Float32[Tensor, "K h w"], height: int, width: int) -> Segmented:
-        """Scores as probabilities: what is missing to 1 is "no object", larger sums are scaled to 1."""
-        total = scores.sum(0)
-        if not total.isfinite().all():
+        """The label image of the largest scores."""
+        if not scores.isfinite().all():
             raise LabelError(f"{self._name}: scores that are not finite; try --device cpu or another network")
-        probabilities = (scores / total.clamp(min=1)).cpu().numpy()
-        return answer(scores.cpu().numpy(), probabilities, self._ids, height, width)
+        return Segmented(self._ids[arg_max_resized(scores.cpu().numpy(), height, width)])
 
 
 def class_ids(names: Sequence[str], family: str, model: str) -> tuple[list[int | None], str | None]:

@@ -4,7 +4,6 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass, fields
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int16, Int32, Int64, Shaped
@@ -87,17 +86,17 @@ def lift(
     scene: Scene,
     masks: Masks,
     *,
-    votes: Literal["track", "projection"] = "track",
     views: Collection[int] | None = None,
     valid: ValidPixels = ALL_VALID,
 ) -> LiftedLabels:
     """Transfer 2D labels to the SfM points: each point takes the label that most of its pixels have.
 
+    A point votes once per observation of its track; where a scene has no tracks, once per view whose frustum
+    it is in, occluded or not.
+
     Args:
         scene: The capture.
         masks: Label images, [H, W] of category ids; unlabelled pixels do not vote.
-        votes: "track": a point votes once per observation of its track. "projection": once per view whose
-            frustum it is in, occluded or not; used too where a scene has no tracks.
         views: Rows of `Scene.views` that vote; None: all.
         valid: The pixels that count. A point that is seen on more that do not count than that do is ignored.
 
@@ -112,8 +111,7 @@ def lift(
     flat_counts = counts.reshape(-1)  # np.add.at is several times faster on one axis
     num_pixels = np.zeros(len(ids), np.int64)
     balance = np.zeros(len(scene.points.xyz), np.int32)  # pixels that count less those that do not
-    tracked = votes == "track" and len(scene.points.track_points) > 0
-    pixels = _track_pixels(scene) if tracked else _projected_pixels(scene)
+    pixels = _track_pixels(scene) if len(scene.points.track_points) else _projected_pixels(scene)
     for row, (view, (points, uv)) in enumerate(zip(scene.views, pixels, strict=True)):
         if views is not None and row not in views:
             continue

@@ -23,7 +23,7 @@ from sagesplat.segment.masks import UNLABELLED, Taxonomy, taxonomy_of
 from sagesplat.segment.segmenters import (
     Segmented,
     SegmenterFactory,
-    answer,
+    arg_max_resized,
     existing_file,
     group_classes,
     parse_device,
@@ -32,6 +32,7 @@ from sagesplat.segment.taxonomies import Source, to_coco
 
 _Value = Annotated[float, Meta(ge=-1e30, le=1e30)]
 _Scale = Annotated[float, Meta(gt=0, le=1e30)]
+_TIME_LIMIT = 300.0  # seconds that a network may take for a photo
 _PIXELS = 2**24  # of a network's input: 200 MB
 _VALUES = 2**29  # of its output: 2 GB
 _OUTPUTS = {f"tensor({kind})" for kind in ("float", "float16", "double", "int64", "int32", "uint8")}
@@ -95,9 +96,9 @@ class OnnxSegmenter:
         *,
         device: str = "auto",
         threads: int = 1,
-        time_limit: float = 0,
+        time_limit: float = _TIME_LIMIT,
     ):
-        """`time_limit`: seconds for a photo, 0: none. LabelError for a model or classes of no use."""
+        """`time_limit`: seconds for a photo. LabelError for a model or classes of no use."""
         model, classes = Path(model), Path(classes)
         self.classes = read_classes(classes)
         self.taxonomy = self.classes.taxonomy
@@ -136,7 +137,7 @@ class OnnxSegmenter:
             )
 
     def __call__(self, photos: Sequence[UInt8[np.ndarray, "H W 3"]], /) -> list[Segmented]:
-        """Label images and probabilities (softmax of the logits), one photo after the other."""
+        """Label images, one photo after the other."""
         return [self._segment(photo) for photo in photos]
 
     def _segment(self, photo: UInt8[np.ndarray, "H W 3"]) -> Segmented:
@@ -148,7 +149,7 @@ class OnnxSegmenter:
         if axis is None:
             raise self._unfit(output)
         logits = np.moveaxis(output[0], axis - 1, 0).astype(np.float32, copy=False)
-        return answer(*self._grouped(logits), self._ids, height, width)
+        return Segmented(self._ids[arg_max_resized(self._grouped(logits), height, width)])
 
     def _run(self, photo: UInt8[np.ndarray, "H W 3"]) -> np.ndarray:
         """The network's first output, [1, ...]."""
@@ -160,8 +161,7 @@ class OnnxSegmenter:
         # a network may hold a loop that never ends; onnxruntime looks at this before each node
         timer = threading.Timer(self._time_limit, setattr, (options, "terminate", True))
         timer.daemon = True
-        if self._time_limit > 0:
-            timer.start()
+        timer.start()
         try:
             feeds = {self._input: np.ascontiguousarray(x[None])}
             output = np.asarray(self._session.run([self._output], feeds, options)[0])
@@ -170,8 +170,7 @@ class OnnxSegmenter:
                 raise
             if options.terminate:
                 raise LabelError(
-                    f"{self._model}: no answer within {self._time_limit:g} s; raise --time-limit, or take "
-                    "another network"
+                    f"{self._model}: no answer within {self._time_limit:g} s; take another network"
                 ) from None
             raise LabelError(f"{self._model}: does not run ({_first_line(error)}); export it again") from None
         finally:
@@ -180,18 +179,15 @@ class OnnxSegmenter:
             raise self._unfit(output)
         return output
 
-    def _grouped(
-        self, logits: Float32[np.ndarray, "C h w"]
-    ) -> tuple[Float32[np.ndarray, "K h w"], Float32[np.ndarray, "K h w"]]:
-        """Log of the summed probability of each category, up to a constant per pixel; and the probability."""
+    def _grouped(self, logits: Float32[np.ndarray, "C h w"]) -> Float32[np.ndarray, "K h w"]:
+        """Log of the summed probability of each category, up to a constant per pixel."""
         if not np.isfinite(logits).all():
             raise LabelError(f"{self._model}: logits that are not finite; export it again (in 32 bits)")
         top = logits.max(0)
         members = np.eye(len(self._ids), dtype=np.float32)[:, self._group]
         sums = np.tensordot(members, np.exp(logits - top), 1)
         # Relative to the smallest float: a category far below the best is no -inf, which would spread.
-        ranks = np.log(np.maximum(sums, np.finfo(np.float32).tiny)) + top
-        return ranks, sums / sums.sum(0)
+        return np.log(np.maximum(sums, np.finfo(np.float32).tiny)) + top
 
     def _of_numbers(self, output: np.ndarray, height: int, width: int) -> Segmented:
         """Label image of a network that ends in an arg max: [1, h, w] class numbers, with axes of 1."""
@@ -205,7 +201,7 @@ class OnnxSegmenter:
             raise self._unfit(output)
         rows = ((np.arange(height) + 0.5) * numbers.shape[0] / height).astype(int)
         columns = ((np.arange(width) + 0.5) * numbers.shape[1] / width).astype(int)
-        return Segmented(self.classes.label_ids[numbers[rows[:, None], columns]], None, self._ids[:0])
+        return Segmented(self.classes.label_ids[numbers[rows[:, None], columns]])
 
     def _unfit(self, output: np.ndarray) -> LabelError:
         largest = f" up to {output.max()}" if np.issubdtype(output.dtype, np.integer) and output.size else ""
@@ -277,7 +273,7 @@ def _settings(config: MasksConfig) -> dict[str, Any]:
 
 
 def _load(config: MasksConfig, device: str, threads: int, warn: Callable[[str], None]) -> OnnxSegmenter:
-    return OnnxSegmenter(**_settings(config), device=device, threads=threads, time_limit=config.time_limit)
+    return OnnxSegmenter(**_settings(config), device=device, threads=threads)
 
 
 FACTORY = SegmenterFactory(_settings, _load, (".onnx",))

@@ -1,9 +1,8 @@
 """Segmenters: their interface, and the loop that applies one to the views of a scene."""
 
 import re
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from itertools import groupby
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -27,10 +26,8 @@ from sagesplat.segment.masks import (
     write_labels,
     write_mask,
 )
-from sagesplat.segment.soft import soft_path, write_soft
 
 _BEGINS = 60.0  # seconds that another process may take to begin a folder
-NEGLIGIBLE = 0.5 / 255  # no 8-bit image of probabilities shows less
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +35,6 @@ class Segmented:
     """A segmenter's answer for a photo."""
 
     label_ids: Int16[np.ndarray, "H W"]  # category id of each pixel, -1 where it has none
-    probabilities: Float32[np.ndarray, "C h w"] | None  # 0 ... 1, at most 1 in sum; covers the whole photo
-    ids: Int16[np.ndarray, " C"]  # category id of each row of probabilities; others are negligible
     instances: Int16[np.ndarray, "H W"] | None = None
     """Number of each pixel's instance in this photo, -1 for none; an instance lies within one category."""
 
@@ -92,8 +87,6 @@ def segment_views(
     segmenter: Segmenter,
     target: Path,
     *,
-    batch: int = 1,
-    soft: Path | None = None,
     on_view: Callable[[int, int], None] | None = None,
 ) -> None:
     """Write the label image of every view with a segmentation network, then labels.json.
@@ -103,15 +96,13 @@ def segment_views(
         photos: Its photos, uint8 [H, W, 3] by row of `scene.views`.
         segmenter: Maps photos to label images; it has a `taxonomy`.
         target: Folder to write: PNGs named like the photos, and labels.json.
-        batch: Photos that the network computes at once.
-        soft: Folder for the probabilities; None: they are not kept.
         on_view: Called with (views done, views in all).
 
     Raises:
         LabelError: If the network's answer cannot be used or the folder cannot be written.
     """
     rows = range(len(scene.views))
-    occurring = segment_some(scene, photos, segmenter, target, rows, batch=batch, soft=soft, on_view=on_view)
+    occurring = segment_some(scene, photos, segmenter, target, rows, on_view=on_view)
     write_labels(target, segmenter.taxonomy, occurring)
 
 
@@ -122,8 +113,6 @@ def segment_some(
     target: Path,
     rows: Sequence[int],
     *,
-    batch: int = 1,
-    soft: Path | None = None,
     instances: Path | None = None,
     below: Masks | None = None,
     on_view: Callable[[int, int], None] | None = None,
@@ -132,20 +121,18 @@ def segment_some(
 
     Several processes may do so with other views and the same network: the first one begins the folder.
 
-    Up to `batch` photos of equal size are given to the segmenter at once. With `soft`, the probabilities of
-    each view are kept there too (`soft.read_soft`), and in the folder `instances` those of the answers that
-    have some (`instances.read_instances`). A finished label image in `target` is kept, and a
-    killed run resumes, unless it is of other categories: empty the folder before using another
-    model of the same ones. `below`: label images that the answers are painted over. `on_view(done, total)` is
-    called after each view, `total` being that of `rows`. Raises LabelError.
+    In the folder `instances` those of the answers that have some are kept (`instances.read_instances`). A
+    finished label image in `target` is kept, and a killed run resumes, unless it is of other categories:
+    empty the folder before using another model of the same ones. `below`: label images that the answers are
+    painted over. `on_view(done, total)` is called after each view, `total` being that of `rows`. Raises
+    LabelError.
     """
     if not scene.views:
         raise LabelError(f"{scene.path}: a scene without views; there is no photo to segment")
     taxonomy, total = segmenter.taxonomy if below is None else below.taxonomy | segmenter.taxonomy, len(rows)
-    softs = [None if soft is None else soft_path(soft, view) for view in scene.views]
     with locked(target, _BEGINS):
         paths = prepare_folder(target, scene.views)
-        _begin(target, taxonomy, [*paths, *(path for path in softs if path is not None)])
+        _begin(target, taxonomy, paths)
     occurring: set[int] = set()
     done = 0
 
@@ -158,24 +145,20 @@ def segment_some(
 
     missing = []
     for row in rows:
-        view = scene.views[row]
-        path, label_ids = softs[row], None
-        if path is None or path.is_file():
-            label_ids = _finished(paths[row], taxonomy, view)
+        label_ids = _finished(paths[row], taxonomy, scene.views[row])
         if label_ids is None:
             missing.append(row)
         else:
             finish(label_ids)
-    for some in _batches(scene.views, missing, batch):
-        for row, found in zip(some, segmenter([photos[row] for row in some]), strict=True):
-            if below is not None:
-                has = found.label_ids != UNLABELLED
-                label_ids = np.where(has, found.label_ids, below[scene.views[row]])
-                found = replace(found, label_ids=label_ids, probabilities=None)
-            if instances is not None and found.instances is not None:
-                write_instances(instance_path(instances, scene.views[row]), found.instances)
-            _write(found, paths[row], softs[row], taxonomy)
-            finish(found.label_ids)
+    for row in missing:
+        (found,) = segmenter([photos[row]])
+        label_ids = found.label_ids
+        if below is not None:
+            label_ids = np.where(label_ids != UNLABELLED, label_ids, below[scene.views[row]])
+        if instances is not None and found.instances is not None:
+            write_instances(instance_path(instances, scene.views[row]), found.instances)
+        write_mask(paths[row], label_ids, taxonomy)
+        finish(label_ids)
     return occurring
 
 
@@ -197,26 +180,6 @@ def _finished(path: Path, taxonomy: Taxonomy, view: View) -> Int16[np.ndarray, "
     return label_ids if label_ids.shape == _size(view) else None
 
 
-def _write(found: Segmented, path: Path, soft: Path | None, taxonomy: Taxonomy) -> None:
-    """Keep an answer. The label image comes last: where it exists, the probabilities do too."""
-    if soft is not None:
-        if found.probabilities is None:
-            raise LabelError(
-                f"{soft.parent}: the network answers with ids and not with probabilities; "
-                "segment without them"
-            )
-        write_soft(soft, found.probabilities, found.ids, found.label_ids.shape)
-    write_mask(path, found.label_ids, taxonomy)
-
-
-def _batches(views: Sequence[View], rows: Sequence[int], batch: int) -> Iterator[list[int]]:
-    """Rows of views of equal size, up to `batch` at once."""
-    for _, group in groupby(sorted(rows, key=lambda row: _size(views[row])), lambda row: _size(views[row])):
-        same = list(group)
-        for start in range(0, len(same), max(batch, 1)):
-            yield same[start : start + max(batch, 1)]
-
-
 def _size(view: View) -> tuple[int, int]:
     return view.camera.height, view.camera.width
 
@@ -228,19 +191,6 @@ def group_classes(label_ids: Sequence[int | None]) -> tuple[Int16[np.ndarray, " 
     """
     each = np.array([UNLABELLED if i is None else i for i in label_ids], np.int16)
     return np.unique(each, return_inverse=True)
-
-
-def answer(
-    ranks: Float32[np.ndarray, "K h w"],
-    probabilities: Float32[np.ndarray, "K h w"],
-    ids: Int16[np.ndarray, " K"],
-    height: int,
-    width: int,
-) -> Segmented:
-    """Each pixel has the id of the highest rank; rows that are negligible everywhere are left out."""
-    label_ids = ids[arg_max_resized(ranks, height, width)]
-    kept = (ids != UNLABELLED) & (probabilities.max((1, 2)) >= NEGLIGIBLE)
-    return Segmented(label_ids, probabilities[kept], ids[kept])
 
 
 def arg_max_resized(

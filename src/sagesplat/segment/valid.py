@@ -97,8 +97,6 @@ def write_valid(
     Raises:
         LabelError: For masks that cannot be used, or where no pixel of a training view is left.
     """
-    if dilation < 0:
-        raise LabelError(f"--labels.ignore-dilation {dilation} is no number of pixels; give 0 or more")
     shutil.rmtree(target, ignore_errors=True)
     given, transparent = _Given(scene), ignores_alpha(scene)
     shares = np.zeros(len(scene.views), np.float32)

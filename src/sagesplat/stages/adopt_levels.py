@@ -184,10 +184,9 @@ def _write(
     """
     run, levels = job.run, len(next(iter(ladder.sizes.values())))
     run.provenance("nest").unlink(missing_ok=True)  # from here on the earlier ladder is gone
-    bits = tuple(settings["sh_bits"])
-    g = ladder.gaussians.select(torch.from_numpy(packed(ladder.gaussians, ladder.sizes, sh_bits=bits)))
+    g = ladder.gaussians.select(torch.from_numpy(packed(ladder.gaussians, ladder.sizes)))
     chunks = write_increments(
-        run.increments, g, ladder.sizes, job.names(), replaces=ladder.replaces, sh_bits=bits,
+        run.increments, g, ladder.sizes, job.names(), replaces=ladder.replaces,
         kind=lambda _, level: "ply" if lossless and level > num_lower else "spz",
         fine=range(coarse + 1, levels + 1), antialiased=job.antialiased,
     )  # fmt: skip

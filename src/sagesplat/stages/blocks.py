@@ -65,9 +65,6 @@ def check(config: BlocksConfig, train: TrainConfig) -> None:
     """RunError for settings out of range, or that do not go together."""
     wrong = (
         ("count", config.count, config.count >= 1, "1 or more"),
-        ("margin", config.margin, 0 <= config.margin <= 2, "a share such as 0.2"),
-        ("min-share", config.min_share, 0 < config.min_share <= 1, "a share such as 0.25"),
-        ("far-share", config.far_share, config.far_share >= 0, "a share such as 0.5"),
         ("boundary-steps", config.boundary_steps, config.boundary_steps >= 0, "0 or more"),
     )
     for name, value, fine, cure in wrong:
@@ -93,10 +90,10 @@ def divide(job: Job, config: BlocksConfig, seed: int) -> Blocks:
 
     def make() -> list[str]:
         scene = job.scene
-        blocks = split(scene, config.count, config.margin)
+        blocks = split(scene, config.count)
         of_points = blocks.of(scene.points.xyz)
         shares = visible_shares(scene, of_points, len(blocks))
-        assigned = assigned_views(scene, blocks, shares, config.min_share)
+        assigned = assigned_views(scene, blocks, shares)
         training = np.isin(np.arange(len(scene.views)), scene.train_ids)
         labels = LiftedLabels.read(run.labels, len(scene.points.xyz))
         photos = photo_hashes(run.photo_hashes, scene)
@@ -104,7 +101,7 @@ def divide(job: Job, config: BlocksConfig, seed: int) -> Blocks:
         for number in range(len(blocks)):
             rows = np.flatnonzero(assigned[:, number] & training).tolist()
             sees.append(np.flatnonzero((shares[rows] >= _SEEN).any(0)).tolist())
-            part, kept = training_scene(scene, blocks, number, rows, config.far_share, seed)
+            part, kept = training_scene(scene, blocks, number, rows, seed)
             _begin(run.block(number), part, labels, kept, photos)
         for old in run.blocks.glob("[0-9]*"):
             if int(old.name) >= len(blocks):

@@ -383,7 +383,7 @@ def _seen_in_photos(job: Job) -> dict[int, Seen]:
 def _seen_from_drawn(job: Job) -> dict[int, Seen]:
     """The same of the viewpoints at which fidelity was sampled."""
     sampled = sampled_of(job)
-    shares = np.where(sampled.shown(job.fit_config.min_share), sampled.pixels / sampled.image[:, None], 0.0)
+    shares = np.where(sampled.shown(), sampled.pixels / sampled.image[:, None], 0.0)
     return {
         label: Seen(shares[:, column], sampled.distance[:, column].astype(np.float64))
         for column, label in enumerate(sampled.labels)
@@ -392,7 +392,7 @@ def _seen_from_drawn(job: Job) -> dict[int, Seen]:
 
 def _shares(job: Job) -> dict[int, np.ndarray]:
     """By label id, the pixel share in each view [V]; 0 where it is too small."""
-    table = large_enough(observations_of(job), job.scene, job.fit_config.min_share)
+    table = large_enough(observations_of(job), job.scene)
     table = table.select(table.level == table.level.max(initial=0))
     sizes = np.array([view.camera.width * view.camera.height for view in job.scene.views])
     shares = {label: np.zeros(len(sizes)) for label in set(table.label_id.tolist())}

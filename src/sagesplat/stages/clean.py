@@ -65,7 +65,7 @@ def _clean(job: Job, last: Path, config: CleanConfig) -> Cleaned:
     g, scene = read_level(last).to(device_of(job.backend)), job.scene
     rows = job.inliers.rows(scene, scene.train_ids)
     floaters = find_floaters(
-        g, scene, rows, config,
+        g, scene, rows,
         label_image=job.masks.__getitem__, valid=job.inliers, antialiased=job.antialiased,
         on_view=lambda done: job.emit(Progress("clean", done, len(rows))),
     )  # fmt: skip

@@ -63,11 +63,10 @@ def clean_splat(
     check_size(splat.gaussians, str(source))
     g, filtered = splat.gaussians.to(device_of(backend)), splat.antialiased
     scene, photos, how = _views(g, filtered, cameras, backend)
-    if cameras is None:  # what they hardly show may be seen from nearer, or from elsewhere
-        config = replace(config, min_views=0, shown_share=0)
     real, rows = not isinstance(photos, Renders), list(range(len(scene.views)))
     floaters = find_floaters(
-        g, scene, rows, config,
+        g, scene, rows,
+        hardly_shown=cameras is not None,  # what drawn viewpoints hardly show may be seen from nearer
         label_image=RenderedLabels(g, backend, filtered).__getitem__, antialiased=filtered,
         on_view=lambda done: emit(Progress("clean", done, len(rows))),
     )  # fmt: skip

@@ -31,9 +31,8 @@ def tune_composition(job: Job, g: Gaussians, steps: int) -> Gaussians:
 
 
 def compose(job: Job, plan: Plan) -> Gaussians:
-    """The composition of a plan, tuned if the run's plans are (`PlanConfig.tune_steps`)."""
-    steps = settings_of(job.run, "plan").get("tune_steps", 0)
-    return tune_composition(job, job.ladder.compose(plan.levels), steps)
+    """The composition of a plan."""
+    return job.ladder.compose(plan.levels)
 
 
 def classic(job: Job, g: Gaussians) -> Gaussians:
@@ -57,8 +56,7 @@ def compose_plan(job: Job) -> None:
             size = f"{plan.transfer_bytes / 1e6:.2f} MB to send ({run.composed.name}: {size})"
         return [f"{len(g):,} Gaussians, {size}"]
 
-    settings = {"tune_steps": settings_of(run, "plan").get("tune_steps", 0)}
-    run_stage(job, "compose", settings, compose_inputs(job), [run.composed], make)
+    run_stage(job, "compose", {}, compose_inputs(job), [run.composed], make)
 
 
 def compose_inputs(job: Job) -> list[Path]:

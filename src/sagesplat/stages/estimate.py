@@ -18,7 +18,7 @@ from sagesplat.train import memory
 from sagesplat.train.early_stopping import ActiveTiles, trainable_rows
 from sagesplat.train.lr_schedule import LrSchedule, lr_schedule
 from sagesplat.train.photo_loader import PhotoLoader
-from sagesplat.train.state import from_points, initial_state, largest_scales
+from sagesplat.train.state import from_points, initial_state
 from sagesplat.train.stepper import Stepper
 from sagesplat.train.strategy import schedule_of
 
@@ -57,8 +57,7 @@ def tell_duration(job: Job, config: RunConfig) -> None:
 def step_seconds(job: Job, config: TrainConfig, most: int) -> tuple[float, float]:
     """Seconds of a training step on full-size photos: a part that is fixed, and one for each Gaussian."""
     scene = job.given_scene
-    largest = largest_scales(scene, config.initial_angle) if config.initial_angle else None
-    points = from_points(scene.points, job.initial_labels, config.sh_degree, largest=largest)
+    points = from_points(scene.points, job.initial_labels, config.sh_degree)
     count = max(min(most, _MOST_TIMED), 2 * len(points))
     few = _timed(job, config, points, degree=0)
     many = _timed(job, config, grown(points, count), degree=config.sh_degree)

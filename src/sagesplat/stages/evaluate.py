@@ -10,14 +10,13 @@ from sagesplat.adapt.plan import Plan
 from sagesplat.core.events import Progress
 from sagesplat.output import tables
 from sagesplat.run.job import Job
-from sagesplat.run.records import settings_of
 from sagesplat.run.stage import run_stage
 from sagesplat.segment.display_names import titles
 from sagesplat.stages.compose import compose, compose_inputs
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.plan import main_target, scene_plan
 from sagesplat.stages.results import budget_plan_of, plans_of
-from sagesplat.stages.shared import _show, label_images
+from sagesplat.stages.shared import _show
 
 
 def evaluate_plans(job: Job) -> None:
@@ -25,11 +24,11 @@ def evaluate_plans(job: Job) -> None:
     run, method = job.run, method_of(job)
 
     def make() -> list[str]:
-        fitted, within = job.fit_config, budget_plan_of(job)
+        within = budget_plan_of(job)
         plans = [*plans_of(job), *([within] if within else [])]
         table = evaluate(
-            job.scene, job.photos, label_images(job, fitted.masks), job.ladder, plans, method.predicted,
-            region=fitted.region, min_share=fitted.min_share, uniform=_levels_beside(job, plans),
+            job.scene, job.photos, job.best_masks, job.ladder, plans, method.predicted,
+            uniform=_levels_beside(job, plans),
             compose=lambda plan: compose(job, plan), valid=job.valid,
             backend=job.backend, antialiased=job.antialiased,
             progress=lambda done, total: job.emit(Progress("evaluate", done, total)),
@@ -43,8 +42,7 @@ def evaluate_plans(job: Job) -> None:
 
     fitted = [run.provenance("observe"), run.provenance("fit")]
     inputs = [run.labels, *method.files, *fitted, *compose_inputs(job)]
-    settings = {"tune_steps": settings_of(run, "plan").get("tune_steps", 0), "colours": True}
-    run_stage(job, "evaluate", settings, inputs, [run.evaluation], make)
+    run_stage(job, "evaluate", {"colours": True}, inputs, [run.evaluation], make)
 
 
 def _levels_beside(job: Job, plans: Sequence[Plan]) -> list[int]:

@@ -26,7 +26,6 @@ from sagesplat.formats.lod_meta_write import write_lod_meta
 from sagesplat.formats.splats_write import write_splat, written_as
 from sagesplat.raster import device_of, rasterize
 from sagesplat.run.job import Job
-from sagesplat.run.records import settings_of
 from sagesplat.scene.scene import Camera
 from sagesplat.stages.compose import classic, compose
 from sagesplat.stages.plan import main_plan, scene_plan
@@ -52,14 +51,14 @@ def increment_files(job: Job, folder: Path, kind: FileFormat) -> list[Increment]
     What streams hold is kept by the finest steps of SPZ. Of two opacities a Gaussian gets that of the full
     model. PLY files are for viewers that do not antialias.
     """
-    ladder, made = read_prefixes(job.run.prefixes), settings_of(job.run, "nest")
+    ladder = read_prefixes(job.run.prefixes)
     listed = read_index(job.run.increments)
     streams = any(one.format == "stream" for one in listed)
     g = read_increments(job.run.increments, listed) if streams else ladder.gaussians
     antialiased = job.antialiased and kind != "ply"
     return write_increments(
         folder, classic(job, g) if kind == "ply" else g, ladder.sizes, job.names(), replaces=ladder.replaces,
-        kind=kind, sh_bits=tuple(made["sh_bits"]), fine=ladder.levels if streams else (),
+        kind=kind, fine=ladder.levels if streams else (),
         antialiased=antialiased,
     )  # fmt: skip
 

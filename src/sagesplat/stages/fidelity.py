@@ -36,7 +36,7 @@ def fit_drawn(job: Job, config: FitConfig) -> dict[int, ViewModel]:
         Compositions(job, [drawn.cameras[row] for row in drawn.rows(name)])
         for name in ("bias", "calibration")
     )
-    models = fit_fidelity(sampled, fit, job.scene.scale, config.min_share, confidence)
+    models = fit_fidelity(sampled, fit, job.scene.scale, confidence)
     models.pop(UNLABELLED, None)  # has no target and stays in full
     for _ in range(_ROUNDS):
         models = recentred(models, trial(job, config, models, sampled.labels, bias), confidence)
@@ -60,7 +60,7 @@ def trial(
     distance = compositions.distances(labels, config.distance)
     planned = plan_nominal(models, labels, len(job.ladder.levels), distance, cameras, NOMINAL)
     fidelity, pixels = compositions.measure(planned)
-    shown = shown_enough(pixels, cameras, config.min_share)
+    shown = shown_enough(pixels, cameras)
     return Trial(labels, cameras, distance, shown, planned, fidelity)
 
 

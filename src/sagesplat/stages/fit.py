@@ -32,7 +32,7 @@ def fit_ladder(job: Job, config: FitConfig) -> None:
     run, method = job.run, method_of(job)
 
     def make() -> list[str]:
-        table = observed(job, config)
+        table = observed(job)
         models = fit_curves(job, table)
         write_models(run.models, models)
         statuses = [m.status for m in models.values()]
@@ -48,11 +48,10 @@ def fit_ladder(job: Job, config: FitConfig) -> None:
 
 
 def _check_observed(run: RunDir, config: FitConfig) -> None:
-    """RunError where the levels were observed with other distances or label images than `config` names."""
-    made = settings_of(run, "observe")
-    for name, wanted in (("distance", config.distance), ("masks", config.masks)):
-        if made[name] != wanted:
-            raise RunError(
-                f"{run.observations}: observed with {name} {made[name]}; add --fit.{name} {made[name]}, or "
-                f"observe again: `sagesplat observe {run.path} --fit.{name} {wanted} --force`"
-            )
+    """RunError where the levels were observed with other distances than `config` names."""
+    made, wanted = settings_of(run, "observe")["distance"], config.distance
+    if made != wanted:
+        raise RunError(
+            f"{run.observations}: observed with distance {made}; add --fit.distance {made}, or "
+            f"observe again: `sagesplat observe {run.path} --fit.distance {wanted} --force`"
+        )

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Int16
 
-from sagesplat.core.config import LabelsConfig, LiftConfig, MasksConfig
+from sagesplat.core.config import LabelsConfig, MasksConfig
 from sagesplat.core.errors import LabelError, RunError
 from sagesplat.core.events import Noted, Progress, Warned
 from sagesplat.core.limits import LabelId
@@ -36,13 +36,13 @@ from sagesplat.segment.lift import agreement_in, lift
 from sagesplat.segment.masks import MAX_LABEL_ID, UNLABELLED, Masks, Taxonomy, import_masks, write_labels
 from sagesplat.segment.registry import SEGMENTERS, segmenter_for
 from sagesplat.segment.segmenters import segment_some
-from sagesplat.segment.soft import read_soft, soft_path
 from sagesplat.segment.valid import ValidPixels, write_valid
 from sagesplat.stages.memory import check_network
 from sagesplat.stages.prompts import MASKS, Scores, Timed, load, prompt_lines, settings_of
-from sagesplat.train.fuse import Soft, fuse
+from sagesplat.train.fuse import fuse
 
 _MARKER = ".network.json"
+_DILATION = 3  # px of the training photos by which regions that do not count are grown
 _EDIT = "edit.json"
 
 
@@ -107,7 +107,7 @@ def _find_valid(
         run.valid,
         label_ids=Masks(run.segmented, before),
         ignore=ids,
-        dilation=labels.ignore_dilation,
+        dilation=_DILATION,
     )
     if empty := [view.name for view, share in zip(views, shares, strict=True) if share == 1]:
         names = ", ".join(empty[:5]) + (", ..." if len(empty) > 5 else "")
@@ -156,8 +156,6 @@ def _import(job: Job, config: MasksConfig, target: Path, stage: str) -> None:
 
     def make() -> list[str]:
         shutil.rmtree(target, ignore_errors=True)
-        if target == run.segmented:
-            shutil.rmtree(run.soft, ignore_errors=True)  # a network's, and these are not its label images
         missing = import_masks(job.scene, source, target)
         if missing:
             names = ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
@@ -174,10 +172,8 @@ def _segment(job: Job, config: MasksConfig, kind: str, *, instances: bool = Fals
     run, inputs = job.run, [job.run.scene]
     own = settings_of(kind, config)
     hashed = {name: file_hash(v) if isinstance(v, Path) else v for name, v in own.items()}
-    settings = {"segmenter": kind, "soft": config.soft, **hashed}
+    settings = {"segmenter": kind, **hashed}
     if kind == MASKS:  # prompts over them
-        if config.soft:
-            raise RunError("--soft: given label images have no probabilities; leave it out")
         _import(job, config, run.given, "given")
         settings["given"] = file_hash(run.given)
         inputs.append(run.given / "labels.json")
@@ -188,10 +184,9 @@ def _segment(job: Job, config: MasksConfig, kind: str, *, instances: bool = Fals
         marker, key = run.segmented / _MARKER, {**settings, "scene": file_hash(run.scene)}
         if not _is(marker, key):
             shutil.rmtree(run.segmented, ignore_errors=True)
-            shutil.rmtree(run.soft, ignore_errors=True)
             shutil.rmtree(run.photo_instances, ignore_errors=True)
         write_json(marker, key)
-        check_network(job, "text" if kind == MASKS else kind, own, config.batch)
+        check_network(job, "text" if kind == MASKS else kind, own)
         some = split(range(len(job.scene.views)), job.executor.parallel)  # each loads the network
         found = work_all(job, "segment", _segment_some, [(rows, config, kind, instances) for rows in some])
         taxonomy = found[0][0]
@@ -231,22 +226,22 @@ def _segment_some(job: Job, part: tuple[Sequence[int], MasksConfig, str, bool]) 
 
     occurring = segment_some(
         job.scene, job.photos, Timed(segmenter, lambda: remaining, note), run.segmented, rows,
-        batch=config.batch, soft=run.soft if config.soft else None, below=given,
+        below=given,
         instances=None if kind == MASKS else run.photo_instances, on_view=on_view,
     )  # fmt: skip
     return segmenter.taxonomy if below is None else below | segmenter.taxonomy, occurring
 
 
-def lift_labels(job: Job, config: LiftConfig) -> None:
+def lift_labels(job: Job) -> None:
     """Vote the label images onto the SfM points."""
     run = job.run
 
     def make() -> list[str]:
-        if config.votes == "track" and not len(job.given_scene.points.track_points):
+        if not len(job.given_scene.points.track_points):
             job.emit(Warned("the points have no tracks: all views that a point projects into vote"))
         scene = job.given_scene
         voters = set(scene.train_ids.tolist())
-        lifted = lift(scene, job.masks, votes=config.votes, views=voters, valid=job.valid)
+        lifted = lift(scene, job.masks, views=voters, valid=job.valid)
         lifted.write(run.labels)
         lines = [f"{100 * lifted.agreement:.1f} % of the votes agree with the label of their point"]
         if lifted.ignored is not None:
@@ -254,23 +249,19 @@ def lift_labels(job: Job, config: LiftConfig) -> None:
         return lines
 
     labels = run.masks / "labels.json"
-    run_stage(job, "lift", asdict(config), [run.scene, run.provenance("masks"), labels], [run.labels], make)
+    run_stage(job, "lift", {}, [run.scene, run.provenance("masks"), labels], [run.labels], make)
 
 
 def fuse_masks(job: Job) -> None:
-    """Let the label images of all training views vote on the trained Gaussians, and draw the votes back.
-
-    With the probabilities of the network, where they were kept.
-    """
+    """Let the label images of all training views vote on the trained Gaussians, and draw the votes back."""
     run = job.run
-    soft = _soft(job) if run.soft.is_dir() else None
 
     def make() -> list[str]:
         shutil.rmtree(run.fused, ignore_errors=True)
         g = job.snapshots.load(job.snapshots.levels[-1])
         fused = fuse(
             g, job.scene, job.masks, run.fused,
-            soft=soft, valid=job.valid, antialiased=job.antialiased, backend=job.backend,
+            valid=job.valid, antialiased=job.antialiased, backend=job.backend,
             on_view=lambda done, total: job.emit(Progress("fuse", done, total)),
         )  # fmt: skip
         before, after = (_agreement(job, masks) for masks in (job.masks, job.category_masks))
@@ -282,7 +273,7 @@ def fuse_masks(job: Job) -> None:
 
     made = [run.provenance(stage) for stage in ("masks", "train")]
     inputs = [*run.scene_files, run.masks / "labels.json", run.levels, *made]
-    run_stage(job, "fuse", {"soft": soft is not None}, inputs, [run.fused / "labels.json"], make)
+    run_stage(job, "fuse", {}, inputs, [run.fused / "labels.json"], make)
 
 
 @dataclass(frozen=True)
@@ -315,17 +306,3 @@ def _agreement(job: Job, masks: Masks) -> float:
     lifted = lift(job.scene, masks, views=voters)
     others = set(range(len(job.scene.views))) - voters
     return agreement_in(job.scene, masks, lifted.label_ids, others)
-
-
-def _soft(job: Job) -> Soft:
-    """The network's probabilities, of the categories that are left."""
-    table = edit_of(job.run)  # what never was likeliest has no label
-
-    def soft(row: int) -> tuple[np.ndarray, np.ndarray]:
-        ids, p = read_soft(soft_path(job.run.soft, job.scene.views[row]))
-        ids = table[ids]
-        left = np.unique(ids[ids != UNLABELLED])
-        planes = [np.where(ids == label, p, 0).sum(0) for label in left]
-        return left, np.array(planes, np.float32).reshape(len(left), *ids.shape[1:])
-
-    return soft

@@ -45,14 +45,14 @@ def check_nest(job: Job, count: int, sh_degree: int) -> None:
         job.emit(Warned(f"{job.run.path}: {needs}"))
 
 
-def check_network(job: Job, kind: str, settings: dict[str, Any], batch: int) -> None:
+def check_network(job: Job, kind: str, settings: dict[str, Any]) -> None:
     """RunError where a network (of `SEGMENTERS`, with its settings) needs more memory than the limit."""
     model = settings.get("model")
     if job.backend == "cuda" or model is None:  # segmenters of others may have no such file
         return
     limit = job.memory_limit or memory.default_limit()
     largest = max(view.camera.width * view.camera.height for view in job.scene.views)
-    needed = network_memory(kind, weights(model), largest, batch)
+    needed = network_memory(kind, weights(model), largest)
     if kind == "text":
         needed += _masks_weights(model, settings["mask_model"])
     elif "over_model" in settings:  # both are in memory, and compute one after the other
@@ -66,11 +66,11 @@ def check_network(job: Job, kind: str, settings: dict[str, Any], batch: int) -> 
         )
 
 
-def network_memory(kind: str, weights: float, pixels: int, batch: int = 1) -> float:
+def network_memory(kind: str, weights: float, pixels: int) -> float:
     """Bytes that a network needs at least, by those of its weights and the pixels of a photo."""
     computes = {"onnx": _ONNX, "hf": min(_HF[0] * weights, _HF[1]), "text": _TEXT}.get(kind, 0.0)
     # files are read into memory, and become parameters before they are released
-    return _RUNTIME + max(2 * weights, weights + computes) + pixels * (_PIXEL + 3 * batch)
+    return _RUNTIME + max(2 * weights, weights + computes) + pixels * (_PIXEL + 3)
 
 
 def _masks_weights(detector: Path | str, masks: Path | str) -> float:

@@ -22,7 +22,6 @@ from sagesplat.core.config import FitConfig, PlanConfig
 from sagesplat.core.errors import RunError
 from sagesplat.formats.increments import INDEX, totals
 from sagesplat.run.job import Job
-from sagesplat.run.records import settings_of
 from sagesplat.scene.scene import Camera
 from sagesplat.segment.masks import UNLABELLED
 from sagesplat.stages.fidelity import compositions_at, fit_drawn
@@ -35,7 +34,7 @@ from sagesplat.stages.results import (
     sampled_of,
     viewpoints_of,
 )
-from sagesplat.stages.shared import distances, label_images, label_named, observed
+from sagesplat.stages.shared import distances, label_named, observed
 from sagesplat.stages.viewpoints import fit_viewpoints
 
 _MENDINGS = 4  # times that a plan of a scene is measured in its composition and mended
@@ -100,7 +99,7 @@ class Method(Protocol):
 class Snapshots(Method):
     """The paper's: snapshots of the training, Eq. 3 over distance, the fewest Gaussians (Eq. 1)."""
 
-    fit_settings = ("min_share", "region")
+    fit_settings = ()
     streams = False
 
     def __init__(self, job: Job) -> None:
@@ -159,7 +158,7 @@ class Snapshots(Method):
 class NestedLevels(Method):
     """Ours: prefixes of one model, lower bounds of two qualities by viewpoint, the fewest bytes."""
 
-    fit_settings = ("min_share", "region", "confidence")
+    fit_settings = ("confidence",)
     streams = True
 
     def __init__(self, job: Job) -> None:
@@ -209,7 +208,7 @@ class NestedLevels(Method):
         at = {label: i for i, label in enumerate(found.labels)}
         rows = [-1 if label == UNLABELLED else at.get(label, -1) for label in self.costs.labels]
         # unlabelled pixels have no target, and stay in full
-        known = (np.array(rows) >= 0) & found.shown(settings_of(self.job.run, "sample")["min_share"])[:, rows]
+        known = (np.array(rows) >= 0) & found.shown()[:, rows]
         fidelity = np.where(known[..., None], found.fidelity[:, rows].astype(np.float64), np.nan)
         return fidelity, np.where(known, found.pixels[:, rows], 0).astype(np.float64)
 
@@ -226,7 +225,7 @@ class NestedLevels(Method):
         self, column: Callable[[Observations], np.ndarray], levels: Sequence[int], missing: float
     ) -> np.ndarray:
         """A column of the observations of views that show enough of a category, float64 [V, L, K]."""
-        seen, labels = observed(self.job, self.job.fit_config), np.array(self.costs.labels)
+        seen, labels = observed(self.job), np.array(self.costs.labels)
         seen = seen.select(np.isin(seen.label_id, labels) & np.isin(seen.level, levels))
         table = np.full((len(self.job.scene.views), len(labels), len(levels)), missing)
         at = np.searchsorted(labels, seen.label_id), np.searchsorted(levels, seen.level)
@@ -288,7 +287,7 @@ class NestedLevels(Method):
         levels = np.array([[plan.levels[label] for label in self.costs.labels] for plan in plans])
         planned = np.broadcast_to(levels, (len(cameras), *levels.shape))
         fidelity, pixels = compositions_at(self.job, cameras, planned, "plan")
-        shown = shown_enough(pixels, cameras, self.job.fit_config.min_share)
+        shown = shown_enough(pixels, cameras)
         shown &= np.array(self.costs.labels) != UNLABELLED
         return np.where(shown[:, None], fidelity[..., :-1], np.nan).astype(np.float64)
 
@@ -316,17 +315,17 @@ class NestedLevels(Method):
 
     def unseen_labels(self) -> LabelImages | None:
         """See `Method`: a promise is measured on the photo's own."""
-        return label_images(self.job, self.job.fit_config.masks)
+        return self.job.best_masks
 
     def coverage(self, targets: Sequence[float]) -> Decisions | None:
         """See `Method`; every category at the same level, costs in transfer bytes."""
         job, costs = self.job, self.bytes_to_send
-        return score(observed(job, job.fit_config), job.scene, promises_of(job), costs, targets)
+        return score(observed(job), job.scene, promises_of(job), costs, targets)
 
 
 def _training_rows(job: Job) -> Observations:
     """A row for each training view that shows enough of a category; what it measures is of the last level."""
-    table = observed(job, job.fit_config)
+    table = observed(job)
     last = table.level == job.ladder.levels[-1]
     return table.select(last & np.isin(table.view, job.scene.train_ids))
 

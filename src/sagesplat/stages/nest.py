@@ -38,7 +38,7 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
         masks, sky = job.best_masks, job.sky
         shell = sky.shell if sky else None
         ordered = nested.order(
-            full, job.scene, masks, config,
+            full, job.scene, masks,
             base=base, valid=job.inliers, antialiased=job.antialiased, shell=shell,
         )  # fmt: skip
         key = checkpoint_key(run, settings, inputs)
@@ -129,8 +129,7 @@ def write_ladder(
     """
     job.run.provenance("nest").unlink(missing_ok=True)  # from here on the earlier ladder is gone
     made = write_streams(
-        job.run.increments, g, sizes, job.names(), second=second, sh_bits=config.sh_bits,
-        antialiased=job.antialiased,
+        job.run.increments, g, sizes, job.names(), second=second, antialiased=job.antialiased
     )  # fmt: skip
     # what is measured, planned and written from here on is what a viewer gets
     sent, seconds = read_streams(job.run.increments, made.increments)

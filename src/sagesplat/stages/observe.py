@@ -14,7 +14,7 @@ from sagesplat.run.remote import work_all
 from sagesplat.run.stage import run_stage
 from sagesplat.segment.display_names import titles
 from sagesplat.stages.methods import method_of
-from sagesplat.stages.shared import _show, distances, label_image_inputs, label_images
+from sagesplat.stages.shared import _show, distances, label_image_inputs
 
 
 def observe_levels(job: Job, config: FitConfig) -> None:
@@ -35,24 +35,24 @@ def observe_levels(job: Job, config: FitConfig) -> None:
 
     levels = method_of(job).level_files[0]
     inputs = [*run.scene_files, run.labels, run.provenance("train"), levels, *label_image_inputs(run)]
-    settings = {"distance": config.distance, "masks": config.masks}
+    settings = {"distance": config.distance}
     run_stage(job, "observe", settings, inputs, [run.observations], make)
 
 
 def observed_views(job: Job, config: FitConfig, labels: Collection[int] | None = None) -> Observations:
     """The observations of all categories in all views, or of some alone (ids), divided among who compute."""
     far = distances(job, config.distance)
-    parts = [(rows, config.masks, far, labels) for rows in split(range(len(job.scene.views)), job.pieces)]
+    parts = [(rows, far, labels) for rows in split(range(len(job.scene.views)), job.pieces)]
     return merge(work_all(job, "observe", _observe_views, parts))
 
 
 def _observe_views(
-    job: Job, part: tuple[Sequence[int], str, dict[int, np.ndarray], Collection[int] | None]
+    job: Job, part: tuple[Sequence[int], dict[int, np.ndarray], Collection[int] | None]
 ) -> Observations:
-    """The observations of some views (rows, source of label images, distances in all views, categories)."""
-    rows, masks, far, labels = part
+    """The observations of some views (rows, distances in all views, categories)."""
+    rows, far, labels = part
     return observe(
-        job.scene, job.photos, label_images(job, masks), job.ladder, far,
+        job.scene, job.photos, job.best_masks, job.ladder, far,
         views=rows, valid=job.valid, labels=labels, backend=job.backend, antialiased=job.antialiased,
         progress=lambda done, total: job.emit(Progress("observe", done, total)),
     )  # fmt: skip

@@ -91,7 +91,7 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
     make_masks(job, config.masks, config.labels)
     if config.labels.instances:
         find_photo_instances(job, config.masks, config.labels)
-    lift_labels(job, config.lift)
+    lift_labels(job)
     tell_duration(job, config)
     train(job, config.train, config.blocks, config.seed)
     if config.fuse:

@@ -36,7 +36,7 @@ def refit(before: Job, job: Job, config: FitConfig, changed: Collection[int]) ->
 
     Both are calibrated in compositions in which the others are at the levels that their own models choose.
     """
-    table = observed(job, config)
+    table = observed(job)
     curves = {key: one for key, one in models_of(before).items() if key[0] in _kept(before, job, changed)}
     fresh = fit_curves(job, table.select(np.isin(table.label_id, list(changed))))
     write_models(job.run.models, dict(sorted({**curves, **fresh}.items())))
@@ -65,7 +65,7 @@ def _fit_drawn(
     drawn, sampled, confidence = viewpoints_of(job), sampled_of(job), config.confidence
     fit = [drawn.cameras[row] for row in drawn.rows("fit")]
     mine = _columns(sampled, [label for label in sampled.labels if label in changed and label != UNLABELLED])
-    models = fit_fidelity(mine, fit, job.scene.scale, config.min_share, confidence)
+    models = fit_fidelity(mine, fit, job.scene.scale, confidence)
     for name, step in (("bias", recentred), ("calibration", calibrated)):
         cameras = _some([drawn.cameras[row] for row in drawn.rows(name)], _MOST[name])
         measured = trial(

@@ -25,7 +25,6 @@ from sagesplat.formats.stream_header import read_header as read_stream_header
 from sagesplat.formats.stream_increments import read_streams, write_streams
 from sagesplat.metrics.image import tiles_around
 from sagesplat.run.job import Job
-from sagesplat.run.records import settings_of
 from sagesplat.segment.lift import LiftedLabels
 from sagesplat.segment.masks import UNLABELLED, Masks, Taxonomy, mask_path, write_mask
 from sagesplat.segment.relabel import Relabelled
@@ -41,7 +40,6 @@ def move_levels(job: Job, new: Job, made: Relabelled) -> None:
     assert isinstance(ladder, PrefixLadder)
     changed = sorted(made.changed)
     g, sizes, second = regrouped(ladder, made.new_ids, changed)
-    sh_bits = tuple(settings_of(job.run, "nest").get("sh_bits", (5, 4)))
     folder = new.run.increments
     kept = [one for one in read_index(folder) if one.label_id in made.names and one.label_id not in changed]
     headers = _headers(job.run.increments)
@@ -52,8 +50,8 @@ def move_levels(job: Job, new: Job, made: Relabelled) -> None:
     }
     with TemporaryDirectory(dir=new.run.adapted) as work:
         written = write_streams(
-            Path(work) / "streams", g, sizes, made.names, second=second, sh_bits=sh_bits,
-            antialiased=job.antialiased, grids=grids,
+            Path(work) / "streams", g, sizes, made.names, second=second, antialiased=job.antialiased,
+            grids=grids,
         )  # fmt: skip
         decoded, seconds = read_streams(Path(work) / "streams", written.increments)
         for one in {one.uri for one in read_index(folder)} - {one.uri for one in kept}:
@@ -189,7 +187,7 @@ def measure(job: Job, new: Job, made: Relabelled, fit: FitConfig) -> bool:
     fresh = {one for old, ids in made.new_ids.items() if made.moved(old) is None for one in set(ids.tolist())}
     moved = {old: None if (to := made.moved(old)) in fresh else to for old in made.new_ids}
     if new.run.observations.exists():
-        _observe(job, new, made, fit, moved, fresh)
+        _observe(job, new, fit, moved, fresh)
     drawn, labels = viewpoints_of(job), sorted(made.names)
     cameras = [drawn.cameras[row] for row in drawn.rows("fit")]
     far = distances_at(job.scene, new.point_labels, cameras, labels, fit.distance)
@@ -205,20 +203,11 @@ def measure(job: Job, new: Job, made: Relabelled, fit: FitConfig) -> bool:
 def _observe(
     job: Job,
     new: Job,
-    made: Relabelled,
     fit: FitConfig,
     moved: Mapping[int, int | None],
     fresh: Collection[int],
 ) -> None:
-    """Write the observations. Borders move in label images that are rendered, and so all is measured there;
-    merging moves those of eroded masks.
-    """
-    if fit.masks != "given":
-        observed_views(new, fit).write_csv(new.run.observations)
-        return
-    if fit.region == "eroded":
-        fresh = {*fresh, *made.changed}
-        moved = {old: None if to in fresh else to for old, to in moved.items()}
+    """Write the observations; those of the categories `fresh` are measured."""
     table = observations_of(job)
     # rows of categories without Gaussians keep their label
     rest = {label: label for label in np.unique(table.label_id).tolist() if label not in moved}

@@ -200,7 +200,7 @@ def _promise(job: Job) -> tuple[PromiseFacts | None, dict[int, np.ndarray]]:
     models, sets, sampled = fidelity_of(job), viewpoints_of(job), sampled_of(job)
     confidence = min((model.confidence for model in models.values()), default=0.0)
     facts = PromiseFacts(confidence, *(len(sets.rows(name)) for name in SETS))
-    shown = sampled.shown(job.fit_config.min_share)
+    shown = sampled.shown()
     drawn = {label: sampled.fidelity[shown[:, column], column] for column, label in enumerate(sampled.labels)}
     return facts, {label: values for label, values in drawn.items() if len(values)}
 

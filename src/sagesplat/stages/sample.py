@@ -37,6 +37,7 @@ USUAL = {"fit": VIEWS[1], "bias": 60, "calibration": 180}  # as many as the trai
 MOST = {"fit": VIEWS[-1], "bias": 60, "calibration": 300}  # after a long training up to these, by
 _EXTRA = 0.25  # this share of its time: they make bounds a little tighter, no more
 _RENDERS = 2.5  # a training step: a render takes about a quarter of it (demo: 0.6 of the training's time)
+_SEED = 0  # of the draws
 _LABEL_IMAGE = 4  # renders that a viewpoint's label image takes
 _FEWEST = {"fit": 20, "bias": 4, "calibration": 20}
 
@@ -44,7 +45,7 @@ _FEWEST = {"fit": 20, "bias": 4, "calibration": 20}
 def sample_levels(job: Job, config: SampleConfig, fit: FitConfig) -> None:
     """Draw viewpoints, and measure every level of every category there against the full model.
 
-    Nested levels only. `fit`: how distances are measured, and which categories are too small to count.
+    Nested levels only. `fit`: how distances are measured.
     """
     run = job.run
     if run.ladder != "nested":
@@ -71,7 +72,7 @@ def sample_levels(job: Job, config: SampleConfig, fit: FitConfig) -> None:
     inputs = [*run.scene_files, run.labels, method_of(job).level_files[0], *made_by]
     if config.viewpoints:
         inputs.append(config.viewpoints)
-    settings = asdict(config) | {"distance": fit.distance, "min_share": fit.min_share}
+    settings = asdict(config) | {"distance": fit.distance}
     run_stage(job, "sample", settings, inputs, [run.viewpoints, run.sampled], make)
 
 
@@ -81,7 +82,7 @@ def _checked(config: SampleConfig) -> Rule:
         raise RunError(
             f"{config.views} and {config.calibration_views} viewpoints are impossible; give 0 or more"
         )
-    rule = Rule(config.seed, config.neighbours, config.shift, config.turn)
+    rule = Rule(_SEED, config.neighbours, config.shift, config.turn)
     rule.check()
     return rule
 
@@ -130,7 +131,7 @@ def _until_it_stops_shrinking(
         table = more if table is None else _joined(table, more)
         if stop == stops[-1]:
             break
-        models = fit_fidelity(table, cameras[:stop], job.scene.scale, fit.min_share, fit.confidence)
+        models = fit_fidelity(table, cameras[:stop], job.scene.scale, fit.confidence)
         errors.append(float(np.mean([model.rmse for model in models.values()])))
         if len(errors) > 1 and errors[-1] > (1 - _SHRINKS) * errors[-2]:
             break

@@ -234,6 +234,7 @@ def _find_poses(job: Job, source: Path, capture: Path, config: PosesConfig, leav
         result = reconstruct(
             source, capture, config,
             lambda stage, done, total: job.emit(_poses_progress(stage, done / max(total, 1))),
+            device="cpu" if job.device == "cpu" else "auto", threads=job.threads or -1,
             alpha=leaving_out.scene.alpha, ignored=leaving_out.of_photos(),
         )  # fmt: skip
         for name, reason in list(result.unregistered.items())[:5]:

@@ -1,20 +1,18 @@
 """Helpers that several stages share: settings, label images and distances of a run."""
 
 from collections.abc import Collection, Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 
 from sagesplat.adapt.observe import (
     PERCENTILE,
-    LabelImages,
     Observations,
-    RenderedLabels,
     distances_in_views,
     large_enough,
 )
-from sagesplat.core.config import FitConfig, TrainConfig
+from sagesplat.core.config import TrainConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import TableMade
 from sagesplat.core.names import composed
@@ -59,13 +57,6 @@ def sky_inputs(run: RunDir) -> list[Path]:
     return [run.sky] if run.sky.exists() else []
 
 
-def label_images(job: Job, source: str) -> LabelImages:
-    """The label images that came with the photos ("given"), or those of the 3D labels ("rendered")."""
-    if source == "given":
-        return job.best_masks
-    return RenderedLabels(job.ladder.load(job.ladder.levels[-1]), job.backend, job.antialiased)
-
-
 def distances(job: Job, distance: str) -> dict[int, np.ndarray]:
     """d_min of each category in each view, as `FitConfig.distance` says; kept, as several stages ask."""
     percentile = PERCENTILE if distance == "percentile" else 0.0
@@ -77,10 +68,9 @@ def distances(job: Job, distance: str) -> dict[int, np.ndarray]:
     return kept[3]
 
 
-def observed(job: Job, config: FitConfig) -> Observations:
-    """The rows of views that show enough of a category, with SSIM of the region that models are fitted to."""
-    table = large_enough(observations_of(job), job.scene, config.min_share)
-    return replace(table, ssim=table.ssim_eroded) if config.region == "eroded" else table
+def observed(job: Job) -> Observations:
+    """The rows of views that show enough of a category."""
+    return large_enough(observations_of(job), job.scene)
 
 
 def _show(job: Job, table: Table) -> None:

@@ -21,7 +21,7 @@ from sagesplat.run.executor import split
 from sagesplat.run.job import Job
 from sagesplat.run.remote import work_all
 from sagesplat.segment.masks import UNLABELLED
-from sagesplat.stages.shared import distances, label_images
+from sagesplat.stages.shared import distances
 from sagesplat.train.early_stopping import VIEWS, spread
 
 _MEASURED = np.flatnonzero(TARGETS >= 0.499)  # of TARGETS, those that compositions are planned for
@@ -59,7 +59,7 @@ def fit_viewpoints(
             compositions.setdefault(tuple(plan.levels.items()), []).append(number)
         planned.append((row, [(targets, dict(levels)) for levels, targets in compositions.items()]))
     wanted = sorted(set(table.label_id.tolist())) if known else None
-    parts = [(some, config, wanted) for some in split(planned, job.pieces)]
+    parts = [(some, wanted) for some in split(planned, job.pieces)]
     measured = [one for some in work_all(job, "fit", _measure_compositions, parts) for one in some]
     found = calibrated(in_composition(fits, _changes(table, measured)), config.confidence)
     return dict(sorted({**known, **found}.items()))
@@ -80,17 +80,16 @@ def _changes(
 
 
 def _measure_compositions(
-    job: Job, part: tuple[Sequence[_Planned], FitConfig, Sequence[int] | None]
+    job: Job, part: tuple[Sequence[_Planned], Sequence[int] | None]
 ) -> list[tuple[int, int, int, list[int], float]]:
     """(label id, its level, row, numbers of targets, SSIM) of compositions in some views.
 
     Of the categories that are wanted (ids), by rendering the parts of images that show them; None: of all.
     """
-    planned, config, wanted = part
+    planned, wanted = part
     ladder = job.ladder
     assert isinstance(ladder, PrefixLadder)
-    name = "ssim_eroded" if config.region == "eroded" else "ssim"
-    masks, workspace = label_images(job, config.masks), Workspace()
+    masks, workspace = job.best_masks, Workspace()
 
     def in_view(of_view: _Planned) -> list[tuple[int, int, int, list[int], float]]:
         row, compositions = of_view
@@ -106,7 +105,7 @@ def _measure_compositions(
         for targets, levels in compositions:
             found = measure(seen.render(levels), photo, masks[view], inner, job.valid[view], tiles)
             rows += [
-                (label, levels.get(label, -1), row, targets, values[name])
+                (label, levels.get(label, -1), row, targets, values["ssim"])
                 for label, values in found.items()
                 if wanted is None or label in wanted
             ]

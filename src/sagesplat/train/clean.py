@@ -2,7 +2,6 @@
 
 Criteria, each by itself:
 
-- few views: hardly any training view supports them, so nothing says where they are;
 - hardly shown: a camera of the capture that turned towards them would show little else, but all photos
   together show next to nothing of them;
 - in front: most views that support them show content far behind them;
@@ -36,10 +35,14 @@ from sagesplat.segment.masks import UNLABELLED
 from sagesplat.segment.valid import ALL_VALID, ValidPixels
 from sagesplat.train.early_stopping import spread
 
-Criterion = Literal["few views", "hardly shown", "in front", "category"]
+Criterion = Literal["hardly shown", "in front", "category"]
 CRITERIA = get_args(Criterion)
 LabelImage = Callable[[View], np.ndarray]  # a view's category ids, int16 [H, W]; -1: unlabelled
 
+_MIN_WEIGHT = 0.1  # a view supports a Gaussian if its blending weights there, summed over pixels, reach this
+_SHOWN_SHARE = 0.003  # hardly shown: less of the weight that the nearest camera would see if it looked at it
+_CONTENT_DEPTH = 0.8  # in front: nearer than this fraction of the depth of the content around it
+_CATEGORY_DEPTH = 0.3  # category: nearer than this fraction of the median depth of the category
 _MOST = 0.5  # of the views that support a Gaussian, or of its weight
 _NEAR = 0.05  # quantile of the depths of tracked points, or of the pixels, that is a view's near content
 _TRACKED = 20  # points in a view at least
@@ -78,20 +81,20 @@ def find_floaters(
     g: Gaussians,
     scene: Scene,
     views: Collection[int],
-    config: CleanConfig,
     *,
+    hardly_shown: bool = True,
     label_image: LabelImage | None = None,
     valid: ValidPixels = ALL_VALID,
     antialiased: bool = False,
     on_view: Callable[[int], None] | None = None,
 ) -> Floaters:
-    """Find floaters by the criteria of `config`.
+    """Find floaters by each of the `CRITERIA`.
 
     Args:
         g: N trained Gaussians.
         scene: Views, and points whose tracks tell how near the content of a view is, where it has some.
         views: Rows of `Scene.views` that the Gaussians were trained on.
-        config: Thresholds.
+        hardly_shown: Whether those count that the views hardly show: not where views were drawn.
         label_image: Needed for the criterion "category", and for Gaussians of at least two categories.
         valid: The pixels that count.
         antialiased: How the Gaussians were trained.
@@ -99,15 +102,11 @@ def find_floaters(
 
     Returns:
         The Gaussians that each criterion found, and their importance.
-
-    Raises:
-        RunError: If a threshold is impossible.
     """
-    check(config)
     n = len(g)
     supported, in_front, contradicting, weight = np.zeros((4, n), np.float32)
     ids = np.unique(np.append(g.label_ids.cpu().numpy(), UNLABELLED))
-    if len(ids) < 3 or not config.category_depth:  # of one category nothing can contradict
+    if len(ids) < 3:  # of one category nothing can contradict
         label_image = None
     xyz, space, most = g.means.cpu().numpy(), Workspace(), np.zeros(n, np.float32)
     breadth = g.log_scales.exp().sort(dim=1).values[:, 1:].prod(1)
@@ -119,17 +118,16 @@ def find_floaters(
         weights = np.zeros((n, width), np.float32)
         add_weights(g, view.camera, columns, weights, antialiased=antialiased, workspace=space)
         depth = xyz @ view.camera.w2c[2, :3] + view.camera.w2c[2, 3]
-        near, against = np.zeros(n, bool), np.zeros(n, np.float32)
-        if config.content_depth:
-            near = depth < config.content_depth * _content(g, scene, row, depth, antialiased, space)
+        near = depth < _CONTENT_DEPTH * _content(g, scene, row, depth, antialiased, space)
+        against = np.zeros(n, np.float32)
         if label_image is not None:
-            against = _contradicting(weights[:, 1:], depth, config.category_depth)
+            against = _contradicting(weights[:, 1:], depth)
         return weights.sum(1), _most_pixels(g, breadth, view.camera), near, against
 
     small = n * width <= _SIDE_BY_SIDE
     in_views = each_view(of_view, list(views), g.means.device) if small else map(of_view, views)
     for done, (total, pixels, near, against) in enumerate(in_views, 1):
-        supports = total >= config.min_weight
+        supports = total >= _MIN_WEIGHT
         weight += total
         supported += supports
         most = np.maximum(most, pixels)
@@ -138,8 +136,7 @@ def find_floaters(
         if on_view:
             on_view(done)
     found = {
-        "few views": supported < config.min_views,
-        "hardly shown": weight < config.shown_share * most,
+        "hardly shown": (weight < _SHOWN_SHARE * most) & hardly_shown,
         "in front": (supported > 0) & (in_front > _MOST * supported),
         "category": (supported > 0) & (contradicting > _MOST * weight),
     }
@@ -241,20 +238,9 @@ def _unmissed(
 
 
 def check(config: CleanConfig) -> None:
-    """RunError for a threshold that is impossible."""
-    limits = {
-        "min_views": 10**6,
-        "min_weight": 10**6,
-        "shown_share": 1,
-        "content_depth": 1,
-        "category_depth": 1,
-        "max_loss": 100,
-    }
-    for name, most in limits.items():
-        value = getattr(config, name)
-        if not 0 <= value <= most:
-            flag = name.replace("_", "-")
-            raise RunError(f"--clean.{flag} {value:g} is impossible; choose 0 to {most:,}")
+    """RunError for an impossible loss."""
+    if not 0 <= config.max_loss <= 100:
+        raise RunError(f"--clean.max-loss {config.max_loss:g} is impossible; choose 0 to 100")
 
 
 def _most_pixels(g: Gaussians, breadth: Float[Tensor, " N"], camera: Camera) -> Float32[np.ndarray, " N"]:
@@ -324,7 +310,7 @@ def _tracked(scene: Scene, row: int) -> Float[np.ndarray, " P"]:
 
 
 def _contradicting(
-    weights: Float32[np.ndarray, "N L"], depth: Float[np.ndarray, " N"], share: float
+    weights: Float32[np.ndarray, "N L"], depth: Float[np.ndarray, " N"]
 ) -> Float32[np.ndarray, " N"]:
     """Weight of each Gaussian on pixels of categories whose median depth is far behind it."""
     found = np.zeros(len(depth), np.float32)
@@ -332,5 +318,5 @@ def _contradicting(
         rows = np.flatnonzero(column)
         if len(rows):
             median = weighted_quantile(depth[rows], column[rows], 0.5)
-            found[rows] += column[rows] * (depth[rows] < share * median)
+            found[rows] += column[rows] * (depth[rows] < _CATEGORY_DEPTH * median)
     return found

@@ -16,6 +16,10 @@ from sagesplat.train.schedule import Schedule
 from sagesplat.train.sky import Shell
 from sagesplat.train.state import TrainState
 
+# Thresholds of 3DGS: Gaussians larger than the first fraction of the scene extent are split, smaller ones
+# cloned; fainter ones than `PRUNE_OPACITY` go, after the first opacity reset also those that are larger than
+# the last fraction.
+_GROW_SCALE, PRUNE_OPACITY, _PRUNE_SCALE = 0.01, 5e-3, 0.1
 _SPLIT_SHRINK = 1.6
 
 
@@ -88,18 +92,17 @@ def refine(
     size = g.log_scales.exp().amax(-1)
     if shell:  # on it as seen from within
         size = torch.where(shell.holds(g.means), size / shell.scale, size)
-    threshold = config.grow_absgrad if config.absgrad else config.grow_grad
-    grows = (state.grad_sum / state.grad_count.clamp_min(1) > threshold) & trainable
+    grows = (state.grad_sum / state.grad_count.clamp_min(1) > config.grow_grad) & trainable
     if int(grows.sum()) > room:
         strength = torch.where(grows, state.grad_sum / state.grad_count.clamp_min(1), -1.0)
         grows = torch.zeros_like(grows)
         grows[torch.topk(strength, max(room, 0)).indices] = True
-    small = size <= config.grow_scale * extent
+    small = size <= _GROW_SCALE * extent
     clones = g.select(grows & small)
     halves = _split(g.select(grows & ~small), state.rng, shell)
-    faint = g.logit_opacities.sigmoid() < config.prune_opacity
+    faint = g.logit_opacities.sigmoid() < PRUNE_OPACITY
     if state.last_reset >= 0:
-        faint |= size > config.prune_scale * extent
+        faint |= size > _PRUNE_SCALE * extent
     state.replace_rows(~(grows & ~small) & ~(faint & trainable), concat([clones, halves]))
 
 
@@ -115,9 +118,9 @@ def _split(g: Gaussians, rng: np.random.Generator, shell: Shell | None = None) -
     return replace(both, means=means, log_scales=both.log_scales - float(np.log(_SPLIT_SHRINK)))
 
 
-def reset_opacities(state: TrainState, config: TrainConfig, trainable: Tensor) -> None:
+def reset_opacities(state: TrainState, trainable: Tensor) -> None:
     """Lower opacities to twice the pruning threshold; their moments start again."""
-    ceiling = float(np.log(2 * config.prune_opacity / (1 - 2 * config.prune_opacity)))
+    ceiling = float(np.log(2 * PRUNE_OPACITY / (1 - 2 * PRUNE_OPACITY)))
     name = PARAMETERS[3]
     logits = getattr(state.gaussians, name)
     logits[trainable] = logits[trainable].clamp_max(ceiling)

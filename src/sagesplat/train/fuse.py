@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Int16
-from PIL import Image
 from scipy.ndimage import binary_opening
 
 from sagesplat.core.errors import LabelError
@@ -17,9 +16,6 @@ from sagesplat.raster import Backend, Workspace, add_weights, device_of, rasteri
 from sagesplat.scene.scene import Camera, Scene
 from sagesplat.segment.masks import UNLABELLED, Masks, prepare_folder, write_labels, write_mask
 from sagesplat.segment.valid import ALL_VALID, ValidPixels
-
-Soft = Callable[[int], tuple[Int16[np.ndarray, " K"], Float32[np.ndarray, "K h w"]]]
-"""Row of Scene.views -> category ids (-1 = none; repeated ones add up), probabilities at any resolution."""
 
 THIN_RADIUS = 3  # px; what an opening by a disc of this radius removes is thin
 
@@ -58,15 +54,14 @@ def gather(
     masks: Masks,
     views: Collection[int],
     *,
-    soft: Soft | None = None,
     valid: ValidPixels = ALL_VALID,
     antialiased: bool = False,
     on_view: Callable[[int], None] | None = None,
 ) -> Votes:
     """Let the pixels of `views` (rows of `Scene.views`) vote on the Gaussians that contribute to them.
 
-    A pixel's vote is its category in `masks`, or its distribution with `soft`, times the blending weight
-    (alpha times transmittance) of the Gaussian. Unlabelled is a candidate too, but views without any label
+    A pixel's vote is its category in `masks`, times the blending weight (alpha times transmittance) of the
+    Gaussian. Unlabelled is a candidate too, but views without any label
     do not vote, and no pixel that is not `valid`. `on_view(done)` is called after each view.
     """
     ids = np.array([UNLABELLED, *sorted(masks.taxonomy.names)], np.int16)
@@ -75,45 +70,14 @@ def gather(
         camera, label_ids = scene.views[row].camera, masks[scene.views[row]]
         counts = valid[scene.views[row]]
         if (label_ids != UNLABELLED).any():
-            if soft is None:
-                columns = np.searchsorted(ids, label_ids)
-                if counts is not None:
-                    columns[~counts] = -1
-                add_weights(gaussians, camera, columns, votes, antialiased=antialiased, workspace=workspace)
-            else:
-                pixels = soft_pixels(soft, row, camera, ids)
-                if counts is not None:
-                    pixels *= counts
-                _add_soft(gaussians, camera, pixels, votes, antialiased, workspace)
+            columns = np.searchsorted(ids, label_ids)
+            if counts is not None:
+                columns[~counts] = -1
+            add_weights(gaussians, camera, columns, votes, antialiased=antialiased, workspace=workspace)
         if on_view:
             on_view(done + 1)
     total = votes.sum(1, keepdims=True)
     return Votes(ids, np.divide(votes, total, out=np.zeros_like(votes), where=total > 0))
-
-
-def soft_pixels(
-    soft: Soft, row: int, camera: Camera, ids: Int16[np.ndarray, " C"]
-) -> Float32[np.ndarray, "C H W"]:
-    """A view's distribution over `ids` at its own size (bilinear); the first id, -1, has what others leave.
-
-    LabelError for probabilities that are none.
-    """
-    given, probabilities = soft(row)
-    if probabilities.ndim != 3 or len(given) != len(probabilities):
-        raise LabelError(
-            f"soft labels of shape {probabilities.shape} for {len(given)} categories; give one plane for each"
-        )
-    if not (probabilities >= 0).all() or not np.isfinite(probabilities).all():
-        raise LabelError(f"soft labels of view {row} hold NaN, Inf or less than 0; give probabilities")
-    planes = np.zeros((len(ids), camera.height, camera.width), np.float32)
-    column_of = {int(label_id): column for column, label_id in enumerate(ids)}
-    for label_id, plane in zip(given.tolist(), probabilities, strict=True):
-        if column := column_of.get(label_id):  # neither unknown nor -1
-            planes[column] += _resized(plane, camera)
-    total = planes.sum(0)
-    planes /= np.maximum(total, 1)
-    planes[0] = np.maximum(1 - total, 0)
-    return planes
 
 
 def draw(
@@ -142,20 +106,18 @@ def refine(
     drawn: Float32[np.ndarray, "C H W"],
     ids: Int16[np.ndarray, " C"],
     options: FuseOptions,
-    own: Float32[np.ndarray, "C H W"] | None = None,
 ) -> Int16[np.ndarray, "H W"]:
     """A view's label image with the votes of all views (`drawn`, see `draw`) taken into account.
 
-    A product of experts: the category with the largest log p_view + weight * log p_fused wins. p_view is
-    `own` (see `soft_pixels`) or comes from the label. A pixel keeps its label where voters cover less than
+    A product of experts: the category with the largest log p_view + weight * log p_fused wins. p_view
+    comes from the label. A pixel keeps its label where voters cover less than
     `min_share` of it or where the winner has less than that of their votes. An unlabelled pixel prefers no
     category; no label is taken away.
     """
     covered = drawn.sum(0)
     fused = drawn / np.maximum(covered, 1e-6)
     tiny = 1 - options.confidence
-    if own is None:
-        own = np.where(label_ids == ids[:, None, None], options.confidence, tiny).astype(np.float32)
+    own = np.where(label_ids == ids[:, None, None], options.confidence, tiny).astype(np.float32)
     trust = np.where(thin_parts(label_ids), options.keep_thin, 1).astype(np.float32)
     trust[label_ids == UNLABELLED] = 0
     score = trust * np.log(np.maximum(own[1:], tiny / len(ids)))
@@ -185,7 +147,6 @@ def fuse(
     target: Path,
     *,
     views: Collection[int] | None = None,
-    soft: Soft | None = None,
     valid: ValidPixels = ALL_VALID,
     options: FuseOptions | None = None,
     antialiased: bool = False,
@@ -204,7 +165,6 @@ def fuse(
         masks: Label images to start from.
         target: Folder to write, in the format of `import_masks`.
         views: Rows of `Scene.views` that vote; None: the training views. All views are written.
-        soft: Class probabilities beside the hard labels.
         valid: The pixels that vote; the others get labels as unlabelled ones do.
         options: Weights and thresholds.
         antialiased: How the model was trained.
@@ -215,7 +175,7 @@ def fuse(
         The share of changed pixels in each view, and a record of the options.
 
     Raises:
-        LabelError: If `target` is the folder of `masks`, or `soft` holds no probabilities.
+        LabelError: If `target` is the folder of `masks`.
     """
     options = options or FuseOptions()
     voters: Collection[int] = scene.train_ids.tolist() if views is None else views
@@ -228,45 +188,18 @@ def fuse(
             on_view(done, total)
 
     g = gaussians.detach().to(device_of(backend))
-    votes = gather(g, scene, masks, voters, soft=soft, valid=valid, antialiased=antialiased, on_view=report)
+    votes = gather(g, scene, masks, voters, valid=valid, antialiased=antialiased, on_view=report)
     paths, workspace = prepare_folder(target, scene.views), Workspace()
     occurring: set[int] = set()
     changed: list[float] = []
     for row, (view, path) in enumerate(zip(scene.views, paths, strict=True)):
         before = masks[view]
         drawn = draw(g, view.camera, votes, antialiased=antialiased, backend=backend, workspace=workspace)
-        own = None if soft is None else soft_pixels(soft, row, view.camera, votes.ids)
-        after = refine(before, drawn, votes.ids, options, own)
+        after = refine(before, drawn, votes.ids, options)
         write_mask(path, after, masks.taxonomy)
         occurring.update(np.unique(after).tolist())
         changed.append(float((after != before).mean()))
         report(len(voters) + row + 1)
     write_labels(target, masks.taxonomy, occurring)
-    record = {**asdict(options), "soft": soft is not None, "changed": float(np.mean(changed))}
+    record = {**asdict(options), "changed": float(np.mean(changed))}
     return Fused(np.array(changed, np.float32), record)
-
-
-def _add_soft(
-    gaussians: Gaussians,
-    camera: Camera,
-    pixels: Float32[np.ndarray, "C H W"],
-    votes: Float32[np.ndarray, "N C"],
-    antialiased: bool,
-    workspace: Workspace,
-) -> None:
-    """Add blending weight times distribution over a view's pixels: the gradient of a drawing of features."""
-    device = gaussians.means.device
-    weights = torch.from_numpy(np.ascontiguousarray(np.moveaxis(pixels, 0, 2))).to(device)
-    with torch.enable_grad():
-        features = torch.zeros(votes.shape, device=device, requires_grad=True)
-        render = rasterize(
-            gaussians, camera, sh_degree=0, features=features, antialiased=antialiased, workspace=workspace
-        )
-        assert render.features is not None
-        (gradient,) = torch.autograd.grad(render.features, features, weights)
-    votes += gradient.cpu().numpy()
-
-
-def _resized(plane: Float32[np.ndarray, "h w"], camera: Camera) -> Float32[np.ndarray, "H W"]:
-    image = Image.fromarray(np.ascontiguousarray(plane, np.float32))
-    return np.asarray(image.resize((camera.width, camera.height), Image.Resampling.BILINEAR))

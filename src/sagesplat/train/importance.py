@@ -14,7 +14,7 @@ from sagesplat.raster import Workspace, add_weights, each_view, rasterize
 from sagesplat.scene.scene import Scene
 from sagesplat.segment.valid import ALL_VALID, ValidPixels
 
-Criterion = Literal["weight", "weight-volume", "peak", "sensitivity", "opacity"]
+Criterion = Literal["weight", "weight-volume", "sensitivity"]
 _VOLUME_POWER, _LARGE = 0.1, 0.9  # LightGaussian's exponent, and the quantile at which its volumes are cut
 
 
@@ -33,13 +33,10 @@ def importance(
     Only pixels that are `valid` count.
 
     weight: blending weight (alpha times transmittance) summed over all pixels; weight-volume: times the
-    volume to the power 0.1, as LightGaussian (arXiv:2311.17245, eq. 3); peak: the largest sum of one view;
-    sensitivity: squared change of the pictures when it fades, to first order: the squared gradients of
-    pictures seen through random signs (Hutchinson's estimate of the diagonal of Fisher's information);
-    opacity: its opacity, whatever is in front of it.
+    volume to the power 0.1, as LightGaussian (arXiv:2311.17245, eq. 3); sensitivity: squared change
+    of the pictures when it fades, to first order: the squared gradients of pictures seen through random signs
+    (Hutchinson's estimate of the diagonal of Fisher's information).
     """
-    if criterion == "opacity":
-        return torch.sigmoid(g.logit_opacities.detach()).cpu().numpy()
     if criterion == "sensitivity":
         return _sensitivity(g, scene, views, valid, antialiased, seed)
     total, workspace = np.zeros(len(g), np.float32), Workspace()
@@ -50,7 +47,7 @@ def importance(
         if counts is not None:
             columns[~counts] = -1
         add_weights(g, camera, columns, weights, antialiased=antialiased, workspace=workspace)
-        total = np.maximum(total, weights[:, 0]) if criterion == "peak" else total + weights[:, 0]
+        total += weights[:, 0]
     if criterion == "weight-volume" and len(g):
         volumes = torch.exp(g.log_scales.detach().sum(1)).cpu().numpy()
         total *= np.clip(volumes / np.quantile(volumes, _LARGE), 0, 1) ** _VOLUME_POWER

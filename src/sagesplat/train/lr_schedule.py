@@ -12,9 +12,18 @@ from jaxtyping import Bool, UInt8
 from PIL import Image
 
 from sagesplat.core.config import TrainConfig
-from sagesplat.core.gaussians import PARAMETERS
 from sagesplat.scene.scene import Camera
 
+# Adam's learning rates of 3DGS (Kerbl et al. 2023); that of the means is times the scene extent.
+PUBLISHED_RATES = {
+    "means": 1.6e-4,
+    "quats": 1e-3,
+    "log_scales": 5e-3,
+    "logit_opacities": 5e-2,
+    "sh0": 2.5e-3,
+    "shN": 1.25e-4,
+}
+SGLD_NOISE = 5e5  # of 3DGS-MCMC (Kheradmand et al. 2024), times the learning rate of the means
 # Of the fast schedule: multiplier of the published learning rates at the start, and the share of the run from
 # which on those of all but the means shrink. A run of `_SHORT` steps or fewer has to learn to its end: rates
 # shrink to `_SHORT_SHRINK_TO` (means: their own), in longer runs less and less, down to the other pair.
@@ -37,7 +46,7 @@ class LrSchedule:
     def learning_rates(self, step: int) -> dict[str, float]:
         """Adam's learning rate at a step, by parameter name."""
         config, share = self.config, step / self.config.max_steps
-        learning_rates = {name: getattr(config, f"{name}_lr") for name in PARAMETERS}
+        learning_rates = dict(PUBLISHED_RATES)
         if config.lr_schedule == "published":
             learning_rates["means"] *= self.extent * _MEANS_SHRINK_TO**share
             return learning_rates
@@ -50,12 +59,12 @@ class LrSchedule:
         return {name: rate * (_GAIN if name == "means" else gain) for name, rate in learning_rates.items()}
 
     def sgld_noise(self, step: int) -> float:
-        """MCMC's noise at a step, in 1 / world units: the published rate of the means times `mcmc_noise`, as
-        if the scene were scaled to an extent of 1.
+        """MCMC's noise at a step, in 1 / world units: the published rate of the means times `SGLD_NOISE`,
+        as if the scene were scaled to an extent of 1.
         """
         return (
-            self.config.mcmc_noise
-            * self.config.means_lr
+            SGLD_NOISE
+            * PUBLISHED_RATES["means"]
             * _MEANS_SHRINK_TO ** (step / self.config.max_steps)
             / self.extent
         )

@@ -12,15 +12,16 @@ import torch
 from numba import prange
 from torch import Tensor
 
-from sagesplat.core.config import TrainConfig
 from sagesplat.core.gaussians import PARAMETERS
 from sagesplat.kernels.jit import njit
 from sagesplat.raster.reference import rotation_matrices
 from sagesplat.train import densify
+from sagesplat.train.densify import PRUNE_OPACITY
 from sagesplat.train.state import TrainState
 
 REFINE_STOP = 25_000  # step of 30,000 at which refinement ends, as published
 MOST = 51  # Gaussians that may share a place; larger counts are treated as 51
+OPACITY_WEIGHT, SCALE_WEIGHT = 0.01, 0.01  # of the mean opacity and scale in the loss, as published
 _GROWTH = 0.05  # of the present count, at each refinement, as published
 _GROWN_BY = 0.5  # share of the refinements after which even a short run has reached its cap
 _SHARPNESS, _FAINT = 100.0, 0.005  # k and 1 - t of equation 8: the noise fades around this opacity
@@ -48,16 +49,16 @@ def shares(logits: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
     return opacity.log() - spared, logits.double().sigmoid().log() - line.log()
 
 
-def relocate(state: TrainState, config: TrainConfig, trainable: Tensor) -> int:
-    """Move dead Gaussians, opacity at most `prune_opacity`, onto living ones; returns how many.
+def relocate(state: TrainState, trainable: Tensor) -> int:
+    """Move dead Gaussians, opacity at most `PRUNE_OPACITY`, onto living ones; returns how many.
 
     Hosts are drawn by opacity. A relocated Gaussian copies its host, label included, and the
     moments of both are reset. Rows that are not `trainable` (bool [N]) are neither moved nor hosts: a stopped
     category keeps its dead ones. Without a living Gaussian nothing moves. Changes tensors in place.
     """
-    alive = state.gaussians.logit_opacities.sigmoid() > config.prune_opacity
+    alive = state.gaussians.logit_opacities.sigmoid() > PRUNE_OPACITY
     dead = (trainable & ~alive).nonzero().squeeze(1)
-    hosts = _land(state, config, trainable & alive, len(dead))
+    hosts = _land(state, trainable & alive, len(dead))
     if len(hosts):
         labels = state.gaussians.label_ids
         labels[dead] = labels[hosts]
@@ -73,7 +74,7 @@ def growth(most: int, num_points: int, refinements: int) -> float:
     return max(_GROWTH, (most / max(num_points, 1)) ** (1 / max(1.0, _GROWN_BY * refinements)) - 1)
 
 
-def add(state: TrainState, config: TrainConfig, most: int, trainable: Tensor, growth: float = _GROWTH) -> int:
+def add(state: TrainState, most: int, trainable: Tensor, growth: float = _GROWTH) -> int:
     """Add a share of the present count, never beyond `most` in all, in places drawn by opacity; returns how
     many.
 
@@ -81,17 +82,17 @@ def add(state: TrainState, config: TrainConfig, most: int, trainable: Tensor, gr
     `trainable` (bool [N]) must be made anew.
     """
     n = len(state.gaussians)
-    living = trainable & (state.gaussians.logit_opacities.sigmoid() > config.prune_opacity)
+    living = trainable & (state.gaussians.logit_opacities.sigmoid() > PRUNE_OPACITY)
     # withheld places count as taken, so they are no part of this growth
     room = densify.room(state, min(most, n + state.withheld + math.ceil(growth * n)), trainable)
-    hosts = _land(state, config, living, room)
+    hosts = _land(state, living, room)
     if len(hosts):
         keep = torch.ones(n, dtype=torch.bool, device=hosts.device)
         state.replace_rows(keep, state.gaussians.select(hosts))
     return len(hosts)
 
 
-def _land(state: TrainState, config: TrainConfig, living: Tensor, count: int) -> Tensor:
+def _land(state: TrainState, living: Tensor, count: int) -> Tensor:
     """Hosts [count] of as many Gaussians, already with the opacity and scales of their share."""
     g, rows = state.gaussians, living.nonzero().squeeze(1)
     if not count or not len(rows):
@@ -102,7 +103,7 @@ def _land(state: TrainState, config: TrainConfig, living: Tensor, count: int) ->
     hosts = rows[drawn.clamp_max(len(rows) - 1).to(rows.device)]
     places, landed = hosts.unique(return_counts=True)
     logits, log_factors = shares(g.logit_opacities[places], 1 + landed)
-    lowest = float(torch.logit(torch.tensor(config.prune_opacity)))  # a share no fainter, as in gsplat
+    lowest = float(torch.logit(torch.tensor(PRUNE_OPACITY)))  # a share no fainter, as in gsplat
     g.logit_opacities[places] = logits.clamp_min(lowest).float()
     g.log_scales[places] += log_factors[:, None].float()
     for name in PARAMETERS:
@@ -114,7 +115,7 @@ def _land(state: TrainState, config: TrainConfig, living: Tensor, count: int) ->
 def perturb(state: TrainState, rate: float, trainable: Tensor) -> None:
     """Add SGLD noise (equation 8): mean += rate * sigmoid(100 (0.005 - opacity)) * covariance @ normal.
 
-    `rate` is the step's learning rate of the means times `mcmc_noise`, in 1 / world units, since a covariance
+    `rate` is the step's learning rate of the means times `SGLD_NOISE`, in 1 / world units, since a covariance
     is in square ones. Only rows that are `trainable` (bool [N]) move. Draws one number from `state.rng`; on a
     CPU the result does not depend on the number of threads. Changes the means in place.
     """
@@ -202,7 +203,7 @@ def add_regularisation_gradients(
 
     `grads` are the loss's gradients by parameter name, changed in place. The means are over all N Gaussians
     and their 3 N scales in world units, but only rows that are `trainable` (bool [N]) get a gradient.
-    `opacity` is `mcmc_opacity`, `scale` is `mcmc_scale` (in 1 / world units).
+    `scale` is in 1 / world units.
     """
     g = state.gaussians
     o, pull = g.logit_opacities.sigmoid(), trainable / max(1, len(g))

@@ -14,6 +14,7 @@ from sagesplat.core.config import NestConfig, TrainConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import Gaussians, concat
 from sagesplat.core.second_opacity import weight_at
+from sagesplat.formats.spz import SH_BITS
 from sagesplat.kernels.jit import njit
 from sagesplat.raster import Backend, device_of
 from sagesplat.scene.images import Photos
@@ -32,7 +33,10 @@ from sagesplat.train.stepper import Stepper
 from sagesplat.train.trainer import LOOK_EVERY, finite, named_failures, train
 from sagesplat.train.votes import label_weights, winners
 
-_SHRINK_TO = 0.05  # of the learning rates, at the end
+# docs/developers/nested.md compares these
+_LR_MULTIPLIER, _SHRINK_TO = 4.0, 0.05  # of 3DGS's late learning rates: at first, and what is left of it
+_DRAWN_FROM = 0.03  # smallest prefix that a step draws; less favours categories that are easy to represent
+_FULL_SHARE_END = 0.9  # of the last steps draw the full model
 _SAVE_EVERY = 500
 _AVERAGE_EVERY = 5
 _NEARLY_FULL, _NEARLY_FROM = 0.2, 0.4  # share of the full steps that draw less, and the least prefix of these
@@ -83,7 +87,6 @@ def order(
     g: Gaussians,
     scene: Scene,
     masks: Masks,
-    config: NestConfig,
     *,
     base: Gaussians | None = None,
     valid: ValidPixels = ALL_VALID,
@@ -97,11 +100,11 @@ def order(
     one. Gaussians on the `shell`, and no others, are of the sky.
     """
     views = scene.train_ids.tolist()
-    importances = importance(g, scene, views, config.criterion, valid=valid, antialiased=antialiased)
+    importances = importance(g, scene, views, "sensitivity", valid=valid, antialiased=antialiased)
     of_base = np.zeros(len(g), bool)
     if base is not None and len(base):
         kept = np.sort(np.argsort(-importances, kind="stable")[: max(len(g) - len(base), 0)])
-        own = importance(base, scene, views, config.criterion, valid=valid, antialiased=antialiased)
+        own = importance(base, scene, views, "sensitivity", valid=valid, antialiased=antialiased)
         g = concat([base, g.select(torch.from_numpy(kept))])
         importances = np.concatenate([own, importances[kept]])
         of_base = np.arange(len(g)) < len(base)
@@ -141,11 +144,9 @@ def capped_config(config: TrainConfig, cap: int, steps: int) -> TrainConfig:
     Without its regularisers: in trainings of a few thousand steps they cost 0.2 to 1 dB
     (docs/developers/far.md).
     """
-    mcmc = replace(config, strategy="mcmc", max_gaussians=cap, max_steps=steps, level_every=steps)
-    mcmc = replace(mcmc, mcmc_opacity=0.0, mcmc_scale=0.0)
-    return replace(
-        mcmc, freeze_at=None, gradient_freeze_share=0.0, poses=False, exposure="off", outliers=False
-    )
+    mcmc = replace(config, strategy="mcmc", mcmc_regularise=False, max_gaussians=cap)
+    mcmc = replace(mcmc, max_steps=steps, level_every=steps)
+    return replace(mcmc, freeze_at=None, poses=False, exposure="off", outliers=False)
 
 
 def train_capped(
@@ -193,21 +194,20 @@ def nest(
 ) -> Iterator[NestStep | Resumed | Nested]:
     """Train a nested ladder: afterwards every composition of prefixes renders well.
 
-    Each step draws a prefix of every category, log-uniform between `config.drawn_from` and 1, or the full
-    model (with a probability that rises from `config.full_share` to `config.full_share_end`; a fifth of these
-    steps draw prefixes between 40 and 100 %), and compares the composition with a photo. Values are rounded
-    as the increments will hold them. The result is the mean of the last steps' values (at most 500 steps, or
-    a fifth): prefixes pull in different directions to the end. Gaussians outside the composition, and their
-    Adam moments, stay as they are. With `config.two_opacities` each category is drawn with the opacities that
-    its prefix has, between the first and the second ones. At five steps all Gaussians are sorted again by
-    importance: in each category the base model stays first.
+    Each step draws a prefix of every category, log-uniform between 3 % and all of it, or the full model (with
+    a probability that rises from `config.full_share` to 0.9; a fifth of these steps draw prefixes between 40
+    and 100 %), and compares the composition with a photo. Values are rounded as the increments will hold
+    them. The result is the mean of the last steps' values (at most 500 steps, or a fifth): prefixes pull in
+    different directions to the end. Gaussians outside the composition, and their Adam moments, stay as they
+    are. Prefixes are drawn with the opacities that they have, between the first and the second ones. At five
+    steps all Gaussians are sorted again by importance: in each category the base model stays first.
 
     Args:
         nested: The ordered model to start from (`order`).
         scene: The capture; `scene.train_ids` are used.
         photos: Its photos.
         train_config: Settings of the training that made the model.
-        config: Steps, levels and learning-rate multiplier of this one.
+        config: Steps, levels and the loss of this one.
         valid: The pixels that count; nothing is learnt from the others.
         seed: Of all random numbers.
         backend: Rasteriser; decides the device.
@@ -229,7 +229,7 @@ def nest(
     labels, of_base = nested.gaussians.label_ids.numpy()[near], nested.of_base[near]
     state = initial_state(nested.gaussians.select(torch.from_numpy(near)), seed)
     state.order_share = torch.from_numpy(spans.order[near]) if spans else order_shares(labels, of_base, -near)
-    if config.two_opacities and spans is None:
+    if spans is None:
         given = nested.second_opacities
         state.add_second_opacities(None if given is None else given[torch.from_numpy(near)])
     if checkpoint and checkpoint.exists():
@@ -247,7 +247,7 @@ def nest(
         edges = torch.from_numpy(np.stack([spans.first, spans.last])[:, near]).to(device)
     stepper = Stepper(
         PhotoLoader(scene, photos, device, valid), replace(train_config, batch=1), ActiveTiles(scene, None),
-        backend, sh_bits=config.sh_bits, rate_weight=config.rate_weight, shell=shell,
+        backend, sh_bits=SH_BITS, rate_weight=config.rate_weight, shell=shell,
         sky=shell.holds(state.gaussians.means) if shell else None,
     )  # fmt: skip
     rates = learning_rates(train_config, config, scene)
@@ -259,8 +259,8 @@ def nest(
         while state.step < config.steps:
             if state.step in sort_at:
                 importances = importance(
-                    state.gaussians, scene, _sorting(views, sort_at.index(state.step)), config.criterion,
-                    valid=valid, antialiased=train_config.antialiased,
+                    state.gaussians, scene, _sorting(views, sort_at.index(state.step)),
+                    "sensitivity", valid=valid, antialiased=train_config.antialiased,
                 )  # fmt: skip
                 state.order_share = order_shares(labels, of_base, importances).to(device)
             if edges is None:
@@ -378,12 +378,12 @@ def draw_shares(
     rng: np.random.Generator, num_labels: int, config: NestConfig, done: float
 ) -> Float32[np.ndarray, " L"]:
     """Prefix of each category that a step renders, as a share of it; `done`: share of the steps taken."""
-    full = config.full_share + (config.full_share_end - config.full_share) * done
+    full = config.full_share + (_FULL_SHARE_END - config.full_share) * done
     if rng.random() < full:
         if rng.random() < _NEARLY_FULL:  # else levels of more than a half are hardly trained in the end
             return rng.uniform(_NEARLY_FROM, 1, num_labels).astype(np.float32)
         return np.ones(num_labels, np.float32)
-    return np.exp(rng.uniform(np.log(config.drawn_from), 0, num_labels)).astype(np.float32)
+    return np.exp(rng.uniform(np.log(_DRAWN_FROM), 0, num_labels)).astype(np.float32)
 
 
 def learning_rates(
@@ -395,7 +395,7 @@ def learning_rates(
     ).learning_rates(2)
 
     def rates(step: int) -> Mapping[str, float]:
-        multiplier = config.lr_multiplier * _SHRINK_TO ** (step / config.steps)
+        multiplier = _LR_MULTIPLIER * _SHRINK_TO ** (step / config.steps)
         return {name: multiplier * rate for name, rate in third.items()}
 
     return rates
@@ -407,14 +407,10 @@ def check(config: NestConfig) -> None:
         ("levels", config.levels, 1 <= config.levels <= 64, "1 to 64"),
         ("steps", config.steps, config.steps >= 0, "0 or more"),
         ("smallest", config.smallest, 0 < config.smallest <= 1, "a share such as 0.01"),
-        ("drawn-from", config.drawn_from, 0 < config.drawn_from <= 1, "a share such as 0.05"),
         ("full-share", config.full_share, 0 <= config.full_share <= 1, "a share such as 0.1"),
-        ("full-share-end", config.full_share_end, 0 <= config.full_share_end <= 1, "a share such as 0.9"),
-        ("sh-bits", config.sh_bits, all(1 <= b <= 8 for b in config.sh_bits), "1 to 8, such as 5 4"),
         ("rate-weight", config.rate_weight, config.rate_weight >= 0, "a number such as 0.0006, or 0"),
         ("base-share", config.base_share, 0 <= config.base_share < 1, "a share such as 0.1, or 0"),
         ("base-steps", config.base_steps, config.base_steps >= 1, "1 or more"),
-        ("lr-multiplier", config.lr_multiplier, config.lr_multiplier > 0, "a number such as 4"),
     )
     for name, value, fine, cure in wrong:
         if not fine:

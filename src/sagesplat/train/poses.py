@@ -227,7 +227,7 @@ def fit_pose(
                 gaussians, replace(small, w2c=moved(small.w2c, axes @ at)),
                 antialiased=config.antialiased, pose=pose, workspace=workspace, backend=backend,
             )  # fmt: skip
-            value = photometric_loss(render.rgb, target, config.ssim_weight, None, workspace, counts)
+            value = photometric_loss(render.rgb, target, workspace=workspace, valid=counts)
             value.backward()
             assert pose.grad is not None
             return float(value.detach()), axes.T @ pose.grad.cpu().numpy().astype(np.float64)

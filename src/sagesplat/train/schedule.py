@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from sagesplat.core.config import TrainConfig
 
 _REFERENCE_STEPS = 30_000
+# Steps between two opacity resets, and between two increases of the SH degree (Kerbl et al. 2023).
+RESET_EVERY, RAISE_SH_EVERY = 3000, 1000
 _MIN_REFINEMENTS, _LATEST_STOP = 8, 0.7  # refinements of a short fast run; share of the run
 _MIN_RESET_INTERVAL = 1500  # steps that a model needs between two resets, however short the run
 
@@ -33,7 +35,7 @@ def scaled_schedule(config: TrainConfig, refine_stop: int) -> Schedule:
     def scaled(step: int) -> int:
         return max(1, round(step * share))
 
-    reset_every = max(scaled(config.reset_every), min(config.reset_every, _MIN_RESET_INTERVAL))
+    reset_every = max(scaled(RESET_EVERY), _MIN_RESET_INTERVAL)
     start, stop = min(config.refine_start, config.max_steps // 5), scaled(refine_stop)
     if config.lr_schedule == "fast":  # short runs need time to grow too
         enough = start + _MIN_REFINEMENTS * config.refine_every
@@ -43,6 +45,6 @@ def scaled_schedule(config: TrainConfig, refine_stop: int) -> Schedule:
         refine_start=start,
         refine_stop=stop,
         reset_every=reset_every,
-        raise_sh_every=scaled(config.raise_sh_every),
+        raise_sh_every=scaled(RAISE_SH_EVERY),
         recovery=min(1000, reset_every // 2),
     )

@@ -4,14 +4,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float32
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from sagesplat.core import geometry
 from sagesplat.core.gaussians import PARAMETERS, Gaussians, concat
 from sagesplat.core.sh import num_bases, rgb_to_sh0
-from sagesplat.scene.scene import Points, Scene
+from sagesplat.scene.scene import Points
 from sagesplat.segment.lift import IGNORED
 from sagesplat.train.view_parameters import ViewParameters
 
@@ -93,19 +91,15 @@ def from_points(
     sh_degree: int,
     opacity: float = INITIAL_OPACITY,
     scale: float = 1.0,
-    largest: Float32[np.ndarray, " P"] | None = None,
 ) -> Gaussians:
     """Gaussians at the SfM points: isotropic, scale `scale` times the mean distance to three neighbours.
 
-    With `largest` at most so large. There is none at the points labelled `IGNORED`, which show what does not
-    belong to the scene.
+    There is none at the points labelled `IGNORED`, which show what does not belong to the scene.
     """
     kept = label_ids != IGNORED
     xyz, label_ids = points.xyz[kept], label_ids[kept]
     n = len(xyz)
     scales = scale * geometry.mean_neighbour_distance(xyz)
-    if largest is not None:
-        scales = np.minimum(scales, largest[kept])
     quats = torch.zeros(n, 4)
     quats[:, 0] = 1
     rgb = torch.from_numpy(points.rgb[kept].astype(np.float32) / 255)
@@ -118,17 +112,6 @@ def from_points(
         shN=torch.zeros(n, num_bases(sh_degree) - 1, 3),
         label_ids=torch.from_numpy(label_ids.astype(np.int16)),
     )
-
-
-def largest_scales(scene: Scene, angle: float) -> Float32[np.ndarray, " P"]:
-    """The scale at each SfM point, world units, that the nearest training camera sees at an angle (radians).
-
-    As a limit of initial scales: a point far from its neighbours begins as a Gaussian that covers much of the
-    image, costs most of a step and is slow to shrink.
-    """
-    cameras = np.stack([scene.views[row].camera.position for row in scene.train_ids])
-    distances, _ = KDTree(cameras).query(scene.points.xyz)
-    return np.maximum(angle * distances, 1e-7).astype(np.float32)
 
 
 def initial_state(gaussians: Gaussians, seed: int) -> TrainState:

@@ -19,7 +19,6 @@ from sagesplat.segment.valid import ALL_VALID, ValidPixels
 from sagesplat.train import optim, rate
 from sagesplat.train.early_stopping import ActiveTiles, trainable_rows
 from sagesplat.train.exposure import transform
-from sagesplat.train.gradient_freezing import GradientFreezing
 from sagesplat.train.group import ALONE, Group
 from sagesplat.train.lr_schedule import LrSchedule
 from sagesplat.train.outliers import OutlierSchedule, inliers
@@ -43,7 +42,6 @@ class Stepper:
     backend: Backend = "auto"
     group: Group = ALONE
     strategy: Strategy = field(default_factory=Strategy)  # without one the set of Gaussians is fixed
-    gradient_freezing: GradientFreezing | None = None
     sh_bits: tuple[int, int] | None = None  # render Gaussians rounded as SPZ files will store them
     rate_weight: float = 0.0  # loss per bit that the harmonics of a Gaussian take, rounded so
     view_updates: Mapping[str, ViewUpdate] = field(default_factory=dict)  # of `TrainState.per_view`
@@ -111,8 +109,6 @@ class Stepper:
             grads = {name: grad / batch for name, grad in grads.items()}
         if self.sh_bits and self.rate_weight:
             rate.add_gradient(grads["shN"], state.gaussians.shN, self.sh_bits, self.rate_weight, drawn_rows)
-        if self.gradient_freezing:
-            self.gradient_freezing.watch(grads)
         state.step += 1
         self.strategy.step_pre_update(state, grads, trainable)
         scaled = {name: rate * math.sqrt(batch) for name, rate in learning_rates.items()}
@@ -180,8 +176,7 @@ class Stepper:
             sh_degree=degree,
             antialiased=self.config.antialiased,
             tile_mask=tiles,
-            trainable=trainable if self.active_tiles.frozen or self.gradient_freezing else None,
-            absgrad=self.config.absgrad,
+            trainable=trainable if self.active_tiles.frozen else None,
             pose=pose,
             workspace=self.workspace,
             backend=self.backend,
@@ -190,7 +185,7 @@ class Stepper:
         valid = self.photo_loader.valid(view, factor)
         if self.outliers is not None and self.outliers(step):
             valid = inliers(rgb, photo, valid, tiles)
-        loss = photometric_loss(rgb, photo, self.config.ssim_weight, tiles, self.workspace, valid)
+        loss = photometric_loss(rgb, photo, tile_mask=tiles, workspace=self.workspace, valid=valid)
         return loss, render
 
     def _next_view(self, state: TrainState) -> int:

@@ -126,7 +126,7 @@ class DefaultStrategy(Densification):
         if self.resets(state.step):
             trainable = trainable_rows(state.gaussians, state.frozen)
             # nothing on the shell stands before anything, and what no photo shows would never come back
-            densify.reset_opacities(state, self.config, self._near(state, trainable))
+            densify.reset_opacities(state, self._near(state, trainable))
         return refined
 
     def resets(self, step: int) -> bool:
@@ -148,21 +148,22 @@ class McmcStrategy(Densification):
 
     def step_pre_update(self, state: TrainState, grads: dict[str, Tensor], trainable: Tensor) -> None:
         """Add the gradients of the regularisation of opacities and scales."""
-        opacity, scale = self.config.mcmc_opacity, self.config.mcmc_scale / self.scene.extent
-        mcmc.add_regularisation_gradients(state, grads, opacity, scale, self._near(state, trainable))
+        if self.config.mcmc_regularise:
+            near = self._near(state, trainable)
+            scale = mcmc.SCALE_WEIGHT / self.scene.extent
+            mcmc.add_regularisation_gradients(state, grads, mcmc.OPACITY_WEIGHT, scale, near)
 
     def step_post_update(self, state: TrainState, trainable: Tensor) -> None:
         """Add SGLD noise to the means."""
-        if noise := self.rates.sgld_noise(state.step):
-            mcmc.perturb(state, noise, self._near(state, trainable))
+        mcmc.perturb(state, self.rates.sgld_noise(state.step), self._near(state, trainable))
 
     def refine(self, state: TrainState, trainable: Tensor) -> None:
         """Relocate dead Gaussians, then add new ones up to the cap."""
         most = densify.cap(self.config, self.num_pixels, self.num_points)
         refinements = (self.schedule.refine_stop - self.schedule.refine_start) // self.config.refine_every
-        mcmc.relocate(state, self.config, trainable)
+        mcmc.relocate(state, trainable)
         growth = mcmc.growth(most, self.num_points, refinements)
-        mcmc.add(state, self.config, most, trainable, growth)
+        mcmc.add(state, most, trainable, growth)
 
 
 STRATEGIES: dict[str, type[Densification]] = {"default": DefaultStrategy, "mcmc": McmcStrategy}

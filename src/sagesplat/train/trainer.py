@@ -26,14 +26,13 @@ from sagesplat.train.checkpoint import latest_checkpoint, previous, write_checkp
 from sagesplat.train.early_stopping import ActiveTiles, label_quality, measured_views, trainable_rows
 from sagesplat.train.events import Event, Found, LabelFrozen, LevelSaved, Resumed, Step, Trained
 from sagesplat.train.exposure import ExposureUpdate, exposure_update
-from sagesplat.train.gradient_freezing import GradientFreezing
 from sagesplat.train.group import ALONE, Group
 from sagesplat.train.lr_schedule import LrSchedule, lr_schedule
 from sagesplat.train.outliers import OutlierSchedule
 from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.poses import pose_update
 from sagesplat.train.sky import Shell
-from sagesplat.train.state import TrainState, from_points, initial_state, largest_scales
+from sagesplat.train.state import TrainState, from_points, initial_state
 from sagesplat.train.stepper import Stepper
 from sagesplat.train.strategy import Densification, make_strategy
 from sagesplat.train.view_parameters import ViewParameters, ViewUpdate
@@ -154,7 +153,6 @@ class Training:
     strategy: Densification
     rates: LrSchedule
     measured: dict[int, list[int]]  # rows of the views on which each category is measured, for early stopping
-    gradient_freezing: GradientFreezing | None
     folder: Path | None  # None: this process writes nothing
     settings: str
     resumed: Resumed | None
@@ -163,7 +161,6 @@ class Training:
 
     def __post_init__(self) -> None:
         self.trainable = trainable_rows(self.state.gaussians, self.state.frozen)
-        self.active = self.trainable  # of those, the ones whose gradients are not frozen
         self.unfinished = bool(self.trainable.any())
         self._saved = self.state.step
 
@@ -184,7 +181,7 @@ class Training:
         """One optimiser step."""
         step = self.state.step + 1
         loss = self.stepper(
-            self.state, self._sh_degree(step - 1), self.rates.learning_rates(step), self.active,
+            self.state, self._sh_degree(step - 1), self.rates.learning_rates(step), self.trainable,
             self.rates.factor(step),
         )  # fmt: skip
         on_cpu = not loss.is_cuda
@@ -193,20 +190,15 @@ class Training:
         return Step(step, self.loss, len(self.state.gaussians), self.stepper.drawn)
 
     def _after_step(self) -> Iterator[Event]:
-        """Record a level, stop categories, densify, freeze by gradients, and save a checkpoint, as is due."""
+        """Record a level, stop categories, densify, and save a checkpoint, as is due."""
         step = self.state.step
         records = self._records(step)
-        late = self.config.levels_after_reset and self.strategy.resets(step)
-        if records and not late:
+        if records:
             yield self._save_level()
         if records and self.config.freeze_at is not None:
             yield from self._stop_categories(self.config.freeze_at)
         if self.strategy.step_post(self.state):
             self._update_trainable()
-        if self.gradient_freezing and step % self.config.refine_every == 0:
-            self.active = self.gradient_freezing.turn(self.trainable)
-        if records and late:
-            yield self._save_level()
         if records:
             self.stepper.group.collect(self.state.grad_sum, self.state.grad_count)
             self._save_checkpoint()
@@ -220,7 +212,7 @@ class Training:
         return min(self.config.sh_degree, step // self.strategy.schedule.raise_sh_every)
 
     def _update_trainable(self) -> None:
-        self.active = self.trainable = trainable_rows(self.state.gaussians, self.state.frozen)
+        self.trainable = trainable_rows(self.state.gaussians, self.state.frozen)
 
     def _save_level(self) -> LevelSaved:
         state, path = self.state, None
@@ -261,14 +253,6 @@ class Training:
         self.unfinished = bool(self.trainable.any())
 
 
-def _largest_scales(scene: Scene, angle: float, shell: Shell | None) -> np.ndarray:
-    """As `largest_scales`, without a limit for the points of the sky: they lie as far apart as wanted."""
-    largest = largest_scales(scene, angle)
-    if shell:
-        largest[shell.holds(torch.from_numpy(scene.points.xyz)).numpy()] = np.inf
-    return largest
-
-
 def begin(
     scene: Scene,
     photos: Photos,
@@ -294,7 +278,6 @@ def begin(
     strategy = make_strategy(config, scene, rates, group, shell)
     g = start or from_points(
         scene.points, label_ids, config.sh_degree, strategy.initial_opacity, strategy.initial_scale,
-        _largest_scales(scene, config.initial_angle, shell) if config.initial_angle else None,
     )  # fmt: skip
     batched = replace(config, batch=max(config.batch, group.size))
     updates, found = view_updates(scene, photos, batched)
@@ -312,19 +295,15 @@ def begin(
             _check_levels(folder / CHECKPOINT, state.step)
         else:
             state.clear_statistics()  # the first process has those of all
-    share = config.gradient_freeze_share
-    freezing = GradientFreezing(share) if share else None
     tiles = ActiveTiles(scene, masks, frozenset(state.frozen), device, valid)
     outliers = OutlierSchedule.of(config.max_steps, batched.batch, len(scene.train_ids))
     stepper = Stepper(
-        PhotoLoader(scene, photos, device, valid), config, tiles, backend, group, strategy, freezing,
+        PhotoLoader(scene, photos, device, valid), config, tiles, backend, group, strategy,
         view_updates=updates, outliers=outliers if config.outliers else None, shell=shell,
     )  # fmt: skip
     measured = measured_views(scene, masks) if config.freeze_at is not None and masks is not None else {}
     folder = folder if group.leads else None
-    return Training(
-        config, state, stepper, strategy, rates, measured, freezing, folder, settings, resumed, found
-    )
+    return Training(config, state, stepper, strategy, rates, measured, folder, settings, resumed, found)
 
 
 def view_updates(
@@ -375,18 +354,8 @@ def _check(config: TrainConfig, masks: Masks | None) -> None:
             raise RunError(
                 f"--train.{name.replace('_', '-')} {value} is impossible; choose {low} to {high:,}"
             )
-    if not 0 <= config.initial_angle <= 3:
-        raise RunError(
-            f"--train.initial-angle {config.initial_angle} is impossible; choose an angle in radians, such "
-            "as 0.015, or 0 for no limit"
-        )
     target = config.freeze_at
     if target is not None and not 0 < target <= 1:
         raise RunError(f"--train.freeze-at {target} is no SSIM to reach; choose a number such as 0.8")
-    if not 0 <= config.gradient_freeze_share < 1:
-        raise RunError(
-            f"--train.gradient-freeze-share {config.gradient_freeze_share} is impossible; "
-            "choose a share below 1, such as 0.5"
-        )
     if target is not None and masks is None:
         raise RunError("--train.freeze-at needs label images to measure categories on; bring masks")

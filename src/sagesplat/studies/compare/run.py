@@ -11,15 +11,14 @@ from typing import Any
 import numpy as np
 
 from sagesplat.adapt.allocate import along
-from sagesplat.adapt.observe import TOTAL, as_unit, measure, measure_total, render_rgb
+from sagesplat.adapt.observe import MIN_SHARE, TOTAL, as_unit, measure, measure_total, render_rgb
 from sagesplat.adapt.plan import Plan, check_target
-from sagesplat.core.config import CompareConfig, FitConfig, PlanConfig
+from sagesplat.core.config import CompareConfig, PlanConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Progress, RunDone, TableMade
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.increments import INDEX, read_increments, read_index, shown, write_increments
 from sagesplat.formats.levels import read_level, write_set
-from sagesplat.formats.spz import SH_BITS
 from sagesplat.formats.stream_increments import write_streams
 from sagesplat.io.files import write_text
 from sagesplat.metrics.color_correct import color_correct_affine
@@ -40,7 +39,7 @@ from sagesplat.stages.nest import train_capped
 from sagesplat.stages.observe import observe_levels
 from sagesplat.stages.plan import PAPER_TARGETS, ssim_target, ssim_targets
 from sagesplat.stages.results import increments_of
-from sagesplat.stages.shared import inlier_inputs, label_images, train_config
+from sagesplat.stages.shared import inlier_inputs, train_config
 from sagesplat.studies.compare.report import (
     CONSOLE,
     FILE,
@@ -107,7 +106,7 @@ def compare(job: Job, config: CompareConfig, copy: Path | None = None) -> list[P
             *prefixes(nested),
             *_planned(nested, config),
         ]
-        points = measure_sets(job, contenders, load_metrics(job, config.lpips), job.fit_config)
+        points = measure_sets(job, contenders, load_metrics(job, config.lpips))
         walks = _walks(nested, sage)
         (folder / PAGE).unlink(missing_ok=True)  # it shows what was measured before
         write_comparison(file, points, walks, scene=job.scene.name, views=len(job.scene.test_ids))
@@ -338,11 +337,9 @@ def _of_plan(nested: NestedLevels, name: str, plan: Plan) -> Contender:
     )  # fmt: skip
 
 
-def measure_sets(
-    job: Job, contenders: Sequence[Contender], metrics: dict[str, Lpips], config: FitConfig
-) -> list[Point]:
-    """All contenders on all test views, some at a time; of `config` what categories are measured by."""
-    labels = label_images(job, config.masks)
+def measure_sets(job: Job, contenders: Sequence[Contender], metrics: dict[str, Lpips]) -> list[Point]:
+    """All contenders on all test views, some at a time."""
+    labels = job.best_masks
     tests, workspace, points = job.valid.rows(job.scene, job.scene.test_ids), Workspace(), []
     done, total = 0, len(contenders) * len(tests)
 
@@ -368,7 +365,7 @@ def measure_sets(
             valid, of_photo = job.valid[job.scene.views[row]], features_of(metrics, photo)
             for g, (_, arrived), values in zip(sets, sent, found, strict=True):
                 image = image_of(g, row)
-                values.append(_values(config, image, photo, here, valid))
+                values.append(_values(image, photo, here, valid))
                 if valid is not None:
                     of_photo = features_of(metrics, pasted(photo, image, valid))
                 for column, metric in metrics.items():
@@ -398,13 +395,12 @@ def _corrected(
 
 
 def _values(
-    config: FitConfig, image: np.ndarray, photo: np.ndarray, labels: np.ndarray, valid: np.ndarray | None
+    image: np.ndarray, photo: np.ndarray, labels: np.ndarray, valid: np.ndarray | None
 ) -> dict[str | int, float]:
     """What is measured of one image: of the whole by name, SSIM of its categories by label id."""
-    name = "ssim_eroded" if config.region == "eroded" else "ssim"
-    rows, few = measure(image, photo, labels, valid=valid), config.min_share * labels.size
+    rows, few = measure(image, photo, labels, valid=valid), MIN_SHARE * labels.size
     whole = {"ssim": rows[TOTAL]["ssim"], "ssim_sent": rows[TOTAL]["ssim"], "psnr": rows[TOTAL]["psnr"]}
-    return whole | {i: of[name] for i, of in rows.items() if i != TOTAL and of["num_pixels"] >= few}
+    return whole | {i: of["ssim"] for i, of in rows.items() if i != TOTAL and of["num_pixels"] >= few}
 
 
 def _point(
@@ -431,16 +427,14 @@ def _point(
 
 def encode_set(job: Job, g: Gaussians) -> tuple[dict[int, int], Gaussians]:
     """Bytes by label id, one file each encoded as the run's increments are, and what a viewer decodes."""
-    bits = tuple(settings_of(job.run, "nest").get("sh_bits", SH_BITS))
     streams = any(one.format == "stream" for one in read_index(job.run.increments))
     whole = {label: (count,) for label, count in g.counts().items()}
     with TemporaryDirectory() as folder:
         path = Path(folder) / "increments"
-        given = {"sh_bits": bits, "antialiased": job.antialiased}
         if streams:
-            increments = write_streams(path, g, whole, job.names(), **given).increments
+            increments = write_streams(path, g, whole, job.names(), antialiased=job.antialiased).increments
         else:
-            increments = write_increments(path, g, whole, job.names(), **given)
+            increments = write_increments(path, g, whole, job.names(), antialiased=job.antialiased)
         arrived = read_increments(path, increments) if increments else g
     return {c.label_id: c.nbytes for c in increments}, arrived
 

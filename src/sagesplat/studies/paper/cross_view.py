@@ -3,13 +3,20 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float32, Int32
 
 from sagesplat.adapt.ladder import Ladder
-from sagesplat.adapt.observe import TOTAL, LabelImages, RenderedLabels, as_unit, measure, render_rgb
+from sagesplat.adapt.observe import (
+    MIN_SHARE,
+    TOTAL,
+    LabelImages,
+    RenderedLabels,
+    as_unit,
+    measure,
+    render_rgb,
+)
 from sagesplat.adapt.plan import Plan
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.columns import from_rows, read_columns, write_columns
@@ -72,8 +79,6 @@ def cross_view(
     *,
     labels: LabelImages | None = None,
     valid: ValidPixels = ALL_VALID,
-    min_share: float = 0.0,
-    region: Literal["mask", "eroded"] = "mask",
     backend: Backend = "auto",
     antialiased: bool = False,
     progress: Callable[[int, int], None] | None = None,
@@ -83,9 +88,9 @@ def cross_view(
     `plan_for` (row of Scene.views, target). `labels`: the pixels of each category (default: as the Gaussians
     paint them, as nobody has masks of unseen views). `valid`: the pixels of photos that count.
 
-    The oracle knows what every settled level measures in that view. Categories with less than `min_share` of
-    the rendered pixels are planned but make no row. `region`: where SSIM is measured. `progress` hears
-    (images measured, images in all).
+    The oracle knows what every settled level measures in that view. Categories with less than
+    `MIN_SHARE` of the rendered pixels are planned but make no row. `progress` hears (images measured, images
+    in all).
     """
     rows: list[dict[str, float]] = []
     labels = labels or RenderedLabels(ladder.load(ladder.levels[-1]), backend, antialiased)
@@ -100,10 +105,7 @@ def cross_view(
         done += 1
         if progress:
             progress(done, total)
-        rows = measure(image, as_unit(photos[row]), labels[view], valid=valid[view])
-        if region == "eroded":
-            rows = {label: {**values, "ssim": values["ssim_eroded"]} for label, values in rows.items()}
-        return rows
+        return measure(image, as_unit(photos[row]), labels[view], valid=valid[view])
 
     at_level: dict[int, dict[int, dict[int, dict[str, float]]]] = {}
     for level in ladder.levels:  # one level in memory at a time
@@ -114,7 +116,7 @@ def cross_view(
             plan = plan_for(row, target)
             composed = measured(ladder.compose(plan.levels), row)
             levels = {level: views_of[row] for level, views_of in at_level.items()}
-            rows += _rows(plan, composed, levels, ladder, min_share)
+            rows += _rows(plan, composed, levels, ladder)
     return from_rows(CrossView, rows)
 
 
@@ -123,13 +125,12 @@ def _rows(
     composed: Mapping[int, Mapping[str, float]],
     levels: Mapping[int, Mapping[int, Mapping[str, float]]],
     ladder: Ladder,
-    min_share: float,
 ) -> list[dict[str, float]]:
     """The rows of one view at one target; `levels` holds what each level measures there, by label."""
     rows = []
     chosen = {choice.label_id: choice for choice in plan.choices}
     full = levels[ladder.levels[-1]]
-    fewest = min_share * composed[TOTAL]["num_pixels"]
+    fewest = MIN_SHARE * composed[TOTAL]["num_pixels"]
     assert plan.view is not None
     for label, values in composed.items():
         if values["num_pixels"] < fewest or (label != TOTAL and label not in chosen):

@@ -47,10 +47,9 @@ def cross_views(job: Job) -> None:
         )
 
     def make() -> list[str]:
-        fitted = job.fit_config
         table = cross_view(
             job.scene, job.photos, job.ladder, targets, method.plan_view,
-            labels=method.unseen_labels(), valid=job.valid, min_share=fitted.min_share, region=fitted.region,
+            labels=method.unseen_labels(), valid=job.valid,
             backend=job.backend, antialiased=job.antialiased,
             progress=lambda done, total: job.emit(Progress("crossview", done, total)),
         )  # fmt: skip
@@ -177,7 +176,7 @@ def tables_and_figures(job: Job, config: PaperConfig) -> None:
             names=titles(job.names()),
             colours=label_colors(job),
             observations=observations_of(job),
-            fitted=observed(job, job.fit_config),
+            fitted=observed(job),
             train_views=job.scene.train_ids,
             test_views=job.scene.test_ids,
             view_names=[v.name for v in job.scene.views],

@@ -126,7 +126,7 @@ def _trained_alike(earlier: Sequence[Cell], cell: Cell) -> Cell | None:
 
     def trained(of: Cell) -> tuple:
         c = of.config
-        return of.scene, c.scene, c.poses, c.masks, c.labels, c.lift, c.train, c.clean, c.blocks, c.seed
+        return of.scene, c.scene, c.poses, c.masks, c.labels, c.train, c.clean, c.blocks, c.seed
 
     return next((c for c in earlier if trained(c) == trained(cell)), None)
 
@@ -140,7 +140,7 @@ def _share_training(runs: Path, like: Cell | None, cell: Cell) -> None:
     if old.capture.exists() or old.blocks.exists():  # these are named in there
         return
     stages = [old.provenance(stage) for stage in ("scene", "segment", "masks", "lift", "train", "clean")]
-    made = [old.scene, old.segmented, old.soft, old.masks, old.labels]
+    made = [old.scene, old.segmented, old.masks, old.labels]
     made += [old.levels, old.checkpoint, old.cap, old.frozen, old.cameras, old.refined, old.inliers]
     made += [old.sky, old.cleaned, old.floaters, old.floaters_picture, *stages]
     with atomic_folder(new.path) as fresh:

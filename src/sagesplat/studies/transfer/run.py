@@ -39,13 +39,12 @@ def transfer(
     targets = targets or list[float](settings_of(job_b.run, "plan")["targets"])
     for target in targets:
         check_target(target)
-    for name in ("distance", "masks", "region"):
-        there, here = (getattr(job.fit_config, name) for job in (job_a, job_b))
-        if there != here:
-            raise RunError(
-                f"{b.name}: measured with --fit.{name} {here}, {a.name} with {there}; run one of them again "
-                "like the other"
-            )
+    there, here = (job.fit_config.distance for job in (job_a, job_b))
+    if there != here:
+        raise RunError(
+            f"{b.name}: measured with --fit.distance {here}, {a.name} with {there}; run one of them again "
+            "like the other"
+        )
     scores = score.transfer(a, b, targets)
     summary = summary_table(scores)
     transfer_table(scores).write(out / "transfer")
@@ -89,7 +88,7 @@ def load_fitted(job: Job) -> FittedRun:
     return FittedRun(
         name=str(run.path),
         names=job.names(),
-        observations=observed(job, job.fit_config),
+        observations=observed(job),
         models=models_of(job),
         counts=job.ladder.counts,
         recovering=job.ladder.recovering,
