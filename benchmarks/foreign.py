@@ -22,7 +22,8 @@ CALLS = {
     # networks and weights
     "InferenceSession", "from_pretrained", "load_file", "safe_open",
     # our own
-    "read_json", "read_object", "Npz", "read_columns", "read_header", "parse_header",
+    "read_json", "read_json_as", "parse_json_as", "known_json", "read_toml",
+    "Npz", "read_columns", "read_header", "parse_header",
 }  # fmt: skip
 LOADERS = {"np", "numpy", "torch", "json", "tomllib", "pickle", "image"}  # whose `load` reads a file
 WRITING = set("wxa")

@@ -16,7 +16,6 @@ from sagesplat.adapt.photo_models import (
     in_composition,
     measured_at,
 )
-from sagesplat.adapt.viewpoint import _to_json
 from sagesplat.core.errors import RunError
 
 GRID = np.arange(0.5, 0.86, 0.05).round(2).tolist()
@@ -154,7 +153,7 @@ def test_test_views_change_nothing(model):
     observations = synthetic(SCENE, 1)
     spoiled = np.where(np.isin(observations.view, SCENE.test_ids), np.float32(0.1), observations.ssim)
     again = fit_photo_models(replace(observations, ssim=spoiled), SCENE)[5]
-    assert _to_json(again) == _to_json(model)
+    assert to_plain(again) == to_plain(model)
 
 
 def test_what_is_lost_in_composition_raises_the_thresholds():

@@ -17,7 +17,6 @@ from sagesplat.adapt.viewpoint import (
     STATUSES,
     Calibration,
     ViewModel,
-    _to_json,
     constant_curve,
     means_at,
     monotone,
@@ -25,6 +24,7 @@ from sagesplat.adapt.viewpoint import (
     write_promises,
 )
 from sagesplat.core.errors import DataError
+from sagesplat.io.typed import to_plain
 
 SCENE = orbit(160)
 CALIBRATION = Calibration(
@@ -39,7 +39,7 @@ def model() -> ViewModel:
 
 def test_formulas_of_the_module_text(model):
     """What a viewer computes from promises.json, written out for one viewpoint."""
-    entry = json.loads(json.dumps(_to_json(model)))
+    entry = json.loads(json.dumps(to_plain(model)))
     distance, position, direction = viewpoints(SCENE, SCENE.test_ids[:1])
     x = np.array([*position[0] / entry["extent"], *direction[0], np.log(distance[0])])
     X, u = np.array(entry["inputs"]), np.array(entry["heldout_inputs"], float)
@@ -121,11 +121,6 @@ def test_round_trip(tmp_path, model):
     assert (again.status, again.levels, again.quality) == (model.status, LEVELS, "ssim")
     assert again.calibration.num_views == 40
     assert model.status in STATUSES
-    # written before there was a discount
-    entry = _to_json(model)
-    del entry["calibration"]["discount"]
-    (tmp_path / "old.json").write_text(json.dumps({"promises": [entry]}))
-    assert read_promises(tmp_path / "old.json")[5].calibration.discount == 0
 
 
 @pytest.mark.parametrize(
@@ -134,7 +129,7 @@ def test_round_trip(tmp_path, model):
      ("curves", []), ("extent", "far"), ("inputs", []), ("calibration", {}), ("calibration", 3)],
 )  # fmt: skip
 def test_spoilt_files_are_one_line(tmp_path, model, name, value):
-    _refused(tmp_path / "promises.json", {**_to_json(model), name: value})
+    _refused(tmp_path / "promises.json", {**to_plain(model), name: value})
 
 
 @pytest.mark.parametrize(
@@ -144,7 +139,7 @@ def test_spoilt_files_are_one_line(tmp_path, model, name, value):
      ("discount", -1), ("discount", float("inf")), ("num_views", "x")],
 )  # fmt: skip
 def test_spoilt_calibrations_are_one_line(tmp_path, model, name, value):
-    entry = _to_json(model)
+    entry = to_plain(model)
     _refused(tmp_path / "promises.json", {**entry, "calibration": {**entry["calibration"], name: value}})
 
 

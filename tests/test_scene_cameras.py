@@ -143,5 +143,5 @@ def test_no_file(tmp_path):
 
 
 def test_one_wrong_camera_is_no_list(tmp_path):
-    with pytest.raises(DataError, match="no list of cameras"):
+    with pytest.raises(DataError, match="not a list of cameras"):
         read_camera_file(put(tmp_path, [entry(0), entry(1) | {"fx": 0}]))

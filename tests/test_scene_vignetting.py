@@ -16,6 +16,7 @@ from sagesplat.core.errors import RunError, SceneError
 from sagesplat.core.events import StageDone
 from sagesplat.demo.capture import make_capture
 from sagesplat.demo.wild import Wild
+from sagesplat.io.typed import convert_as
 from sagesplat.run.capture import fingerprint
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
@@ -23,7 +24,7 @@ from sagesplat.scene import describe, load_scene
 from sagesplat.scene.images import Photos, load_photo
 from sagesplat.scene.scene import Camera, Points, Scene, View, Vignetting
 from sagesplat.scene.stored import read_scene, write_scene
-from sagesplat.scene.vignetting import corrected, light, parse_vignetting
+from sagesplat.scene.vignetting import corrected, light
 from sagesplat.scene.vignetting_fit import estimate_vignetting, with_vignetting
 from sagesplat.stages.noticed import noticed
 from sagesplat.stages.scene import open_scene
@@ -200,10 +201,9 @@ def test_training_tells_of_a_lens_that_nobody_corrected(capture):
      {"coefficients": [True, 2], "reach": 1}],
 )  # fmt: skip
 def test_a_damaged_record_is_refused(capture, tmp_path, made):
-    with pytest.raises(ValueError, match="vignetting"):
-        parse_vignetting(made)
-    assert parse_vignetting(None) is None
-    assert parse_vignetting(json.loads(json.dumps(asdict(LENS)))) == LENS
+    with pytest.raises(ValueError, match=r"expected|Expected|missing"):
+        convert_as(made, Vignetting)
+    assert convert_as(json.loads(json.dumps(asdict(LENS))), Vignetting) == LENS
     job = Job(RunDir(tmp_path / "run"), lambda _: None)
     open_scene(job, capture, SceneConfig())
     kept = json.loads(job.run.scene.read_text())

@@ -18,7 +18,7 @@ from sagesplat.scene.refined import read_refined
 from sagesplat.stages import blocks
 from sagesplat.stages.observe import observe_levels
 from sagesplat.stages.pipeline import nest, train
-from sagesplat.stages.refine import PoseFigures, pose_lines, read_pose_figures
+from sagesplat.stages.refine import PoseFigures, pose_lines, read_refined_figures
 
 POSES = replace(SMALL_RUN.train, max_steps=40, level_every=20, poses=True)
 FIGURES = PoseFigures(0.3, 0.02, 0.001, 1, 2, 3, (20.0, 24.5), (0.7, 0.8))
@@ -44,7 +44,7 @@ def test_cameras_and_figures_are_written(refined):
     assert not cameras.fitted[given.train_ids].any()
     assert cameras.fitted[given.test_ids].any()
     assert all(np.array_equal(v.camera.w2c, w2c) for v, w2c in zip(job.scene.views, cameras.w2c, strict=True))
-    figures = read_pose_figures(job.run.refined)
+    figures = read_refined_figures(job.run.refined).poses
     assert figures is not None
     assert figures.psnr is not None
     assert figures.psnr[1] > figures.psnr[0] - 0.01
@@ -94,7 +94,7 @@ def test_lines_say_what_diverged():
 @pytest.mark.parametrize("content", [[], {"poses": []}, *({"poses": {"pixels": x}} for x in ("far", 1.0))])
 def test_other_figures_are_refused(tmp_path, content):
     path = tmp_path / "refined.json"
-    assert read_pose_figures(path) is None
+    assert read_refined_figures(path).poses is None
     write_json(path, content)
     with pytest.raises(RunError, match=r"refined\.json: not what was refined .*--force"):
-        read_pose_figures(path)
+        read_refined_figures(path)

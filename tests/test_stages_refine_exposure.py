@@ -18,7 +18,8 @@ from sagesplat.run.run_dir import RunDir
 from sagesplat.scene.refined import read_refined
 from sagesplat.stages import blocks
 from sagesplat.stages.pipeline import run_all, train
-from sagesplat.stages.refine_exposure import ExposureFigures, exposure_lines, read_exposure_figures
+from sagesplat.stages.refine import read_refined_figures
+from sagesplat.stages.refine_exposure import ExposureFigures, exposure_lines
 from sagesplat.stages.results import evaluation_of
 
 CONFIG = replace(SMALL_RUN, train=replace(SMALL_RUN.train, exposure="affine"))
@@ -60,7 +61,7 @@ def test_held_out_views_are_fitted_to_their_photos(run):
 
 
 def test_figures_are_kept_and_said(run):
-    figures = read_exposure_figures(RunDir(run[0]).refined)
+    figures = read_refined_figures(RunDir(run[0]).refined).exposure
     assert figures is not None
     assert figures.psnr is not None
     assert figures.psnr["exposed"] > figures.psnr["plain"]
@@ -103,12 +104,11 @@ def test_lines_and_files_of_figures(tmp_path):
     assert "cc_ssim 0.740 / cc_psnr 23.50 dB" in exposure_lines(FIGURES)[1]
     assert len(exposure_lines(replace(FIGURES, psnr=None, ssim=None))) == 1
     path = tmp_path / "refined.json"
-    assert read_exposure_figures(path) is None
     for content in ([], {"exposure": 3}, {"exposure": {"range_ev": 1}}):
         write_json(path, content)
         with pytest.raises(RunError, match=r"refined\.json"):
-            read_exposure_figures(path)
+            read_refined_figures(path)
     wrong = {"range_ev": 1.0, "psnr": {"plain": 1.0}, "ssim": None}
     write_json(path, {"exposure": wrong})
     with pytest.raises(RunError, match="other measurements"):
-        read_exposure_figures(path)
+        read_refined_figures(path)

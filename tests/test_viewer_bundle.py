@@ -532,10 +532,10 @@ def test_a_damaged_stream_is_named(tmp_path, contents, viewer, wrong) -> None:
 def test_in_the_pack_what_the_first_view_skips_comes_last() -> None:
     made = replace(model(2, 6, [1, 2, 3, 4]), weights=np.zeros((6, 4)))
     made = replace(made, inputs=np.tile([0, 0, 0, 0, 0, 1.0, math.log(5)], (6, 1)))  # where it is looked from
-    flat = replace(made.curves[0], params=made.curves[0].params._replace(g1=0, g2=0))
+    flat = replace(made.curves[0], params=replace(made.curves[0].params, g1=0, g2=0))
     means = (0.3, 0.62, 0.9, 0.95)
     curves = tuple(
-        replace(flat, level=k, params=flat.params._replace(K1=mean, K2=mean))
+        replace(flat, level=k, params=replace(flat.params, K1=mean, K2=mean))
         for k, mean in enumerate(means, 1)
     )
     one = Ladder([10, 20, 100, 50], 1.0, FRONT, replace(made, curves=curves), np.full(1, 0.1), [3])
@@ -583,8 +583,8 @@ def test_what_gains_more_a_byte_comes_first_in_the_pack() -> None:
 
 def test_promises_and_pixels_rule_the_order_of_the_pack() -> None:
     made = replace(model(2, 6, [1, 2, 3]), weights=np.zeros((6, 3)))
-    flat = replace(made.curves[0], params=made.curves[0].params._replace(K1=0.3, K2=0.3, g1=0, g2=0))
-    better = replace(flat, level=2, params=flat.params._replace(K1=0.9, K2=0.9))
+    flat = replace(made.curves[0], params=replace(made.curves[0].params, K1=0.3, K2=0.3, g1=0, g2=0))
+    better = replace(flat, level=2, params=replace(flat.params, K1=0.9, K2=0.9))
     made = replace(made, curves=(flat, better, replace(better, level=3)))
     small, large = (Ladder([10, 50, 10], 1.0, FRONT, made, np.array([s])) for s in (0.01, 0.5))
     order = order_at_origin(small, large)

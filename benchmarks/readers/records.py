@@ -1,6 +1,7 @@
 """Readers of what lies in a run folder, a bundle or a study: JSON, CSV and TOML."""
 
 import json
+from dataclasses import fields
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -39,8 +40,7 @@ from sagesplat.stages.boundaries import _seconds
 from sagesplat.stages.clean import read_clean_figures
 from sagesplat.stages.edited import LabelSettings, label_settings, write_edited
 from sagesplat.stages.prompts import read_scores
-from sagesplat.stages.refine import read_pose_figures
-from sagesplat.stages.refine_exposure import read_exposure_figures
+from sagesplat.stages.refine import read_refined_figures
 from sagesplat.stages.train import read_cap, read_frozen
 from sagesplat.studies.compare.report import OfLabel, Point, Walk, read_comparison, write_comparison
 from sagesplat.studies.measure.levels import levels_of
@@ -105,11 +105,6 @@ def _figures(folder: Path, size: int) -> list[bytes]:
     return as_json({"poses": entry, "exposure": exposure} | {f"note{i}": i for i in range(size - 1)})
 
 
-def _read_figures(path: Path) -> None:
-    read_pose_figures(path)
-    read_exposure_figures(path)
-
-
 def _floaters(folder: Path, size: int) -> list[bytes]:
     counts, decibels = dict.fromkeys(CRITERIA, 3), {"train": 20.5, "calibration": 19.0}
     entry = {"gaussians": 50, "found": counts, "removed": counts, "before": decibels, "after": decibels}
@@ -117,13 +112,17 @@ def _floaters(folder: Path, size: int) -> list[bytes]:
 
 
 def _models(folder: Path, size: int) -> list[bytes]:
-    curve = CURVE | {"params": dict.fromkeys(eq3.Eq3._fields, 0.5), "status": sorted(eq3.STATUSES)[0]}
+    params = {field.name: 0.5 for field in fields(eq3.Eq3)}
+    curve = CURVE | {"params": params, "status": sorted(eq3.STATUSES)[0]}
     return as_json({"models": [curve | {"level": 1 + i} for i in range(size)]})
 
 
 def _promises(folder: Path, size: int) -> list[bytes]:
     curve = json.loads(_models(folder, 1)[0])["models"][0]
-    entry = dict.fromkeys(viewpoint.NUMBERS, 0.5) | {"curves": [curve], "lengths": [1, 2, 0.5]}
+    entry = dict.fromkeys(("extent", "median_log_distance", "heldout_variance", "rmse"), 0.5) | {
+        "curves": [curve],
+        "lengths": [1, 2, 0.5],
+    }
     entry |= {"inputs": [[0.1] * 7, [0.2] * 7], "heldout_inputs": [False, True], "weights": [[0.1], [0.2]]}
     calibration = {"status": sorted(viewpoint.STATUSES)[0], "confidence": 0.95, "num_views": 20}
     calibration |= {"targets": [0.5, 0.7], "thresholds": [0.52, 0.7], "least_support": 0.2}
@@ -171,7 +170,7 @@ def _sampled(folder: Path, size: int) -> list[bytes]:
 
 
 def _plans(folder: Path, size: int) -> list[bytes]:
-    choice = CHOICE | {"status": sorted(plan.STATUSES)[0], "transfer_bytes": 9}
+    choice = CHOICE | {"status": "ok", "transfer_bytes": 9}
     scene = {"target": 0.8, "view": None, "share": 0.9, "choices": [choice]}
     budget = scene | {"target": None, "budget": 1e6, "unit": "bytes", "fits": True}
     views = [scene | {"view": 1 + i} for i in range(size)]
@@ -417,7 +416,7 @@ READERS = (
     Reader("cameras", ".json", _cameras, file("path.json", _read_cameras), 100),
     Reader("refined", ".npz", _refined, file("cameras.npz", _read_refined), 1000),
     Reader("sky", ".npz", _sky, file("sky.npz", read_sky), 1000),
-    Reader("refined-figures", ".json", _figures, file("refined.json", _read_figures), 3000),
+    Reader("refined-figures", ".json", _figures, file("refined.json", read_refined_figures), 3000),
     Reader("floaters", ".json", _floaters, file("floaters.json", read_clean_figures), 3000),
     Reader("sampled", ".npz", _sampled, file("fidelity.npz", fidelity.read_sampled), 1000),
     Reader("plans", ".json", _plans, file("plan.json", _read_plans), 100),

@@ -1,26 +1,28 @@
 """SSIM over viewing distance, per category and level (Eq. 3 of the paper)."""
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
-from typing import NamedTuple, overload
+from typing import Annotated, Literal, NamedTuple, get_args, overload
 
 import numpy as np
 from jaxtyping import Float
+from msgspec import Meta
 from scipy.ndimage import median_filter
 from scipy.optimize import least_squares
 
 from sagesplat.adapt.observe import TOTAL, Observations
-from sagesplat.core.errors import DataError, short
-from sagesplat.io.files import read_json, write_json
+from sagesplat.core.limits import Count, NotNegative, Number, StepNumber
+from sagesplat.io.files import write_json
+from sagesplat.io.typed import read_json_as
 
 NOISE = 0.05  # SSIM residual from which an observation counts as an outlier (scale of the soft L1 loss)
 FLOOR = 0.003  # SSIM residual below which a better fit does not justify a parameter
 REGIME_SIZE = 4  # parameters of one regime: K, gamma, mu, alpha
 SIDE = 6  # fewest observations on a side of beta
-LARGEST = 1e30  # numbers of a model that is read; those of fits are far smaller
-STATUSES = ("two regimes", "one regime", "constant", "not converged")
+Status = Literal["two regimes", "one regime", "constant", "not converged"]
+STATUSES: tuple[Status, ...] = get_args(Status)
 
 # Bounds and starts of one regime, with distances mapped to [0, 1]. gamma = s**-alpha, where s is the distance
 # from mu at which SSIM has fallen to K/e: unlike gamma, s means the same at every alpha.
@@ -31,18 +33,22 @@ STARTS = np.stack(
 ).reshape(-1, 3)  # log s, mu, alpha
 
 
-class Eq3(NamedTuple):
+@dataclass(frozen=True)
+class Eq3:
     """K1 exp(-g1 |d - mu1|^a1) for d < beta, K2 exp(-g2 |d - mu2|^a2) from beta on; d in world units."""
 
-    K1: float
-    g1: float
-    mu1: float
-    a1: float
-    K2: float
-    g2: float
-    mu2: float
-    a2: float
-    beta: float
+    K1: Number
+    g1: NotNegative
+    mu1: Number
+    a1: Number
+    K2: Number
+    g2: NotNegative
+    mu2: Number
+    a2: Number
+    beta: Number
+
+    def __iter__(self) -> Iterator[float]:
+        return iter(astuple(self))
 
     def __call__(self, distance: np.ndarray) -> np.ndarray:
         """SSIM at each distance, as the equation says and nothing more."""
@@ -55,14 +61,18 @@ class Eq3(NamedTuple):
 class SsimModel:
     """What SSIM to expect of one category at one level, by distance."""
 
-    label_id: int
-    level: int  # of snapshots the training step, of nested levels 1 to K
+    label_id: Annotated[int, Meta(ge=TOTAL, le=2**15 - 1)]
+    level: StepNumber  # of snapshots the training step, of nested levels 1 to K
     params: Eq3  # one regime or a constant: both halves are equal
-    d_range: tuple[float, float]  # smallest and largest distance fitted, world units; (0, 0) = none known
-    median: float  # SSIM where the distance is unknown
-    rmse: float  # of the fitted observations, SSIM
-    num_observations: int
-    status: str  # one of STATUSES; "not converged" still holds the best parameters found
+    d_range: tuple[Number, Number]  # smallest and largest distance fitted, world units; (0, 0) = none known
+    median: Number  # SSIM where the distance is unknown
+    rmse: Number  # of the fitted observations, SSIM
+    num_observations: Count
+    status: Status  # "not converged" still holds the best parameters found
+
+    def __post_init__(self) -> None:
+        if self.d_range[0] > self.d_range[1]:
+            raise ValueError("the smallest distance is above the largest")
 
     @overload
     def __call__(self, distance: float) -> float: ...
@@ -144,7 +154,7 @@ def fit_model(
     low, high = (float(d[0]), float(d[-1])) if len(d) else (0.0, 0.0)
 
     flat = Eq3(median, 0.0, low, 1.0, median, 0.0, low, 1.0, high)
-    candidates = [(_criterion(y - median, 1), flat, "constant")]
+    candidates: list[tuple[float, Eq3, Status]] = [(_criterion(y - median, 1), flat, "constant")]
     if high - low > 1e-6 * abs(high):
         candidates += _regimes(d, y)
     _, params, status = min(candidates, key=lambda candidate: candidate[0])
@@ -153,7 +163,7 @@ def fit_model(
     return SsimModel(label_id, level, params, (low, high), median, rmse, len(ssim), status)
 
 
-def _regimes(d: np.ndarray, y: np.ndarray) -> list[tuple[float, Eq3, str]]:
+def _regimes(d: np.ndarray, y: np.ndarray) -> list[tuple[float, Eq3, Status]]:
     """(criterion, parameters, status) of one and of two regimes on observations sorted by distance."""
     low, span = d[0], d[-1] - d[0]
     x = (d - low) / span
@@ -264,39 +274,17 @@ def _criterion(residual: np.ndarray, num_parameters: int) -> float:
 
 def write_models(path: Path, models: dict[tuple[int, int], SsimModel]) -> None:
     """models.json: one entry per (category, level)."""
-    entries = [{**vars(model), "params": model.params._asdict()} for model in models.values()]
-    write_json(path, {"models": entries})
+    write_json(path, {"models": [asdict(model) for model in models.values()]})
+
+
+@dataclass(frozen=True)
+class _Models:
+    models: list[SsimModel]
 
 
 def read_models(path: Path) -> dict[tuple[int, int], SsimModel]:
     """What `write_models` wrote; DataError where the content cannot be used."""
-    cure = "delete it and run `sagesplat fit` again"
-    document = read_json(path, cure)
-    try:
-        models = [model_from_json(entry) for entry in document["models"]]
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise DataError(f"{path}: not a file of quality models ({short(repr(error))}); {cure}") from None
-    return {(model.label_id, model.level): model for model in models}
-
-
-def model_from_json(entry: dict) -> SsimModel:
-    """The model of one entry; KeyError, TypeError or ValueError for unusable content."""
-    low, high = map(float, entry["d_range"])
-    model = SsimModel(
-        label_id=int(entry["label_id"]),
-        level=int(entry["level"]),
-        params=Eq3(**{name: float(entry["params"][name]) for name in Eq3._fields}),
-        d_range=(low, high),
-        median=float(entry["median"]),
-        rmse=float(entry["rmse"]),
-        num_observations=int(entry["num_observations"]),
-        status=str(entry["status"]),
+    models = read_json_as(
+        path, _Models, "a file of quality models", "delete it and run `sagesplat fit` again"
     )
-    finite = (np.abs([*model.params, low, high, model.median, model.rmse]) < LARGEST).all()
-    if not finite or low > high or min(model.params.g1, model.params.g2) < 0:
-        raise ValueError(f"category {model.label_id}, level {model.level}: numbers out of range")
-    if not (-2 <= model.label_id < 2**15 and 0 <= model.level < 2**31):
-        raise ValueError(f"category {model.label_id}, level {model.level}")
-    if model.status not in STATUSES:
-        raise ValueError(f"unknown status {model.status!r}")
-    return model
+    return {(model.label_id, model.level): model for model in models.models}

@@ -1,11 +1,10 @@
 """Which level of each category meets a target at the least Gaussians (Eq. 1 of the paper); plan.json."""
 
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -13,44 +12,50 @@ from jaxtyping import Bool, Float, Int
 from sagesplat.adapt.allocate import choose
 from sagesplat.adapt.eq3 import SsimModel
 from sagesplat.adapt.viewpoint import QualityKind
-from sagesplat.core.errors import DataError, RunError, short
+from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import BYTES_PER_GAUSSIAN
-from sagesplat.io.files import read_json, write_json
+from sagesplat.core.limits import Count, LabelId, NotNegative, NumberOrNaN, Share, StepNumber
+from sagesplat.io.files import write_json
+from sagesplat.io.typed import read_json_as
 
 Models = Mapping[tuple[int, int], SsimModel]  # by (label id, level)
 Counts = Mapping[tuple[int, int], int]  # Gaussians of each (label id, level)
 
 _UNITS = {"gpu-bytes": "bytes of GPU memory", "count": "Gaussians"}
 _CURE = "delete it and run `sagesplat plan` again"
-STATUSES = (
+Status = Literal[
     "ok",  # the level is predicted, or measured, to reach the target
     "infeasible",  # no level is; this is the best attainable
     "no promise",  # too far from all that was sampled, or too little known: the highest level
     "no model",  # nothing is known of the category: the highest level
-)
+]
 
 
 @dataclass(frozen=True)
 class Reached:
     """The share of viewpoints that measure a target, with its Clopper-Pearson interval at 95 %."""
 
-    share: float
-    low: float
-    high: float
-    num_views: int
+    share: Share
+    low: Share
+    high: Share
+    num_views: Count
+
+    def __post_init__(self) -> None:
+        if not self.low <= self.share <= self.high:
+            raise ValueError("an impossible share of views")
 
 
 @dataclass(frozen=True)
 class Choice:
     """The level of one category."""
 
-    label_id: int
-    level: int  # of snapshots the training step, of nested levels 1 to K
-    predicted: float  # quality; in a scene what at least `share` of the views reach; NaN: nothing promised
-    distance: float  # of the view, world units; NaN in a scene and where unknown
-    count: int  # Gaussians
-    status: str  # one of STATUSES
-    transfer_bytes: int | None = None  # of its increments; None for snapshots
+    label_id: LabelId
+    level: StepNumber  # of snapshots the training step, of nested levels 1 to K
+    predicted: NumberOrNaN  # quality; in a scene of at least `share` of the views; NaN: nothing promised
+    distance: NumberOrNaN  # of the view, world units; NaN in a scene and where unknown
+    count: Count  # Gaussians
+    status: Status
+    transfer_bytes: Count | None = None  # of its increments; None for snapshots
     calibrated: bool | None = None  # whether the promise is proven; None: no bound, a mere prediction
     reached: Reached | None = None  # of a scene's plan: views that measure the target at this level
 
@@ -69,11 +74,11 @@ class Choice:
 class Plan:
     """One level per category, for one view or for a whole scene."""
 
-    target: float  # quality that every category is to reach; NaN for a plan within a budget
-    view: int | None  # row in Scene.views; None = the scene
+    target: NumberOrNaN  # quality that every category is to reach; NaN for a plan within a budget
+    view: Count | None  # row in Scene.views; None = the scene
     choices: tuple[Choice, ...]  # ordered by label id
-    share: float | None = None  # of the views that must reach the target; None for one view
-    budget: float | None = None  # what the composition may cost, in `unit`
+    share: Share | None = None  # of the views that must reach the target; None for one view
+    budget: NotNegative | None = None  # what the composition may cost, in `unit`
     unit: str | None = None  # bytes, gpu-bytes or count
     fits: bool = True  # whether it keeps the budget
     quality: QualityKind = "ssim"  # of which it is the target
@@ -304,29 +309,26 @@ def write_plans(
     write_json(path, document)
 
 
+@dataclass(frozen=True)
+class _Plans:
+    scene: tuple[Plan, ...]
+    views: tuple[Plan, ...]
+    budget: Plan | None = None
+
+
 def read_plans(path: Path | str) -> tuple[tuple[Plan, ...], tuple[Plan, ...]]:
     """The scene's plans and the single views' that `write_plans` wrote; DataError for unusable content."""
-    path = Path(path)
-    document = read_json(path, _CURE)
-    with _usable(path):
-        scene_plans = tuple(_from_json(entry) for entry in document["scene"])
-        view_plans = tuple(_from_json(entry) for entry in document["views"])
-        return scene_plans, view_plans
+    plans = _read(Path(path))
+    return plans.scene, plans.views
 
 
 def read_budget_plan(path: Path) -> Plan | None:
     """The plan for a budget, if there is one; DataError for unusable content."""
-    document = read_json(path, _CURE)
-    with _usable(path):
-        return _from_json(document["budget"]) if "budget" in document else None
+    return _read(path).budget
 
 
-@contextmanager
-def _usable(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise DataError(f"{path}: not a file of plans ({short(repr(error))}); {_CURE}") from None
+def _read(path: Path) -> _Plans:
+    return read_json_as(path, _Plans, "a file of plans", _CURE)
 
 
 def _to_json(plan: Plan) -> dict[str, Any]:
@@ -340,49 +342,3 @@ def _to_json(plan: Plan) -> dict[str, Any]:
     own["target"] = None if math.isnan(plan.target) else plan.target
     totals = {n: getattr(plan, n) for n in ("count", "nbytes", "transfer_bytes", "status", "binding")}
     return {**own, **totals, "choices": choices}
-
-
-def _from_json(entry: dict[str, Any]) -> Plan:
-    def number(value: float | None) -> float:
-        return math.nan if value is None else float(value)
-
-    def maybe(kind: Callable[[Any], Any], value: Any) -> Any:
-        return None if value is None else kind(value)
-
-    choices = tuple(
-        Choice(
-            label_id=int(choice["label_id"]),
-            level=int(choice["level"]),
-            predicted=number(choice["predicted" if "predicted" in choice else "predicted_ssim"]),
-            distance=number(choice["distance"]),
-            count=int(choice["count"]),
-            status=str(choice["status"]),
-            transfer_bytes=maybe(int, choice.get("transfer_bytes")),
-            calibrated=maybe(bool, choice.get("calibrated")),
-            reached=maybe(_reached, choice.get("reached")),
-        )
-        for choice in entry["choices"]
-    )
-    if unknown := {choice.status for choice in choices} - set(STATUSES):
-        raise ValueError(f"unknown status {unknown.pop()!r}")
-    quality = entry.get("quality", "ssim")  # the only one of older runs
-    if quality not in get_args(QualityKind):
-        raise ValueError(f"unknown quality {quality!r}")
-    return Plan(
-        target=number(entry["target"]),
-        view=maybe(int, entry["view"]),
-        choices=choices,
-        share=maybe(float, entry["share"]),
-        budget=maybe(float, entry.get("budget")),
-        unit=maybe(str, entry.get("unit")),
-        fits=bool(entry.get("fits", True)),
-        quality=quality,
-    )
-
-
-def _reached(entry: dict[str, Any]) -> Reached:
-    share, low, high = (float(entry[name]) for name in ("share", "low", "high"))
-    found = Reached(share, low, high, int(entry["num_views"]))
-    if not 0 <= found.low <= found.share <= found.high <= 1 or found.num_views < 0:
-        raise ValueError("an impossible share of views")
-    return found

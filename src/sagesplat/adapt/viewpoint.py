@@ -19,24 +19,26 @@ median.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Annotated, Literal, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float
+from msgspec import Meta
 
-from sagesplat.adapt.eq3 import LARGEST, Eq3, SsimModel, model_from_json
+from sagesplat.adapt.eq3 import Eq3, SsimModel
 from sagesplat.adapt.process import inputs_of, matern32
-from sagesplat.core.errors import DataError, short
-from sagesplat.io.files import read_json, write_json
+from sagesplat.core.limits import LARGEST, Count, LabelId, NotNegative, Number, Positive, Share
+from sagesplat.io.files import write_json
+from sagesplat.io.typed import read_json_as, refused, to_plain
 
 QualityKind = Literal["fidelity", "ssim"]  # against the full model, or against photos
-STATUSES = (
+Status = Literal[
     "calibrated",  # the bound holds at its confidence
     "uncalibrated",  # too few calibration views for that: widened, but nothing is proven
-)
-NUMBERS = ("extent", "median_log_distance", "heldout_variance", "rmse")
+]
+STATUSES: tuple[Status, ...] = get_args(Status)
 
 
 class Prediction(NamedTuple):
@@ -51,13 +53,13 @@ class Prediction(NamedTuple):
 class Calibration:
     """From the expected quality to a lower confidence bound."""
 
-    status: str  # one of STATUSES
-    confidence: float  # share of decisions that hold
-    num_views: int  # calibration views that show the category
+    status: Status
+    confidence: Annotated[float, Meta(gt=0, lt=1)]  # share of decisions that hold
+    num_views: Count  # calibration views that show the category
     targets: Float[np.ndarray, " G"]  # ascending
     thresholds: Float[np.ndarray, " G"]  # ascending: the mean from which on a level keeps the target
-    least_support: float  # below it there is no bound
-    discount: float = 0.0  # of the mean where the support is 0; none at a known viewpoint
+    least_support: Share  # below it there is no bound
+    discount: NotNegative = 0.0  # of the mean where the support is 0; none at a known viewpoint
 
     def bound(
         self, mean: Float[np.ndarray, "V K"], support: Float[np.ndarray, " V"]
@@ -83,17 +85,17 @@ NO_CALIBRATION = Calibration("uncalibrated", 0.95, 0, np.zeros(0), np.zeros(0), 
 class ViewModel:
     """What quality to expect of one category, by level and viewpoint (formulas: the module's text)."""
 
-    label_id: int
+    label_id: LabelId
     quality: QualityKind
     curves: tuple[SsimModel, ...]  # of each level, ascending: Eq. 3, or a constant (`constant_curve`)
-    extent: float  # of the scene, world units
-    median_log_distance: float  # log distance, for viewpoints that know none
+    extent: Positive  # of the scene, world units
+    median_log_distance: Number  # log distance, for viewpoints that know none
     inputs: Float[np.ndarray, "n 7"]  # of the views behind it: position / extent, direction, log d
     heldout_inputs: Bool[np.ndarray, " n"]  # photos that training never saw; of fidelity none
-    lengths: tuple[float, float, float]  # of the three groups of inputs
-    heldout_variance: float  # over the variance of the process
+    lengths: tuple[Positive, Positive, Positive]  # of the three groups of inputs
+    heldout_variance: NotNegative  # over the variance of the process
     weights: Float[np.ndarray, "n K"]
-    rmse: float  # of its views, each predicted without itself; over all levels
+    rmse: Number  # of its views, each predicted without itself; over all levels
     calibration: Calibration = field(default=NO_CALIBRATION)
 
     @property
@@ -107,7 +109,7 @@ class ViewModel:
         return len(self.inputs)
 
     @property
-    def status(self) -> str:
+    def status(self) -> Status:
         """One of STATUSES."""
         return self.calibration.status
 
@@ -169,75 +171,34 @@ def constant_curve(label_id: int, level: int, value: float, rmse: float, n: int)
 
 def write_promises(path: Path, models: Mapping[int, ViewModel]) -> None:
     """fidelity.json or promises.json: one entry per category."""
-    write_json(path, {"promises": [_to_json(model) for model in models.values()]})
+    write_json(path, {"promises": [to_plain(model) for model in models.values()]})
+
+
+@dataclass(frozen=True, eq=False)
+class _Promises:
+    promises: list[ViewModel]
 
 
 def read_promises(path: Path | str) -> dict[int, ViewModel]:
     """What `write_promises` wrote; DataError where the content cannot be used."""
-    path = Path(path)
-    cure = "delete it and run `sagesplat fit` again"
-    document = read_json(path, cure)
-    try:
-        models = [_from_json(entry) for entry in document["promises"]]
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise DataError(f"{path}: not a file of promises ({short(repr(error))}); {cure}") from None
+    path, what, cure = Path(path), "a file of promises", "delete it and run `sagesplat fit` again"
+    models = read_json_as(path, _Promises, what, cure).promises
+    with refused(path, what, cure):
+        for model in models:
+            _check(model)
     return {model.label_id: model for model in models}
 
 
-def _to_json(model: ViewModel) -> dict[str, Any]:
-    entry = {f.name: getattr(model, f.name) for f in fields(model)}
-    entry["curves"] = [{**vars(curve), "params": curve.params._asdict()} for curve in model.curves]
-    entry["calibration"] = _plain(vars(model.calibration))
-    return _plain(entry)
-
-
-def _plain(entry: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in entry.items()}
-
-
-def _from_json(entry: dict[str, Any]) -> ViewModel:
-    curves = tuple(model_from_json(curve) for curve in entry["curves"])
-    x, y, z = map(float, entry["lengths"])
-    inputs, weights = (np.array(entry[k], np.float64) for k in ("inputs", "weights"))
-    numbers = {name: float(entry[name]) for name in NUMBERS}
-    u = np.array(entry["heldout_inputs"], bool)
-    n = len(u)
-    if not n or u.shape != (n,) or not curves or (inputs.shape, weights.shape) != ((n, 7), (n, len(curves))):
+def _check(model: ViewModel) -> None:
+    """ValueError for a model whose parts do not belong together."""
+    n, calibration = len(model.heldout_inputs), model.calibration
+    shapes = (len(model.inputs), *model.weights.shape)
+    if not n or not model.curves or shapes != (n, n, len(model.curves)):
         raise ValueError("lists of unequal length")
-    values = (inputs, weights, (x, y, z), list(numbers.values()))
-    if not all((np.abs(a) < LARGEST).all() for a in values):
-        raise ValueError("numbers out of range")
-    if min(x, y, z, numbers["extent"]) <= 0 or numbers["heldout_variance"] < 0:
-        raise ValueError("numbers out of range")
-    if entry["quality"] not in get_args(QualityKind):
-        raise ValueError(f"unknown quality {entry['quality']!r}")
-    return ViewModel(
-        label_id=int(entry["label_id"]),
-        quality=entry["quality"],
-        curves=curves,
-        heldout_inputs=u,
-        lengths=(x, y, z),
-        inputs=inputs,
-        weights=weights,
-        calibration=_calibration_from_json(entry["calibration"]),
-        **numbers,
-    )
-
-
-def _calibration_from_json(entry: dict[str, Any]) -> Calibration:
-    targets, thresholds = (np.array(entry[k], np.float64) for k in ("targets", "thresholds"))
-    confidence, least = float(entry["confidence"]), float(entry["least_support"])
-    discount = float(entry.get("discount", 0.0))
-    if targets.ndim != 1 or targets.shape != thresholds.shape:
+    if calibration.targets.shape != calibration.thresholds.shape:
         raise ValueError("lists of unequal length")
-    rising = all((np.diff(values) > 0).all() for values in (targets, thresholds))
-    within = all((np.abs(values) <= 1).all() for values in (targets, thresholds))
-    if not rising or not within or not 0 < confidence < 1 or not 0 <= least <= 1:
+    for rising in (calibration.targets, calibration.thresholds):
+        if not (np.diff(rising) > 0).all() or not (np.abs(rising) <= 1).all():
+            raise ValueError("targets or thresholds out of range")
+    if not all((np.abs(array) < LARGEST).all() for array in (model.inputs, model.weights)):
         raise ValueError("numbers out of range")
-    if not 0 <= discount < LARGEST:
-        raise ValueError("numbers out of range")
-    if entry["status"] not in STATUSES:
-        raise ValueError(f"unknown status {entry['status']!r}")
-    return Calibration(
-        str(entry["status"]), confidence, int(entry["num_views"]), targets, thresholds, least, discount
-    )

@@ -18,16 +18,19 @@ visitor who moves as the rule says.
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation, Slerp
 
-from sagesplat.core.errors import DataError, RunError, short
-from sagesplat.core.typed import check_fields, types_of
+from sagesplat.core.errors import RunError
+from sagesplat.core.limits import Count, Seed, Share
 from sagesplat.io.files import read_json, write_json
-from sagesplat.scene.cameras import VIEWPOINTS, camera_of_entry
-from sagesplat.scene.nerfstudio import world_to_camera
+from sagesplat.io.typed import convert_as, read_json_as, refused
+from sagesplat.scene.cameras import VIEWPOINTS, ViewpointsFile
+from sagesplat.scene.nerfstudio import Poses
 from sagesplat.scene.scene import Camera, Scene
 
 SETS = ("fit", "bias", "calibration")  # what they are for; none of them is used for another
@@ -41,10 +44,10 @@ _CLEAR = 0.5  # of the way to the closest point that its cameras have
 class Rule:
     """The distribution that viewpoints are drawn from (the module's text)."""
 
-    seed: int = 0
-    neighbours: int = 4  # nearest cameras that one is drawn from; 0: no interpolation
-    shift: float = 0.03  # share of the scene's extent
-    turn: float = 0.05  # radians
+    seed: Seed = 0
+    neighbours: Count = 4  # nearest cameras that one is drawn from; 0: no interpolation
+    shift: Share = 0.03  # share of the scene's extent
+    turn: Annotated[float, Meta(ge=0, le=LARGEST_TURN)] = 0.05  # radians
 
     def check(self) -> None:
         """RunError for a rule that cannot be followed."""
@@ -169,21 +172,22 @@ def write_viewpoints(path: Path, drawn: Viewpoints) -> None:
     write_json(path, {**head, "viewpoints": entries})
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Drawn(ViewpointsFile):
+    rule: Rule
+    cameras: str
+
+
 def read_viewpoints(path: Path) -> Viewpoints:
     """What `write_viewpoints` wrote; DataError where the content cannot be used."""
-    cure = "delete it and run `sagesplat sample` again"
-    document = read_json(path, cure)
-    try:
-        if document["format"] != VIEWPOINTS:
-            raise ValueError(f"format {document['format']!r}")
-        check_fields(document["rule"], types_of(Rule))
-        cameras = tuple(camera_of_entry(entry) for entry in document["viewpoints"])
-        sets = tuple(str(entry["set"]) for entry in document["viewpoints"])
+    what, cure = "a file of viewpoints", "delete it and run `sagesplat sample` again"
+    made = read_json_as(path, _Drawn, what, cure)
+    with refused(path, what, cure):
+        cameras = tuple(entry.camera() for entry in made.viewpoints)
+        sets = tuple(entry.set for entry in made.viewpoints)
         if unknown := set(sets) - set(SETS):
             raise ValueError(f"unknown set {unknown.pop()!r}")
-        return Viewpoints(Rule(**document["rule"]), str(document["cameras"]), cameras, sets)
-    except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
-        raise DataError(f"{path}: not a file of viewpoints ({short(repr(error))}); {cure}") from None
+    return Viewpoints(made.rule, made.cameras, cameras, sets)
 
 
 def read_cameras(path: Path, like: Camera) -> list[Camera]:
@@ -201,14 +205,12 @@ def read_cameras(path: Path, like: Camera) -> list[Camera]:
     """
     cure = "give a viewpoints.json, or a transforms.json whose frames have a transform_matrix"
     document = read_json(path, cure)
-    try:
-        if document.get("format") == VIEWPOINTS:
-            cameras = [camera_of_entry(entry) for entry in document["viewpoints"]]
+    with refused(path, "a list of viewpoints", cure):
+        if isinstance(document, dict) and document.get("format") == VIEWPOINTS:
+            cameras = [entry.camera() for entry in convert_as(document, ViewpointsFile).viewpoints]
         else:
-            poses = [world_to_camera(frame.get("transform_matrix")) for frame in document["frames"]]
+            poses = [frame.world_to_camera() for frame in convert_as(document, Poses).frames]
             cameras = [replace(like.neutral, w2c=w2c.astype(np.float32)) for w2c in poses]
         if not cameras:
             raise ValueError("no viewpoints")
-    except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
-        raise DataError(f"{path}: no list of viewpoints ({short(repr(error))}); {cure}") from None
     return cameras

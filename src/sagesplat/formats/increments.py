@@ -6,25 +6,27 @@ level on, and not the ones below.
 """
 
 import hashlib
-import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import groupby, pairwise
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
 from jaxtyping import Int64
+from msgspec import Meta
 
-from sagesplat.core.errors import DataError, short
+from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import Gaussians, concat
+from sagesplat.core.limits import Count, LabelId, Sha256, Share
 from sagesplat.core.names import slugs
 from sagesplat.formats.levels import starts_of
 from sagesplat.formats.ply import read_ply, write_ply
 from sagesplat.formats.spz import SH_BITS, encode_spz, packing_order, read_spz
 from sagesplat.formats.stream import Decoded, decode_stream
-from sagesplat.io.files import atomic_folder, read_json, write_json
+from sagesplat.io.files import atomic_folder, write_json
+from sagesplat.io.typed import read_json_as
 
 FileFormat = Literal["spz", "ply"]  # of a file that is one increment
 Format = Literal["stream", "spz", "ply"]
@@ -34,7 +36,8 @@ STREAM = ".sgst"
 _FORMATS: dict[str, Format] = {STREAM: "stream", ".ply": "ply"}  # by suffix; all others are SPZ
 _FINE_BITS = 8, 8  # of SH coefficients
 _CURE = "delete that folder and run `sagesplat nest` again"
-_URI = r"(?!\.)[A-Za-z0-9_.-]{1,200}"  # a plain file name
+Size = Annotated[int, Meta(ge=1, le=2**53 - 1)]
+_FileName = Annotated[str, Meta(pattern=r"^(?!\.)[A-Za-z0-9_.-]{1,200}\Z")]
 GPU_BYTES = (16, 24, 40, 56)  # per Gaussian in Spark 2.2, by SH degree
 
 
@@ -42,16 +45,20 @@ GPU_BYTES = (16, 24, 40, 56)  # per Gaussian in Spark 2.2, by SH degree
 class Increment:
     """The Gaussians that a level of a category adds to the level below it, or replaces it by, as bytes."""
 
-    label_id: int
-    level: int
-    uri: str  # file in the folder of the index; its name holds a hash, so it can be cached for ever
-    count: int  # Gaussians
-    nbytes: int
-    gpu_bytes: int
-    sha256: str
+    label_id: LabelId
+    level: Size
+    uri: _FileName  # in the folder of the index; its name holds a hash, so it can be cached for ever
+    count: Size  # Gaussians
+    nbytes: Size
+    gpu_bytes: Size
+    sha256: Sha256
     refine: Refine = "ADD"  # REPLACE: instead of all increments of lower levels
-    offset: int = 0  # its first byte in the file: a coded stream has all levels of a category
-    weight: float | None = None  # of second opacities where this is the newest level; None: there are none
+    offset: Count = 0  # its first byte in the file: a coded stream has all levels of a category
+    weight: Share | None = None  # of second opacities where this is the newest level; None: there are none
+
+    def __post_init__(self) -> None:
+        if self.offset and self.format != "stream":
+            raise ValueError(f"offset {self.offset} in a file of its own")
 
     @property
     def format(self) -> Format:
@@ -135,37 +142,14 @@ def write_index(folder: Path, written: Sequence[Increment]) -> None:
     write_json(folder / INDEX, {"format": "+".join(formats), "chunks": chunks})
 
 
+@dataclass(frozen=True)
+class _Index:
+    chunks: list[Increment]
+
+
 def read_index(folder: Path) -> list[Increment]:
     """The increments that `write_increments` listed; DataError for an invalid index."""
-    document: Any = read_json(folder / INDEX, _CURE)
-    try:
-        listed = [checked(Increment(**entry)) for entry in document["chunks"]]
-    except (KeyError, TypeError, ValueError) as error:
-        raise DataError(
-            f"{folder / INDEX}: not an index of increments ({short(repr(error))}); {_CURE}"
-        ) from None
-    return listed
-
-
-def checked(increment: Increment) -> Increment:
-    """The increment; ValueError for an impossible entry, such as a file outside the folder."""
-    sizes = (increment.level, increment.count, increment.nbytes, increment.gpu_bytes)
-    if not all(type(size) is int and 0 < size < 2**53 for size in sizes):
-        raise ValueError("an increment without content")
-    if type(increment.label_id) is not int or not -1 <= increment.label_id < 2**15:
-        raise ValueError(f"label id {increment.label_id!r}")
-    if not isinstance(increment.uri, str) or not re.fullmatch(_URI, increment.uri):
-        raise ValueError(f"{increment.uri!r} is not a file name of an increment")
-    if not isinstance(increment.sha256, str) or not re.fullmatch("[0-9a-f]{64}", increment.sha256):
-        raise ValueError(f"{increment.sha256!r} is not a SHA-256")
-    if increment.refine not in get_args(Refine):
-        raise ValueError(f"refine {increment.refine!r}")
-    offset, weight = increment.offset, increment.weight
-    if type(offset) is not int or not 0 <= offset < (2**53 if increment.format == "stream" else 1):
-        raise ValueError(f"offset {offset!r}")
-    if weight is not None and not (type(weight) in (int, float) and 0 <= weight <= 1):
-        raise ValueError(f"weight {weight!r}")
-    return increment
+    return read_json_as(folder / INDEX, _Index, "an index of increments", _CURE).chunks
 
 
 def read_increments(folder: Path, listed: Sequence[Increment]) -> Gaussians:

@@ -9,10 +9,10 @@ the file itself, and this is a dictionary of their names. `parents` are the cate
 
 import json
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -20,9 +20,11 @@ from jaxtyping import Int16
 from torch import Tensor
 
 from sagesplat.core.errors import DataError, short
+from sagesplat.core.limits import AtLeast1, CategoryId, LabelId
 from sagesplat.core.names import repaired
 from sagesplat.formats.splat import Splat
-from sagesplat.io.files import atomic_path, loads_json, regular
+from sagesplat.io.files import atomic_path, regular
+from sagesplat.io.typed import parse_json_as
 
 _FORMAT = "sagesplat-labels"
 NO_PARENTS: Mapping[int, str] = MappingProxyType({})
@@ -87,41 +89,26 @@ def with_labels(splat: Splat, path: Path) -> Splat:
         ) from None
 
 
+@dataclass(frozen=True)
+class _Document:
+    format: Literal["sagesplat-labels"]
+    version: Literal[1]
+    names: dict[CategoryId, str]
+    parents: dict[CategoryId, str] = field(default_factory=dict)
+    runs: list[tuple[LabelId, AtLeast1]] | None = None
+
+
 def labelled(splat: Splat, content: bytes) -> Splat:
     """The splat with the labels that `as_json` wrote; ValueError if they do not fit."""
-    try:
-        document = loads_json(content)
-        if document["format"] != _FORMAT or document["version"] != 1:
-            raise ValueError(f"format {document['format']!r:.40}, version {document['version']!r:.20}")
-        labels = splat.gaussians.label_ids
-        if "runs" in document:
-            labels = _labels(document["runs"], len(splat.gaussians))
-        names, parents = _names(document["names"]), _names(document.get("parents", {}))
-    except (TypeError, KeyError, AttributeError) as error:
-        raise ValueError(repr(error)) from None
+    made, labels = parse_json_as(content, _Document), splat.gaussians.label_ids
+    if made.runs is not None:
+        if sum(size for _, size in made.runs) != len(labels):
+            raise ValueError(f"labels of other than its {len(labels)} rows")
+        ids, sizes = (np.array([run[i] for run in made.runs], np.int64) for i in (0, 1))
+        labels = torch.from_numpy(np.repeat(ids, sizes).astype(np.int16))
+    names, parents = (
+        {label: repaired(name, f"category {label}") for label, name in given.items()}
+        for given in (made.names, made.parents)
+    )
     g = replace(splat.gaussians, label_ids=labels)
     return replace(splat, gaussians=g, names=splat.names | names, parents=splat.parents | parents)
-
-
-def _labels(runs: Any, count: int) -> Int16[Tensor, " N"]:
-    """Labels of `count` rows; ValueError unless `runs` are those of as many."""
-    for run in runs:
-        label, size = run
-        if (
-            type(label) is not int
-            or type(size) is not int
-            or not -1 <= label < 2**15
-            or not 0 < size <= count
-        ):
-            raise ValueError(f"{run!r:.60} in place of a label and a number of rows")
-    if sum(size for _, size in runs) != count:
-        raise ValueError(f"labels of other than its {count} rows")
-    labels, sizes = (np.array([run[i] for run in runs], np.int64) for i in (0, 1))
-    return torch.from_numpy(np.repeat(labels, sizes).astype(np.int16))
-
-
-def _names(names: Mapping[str, Any]) -> dict[int, str]:
-    found = {int(label): repaired(name, f"category {label}") for label, name in names.items()}
-    if not all(0 <= label < 2**15 for label in found):
-        raise ValueError("names of no label ids")
-    return found

@@ -8,22 +8,26 @@ level which rows of which file are in it ({"0": {"file": 0, "offset": 0, "count"
 """
 
 from collections import defaultdict
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Annotated, Literal
 
 import torch
+from msgspec import Meta
 
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import concat
 from sagesplat.formats.labels import with_labels
 from sagesplat.formats.sog import read_sog
 from sagesplat.formats.splat import Splat
-from sagesplat.io.files import loads_json, regular
+from sagesplat.io.files import regular
+from sagesplat.io.typed import parse_json_as, refused
 
 LOD_META = "lod-meta.json"
 _MOST_LEVELS = 100
 _CURE = "copy its folder again"
+_Number = Annotated[int, Meta(ge=0, lt=2**40)]
+_Name = Annotated[str, Meta(max_length=1000, pattern=r"^[^\x00-\x1f\x7f]+\Z")]
 
 Slices = dict[int, list[tuple[int, int]]]  # by file: first row and number of rows of each leaf
 
@@ -89,40 +93,50 @@ def _inside(path: Path, name: str) -> Path:
     return file
 
 
+@dataclass(frozen=True)
+class _Rows:
+    file: _Number
+    offset: _Number
+    count: _Number
+
+
+@dataclass(frozen=True)
+class _Node:
+    children: "list[_Node] | None" = None
+    lods: dict[str, _Rows | None] | None = None
+
+
+@dataclass(frozen=True)
+class _Meta:
+    lodLevels: Annotated[int, Meta(ge=1, le=_MOST_LEVELS)]
+    filenames: list[_Name]
+    tree: _Node
+    environment: _Name | Literal[""] | None = None
+    version: Literal[1] = 1
+
+
 def _parsed(path: Path, lod: int) -> tuple[int, list[str], str | None, Slices]:
     """Number of levels, file names, the environment's, and the rows of a level by file."""
     try:
-        meta = loads_json(regular(path).read_bytes())
-        levels, files, environment = meta["lodLevels"], meta["filenames"], meta.get("environment")
-        if type(levels) is not int or not 0 < levels <= _MOST_LEVELS or meta.get("version", 1) != 1:
-            raise ValueError(f"version {meta.get('version', 1)!r:.20}, {levels!r:.20} levels")
-        if not isinstance(files, list) or not all(map(_is_name, files)) or not _is_name(environment or "."):
-            raise ValueError("names of files that are none")
-        return levels, files, environment or None, _slices(meta["tree"], str(lod), len(files))
+        content = regular(path).read_bytes()
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror}); give a {LOD_META}") from None
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise DataError(f"{path}: not a streamed SOG ({short(repr(error))}); {_CURE}") from None
+    with refused(path, "a streamed SOG", _CURE):
+        meta = parse_json_as(content, _Meta)
+        slices = _slices(meta.tree, str(lod), len(meta.filenames))
+    return meta.lodLevels, meta.filenames, meta.environment or None, slices
 
 
-def _is_name(value: Any) -> bool:
-    return isinstance(value, str) and 0 < len(value) <= 1000 and value.isprintable()
-
-
-def _slices(tree: Any, lod: str, files: int) -> Slices:
+def _slices(tree: _Node, lod: str, files: int) -> Slices:
     found: Slices = defaultdict(list)
     nodes = [tree]
     while nodes:
         node = nodes.pop()
-        nodes += node.get("children") or []
-        if (rows := (node.get("lods") or {}).get(lod)) is None:
+        nodes += node.children or []
+        if (rows := (node.lods or {}).get(lod)) is None:
             continue
-        numbers = [rows["file"], rows["offset"], rows["count"]]
-        if (
-            any(type(number) is not int or not 0 <= number < 2**40 for number in numbers)
-            or numbers[0] >= files
-        ):
-            raise ValueError(f"rows {numbers!r:.60}")
-        if numbers[2]:
-            found[numbers[0]].append((numbers[1], numbers[2]))
+        if rows.file >= files:
+            raise ValueError(f"rows of file {rows.file}, which is not listed")
+        if rows.count:
+            found[rows.file].append((rows.offset, rows.count))
     return found

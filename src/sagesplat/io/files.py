@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from sagesplat.core.errors import RunError, short
+from sagesplat.core.errors import RunError, SageError, short
 from sagesplat.io.lock import alone
 
 _FULL = {errno.ENOSPC: "the disk is full", errno.EDQUOT: "the quota is used up"}
@@ -228,17 +228,17 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=1) + "\n")
 
 
-def read_json(path: Path, cure: str = "") -> Any:
-    """The content of a JSON file. RunError if it is unreadable, with a `cure`. Memory: 64 bytes per byte."""
+def read_json(path: Path, cure: str = "", error: type[SageError] = RunError) -> Any:
+    """The content of a JSON file; `error` if it is unreadable, with a `cure`. Memory: 64 bytes per byte."""
     cure = cure and f"; {cure}"
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise RunError(f"{path}: no such file{cure}") from None
+        raise error(f"{path}: no such file{cure}") from None
     except RecursionError:
-        raise RunError(f"{path}: not readable as JSON (nested too deeply){cure}") from None
-    except (OSError, ValueError) as error:
-        raise RunError(f"{path}: not readable as JSON ({short(error)}){cure}") from error
+        raise error(f"{path}: not readable as JSON (nested too deeply){cure}") from None
+    except (OSError, ValueError) as reason:
+        raise error(f"{path}: not readable as JSON ({short(reason)}){cure}") from reason
 
 
 def regular(path: Path) -> Path:
@@ -248,18 +248,9 @@ def regular(path: Path) -> Path:
     return path
 
 
-def loads_json(content: bytes) -> Any:
+def loads_json(content: bytes | str) -> Any:
     """The value of JSON in UTF-8, also with a byte order mark. ValueError if it is none."""
     try:
-        return json.loads(content.decode("utf-8-sig"))
+        return json.loads(content if isinstance(content, str) else content.decode("utf-8-sig"))
     except RecursionError:
         raise ValueError("JSON that is nested too deeply") from None
-
-
-def read_object(path: Path) -> dict[str, Any]:
-    """The JSON object in a file; empty where there is none that can be read."""
-    try:
-        content = read_json(path)
-    except RunError:
-        return {}
-    return content if isinstance(content, dict) else {}

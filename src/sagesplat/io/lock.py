@@ -9,8 +9,11 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+
+import msgspec
 
 from sagesplat.core.errors import RunError
 
@@ -134,6 +137,16 @@ def _take(handle: int) -> None:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
+@dataclass(frozen=True)
+class _Holder:
+    """Who holds a lock, as written into its file."""
+
+    pid: int
+    host: str
+    command: str
+    since: str
+
+
 def _ourselves() -> dict[str, str | int]:
     command = " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
     now = datetime.now().astimezone().isoformat(" ", "seconds")
@@ -143,9 +156,7 @@ def _ourselves() -> dict[str, str | int]:
 def _holder(path: Path) -> str:
     """A description of the process that holds the lock."""
     try:
-        holder = json.loads(path.read_text(encoding="utf-8"))
-        who = f"process {holder['pid']} on {holder['host']}"
-        return f"{who} (`{holder['command']}`, since {holder['since']})"
-    # it has not written its description yet
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        holder = msgspec.convert(json.loads(path.read_text(encoding="utf-8")), _Holder)
+    except (OSError, ValueError, RecursionError):  # it has not written its description yet
         return "another process"
+    return f"process {holder.pid} on {holder.host} (`{holder.command}`, since {holder.since})"

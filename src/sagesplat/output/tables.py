@@ -4,13 +4,13 @@ import csv
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
-from sagesplat.adapt.eq3 import SsimModel
+from sagesplat.adapt.eq3 import Eq3, SsimModel
 from sagesplat.adapt.evaluate import QUALITIES, Evaluation
 from sagesplat.adapt.observe import TOTAL, Observations
 from sagesplat.adapt.plan import Choice, Counts, Plan, quality_title
@@ -368,7 +368,7 @@ def evaluation_table(evaluation: Evaluation, labels: Sequence[int], names: Mappi
 
 def models_table(models: Mapping[tuple[int, int], SsimModel], names: Mapping[int, str]) -> Table:
     """Eq. 3 for every label and level: parameters, fitted distances, error."""
-    parameters = next(iter(models.values())).params._fields if models else ()
+    parameters = [one.name for one in fields(Eq3)] if models else []
     body = [
         (name_of(m.label_id, names), m.level, *m.params, *m.d_range, m.rmse, m.num_observations, m.status)
         for _, m in sorted(models.items())

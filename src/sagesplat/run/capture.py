@@ -4,22 +4,20 @@ import hashlib
 import json
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from sagesplat.core.config import SceneConfig
 from sagesplat.core.errors import RunError, short
-from sagesplat.core.typed import check_fields, types_of
-from sagesplat.io.files import read_json, read_object, write_json
+from sagesplat.io.files import write_json
+from sagesplat.io.typed import convert_as, known_json, read_json_as
 from sagesplat.run.records import file_hash
 from sagesplat.scene import load_scene
 from sagesplat.scene.scene import Scene, Vignetting
-from sagesplat.scene.vignetting import parse_vignetting
 from sagesplat.scene.vignetting_fit import with_vignetting
 
 _CURE = "delete it, and run `sagesplat run SCENE RUN` again with the same settings"
-_TYPES = {"path": Path, "fingerprint": str}
 
 
 @dataclass(frozen=True)
@@ -27,10 +25,15 @@ class Capture:
     """What scene.json says of the capture that a run is made from."""
 
     path: Path
-    settings: dict[str, Any]  # how it is read; none for a stored scene
+    settings: dict[str, Any]  # of `SceneConfig`: how it is read; none for a stored scene
     fingerprint: str
-    photos: dict[str, str] | None  # SHA-256 by name; None in run folders made before it was kept
+    photos: dict[str, str] | None = None  # SHA-256 by name
     vignetting: Vignetting | None = None  # that was found in the photos, where it was looked for
+
+    def __post_init__(self) -> None:
+        convert_as(self.settings, SceneConfig)
+        if unknown := sorted(self.settings.keys() - {field.name for field in fields(SceneConfig)}):
+            raise ValueError(f"setting {short(unknown[0])} is not known")
 
     def load(self) -> Scene:
         """The capture, whose vignetting is not estimated again. Raises SceneError."""
@@ -40,21 +43,7 @@ class Capture:
 
 def read_capture(path: Path) -> Capture:
     """The capture that a scene.json names; RunError for anything else."""
-    made = read_json(path, _CURE)
-    try:
-        if not isinstance(made, dict) or not isinstance(made.get("settings"), dict):
-            raise ValueError("no settings")
-        check_fields({name: made.get(name) for name in _TYPES}, _TYPES)
-        check_fields(made["settings"], types_of(SceneConfig))
-        if unknown := sorted(made["settings"].keys() - types_of(SceneConfig).keys()):
-            raise ValueError(f"setting {short(unknown[0])} is not known")
-        photos = made.get("photos")
-        if photos is not None and not (isinstance(photos, dict) and set(map(type, photos.values())) <= {str}):
-            raise ValueError("photos without hashes")
-        vignetting = parse_vignetting(made.get("vignetting"))
-    except ValueError as error:
-        raise RunError(f"{path}: not the scene of a run ({short(error)}); {_CURE}") from None
-    return Capture(Path(made["path"]), made["settings"], made["fingerprint"], photos, vignetting)
+    return read_json_as(path, Capture, "the scene of a run", _CURE, RunError)
 
 
 def fingerprint(scene: Scene) -> str:
@@ -84,7 +73,7 @@ class Hashes:
 
     def __init__(self, kept: Path, files: Mapping[str, Path]) -> None:
         """`kept`: where `keep` wrote what was known of the files before; it may be missing."""
-        self._path, self._known = kept, read_object(kept)
+        self._path, self._known = kept, known_json(kept, dict) or {}
         self._found = {name: _state_of(path, self._known.get(name)) for name, path in files.items()}
 
     @property

@@ -1,7 +1,8 @@
 """The settings that a run folder knows: defaults of the next command on it."""
 
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Any, TypeVar
 
 from sagesplat.core.config import (
     AdoptConfig,
@@ -17,8 +18,8 @@ from sagesplat.core.config import (
     SceneConfig,
     TrainConfig,
 )
-from sagesplat.core.typed import check_fields, fits, types_of
-from sagesplat.io.files import read_object
+from sagesplat.core.limits import NotNegative, Seed
+from sagesplat.io.typed import convert_as, known_json
 from sagesplat.run.records import FORMAT
 from sagesplat.run.run_dir import LadderKind, RunDir
 
@@ -45,10 +46,13 @@ def recorded_settings(run: RunDir, of: str = "run") -> dict[str, Any]:
     tuned = nest.get("boundary_steps")
     boundary = {} if tuned is None else {"boundary_steps": tuned}
     adopted = _made(run, "adopt")
-    label_images = {} if adopted.get("labelled") else read_object(run.segmentation)  # else made by adopt
+    scene, label_images = known_json(run.scene, _Made), known_json(run.segmentation, dict) or {}
+    if adopted.get("labelled"):
+        label_images = {}  # made by adopt
+    seeded = _config(_Seeded, nest if of == "nest" and nest else train)
     known: dict[str, Any] = {
         "adopt": _config(AdoptConfig, {**adopted, **_levels_of_adopted(nest)}) if adopted else None,
-        "scene_config": _config(SceneConfig, read_object(run.scene).get("settings")),
+        "scene_config": _config(SceneConfig, scene.settings) if scene else None,
         "poses": _config(PosesConfig, _made(run, "poses")),
         "masks": _config(MasksConfig, label_images),
         "labels": _config(LabelsConfig, _labels(run)),
@@ -59,7 +63,7 @@ def recorded_settings(run: RunDir, of: str = "run") -> dict[str, Any]:
         "sample": _config(SampleConfig, _made(run, "sample")),
         "fit": _config(FitConfig, observed),
         "plan": _config(PlanConfig, _made(run, "plan")),
-        "seed": _seed((nest if of == "nest" and nest else train).get("seed")),
+        "seed": seeded.seed if seeded else None,
         "fuse": True if run.provenance("fuse").exists() else None,
     }
     return {name: value for name, value in known.items() if value is not None}
@@ -83,49 +87,47 @@ def _levels_of_adopted(nest: dict[str, Any]) -> dict[str, Any]:
 def stage_seconds(run: RunDir) -> dict[str, float]:
     """How long each finished stage of a run took, by its name."""
     folders = dict.fromkeys([run.path / "provenance", run.adapted / "provenance"])
-    found = {}
-    for folder in folders:
-        for path in sorted(folder.glob("*.json")):
-            seconds: Any = read_object(path).get("seconds")
-            if fits(seconds, float):
-                found[path.stem] = float(seconds)
-    return found
+    paths = (path for folder in folders for path in sorted(folder.glob("*.json")))
+    return {path.stem: made.seconds for path in paths if (made := known_json(path, _Timed))}
+
+
+@dataclass(frozen=True)
+class _Timed:
+    seconds: NotNegative
+
+
+@dataclass(frozen=True)
+class _Made:
+    """Of a file with settings those."""
+
+    settings: dict[str, Any]
+    format: int = FORMAT
 
 
 def _made(run: RunDir, stage: str) -> dict[str, Any]:
     """The settings of a finished stage, empty where it is not done or of another format."""
-    made = read_object(run.provenance(stage))
-    settings = made.get("settings")
-    return settings if made.get("format") == FORMAT and isinstance(settings, dict) else {}
+    made = known_json(run.provenance(stage), _Made)
+    return made.settings if made and made.format == FORMAT else {}
 
 
 def _begun(run: RunDir) -> dict[str, Any]:
     """The settings of a training that did not end: of the run, or of its first block."""
     for folder in (run.replacement, run, run.block(0)):
-        settings = read_object(folder.cap).get("settings")
-        if isinstance(settings, dict):
-            return settings
+        if made := known_json(folder.cap, _Made):
+            return made.settings
     return {}
 
 
-def _seed(value: Any) -> int | None:
-    return value if fits(value, int) else None
+@dataclass(frozen=True)
+class _Seeded:
+    seed: Seed
 
 
-def _config(kind: type[Config], settings: Any) -> Config | None:
+def _config(kind: type[Config], settings: dict[str, Any]) -> Config | None:
     """Settings of a kind from a JSON object; None where it holds none of them, or one of a wrong type."""
-    types = types_of(kind)
-    try:
-        values = {name: settings[name] for name in types if name in settings}
-        check_fields(values, types)
-    except (TypeError, ValueError):
+    if not settings.keys() & {field.name for field in fields(kind)}:
         return None
-    made = {name: _plain(value, types[name]) for name, value in values.items()}
-    return kind(**made) if made else None
-
-
-def _plain(value: Any, kind: Any) -> Any:
-    """A value of a JSON file as settings have it: JSON has neither tuples nor paths."""
-    if isinstance(value, list):
-        return tuple(value)
-    return Path(value) if isinstance(value, str) and Path in get_args(kind) else value
+    try:
+        return convert_as(settings, kind)
+    except ValueError:
+        return None

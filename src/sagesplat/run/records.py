@@ -5,14 +5,16 @@ import json
 import math
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from sagesplat import __version__
 from sagesplat.core import config
 from sagesplat.core.errors import RunError, short
-from sagesplat.core.typed import check_fields, fits, types_of
+from sagesplat.core.limits import NotNegative, Number, Seed
 from sagesplat.io.files import read_json, write_json
+from sagesplat.io.typed import convert_as, refused
 from sagesplat.run.run_dir import RunDir
 
 FORMAT = 3  # of the run folder; raised when older folders can no longer be read
@@ -30,7 +32,24 @@ _KINDS = {  # settings by stage; those of other stages are compared, and never u
     "fit": config.FitConfig,
     "plan": config.PlanConfig,
 }
-_MORE: dict[str, Any] = {"seed": int, "targets": list[float], "boundary_steps": int}
+
+
+@dataclass(frozen=True)
+class _More:
+    """Settings of stages beside those of their kind."""
+
+    seed: Seed = 0
+    targets: list[Number] = field(default_factory=list)
+    boundary_steps: int = 0
+
+
+@dataclass(frozen=True)
+class _Record:
+    """What every record holds."""
+
+    settings: dict[str, Any]
+    inputs: dict[str, str]
+    seconds: NotNegative = 0.0
 
 
 class Settings(dict[str, Any]):
@@ -84,40 +103,21 @@ def read_record(path: Path) -> dict[str, Any]:
 
     RunError for anything else, for settings of a wrong type, and for a run folder of another format.
     """
-    try:
-        made = read_json(path)
-        if not isinstance(made, dict):
-            raise ValueError("no object")
+    cure = "run that stage again with --force"
+    made = read_json(path, cure, _NoRecord)
+    if isinstance(made, dict):
         check_format(path, made)
-        return made | {"settings": Settings(_checked(path.stem, made), path)}
-    except _OtherFormat:
-        raise
-    except (RunError, ValueError) as error:
-        reason = short(str(error).removeprefix(f"{path}: "))
-        raise _NoRecord(
-            f"{path}: not the record of a stage; run that stage again with --force ({reason})"
-        ) from None
-
-
-def _checked(stage: str, made: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The settings of a record; ValueError where a part of it cannot be used."""
-    settings = made.get("settings")
-    if not isinstance(settings, dict) or not fits(made.get("inputs"), dict[str, str]):
-        raise ValueError("no settings or no inputs")
-    if not fits(made.get("seconds", 0.0), float):
-        raise ValueError("no seconds")
-    check_fields(settings, {**_MORE, **types_of(_KINDS[stage])} if stage in _KINDS else _MORE)
-    return settings
-
-
-class _OtherFormat(RunError):
-    """A run folder that another version made."""
+    with refused(path, "the record of a stage", cure, _NoRecord):
+        settings = convert_as(made, _Record).settings
+        for kind in (_More, _KINDS.get(path.stem, _More)):
+            convert_as(settings, kind)
+    return made | {"settings": Settings(settings, path)}
 
 
 def check_format(path: Path, made: Mapping[str, Any]) -> None:
     """RunError unless a record, which was read from `path`, is of the format that is read here."""
     if made.get("format") != FORMAT:
-        raise _OtherFormat(
+        raise RunError(
             f"{path}: from a run folder of format {short(made.get('format'))}, this sagesplat "
             f"({__version__}) reads {FORMAT}; run again into a new folder"
         )

@@ -3,15 +3,17 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int, Int64
+from msgspec import Meta
 
 from sagesplat.core import geometry
-from sagesplat.core.errors import RunError, SceneError, short
-from sagesplat.core.typed import check_fields, types_of
-from sagesplat.io.files import read_json, write_json
+from sagesplat.core.errors import RunError, SceneError
+from sagesplat.core.limits import Count, NotNegative, Number
+from sagesplat.io.files import write_json
+from sagesplat.io.typed import read_json_as, refused
 from sagesplat.scene.scene import Points, Scene
 
 MOST = 4096  # blocks
@@ -25,6 +27,7 @@ _FAR_SHARE = 0.5  # limit on the points beyond the margin, as a share of the blo
 _NARROW = 0.25  # least width of a scene as a share of its length, for the margin
 _LEAST_UP = 0.02  # share of the cameras' variance that is added along their mean up direction
 _MOST_SAMPLED = 200_000  # points that a split considers
+_Corner = tuple[Number | None, Number | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,45 +244,46 @@ def write_blocks(path: Path, blocks: Blocks, **more: Any) -> None:
     write_json(path, {"axes": blocks.axes.tolist(), **corners, "margin": blocks.margin, **more})
 
 
+@dataclass(frozen=True, eq=False)
+class _Partition:
+    """What `write_blocks` writes; a corner of null is infinitely far."""
+
+    axes: Float64[np.ndarray, "2 3"]
+    low: Annotated[list[_Corner], Meta(min_length=1, max_length=MOST)]
+    high: list[_Corner]
+    margin: NotNegative
+
+    def __post_init__(self) -> None:
+        if len(self.low) != len(self.high):
+            raise ValueError(f"{len(self.low)} boxes with {len(self.high)} ends")
+
+
 def read_blocks(path: Path) -> Blocks:
     """The partition that `write_blocks` wrote; SceneError for any other content."""
-    content = read_json(path, _CURE)
-    try:
-        low = np.array([[-np.inf if v is None else float(v) for v in row] for row in content["low"]])
-        high = np.array([[np.inf if v is None else float(v) for v in row] for row in content["high"]])
-        axes, margin = np.array(content["axes"], np.float64), float(content["margin"])
-        if low.shape != high.shape or low.shape[1:] != (2,) or axes.shape != (2, 3):
-            raise ValueError(f"boxes of shape {low.shape}")
-        if not 1 <= len(low) <= MOST or np.isnan([low, high]).any():
-            raise ValueError(f"{len(low)} boxes")
-        if not np.isfinite([*axes.flat, margin]).all() or margin < 0:
-            raise ValueError("axes or a margin that are none")
-    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
-        raise SceneError(f"{path}: not a partition ({short(error)}); {_CURE}") from None
-    return Blocks(axes, low, high, margin)
+    made = read_json_as(path, _Partition, "a partition", _CURE, SceneError)
+    low = np.array([[-np.inf if v is None else v for v in row] for row in made.low])
+    high = np.array([[np.inf if v is None else v for v in row] for row in made.high])
+    return Blocks(made.axes, low, high, made.margin)
 
 
 @dataclass(frozen=True)
 class Division:
     """What each of B blocks is made of."""
 
-    points: list[int]  # SfM points in its box
-    views: list[int]  # training views
-    sees: list[list[int]]  # blocks that its training views see
+    points: list[Count]  # SfM points in its box
+    views: list[Count]  # training views
+    sees: list[list[Count]]  # blocks that its training views see
 
 
 def read_division(path: Path) -> Division:
     """What `write_blocks` wrote of the content of the blocks; SceneError for anything else."""
-    content, count = read_json(path, _CURE), len(read_blocks(path))
-    try:
-        made = Division(content["points"], content["views"], content["sees"])
-        check_fields(vars(made), types_of(Division))
+    count, what = len(read_blocks(path)), "a partition"
+    made = read_json_as(path, Division, what, _CURE, SceneError)
+    with refused(path, what, _CURE, SceneError):
         if {len(made.points), len(made.views), len(made.sees)} != {count}:
             raise ValueError(f"not of {count} blocks")
-        if not all(0 <= other < count for each in made.sees for other in each):
+        if any(other >= count for each in made.sees for other in each):
             raise ValueError("a block that sees one that is not there")
-    except (KeyError, TypeError, ValueError) as error:
-        raise SceneError(f"{path}: not a partition ({short(error)}); {_CURE}") from None
     return made
 
 

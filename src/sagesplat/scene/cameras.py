@@ -2,20 +2,25 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
+from jaxtyping import Float64
+from msgspec import Meta
 
-from sagesplat.core.errors import DataError, short
 from sagesplat.core.names import repaired
 from sagesplat.io.files import read_json
+from sagesplat.io.typed import convert_as, refused
 from sagesplat.scene import load_scene
 from sagesplat.scene.loading import MAX_SIDE
 from sagesplat.scene.nerfstudio import LARGEST, MAX_SHEAR, frame_cameras
 from sagesplat.scene.scene import Camera, View
 
-VIEWPOINTS = "sagesplat-viewpoints"  # the format of viewpoints.json
+Viewpoints = Literal["sagesplat-viewpoints"]  # the format of viewpoints.json
+(VIEWPOINTS,) = get_args(Viewpoints)
 MOST_PIXELS = 2**28  # of a camera's image
+Side = Annotated[int, Meta(ge=1, le=MAX_SIDE)]  # pixels
+_Byte = Annotated[int, Meta(ge=0, le=255)]
 _CURE = (
     "give a cameras.json of 3DGS, a viewpoints.json, a transforms.json with the intrinsics of its frames, or "
     "a capture (COLMAP, nerfstudio)"
@@ -51,18 +56,17 @@ def read_camera_file(path: Path) -> list[NamedCamera]:
     if path.is_dir() or path.suffix != ".json":
         return _of_capture(path)
     document = read_json(path, _CURE)
-    try:
+    if isinstance(document, dict) and document.get("format") != VIEWPOINTS:
+        return _of_transforms(path)
+    with refused(path, "a list of cameras", _CURE):
         if isinstance(document, list):
-            found = [_of_3dgs(entry, number) for number, entry in enumerate(document)]
-        elif isinstance(document, dict) and document.get("format") == VIEWPOINTS:
-            entries = enumerate(document["viewpoints"])
-            found = [NamedCamera(f"{number:03}", camera_of_entry(entry)) for number, entry in entries]
+            entries = convert_as(document, list[_Of3dgs])
+            found = [_of_3dgs(entry, number) for number, entry in enumerate(entries)]
         else:
-            return _of_transforms(path)
+            cameras = convert_as(document, ViewpointsFile).viewpoints
+            found = [NamedCamera(f"{number:03}", entry.camera()) for number, entry in enumerate(cameras)]
         if not found:
             raise ValueError("no cameras")
-    except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
-        raise DataError(f"{path}: no list of cameras ({short(repr(error))}); {_CURE}") from None
     return found
 
 
@@ -78,55 +82,66 @@ def _of_transforms(path: Path) -> list[NamedCamera]:
     return [NamedCamera(repaired(name), _within_limits(camera)) for name, camera in cameras]
 
 
-def _of_3dgs(entry: dict[str, Any], number: int) -> NamedCamera:
-    """An entry of 3DGS's cameras.json; the principal point is the middle. As `camera_of_entry`."""
-    c2w, position = _numbers(entry["rotation"], 3, 3), _numbers(entry["position"], 3)
-    fx, fy = float(_numbers(entry["fx"])), float(_numbers(entry["fy"]))
-    width, height = entry["width"], entry["height"]
-    _check_size(width, height)
+@dataclass(frozen=True, eq=False)
+class _Of3dgs:
+    """An entry of 3DGS's cameras.json; the principal point is the middle."""
+
+    rotation: Float64[np.ndarray, "3 3"]
+    position: Float64[np.ndarray, " 3"]
+    fx: float
+    fy: float
+    width: Side
+    height: Side
+    img_name: Any = None
+
+
+@dataclass(frozen=True, eq=False)
+class CameraEntry:
+    """A camera of viewpoints.json."""
+
+    w2c: Float64[np.ndarray, "4 4"]
+    K: Float64[np.ndarray, "3 3"]
+    width: Side
+    height: Side
+    background: tuple[_Byte, _Byte, _Byte]
+    set: str = ""
+
+    def camera(self) -> Camera:
+        """The camera; ValueError where it cannot be used."""
+        return _camera(self.w2c, self.K, self.width, self.height, self.background)
+
+
+@dataclass(frozen=True, eq=False)
+class ViewpointsFile:
+    """The cameras of viewpoints.json."""
+
+    format: Viewpoints
+    viewpoints: list[CameraEntry]
+
+
+def _of_3dgs(entry: _Of3dgs, number: int) -> NamedCamera:
     w2c = np.eye(4)
-    w2c[:3, :3], w2c[:3, 3] = c2w.T, -c2w.T @ position
-    K = np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])
-    name = entry.get("img_name")
-    name = repaired(name) if isinstance(name, str) and name else f"{number:03}"
-    return NamedCamera(name, _camera(w2c, K, width, height))
-
-
-def camera_of_entry(entry: dict[str, Any]) -> Camera:
-    """The camera of an entry of viewpoints.json. Raises ValueError, TypeError or KeyError."""
-    w2c, K = _numbers(entry["w2c"], 4, 4), _numbers(entry["K"], 3, 3)
-    width, height = entry["width"], entry["height"]
-    _check_size(width, height)
-    red, green, blue = (int(value) for value in entry["background"])
-    return _camera(w2c, K, width, height, (red, green, blue))
-
-
-def _numbers(value: Any, *shape: int) -> np.ndarray:
-    array = np.array(value, np.float64)
-    if array.shape != shape:
-        raise ValueError(f"{short(value)} has to be {' x '.join(map(str, shape)) or 'one number'}")
-    if not (np.abs(array) <= LARGEST).all():
-        raise ValueError(f"values that are not finite or above {LARGEST:g}")
-    return array
-
-
-def _check_size(width: Any, height: Any) -> None:
-    whole = all(isinstance(side, int) and 0 < side <= MAX_SIDE for side in (width, height))
-    if not whole or width * height > MOST_PIXELS:
-        raise ValueError(f"size {short(width)} x {short(height)} is out of range")
+    w2c[:3, :3], w2c[:3, 3] = entry.rotation.T, -entry.rotation.T @ entry.position
+    K = np.array([[entry.fx, 0, entry.width / 2], [0, entry.fy, entry.height / 2], [0, 0, 1]])
+    given = entry.img_name
+    name = repaired(given) if isinstance(given, str) and given else f"{number:03}"
+    return NamedCamera(name, _camera(w2c, K, entry.width, entry.height))
 
 
 def _within_limits(camera: Camera) -> Camera:
-    _check_size(camera.width, camera.height)
+    if max(camera.width, camera.height) > MAX_SIDE or camera.width * camera.height > MOST_PIXELS:
+        raise ValueError(f"size {camera.width} x {camera.height} is out of range")
     return camera
 
 
 def _camera(
     w2c: np.ndarray, K: np.ndarray, width: int, height: int, background: tuple[int, int, int] = (0, 0, 0)
 ) -> Camera:
+    if not (np.abs([*w2c.flat, *K.flat]) <= LARGEST).all():
+        raise ValueError(f"values that are not finite or above {LARGEST:g}")
     axes = w2c[:3, :3]
     if np.abs(axes @ axes.T - np.eye(3)).max() > MAX_SHEAR or np.linalg.det(axes) < 0:
         raise ValueError("it is no rotation")
     if min(K[0, 0], K[1, 1]) <= 0:
         raise ValueError("it has no focal length")
-    return Camera(w2c.astype(np.float32), K.astype(np.float32), width, height, background)
+    return _within_limits(Camera(w2c.astype(np.float32), K.astype(np.float32), width, height, background))

@@ -5,19 +5,20 @@ and the synthetic scenes of Mildenhall et al. 2020. Poses are camera-to-world wi
 z back). The world frame is the file's: it is not rotated, moved or scaled.
 """
 
-from collections import ChainMap
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float64
+from msgspec import Meta
 
-from sagesplat.core.errors import RunError, SceneError, short
+from sagesplat.core.errors import SceneError, short
 from sagesplat.core.names import check_photo, repaired
 from sagesplat.io.files import read_json
+from sagesplat.io.typed import convert_as, refused
 from sagesplat.scene.images import has_alpha, photo_size
 from sagesplat.scene.loading import MAX_SIDE, MIN_VIEWS, camera_of, check_settings
 from sagesplat.scene.points import random_points, read_points
@@ -31,6 +32,63 @@ LARGEST = 1e9  # largest number accepted; float32 is too coarse beyond
 MAX_SHEAR = 1e-2  # largest |R^T R - I| that rounding explains
 BLENDER_CUBE = 1.3  # half the side of the cube that NeRF's Blender scenes fit into (3DGS's initial points)
 WHITE = (255, 255, 255)
+_CURE = "give a folder with a complete transforms file"
+_Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)] | None
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """Of a frame its pose, camera to world with OpenGL axes."""
+
+    transform_matrix: Float64[np.ndarray, "rows columns"] | None = None
+
+    def world_to_camera(self) -> Float64[np.ndarray, "4 4"]:
+        """World to camera with OpenCV axes. Raises ValueError."""
+        if self.transform_matrix is None:
+            raise ValueError("no transform_matrix")
+        return world_to_camera(self.transform_matrix)
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Of a transforms file the poses of its frames."""
+
+    frames: list[Pose]
+
+
+@dataclass(frozen=True, eq=False)
+class _Frame(Pose):
+    """A frame, with values that the file states once for all of them."""
+
+    file_path: str | None = None
+    mask_path: str | None = None
+    camera_model: str | None = None
+    is_fisheye: Any = None
+    w: _Number = None
+    h: _Number = None
+    fl_x: _Number = None
+    fl_y: _Number = None
+    camera_angle_x: _Number = None
+    camera_angle_y: _Number = None
+    cx: _Number = None
+    cy: _Number = None
+    k1: _Number = None
+    k2: _Number = None
+    k3: _Number = None
+    k4: _Number = None
+    p1: _Number = None
+    p2: _Number = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Transforms:
+    """A transforms file; what is in its frames is read frame by frame."""
+
+    frames: Annotated[list[dict[str, Any]], Meta(min_length=1)]
+    ply_file_path: str | None = None
+    train_filenames: list[str] | None = None
+    test_filenames: list[str] | None = None
+    val_filenames: list[str] | None = None
 
 
 def load_transforms(path: Path, *, downscale: int = 1, test_every: int = 8) -> Scene:
@@ -51,11 +109,10 @@ def load_transforms(path: Path, *, downscale: int = 1, test_every: int = 8) -> S
     if test_every:
         views, test_names = _listed_split(file, content, frames, views)
     views = _sorted(file, views, test_names)
-    listed = content.get("ply_file_path")
-    if listed is None:
+    if content.ply_file_path is None:
         points = random_points(views)
     else:
-        points = read_points(file.parent / _inside(file, "ply_file_path", listed))
+        points = read_points(file.parent / _inside(file, "ply_file_path", content.ply_file_path))
     folder = file.parent
     return Scene(repaired(folder.resolve().name), folder, views, points, test_every, test_names=test_names)
 
@@ -94,35 +151,39 @@ def frame_cameras(file: Path) -> tuple[list[tuple[str, Camera]], bool]:
     found, photos = [], []
     pinholes: dict[tuple, np.ndarray] = {}  # computing one takes milliseconds
     for number, frame in enumerate(frames):
-        name = str(frame.get("file_path") or f"{number:03}")
+        name = frame.file_path or f"{number:03}"
         try:
             path = _inside(file, "file_path", name)
             photos.append(_photo(file.parent, path))
-            if photos[-1] is None and (frame.get("w") is None or frame.get("h") is None):
+            if photos[-1] is None and (frame.w is None or frame.h is None):
                 raise ValueError("neither w and h nor its photo")
             lens = _lens(frame, photos[-1] or file)
             key = (lens.model, lens.params, lens.width, lens.height)
             if key not in pinholes:
                 pinholes[key] = intrinsics(lens) if is_pinhole(lens) else pinhole(lens)
-            w2c = world_to_camera(frame.get("transform_matrix")).astype(np.float32)
-        except (TypeError, ValueError, OverflowError) as error:
+            w2c = frame.world_to_camera().astype(np.float32)
+        except ValueError as error:
             cure = "export the transforms again"
             raise SceneError(f"{file}: frame {short(repr(name))}: {short(error)}; {cure}") from None
         found.append((name, Camera(w2c, pinholes[key].astype(np.float32), lens.width, lens.height)))
     return found, None not in photos
 
 
-def _read(file: Path) -> tuple[dict[str, Any], list[Mapping[str, Any]]]:
+def _read(file: Path) -> tuple[_Transforms, list[_Frame]]:
     """The content of a transforms file, and its frames with the file's shared values filled in."""
-    try:
-        content = read_json(file)
-    except RunError as error:
-        raise SceneError(f"{error}; give a folder with a complete transforms file") from None
-    frames = content.get("frames") if isinstance(content, dict) else None
-    if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
-        raise SceneError(f'{file}: no frames; export the transforms again, with {{"frames": [...]}} in them')
-    shared = {key: value for key, value in content.items() if key != "frames"}
-    return content, [ChainMap(frame, shared) for frame in frames]  # copies would take frames x keys
+    content = read_json(file, _CURE, SceneError)
+    cure = 'export the transforms again, with {"frames": [...]} in them'
+    with refused(file, "a transforms file", cure, SceneError):
+        transforms = convert_as(content, _Transforms)
+    shared = {field.name: content[field.name] for field in fields(_Frame) if field.name in content}
+    frames = []
+    for number, entry in enumerate(transforms.frames):
+        try:
+            frames.append(convert_as(shared | entry, _Frame))
+        except ValueError as error:
+            name = short(repr(entry.get("file_path", number)))
+            raise SceneError(f"{file}: frame {name}: {short(error)}; export the transforms again") from None
+    return transforms, frames
 
 
 def _inside(file: Path, key: str, value: Any) -> PurePosixPath:
@@ -141,10 +202,10 @@ def _inside(file: Path, key: str, value: Any) -> PurePosixPath:
     return path
 
 
-def _views(file: Path, frames: Sequence[Mapping[str, Any]], downscale: int) -> list[View]:
+def _views(file: Path, frames: Sequence[_Frame], downscale: int) -> list[View]:
     """The views of the frames, in order; names are relative to images/ if all photos are in it."""
     folder = file.parent
-    paths = [_inside(file, "file_path", frame.get("file_path")) for frame in frames]
+    paths = [_inside(file, "file_path", frame.file_path) for frame in frames]
     if all(path.parts[0] == "images" and len(path.parts) > 1 for path in paths):
         folder, paths = folder / "images", [path.relative_to("images") for path in paths]
     small = file.parent / f"images_{downscale}"
@@ -167,9 +228,9 @@ def _views(file: Path, frames: Sequence[Mapping[str, Any]], downscale: int) -> l
             key = (lens.model, lens.params, lens.width, lens.height)
             if key not in lenses:
                 lenses[key] = lens, intrinsics(lens) if is_pinhole(lens) else pinhole(lens)
-            w2c = world_to_camera(frame.get("transform_matrix"))
+            w2c = frame.world_to_camera()
             valid = _mask(file, frame)
-        except (TypeError, ValueError, OverflowError) as error:
+        except ValueError as error:
             reason = short(error)
             raise SceneError(f"{file}: frame {str(path)!r}: {reason}; export the transforms again") from None
         lens, K = lenses[key]
@@ -179,14 +240,13 @@ def _views(file: Path, frames: Sequence[Mapping[str, Any]], downscale: int) -> l
     return views
 
 
-def _mask(file: Path, frame: Mapping[str, Any]) -> Path | None:
+def _mask(file: Path, frame: _Frame) -> Path | None:
     """The image that says which pixels of a frame's photo count. Raises ValueError where it is missing."""
-    value = frame.get("mask_path")
-    if value is None:
+    if frame.mask_path is None:
         return None
-    path = file.parent / _inside(file, "mask_path", value)
+    path = file.parent / _inside(file, "mask_path", frame.mask_path)
     if not path.is_file():
-        raise ValueError(f"no file {short(repr(value))}, its mask_path")
+        raise ValueError(f"no file {short(repr(frame.mask_path))}, its mask_path")
     return path
 
 
@@ -202,29 +262,30 @@ def _photo(root: Path, path: PurePosixPath) -> Path | None:
     return None
 
 
-def _lens(frame: Mapping[str, Any], photo: Path) -> Lens:
+def _lens(frame: _Frame, photo: Path) -> Lens:
     """A frame's lens as a COLMAP camera model; `photo` gives the size if the frame does not.
 
     With k3, OPENCV becomes COLMAP's FULL_OPENCV. k4 is accepted for the fisheye only, since other models
     define it differently. Raises ValueError.
     """
-    model = frame.get("camera_model") or (FISHEYE if frame.get("is_fisheye") else "OPENCV")
+    model = frame.camera_model or (FISHEYE if frame.is_fisheye else "OPENCV")
     if model not in (*PERSPECTIVE, FISHEYE):
         known = ", ".join((*PERSPECTIVE, FISHEYE))
-        raise ValueError(f"camera_model {str(model)[:40]!r} is not one of {known}")
-    if frame.get("w") is None or frame.get("h") is None:
+        raise ValueError(f"camera_model {model[:40]!r} is not one of {known}")
+    if frame.w is None or frame.h is None:
         width, height = photo_size(photo)
     else:
-        width, height = round(_number(frame, "w")), round(_number(frame, "h"))
+        width, height = round(frame.w), round(frame.h)
     if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
         raise ValueError(f"size {width} x {height} is out of range")
-    fx = _focal(frame, "fl_x", "camera_angle_x", width)
-    fy = _focal(frame, "fl_y", "camera_angle_y", height)
+    fx = _focal(frame.fl_x, frame.camera_angle_x, width)
+    fy = _focal(frame.fl_y, frame.camera_angle_y, height)
     fx, fy = fx or fy, fy or fx
     if fx is None or fy is None:
         raise ValueError("neither fl_x nor camera_angle_x")
-    cx, cy = _number(frame, "cx", width / 2), _number(frame, "cy", height / 2)
-    k1, k2, k3, k4, p1, p2 = (_number(frame, key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    cx, cy = (width / 2 if frame.cx is None else frame.cx), (height / 2 if frame.cy is None else frame.cy)
+    given = (frame.k1, frame.k2, frame.k3, frame.k4, frame.p1, frame.p2)
+    k1, k2, k3, k4, p1, p2 = (0.0 if value is None else value for value in given)
     params = (fx, fy, cx, cy)
     if model == FISHEYE and not (p1 or p2):
         return Lens(FISHEYE, (*params, k1, k2, k3, k4), width, height)
@@ -235,35 +296,19 @@ def _lens(frame: Mapping[str, Any], photo: Path) -> Lens:
     return Lens("OPENCV", (*params, k1, k2, p1, p2), width, height)
 
 
-def _focal(frame: Mapping[str, Any], key: str, angle: str, side: int) -> float | None:
-    """The focal length in pixels: `key`, or from the field of view `angle` in radians; None with neither."""
-    if frame.get(key) is not None:
-        focal = _number(frame, key)
-    elif frame.get(angle) is not None:
-        radians = _number(frame, angle)
-        focal = side / 2 / np.tan(radians / 2) if 0 < radians < np.pi else 0.0
-    else:
-        return None
+def _focal(focal: float | None, angle: float | None, side: int) -> float | None:
+    """The focal length in pixels, as given or from the field of view in radians; None with neither."""
+    if focal is None:
+        if angle is None:
+            return None
+        focal = side / 2 / float(np.tan(angle / 2)) if 0 < angle < np.pi else 0.0
     if not focal > 0:
-        raise ValueError(f"{key} or {angle} is out of range")
-    return float(focal)
+        raise ValueError("the focal length (fl_x, fl_y) or angle (camera_angle_x, _y) is out of range")
+    return focal
 
 
-def _number(frame: Mapping[str, Any], key: str, default: float | None = None) -> float:
-    value = frame.get(key)
-    value = default if value is None else value
-    if value is None:
-        raise ValueError(f"no {key}")
-    if not isinstance(value, int | float) or not abs(value) <= LARGEST:
-        raise ValueError(f"{key} is {str(value)[:40]!r}, no number up to {LARGEST:g}")
-    return float(value)
-
-
-def world_to_camera(matrix: Any) -> Float64[np.ndarray, "4 4"]:
+def world_to_camera(c2w: Float64[np.ndarray, "rows columns"]) -> Float64[np.ndarray, "4 4"]:
     """World to camera with OpenCV axes, from camera to world with OpenGL axes. Raises ValueError."""
-    if matrix is None:
-        raise ValueError("no transform_matrix")
-    c2w = np.array(matrix, float)
     if c2w.shape not in ((3, 4), (4, 4)):
         raise ValueError(f"transform_matrix has shape {c2w.shape}, not 4 x 4")
     if not (np.abs(c2w) <= LARGEST).all():
@@ -285,18 +330,21 @@ def world_to_camera(matrix: Any) -> Float64[np.ndarray, "4 4"]:
 
 
 def _listed_split(
-    file: Path, content: dict[str, Any], frames: Sequence[Mapping[str, Any]], views: list[View]
+    file: Path, content: _Transforms, frames: Sequence[_Frame], views: list[View]
 ) -> tuple[list[View], frozenset[str] | None]:
     """The views that the file's lists name, and the names of the test views (None without lists)."""
-    kinds = [kind for kind in ("train", "test", "val") if content.get(f"{kind}_filenames") is not None]
-    if not kinds:
+    lists = {
+        kind: names
+        for kind in ("train", "test", "val")
+        if (names := getattr(content, f"{kind}_filenames")) is not None
+    }
+    if not lists:
         return views, None
-    paths = [_inside(file, "file_path", frame["file_path"]) for frame in frames]
+    paths = [_inside(file, "file_path", frame.file_path) for frame in frames]
     name_of = {path: view.name for path, view in zip(paths, views, strict=True)}
     names: dict[str, set[str]] = {}
-    for kind in kinds:
-        listed = content[f"{kind}_filenames"]
-        listed = [_inside(file, f"{kind}_filenames", p) for p in (listed if isinstance(listed, list) else [])]
+    for kind, given in lists.items():
+        listed = [_inside(file, f"{kind}_filenames", path) for path in given]
         unknown = [path for path in listed if path not in name_of]
         if not listed or unknown:
             first = f", first {short(repr(str(unknown[0])))}" if unknown else ""

@@ -16,8 +16,9 @@ from typing import Any, Literal
 from sagesplat.core.config import PosesConfig
 from sagesplat.core.errors import BackendUnavailable, SceneError
 from sagesplat.core.extras import install
-from sagesplat.core.typed import check_fields, types_of
-from sagesplat.io.files import read_object, write_json
+from sagesplat.core.limits import Count, Number
+from sagesplat.io.files import write_json
+from sagesplat.io.typed import convert_as, known_json
 from sagesplat.scene._prepare import PreparedPhoto, prepare_photos
 from sagesplat.scene.detect import PHOTOS
 from sagesplat.scene.feature_masks import OfPhoto, write_feature_masks
@@ -30,12 +31,12 @@ class Reconstruction:
     """The result of structure from motion; also in poses.json."""
 
     workspace: Path
-    num_photos: int  # readable ones
-    num_registered: int
+    num_photos: Count  # readable ones
+    num_registered: Count
     unregistered: dict[str, str]  # photo -> reason
-    num_points: int
-    reprojection_error: float  # mean, pixels
-    seconds: dict[str, float]  # by stage, of the last run
+    num_points: Count
+    reprojection_error: Number  # mean, pixels
+    seconds: dict[str, Number]  # by stage, of the last run
 
 
 OnProgress = Callable[[str, int, int], None]  # stage, done, total
@@ -211,23 +212,19 @@ def _request(source: Path, photos: list[PreparedPhoto], config: PosesConfig) -> 
 def _resume(workspace: Path, request: dict[str, Any]) -> Reconstruction | None:
     """The finished result of the same request, if any; results of another request are removed."""
     work, report = workspace / "sfm", workspace / REPORT
-    request = json.loads(json.dumps(request))
-    old = read_object(work / "request.json")
+    request, old = json.loads(json.dumps(request)), known_json(work / "request.json", dict) or {}
     if {k: v for k, v in old.items() if k not in ("min_photos", "threads")} != request:
         for name in ("database.db", "database.db-wal", "database.db-shm", "models.json", "seconds.json"):
             (work / name).unlink(missing_ok=True)
         report.unlink(missing_ok=True)
         return None
-    content = read_object(report)
-    if not (content.get("complete") is True and (workspace / "sparse" / "0").is_dir()):
+    content = known_json(report, dict) or {}
+    if content.get("complete") is not True or not (workspace / "sparse" / "0").is_dir():
         return None
-    types = {name: kind for name, kind in types_of(Reconstruction).items() if name != "workspace"}
     try:
-        fields: dict[str, Any] = {name: content[name] for name in types}
-        check_fields(fields, types)
-    except (KeyError, ValueError):
+        return convert_as(content | {"workspace": workspace}, Reconstruction)
+    except ValueError:
         return None
-    return Reconstruction(workspace=workspace, **fields)
 
 
 def _run(work: Path, on_progress: OnProgress) -> dict[str, Any]:

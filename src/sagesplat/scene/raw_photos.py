@@ -5,16 +5,18 @@ with this (`segment.fit`).
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Shaped
+from msgspec import Meta
 
-from sagesplat.core.errors import RunError, SceneError, short
-from sagesplat.io.files import read_json
-from sagesplat.scene.colmap_read import camera_of_model, read_model
+from sagesplat.core.errors import SceneError
+from sagesplat.core.limits import Count, Number
+from sagesplat.io.typed import read_json_as, refused
+from sagesplat.scene.colmap_read import CAMERA_MODELS, camera_of_model, read_model
 from sagesplat.scene.scene import Lens
 
 REPORT = "poses.json"
@@ -64,6 +66,33 @@ def describe_raw(model: Path, names: Mapping[str, tuple[str, int]]) -> dict[str,
     return {"lenses": lenses, "photos": photos}
 
 
+@dataclass(frozen=True)
+class _Lens:
+    model: str
+    width: Count
+    height: Count
+    params: list[Number]
+
+    def __post_init__(self) -> None:
+        if self.model not in CAMERA_MODELS:
+            raise ValueError(f"no camera model {self.model!r:.40}")
+
+
+@dataclass(frozen=True)
+class _Raw:
+    lenses: list[_Lens] = field(default_factory=list)
+    photos: dict[str, tuple[Count, Annotated[int, Meta(ge=1, le=8)]]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if any(index >= len(self.lenses) for index, _ in self.photos.values()):
+            raise ValueError("a photo of a lens that is not there")
+
+
+@dataclass(frozen=True)
+class _Report:
+    raw: _Raw = field(default_factory=_Raw)
+
+
 def raw_photos(capture: Path) -> dict[str, RawPhoto]:
     """The photos of a capture before they were undistorted, by name; empty where that is not known.
 
@@ -72,22 +101,11 @@ def raw_photos(capture: Path) -> dict[str, RawPhoto]:
     path = capture / REPORT
     if not path.is_file():
         return {}
-    try:
-        raw = read_json(path).get("raw", {"lenses": [], "photos": {}})
-        lenses = [_lens(i, lens) for i, lens in enumerate(raw["lenses"])]
-        return {name: _photo(lenses, *entry) for name, entry in raw["photos"].items()}
-    except (RunError, AttributeError, KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
-        reason = short(str(error).removeprefix(f"{path}: "))
-        raise SceneError(f"{path}: not readable ({reason}); find the poses again, or remove it") from None
-
-
-def _lens(index: int, about: dict[str, Any]) -> Lens:
-    params = [float(value) for value in about["params"]]
-    c = camera_of_model(index, str(about["model"]), int(about["width"]), int(about["height"]), params)
-    return Lens(c.model, c.params, c.width, c.height)
-
-
-def _photo(lenses: list[Lens], index: int, orientation: int) -> RawPhoto:
-    if type(index) is not int or not 0 <= index < len(lenses) or orientation not in range(1, 9):
-        raise ValueError(f"lens {index!r}, orientation {orientation!r}")
-    return RawPhoto(lenses[index], orientation)
+    what, cure = "a report of poses", "find the poses again, or remove it"
+    raw = read_json_as(path, _Report, what, cure, SceneError).raw
+    with refused(path, what, cure, SceneError):
+        lenses = []
+        for index, one in enumerate(raw.lenses):
+            c = camera_of_model(index, one.model, one.width, one.height, one.params)
+            lenses.append(Lens(c.model, c.params, c.width, c.height))
+    return {name: RawPhoto(lenses[index], turned) for name, (index, turned) in raw.photos.items()}

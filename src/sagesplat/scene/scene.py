@@ -4,10 +4,11 @@ import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float32, Int32, Int64, UInt8
+from msgspec import Meta
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +60,10 @@ class Lens:
     height: int
 
 
+STEEPEST = 10.0  # magnitude of a coefficient of a vignetting
+_Steepness = Annotated[float, Meta(ge=-STEEPEST, le=STEEPEST)]
+
+
 @dataclass(frozen=True)
 class Vignetting:
     """Share of the light that a lens lets through: exp(a s + b s^2) for s = tan^2(angle to its axis) / reach.
@@ -66,8 +71,8 @@ class Vignetting:
     Farther out than `reach` it stays what it is there.
     """
 
-    coefficients: tuple[float, float]  # a, b
-    reach: float  # tan^2
+    coefficients: tuple[_Steepness, _Steepness]  # a, b
+    reach: Annotated[float, Meta(gt=0, le=1e6)]  # tan^2
 
     @property
     def lost(self) -> float:

@@ -1,19 +1,23 @@
 """A scene in one .npz file: cameras, points and splits, such as those of one block of a large scene."""
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 
 from sagesplat.core.errors import SceneError, short
 from sagesplat.core.names import check_photo, repaired
 from sagesplat.io.files import atomic_path
 from sagesplat.io.npz import Npz
-from sagesplat.scene.scene import Camera, Lens, Points, Scene, View
-from sagesplat.scene.vignetting import parse_vignetting
+from sagesplat.io.typed import parse_json_as
+from sagesplat.scene.scene import Camera, Lens, Points, Scene, View, Vignetting
 
 SUFFIX = ".npz"
+_Side = Annotated[int, Meta(ge=1, le=2**16 - 1)]  # pixels
+_Byte = Annotated[int, Meta(ge=0, le=255)]
 _POINTS = {
     "xyz": (np.float32, 2),
     "rgb": (np.uint8, 2),
@@ -52,38 +56,54 @@ def write_scene(path: Path, scene: Scene) -> None:
         )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class _View:
+    """A view, without its camera's arrays."""
+
+    name: str
+    image: Path
+    size: tuple[_Side, _Side]
+    background: tuple[_Byte, _Byte, _Byte]
+    lens: Lens | None = None
+    vignetting: Vignetting | None = None
+
+    def __post_init__(self) -> None:
+        check_photo(self.name)
+
+
+@dataclass(frozen=True)
+class _About:
+    name: str
+    views: list[_View]
+    test: frozenset[str]
+    calibration: frozenset[str]
+
+
 def read_scene(path: Path) -> Scene:
     """The scene that `write_scene` wrote; SceneError for anything else."""
     try:
         with Npz(path) as stored:
-            about = json.loads(str(stored["about"]))
+            about = parse_json_as(str(stored["about"]), _About)
             w2c, K = stored["w2c"].astype(np.float32), stored["K"].astype(np.float32)
             columns = {name: stored[name].astype(kind) for name, (kind, _) in _POINTS.items()}
-        views = tuple(_view(*entry) for entry in zip(about["views"], w2c, K, strict=True))
+        views = tuple(_view(*entry) for entry in zip(about.views, w2c, K, strict=True))
         points = Points(**columns)
         _check(points, len(views))
-        test, calibration = frozenset(about["test"]), frozenset(about["calibration"])
-        name = repaired(str(about["name"]))
-        return Scene(name, path, views, points, test_names=test, calibration_names=calibration)
     except FileNotFoundError:
         raise SceneError(f"{path}: no such file; give the path of a capture") from None
-    except (OSError, KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
+    except (OSError, KeyError, TypeError, ValueError) as error:
         raise SceneError(f"{path}: not a stored scene ({short(error)}); make it again") from None
+    return Scene(
+        repaired(about.name), path, views, points,
+        test_names=about.test, calibration_names=about.calibration,
+    )  # fmt: skip
 
 
-def _view(about: dict, w2c: np.ndarray, K: np.ndarray) -> View:
-    width, height = about["size"]
-    if type(width) is not int or type(height) is not int or not (0 < width < 2**16 and 0 < height < 2**16):
-        raise ValueError(f"a view of {width!r} x {height!r} pixels")
+def _view(about: _View, w2c: np.ndarray, K: np.ndarray) -> View:
     if w2c.shape != (4, 4) or K.shape != (3, 3) or not (np.isfinite(w2c).all() and np.isfinite(K).all()):
-        raise ValueError(f"no camera for {about['name']}")
-    check_photo(str(about["name"]))
-    r, g, b = map(int, about["background"])
-    lens = about["lens"]
-    if lens:
-        lens = Lens(lens["model"], tuple(map(float, lens["params"])), int(lens["width"]), int(lens["height"]))
-    camera, vignetting = Camera(w2c, K, width, height, (r, g, b)), parse_vignetting(about.get("vignetting"))
-    return View(str(about["name"]), camera, Path(about["image"]), lens, vignetting=vignetting)
+        raise ValueError(f"no camera for {about.name}")
+    camera = Camera(w2c, K, *about.size, about.background)
+    return View(about.name, camera, about.image, about.lens, vignetting=about.vignetting)
 
 
 def _check(points: Points, num_views: int) -> None:

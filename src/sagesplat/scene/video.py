@@ -1,23 +1,25 @@
 """Extracts frames from a video: the sharpest of each interval, without duplicates."""
 
-import re
 from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, UInt8
+from msgspec import Meta
 from PIL import Image
 
-from sagesplat.core.errors import BackendUnavailable, RunError, SceneError, short
+from sagesplat.core.errors import BackendUnavailable, SceneError, short
 from sagesplat.core.extras import install
-from sagesplat.io.files import atomic_path, read_json, write_json
+from sagesplat.core.limits import Count
+from sagesplat.io.files import atomic_path, write_json
+from sagesplat.io.typed import known_json
 
 _GREY_WIDTH = 640  # px, of the copies that sharpness is measured on
 _THUMB_WIDTH = 64  # px, of the copies that are compared for motion
 _BLURRED = 0.75  # of the sharpness of both neighbours
 _SAME = 1.0  # mean absolute difference, grey levels, below which the camera has not moved
-_FRAME = re.compile(r"frame_[0-9]{1,20}\.jpg")
 MAX_PIXELS = 2**26  # of a frame; 8K video has half as many
 MAX_FRAMES = 10**6  # four hours
 _PACKED = 4  # times its size is what a video's packets may hold: those of a forged index overlap
@@ -51,7 +53,7 @@ def extract_frames(
     if not path.is_file():
         raise SceneError(f"{path}: no such file; name a video")
     stat = path.stat()
-    source = {"size": stat.st_size, "mtime_ns": stat.st_mtime_ns, "max_frames": max_frames}
+    source = _Extracted(stat.st_size, stat.st_mtime_ns, max_frames, [])
     if (kept := _finished(folder, source)) is not None:
         return kept
     folder.mkdir(parents=True, exist_ok=True)
@@ -70,20 +72,26 @@ def extract_frames(
             f"{path}: no frame of up to {MAX_PIXELS // 10**6} million pixels can be decoded; copy or convert "
             "the video again"
         )
-    write_json(folder / "video.json", source | {"frames": [p.name for p in paths]})
+    write_json(folder / "video.json", asdict(source) | {"frames": [p.name for p in paths]})
     return paths
 
 
-def _finished(folder: Path, source: dict[str, int]) -> list[Path] | None:
+@dataclass(frozen=True)
+class _Extracted:
+    """Content of video.json: of which file the frames are."""
+
+    size: Count
+    mtime_ns: int
+    max_frames: int
+    frames: list[Annotated[str, Meta(pattern=r"^frame_[0-9]{1,20}\.jpg\Z")]]
+
+
+def _finished(folder: Path, source: _Extracted) -> list[Path] | None:
     """The frames of an earlier, finished run on the same file, if all are there."""
-    try:
-        listed = read_json(folder / "video.json")
-        names = listed.pop("frames")
-        if listed != source or not names or not all(map(_FRAME.fullmatch, names)):
-            return None
-    except (RunError, AttributeError, KeyError, TypeError):  # none, or not ours
+    made = known_json(folder / "video.json", _Extracted)
+    if made is None or not made.frames or replace(made, frames=[]) != source:
         return None
-    paths = [folder / name for name in names]
+    paths = [folder / name for name in made.frames]
     return paths if all(path.is_file() for path in paths) else None
 
 

@@ -6,8 +6,6 @@ from jaxtyping import Float, Float32, UInt8
 from sagesplat.scene.scene import Camera, Vignetting
 
 OFFSET, CURVE = 0.055, 2.4  # sRGB: stored = 1.055 light^(1/2.4) - 0.055, but for the darkest colours
-STEEPEST = 10.0  # magnitude of a coefficient
-_WIDEST = 1e6  # reach, tan^2
 
 
 def corrected(
@@ -34,18 +32,3 @@ def powers(t: Float[np.ndarray, "*S"], reach: float) -> Float[np.ndarray, "*S 2"
     """s and s^2 of `Vignetting`, for tan^2 of angles."""
     share = np.minimum(t / reach, 1)
     return np.stack([share, share * share], -1)
-
-
-def parse_vignetting(made: object) -> Vignetting | None:
-    """What `dataclasses.asdict` made of a vignetting, or None; ValueError for anything else."""
-    if made is None:
-        return None
-    if not isinstance(made, dict) or made.keys() != {"coefficients", "reach"}:
-        raise ValueError("no vignetting")
-    numbers = [*made["coefficients"], made["reach"]] if isinstance(made["coefficients"], list) else []
-    if len(numbers) != 3 or not all(type(x) in (float, int) and abs(x) <= _WIDEST for x in numbers):
-        raise ValueError("vignetting without numbers")
-    a, b, reach = map(float, numbers)
-    if not (abs(a) <= STEEPEST and abs(b) <= STEEPEST and reach > 0):
-        raise ValueError("impossible vignetting")
-    return Vignetting((a, b), reach)

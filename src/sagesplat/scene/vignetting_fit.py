@@ -12,9 +12,9 @@ from jaxtyping import Float64, Int64
 
 from sagesplat.scene.gains import log_gains, spread
 from sagesplat.scene.images import Photos
-from sagesplat.scene.scene import Scene, Vignetting
+from sagesplat.scene.scene import STEEPEST, Scene, Vignetting
 from sagesplat.scene.track_colours import TrackColours, track_colours
-from sagesplat.scene.vignetting import CURVE, OFFSET, STEEPEST, powers
+from sagesplat.scene.vignetting import CURVE, OFFSET, powers
 
 _ENOUGH = 30  # observations of a photo, on average
 _POINTS = 100  # that photos share, at least

@@ -1,11 +1,15 @@
 """COCO panoptic: its 133 categories, and the segments that its JSON files describe."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
-from sagesplat.core.errors import LabelError, RunError, short
+from msgspec import Meta
+
+from sagesplat.core.errors import LabelError, short
 from sagesplat.core.names import check_photo
 from sagesplat.io.files import read_json
+from sagesplat.io.typed import convert_as, refused
 
 _ROWS = [
     line.split(maxsplit=2)
@@ -28,6 +32,33 @@ class Panoptic:
     segments: dict[str, dict[int, int]]  # image name without suffix -> {segment id: category id}
 
 
+@dataclass(frozen=True)
+class _Category:
+    id: int
+    name: str
+
+
+@dataclass(frozen=True)
+class _Segment:
+    id: Annotated[int, Meta(ge=0, lt=2**24)]  # R + 256 G + 65536 B
+    category_id: int
+
+
+@dataclass(frozen=True)
+class _Annotation:
+    file_name: str
+    segments_info: list[_Segment]
+
+    def __post_init__(self) -> None:
+        check_photo(Path(self.file_name).as_posix())
+
+
+@dataclass(frozen=True)
+class _File:
+    annotations: list[_Annotation]
+    categories: list[_Category] = field(default_factory=list)
+
+
 def read_panoptic(folder: Path) -> Panoptic | None:
     """The one panoptic JSON of a folder, with PNGs beside it or in a folder of the JSON's name.
 
@@ -36,10 +67,7 @@ def read_panoptic(folder: Path) -> Panoptic | None:
     """
     found = []
     for path in sorted(folder.glob("*.json")):
-        try:
-            content = read_json(path)
-        except RunError as error:
-            raise LabelError(f"{error}; repair or remove it") from None
+        content = read_json(path, "repair or remove it", LabelError)
         if isinstance(content, dict) and "annotations" in content:
             found.append((path, content))
     if not found:
@@ -48,22 +76,16 @@ def read_panoptic(folder: Path) -> Panoptic | None:
         names = ", ".join(path.name for path, _ in found)
         raise LabelError(f"{folder}: several JSON files with annotations ({names}); leave one of them")
     path, content = found[0]
+    with refused(path, "in COCO's panoptic format", "export the annotations again", LabelError):
+        made = convert_as(content, _File, strict=False)
     beside = path.with_suffix("")
+    names = {category.id: category.name for category in made.categories} or NAMES
     pngs, segments = {}, {}
-    try:
-        names = {int(c["id"]): c["name"] for c in content.get("categories", [])} or NAMES
-        for annotation in content["annotations"]:
-            file = Path(annotation["file_name"])
-            check_photo(file.as_posix())
-            key = str(file.with_suffix(""))
-            pngs[key] = (beside if beside.is_dir() else folder) / file
-            segments[key] = {int(s["id"]): int(s["category_id"]) for s in annotation["segments_info"]}
-    except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
-        raise LabelError(
-            f"{path}: not in COCO's panoptic format ({short(repr(error))}); export the annotations again"
-        ) from None
-    if any(not 0 <= segment < 2**24 for of_image in segments.values() for segment in of_image):
-        raise LabelError(f"{path}: segment ids beyond R + 256 G + 65536 B; export the annotations again")
+    for annotation in made.annotations:
+        file = Path(annotation.file_name)
+        key = str(file.with_suffix(""))
+        pngs[key] = (beside if beside.is_dir() else folder) / file
+        segments[key] = {segment.id: segment.category_id for segment in annotation.segments_info}
     unnamed = sorted({c for of_image in segments.values() for c in of_image.values()} - set(names))
     if unnamed:
         raise LabelError(

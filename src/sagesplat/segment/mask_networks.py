@@ -11,7 +11,7 @@ from PIL import Image
 from torch import Tensor
 
 from sagesplat.core.errors import BackendUnavailable, RunError
-from sagesplat.io.files import read_object
+from sagesplat.io.typed import known_json
 from sagesplat.segment.detections import Boxes, Found
 from sagesplat.segment.detectors import finite, padded_tokens, prepared
 from sagesplat.segment.hub import load_image_processor, load_model, load_tokenizer, package
@@ -181,8 +181,8 @@ class _Squared:
         self, folder: Path, side: int, usual: tuple[tuple[float, float, float], tuple[float, float, float]]
     ):
         try:
-            stored = read_object(folder / "processor_config.json").get("image_processor")
-            stored = stored or read_object(folder / "preprocessor_config.json")
+            stored = (known_json(folder / "processor_config.json", dict) or {}).get("image_processor")
+            stored = stored or known_json(folder / "preprocessor_config.json", dict) or {}
             size = stored.get("size", {})
             self._size = int(size.get("width", side)), int(size.get("height", side))
             self._mean = np.broadcast_to(np.float32(stored.get("image_mean", usual[0])), 3)

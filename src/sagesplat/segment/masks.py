@@ -11,10 +11,11 @@ import numpy as np
 from jaxtyping import Int16, Integer
 from PIL import Image
 
-from sagesplat.core.errors import LabelError, RunError, short
+from sagesplat.core.errors import LabelError, short
 from sagesplat.core.names import LENGTH, RULE, checked, collision_key
 from sagesplat.io.files import atomic_path, read_json, write_json
 from sagesplat.io.pictures import FREE_PIXELS, PictureError, open_picture
+from sagesplat.io.typed import convert_as, refused
 from sagesplat.scene.raw_photos import raw_photos
 from sagesplat.scene.scene import Scene, View
 from sagesplat.segment import coco
@@ -303,24 +304,24 @@ def panoptic_segments(
     return read
 
 
+@dataclass(frozen=True)
+class _Labels:
+    """Of a labels.json; names are checked by `taxonomy_of`."""
+
+    labels: dict[int, Any]
+    unlabelled: int | None = None
+
+
 def _read_labels(path: Path, length: int = LENGTH) -> tuple[Taxonomy, int | None]:
     """The taxonomy of a labels.json, and the value of unlabelled pixels if it is stated.
 
     `length`: characters of a name, at most.
     """
-    try:
-        content = read_json(path)
-    except RunError as error:
-        raise LabelError(f"{error}; it names the ids of the label images") from None
-    try:
-        unlabelled = content.get("unlabelled")
-        unlabelled = None if unlabelled is None else int(unlabelled)
-        names: dict[int, Any] = {int(label_id): name for label_id, name in content["labels"].items()}
-    except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
-        raise LabelError(
-            f'{path}: not of the form {{"unlabelled": 255, "labels": {{"184": "tree-merged"}}}} '
-            f"({short(repr(error))}); rewrite it so"
-        ) from None
+    content = read_json(path, "it names the ids of the label images", LabelError)
+    form = 'of the form {"unlabelled": 255, "labels": {"184": "tree-merged"}}'
+    with refused(path, form, "rewrite it so", LabelError):
+        made = convert_as(content, _Labels, strict=False)
+    unlabelled, names = made.unlabelled, made.labels
     if unlabelled is not None and not 0 <= unlabelled <= VOID_16:
         raise LabelError(f'{path}: "unlabelled" is {short(unlabelled)}; give a pixel value, 0 ... {VOID_16}')
     if unlabelled in names:

@@ -3,19 +3,21 @@
 import math
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float32, Int16, UInt8
+from msgspec import Meta
 from PIL import Image
 
 from sagesplat.core.config import MasksConfig
-from sagesplat.core.errors import BackendUnavailable, LabelError, RunError, short
+from sagesplat.core.errors import BackendUnavailable, LabelError, short
 from sagesplat.core.extras import install
 from sagesplat.core.memory import ran_out
 from sagesplat.io.files import read_json
+from sagesplat.io.typed import convert_as, refused
 from sagesplat.segment import coco
 from sagesplat.segment.masks import UNLABELLED, Taxonomy, taxonomy_of
 from sagesplat.segment.segmenters import (
@@ -26,7 +28,10 @@ from sagesplat.segment.segmenters import (
     group_classes,
     parse_device,
 )
+from sagesplat.segment.taxonomies import Source, to_coco
 
+_Value = Annotated[float, Meta(ge=-1e30, le=1e30)]
+_Scale = Annotated[float, Meta(gt=0, le=1e30)]
 _TIME_LIMIT = 300.0  # seconds that a network may take for a photo
 _PIXELS = 2**24  # of a network's input: 200 MB
 _VALUES = 2**29  # of its output: 2 GB
@@ -50,41 +55,35 @@ def read_classes(path: Path) -> Classes:
     differs. mean and std may be absent: 0.5 each, which maps 0 ... 255 to -1 ... 1. Names of categories are
     COCO's, or the class's where COCO has none of that id. Raises LabelError.
     """
-    try:
-        content = read_json(path)
-    except RunError as error:
-        raise LabelError(f"{error}; it says what the classes of the model are") from None
-    try:
-        classes, ids = content["classes"], _categories(content, path)
-        found = [ids[name] for name in classes]
-        label_ids = [UNLABELLED if i is None else int(i) for i in found]
-        with np.errstate(over="ignore"):  # infinite then, and refused below
-            mean, std = (np.broadcast_to(np.float32(content.get(key, 0.5)), 3) for key in ("mean", "std"))
-    except (AttributeError, LookupError, TypeError, ValueError, OverflowError) as error:
-        raise LabelError(
-            f'{path}: not of the form {{"classes": ["sky"], "coco_panoptic": {{"sky": 187}}}} '
-            f"({short(repr(error))}); list each class with its category id or null"
-        ) from None
-    if not (np.isfinite([mean, std]).all() and (std > 0).all()):
-        raise LabelError(f"{path}: mean {mean.tolist()}, std {std.tolist()}; give numbers, std above 0")
-    pairs = zip(label_ids, classes, strict=True)
-    names = {i: coco.NAMES.get(i, name) for i, name in pairs if i != UNLABELLED}
+    content = read_json(path, "it says what the classes of the model are", LabelError)
+    form = 'of the form {"classes": ["sky"], "coco_panoptic": {"sky": 187}}'
+    with refused(path, form, "list each class with its category id or null", LabelError):
+        made = convert_as(content, _File, strict=False)
+        ids = _categories(made)
+        if missing := [name for name in made.classes if name not in ids]:
+            raise ValueError(f"no category of {missing[0]!r:.60}")
+        mean, std = (np.broadcast_to(np.float32(values), 3) for values in (made.mean, made.std))
+    pairs = [(UNLABELLED if ids[name] is None else ids[name], name) for name in made.classes]
+    names = {i: coco.NAMES.get(i, name) for i, name in pairs if i is not None and i != UNLABELLED}
     taxonomy = taxonomy_of(names, path)  # says which ids do not fit
-    return Classes(np.array(label_ids, np.int16), taxonomy, mean, std)
+    return Classes(np.array([i for i, _ in pairs], np.int16), taxonomy, mean, std)
 
 
-def _categories(content: dict[str, Any], path: Path) -> dict[str, int | None]:
+@dataclass(frozen=True)
+class _File:
+    classes: list[str]
+    coco_panoptic: dict[str, int | None] = field(default_factory=dict)
+    vocabulary: Source | None = None
+    mean: _Value | list[_Value] = 0.5
+    std: _Scale | list[_Scale] = 0.5
+
+
+def _categories(made: _File) -> dict[str, int | None]:
     """The category of each class: listed, or that of COCO nearest to it in a known vocabulary."""
-    if "vocabulary" not in content:
-        return content["coco_panoptic"]
-    from sagesplat.segment.taxonomies import SOURCES, to_coco
-
-    vocabulary, classes = content["vocabulary"], content["classes"]
-    if vocabulary not in SOURCES:
-        raise LabelError(
-            f'{path}: "vocabulary" is {short(repr(vocabulary))}; take one of {", ".join(SOURCES)}'
-        )
-    return dict(zip(classes, to_coco(classes, vocabulary), strict=True)) | content.get("coco_panoptic", {})
+    if made.vocabulary is None:
+        return made.coco_panoptic
+    nearest = zip(made.classes, to_coco(made.classes, made.vocabulary), strict=True)
+    return dict(nearest) | made.coco_panoptic
 
 
 class OnnxSegmenter:

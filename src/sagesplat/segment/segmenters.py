@@ -12,8 +12,9 @@ from PIL import Image
 
 from sagesplat.core.config import MasksConfig
 from sagesplat.core.errors import BackendUnavailable, LabelError, RunError
-from sagesplat.io.files import read_json, write_json
+from sagesplat.io.files import write_json
 from sagesplat.io.lock import locked
+from sagesplat.io.typed import known_json
 from sagesplat.scene.scene import Scene, View
 from sagesplat.segment.instances import instance_path, write_instances
 from sagesplat.segment.masks import (
@@ -164,11 +165,7 @@ def segment_some(
 def _begin(target: Path, taxonomy: Taxonomy, paths: Sequence[Path]) -> None:
     """Remove what an earlier run left, unless it was of the same categories."""
     marker, content = target / ".taxonomy.json", {str(i): name for i, name in taxonomy.names.items()}
-    try:
-        same = read_json(marker) == content
-    except RunError:
-        same = False
-    if not same:
+    if known_json(marker, dict) != content:
         for path in paths:
             path.unlink(missing_ok=True)
         write_json(marker, content)

@@ -4,7 +4,7 @@ import io
 import json
 import shutil
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
@@ -19,13 +19,13 @@ from sagesplat.core.errors import RunError
 from sagesplat.core.events import Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.names import composed
-from sagesplat.core.typed import fits
 from sagesplat.formats.increments import INDEX, Increment, full_scene, read_increments, write_increments
 from sagesplat.formats.label_edits import ladder_hash
 from sagesplat.formats.levels import read_level
-from sagesplat.io.files import read_json, write_json
+from sagesplat.io.files import write_json
 from sagesplat.io.lock import alone
 from sagesplat.io.npz import Npz
+from sagesplat.io.typed import known_json
 from sagesplat.raster import rasterize
 from sagesplat.run.job import Job
 from sagesplat.run.records import is_made_from, settings_of
@@ -209,7 +209,7 @@ def _live_bundle(job: Job, folder: Path, viewer: Path) -> bool:
         raise RunError(f"{job.run.levels}: no level yet; wait, or run `sagesplat train`")
     newest = {"level": steps[-1].name, "written": steps[-1].stat().st_mtime_ns}
     previous = _read_live(folder / _LIVE)
-    if previous.get("of") == newest and (folder / MANIFEST).exists():
+    if previous and previous.of == newest and (folder / MANIFEST).exists():
         return False
     if not previous:
         check_target(folder)
@@ -228,7 +228,7 @@ def _live_bundle(job: Job, folder: Path, viewer: Path) -> bool:
     shutil.rmtree(work)
     write_documents(folder, replace(_contents(job, g, antialiased), chunks=chunks, live=True))
     uris = [chunk.uri for chunk in chunks]
-    kept = [uris, *(version for version in previous.get("kept", []) if version != uris)][:3]
+    kept = [uris, *(version for version in (previous.kept if previous else ()) if version != uris)][:3]
     write_json(folder / _LIVE, {"of": newest, "kept": kept})
     for path in target.iterdir():
         if path.name not in {uri for version in kept for uri in version}:
@@ -236,14 +236,17 @@ def _live_bundle(job: Job, folder: Path, viewer: Path) -> bool:
     return True
 
 
-def _read_live(path: Path) -> dict[str, Any]:
-    """What the last call of `live_bundle` wrote down; empty where there is nothing of use."""
-    try:
-        made = read_json(path)
-    except RunError:
-        return {}
-    usable = isinstance(made, dict) and fits(made.get("kept"), list[list[str]])
-    return made if usable else {}
+@dataclass(frozen=True)
+class _Live:
+    """What the last call of `live_bundle` wrote down."""
+
+    of: Any = None  # the newest snapshot then
+    kept: list[list[str]] = field(default_factory=list)  # files of the last versions
+
+
+def _read_live(path: Path) -> _Live | None:
+    """What the last call of `live_bundle` wrote down; None where there is nothing of use."""
+    return known_json(path, _Live)
 
 
 def _check_made(job: Job) -> None:

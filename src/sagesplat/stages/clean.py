@@ -1,31 +1,37 @@
 """Removes floaters from the last level of a training: what the nested levels are made of."""
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from sagesplat.core.config import CleanConfig
-from sagesplat.core.errors import RunError, short
+from sagesplat.core.errors import RunError
 from sagesplat.core.events import Progress
-from sagesplat.core.typed import check_fields, types_of
+from sagesplat.core.limits import Count, Number
 from sagesplat.formats.levels import read_level, select_level
-from sagesplat.io.files import read_json, write_json
+from sagesplat.io.files import write_json
+from sagesplat.io.typed import read_json_as
 from sagesplat.raster import device_of
 from sagesplat.run.job import Job
 from sagesplat.run.stage import run_stage
 from sagesplat.stages.shared import inlier_inputs
-from sagesplat.train.clean import CRITERIA, Cleaned, check, clean, find_floaters
+from sagesplat.train.clean import Cleaned, Criterion, check, clean, find_floaters
 
 
 @dataclass(frozen=True)
 class CleanFigures:
     """What was found and removed, by criterion, and what that cost."""
 
-    gaussians: int  # before
-    found: dict[str, int]
-    removed: dict[str, int]
-    before: dict[str, float]  # mean PSNR of some views, by kind ("train", "calibration"), dB
-    after: dict[str, float]
+    gaussians: Count  # before
+    found: dict[Criterion, Count]
+    removed: dict[Criterion, Count]
+    before: dict[str, Number]  # mean PSNR of some views, by kind ("train", "calibration"), dB
+    after: dict[str, Number]
+
+    def __post_init__(self) -> None:
+        if self.found.keys() != self.removed.keys() or self.before.keys() != self.after.keys():
+            raise ValueError("other criteria or views before than after")
+        if any(count > self.found[name] for name, count in self.removed.items()):
+            raise ValueError("more removed than found")
 
 
 def clean_levels(job: Job, config: CleanConfig) -> None:
@@ -111,23 +117,4 @@ def read_clean_figures(path: Path) -> CleanFigures | None:
     if not path.exists():
         return None
     cure = "delete it and run `sagesplat clean RUN`"
-    made = read_json(path, cure)
-    try:
-        if not isinstance(made, dict):
-            raise ValueError("no object")
-        types = types_of(CleanFigures)
-        check_fields(made, types)
-        figures = CleanFigures(**{name: made[name] for name in types})
-        _check_counts(figures.found, figures.removed)
-        if figures.before.keys() != figures.after.keys():
-            raise ValueError("other views before than after")
-        return figures
-    except (KeyError, TypeError, ValueError) as error:
-        raise RunError(f"{path}: not what was cleaned ({short(error)}); {cure}") from None
-
-
-def _check_counts(found: Mapping[str, int], removed: Mapping[str, int]) -> None:
-    if found.keys() != removed.keys() or not found.keys() <= set(CRITERIA):
-        raise ValueError("other criteria")
-    if not all(0 <= removed[name] <= count < 2**40 for name, count in found.items()):
-        raise ValueError("impossible counts")
+    return read_json_as(path, CleanFigures, "what was cleaned", cure, RunError)

@@ -1,11 +1,12 @@
 """edited.json of a run folder that was made by editing the labels of another run."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from sagesplat.core.errors import RunError
-from sagesplat.core.typed import check_fields, types_of
-from sagesplat.io.files import read_json, write_json
+from sagesplat.core.limits import NotNegative, Text
+from sagesplat.io.files import write_json
+from sagesplat.io.typed import read_json_as
 from sagesplat.run.run_dir import RunDir
 
 _FORMAT, _CURE = "sagesplat-edited-run", "apply the edits again"
@@ -15,26 +16,24 @@ _FORMAT, _CURE = "sagesplat-edited-run", "apply the edits again"
 class LabelSettings:
     """What edits say of categories besides names and Gaussians, by name."""
 
-    weights: dict[str, float] = field(default_factory=dict)  # of plans within a budget, where it is not 1
-    hidden: tuple[str, ...] = ()  # when a viewer opens the scene
-    always: tuple[str, ...] = ()  # in full whatever the plan says
+    weights: dict[str, NotNegative] = field(default_factory=dict)  # of plans in a budget, where it is not 1
+    hidden: tuple[Text, ...] = ()  # when a viewer opens the scene
+    always: tuple[Text, ...] = ()  # in full whatever the plan says
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Edited(LabelSettings):
+    """Of edited.json what is read; all of it is written."""
+
+    format: Literal["sagesplat-edited-run"]
 
 
 def label_settings(run: RunDir) -> LabelSettings:
     """Those of an edited run; none of any other. RunError for a damaged file."""
     if not run.edited.exists():
         return LabelSettings()
-    about = read_json(run.edited, _CURE)
-    types = types_of(LabelSettings)
-    try:
-        if not isinstance(about, dict) or about.get("format") != _FORMAT:
-            raise ValueError("of another format")
-        found = {name: about[name] for name in types}
-        check_fields(found, types)
-    except (KeyError, ValueError) as error:
-        raise RunError(f"{run.edited}: not what was made of edits ({error}); {_CURE}") from None
-    weights = {name: float(weight) for name, weight in found["weights"].items()}
-    return LabelSettings(weights, tuple(found["hidden"]), tuple(found["always"]))
+    found = read_json_as(run.edited, _Edited, "what was made of edits", _CURE, RunError)
+    return LabelSettings(found.weights, found.hidden, found.always)
 
 
 def write_edited(run: RunDir, source: str, edits: Any, settings: LabelSettings) -> None:

@@ -3,7 +3,7 @@
 import json
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,9 @@ from jaxtyping import Float32, Int16
 from sagesplat.core.config import LabelsConfig, MasksConfig
 from sagesplat.core.errors import LabelError, RunError
 from sagesplat.core.events import Noted, Progress, Warned
-from sagesplat.core.typed import fits
-from sagesplat.io.files import read_json, write_json
+from sagesplat.core.limits import LabelId
+from sagesplat.io.files import write_json
+from sagesplat.io.typed import known_json, read_json_as, refused
 from sagesplat.run.executor import split
 from sagesplat.run.job import Job
 from sagesplat.run.records import file_hash
@@ -202,10 +203,7 @@ def _segment(job: Job, config: MasksConfig, kind: str, *, instances: bool = Fals
 
 def _is(marker: Path, key: dict[str, Any]) -> bool:
     """Whether a folder of label images was begun with this network and these photos."""
-    try:
-        return read_json(marker) == json.loads(json.dumps(key))
-    except RunError:
-        return False
+    return known_json(marker, dict) == json.loads(json.dumps(key))
 
 
 def _segment_some(job: Job, part: tuple[Sequence[int], MasksConfig, str, bool]) -> tuple[Taxonomy, set[int]]:
@@ -278,17 +276,18 @@ def fuse_masks(job: Job) -> None:
     run_stage(job, "fuse", {}, inputs, [run.fused / "labels.json"], make)
 
 
+@dataclass(frozen=True)
+class _Edit:
+    table: list[LabelId]
+
+
 def read_edit_table(path: Path, before: Taxonomy) -> Int16[np.ndarray, " T"]:
     """What became of each id of the categories `before`: its new id, or -1. RunError for another file."""
-    cure = f"delete {path.parent} and run `sagesplat masks` again"
-    made = read_json(path, cure)
-    table: Any = made.get("table") if isinstance(made, dict) else None
-    if (
-        not fits(table, list[int])
-        or len(table) <= max(before.names)
-        or not all(UNLABELLED <= new <= MAX_LABEL_ID for new in table)
-    ):
-        raise RunError(f"{path}: not of these categories; {cure}")
+    what, cure = "of these categories", f"delete {path.parent} and run `sagesplat masks` again"
+    table = read_json_as(path, _Edit, what, cure, RunError).table
+    with refused(path, what, cure, RunError):
+        if len(table) <= max(before.names):
+            raise ValueError(f"{len(table)} ids")
     return np.array(table, np.int16)
 
 

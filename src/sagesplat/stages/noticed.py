@@ -4,8 +4,7 @@ import numpy as np
 
 from sagesplat.run.job import Job
 from sagesplat.stages.clean import CleanFigures, read_clean_figures
-from sagesplat.stages.refine import read_pose_figures
-from sagesplat.stages.refine_exposure import read_exposure_figures
+from sagesplat.stages.refine import read_refined_figures
 
 _LEAST_SHARE = 5e-4  # of all pixels
 _LEAST_MOVE = 0.05  # px
@@ -14,7 +13,8 @@ _LEAST_MOVE = 0.05  # px
 def noticed(job: Job) -> tuple[str, ...]:
     """What was noticed, in words; nothing where a capture is clean. RunError for files that are damaged."""
     run, lines = job.run, list[str]()
-    if exposure := read_exposure_figures(run.refined):
+    refined = read_refined_figures(run.refined)
+    if exposure := refined.exposure:
         lines.append(f"exposure varies by {exposure.range_ev:.1f} EV")
     if lens := job.given_scene.views[0].vignetting:
         lines.append(f"vignetting of {100 * lens.lost:.0f} % taken out of the photos")
@@ -22,8 +22,7 @@ def noticed(job: Job) -> tuple[str, ...]:
         lines.append(f"{100 * share:.2g} % of pixels ignored")
     if run.ladder == "nested" and (floaters := read_clean_figures(run.floaters)):
         lines += _removed(floaters)
-    poses = read_pose_figures(run.refined)
-    if poses and poses.pixels >= _LEAST_MOVE:
+    if (poses := refined.poses) and poses.pixels >= _LEAST_MOVE:
         lines.append(f"poses moved by {poses.pixels:.1f} px")
     return tuple(lines)
 

@@ -12,8 +12,9 @@ from jaxtyping import UInt8
 from sagesplat.core.config import MasksConfig
 from sagesplat.core.durations import duration
 from sagesplat.core.errors import LabelError
-from sagesplat.core.typed import fits, types_of
-from sagesplat.io.files import read_object, write_json
+from sagesplat.core.limits import Number
+from sagesplat.io.files import write_json
+from sagesplat.io.typed import known_json
 from sagesplat.segment import text
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.segment.registry import SEGMENTERS
@@ -109,17 +110,14 @@ class Scores:
 class KnownScores:
     """What a file of `Scores` holds."""
 
-    best: dict[str, float] = field(default_factory=dict)  # highest score, by the category's name
-    shared: dict[str, float] = field(default_factory=dict)  # areas, by pair of names: see `TextSegmenter`
-    threshold: float = 0.0  # least score that counts
+    best: dict[str, Number] = field(default_factory=dict)  # highest score, by the category's name
+    shared: dict[str, Number] = field(default_factory=dict)  # areas, by pair of names: see `TextSegmenter`
+    threshold: Number = 0.0  # least score that counts
 
 
 def read_scores(path: Path) -> KnownScores:
     """What is in a file of `Scores`; nothing where it is not there or damaged."""
-    content, types = read_object(path), types_of(KnownScores)
-    if not all(fits(content.get(name), kind) for name, kind in types.items()):
-        return KnownScores()
-    return KnownScores(**{name: content[name] for name in types})
+    return known_json(path, KnownScores) or KnownScores()
 
 
 def _add(scores: Mapping[str, float], best: dict[str, float]) -> None:

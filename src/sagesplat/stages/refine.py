@@ -1,7 +1,6 @@
 """Writes what training refined of the cameras, for everything after it."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,17 +10,23 @@ import torch
 
 from sagesplat.adapt.observe import as_unit, measure_total, render_rgb
 from sagesplat.core.config import TrainConfig
-from sagesplat.core.errors import RunError, short
+from sagesplat.core.errors import RunError
 from sagesplat.core.events import Progress
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.core.typed import check_fields, types_of
-from sagesplat.io.files import read_json, write_json
+from sagesplat.core.limits import Count, Number
+from sagesplat.io.files import write_json
+from sagesplat.io.typed import read_json_as
 from sagesplat.raster import Workspace, device_of
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.scene.refined import given_cameras, with_cameras, write_refined
 from sagesplat.scene.scene import Camera, Scene
-from sagesplat.stages.refine_exposure import exposure_figures, exposure_lines, with_exposures
+from sagesplat.stages.refine_exposure import (
+    ExposureFigures,
+    exposure_figures,
+    exposure_lines,
+    with_exposures,
+)
 from sagesplat.train.events import Trained
 from sagesplat.train.poses import PoseUpdate, diverged, fit_pose, pose_update, refined_cameras
 from sagesplat.train.view_parameters import ViewParameters
@@ -31,16 +36,22 @@ from sagesplat.train.view_parameters import ViewParameters
 class PoseFigures:
     """What pose refinement did: of the training views, and of the test views as given and as fitted."""
 
-    pixels: float  # how far the image of a training view moved, root mean square over its points; their mean
-    degrees: float  # how far the training views turned, mean
-    shift: float  # how far they moved, mean, as a share of the scene's extent
-    diverged: int  # training views whose pose was put back
-    fitted: int  # held-out views whose pose was fitted to their photo
-    held_out: int  # all held-out views
-    psnr: (
-        tuple[float, float] | None
-    )  # mean over the test views: given poses, fitted poses; None: no test views
-    ssim: tuple[float, float] | None
+    pixels: Number  # how far the image of a training view moved, root mean square over its points; their mean
+    degrees: Number  # how far the training views turned, mean
+    shift: Number  # how far they moved, mean, as a share of the scene's extent
+    diverged: Count  # training views whose pose was put back
+    fitted: Count  # held-out views whose pose was fitted to their photo
+    held_out: Count  # all held-out views
+    psnr: tuple[Number, Number] | None  # mean over the test views, given and fitted; None: no test views
+    ssim: tuple[Number, Number] | None
+
+
+@dataclass(frozen=True)
+class Refined:
+    """Content of refined.json: what was refined; None: nothing was."""
+
+    poses: PoseFigures | None = None
+    exposure: ExposureFigures | None = None
 
 
 def write_cameras(job: Job, place: RunDir, config: TrainConfig, trained: Trained) -> list[str]:
@@ -148,24 +159,10 @@ def pose_lines(figures: PoseFigures) -> list[str]:
     return lines
 
 
-def read_pose_figures(path: Path) -> PoseFigures | None:
-    """What `write_cameras` wrote of the poses; None: not refined. RunError for anything else."""
+def read_refined_figures(path: Path) -> Refined:
+    """What `write_cameras` wrote of poses and exposures. RunError for anything else."""
     if not path.exists():
-        return None
-    cure = "run `sagesplat train` again with --force"
-    made = read_json(path, cure)
-    try:
-        if not isinstance(made, dict) or not isinstance(made.get("poses", {}), dict):
-            raise ValueError("no object")
-        if "poses" not in made:
-            return None
-        entry = made["poses"]
-        check_fields(entry, types_of(PoseFigures))
-        figures = PoseFigures(**entry)
-        return replace(figures, psnr=_pair(figures.psnr), ssim=_pair(figures.ssim))
-    except (TypeError, ValueError) as error:
-        raise RunError(f"{path}: not what was refined ({short(error)}); {cure}") from None
-
-
-def _pair(values: Sequence[float] | None) -> tuple[float, float] | None:
-    return None if values is None else (values[0], values[1])
+        return Refined()
+    return read_json_as(
+        path, Refined, "what was refined", "run `sagesplat train` again with --force", RunError
+    )

@@ -1,16 +1,13 @@
 """Exposure of all views after a training, learned or fitted to held-out photos, and what it is worth."""
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32
 
 from sagesplat.adapt.observe import as_unit, measure_total, render_rgb
-from sagesplat.core.errors import RunError, short
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.core.typed import check_fields, types_of
-from sagesplat.io.files import read_json
+from sagesplat.core.limits import Number
 from sagesplat.metrics.color_correct import color_correct_affine
 from sagesplat.raster import Workspace, device_of
 from sagesplat.run.job import Job
@@ -30,9 +27,13 @@ class ExposureFigures:
     plain: without a transform; exposed: with the one fitted to the photo; cc: colour-corrected (gsplat).
     """
 
-    range_ev: float  # from the darkest to the brightest training photo, EV
-    psnr: dict[str, float] | None  # dB
-    ssim: dict[str, float] | None
+    range_ev: Number  # from the darkest to the brightest training photo, EV
+    psnr: dict[str, Number] | None  # dB
+    ssim: dict[str, Number] | None
+
+    def __post_init__(self) -> None:
+        if any(measured is not None and set(measured) != set(_HOW) for measured in (self.psnr, self.ssim)):
+            raise ValueError("other measurements")
 
 
 def with_exposures(
@@ -89,24 +90,3 @@ def exposure_lines(figures: ExposureFigures) -> list[str]:
             f"cc_ssim {ssim['cc']:.3f} / cc_psnr {decibels['cc']:.2f} dB"
         )
     return lines
-
-
-def read_exposure_figures(path: Path) -> ExposureFigures | None:
-    """What refined.json says of exposures; None: none were learned. RunError for anything else."""
-    if not path.exists():
-        return None
-    cure = "run `sagesplat train` again with --force"
-    made = read_json(path, cure)
-    try:
-        if not isinstance(made, dict) or not isinstance(made.get("exposure", {}), dict):
-            raise ValueError("no object")
-        if "exposure" not in made:
-            return None
-        check_fields(made["exposure"], types_of(ExposureFigures))
-        figures = ExposureFigures(**made["exposure"])
-        for measured in (figures.psnr, figures.ssim):
-            if measured is not None and set(measured) != set(_HOW):
-                raise ValueError("other measurements")
-        return figures
-    except (TypeError, ValueError) as error:
-        raise RunError(f"{path}: not what was refined ({short(error)}); {cure}") from None

@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,15 +12,15 @@ import numpy as np
 from sagesplat.core.config import TrainConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Progress, Training, Warned
-from sagesplat.core.typed import fits
-from sagesplat.io.files import read_json, write_json
+from sagesplat.core.limits import LabelId, StepNumber
+from sagesplat.io.files import write_json
+from sagesplat.io.typed import read_json_as
 from sagesplat.run.job import Job
 from sagesplat.run.records import checkpoint_key
 from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
 from sagesplat.scene.scene import Scene
 from sagesplat.segment.display_names import titles
-from sagesplat.segment.masks import MAX_LABEL_ID
 from sagesplat.stages.outliers import write_inliers
 from sagesplat.stages.refine import write_cameras
 from sagesplat.stages.shared import valid_inputs
@@ -110,13 +110,15 @@ def write_cap(path: Path, cap: int, settings: Mapping[str, Any]) -> None:
     write_json(path, {"cap": cap, "settings": dict(settings)})
 
 
+@dataclass(frozen=True)
+class _Cap:
+    cap: StepNumber
+
+
 def read_cap(path: Path) -> int:
     """The cap that `write_cap` wrote; RunError for anything else."""
-    made = read_json(path, "delete it, and run the same command again")
-    cap = made.get("cap") if isinstance(made, dict) else None
-    if type(cap) is not int or not 0 <= cap < 2**31:
-        raise RunError(f"{path}: no cap of Gaussians in it; delete it, and run the same command again")
-    return cap
+    cure = "delete it, and run the same command again"
+    return read_json_as(path, _Cap, "a cap of Gaussians", cure, RunError).cap
 
 
 def write_frozen(path: Path, steps: Mapping[int, int]) -> None:
@@ -126,17 +128,8 @@ def write_frozen(path: Path, steps: Mapping[int, int]) -> None:
 
 def read_frozen(path: Path) -> dict[int, int]:
     """The steps that `write_frozen` wrote; RunError for anything else."""
-    cure = "write {} into it if no category stopped early"
-    made = read_json(path, cure)
-    try:
-        if not fits(made, dict[str, int]):
-            raise ValueError
-        steps = {int(label): step for label, step in made.items()}
-        if not all(-1 <= label <= MAX_LABEL_ID and 0 <= step < 2**31 for label, step in steps.items()):
-            raise ValueError
-    except ValueError:
-        raise RunError(f"{path}: not the steps at which categories stopped; {cure}") from None
-    return steps
+    what, cure = "the steps at which categories stopped", "write {} into it if no category stopped early"
+    return read_json_as(path, dict[LabelId, StepNumber], what, cure, RunError)
 
 
 def train_inputs(job: Job, config: TrainConfig) -> list[Path]:

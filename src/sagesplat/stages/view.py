@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +12,7 @@ from sagesplat.core.extras import install
 from sagesplat.core.names import visible
 from sagesplat.formats.label_edits import FILE
 from sagesplat.io.files import read_json
+from sagesplat.io.typed import known_json
 from sagesplat.run.records import check_format
 from sagesplat.run.run_dir import RunDir, check_links
 from sagesplat.viewer.built import check_viewer, package_viewer
@@ -150,21 +151,44 @@ def _is_finished(run: RunDir) -> bool:
     return finished and (run.promises.exists() or not has_photos(run))
 
 
+@dataclass(frozen=True)
+class _Chunk:
+    sha256: str
+
+
+@dataclass(frozen=True)
+class _Levels:
+    levels: list[_Chunk]
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """Of a manifest what says of which levels it is."""
+
+    ladder: str
+    labels: list[_Levels]
+
+
+@dataclass(frozen=True)
+class _Chunks:
+    chunks: list[_Chunk]
+
+
 def _is_current(run: RunDir, folder: Path) -> bool:
     """Whether a bundle has the run's chunks, and promises and a target no older than the run's."""
     from sagesplat.formats.increments import INDEX
 
     if not (folder / MANIFEST).exists():
         return False
-    try:
-        manifest: Any = read_json(folder / MANIFEST)
-        held = {level["sha256"] for label in manifest["labels"] for level in label["levels"]}
-        chunks = {chunk["sha256"] for chunk in read_json(run.increments / INDEX)["chunks"]}
-    except (RunError, KeyError, TypeError):  # `bundle` says what is wrong with the run
+    manifest = known_json(folder / MANIFEST, _Shown)
+    listed = known_json(run.increments / INDEX, _Chunks)
+    if manifest is None or listed is None:  # `bundle` says what is wrong with the run
         return False
+    held = {level.sha256 for label in manifest.labels for level in label.levels}
+    chunks = {chunk.sha256 for chunk in listed.chunks}
     made = (folder / MANIFEST).stat().st_mtime
     newer = (path for path in (run.fidelity, run.promises, run.plan) if path.exists())
-    return "ladder" in manifest and held == chunks and all(path.stat().st_mtime <= made for path in newer)
+    return held == chunks and all(path.stat().st_mtime <= made for path in newer)
 
 
 def _follow(job: "Job", site: "Site", stop: threading.Event) -> None:

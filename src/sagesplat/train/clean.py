@@ -15,6 +15,7 @@ import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import partial
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -34,7 +35,8 @@ from sagesplat.segment.masks import UNLABELLED
 from sagesplat.segment.valid import ALL_VALID, ValidPixels
 from sagesplat.train.early_stopping import spread
 
-CRITERIA = ("hardly shown", "in front", "category")
+Criterion = Literal["hardly shown", "in front", "category"]
+CRITERIA = get_args(Criterion)
 LabelImage = Callable[[View], np.ndarray]  # a view's category ids, int16 [H, W]; -1: unlabelled
 
 _MIN_WEIGHT = 0.1  # a view supports a Gaussian if its blending weights there, summed over pixels, reach this

@@ -13,7 +13,8 @@ from itertools import groupby
 from pathlib import Path
 
 from sagesplat.core.errors import DataError, RunError
-from sagesplat.io.files import atomic_folder, read_json, unwritable, write_text
+from sagesplat.io.files import atomic_folder, unwritable, write_text
+from sagesplat.io.typed import known_json
 from sagesplat.viewer.built import PAGE, POSTER, check_viewer, with_pack, with_poster
 from sagesplat.viewer.manifest import FORMAT, THIRD_PARTY, Contents, documents, pack_order
 from sagesplat.viewer.pack import write_pack
@@ -115,10 +116,7 @@ def check_target(out: Path) -> None:
 
 def is_bundle(folder: Path) -> bool:
     """Whether a folder holds a bundle's manifest."""
-    try:
-        return read_json(folder / MANIFEST)["format"] == FORMAT
-    except (RunError, KeyError, TypeError):
-        return False
+    return (known_json(folder / MANIFEST, dict) or {}).get("format") == FORMAT
 
 
 def verified_files(contents: Contents) -> Iterator[tuple[str, bytes]]:

@@ -56,10 +56,11 @@ def curve_entry(curve: SsimModel, exact: bool = False) -> dict[str, Any]:
 
     If both regimes are equal, only the far one is written, from distance 0 on.
     """
-    near, far, beta = curve.params[:4], curve.params[4:8], curve.params.beta
+    params, beta = tuple(curve.params), curve.params.beta
+    near, far = params[:4], params[4:8]
     if far[1] == 0:
         far = (far[0], 0.0, 0.0, 1.0)  # a constant; the other parameters have no effect
-    if curve.params[:4] == curve.params[4:8]:
+    if params[:4] == params[4:8]:
         near, beta = (0.0, 0.0, 0.0, 1.0), 0.0
     entry = {
         "level": curve.level,
@@ -84,7 +85,7 @@ def curve_of(entry: dict[str, Any], label_id: int = -1) -> SsimModel:
     """The model that `curve_entry` wrote."""
     low, high = entry["range"]
     return SsimModel(
-        label_id, entry["level"], Eq3(*entry["params"]), (low, high), entry["median"], math.nan, 0, ""
+        label_id, entry["level"], Eq3(*entry["params"]), (low, high), entry["median"], math.nan, 0, "constant"
     )
 
 

@@ -12,9 +12,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullLocator
 
-from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import BYTES_PER_GAUSSIAN
-from sagesplat.io.files import read_json, write_json, write_text
+from sagesplat.core.limits import Count, NumberOrNaN
+from sagesplat.io.files import write_json, write_text
+from sagesplat.io.typed import read_json_as
 from sagesplat.output.figures import ACCENT, FAINT, INK, STYLE, caption, save_figure
 from sagesplat.output.tables import MB, Table
 
@@ -56,9 +57,9 @@ Size = Literal["raw", "encoded"]
 class OfLabel:
     """One category of a point."""
 
-    count: int
-    encoded: int  # bytes
-    ssim: float  # mean over the test views that show it; NaN: none does
+    count: Count
+    encoded: Count  # bytes
+    ssim: NumberOrNaN  # mean over the test views that show it; NaN: none does
 
 
 @dataclass(frozen=True)
@@ -67,20 +68,22 @@ class Point:
 
     method: str
     name: str
-    target: float  # SSIM that it was planned for; NaN: none
-    budget: float  # bytes that it was planned for; NaN: none
-    count: int
-    encoded: int  # bytes of its files
-    steps: int  # training steps that it took, from the start
-    ssim: float
-    ssim_sent: float  # of what a viewer decodes from the files
-    psnr: float  # dB
-    lpips_alex: float  # NaN where it could not be measured
-    lpips_vgg: float
-    cc_ssim: float = math.nan  # colour-corrected, as gsplat; NaN where no photo has an exposure of its own
-    cc_psnr: float = math.nan
-    cc_lpips_alex: float = math.nan
-    cc_lpips_vgg: float = math.nan
+    target: NumberOrNaN  # SSIM that it was planned for; NaN: none
+    budget: NumberOrNaN  # bytes that it was planned for; NaN: none
+    count: Count
+    encoded: Count  # bytes of its files
+    steps: Count  # training steps that it took, from the start
+    ssim: NumberOrNaN
+    ssim_sent: NumberOrNaN  # of what a viewer decodes from the files
+    psnr: NumberOrNaN  # dB
+    lpips_alex: NumberOrNaN  # NaN where it could not be measured
+    lpips_vgg: NumberOrNaN
+    cc_ssim: NumberOrNaN = (
+        math.nan
+    )  # colour-corrected, as gsplat; NaN where no photo has an exposure
+    cc_psnr: NumberOrNaN = math.nan
+    cc_lpips_alex: NumberOrNaN = math.nan
+    cc_lpips_vgg: NumberOrNaN = math.nan
     labels: dict[int, OfLabel] = field(default_factory=dict)
 
     @property
@@ -95,12 +98,12 @@ class Walk:
 
     method: str
     keeps: bool  # what it was sent once; else it has only what the present view needs
-    first: int  # for the first view
-    later: int  # for all others
-    again: int  # of the later ones, those of files that had been sent before
-    replaced: int  # of files that the viewer held and that a higher level made useless
-    changes: int  # of a category's level
-    upgrades: int  # of these, to a higher one
+    first: Count  # for the first view
+    later: Count  # for all others
+    again: Count  # of the later ones, those of files that had been sent before
+    replaced: Count  # of files that the viewer held and that a higher level made useless
+    changes: Count  # of a category's level
+    upgrades: Count  # of these, to a higher one
 
 
 class Least(NamedTuple):
@@ -119,26 +122,20 @@ def write_comparison(path: Path, points: Sequence[Point], walks: Sequence[Walk],
     write_json(path, {**more, "points": rows, "walks": [asdict(walk) for walk in walks]})
 
 
+@dataclass(frozen=True)
+class _Comparison:
+    points: list[Point]
+    walks: list[Walk]
+
+
 def read_comparison(path: Path) -> tuple[list[Point], list[Walk]]:
     """What `write_comparison` wrote; DataError for anything else."""
-    document = read_json(path)
-    try:
-        points = []
-        for row in document["points"]:
-            labels = {int(label): OfLabel(**_known(of)) for label, of in row["labels"].items()}
-            values = {name: value for name, value in _known(row).items() if name != "raw"}
-            points.append(Point(**{**values, "labels": labels}))
-        return points, [Walk(**row) for row in document["walks"]]
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise DataError(f"{path}: not a comparison ({error!r}); delete it and compare again") from None
+    made = read_json_as(path, _Comparison, "a comparison", "delete it and compare again")
+    return made.points, made.walks
 
 
 def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
     return {name: None if isinstance(v, float) and math.isnan(v) else v for name, v in values.items()}
-
-
-def _known(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: math.nan if value is None else value for name, value in values.items()}
 
 
 def least(points: Sequence[Point], ssim: float, size: Size) -> Least:

@@ -20,7 +20,7 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.increments import INDEX, read_increments, read_index, shown, write_increments
 from sagesplat.formats.levels import read_level, write_set
 from sagesplat.formats.stream_increments import write_streams
-from sagesplat.io.files import read_json, write_json
+from sagesplat.io.files import write_text
 from sagesplat.metrics.color_correct import color_correct_affine
 from sagesplat.metrics.image import pasted
 from sagesplat.metrics.lpips import Lpips
@@ -128,7 +128,7 @@ def compare(job: Job, config: CompareConfig, copy: Path | None = None) -> list[P
         table = tables[stem].only(*columns)
         job.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
     if copy:
-        write_json(copy, read_json(file))
+        write_text(copy, file.read_text(encoding="utf-8"))
     job.emit(RunDone(folder / PAGE))
     return points
 

@@ -1,26 +1,36 @@
 """The levels that are measured: files of splats, streamed SOG, bundles and run folders."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from sagesplat.core.errors import DataError, RunError, short
+from msgspec import Meta
+
+from sagesplat.core.errors import DataError, RunError
+from sagesplat.core.limits import Count, LabelId, Sha256, Share
 from sagesplat.core.names import repaired
-from sagesplat.formats.increments import INDEX, Increment, checked, read_increments, read_index, shown
+from sagesplat.formats.increments import (
+    INDEX,
+    Increment,
+    Refine,
+    Size,
+    read_increments,
+    read_index,
+    shown,
+)
 from sagesplat.formats.lod_meta import LOD_META, level_files
 from sagesplat.formats.sog import META
 from sagesplat.formats.splats import Splat, num_lods, read_splat
-from sagesplat.io.files import read_json
+from sagesplat.io.typed import convert_as, read_json_as, refused
 from sagesplat.run.records import settings_of
 from sagesplat.run.run_dir import RunDir
 from sagesplat.segment.display_names import titles
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.viewer.bundle import MANIFEST, is_bundle
 
-_MOST_LABELS = 2**15
 _BUNDLE_CURE = "make it again with `sagesplat bundle`"
 
 
@@ -88,32 +98,50 @@ def unique_names(levels: Sequence[Level], paths: Sequence[Path]) -> list[str]:
     return names
 
 
+@dataclass(frozen=True)
+class _BundleLevel:
+    """A level of a category in a bundle's manifest."""
+
+    uri: Annotated[str, Meta(pattern="^chunks/")]
+    count: Size
+    bytes: Size
+    gpuBytes: Size
+    sha256: Sha256
+    refine: Refine = "ADD"
+    offset: Count = 0
+    weight: Share | None = None
+
+    def increment(self, label_id: int, number: int) -> Increment:
+        uri = self.uri.removeprefix("chunks/")
+        sizes = self.count, self.bytes, self.gpuBytes
+        return Increment(label_id, number, uri, *sizes, self.sha256, self.refine, self.offset, self.weight)
+
+
+@dataclass(frozen=True)
+class _BundleLabel:
+    id: LabelId
+    title: str
+    levels: list[_BundleLevel]
+
+
+@dataclass(frozen=True)
+class _Bundle:
+    labels: Annotated[list[_BundleLabel], Meta(max_length=2**15)]
+    antialiased: Any = False
+
+
 def _of_bundle(path: Path, name: str) -> list[Level]:
-    file = path / MANIFEST
-    manifest = read_json(file, _BUNDLE_CURE)
-    try:
-        labels = manifest["labels"]
-        if not isinstance(labels, list) or len(labels) > _MOST_LABELS:
-            raise ValueError(f"labels {labels!r:.40}")
-        names = {entry["id"]: repaired(entry["title"], "?") for entry in labels}
-        listed = [
-            _chunk(entry["id"], number, level)
-            for entry in labels
-            for number, level in enumerate(entry["levels"], 1)
+    file, what = path / MANIFEST, "a bundle of sagesplat"
+    manifest = read_json_as(file, _Bundle, what, _BUNDLE_CURE)
+    names = {label.id: repaired(label.title, "?") for label in manifest.labels}
+    with refused(file, what, _BUNDLE_CURE):
+        made = [
+            asdict(level.increment(label.id, number))
+            for label in manifest.labels
+            for number, level in enumerate(label.levels, 1)
         ]
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise DataError(f"{file}: no bundle of sagesplat ({short(repr(error))}); {_BUNDLE_CURE}") from None
-    return _of_chunks(path / "chunks", listed, names, name, manifest.get("antialiased") is True)
-
-
-def _chunk(label_id: int, number: int, level: Mapping[str, Any]) -> Increment:
-    """A level of a category in a bundle's manifest. ValueError, KeyError or TypeError where it is none."""
-    uri = level["uri"]
-    if not isinstance(uri, str) or not uri.startswith("chunks/"):
-        raise ValueError(f"uri {uri!r:.60}")
-    sizes = level["count"], level["bytes"], level["gpuBytes"]
-    more = {key: level[key] for key in ("refine", "offset", "weight") if key in level}
-    return checked(Increment(label_id, number, uri[len("chunks/") :], *sizes, level["sha256"], **more))
+        listed = convert_as(made, list[Increment])
+    return _of_chunks(path / "chunks", listed, names, name, manifest.antialiased is True)
 
 
 def _of_run(path: Path, name: str) -> list[Level]:

@@ -1,19 +1,19 @@
 """The file of a sweep: scenes, variants of the settings, seeds and targets."""
 
-import re
-import tomllib
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
-from types import UnionType
-from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, get_args, get_type_hints
+
+from msgspec import Meta
 
 from sagesplat.core.config import RunConfig
 from sagesplat.core.errors import DataError, short
+from sagesplat.core.limits import Seed, SomeShare
+from sagesplat.io.typed import convert_as, read_toml, refused
 
 MAX_LENGTH = 2**20  # characters of a file
-MAX_DOTS = 64  # in one line of it
 MAX_RUNS = 10_000
 BUILT_IN = "demo"  # as a scene's path: the built-in capture
 _SET_BY = {
@@ -22,15 +22,7 @@ _SET_BY = {
     "target_fidelity": "targets",
     "other_targets": "targets",
 }
-_NEEDED = {
-    bool: "true or false", int: "a whole number", float: "a finite number", str: "text in quotes",
-    Path: "a path in quotes", tuple: "a list", dict: "a table",
-}  # fmt: skip
-_RENAMED = {  # settings by their names until the last release
-    "pace": "lr_schedule", "rest_share": "gradient_freeze_share", "seed_share": "base_share",
-    "seed_steps": "base_steps", "gain": "lr_multiplier", "seam_steps": "boundary_steps",
-}  # fmt: skip
-Config = TypeVar("Config")  # a frozen dataclass of settings
+_Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.+-]{0,99}\Z")]  # also of a folder
 
 
 @dataclass(frozen=True)
@@ -55,41 +47,22 @@ Sweep = tuple[Cell, ...]
 class _File:
     """What a sweep file may hold."""
 
-    targets: tuple[float, ...] = ()
-    seeds: tuple[int, ...] = ()
-    settings: RunConfig = field(default_factory=RunConfig)
-    scenes: dict[str, str] = field(default_factory=dict)
-    variants: dict[str, dict[str, Any]] = field(default_factory=dict)
+    targets: Annotated[tuple[SomeShare, ...], Meta(min_length=1)]
+    seeds: Annotated[tuple[Seed, ...], Meta(min_length=1)]
+    scenes: Annotated[dict[_Name, str], Meta(min_length=1)]
+    settings: dict[str, Any] = field(default_factory=dict)
+    variants: dict[_Name, dict[str, Any]] = field(default_factory=dict)
 
 
-def read_sweep(path: Path, tell: Callable[[str], None] = lambda text: None) -> Sweep:
-    """The cells that a sweep file asks for, by scene, variant and seed. DataError where it is not one.
-
-    `tell` gets a line for each setting with an old name.
-    """
-    try:
-        text = path.read_text(encoding="utf-8")
-        _need(len(text) <= MAX_LENGTH, f"{path}: {len(text)} characters, more than a sweep has; split it")
-        # The parser keeps every prefix of a key of many parts.
-        dots = max(line.count(".") for line in text.split("\n"))
-        _need(dots <= MAX_DOTS, f"{path}: a line with {dots} dots; write lists and tables on several lines")
-        document = tomllib.loads(text)
-    except (OSError, ValueError, RecursionError) as error:
-        raise DataError(
-            f"{path}: not readable as TOML ({short(error)}); examples/sweep.toml shows one"
-        ) from None
-    folder = path.parent
-    _rename(document, f"{path}: ", tell)
-    file = _set(_File(), document, f"{path}: ", folder)
+def read_sweep(path: Path) -> Sweep:
+    """The cells that a sweep file asks for, by scene, variant and seed. DataError where it is not one."""
+    what, cure, folder = "a sweep", "examples/sweep.toml shows one", path.parent
+    document = read_toml(path, cure, most=MAX_LENGTH)
+    with refused(path, what, cure):
+        file = convert_as(_known(document, _File, "", folder), _File)
     targets = sorted(round(target, 6) for target in file.targets)
-    for key, values in (("scenes", list(file.scenes)), ("targets", targets), ("seeds", file.seeds)):
-        _need(values, f"{path}: {key}: missing or empty; give at least one")
+    for key, values in (("targets", targets), ("seeds", file.seeds)):
         _need(len(set(values)) == len(values), f"{path}: {key}: two are equal; leave one out")
-    _need(targets[0] > 0 and targets[-1] <= 1, f"{path}: targets: an SSIM is above 0 and at most 1")
-    _need(min(file.seeds) >= 0, f"{path}: seeds: {min(file.seeds)} is negative; take 0 or more")
-    for name in (*file.scenes, *file.variants):
-        fine = re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,99}", name)
-        _need(fine, f"{path}: the name {short(repr(name))} makes no folder; use letters, digits, _ . + and -")
     count = len(file.scenes) * max(1, len(file.variants)) * len(file.seeds)
     _need(count <= MAX_RUNS, f"{path}: {count} runs, at most {MAX_RUNS} are possible; split the sweep")
     main = targets.pop(len(targets) // 2)
@@ -101,29 +74,15 @@ def read_sweep(path: Path, tell: Callable[[str], None] = lambda text: None) -> S
             f"{path}: scenes.{scene}: no folder {short(capture)}; mend the path",
         )
         for variant, changes in (file.variants or {"": {}}).items():
-            config = _set(file.settings, changes, f"{path}: variants.{variant}.", folder)
+            with refused(path, what, cure):
+                changes = _known(changes, RunConfig, f"variants.{variant}.", folder)
+                config = convert_as(_merged(file.settings, changes), RunConfig)
             plan = replace(config.plan, target_ssim=main, other_targets=tuple(targets))
             cells += [Cell(scene, variant, capture, replace(config, plan=plan, seed=s)) for s in file.seeds]
     names = [cell.name.lower() for cell in cells]  # some disks know no capitals
     for name, times in Counter(names).items():
         _need(times == 1, f"{path}: two runs would be called {name}; rename a scene or a variant")
     return tuple(cells)
-
-
-def _rename(table: dict[str, Any], where: str, tell: Callable[[str], None]) -> None:
-    """Give settings with old names their new ones, in the tables of stages within settings and variants."""
-    tables = [("settings.", table.get("settings"))]
-    variants = table.get("variants")
-    if isinstance(variants, dict):
-        tables += [(f"variants.{name}.", changes) for name, changes in variants.items()]
-    for prefix, of_run in tables:
-        for stage in ("train", "nest", "blocks"):
-            inner = of_run.get(stage) if isinstance(of_run, dict) else None
-            if not isinstance(inner, dict):
-                continue
-            for old in [key for key in inner if key in _RENAMED]:
-                tell(f"{where}{prefix}{stage}.{old} is called {_RENAMED[old]} now; the old name will go")
-                inner[_RENAMED[old]] = inner.pop(old)
 
 
 def _is_folder(path: Path) -> bool:
@@ -138,39 +97,30 @@ def _need(fine: object, message: str) -> None:
         raise DataError(message)
 
 
-def _set(config: Config, table: Any, where: str, folder: Path) -> Config:
-    """Settings with those of a TOML table in place; `where` is the path and key for errors."""
-    _need(isinstance(table, dict), f"{where.rstrip('.')}: {short(repr(table))} given, a table is needed")
-    hints = get_type_hints(type(config))
-    values = {}
+def _known(table: Any, kind: Any, where: str, folder: Path) -> Any:
+    """A table with its paths relative to `folder`; ValueError for a key that there is not."""
+    if not isinstance(table, dict):
+        return table
+    hints, made = get_type_hints(kind), {}
     for name, value in table.items():
-        key = f"{where}{name}"
-        _need(name not in _SET_BY, f"{key}: set by the list `{_SET_BY.get(name)}`; leave it out here")
-        _need(name in hints, f"{where}{short(repr(name))}: no such key; there are {', '.join(hints)}")
-        inner = getattr(config, name)
+        if name in _SET_BY:
+            raise ValueError(f"{where}{name}: set by the list {_SET_BY[name]}; leave it out")
+        if name not in hints:
+            raise ValueError(f"{where}{short(repr(name))}: no such key; there are {', '.join(hints)}")
+        inner = RunConfig if (kind, name) == (_File, "settings") else hints[name]
         if is_dataclass(inner):
-            values[name] = _set(inner, value, f"{key}.", folder)
+            made[name] = _known(value, inner, f"{where}{name}.", folder)
+        elif Path in get_args(inner) and isinstance(value, str):
+            made[name] = str(folder / value)
         else:
-            values[name] = _value(hints[name], value, key, folder)
-    return replace(config, **values)  # pyright: ignore[reportArgumentType]
+            made[name] = value
+    return made
 
 
-def _value(hint: Any, value: Any, key: str, folder: Path) -> Any:
-    """A value of a TOML file as the type that a setting has; paths are relative to `folder`."""
-    kind, of = get_origin(hint) or hint, get_args(hint)
-    if kind is UnionType:  # X | None, and TOML has no null
-        return _value(of[0], value, key, folder)
-    if kind is Any or (kind is Literal and value in of):
-        return value
-    if kind is tuple and isinstance(value, list):
-        return tuple(_value(of[0], v, f"{key}[{i}]", folder) for i, v in enumerate(value))
-    if kind is dict and isinstance(value, dict):
-        return {name: _value(of[1], v, f"{key}.{name}", folder) for name, v in value.items()}
-    if kind is Path and isinstance(value, str):
-        return folder / value
-    if kind is float and type(value) in (int, float) and abs(value) < 1e300:  # neither NaN nor infinite
-        return float(value)
-    if kind in (bool, int, str) and type(value) is kind:
-        return value
-    needed = " or ".join(map(repr, of)) if kind is Literal else _NEEDED[kind]
-    raise DataError(f"{key}: {short(repr(value))} given, {needed} is needed")
+def _merged(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings with those of a variant in place."""
+    merged = {**settings, **changes}
+    for name in settings.keys() & changes.keys():
+        if isinstance(settings[name], dict) and isinstance(changes[name], dict):
+            merged[name] = _merged(settings[name], changes[name])
+    return merged
