@@ -4,6 +4,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
+LadderKind = Literal["nested", "snapshots"]  # prefixes of one model, or the levels that training recorded
+
 
 @dataclass(frozen=True)
 class SceneConfig:
@@ -393,7 +395,7 @@ class PlanConfig:
     weights: dict[str, float] = field(default_factory=dict)
     """Weights of categories within the budget, by name (1 unless named)."""
 
-    def with_target(self, ladder: Literal["nested", "snapshots"]) -> "PlanConfig":
+    def with_target(self, ladder: LadderKind) -> "PlanConfig":
         """The same with the default target of the ladder, where none is given."""
         if self.target_fidelity is not None or self.target_ssim is not None:
             return self
@@ -523,7 +525,7 @@ class RunConfig:
     plan: PlanConfig = field(default_factory=PlanConfig)
     fuse: bool = False
     """Fuse the label images of all views through the trained Gaussians."""
-    ladder: Literal["nested", "snapshots"] = "nested"
+    ladder: LadderKind = "nested"
     """Levels: nested (prefixes of one model), or the snapshots of training as in the paper."""
     seed: int = 0
     """Seed of the random numbers."""

@@ -8,6 +8,7 @@ from sagesplat.core.config import (
     BlocksConfig,
     CleanConfig,
     FitConfig,
+    LadderKind,
     LabelsConfig,
     LiftConfig,
     MasksConfig,
@@ -21,16 +22,16 @@ from sagesplat.core.config import (
 from sagesplat.core.typed import check_fields, fits, types_of
 from sagesplat.io.files import read_object
 from sagesplat.run.records import FORMAT
-from sagesplat.run.run_dir import LadderKind, RunDir
+from sagesplat.run.run_dir import RunDir
 
 Config = TypeVar("Config")
 
 
 def recorded_ladder(path: Path) -> LadderKind:
-    """The kind of levels that a run has results of: snapshots only where there are no others."""
-    kinds: tuple[LadderKind, ...] = ("nested", "snapshots")
+    """The kind of levels that a run has results of: nested ones, unless there are only others."""
+    kinds: tuple[LadderKind, ...] = get_args(LadderKind)
     made = [kind for kind in kinds if (RunDir(path, kind).adapted / "provenance").is_dir()]
-    return "snapshots" if made == ["snapshots"] else "nested"
+    return made[0] if len(made) == 1 else "nested"
 
 
 def recorded_settings(run: RunDir, of: str = "run") -> dict[str, Any]:

@@ -9,28 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from sagesplat import __version__
-from sagesplat.core import config
 from sagesplat.core.errors import RunError, short
 from sagesplat.core.typed import check_fields, fits, types_of
 from sagesplat.io.files import read_json, write_json
 from sagesplat.run.run_dir import RunDir
+from sagesplat.run.stage_table import STAGES
 
 FORMAT = 3  # of the run folder; raised when older folders can no longer be read
-_KINDS = {  # settings by stage; those of other stages are compared, and never used
-    "scene": config.SceneConfig,
-    "poses": config.PosesConfig,
-    "masks": config.LabelsConfig,
-    "lift": config.LiftConfig,
-    "train": config.TrainConfig,
-    "base": config.TrainConfig,
-    "clean": config.CleanConfig,
-    "blocks": config.BlocksConfig,
-    "nest": config.NestConfig,
-    "observe": config.FitConfig,
-    "sample": config.SampleConfig,
-    "fit": config.FitConfig,
-    "plan": config.PlanConfig,
-}
 _MORE: dict[str, Any] = {"seed": int, "targets": list[float], "tune_steps": int, "boundary_steps": int}
 
 
@@ -107,7 +92,8 @@ def _checked(stage: str, made: Mapping[str, Any]) -> Mapping[str, Any]:
         raise ValueError("no settings or no inputs")
     if not fits(made.get("seconds", 0.0), float):
         raise ValueError("no seconds")
-    check_fields(settings, {**_MORE, **types_of(_KINDS[stage])} if stage in _KINDS else _MORE)
+    kind = STAGES[stage].settings if stage in STAGES else None
+    check_fields(settings, _MORE if kind is None else {**_MORE, **types_of(kind)})
     return settings
 
 

@@ -15,13 +15,13 @@ from sagesplat.adapt.bound_plans import Costs, plan_for_view, quality_at
 from sagesplat.adapt.observe import PERCENTILE, RenderedLabels, distances_in_views, widest_lens, within_lens
 from sagesplat.adapt.plan import Plan, plan_view
 from sagesplat.adapt.viewpoint import ViewModel
-from sagesplat.core.config import PlanConfig, RunConfig
+from sagesplat.core.config import LadderKind, PlanConfig, RunConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit, Event
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.raster import Backend, cuda, resolve_backend, set_threads
 from sagesplat.run.job import NO_RUN, Job
-from sagesplat.run.run_dir import LadderKind, RunDir, check_links
+from sagesplat.run.run_dir import RunDir, check_links
 from sagesplat.scene.scene import Camera, Scene, View
 from sagesplat.segment.display_names import titles
 from sagesplat.stages import label_edits, pipeline

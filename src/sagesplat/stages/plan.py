@@ -4,12 +4,12 @@ from dataclasses import asdict
 
 from sagesplat.adapt.plan import Plan, check_target, quality_title, write_plans
 from sagesplat.adapt.viewpoint import QualityKind
-from sagesplat.core.config import PlanConfig
+from sagesplat.core.config import LadderKind, PlanConfig
 from sagesplat.core.errors import RunError
 from sagesplat.output.tables import plan_table
 from sagesplat.run.job import Job
 from sagesplat.run.records import settings_of
-from sagesplat.run.run_dir import LadderKind, RunDir
+from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
 from sagesplat.segment.display_names import titles
 from sagesplat.stages.methods import method_of
