@@ -103,7 +103,7 @@ def compare(
     blocks.label_block_categories(job)
     blocks.nest_blocks(job, in_blocks.blocks, in_blocks.nest, in_blocks.seed)
     list(fresh.run([Task("as one", as_one, (other.spec, replace(whole, blocks=BlocksConfig())))], tell))
-    partition = read_blocks(job.run.blocks / "blocks.json")
+    partition = read_blocks(job.run.division)
     files = [job.run.block(number).interior for number in range(len(partition))]
     sets = {
         "blocks, put together": together(files).full,

@@ -201,7 +201,7 @@ def _planned(job: Job, asked: Asked) -> list[Contender]:
 
 def _trained(job: Job) -> Contender:
     """The trained model as it was when nesting began."""
-    return Contender(TRAINED, "trained", job.snapshots.levels[-1], partial(read_level, job.trained))
+    return Contender(TRAINED, "trained", job.last_level.step, partial(read_level, job.trained))
 
 
 def _as_decoded(job: Job, contender: Contender) -> Contender:
@@ -226,7 +226,7 @@ def _as_one(job: Job, place: Path, asked: Asked) -> Baseline:
     run = job.run
     return Baseline(
         AS_ONE, f"{config.steps} steps more", place / f"as-one-{config.steps}.npz",
-        job.snapshots.levels[-1] + config.steps, {**asdict(config), "seed": asked.seed},
+        job.last_level.step + config.steps, {**asdict(config), "seed": asked.seed},
         [*run.scene_files, job.trained, *inlier_inputs(run), *sky_inputs(run)], train_as_one,
         lambda: (config, asked.seed),
     )  # fmt: skip
@@ -297,7 +297,7 @@ def _figures(
         "steps": {
             "train": settings_of(job.run, "train")["max_steps"],
             "nest": settings_of(job.run, "nest")["steps"],
-            "as_one": as_one.step - job.snapshots.levels[-1],
+            "as_one": as_one.step - job.last_level.step,
         },
         "antialiased": job.antialiased,
         "trained_gaussians": sum(read_header(job.trained).counts.values()),

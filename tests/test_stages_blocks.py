@@ -369,7 +369,7 @@ def test_a_run_in_blocks(finished: Path, capture: Path) -> None:
     assert set(ladder.sizes) <= set(names)
     assert {split_name(names[label])[1] for label in ladder.sizes} == {0, 1}
     # every Gaussian is in the block that its name says: those that were tuned may have moved a little
-    blocks = read_blocks(run.blocks / "blocks.json")
+    blocks = read_blocks(run.division)
     g = snapshots.load(40)
     of_name = np.array([split_name(names[label])[1] for label in g.label_ids.tolist()])
     np.testing.assert_array_equal(blocks.of(g.means.numpy()), of_name)
@@ -421,7 +421,7 @@ def test_instances_of_blocks(finished: Path, tmp_path: Path) -> None:
     assert {("potted plant 1", 0), ("dining table", 0), ("dining table", 1)} <= found
     assert {block for name, block in found if name in job.parents} == {0, 1}
     # every Gaussian is in the block that its name says
-    blocks = read_blocks(job.run.blocks / "blocks.json")
+    blocks = read_blocks(job.run.division)
     means = ladder.gaussians.means.numpy()
     of_name = np.array([split_name(names[label])[1] for label in ladder.gaussians.label_ids.tolist()])
     beyond = blocks.to_border(means)[blocks.of(means) != of_name]

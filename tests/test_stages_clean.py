@@ -100,7 +100,7 @@ def test_another_training_is_cleaned_anew(run: RunDir) -> None:
 
 
 def test_a_scene_in_blocks_and_an_adopted_splat_are_refused(run: RunDir) -> None:
-    write_json(run.blocks / "blocks.json", {})
+    write_json(run.division, {})
     with pytest.raises(RunError, match=r"blocks: floaters are not removed from a scene in blocks"):
         clean(job_of(run), CleanConfig(min_views=2))
     run.adopted.write_bytes(b"")

@@ -261,7 +261,7 @@ def test_a_run_with_sky(capture, tmp_path):
     make_masks(job, SMALL_RUN.masks, SMALL_RUN.labels)
     lift_labels(job, SMALL_RUN.lift)
     train(job, replace(SMALL_RUN.train, max_steps=2), BlocksConfig(), 0)
-    trained = job.snapshots.load(job.snapshots.levels[-1])
+    trained = job.load_last_level()
     clean_levels(job, CleanConfig(min_views=6, max_loss=9.0))
     nest(job, replace(SMALL_RUN.nest, base_share=0.3, base_steps=1), BlocksConfig(), 0)
     found = job.sky
@@ -271,7 +271,7 @@ def test_a_run_with_sky(capture, tmp_path):
     assert len(cleaned) < len(trained)
     assert found.shell.holds(cleaned.means).sum() == found.shell.holds(trained.means).sum()
     assert any("on a sphere 10 scene extents away" in line for line in lines)
-    for g in (job.snapshots.load(job.snapshots.levels[-1]), job.ladder.load(job.ladder.levels[-1])):
+    for g in (job.load_last_level(), job.ladder.load(job.ladder.levels[-1])):
         on = g.label_ids == SKY
         assert on.any()
         assert off_shell(found.shell, g.means[on]) < 0.03  # rounded in SPZ files

@@ -55,7 +55,7 @@ class Ladder(Protocol):
 
 
 @dataclass(frozen=True)
-class SnapshotLadder(Ladder):
+class RecordedLadder(Ladder):
     """The paper's: what training recorded on its way."""
 
     files: tuple[LevelFile, ...]
@@ -192,12 +192,12 @@ def _unknown(level: int, levels: list[int]) -> RunError:
     return RunError(f"level {level} is not in the ladder; it has {levels}")
 
 
-def read_ladder(folder: Path) -> SnapshotLadder:
+def read_ladder(folder: Path) -> RecordedLadder:
     """The snapshots in a `levels` folder."""
     files = tuple(sorted((read_header(p) for p in folder.glob("[!.]*.npz")), key=lambda f: f.step))
     if not files:
         raise RunError(f"{folder}: no levels; run `sagesplat train` first")
-    return SnapshotLadder(files)
+    return RecordedLadder(files)
 
 
 def read_prefixes(path: Path) -> PrefixLadder:

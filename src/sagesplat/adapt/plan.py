@@ -258,13 +258,13 @@ def _choose(
     needed = max(1, math.ceil(share * len(distances) - 1e-9))
     predicted = np.sort(ssim, 1)[:, -needed]  # what the best `needed` views reach
     most_views = (ssim >= target).sum(1), ssim.mean(1)
-    found, met = choose_snapshot(predicted, counts, target, most_views)
+    found, met = choose_latest(predicted, counts, target, most_views)
     at = int(found)
     status = "ok" if met else "infeasible"
     return Choice(label_id, steps[at], float(predicted[at]), distance, int(counts[at]), status)
 
 
-def choose_snapshot(
+def choose_latest(
     ssim: Float[np.ndarray, "... K"],
     counts: Int[np.ndarray, " K"],
     target: float,

@@ -14,6 +14,7 @@ from sagesplat.adapt.eq3 import SsimModel
 from sagesplat.adapt.evaluate import QUALITIES, Evaluation
 from sagesplat.adapt.observe import TOTAL, Observations
 from sagesplat.adapt.plan import Choice, Counts, Plan, quality_title
+from sagesplat.core.events import TableMade
 from sagesplat.core.gaussians import BYTES_PER_GAUSSIAN
 from sagesplat.io.columns import text_cell
 from sagesplat.io.files import atomic_path, write_text
@@ -46,6 +47,11 @@ class Table:
     def cells(self) -> list[list[str]]:
         """The rows as text; NaN reads as a dash."""
         return [[_text(v, spec) for v, spec in zip(row, self.formats, strict=True)] for row in self.rows]
+
+    @property
+    def event(self) -> TableMade:
+        """What shows the table to whom listens."""
+        return TableMade(self.title, self.header, tuple(map(tuple, self.cells())))
 
     def columns(self) -> list[str]:
         """The header in one line, with the titles of groups before it."""

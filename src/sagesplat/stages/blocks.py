@@ -88,7 +88,7 @@ def _division(config: BlocksConfig) -> dict[str, float]:
 
 def divide(job: Job, config: BlocksConfig, seed: int) -> Blocks:
     """Split the scene, and create a run folder for each block with its part of the capture."""
-    run, file = job.run, job.run.blocks / "blocks.json"
+    run, file = job.run, job.run.division
     settings = {**_division(config), "seed": seed}
 
     def make() -> list[str]:
@@ -198,7 +198,7 @@ def train_blocks(job: Job, config: BlocksConfig, train: TrainConfig, seed: int) 
         merged = _merge_levels(run, blocks, parts)
         return [f"{merged:,} Gaussians of {len(blocks)} blocks"]
 
-    inputs = [*train_inputs(job, train), run.blocks / "blocks.json", run.provenance("blocks")]
+    inputs = [*train_inputs(job, train), run.division, run.provenance("blocks")]
     run_stage(job, "train", settings, inputs, [run.levels], make, swaps=True)
 
 
@@ -241,12 +241,12 @@ def label_block_categories(job: Job) -> None:
     A pixel keeps its category and gets the block whose Gaussians contribute most to it.
     """
     run = job.run
-    blocks, masks = read_blocks(run.blocks / "blocks.json"), job.category_masks
+    blocks, masks = read_blocks(run.division), job.category_masks
     parts = BlockCategories(masks.taxonomy, len(blocks))
 
     def make() -> list[str]:
         scene, names = job.scene, parts.names
-        g = job.snapshots.load(job.snapshots.levels[-1])
+        g = job.load_last_level()
         by_block = replace(g, label_ids=torch.from_numpy(parts.block_of(g.label_ids.numpy())))
         painted = RenderedLabels(by_block, job.backend, job.antialiased)
         shutil.rmtree(run.block_categories, ignore_errors=True)
@@ -268,7 +268,7 @@ def label_block_categories(job: Job) -> None:
         ]
 
     made = [run.provenance(stage) for stage in ("train", "masks")]
-    inputs = [run.scene, run.labels, run.levels, run.blocks / "blocks.json", run.masks / "labels.json", *made]
+    inputs = [run.scene, run.labels, run.levels, run.division, run.masks / "labels.json", *made]
     if masks.folder == run.fused:
         inputs.append(run.provenance("fuse"))
     outputs = [run.block_categories / "labels.json", run.block_categories / "labels.npz"]
@@ -277,7 +277,7 @@ def label_block_categories(job: Job) -> None:
 
 def nest_blocks(job: Job, config: BlocksConfig, nest: NestConfig, seed: int) -> None:
     """Make the nested levels of the blocks, tune them along the boundaries, and merge them."""
-    run, file = job.run, job.run.blocks / "blocks.json"
+    run, file = job.run, job.run.division
     nested.check(nest)
     blocks = read_blocks(file)
     settings = {**asdict(nest), "seed": seed, "boundary_steps": config.boundary_steps}
@@ -310,7 +310,7 @@ def nest_block(
     """Make the nested levels of one block, and its interior: the Gaussians inside the block's border."""
     job = spec.open(named(emit, f"block {number}"))
     run = job.run
-    labels = (run.instances if job.has_instances else run.masks) / "labels.json"
+    labels = (run.instances if job.run.has_instances else run.masks) / "labels.json"
     nest_levels(job, config, seed)
 
     def make() -> list[str]:
@@ -333,14 +333,14 @@ def _tune(job: Job, blocks: Blocks, config: BlocksConfig, nest: NestConfig, seed
     """Tune the blocks along their boundaries, neighbours one after the other; the files with the results."""
     run, every = job.run, range(len(blocks))
     files = [run.block(number).interior for number in every]
-    colour, sees = graph_colouring(blocks.neighbours()), read_division(run.blocks / "blocks.json").sees
+    colour, sees = graph_colouring(blocks.neighbours()), read_division(run.division).sees
     steps = replace(nest, steps=config.boundary_steps)
     for now in range(int(colour.max()) + 1):
         mine = [number for number in every if colour[number] == now]
         tasks = []
         for number in mine:
             others = [files[other] for other in sees[number] if other != number]
-            what = (_spec(job, number), run.blocks / "blocks.json", number, others, steps, seed)
+            what = (_spec(job, number), run.division, number, others, steps, seed)
             tasks.append(Task(f"boundaries of block {number}", tune_boundaries, what, job.gpus))
         results(job.executor, tasks, job.emit)
         for number in mine:

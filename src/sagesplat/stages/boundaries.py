@@ -5,7 +5,7 @@ import torch
 
 from sagesplat.adapt.ladder import read_ladder
 from sagesplat.adapt.observe import as_unit, render_rgb
-from sagesplat.core.events import Progress, TableMade
+from sagesplat.core.events import Progress
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.levels import read_sizes
 from sagesplat.io.files import write_text
@@ -26,7 +26,7 @@ _VIEWS = 32  # training views that are measured if there are no test views
 
 def measure_borders(job: Job) -> None:
     """Measure the quality near the borders of the blocks and elsewhere, and the balance of the blocks."""
-    run, file = job.run, job.run.blocks / "blocks.json"
+    run, file = job.run, job.run.division
     table_file = run.adapted / "blocks.csv"
 
     def make() -> list[str]:
@@ -35,7 +35,7 @@ def measure_borders(job: Job) -> None:
         sets = {"merged": together(files).full, "tuned": job.ladder.load(job.ladder.levels[-1])}
         tables = [balance_table(job, blocks), border_table(job, blocks, sets)]
         for table in tables:
-            job.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
+            job.emit(table.event)
         tables[0].write_csv(table_file)
         tables[1].write_csv(run.adapted / "borders.csv")
         text = "\n\n".join(f"## {t.title}\n\n{t.markdown()}" for t in tables)
@@ -49,7 +49,7 @@ def measure_borders(job: Job) -> None:
 
 def balance_table(job: Job, blocks: Blocks) -> Table:
     """Points, views, Gaussians and seconds of each block, one row each."""
-    made = read_division(job.run.blocks / "blocks.json")
+    made = read_division(job.run.division)
     rows: list[tuple[str | int | float, ...]] = []
     for number in range(len(blocks)):
         run = job.run.block(number)

@@ -36,7 +36,7 @@ def clean_levels(job: Job, config: CleanConfig) -> None:
     def make() -> list[str]:
         for earlier in (run.cleaned, run.floaters_picture):
             earlier.unlink(missing_ok=True)
-        last = job.snapshots.files[-1]
+        last = job.last_level
         if config.floaters == "keep":
             write_json(run.floaters, asdict(CleanFigures(sum(last.counts.values()), {}, {}, {}, {})))
             return ["nothing is removed"]

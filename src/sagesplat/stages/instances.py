@@ -95,7 +95,7 @@ def make_instances(job: Job, labels: LabelsConfig) -> None:
         _remove(job)
         masks = job.category_masks
         ids = wanted_ids(masks.taxonomy.names, wanted)
-        g = job.snapshots.load(job.snapshots.levels[-1])
+        g = job.load_last_level()
         if job.has_blocks:
             g = replace(g, label_ids=torch.from_numpy(_parts(job, masks).category_ids(g.label_ids.numpy())))
         found = _find(job, g, masks, ids)
@@ -137,7 +137,6 @@ def _remove(job: Job) -> None:
     run.parents.unlink(missing_ok=True)
     for folder in (run.instances, run.block_instances):
         shutil.rmtree(folder, ignore_errors=True)
-    job.__dict__.pop("parents", None)
 
 
 def _find(job: Job, g: Gaussians, masks: Masks, ids: list[int]) -> Instances:
@@ -203,7 +202,7 @@ def _draw(
 
 def _parts(job: Job, masks: Masks) -> BlockCategories:
     """The (block, category) pairs of the categories of `masks`."""
-    return BlockCategories(masks.taxonomy, len(read_blocks(job.run.blocks / "blocks.json")))
+    return BlockCategories(masks.taxonomy, len(read_blocks(job.run.division)))
 
 
 def _split_by_block(job: Job, before: Masks, instances: Masks, points: LiftedLabels) -> None:
@@ -216,7 +215,7 @@ def _split_by_block(job: Job, before: Masks, instances: Masks, points: LiftedLab
     views = job.scene.views
     for view, path in zip(views, prepare_folder(run.block_instances, views), strict=True):
         write_mask(path, parts.ids(instances[view], of_categories.block_of(by_block[view])), parts.names)
-    block = read_blocks(run.blocks / "blocks.json").of(job.scene.points.xyz)
+    block = read_blocks(run.division).of(job.scene.points.xyz)
     labels = replace(points, label_ids=parts.ids(points.label_ids, block))
     labels.write(run.block_instances / "labels.npz")
     parts.names.write(run.block_instances / "labels.json")

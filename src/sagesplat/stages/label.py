@@ -269,7 +269,7 @@ def fuse_masks(job: Job) -> None:
 
     def make() -> list[str]:
         shutil.rmtree(run.fused, ignore_errors=True)
-        g = job.snapshots.load(job.snapshots.levels[-1])
+        g = job.load_last_level()
         fused = fuse(
             g, job.scene, job.masks, run.fused,
             soft=soft, valid=job.valid, antialiased=job.antialiased, backend=job.backend,

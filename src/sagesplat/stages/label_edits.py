@@ -158,7 +158,7 @@ def _begin(job: Job, fresh: Path, edits: LabelEdits, made: Relabelled) -> Job:
                 shutil.copy2(source / name, target / name)
     for stage in _LATER:
         new.provenance(stage).unlink(missing_ok=True)
-    if job.has_instances:
+    if job.run.has_instances:
         _keep_instances_alone(job.run, new)
     if job.has_block_categories:  # they keep their names
         shutil.copytree(job.run.block_labels, new.block_categories)

@@ -35,7 +35,7 @@ from sagesplat.stages.results import (
     sampled_of,
     viewpoints_of,
 )
-from sagesplat.stages.shared import distances, label_images, label_named, observed
+from sagesplat.stages.shared import label_images, label_named, observed
 from sagesplat.stages.viewpoints import fit_viewpoints
 
 _MENDINGS = 4  # times that a plan of a scene is measured in its composition and mended
@@ -114,7 +114,7 @@ class Snapshots(Method):
 
     @cached_property
     def _distances(self) -> dict[int, np.ndarray]:
-        return distances(self.job, self.job.fit_config.distance)
+        return self.job.distances(self.job.fit_config.distance)
 
     @cached_property
     def _training_distances(self) -> dict[int, np.ndarray]:
@@ -190,7 +190,7 @@ class NestedLevels(Method):
     def qualities(self) -> dict[QualityKind, Quality]:
         """What is predicted of the levels in every view of the scene."""
         job = self.job
-        far = distances(job, job.fit_config.distance)
+        far = job.distances(job.fit_config.distance)
         cameras = [view.camera for view in job.scene.views]
         return {
             "fidelity": quality_at(self.costs, fidelity_of(job), far, cameras, "fidelity"),

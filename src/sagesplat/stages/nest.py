@@ -76,7 +76,7 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
 def _make_base_model(job: Job, config: NestConfig, seed: int) -> None:
     """Train the small model that the ladder begins with: a stage, so that a killed run has it already."""
     run, made = job.run, train_config(job)
-    full = job.snapshots.size(job.snapshots.levels[-1])  # with floaters: the size is that of what is trained
+    full = job.recorded.size(job.last_level.step)  # with floaters: the size is that of what is trained
     cap = max(1, round(config.base_share * full))
     settings = {**asdict(nested.capped_config(made, cap, config.base_steps)), "seed": seed, "start": "merged"}
 

@@ -32,7 +32,6 @@ from sagesplat.segment.relabel import Relabelled
 from sagesplat.stages.observe import observed_views
 from sagesplat.stages.results import observations_of, sampled_of, viewpoints_of
 from sagesplat.stages.sample import measured_levels
-from sagesplat.stages.shared import distances
 
 
 def move_levels(job: Job, new: Job, made: Relabelled) -> None:
@@ -117,7 +116,7 @@ def move_labels(job: Job, new: Job, made: Relabelled) -> None:
 
 def _label_folders(job: Job, new: Job) -> list[tuple[Path, Path]]:
     """Folders of label images and where they go: those of instances are the only ones of an edited run."""
-    if job.has_instances:
+    if job.run.has_instances:
         return [(job.run.instances, new.run.masks)]
     both = [(job.run.masks, new.run.masks), (job.run.fused, new.run.fused)]
     return [(source, target) for source, target in both if (source / "labels.json").exists()]
@@ -222,6 +221,6 @@ def _observe(
     table = observations_of(job)
     # rows of categories without Gaussians keep their label
     rest = {label: label for label in np.unique(table.label_id).tolist() if label not in moved}
-    known = regrouped_observations(table, {**rest, **moved}, distances(new, fit.distance))
+    known = regrouped_observations(table, {**rest, **moved}, new.distances(fit.distance))
     parts = [known, observed_views(new, fit, fresh)] if fresh else [known]
     merge(parts).write_csv(new.run.observations)

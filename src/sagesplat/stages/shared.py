@@ -1,24 +1,18 @@
-"""Helpers that several stages share: settings, label images and distances of a run."""
+"""Helpers that several stages share: settings, label images and names of a run."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 
-import numpy as np
-
 from sagesplat.adapt.observe import (
-    PERCENTILE,
     LabelImages,
     Observations,
     RenderedLabels,
-    distances_in_views,
     large_enough,
 )
 from sagesplat.core.config import FitConfig, TrainConfig
 from sagesplat.core.errors import RunError
-from sagesplat.core.events import TableMade
 from sagesplat.core.names import composed
-from sagesplat.output.tables import Table
 from sagesplat.run.job import Job
 from sagesplat.run.records import settings_of
 from sagesplat.run.run_dir import RunDir
@@ -39,8 +33,7 @@ def train_config(job: Job) -> TrainConfig:
 def label_image_inputs(run: RunDir) -> list[Path]:
     """What decides the label images that stages after training look at: the records of who made them."""
     made = [("masks", run.masks), ("fuse", run.fused), ("block_categories", run.block_categories)]
-    if run.ladder == "nested":
-        made.append(("instances", run.instances))
+    made += [("instances", run.instances)] if run.has_instances else []
     return [run.provenance(stage) for stage, folder in made if (folder / "labels.json").exists()]
 
 
@@ -66,25 +59,10 @@ def label_images(job: Job, source: str) -> LabelImages:
     return RenderedLabels(job.ladder.load(job.ladder.levels[-1]), job.backend, job.antialiased)
 
 
-def distances(job: Job, distance: str) -> dict[int, np.ndarray]:
-    """d_min of each category in each view, as `FitConfig.distance` says; kept, as several stages ask."""
-    percentile = PERCENTILE if distance == "percentile" else 0.0
-    scene, labels = job.scene, job.point_labels
-    kept = job.__dict__.get("_distances")
-    if kept is None or kept[0] is not scene or kept[1] != percentile or not np.array_equal(kept[2], labels):
-        found = distances_in_views(scene, labels, percentile)
-        kept = job.__dict__["_distances"] = scene, percentile, labels, found
-    return kept[3]
-
-
 def observed(job: Job, config: FitConfig) -> Observations:
     """The rows of views that show enough of a category, with SSIM of the region that models are fitted to."""
     table = large_enough(observations_of(job), job.scene, config.min_share)
     return replace(table, ssim=table.ssim_eroded) if config.region == "eroded" else table
-
-
-def _show(job: Job, table: Table) -> None:
-    job.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
 
 
 def labels_named(job: Job, names: Sequence[str]) -> list[int]:

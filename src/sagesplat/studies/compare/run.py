@@ -15,7 +15,7 @@ from sagesplat.adapt.observe import TOTAL, as_unit, measure, measure_total, rend
 from sagesplat.adapt.plan import Plan, check_target
 from sagesplat.core.config import CompareConfig, FitConfig, PlanConfig
 from sagesplat.core.errors import RunError
-from sagesplat.core.events import Progress, RunDone, TableMade
+from sagesplat.core.events import Progress, RunDone
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.increments import INDEX, read_increments, read_index, shown, write_increments
 from sagesplat.formats.levels import read_level, write_set
@@ -127,7 +127,7 @@ def compare(job: Job, config: CompareConfig, copy: Path | None = None) -> list[P
     run_stage(job, "compared", {}, [file], [folder / PAGE], show)
     for stem, columns in CONSOLE.items():
         table = tables[stem].only(*columns)
-        job.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
+        job.emit(table.event)
     if copy:
         write_json(copy, read_json(file))
     job.emit(RunDone(folder / PAGE))
@@ -160,7 +160,7 @@ def _check(job: Job, config: CompareConfig) -> None:
     for target in config.targets:
         check_target(target)
     smallest = min(config.caps, default=1.0)
-    if round(smallest * job.snapshots.size(job.snapshots.levels[-1])) < _FEWEST:
+    if round(smallest * job.recorded.size(job.last_level.step)) < _FEWEST:
         raise RunError(f"{run.path}: --caps {smallest:g} leaves too few Gaussians to train; choose more")
 
 
@@ -188,7 +188,7 @@ class Baseline:
 
 def pruned_sets(job: Job, config: CompareConfig, folder: Path) -> list[Baseline]:
     """The last snapshot, pruned by LightGaussian's criterion (arXiv:2311.17245) and tuned."""
-    last = job.snapshots.files[-1]
+    last = job.last_level
     steps = settings_of(job.run, "nest")["steps"] if config.tune_steps < 0 else config.tune_steps
 
     @cache
@@ -209,14 +209,14 @@ def pruned_sets(job: Job, config: CompareConfig, folder: Path) -> list[Baseline]
 
 def _prune(job: Job, of: tuple[float, int, np.ndarray]) -> Gaussians:
     share, steps, weights = of
-    g = read_level(job.snapshots.files[-1].path)
+    g = read_level(job.last_level.path)
     return tune_composition(job, prune_to(g, max(1, round(share * len(g))), weights), steps)
 
 
 def mcmc_sets(job: Job, config: CompareConfig, folder: Path) -> list[Baseline]:
     """3DGS-MCMC from the start, its Gaussians capped at shares of the last snapshot's."""
     run, made, found = job.run, train_config(job), []
-    full, seed = job.snapshots.size(job.snapshots.levels[-1]), settings_of(job.run, "train")["seed"]
+    full, seed = job.recorded.size(job.last_level.step), settings_of(job.run, "train")["seed"]
     for share in sorted(set(config.caps)):
         cap, path = round(share * full), folder / f"mcmc-{share:g}.npz"
         settings = {**asdict(capped_config(made, cap, made.max_steps)), "seed": seed}
@@ -265,7 +265,7 @@ def _keep(job: Job, part: tuple[Callable[[Job, Any], Gaussians], Any, str, int])
 
 def snapshot_points(snapshots: Job, config: CompareConfig) -> list[Contender]:
     """Settled snapshots, spread in size; of equal ones the latest."""
-    ladder = snapshots.snapshots
+    ladder = snapshots.recorded
     sizes = [ladder.size(level) for level in ladder.levels]
     wanted = np.geomspace(max(1, min(sizes)), max(sizes), config.snapshots)[::-1]
     picked = sorted({nearest_snapshot(ladder, round(size)) for size in wanted.tolist()})
@@ -286,7 +286,7 @@ def _sage(sage: Snapshots, targets: Sequence[float], share: float) -> list[Conte
 def prefixes(nested: NestedLevels) -> list[Contender]:
     """The levels, all categories at the same one: as they are sent."""
     job, costs = nested.job, nested.costs
-    steps = job.snapshots.levels[-1] + settings_of(job.run, "nest")["steps"]
+    steps = job.last_level.step + settings_of(job.run, "nest")["steps"]
     found = []
     for k in range(costs.transfer_bytes.shape[1]):
         bytes_of = dict(zip(costs.labels, costs.transfer_bytes[:, k].tolist(), strict=True))
@@ -330,7 +330,7 @@ def planned_within(
 
 def _of_plan(nested: NestedLevels, name: str, plan: Plan) -> Contender:
     job = nested.job
-    steps = job.snapshots.levels[-1] + settings_of(job.run, "nest")["steps"]
+    steps = job.last_level.step + settings_of(job.run, "nest")["steps"]
     return Contender(
         PLANNED, name, steps, partial(job.ladder.compose, plan.levels),
         {choice.label_id: choice.transfer_bytes or 0 for choice in plan.choices}, plan.target,
