@@ -99,9 +99,9 @@ def compare(
     other = Job(RunDir(out / "one"), tell, "cpu", threads)
     for each in (job, other):
         label(each.spec, scene, in_blocks, tell)
-    blocks.train_blocks(job, in_blocks.blocks, in_blocks.train, in_blocks.seed)
+    blocks.train_scene(job, in_blocks.train, in_blocks.blocks, in_blocks.seed)
     blocks.label_block_categories(job)
-    blocks.nest_blocks(job, in_blocks.blocks, in_blocks.nest, in_blocks.seed)
+    blocks.nest_scene(job, in_blocks.nest, in_blocks.blocks, in_blocks.seed)
     list(fresh.run([Task("as one", as_one, (other.spec, replace(whole, blocks=BlocksConfig())))], tell))
     partition = read_blocks(job.run.division)
     files = [job.run.block(number).interior for number in range(len(partition))]

@@ -36,7 +36,8 @@ from sagesplat.raster import device_of, resolve_backend
 from sagesplat.run.job import Job
 from sagesplat.run.records import seconds_of, settings_of
 from sagesplat.run.run_dir import RunDir
-from sagesplat.stages import pipeline
+from sagesplat.stages.blocks import nest_scene, train_scene
+from sagesplat.stages.clean import clean_levels
 from sagesplat.stages.label import lift_labels, make_masks
 from sagesplat.stages.methods import NestedLevels
 from sagesplat.stages.results import increments_of
@@ -135,8 +136,8 @@ def open_job(folder: Path, scene: str, asked: Asked, say: Say) -> Job:
         _train(job, folder, scene, asked)
     if not job.run.prefixes.exists():
         config = replace(_config(scene, asked).nest, steps=asked.nest_steps, base_steps=asked.base_steps)
-        pipeline.clean(job, CleanConfig())
-        pipeline.nest(job, config, RunConfig().blocks, asked.seed)
+        clean_levels(job, CleanConfig())
+        nest_scene(job, config, RunConfig().blocks, asked.seed)
     return job
 
 
@@ -152,7 +153,7 @@ def _train(job: Job, folder: Path, scene: str, asked: Asked) -> None:
     open_scene(job, capture, config.scene)
     make_masks(job, MasksConfig(), LabelsConfig())
     lift_labels(job, LiftConfig())
-    pipeline.train(job, config.train, config.blocks, asked.seed)
+    train_scene(job, config.train, config.blocks, asked.seed)
 
 
 def _told(name: str, say: Say) -> Callable[[Event], None]:

@@ -125,7 +125,7 @@ def test_a_killed_run_goes_on_and_ends_with_the_same_levels(
     with pytest.raises(Killed):
         run_all(Job(RunDir(tmp_path / "run", "snapshots"), emit), capture, CONFIG)
     monkeypatch.setattr(
-        "sagesplat.stages.pipeline._promise", lambda job, config: None
+        "sagesplat.stages.pipeline.measure_and_plan", lambda job, config: None
     )  # only levels are compared
     events = work(tmp_path / "run", capture)
     assert named(events, StageSkipped) == ["scene", "segment", "masks", "lift"]

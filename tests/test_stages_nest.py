@@ -554,7 +554,7 @@ def test_chunks_are_exported_as_files(finished: Path, tmp_path: Path) -> None:
     assert counts[0] == counts[1]
     with pytest.raises(RunError, match="exists"):
         export_increments(job, tmp_path / "ply", "ply")
-    with pytest.raises(RunError, match="snapshots have no chunks"):
+    with pytest.raises(RunError, match="these levels have no chunks"):
         export_increments(Job(RunDir(finished, "snapshots"), print), tmp_path / "none", "ply")
 
 

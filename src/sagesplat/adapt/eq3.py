@@ -56,7 +56,7 @@ class SsimModel:
     """What SSIM to expect of one category at one level, by distance."""
 
     label_id: int
-    level: int  # of snapshots the training step, of nested levels 1 to K
+    level: int  # of recorded levels the training step, of nested ones 1 to K
     params: Eq3  # one regime or a constant: both halves are equal
     d_range: tuple[float, float]  # smallest and largest distance fitted, world units; (0, 0) = none known
     median: float  # SSIM where the distance is unknown

@@ -1,4 +1,4 @@
-"""The levels of every category, snapshots or nested, read from disk on demand."""
+"""The levels of every category, recorded in training or nested, read from disk on demand."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -24,11 +24,11 @@ from sagesplat.formats.levels import (
 
 
 class Ladder(Protocol):
-    """Levels of quality, each category by itself: snapshots of a training, or prefixes of one model."""
+    """Levels of quality, each category by itself: recorded in training, or prefixes of one model."""
 
     @property
     def levels(self) -> list[int]:
-        """Their numbers, ascending: training steps of snapshots, 1 to K of prefixes."""
+        """Their numbers, ascending: training steps of recorded ones, 1 to K of prefixes."""
         ...
 
     @property
@@ -193,7 +193,7 @@ def _unknown(level: int, levels: list[int]) -> RunError:
 
 
 def read_ladder(folder: Path) -> RecordedLadder:
-    """The snapshots in a `levels` folder."""
+    """The levels that training recorded in a `levels` folder."""
     files = tuple(sorted((read_header(p) for p in folder.glob("[!.]*.npz")), key=lambda f: f.step))
     if not files:
         raise RunError(f"{folder}: no levels; run `sagesplat train` first")

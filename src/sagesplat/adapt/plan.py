@@ -45,12 +45,12 @@ class Choice:
     """The level of one category."""
 
     label_id: int
-    level: int  # of snapshots the training step, of nested levels 1 to K
+    level: int  # of recorded levels the training step, of nested ones 1 to K
     predicted: float  # quality; in a scene what at least `share` of the views reach; NaN: nothing promised
     distance: float  # of the view, world units; NaN in a scene and where unknown
     count: int  # Gaussians
     status: str  # one of STATUSES
-    transfer_bytes: int | None = None  # of its increments; None for snapshots
+    transfer_bytes: int | None = None  # of its increments; None for recorded levels
     calibrated: bool | None = None  # whether the promise is proven; None: no bound, a mere prediction
     reached: Reached | None = None  # of a scene's plan: views that measure the target at this level
 
@@ -95,7 +95,7 @@ class Plan:
 
     @property
     def transfer_bytes(self) -> int | None:
-        """Bytes of the increments to send; None for snapshots."""
+        """Bytes of the increments to send; None for recorded levels."""
         sizes = [choice.transfer_bytes for choice in self.choices]
         return None if None in sizes else sum(size for size in sizes if size is not None)
 
@@ -270,7 +270,7 @@ def choose_latest(
     target: float,
     otherwise: Sequence[Float[np.ndarray, "... K"] | Int[np.ndarray, "... K"]] = (),
 ) -> tuple[Int[np.ndarray, "..."], Bool[np.ndarray, "..."]]:
-    """`allocate.choose` for K snapshots in order of their steps: of equal ones the latest."""
+    """`allocate.choose` for K recorded levels in order of their steps: of equal ones the latest."""
     found, met = choose(ssim[..., ::-1], counts[::-1], target, [key[..., ::-1] for key in otherwise])
     return np.asarray(len(counts) - 1 - found), met  # [] too: numpy makes a number of that
 

@@ -1,6 +1,6 @@
 """Settings of every stage. Standard library only, so that the command line answers at once."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -132,7 +132,7 @@ class TrainConfig:
     """Learning rates. fast: larger at first, on downscaled photos where those have the same detail;
     published: as in 3DGS."""
     level_every: int = 0
-    """Steps between two snapshots, not scaled (0: a thirtieth of --train.max-steps)."""
+    """Steps between two recorded levels, not scaled (0: a thirtieth of --train.max-steps)."""
     sh_degree: int = 3
     """Degree of the spherical harmonics."""
     initial_angle: float = 0.0
@@ -206,7 +206,7 @@ class TrainConfig:
     mcmc_scale: float = 0.01
     """Weight of the mean scale in the loss (3DGS-MCMC)."""
     levels_after_reset: bool = False
-    """Record a snapshot that falls on an opacity reset after the reset, as the paper may have, not before."""
+    """Record a level that falls on an opacity reset after the reset, as the paper may have, not before."""
     freeze_at: float | None = None
     """Stop each category when its mean SSIM in the training views reaches this (Fig. 1 of the paper)."""
     gradient_freeze_share: float = 0.0
@@ -380,7 +380,7 @@ class PlanConfig:
     viewpoint (default: 0.95, where --target-ssim is not given; 1: the full model)."""
     target_ssim: float | None = None
     """SSIM against photos that the planned scene must reach; with --target-fidelity a plan beside that one
-    (default: none, of snapshots 0.8)."""
+    (default: none, of the levels of the paper 0.8)."""
     share: float = 0.95
     """Fraction of the viewpoints in which the level of a category must reach the target."""
     tune_steps: int = 0
@@ -394,16 +394,6 @@ class PlanConfig:
     """Unit of the budget: bytes to transfer, bytes of GPU memory in the viewer, or Gaussians."""
     weights: dict[str, float] = field(default_factory=dict)
     """Weights of categories within the budget, by name (1 unless named)."""
-
-    def with_target(self, ladder: LadderKind) -> "PlanConfig":
-        """The same with the default target of the ladder, where none is given."""
-        if self.target_fidelity is not None or self.target_ssim is not None:
-            return self
-        return (
-            replace(self, target_fidelity=self.target)
-            if ladder == "nested"
-            else replace(self, target_ssim=0.8)
-        )
 
     @property
     def quality(self) -> Literal["fidelity", "ssim"]:
@@ -526,6 +516,6 @@ class RunConfig:
     fuse: bool = False
     """Fuse the label images of all views through the trained Gaussians."""
     ladder: LadderKind = "nested"
-    """Levels: nested (prefixes of one model), or the snapshots of training as in the paper."""
+    """Levels: nested (prefixes of one model), or those that training recorded, as in the paper."""
     seed: int = 0
     """Seed of the random numbers."""

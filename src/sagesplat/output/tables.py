@@ -147,7 +147,7 @@ def name_of(label_id: int, names: Mapping[int, str]) -> str:
 
 
 def bytes_of(choice: Choice) -> int:
-    """What a choice costs: bytes to send, of snapshots 248 a Gaussian."""
+    """What a choice costs: bytes to send, or 248 a Gaussian."""
     return choice.nbytes if choice.transfer_bytes is None else choice.transfer_bytes
 
 
@@ -158,7 +158,7 @@ def by_size(counts: Counts) -> list[int]:
 
 
 def last_counts(counts: Counts) -> dict[int, int]:
-    """Gaussians of each label in the full model, the last level: of snapshots it is 3DGS itself."""
+    """Gaussians of each label in the full model, the last level: of recorded ones it is 3DGS itself."""
     last: dict[int, int] = {}
     for (label_id, _), count in sorted(counts.items(), key=lambda item: item[0][1]):
         last[label_id] = count

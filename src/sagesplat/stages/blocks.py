@@ -43,7 +43,9 @@ from sagesplat.scene.stored import write_scene
 from sagesplat.segment.block_categories import BlockCategories
 from sagesplat.segment.lift import LiftedLabels
 from sagesplat.segment.masks import Taxonomy, mask_path, prepare_folder, write_labels, write_mask
+from sagesplat.stages.boundaries import measure_borders
 from sagesplat.stages.nest import nest_levels, write_ladder
+from sagesplat.stages.scene import check_not_adopted
 from sagesplat.stages.shared import label_image_inputs, train_config
 from sagesplat.stages.train import read_frozen, train_inputs, train_levels, write_frozen
 from sagesplat.train import memory, nested
@@ -175,8 +177,15 @@ def _needed(block: Job, config: TrainConfig) -> int:
     return memory.fit(block.scene, config, block.memory_limit, processes=block.processes).needed
 
 
-def train_blocks(job: Job, config: BlocksConfig, train: TrainConfig, seed: int) -> None:
-    """Split the scene, train its blocks as tasks, and merge their levels."""
+def train_scene(job: Job, train: TrainConfig, config: BlocksConfig, seed: int) -> None:
+    """Train the scene: as one, or split into blocks, which are trained as tasks and merged."""
+    check_not_adopted(job.run)
+    if config.count == 1:
+        if job.has_blocks:
+            raise RunError(
+                f"{job.run.blocks}: this run is in blocks; add --blocks.count, or begin another run"
+            )
+        return train_levels(job, train, seed)
     check(config, train)
     # a photo of several blocks would get several exposures, and every block a sky around the others
     train = replace(train, exposure="off", sky="off")
@@ -240,6 +249,7 @@ def label_block_categories(job: Job) -> None:
 
     A pixel keeps its category and gets the block whose Gaussians contribute most to it.
     """
+    check_not_adopted(job.run)
     run = job.run
     blocks, masks = read_blocks(run.division), job.category_masks
     parts = BlockCategories(masks.taxonomy, len(blocks))
@@ -275,8 +285,11 @@ def label_block_categories(job: Job) -> None:
     run_stage(job, "block_categories", {}, inputs, outputs, make)
 
 
-def nest_blocks(job: Job, config: BlocksConfig, nest: NestConfig, seed: int) -> None:
-    """Make the nested levels of the blocks, tune them along the boundaries, and merge them."""
+def nest_scene(job: Job, nest: NestConfig, config: BlocksConfig, seed: int) -> None:
+    """Make the nested levels of the scene as one, or of its blocks: tuned along the boundaries and merged."""
+    check_not_adopted(job.run)
+    if not job.has_blocks:
+        return nest_levels(job, nest, seed)
     run, file = job.run, job.run.division
     nested.check(nest)
     blocks = read_blocks(file)
@@ -302,6 +315,7 @@ def nest_blocks(job: Job, config: BlocksConfig, nest: NestConfig, seed: int) -> 
 
     inputs = [run.scene, run.labels, run.levels, run.provenance("train"), *label_image_inputs(run), file]
     run_stage(job, "nest", settings, inputs, [run.prefixes, run.increments], make, swaps=True)
+    measure_borders(job)
 
 
 def nest_block(

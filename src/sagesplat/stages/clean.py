@@ -13,6 +13,7 @@ from sagesplat.io.files import read_json, write_json
 from sagesplat.raster import device_of
 from sagesplat.run.job import Job
 from sagesplat.run.stage import run_stage
+from sagesplat.stages.scene import check_not_adopted
 from sagesplat.stages.shared import inlier_inputs
 from sagesplat.train.clean import CRITERIA, Cleaned, check, clean, find_floaters
 
@@ -31,6 +32,9 @@ class CleanFigures:
 def clean_levels(job: Job, config: CleanConfig) -> None:
     """Write the last level without its floaters (`RunDir.cleaned`); the level itself stays as recorded."""
     run = job.run
+    check_not_adopted(run)
+    if job.has_blocks:
+        raise RunError(f"{run.blocks}: floaters are not removed from a scene in blocks; nest it as it is")
     check(config)
 
     def make() -> list[str]:

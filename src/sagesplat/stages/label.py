@@ -39,6 +39,7 @@ from sagesplat.segment.soft import read_soft, soft_path
 from sagesplat.segment.valid import ValidPixels, write_valid
 from sagesplat.stages.memory import check_network
 from sagesplat.stages.prompts import MASKS, Scores, Timed, load, prompt_lines, settings_of
+from sagesplat.stages.scene import check_not_adopted
 from sagesplat.train.fuse import Soft, fuse
 
 _MARKER = ".network.json"
@@ -242,6 +243,7 @@ def _segment_some(job: Job, part: tuple[Sequence[int], MasksConfig, str, bool]) 
 def lift_labels(job: Job, config: LiftConfig) -> None:
     """Vote the label images onto the SfM points."""
     run = job.run
+    check_not_adopted(run)
 
     def make() -> list[str]:
         if config.votes == "track" and not len(job.given_scene.points.track_points):
@@ -265,6 +267,7 @@ def fuse_masks(job: Job) -> None:
     With the probabilities of the network, where they were kept.
     """
     run = job.run
+    check_not_adopted(run)
     soft = _soft(job) if run.soft.is_dir() else None
 
     def make() -> list[str]:

@@ -43,7 +43,6 @@ _OF_LADDER = (
     "models.json", "promises.json", "plan.json", "provenance",
 )  # fmt: skip
 _MEASURED = ("nest", "observe", "sample", "fit", "plan")  # stages in their order, each recorded again
-_LATER = ("compose", "evaluate", "report", "crossview", "same_size", "paper", "base")
 
 
 @dataclass(frozen=True)
@@ -156,8 +155,9 @@ def _begin(job: Job, fresh: Path, edits: LabelEdits, made: Relabelled) -> Job:
                 shutil.copytree(source / name, target / name, dirs_exist_ok=True)
             elif (source / name).exists():
                 shutil.copy2(source / name, target / name)
-    for stage in _LATER:
-        new.provenance(stage).unlink(missing_ok=True)
+    for earlier in (new.adapted / "provenance").glob("*.json"):
+        if earlier.stem not in _MEASURED:
+            earlier.unlink()
     if job.run.has_instances:
         _keep_instances_alone(job.run, new)
     if job.has_block_categories:  # they keep their names

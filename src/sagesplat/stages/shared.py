@@ -4,11 +4,17 @@ from collections.abc import Collection, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 
+import numpy as np
+
 from sagesplat.adapt.observe import (
+    PERCENTILE,
     LabelImages,
     Observations,
     RenderedLabels,
+    distances_in_views,
     large_enough,
+    widest_lens,
+    within_lens,
 )
 from sagesplat.core.config import FitConfig, TrainConfig
 from sagesplat.core.errors import RunError
@@ -16,6 +22,7 @@ from sagesplat.core.names import composed
 from sagesplat.run.job import Job
 from sagesplat.run.records import settings_of
 from sagesplat.run.run_dir import RunDir
+from sagesplat.scene.scene import Camera, View
 from sagesplat.segment.block_categories import split_name
 from sagesplat.segment.display_colors import colors_of, rgb_of
 from sagesplat.segment.display_names import meant
@@ -57,6 +64,15 @@ def label_images(job: Job, source: str) -> LabelImages:
     if source == "given":
         return job.best_masks
     return RenderedLabels(job.ladder.load(job.ladder.levels[-1]), job.backend, job.antialiased)
+
+
+def distances_from(job: Job, camera: Camera) -> dict[int, np.ndarray]:
+    """d_min of each category from a camera, float [1], measured as those that the models were fitted to."""
+    percentile = PERCENTILE if job.fit_config.distance == "percentile" else 0.0
+    lens = within_lens(camera, widest_lens([view.camera for view in job.scene.views]))
+    views = (View("photo", lens, Path()), View("viewer", camera, Path()))
+    seen = distances_in_views(replace(job.scene, views=views), job.point_labels, percentile)
+    return {label: np.where(np.isnan(d[:1]), d[1:], d[:1]) for label, d in seen.items()}
 
 
 def observed(job: Job, config: FitConfig) -> Observations:

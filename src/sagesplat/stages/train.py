@@ -1,4 +1,4 @@
-"""Makes the levels: trains 3DGS from the labelled points and records snapshots."""
+"""Makes the levels: trains 3DGS from the labelled points and records them."""
 
 import shutil
 from collections.abc import Mapping

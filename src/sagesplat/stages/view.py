@@ -183,7 +183,7 @@ def _follow(job: "Job", site: "Site", stop: threading.Event) -> None:
 
 
 def _refresh(job: "Job", site: "Site") -> bool:
-    """Show the newest snapshot, or the bundle of a run that is finished: True for that."""
+    """Show the newest level of a training, or the bundle of a run that is finished: True for that."""
     from sagesplat.stages.bundle import live_bundle
 
     if _is_finished(job.run):

@@ -35,12 +35,13 @@ from sagesplat.run.stage import Stage, run_stage, run_stages
 from sagesplat.segment.display_names import titles
 from sagesplat.stages.compose import compose_inputs, tune_composition
 from sagesplat.stages.fit import fit_ladder
-from sagesplat.stages.methods import NestedLevels, Snapshots, method_of
+from sagesplat.stages.methods import NestedLevels, method_of
 from sagesplat.stages.nest import train_capped
 from sagesplat.stages.observe import observe_levels
 from sagesplat.stages.plan import PAPER_TARGETS, ssim_target, ssim_targets
 from sagesplat.stages.results import increments_of
 from sagesplat.stages.shared import inlier_inputs, label_images, train_config
+from sagesplat.stages.snapshots import Snapshots
 from sagesplat.studies.compare.report import (
     CONSOLE,
     FILE,
