@@ -21,7 +21,6 @@ from sagesplat.stages import blocks
 from sagesplat.stages.boundaries import balance_table, border_table
 from sagesplat.stages.label import lift_labels, make_masks
 from sagesplat.stages.nest import nest_levels
-from sagesplat.stages.pipeline import train
 from sagesplat.stages.scene import open_scene
 from sagesplat.train.boundaries import together
 
@@ -85,7 +84,7 @@ def label(spec: JobSpec, scene: Path, config: RunConfig, emit: Emit) -> None:
 def as_one(spec: JobSpec, config: RunConfig, emit: Emit) -> None:
     """Train and nest the scene as one."""
     job = spec.open(named(emit, "as one"))
-    train(job, config.train, config.blocks, config.seed)
+    blocks.train_scene(job, config.train, config.blocks, config.seed)
     nest_levels(job, config.nest, config.seed)
 
 

@@ -19,7 +19,7 @@ from sagesplat.adapt.observe import RenderedLabels
 from sagesplat.core.config import NestConfig, PlanConfig, RunConfig, SceneConfig, TrainConfig
 from sagesplat.core.gaussians import PARAMETERS, Gaussians
 from sagesplat.core.sh import num_bases, sh0_to_rgb
-from sagesplat.io.files import write_json
+from sagesplat.io.files import write_json, write_text
 from sagesplat.raster import Backend, Render, rasterize, set_threads
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
@@ -52,12 +52,21 @@ _FIGURES = (
 )  # fmt: skip
 
 
+# the files that make so many small runs that their reports are a word
+_PLAIN_REPORTS = ("test_run_stage", "test_run_executor", "test_stages_blocks", "test_studies_sweep")
+
+
 @pytest.fixture(scope="module", autouse=True)
 def no_figures(request: pytest.FixtureRequest) -> Iterator[None]:
     """Reports without figures, which take most of the time of a small run, and have their own tests."""
     with pytest.MonkeyPatch.context() as patch:
         if request.path.stem not in _FIGURES:
             patch.setattr("sagesplat.output.figures.save_figure", lambda figure, path, svg=True: b"<svg/>")
+        if request.path.stem in _PLAIN_REPORTS:
+            patch.setattr(
+                "sagesplat.output.report.write_report",
+                lambda folder, _: write_text(folder / "index.html", "report"),
+            )
         yield
 
 

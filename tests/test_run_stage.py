@@ -4,7 +4,6 @@ import csv
 import os
 import shutil
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -50,17 +49,6 @@ CONFIG = RunConfig(
     plan=PlanConfig(target_ssim=0.4),
 )
 BLOCKS = BlocksConfig(count=2, boundary_steps=5)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def plain_report() -> Iterator[None]:
-    """Figures take most of the time of so small a run, and have their own tests."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            "sagesplat.output.report.write_report",
-            lambda folder, _: write_text(folder / "index.html", "report"),
-        )
-        yield
 
 
 @pytest.fixture(scope="module")
