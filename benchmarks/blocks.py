@@ -18,6 +18,7 @@ from sagesplat.run.job import Job, JobSpec
 from sagesplat.run.run_dir import RunDir
 from sagesplat.scene.blocks import read_blocks
 from sagesplat.stages import blocks
+from sagesplat.stages.block_levels import nest_scene
 from sagesplat.stages.boundaries import balance_table, border_table
 from sagesplat.stages.label import lift_labels, make_masks
 from sagesplat.stages.nest import nest_levels
@@ -100,7 +101,7 @@ def compare(
         label(each.spec, scene, in_blocks, tell)
     blocks.train_scene(job, in_blocks.train, in_blocks.blocks, in_blocks.seed)
     blocks.label_block_categories(job)
-    blocks.nest_scene(job, in_blocks.nest, in_blocks.blocks, in_blocks.seed)
+    nest_scene(job, in_blocks.nest, in_blocks.blocks, in_blocks.seed)
     list(fresh.run([Task("as one", as_one, (other.spec, replace(whole, blocks=BlocksConfig())))], tell))
     partition = read_blocks(job.run.division)
     files = [job.run.block(number).interior for number in range(len(partition))]

@@ -36,14 +36,15 @@ from sagesplat.raster import device_of, resolve_backend
 from sagesplat.run.job import Job
 from sagesplat.run.records import seconds_of, settings_of
 from sagesplat.run.run_dir import RunDir
-from sagesplat.stages.blocks import nest_scene, train_scene
+from sagesplat.stages.block_levels import nest_scene
+from sagesplat.stages.blocks import train_scene
 from sagesplat.stages.clean import clean_levels
 from sagesplat.stages.label import lift_labels, make_masks
 from sagesplat.stages.methods import NestedLevels
 from sagesplat.stages.results import increments_of
 from sagesplat.stages.sample import sample_levels
 from sagesplat.stages.scene import open_scene
-from sagesplat.stages.shared import inlier_inputs, sky_inputs, train_config
+from sagesplat.stages.shared import existing, inlier_inputs, train_config
 from sagesplat.studies.compare.report import Point
 from sagesplat.studies.compare.run import (
     Baseline,
@@ -228,7 +229,7 @@ def _as_one(job: Job, place: Path, asked: Asked) -> Baseline:
     return Baseline(
         AS_ONE, f"{config.steps} steps more", place / f"as-one-{config.steps}.npz",
         job.last_level.step + config.steps, {**asdict(config), "seed": asked.seed},
-        [*run.scene_files, job.trained, *inlier_inputs(run), *sky_inputs(run)], train_as_one,
+        [*run.scene_files, job.trained, *inlier_inputs(run), *existing(run.sky)], train_as_one,
         lambda: (config, asked.seed),
     )  # fmt: skip
 

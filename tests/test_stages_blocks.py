@@ -47,7 +47,8 @@ from sagesplat.scene.scene import Camera, Lens, Points, Scene, View
 from sagesplat.scene.stored import read_scene, write_scene
 from sagesplat.segment.block_categories import BlockCategories, category_of, split_name
 from sagesplat.segment.masks import Masks, Taxonomy
-from sagesplat.stages.blocks import check, nest_scene
+from sagesplat.stages.block_levels import nest_scene
+from sagesplat.stages.blocks import check
 from sagesplat.stages.bundle import _contents, live_bundle
 from sagesplat.stages.instances import make_instances
 from sagesplat.stages.label_edits import apply_labels

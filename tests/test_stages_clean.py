@@ -16,7 +16,8 @@ from sagesplat.formats.levels import read_header, read_level, select_level, writ
 from sagesplat.io.files import write_json
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
-from sagesplat.stages.blocks import nest_scene, train_scene
+from sagesplat.stages.block_levels import nest_scene
+from sagesplat.stages.blocks import train_scene
 from sagesplat.stages.clean import CleanFigures, clean_levels, clean_lines, read_clean_figures
 
 

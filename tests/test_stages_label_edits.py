@@ -34,7 +34,7 @@ from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.segment.relabel import relabelled
-from sagesplat.stages import blocks, pipeline
+from sagesplat.stages import block_levels, pipeline
 from sagesplat.stages.label_edits import LabelsApplied, apply_labels
 from sagesplat.stages.observe import observed_views
 from sagesplat.stages.results import fidelity_of, increments_of, observations_of, sampled_of, viewpoints_of
@@ -113,7 +113,7 @@ def test_later_commands_find_the_edited_run_done(run: Path, viewer: Path) -> Non
     done = later_commands(made.path)
     assert [("StageSkipped", stage) for stage in ("observe", "sample", "fit", "plan")] == done[:4]
     with pytest.raises(RunError, match="made by editing"):
-        blocks.nest_scene(job_of(made.path), RunConfig().nest, RunConfig().blocks, 0)
+        block_levels.nest_scene(job_of(made.path), RunConfig().nest, RunConfig().blocks, 0)
 
 
 def test_a_merged_category_has_the_levels_of_its_parts(run: Path, viewer: Path) -> None:
@@ -292,7 +292,7 @@ def test_instances_keep_their_category_through_edits(tmp_path: Path, viewer: Pat
     plants = sorted(name for name, parent in before.parents.items() if parent == "potted plant")
     made = edited(run, viewer, Rename("vase 1", "urn"), Hide("urn", True), Merge(plants[1], plants[0]))
     after = job_of(made.path)
-    assert not after.has_instances  # its label images are those of the instances
+    assert not after.run.has_instances  # its label images are those of the instances
     assert after.parents["urn"] == "vase"
     assert after.parents[plants[0]] == "potted plant"
     assert plants[1] not in {*after.parents, *after.names().values()}

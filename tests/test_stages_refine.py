@@ -16,7 +16,8 @@ from sagesplat.run.records import uses
 from sagesplat.run.run_dir import RunDir
 from sagesplat.scene.refined import read_refined
 from sagesplat.stages import blocks
-from sagesplat.stages.blocks import nest_scene, train_scene
+from sagesplat.stages.block_levels import nest_scene
+from sagesplat.stages.blocks import train_scene
 from sagesplat.stages.observe import observe_levels
 from sagesplat.stages.refine import PoseFigures, pose_lines, read_pose_figures
 

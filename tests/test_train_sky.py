@@ -23,7 +23,8 @@ from sagesplat.run.run_dir import RunDir
 from sagesplat.scene.images import Photos
 from sagesplat.segment.masks import Masks, Taxonomy, mask_path
 from sagesplat.segment.valid import ValidPixels
-from sagesplat.stages.blocks import nest_scene, train_scene
+from sagesplat.stages.block_levels import nest_scene
+from sagesplat.stages.blocks import train_scene
 from sagesplat.stages.clean import clean_levels
 from sagesplat.stages.label import lift_labels, make_masks
 from sagesplat.stages.scene import open_scene

@@ -279,7 +279,7 @@ def nest(
     seed: Seed = 0,
 ) -> None:
     """Make the nested levels: order the trained Gaussians, train prefixes, write the increments."""
-    from sagesplat.stages.blocks import nest_scene
+    from sagesplat.stages.block_levels import nest_scene
 
     with open_job(run, machine) as job:
         nest_scene(job, nest, blocks, seed)

@@ -71,6 +71,10 @@ class Job:
             memory_limit=self.memory_limit or self.executor.memory,
         )
 
+    def block_spec(self, number: int) -> "JobSpec":
+        """The job on a block of a large scene."""
+        return replace(self.spec, run=self.run.block(number))
+
     @property
     def gpus(self) -> float:
         """GPUs that a task of this job computes on."""

@@ -35,7 +35,7 @@ from sagesplat.stages.results import (
     sampled_of,
     viewpoints_of,
 )
-from sagesplat.stages.shared import distances_from, label_images, label_named, observed
+from sagesplat.stages.shared import distances_from, label_images, label_named, observed, rendered_labels
 from sagesplat.stages.viewpoints import fit_viewpoints
 
 _MENDINGS = 4  # times that a plan of a scene is measured in its composition and mended
@@ -231,10 +231,7 @@ class NestedLevels(Method):
 
     @cached_property
     def _full_model(self) -> RenderedLabels:
-        """The label image of the full model, from any camera."""
-        return RenderedLabels(
-            self.job.ladder.load(self.job.ladder.levels[-1]), self.job.backend, self.job.antialiased
-        )
+        return rendered_labels(self.job)
 
     def plan_scene(self, target: float, share: float, quality: QualityKind = "ssim") -> Plan:
         """See `Method`."""

@@ -22,6 +22,7 @@ from sagesplat.run.job import Job
 from sagesplat.stages import blocks
 from sagesplat.stages.adopt import open_splat
 from sagesplat.stages.adopt_levels import make_levels
+from sagesplat.stages.block_levels import nest_scene
 from sagesplat.stages.clean import clean_levels
 from sagesplat.stages.compose import compose_plan
 from sagesplat.stages.estimate import tell_duration
@@ -96,7 +97,7 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
     if job.run.ladder == "nested":
         if not job.has_blocks:
             clean_levels(job, config.clean)
-        blocks.nest_scene(job, config.nest, config.blocks, config.seed)
+        nest_scene(job, config.nest, config.blocks, config.seed)
     measure_and_plan(job, config)
 
 

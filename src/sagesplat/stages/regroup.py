@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 
 from sagesplat.adapt.fidelity import distances_at, write_sampled
 from sagesplat.adapt.ladder import PrefixLadder
-from sagesplat.adapt.observe import RenderedLabels, merge
+from sagesplat.adapt.observe import merge
 from sagesplat.adapt.regroup import regrouped, regrouped_observations, regrouped_samples
 from sagesplat.core.config import FitConfig
 from sagesplat.core.events import Progress
@@ -32,6 +32,7 @@ from sagesplat.segment.relabel import Relabelled
 from sagesplat.stages.observe import observed_views
 from sagesplat.stages.results import observations_of, sampled_of, viewpoints_of
 from sagesplat.stages.sample import measured_levels
+from sagesplat.stages.shared import rendered_labels
 
 
 def move_levels(job: Job, new: Job, made: Relabelled) -> None:
@@ -131,7 +132,7 @@ def _move_pixels(job: Job, new: Job, made: Relabelled, taxonomy: Taxonomy) -> No
             split[old] = np.unique(made.new_ids[old])
         else:
             table[old + 1] = moved
-    painted = _painted(new) if split else None
+    painted = rendered_labels(new) if split else None
     for source, target in _label_folders(job, new):
         masks = Masks(source, Taxonomy.read(source / "labels.json"))
         for done, view in enumerate(job.scene.views):
@@ -145,11 +146,6 @@ def _move_pixels(job: Job, new: Job, made: Relabelled, taxonomy: Taxonomy) -> No
                         pixels[mine] = _nearest(shown, mine, parts)
             write_mask(mask_path(target, view), pixels, taxonomy)
             job.emit(Progress("labels", done + 1, len(job.scene.views)))
-
-
-def _painted(new: Job) -> RenderedLabels:
-    ladder = new.ladder
-    return RenderedLabels(ladder.load(ladder.levels[-1]), new.backend, new.antialiased)
 
 
 def _nearest(painted: np.ndarray, mine: np.ndarray, parts: np.ndarray) -> np.ndarray:

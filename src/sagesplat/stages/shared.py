@@ -44,26 +44,24 @@ def label_image_inputs(run: RunDir) -> list[Path]:
     return [run.provenance(stage) for stage, folder in made if (folder / "labels.json").exists()]
 
 
-def valid_inputs(run: RunDir) -> list[Path]:
-    """The images of the pixels that count, where some do not."""
-    return [run.valid] if run.valid.exists() else []
+def existing(*paths: Path) -> list[Path]:
+    """Those that are there: inputs of a stage that not every run has."""
+    return [path for path in paths if path.exists()]
 
 
 def inlier_inputs(run: RunDir) -> list[Path]:
     """The images of the pixels that Gaussians are fitted to after training, where some are not."""
-    return [run.inliers] if run.inliers.exists() else valid_inputs(run)
+    return existing(run.inliers) or existing(run.valid)
 
 
-def sky_inputs(run: RunDir) -> list[Path]:
-    """The sky that training began with, where photos show some."""
-    return [run.sky] if run.sky.exists() else []
+def rendered_labels(job: Job) -> RenderedLabels:
+    """The label images that the full model paints."""
+    return RenderedLabels(job.ladder.load(job.ladder.levels[-1]), job.backend, job.antialiased)
 
 
 def label_images(job: Job, source: str) -> LabelImages:
     """The label images that came with the photos ("given"), or those of the 3D labels ("rendered")."""
-    if source == "given":
-        return job.best_masks
-    return RenderedLabels(job.ladder.load(job.ladder.levels[-1]), job.backend, job.antialiased)
+    return job.best_masks if source == "given" else rendered_labels(job)
 
 
 def distances_from(job: Job, camera: Camera) -> dict[int, np.ndarray]:
