@@ -89,12 +89,14 @@ def make_instances(job: Job, masks: MasksConfig, labels: LabelsConfig) -> None:
     run = job.run
     check_not_adopted(run)
     if not labels.instances:
-        if run.instances.exists() and not job.force:
-            raise RunError(
-                f"{run.instances}: instances were told apart; name the same --labels.instances, or add "
-                "--force to fold them back into their categories"
-            )
-        return _remove(run)
+        if run.instances.exists():
+            if not job.force:
+                raise RunError(
+                    f"{run.instances}: instances were told apart; name the same --labels.instances, or add "
+                    "--force to fold them back into their categories"
+                )
+            _remove(run)
+        return
     find_photo_instances(job, masks, labels)
     wanted = parse_instances(labels.instances)
     merge = later_merges(run, labels)
