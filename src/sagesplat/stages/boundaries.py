@@ -1,5 +1,7 @@
 """Makes the tables of a scene in blocks: balance of the blocks, and quality along their borders."""
 
+import math
+
 import numpy as np
 import torch
 
@@ -13,8 +15,7 @@ from sagesplat.metrics.image import pasted, squared_error_map, ssim_map
 from sagesplat.output.tables import Table
 from sagesplat.raster import Workspace, device_of, rasterize
 from sagesplat.run.job import Job
-from sagesplat.run.records import seconds_of
-from sagesplat.run.run_dir import RunDir
+from sagesplat.run.recorded import stage_seconds
 from sagesplat.run.stage import run_stage
 from sagesplat.scene.blocks import Blocks, read_blocks, read_division
 from sagesplat.train.boundaries import bands, together
@@ -53,16 +54,13 @@ def balance_table(job: Job, blocks: Blocks) -> Table:
     rows: list[tuple[str | int | float, ...]] = []
     for number in range(len(blocks)):
         run = job.run.block(number)
-        seconds = [_seconds(run, stage) for stage in _TIMED]
+        took = stage_seconds(run)
+        seconds = [took.get(stage, math.nan) for stage in _TIMED]
         trained = sum(read_ladder(run.levels).files[-1].counts.values())
         kept = sum(n[-1] for n in read_sizes(run.interior).values())
         rows.append((number, made.points[number], made.views[number], trained, kept, *seconds))
     header = ("block", "points", "views", "Gaussians", "inside", *(f"{stage} s" for stage in _TIMED))
     return Table("Blocks", header, ("d", ",d", "d", ",d", ",d", ".1f", ".1f", ".1f", ".1f"), rows)
-
-
-def _seconds(run: RunDir, stage: str) -> float:
-    return seconds_of(run, stage) if run.provenance(stage).exists() else float("nan")
 
 
 def border_table(job: Job, blocks: Blocks, sets: dict[str, Gaussians]) -> Table:
