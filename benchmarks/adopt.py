@@ -62,7 +62,7 @@ def trained(name: str, folder: Path, transform: Transform) -> Case:
     case = CASES[name]
     capture = case.capture(folder / "captures" / name)
     job = run_scene(capture, folder / name, case.config, force=True).job
-    g = job.snapshots.load(job.snapshots.levels[-1])
+    g = job.load_last_level()
     source = folder / f"{name}.ply"
     write_ply(source, g, job.names(), antialiased=job.antialiased)
     rivals = {}

@@ -18,10 +18,10 @@ from sagesplat.run.job import Job, JobSpec
 from sagesplat.run.run_dir import RunDir
 from sagesplat.scene.blocks import read_blocks
 from sagesplat.stages import blocks
+from sagesplat.stages.block_levels import nest_scene
 from sagesplat.stages.boundaries import balance_table, border_table
 from sagesplat.stages.label import lift_labels, make_masks
 from sagesplat.stages.nest import nest_levels
-from sagesplat.stages.pipeline import train
 from sagesplat.stages.scene import open_scene
 from sagesplat.train.boundaries import together
 
@@ -85,7 +85,7 @@ def label(spec: JobSpec, scene: Path, config: RunConfig, emit: Emit) -> None:
 def as_one(spec: JobSpec, config: RunConfig, emit: Emit) -> None:
     """Train and nest the scene as one."""
     job = spec.open(named(emit, "as one"))
-    train(job, config.train, config.blocks, config.seed)
+    blocks.train_scene(job, config.train, config.blocks, config.seed)
     nest_levels(job, config.nest, config.seed)
 
 
@@ -99,11 +99,11 @@ def compare(
     other = Job(RunDir(out / "one"), tell, "cpu", threads)
     for each in (job, other):
         label(each.spec, scene, in_blocks, tell)
-    blocks.train_blocks(job, in_blocks.blocks, in_blocks.train, in_blocks.seed)
+    blocks.train_scene(job, in_blocks.train, in_blocks.blocks, in_blocks.seed)
     blocks.label_block_categories(job)
-    blocks.nest_blocks(job, in_blocks.blocks, in_blocks.nest, in_blocks.seed)
+    nest_scene(job, in_blocks.nest, in_blocks.blocks, in_blocks.seed)
     list(fresh.run([Task("as one", as_one, (other.spec, replace(whole, blocks=BlocksConfig())))], tell))
-    partition = read_blocks(job.run.blocks / "blocks.json")
+    partition = read_blocks(job.run.division)
     files = [job.run.block(number).interior for number in range(len(partition))]
     sets = {
         "blocks, put together": together(files).full,

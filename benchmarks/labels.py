@@ -47,7 +47,7 @@ Corrupt = Callable[[np.ndarray, np.random.Generator], np.ndarray]
 def measure(out: Path, steps: int, seed: int) -> dict[str, float]:
     """ARI with shuffled and corrupted masks, mIoU of unseen views, seconds and GB of lifting."""
     job = _trained(out, steps)
-    g = job.snapshots.load(job.snapshots.levels[-1])
+    g = job.load_last_level()
     truth = _truth_of(job.scene, g)
     opaque = (torch.sigmoid(g.logit_opacities) >= OPAQUE).numpy()
     result: dict[str, float] = {

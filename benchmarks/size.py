@@ -36,13 +36,16 @@ from sagesplat.raster import device_of, resolve_backend
 from sagesplat.run.job import Job
 from sagesplat.run.records import seconds_of, settings_of
 from sagesplat.run.run_dir import RunDir
-from sagesplat.stages import pipeline
+from sagesplat.run.stage_table import STAGES, StageKind
+from sagesplat.stages.block_levels import nest_scene
+from sagesplat.stages.blocks import train_scene
+from sagesplat.stages.clean import clean_levels
 from sagesplat.stages.label import lift_labels, make_masks
 from sagesplat.stages.methods import NestedLevels
 from sagesplat.stages.results import increments_of
 from sagesplat.stages.sample import sample_levels
 from sagesplat.stages.scene import open_scene
-from sagesplat.stages.shared import inlier_inputs, sky_inputs, train_config
+from sagesplat.stages.shared import existing, inlier_inputs, train_config
 from sagesplat.studies.compare.report import Point
 from sagesplat.studies.compare.run import (
     Baseline,
@@ -67,6 +70,7 @@ from sagesplat.train.stepper import Stepper
 Say = Callable[[str], None]
 SCENES = {"garden": "garden", "dinosaur": "dinosaur", "built-in": "built-in-11"}  # name: of `promises.CASES`
 AS_ONE, TRAINED = "3DGS, as one", "3DGS"
+STAGES["as_one"] = StageKind(("nest", "train"))  # of this benchmark alone
 _TOGETHER = 8  # sets in memory at a time
 _TIMED = 100  # steps of nesting, and on the full model, whose CPU time decides how many take as long
 
@@ -135,8 +139,8 @@ def open_job(folder: Path, scene: str, asked: Asked, say: Say) -> Job:
         _train(job, folder, scene, asked)
     if not job.run.prefixes.exists():
         config = replace(_config(scene, asked).nest, steps=asked.nest_steps, base_steps=asked.base_steps)
-        pipeline.clean(job, CleanConfig())
-        pipeline.nest(job, config, RunConfig().blocks, asked.seed)
+        clean_levels(job, CleanConfig())
+        nest_scene(job, config, RunConfig().blocks, asked.seed)
     return job
 
 
@@ -152,7 +156,7 @@ def _train(job: Job, folder: Path, scene: str, asked: Asked) -> None:
     open_scene(job, capture, config.scene)
     make_masks(job, MasksConfig(), LabelsConfig())
     lift_labels(job, LiftConfig())
-    pipeline.train(job, config.train, config.blocks, asked.seed)
+    train_scene(job, config.train, config.blocks, asked.seed)
 
 
 def _told(name: str, say: Say) -> Callable[[Event], None]:
@@ -201,7 +205,7 @@ def _planned(job: Job, asked: Asked) -> list[Contender]:
 
 def _trained(job: Job) -> Contender:
     """The trained model as it was when nesting began."""
-    return Contender(TRAINED, "trained", job.snapshots.levels[-1], partial(read_level, job.trained))
+    return Contender(TRAINED, "trained", job.last_level.step, partial(read_level, job.trained))
 
 
 def _as_decoded(job: Job, contender: Contender) -> Contender:
@@ -220,14 +224,14 @@ def _as_one(job: Job, place: Path, asked: Asked) -> Baseline:
         steps=nest["steps"], lr_multiplier=nest["lr_multiplier"], sh_bits=tuple(nest["sh_bits"]),
         two_opacities=nest["two_opacities"],
     )  # fmt: skip
-    there = sorted(place.glob("as-one-*.npz"))
+    there = sorted(place.glob("as_one-*.npz"))
     before = int(there[0].stem.rpartition("-")[2]) if there else 0
     config = replace(config, steps=asked.as_one_steps or before or _steps_as_long(job, config))
     run = job.run
     return Baseline(
-        AS_ONE, f"{config.steps} steps more", place / f"as-one-{config.steps}.npz",
-        job.snapshots.levels[-1] + config.steps, {**asdict(config), "seed": asked.seed},
-        [*run.scene_files, job.trained, *inlier_inputs(run), *sky_inputs(run)], train_as_one,
+        AS_ONE, f"{config.steps} steps more", place / f"as_one-{config.steps}.npz",
+        job.last_level.step + config.steps, {**asdict(config), "seed": asked.seed},
+        [*run.scene_files, job.trained, *inlier_inputs(run), *existing(run.sky)], train_as_one,
         lambda: (config, asked.seed),
     )  # fmt: skip
 
@@ -297,7 +301,7 @@ def _figures(
         "steps": {
             "train": settings_of(job.run, "train")["max_steps"],
             "nest": settings_of(job.run, "nest")["steps"],
-            "as_one": as_one.step - job.snapshots.levels[-1],
+            "as_one": as_one.step - job.last_level.step,
         },
         "antialiased": job.antialiased,
         "trained_gaussians": sum(read_header(job.trained).counts.values()),

@@ -1,7 +1,7 @@
 """Small labelled Gaussians, cameras and a capture on disk that several tests share."""
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +17,19 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from sagesplat.adapt.observe import RenderedLabels
-from sagesplat.core.config import NestConfig, PlanConfig, RunConfig, SceneConfig, TrainConfig
+from sagesplat.core.config import NestConfig, PlanConfig, RunConfig, SampleConfig, SceneConfig, TrainConfig
+from sagesplat.core.events import Event
 from sagesplat.core.gaussians import PARAMETERS, Gaussians
 from sagesplat.core.sh import num_bases, sh0_to_rgb
-from sagesplat.io.files import write_json
+from sagesplat.demo.capture import make_capture as make_demo_capture
+from sagesplat.io.files import write_json, write_text
 from sagesplat.raster import Backend, Render, rasterize, set_threads
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.scene import load_scene
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage, write_model
 from sagesplat.scene.scene import Camera, Scene
+from sagesplat.stages.api import run_scene
 from sagesplat.stages.pipeline import run_all
 
 # a busy machine is no failure
@@ -57,12 +60,21 @@ _FIGURES = (
 )  # fmt: skip
 
 
+# the files that make so many small runs that their reports are a word
+_PLAIN_REPORTS = ("test_run_stage", "test_run_executor", "test_stages_blocks", "test_studies_sweep")
+
+
 @pytest.fixture(scope="module", autouse=True)
 def no_figures(request: pytest.FixtureRequest) -> Iterator[None]:
     """Reports without figures, which take most of the time of a small run, and have their own tests."""
     with pytest.MonkeyPatch.context() as patch:
         if request.path.stem not in _FIGURES:
             patch.setattr("sagesplat.output.figures.save_figure", lambda figure, path, svg=True: b"<svg/>")
+        if request.path.stem in _PLAIN_REPORTS:
+            patch.setattr(
+                "sagesplat.output.report.write_report",
+                lambda folder, _: write_text(folder / "index.html", "report"),
+            )
         yield
 
 
@@ -193,6 +205,35 @@ def finished_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_json(masks / "labels.json", {"labels": {"3": "car", "184": "tree-merged"}})
     run_all(Job(RunDir(folder / "run"), lambda event: None, "cpu"), folder / "capture", SMALL_RUN)
     return folder / "run"
+
+
+@dataclass(frozen=True)
+class DemoRun:
+    """A run of the modelled garden on both kinds of levels. Copy its folder before a change."""
+
+    capture: Path
+    path: Path
+    config: RunConfig
+    events: dict[str, list[Event]]  # by ladder; the nested one was made first
+
+
+@pytest.fixture(scope="session")
+def demo_run(tmp_path_factory: pytest.TempPathFactory) -> DemoRun:
+    """The run that tests of the whole flow look at."""
+    folder = tmp_path_factory.mktemp("demo")
+    make_demo_capture(folder / "capture", views=16, width=80, height=60)
+    config = RunConfig(
+        scene=SceneConfig(calibrate_every=4),
+        train=TrainConfig(max_steps=90, level_every=30),
+        nest=NestConfig(steps=40, levels=5, smallest=0.1, base_steps=30),
+        sample=SampleConfig(views=8, calibration_views=8),
+        plan=PlanConfig(target_ssim=0.4),
+    )
+    made = DemoRun(folder / "capture", folder / "run", config, {"nested": [], "snapshots": []})
+    for ladder, events in made.events.items():
+        of_ladder = replace(config, ladder=ladder)
+        run_scene(made.capture, made.path, of_ladder, on_event=events.append, backend="cpu", threads=1)
+    return made
 
 
 def damage(content: bytes, data: st.DataObject) -> bytes:

@@ -39,7 +39,7 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
 @pytest.fixture
 def up_to_levels(monkeypatch: pytest.MonkeyPatch) -> None:
     """What follows the levels takes most of the time, and is the same for all of them."""
-    monkeypatch.setattr(pipeline, "_promise", lambda job, config: None)
+    monkeypatch.setattr(pipeline, "measure_and_plan", lambda job, config: None)
 
 
 @pytest.fixture(scope="module")

@@ -28,6 +28,7 @@ from sagesplat.stages import export, pipeline, preflight, train
 from sagesplat.stages import plan as plan_stage
 from sagesplat.stages.nest import nest_levels
 from sagesplat.stages.train import train_levels
+from sagesplat.studies.paper.snapshots import adapt_snapshots
 
 SETTINGS = "--train.max-steps 60 --train.level-every 30 --ladder snapshots --target-ssim 0.4 --test-every 6"
 Call = Callable[..., tuple[int, str]]
@@ -293,12 +294,12 @@ def test_snapshots_are_adapted_with_the_settings_of_the_nested_levels(run: Path)
     record.write_text(record.read_text().replace('"budget": 0.0', '"budget": 5000.0'))
     events: list[Event] = []
     snapshots = Job(RunDir(run, "snapshots"), events.append, "cpu")
-    pipeline.adapt_snapshots(snapshots)
+    adapt_snapshots(snapshots)
     assert [e.name for e in events if isinstance(e, StageDone)] == ["observe", "fit", "plan"]
     plans = read_plans(snapshots.run.plan)[0]
     assert [plan.target for plan in plans] == [0.3, 0.4, 0.5]
     events.clear()
-    pipeline.adapt_snapshots(snapshots)
+    adapt_snapshots(snapshots)
     assert [e.name for e in events if isinstance(e, StageSkipped)] == ["observe", "fit", "plan"]
 
 

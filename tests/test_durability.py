@@ -535,7 +535,7 @@ def test_a_job_may_keep_its_lock_between_stages(finished: Path, tmp_path: Path) 
     shutil.copytree(finished, run)
     with ExitStack() as locks:
         job = Job(RunDir(run, "snapshots"), lambda event: None, locks=locks)
-        run_stage(job, "extra", {}, [], [run / "extra"], lambda: [])
+        run_stage(job, "compared", {}, [], [run / "extra"], lambda: [])
         code = HOLDS.replace("time.sleep(3600)", "pass")
         command = [sys.executable, "-c", code, str(run)]
         assert "works on it" in subprocess.run(command, capture_output=True, text=True).stderr
@@ -558,10 +558,10 @@ def test_a_result_that_is_being_redone_does_not_count(finished: Path, tmp_path: 
 
         return write
 
-    run_stage(job, "extra", {"n": 1}, [], [output], make("one"))
+    run_stage(job, "compared", {"n": 1}, [], [output], make("one"))
     with pytest.raises(KeyboardInterrupt):
-        run_stage(job, "extra", {"n": 2}, [], [output], make("half"))
-    run_stage(replace(job, force=False), "extra", {"n": 1}, [], [output], make("one"))
+        run_stage(job, "compared", {"n": 2}, [], [output], make("half"))
+    run_stage(replace(job, force=False), "compared", {"n": 1}, [], [output], make("one"))
     assert output.read_text() == "one"
 
 
@@ -575,12 +575,12 @@ def test_a_full_disk_in_any_stage_is_one_line(finished: Path, tmp_path: Path, mo
         return []
 
     with space_for(10, monkeypatch), pytest.raises(RunError, match=rf"run: {FULL}"):
-        run_stage(job, "extra", {}, [], [run / "plain.txt"], make)
-    assert not job.run.provenance("extra").exists()
+        run_stage(job, "compared", {}, [], [run / "plain.txt"], make)
+    assert not job.run.provenance("compared").exists()
     monkeypatch.setattr(stage, "sync_changed", lambda *args: 1 / 0)
     with pytest.raises(ZeroDivisionError):  # what is not on the disk is not done
-        run_stage(job, "extra", {}, [], [run / "plain.txt"], make)
-    assert not job.run.provenance("extra").exists()
+        run_stage(job, "compared", {}, [], [run / "plain.txt"], make)
+    assert not job.run.provenance("compared").exists()
 
 
 # kill -9

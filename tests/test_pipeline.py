@@ -6,44 +6,30 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import DemoRun
 
 from sagesplat.adapt.evaluate import read_evaluation
 from sagesplat.adapt.observe import TOTAL, read_observations
 from sagesplat.adapt.plan import read_plans
-from sagesplat.core.config import PlanConfig, RunConfig, SampleConfig, TrainConfig
+from sagesplat.core.config import PlanConfig, RunConfig
 from sagesplat.core.errors import DataError, RunError
 from sagesplat.core.events import Event, RunDone, StageDone, StageSkipped, Training
-from sagesplat.demo.capture import make_capture
 from sagesplat.formats.levels import read_level
 from sagesplat.formats.ply import read_ply
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.stages.export import export_scene
 from sagesplat.stages.pipeline import run_all
+from sagesplat.stages.report import make_report
 
-STAGES = [
-    "scene",
-    "segment",
-    "masks",
-    "lift",
-    "train",
-    "observe",
-    "fit",
-    "plan",
-    "compose",
-    "evaluate",
-    "report",
-]
-CONFIG = RunConfig(
-    train=TrainConfig(max_steps=90, level_every=30),
-    plan=PlanConfig(target_ssim=0.4),
-    sample=SampleConfig(views=8, calibration_views=8),
-)
+STAGES = ["scene", "segment", "masks", "lift", "train"]  # that both kinds of levels share
+NESTED = ["clean", "base", "nest"]
+PLANNED = ["plan", "compose", "evaluate", "report"]
 
 
-def work(run: Path, capture: Path, config: RunConfig = CONFIG, *, force: bool = False) -> list[Event]:
+def work(run: Path, capture: Path, config: RunConfig, *, force: bool = False) -> list[Event]:
     events: list[Event] = []
-    run_all(Job(RunDir(run, "snapshots"), events.append, force=force), capture, config)
+    run_all(Job(RunDir(run, config.ladder), events.append, force=force), capture, config)
     return events
 
 
@@ -52,38 +38,48 @@ def named(events: list[Event], kind: type) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("demo") / "capture"
-    make_capture(folder, views=12, width=80, height=60)
-    return folder
+def config(demo_run: DemoRun) -> RunConfig:
+    return replace(demo_run.config, ladder="snapshots")
 
 
 @pytest.fixture(scope="module")
-def finished(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    run = tmp_path_factory.mktemp("run") / "run"
-    events = work(run, capture)
-    assert named(events, StageDone) == STAGES
-    assert isinstance(events[-1], RunDone)
-    return run
+def capture(demo_run: DemoRun) -> Path:
+    return demo_run.capture
 
 
-def test_every_artefact_is_there_and_agrees_with_the_others(finished: Path, capture: Path) -> None:
+@pytest.fixture(scope="module")
+def finished(demo_run: DemoRun) -> Path:
+    return demo_run.path
+
+
+def test_stages_are_done_in_order_and_shared_ones_once(demo_run: DemoRun) -> None:
+    events = demo_run.events
+    assert named(events["nested"], StageDone) == [*STAGES, *NESTED, "observe", "sample", "fit", *PLANNED]
+    assert named(events["snapshots"], StageSkipped) == STAGES
+    assert named(events["snapshots"], StageDone) == ["observe", "fit", *PLANNED]
+    assert all(isinstance(heard[-1], RunDone) for heard in events.values())
+
+
+def test_every_artefact_is_there_and_agrees_with_the_others(finished: Path, tmp_path: Path) -> None:
     run = RunDir(finished, "snapshots")
     observations, evaluation = read_observations(run.observations), read_evaluation(run.evaluation)
     assert set(observations.level) == {30, 60, 90}
-    assert set(observations.view) == set(range(12))
+    assert set(observations.view) == set(range(16))
     whole = observations.select(observations.label_id == TOTAL)
     first, last = (whole.ssim[whole.level == level].mean() for level in (30, 90))
     assert last > first + 0.02
     scene_plans, view_plans = read_plans(run.plan)
     assert [p.target for p in scene_plans] == [0.3, 0.4, 0.5]
-    assert len(view_plans) == 12
+    assert len(view_plans) == 16
     composed = read_ply(run.composed)
     assert len(composed) == scene_plans[1].count
     for choice in scene_plans[1].choices:
         assert composed.counts()[choice.label_id] == choice.count
     assert set(evaluation.view) == {0, 8}
-    page = (run.report / "index.html").read_text()
+    copy = RunDir(Path(shutil.copytree(finished, tmp_path / "run")), "snapshots")
+    copy.provenance("report").unlink()
+    make_report(Job(copy, print))  # with figures
+    page = (copy.report / "index.html").read_text()
     assert ">grass<" in page or "grass</td>" in page
     assert "http://" not in page.replace("http://www.w3.org", "")
 
@@ -97,23 +93,23 @@ def test_whole_image_row_is_the_pixel_weighted_mean_of_the_categories(finished: 
     assert np.average(parts.ssim, weights=parts.num_pixels) == pytest.approx(whole.ssim[0], abs=1e-5)
 
 
-def test_a_second_run_has_nothing_to_do(finished: Path, capture: Path) -> None:
-    assert named(work(finished, capture), StageSkipped) == STAGES
+def test_a_second_run_has_nothing_to_do(demo_run: DemoRun, config: RunConfig) -> None:
+    for again in (demo_run.config, config):
+        assert not named(work(demo_run.path, demo_run.capture, again), StageDone)
 
 
 def test_other_settings_need_force_and_redo_only_what_depends_on_them(
-    finished: Path, capture: Path, tmp_path: Path
+    finished: Path, capture: Path, config: RunConfig, tmp_path: Path
 ) -> None:
     run = Path(shutil.copytree(finished, tmp_path / "run"))
-    other = replace(CONFIG, plan=PlanConfig(target_ssim=0.5))
+    other = replace(config, plan=PlanConfig(target_ssim=0.5))
     with pytest.raises(RunError, match=r"plan\.json: made with other .*--force"):
         work(run, capture, other)
-    events = work(run, capture, other, force=True)
-    assert named(events, StageDone) == ["plan", "compose", "evaluate", "report"]
+    assert named(work(run, capture, other, force=True), StageDone) == PLANNED
 
 
 def test_a_killed_run_goes_on_and_ends_with_the_same_levels(
-    finished: Path, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    finished: Path, capture: Path, config: RunConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Killed(Exception):
         pass
@@ -123,12 +119,12 @@ def test_a_killed_run_goes_on_and_ends_with_the_same_levels(
             raise Killed
 
     with pytest.raises(Killed):
-        run_all(Job(RunDir(tmp_path / "run", "snapshots"), emit), capture, CONFIG)
+        run_all(Job(RunDir(tmp_path / "run", "snapshots"), emit), capture, config)
     monkeypatch.setattr(
-        "sagesplat.stages.pipeline._promise", lambda job, config: None
+        "sagesplat.stages.pipeline.measure_and_plan", lambda job, config: None
     )  # only levels are compared
-    events = work(tmp_path / "run", capture)
-    assert named(events, StageSkipped) == ["scene", "segment", "masks", "lift"]
+    events = work(tmp_path / "run", capture, config)
+    assert named(events, StageSkipped) == STAGES[:-1]
     assert min(e.step for e in events if isinstance(e, Training)) == 61
     for level in (30, 60, 90):
         a, b = (read_level(folder / "levels" / f"{level:06d}.npz") for folder in (finished, tmp_path / "run"))
@@ -136,16 +132,18 @@ def test_a_killed_run_goes_on_and_ends_with_the_same_levels(
             np.testing.assert_array_equal(value, b.parameters()[name], err_msg=name)
 
 
-def test_a_run_folder_of_another_scene_is_refused(finished: Path, capture: Path, tmp_path: Path) -> None:
+def test_a_run_folder_of_another_scene_is_refused(
+    finished: Path, capture: Path, config: RunConfig, tmp_path: Path
+) -> None:
     shutil.copytree(capture, tmp_path / "other")
     with pytest.raises(RunError, match=r"scene\.json: made with other path"):
-        work(finished, tmp_path / "other")
+        work(finished, tmp_path / "other", config)
 
 
-def test_a_folder_that_is_no_run_is_left_alone(capture: Path, tmp_path: Path) -> None:
+def test_a_folder_that_is_no_run_is_left_alone(capture: Path, config: RunConfig, tmp_path: Path) -> None:
     (tmp_path / "letter.txt").write_text("dear")
     with pytest.raises(RunError, match="not a run folder"):
-        work(tmp_path, capture)
+        work(tmp_path, capture, config)
     assert [p.name for p in tmp_path.iterdir()] == ["letter.txt"]
 
 
@@ -165,9 +163,11 @@ def test_export_takes_levels_and_categories(finished: Path, tmp_path: Path) -> N
         export_scene(job, tmp_path / "b.ply", level=None, labels=[], target=("ssim", 0.77))
 
 
-def test_a_broken_level_is_one_clear_error(finished: Path, capture: Path, tmp_path: Path) -> None:
+def test_a_broken_level_is_one_clear_error(
+    finished: Path, capture: Path, config: RunConfig, tmp_path: Path
+) -> None:
     run = tmp_path / "run"
     shutil.copytree(finished, run)
     (run / "levels" / "000060.npz").write_bytes(b"PK\x03\x04 broken")
     with pytest.raises(DataError, match=r"levels/000060\.npz: not a readable level"):
-        work(run, capture)
+        work(run, capture, config)

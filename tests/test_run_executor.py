@@ -96,13 +96,9 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def plain_report() -> Iterator[None]:
+def plain_comparison() -> Iterator[None]:
     """Figures take most of the time of so small a run, and have their own tests."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            "sagesplat.output.report.write_report",
-            lambda folder, _: write_text(folder / "index.html", "report"),
-        )
         patch.setattr(compare_study, "write_report", lambda folder, *_: write_text(folder / "compare.md", ""))
         yield
 
@@ -327,7 +323,7 @@ def test_baselines_are_trained_side_by_side(finished: Path, tmp_path: Path) -> N
 
 def test_of_several_stages_those_that_are_done_are_skipped(finished: Path, tmp_path: Path) -> None:
     job, events = again(finished, tmp_path / "run", LOCAL)
-    parts = [Stage(name, {}, [], [job.run.path / name]) for name in ("one", "two", "three")]
+    parts = [Stage(name, {}, [], [job.run.path / name]) for name in ("mcmc-1", "mcmc-2", "mcmc-3")]
 
     def make(missing: Sequence[int], last: int = 3) -> Iterator[tuple[int, Sequence[str]]]:
         for number in list(missing)[::-1][:last]:
@@ -338,6 +334,6 @@ def test_of_several_stages_those_that_are_done_are_skipped(finished: Path, tmp_p
 
     with pytest.raises(RunError, match="broken"):
         run_stages(job, parts, lambda missing: make(missing, 1))
-    assert [e.name for e in events if isinstance(e, StageDone)] == ["three"]
+    assert [e.name for e in events if isinstance(e, StageDone)] == ["mcmc-3"]
     run_stages(job, parts, make)
-    assert [e.name for e in events if isinstance(e, StageDone)] == ["three", "two", "one"]
+    assert [e.name for e in events if isinstance(e, StageDone)] == ["mcmc-3", "mcmc-2", "mcmc-1"]

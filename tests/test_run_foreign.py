@@ -26,7 +26,7 @@ from sagesplat.run import records
 from sagesplat.run.job import Job
 from sagesplat.run.recorded import stage_seconds
 from sagesplat.run.run_dir import RunDir, check_links
-from sagesplat.run.stage import _ORDER
+from sagesplat.run.stage_table import STAGES
 from sagesplat.scene.blocks import Blocks, read_blocks, read_division, write_blocks
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.stages import report, view
@@ -194,7 +194,7 @@ def npz_variants(content: bytes, draw: random.Random, folder: Path) -> Iterator[
 
 def agree(run: Path) -> None:
     """Let the records of all stages say that their inputs are as they are."""
-    for stage in _ORDER:
+    for stage in STAGES:
         path = RunDir(run).provenance(stage)
         try:
             record = read_json(path)

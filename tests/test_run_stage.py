@@ -4,7 +4,6 @@ import csv
 import os
 import shutil
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,6 +29,7 @@ from sagesplat.run import stage
 from sagesplat.run.job import Job
 from sagesplat.run.records import FORMAT, file_hash, input_hashes, is_done, is_made_from, record, settings_of
 from sagesplat.run.run_dir import RunDir
+from sagesplat.run.stage_table import needed_for
 from sagesplat.stages import pipeline
 from sagesplat.stages.fit import fit_ladder
 from sagesplat.stages.label import fuse_masks, make_masks
@@ -49,17 +49,6 @@ CONFIG = RunConfig(
     plan=PlanConfig(target_ssim=0.4),
 )
 BLOCKS = BlocksConfig(count=2, boundary_steps=5)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def plain_report() -> Iterator[None]:
-    """Figures take most of the time of so small a run, and have their own tests."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            "sagesplat.output.report.write_report",
-            lambda folder, _: write_text(folder / "index.html", "report"),
-        )
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -139,6 +128,11 @@ def _files(path: Path) -> list[Path]:
     return [p for p in path.rglob("*") if p.is_file()] if path.is_dir() else [path]
 
 
+def _run_of(record: Path) -> Path:
+    """The run folder that a record is in, or a block's."""
+    return next(folder for folder in record.parents[1:] if (folder / "scene.json").exists())
+
+
 class Watch:
     """Stands for `run_stages`, and notes what stages read that earlier ones wrote and that is no input."""
 
@@ -167,7 +161,7 @@ class Watch:
         self._check(one, mine, read)
         if not self.at_work:
             others = [set()]  # of the next one: it reads before it is a stage
-            for name in ("given_scene", "_refined", "photos", "masks", "snapshots", "ladder", "antialiased"):
+            for name in ("_opened", "_refined", "photos", "masks", "recorded", "ladder", "antialiased"):
                 vars(job).pop(name, None)  # else only the first stage would read them
         _reading.extend(others)
 
@@ -185,6 +179,9 @@ class Watch:
             spared = {(one.name, path.name), (one.name, path.parent.name)} & _NO_INPUTS
             if not (fine or spared or path.name in _CAPTURE):
                 self.missed.append(f"{one.name} reads {path.relative_to(self.root)}")
+            mates = {p.stem for p in makers if _run_of(p) == _run_of(mine)}
+            if mates and not mates & {one.name, *needed_for(one.name)}:
+                self.missed.append(f"{one.name} reads what {', '.join(mates)} made, and does not need it")
 
     def _known(self, inputs: list[Path]) -> set[tuple[int, int]]:
         """Files that inputs stand for: a stage's record stands for all that the stage was made from."""
@@ -194,8 +191,7 @@ class Watch:
             new = {_id(file) for file in _files(path)} - known if path.exists() else set()
             known |= new
             if new and path.parent.name == "provenance":
-                run = next(folder for folder in path.parents[1:] if (folder / "scene.json").exists())
-                inputs += [run / name for name in read_json(path)["inputs"]]
+                inputs += [_run_of(path) / name for name in read_json(path)["inputs"]]
         return known
 
 
@@ -362,7 +358,7 @@ def test_early_stopping_depends_on_label_images_and_other_training_does_not(copy
 
 @pytest.mark.slow
 def test_blocks_lose_fused_label_images_that_the_run_lost(capture: Path, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(pipeline, "_promise", lambda *_: None)  # what follows the levels is not looked at
+    monkeypatch.setattr(pipeline, "measure_and_plan", lambda *_: None)  # only levels are compared
     run = tmp_path / "run"
     config = replace(CONFIG, blocks=BLOCKS, fuse=True)
     work(run, capture, config)

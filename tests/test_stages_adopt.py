@@ -184,7 +184,7 @@ def test_labels_of_the_file_are_merged_and_left_out(
     write_ply(tmp_path / "ball.ply", g, {3: "car", 184: "tree-merged"})
     job = Job(RunDir(tmp_path / "run"), lambda event: None, "cpu")
     open_splat(job, tmp_path / "ball.ply", SMALL, SceneConfig(), MasksConfig(), labels)
-    counts = job.snapshots.load(job.snapshots.levels[-1]).counts()
+    counts = job.load_last_level().counts()
     assert set(counts) == left
     assert sum(counts.values()) == len(g)
     assert set(job.point_labels.tolist()) <= left

@@ -6,52 +6,29 @@ from pathlib import Path
 
 import pytest
 import torch
+from conftest import DemoRun
 
 from sagesplat import (
     FinishedRun,
-    NestConfig,
-    PlanConfig,
-    RunConfig,
     SageError,
-    StageDone,
-    TrainConfig,
     open_run,
     read_ply,
     run_scene,
 )
 from sagesplat.adapt.plan import Plan, read_plans
-from sagesplat.core.config import SampleConfig
 from sagesplat.core.errors import RunError
-from sagesplat.demo.capture import make_capture
 from sagesplat.formats.splats import read_splat
 from sagesplat.stages.export import export_increments, export_scene
 
-CONFIG = RunConfig(
-    train=TrainConfig(max_steps=120, level_every=40),
-    nest=NestConfig(steps=20, levels=4, base_steps=20),
-    sample=SampleConfig(views=8, calibration_views=8),
-    plan=PlanConfig(target_ssim=0.4),
-)
-
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, FinishedRun]:
-    folder = tmp_path_factory.mktemp("runs")
-    make_capture(folder / "capture", views=9, width=64, height=48)
-    events = []
-    found = {
-        ladder: run_scene(folder / "capture", folder / "run", config, on_event=events.append, threads=1)
-        for ladder, config in (("nested", CONFIG), ("snapshots", replace(CONFIG, ladder="snapshots")))
-    }
-    stages = [event.name for event in events if isinstance(event, StageDone)]
-    assert stages.count("train") == 1  # both ladders are of one training
-    assert stages.count("plan") == 2
-    return found
+def runs(demo_run: DemoRun) -> dict[str, FinishedRun]:
+    return {"nested": open_run(demo_run.path), "snapshots": open_run(demo_run.path, "snapshots")}
 
 
 def test_a_composed_scene_is_for_viewers_that_do_not_antialias(runs, tmp_path):
     run = runs["nested"]
-    assert run.antialiased is CONFIG.train.antialiased is True
+    assert run.antialiased is True
     written = read_splat(run.job.run.composed)
     assert not written.antialiased
     (plan,) = (plan for plan in run.plans if plan.target == 0.4)
@@ -89,13 +66,13 @@ def test_a_camera_is_planned_for_fidelity_by_default(runs):
     assert (plan.quality, plan.target, plan.view) == ("fidelity", 0.95, None)
     assert {choice.status for choice in plan.choices} <= {"ok", "no promise", "no model"}
     low, full = (run.plan_camera(camera, target_fidelity=target) for target in (0.3, 1.0))
-    assert low.count <= plan.count <= full.count == len(run.job.ladder.load(4))
+    assert low.count <= plan.count <= full.count == len(run.job.ladder.load(5))
     w2c = camera.w2c.copy()
     w2c[2, 3] += 30  # far from all that was sampled
     lost = run.plan_camera(replace(camera, w2c=w2c), target_fidelity=0.3)
     assert lost.status == "no promise"
     highest = {c.label_id: c.level for c in lost.choices if c.status == "no promise"}
-    assert set(highest.values()) == {4}
+    assert set(highest.values()) == {5}
     assert all(c.calibrated is None for c in lost.choices)
 
 
@@ -142,7 +119,7 @@ def test_a_run_is_opened_again(runs):
     assert [plan.target for plan in run.plans] == [0.3, 0.4, 0.5]
     assert isinstance(run.plans[0], Plan)
     assert set(run.promises) <= set(run.names)
-    assert run.costs.count.shape[1] == 4
+    assert run.costs.count.shape[1] == 5
 
 
 def test_what_is_no_run_folder_is_said(tmp_path: Path):

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -48,10 +47,12 @@ from sagesplat.scene.scene import Camera, Lens, Points, Scene, View
 from sagesplat.scene.stored import read_scene, write_scene
 from sagesplat.segment.block_categories import BlockCategories, category_of, split_name
 from sagesplat.segment.masks import Masks, Taxonomy
+from sagesplat.stages.block_levels import nest_scene
 from sagesplat.stages.blocks import check
 from sagesplat.stages.bundle import _contents, live_bundle
+from sagesplat.stages.instances import make_instances
 from sagesplat.stages.label_edits import apply_labels
-from sagesplat.stages.pipeline import instances, nest, run_all
+from sagesplat.stages.pipeline import run_all
 from sagesplat.stages.results import increments_of
 from sagesplat.stages.shared import labels_named
 from sagesplat.train import boundaries
@@ -333,17 +334,6 @@ def run_in_blocks(capture: Path, run: Path, config: RunConfig = CONFIG, **option
     return events
 
 
-@pytest.fixture(scope="module", autouse=True)
-def plain_report() -> Iterator[None]:
-    """Figures take most of the time of so small a run, and have their own tests."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            "sagesplat.output.report.write_report",
-            lambda folder, _: write_text(folder / "index.html", "report"),
-        )
-        yield
-
-
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("demo") / "capture"
@@ -366,7 +356,7 @@ def test_a_run_in_blocks(finished: Path, capture: Path) -> None:
     assert set(ladder.sizes) <= set(names)
     assert {split_name(names[label])[1] for label in ladder.sizes} == {0, 1}
     # every Gaussian is in the block that its name says: those that were tuned may have moved a little
-    blocks = read_blocks(run.blocks / "blocks.json")
+    blocks = read_blocks(run.division)
     g = snapshots.load(40)
     of_name = np.array([split_name(names[label])[1] for label in g.label_ids.tolist()])
     np.testing.assert_array_equal(blocks.of(g.means.numpy()), of_name)
@@ -408,9 +398,9 @@ def test_instances_of_blocks(finished: Path, tmp_path: Path) -> None:
     path = tmp_path / "run"
     shutil.copytree(finished, path)
     before = job_of(path).names()
-    instances(job_of(path), LabelsConfig(instances="potted plant"), MasksConfig())
+    make_instances(job_of(path), MasksConfig(), LabelsConfig(instances="potted plant"))
     few = replace(CONFIG.nest, steps=4, levels=2, base_share=0.0)
-    nest(job_of(path, force=True), few, BlocksConfig(count=2, boundary_steps=0), 0)
+    nest_scene(job_of(path, force=True), few, BlocksConfig(count=2, boundary_steps=0), 0)
     job = job_of(path)
     names, ladder = job.names(), job.ladder
     assert isinstance(ladder, PrefixLadder)
@@ -418,7 +408,7 @@ def test_instances_of_blocks(finished: Path, tmp_path: Path) -> None:
     assert {("potted plant 1", 0), ("dining table", 0), ("dining table", 1)} <= found
     assert {block for name, block in found if name in job.parents} == {0, 1}
     # every Gaussian is in the block that its name says
-    blocks = read_blocks(job.run.blocks / "blocks.json")
+    blocks = read_blocks(job.run.division)
     means = ladder.gaussians.means.numpy()
     of_name = np.array([split_name(names[label])[1] for label in ladder.gaussians.label_ids.tolist()])
     beyond = blocks.to_border(means)[blocks.of(means) != of_name]
@@ -446,7 +436,7 @@ def test_instances_of_blocks(finished: Path, tmp_path: Path) -> None:
     assert live_bundle(job_of(path), tmp_path / "live", a_viewer(tmp_path))
     live = read_json(tmp_path / "live" / "manifest.json")["labels"]
     assert {(one["id"], one["name"]) for one in live} <= set(before.items())
-    instances(job_of(path, force=True), LabelsConfig(), MasksConfig())
+    make_instances(job_of(path, force=True), MasksConfig(), LabelsConfig())
     assert job_of(path).names() == before
     assert not job_of(path).run.block_instances.exists()
 

@@ -16,8 +16,9 @@ from sagesplat.formats.levels import read_header, read_level, select_level, writ
 from sagesplat.io.files import write_json
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
+from sagesplat.stages.block_levels import nest_scene
+from sagesplat.stages.blocks import train_scene
 from sagesplat.stages.clean import CleanFigures, clean_levels, clean_lines, read_clean_figures
-from sagesplat.stages.pipeline import clean, nest, train
 
 
 @pytest.fixture
@@ -83,29 +84,29 @@ def test_it_is_done_once_and_can_be_switched_off(run: RunDir) -> None:
 def test_nested_levels_are_made_of_what_is_left(run: RunDir) -> None:
     spoil(run)
     clean_levels(job_of(run), CleanConfig())
-    nest(job_of(run, force=True), SMALL_RUN.nest, BlocksConfig(), 0)
+    nest_scene(job_of(run, force=True), SMALL_RUN.nest, BlocksConfig(), 0)
     job = job_of(run)
     assert job.ladder.size(job.ladder.levels[-1]) == sum(read_header(run.cleaned).counts.values())
     run.cleaned.write_bytes(b"PK")
     with pytest.raises(DataError, match=r"cleaned\.npz: .*delete it and run `sagesplat clean` again"):
-        nest(job_of(run, force=True), SMALL_RUN.nest, BlocksConfig(), 0)
+        nest_scene(job_of(run, force=True), SMALL_RUN.nest, BlocksConfig(), 0)
 
 
 def test_another_training_is_cleaned_anew(run: RunDir) -> None:
     made = (run.cleaned, run.floaters, run.floaters_picture, run.provenance("clean"))
     for path in made:
         path.write_bytes(b"of this training")
-    train(job_of(run, force=True), replace(SMALL_RUN.train, max_steps=4), BlocksConfig(), 0)
+    train_scene(job_of(run, force=True), replace(SMALL_RUN.train, max_steps=4), BlocksConfig(), 0)
     assert not any(path.exists() for path in made)
 
 
 def test_a_scene_in_blocks_and_an_adopted_splat_are_refused(run: RunDir) -> None:
-    write_json(run.blocks / "blocks.json", {})
+    write_json(run.division, {})
     with pytest.raises(RunError, match=r"blocks: floaters are not removed from a scene in blocks"):
-        clean(job_of(run), CleanConfig())
+        clean_levels(job_of(run), CleanConfig())
     run.adopted.write_bytes(b"")
     with pytest.raises(RunError, match=r"a splat that was trained elsewhere"):
-        clean(job_of(run), CleanConfig())
+        clean_levels(job_of(run), CleanConfig())
 
 
 def test_a_level_is_selected_as_it_is_stored(run: RunDir, tmp_path: Path) -> None:

@@ -16,8 +16,8 @@ from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.segment.instances import instance_path, read_instances, write_instances
 from sagesplat.segment.lift import LiftedLabels
+from sagesplat.stages.instances import make_instances
 from sagesplat.stages.label import lift_labels, make_masks
-from sagesplat.stages.pipeline import instances
 from sagesplat.stages.scene import open_scene
 from sagesplat.stages.train import train_levels
 
@@ -55,7 +55,7 @@ def test_instances_are_categories_of_their_own_and_can_be_folded_back(run: Path)
     events: list[object] = []
     job = job_on(run, events)
     before = job.names()
-    instances(job, PLANTS, MasksConfig())
+    make_instances(job, MasksConfig(), PLANTS)
     assert stages(events) == ["photo_instances", "instances"]
     names = set(job.names().values())
     assert {"potted plant 1", "vase 1"} <= names
@@ -66,16 +66,16 @@ def test_instances_are_categories_of_their_own_and_can_be_folded_back(run: Path)
     assert Job(RunDir(run, "snapshots"), print).names() == before
     view = job.scene.views[int(job.scene.test_ids[0])]
     assert set(job.best_masks[view].ravel().tolist()) <= set(job.names())
-    instances(job, PLANTS, MasksConfig())
+    make_instances(job, MasksConfig(), PLANTS)
     assert stages(events, StageSkipped) == ["photo_instances", "instances"]
     with pytest.raises(RunError, match="add --force to fold them back"):
-        instances(job, LabelsConfig(), MasksConfig())
+        make_instances(job, MasksConfig(), LabelsConfig())
     again = job_on(run, [], force=True)
     merged = replace(PLANTS, merge="vase 1=vase,potted plant 1=fern")
-    instances(again, merged, MasksConfig())
+    make_instances(again, MasksConfig(), merged)
     assert "vase 1" not in again.names().values()
     assert again.parents["fern"] == "potted plant"
-    instances(again, LabelsConfig(), MasksConfig())
+    make_instances(again, MasksConfig(), LabelsConfig())
     assert job_on(run, []).names() == before
     assert not again.run.parents.exists()
 
@@ -83,12 +83,12 @@ def test_instances_are_categories_of_their_own_and_can_be_folded_back(run: Path)
 def test_what_cannot_be_told_apart_is_one_line_with_a_cure(run: Path, trained: Path) -> None:
     job = job_on(run, [])
     with pytest.raises(LabelError, match="no category 'sofa'; there are building"):
-        instances(job, LabelsConfig(instances="sofa"), MasksConfig())
+        make_instances(job, MasksConfig(), LabelsConfig(instances="sofa"))
     given = trained.parent / "capture" / "instances"
     given.rename(given.with_name("elsewhere"))
     try:
         with pytest.raises(LabelError, match=r"instances: no instances of any photo; put PNGs there"):
-            instances(job, PLANTS, MasksConfig())
+            make_instances(job, MasksConfig(), PLANTS)
     finally:
         given.with_name("elsewhere").rename(given)
     one = job.scene.views[int(job.scene.train_ids[0])]
@@ -102,16 +102,16 @@ def test_what_cannot_be_told_apart_is_one_line_with_a_cure(run: Path, trained: P
             write_instances(path, numbers)
     events: list[object] = []
     with pytest.raises(LabelError, match="no instance of vase is seen in two training photos"):
-        instances(job_on(run, events, force=True), LabelsConfig(instances="vase"), source)
+        make_instances(job_on(run, events, force=True), source, LabelsConfig(instances="vase"))
     said = [event.text for event in events if isinstance(event, Warned)]
     assert said == ["1 instance of vase in a single photo is left to vase: no other view agrees"]
     for view in job.scene.views:
         if view != one:
             instance_path(run.parent / "few" / "instances", view).unlink()
     with pytest.raises(RunError, match=r"instances of 1 of \d+ training photos; give those of two at least"):
-        instances(job_on(run, [], force=True), PLANTS, source)
+        make_instances(job_on(run, [], force=True), source, PLANTS)
     job = job_on(run, [], force=True)
     points = LiftedLabels.read(job.run.labels, len(job.scene.points.xyz))
     replace(points, ignored=points.label_ids == points.label_ids[0]).write(job.run.labels)
-    instances(job, PLANTS, MasksConfig())
+    make_instances(job, MasksConfig(), PLANTS)
     assert set(job.point_labels.tolist()) <= set(job.names())  # ignored ones too

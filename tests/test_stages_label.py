@@ -179,7 +179,7 @@ def test_ignored_categories_have_no_pixel_no_vote_and_no_gaussian(
     assert (job.initial_labels == IGNORED).sum() > 10
     assert job.point_labels.min() == -1
     train_levels(job, TrainConfig(max_steps=3, level_every=3, sky="off"), 0)
-    assert job.snapshots.size(3) == (job.initial_labels != IGNORED).sum()
+    assert job.recorded.size(3) == (job.initial_labels != IGNORED).sum()
 
     for wrong, message in (
         (LabelsConfig(ignore="dgo"), "no category 'dgo'"),

@@ -34,7 +34,7 @@ from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.segment.relabel import relabelled
-from sagesplat.stages import pipeline
+from sagesplat.stages import block_levels, pipeline
 from sagesplat.stages.label_edits import LabelsApplied, apply_labels
 from sagesplat.stages.observe import observed_views
 from sagesplat.stages.results import fidelity_of, increments_of, observations_of, sampled_of, viewpoints_of
@@ -82,7 +82,7 @@ def manifest_of(made: LabelsApplied) -> dict:
 def later_commands(path: Path) -> list[tuple[str, str]]:
     """What the commands from observe on do with a run: the stage, and whether it is skipped or begun."""
     told: list[Event] = []
-    pipeline._promise(job_of(path, told.append), recorded(path))
+    pipeline.measure_and_plan(job_of(path, told.append), recorded(path))
     return [(type(e).__name__, e.name) for e in told if isinstance(e, StageStarted | StageSkipped)]
 
 
@@ -113,7 +113,7 @@ def test_later_commands_find_the_edited_run_done(run: Path, viewer: Path) -> Non
     done = later_commands(made.path)
     assert [("StageSkipped", stage) for stage in ("observe", "sample", "fit", "plan")] == done[:4]
     with pytest.raises(RunError, match="made by editing"):
-        pipeline.nest(job_of(made.path), RunConfig().nest, RunConfig().blocks, 0)
+        block_levels.nest_scene(job_of(made.path), RunConfig().nest, RunConfig().blocks, 0)
 
 
 def test_a_merged_category_has_the_levels_of_its_parts(run: Path, viewer: Path) -> None:
@@ -292,7 +292,7 @@ def test_instances_keep_their_category_through_edits(tmp_path: Path, viewer: Pat
     plants = sorted(name for name, parent in before.parents.items() if parent == "potted plant")
     made = edited(run, viewer, Rename("vase 1", "urn"), Hide("urn", True), Merge(plants[1], plants[0]))
     after = job_of(made.path)
-    assert not after.has_instances  # its label images are those of the instances
+    assert not after.run.has_instances  # its label images are those of the instances
     assert after.parents["urn"] == "vase"
     assert after.parents[plants[0]] == "potted plant"
     assert plants[1] not in {*after.parents, *after.names().values()}

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import pinhole, random_gaussians, write_capture
+from conftest import DemoRun, pinhole, random_gaussians, write_capture
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -17,10 +17,8 @@ from sagesplat.adapt.evaluate import read_evaluation
 from sagesplat.adapt.ladder import PrefixLadder, read_prefixes
 from sagesplat.adapt.observe import TOTAL, read_observations
 from sagesplat.adapt.plan import read_budget_plan, read_plans
-from sagesplat.core.config import FitConfig, NestConfig, PlanConfig, RunConfig, SceneConfig, TrainConfig
+from sagesplat.core.config import FitConfig, NestConfig, PlanConfig, SceneConfig, TrainConfig
 from sagesplat.core.errors import DataError, RunError
-from sagesplat.core.events import Event, StageDone, StageSkipped
-from sagesplat.demo.capture import make_capture
 from sagesplat.formats.increments import packed, read_increments, read_index, totals, write_increments
 from sagesplat.formats.levels import write_set
 from sagesplat.formats.ply import read_ply
@@ -36,7 +34,6 @@ from sagesplat.stages.evaluate import evaluate_plans
 from sagesplat.stages.export import export_increments, export_scene
 from sagesplat.stages.fit import fit_ladder
 from sagesplat.stages.methods import NestedLevels
-from sagesplat.stages.observe import observe_levels
 from sagesplat.stages.pipeline import run_all
 from sagesplat.stages.plan import make_plan
 from sagesplat.stages.shared import observed
@@ -325,45 +322,9 @@ def test_chunks_hold_what_each_level_adds(tmp_path: Path) -> None:
         read_index(tmp_path / "chunks")
 
 
-CONFIG = RunConfig(
-    scene=SceneConfig(calibrate_every=4),
-    train=TrainConfig(max_steps=90, level_every=30),
-    nest=NestConfig(steps=40, levels=5, smallest=0.1, base_steps=30),
-    plan=PlanConfig(target_ssim=0.4),
-)
-STAGES = [
-    "scene",
-    "segment",
-    "masks",
-    "lift",
-    "train",
-    "clean",
-    "base",
-    "nest",
-    "observe",
-    "sample",
-    "fit",
-    "plan",
-    "compose",
-    "evaluate",
-    "report",
-]
-
-
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("demo") / "capture"
-    make_capture(folder, views=16, width=80, height=60)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def finished(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    run = tmp_path_factory.mktemp("run") / "run"
-    events: list[Event] = []
-    run_all(Job(RunDir(run), events.append), capture, CONFIG)
-    assert [e.name for e in events if isinstance(e, StageDone)] == STAGES
-    return run
+def finished(demo_run: DemoRun) -> Path:
+    return demo_run.path
 
 
 def quiet(run: Path, **options) -> Job:
@@ -400,15 +361,9 @@ def test_a_run_makes_a_nested_ladder_by_default(finished: Path) -> None:
     assert not [path.name for path in pages if "3DGS" in path.read_text()]
 
 
-def test_nothing_is_left_to_do_and_the_papers_ladder_lies_beside_it(finished: Path, capture: Path) -> None:
-    events: list[Event] = []
-    run_all(Job(RunDir(finished), events.append), capture, CONFIG)
-    assert [e.name for e in events if isinstance(e, StageSkipped)] == STAGES
-    job = Job(RunDir(finished, "snapshots"), events.append)
-    observe_levels(job, FitConfig())
+def test_the_papers_ladder_has_no_budget(finished: Path) -> None:
+    job = Job(RunDir(finished, "snapshots"), print)
     assert set(read_observations(job.run.observations).level) == {30, 60, 90}
-    assert set(read_observations(RunDir(finished).observations).level) == {1, 2, 3, 4, 5}
-    fit_ladder(job, FitConfig())
     with pytest.raises(RunError, match="--budget needs the nested ladder"):
         make_plan(job, PlanConfig(budget=1e5))
 
@@ -511,10 +466,10 @@ def test_coverage_is_tested_on_the_plans_that_are_made_and_costs_are_bytes(finis
     assert bound.kept.sum() > 0
 
 
-def test_without_calibration_views_a_run_still_promises(capture: Path, tmp_path: Path) -> None:
-    config = replace(CONFIG, scene=SceneConfig(calibrate_every=0), train=TrainConfig(max_steps=20))
+def test_without_calibration_views_a_run_still_promises(demo_run: DemoRun, tmp_path: Path) -> None:
+    config = replace(demo_run.config, scene=SceneConfig(calibrate_every=0), train=TrainConfig(max_steps=20))
     job = quiet(tmp_path / "run")
-    run_all(job, capture, replace(config, nest=replace(QUICK, steps=2, base_share=0.0)))
+    run_all(job, demo_run.capture, replace(config, nest=replace(QUICK, steps=2, base_share=0.0)))
     assert read_plans(job.run.plan)[0]
 
 
@@ -548,7 +503,7 @@ def test_chunks_are_exported_as_files(finished: Path, tmp_path: Path) -> None:
     assert counts[0] == counts[1]
     with pytest.raises(RunError, match="exists"):
         export_increments(job, tmp_path / "ply", "ply")
-    with pytest.raises(RunError, match="snapshots have no chunks"):
+    with pytest.raises(RunError, match="these levels have no chunks"):
         export_increments(Job(RunDir(finished, "snapshots"), print), tmp_path / "none", "ply")
 
 

@@ -29,18 +29,18 @@ def job(finished_run: Path, tmp_path: Path) -> Job:
     """A run on photos of its own model, with a figure in the training view 1 and the test view 0."""
     shutil.copytree(finished_run, tmp_path / "run")
     job = Job(RunDir(tmp_path / "run"), lambda event: None, "cpu")
-    scene, g = job.scene, job.snapshots.load(job.snapshots.levels[-1])
+    scene, g = job.scene, job.load_last_level()
     assert 0 in scene.test_ids
     assert 1 in scene.train_ids
     photos = [render_rgb(g, view.camera, backend="cpu", antialiased=False) * 255 for view in scene.views]
     for photo in photos[:2]:
         photo[FIGURE] = np.where(photo[FIGURE].mean((0, 1)) < 128, 255, 0)
-    job.__dict__["photos"] = [photo.round().astype(np.uint8) for photo in photos]
+    job.photos = [photo.round().astype(np.uint8) for photo in photos]
     return job
 
 
 def test_masks_are_written_used_and_removed(job: Job, monkeypatch: pytest.MonkeyPatch):
-    g, views = job.snapshots.load(job.snapshots.levels[-1]), job.scene.views
+    g, views = job.load_last_level(), job.scene.views
     valid = np.ones((32, 48), bool)
     valid[:, 40:] = False
     write_view(job.run.valid, views[2], valid)
@@ -67,7 +67,7 @@ def test_masks_are_written_used_and_removed(job: Job, monkeypatch: pytest.Monkey
 
 def test_photos_without_outliers_are_said_to_have_none(job: Job):
     """Nor has a photo that does not fit as a whole any."""
-    g = job.snapshots.load(job.snapshots.levels[-1])
+    g = job.load_last_level()
     job.photos[1][:] = 255
     (line,) = write_inliers(job, job.run, ON, g)
     assert line == f"outliers in 0 of {len(job.scene.train_ids)} training photos, 0.0% of their pixels"

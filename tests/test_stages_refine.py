@@ -16,8 +16,9 @@ from sagesplat.run.records import uses
 from sagesplat.run.run_dir import RunDir
 from sagesplat.scene.refined import read_refined
 from sagesplat.stages import blocks
+from sagesplat.stages.block_levels import nest_scene
+from sagesplat.stages.blocks import train_scene
 from sagesplat.stages.observe import observe_levels
-from sagesplat.stages.pipeline import nest, train
 from sagesplat.stages.refine import PoseFigures, pose_lines, read_refined_figures
 
 POSES = replace(SMALL_RUN.train, max_steps=40, level_every=20, poses=True)
@@ -31,7 +32,7 @@ def refined(finished_run, tmp_path_factory):
     shutil.copytree(finished_run, folder)
     shutil.copytree(finished_run.parent / "capture", folder.parent / "capture")
     events = []
-    train(Job(RunDir(folder), events.append, "cpu", force=True), POSES, BlocksConfig(), 0)
+    train_scene(Job(RunDir(folder), events.append, "cpu", force=True), POSES, BlocksConfig(), 0)
     return folder, next(event.lines for event in events if isinstance(event, StageDone))
 
 
@@ -56,11 +57,11 @@ def test_what_follows_is_made_from_them(refined, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(refined[0], folder)
     job = Job(RunDir(folder), lambda event: None, "cpu", force=True)
-    nest(job, SMALL_RUN.nest, BlocksConfig(), 0)
+    nest_scene(job, SMALL_RUN.nest, BlocksConfig(), 0)
     observe_levels(job, SMALL_RUN.fit)
     assert uses(job.run, "nest", job.run.cameras)
     assert uses(job.run, "observe", job.run.cameras)
-    train(job, SMALL_RUN.train, BlocksConfig(), 0)  # without poses
+    train_scene(job, SMALL_RUN.train, BlocksConfig(), 0)  # without poses
     assert not job.run.cameras.exists()
     assert not job.run.refined.exists()
     assert job.scene is job.given_scene
@@ -73,7 +74,7 @@ def test_a_run_that_ended_before_they_were_written_writes_them(refined, tmp_path
     before = read_refined(run.cameras, 8)
     for path in (run.cameras, run.refined, run.provenance("train")):
         path.unlink()
-    train(Job(run, lambda event: None, "cpu"), POSES, BlocksConfig(), 0)
+    train_scene(Job(run, lambda event: None, "cpu"), POSES, BlocksConfig(), 0)
     after = read_refined(run.cameras, 8)
     assert np.array_equal(before.w2c, after.w2c)
     assert np.array_equal(before.fitted, after.fitted)

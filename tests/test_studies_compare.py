@@ -201,7 +201,7 @@ def test_everything_is_measured(compared):
     assert [p.target for p in by_method[SAGE]] == [0.3, 0.5]
     assert len(by_method[SNAPSHOTS]) in (2, 3)
     assert len(by_method[SAME_SHARE]) == 4
-    full = job.snapshots.size(60)
+    full = job.recorded.size(60)
     assert by_method[PRUNED][0].count == round(0.3 * full)
     assert by_method[PRUNED][0].steps == 65
     assert by_method[SAME_SHARE][0].steps == 80
@@ -232,7 +232,7 @@ def test_everything_is_measured(compared):
 
 def test_mcmc_keeps_its_cap_even_below_the_number_of_points(compared):
     job, _, _ = compared
-    full = job.snapshots.size(60)
+    full = job.recorded.size(60)
     assert len(job.scene.points.xyz) > round(0.2 * full)
     for share in (0.2, 1.0):
         g = read_level(job.run.path / "compare" / f"mcmc-{share:g}.npz")

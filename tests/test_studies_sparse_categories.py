@@ -26,7 +26,7 @@ from sagesplat.core.config import (
 from sagesplat.demo.capture import make_capture
 from sagesplat.io.files import read_json, write_json
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import LadderKind, RunDir
+from sagesplat.run.run_dir import RunDir
 from sagesplat.stages.bundle import bundle
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.pipeline import run_all

@@ -3,7 +3,6 @@
 import csv
 import math
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -59,17 +58,6 @@ def done(events: list[Event]) -> list[str]:
 def rows_of(path: Path) -> list[dict[str, str]]:
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
-
-
-@pytest.fixture(scope="module", autouse=True)
-def plain_report() -> Iterator[None]:
-    """Figures take most of the time of so small a run, and have their own tests."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            "sagesplat.output.report.write_report",
-            lambda folder, _: write_text(folder / "index.html", "report"),
-        )
-        yield
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from sagesplat.adapt.eq3 import Eq3, SsimModel, write_models
 from sagesplat.adapt.observe import Observations
-from sagesplat.adapt.plan import choose_snapshot, plan_view
+from sagesplat.adapt.plan import choose_latest, plan_view
 from sagesplat.core.config import SceneConfig
 from sagesplat.core.errors import RunError
 from sagesplat.formats.levels import write_level
@@ -201,8 +201,8 @@ def test_scores_by_hand():
     levels, counts = np.array([100, 200, 300]), np.array([10, 40, 30])
     measured = np.array([[0.75, 0.5, 0.25, 0.25], [0.75, 0.5, 0.75, 0.25], [0.75, 0.75, 0.5, 0.5]])
     predicted = np.array([[0.5, 0.75, 0.25, 0.25], [0.75, 0.5, 0.5, 0.75], [0.5, 0.5, 0.25, 0.5]])
-    assert choose_snapshot(measured.T, counts, 0.75)[0].tolist() == [0, 2, 1, 2]
-    assert choose_snapshot(predicted.T, counts, 0.75)[0].tolist() == [1, 0, 1, 1]
+    assert choose_latest(measured.T, counts, 0.75)[0].tolist() == [0, 2, 1, 2]
+    assert choose_latest(predicted.T, counts, 0.75)[0].tolist() == [1, 0, 1, 1]
     result = score(predicted, measured, levels, counts, 0.75)
     assert result == {
         "reachable": 3, "hit": pytest.approx(2 / 3), "missed": 1,
@@ -223,7 +223,7 @@ quick = settings(max_examples=60, deadline=None)
 def test_the_choice_is_the_planners(ladder, target):
     levels = np.arange(1, len(ladder) + 1)
     counts, *columns = map(np.array, zip(*ladder, strict=True))
-    chosen = levels[choose_snapshot(np.stack(columns), counts, target)[0]]
+    chosen = levels[choose_latest(np.stack(columns), counts, target)[0]]
     for view, ssim in enumerate(columns):
         models = {
             (1, i): SsimModel(1, i, Eq3(*[0.0] * 9), (0.0, 0.0), float(q), 0.0, 1, "constant")

@@ -23,9 +23,10 @@ from sagesplat.run.run_dir import RunDir
 from sagesplat.scene.images import Photos
 from sagesplat.segment.masks import Masks, Taxonomy, mask_path
 from sagesplat.segment.valid import ValidPixels
+from sagesplat.stages.block_levels import nest_scene
+from sagesplat.stages.blocks import train_scene
 from sagesplat.stages.clean import clean_levels
 from sagesplat.stages.label import lift_labels, make_masks
-from sagesplat.stages.pipeline import nest, train
 from sagesplat.stages.scene import open_scene
 from sagesplat.train import densify, sky
 from sagesplat.train.events import Step, Trained
@@ -260,10 +261,10 @@ def test_a_run_with_sky(capture, tmp_path):
     open_scene(job, capture[0].path, SMALL_RUN.scene)
     make_masks(job, SMALL_RUN.masks, SMALL_RUN.labels)
     lift_labels(job)
-    train(job, replace(SMALL_RUN.train, max_steps=2), BlocksConfig(), 0)
-    trained = job.snapshots.load(job.snapshots.levels[-1])
+    train_scene(job, replace(SMALL_RUN.train, max_steps=2), BlocksConfig(), 0)
+    trained = job.load_last_level()
     clean_levels(job, CleanConfig(max_loss=9.0))
-    nest(job, replace(SMALL_RUN.nest, base_share=0.3, base_steps=1), BlocksConfig(), 0)
+    nest_scene(job, replace(SMALL_RUN.nest, base_share=0.3, base_steps=1), BlocksConfig(), 0)
     found = job.sky
     assert found is not None
     lines = [line for event in events if isinstance(event, StageDone) for line in event.lines]
@@ -271,13 +272,13 @@ def test_a_run_with_sky(capture, tmp_path):
     assert len(cleaned) < len(trained)
     assert found.shell.holds(cleaned.means).sum() == found.shell.holds(trained.means).sum()
     assert any("on a sphere 10 scene extents away" in line for line in lines)
-    for g in (job.snapshots.load(job.snapshots.levels[-1]), job.ladder.load(job.ladder.levels[-1])):
+    for g in (job.load_last_level(), job.ladder.load(job.ladder.levels[-1])):
         on = g.label_ids == SKY
         assert on.any()
         assert off_shell(found.shell, g.means[on]) < 0.03  # rounded in SPZ files
         assert not found.shell.holds(g.means[~on]).any()
     assert uses(job.run, "nest", job.run.sky)
-    train(job, replace(SMALL_RUN.train, max_steps=2, sky="off"), BlocksConfig(), 0)
+    train_scene(job, replace(SMALL_RUN.train, max_steps=2, sky="off"), BlocksConfig(), 0)
     assert not job.run.sky.exists()
 
 
@@ -288,6 +289,6 @@ def test_without_sky_nothing_changes(finished_run, tmp_path):
     shutil.copytree(finished_run.parent / "capture", tmp_path / "capture")
     job = Job(RunDir(folder), lambda event: None, "cpu", force=True)
     assert job.sky is None
-    train(job, replace(SMALL_RUN.train, sky="off"), BlocksConfig(), 0)
+    train_scene(job, replace(SMALL_RUN.train, sky="off"), BlocksConfig(), 0)
     before, after = (read_level(path / "levels" / "000004.npz") for path in (finished_run, folder))
     assert all(torch.equal(getattr(before, name), getattr(after, name)) for name in PARAMETERS)

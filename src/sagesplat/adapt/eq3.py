@@ -62,7 +62,7 @@ class SsimModel:
     """What SSIM to expect of one category at one level, by distance."""
 
     label_id: Annotated[int, Meta(ge=TOTAL, le=2**15 - 1)]
-    level: StepNumber  # of snapshots the training step, of nested levels 1 to K
+    level: StepNumber  # of recorded levels the training step, of nested ones 1 to K
     params: Eq3  # one regime or a constant: both halves are equal
     d_range: tuple[Number, Number]  # smallest and largest distance fitted, world units; (0, 0) = none known
     median: Number  # SSIM where the distance is unknown

@@ -1,4 +1,4 @@
-"""The levels of every category, snapshots or nested, read from disk on demand."""
+"""The levels of every category, recorded in training or nested, read from disk on demand."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -24,11 +24,11 @@ from sagesplat.formats.levels import (
 
 
 class Ladder(Protocol):
-    """Levels of quality, each category by itself: snapshots of a training, or prefixes of one model."""
+    """Levels of quality, each category by itself: recorded in training, or prefixes of one model."""
 
     @property
     def levels(self) -> list[int]:
-        """Their numbers, ascending: training steps of snapshots, 1 to K of prefixes."""
+        """Their numbers, ascending: training steps of recorded ones, 1 to K of prefixes."""
         ...
 
     @property
@@ -55,7 +55,7 @@ class Ladder(Protocol):
 
 
 @dataclass(frozen=True)
-class SnapshotLadder(Ladder):
+class RecordedLadder(Ladder):
     """The paper's: what training recorded on its way."""
 
     files: tuple[LevelFile, ...]
@@ -192,12 +192,12 @@ def _unknown(level: int, levels: list[int]) -> RunError:
     return RunError(f"level {level} is not in the ladder; it has {levels}")
 
 
-def read_ladder(folder: Path) -> SnapshotLadder:
-    """The snapshots in a `levels` folder."""
+def read_ladder(folder: Path) -> RecordedLadder:
+    """The levels that training recorded in a `levels` folder."""
     files = tuple(sorted((read_header(p) for p in folder.glob("[!.]*.npz")), key=lambda f: f.step))
     if not files:
         raise RunError(f"{folder}: no levels; run `sagesplat train` first")
-    return SnapshotLadder(files)
+    return RecordedLadder(files)
 
 
 def read_prefixes(path: Path) -> PrefixLadder:

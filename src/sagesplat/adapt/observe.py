@@ -41,7 +41,7 @@ class Observations:
     """One row per (category, level, view); columns of equal length."""
 
     label_id: Int32[np.ndarray, " R"]  # category id, -1 = unlabelled, -2 = the whole image
-    level: Int32[np.ndarray, " R"]  # of snapshots the training step, of nested levels 1 to K
+    level: Int32[np.ndarray, " R"]  # of recorded levels the training step, of nested ones 1 to K
     view: Int32[np.ndarray, " R"]  # row in Scene.views
     distance: Float32[np.ndarray, " R"]  # d_min of method A, world units; NaN where nothing is in sight
     ssim: Float32[np.ndarray, " R"]  # mean of the SSIM map over the category's pixels

@@ -50,12 +50,12 @@ class Choice:
     """The level of one category."""
 
     label_id: LabelId
-    level: StepNumber  # of snapshots the training step, of nested levels 1 to K
+    level: StepNumber  # of recorded levels the training step, of nested ones 1 to K
     predicted: NumberOrNaN  # quality; in a scene of at least `share` of the views; NaN: nothing promised
     distance: NumberOrNaN  # of the view, world units; NaN in a scene and where unknown
     count: Count  # Gaussians
     status: Status
-    transfer_bytes: Count | None = None  # of its increments; None for snapshots
+    transfer_bytes: Count | None = None  # of its increments; None for recorded levels
     calibrated: bool | None = None  # whether the promise is proven; None: no bound, a mere prediction
     reached: Reached | None = None  # of a scene's plan: views that measure the target at this level
 
@@ -100,7 +100,7 @@ class Plan:
 
     @property
     def transfer_bytes(self) -> int | None:
-        """Bytes of the increments to send; None for snapshots."""
+        """Bytes of the increments to send; None for recorded levels."""
         sizes = [choice.transfer_bytes for choice in self.choices]
         return None if None in sizes else sum(size for size in sizes if size is not None)
 
@@ -263,19 +263,19 @@ def _choose(
     needed = max(1, math.ceil(share * len(distances) - 1e-9))
     predicted = np.sort(ssim, 1)[:, -needed]  # what the best `needed` views reach
     most_views = (ssim >= target).sum(1), ssim.mean(1)
-    found, met = choose_snapshot(predicted, counts, target, most_views)
+    found, met = choose_latest(predicted, counts, target, most_views)
     at = int(found)
     status = "ok" if met else "infeasible"
     return Choice(label_id, steps[at], float(predicted[at]), distance, int(counts[at]), status)
 
 
-def choose_snapshot(
+def choose_latest(
     ssim: Float[np.ndarray, "... K"],
     counts: Int[np.ndarray, " K"],
     target: float,
     otherwise: Sequence[Float[np.ndarray, "... K"] | Int[np.ndarray, "... K"]] = (),
 ) -> tuple[Int[np.ndarray, "..."], Bool[np.ndarray, "..."]]:
-    """`allocate.choose` for K snapshots in order of their steps: of equal ones the latest."""
+    """`allocate.choose` for K recorded levels in order of their steps: of equal ones the latest."""
     found, met = choose(ssim[..., ::-1], counts[::-1], target, [key[..., ::-1] for key in otherwise])
     return np.asarray(len(counts) - 1 - found), met  # [] too: numpy makes a number of that
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from sagesplat.core.config import LadderKind
 from sagesplat.core.errors import BackendUnavailable, RunError
 from sagesplat.core.extras import install
 
@@ -76,11 +77,10 @@ class Machine(Parallel):
     memory of the machine or container)."""
 
 
-LadderKind = Literal["nested", "snapshots"]
 _CAPTURE = "capture: a COLMAP workspace, transforms.json, photos or a video"
 Scene = Positional[Annotated[Path, arg(metavar="SCENE", help=_CAPTURE)]]
 Run = Positional[Annotated[Path, arg(metavar="RUN", help="run folder")]]
-Ladder = Annotated[LadderKind, arg(help="Levels: nested (prefixes of one model) or the training snapshots.")]
+Ladder = Annotated[LadderKind, arg(help="Levels: nested (prefixes of one model) or those of the paper.")]
 Seed = Annotated[int, arg(help="Seed of the random numbers.")]
 Flat = arg(name="")
 
@@ -114,7 +114,7 @@ def _approval(run: "RunDir", console: "Console", yes: bool) -> Callable[[str, st
     """Says once what --force redoes, and how long that took; on a terminal it is asked whether to."""
     from sagesplat.core.durations import duration
     from sagesplat.run.recorded import stage_seconds
-    from sagesplat.run.stage import following
+    from sagesplat.run.stage_table import following
 
     asked = False
 

@@ -175,10 +175,8 @@ def masks(
 def lift(run: Run, machine: Annotated[Redo, Flat] = Redo()) -> None:
     """Transfer the labels of the images to the 3D points of the capture."""
     from sagesplat.stages.label import lift_labels
-    from sagesplat.stages.scene import check_not_adopted
 
     with open_job(run, machine) as job:
-        check_not_adopted(job.run)
         lift_labels(job)
 
 
@@ -186,10 +184,8 @@ def lift(run: Run, machine: Annotated[Redo, Flat] = Redo()) -> None:
 def fuse(run: Run, machine: Annotated[Compute, Flat] = Compute()) -> None:
     """Fuse the label images of all views through the trained Gaussians; later stages use the fused ones."""
     from sagesplat.stages.label import fuse_masks
-    from sagesplat.stages.scene import check_not_adopted
 
     with open_job(run, machine) as job:
-        check_not_adopted(job.run)
         fuse_masks(job)
 
 
@@ -201,12 +197,12 @@ def instances(
 ) -> None:
     """Tell the instances of categories apart: each becomes a category of its own, "chair 1", "chair 2"."""
     from sagesplat.run.recorded import recorded_settings
-    from sagesplat.stages import pipeline
+    from sagesplat.stages.instances import make_instances
 
     with open_job(run, machine) as job:
         known = recorded_settings(job.run)
         labels = replace(known.get("labels", LabelsConfig()), instances=categories)
-        pipeline.instances(job, labels, known.get("masks", MasksConfig()))
+        make_instances(job, known.get("masks", MasksConfig()), labels)
 
 
 @command
@@ -217,11 +213,11 @@ def train(
     machine: Annotated[Machine, Flat] = Machine(),
     seed: Seed = 0,
 ) -> None:
-    """Train 3DGS and record snapshots; a killed training resumes."""
-    from sagesplat.stages import pipeline
+    """Train 3DGS and record levels; a killed training resumes."""
+    from sagesplat.stages.blocks import train_scene
 
     with open_job(run, machine) as job:
-        pipeline.train(job, train, blocks, seed)
+        train_scene(job, train, blocks, seed)
 
 
 @command
@@ -246,10 +242,10 @@ def clean(
     if (run / "scene.json").is_file() or (run / "provenance").is_dir():
         if out or cameras or picture:
             raise RunError(f"{run}: a run folder; leave out OUT, --cameras and --picture")
-        from sagesplat.stages import pipeline
+        from sagesplat.stages.clean import clean_levels
 
         with open_job(run, machine) as job:
-            pipeline.clean(job, clean)
+            clean_levels(job, clean)
         return
     if out is None:
         raise RunError(f"{run}: not a run folder; of a splat, name the file to write after it")
@@ -266,10 +262,8 @@ def clean(
 def block_categories(run: Run, machine: Annotated[Compute, Flat] = Compute()) -> None:
     """Render the label images of a scene in blocks; each (block, category) pair becomes a category."""
     from sagesplat.stages import blocks
-    from sagesplat.stages.scene import check_not_adopted
 
     with open_job(run, machine) as job:
-        check_not_adopted(job.run)
         blocks.label_block_categories(job)
 
 
@@ -282,10 +276,10 @@ def nest(
     seed: Seed = 0,
 ) -> None:
     """Make the nested levels: order the trained Gaussians, train prefixes, write the increments."""
-    from sagesplat.stages import pipeline
+    from sagesplat.stages.block_levels import nest_scene
 
     with open_job(run, machine) as job:
-        pipeline.nest(job, nest, blocks, seed)
+        nest_scene(job, nest, blocks, seed)
 
 
 @command
@@ -384,16 +378,16 @@ def report(
         url: address at which the bundle was published: the report links to it, and shows it as a QR code
             for phones
     """
-    from sagesplat.stages import pipeline
     from sagesplat.stages.report import make_report
 
     with open_job(run, machine, "snapshots" if paper else ladder) as job:
         if paper:
             from sagesplat.studies.lpips import warn_of_lpips
             from sagesplat.studies.paper.run import paper_report
+            from sagesplat.studies.paper.snapshots import adapt_snapshots
 
             warn_of_lpips(job, settings.lpips)
-            pipeline.adapt_snapshots(job)
+            adapt_snapshots(job)
             paper_report(job, settings)
         else:
             make_report(job, url)

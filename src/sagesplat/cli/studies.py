@@ -51,17 +51,16 @@ def transfer(
         targets: SSIM targets (default: those that B was planned for)
         lpips: folder with the LPIPS weights (default: where `sagesplat download lpips` puts them)
     """
-    from sagesplat.core.events import TableMade
-    from sagesplat.stages import pipeline
+    from sagesplat.studies.paper.snapshots import adapt_snapshots
     from sagesplat.studies.transfer.run import transfer as evaluate_transfer
 
     out = out or run_b / "transfer"
     with open_job(run_a, machine, "snapshots") as job_a, open_job(run_b, machine, "snapshots") as job_b:
-        pipeline.adapt_snapshots(job_a)
-        pipeline.adapt_snapshots(job_b)
+        adapt_snapshots(job_a)
+        adapt_snapshots(job_b)
         table, line = evaluate_transfer(job_a, job_b, out, targets, lpips)
         table = table.only("split", "predictor", "ssim error", "iteration error", "hit", "regret share")
-        job_b.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
+        job_b.emit(table.event)
     say(line, out)
 
 
@@ -80,10 +79,9 @@ def early_stopping(
             are not yet
         out: folder for the tables (default: RUN_STOPPED/early_stopping)
     """
-    from sagesplat.core.events import TableMade
-    from sagesplat.stages import pipeline
     from sagesplat.stages.scene import check_not_adopted
     from sagesplat.studies.early_stopping import compare_early_stopping
+    from sagesplat.studies.paper.snapshots import observe_snapshots
 
     out = out or stopped / "early_stopping"
     with (
@@ -91,9 +89,9 @@ def early_stopping(
         open_job(full, machine, "snapshots") as job_full,
     ):
         check_not_adopted(job_stopped.run)
-        pipeline.observe_snapshots(job_full)
+        observe_snapshots(job_full)
         table, _ = compare_early_stopping(job_stopped, job_full, out)
-        job_stopped.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
+        job_stopped.emit(table.event)
     say(out)
 
 

@@ -37,7 +37,7 @@ def export(
     Args:
         run: run folder
         out: file to write, or with --chunks a folder
-        level: number of a level (of snapshots: its training step) to write instead of the planned scene
+        level: number of a level (of a recorded one: its training step) to write instead of the planned scene
         labels: names of the categories to write (default: all)
         only: the same as one text, such as "chair 2,vase"; a category means all its instances
         without: categories or instances to leave out, such as "person,chair 1"; says how large the holes are
@@ -225,7 +225,7 @@ def view(
         ssl_certfile: certificate (PEM) for https, which headsets require
         ssl_keyfile: key of the certificate, if it is a separate file
         browser: open the browser
-        follow: show the newest snapshot of a training in progress
+        follow: show the newest level of a training in progress
         edit: edit labels in the viewer and save them in the run folder, for `sagesplat labels apply`; on this
             machine only
     """

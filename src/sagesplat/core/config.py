@@ -1,8 +1,10 @@
 """Settings of every stage. Standard library only, so that the command line answers at once."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
+
+LadderKind = Literal["nested", "snapshots"]  # prefixes of one model, or the levels that training recorded
 
 
 @dataclass(frozen=True)
@@ -105,7 +107,7 @@ class TrainConfig:
     """Learning rates. fast: larger at first, on downscaled photos where those have the same detail;
     published: as in 3DGS."""
     level_every: int = 0
-    """Steps between two snapshots, not scaled (0: a thirtieth of --train.max-steps)."""
+    """Steps between two recorded levels, not scaled (0: a thirtieth of --train.max-steps)."""
     sh_degree: int = 3
     """Degree of the spherical harmonics."""
     antialiased: bool = True
@@ -266,7 +268,7 @@ class PlanConfig:
     viewpoint (default: 0.95, where --target-ssim is not given; 1: the full model)."""
     target_ssim: float | None = None
     """SSIM against photos that the planned scene must reach; with --target-fidelity a plan beside that one
-    (default: none, of snapshots 0.8)."""
+    (default: none, of the levels of the paper 0.8)."""
     share: float = 0.95
     """Fraction of the viewpoints in which the level of a category must reach the target."""
     other_targets: tuple[float, ...] | None = None
@@ -278,16 +280,6 @@ class PlanConfig:
     """Unit of the budget: bytes to transfer, bytes of GPU memory in the viewer, or Gaussians."""
     weights: dict[str, float] = field(default_factory=dict)
     """Weights of categories within the budget, by name (1 unless named)."""
-
-    def with_target(self, ladder: Literal["nested", "snapshots"]) -> "PlanConfig":
-        """The same with the default target of the ladder, where none is given."""
-        if self.target_fidelity is not None or self.target_ssim is not None:
-            return self
-        return (
-            replace(self, target_fidelity=self.target)
-            if ladder == "nested"
-            else replace(self, target_ssim=0.8)
-        )
 
     @property
     def quality(self) -> Literal["fidelity", "ssim"]:
@@ -408,7 +400,7 @@ class RunConfig:
     plan: PlanConfig = field(default_factory=PlanConfig)
     fuse: bool = False
     """Fuse the label images of all views through the trained Gaussians."""
-    ladder: Literal["nested", "snapshots"] = "nested"
-    """Levels: nested (prefixes of one model), or the snapshots of training as in the paper."""
+    ladder: LadderKind = "nested"
+    """Levels: nested (prefixes of one model), or those that training recorded, as in the paper."""
     seed: int = 0
     """Seed of the random numbers."""

@@ -36,7 +36,7 @@ class Training:
     step: int
     total: int
     loss: float
-    counts: dict[str, int]  # Gaussians by category name, at the last snapshot
+    counts: dict[str, int]  # Gaussians by category name, at the last recorded level
     num_gaussians: int
 
 

@@ -62,9 +62,7 @@ def read_toml(path: Path, cure: str, *, most: int) -> dict[str, Any]:
         text = path.read_text(encoding="utf-8")
         dots = max(line.count(".") for line in text.split("\n"))
         if len(text) > most or dots > _MOST_DOTS:
-            raise ValueError(
-                f"{len(text)} characters, a line with {dots} dots: too many"
-            )
+            raise ValueError(f"{len(text)} characters, a line with {dots} dots: too many")
         return tomllib.loads(text)
     except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"{path}: not readable as TOML ({short(error)}); {cure}") from None

@@ -14,6 +14,7 @@ from sagesplat.adapt.eq3 import Eq3, SsimModel
 from sagesplat.adapt.evaluate import QUALITIES, Evaluation
 from sagesplat.adapt.observe import TOTAL, Observations
 from sagesplat.adapt.plan import Choice, Counts, Plan, quality_title
+from sagesplat.core.events import TableMade
 from sagesplat.core.gaussians import BYTES_PER_GAUSSIAN
 from sagesplat.io.columns import text_cell
 from sagesplat.io.files import atomic_path, write_text
@@ -46,6 +47,11 @@ class Table:
     def cells(self) -> list[list[str]]:
         """The rows as text; NaN reads as a dash."""
         return [[_text(v, spec) for v, spec in zip(row, self.formats, strict=True)] for row in self.rows]
+
+    @property
+    def event(self) -> TableMade:
+        """What shows the table to whom listens."""
+        return TableMade(self.title, self.header, tuple(map(tuple, self.cells())))
 
     def columns(self) -> list[str]:
         """The header in one line, with the titles of groups before it."""
@@ -141,7 +147,7 @@ def name_of(label_id: int, names: Mapping[int, str]) -> str:
 
 
 def bytes_of(choice: Choice) -> int:
-    """What a choice costs: bytes to send, of snapshots 248 a Gaussian."""
+    """What a choice costs: bytes to send, or 248 a Gaussian."""
     return choice.nbytes if choice.transfer_bytes is None else choice.transfer_bytes
 
 
@@ -152,7 +158,7 @@ def by_size(counts: Counts) -> list[int]:
 
 
 def last_counts(counts: Counts) -> dict[int, int]:
-    """Gaussians of each label in the full model, the last level: of snapshots it is 3DGS itself."""
+    """Gaussians of each label in the full model, the last level: of recorded ones it is 3DGS itself."""
     last: dict[int, int] = {}
     for (label_id, _), count in sorted(counts.items(), key=lambda item: item[0][1]):
         last[label_id] = count

@@ -2,17 +2,20 @@
 
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from sagesplat.adapt.fidelity import References
-from sagesplat.adapt.ladder import Ladder, SnapshotLadder, read_ladder, read_prefixes
+from sagesplat.adapt.ladder import Ladder, RecordedLadder, read_ladder, read_prefixes
+from sagesplat.adapt.observe import PERCENTILE, distances_in_views
 from sagesplat.core.config import FitConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.formats.levels import LevelFile
 from sagesplat.raster import Backend
 from sagesplat.run.capture import check_photos, fingerprint, photo_hashes, read_capture
 from sagesplat.run.executor import LOCAL, Executor, Local
@@ -34,9 +37,9 @@ _LOCK_WAIT = 60.0  # seconds that a task waits for one which a killed run left b
 NO_RUN = "not a run folder (no scene.json); begin with `sagesplat run SCENE RUN`"
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Job:
-    """A run folder being worked on, and what its stages share."""
+    """A run folder being worked on, and what its stages share. `replace` makes one that has read nothing."""
 
     run: RunDir
     emit: Emit
@@ -51,6 +54,11 @@ class Job:
     lock_wait: float = 0.0  # seconds to wait for who has the run folder
     source: "Job | None" = None  # job of the same scene: share its scene and photos, do not load them again
     before_redo: Callable[[str, str], None] | None = None  # told of a stage to be forced, and what differs
+    # what was computed last, with what it depends on: a stage of this job may change that
+    _refined: tuple[tuple[int, int, int], Scene] | None = field(default=None, init=False, repr=False)
+    _distances: tuple[Scene, tuple[float, bytes], dict[int, np.ndarray]] | None = field(
+        default=None, init=False, repr=False
+    )
 
     @property
     def spec(self) -> "JobSpec":
@@ -62,6 +70,10 @@ class Job:
             backend=self.executor.backend or self.backend,
             memory_limit=self.memory_limit or self.executor.memory,
         )
+
+    def block_spec(self, number: int) -> "JobSpec":
+        """The job on a block of a large scene."""
+        return replace(self.spec, run=self.run.block(number))
 
     @property
     def gpus(self) -> float:
@@ -81,17 +93,25 @@ class Job:
             return given
         stat = path.stat()
         state = stat.st_mtime_ns, stat.st_size, stat.st_ino  # a training of this job may replace the file
-        kept = self.__dict__.get("_refined")
-        if kept is None or kept[0] != state:
-            refined = with_cameras(given, read_refined(path, len(given.views)))
-            kept = self.__dict__["_refined"] = state, refined
-        return kept[1]
+        if self._refined is None or self._refined[0] != state:
+            self._refined = state, with_cameras(given, read_refined(path, len(given.views)))
+        return self._refined[1]
 
-    @cached_property
+    @property
     def given_scene(self) -> Scene:
         """The capture that scene.json names, unchanged since, with its cameras as they were given."""
+        return self._opened[0]
+
+    @cached_property
+    def photos(self) -> Photos:
+        """The photos, loaded when asked for."""
+        return self._opened[1]
+
+    @cached_property
+    def _opened(self) -> tuple[Scene, Photos]:
+        """The capture and its photos, opened together: photos that change from then on are noticed."""
         if self.source is not None:
-            return self.source.given_scene
+            return self.source._opened
         if not self.run.scene.exists():
             raise RunError(f"{self.run.path}: {NO_RUN}")
         made = read_capture(self.run.scene)
@@ -104,22 +124,12 @@ class Job:
             now = photo_hashes(self.run.photo_hashes, scene)
             check_photos(scene, made.photos, now.sha256)
             now.keep()
-        # together with the scene: photos that change from now on are noticed
-        self.__dict__["photos"] = Photos(scene.views, memory.photo_cache(self.memory_limit))
-        return scene
-
-    @cached_property
-    def photos(self) -> Photos:
-        """The photos, loaded when asked for; those of the scene when it was opened."""
-        if self.source is not None:
-            return self.source.photos
-        _ = self.given_scene
-        return self.__dict__["photos"]
+        return scene, Photos(scene.views, memory.photo_cache(self.memory_limit))
 
     @property
     def has_blocks(self) -> bool:
         """Whether the scene is trained in blocks."""
-        return (self.run.blocks / "blocks.json").exists()
+        return self.run.division.exists()
 
     @property
     def has_block_categories(self) -> bool:
@@ -135,14 +145,9 @@ class Job:
     def _labels(self) -> Path:
         if self.has_block_categories:
             return self.run.block_labels / "labels.json"
-        return (self.run.instances if self.has_instances else self.run.masks) / "labels.json"
+        return (self.run.instances if self.run.has_instances else self.run.masks) / "labels.json"
 
     @property
-    def has_instances(self) -> bool:
-        """Whether instances are categories of their own: in the nested levels, not in snapshots."""
-        return self.run.ladder == "nested" and (self.run.instances / "labels.json").exists()
-
-    @cached_property
     def parents(self) -> dict[str, str]:
         """The category of each instance, by name."""
         return read_parents(self.run.parents) if self.run.ladder == "nested" else {}
@@ -166,18 +171,18 @@ class Job:
     def parents_by_id(self) -> dict[int, str]:
         """The category of each instance, by the instance's id: in a scene in blocks that of the block."""
         split = split_name if self.has_block_categories else lambda name: (name, None)
-        found = {}
+        found, parents = {}, self.parents
         for label, name in self.names().items():
             category, block = split(name)
-            if category in self.parents:
-                found[label] = per_block_name(self.parents[category], block)
+            if category in parents:
+                found[label] = per_block_name(parents[category], block)
         return found
 
     @property
     def whole_masks(self) -> Masks:
         """The label images of the scene as one: with its instances, if they were asked for."""
         instances = self.run.instances
-        if self.has_instances:
+        if self.run.has_instances:
             return Masks(instances, Taxonomy.read(instances / "labels.json"))
         return self.category_masks
 
@@ -205,7 +210,7 @@ class Job:
     @property
     def point_label_file(self) -> Path:
         """Where the categories of SfM points are, those of instances if they were asked for."""
-        return self.run.instance_labels if self.has_instances else self.run.labels
+        return self.run.instance_labels if self.run.has_instances else self.run.labels
 
     @property
     def initial_labels(self) -> np.ndarray:
@@ -219,21 +224,39 @@ class Job:
         self.check_named(path, ids)
         return lifted
 
+    def distances(self, distance: str) -> dict[int, np.ndarray]:
+        """d_min of each category in each view, as `FitConfig.distance` says; kept, as several stages ask."""
+        percentile = PERCENTILE if distance == "percentile" else 0.0
+        scene, labels = self.scene, self.point_labels
+        key, kept = (percentile, labels.tobytes()), self._distances
+        if kept is None or kept[0] is not scene or kept[1] != key:
+            kept = self._distances = scene, key, distances_in_views(scene, labels, percentile)
+        return kept[2]
+
     @cached_property
-    def snapshots(self) -> SnapshotLadder:
+    def recorded(self) -> RecordedLadder:
         """The levels that training recorded."""
         return read_ladder(self.run.levels)
 
     @property
+    def last_level(self) -> LevelFile:
+        """What training ended with, floaters included."""
+        return self.recorded.files[-1]
+
+    def load_last_level(self) -> Gaussians:
+        """The Gaussians that training ended with, floaters included."""
+        return self.recorded.load(self.last_level.step)
+
+    @property
     def trained(self) -> Path:
         """The trained model: the last level, without its floaters where some were removed."""
-        return self.run.cleaned if self.run.cleaned.exists() else self.snapshots.files[-1].path
+        return self.run.cleaned if self.run.cleaned.exists() else self.last_level.path
 
     @cached_property
     def ladder(self) -> Ladder:
-        """The levels to choose from: prefixes of the nested model, or the snapshots."""
+        """The levels to choose from: prefixes of the nested model, or those that training recorded."""
         nested = self.run.ladder == "nested"
-        ladder = read_prefixes(self.run.prefixes) if nested else self.snapshots
+        ladder = read_prefixes(self.run.prefixes) if nested else self.recorded
         path = self.run.prefixes if nested else self.run.levels
         self.check_named(path, sorted({label for label, _ in ladder.counts}))
         return ladder

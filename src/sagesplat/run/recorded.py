@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 from sagesplat.core.config import (
     AdoptConfig,
@@ -10,6 +10,7 @@ from sagesplat.core.config import (
     CleanConfig,
     FitConfig,
     LabelsConfig,
+    LadderKind,
     MasksConfig,
     NestConfig,
     PlanConfig,
@@ -21,16 +22,16 @@ from sagesplat.core.config import (
 from sagesplat.core.limits import NotNegative, Seed
 from sagesplat.io.typed import convert_as, known_json
 from sagesplat.run.records import FORMAT
-from sagesplat.run.run_dir import LadderKind, RunDir
+from sagesplat.run.run_dir import RunDir
 
 Config = TypeVar("Config")
 
 
 def recorded_ladder(path: Path) -> LadderKind:
-    """The kind of levels that a run has results of: snapshots only where there are no others."""
-    kinds: tuple[LadderKind, ...] = ("nested", "snapshots")
+    """The kind of levels that a run has results of: nested ones, unless there are only others."""
+    kinds: tuple[LadderKind, ...] = get_args(LadderKind)
     made = [kind for kind in kinds if (RunDir(path, kind).adapted / "provenance").is_dir()]
-    return "snapshots" if made == ["snapshots"] else "nested"
+    return made[0] if len(made) == 1 else "nested"
 
 
 def recorded_settings(run: RunDir, of: str = "run") -> dict[str, Any]:

@@ -10,28 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from sagesplat import __version__
-from sagesplat.core import config
 from sagesplat.core.errors import RunError, short
 from sagesplat.core.limits import NotNegative, Number, Seed
 from sagesplat.io.files import read_json, write_json
 from sagesplat.io.typed import convert_as, refused
 from sagesplat.run.run_dir import RunDir
+from sagesplat.run.stage_table import STAGES
 
 FORMAT = 3  # of the run folder; raised when older folders can no longer be read
-_KINDS = {  # settings by stage; those of other stages are compared, and never used
-    "scene": config.SceneConfig,
-    "poses": config.PosesConfig,
-    "masks": config.LabelsConfig,
-    "train": config.TrainConfig,
-    "base": config.TrainConfig,
-    "clean": config.CleanConfig,
-    "blocks": config.BlocksConfig,
-    "nest": config.NestConfig,
-    "observe": config.FitConfig,
-    "sample": config.SampleConfig,
-    "fit": config.FitConfig,
-    "plan": config.PlanConfig,
-}
 
 
 @dataclass(frozen=True)
@@ -109,7 +95,8 @@ def read_record(path: Path) -> dict[str, Any]:
         check_format(path, made)
     with refused(path, "the record of a stage", cure, _NoRecord):
         settings = convert_as(made, _Record).settings
-        for kind in (_More, _KINDS.get(path.stem, _More)):
+        convert_as(settings, _More)
+        if path.stem in STAGES and (kind := STAGES[path.stem].settings):
             convert_as(settings, kind)
     return made | {"settings": Settings(settings, path)}
 

@@ -15,22 +15,9 @@ from sagesplat.io.files import named_full_disk, remove_temporary, sync_changed
 from sagesplat.io.lock import locked
 from sagesplat.run.job import NO_RUN, Job
 from sagesplat.run.records import is_done, read_record, record
+from sagesplat.run.stage_table import needed_for, stage_kind
 
 _CLOCK_STEP = 2.0  # seconds: some disks keep no finer time
-# Stages that are made of earlier results within minutes: they follow those without --force, as long as
-# their own settings are the same. The settings of the second ones are the plan's.
-_DERIVED = {"observe", "sample", "fit", "plan", "crossview", "same_size", "paper"}
-_OF_PLAN = {"compose", "evaluate", "report"}
-_ORDER = (
-    "adopt", "poses", "scene", "segment", "masks", "photo_instances", "lift", "blocks", "train", "clean",
-    "fuse", "block_categories", "instances", "base", "nest", "observe", "sample", "fit", "plan", "compose",
-    "evaluate", "report", "crossview", "same_size", "paper",
-)  # fmt: skip
-
-
-def following(stage: str) -> tuple[str, ...]:
-    """The stages of a run that may depend on one."""
-    return _ORDER[_ORDER.index(stage) + 1 :] if stage in _ORDER else ()
 
 
 @dataclass(frozen=True)
@@ -55,7 +42,7 @@ def run_stage(
 
     Args:
         job: The run folder, and where events go.
-        name: Of the stage; its record is provenance/NAME.json.
+        name: Of the stage, as in `STAGES`; its record is provenance/NAME.json.
         settings: Everything that the result depends on, besides the inputs; JSON.
         inputs: Files and folders that it is made from; their hashes are recorded.
         outputs: Files and folders that it makes.
@@ -103,7 +90,7 @@ def run_stages(
 
 def _is_done(job: Job, stage: Stage) -> bool:
     """Whether a stage is to be skipped, which is said; RunError where it cannot be done."""
-    if stage.name not in ("adopt", "poses", "scene") and not job.run.scene.exists():
+    if "scene" in needed_for(stage.name) and not job.run.scene.exists():
         raise RunError(f"{job.run.path}: {NO_RUN}")
     for path in stage.inputs:
         if not path.exists():
@@ -122,12 +109,10 @@ def _is_done(job: Job, stage: Stage) -> bool:
 
 
 def _follows(job: Job, stage: Stage) -> bool:
-    """Whether a stage may be made again without --force: for new inputs alone, and within minutes."""
-    if stage.name in _OF_PLAN:
-        return True
-    record = job.run.provenance(stage.name)
-    if stage.name not in _DERIVED or not record.exists():
-        return False
+    """Whether a stage may be made again without --force (`StageKind.again`)."""
+    again, record = stage_kind(stage.name).again, job.run.provenance(stage.name)
+    if again != "inputs" or not record.exists():
+        return again == "always"
     try:
         return read_record(record)["settings"] == stage.settings
     except RunError:  # a broken record is told where it is compared

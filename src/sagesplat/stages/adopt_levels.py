@@ -56,7 +56,7 @@ _COMPARE = 8  # views that merged Gaussians and prefixes of the originals are co
 def make_levels(job: Job, config: AdoptConfig) -> None:
     """Make the ladder of an adopted splat, and its increments."""
     run = job.run
-    g = job.snapshots.load(job.snapshots.levels[-1])
+    g = job.load_last_level()
     shares = usable_shares(config.shares, len(g))
     steps = config.steps if config.fit == "renders" else 0
     settings = asdict(NestConfig(steps=steps, levels=len(shares), base_share=0, rate_weight=0.0))

@@ -5,30 +5,27 @@
 
 from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-import numpy as np
-
-from sagesplat.adapt.bound_plans import Costs, plan_for_view, quality_at
-from sagesplat.adapt.observe import PERCENTILE, RenderedLabels, distances_in_views, widest_lens, within_lens
-from sagesplat.adapt.plan import Plan, plan_view
+from sagesplat.adapt.bound_plans import Costs
+from sagesplat.adapt.plan import Plan
 from sagesplat.adapt.viewpoint import ViewModel
-from sagesplat.core.config import PlanConfig, RunConfig
+from sagesplat.core.config import LadderKind, PlanConfig, RunConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit, Event
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.raster import Backend, cuda, resolve_backend, set_threads
 from sagesplat.run.job import NO_RUN, Job
-from sagesplat.run.run_dir import LadderKind, RunDir, check_links
-from sagesplat.scene.scene import Camera, Scene, View
+from sagesplat.run.run_dir import RunDir, check_links
+from sagesplat.scene.scene import Camera, Scene
 from sagesplat.segment.display_names import titles
 from sagesplat.stages import label_edits, pipeline
 from sagesplat.stages.bundle import BundleMade, bundle
-from sagesplat.stages.methods import NestedLevels
+from sagesplat.stages.methods import Method, NestedLevels, method_of
 from sagesplat.stages.plan import check_targets
-from sagesplat.stages.results import fidelity_of, models_of, plans_of, promises_of
+from sagesplat.stages.results import plans_of
 
 
 def ignore(event: Event) -> None:
@@ -92,7 +89,7 @@ def open_run(folder: Path | str, ladder: LadderKind = "nested") -> "FinishedRun"
 
     Args:
         folder: The run folder.
-        ladder: Which levels to look at: "nested" (prefixes of one model) or "snapshots" (the paper's).
+        ladder: Which levels to look at: "nested" (prefixes of one model), or those of the paper.
 
     Returns:
         The run's scene, levels, plans and SSIM models.
@@ -193,24 +190,27 @@ class FinishedRun:
         return plans_of(self.job)
 
     @cached_property
+    def _method(self) -> Method:
+        return method_of(self.job)
+
+    @cached_property
+    def _nested(self) -> NestedLevels:
+        return self._method if isinstance(self._method, NestedLevels) else NestedLevels(self.job)
+
+    @property
     def fidelity(self) -> dict[int, ViewModel]:
         """Models of fidelity by label id (nested ladder). RunError before `sagesplat fit`."""
-        return fidelity_of(self.job)
+        return self._nested.fidelity
 
-    @cached_property
+    @property
     def promises(self) -> dict[int, ViewModel]:
         """Models of SSIM against photos by label id; otherwise like `fidelity`."""
-        return promises_of(self.job)
+        return self._nested.promises
 
-    @cached_property
-    def _full(self) -> Gaussians:
-        ladder = self.job.ladder
-        return ladder.load(ladder.levels[-1])
-
-    @cached_property
+    @property
     def costs(self) -> Costs:
         """Gaussians and bytes of each category's levels; of a nested ladder."""
-        return NestedLevels(self.job).costs
+        return self._nested.costs
 
     def plan_camera(
         self, camera: Camera, *, target_fidelity: float | None = None, target_ssim: float | None = None
@@ -218,8 +218,9 @@ class FinishedRun:
         """The cheapest level of each category that is promised to reach a target from one camera (Eq. 1).
 
         The camera may be anywhere: no photo has to be taken there. For a nested ladder the promise is a lower
-        confidence bound, for snapshots it is Eq. 3 at the category's distance. For fidelity, categories whose
-        pixels are worth their bytes then get more, until the image is no worse than with all at one level.
+        confidence bound, for the levels of the paper it is Eq. 3 at the category's distance. For fidelity,
+        categories whose pixels are worth their bytes then get more, until the image is no worse than with all
+        at one level.
 
         Args:
             camera: The viewer's: pose in the world of `scene`, intrinsics and image size in pixels.
@@ -238,21 +239,7 @@ class FinishedRun:
             raise RunError("a camera is planned for one target; give target_fidelity or target_ssim")
         config = PlanConfig(target_fidelity, target_ssim)
         config = check_targets(config, self.job.run.ladder)
-        kind, target = config.quality, config.target
-        # Distances have to be measured as those that the models were fitted to.
-        percentile = PERCENTILE if self.job.fit_config.distance == "percentile" else 0.0
-        lens = within_lens(camera, widest_lens([view.camera for view in self.scene.views]))
-        views = (View("photo", lens, Path()), View("viewer", camera, Path()))
-        seen = distances_in_views(replace(self.scene, views=views), self.job.point_labels, percentile)
-        distances = {label: np.where(np.isnan(d[:1]), d[1:], d[:1]) for label, d in seen.items()}
-        if self.job.run.ladder == "nested":
-            models = self.fidelity if kind == "fidelity" else self.promises
-            quality = quality_at(self.costs, models, distances, [camera], kind)
-            pixels = self._pixels(camera) if kind == "fidelity" else None
-            return replace(plan_for_view(quality, self.costs, target, 0, pixels), view=None)
-        ladder, models = self.job.ladder, models_of(self.job)
-        near = {label: float(np.float64(d[0])) for label, d in distances.items()}
-        return plan_view(models, ladder.counts, near, target, None, recovering=ladder.recovering)
+        return self._method.plan_camera(camera, config.target, config.quality)
 
     def bundle(self, out: Path | str, *, single_file: bool = False) -> BundleMade:
         """Write the run for browsers: levels, promises and the viewer, as static files.
@@ -268,11 +255,6 @@ class FinishedRun:
             RunError: For a run without nested levels, or an `out` that is something else.
         """
         return bundle(self.job, Path(out), single_file=single_file)
-
-    def _pixels(self, camera: Camera) -> np.ndarray:
-        """Pixels of each category that a camera sees, as the full model paints them; float64 [L]."""
-        image = RenderedLabels(self._full, self.job.backend, self.job.antialiased)[View("", camera, Path())]
-        return np.array([(image == label).sum() for label in self.costs.labels], np.float64)
 
     def compose(self, plan: Plan | Mapping[int, int]) -> Gaussians:
         """The Gaussians of a plan: each category at its level.

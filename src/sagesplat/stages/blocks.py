@@ -1,4 +1,4 @@
-"""Makes the levels and nested levels of a large scene, from blocks trained independently and merged.
+"""Makes the levels of a scene: trained as one or, of a large scene, in blocks that are merged.
 
 A block has its own run folder, RUN/blocks/NNN, whose capture is a part of the scene. It is trained and nested
 like any other run, on any node, and resumes after a kill. In the merged scene every (block, category) pair is
@@ -7,20 +7,17 @@ a category of its own (`segment.block_categories`), and later stages treat it as
 
 import shutil
 from dataclasses import asdict, replace
-from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from sagesplat.adapt.ladder import read_ladder, read_prefixes
+from sagesplat.adapt.ladder import read_ladder
 from sagesplat.adapt.observe import RenderedLabels
-from sagesplat.core.config import BlocksConfig, NestConfig, TrainConfig
+from sagesplat.core.config import BlocksConfig, TrainConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit, Progress, named
-from sagesplat.core.gaussians import Gaussians, concat
-from sagesplat.core.second_opacity import SecondOpacities
-from sagesplat.formats.levels import read_level, read_sizes, write_level, write_set
+from sagesplat.core.gaussians import concat
+from sagesplat.formats.levels import read_level, write_level
 from sagesplat.io.files import link, write_json
 from sagesplat.run.capture import Hashes, fingerprint, photo_hashes
 from sagesplat.run.executor import Task, results
@@ -30,9 +27,7 @@ from sagesplat.run.stage import run_stage
 from sagesplat.scene.blocks import (
     Blocks,
     assigned_views,
-    graph_colouring,
     read_blocks,
-    read_division,
     split,
     training_scene,
     visible_shares,
@@ -42,21 +37,11 @@ from sagesplat.scene.scene import Scene
 from sagesplat.scene.stored import write_scene
 from sagesplat.segment.block_categories import BlockCategories
 from sagesplat.segment.lift import LiftedLabels
-from sagesplat.segment.masks import Taxonomy, mask_path, prepare_folder, write_labels, write_mask
-from sagesplat.stages.nest import nest_levels, write_ladder
-from sagesplat.stages.shared import label_image_inputs, train_config
+from sagesplat.segment.masks import mask_path, prepare_folder, write_labels, write_mask
+from sagesplat.stages.scene import check_not_adopted
 from sagesplat.stages.train import read_frozen, train_inputs, train_levels, write_frozen
-from sagesplat.train import memory, nested
-from sagesplat.train.boundaries import (
-    around,
-    boundary_views,
-    interior,
-    interior_opacities,
-    interior_sizes,
-    read_nested,
-    together,
-)
-from sagesplat.train.nested import Nested, NestStep
+from sagesplat.train import memory
+from sagesplat.train.boundaries import interior
 
 _SEEN = 0.01  # share of a photo's visible points from which on it sees a block
 
@@ -85,7 +70,7 @@ def _division(config: BlocksConfig) -> dict[str, float]:
 
 def divide(job: Job, config: BlocksConfig, seed: int) -> Blocks:
     """Split the scene, and create a run folder for each block with its part of the capture."""
-    run, file = job.run, job.run.blocks / "blocks.json"
+    run, file = job.run, job.run.division
     settings = {**_division(config), "seed": seed}
 
     def make() -> list[str]:
@@ -133,7 +118,7 @@ def _begin(run: RunDir, scene: Scene, labels: LiftedLabels, rows: np.ndarray, ph
     mine.keep(run.photo_hashes)
 
 
-def _share_masks(job: Job, block: Job) -> None:
+def share_masks(job: Job, block: Job) -> None:
     """Give a block the label images of its views, and the records of who made them, as links.
 
     Links of what the run has no more are removed: the block would take fused label images that were deleted.
@@ -157,14 +142,6 @@ def _share_masks(job: Job, block: Job) -> None:
             link(path, mask_path(run.valid, view))
 
 
-def _spec(job: Job, number: int) -> JobSpec:
-    return replace(job.spec, run=job.run.block(number))
-
-
-def _job_of(job: Job, number: int) -> Job:
-    return _spec(job, number).open(job.emit)
-
-
 def _needed(block: Job, config: TrainConfig) -> int:
     """Predicted host memory of a block's training, bytes (0 on a GPU)."""
     if block.gpus:
@@ -172,8 +149,15 @@ def _needed(block: Job, config: TrainConfig) -> int:
     return memory.fit(block.scene, config, block.memory_limit, processes=block.processes).needed
 
 
-def train_blocks(job: Job, config: BlocksConfig, train: TrainConfig, seed: int) -> None:
-    """Split the scene, train its blocks as tasks, and merge their levels."""
+def train_scene(job: Job, train: TrainConfig, config: BlocksConfig, seed: int) -> None:
+    """Train the scene: as one, or split into blocks, which are trained as tasks and merged."""
+    check_not_adopted(job.run)
+    if config.count == 1:
+        if job.has_blocks:
+            raise RunError(
+                f"{job.run.blocks}: this run is in blocks; add --blocks.count, or begin another run"
+            )
+        return train_levels(job, train, seed)
     check(config, train)
     # a photo of several blocks would get several exposures, and every block a sky around the others
     train = replace(train, exposure="off", sky="off")
@@ -186,16 +170,16 @@ def train_blocks(job: Job, config: BlocksConfig, train: TrainConfig, seed: int) 
     def make() -> list[str]:
         tasks = []
         for number in range(len(blocks)):
-            block = _job_of(job, number)
-            _share_masks(job, block)
-            what = (_spec(job, number), number, train, seed)
+            block = job.block_spec(number).open(job.emit)
+            share_masks(job, block)
+            what = (job.block_spec(number), number, train, seed)
             tasks.append(Task(f"block {number}", train_block, what, job.gpus, _needed(block, train)))
         results(job.executor, tasks, job.emit)
         run.provenance("train").unlink(missing_ok=True)  # from here on the earlier levels are gone
         merged = _merge_levels(run, blocks, parts)
         return [f"{merged:,} Gaussians of {len(blocks)} blocks"]
 
-    inputs = [*train_inputs(job, train), run.blocks / "blocks.json", run.provenance("blocks")]
+    inputs = [*train_inputs(job, train), run.division, run.provenance("blocks")]
     run_stage(job, "train", settings, inputs, [run.levels], make, swaps=True)
 
 
@@ -237,13 +221,14 @@ def label_block_categories(job: Job) -> None:
 
     A pixel keeps its category and gets the block whose Gaussians contribute most to it.
     """
+    check_not_adopted(job.run)
     run = job.run
-    blocks, masks = read_blocks(run.blocks / "blocks.json"), job.category_masks
+    blocks, masks = read_blocks(run.division), job.category_masks
     parts = BlockCategories(masks.taxonomy, len(blocks))
 
     def make() -> list[str]:
         scene, names = job.scene, parts.names
-        g = job.snapshots.load(job.snapshots.levels[-1])
+        g = job.load_last_level()
         by_block = replace(g, label_ids=torch.from_numpy(parts.block_of(g.label_ids.numpy())))
         painted = RenderedLabels(by_block, job.backend, job.antialiased)
         shutil.rmtree(run.block_categories, ignore_errors=True)
@@ -265,134 +250,8 @@ def label_block_categories(job: Job) -> None:
         ]
 
     made = [run.provenance(stage) for stage in ("train", "masks")]
-    inputs = [run.scene, run.labels, run.levels, run.blocks / "blocks.json", run.masks / "labels.json", *made]
+    inputs = [run.scene, run.labels, run.levels, run.division, run.masks / "labels.json", *made]
     if masks.folder == run.fused:
         inputs.append(run.provenance("fuse"))
     outputs = [run.block_categories / "labels.json", run.block_categories / "labels.npz"]
     run_stage(job, "block_categories", {}, inputs, outputs, make)
-
-
-def nest_blocks(job: Job, config: BlocksConfig, nest: NestConfig, seed: int) -> None:
-    """Make the nested levels of the blocks, tune them along the boundaries, and merge them."""
-    run, file = job.run, job.run.blocks / "blocks.json"
-    nested.check(nest)
-    blocks = read_blocks(file)
-    settings = {**asdict(nest), "seed": seed, "boundary_steps": config.boundary_steps}
-
-    def make() -> list[str]:
-        every = range(len(blocks))
-        for number in every:
-            _share_masks(job, _job_of(job, number))
-        tasks = [
-            Task(f"block {i}", nest_block, (_spec(job, i), file, i, nest, seed), job.gpus) for i in every
-        ]
-        results(job.executor, tasks, job.emit)
-        files = [run.block(number).interior for number in every]
-        if config.boundary_steps:
-            files = _tune(job, blocks, config, nest, seed)
-        else:  # the table of blocks would show the seconds of an earlier tuning
-            for number in every:
-                run.block(number).provenance("boundaries").unlink(missing_ok=True)
-        merged = together(files)
-        lines = write_ladder(job, merged.gaussians, merged.sizes, nest, merged.second)
-        return [*lines, f"{len(blocks)} blocks, {config.boundary_steps} steps of boundary tuning each"]
-
-    inputs = [run.scene, run.labels, run.levels, run.provenance("train"), *label_image_inputs(run), file]
-    run_stage(job, "nest", settings, inputs, [run.prefixes, run.increments], make, swaps=True)
-
-
-def nest_block(
-    spec: JobSpec, partition: Path, number: int, config: NestConfig, seed: int, emit: Emit
-) -> None:
-    """Make the nested levels of one block, and its interior: the Gaussians inside the block's border."""
-    job = spec.open(named(emit, f"block {number}"))
-    run = job.run
-    labels = (run.instances if job.has_instances else run.masks) / "labels.json"
-    nest_levels(job, config, seed)
-
-    def make() -> list[str]:
-        blocks = read_blocks(partition)
-        parts = BlockCategories(Taxonomy.read(labels), len(blocks))
-        full = read_prefixes(run.prefixes)
-        g, inside = interior(full.gaussians, blocks, parts, number)
-        if not len(g):
-            raise RunError(f"{run.path}: no Gaussians inside the block; choose fewer with --blocks.count")
-        sizes = interior_sizes(full.gaussians.label_ids.numpy(), inside, full.sizes, parts, number)
-        second = full.second and interior_opacities(full.second, inside, sizes, parts, number)
-        write_set(run.interior, g, config.steps, sizes, second=second)
-        return [f"{len(g):,} of {len(full.gaussians):,} Gaussians are inside the block"]
-
-    inputs = [run.prefixes, labels, partition]
-    run_stage(job, "interior", {}, inputs, [run.interior], make)
-
-
-def _tune(job: Job, blocks: Blocks, config: BlocksConfig, nest: NestConfig, seed: int) -> list[Path]:
-    """Tune the blocks along their boundaries, neighbours one after the other; the files with the results."""
-    run, every = job.run, range(len(blocks))
-    files = [run.block(number).interior for number in every]
-    colour, sees = graph_colouring(blocks.neighbours()), read_division(run.blocks / "blocks.json").sees
-    steps = replace(nest, steps=config.boundary_steps)
-    for now in range(int(colour.max()) + 1):
-        mine = [number for number in every if colour[number] == now]
-        tasks = []
-        for number in mine:
-            others = [files[other] for other in sees[number] if other != number]
-            what = (_spec(job, number), run.blocks / "blocks.json", number, others, steps, seed)
-            tasks.append(Task(f"boundaries of block {number}", tune_boundaries, what, job.gpus))
-        results(job.executor, tasks, job.emit)
-        for number in mine:
-            files[number] = run.block(number).tuned_interior
-    return files
-
-
-def tune_boundaries(
-    spec: JobSpec, partition: Path, number: int, others: list[Path], config: NestConfig, seed: int, emit: Emit
-) -> None:
-    """Train a block's Gaussians near its border on compositions with visible Gaussians of other blocks."""
-    job = spec.open(named(emit, f"block {number}"))
-    run = job.run
-    settings = {**asdict(config), "seed": seed}
-
-    def make() -> list[str]:
-        blocks, sizes = read_blocks(partition), read_sizes(run.interior)
-        g, second = own = read_nested(run.interior)
-        views = boundary_views(job.scene, blocks, number)
-        near = blocks.to_border(g.means.numpy()) < blocks.margin
-        if views and near.any():
-            g, logits = _tuned(job, own, near, others, views, config, seed)
-            second = second if second is None or logits is None else replace(second, logits=logits)
-        write_set(run.tuned_interior, g, config.steps, sizes, second=second)
-        return [f"{int(near.sum()):,} of {len(near):,} Gaussians, {len(views)} views of several blocks"]
-
-    inputs = [run.scene, run.provenance("train"), run.interior, partition, *others]
-    run_stage(job, "boundaries", settings, inputs, [run.tuned_interior], make)
-
-
-def _tuned(
-    job: Job,
-    own: tuple[Gaussians, SecondOpacities | None],
-    near: np.ndarray,
-    others: list[Path],
-    views: list[int],
-    config: NestConfig,
-    seed: int,
-) -> tuple[Gaussians, Tensor | None]:
-    """The block's Gaussians after the training, and their second opacities."""
-    scene = job.scene
-    g, second = around(own, others, scene, views)
-    n = len(g)
-    movable = np.concatenate([near, np.zeros(n - len(near), bool)])
-    kept = frozenset(view.name for row, view in enumerate(scene.views) if row not in set(views))
-    narrowed = replace(scene, test_names=kept)
-    ladder = Nested(g, np.zeros(n, bool), second)
-    for event in nested.nest(
-        ladder, narrowed, job.photos, train_config(job), config,
-        valid=job.valid, seed=seed, backend=job.backend, movable=movable,
-    ):  # fmt: skip
-        if isinstance(event, NestStep):
-            job.emit(Progress("boundaries", event.step, config.steps, f"loss {event.loss:.3f}"))
-        elif isinstance(event, Nested):
-            mine = torch.isin(event.gaussians.label_ids, torch.unique(own[0].label_ids))
-            second = event.second_opacities
-            return event.gaussians.select(mine), None if second is None else second[mine]
-    raise AssertionError("training ends with a Nested event")

@@ -1,11 +1,13 @@
 """Makes the tables of a scene in blocks: balance of the blocks, and quality along their borders."""
 
+import math
+
 import numpy as np
 import torch
 
 from sagesplat.adapt.ladder import read_ladder
 from sagesplat.adapt.observe import as_unit, render_rgb
-from sagesplat.core.events import Progress, TableMade
+from sagesplat.core.events import Progress
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.levels import read_sizes
 from sagesplat.io.files import write_text
@@ -13,8 +15,7 @@ from sagesplat.metrics.image import pasted, squared_error_map, ssim_map
 from sagesplat.output.tables import Table
 from sagesplat.raster import Workspace, device_of, rasterize
 from sagesplat.run.job import Job
-from sagesplat.run.records import seconds_of
-from sagesplat.run.run_dir import RunDir
+from sagesplat.run.recorded import stage_seconds
 from sagesplat.run.stage import run_stage
 from sagesplat.scene.blocks import Blocks, read_blocks, read_division
 from sagesplat.train.boundaries import bands, together
@@ -26,7 +27,7 @@ _VIEWS = 32  # training views that are measured if there are no test views
 
 def measure_borders(job: Job) -> None:
     """Measure the quality near the borders of the blocks and elsewhere, and the balance of the blocks."""
-    run, file = job.run, job.run.blocks / "blocks.json"
+    run, file = job.run, job.run.division
     table_file = run.adapted / "blocks.csv"
 
     def make() -> list[str]:
@@ -35,7 +36,7 @@ def measure_borders(job: Job) -> None:
         sets = {"merged": together(files).full, "tuned": job.ladder.load(job.ladder.levels[-1])}
         tables = [balance_table(job, blocks), border_table(job, blocks, sets)]
         for table in tables:
-            job.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
+            job.emit(table.event)
         tables[0].write_csv(table_file)
         tables[1].write_csv(run.adapted / "borders.csv")
         text = "\n\n".join(f"## {t.title}\n\n{t.markdown()}" for t in tables)
@@ -49,20 +50,17 @@ def measure_borders(job: Job) -> None:
 
 def balance_table(job: Job, blocks: Blocks) -> Table:
     """Points, views, Gaussians and seconds of each block, one row each."""
-    made = read_division(job.run.blocks / "blocks.json")
+    made = read_division(job.run.division)
     rows: list[tuple[str | int | float, ...]] = []
     for number in range(len(blocks)):
         run = job.run.block(number)
-        seconds = [_seconds(run, stage) for stage in _TIMED]
+        took = stage_seconds(run)
+        seconds = [took.get(stage, math.nan) for stage in _TIMED]
         trained = sum(read_ladder(run.levels).files[-1].counts.values())
         kept = sum(n[-1] for n in read_sizes(run.interior).values())
         rows.append((number, made.points[number], made.views[number], trained, kept, *seconds))
     header = ("block", "points", "views", "Gaussians", "inside", *(f"{stage} s" for stage in _TIMED))
     return Table("Blocks", header, ("d", ",d", "d", ",d", ",d", ".1f", ".1f", ".1f", ".1f"), rows)
-
-
-def _seconds(run: RunDir, stage: str) -> float:
-    return seconds_of(run, stage) if run.provenance(stage).exists() else float("nan")
 
 
 def border_table(job: Job, blocks: Blocks, sets: dict[str, Gaussians]) -> Table:

@@ -44,7 +44,7 @@ from sagesplat.stages.results import (
     sampled_of,
     viewpoints_of,
 )
-from sagesplat.stages.shared import category_and_block, category_colors, distances
+from sagesplat.stages.shared import category_and_block, category_colors
 from sagesplat.viewer import boxes
 from sagesplat.viewer.built import check_viewer, package_viewer
 from sagesplat.viewer.bundle import (
@@ -375,7 +375,7 @@ def _target(job: Job) -> tuple[QualityKind, float] | None:
 
 def _seen_in_photos(job: Job) -> dict[int, Seen]:
     """By label id, its share of each photo (0 where it is too small) and its distance there."""
-    shares, far = _shares(job), distances(job, job.fit_config.distance)
+    shares, far = _shares(job), job.distances(job.fit_config.distance)
     nowhere, unknown = np.zeros(len(job.scene.views)), np.full(len(job.scene.views), np.nan)
     return {label: Seen(shares.get(label, nowhere), far.get(label, unknown)) for label in {*shares, *far}}
 

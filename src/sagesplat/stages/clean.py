@@ -13,6 +13,7 @@ from sagesplat.io.typed import read_json_as
 from sagesplat.raster import device_of
 from sagesplat.run.job import Job
 from sagesplat.run.stage import run_stage
+from sagesplat.stages.scene import check_not_adopted
 from sagesplat.stages.shared import inlier_inputs
 from sagesplat.train.clean import Cleaned, Criterion, check, clean, find_floaters
 
@@ -37,12 +38,15 @@ class CleanFigures:
 def clean_levels(job: Job, config: CleanConfig) -> None:
     """Write the last level without its floaters (`RunDir.cleaned`); the level itself stays as recorded."""
     run = job.run
+    check_not_adopted(run)
+    if job.has_blocks:
+        raise RunError(f"{run.blocks}: floaters are not removed from a scene in blocks; nest it as it is")
     check(config)
 
     def make() -> list[str]:
         for earlier in (run.cleaned, run.floaters_picture):
             earlier.unlink(missing_ok=True)
-        last = job.snapshots.files[-1]
+        last = job.last_level
         if config.floaters == "keep":
             write_json(run.floaters, asdict(CleanFigures(sum(last.counts.values()), {}, {}, {}, {})))
             return ["nothing is removed"]

@@ -28,6 +28,7 @@ from sagesplat.raster import device_of, rasterize
 from sagesplat.run.job import Job
 from sagesplat.scene.scene import Camera
 from sagesplat.stages.compose import classic, compose
+from sagesplat.stages.methods import method_of
 from sagesplat.stages.plan import main_plan, scene_plan
 from sagesplat.stages.shared import labels_named
 from sagesplat.train.early_stopping import spread
@@ -38,8 +39,8 @@ RasterizeMode = Literal["classic", "antialiased"]  # gsplat's names
 
 def export_increments(job: Job, folder: Path, kind: FileFormat) -> int:
     """Write what each level of each category adds as files of their own; returns how many."""
-    if job.run.ladder != "nested":
-        raise RunError(f"{job.run.path}: snapshots have no chunks; use --ladder nested")
+    if not method_of(job).streams:
+        raise RunError(f"{job.run.path}: these levels have no chunks; use --ladder nested")
     if folder.exists() and not (job.force and (folder / INDEX).exists()):
         raise RunError(f"{folder}: exists; choose a new folder (--force replaces one of chunks)")
     return len(increment_files(job, folder, kind))

@@ -18,6 +18,7 @@ from sagesplat.core.events import Progress, Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.run.job import Job
 from sagesplat.run.records import file_hash
+from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
 from sagesplat.scene.blocks import read_blocks
 from sagesplat.scene.scene import View
@@ -36,6 +37,7 @@ from sagesplat.segment.lift import LiftedLabels, lift
 from sagesplat.segment.masks import Masks, Taxonomy, prepare_folder, write_mask
 from sagesplat.segment.parents import write_parents
 from sagesplat.stages.label import later_merges, segmenter_kind
+from sagesplat.stages.scene import check_not_adopted
 from sagesplat.train.instances import Instances, gather, label
 
 _LISTED = 8  # instances that are named in a line
@@ -78,9 +80,24 @@ def _check_seen(job: Job) -> None:
         )
 
 
-def make_instances(job: Job, labels: LabelsConfig) -> None:
-    """Find the 3D instances of some categories; draw label images of all views and label the points."""
+def make_instances(job: Job, masks: MasksConfig, labels: LabelsConfig) -> None:
+    """Find the 3D instances of some categories; draw label images of all views and label the points.
+
+    Where none are asked for, those of an earlier command become parts of their categories again; RunError
+    without --force.
+    """
     run = job.run
+    check_not_adopted(run)
+    if not labels.instances:
+        if run.instances.exists():
+            if not job.force:
+                raise RunError(
+                    f"{run.instances}: instances were told apart; name the same --labels.instances, or add "
+                    "--force to fold them back into their categories"
+                )
+            _remove(run)
+        return
+    find_photo_instances(job, masks, labels)
     wanted = parse_instances(labels.instances)
     merge = later_merges(run, labels)
     outputs = [run.instances / "labels.json", run.instance_labels]
@@ -92,10 +109,10 @@ def make_instances(job: Job, labels: LabelsConfig) -> None:
         stages.append("block_categories")
 
     def make() -> list[str]:
-        _remove(job)
+        _remove(run)
         masks = job.category_masks
         ids = wanted_ids(masks.taxonomy.names, wanted)
-        g = job.snapshots.load(job.snapshots.levels[-1])
+        g = job.load_last_level()
         if job.has_blocks:
             g = replace(g, label_ids=torch.from_numpy(_parts(job, masks).category_ids(g.label_ids.numpy())))
         found = _find(job, g, masks, ids)
@@ -119,25 +136,11 @@ def make_instances(job: Job, labels: LabelsConfig) -> None:
     run_stage(job, "instances", settings, inputs, outputs, make)
 
 
-def fold_back(job: Job) -> None:
-    """Make the instances of an earlier command parts of their categories again; RunError without --force."""
-    if not job.run.instances.exists():
-        return
-    if not job.force:
-        raise RunError(
-            f"{job.run.instances}: instances were told apart; name the same --labels.instances, or add "
-            "--force to fold them back into their categories"
-        )
-    _remove(job)
-
-
-def _remove(job: Job) -> None:
-    run = job.run
+def _remove(run: RunDir) -> None:
     run.provenance("instances").unlink(missing_ok=True)
     run.parents.unlink(missing_ok=True)
     for folder in (run.instances, run.block_instances):
         shutil.rmtree(folder, ignore_errors=True)
-    job.__dict__.pop("parents", None)
 
 
 def _find(job: Job, g: Gaussians, masks: Masks, ids: list[int]) -> Instances:
@@ -203,7 +206,7 @@ def _draw(
 
 def _parts(job: Job, masks: Masks) -> BlockCategories:
     """The (block, category) pairs of the categories of `masks`."""
-    return BlockCategories(masks.taxonomy, len(read_blocks(job.run.blocks / "blocks.json")))
+    return BlockCategories(masks.taxonomy, len(read_blocks(job.run.division)))
 
 
 def _split_by_block(job: Job, before: Masks, instances: Masks, points: LiftedLabels) -> None:
@@ -216,7 +219,7 @@ def _split_by_block(job: Job, before: Masks, instances: Masks, points: LiftedLab
     views = job.scene.views
     for view, path in zip(views, prepare_folder(run.block_instances, views), strict=True):
         write_mask(path, parts.ids(instances[view], of_categories.block_of(by_block[view])), parts.names)
-    block = read_blocks(run.blocks / "blocks.json").of(job.scene.points.xyz)
+    block = read_blocks(run.division).of(job.scene.points.xyz)
     labels = replace(points, label_ids=parts.ids(points.label_ids, block))
     labels.write(run.block_instances / "labels.npz")
     parts.names.write(run.block_instances / "labels.json")

@@ -39,6 +39,7 @@ from sagesplat.segment.segmenters import segment_some
 from sagesplat.segment.valid import ValidPixels, write_valid
 from sagesplat.stages.memory import check_network
 from sagesplat.stages.prompts import MASKS, Scores, Timed, load, prompt_lines, settings_of
+from sagesplat.stages.scene import check_not_adopted
 from sagesplat.train.fuse import fuse
 
 _MARKER = ".network.json"
@@ -235,6 +236,7 @@ def _segment_some(job: Job, part: tuple[Sequence[int], MasksConfig, str, bool]) 
 def lift_labels(job: Job) -> None:
     """Vote the label images onto the SfM points."""
     run = job.run
+    check_not_adopted(run)
 
     def make() -> list[str]:
         if not len(job.given_scene.points.track_points):
@@ -255,10 +257,11 @@ def lift_labels(job: Job) -> None:
 def fuse_masks(job: Job) -> None:
     """Let the label images of all training views vote on the trained Gaussians, and draw the votes back."""
     run = job.run
+    check_not_adopted(run)
 
     def make() -> list[str]:
         shutil.rmtree(run.fused, ignore_errors=True)
-        g = job.snapshots.load(job.snapshots.levels[-1])
+        g = job.load_last_level()
         fused = fuse(
             g, job.scene, job.masks, run.fused,
             valid=job.valid, antialiased=job.antialiased, backend=job.backend,

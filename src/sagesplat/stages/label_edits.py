@@ -30,7 +30,7 @@ from sagesplat.stages.plan import make_plan
 from sagesplat.stages.refit import refit
 from sagesplat.stages.regroup import measure, move_labels, move_levels
 from sagesplat.stages.results import increments_of
-from sagesplat.stages.view import _is_finished
+from sagesplat.stages.view import is_finished
 
 # what a run begins with, as it is; label images, point labels and levels are written anew
 _KEPT = (
@@ -43,7 +43,6 @@ _OF_LADDER = (
     "models.json", "promises.json", "plan.json", "provenance",
 )  # fmt: skip
 _MEASURED = ("nest", "observe", "sample", "fit", "plan")  # stages in their order, each recorded again
-_LATER = ("compose", "evaluate", "report", "crossview", "same_size", "paper", "base")
 
 
 @dataclass(frozen=True)
@@ -85,7 +84,7 @@ def apply_labels(
     path = edits or job.run.path / FILE
     out = (out or job.run.path.resolve().with_name(f"{job.run.path.resolve().name}-edited")).resolve()
     job = replace(job, run=replace(job.run, ladder="nested"), locks=None)
-    if not _is_finished(job.run):
+    if not is_finished(job.run):
         raise RunError(f"{job.run.path}: not finished; run `sagesplat run` again, then apply the edits")
     found = read_edits(path)
     made = _checked(job, found, path)
@@ -156,9 +155,10 @@ def _begin(job: Job, fresh: Path, edits: LabelEdits, made: Relabelled) -> Job:
                 shutil.copytree(source / name, target / name, dirs_exist_ok=True)
             elif (source / name).exists():
                 shutil.copy2(source / name, target / name)
-    for stage in _LATER:
-        new.provenance(stage).unlink(missing_ok=True)
-    if job.has_instances:
+    for earlier in (new.adapted / "provenance").glob("*.json"):
+        if earlier.stem not in _MEASURED:
+            earlier.unlink()
+    if job.run.has_instances:
         _keep_instances_alone(job.run, new)
     if job.has_block_categories:  # they keep their names
         shutil.copytree(job.run.block_labels, new.block_categories)
@@ -201,13 +201,9 @@ def _make(job: Job, new: Job, made: Relabelled) -> bool:
     _sign(new.run, "sample")
     refit(job, new, fit, made.changed)
     _sign(new.run, "fit")
-    make_plan(new, _weighed(known.get("plan", PlanConfig()), made))
+    plan: PlanConfig = known.get("plan", PlanConfig())
+    make_plan(new, replace(plan, weights=made.weights if plan.budget else {}))
     return rendered
-
-
-def _weighed(plan: PlanConfig, made: Relabelled) -> PlanConfig:
-    """The plan's settings with the weights that the edited run has; only a budget uses them."""
-    return replace(plan, weights=made.weights if plan.budget else {})
 
 
 def _sign(run: RunDir, stage: str, more: Sequence[Path] = ()) -> None:

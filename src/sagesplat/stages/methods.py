@@ -1,12 +1,13 @@
-"""How a scene is adapted: the paper's snapshots or nested levels, behind one protocol.
+"""How a scene is adapted: nested levels here, the paper's in `stages.snapshots`, behind one protocol.
 
 Stages and studies ask `method_of` what they need and never which of the two it is.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
@@ -14,27 +15,26 @@ from sagesplat.adapt.bound_plans import Costs, Quality, plan_for_view, plan_with
 from sagesplat.adapt.coverage import Decisions, score
 from sagesplat.adapt.eq3 import SsimModel
 from sagesplat.adapt.fidelity import shown_enough
-from sagesplat.adapt.observe import LabelImages, Observations
-from sagesplat.adapt.plan import Plan, plan_scene, plan_view
+from sagesplat.adapt.observe import LabelImages, Observations, RenderedLabels
+from sagesplat.adapt.plan import Plan
 from sagesplat.adapt.scene_plans import mended, plan_for_scene
-from sagesplat.adapt.viewpoint import QualityKind, write_promises
-from sagesplat.core.config import FitConfig, PlanConfig
+from sagesplat.adapt.viewpoint import QualityKind, ViewModel, write_promises
+from sagesplat.core.config import FitConfig, LadderKind, PlanConfig
 from sagesplat.core.errors import RunError
 from sagesplat.formats.increments import INDEX, totals
 from sagesplat.run.job import Job
-from sagesplat.scene.scene import Camera
+from sagesplat.scene.scene import Camera, View
 from sagesplat.segment.masks import UNLABELLED
 from sagesplat.stages.fidelity import compositions_at, fit_drawn
 from sagesplat.stages.results import (
     fidelity_of,
     has_photos,
     increments_of,
-    models_of,
     promises_of,
     sampled_of,
     viewpoints_of,
 )
-from sagesplat.stages.shared import distances, label_named, observed
+from sagesplat.stages.shared import distances_from, label_named, observed, rendered_labels
 from sagesplat.stages.viewpoints import fit_viewpoints
 
 _MENDINGS = 4  # times that a plan of a scene is measured in its composition and mended
@@ -44,12 +44,17 @@ Curves = Mapping[tuple[int, int], SsimModel]  # Eq. 3 by (label id, level)
 class Method(Protocol):
     """Levels of a run, what predicts their SSIM, and what they cost. The levels themselves: `Job.ladder`."""
 
+    default_target: ClassVar[dict[str, float]]  # of `PlanConfig`, where none is given
+    has_fidelity: ClassVar[bool]  # whether levels are compared with the full model too
+    has_instances: ClassVar[bool]  # whether instances can be categories of their own
+    streams: ClassVar[bool]  # whether a viewer can load the levels
     level_files: Sequence[Path]  # what the levels are read from
     sample_files: Sequence[Path] = ()  # what `sample` leaves
     model_files: Sequence[Path]  # what `fit` leaves
     files: Sequence[Path]  # what a plan, and all that is made from it, depends on
     fit_settings: tuple[str, ...]  # fields of FitConfig that the models depend on
-    streams: bool  # whether a viewer can load the levels
+
+    def __init__(self, job: Job) -> None: ...
 
     def fit(self, table: Observations, config: FitConfig, curves: Curves) -> list[str]:
         """Fit what there is beside Eq. 3; `table`: of views that show enough of a category."""
@@ -64,6 +69,10 @@ class Method(Protocol):
 
     def plan_view(self, row: int, target: float, quality: QualityKind = "ssim") -> Plan:
         """The cheapest levels predicted to reach `target` in a view, seen or not."""
+        ...
+
+    def plan_camera(self, camera: Camera, target: float, quality: QualityKind) -> Plan:
+        """The same from any camera."""
         ...
 
     def plan_scene(self, target: float, share: float, quality: QualityKind = "ssim") -> Plan:
@@ -96,70 +105,12 @@ class Method(Protocol):
         return None
 
 
-class Snapshots(Method):
-    """The paper's: snapshots of the training, Eq. 3 over distance, the fewest Gaussians (Eq. 1)."""
-
-    fit_settings = ()
-    streams = False
-
-    def __init__(self, job: Job) -> None:
-        self.job = job
-        self.level_files, self.model_files = [job.run.levels], [job.run.models]
-        self.files = [*self.level_files, *self.model_files]
-
-    @cached_property
-    def _models(self) -> Curves:
-        return models_of(self.job)
-
-    @cached_property
-    def _distances(self) -> dict[int, np.ndarray]:
-        return distances(self.job, self.job.fit_config.distance)
-
-    @cached_property
-    def _training_distances(self) -> dict[int, np.ndarray]:
-        """Of the training views that show enough of a category, by label id."""
-        seen = _training_rows(self.job)
-        return {label: seen.distance[seen.label_id == label] for label, _ in self.job.ladder.counts}
-
-    def check(self, config: PlanConfig) -> None:
-        """See `Method`."""
-        if config.budget:
-            self.plan_budget(config)
-
-    def predicted(self, quality: QualityKind, label_id: int, level: int, row: int) -> float:
-        """See `Method`."""
-        model = self._models.get((label_id, level))
-        return model(self._distance(label_id, row)) if model else np.nan
-
-    def _distance(self, label_id: int, row: int) -> float:
-        return float(self._distances[label_id][row]) if label_id in self._distances else np.nan
-
-    def plan_view(self, row: int, target: float, quality: QualityKind = "ssim") -> Plan:
-        """See `Method`."""
-        ladder = self.job.ladder
-        here = {label: self._distance(label, row) for label in self._distances}
-        return plan_view(self._models, ladder.counts, here, target, row, recovering=ladder.recovering)
-
-    def plan_scene(self, target: float, share: float, quality: QualityKind = "ssim") -> Plan:
-        """See `Method`."""
-        ladder, far = self.job.ladder, self._training_distances
-        return plan_scene(self._models, ladder.counts, far, target, share, recovering=ladder.recovering)
-
-    def plan_budget(self, config: PlanConfig) -> Plan:
-        """See `Method`."""
-        raise RunError("--budget needs the nested ladder; use --ladder nested")
-
-    def amount(self, plan: Plan) -> str:
-        """See `Method`."""
-        full = self.job.ladder.size(self.job.ladder.levels[-1])
-        return f"{plan.count:,} of {full:,} Gaussians"
-
-
 class NestedLevels(Method):
     """Ours: prefixes of one model, lower bounds of two qualities by viewpoint, the fewest bytes."""
 
+    default_target: ClassVar[dict[str, float]] = {"target_fidelity": 0.95}
+    has_fidelity = has_instances = streams = True
     fit_settings = ("confidence",)
-    streams = True
 
     def __init__(self, job: Job) -> None:
         run = job.run
@@ -186,14 +137,24 @@ class NestedLevels(Method):
         return Costs(tuple(labels), *columns)
 
     @cached_property
+    def fidelity(self) -> dict[int, ViewModel]:
+        """Models of fidelity by label id."""
+        return fidelity_of(self.job)
+
+    @cached_property
+    def promises(self) -> dict[int, ViewModel]:
+        """Models of SSIM against photos by label id."""
+        return promises_of(self.job)
+
+    @cached_property
     def qualities(self) -> dict[QualityKind, Quality]:
         """What is predicted of the levels in every view of the scene."""
         job = self.job
-        far = distances(job, job.fit_config.distance)
+        far = job.distances(job.fit_config.distance)
         cameras = [view.camera for view in job.scene.views]
         return {
-            "fidelity": quality_at(self.costs, fidelity_of(job), far, cameras, "fidelity"),
-            "ssim": quality_at(self.costs, promises_of(job), far, cameras, "ssim"),
+            "fidelity": quality_at(self.costs, self.fidelity, far, cameras, "fidelity"),
+            "ssim": quality_at(self.costs, self.promises, far, cameras, "ssim"),
         }
 
     @cached_property
@@ -256,6 +217,20 @@ class NestedLevels(Method):
     def plan_view(self, row: int, target: float, quality: QualityKind = "ssim") -> Plan:
         """See `Method`."""
         return plan_for_view(self.qualities[quality], self.costs, target, row, self.shown[row])
+
+    def plan_camera(self, camera: Camera, target: float, quality: QualityKind) -> Plan:
+        """See `Method`."""
+        job, models = self.job, self.fidelity if quality == "fidelity" else self.promises
+        found = quality_at(self.costs, models, distances_from(job, camera), [camera], quality)
+        pixels = None
+        if quality == "fidelity":
+            image = self._full_model[View("", camera, Path())]
+            pixels = np.array([(image == label).sum() for label in self.costs.labels], np.float64)
+        return replace(plan_for_view(found, self.costs, target, 0, pixels), view=None)
+
+    @cached_property
+    def _full_model(self) -> RenderedLabels:
+        return rendered_labels(self.job)
 
     def plan_scene(self, target: float, share: float, quality: QualityKind = "ssim") -> Plan:
         """See `Method`."""
@@ -320,16 +295,16 @@ class NestedLevels(Method):
     def coverage(self, targets: Sequence[float]) -> Decisions | None:
         """See `Method`; every category at the same level, costs in transfer bytes."""
         job, costs = self.job, self.bytes_to_send
-        return score(observed(job), job.scene, promises_of(job), costs, targets)
+        return score(observed(job), job.scene, self.promises, costs, targets)
 
 
-def _training_rows(job: Job) -> Observations:
-    """A row for each training view that shows enough of a category; what it measures is of the last level."""
-    table = observed(job)
-    last = table.level == job.ladder.levels[-1]
-    return table.select(last & np.isin(table.view, job.scene.train_ids))
+def method_for(ladder: LadderKind) -> type[Method]:
+    """The method of a kind of levels."""
+    from sagesplat.stages.snapshots import Snapshots  # which needs the protocol
+
+    return NestedLevels if ladder == "nested" else Snapshots
 
 
 def method_of(job: Job) -> Method:
     """The method of the run's ladder."""
-    return (NestedLevels if job.run.ladder == "nested" else Snapshots)(job)
+    return method_for(job.run.ladder)(job)

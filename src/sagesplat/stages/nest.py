@@ -15,7 +15,7 @@ from sagesplat.run.job import Job
 from sagesplat.run.records import checkpoint_key
 from sagesplat.run.stage import run_stage
 from sagesplat.stages.memory import check_nest
-from sagesplat.stages.shared import inlier_inputs, label_image_inputs, sky_inputs, train_config
+from sagesplat.stages.shared import existing, inlier_inputs, label_image_inputs, train_config
 from sagesplat.train import nested
 from sagesplat.train.base_model import merged_start
 from sagesplat.train.checkpoint import can_resume, remove_checkpoints
@@ -64,8 +64,7 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
         remove_checkpoints(run.nest_checkpoint)
         return lines
 
-    made = [run.provenance("train"), *label_image_inputs(run), *sky_inputs(run)]
-    made += [run.cleaned] if run.cleaned.exists() else []
+    made = [run.provenance("train"), *label_image_inputs(run), *existing(run.sky, run.cleaned)]
     inputs = [*run.scene_files, run.labels, run.levels, *made]
     if config.base_share:
         _make_base_model(job, config, seed)
@@ -76,12 +75,11 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
 def _make_base_model(job: Job, config: NestConfig, seed: int) -> None:
     """Train the small model that the ladder begins with: a stage, so that a killed run has it already."""
     run, made = job.run, train_config(job)
-    full = job.snapshots.size(job.snapshots.levels[-1])  # with floaters: the size is that of what is trained
+    full = job.recorded.size(job.last_level.step)  # with floaters: the size is that of what is trained
     cap = max(1, round(config.base_share * full))
     settings = {**asdict(nested.capped_config(made, cap, config.base_steps)), "seed": seed, "start": "merged"}
 
-    cleaned = [run.cleaned] if run.cleaned.exists() else []
-    inputs = [*run.scene_files, run.labels, run.levels, *cleaned, *inlier_inputs(run), *sky_inputs(run)]
+    inputs = [*run.scene_files, run.labels, run.levels, *inlier_inputs(run), *existing(run.cleaned, run.sky)]
 
     def make() -> list[str]:
         views = job.inliers.rows(job.scene, job.scene.train_ids)

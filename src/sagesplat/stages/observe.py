@@ -14,7 +14,7 @@ from sagesplat.run.remote import work_all
 from sagesplat.run.stage import run_stage
 from sagesplat.segment.display_names import titles
 from sagesplat.stages.methods import method_of
-from sagesplat.stages.shared import _show, distances, label_image_inputs
+from sagesplat.stages.shared import label_image_inputs
 
 
 def observe_levels(job: Job, config: FitConfig) -> None:
@@ -25,7 +25,8 @@ def observe_levels(job: Job, config: FitConfig) -> None:
         table = observed_views(job, config)
         table.write_csv(run.observations)
         seen = table.select(np.isin(table.view, job.scene.train_ids))
-        _show(job, tables.ladder_table(seen, job.ladder.counts, job.ladder.recovering, titles(job.names())))
+        names = titles(job.names())
+        job.emit(tables.ladder_table(seen, job.ladder.counts, job.ladder.recovering, names).event)
         exposed = any(view.camera.exposure is not None for view in job.scene.views)
         how = ", rendered with the exposure of their photos" if exposed else ""
         return [
@@ -41,7 +42,7 @@ def observe_levels(job: Job, config: FitConfig) -> None:
 
 def observed_views(job: Job, config: FitConfig, labels: Collection[int] | None = None) -> Observations:
     """The observations of all categories in all views, or of some alone (ids), divided among who compute."""
-    far = distances(job, config.distance)
+    far = job.distances(config.distance)
     parts = [(rows, far, labels) for rows in split(range(len(job.scene.views)), job.pieces)]
     return merge(work_all(job, "observe", _observe_views, parts))
 

@@ -4,15 +4,11 @@ import math
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from sagesplat.core.config import (
     AdoptConfig,
     BlocksConfig,
-    CleanConfig,
-    FitConfig,
     LabelsConfig,
-    MasksConfig,
     NestConfig,
     PlanConfig,
     RunConfig,
@@ -23,28 +19,24 @@ from sagesplat.core.events import Emit, Progress, StageDone, StageStarted
 from sagesplat.demo.capture import cached_capture
 from sagesplat.demo.wild import EVERYTHING, NOTHING, Wild
 from sagesplat.run.job import Job
-from sagesplat.run.recorded import recorded_settings
-from sagesplat.run.run_dir import RunDir
 from sagesplat.stages import blocks
 from sagesplat.stages.adopt import open_splat
 from sagesplat.stages.adopt_levels import make_levels
-from sagesplat.stages.boundaries import measure_borders
+from sagesplat.stages.block_levels import nest_scene
 from sagesplat.stages.clean import clean_levels
 from sagesplat.stages.compose import compose_plan
 from sagesplat.stages.estimate import tell_duration
 from sagesplat.stages.evaluate import evaluate_plans
 from sagesplat.stages.fit import fit_ladder
-from sagesplat.stages.instances import find_photo_instances, fold_back, make_instances
+from sagesplat.stages.instances import find_photo_instances, make_instances
 from sagesplat.stages.label import fuse_masks, lift_labels, make_masks
 from sagesplat.stages.methods import method_of
-from sagesplat.stages.nest import nest_levels
 from sagesplat.stages.observe import observe_levels
 from sagesplat.stages.plan import check_targets, make_plan
 from sagesplat.stages.preflight import check_segmenter, check_training
 from sagesplat.stages.report import make_report
 from sagesplat.stages.sample import sample_levels
 from sagesplat.stages.scene import check_not_adopted, open_scene
-from sagesplat.stages.train import train_levels
 from sagesplat.train import nested
 from sagesplat.train.clean import check as check_clean
 
@@ -82,7 +74,8 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
     check_targets(config.plan, config.ladder)  # before hours of training
     nested.check(config.nest)
     check_clean(config.clean)
-    check_instances(config)
+    if config.labels.instances and not method_of(job).has_instances:
+        raise RunError("--labels.instances: these levels have no instances; use --ladder nested")
     blocks.check(config.blocks, config.train)
     check_segmenter(job, scene, config.masks)
     open_scene(job, scene, config.scene, config.poses, config.masks, config.labels)
@@ -93,19 +86,19 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
         find_photo_instances(job, config.masks, config.labels)
     lift_labels(job)
     tell_duration(job, config)
-    train(job, config.train, config.blocks, config.seed)
+    blocks.train_scene(job, config.train, config.blocks, config.seed)
     if config.fuse:
         fuse_masks(job)
     elif job.run.fused.exists():
         raise RunError(f"{job.run.fused}: label images were fused; add --fuse, or delete that folder")
     if job.has_blocks:
         blocks.label_block_categories(job)
-    instances(job, config.labels, config.masks)
+    make_instances(job, config.masks, config.labels)
     if job.run.ladder == "nested":
         if not job.has_blocks:
-            clean(job, config.clean)
-        nest(job, config.nest, config.blocks, config.seed)
-    _promise(job, config)
+            clean_levels(job, config.clean)
+        nest_scene(job, config.nest, config.blocks, config.seed)
+    measure_and_plan(job, config)
 
 
 def adopt(job: Job, source: Path, adopted: AdoptConfig, config: RunConfig) -> None:
@@ -124,10 +117,10 @@ def adopt(job: Job, source: Path, adopted: AdoptConfig, config: RunConfig) -> No
     open_splat(job, source, adopted, config.scene, config.masks, config.labels)
     method_of(job).check(config.plan)
     make_levels(job, adopted)
-    _promise(job, config)
+    measure_and_plan(job, config)
 
 
-def _promise(job: Job, config: RunConfig) -> None:
+def measure_and_plan(job: Job, config: RunConfig) -> None:
     """From the levels to the report."""
     observe_levels(job, config.fit)
     sample_levels(job, config.sample, config.fit)
@@ -136,80 +129,6 @@ def _promise(job: Job, config: RunConfig) -> None:
     compose_plan(job)
     evaluate_plans(job)
     make_report(job)
-
-
-def observe_snapshots(job: Job) -> None:
-    """Measure the training snapshots of a run, as its levels were measured; `job` is one on the snapshots."""
-    check_not_adopted(job.run)
-    observe_levels(job, _recorded(job).get("fit", FitConfig()))
-
-
-def adapt_snapshots(job: Job) -> None:
-    """Measure, model and plan the training snapshots of a run, with the settings that it was made with.
-
-    `job` is one on the snapshots. Stages that are done are skipped.
-    """
-    check_not_adopted(job.run)
-    known = _recorded(job)
-    fit: FitConfig = known.get("fit", FitConfig())
-    observe_levels(job, fit)
-    fit_ladder(job, fit)
-    plan: PlanConfig = known.get("plan", PlanConfig())
-    others = plan.other_targets if plan.quality == "ssim" else None  # snapshots have no fidelity
-    make_plan(job, replace(plan, target_fidelity=None, other_targets=others, budget=0.0, weights={}))
-
-
-def _recorded(job: Job) -> dict[str, Any]:
-    """What the run records of its snapshots, else of its nested levels."""
-    nested_levels = recorded_settings(RunDir(job.run.path, "nested"))
-    return nested_levels | recorded_settings(RunDir(job.run.path, "snapshots"))
-
-
-def train(job: Job, config: TrainConfig, of_blocks: BlocksConfig, seed: int) -> None:
-    """Train the scene as one, or in blocks."""
-    check_not_adopted(job.run)
-    if of_blocks.count > 1:
-        blocks.train_blocks(job, of_blocks, config, seed)
-    elif job.has_blocks:
-        raise RunError(f"{job.run.blocks}: this run is in blocks; add --blocks.count, or begin another run")
-    else:
-        train_levels(job, config, seed)
-
-
-def instances(job: Job, labels: LabelsConfig, masks: MasksConfig) -> None:
-    """Tell instances apart, or make those of an earlier command parts of their categories again."""
-    check_not_adopted(job.run)
-    if labels.instances:
-        find_photo_instances(job, masks, labels)
-        make_instances(job, labels)
-    else:
-        fold_back(job)
-
-
-def check_instances(config: RunConfig) -> None:
-    """RunError for settings that instances cannot be told apart with."""
-    if not config.labels.instances:
-        return
-    if config.ladder == "snapshots":
-        raise RunError("--labels.instances: snapshots have no instances; use --ladder nested")
-
-
-def clean(job: Job, config: CleanConfig) -> None:
-    """Remove floaters from the last level of a training."""
-    check_not_adopted(job.run)
-    if job.has_blocks:
-        raise RunError(f"{job.run.blocks}: floaters are not removed from a scene in blocks; nest it as it is")
-    clean_levels(job, config)
-
-
-def nest(job: Job, config: NestConfig, of_blocks: BlocksConfig, seed: int) -> None:
-    """Make the nested ladder of a trained scene, or of its blocks."""
-    check_not_adopted(job.run)
-    if job.has_blocks:
-        blocks.nest_blocks(job, of_blocks, config, seed)
-        measure_borders(job)
-    else:
-        nest_levels(job, config, seed)
 
 
 def demo_capture(emit: Emit, places: tuple[int, int] = (1, 1), wild: Wild = NOTHING) -> Path:

@@ -1,31 +1,33 @@
 """Makes plans: a level per category, for the scene, for views, within a budget."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 from sagesplat.adapt.plan import Plan, check_target, quality_title, write_plans
 from sagesplat.adapt.viewpoint import QualityKind
-from sagesplat.core.config import PlanConfig
+from sagesplat.core.config import LadderKind, PlanConfig
 from sagesplat.core.errors import RunError
 from sagesplat.output.tables import plan_table
 from sagesplat.run.job import Job
 from sagesplat.run.records import settings_of
-from sagesplat.run.run_dir import LadderKind, RunDir
+from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
 from sagesplat.segment.display_names import titles
-from sagesplat.stages.methods import method_of
+from sagesplat.stages.methods import method_for, method_of
 from sagesplat.stages.results import budget_plan_of, plans_of
-from sagesplat.stages.shared import _show, label_image_inputs
+from sagesplat.stages.shared import label_image_inputs
 
 PAPER_TARGETS = (0.6, 0.7, 0.8)  # SSIM, where a run has no such target of its own
 
 
 def check_targets(config: PlanConfig, ladder: LadderKind) -> PlanConfig:
     """The settings with their targets filled in; RunError where these levels cannot be planned for them."""
-    config = config.with_target(ladder)
+    method = method_for(ladder)
+    if config.target_fidelity is None and config.target_ssim is None:
+        config = replace(config, **method.default_target)
     for quality, target in config.all_targets:
         check_target(target, quality)
-    if ladder == "snapshots" and config.target_fidelity is not None:
-        raise RunError("--target-fidelity needs the nested ladder; give --target-ssim for snapshots")
+    if config.target_fidelity is not None and not method.has_fidelity:
+        raise RunError("--target-fidelity needs the nested ladder; give --target-ssim")
     return config
 
 
@@ -67,12 +69,9 @@ def show_plan(job: Job) -> None:
             "of full model",
             f"promised {quality_title(plan.quality)}",
         )
-        reached = (
-            ("reached in", "from", "to", "views")
-            if plan.budget is None and job.run.ladder == "nested"
-            else ()
-        )
-        _show(job, table.only(*columns, *reached, "status"))
+        counted = plan.budget is None and method_of(job).streams
+        reached = ("reached in", "from", "to", "views") if counted else ()
+        job.emit(table.only(*columns, *reached, "status").event)
 
 
 def main_target(run: RunDir) -> tuple[QualityKind, float]:

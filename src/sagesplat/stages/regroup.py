@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 
 from sagesplat.adapt.fidelity import distances_at, write_sampled
 from sagesplat.adapt.ladder import PrefixLadder
-from sagesplat.adapt.observe import RenderedLabels, merge
+from sagesplat.adapt.observe import merge
 from sagesplat.adapt.regroup import regrouped, regrouped_observations, regrouped_samples
 from sagesplat.core.config import FitConfig
 from sagesplat.core.events import Progress
@@ -31,7 +31,7 @@ from sagesplat.segment.relabel import Relabelled
 from sagesplat.stages.observe import observed_views
 from sagesplat.stages.results import observations_of, sampled_of, viewpoints_of
 from sagesplat.stages.sample import measured_levels
-from sagesplat.stages.shared import distances
+from sagesplat.stages.shared import rendered_labels
 
 
 def move_levels(job: Job, new: Job, made: Relabelled) -> None:
@@ -115,7 +115,7 @@ def move_labels(job: Job, new: Job, made: Relabelled) -> None:
 
 def _label_folders(job: Job, new: Job) -> list[tuple[Path, Path]]:
     """Folders of label images and where they go: those of instances are the only ones of an edited run."""
-    if job.has_instances:
+    if job.run.has_instances:
         return [(job.run.instances, new.run.masks)]
     both = [(job.run.masks, new.run.masks), (job.run.fused, new.run.fused)]
     return [(source, target) for source, target in both if (source / "labels.json").exists()]
@@ -130,7 +130,7 @@ def _move_pixels(job: Job, new: Job, made: Relabelled, taxonomy: Taxonomy) -> No
             split[old] = np.unique(made.new_ids[old])
         else:
             table[old + 1] = moved
-    painted = _painted(new) if split else None
+    painted = rendered_labels(new) if split else None
     for source, target in _label_folders(job, new):
         masks = Masks(source, Taxonomy.read(source / "labels.json"))
         for done, view in enumerate(job.scene.views):
@@ -144,11 +144,6 @@ def _move_pixels(job: Job, new: Job, made: Relabelled, taxonomy: Taxonomy) -> No
                         pixels[mine] = _nearest(shown, mine, parts)
             write_mask(mask_path(target, view), pixels, taxonomy)
             job.emit(Progress("labels", done + 1, len(job.scene.views)))
-
-
-def _painted(new: Job) -> RenderedLabels:
-    ladder = new.ladder
-    return RenderedLabels(ladder.load(ladder.levels[-1]), new.backend, new.antialiased)
 
 
 def _nearest(painted: np.ndarray, mine: np.ndarray, parts: np.ndarray) -> np.ndarray:
@@ -211,6 +206,6 @@ def _observe(
     table = observations_of(job)
     # rows of categories without Gaussians keep their label
     rest = {label: label for label in np.unique(table.label_id).tolist() if label not in moved}
-    known = regrouped_observations(table, {**rest, **moved}, distances(new, fit.distance))
+    known = regrouped_observations(table, {**rest, **moved}, new.distances(fit.distance))
     parts = [known, observed_views(new, fit, fresh)] if fresh else [known]
     merge(parts).write_csv(new.run.observations)

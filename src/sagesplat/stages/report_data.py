@@ -7,6 +7,7 @@ import platform
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from sagesplat.adapt.ladder import PrefixLadder
 from sagesplat.adapt.observe import as_unit, measure_total, render_rgb
 from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.adapt.viewpoints import SETS
+from sagesplat.core.config import LadderKind
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.pictures import open_picture
 from sagesplat.output.figures import Panel
@@ -24,8 +26,9 @@ from sagesplat.output.place_figures import Place
 from sagesplat.output.report_data import PromiseFacts, ReportData
 from sagesplat.run.capture import read_capture
 from sagesplat.run.job import Job
-from sagesplat.run.records import read_record, settings_of
+from sagesplat.run.records import read_record, settings_of, uses
 from sagesplat.run.run_dir import RunDir
+from sagesplat.run.stage_table import STAGES, needed_for
 from sagesplat.scene import describe
 from sagesplat.segment.block_categories import category_of
 from sagesplat.segment.display_names import titles
@@ -45,10 +48,6 @@ from sagesplat.stages.shared import label_colors
 from sagesplat.viewer.frames import FLIP, upward
 
 PANELS = 3  # views shown in pictures
-STAGES = (
-    *("adopt", "poses", "scene", "segment", "masks", "lift", "train", "clean", "fuse"),
-    *("nest", "observe", "sample", "fit", "plan", "compose", "evaluate"),
-)
 
 
 def report_data(
@@ -140,9 +139,14 @@ def _adopted(job: Job, ladder: PrefixLadder) -> list[tuple[str, str]]:
 
 def stage_records(run: RunDir) -> list[Path]:
     """The records of the stages that a run's results were made by: not of one whose result was deleted."""
-    without = set() if (run.fused / "labels.json").exists() else {"fuse"}
-    without |= {"clean"} if run.ladder != "nested" else set()  # snapshots are as training recorded them
-    return [path for s in STAGES if s not in without and (path := run.provenance(s)).exists()]
+    made = needed_for("report")
+    if not (run.fused / "labels.json").exists():
+        made.remove("fuse")
+    if run.ladder != "nested":  # levels are as training recorded them, of categories
+        made -= {"clean", "instances", "photo_instances"}
+    elif not uses(run, "nest", run.base_model):
+        made.remove("base")
+    return [path for stage in STAGES if stage in made and (path := run.provenance(stage)).exists()]
 
 
 def _parts(run: RunDir, names: dict[int, str]) -> dict[int, int]:
@@ -172,8 +176,10 @@ def links(run: RunDir) -> list[tuple[str, str]]:
     """What else was made of a run, by title: addresses relative to its report."""
     pages = [
         ("Its bundle, for any static web server", run.path / "bundle"),
-        ("The paper's tables and figures, of training snapshots", RunDir(run.path, "snapshots").paper),
-        ("The paper's tables and figures, of nested levels", RunDir(run.path, "nested").paper),
+    ]
+    pages += [
+        (f"The paper's tables and figures, --ladder {kind}", RunDir(run.path, kind).paper)
+        for kind in get_args(LadderKind)
     ]
     found = [(title, folder / "index.html") for title, folder in pages]
     return [(title, os.path.relpath(path, run.report)) for title, path in found if path.is_file()]

@@ -53,9 +53,10 @@ def sample_levels(job: Job, config: SampleConfig, fit: FitConfig) -> None:
     rule = _checked(config)  # before an earlier result is given up
 
     def make() -> list[str]:
-        base, source = _base_cameras(job, config)
+        own, given = capture_cameras(job.scene), config.viewpoints
+        base = own if given is None else read_cameras(given, own[0])
         counts = _counts(job, config)
-        drawn = draw(job.scene, base, rule, counts, source)
+        drawn = draw(job.scene, base, rule, counts, given.name if given else "capture")
         table, used = _until_it_stops_shrinking(job, drawn, fit, bool(config.views))
         rows = np.sort(np.concatenate([drawn.rows("fit")[:used], drawn.rows("bias", "calibration")]))
         drawn = replace(
@@ -85,14 +86,6 @@ def _checked(config: SampleConfig) -> Rule:
     rule = Rule(_SEED, config.neighbours, config.shift, config.turn)
     rule.check()
     return rule
-
-
-def _base_cameras(job: Job, config: SampleConfig) -> tuple[list[Camera], str]:
-    """The cameras to draw from, and where they are from."""
-    own = capture_cameras(job.scene)
-    if config.viewpoints is None:
-        return own, "capture"
-    return read_cameras(config.viewpoints, own[0]), config.viewpoints.name
 
 
 def _counts(job: Job, config: SampleConfig) -> dict[str, int]:

@@ -1,25 +1,28 @@
-"""Helpers that several stages share: settings, label images and distances of a run."""
+"""Helpers that several stages share: settings, label images and names of a run."""
 
 from collections.abc import Collection, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 
 from sagesplat.adapt.observe import (
     PERCENTILE,
+    LabelImages,
     Observations,
+    RenderedLabels,
     distances_in_views,
     large_enough,
+    widest_lens,
+    within_lens,
 )
 from sagesplat.core.config import TrainConfig
 from sagesplat.core.errors import RunError
-from sagesplat.core.events import TableMade
 from sagesplat.core.names import composed
-from sagesplat.output.tables import Table
 from sagesplat.run.job import Job
 from sagesplat.run.records import settings_of
 from sagesplat.run.run_dir import RunDir
+from sagesplat.scene.scene import Camera, View
 from sagesplat.segment.block_categories import split_name
 from sagesplat.segment.display_colors import colors_of, rgb_of
 from sagesplat.segment.display_names import meant
@@ -37,44 +40,42 @@ def train_config(job: Job) -> TrainConfig:
 def label_image_inputs(run: RunDir) -> list[Path]:
     """What decides the label images that stages after training look at: the records of who made them."""
     made = [("masks", run.masks), ("fuse", run.fused), ("block_categories", run.block_categories)]
-    if run.ladder == "nested":
-        made.append(("instances", run.instances))
+    made += [("instances", run.instances)] if run.has_instances else []
     return [run.provenance(stage) for stage, folder in made if (folder / "labels.json").exists()]
 
 
-def valid_inputs(run: RunDir) -> list[Path]:
-    """The images of the pixels that count, where some do not."""
-    return [run.valid] if run.valid.exists() else []
+def existing(*paths: Path) -> list[Path]:
+    """Those that are there: inputs of a stage that not every run has."""
+    return [path for path in paths if path.exists()]
 
 
 def inlier_inputs(run: RunDir) -> list[Path]:
     """The images of the pixels that Gaussians are fitted to after training, where some are not."""
-    return [run.inliers] if run.inliers.exists() else valid_inputs(run)
+    return existing(run.inliers) or existing(run.valid)
 
 
-def sky_inputs(run: RunDir) -> list[Path]:
-    """The sky that training began with, where photos show some."""
-    return [run.sky] if run.sky.exists() else []
+def rendered_labels(job: Job) -> RenderedLabels:
+    """The label images that the full model paints."""
+    return RenderedLabels(job.ladder.load(job.ladder.levels[-1]), job.backend, job.antialiased)
 
 
-def distances(job: Job, distance: str) -> dict[int, np.ndarray]:
-    """d_min of each category in each view, as `FitConfig.distance` says; kept, as several stages ask."""
-    percentile = PERCENTILE if distance == "percentile" else 0.0
-    scene, labels = job.scene, job.point_labels
-    kept = job.__dict__.get("_distances")
-    if kept is None or kept[0] is not scene or kept[1] != percentile or not np.array_equal(kept[2], labels):
-        found = distances_in_views(scene, labels, percentile)
-        kept = job.__dict__["_distances"] = scene, percentile, labels, found
-    return kept[3]
+def label_images(job: Job, source: str) -> LabelImages:
+    """The label images that came with the photos ("given"), or those of the 3D labels ("rendered")."""
+    return job.best_masks if source == "given" else rendered_labels(job)
+
+
+def distances_from(job: Job, camera: Camera) -> dict[int, np.ndarray]:
+    """d_min of each category from a camera, float [1], measured as those that the models were fitted to."""
+    percentile = PERCENTILE if job.fit_config.distance == "percentile" else 0.0
+    lens = within_lens(camera, widest_lens([view.camera for view in job.scene.views]))
+    views = (View("photo", lens, Path()), View("viewer", camera, Path()))
+    seen = distances_in_views(replace(job.scene, views=views), job.point_labels, percentile)
+    return {label: np.where(np.isnan(d[:1]), d[1:], d[:1]) for label, d in seen.items()}
 
 
 def observed(job: Job) -> Observations:
     """The rows of views that show enough of a category."""
     return large_enough(observations_of(job), job.scene)
-
-
-def _show(job: Job, table: Table) -> None:
-    job.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
 
 
 def labels_named(job: Job, names: Sequence[str]) -> list[int]:

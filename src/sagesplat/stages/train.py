@@ -1,4 +1,4 @@
-"""Makes the levels: trains 3DGS from the labelled points and records snapshots."""
+"""Makes the levels: trains 3DGS from the labelled points and records them."""
 
 import shutil
 from collections.abc import Mapping
@@ -23,7 +23,7 @@ from sagesplat.scene.scene import Scene
 from sagesplat.segment.display_names import titles
 from sagesplat.stages.outliers import write_inliers
 from sagesplat.stages.refine import write_cameras
-from sagesplat.stages.shared import valid_inputs
+from sagesplat.stages.shared import existing
 from sagesplat.train import memory
 from sagesplat.train.checkpoint import can_resume, remove_checkpoints
 from sagesplat.train.events import Found, LabelFrozen, LevelSaved, Resumed, Step, Trained
@@ -135,16 +135,9 @@ def read_frozen(path: Path) -> dict[int, int]:
 def train_inputs(job: Job, config: TrainConfig) -> list[Path]:
     """What a training reads besides photos: label images where categories may stop early, or one is sky."""
     run = job.run
-    masks = [run.provenance("masks")] if config.freeze_at is not None or _may_show_sky(job, config) else []
-    return [run.scene, run.labels, *masks, *valid_inputs(run)]
-
-
-def _may_show_sky(job: Job, config: TrainConfig) -> bool:
-    return (
-        config.sky == "auto"
-        and (job.run.masks / "labels.json").exists()
-        and bool(sky_labels(job.masks.taxonomy))
-    )
+    labelled = config.sky == "auto" and (run.masks / "labels.json").exists()
+    look = config.freeze_at is not None or (labelled and sky_labels(job.masks.taxonomy))
+    return [run.scene, run.labels, *([run.provenance("masks")] if look else []), *existing(run.valid)]
 
 
 def _place(job: Job, key: str) -> RunDir:

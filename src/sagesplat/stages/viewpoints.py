@@ -21,7 +21,6 @@ from sagesplat.run.executor import split
 from sagesplat.run.job import Job
 from sagesplat.run.remote import work_all
 from sagesplat.segment.masks import UNLABELLED
-from sagesplat.stages.shared import distances
 from sagesplat.train.early_stopping import VIEWS, spread
 
 _MEASURED = np.flatnonzero(TARGETS >= 0.499)  # of TARGETS, those that compositions are planned for
@@ -48,7 +47,7 @@ def fit_viewpoints(
     """
     table = table.select(~np.isin(table.label_id, [UNLABELLED, *known]))
     fits = fit_photos(table, job.scene, curves)
-    far = distances(job, config.distance)
+    far = job.distances(config.distance)
     cameras = [view.camera for view in job.scene.views]
     quality = quality_at(costs, {**known, **calibrated(fits, config.confidence)}, far, cameras)
     planned: list[_Planned] = []

@@ -15,7 +15,7 @@ from sagesplat.adapt.observe import MIN_SHARE, TOTAL, as_unit, measure, measure_
 from sagesplat.adapt.plan import Plan, check_target
 from sagesplat.core.config import CompareConfig, PlanConfig
 from sagesplat.core.errors import RunError
-from sagesplat.core.events import Progress, RunDone, TableMade
+from sagesplat.core.events import Progress, RunDone
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.increments import INDEX, read_increments, read_index, shown, write_increments
 from sagesplat.formats.levels import read_level, write_set
@@ -34,12 +34,13 @@ from sagesplat.run.stage import Stage, run_stage, run_stages
 from sagesplat.segment.display_names import titles
 from sagesplat.stages.compose import compose_inputs, tune_composition
 from sagesplat.stages.fit import fit_ladder
-from sagesplat.stages.methods import NestedLevels, Snapshots, method_of
+from sagesplat.stages.methods import NestedLevels, method_of
 from sagesplat.stages.nest import train_capped
 from sagesplat.stages.observe import observe_levels
 from sagesplat.stages.plan import PAPER_TARGETS, ssim_target, ssim_targets
 from sagesplat.stages.results import increments_of
 from sagesplat.stages.shared import inlier_inputs, train_config
+from sagesplat.stages.snapshots import Snapshots
 from sagesplat.studies.compare.report import (
     CONSOLE,
     FILE,
@@ -126,7 +127,7 @@ def compare(job: Job, config: CompareConfig, copy: Path | None = None) -> list[P
     run_stage(job, "compared", {}, [file], [folder / PAGE], show)
     for stem, columns in CONSOLE.items():
         table = tables[stem].only(*columns)
-        job.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
+        job.emit(table.event)
     if copy:
         write_text(copy, file.read_text(encoding="utf-8"))
     job.emit(RunDone(folder / PAGE))
@@ -159,7 +160,7 @@ def _check(job: Job, config: CompareConfig) -> None:
     for target in config.targets:
         check_target(target)
     smallest = min(config.caps, default=1.0)
-    if round(smallest * job.snapshots.size(job.snapshots.levels[-1])) < _FEWEST:
+    if round(smallest * job.recorded.size(job.last_level.step)) < _FEWEST:
         raise RunError(f"{run.path}: --caps {smallest:g} leaves too few Gaussians to train; choose more")
 
 
@@ -187,7 +188,7 @@ class Baseline:
 
 def pruned_sets(job: Job, config: CompareConfig, folder: Path) -> list[Baseline]:
     """The last snapshot, pruned by LightGaussian's criterion (arXiv:2311.17245) and tuned."""
-    last = job.snapshots.files[-1]
+    last = job.last_level
     steps = settings_of(job.run, "nest")["steps"] if config.tune_steps < 0 else config.tune_steps
 
     @cache
@@ -208,14 +209,14 @@ def pruned_sets(job: Job, config: CompareConfig, folder: Path) -> list[Baseline]
 
 def _prune(job: Job, of: tuple[float, int, np.ndarray]) -> Gaussians:
     share, steps, weights = of
-    g = read_level(job.snapshots.files[-1].path)
+    g = read_level(job.last_level.path)
     return tune_composition(job, prune_to(g, max(1, round(share * len(g))), weights), steps)
 
 
 def mcmc_sets(job: Job, config: CompareConfig, folder: Path) -> list[Baseline]:
     """3DGS-MCMC from the start, its Gaussians capped at shares of the last snapshot's."""
     run, made, found = job.run, train_config(job), []
-    full, seed = job.snapshots.size(job.snapshots.levels[-1]), settings_of(job.run, "train")["seed"]
+    full, seed = job.recorded.size(job.last_level.step), settings_of(job.run, "train")["seed"]
     for share in sorted(set(config.caps)):
         cap, path = round(share * full), folder / f"mcmc-{share:g}.npz"
         settings = {**asdict(capped_config(made, cap, made.max_steps)), "seed": seed}
@@ -264,7 +265,7 @@ def _keep(job: Job, part: tuple[Callable[[Job, Any], Gaussians], Any, str, int])
 
 def snapshot_points(snapshots: Job, config: CompareConfig) -> list[Contender]:
     """Settled snapshots, spread in size; of equal ones the latest."""
-    ladder = snapshots.snapshots
+    ladder = snapshots.recorded
     sizes = [ladder.size(level) for level in ladder.levels]
     wanted = np.geomspace(max(1, min(sizes)), max(sizes), config.snapshots)[::-1]
     picked = sorted({nearest_snapshot(ladder, round(size)) for size in wanted.tolist()})
@@ -285,7 +286,7 @@ def _sage(sage: Snapshots, targets: Sequence[float], share: float) -> list[Conte
 def prefixes(nested: NestedLevels) -> list[Contender]:
     """The levels, all categories at the same one: as they are sent."""
     job, costs = nested.job, nested.costs
-    steps = job.snapshots.levels[-1] + settings_of(job.run, "nest")["steps"]
+    steps = job.last_level.step + settings_of(job.run, "nest")["steps"]
     found = []
     for k in range(costs.transfer_bytes.shape[1]):
         bytes_of = dict(zip(costs.labels, costs.transfer_bytes[:, k].tolist(), strict=True))
@@ -329,7 +330,7 @@ def planned_within(
 
 def _of_plan(nested: NestedLevels, name: str, plan: Plan) -> Contender:
     job = nested.job
-    steps = job.snapshots.levels[-1] + settings_of(job.run, "nest")["steps"]
+    steps = job.last_level.step + settings_of(job.run, "nest")["steps"]
     return Contender(
         PLANNED, name, steps, partial(job.ladder.compose, plan.levels),
         {choice.label_id: choice.transfer_bytes or 0 for choice in plan.choices}, plan.target,

@@ -10,7 +10,7 @@ from scipy.ndimage import uniform_filter
 from sagesplat.adapt.free_viewpoints import check_size, free_cameras
 from sagesplat.core.config import MeasureConfig
 from sagesplat.core.errors import RunError, SageError
-from sagesplat.core.events import Emit, Progress, StageStarted, TableMade, Warned
+from sagesplat.core.events import Emit, Progress, StageStarted, Warned
 from sagesplat.formats.splats import Splat
 from sagesplat.metrics.image import ssim_map
 from sagesplat.metrics.lpips import Lpips, load_lpips
@@ -171,7 +171,7 @@ def _show(measured: Measured, emit: Emit) -> None:
         "worst SSIM",
     )
     table = levels_table(measured).only(*columns)
-    emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
+    emit(table.event)
     if measured.labels():
         table = categories_table(measured)
-        emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
+        emit(table.event)

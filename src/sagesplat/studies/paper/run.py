@@ -10,7 +10,7 @@ from sagesplat.adapt.observe import distances_in_views
 from sagesplat.adapt.plan import Plan, plan_view
 from sagesplat.core.config import PaperConfig
 from sagesplat.core.errors import RunError
-from sagesplat.core.events import Progress, RunDone, TableMade
+from sagesplat.core.events import Progress, RunDone
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.columns import from_rows, write_columns
 from sagesplat.output.tables import Table, name_of, promise_kept
@@ -21,7 +21,7 @@ from sagesplat.stages.compose import compose_inputs, tune_composition
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.plan import ssim_targets
 from sagesplat.stages.results import has_photos, models_of, observations_of, plans_of
-from sagesplat.stages.shared import distances, label_colors, observed
+from sagesplat.stages.shared import label_colors, observed
 from sagesplat.studies.lpips import load_metrics, lpips_hashes
 from sagesplat.studies.paper.cross_view import NONE, cross_view, read_cross_view
 from sagesplat.studies.paper.report import PaperData, Picture, four_levels, take_pictures, write_paper
@@ -39,7 +39,7 @@ def paper_report(job: Job, config: PaperConfig) -> None:
 
 def cross_views(job: Job) -> None:
     """Plan each unseen view by itself and measure its composition."""
-    run, method, targets = job.run, method_of(job), _targets(job)
+    run, method, targets = job.run, method_of(job), ssim_targets(job.run)
     if not has_photos(run):
         raise RunError(
             f"{run.path}: crossview needs photos, and this splat came without; "
@@ -59,7 +59,7 @@ def cross_views(job: Job) -> None:
             kept.write(run.adapted / "promises_kept")
             by_target = targets_table(scores, titles(job.names()))
             by_target.write(run.adapted / "promises_by_target")
-            job.emit(TableMade(kept.title, kept.header, tuple(map(tuple, kept.cells()))))
+            job.emit(kept.event)
         lines = []
         for target in np.unique(table.target):
             fared = promise_kept(table.select(table.target == target))
@@ -205,18 +205,14 @@ def _made_of(job: Job) -> list[Path]:
     return [run.labels, run.provenance("observe"), run.provenance("fit"), *compose_inputs(job)]
 
 
-def _targets(job: Job) -> list[float]:
-    return ssim_targets(job.run)
-
-
 def _view_plans(job: Job, view: int) -> list[Plan]:
     """Plans for one view at every target, as the paper's Table III makes them: from its four iterations."""
     levels = four_levels(job.ladder.levels)
     counts = {key: n for key, n in job.ladder.counts.items() if key[1] in levels}
-    seen = distances(job, job.fit_config.distance)
+    seen = job.distances(job.fit_config.distance)
     here = {label: float(d[view]) for label, d in seen.items()}
     models = models_of(job)
-    return [plan_view(models, counts, here, target, view) for target in _targets(job)]
+    return [plan_view(models, counts, here, target, view) for target in ssim_targets(job.run)]
 
 
 def _view(job: Job, config: PaperConfig) -> int:

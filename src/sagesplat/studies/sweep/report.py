@@ -9,7 +9,7 @@ from sagesplat.io.files import write_text
 from sagesplat.output.tables import Table
 
 # columns of numbers, with their formats: SSIM and PSNR (dB) are of whole test views, "full" is the full model
-# (the last level: of snapshots 3DGS itself), `error` the mean error of a category's prediction there; a
+# (the last level: of recorded levels 3DGS itself), `error` the mean error of a category's prediction there; a
 # training that resumed after a kill counts the seconds since then
 MEASURES = {
     "Gaussians": ",.0f", "of full model": ".1%", "MB": ".2f", "SSIM": ".3f", "full SSIM": ".3f",

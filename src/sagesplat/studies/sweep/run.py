@@ -10,7 +10,7 @@ import numpy as np
 
 from sagesplat.adapt.observe import TOTAL
 from sagesplat.core.errors import RunError, SageError
-from sagesplat.core.events import Emit, Progress, StageDone, StageStarted, TableMade, Warned, named
+from sagesplat.core.events import Emit, Progress, StageDone, StageStarted, Warned, named
 from sagesplat.io.files import atomic_folder, link
 from sagesplat.output.tables import MB, Table, mean, promise_kept
 from sagesplat.raster import Backend
@@ -54,7 +54,7 @@ def run_sweep(
             emit(StageDone(name, done.seconds, (f"run {number + 1} of {len(sweep)}",)))
         _write(out, [row for at in sorted(rows) for row in rows[at]])
     shown = readable(summarise([row for at in sorted(rows) for row in rows[at]]), SHOWN)
-    emit(TableMade(shown.title, shown.header, tuple(map(tuple, shown.cells()))))
+    emit(shown.event)
     if failed:
         names = ", ".join(failed[number] for number in sorted(failed))
         raise RunError(

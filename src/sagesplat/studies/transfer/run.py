@@ -15,7 +15,7 @@ from sagesplat.output.tables import Table
 from sagesplat.run.job import Job
 from sagesplat.run.records import settings_of
 from sagesplat.stages.results import models_of
-from sagesplat.stages.shared import distances, observed
+from sagesplat.stages.shared import observed
 from sagesplat.studies.paper.report import Picture, panel, take_pictures
 from sagesplat.studies.transfer import score
 from sagesplat.studies.transfer.report import headline, summary_table, transfer_figure, transfer_table
@@ -60,7 +60,7 @@ def _pictures(
     """Fig. 5: a view of B composed as A's models say (distances over the extent), B's own for the rest."""
     rows = b.test_views if len(b.test_views) else b.train_views
     row = int(rows[len(rows) // 2])
-    seen = distances(job, job.fit_config.distance)
+    seen = job.distances(job.fit_config.distance)
     here = {label: float(d[row]) for label, d in seen.items()}
     try:
         metric = load_lpips("alex", lpips)

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from sagesplat.adapt.eq3 import SsimModel
 from sagesplat.adapt.observe import Observations
-from sagesplat.adapt.plan import Counts, Models, choose_snapshot
+from sagesplat.adapt.plan import Counts, Models, choose_latest
 from sagesplat.core.errors import RunError
 from sagesplat.core.geometry import mean_neighbour_distance
 from sagesplat.segment.masks import UNLABELLED_NAME
@@ -174,7 +174,7 @@ def transferred_levels(
         d = np.array([distances.get(shared.label_b, np.nan)]) * scale
         counts = np.array([b.counts[shared.label_b, level] for level in shared.levels])
         ssim = np.stack([model(d) for model in models])
-        levels[shared.label_b] = shared.levels[int(choose_snapshot(ssim.T, counts, target)[0][0])]
+        levels[shared.label_b] = shared.levels[int(choose_latest(ssim.T, counts, target)[0][0])]
     return levels
 
 
@@ -186,7 +186,7 @@ def score(
     target: float,
 ) -> dict[str, Any]:
     """Levels chosen by prediction against those chosen knowing the measurement: some columns of Transfer."""
-    chosen, best = (choose_snapshot(ssim.T, counts, target)[0] for ssim in (predicted, measured))
+    chosen, best = (choose_latest(ssim.T, counts, target)[0] for ssim in (predicted, measured))
     reached = measured >= target
     hit, reachable = reached[chosen, np.arange(len(chosen))], reached.any(0)
     return {
