@@ -552,23 +552,6 @@ def label_edits(run: Path, views: int = 60, split: bool = False, write: bool = F
 
 
 @app.command
-def server(idle: int = 1000, slow: int = 1000, honest: int = 200, write: bool = False) -> None:
-    """`sagesplat view` with idle, slow and honest clients at once, plain and over TLS."""
-    from benchmarks import server as serving
-
-    rows = [serving.measure(idle, slow, honest, tls) for tls in (False, True)]
-    for row in rows:
-        print(
-            f"{'TLS' if row['tls'] else 'plain':5} {row['finished']} of {honest} honest ones finished"
-            f" in {row['seconds']:.0f} s (a file {row['file_median_s']:.1f} s, at most"
-            f" {row['file_longest_s']:.1f});"
-            f" server {row['server_rss_mb']:.0f} MB, terminal {row['terminal_lines']} lines"
-        )
-    result = {"date": date.today().isoformat(), "commit": serving.commit(), "command": "benchmarks server"}
-    _finish("server", {**result, "rows": rows}, write)
-
-
-@app.command
 def fuzz(
     readers: tyro.conf.Positional[tuple[str, ...]] = (),
     *,

@@ -1,27 +1,26 @@
-"""`sagesplat view` under load: idle, slow and honest clients at once, from another process."""
+"""`sagesplat view` under load: idle, slow and honest clients at once, from another process.
 
+python -m benchmarks.server [--idle 1000] [--slow 1000] [--honest 200]
+"""
+
+import argparse
 import asyncio
 import hashlib
+import json
 import random
 import resource
 import ssl
 import subprocess
 import sys
 import tempfile
-import threading
 import time
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-FILES, SIZE, LARGE = (
-    10,
-    200_000,
-    20_000_000,
-)  # files of a bundle, bytes of each, bytes of one that is read slowly
-_AGAIN = 1.0  # seconds until a bad client that was cut comes back
+FILES, SIZE = 10, 200_000  # files of a bundle, and bytes of each
+LARGE = 20_000_000  # bytes of a file that is read slowly
+_AGAIN = 1.0  # seconds until a bad client that was cut off comes back
 _TRICKLE = 0.2  # seconds between two bytes of a slow request, and between two reads of a slow reader
-_CODE = "from sagesplat.cli import main; main()"
 _PATIENCE = 60.0  # seconds that an honest client waits for a file
 
 
@@ -53,38 +52,44 @@ def make_certificate(folder: Path) -> tuple[Path, Path]:
 
 def measure(idle: int, slow: int, honest: int, tls: bool, files: int = FILES) -> dict[str, Any]:
     """Who finished, seconds, and the server's memory and lines; `files`: what each honest client loads."""
-    _allow_files(idle + slow + honest)
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = min(idle + slow + honest + 100, hard)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, wanted), hard))
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         hashes = make_bundle(folder / "bundle")
-        pem = make_certificate(folder) if tls else None
-        words = [sys.executable, "-c", _CODE, "view", str(folder / "bundle"), "--port", "0", "--no-browser"]
-        if pem:
-            words += ["--ssl-certfile", str(pem[0]), "--ssl-keyfile", str(pem[1])]
-        with (folder / "terminal").open("w+b") as terminal:
-            with subprocess.Popen(words, stdout=terminal, stderr=subprocess.STDOUT) as server:
-                try:
-                    port = _port(folder / "terminal")
-                    memory = _Memory(server.pid)
-                    context = ssl.create_default_context(cafile=str(pem[0])) if pem else None
-                    clients = _Clients(port, context, dict(list(hashes.items())[:files]))
-                    found = asyncio.run(clients.run(idle, slow, honest))
-                    found["server_rss_mb"] = memory.end()
-                finally:
-                    server.terminate()
-            terminal.seek(0)
-            found["terminal_lines"] = len(terminal.read().splitlines())
+        command = [
+            sys.executable,
+            "-m",
+            "sagesplat",
+            "view",
+            folder / "bundle",
+            "--port",
+            "0",
+            "--no-browser",
+        ]
+        context = None
+        if tls:
+            certificate, key = make_certificate(folder)
+            command += ["--ssl-certfile", certificate, "--ssl-keyfile", key]
+            context = ssl.create_default_context(cafile=str(certificate))
+        terminal = folder / "terminal"
+        with (
+            terminal.open("wb") as output,
+            subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT) as server,
+        ):
+            try:
+                clients = _Clients(_port(terminal), context, dict(list(hashes.items())[:files]))
+                found = asyncio.run(clients.run(idle, slow, honest))
+                found["server_rss_mb"] = _peak_memory(server.pid)
+            finally:
+                server.terminate()
+        found["terminal_lines"] = len(terminal.read_text().splitlines())
     return {"tls": tls, "idle": idle, "slow": slow, "honest": honest, **found}
 
 
-def _allow_files(count: int) -> None:
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if soft < count + 100:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (min(count + 100, hard), hard))
-
-
 def _port(terminal: Path) -> int:
-    end = time.monotonic() + 30
+    end = time.monotonic() + _PATIENCE
     while time.monotonic() < end:
         lines = terminal.read_text().splitlines()
         if len(lines) >= 3:
@@ -93,26 +98,11 @@ def _port(terminal: Path) -> int:
     raise TimeoutError(terminal.read_text())
 
 
-class _Memory:
-    """Looks at a process's memory until the end."""
-
-    def __init__(self, process: int):
-        self._status, self._most, self._stop = Path(f"/proc/{process}/status"), 0, threading.Event()
-        self._thread = threading.Thread(target=self._look)
-        self._thread.start()
-
-    def _look(self) -> None:
-        while not self._stop.wait(0.05):
-            with suppress(OSError, StopIteration):
-                lines = self._status.read_text().splitlines()
-                line = next(line for line in lines if line.startswith("VmRSS"))
-                self._most = max(self._most, int(line.split()[1]))
-
-    def end(self) -> float:
-        """The most that it had, MB."""
-        self._stop.set()
-        self._thread.join()
-        return self._most * 1024 / 1e6
+def _peak_memory(process: int) -> float:
+    """The most memory that a process has had, in MB."""
+    lines = Path(f"/proc/{process}/status").read_text().splitlines()
+    peak = next(line for line in lines if line.startswith("VmHWM"))
+    return int(peak.split()[1]) * 1024 / 1e6
 
 
 class _Clients:
@@ -207,9 +197,19 @@ class _Clients:
         return await reader.readexactly(int(length.partition(b":")[2]))
 
 
-def commit() -> str:
-    """The commit that is checked out."""
-    done = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False
+def main() -> None:
+    """Print a row of figures for plain HTTP and one for TLS, as JSON."""
+    parser = argparse.ArgumentParser(
+        description="`sagesplat view` with idle, slow and honest clients at once"
     )
-    return done.stdout.strip()
+    for name, count in (("idle", 1000), ("slow", 1000), ("honest", 200)):
+        parser.add_argument(f"--{name}", type=int, default=count, help="number of clients")
+    counts = vars(parser.parse_args())
+    for tls in (False, True):
+        row = measure(**counts, tls=tls)
+        rounded = {key: round(value, 2) if isinstance(value, float) else value for key, value in row.items()}
+        print(json.dumps(rounded), flush=True)
+
+
+if __name__ == "__main__":
+    main()

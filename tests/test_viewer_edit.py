@@ -224,11 +224,11 @@ def served(tmp_path: Path) -> Iterator[tuple[int, str, Path]]:
     pytest.importorskip("uvicorn", reason="needs the extra `view`")
     from test_viewer_server import running
 
-    from sagesplat.viewer.edit_site import EditSite
+    from sagesplat.viewer.edit_endpoint import EditEndpoint
     from sagesplat.viewer.site import Site
 
-    taking = EditSite(Site(tmp_path), tmp_path / "labels.edit.json", lambda: "a" * 64)
-    with running(taking) as port:  # type: ignore[arg-type]
+    taking = EditEndpoint(tmp_path / "labels.edit.json", lambda: "a" * 64)
+    with running(Site(tmp_path, routes=(taking.route,))) as port:
         yield port, taking.token, tmp_path / "labels.edit.json"
 
 
@@ -254,7 +254,7 @@ def test_edits_are_saved_and_read_back(served: tuple[int, str, Path]) -> None:
 @pytest.mark.parametrize(
     ("headers", "why"),
     [
-        ({"host": "evil.example"}, "this machine only"),
+        ({"host": "evil.example"}, "does not answer to this name"),
         ({"origin": "http://evil.example"}, "other sites"),
         ({"origin": "null"}, "other sites"),
         ({"sec-fetch-site": "cross-site"}, "other sites"),
@@ -302,8 +302,8 @@ def test_what_is_no_edit_is_not_saved(
 
 def test_preflights_and_other_methods_get_nothing(served: tuple[int, str, Path]) -> None:
     port, token, _ = served
-    assert ask(port, "OPTIONS", None, origin="http://evil.example")[0] == 403
-    assert ask(port, "DELETE", token)[0] == 405
+    for method in ("OPTIONS", "DELETE", "POST"):
+        assert ask(port, method, token, origin="http://evil.example")[0] == 405
 
 
 def test_labels_are_edited_on_this_machine_only(finished_run: Path) -> None:

@@ -13,7 +13,7 @@ from benchmarks.hostile import Reader
 from sagesplat.cli import parse
 from sagesplat.cli.base import COMMANDS
 from sagesplat.formats.label_edits import FILE, LabelEdits, Rename, dump_edits
-from sagesplat.viewer.edit_site import EditSite
+from sagesplat.viewer.edit_endpoint import EditEndpoint
 from sagesplat.viewer.site import Site
 
 _TOKEN = "a-token"
@@ -99,8 +99,9 @@ def _answer_edit(folder: Path, content: bytes) -> None:
     async def send(message: Any) -> None:
         sent.append(message)
 
-    site = EditSite(Site(folder, viewer=folder), folder / FILE, lambda: "0" * 64)
-    site.token = _TOKEN
+    edits = EditEndpoint(folder / FILE, lambda: "0" * 64)
+    edits.token = _TOKEN
+    site = Site(folder, viewer=folder, routes=(edits.route,))
     before = (folder / FILE).read_bytes()
     _loop().run_until_complete(site(scope, receive, send))
     (folder / FILE).write_bytes(before)

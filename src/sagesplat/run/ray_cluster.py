@@ -8,17 +8,17 @@ import logging
 import os
 import secrets
 import shutil
+import signal
 import socket
 import sys
 import tempfile
+import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import ray
-from ray._private import ray_constants, services
-from ray._raylet import AuthenticationTokenLoader, Config  # pyright: ignore
 from ray.exceptions import RayError
 
 from sagesplat.core import signals
@@ -27,13 +27,16 @@ from sagesplat.run.ray_task import ANSWER, checks_tokens
 
 _STORE = 256 * 2**20  # bytes of shared memory of a cluster of our own: results are small
 _TOKENS = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
-_LOOPBACK = ray_constants.ENABLE_RAY_CLUSTERS_ENV_VAR  # 0: nodes have the address 127.0.0.1
 _GREETED = 10.0  # seconds that a head may take to greet
 _SETTINGS = b"\0\0\0\4\0\0\0\0\0"  # HTTP/2's first frame, by client and server alike (RFC 9113, 3.4)
 _GREETING = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + _SETTINGS
 _OPEN = (
     "this Ray cluster does not check tokens: whoever reaches its port can run programs as you; start it "
     "with RAY_AUTH_MODE=token (docs/pipeline.md, several machines)"
+)
+_WAITS = (
+    "the cluster that this machine belongs to does not answer yet; if its head is gone, stop this and let "
+    "`ray stop` here forget it"
 )
 # Ray's own word on tokens, which depends on its version; we say what matters
 _ABOUT_TOKENS = "authentication_token_setup"
@@ -52,10 +55,9 @@ def connected(address: str = "") -> Iterator[Mapping[str, float]]:
     if ray.is_initialized():
         yield ray.cluster_resources()
         return
-    warn = _Warnings()
     address = address or os.environ.get("RAY_ADDRESS", "")
-    with _heard(warn):
-        if _join(address):
+    with _heard() as warn:
+        if _join(address, warn):
             if _tells_that_it_is_open():
                 warn(_OPEN)
             yield from _resources()
@@ -71,33 +73,35 @@ def _resources() -> Iterator[Mapping[str, float]]:
         ray.shutdown()
 
 
-def _join(address: str) -> bool:
+def _join(address: str, warn: "_Warnings") -> bool:
     """Connect to a cluster; False where none is named and none runs."""
     if address == "local":
         return False
     named = address not in ("", "auto")
-    try:
-        head = services.canonicalize_bootstrap_address(address if named else "auto") or ""
-    except ConnectionError:  # this machine is no node of any
-        return False
-    except ValueError:
-        head = ""
-    _check_answers(head, address if named else "")
+    if named:
+        _check_answers(address)
+    waits = threading.Timer(_GREETED, warn, [_WAITS])
+    waits.daemon = True
+    waits.start()
     try:
         with signals.answered_at_once():  # Ray waits for minutes, and starts nothing here
-            _init(address=head)
+            _init(address=address if named else "auto")
     except ConnectionError as error:
-        raise _no_connection(error) from None
+        if named:
+            raise _no_connection(error) from None
+        return False  # this machine is no node of any
+    finally:
+        waits.cancel()
     return True
 
 
 def _init(**options: Any) -> None:
     """`ray.init` without the output of tasks; RunError or ConnectionError where it fails."""
-    # it would end the process without a line
-    ray._private.utils.set_sigterm_handler = lambda _: None  # type: ignore[attr-defined]
     try:
         with signals.deferred():  # processes of a cluster that is half begun would stay
             ray.init(log_to_driver=False, logging_level=logging.WARNING, **options)
+    except SystemExit:  # of the handler that Ray sets for SIGTERM, which says nothing
+        raise signals.Stopped(signal.SIGTERM) from None
     except ConnectionError:
         raise
     except (OSError, RuntimeError, ValueError, AssertionError, TimeoutError, RayError) as error:
@@ -118,18 +122,16 @@ def _own_cluster() -> Iterator[None]:
     """A cluster of this machine that only this process and those that it starts can use."""
     folder = Path(tempfile.mkdtemp(prefix="sagesplat-ray-"))  # for this user only; Ray opens its own to all
     token = folder / "token"
-    before = {name: os.environ.get(name) for name in (*_TOKENS, _LOOPBACK)}
-    clusters = ray_constants.ENABLE_RAY_CLUSTER
+    before = {name: os.environ.get(name) for name in _TOKENS}
     try:
         token.touch(0o600)
         token.write_text(secrets.token_hex(32))
         os.environ.pop("RAY_AUTH_TOKEN", None)
-        os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(token), _LOOPBACK: "0"}
-        ray_constants.ENABLE_RAY_CLUSTER = False  # it has read the variable already
+        os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(token)}
         _reload_tokens()
         _init(
             address="local", include_dashboard=False, object_store_memory=_STORE,
-            _temp_dir=str(folder / "ray"),
+            _node_ip_address="127.0.0.1", _temp_dir=str(folder / "ray"),
         )  # fmt: skip
         yield
     finally:
@@ -139,12 +141,17 @@ def _own_cluster() -> Iterator[None]:
             os.environ.pop(name, None)
             if value is not None:
                 os.environ[name] = value
-        ray_constants.ENABLE_RAY_CLUSTER = clusters
         _reload_tokens()
 
 
 def _reload_tokens() -> None:
-    """Let Ray read its variables again; it does so itself where it makes tokens the default."""
+    """Let Ray read its variables again.
+
+    It has read them when it was imported, and nothing public lets it do so again: this is why the version of
+    Ray has an upper bound in pyproject.toml.
+    """
+    from ray._raylet import AuthenticationTokenLoader, Config  # pyright: ignore
+
     Config.initialize("")
     AuthenticationTokenLoader.instance().reset_cache()
 
@@ -177,27 +184,20 @@ class _Warnings(logging.Handler):
         if record.module != _ABOUT_TOKENS:
             self(record.getMessage())
 
-    def hear(self, data: Mapping[str, Any], **_: object) -> None:
-        """What Ray would print itself: news of nodes, and the output of tasks, which is left out."""
-        if data.get("pid") in ("raylet", "autoscaler"):
-            for line in data["lines"]:
-                self(line)
-
 
 @contextmanager
-def _heard(warn: _Warnings) -> Iterator[None]:
-    """Send Ray's warnings to `warn` instead of several lines each to the terminal."""
-    worker: Any = ray._private.worker  # type: ignore[attr-defined]
-    logger = logging.getLogger("ray")
-    printed, handlers = worker.print_to_stdstream, logger.handlers[:]
-    worker.print_to_stdstream, logger.handlers[:] = warn.hear, [warn]
+def _heard() -> Iterator[_Warnings]:
+    """Write Ray's warnings as single lines instead of several each."""
+    warn, logger = _Warnings(), logging.getLogger("ray")
+    handlers = logger.handlers[:]
+    logger.handlers[:] = [warn]
     try:
-        yield
+        yield warn
     finally:
-        worker.print_to_stdstream, logger.handlers[:] = printed, handlers
+        logger.handlers[:] = handlers
 
 
-def _check_answers(head: str, named: str) -> None:
+def _check_answers(head: str) -> None:
     """RunError where no head answers at host:port `head`: Ray itself would wait for a quarter of an hour."""
     host, _, port = head.rpartition(":")
     try:
@@ -215,12 +215,7 @@ def _check_answers(head: str, named: str) -> None:
         cause = "not HOST:PORT"
     except OSError as error:
         cause = short(error)
-    if named:
-        raise RunError(
-            f"--executor ray:{named}: no answer ({cause}); name the cluster's head as HOST:PORT, "
-            "such as ray:10.0.0.1:6379, or start one with `ray start --head`"
-        )
     raise RunError(
-        f"--executor ray: no answer from {head}, the head of the cluster that this machine belongs to "
-        f"({cause}); `ray stop` here forgets it, or start the head again"
+        f"--executor ray:{head}: no answer ({cause}); name the cluster's head as HOST:PORT, "
+        "such as ray:10.0.0.1:6379, or start one with `ray start --head`"
     )

@@ -17,7 +17,15 @@ from sagesplat.run.records import check_format
 from sagesplat.run.run_dir import RunDir, check_links
 from sagesplat.viewer.built import check_viewer, package_viewer
 from sagesplat.viewer.hosts import Hosts, is_loopback
-from sagesplat.viewer.server import MANIFEST, View, _check_certificate, _hint, _urls, bind
+from sagesplat.viewer.server import (
+    MANIFEST,
+    View,
+    bind,
+    check_certificate,
+    connection_hint,
+    make_server,
+    urls_of,
+)
 
 if TYPE_CHECKING:
     from sagesplat.run.job import Job
@@ -48,31 +56,33 @@ def show(
     certificate of no use, no extra `view`, no built viewer.
     """
     try:
-        from sagesplat.viewer.connections import make_server
-        from sagesplat.viewer.edit_site import EditSite
+        import uvicorn  # noqa: F401
+
+        from sagesplat.viewer.edit_endpoint import EditEndpoint
         from sagesplat.viewer.site import Site
     except ImportError:
         raise BackendUnavailable(
             f"showing a bundle needs starlette and uvicorn; {install('sagesplat[view]')}"
         ) from None
-    _check_certificate(ssl_certfile, ssl_keyfile)
+    check_certificate(ssl_certfile, ssl_keyfile)
     if edit:
         _check_edit(path, host, follow)
     check_viewer(package_viewer())
-    site = Site(hosts=Hosts(host, certificate=ssl_certfile is not None))
+    editing = EditEndpoint(path / FILE, lambda: _ladder_of(site.folder)) if edit else None
+    hosts = Hosts(host, certificate=ssl_certfile is not None)
+    site = Site(hosts=hosts, routes=(editing.route,) if editing else ())
     listener = bind(host or "127.0.0.1", port)  # first: making a bundle takes its time
     try:
         keep = _fill(site, path, emit, follow)
     except BaseException:
         listener.close()
         raise
-    editing = EditSite(site, path / FILE, lambda: _ladder_of(site.folder)) if edit else None
-    server = make_server(editing or site, ssl_certfile, ssl_keyfile)
+    server = make_server(site, ssl_certfile, ssl_keyfile)
     secure = ssl_certfile is not None
-    urls = _urls(listener, secure)
+    urls = urls_of(listener, secure)
     if editing:
         urls = tuple(f"{url}#edit={editing.token}" for url in urls)
-    return View(urls, _hint(urls, secure, host), server, listener, keep)
+    return View(urls, connection_hint(urls, secure, host), server, listener, keep)
 
 
 def _check_edit(path: Path, host: str | None, follow: bool) -> None:

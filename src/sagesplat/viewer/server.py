@@ -1,6 +1,7 @@
 """The server for bundles: port, TLS, and how a headset connects."""
 
 import errno
+import logging
 import os
 import socket
 import ssl
@@ -17,11 +18,15 @@ from sagesplat.core.errors import RunError
 
 if TYPE_CHECKING:
     import uvicorn
+    from starlette.types import ASGIApp
 
 
 MANIFEST = "manifest.json"
 PORT = 8000
 _TRIED = 100  # ports from PORT on, if none is given
+_MOST = 2500  # connections; while there are more, requests get 503
+# Seconds until an idle connection is closed. The end of an answer to a slow reader may be on its way so long.
+_KEEP_ALIVE = 60
 
 
 @dataclass(frozen=True)
@@ -81,6 +86,19 @@ def bind(host: str, port: int | None) -> socket.socket:
     raise RunError(f"port {port} is taken; choose another --port, or leave it out")
 
 
+def make_server(app: "ASGIApp", certificate: Path | None = None, key: Path | None = None) -> "uvicorn.Server":
+    """A silent server for `app`, to be `run` on sockets; https with a certificate."""
+    import uvicorn
+
+    logging.getLogger("asyncio").setLevel(logging.CRITICAL)  # strangers can make connections fail at will
+    config = uvicorn.Config(
+        app, http="h11", ws="none", lifespan="off", log_config=None, log_level="critical", access_log=False,
+        server_header=False, proxy_headers=False, limit_concurrency=_MOST, timeout_keep_alive=_KEEP_ALIVE,
+        timeout_graceful_shutdown=1, ssl_certfile=certificate, ssl_keyfile=key,
+    )  # fmt: skip
+    return uvicorn.Server(config)
+
+
 def has_display() -> bool:
     """Whether a browser window can open here."""
     if sys.platform in ("win32", "darwin"):
@@ -88,7 +106,8 @@ def has_display() -> bool:
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
-def _check_certificate(certificate: Path | None, key: Path | None) -> None:
+def check_certificate(certificate: Path | None, key: Path | None) -> None:
+    """RunError unless these are a certificate and its key, or neither is given."""
     if certificate is None and key is None:
         return
     if certificate is None:
@@ -104,7 +123,7 @@ def _check_certificate(certificate: Path | None, key: Path | None) -> None:
         raise RunError(f"{certificate}: no certificate with its key (PEM, no password): {why}") from None
 
 
-def _urls(listener: socket.socket, secure: bool) -> tuple[str, ...]:
+def urls_of(listener: socket.socket, secure: bool) -> tuple[str, ...]:
     """URLs of a bound socket; the first is for this machine."""
     host, port = listener.getsockname()[:2]
     hosts = [f"[{host}]" if ":" in host else host]
@@ -123,7 +142,7 @@ def _network_address() -> str | None:
             return None
 
 
-def _hint(urls: tuple[str, ...], secure: bool, host: str | None) -> str:
+def connection_hint(urls: tuple[str, ...], secure: bool, host: str | None) -> str:
     """One line: how a headset connects. Browsers offer WebXR on localhost and https only."""
     if secure and host is not None:
         return f"headset: open {urls[-1]} there and accept the certificate"

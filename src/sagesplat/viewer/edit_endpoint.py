@@ -10,69 +10,61 @@ import secrets
 from collections.abc import Callable
 from pathlib import Path
 
-from starlette.datastructures import Headers
+from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
-from starlette.types import Receive, Scope, Send
+from starlette.routing import Route
 
 from sagesplat.core.errors import SageError
 from sagesplat.formats.label_edits import FILE, MAX_BYTES, parse_edits
 from sagesplat.io.files import write_text
 from sagesplat.viewer.hosts import is_loopback
-from sagesplat.viewer.site import HEADERS, Site
 
 _TOKEN = "x-sagesplat-token"
 
 
-class EditSite:
-    """A `Site` that also reads and writes one file of label edits.
+class EditEndpoint:
+    """Reads and writes one file of label edits; `route` is for a `Site` that answers this machine only.
 
     `ladder`: hash of the levels that are shown (`ladder_hash`), asked for at each request. Edits of other
     levels are refused.
     """
 
-    def __init__(self, site: Site, path: Path, ladder: Callable[[], str]):
+    def __init__(self, path: Path, ladder: Callable[[], str]):
         self.token = secrets.token_urlsafe(24)
-        self._site, self._path, self._ladder = site, path, ladder
+        self.route = Route(f"/{FILE}", self._answer, methods=["GET", "PUT"])
+        self._path, self._ladder = path, ladder
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer one request."""
-        if scope["type"] != "http" or scope["path"] != f"/{FILE}":
-            await self._site(scope, receive, send)
-            return
-        response = self._refusal(scope) or await self._answer(scope, receive)
-        response.headers.update({**HEADERS, "cache-control": "no-store"})
-        await response(scope, receive, send)
+    async def _answer(self, request: Request) -> Response:
+        response = self._refusal(request) or await self._allowed(request)
+        response.headers["cache-control"] = "no-store"
+        return response
 
-    def _refusal(self, scope: Scope) -> Response | None:
+    def _refusal(self, request: Request) -> Response | None:
         """The answer to who may not read or write edits; None to who may."""
-        headers, client = Headers(scope=scope), scope.get("client")
-        host = headers.get("host", "")
-        if not self._site.answers_to(host) or client is None or not is_loopback(client[0]):
+        headers, client = request.headers, request.client
+        if client is None or not is_loopback(client.host):
             return PlainTextResponse("edits are taken from this machine only", 403)
+        own = f"{request.scope['scheme']}://{headers.get('host', '')}"
         origin, site = headers.get("origin"), headers.get("sec-fetch-site", "same-origin")
-        if origin not in (None, f"{scope['scheme']}://{host}") or site not in ("same-origin", "none"):
+        if origin not in (None, own) or site not in ("same-origin", "none"):
             return PlainTextResponse("edits are not taken from pages of other sites", 403)
         if not hmac.compare_digest(headers.get(_TOKEN, "").encode(), self.token.encode()):
             return PlainTextResponse(
                 "not the token of this viewer; open the address that the command says", 403
             )
-        if scope["method"] not in ("GET", "PUT"):
-            return PlainTextResponse("only GET and PUT", 405, {"allow": "GET, PUT"})
         return None
 
-    async def _answer(self, scope: Scope, receive: Receive) -> Response:
-        if scope["method"] == "GET":
+    async def _allowed(self, request: Request) -> Response:
+        if request.method != "PUT":
             if not self._path.is_file():
                 return Response(status_code=204)
             return Response(self._path.read_bytes(), media_type="application/json")
         content = bytearray()
-        while (message := await receive())["type"] == "http.request":
-            content += message.get("body", b"")
+        async for piece in request.stream():
+            content += piece
             if len(content) > MAX_BYTES:
                 return PlainTextResponse(f"edits of more than {MAX_BYTES >> 20} MiB; nothing was saved", 413)
-            if not message.get("more_body"):
-                return self._save(bytes(content))
-        return PlainTextResponse("cut off; nothing was saved", 400)
+        return self._save(bytes(content))
 
     def _save(self, content: bytes) -> Response:
         try:
