@@ -18,7 +18,7 @@ from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import concat
 from sagesplat.formats.labels import with_labels
 from sagesplat.formats.sog import read_sog
-from sagesplat.formats.splat import Splat
+from sagesplat.formats.splat import Splat, SplatReader
 from sagesplat.io.files import loads_json, regular
 
 LOD_META = "lod-meta.json"
@@ -126,3 +126,11 @@ def _slices(tree: Any, lod: str, files: int) -> Slices:
         if numbers[2]:
             found[numbers[0]].append((numbers[1], numbers[2]))
     return found
+
+
+READER = SplatReader(
+    lambda path, options: read_lod_meta(path, options.lod),
+    json_key="lodLevels",
+    in_folder=LOD_META,
+    num_lods=count_levels,
+)

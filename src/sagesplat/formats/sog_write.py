@@ -27,6 +27,7 @@ from sagesplat.formats.labels import NO_PARENTS, as_json, sidecar
 from sagesplat.formats.ply import BASES
 from sagesplat.formats.quantisation import OTHERS
 from sagesplat.formats.sog import META
+from sagesplat.formats.splat import SplatWriter
 from sagesplat.io.files import atomic_folder, atomic_path
 
 GENERATOR = f"sagesplat {__version__}"
@@ -274,3 +275,10 @@ def _nearest(points: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, np.nd
         found = table[np.arange(len(block)), nearest] + np.square(block).sum(1)
         distances[start : start + _BLOCK] = found.clip(0)
     return of, distances
+
+
+WRITER = SplatWriter(
+    lambda path, g, names, parents, antialiased: write_sog(
+        path, g, names, parents=parents, antialiased=antialiased
+    )
+)
