@@ -17,8 +17,7 @@ from test_scene_colmap import poses
 
 from sagesplat.core.errors import SceneError
 from sagesplat.core.geometry import project, to_camera
-from sagesplat.scene import nerfstudio
-from sagesplat.scene import load_scene
+from sagesplat.scene import load_scene, nerfstudio
 from sagesplat.scene.colmap import load_colmap
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage, write_model
 from sagesplat.scene.detect import CAPTURES, CaptureFormat, detect

@@ -1,4 +1,4 @@
-"""Splat formats that are read and written; a new one is a file with a `READER` or `WRITER` and a line here."""
+"""Splat formats; a new one is a file with a `READER` or `WRITER`, or both, and a line here for each."""
 
 from sagesplat.formats import (
     compressed_ply,
