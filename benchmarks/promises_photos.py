@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from sagesplat.adapt.coverage import Decisions, decide, together
+from sagesplat.adapt.coverage import Decisions, decide
 from sagesplat.adapt.eq3 import fit_models
 from sagesplat.adapt.observe import Observations
 from sagesplat.adapt.photo_models import fit_photo_models, measured_at
@@ -73,7 +73,7 @@ def redrawn(
             says = {"bound": bound, "perfect": views.ssim}
             parts.append(decide(says, views.ssim, cost, targets, views.rows, label))
         if parts:
-            found.append(together(parts))
+            found.append(Decisions.joined(parts))
     return found
 
 
@@ -89,7 +89,7 @@ def summary(draws: Sequence[Decisions]) -> dict[str, Any]:
         coverage = [one.kept.sum() / one.accepted.sum() for one in of if one.accepted.any()]
         if not coverage:
             continue
-        totals = together(of).totals()
+        totals = Decisions.joined(of).totals()
         low = float(np.percentile(coverage, 5))
         excess, perfect = totals["excess"], totals["perfect_excess"]
         rows[f"{target:g}"] = {

@@ -183,7 +183,7 @@ def measure(folder: Path, scene: str, asked: Asked, say: Say) -> Measured:
     as_one = _as_one(job, place, asked)
     baselines = [*pruned_sets(job, config, place), *mcmc_sets(job, config, place), as_one]
     contenders = [*snapshot_points(job, config), *trained_sets(job, baselines).values(), _trained(job)]
-    metrics = load_metrics(job, asked.lpips, NETS if asked.vgg else NETS[:1])
+    metrics = load_metrics(job.emit, asked.lpips, NETS if asked.vgg else NETS[:1])
     points = measure_sets(job, prefixes(NestedLevels(job)), metrics, FitConfig())
     points += measure_sets(job, _planned(job, asked), metrics, FitConfig())
     for begin in range(0, len(contenders), _TOGETHER):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from viewpoint_fields import LEVELS, orbit, synthetic, viewpoints
 
-from sagesplat.adapt.coverage import PREDICTORS, decide, score, together
+from sagesplat.adapt.coverage import PREDICTORS, Decisions, decide, score
 from sagesplat.adapt.photo_models import fit_photo_models
 from sagesplat.core.errors import RunError
 
@@ -49,7 +49,7 @@ def test_the_interval_draws_views_not_decisions():
     measured = np.where(good, 0.8, 0.6)[:, None]
     says, cost = np.full((40, 1), 0.75), np.ones(1, np.int64)
     parts = [decide({"bound": says}, measured, cost, [0.7], np.arange(40), label) for label in range(10)]
-    one, ten = parts[0].interval(), together(parts).interval()
+    one, ten = parts[0].interval(), Decisions.joined(parts).interval()
     assert one == ten
     assert one[0] < good.mean() < one[1]
     standard_error = np.sqrt(good.mean() * (1 - good.mean()) / 40)

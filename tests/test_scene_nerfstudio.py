@@ -17,10 +17,10 @@ from test_scene_colmap import poses
 
 from sagesplat.core.errors import SceneError
 from sagesplat.core.geometry import project, to_camera
-from sagesplat.scene import nerfstudio
+from sagesplat.scene import load_scene, nerfstudio
 from sagesplat.scene.colmap import load_colmap
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage, write_model
-from sagesplat.scene.detect import detect
+from sagesplat.scene.detect import CAPTURES, CaptureFormat, detect
 from sagesplat.scene.images import load_photo, photo_size
 from sagesplat.scene.nerfstudio import load_blender, load_transforms
 from sagesplat.scene.points import random_points
@@ -512,7 +512,7 @@ def test_detect_says_what_it_looked_for(tmp_path):
     for name, message in (
         (
             "empty",
-            r"no capture \(looked for cameras.bin and cameras.txt .*transforms.json.*photos in images/",
+            r"no capture \(looked for .*cameras.bin.*cameras.txt.*transforms.json.*photos in images/",
         ),
         ("notes.txt", "neither a transforms .json nor a video"),
         ("none", "no such file or folder"),
@@ -521,3 +521,16 @@ def test_detect_says_what_it_looked_for(tmp_path):
             detect(tmp_path / name)
         assert str(raised.value).startswith(str(tmp_path / name))
         assert "\n" not in str(raised.value)
+
+
+def test_a_capture_format_is_a_function_and_a_line(tmp_path, monkeypatch):
+    capture(tmp_path)
+    (tmp_path / "transforms.json").rename(tmp_path / "scan.toy")
+
+    def load_toy(path, **options):
+        (tmp_path / "scan.toy").rename(tmp_path / "transforms.json")
+        return load_transforms(tmp_path, **options)
+
+    monkeypatch.setitem(CAPTURES, "toy", CaptureFormat(("scan.toy",), load_toy, suffix=".toy"))
+    assert detect(tmp_path) == detect(tmp_path / "scan.toy") == "toy"
+    assert len(load_scene(tmp_path, test_every=0).views) == 5

@@ -13,8 +13,7 @@ from sagesplat.core.errors import LabelError, RunError
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.labels import as_json, labelled
 from sagesplat.formats.splat import Splat
-from sagesplat.formats.splats import read_splat
-from sagesplat.formats.splats_write import write_splat
+from sagesplat.formats.splats import read_splat, write_splat
 from sagesplat.io.files import write_json
 from sagesplat.segment.display_names import title_of
 from sagesplat.segment.instances import parse_instances, read_instances, wanted_ids, write_instances

@@ -25,8 +25,7 @@ from sagesplat.core.events import Event, StageDone, Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.increments import read_index
 from sagesplat.formats.ply import read_ply, write_ply
-from sagesplat.formats.splats import read_splat
-from sagesplat.formats.splats_write import write_splat
+from sagesplat.formats.splats import read_splat, write_splat
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.stages import pipeline

@@ -213,6 +213,7 @@ def test_a_second_report_has_nothing_to_do_and_another_view_needs_force(finished
         paper_report(again, replace(PAPER, lpips=job.run.path / "nowhere", view=job.scene.views[3].name))
 
 
+@pytest.mark.slow
 def test_a_capture_without_test_views(capture, tmp_path):
     config = replace(CONFIG, scene=SceneConfig(test_every=0), train=TrainConfig(max_steps=20, level_every=10))
     job, _ = work(tmp_path / "run", capture, config)
@@ -260,6 +261,7 @@ def test_impossible_targets_are_refused_before_training(capture, tmp_path, targe
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_a_target_of_one_is_a_plan_out_of_reach(finished, tmp_path):
     job, _ = finished
     folder = tmp_path / "run"

@@ -18,7 +18,6 @@ from sagesplat.adapt.observe import Observations, read_observations
 from sagesplat.core.events import Event
 from sagesplat.formats import label_edits
 from sagesplat.io import lock
-from sagesplat.io.columns import write_columns
 from sagesplat.io.files import read_json
 from sagesplat.run import remote
 from sagesplat.run.capture import fingerprint, photo_hashes
@@ -187,7 +186,7 @@ def _table(kind: Any) -> Any:
 
     def make(folder: Path, size: int) -> list[bytes]:
         rows = {name: np.full(2 * size, 1, dtype) for name, dtype in _types(kind).items()}
-        return [written(folder / "t.csv", lambda path: write_columns(path, kind(**rows)))]
+        return [written(folder / "t.csv", kind(**rows).write_csv)]
 
     return make
 

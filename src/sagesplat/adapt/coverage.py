@@ -6,7 +6,7 @@ so that means are compared with means and bounds with bounds.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -17,6 +17,7 @@ from sagesplat.adapt.observe import Observations
 from sagesplat.adapt.photo_models import measured_at
 from sagesplat.adapt.plan import check_target
 from sagesplat.adapt.viewpoint import Calibration, ViewModel, means_at, monotone
+from sagesplat.io.columns import ColumnTable
 from sagesplat.scene.scene import Scene
 
 # means of each level over the training views, of the paper's model, of the viewpoint model; each less its own
@@ -27,7 +28,7 @@ INTERVAL = (0.025, 0.975)  # quantiles of it
 
 
 @dataclass(frozen=True, eq=False)
-class Decisions:
+class Decisions(ColumnTable):
     """One row per (target, category, predictor, view)."""
 
     target: Float[np.ndarray, " R"]
@@ -41,10 +42,6 @@ class Decisions:
     excess: Float[np.ndarray, " R"]  # measured - target of the chosen level
     perfect_excess: Float[np.ndarray, " R"]  # of the cheapest level that measures the target; NaN: none does
     regret: Float[np.ndarray, " R"]  # cost above that level's, in the unit of the costs
-
-    def select(self, keep: np.ndarray) -> "Decisions":
-        """The rows that a boolean mask or an index array names."""
-        return Decisions(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
     def by(self, predictor: str) -> "Decisions":
         """The rows of one predictor."""
@@ -131,14 +128,7 @@ def decide(
                     regret=(cost[level] - cost[best]).astype(np.float64),
                 )
             )
-    return together(parts)
-
-
-def together(parts: Sequence[Decisions]) -> Decisions:
-    """All rows of one or more tables."""
-    return Decisions(
-        **{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Decisions)}
-    )
+    return Decisions.joined(parts)
 
 
 def score(
@@ -183,7 +173,7 @@ def score(
         every = {**means, "mean": predicted.mean, **bounds, "bound": predicted.bound, "perfect": measured}
         cost = np.array([costs[label_id, level] for level in model.levels])
         parts.append(decide(every, measured, cost, targets, rows, label_id))
-    return together(parts)
+    return Decisions.joined(parts)
 
 
 class _Constant:

@@ -5,7 +5,7 @@ model rendered from the same viewpoint, over the pixels that the full model's Ga
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import get_args
 
@@ -27,7 +27,7 @@ from sagesplat.adapt.observe import (
 from sagesplat.adapt.plan import Plan
 from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.io.columns import from_rows, read_columns, write_columns
+from sagesplat.io.columns import ColumnTable, from_rows, read_columns
 from sagesplat.metrics.image import means_by_label, ssim_map
 from sagesplat.raster import Backend, Workspace, device_of, each_view
 from sagesplat.scene.images import Photos
@@ -41,7 +41,7 @@ KEPT = 512 * 2**20  # bytes of the full model's images to keep; of further views
 
 
 @dataclass(frozen=True, eq=False)
-class Evaluation:
+class Evaluation(ColumnTable):
     """One row per (plan, view, category), one per (plan, view) for the whole image, one per (level, view).
 
     The last are of all categories at one level, and have no target.
@@ -69,13 +69,6 @@ class Evaluation:
     full_cc_psnr: Float32[np.ndarray, " R"]
     full_cc_ssim: Float32[np.ndarray, " R"]
 
-    def __len__(self) -> int:
-        return len(self.label_id)
-
-    def select(self, keep: np.ndarray) -> "Evaluation":
-        """The rows that a boolean mask or an index array names."""
-        return Evaluation(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
-
     def of(self, plan: Plan) -> "Evaluation":
         """The rows of a plan: for its target, or within the budget."""
         within = np.isnan(self.target) if np.isnan(plan.target) else self.target == np.float32(plan.target)
@@ -94,10 +87,6 @@ class Evaluation:
         return replace(
             self, ssim=np.where(self.quality == QUALITIES.index("fidelity"), self.fidelity, self.ssim)
         )
-
-    def write_csv(self, path: Path) -> None:
-        """One line per row, a header first; floats so that they read back identical."""
-        write_columns(path, self)
 
 
 def read_evaluation(path: Path) -> Evaluation:

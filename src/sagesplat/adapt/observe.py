@@ -1,7 +1,7 @@
 """Observations: the quality of each category at each level, view by view."""
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
@@ -16,7 +16,7 @@ from sagesplat.adapt.ladder import Ladder, PrefixLadder
 from sagesplat.adapt.seen import seen_from
 from sagesplat.core import geometry
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.io.columns import from_rows, read_columns, write_columns
+from sagesplat.io.columns import ColumnTable, from_rows, read_columns
 from sagesplat.metrics.color_correct import color_correct_affine
 from sagesplat.metrics.image import (
     box_of,
@@ -37,7 +37,7 @@ TOTAL = -2  # label id of the rows that average over all pixels of the image
 
 
 @dataclass(frozen=True, eq=False)
-class Observations:
+class Observations(ColumnTable):
     """One row per (category, level, view); columns of equal length."""
 
     label_id: Int32[np.ndarray, " R"]  # category id, -1 = unlabelled, -2 = the whole image
@@ -48,17 +48,6 @@ class Observations:
     ssim_eroded: Float32[np.ndarray, " R"]  # the same over the mask eroded by 5 px; NaN if nothing is left
     psnr: Float32[np.ndarray, " R"]  # dB over the category's pixels
     num_pixels: Int32[np.ndarray, " R"]
-
-    def __len__(self) -> int:
-        return len(self.label_id)
-
-    def select(self, keep: np.ndarray) -> "Observations":
-        """The rows that a boolean mask or an index array names."""
-        return Observations(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
-
-    def write_csv(self, path: Path) -> None:
-        """One line per row, a header first; floats so that they read back identical."""
-        write_columns(path, self)
 
 
 def read_observations(path: Path) -> Observations:
@@ -397,7 +386,5 @@ def _each_image(
 
 def merge(parts: Sequence[Observations]) -> Observations:
     """Tables of neighbouring views, in their order, as the one that all views together make."""
-    columns = {
-        f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Observations)
-    }
-    return Observations(**columns).select(np.argsort(columns["level"], kind="stable"))
+    table = Observations.joined(parts)
+    return table.select(np.argsort(table.level, kind="stable"))

@@ -39,7 +39,7 @@ from sagesplat.core.config import (
 )
 from sagesplat.core.errors import RunError
 
-_SPLAT = "splat: PLY, compressed PLY, SPZ, SOG, lod-meta.json, .splat or glTF"
+_SPLAT = "splat: PLY, compressed PLY, SPZ, SOG, streamed SOG (lod-meta.json), glTF or .splat"
 _INSTANCES = (
     'categories, such as "chair,car"; things: all that can be counted; *: all; "": fold instances back'
 )

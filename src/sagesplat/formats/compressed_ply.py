@@ -23,7 +23,7 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.sh import C0
 from sagesplat.formats.ply import BASES, is_antialiased
 from sagesplat.formats.quantisation import largest_restored, logits_of_bytes
-from sagesplat.formats.splat import Splat
+from sagesplat.formats.splat import Splat, SplatReader
 from sagesplat.io.ply_header import Element, read_elements
 
 _CHUNK = 256  # Gaussians
@@ -32,8 +32,12 @@ _WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _BITS = np.array([[21, 11], [11, 10], [0, 11]], np.uint32)  # of positions and scales: shift, width
 
 
-def is_compressed(elements: list[Element]) -> bool:
-    """Whether a PLY with these elements is a compressed one."""
+def _is_compressed(file: BinaryIO) -> bool:
+    """Whether a PLY is a compressed one; not if it is damaged: the reader of PLY files says what is wrong."""
+    try:
+        elements = read_elements(file)[1]
+    except ValueError:
+        return False
     return any(element.name == "vertex" and _WORDS[0] in element.types for element in elements)
 
 
@@ -144,3 +148,8 @@ def _rotations(words: np.ndarray) -> np.ndarray:
 def _harmonics(values: np.ndarray) -> np.ndarray:
     share = np.where(values == 0, 0.0, np.where(values == 255, 1.0, (values + 0.5) / 256))
     return (share - 0.5) * 8
+
+
+READER = SplatReader(
+    lambda path, _: read_compressed_ply(path), magic=(b"ply\n", b"ply\r"), accepts=_is_compressed
+)

@@ -15,7 +15,7 @@ from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.sh import C0
 from sagesplat.formats.quantisation import logits_of_bytes
-from sagesplat.formats.splat import Splat
+from sagesplat.formats.splat import Splat, SplatReader
 
 _ROW = np.dtype(
     [("means", "<f4", 3), ("scales", "<f4", 3), ("rgb", "u1", 3), ("alpha", "u1"), ("quat", "u1", 4)]
@@ -49,3 +49,6 @@ def read_dotsplat(path: Path) -> Splat:
         label_ids=torch.full((len(table),), -1, dtype=torch.int16),
     )
     return Splat(g, ".splat")
+
+
+READER = SplatReader(lambda path, _: read_dotsplat(path), suffix=".splat")

@@ -21,7 +21,7 @@ import torch
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians, concat
 from sagesplat.core.transform import transformed
-from sagesplat.formats.splat import Splat
+from sagesplat.formats.splat import Splat, SplatReader
 from sagesplat.formats.spz import decode_spz
 from sagesplat.io.files import loads_json, regular
 
@@ -255,3 +255,6 @@ def _attributes(asset: _Asset, attributes: dict[str, int]) -> Gaussians:
         name: torch.from_numpy(array) for name, array in (arrays | {"logit_opacities": logits}).items()
     }
     return Gaussians(**tensors, label_ids=torch.full((len(means),), -1, dtype=torch.int16))
+
+
+READER = SplatReader(lambda path, _: read_gltf(path), magic=(b"glTF",), json_key="asset")

@@ -53,6 +53,16 @@ def write_labels(
     return sidecar(path)
 
 
+def write_or_remove_labels(
+    path: Path, label_ids: Int16[Tensor, " N"], names: Mapping[int, str], parents: Mapping[int, str]
+) -> None:
+    """Write the labels beside `path`; where no row has one, remove those of an earlier file."""
+    if bool((label_ids >= 0).any()):
+        write_labels(path, label_ids, names, parents)
+    else:
+        sidecar(path).unlink(missing_ok=True)
+
+
 def as_json(
     label_ids: Int16[Tensor, " N"],
     names: Mapping[int, str],

@@ -19,7 +19,7 @@ from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import concat
 from sagesplat.formats.labels import with_labels
 from sagesplat.formats.sog import read_sog
-from sagesplat.formats.splat import Splat
+from sagesplat.formats.splat import Splat, SplatReader
 from sagesplat.io.files import regular
 from sagesplat.io.typed import parse_json_as, refused
 
@@ -140,3 +140,11 @@ def _slices(tree: _Node, lod: str, files: int) -> Slices:
         if rows.count:
             found[rows.file].append((rows.offset, rows.count))
     return found
+
+
+READER = SplatReader(
+    lambda path, options: read_lod_meta(path, options.lod),
+    json_key="lodLevels",
+    in_folder=LOD_META,
+    num_lods=count_levels,
+)

@@ -11,6 +11,7 @@ from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.lod_meta import LOD_META
 from sagesplat.formats.sog_write import GENERATOR, put_sog, sog_files, sog_order
+from sagesplat.formats.splat import SplatWriter
 from sagesplat.io.files import atomic_folder, write_json
 
 LEAF = 2**17  # Gaussians of the finest level in a leaf, at most
@@ -146,3 +147,10 @@ def _bounds(
         low, high = (end(np.concatenate([p[i] for p in parts]), 0) for i, end in ((0, np.min), (1, np.max)))
     node["bound"] = {"min": low.tolist(), "max": high.tolist()}
     return low, high
+
+
+WRITER = SplatWriter(
+    write_levels=lambda path, levels, names, parents, antialiased: write_lod_meta(
+        path.parent, levels, names, parents=parents, antialiased=antialiased
+    )
+)

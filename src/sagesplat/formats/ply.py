@@ -16,7 +16,8 @@ from sagesplat import __version__
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.names import repaired
-from sagesplat.formats.splat import Splat
+from sagesplat.formats.labels import sidecar, write_labels
+from sagesplat.formats.splat import Splat, SplatReader, SplatWriter
 from sagesplat.io.files import atomic_path
 from sagesplat.io.ply_header import read_header
 
@@ -285,3 +286,18 @@ def _check_values(path: Path, columns: np.ndarray, wanted: list[str]) -> None:
         raise DataError(
             f"{path}: {bad} Gaussians have a rotation (rot_0..3) of zeros; export the scene again"
         )
+
+
+def _write_with_labels(
+    path: Path, g: Gaussians, names: Mapping[int, str], parents: Mapping[int, str], antialiased: bool
+) -> None:
+    """Write a PLY; with `parents` a dictionary of labels too, as many tools drop the header's comments."""
+    write_ply(path, g, names, parents=parents, antialiased=antialiased)
+    if parents:
+        write_labels(path, g.label_ids, names, parents, runs=False)
+    else:
+        sidecar(path).unlink(missing_ok=True)  # of an earlier file
+
+
+READER = SplatReader(lambda path, _: read_ply_splat(path), magic=(b"ply\n", b"ply\r"))
+WRITER = SplatWriter(_write_with_labels, antialiases=False)

@@ -23,7 +23,7 @@ from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.ply import BASES
 from sagesplat.formats.quantisation import largest_restored, logits_of_bytes
-from sagesplat.formats.splat import Splat
+from sagesplat.formats.splat import Splat, SplatReader
 from sagesplat.io.files import loads_json, regular
 from sagesplat.io.pictures import PictureError, open_picture
 
@@ -180,3 +180,6 @@ def _harmonics(part: dict[str, Any], files: list[bytes], count: int, first: bool
     else:
         codebook = _codebook(part)
     return codebook[palette[rows]]
+
+
+READER = SplatReader(lambda path, _: read_sog(path), magic=(b"PK\x03\x04",), json_key="means", in_folder=META)

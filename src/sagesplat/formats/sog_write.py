@@ -23,10 +23,11 @@ from sagesplat import __version__
 from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.geometry import morton_order
-from sagesplat.formats.labels import NO_PARENTS, as_json, sidecar
+from sagesplat.formats.labels import NO_PARENTS, write_or_remove_labels
 from sagesplat.formats.ply import BASES
 from sagesplat.formats.quantisation import OTHERS
 from sagesplat.formats.sog import META
+from sagesplat.formats.splat import SplatWriter
 from sagesplat.io.files import atomic_folder, atomic_path
 
 GENERATOR = f"sagesplat {__version__}"
@@ -77,7 +78,7 @@ def write_sog(
             for name, content in files.items():
                 archive.writestr(zipfile.ZipInfo(name), content)  # of 1980: no time stamp
         nbytes = temporary.stat().st_size
-        _put_labels(path, g, names or {}, parents or {})
+        write_or_remove_labels(path, g.label_ids, names or {}, parents or {})
     return nbytes
 
 
@@ -91,16 +92,7 @@ def put_sog(
     """Put the files of a SOG scene into a folder, with the labels beside."""
     for name, content in files.items():
         (folder / name).write_bytes(content)
-    _put_labels(folder / META, g, names, parents)
-
-
-def _put_labels(path: Path, g: Gaussians, names: Mapping[int, str], parents: Mapping[int, str]) -> None:
-    """Write the labels beside, or remove those of an earlier file."""
-    if bool((g.label_ids >= 0).any()):
-        with atomic_path(sidecar(path)) as temporary:
-            temporary.write_bytes(as_json(g.label_ids, names, parents))
-    else:
-        sidecar(path).unlink(missing_ok=True)
+    write_or_remove_labels(folder / META, g.label_ids, names, parents)
 
 
 def sog_order(g: Gaussians) -> Int64[np.ndarray, " N"]:
@@ -274,3 +266,10 @@ def _nearest(points: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, np.nd
         found = table[np.arange(len(block)), nearest] + np.square(block).sum(1)
         distances[start : start + _BLOCK] = found.clip(0)
     return of, distances
+
+
+WRITER = SplatWriter(
+    lambda path, g, names, parents, antialiased: write_sog(
+        path, g, names, parents=parents, antialiased=antialiased
+    )
+)

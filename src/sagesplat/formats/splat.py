@@ -1,6 +1,9 @@
-"""The Splat type: Gaussians of somebody else's file, and what was wrong with them."""
+"""Splats: Gaussians of somebody else's file with what was wrong with them, and how formats are described."""
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import BinaryIO, Literal
 
 import torch
 from torch import Tensor
@@ -8,6 +11,8 @@ from torch import Tensor
 from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import Gaussians
 
+# Axes in a file, left or right, up or down, front or back: SPZ's own are rub; COLMAP's and PLY's are rdf.
+Frame = Literal["rub", "ldb", "rdb", "lub", "ldf", "rdf", "luf", "ruf"]
 OPAQUE = 16.0  # logit of opacities that a file has as infinite; its sigmoid is 1 - 1e-7
 
 
@@ -22,6 +27,46 @@ class Splat:
     announced: int = -1  # Gaussians in the file; -1: as many as there are
     dropped: dict[str, int] = field(default_factory=dict)  # reason -> Gaussians that were left out
     parents: dict[int, str] = field(default_factory=dict)  # by label id of an instance: its category's name
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """What a caller of `read_splat` chooses; a reader uses what its format knows."""
+
+    lod: int = 0  # level of detail, 0 is the finest; above it only for a reader with `num_lods`
+    spz_axes: Frame = "rub"  # of SPZ files that do not say theirs
+
+
+@dataclass(frozen=True)
+class SplatReader:
+    """How one format is recognised and read; `registry.READERS` lists all.
+
+    A file is of the first format whose `magic` it begins with and that `accepts` it, or whose `json_key` its
+    document has. Only if there is none does the suffix of its name tell.
+    """
+
+    read: Callable[[Path, ReadOptions], Splat]
+    magic: tuple[bytes, ...] = ()  # of at most 64 bytes
+    accepts: Callable[[BinaryIO], bool] | None = None  # tells apart formats that begin with the same bytes
+    json_key: str | None = None
+    suffix: str | None = None  # of files without a header, such as ".splat"
+    in_folder: str | None = None  # name of the file to read where the path is of a folder
+    num_lods: Callable[[Path], int] | None = None  # levels of detail of a file; None: the format has one
+
+
+Names = Mapping[int, str]
+# Of a path: a scene, category names by label id, names of the categories that instances are of, antialiasing.
+WriteScene = Callable[[Path, Gaussians, Names, Names, bool], object]
+WriteLevels = Callable[[Path, Sequence[Gaussians], Names, Names, bool], object]  # the finest first
+
+
+@dataclass(frozen=True)
+class SplatWriter:
+    """How one format is written: a scene, or its levels of detail; `registry.WRITERS` lists all."""
+
+    write: WriteScene | None = None
+    write_levels: WriteLevels | None = None
+    antialiases: bool = True  # whether viewers draw a file as it says that it was trained
 
 
 def cleaned(splat: Splat, name: str) -> Splat:

@@ -1,28 +1,18 @@
-"""Reads the splat files of other tools, whatever their format; docs/formats.md has the table."""
+"""Reads and writes splat files in the formats of `registry`; docs/formats.md has the table."""
 
 import stat
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import BinaryIO
 
 from sagesplat.core.errors import DataError
-from sagesplat.formats.compressed_ply import is_compressed, read_compressed_ply
-from sagesplat.formats.dotsplat import read_dotsplat
-from sagesplat.formats.gltf import read_gltf
+from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.labels import with_labels
-from sagesplat.formats.lod_meta import LOD_META, count_levels, read_lod_meta
-from sagesplat.formats.ply import read_ply_splat
-from sagesplat.formats.sog import META, read_sog
-from sagesplat.formats.splat import Splat, cleaned
-from sagesplat.formats.spz import Frame, read_spz_splat
+from sagesplat.formats.registry import READERS, WRITERS
+from sagesplat.formats.splat import Frame, ReadOptions, Splat, SplatReader, SplatWriter, WriteScene, cleaned
 from sagesplat.io.files import loads_json
-from sagesplat.io.ply_header import read_elements
 
-__all__ = ["Splat", "num_lods", "read_splat"]
-
-_KNOWN = "PLY, compressed PLY, SPZ, SOG, lod-meta.json, glTF, .splat"
-_LOD = "streamed SOG"
+__all__ = ["Splat", "num_lods", "read_splat", "scene_writer", "write_splat", "writer_of"]
 
 
 def read_splat(path: Path | str, lod: int = 0, *, spz_axes: Frame = "rub") -> Splat:
@@ -59,78 +49,95 @@ def read_splat(path: Path | str, lod: int = 0, *, spz_axes: Frame = "rub") -> Sp
         >>> splat.kind, len(splat.gaussians), splat.dropped, splat.names
         ('PLY', 4, {'a rotation of zeros': 1}, {0: 'tree'})
     """
-    path = Path(path)
-    path, kind = _found(path)
-    if kind == _LOD:
-        return cleaned(read_lod_meta(path, lod), str(path))
-    if lod:
+    path, kind, reader = _found(Path(path))
+    if lod and reader.num_lods is None:
         raise DataError(f"{path}: {kind} has one level; read level 0")
-    readers: dict[str, Callable[[Path], Splat]] = {
-        "PLY": read_ply_splat,
-        "compressed PLY": read_compressed_ply,
-        "SPZ": partial(read_spz_splat, frame=spz_axes),
-        "SOG": read_sog,
-        "glTF": read_gltf,
-        ".splat": read_dotsplat,
-    }
-    return cleaned(with_labels(readers[kind](path), path), str(path))
+    splat = reader.read(path, ReadOptions(lod=lod, spz_axes=spz_axes))
+    return cleaned(with_labels(splat, path), str(path))
 
 
 def num_lods(path: Path) -> int:
     """How many levels of detail a splat file or folder has: 1, but of a streamed SOG."""
-    path, kind = _found(path)
-    return count_levels(path) if kind == _LOD else 1
+    path, _, reader = _found(path)
+    return reader.num_lods(path) if reader.num_lods else 1
 
 
-def _found(path: Path) -> tuple[Path, str]:
+def _found(path: Path) -> tuple[Path, str, SplatReader]:
     """The file to read, which may be in the folder `path`, and its format; DataError if it has none."""
     try:
         if path.is_dir():
-            inside = [path / name for name in (LOD_META, META) if (path / name).exists()]
+            names = [reader.in_folder for reader in READERS.values() if reader.in_folder]
+            inside = [path / name for name in names if (path / name).exists()]
             if not inside:
-                raise DataError(f"{path}: a folder without {LOD_META} or {META}; give a splat file")
+                raise DataError(f"{path}: a folder without {' or '.join(names)}; give a splat file")
             path = inside[0]
         if not stat.S_ISREG(path.stat().st_mode):
             raise DataError(f"{path}: no regular file; give a splat file")
         with path.open("rb") as file:
-            kind = _kind(path, file)
+            keys = _json_keys(file)
+            kinds = [kind for kind, reader in READERS.items() if _recognises(reader, file, keys)]
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror}); give a splat file") from None
-    if kind is None:
-        raise DataError(f"{path}: no splat format that is known; convert it to one of {_KNOWN}")
-    return path, kind
+    kinds += [kind for kind, reader in READERS.items() if reader.suffix == path.suffix.lower()]
+    if not kinds:
+        raise DataError(f"{path}: no splat format that is known; convert it to one of {', '.join(READERS)}")
+    return path, kinds[0], READERS[kinds[0]]
 
 
-def _kind(path: Path, file: BinaryIO) -> str | None:
-    head = file.read(64)
-    if head.startswith((b"\x1f\x8b", b"NGSP")):
-        return "SPZ"
-    if head.startswith(b"glTF"):
-        return "glTF"
-    if head.startswith(b"PK\x03\x04"):
-        return "SOG"
-    if head.startswith((b"ply\n", b"ply\r")):
-        return _kind_of_ply(path, file)
-    if head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):
-        return _kind_of_json(file)
-    return ".splat" if path.suffix.lower() == ".splat" else None
-
-
-def _kind_of_ply(path: Path, file: BinaryIO) -> str:
+def _json_keys(file: BinaryIO) -> Collection[str]:
+    """The keys of the object that a JSON file holds; none of another file."""
     file.seek(0)
-    try:
-        elements = read_elements(file)[1]
-    except ValueError:
-        return "PLY"  # its reader says what is wrong
-    return "compressed PLY" if is_compressed(elements) else "PLY"
-
-
-def _kind_of_json(file: BinaryIO) -> str | None:
+    if not file.read(64).removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):
+        return ()
     file.seek(0)
     try:
         document = loads_json(file.read())
     except ValueError:
-        return None
-    keys = set(document) if isinstance(document, dict) else set()
-    known = {"lodLevels": _LOD, "means": "SOG", "asset": "glTF"}
-    return next((kind for key, kind in known.items() if key in keys), None)
+        return ()
+    return document.keys() if isinstance(document, dict) else ()
+
+
+def _recognises(reader: SplatReader, file: BinaryIO, json_keys: Collection[str]) -> bool:
+    file.seek(0)
+    if file.read(64).startswith(reader.magic):
+        file.seek(0)
+        return reader.accepts is None or reader.accepts(file)
+    return reader.json_key in json_keys
+
+
+def writer_of(path: Path) -> SplatWriter:
+    """How files of this name are written; DataError for a name that says no format."""
+    writer = WRITERS.get(path.name) or WRITERS.get(path.suffix.lower())
+    if writer is None:
+        raise DataError(f"{path}: its name says no format that is written; use {_listed(WRITERS)}")
+    return writer
+
+
+def write_splat(
+    path: Path,
+    g: Gaussians,
+    names: Mapping[int, str] | None = None,
+    *,
+    parents: Mapping[int, str] | None = None,
+    antialiased: bool = False,
+) -> None:
+    """Write Gaussians in the format that the suffix says (`registry.WRITERS`), with their labels and `names`.
+
+    `parents` are the names of the categories that instances are of, by label id. `read_splat` finds all of it
+    again. DataError for another suffix, one of a format of several levels, and what the formats cannot hold.
+    """
+    scene_writer(path)(path, g, names or {}, parents or {}, antialiased)
+
+
+def scene_writer(path: Path) -> WriteScene:
+    """What writes a scene to a file of this name; DataError unless the name is of a format of one scene."""
+    write = writer_of(path).write
+    if write is None:
+        single = [name for name, writer in WRITERS.items() if writer.write]
+        raise DataError(f"{path}: holds several levels; name a {_listed(single)}")
+    return write
+
+
+def _listed(names: Collection[str]) -> str:
+    *first, last = names
+    return f"{', '.join(first)} or {last}"

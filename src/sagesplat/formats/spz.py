@@ -39,10 +39,11 @@ from sagesplat.formats.quantisation import (
     largest_restored,
     logits_of_bytes,
 )
-from sagesplat.formats.splat import Splat
+from sagesplat.formats.splat import Frame, Splat, SplatReader, SplatWriter
 from sagesplat.formats.spz_container import (
     ANTIALIASED,
     BASES,
+    MAGIC,
     MAX_BITS,
     MAX_COUNT,
     Packed,
@@ -51,9 +52,6 @@ from sagesplat.formats.spz_container import (
     zstd_packed,
 )
 from sagesplat.io.files import atomic_path
-
-# Axes in the file, left or right, up or down, front or back: SPZ's own are rub; COLMAP's and PLY's are rdf.
-Frame = Literal["rub", "ldb", "rdb", "lub", "ldf", "rdf", "luf", "ruf"]
 
 SH_BITS = (5, 4)  # of degree 1, of degrees 2 and 3; as in the reference implementation
 _LARGEST = 2**23 - 1  # magnitude of a fixed-point coordinate
@@ -349,3 +347,13 @@ def _fixed(positions: np.ndarray) -> np.ndarray:
     wide = np.zeros((len(positions), 3, 4), np.uint8)
     wide[..., 1:] = positions.reshape(-1, 3, 3)
     return wide.view("<i4")[..., 0] >> 8
+
+
+READER = SplatReader(
+    lambda path, options: read_spz_splat(path, frame=options.spz_axes), magic=(b"\x1f\x8b", MAGIC)
+)
+WRITER = SplatWriter(
+    lambda path, g, names, parents, antialiased: write_spz(
+        path, g, version=4, names=names, parents=parents, antialiased=antialiased
+    )
+)

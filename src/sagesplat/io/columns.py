@@ -5,7 +5,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Self, TypeVar
 
 import numpy as np
 
@@ -15,7 +15,34 @@ from sagesplat.io.files import atomic_path
 _CELL = 40  # characters of a number, at most: numpy pads all cells of a column to the widest
 # what spreadsheets begin a formula with (OWASP, "CSV Injection"), and those characters in full width
 _FORMULA = re.compile("'*[=+\\-@\t\r\n\uff1d\uff0b\uff0d\uff20]")
-Columns = TypeVar("Columns")  # a dataclass whose fields are annotated with jaxtyping arrays [R]
+Columns = TypeVar("Columns", bound="ColumnTable")  # its fields are annotated with jaxtyping arrays [R]
+
+
+class ColumnTable:
+    """Base of tables: frozen dataclasses whose fields are columns, numpy arrays [R]."""
+
+    def __len__(self) -> int:
+        return len(next(iter(vars(self).values())))
+
+    def select(self, keep: np.ndarray) -> Self:
+        """The rows that a boolean mask or an index array names."""
+        return type(self)(**{name: column[keep] for name, column in vars(self).items()})
+
+    @classmethod
+    def joined(cls, tables: Sequence[Self]) -> Self:
+        """The rows of several tables in turn."""
+        names = [f.name for f in fields(cls)]  # pyright: ignore[reportArgumentType]
+        return cls(**{name: np.concatenate([getattr(table, name) for table in tables]) for name in names})
+
+    def write_csv(self, path: Path) -> None:
+        """A header, then one line per row; floats so that they read back identical."""
+        names = list(vars(self))
+        # numpy prints the shortest text that reads back as the same float32
+        columns = [getattr(self, name).astype(str).tolist() for name in names]
+        with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(names)
+            writer.writerows(zip(*columns, strict=True))
 
 
 def text_cell(text: str) -> str:
@@ -26,17 +53,6 @@ def text_cell(text: str) -> str:
 def cell_text(cell: str) -> str:
     """The text that `text_cell` made a cell of."""
     return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
-
-
-def write_columns(path: Path, table: Any) -> None:
-    """Write a table as CSV: a header and one line per row; floats read back exactly."""
-    names = [f.name for f in fields(table)]
-    # numpy prints the shortest text that reads back as the same float32
-    columns = [getattr(table, name).astype(str).tolist() for name in names]
-    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(names)
-        writer.writerows(zip(*columns, strict=True))
 
 
 def _types(table: type) -> dict[str, np.dtype]:
@@ -51,7 +67,7 @@ def from_rows(table: type[Columns], rows: Sequence[Mapping[str, float]]) -> Colu
 
 
 def read_columns(path: Path, table: type[Columns], cure: str) -> Columns:
-    """The table that `write_columns` wrote. DataError for another file; `cure` is the error's advice.
+    """The table that `ColumnTable.write_csv` wrote. DataError for another file; `cure` is the error's advice.
 
     Needs at most 96 bytes of memory per byte of the file, plus `_CELL` characters per number.
     """

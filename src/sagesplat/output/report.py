@@ -102,8 +102,7 @@ def _merged_evaluation(rows: Evaluation, to: Categories) -> Evaluation:
     """The rows by category; those of whole images at one level stay as they are."""
     uniform = rows.label_id == UNIFORM
     parts = [merged(rows.select(~uniform), to, ("quality", "target", "view")), rows.select(uniform)]
-    columns = {f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Evaluation)}
-    return Evaluation(**columns)
+    return Evaluation.joined(parts)
 
 
 def template(path: Path) -> Template:

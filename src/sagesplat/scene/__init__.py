@@ -7,10 +7,8 @@ from typing import Literal
 import numpy as np
 
 from sagesplat.core.errors import SceneError
-from sagesplat.scene.colmap import load_colmap
-from sagesplat.scene.detect import detect
+from sagesplat.scene.detect import CAPTURES, detect
 from sagesplat.scene.images import Photos
-from sagesplat.scene.nerfstudio import load_blender, load_transforms
 from sagesplat.scene.scene import Scene
 from sagesplat.scene.stored import read_scene
 from sagesplat.scene.vignetting_fit import estimate_vignetting, with_vignetting
@@ -58,8 +56,7 @@ def load_scene(
         raise SceneError(f"{path}: {kind} without poses; `sagesplat run` finds them")
     if kind == "stored":
         return read_scene(path)
-    load = {"colmap": load_colmap, "transforms": load_transforms, "blender": load_blender}[kind]
-    scene = load(path, downscale=downscale, test_every=test_every)
+    scene = CAPTURES[kind].load(path, downscale=downscale, test_every=test_every)
     alpha = scene.alpha if alpha == "auto" else alpha
     scene = replace(scene, calibrate_every=calibrate_every, alpha=alpha)
     return with_vignetting(scene, estimate_vignetting(scene, Photos(scene.views))) if vignetting else scene

@@ -1,13 +1,16 @@
-"""Detects the kind of capture at a path."""
+"""The formats of captures, and which of them is at a path."""
 
 import os
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from sagesplat.core.errors import SceneError
 from sagesplat.scene import stored
+from sagesplat.scene.colmap import load_colmap
+from sagesplat.scene.nerfstudio import load_blender, load_transforms
+from sagesplat.scene.scene import Scene
 
-Kind = Literal["colmap", "transforms", "blender", "stored", "photos", "video"]
 # Their content decides how they are read (`io.pictures`).
 PHOTOS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".avif", ".heic", ".heif"})
 VALID_FOLDER = "masks_valid"  # beside photos: masks named like them, black where pixels do not count
@@ -16,12 +19,29 @@ VIDEOS = frozenset(
 )
 
 
-def detect(path: Path) -> Kind:
+@dataclass(frozen=True)
+class CaptureFormat:
+    """How captures of one format, photos with poses, are recognised and loaded."""
+
+    files: tuple[str, ...]  # in the capture's folder: one of them is there
+    load: Callable[..., Scene]  # (path, downscale=, test_every=) -> the scene
+    suffix: str | None = None  # of other files that stand for a capture
+
+
+CAPTURES = {
+    "colmap": CaptureFormat(
+        ("sparse/0/cameras.bin", "sparse/0/cameras.txt", "sparse/cameras.bin", "sparse/cameras.txt"),
+        load_colmap,
+    ),
+    "transforms": CaptureFormat(("transforms.json",), load_transforms, suffix=".json"),
+    "blender": CaptureFormat(("transforms_train.json",), load_blender),
+}
+
+
+def detect(path: Path) -> str:
     """The kind of capture at a path: the first of these that matches.
 
-    - colmap: cameras.bin or .txt in sparse/0 or sparse;
-    - transforms: transforms.json in the folder, or the path of any .json file;
-    - blender: transforms_train.json in the folder, or its path;
+    - a name in `CAPTURES`: one of its files is in the folder, or the path is of one, or has its suffix;
     - stored: an .npz file, such as the capture of one block (`scene.stored`);
     - photos: photos in images/, or in the folder itself;
     - video: the path of a video file.
@@ -32,26 +52,24 @@ def detect(path: Path) -> Kind:
         return _of_file(path)
     if not os.path.isdir(path):
         raise SceneError(f"{path}: no such file or folder; give a capture's folder or a video")
-    models = (path / "sparse" / "0", path / "sparse")
-    if any((model / name).is_file() for model in models for name in ("cameras.bin", "cameras.txt")):
-        return "colmap"
-    if (path / "transforms.json").is_file():
-        return "transforms"
-    if (path / "transforms_train.json").is_file():
-        return "blender"
+    for kind, capture in CAPTURES.items():
+        if any((path / name).is_file() for name in capture.files):
+            return kind
     if any(_holds_photos(folder) for folder in (path / "images", path)):
         return "photos"
+    looked_for = ", ".join(name for capture in CAPTURES.values() for name in capture.files)
     raise SceneError(
-        f"{path}: no capture (looked for cameras.bin and cameras.txt in sparse/0 and sparse, "
-        "transforms.json, transforms_train.json, and photos in images/ and the folder); "
+        f"{path}: no capture (looked for {looked_for}, and photos in images/ and the folder); "
         "give a folder that has one of them, or a video file"
     )
 
 
-def _of_file(path: Path) -> Kind:
+def _of_file(path: Path) -> str:
     suffix = path.suffix.lower()
-    if suffix == ".json":
-        return "blender" if path.name == "transforms_train.json" else "transforms"
+    named = [kind for kind, capture in CAPTURES.items() if path.name in capture.files]
+    named += [kind for kind, capture in CAPTURES.items() if capture.suffix == suffix]
+    if named:
+        return named[0]
     if suffix == stored.SUFFIX:
         return "stored"
     if suffix in VIDEOS:

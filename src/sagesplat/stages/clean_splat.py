@@ -12,14 +12,12 @@ from sagesplat.adapt.free_viewpoints import check_size, free_cameras
 from sagesplat.adapt.observe import RenderedLabels
 from sagesplat.adapt.renders import Renders
 from sagesplat.core.config import CleanConfig
-from sagesplat.core.errors import DataError, RunError
+from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit, Progress, StageDone, StageStarted, Warned
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.formats.lod_meta import LOD_META
 from sagesplat.formats.ply import read_ply_splat, select_ply
 from sagesplat.formats.splat import Splat, undrawable
-from sagesplat.formats.splats import read_splat
-from sagesplat.formats.splats_write import write_splat, written_as
+from sagesplat.formats.splats import read_splat, scene_writer, write_splat
 from sagesplat.raster import Backend, device_of
 from sagesplat.scene import load_scene
 from sagesplat.scene.cameras import read_camera_file
@@ -94,8 +92,7 @@ def _check_paths(source: Path, out: Path, picture: Path | None, config: CleanCon
     """RunError for what would overwrite the splat, or write nothing."""
     if config.floaters == "keep":
         raise RunError("--clean.floaters keep: nothing would be removed; leave it out")
-    if written_as(out) == LOD_META:
-        raise DataError(f"{out}: holds several levels; name a .ply, .spz or .sog")
+    scene_writer(out)  # the name is that of a file which can be written
     for path in (out, picture):
         if path is not None and path.resolve() == source.resolve():
             raise RunError(f"{path}: the splat itself; name another file")
@@ -133,7 +130,7 @@ def _scene_of(path: Path, cameras: Sequence[Camera]) -> Scene:
 
 def _write(source: Path, out: Path, splat: Splat, keep: np.ndarray) -> None:
     """Write the Gaussians that stay; from PLY to PLY their rows with all properties that the file has."""
-    if splat.kind == "PLY" and written_as(out) == ".ply":
+    if splat.kind == "PLY" and out.suffix.lower() == ".ply":
         g = read_ply_splat(source).gaussians
         drawn = ~torch.stack(list(undrawable(g).values())).any(0).numpy()
         labelled_here = torch.equal(g.label_ids[torch.from_numpy(drawn)], splat.gaussians.label_ids)

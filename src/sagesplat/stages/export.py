@@ -22,8 +22,8 @@ from sagesplat.formats.increments import (
     write_increments,
 )
 from sagesplat.formats.lod_meta import LOD_META
-from sagesplat.formats.lod_meta_write import write_lod_meta
-from sagesplat.formats.splats_write import write_splat, written_as
+from sagesplat.formats.splat import WriteLevels
+from sagesplat.formats.splats import write_splat, writer_of
 from sagesplat.raster import device_of, rasterize
 from sagesplat.run.job import Job
 from sagesplat.scene.scene import Camera
@@ -83,12 +83,12 @@ def export_scene(
     `rasterize_mode`: how the file will be drawn; None: `classic` for a PLY, else as the run was trained.
     `lod-meta.json` gets `levels`, or all there are, as levels of detail. Returns the number of Gaussians.
     """
-    written = written_as(path)
+    writer = writer_of(path)
     if rasterize_mode == "antialiased" and not job.antialiased:
         raise RunError(f"{job.run.path}: trained without antialiasing; leave out --rasterize-mode")
-    if rasterize_mode == "classic" and written == LOD_META:
+    if rasterize_mode == "classic" and writer.write_levels:
         raise RunError(f"{path}: says how it is drawn; leave out --rasterize-mode")
-    if written == LOD_META:
+    if writer.write_levels:
         _check_folder(job, path.parent)
     elif path.exists() and not job.force:
         raise RunError(f"{path}: exists; add --force to replace it")
@@ -97,8 +97,8 @@ def export_scene(
     wanted = [label for label in wanted if label not in gone]
     if not wanted:
         raise RunError(f"{path}: no category is left; leave out some of --without")
-    if written == LOD_META:
-        return _export_levels(job, path.parent, levels, wanted)
+    if writer.write_levels:
+        return _export_levels(job, path, writer.write_levels, levels, wanted)
     if levels:
         raise RunError(f"{path}: levels are for {LOD_META}; name one with --level")
     if level is not None:
@@ -108,7 +108,7 @@ def export_scene(
     g = whole.of_labels(wanted)
     if gone:
         job.emit(Warned(_holes(job, whole, g, without)))
-    mode = rasterize_mode or ("classic" if written == ".ply" else "antialiased")
+    mode = rasterize_mode or ("antialiased" if writer.antialiases else "classic")
     if mode == "classic":
         write_splat(path, classic(job, g), job.names(), parents=job.parents_by_id)
     else:
@@ -146,9 +146,11 @@ def _check_folder(job: Job, folder: Path) -> None:
         raise RunError(f"{folder}: not empty; choose a new folder (--force replaces one that export wrote)")
 
 
-def _export_levels(job: Job, folder: Path, levels: Sequence[int], wanted: Sequence[int]) -> int:
+def _export_levels(
+    job: Job, path: Path, write: WriteLevels, levels: Sequence[int], wanted: Sequence[int]
+) -> int:
     chosen = sorted(set(levels) or job.ladder.levels, reverse=True)  # the finest is level of detail 0
     sets = [job.ladder.load(level, wanted) for level in chosen]
     sets = [g for i, g in enumerate(sets) if len(g) and (i == 0 or len(g) < len(sets[i - 1]))]
-    write_lod_meta(folder, sets, job.names(), parents=job.parents_by_id, antialiased=job.antialiased)
+    write(path, sets, job.names(), job.parents_by_id, job.antialiased)
     return len(sets[0]) if sets else 0

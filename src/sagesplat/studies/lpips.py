@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sagesplat.core.errors import SageError
-from sagesplat.core.events import Warned
+from sagesplat.core.events import Emit, Warned
 from sagesplat.metrics.lpips import Features, Lpips, Net, load_lpips, weights_path
 from sagesplat.run.job import Job
 from sagesplat.run.records import file_hash
@@ -21,14 +21,14 @@ def lpips_hashes(folder: Path | None) -> dict[str, str | None]:
     return {net: file_hash(path) if path.is_file() else None for net, path in paths.items()}
 
 
-def load_metrics(job: Job, folder: Path | None, nets: Sequence[Net] = NETS) -> dict[str, Lpips]:
+def load_metrics(emit: Emit, folder: Path | None, nets: Sequence[Net] = NETS) -> dict[str, Lpips]:
     """LPIPS as the field feeds it, by column; what cannot be loaded is left out with a warning."""
     found = {}
     for net in nets:
         try:
             found[f"lpips_{net}"] = load_lpips(net, folder, as_3dgs=net == "vgg")
         except SageError as error:
-            job.emit(Warned(f"no LPIPS ({net}): {error}"))
+            emit(Warned(f"no LPIPS ({net}): {error}"))
     return found
 
 

@@ -107,7 +107,7 @@ def compare(job: Job, config: CompareConfig, copy: Path | None = None) -> list[P
             *prefixes(nested),
             *_planned(nested, config),
         ]
-        points = measure_sets(job, contenders, load_metrics(job, config.lpips))
+        points = measure_sets(job, contenders, load_metrics(job.emit, config.lpips))
         walks = _walks(nested, sage)
         (folder / PAGE).unlink(missing_ok=True)  # it shows what was measured before
         write_comparison(file, points, walks, scene=job.scene.name, views=len(job.scene.test_ids))

@@ -9,16 +9,15 @@ from scipy.ndimage import uniform_filter
 
 from sagesplat.adapt.free_viewpoints import check_size, free_cameras
 from sagesplat.core.config import MeasureConfig
-from sagesplat.core.errors import RunError, SageError
+from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit, Progress, StageStarted, Warned
 from sagesplat.formats.splats import Splat
 from sagesplat.metrics.image import ssim_map
-from sagesplat.metrics.lpips import Lpips, load_lpips
 from sagesplat.output.contact_sheet import contact_sheet
 from sagesplat.raster import Backend
 from sagesplat.scene.cameras import read_camera_file
 from sagesplat.scene.scene import Camera
-from sagesplat.studies.lpips import NETS
+from sagesplat.studies.lpips import load_metrics
 from sagesplat.studies.measure.levels import Level, levels_of, unique_names
 from sagesplat.studies.measure.report import (
     SIDE,
@@ -62,7 +61,7 @@ def measure(
         raise RunError(
             f"{config.cameras}: no camera has {reference.name} in sight; give cameras of this scene"
         )
-    metrics = _metrics(config.lpips, emit)
+    metrics = load_metrics(emit, config.lpips)
 
     def done(images: int) -> None:
         emit(Progress("measure", images, total))
@@ -129,17 +128,6 @@ def _viewpoints(
     some = [found[i] for i in picked]
     line = f"{len(some)} of the {len(found)} cameras of {config.cameras.name}"
     return [one.camera.within(config.size) for one in some], [one.name for one in some], [line]
-
-
-def _metrics(folder: Path | None, emit: Emit) -> dict[str, Lpips]:
-    """LPIPS as the field feeds it, by column; what cannot be loaded is left out with a warning."""
-    found = {}
-    for net in NETS:
-        try:
-            found[f"lpips_{net}"] = load_lpips(net, folder, as_3dgs=net == "vgg")
-        except SageError as error:
-            emit(Warned(f"no LPIPS ({net}): {error}"))
-    return found
 
 
 def _strip(truth: Splat, levels: Sequence[Level], camera: Camera, name: str, renderer: Renderer) -> Strip:

@@ -1,7 +1,7 @@
 """Cross-view evaluation: each unseen view gets a plan of its own, and masks from the 3D labels."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ from sagesplat.adapt.observe import (
 )
 from sagesplat.adapt.plan import Plan
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.io.columns import from_rows, read_columns, write_columns
+from sagesplat.io.columns import ColumnTable, from_rows, read_columns
 from sagesplat.raster import Backend, Workspace
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
@@ -29,7 +29,7 @@ NONE = -1  # level or count where there is none
 
 
 @dataclass(frozen=True, eq=False)
-class CrossView:
+class CrossView(ColumnTable):
     """One row per (target, view, category in sight) and one per (target, view) for the whole image."""
 
     target: Float32[np.ndarray, " R"]  # SSIM
@@ -47,22 +47,11 @@ class CrossView:
     full_psnr: Float32[np.ndarray, " R"]
     num_pixels: Int32[np.ndarray, " R"]
 
-    def __len__(self) -> int:
-        return len(self.label_id)
-
-    def select(self, keep: np.ndarray) -> "CrossView":
-        """The rows that a boolean mask or an index array names."""
-        return CrossView(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
-
     @property
     def regret(self) -> Float32[np.ndarray, " R"]:
         """Gaussians above the cheapest level that measures the target; NaN unless the chosen one does too."""
         known = (self.oracle_level != NONE) & (self.level_ssim >= self.target)
         return np.where(known, self.count - self.oracle_count, np.nan).astype(np.float32)
-
-    def write_csv(self, path: Path) -> None:
-        """One line per row, a header first; floats so that they read back identical."""
-        write_columns(path, self)
 
 
 def read_cross_view(path: Path) -> CrossView:

@@ -12,7 +12,7 @@ from sagesplat.core.config import PaperConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Progress, RunDone
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.io.columns import from_rows, write_columns
+from sagesplat.io.columns import from_rows
 from sagesplat.output.tables import Table, name_of, promise_kept
 from sagesplat.run.job import Job
 from sagesplat.run.stage import run_stage
@@ -143,7 +143,7 @@ def equal_size(job: Job, config: PaperConfig) -> None:
             advance(_IMAGES_A_TRAINING)
             return result
 
-        metrics = load_metrics(job, config.lpips)
+        metrics = load_metrics(job.emit, config.lpips)
         rows: list[dict[str, float]] = []
         for of_view, plans, views in comparisons:
             sets = contenders(job.scene, job.ladder, plans, tuned, antialiased=job.antialiased)
@@ -151,7 +151,7 @@ def equal_size(job: Job, config: PaperConfig) -> None:
                 job.scene, job.photos, views, sets, metrics, of_view=of_view, valid=job.valid,
                 backend=job.backend, antialiased=job.antialiased, progress=lambda *_: advance(1),
             )  # fmt: skip
-        write_columns(run.same_size, from_rows(SameSize, rows))
+        from_rows(SameSize, rows).write_csv(run.same_size)
         return [f"{len(rows)} images measured"]
 
     inputs = [run.levels, run.models, run.observations, *_made_of(job)]
@@ -231,7 +231,7 @@ def _panels(job: Job, config: PaperConfig, view: int) -> dict[str, list[Picture]
     """The view of Table III, and for cross-view two test views, in pictures."""
     tests = job.scene.test_ids
     rows = [view, *(int(tests[len(tests) * i // 4]) for i in (1, 3) if len(tests))]
-    metric = load_metrics(job, config.lpips, ["alex"]).get("lpips_alex")
+    metric = load_metrics(job.emit, config.lpips, ["alex"]).get("lpips_alex")
     full = job.ladder.load(job.ladder.levels[-1])
     panels = {}
     for row in dict.fromkeys(rows):

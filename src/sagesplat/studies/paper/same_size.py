@@ -1,7 +1,7 @@
 """Quality at equal model size (Table IV of the paper): compositions against 3DGS of the same size."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ from sagesplat.adapt.ladder import Ladder
 from sagesplat.adapt.observe import as_unit, measure_total, render_rgb
 from sagesplat.adapt.plan import Plan
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.io.columns import read_columns
+from sagesplat.io.columns import ColumnTable, read_columns
 from sagesplat.metrics.image import pasted
 from sagesplat.metrics.lpips import Lpips
 from sagesplat.raster import Backend, Workspace
@@ -36,7 +36,7 @@ class Contender(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class SameSize:
+class SameSize(ColumnTable):
     """One row per (contender, view)."""
 
     of_view: Int32[np.ndarray, " R"]  # view that the compositions were planned for; -1 = for the scene
@@ -49,13 +49,9 @@ class SameSize:
     lpips_alex: Float32[np.ndarray, " R"]  # NaN where it could not be measured
     lpips_vgg: Float32[np.ndarray, " R"]  # fed as the evaluation of 3DGS feeds it
 
-    def select(self, keep: np.ndarray) -> "SameSize":
-        """The rows that a boolean mask or an index array names."""
-        return SameSize(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
-
 
 def read_same_size(path: Path) -> SameSize:
-    """The table that `columns.write_columns` wrote. DataError where it is not one."""
+    """The table that `write_csv` wrote. DataError where it is not one."""
     return read_columns(path, SameSize, "delete it and run `sagesplat report --paper` again")
 
 

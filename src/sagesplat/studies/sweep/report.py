@@ -54,7 +54,8 @@ def readable(summary: Table, measures: Sequence[str]) -> Table:
     return Table(summary.title, header, ("",) * len(header), body)
 
 
-def _write(out: Path, rows: list[Row]) -> None:
+def write_tables(out: Path, rows: list[Row]) -> None:
+    """cells.csv with these rows, and summary.csv and .md with their means, in the folder `out`."""
     header = ("scene", "variant", "seed", "target", *MEASURES, "status")
     Table("Runs", header, ("", "", "d", "g", *MEASURES.values(), ""), rows).write_csv(out / "cells.csv")
     summary = summarise(rows)

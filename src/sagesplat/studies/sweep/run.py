@@ -21,7 +21,7 @@ from sagesplat.run.run_dir import RunDir
 from sagesplat.stages.pipeline import demo_capture, run_all
 from sagesplat.stages.results import evaluation_of, plans_of
 from sagesplat.studies.sweep.file import Cell, Sweep
-from sagesplat.studies.sweep.report import MEASURES, SHOWN, Row, _write, readable, summarise
+from sagesplat.studies.sweep.report import MEASURES, SHOWN, Row, readable, summarise, write_tables
 
 
 def run_sweep(
@@ -52,7 +52,7 @@ def run_sweep(
             failed[number] = name
         else:
             emit(StageDone(name, done.seconds, (f"run {number + 1} of {len(sweep)}",)))
-        _write(out, [row for at in sorted(rows) for row in rows[at]])
+        write_tables(out, [row for at in sorted(rows) for row in rows[at]])
     shown = readable(summarise([row for at in sorted(rows) for row in rows[at]]), SHOWN)
     emit(shown.event)
     if failed:

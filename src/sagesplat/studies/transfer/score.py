@@ -12,6 +12,7 @@ from sagesplat.adapt.observe import Observations
 from sagesplat.adapt.plan import Counts, Models, choose_latest
 from sagesplat.core.errors import RunError
 from sagesplat.core.geometry import mean_neighbour_distance
+from sagesplat.io.columns import ColumnTable
 from sagesplat.segment.masks import UNLABELLED_NAME
 
 NORMALISATIONS = ("raw", "extent", "footprint")
@@ -48,7 +49,7 @@ class Shared:
 
 
 @dataclass(frozen=True, eq=False)
-class Transfer:
+class Transfer(ColumnTable):
     """One row per (split of B, target, category, predictor); NaN where no view can tell."""
 
     split: np.ndarray  # [R] "train" or "test" views of B
@@ -65,10 +66,6 @@ class Transfer:
     missed: Int[np.ndarray, " R"]  # those in which it does not: chosen too cheap
     regret: Float[np.ndarray, " R"]  # mean Gaussians above the cheapest such level where it does
     regret_share: Float[np.ndarray, " R"]  # the same over the category's Gaussians at its last level
-
-    def select(self, keep: np.ndarray) -> "Transfer":
-        """The rows that a boolean mask or an index array names."""
-        return Transfer(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
 
 def point_spacings(xyz: Float[np.ndarray, "P 3"], point_labels: Int[np.ndarray, " P"]) -> dict[int, float]:
