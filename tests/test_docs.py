@@ -1,11 +1,12 @@
-"""What the documents name is there: links, files, modules, commands and flags."""
+"""What the documents say is so: links, files, modules, commands, flags, messages, dates of measurements."""
 
 import importlib
-import inspect
 import re
+import shlex
 import subprocess
 import tomllib
 import warnings
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -13,19 +14,23 @@ import pytest
 import tyro
 
 import sagesplat
-from benchmarks import __main__ as measuring
 from sagesplat import cli
+from sagesplat.cli.parse import arguments
+from tools import doc_tables
 
 ROOT = Path(__file__).parents[1]
-DOCS = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
+DOCS = ROOT / "docs"
+PAGES = sorted(DOCS.rglob("*.md"))
+README = ROOT / "README.md"
 FOREIGN = {  # flags of other tools
-    *("--only-binary", "--constraint", "--dest", "--require-hashes"),  # pip
-    "--fix", "--address", "--generate", "--no-index", "--find-links", "--revision", "--extra", "--upgrade",
-    "--decimate",  # splat-transform
-    "--densify-until", "--no-masks",  # OpenSplat
-}  # fmt: skip
-
-FOREIGN_FILES = {"stages/NAME.py", "simple_trainer.py"}  # a placeholder; gsplat's
+    *("--only-binary", "--constraint", "--dest", "--require-hashes", "--extra", "--upgrade"),  # pip, uv
+    *("--fix", "--address", "--generate", "--head", "--scale", "--decimate"),  # ruff, Ray, splat-transform
+    *("--densify-until", "--no-masks"),  # OpenSplat
+}
+FOREIGN_FILES = {  # a placeholder; gsplat's, instant-ngp's
+    *("stages/NAME.py", "simple_trainer.py", "docs/nerf_dataset_tips.md")
+}
+PLACEHOLDER = re.compile(r"…|\.\.\.|\bK\b")  # lines that leave something out, or stand for several
 
 
 @cache
@@ -40,13 +45,11 @@ def tracked() -> list[str]:
 
 @cache
 def flags() -> set[str]:
-    """Every flag of every command, of `sagesplat` and of `python -m benchmarks`."""
+    """Every flag of every command."""
     found = {"--version", "--help", "--help-all"}
-    measured = [f for n, f in vars(measuring).items() if inspect.isfunction(f) and not n.startswith("_")]
-    measured = [f for f in measured if f.__module__ == measuring.__name__]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # tyro has no other way to its parsers yet
-        waiting = list(map(tyro.extras.get_parser, [*cli.commands().values(), *measured]))
+        waiting = list(map(tyro.extras.get_parser, cli.commands().values()))
     while waiting:
         for action in waiting.pop()._actions:
             found.update(action.option_strings)
@@ -55,9 +58,18 @@ def flags() -> set[str]:
     return found
 
 
+@cache
+def flags_of_module(name: str) -> set[str]:
+    """Those of `python -m NAME`: arguments of its functions and fields of its types."""
+    path = ROOT / name.replace(".", "/")
+    source = path / "__main__.py" if path.is_dir() else path.with_suffix(".py")
+    assert source.is_file(), f"no python -m {name}"
+    return {f"--{each.replace('_', '-')}" for each in re.findall(r"\b(\w+): ", source.read_text())}
+
+
 def words(path: Path) -> list[str]:
     """What stands between backticks, and the lines of code blocks."""
-    text = path.read_text()
+    text = re.sub(r"\\\n\s*", "", path.read_text())
     fenced = "\n".join(re.findall(r"^```\w*\n([^`]*)^```$", text, re.MULTILINE))
     blocks = [*re.findall(r"^ {4,}\S.*$", text, re.MULTILINE), *fenced.splitlines()]
     return [" ".join(word.split()) for word in re.findall(r"`([^`]+)`", text)] + blocks
@@ -76,78 +88,111 @@ def resolve(name: str) -> object | None:
     return found
 
 
-def anchor(title: str) -> str:
-    """GitHub's anchor of a title."""
-    return re.sub(r"[^\w\- ]", "", title.strip().lower()).replace(" ", "-")
+def test_links_outside_of_the_site_lead_somewhere():
+    """Those of pages of the site are followed by `tests/test_site.py`, anchors included."""
+    for path in ROOT.glob("*.md"):
+        for target in re.findall(r"\]\(([^)\s]+)\)", path.read_text()):
+            if not target.startswith(("http://", "https://", "#")):
+                assert (ROOT / target.partition("#")[0]).exists(), f"{path.name}: {target}"
 
 
-@pytest.mark.parametrize("path", DOCS, ids=lambda path: path.name)
-def test_links_lead_somewhere(path):
-    for target in re.findall(r"\]\(([^)\s]+)\)", path.read_text()):
-        if target.startswith(("http://", "https://")):
-            continue
-        file, _, part = target.partition("#")
-        there = (path.parent / file) if file else path
-        assert there.exists(), f"{path.name}: {target}"
-        if part and there.suffix == ".md":
-            titles = re.findall(r"^#+ (.+)$", there.read_text(), re.MULTILINE)
-            assert part in {anchor(title) for title in titles}, f"{path.name}: {target}"
+def test_no_message_or_comment_names_a_page_that_is_gone():
+    folders = (("src", "py"), ("tests", "py"), ("web/src", "ts"))
+    for path in (path for folder, kind in folders for path in (ROOT / folder).rglob(f"*.{kind}")):
+        for page in set(re.findall(r"\bdocs/[\w/-]+\.md\b", path.read_text())) - FOREIGN_FILES:
+            assert (ROOT / page).exists(), f"{path.name}: {page}"
 
 
-@pytest.mark.parametrize("path", DOCS, ids=lambda path: path.name)
-def test_files_and_modules_exist(path):
+@pytest.mark.parametrize("path", [README, *PAGES], ids=lambda path: path.name)
+def test_what_is_named_exists(path):
+    """Files, modules, commands and flags."""
     gone = []
     for word in words(path):
         for file in re.findall(r"(?<![\w.*])[\w./-]+\.(?:py|ts|mjs)\b", word):
             known = any(each.endswith(f"/{file.lstrip('./')}") for each in tracked())
-            if not known and file not in FOREIGN_FILES:
-                gone.append(file)
-        for name in re.findall(r"\bsagesplat((?:\.\w+)+)", word):
-            if resolve(f"sagesplat{name}") is None:
-                gone.append(f"sagesplat{name}")
-    assert gone == []
-
-
-@pytest.mark.parametrize("path", DOCS, ids=lambda path: path.name)
-def test_commands_and_flags_exist(path):
-    gone = []
-    for word in words(path):
+            gone += [] if known or file in FOREIGN_FILES else [file]
+        names = re.findall(r"\bsagesplat((?:\.\w+)+)", word)
+        gone += [name for name in names if resolve(f"sagesplat{name}") is None]
+        module = re.search(r"python -m ((?:benchmarks|tests)\.[a-z]\w+)", word)
+        known_flags = flags() | FOREIGN | (flags_of_module(module[1]) if module else set())
         for flag in re.findall(r"(?<![\w-])--[a-z][\w.-]*\w", word):
             group = any(each.startswith(f"{flag}.") for each in flags())  # `--train`: all of its flags
-            gone += [] if group or flag in flags() | FOREIGN else [flag]
-        found = re.match(r"\s*(?:\.venv/bin/)?sagesplat ([a-z][\w-]*)", word)
-        gone += [found[0]] if found and found[1] not in cli.commands() else []
+            earlier = re.match(r"python -m benchmarks ", word)  # of the commit that is named
+            gone += [] if group or flag in known_flags or earlier else [flag]
+        command = re.match(r"\s*(?:\.venv/bin/)?sagesplat ([a-z][\w-]*)", word)
+        gone += [command[0]] if command and command[1] not in cli.commands() else []
     assert gone == []
 
 
-def test_core_types_are_where_the_architecture_says():
-    text = (ROOT / "docs" / "architecture.md").read_text()
+def command_lines(path: Path) -> Iterator[str]:
+    """What begins with `sagesplat` in code blocks and between backticks, without comments."""
+    text = re.sub(r"\\\n\s*", "", path.read_text())
+    fenced = re.findall(r"^```(?:sh|)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    indented = re.findall(r"^ {4,}(\S.*)$", text, re.MULTILINE)
+    for line in ["\n".join(fenced), "\n".join(indented)]:
+        yield from re.findall(r"^\s*(?:\$ )?(?:\.venv/bin/)?(sagesplat [a-z-]+ .*?)(?:\s+#.*)?$", line, re.M)
+    for line in re.findall(r"`(sagesplat [a-z-]+ [^`]*)`", text.replace("\n", " ")):
+        yield line if " -" in line else ""  # in a sentence, arguments may be left out
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(DOCS)))
+def test_command_lines_are_accepted(path, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # no run folders whose settings would be read
+    for line in dict.fromkeys(command_lines(path)):
+        if not line or PLACEHOLDER.search(line) or "--help" in line:
+            continue
+        typed = shlex.split(line.rstrip(","))[1:]
+        arguments(typed[0], cli.commands()[typed[0]], typed[1:])
+
+
+def test_error_messages_are_those_of_the_code():
+    """Each message of the page, cut where something stands for a path or a number, is in the sources."""
+    files = [*(ROOT / "src").rglob("*.py"), *(ROOT / "web/src").rglob("*.ts")]
+    code = "".join(path.read_text() for path in files)
+    code = re.sub(r'"\s*\n\s*f?"', "", code)  # a message over several lines
+    code = re.sub(r"\$?\{[^{}\n]*\}", "…", code)
+    tables = "".join((DOCS / "help" / name).read_text() for name in ("errors.md", "troubleshooting.md"))
+    messages = re.findall(r"^\| `(?!RUN|infeas|uncal|lift|unlab)([^`]{12,})` \|", tables, re.MULTILINE)
+    assert len(messages) > 25
+    for message in messages:
+        for part in (part.strip(" .:;,()") for part in message.split("…")):
+            assert part in code, f"{message}: no {part!r}"
+
+
+def test_measured_tables_say_when_on_which_commit_and_how():
+    found = list(doc_tables.tables(DOCS))
+    assert len(found) > 50
+    unsaid = [
+        f"{table.page}:{table.line}"
+        for table in found
+        if not (table.measured and table.commit and (table.command or table.page.startswith("developers/")))
+    ]
+    assert unsaid == []
+
+
+def test_the_architecture_is_that_of_the_package():
+    """Layers, folders, and the files of the core types."""
+    text = (DOCS / "architecture.md").read_text()
+    contract = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"][0]
+    layers = [line.replace("sagesplat.", "").replace("|", "·") for line in contract["layers"]]
+    assert "\n".join(f"    {layer}" for layer in layers) in text
+    folders = {path.parent.name for path in (ROOT / "src" / "sagesplat").glob("*/__init__.py")}
+    assert set(re.findall(r"^\| `(\w+)/` \|", text, re.MULTILINE)) == folders
     rows = re.findall(r"^\| ((?:`\w+`(?:, )?)+) \| `([\w/]+\.py)` \|", text, re.MULTILINE)
-    assert len(rows) > 20
+    assert len(rows) > 10
     for types, file in rows:
         source = (ROOT / "src" / "sagesplat" / file).read_text()
         for name in re.findall(r"`(\w+)`", types):
             assert re.search(rf"^class {name}\b", source, re.MULTILINE), f"{name} in {file}"
 
 
-def test_layers_and_folders_are_those_of_the_package():
-    text = (ROOT / "docs" / "architecture.md").read_text()
-    contract = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"][0]
-    layers = [line.replace("sagesplat.", "").replace("|", "·") for line in contract["layers"]]
-    assert "\n".join(f"    {layer}" for layer in layers) in text
-    folders = {path.parent.name for path in (ROOT / "src" / "sagesplat").glob("*/__init__.py")}
-    assert set(re.findall(r"^\| `(\w+)/` \|", text, re.MULTILINE)) == folders
-
-
 def test_what_the_paper_page_names_exists():
     """Functions after `sagesplat.`, and test files with the tests behind the colon."""
-    text = (ROOT / "docs" / "paper.md").read_text()
+    text = (DOCS / "paper.md").read_text()
     rows = [line.split("|")[1:-1] for line in text.splitlines() if line.startswith("| ") and "`" in line]
-    named = 0
     for row in rows:
         for name in re.findall(r"`((?:[a-z]\w*\.)+\w+)`", row[1]):
             assert resolve(f"sagesplat.{name}") is not None, name
-            named += 1
         pattern = r"((?:`test_[\w*]+`(?:, )?)+)(?:: ((?:`test_\w+`(?:, )?)+))?"
         for files, tests in re.findall(pattern, row[-1]):
             globs = [f"{name}.py" for name in re.findall(r"`([\w*]+)`", files)]
@@ -156,5 +201,3 @@ def test_what_the_paper_page_names_exists():
             source = "".join(path.read_text() for path in paths)
             for test in re.findall(r"`(\w+)`", tests):
                 assert f"def {test}(" in source, test
-                named += 1
-    assert named > 40

@@ -1,7 +1,6 @@
-"""The documentation site: builds without a warning, links lead somewhere, command lines are accepted."""
+"""The documentation site: builds without a warning, links lead somewhere, pages are sound in a browser."""
 
 import re
-import shlex
 import subprocess
 import sys
 import threading
@@ -19,17 +18,13 @@ from browser import open_page
 from page_checks import wrong_with
 
 import sagesplat
-from benchmarks import doc_tables
 from sagesplat import cli
-from sagesplat.cli.parse import arguments
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-PAGES = sorted(DOCS.rglob("*.md"))
-PLACEHOLDER = re.compile(r"…|\.\.\.|\bK\b")  # lines that leave something out, or stand for several
 
 
 class Page:
@@ -38,6 +33,7 @@ class Page:
     def __init__(self, text: str) -> None:
         self.anchors = {unescape(name) for name in re.findall(r'<[^>]*?\s(?:id|name)="([^"]+)"', text)}
         self.targets = {unescape(target) for target in re.findall(r'<[^>]*?\s(?:href|src)="([^"]+)"', text)}
+        self.links = {unescape(target) for target in re.findall(r'<a\b[^>]*?\shref="([^"]+)"', text)}
 
 
 @pytest.fixture(scope="module")
@@ -52,12 +48,13 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_links_pictures_and_anchors_lead_somewhere(site):
     pages = {path: Page(path.read_text()) for path in site.rglob("*.html")}
-    assert len(pages) > 40
+    assert len(pages) > 35
     gone = []
     for path, page in pages.items():
         for target in page.targets:
             link = urlsplit(target)
-            if link.scheme or link.netloc:
+            if link.scheme or link.netloc:  # a link; scripts, styles and pictures are the site's own
+                gone += [] if target in page.links else [f"{path.name} loads {target}"]
                 continue
             there = (path.parent / unquote(link.path)).resolve() if link.path else path
             found = there.exists() and there.is_relative_to(site)
@@ -68,67 +65,11 @@ def test_links_pictures_and_anchors_lead_somewhere(site):
     assert gone == []
 
 
-def test_nothing_is_loaded_from_elsewhere(site):
-    """The site works offline: scripts, styles and pictures are its own."""
-    for path in site.rglob("*.html"):
-        loaded = re.findall(
-            r'<(?:script|img|link|iframe)\b[^>]*(?:src|href)="(https?:[^"]+)"', path.read_text()
-        )
-        assert loaded == [], path.name
-
-
 def test_every_command_and_public_name_is_in_the_reference(site):
     commands = Page((site / "reference/cli.html").read_text()).anchors
     assert {f"sagesplat-{name}" for name in cli.commands()} <= commands
     names = Page((site / "reference/python.html").read_text()).anchors
     assert {f"sagesplat.{name}" for name in sagesplat.__all__} <= names
-
-
-def command_lines(path: Path) -> Iterator[str]:
-    """What begins with `sagesplat` in code blocks and between backticks, without comments."""
-    text = re.sub(r"\\\n\s*", "", path.read_text())
-    fenced = re.findall(r"^```(?:sh|)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
-    indented = re.findall(r"^ {4,}(\S.*)$", text, re.MULTILINE)
-    for line in ["\n".join(fenced), "\n".join(indented)]:
-        yield from re.findall(r"^\s*(?:\$ )?(?:\.venv/bin/)?(sagesplat [a-z-]+ .*?)(?:\s+#.*)?$", line, re.M)
-    for line in re.findall(r"`(sagesplat [a-z-]+ [^`]*)`", text.replace("\n", " ")):
-        yield line if " -" in line else ""  # in a sentence, arguments may be left out
-
-
-@pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(DOCS)))
-def test_command_lines_are_accepted(path, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # no run folders whose settings would be read
-    for line in dict.fromkeys(command_lines(path)):
-        if not line or PLACEHOLDER.search(line) or "--help" in line:
-            continue
-        words = shlex.split(line.rstrip(","))[1:]
-        assert words[0] in cli.commands(), line
-        arguments(words[0], cli.commands()[words[0]], words[1:])
-
-
-def test_error_messages_are_those_of_the_code():
-    """Each message of the page, cut where something stands for a path or a number, is in the sources."""
-    files = [*(ROOT / "src").rglob("*.py"), *(ROOT / "web/src").rglob("*.ts")]
-    code = "".join(path.read_text() for path in files)
-    code = re.sub(r'"\s*\n\s*f?"', "", code)  # a message over several lines
-    code = re.sub(r"\$?\{[^{}\n]*\}", "…", code)
-    tables = "".join((DOCS / "help" / name).read_text() for name in ("errors.md", "troubleshooting.md"))
-    messages = re.findall(r"^\| `(?!RUN|infeas|uncal|lift|unlab)([^`]{12,})` \|", tables, re.MULTILINE)
-    assert len(messages) > 25
-    for message in messages:
-        for part in (part.strip(" .:;,()") for part in message.split("…")):
-            assert part in code, f"{message}: no {part!r}"
-
-
-def test_measured_tables_say_when_on_which_commit_and_how():
-    found = list(doc_tables.tables(DOCS))
-    assert len(found) > 60
-    unsaid = [
-        f"{table.page}:{table.line}"
-        for table in found
-        if not (table.measured and table.commit and (table.command or table.page.startswith("developers/")))
-    ]
-    assert unsaid == [], "`python -m benchmarks tables` lists them"
 
 
 @pytest.fixture(scope="module")
@@ -139,6 +80,7 @@ def browser(site: Path) -> Iterator["Browser"]:
         yield launched
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_pages_are_sound_on_a_phone(site, browser, scheme):
     """From the disk, at 360 px: nothing wider than the screen, no complaint, contrast, names, sizes."""
@@ -168,6 +110,7 @@ FOCUSED = """(drawer) => {
 }"""
 
 
+@pytest.mark.slow
 def test_the_focus_stays_on_the_screen_of_a_phone(site, browser):
     """Drawers beside the screen take no focus while they are closed, and the keyboard opens them."""
     with open_page((site / "labels.html").as_uri(), (360, 740), browser=browser) as opened:
@@ -191,14 +134,16 @@ def test_the_focus_stays_on_the_screen_of_a_phone(site, browser):
             page.keyboard.press("Space")
 
 
+@pytest.mark.slow
 def test_search_finds_a_flag_from_the_disk(site, browser):
-    address = f"{(site / 'search.html').as_uri()}?q=gradient-freeze-share"
+    address = f"{(site / 'search.html').as_uri()}?q=freeze-at"
     with open_page(address, browser=browser) as opened:
         found = opened.wait_for("document.querySelectorAll('#search-results li a').length")
         assert found > 0
         assert opened.complaints == []
 
 
+@pytest.mark.slow
 def test_scenes_of_the_gallery_are_live(site, browser):
     if not any((site / "gallery").glob("*.html")):
         pytest.skip("no scenes in build/gallery; `make gallery` makes one")

@@ -32,7 +32,7 @@ _SETTINGS = b"\0\0\0\4\0\0\0\0\0"  # HTTP/2's first frame, by client and server 
 _GREETING = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + _SETTINGS
 _OPEN = (
     "this Ray cluster does not check tokens: whoever reaches its port can run programs as you; start it "
-    "with RAY_AUTH_MODE=token (docs/pipeline.md, several machines)"
+    "with RAY_AUTH_MODE=token (docs/guides/cluster.md)"
 )
 _WAITS = (
     "the cluster that this machine belongs to does not answer yet; if its head is gone, stop this and let "
