@@ -19,7 +19,6 @@ from benchmarks import audit as table_iii
 from benchmarks import deeplab as segmenting
 from benchmarks import formats as formatting
 from benchmarks import freeze as freezing
-from benchmarks import fuzz as fuzzing
 from benchmarks import labels as labelling
 from benchmarks import measure, plain, size_tables, workloads
 from benchmarks import plans as planning
@@ -566,44 +565,6 @@ def server(idle: int = 1000, slow: int = 1000, honest: int = 200, write: bool = 
         )
     result = {"date": date.today().isoformat(), "commit": serving.commit(), "command": "benchmarks server"}
     _finish("server", {**result, "rows": rows}, write)
-
-
-@app.command
-def fuzz(
-    readers: tyro.conf.Positional[tuple[str, ...]] = (),
-    *,
-    seconds: float = 720,
-    out: Path = Path("fuzz-findings"),
-    seed: int = 0,
-    jobs: int = 2,
-    write: bool = False,
-) -> None:
-    """Damaged files for every reader, guided by coverage where atheris is installed; fails on findings.
-
-    Args:
-        readers: names (none: all; benchmarks/readers lists them).
-        seconds: of all readers together, in `jobs` processes.
-        out: folder for the files that a reader fails on.
-        seed: of the random numbers.
-        jobs: processes.
-        write: keep the figures in benchmarks/results/fuzz.json.
-    """
-    rows = []
-    for row in fuzzing.run(seconds, readers, out, seed, jobs):
-        branches = "" if row["branches"] is None else f", {row['branches']} branches"
-        print(f"{row['reader']:20} {row['executions']:>10,} in {row['seconds']:>6} s{branches}", flush=True)
-        for text in row["findings"].values():
-            print(f"    {text}")
-        rows.append(row)
-    found = sum(len(row["findings"]) for row in rows)
-    executions = sum(row["executions"] for row in rows)
-    result = {"executions": executions, "findings": found, "readers": len(rows)}
-    result |= {"guided": any(row["guided"] for row in rows), "seconds": seconds, "jobs": jobs}
-    if write:
-        fuzzing.write(RESULTS.parent / "fuzz.json", result, rows)
-    _finish("fuzz", result, False)
-    if found:
-        raise SystemExit(f"{found} findings; the files are in {out}")
 
 
 @app.command

@@ -17,7 +17,6 @@ import numpy as np
 import torch
 from scipy.spatial import KDTree
 
-from benchmarks.readers.foreign_splats import dotsplat, put_sog, sog
 from sagesplat.core.errors import BackendUnavailable
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.lod_meta_write import write_lod_meta
@@ -25,6 +24,7 @@ from sagesplat.formats.ply import write_ply
 from sagesplat.formats.sog_write import write_sog
 from sagesplat.formats.splats import read_splat
 from sagesplat.formats.spz import write_spz
+from tests.fuzz.readers.foreign_splats import dotsplat, put_sog, sog
 
 PACKAGE = "@playcanvas/splat-transform@3.7"
 ATTRIBUTES = ("positions", "rotations", "scales", "opacities", "colours", "harmonics")

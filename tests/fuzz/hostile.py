@@ -1,6 +1,6 @@
-"""What a reader of foreign bytes must not do, and the check of it; benchmarks/readers lists the readers.
+"""What a reader of foreign bytes must not do, and the check of it; tests/fuzz/readers lists the readers.
 
-`check` is the oracle of tests/test_hostile_input.py and of `python -m benchmarks fuzz`.
+`check` is the oracle of tests/test_hostile_input.py and of `python -m tests.fuzz`.
 
 Honest memory is the peak that a reader takes for a valid file of some ten kilobytes or more, for each byte
 of it. A damaged file may take `ALLOWED` times that for each of its bytes, and the reader's `base`. Two peaks

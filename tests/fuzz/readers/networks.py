@@ -11,11 +11,11 @@ from unittest.mock import patch
 import numpy as np
 import torch
 
-from benchmarks.hostile import MIB, Reader
-from benchmarks.readers.making import as_json, file
 from sagesplat.metrics import lpips
 from sagesplat.segment import deeplabv2
 from sagesplat.segment.onnx import OnnxSegmenter, read_classes
+from tests.fuzz.hostile import MIB, Reader
+from tests.fuzz.readers.making import as_json, file
 
 CLASSES = {"classes": ["sky", "x"], "coco_panoptic": {"sky": 187, "x": None}, "mean": [0.4, 0.5, 0.6]}
 FLOAT, INTS = 1, 7  # of a tensor's elements, and of an attribute

@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.hostile import Reader
-from benchmarks.readers.making import PHOTOS, as_json, file, splats, written
 from sagesplat.adapt.ladder import read_ladder, read_prefixes
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.second_opacity import SecondOpacities
@@ -27,6 +25,8 @@ from sagesplat.segment.soft import read_soft, write_soft
 from sagesplat.train.checkpoint import latest_checkpoint, write_checkpoint
 from sagesplat.train.state import initial_state
 from sagesplat.train.view_parameters import ViewParameters
+from tests.fuzz.hostile import Reader
+from tests.fuzz.readers.making import PHOTOS, as_json, file, splats, written
 
 SETTINGS = json.dumps({"settings": {"steps": 2, "antialiased": True}})  # of the checkpoint
 CHUNK = {"label_id": 2, "level": 1, "count": 3, "nbytes": 99, "gpu_bytes": 48, "sha256": "0" * 64}

@@ -1,11 +1,11 @@
 """Every reader of bytes that may come from somebody else, by subject: the one list of them.
 
-`benchmarks/foreign.py` finds the functions of the package that read, and a test fails where one of them is
+`tests/fuzz/foreign.py` finds the functions of the package that read, and a test fails where one of them is
 neither reached by a reader of this list nor an exception with a reason.
 """
 
-from benchmarks.hostile import Reader
-from benchmarks.readers import captures, downloads, foreign_splats, networks, records, requests, splats
+from tests.fuzz.hostile import Reader
+from tests.fuzz.readers import captures, downloads, foreign_splats, networks, records, requests, splats
 
 READERS: tuple[Reader, ...] = (
     *captures.READERS,

@@ -13,13 +13,13 @@ import numpy as np
 import torch
 from PIL import Image
 
-from benchmarks.hostile import MIB, Reader
-from benchmarks.readers.making import as_json, file, put, splats, written
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.labels import sidecar
 from sagesplat.formats.ply import write_ply
 from sagesplat.formats.splats import num_lods, read_splat
 from sagesplat.formats.spz import encode_spz
+from tests.fuzz.hostile import MIB, Reader
+from tests.fuzz.readers.making import as_json, file, put, splats, written
 
 BANDS = {0: 0, 3: 1, 8: 2, 15: 3}
 

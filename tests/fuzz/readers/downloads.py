@@ -15,10 +15,10 @@ from urllib import request
 
 import torch
 
-from benchmarks.hostile import MIB, Reader
-from benchmarks.readers.networks import LAYOUT
 from sagesplat.download import remote_zip, scenes, weights
 from sagesplat.metrics import lpips
+from tests.fuzz.hostile import MIB, Reader
+from tests.fuzz.readers.networks import LAYOUT
 
 BETWEEN = b"\n=====\n"
 LIMIT = 10**6  # bytes that the scene's files may have

@@ -9,12 +9,12 @@ from urllib.parse import unquote
 
 import h11
 
-from benchmarks.hostile import Reader
 from sagesplat.cli import parse
 from sagesplat.cli.base import COMMANDS
 from sagesplat.formats.label_edits import FILE, LabelEdits, Rename, dump_edits
 from sagesplat.viewer.edit_site import EditSite
 from sagesplat.viewer.site import Site
+from tests.fuzz.hostile import Reader
 
 _TOKEN = "a-token"
 SECRET = b"not in the folder that is served"

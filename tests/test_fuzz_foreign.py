@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from benchmarks.foreign import EXCEPTIONS, MACHINE, OURS, PACKAGE, readers_in
-from benchmarks.readers import READERS
+from tests.fuzz.foreign import EXCEPTIONS, MACHINE, OURS, PACKAGE, readers_in
+from tests.fuzz.readers import READERS
 
 
 @contextmanager
@@ -57,8 +57,8 @@ def run_by_readers(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
 
 def test_every_function_that_reads_is_fuzzed_or_an_exception(run_by_readers: set[str]):
     missing = [
-        f"{name} reads (line {line}: {call}), and no reader of benchmarks/readers runs it: add one "
-        "there that does, or its name and a reason to EXCEPTIONS in benchmarks/foreign.py"
+        f"{name} reads (line {line}: {call}), and no reader of tests/fuzz/readers runs it: add one "
+        "there that does, or its name and a reason to EXCEPTIONS in tests/fuzz/foreign.py"
         for name, call, line in readers_in()
         if name not in run_by_readers and name not in EXCEPTIONS
     ]

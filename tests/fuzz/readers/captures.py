@@ -10,8 +10,6 @@ import av
 import numpy as np
 from PIL import Image
 
-from benchmarks.hostile import MIB, Reader
-from benchmarks.readers.making import PHOTOS, as_json, file, put, put_photos, written
 from sagesplat.core.errors import SceneError
 from sagesplat.io.pictures import PictureError
 from sagesplat.scene import _prepare, photos, video
@@ -25,6 +23,8 @@ from sagesplat.scene.scene import Camera, View
 from sagesplat.segment.coco import read_panoptic
 from sagesplat.segment.instances import read_instances, write_instances
 from sagesplat.segment.masks import Taxonomy, import_masks, read_mask, write_mask
+from tests.fuzz.hostile import MIB, Reader
+from tests.fuzz.readers.making import PHOTOS, as_json, file, put, put_photos, written
 
 NAMES = {"unlabelled": 255, "labels": {"184": "tree-merged", "7": "sky"}}
 CAMERA = Camera(np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32), 16, 12)

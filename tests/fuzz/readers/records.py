@@ -7,10 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.hostile import MIB, Reader
-from benchmarks.readers.captures import points
-from benchmarks.readers.making import PHOTOS, as_json, file, put, put_photos, written
-from benchmarks.readers.splats import CHUNK
 from sagesplat.adapt import eq3, fidelity, plan, viewpoint, viewpoints
 from sagesplat.adapt.evaluate import Evaluation, read_evaluation
 from sagesplat.adapt.observe import Observations, read_observations
@@ -50,6 +46,10 @@ from sagesplat.studies.sweep.file import read_sweep
 from sagesplat.train.clean import CRITERIA
 from sagesplat.train.sky import Shell, Sky, read_sky, write_sky
 from sagesplat.viewer.bundle import is_bundle
+from tests.fuzz.hostile import MIB, Reader
+from tests.fuzz.readers.captures import points
+from tests.fuzz.readers.making import PHOTOS, as_json, file, put, put_photos, written
+from tests.fuzz.readers.splats import CHUNK
 
 CURVE = {
     "label_id": 2,
@@ -338,7 +338,7 @@ def _read_manifest(path: Path) -> None:
 
 def _begun(folder: Path, size: int) -> list[bytes]:
     """A checkpoint from which a bundle of a training reads one setting."""
-    from benchmarks.readers.splats import _checkpoints
+    from tests.fuzz.readers.splats import _checkpoints
 
     return _checkpoints(folder, size)
 

@@ -17,10 +17,10 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-from benchmarks.hostile import Finding, Reader, check, honest_memory, watchdog
-from benchmarks.mutate import MOST, mutate
+from tests.fuzz.hostile import Finding, Reader, check, honest_memory, watchdog
+from tests.fuzz.mutate import MOST, mutate
 
-CORPUS = Path(__file__).parents[1] / "tests" / "data" / "hostile"
+CORPUS = Path(__file__).parents[1] / "data" / "hostile"
 MEMORY = 16 * 2**30  # bytes of address space; torch takes some of them for itself
 MEASURED = 32  # of so many inputs one has its memory measured in Python, which takes time
 LARGE = 512  # of so many inputs one is a damaged copy of a large file
@@ -50,8 +50,7 @@ def keep(out: Path, reader: Reader, kind: str, content: bytes) -> None:
 def fuzz_reader(reader: Reader, folder: Path, seconds: float, out: Path, seed: int) -> None:
     """Fuzz one reader for a time, and end the process.
 
-    `folder` is the reader's: it gets what the reader needs, the inputs that reached something new, and
-    a log. Files that it fails on go to `out`.
+    `folder` is the reader's: it gets what the reader needs and a log. Files that it fails on go to `out`.
     """
     with (folder / "log").open("a") as log:  # libFuzzer's, and what a crash leaves
         os.dup2(log.fileno(), 1)
@@ -81,8 +80,8 @@ class _Target:
             shutil.rmtree(made, ignore_errors=True)
             made.mkdir()
         self.samples = self.reader.make(self.files, 1)
-        kept = (CORPUS / self.reader.name, folder / "corpus")
-        self.seeds = [*self.samples, *(p.read_bytes() for k in kept for p in sorted(k.glob("*")))]
+        kept = sorted((CORPUS / self.reader.name).glob("*"))
+        self.seeds = [*self.samples, *(path.read_bytes() for path in kept)]
         self.honest, self.large = honest_memory(self.reader, large)
         with (folder / "shared").open("r+b") as file:
             self._shared = mmap.mmap(file.fileno(), SHARED)

@@ -1,8 +1,8 @@
-"""Which functions of the package read bytes, and which of them need no reader in benchmarks/readers.
+"""Which functions of the package read bytes, and which of them need no reader in tests/fuzz/readers.
 
 A function reads bytes where it calls one of `CALLS`: the ways of Python and of our libraries to open, parse
 or fetch, and those functions of io/ through which the rest of the package reads.
-tests/test_benchmarks_foreign.py runs every reader on a valid file, and fails where a function that reads is
+tests/test_fuzz_foreign.py runs every reader on a valid file, and fails where a function that reads is
 neither run by one of them nor listed in `EXCEPTIONS`.
 """
 
@@ -10,7 +10,7 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
-PACKAGE = Path(__file__).parents[1] / "src" / "sagesplat"
+PACKAGE = Path(__file__).parents[2] / "src" / "sagesplat"
 CALLS = {
     # files
     "open", "read_bytes", "read_text", "fromfile", "memmap", "loadtxt", "genfromtxt", "mmap",
