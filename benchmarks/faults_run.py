@@ -7,8 +7,9 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 
 PROGRAM = (sys.executable, "-m", "sagesplat")
@@ -135,17 +136,6 @@ class Command:
             time.sleep(_QUICK)
         return working
 
-    def limit_memory(self, more: int) -> bool:
-        """Let its address space grow by so many bytes at most; whether it was still at work."""
-        import resource
-
-        if self._process.poll() is not None:
-            return False
-        pages = int(Path(f"/proc/{self._process.pid}/statm").read_text().split()[0])
-        limit = pages * resource.getpagesize() + more
-        resource.prlimit(self._process.pid, resource.RLIMIT_AS, (limit, limit))
-        return True
-
     def end(self, seconds: float | None = None) -> int | None:
         """Its exit code; None where it still works after so many seconds."""
         try:
@@ -190,3 +180,46 @@ def ends(of: Mapping[str, float]) -> dict[str, float]:
             before, within = before + seconds, 0.0
             found[name] = before
     return found
+
+
+@dataclass
+class Outcome:
+    """A case: what was done to it, and what became of it."""
+
+    case: str
+    against: str = "1 thread"  # the case whose seconds it is compared with
+    disturbances: list[str] = field(default_factory=list)
+    runs: int = 1
+    seconds: float = 0.0  # of all runs
+    again: list[str] = field(default_factory=list)  # what the runs said of work that was done again
+    stages: dict[str, float] = field(default_factory=dict)  # seconds
+    problems: list[str] = field(default_factory=list)  # a run that did not end as it should
+    differing: list[str] = field(default_factory=list)  # files
+    skipped: str = ""  # why
+    of: dict[str, str] = field(default_factory=dict)  # command, commit and date
+
+    @property
+    def result(self) -> str:
+        """Whether a case ended as the undisturbed run, in words."""
+        if self.skipped:
+            return f"skipped: {self.skipped}"
+        if self.problems:
+            return self.problems[0]
+        return f"no: {', '.join(self.differing[:3])}" if self.differing else "same"
+
+
+def finish(found: Outcome, command: Command) -> None:
+    """Wait for a command that is to end well."""
+    code = command.end()
+    found.stages = stages(command.said)
+    if code or command.errors:
+        found.problems.append(f"exit code {code}: {command.errors.strip()}")
+    found.again += AGAIN.findall(command.said)
+
+
+@contextmanager
+def timed(found: Outcome) -> Iterator[Outcome]:
+    """Measures what a case takes, without the start of its cluster."""
+    begin = time.perf_counter()
+    yield found
+    found.seconds = time.perf_counter() - begin

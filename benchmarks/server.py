@@ -14,6 +14,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import tyro
+
+from benchmarks.common import finish
+
 FILES, SIZE, LARGE = (
     10,
     200_000,
@@ -207,9 +211,18 @@ class _Clients:
         return await reader.readexactly(int(length.partition(b":")[2]))
 
 
-def commit() -> str:
-    """The commit that is checked out."""
-    done = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False
-    )
-    return done.stdout.strip()
+def main(idle: int = 1000, slow: int = 1000, honest: int = 200, write: bool = False) -> None:
+    """`sagesplat view` with idle, slow and honest clients at once, plain and over TLS."""
+    rows = [measure(idle, slow, honest, tls) for tls in (False, True)]
+    for row in rows:
+        print(
+            f"{'TLS' if row['tls'] else 'plain':5} {row['finished']} of {honest} honest ones finished"
+            f" in {row['seconds']:.0f} s (a file {row['file_median_s']:.1f} s, at most"
+            f" {row['file_longest_s']:.1f});"
+            f" server {row['server_rss_mb']:.0f} MB, terminal {row['terminal_lines']} lines"
+        )
+    finish("server", {"rows": rows}, write)
+
+
+if __name__ == "__main__":
+    tyro.cli(main, prog="python -m benchmarks.server")

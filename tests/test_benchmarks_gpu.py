@@ -11,8 +11,8 @@ import pytest
 import torch
 from conftest import random_gaussians, write_capture
 
-from benchmarks import gsplat_trainer
-from benchmarks.gpu import base, runs, script, split
+from benchmarks.gpu import __main__ as script
+from benchmarks.gpu import base, gsplat_trainer, runs, split
 from sagesplat.core.config import TrainConfig
 from sagesplat.demo.capture import make_capture
 from sagesplat.metrics.image import photometric_loss, ssim_map
@@ -25,7 +25,7 @@ from sagesplat.train.state import from_points
 def test_a_trial_of_the_whole_script(tmp_path, capsys):
     make_capture(tmp_path / "capture", views=9, width=64, height=48)
     out = tmp_path / "out"
-    assert script.main(base.Asked(tmp_path / "capture", steps=60, device="cpu", out=out)) == 0
+    assert script.check(base.Asked(tmp_path / "capture", steps=60, device="cpu", out=out)) == 0
     table = capsys.readouterr().out.splitlines()[-len(script.CHECKS) :]
     assert [line.split()[:2] for line in table] == [
         ["agreement", "ok"], ["full", "ok"], ["race", "ok"], ["freeze", "ok"], ["split", "ok"],
@@ -47,7 +47,7 @@ def test_a_trial_of_the_whole_script(tmp_path, capsys):
 def test_a_machine_without_a_gpu_says_so_in_one_line(capsys):
     if cuda.missing() is None:
         pytest.skip("there is one")
-    assert script.main(base.Asked(Path("nowhere"), device="cuda")) == 2
+    assert script.check(base.Asked(Path("nowhere"), device="cuda")) == 2
     out, err = capsys.readouterr()
     assert out == ""
     (line,) = err.splitlines()
@@ -63,14 +63,14 @@ def test_a_check_that_fails_does_not_keep_others_from_running(tmp_path, monkeypa
 
     monkeypatch.setattr(script, "CHECKS", {"one": broken, "two": fine})
     write_capture(tmp_path / "capture", random_gaussians(40))
-    assert script.main(base.Asked(tmp_path / "capture", device="cpu", out=tmp_path / "out")) == 1
+    assert script.check(base.Asked(tmp_path / "capture", device="cpu", out=tmp_path / "out")) == 1
     printed = capsys.readouterr().out
     assert printed.splitlines()[-2:] == [
         "one        FAILED   RuntimeError: first line",
         "two        ok       well",
     ]
     assert "no categories: " in printed
-    assert script.main(base.Asked(tmp_path / "capture", device="cpu", only=("three",))) == 2
+    assert script.check(base.Asked(tmp_path / "capture", device="cpu", only=("three",))) == 2
 
 
 def test_a_lost_device_leaves_the_rest_to_a_new_process(tmp_path, monkeypatch):
@@ -87,7 +87,7 @@ def test_a_lost_device_leaves_the_rest_to_a_new_process(tmp_path, monkeypatch):
     assert found["two"] == base.Outcome("ok", "well")
     assert found["three"].state == "FAILED"
     (command,) = commands
-    assert command[1:6] == ["-m", "benchmarks", "gpu", "--scene", "scene"]
+    assert command[1:5] == ["-m", "benchmarks.gpu", "--scene", "scene"]
     assert command[command.index("--only") :] == ["--only", "two", "three"]
     assert command[command.index("--minutes") + 1] == "1.5"
     assert "--write" in command

@@ -1,7 +1,6 @@
 """What the documents name is there: links, files, modules, commands and flags."""
 
 import importlib
-import inspect
 import re
 import subprocess
 import tomllib
@@ -13,7 +12,7 @@ import pytest
 import tyro
 
 import sagesplat
-from benchmarks import __main__ as measuring
+from benchmarks.__main__ import names
 from sagesplat import cli
 
 ROOT = Path(__file__).parents[1]
@@ -40,10 +39,10 @@ def tracked() -> list[str]:
 
 @cache
 def flags() -> set[str]:
-    """Every flag of every command, of `sagesplat` and of `python -m benchmarks`."""
+    """Every flag of every command, of `sagesplat`, of benchmarks, of the fuzzer."""
     found = {"--version", "--help", "--help-all"}
-    measured = [f for n, f in vars(measuring).items() if inspect.isfunction(f) and not n.startswith("_")]
-    measured = [f for f in measured if f.__module__ == measuring.__name__]
+    modules = [*(f"benchmarks.{name}" for name in names()), "tests.fuzz.__main__", "tools.pictures"]
+    measured = [importlib.import_module(name.replace(".gpu", ".gpu.__main__")).main for name in modules]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # tyro has no other way to its parsers yet
         waiting = list(map(tyro.extras.get_parser, [*cli.commands().values(), *measured]))

@@ -19,9 +19,9 @@ from browser import open_page
 from page_checks import wrong_with
 
 import sagesplat
-from benchmarks import doc_tables
 from sagesplat import cli
 from sagesplat.cli.parse import arguments
+from tools import doc_tables
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -128,7 +128,7 @@ def test_measured_tables_say_when_on_which_commit_and_how():
         for table in found
         if not (table.measured and table.commit and (table.command or table.page.startswith("developers/")))
     ]
-    assert unsaid == [], "`python -m benchmarks tables` lists them"
+    assert unsaid == [], "`python -m tools.doc_tables` lists them"
 
 
 @pytest.fixture(scope="module")

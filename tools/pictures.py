@@ -1,4 +1,7 @@
-"""Pictures of the documentation that are made from finished runs: screenshots of the viewer, and a result."""
+"""Pictures of README and docs/images from a finished run: python -m tools.pictures RUN OUT
+
+Screenshots of the viewer, and a test view: photo, full model, composed scene, categories.
+"""
 
 import threading
 from collections.abc import Iterator
@@ -7,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import tyro
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
@@ -132,3 +136,33 @@ def _packed(path: Path) -> None:
     """The same picture, without transparency and as small as PNG makes it."""
     image: Any = Image.open(path).convert("RGB")
     image.save(path, optimize=True)
+
+
+def main(
+    run: tyro.conf.Positional[Path],
+    out: tyro.conf.Positional[Path],
+    *,
+    name: str = "",
+    photo: str = "",
+    press: str = "",
+    column: int = 0,
+) -> None:
+    """Pictures of README and docs/images from a finished run: the viewer's screenshots, and its result.
+
+    Args:
+        run: finished run folder.
+        out: folder for viewer.png, viewer-phone.png and demo.png.
+        name: file name, without suffix, of a single screenshot instead.
+        photo: name of the photo at whose viewpoint the phone, or the single screenshot, stands (default:
+            where the viewer begins).
+        press: selector of something to click first, such as ".labels .blocks".
+        column: number of the test view in demo.png, of those in the report.
+    """
+    for path in screenshots(run, out, name=name, photo=photo, press=press):
+        print(path)
+    if not name:
+        result(run, out / "demo.png", column)
+
+
+if __name__ == "__main__":
+    tyro.cli(main, prog="python -m tools.pictures")

@@ -1,4 +1,7 @@
-"""The measured tables of the documents, and how old they are."""
+"""The measured tables of the documents, the oldest first, with the commits to the code since.
+
+python -m tools.doc_tables
+"""
 
 import re
 import subprocess
@@ -67,3 +70,7 @@ def ages(docs: Path, today: date) -> str:
         changes = f"{since[table.commit]:>5} commits" if table.commit else "   no commit"
         lines.append(f"{age} {changes}  {table.page}:{table.line}  {table.title}")
     return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    print(ages(Path("docs"), date.today()))

@@ -13,13 +13,15 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
+import tyro
 
+from benchmarks.common import GARDEN, RESULTS, ROOT, rounded
 from benchmarks.gpu.agreement import agreement
-from benchmarks.gpu.base import ROOT, Asked, Bench, Outcome, one_line, rounded, wait
+from benchmarks.gpu.base import Asked, Bench, Outcome, one_line, wait
 from benchmarks.gpu.runs import freeze, full, multi, race
 from benchmarks.gpu.split import split
 from sagesplat.core.errors import BackendUnavailable, SageError
@@ -29,13 +31,29 @@ from sagesplat.scene.images import Photos
 from sagesplat.segment.lift import lift
 from sagesplat.segment.masks import Masks, Taxonomy, import_masks
 
-RESULTS = ROOT / "benchmarks" / "results"
 CHECKS: dict[str, Callable[[Bench], Outcome]] = {
     "agreement": agreement, "full": full, "race": race, "freeze": freeze, "split": split, "multi": multi,
 }  # fmt: skip
 
 
-def main(asked: Asked) -> int:
+def main(
+    scene: Path = GARDEN,
+    downscale: int = 1,
+    steps: int = 30_000,
+    minutes: float = 9.0,
+    device: Literal["cuda", "cpu"] = "cuda",
+    only: tuple[str, ...] = (),
+    masks: Path | None = None,
+    lpips: Path | None = None,
+    out: Path | None = None,
+    write: bool = False,
+) -> None:
+    """All checks that a machine with a GPU owes, in so many minutes; `--device cpu` tries the script."""
+    asked = Asked(scene, downscale, steps, minutes, device, only, masks, lpips, out, write)
+    raise SystemExit(check(asked))
+
+
+def check(asked: Asked) -> int:
     """Do the checks; 0: all well, 1: some failed, 2: this machine cannot."""
     unknown = [name for name in asked.only if name not in CHECKS]
     if unknown:
@@ -186,3 +204,7 @@ def build() -> float:
     seconds = time.perf_counter() - begin
     print(f"gsplat's kernels compiled or loaded in {seconds:.0f} s", flush=True)
     return seconds
+
+
+if __name__ == "__main__":
+    tyro.cli(main, prog="python -m benchmarks.gpu")
