@@ -1,10 +1,10 @@
 """What there is to read: lines, documents, options, longest files and functions, imports between folders.
 
     python -m benchmarks.structure                          # this checkout
-    python -m benchmarks.structure --against v0.1.0         # before and after: a revision, or another checkout
+    python -m benchmarks.structure --against v0.1.0         # before and after; or another checkout's folder
 
-It reads sources and imports nothing of them (but for the options, which `sagesplat run --help-all` prints). Imports
-for type checkers alone (`if TYPE_CHECKING`) do not count; those inside functions do.
+It reads sources and imports nothing of them, but for the options, which `sagesplat run --help-all` prints.
+Imports for type checkers alone (`if TYPE_CHECKING`) do not count; those inside functions do.
 """
 
 import ast
@@ -107,9 +107,8 @@ def options(root: Path) -> int | None:
     done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
     if done.returncode:
         return None
-    return len(
-        set(re.findall(r"^\W*(?:-\w, )?--([\w.-]+)", done.stdout, re.MULTILINE)) - {"help", "help-all"}
-    )
+    found = re.findall(r"^\W*(?:-\w, )?--([\w.-]+)", done.stdout, re.MULTILINE)
+    return len(set(found) - {"help", "help-all"})
 
 
 def _lines(paths: Iterable[Path]) -> int:

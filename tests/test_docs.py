@@ -5,6 +5,7 @@ import re
 import subprocess
 import tomllib
 import warnings
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -37,12 +38,19 @@ def tracked() -> list[str]:
     return [f"/{line}" for line in done.stdout.splitlines()]
 
 
+def main_of(name: str) -> Callable[..., None]:
+    """What `python -m NAME` calls."""
+    module = importlib.import_module(name)
+    return (importlib.import_module(f"{name}.__main__") if hasattr(module, "__path__") else module).main
+
+
 @cache
 def flags() -> set[str]:
     """Every flag of every command, of `sagesplat`, of benchmarks, of the fuzzer."""
     found = {"--version", "--help", "--help-all"}
-    modules = [*(f"benchmarks.{name}" for name in names()), "tests.fuzz.__main__", "tools.pictures"]
-    measured = [importlib.import_module(name.replace(".gpu", ".gpu.__main__")).main for name in modules]
+    measured = [
+        main_of(name) for name in (*map("benchmarks.{}".format, names()), "tests.fuzz", "tools.pictures")
+    ]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # tyro has no other way to its parsers yet
         waiting = list(map(tyro.extras.get_parser, [*cli.commands().values(), *measured]))
