@@ -1,4 +1,4 @@
-"""Nothing is lost: the same result when nodes, drivers and processes are killed and when the disk is full.
+"""Nothing is lost: the same result when nodes, drivers and processes are killed.
 
 Every case runs the real command in a process of its own, in the same folder (so that even files with paths in
 them are the same), and what it leaves is compared with an undisturbed run, file by file, bit for bit.
@@ -7,10 +7,7 @@ them are the same), and what it leaves is compared with an undisturbed run, file
 import json
 import os
 import random
-import re
 import shutil
-import signal
-import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -34,20 +31,14 @@ from benchmarks.faults_run import (
     finish,
     settings,
     timed,
-    used,
 )
 from sagesplat.core.errors import RunError, SageError
 from sagesplat.demo.capture import cached_capture
 from sagesplat.output.tables import Table
 
 NODE = {"num_cpus": 1, "object_store_memory": 80 * 2**20, "include_dashboard": False}
-CASES = ("a", "b", "c", "d", "e", "f", "g")
+CASES = ("a", "b", "c", "d", "e")
 NODES = 3
-LINE = re.compile(r"sagesplat: [^\n]+\n")
-FULL = re.compile(
-    r"sagesplat: [^\n]*no space left, the disk is full; free [\d,]+ MB and run the same command[^\n]*\n"
-)
-SIGNALS = ((signal.SIGTERM, 1, 143), (signal.SIGINT, 5, 2))  # how often, and the exit code
 _BEFORE = {"train": "blocks", "nest": "block_categories"}  # the stage that ends before another begins
 
 
@@ -55,7 +46,7 @@ def main(
     scene: tyro.conf.Positional[str],
     *,
     out: Path,
-    only: tuple[Literal["a", "b", "c", "d", "e", "f", "g"], ...] = (),
+    only: tuple[Literal["a", "b", "c", "d", "e"], ...] = (),
     downscale: int = 1,
     steps: int = 300,
     nest_steps: int = 100,
@@ -64,18 +55,18 @@ def main(
     seed: int = 0,
     write: bool = False,
 ) -> None:
-    """Nodes, drivers and runs killed at random, a full disk: the same result, and what it costs.
+    """Nodes, drivers and runs killed at random: the same result, and what it costs.
 
     Args:
         scene: a capture, or demo for the built-in one.
         out: folder for the runs, what they print, faults.json and faults.md.
-        only: cases: undisturbed (a), on three nodes (b), nodes killed (c), driver killed (d), disk full (e),
-            run killed again and again (f), SIGTERM and five quick Ctrl-C (g).
+        only: cases: undisturbed (a), on three nodes (b), nodes killed (c), driver killed (d),
+            run killed again and again (e).
         downscale: times smaller photos.
         steps: of the training of each block.
         nest_steps: of its nested ladder, and of the small model that this begins with.
         levels: of the ladder.
-        kills: of case f; case g has half as many.
+        kills: of case e.
         seed: of the random moments.
         write: also put the result into benchmarks/results.
     """
@@ -103,26 +94,26 @@ def measure(asked: Asked, wanted: Sequence[str], tell: Callable[[str], None]) ->
     Each is told in a line. RunError where there is no undisturbed run to compare with.
     """
     file = asked.out / "faults.json"
-    before = json.loads(file.read_text()) if file.exists() else {"cases": [], "digests": {}, "bytes": 0}
+    before = json.loads(file.read_text()) if file.exists() else {"cases": [], "digests": {}}
     cases = {row["case"]: Outcome(**row) for row in before["cases"]}
-    digest, nbytes = before["digests"], before["bytes"]
+    digest = before["digests"]
 
     def judge(found: Outcome) -> None:
         found.differing = sorted({*found.differing, *differing(digest, digests(asked.run))})
 
     def keep(found: Outcome) -> None:
-        nonlocal digest, nbytes
+        nonlocal digest
         if found.case == "1 thread":
-            digest, nbytes = digests(asked.run), used(asked.run)
+            digest = digests(asked.run)
         if asked.run.exists():
             judge(found)
             if found.differing or found.problems:
                 shutil.move(asked.run, asked.out / f"run-{found.case.replace(' ', '-')}")
-        shutil.rmtree(asked.disk, ignore_errors=True)
+        shutil.rmtree(asked.run, ignore_errors=True)
         found.of = origin()
         cases[found.case] = found
         rows = [asdict(case) for case in cases.values()]
-        file.write_text(json.dumps({"cases": rows, "digests": digest, "bytes": nbytes}, indent=1) + "\n")
+        file.write_text(json.dumps({"cases": rows, "digests": digest}, indent=1) + "\n")
         tell(f"{found.case}: {found.seconds:.1f} s, {len(found.disturbances)} disturbances, {found.result}")
 
     def known(case: str) -> Outcome:
@@ -142,12 +133,7 @@ def measure(asked: Asked, wanted: Sequence[str], tell: Callable[[str], None]) ->
     if "d" in wanted:
         keep(driver_killed(asked, known(f"{NODES} nodes")))
     if "e" in wanted:
-        for ray in (False, True):
-            keep(disk_full(asked, nbytes, judge, ray))
-    if "f" in wanted:
         keep(killed(asked, known("1 thread"), judge))
-    if "g" in wanted:
-        keep(signalled(asked, known("1 thread"), max(2, asked.kills // 2)))
     if "a" in wanted:
         keep(undisturbed(asked, 2))
     return cases
@@ -226,62 +212,6 @@ def driver_killed(asked: Asked, known: Outcome) -> Outcome:
     return found
 
 
-@contextmanager
-def small_disk(folder: Path, size: int) -> Iterator[Callable[[int], None]]:
-    """A tmpfs of so many bytes; yields what makes it larger. RunError where that is not allowed."""
-    folder.mkdir(parents=True, exist_ok=True)
-    mount = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
-    if not shutil.which("mount") or subprocess.run(mount, capture_output=True).returncode:
-        raise RunError(f"{folder}: mounting a tmpfs takes root; run as root, or leave out case e")
-
-    def grow(size: int) -> None:
-        subprocess.run(["mount", "-o", f"remount,size={size}", str(folder)], check=True)
-
-    try:
-        yield grow
-    finally:
-        subprocess.run(["umount", "--lazy", str(folder)], check=True)
-
-
-def disk_full(asked: Asked, nbytes: int, judge: Callable[[Outcome], None], ray: bool) -> Outcome:
-    """A disk for a part of `nbytes`, made larger each time that it is full."""
-    chance = random.Random(f"{asked.seed} disk {ray}")
-    size = int(chance.uniform(0.1, 0.3) * nbytes)
-    name, against = ("disk full, 3 nodes", f"{NODES} nodes") if ray else ("disk full", "1 thread")
-    found = Outcome(name, against)
-    try:
-        with small_disk(asked.disk, size) as grow:
-            if ray:
-                with cluster() as nodes, timed(found):
-                    _until_it_fits(asked, found, size, grow, chance, "e-ray", _on(nodes))
-            else:
-                with timed(found):
-                    _until_it_fits(asked, found, size, grow, chance, "e", ("--threads=1",))
-            judge(found)
-    except RunError as error:
-        found.skipped = str(error)
-    return found
-
-
-def _until_it_fits(
-    asked: Asked, found: Outcome, size: int, grow: Callable[[int], None], chance: random.Random, name: str,
-    words: tuple[str, ...],
-) -> None:  # fmt: skip
-    while True:
-        with Command(asked, name, *words) as command:
-            if command.end() != 2:
-                finish(found, command)
-                return
-            found.again += AGAIN.findall(command.said)
-            said = command.errors
-        found.disturbances.append(f"full at {size:,} bytes: {said.strip()}")
-        if not FULL.fullmatch(said):
-            found.problems.append(f"not the line of a full disk: {said.strip()}")
-            return
-        size = int(size * chance.uniform(1.3, 1.8))
-        grow(size)
-
-
 def killed(asked: Asked, known: Outcome, judge: Callable[[Outcome], None]) -> Outcome:
     """`kill -9` again and again, at random times that spread over the whole run.
 
@@ -294,7 +224,7 @@ def killed(asked: Asked, known: Outcome, judge: Callable[[Outcome], None]) -> Ou
     with timed(found):
         while left := asked.kills - len(found.disturbances):
             after = chance.uniform(0, 2 * (start + (total - done) / (left + 1)))
-            with Command(asked, "f", "--threads=1") as command:
+            with Command(asked, "e", "--threads=1") as command:
                 if command.end(after) is not None:
                     finish(found, command)
                     judge(found)
@@ -308,40 +238,9 @@ def killed(asked: Asked, known: Outcome, judge: Callable[[Outcome], None]) -> Ou
                 done = max([done, *(reached.get(name, 0.0) for name in command.done)])
                 found.disturbances.append(f"after {after:.1f} s, past {last}")
                 found.again += AGAIN.findall(command.said)
-        with Command(asked, "f", "--threads=1") as command:
+        with Command(asked, "e", "--threads=1") as command:
             finish(found, command)
     return found
-
-
-def signalled(asked: Asked, known: Outcome, times: int) -> Outcome:
-    """SIGTERM and five quick Ctrl-C in turn, at random times; the same command each time."""
-    chance = random.Random(f"{asked.seed} signals")
-    found = Outcome("SIGTERM, five Ctrl-C")
-    with timed(found):
-        for turn in range(times):
-            number, often, code = SIGNALS[turn % 2]
-            after = chance.uniform(0.1, 1.5 * known.seconds / times)
-            with Command(asked, "g", "--threads=1") as command:
-                if command.end(after) is None and command.signal(number, often):
-                    found.disturbances.append(f"{signal.Signals(number).name} x {often} after {after:.1f} s")
-                    _refused(found, command, code)
-                    _left_over(found, asked.run)
-        with Command(asked, "g", "--threads=1") as command:
-            finish(found, command)
-    return found
-
-
-def _refused(found: Outcome, command: Command, code: int) -> None:
-    """A command that was disturbed ends by itself: well, or with this code and one line."""
-    ended = command.end()
-    if ended not in (0, code) or (ended and not LINE.fullmatch(command.errors)):
-        found.problems.append(f"exit code {ended}: {command.errors.strip()}")
-
-
-def _left_over(found: Outcome, run: Path) -> None:
-    found.problems += [
-        f"{path.name} was left" for path in run.rglob(".*.tmp-*") if "cluster" not in path.name
-    ]
 
 
 def tables(scene: str, cases: Mapping[str, Outcome]) -> list[Table]:

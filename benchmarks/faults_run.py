@@ -17,8 +17,6 @@ AGAIN = re.compile(r"^! (.*(?:; done again |resuming from step ).*)$", re.MULTIL
 _DONE = re.compile(r"^✓ (.+?) +(\d+\.\d) s  ", re.MULTILINE)
 _SKIPPED = re.compile(r"^· (.+?) +up to date$", re.MULTILINE)
 _POLL = 0.1  # seconds between two looks at what a run printed
-_QUICK = 0.05  # seconds between two signals
-_BLOCK = 4096  # bytes: what a tmpfs gives out
 # What tells seconds, and so differs between any two runs. All else has to be the same
 TIMES = {
     "provenance/*.json": "seconds, and so the hashes of records among the inputs; all else is compared",
@@ -42,14 +40,9 @@ class Asked:
     seed: int = 0
 
     @property
-    def disk(self) -> Path:
-        """Where a small disk is mounted."""
-        return self.out / "disk"
-
-    @property
     def run(self) -> Path:
         """The run folder of every case."""
-        return self.disk / "run"
+        return self.out / "run"
 
 
 def settings(downscale: int, steps: int, nest_steps: int, levels: int) -> tuple[str, ...]:
@@ -92,14 +85,6 @@ def differing(first: Mapping[str, str], second: Mapping[str, str]) -> list[str]:
     return found
 
 
-def used(run: Path) -> int:
-    """Bytes that a tmpfs would need for a folder; what is linked twice counts once."""
-    sizes = {}
-    for stat in (path.stat() for path in run.rglob("*") if path.is_file()):
-        sizes[stat.st_ino] = -(-stat.st_size // _BLOCK) * _BLOCK
-    return sum(sizes.values())
-
-
 class Command:
     """`sagesplat run` in a process of its own; killed at the end of the block if it is still there."""
 
@@ -126,14 +111,6 @@ class Command:
         working = self._process.poll() is None
         self._process.kill()
         self._process.wait()
-        return working
-
-    def signal(self, number: int, times: int = 1) -> bool:
-        """Send it a signal, several times in quick succession; whether it was still at work."""
-        working = self._process.poll() is None
-        for _ in range(times):
-            self._process.send_signal(number)  # nothing where it has ended
-            time.sleep(_QUICK)
         return working
 
     def end(self, seconds: float | None = None) -> int | None:
@@ -195,14 +172,11 @@ class Outcome:
     stages: dict[str, float] = field(default_factory=dict)  # seconds
     problems: list[str] = field(default_factory=list)  # a run that did not end as it should
     differing: list[str] = field(default_factory=list)  # files
-    skipped: str = ""  # why
     of: dict[str, str] = field(default_factory=dict)  # command, commit and date
 
     @property
     def result(self) -> str:
         """Whether a case ended as the undisturbed run, in words."""
-        if self.skipped:
-            return f"skipped: {self.skipped}"
         if self.problems:
             return self.problems[0]
         return f"no: {', '.join(self.differing[:3])}" if self.differing else "same"

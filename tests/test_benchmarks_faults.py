@@ -1,7 +1,6 @@
 """Disturbed runs: what is compared of two run folders, what runs print, and the table."""
 
 import json
-import os
 import sys
 from pathlib import Path
 
@@ -9,7 +8,7 @@ import pytest
 
 from benchmarks import faults, faults_run
 from benchmarks.faults import tables
-from benchmarks.faults_run import AGAIN, Asked, Command, Outcome, differing, digests, ends, stages, used
+from benchmarks.faults_run import AGAIN, Asked, Command, Outcome, differing, digests, ends, stages
 from sagesplat.core.errors import RunError
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="kills and mounts are POSIX only")
@@ -64,13 +63,6 @@ def test_everything_else_is(run: Path) -> None:
     ]
 
 
-def test_room_on_a_disk_is_counted_in_blocks_and_links_once(tmp_path: Path) -> None:
-    (tmp_path / "a").write_bytes(bytes(5000))
-    (tmp_path / "b").write_bytes(b"1")
-    os.link(tmp_path / "a", tmp_path / "c")
-    assert used(tmp_path) == 3 * 4096
-
-
 def test_what_a_run_prints_is_understood() -> None:
     found = stages(SAID)
     assert found == {"scene": 0.5, "block 0/train": 2.0, "block 1/train": 3.0, "train": 5.5}
@@ -81,31 +73,22 @@ def test_what_a_run_prints_is_understood() -> None:
     ]
 
 
-def test_the_line_of_a_full_disk() -> None:
-    line = "sagesplat: a.npz: no space left, the disk is full; free 1 MB and run the same command again\n"
-    assert faults.FULL.fullmatch(line)
-    assert not faults.FULL.fullmatch(line + "another\n")
-    assert not faults.FULL.fullmatch("Traceback\n" + line)
-
-
 def test_the_tables_say_what_was_lost_and_what_differs() -> None:
     local = Outcome("1 thread", seconds=10.0, stages={"train": 5.5, "block 0/train": 2.0, "lift": 0.1})
     spread = Outcome("3 nodes", seconds=8.0, stages={"train": 2.75, "lift": 0.1})
     lost = Outcome("node killed, 1 of 3", "3 nodes", ["a node"], 1, 9.0, ["block 1"], differing=["a", "b"])
-    full = Outcome("disk full", skipped="no root")
-    cases, speed = tables("demo", {found.case: found for found in (local, spread, lost, full)})
+    cases, speed = tables("demo", {found.case: found for found in (local, spread, lost)})
     assert cases.cells() == [
         ["1 thread", "0", "10", "–", "0", "same"],
         ["3 nodes", "0", "8", "–", "0", "same"],
         ["node killed, 1 of 3", "1", "9", "1", "1", "no: a, b"],
-        ["disk full", "0", "0", "–", "0", "skipped: no root"],
     ]
     assert speed.cells() == [["train", "5.5", "2.8", "2.00"], ["all", "10.0", "8.0", "1.25"]]
 
 
 def test_a_case_needs_the_undisturbed_run(tmp_path: Path) -> None:
     with pytest.raises(RunError, match=r"faults\.json: no case '1 thread' yet; run cases a and b first$"):
-        faults.measure(Asked(tmp_path, tmp_path / "out", ()), ("f",), print)
+        faults.measure(Asked(tmp_path, tmp_path / "out", ()), ("e",), print)
 
 
 def program(folder: Path, monkeypatch: pytest.MonkeyPatch, does: str) -> Asked:
@@ -134,26 +117,3 @@ def test_a_command_is_killed(tmp_path: Path, monkeypatch) -> None:
         assert command.kill()
         assert not command.kill()
     assert command.end() == -9
-
-
-def test_a_full_disk_is_skipped_where_nothing_can_be_mounted(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(faults.shutil, "which", lambda name: None)
-    found = faults.disk_full(Asked(tmp_path, tmp_path, ()), 10**6, lambda found: None, ray=False)
-    assert found.result.startswith("skipped: ")
-    assert "mounting a tmpfs takes root" in found.skipped
-
-
-def test_what_a_disturbed_process_has_to_say(tmp_path: Path, monkeypatch) -> None:
-    """Nothing and code 0, or one line and the code of what was done to it."""
-    for does, problems in (
-        ('echo "sagesplat: ended" >&2; exit 2', 0),
-        ("exit 0", 0),
-        ('echo "sagesplat: ended" >&2; exit 3', 1),
-        ('echo "sagesplat: ended" >&2; echo "and more" >&2; exit 2', 1),
-        ("exit 2", 1),
-    ):
-        asked = program(tmp_path, monkeypatch, does)
-        found = Outcome("x")
-        with Command(asked, "x") as command:
-            faults._refused(found, command, 2)
-        assert len(found.problems) == problems, does
