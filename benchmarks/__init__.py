@@ -1,1 +1,1 @@
-"""Figures that are measured, not tested: `python -m benchmarks step|agreement`."""
+"""Figures that are measured, not tested: `python -m benchmarks.NAME`."""

@@ -5,6 +5,8 @@ as PLY with labels, and decimated by splat-transform. Every image is compared wi
 """
 
 import resource
+import shutil
+import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,13 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tyro
 
-from benchmarks.formats import Transform
+from benchmarks.common import GARDEN, finish
 from benchmarks.promises import CASES
-from benchmarks.workloads import GARDEN
 from sagesplat.adapt.free_viewpoints import free_cameras
 from sagesplat.adapt.observe import render_rgb
 from sagesplat.core.config import AdoptConfig, LabelsConfig, MasksConfig, SceneConfig
+from sagesplat.core.errors import BackendUnavailable
 from sagesplat.core.events import Event, StageDone
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.ply import write_ply
@@ -32,6 +35,7 @@ from sagesplat.stages.adopt import open_splat
 from sagesplat.stages.adopt_levels import make_levels
 from sagesplat.stages.api import run_scene
 
+PACKAGE = "@playcanvas/splat-transform@3.7"
 SPLATS = GARDEN.parent.parent / "splats"
 SHARES = (0.05, 0.1, 0.2, 0.35, 0.5, 0.7)
 BELOW = (0.0125, 0.025)  # so that small levels share a set with those as in a usual ladder
@@ -48,6 +52,69 @@ class Case:
     rivals: Mapping[float, Gaussians]  # by share of the Gaussians
     cameras: Path | None  # a capture; None: viewpoints are drawn
     scene: SceneConfig = SceneConfig()
+
+
+def main(
+    folder: Path = Path("runs/adopt"),
+    scenes: tuple[str, ...] = ("playbot", "garden", "built-in-11"),
+    splat_transform: Path | None = None,
+    views: int = 40,
+    steps: int = 3000,
+    write: bool = False,
+) -> None:
+    """Levels of adopted splats beside those of splat-transform, at equal counts.
+
+    Args:
+        folder: where runs are made; what is done already is skipped.
+        scenes: a streamed SOG in the folder of splats, and scenes of `promises`.
+        splat_transform: its command (default: by npx).
+        views: viewpoints to draw for a splat without a capture.
+        steps: of the training of the lower levels.
+        write: keep the figures in benchmarks/results/cpu/adopt.json.
+    """
+    results = {}
+    for name in scenes:
+        streamed = SPLATS / name / "lod-meta.json"
+        if streamed.exists():
+            case = published(streamed)
+        else:
+            case = trained(name, folder, find_transform(splat_transform))
+        results[name] = measure(case, folder / "adopted" / name, views, steps, print)
+    finish("adopt", results, write)
+
+
+@dataclass(frozen=True)
+class Transform:
+    """splat-transform as a command."""
+
+    command: tuple[str, ...]
+
+    def __call__(self, *arguments: str | Path) -> None:
+        """Run it; BackendUnavailable with what it said if it fails."""
+        call = [*self.command, "-q", "-w", "-g", "cpu", *map(str, arguments)]
+        done = subprocess.run(call, capture_output=True, text=True, check=False)
+        if done.returncode:
+            said = (done.stderr or done.stdout).strip().splitlines()[-1:]
+            raise BackendUnavailable(f"{' '.join(call)} failed: {' '.join(said)}")
+
+
+def find_transform(path: Path | None) -> Transform:
+    """splat-transform 3, at a path or by npx; BackendUnavailable where there is none."""
+    if path is None and shutil.which("npx") is None:
+        raise BackendUnavailable(
+            "no splat-transform: install Node 22 or newer, or name one (--splat-transform)"
+        )
+    command = (str(path),) if path else ("npx", "--yes", PACKAGE)
+    try:
+        said = subprocess.run([*command, "--version"], capture_output=True, text=True, check=False)
+    except OSError as error:
+        raise BackendUnavailable(f"{path}: cannot be run ({error.strerror}); name splat-transform") from None
+    text = said.stdout + said.stderr
+    if "v3." not in text:
+        raise BackendUnavailable(
+            f"{command[0]}: {text.strip()[:100]!r} is not splat-transform 3; it needs Node 22"
+        )
+    return Transform(command)
 
 
 def published(source: Path) -> Case:
@@ -156,3 +223,7 @@ def _line(share: float, case: Case, scored: Mapping[str, Mapping[float, Quality]
         f"{int(ours['count']):,} {ours['psnr']:.2f} dB {ours['ssim']:.4f}: "
         f"{ours['psnr'] - rival['psnr']:+.2f} dB {ours['ssim'] - rival['ssim']:+.4f}"
     )
+
+
+if __name__ == "__main__":
+    tyro.cli(main, prog="python -m benchmarks.adopt")

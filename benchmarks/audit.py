@@ -101,3 +101,13 @@ def sums_table() -> Table:
         body.append((name, PRINTED_TOTALS[i], total, total - PRINTED_TOTALS[i], "; ".join(wrong)))
     header = ("", "total printed", "sum of its rows", "difference", "MB that are not 248 bytes a Gaussian")
     return Table("Sums", header, ("", ",d", ",d", "+,d", ""), body)
+
+
+def main() -> None:
+    """Print both tables."""
+    for table in (choices_table(), sums_table()):
+        print(f"{table.title}\n\n{table.markdown()}")
+
+
+if __name__ == "__main__":
+    main()

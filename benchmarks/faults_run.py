@@ -7,8 +7,9 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 
 PROGRAM = (sys.executable, "-m", "sagesplat")
@@ -16,8 +17,6 @@ AGAIN = re.compile(r"^! (.*(?:; done again |resuming from step ).*)$", re.MULTIL
 _DONE = re.compile(r"^✓ (.+?) +(\d+\.\d) s  ", re.MULTILINE)
 _SKIPPED = re.compile(r"^· (.+?) +up to date$", re.MULTILINE)
 _POLL = 0.1  # seconds between two looks at what a run printed
-_QUICK = 0.05  # seconds between two signals
-_BLOCK = 4096  # bytes: what a tmpfs gives out
 # What tells seconds, and so differs between any two runs. All else has to be the same
 TIMES = {
     "provenance/*.json": "seconds, and so the hashes of records among the inputs; all else is compared",
@@ -41,14 +40,9 @@ class Asked:
     seed: int = 0
 
     @property
-    def disk(self) -> Path:
-        """Where a small disk is mounted."""
-        return self.out / "disk"
-
-    @property
     def run(self) -> Path:
         """The run folder of every case."""
-        return self.disk / "run"
+        return self.out / "run"
 
 
 def settings(downscale: int, steps: int, nest_steps: int, levels: int) -> tuple[str, ...]:
@@ -91,14 +85,6 @@ def differing(first: Mapping[str, str], second: Mapping[str, str]) -> list[str]:
     return found
 
 
-def used(run: Path) -> int:
-    """Bytes that a tmpfs would need for a folder; what is linked twice counts once."""
-    sizes = {}
-    for stat in (path.stat() for path in run.rglob("*") if path.is_file()):
-        sizes[stat.st_ino] = -(-stat.st_size // _BLOCK) * _BLOCK
-    return sum(sizes.values())
-
-
 class Command:
     """`sagesplat run` in a process of its own; killed at the end of the block if it is still there."""
 
@@ -126,25 +112,6 @@ class Command:
         self._process.kill()
         self._process.wait()
         return working
-
-    def signal(self, number: int, times: int = 1) -> bool:
-        """Send it a signal, several times in quick succession; whether it was still at work."""
-        working = self._process.poll() is None
-        for _ in range(times):
-            self._process.send_signal(number)  # nothing where it has ended
-            time.sleep(_QUICK)
-        return working
-
-    def limit_memory(self, more: int) -> bool:
-        """Let its address space grow by so many bytes at most; whether it was still at work."""
-        import resource
-
-        if self._process.poll() is not None:
-            return False
-        pages = int(Path(f"/proc/{self._process.pid}/statm").read_text().split()[0])
-        limit = pages * resource.getpagesize() + more
-        resource.prlimit(self._process.pid, resource.RLIMIT_AS, (limit, limit))
-        return True
 
     def end(self, seconds: float | None = None) -> int | None:
         """Its exit code; None where it still works after so many seconds."""
@@ -190,3 +157,43 @@ def ends(of: Mapping[str, float]) -> dict[str, float]:
             before, within = before + seconds, 0.0
             found[name] = before
     return found
+
+
+@dataclass
+class Outcome:
+    """A case: what was done to it, and what became of it."""
+
+    case: str
+    against: str = "1 thread"  # the case whose seconds it is compared with
+    disturbances: list[str] = field(default_factory=list)
+    runs: int = 1
+    seconds: float = 0.0  # of all runs
+    again: list[str] = field(default_factory=list)  # what the runs said of work that was done again
+    stages: dict[str, float] = field(default_factory=dict)  # seconds
+    problems: list[str] = field(default_factory=list)  # a run that did not end as it should
+    differing: list[str] = field(default_factory=list)  # files
+    of: dict[str, str] = field(default_factory=dict)  # command, commit and date
+
+    @property
+    def result(self) -> str:
+        """Whether a case ended as the undisturbed run, in words."""
+        if self.problems:
+            return self.problems[0]
+        return f"no: {', '.join(self.differing[:3])}" if self.differing else "same"
+
+
+def finish(found: Outcome, command: Command) -> None:
+    """Wait for a command that is to end well."""
+    code = command.end()
+    found.stages = stages(command.said)
+    if code or command.errors:
+        found.problems.append(f"exit code {code}: {command.errors.strip()}")
+    found.again += AGAIN.findall(command.said)
+
+
+@contextmanager
+def timed(found: Outcome) -> Iterator[Outcome]:
+    """Measures what a case takes, without the start of its cluster."""
+    begin = time.perf_counter()
+    yield found
+    found.seconds = time.perf_counter() - begin

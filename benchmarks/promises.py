@@ -8,8 +8,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import tyro
+
 from benchmarks import promises_fidelity, promises_photos
-from benchmarks.workloads import GARDEN
+from benchmarks.common import GARDEN, finish
 from sagesplat.core.config import RunConfig, SceneConfig, TrainConfig
 from sagesplat.core.errors import SageError
 from sagesplat.demo.capture import make_capture
@@ -70,3 +72,26 @@ def measure(folder: Path, names: tuple[str, ...], views: int, redraws: int, say:
             say(line)
         results[name] = {"fidelity": fidelity, "photos": photos}
     return results
+
+
+def main(
+    folder: Path = Path("runs/promises"),
+    scenes: tuple[str, ...] = tuple(CASES),
+    views: int = 300,
+    redraws: int = 20,
+    write: bool = False,
+) -> None:
+    """Coverage of promises: fidelity at fresh viewpoints, SSIM against photos over redraws.
+
+    Args:
+        folder: where the scenes are run; what is done there already is not run again.
+        scenes: which of them.
+        views: fresh viewpoints a scene.
+        redraws: of calibration and test photos.
+        write: keep the figures in benchmarks/results/cpu/promises.json.
+    """
+    finish("promises", measure(folder, scenes, views, redraws, print), write)
+
+
+if __name__ == "__main__":
+    tyro.cli(main, prog="python -m benchmarks.promises")

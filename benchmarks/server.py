@@ -3,10 +3,8 @@
 python -m benchmarks.server [--idle 1000] [--slow 1000] [--honest 200]
 """
 
-import argparse
 import asyncio
 import hashlib
-import json
 import random
 import resource
 import ssl
@@ -16,6 +14,10 @@ import tempfile
 import time
 from pathlib import Path
 from typing import Any
+
+import tyro
+
+from benchmarks.common import finish
 
 FILES, SIZE = 10, 200_000  # files of a bundle, and bytes of each
 LARGE = 20_000_000  # bytes of a file that is read slowly
@@ -197,19 +199,18 @@ class _Clients:
         return await reader.readexactly(int(length.partition(b":")[2]))
 
 
-def main() -> None:
-    """Print a row of figures for plain HTTP and one for TLS, as JSON."""
-    parser = argparse.ArgumentParser(
-        description="`sagesplat view` with idle, slow and honest clients at once"
-    )
-    for name, count in (("idle", 1000), ("slow", 1000), ("honest", 200)):
-        parser.add_argument(f"--{name}", type=int, default=count, help="number of clients")
-    counts = vars(parser.parse_args())
-    for tls in (False, True):
-        row = measure(**counts, tls=tls)
-        rounded = {key: round(value, 2) if isinstance(value, float) else value for key, value in row.items()}
-        print(json.dumps(rounded), flush=True)
+def main(idle: int = 1000, slow: int = 1000, honest: int = 200, write: bool = False) -> None:
+    """`sagesplat view` with idle, slow and honest clients at once, plain and over TLS."""
+    rows = [measure(idle, slow, honest, tls) for tls in (False, True)]
+    for row in rows:
+        print(
+            f"{'TLS' if row['tls'] else 'plain':5} {row['finished']} of {honest} honest ones finished"
+            f" in {row['seconds']:.0f} s (a file {row['file_median_s']:.1f} s, at most"
+            f" {row['file_longest_s']:.1f});"
+            f" server {row['server_rss_mb']:.0f} MB, terminal {row['terminal_lines']} lines"
+        )
+    finish("server", {"rows": rows}, write)
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main, prog="python -m benchmarks.server")

@@ -13,9 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tyro
 
 from benchmarks import far
+from benchmarks.common import finish
 from benchmarks.promises import CASES
+from benchmarks.size_tables import AS_ONE, TRAINED, Measured, summary, table, write_survey
 from sagesplat.core.config import (
     CleanConfig,
     CompareConfig,
@@ -27,12 +30,12 @@ from sagesplat.core.config import (
     RunConfig,
     SampleConfig,
 )
-from sagesplat.core.errors import RunError
+from sagesplat.core.errors import RunError, SageError
 from sagesplat.core.events import Event, StageDone, StageSkipped, Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.levels import read_header, read_level
 from sagesplat.formats.quantisation import rounded
-from sagesplat.raster import device_of, resolve_backend
+from sagesplat.raster import device_of, resolve_backend, set_threads
 from sagesplat.run.job import Job
 from sagesplat.run.records import seconds_of, settings_of
 from sagesplat.run.run_dir import RunDir
@@ -69,7 +72,6 @@ from sagesplat.train.stepper import Stepper
 
 Say = Callable[[str], None]
 SCENES = {"garden": "garden", "dinosaur": "dinosaur", "built-in": "built-in-11"}  # name: of `promises.CASES`
-AS_ONE, TRAINED = "3DGS, as one", "3DGS"
 STAGES["as_one"] = StageKind(("nest", "train"))  # of this benchmark alone
 _TOGETHER = 8  # sets in memory at a time
 _TIMED = 100  # steps of nesting, and on the full model, whose CPU time decides how many take as long
@@ -115,15 +117,6 @@ class Asked:
             snapshots=self.snapshots, shares=self.shares, caps=self.caps, tune_steps=self.tune_steps,
             lpips=self.lpips,
         )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Measured:
-    """A capture's sets on the test views, as decoded, and what else was measured of the run."""
-
-    scene: str
-    points: list[Point]
-    figures: dict[str, Any]
 
 
 def open_job(folder: Path, scene: str, asked: Asked, say: Say) -> Job:
@@ -319,3 +312,41 @@ def _figures(
         "farther": far.from_farther(job, {"full": full}, full)["full"],
         "bytes_from_far": far.bytes_needed(job, asked.far_views) if asked.far_views else {},
     }
+
+
+def main(
+    folder: Path = Path("runs/size"),
+    scenes: tuple[str, ...] = tuple(SCENES),
+    asked: tyro.conf.OmitArgPrefixes[Asked] = Asked(),
+    threads: int = 0,
+    survey: bool = False,
+    write: bool = False,
+) -> None:
+    """Bytes at equal SSIM beside sets made for one size, what nesting costs, and levels from far away.
+
+    Args:
+        folder: where runs are made; what is done already is skipped.
+        scenes: garden, dinosaur, built-in, folders of captures, or run folders with a training.
+        threads: 0: one per core.
+        survey: also write FOLDER/survey, rows as the public compression survey has them.
+        write: keep the figures in benchmarks/results/size.json.
+    """
+    set_threads(threads)
+    asked, results = replace(asked, vgg=asked.vgg or survey), {}
+    for scene in scenes:
+        begin = time.perf_counter()
+        try:
+            found = measure(folder, scene, asked, lambda line: print(line, flush=True))
+        except SageError as error:
+            raise SystemExit(str(error)) from None
+        shown = table(found)
+        print(f"\n{shown.title}\n\n{shown.markdown()}")
+        if survey:
+            for path in write_survey(folder / "survey", found):
+                print(f"{path}\n{path.read_text()}")
+        results[found.scene] = summary(found) | {"measured_in_s": time.perf_counter() - begin}
+    finish("size", {"scenes": results}, write, "")
+
+
+if __name__ == "__main__":
+    tyro.cli(main, prog="python -m benchmarks.size")

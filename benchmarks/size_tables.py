@@ -3,14 +3,15 @@
 import csv
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks.size import AS_ONE, TRAINED, Measured
 from sagesplat.io.files import atomic_path
 from sagesplat.output.tables import MB, Table
 from sagesplat.studies.compare.report import MCMC, PLANNED, PRUNED, SAME_SHARE, SNAPSHOTS, Point, least
 
+AS_ONE, TRAINED = "3DGS, as one", "3DGS"  # methods beside those of `sagesplat compare`
 BASELINES = (SNAPSHOTS, PRUNED, MCMC)
 OUTSIDE = "above our top"  # a baseline whose SSIM none of our levels reaches
 SURVEY = ("Submethod", "PSNR", "SSIM", "LPIPS", "Size [Bytes]", "#Gaussians")  # w-m/3dgs-compression-survey
@@ -19,6 +20,15 @@ _LOW = 4  # levels that count as the lowest
 _FOLDERS = {
     SAME_SHARE: "sagesplat", MCMC: "3dgs-mcmc", PRUNED: "3dgs-pruned", TRAINED: "3dgs", AS_ONE: "3dgs-as-one",
 }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A capture's sets on the test views, as decoded, and what else was measured of the run."""
+
+    scene: str
+    points: list[Point]
+    figures: dict[str, Any]
 
 
 def ratio(ours: Sequence[Point], baseline: Point) -> tuple[float, str]:

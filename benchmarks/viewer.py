@@ -7,9 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import tyro
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
+from benchmarks.common import finish
 from sagesplat.output.figures import STYLE
 from sagesplat.stages.view import show
 from tests.browser import Opened, launch, open_page
@@ -161,3 +163,28 @@ def figure(curves: Path, out: Path) -> None:
             fontsize=10,
         )
         picture.savefig(out, dpi=120, pil_kwargs={"optimize": True})
+
+
+def main(
+    bundle: Path | None = None, curves: Path | None = None, out: Path | None = None, write: bool = False
+) -> None:
+    """A bundle in Chromium at 2, 10, 50 Mbit/s: bytes and seconds to the first picture and to targets.
+
+    Args:
+        bundle: folder of the bundle.
+        curves: instead of that, curve.csv as `node web/test/network.report.mjs` writes it, which is drawn.
+        out: picture of the curves.
+        write: keep the figures in benchmarks/results/cpu.
+    """
+    if curves and out:
+        figure(curves, out)
+    elif bundle:
+        result = measure(bundle)
+        print(table(result))
+        finish("viewer", result, write)
+    else:
+        raise SystemExit("viewer: name a bundle (--bundle), or curves and a picture (--curves, --out)")
+
+
+if __name__ == "__main__":
+    tyro.cli(main, prog="python -m benchmarks.viewer")

@@ -6,16 +6,47 @@ import os
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tyro
 
+from benchmarks.common import ROOT, commit, finish
 from sagesplat.adapt.observe import TOTAL
 
-HERE = Path(__file__).parents[1]
+
+def main(
+    scene: Path,
+    out: Path | None = None,
+    downscale: int = 1,
+    steps: int = 3000,
+    threads: int = 0,
+    sources: tuple[Path, ...] = (ROOT,),
+    repeats: int = 1,
+    write: bool = False,
+) -> None:
+    """Seconds of `sagesplat run` by stage.
+
+    Args:
+        scene: capture.
+        out: folder for the runs; what is done is not done again (default: one that is removed afterwards).
+        downscale: of the photos.
+        steps: of training.
+        threads: 0: one per core.
+        sources: checkouts of the package, which take turns (`git worktree add`).
+        repeats: of each.
+        write: keep the results.
+    """
+    options = ["--downscale", str(downscale), "--train.max-steps", str(steps), "--threads", str(threads)]
+    with tempfile.TemporaryDirectory() as folder:
+        found = measure(scene.resolve(), out or Path(folder), sources, repeats, options)
+    print(*table(found), sep="\n")
+    result = {"scene": scene.name, "downscale": downscale, "steps": steps, "threads": threads, "runs": found}
+    finish(f"whole_{scene.name}", result, write)
 
 
 def measure(
@@ -62,17 +93,6 @@ def _medians(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return plain | {"stages": stages}
 
 
-def commit(source: Path) -> str:
-    """The commit of a checkout."""
-    done = subprocess.run(
-        ["git", "-C", str(source), "rev-parse", "--short", "HEAD"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    return done.stdout.strip()
-
-
 def table(found: dict[str, dict[str, Any]]) -> list[str]:
     """Lines: a stage each, seconds of every checkout, and the ratio of the last to the first."""
     runs = list(found.values())
@@ -82,3 +102,7 @@ def table(found: dict[str, dict[str, Any]]) -> list[str]:
         ratio = f"  {seconds[-1] / seconds[0]:5.2f}" if len(runs) > 1 and seconds[0] else ""
         lines.append(f"{name:10}" + "".join(f"{s:9.1f}" for s in seconds) + ratio)
     return lines
+
+
+if __name__ == "__main__":
+    tyro.cli(main, prog="python -m benchmarks.whole")

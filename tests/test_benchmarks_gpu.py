@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import gsplat
 import gsplat_standin
@@ -11,8 +12,8 @@ import pytest
 import torch
 from conftest import random_gaussians, write_capture
 
-from benchmarks import gsplat_trainer
-from benchmarks.gpu import base, runs, script, split
+from benchmarks.gpu import __main__ as script
+from benchmarks.gpu import base, gsplat_trainer, runs, split
 from sagesplat.core.config import TrainConfig
 from sagesplat.demo.capture import make_capture
 from sagesplat.metrics.image import photometric_loss, ssim_map
@@ -22,21 +23,31 @@ from sagesplat.scene.scene import Camera
 from sagesplat.train.state import from_points
 
 
-def test_a_trial_of_the_whole_script(tmp_path, capsys):
-    make_capture(tmp_path / "capture", views=9, width=64, height=48)
-    out = tmp_path / "out"
-    assert script.main(base.Asked(tmp_path / "capture", steps=60, device="cpu", out=out)) == 0
-    table = capsys.readouterr().out.splitlines()[-len(script.CHECKS) :]
-    assert [line.split()[:2] for line in table] == [
-        ["agreement", "ok"], ["full", "ok"], ["race", "ok"], ["freeze", "ok"], ["split", "ok"],
-        ["multi", "skipped"],
-    ]  # fmt: skip
-    figures = {name: json.loads((out / f"{name}.json").read_text()) for name in script.CHECKS}
+def tried(folder: Path, only: tuple[str, ...] = ()) -> dict[str, dict[str, Any]]:
+    """What a trial on the CPU writes, by check."""
+    make_capture(folder / "capture", views=9, width=64, height=48)
+    asked = base.Asked(folder / "capture", steps=60, device="cpu", only=only, out=folder / "out")
+    assert script.check(asked) == 0
+    return {name: json.loads((folder / f"out/{name}.json").read_text()) for name in only or script.CHECKS}
+
+
+def test_a_trial_of_the_script(tmp_path):
+    figures = tried(tmp_path, ("agreement", "full"))
     assert figures["agreement"]["figures"]["frozen"]["kept"]
     assert figures["agreement"]["figures"]["frozen"]["others_grew"] > 0
     run = figures["full"]["figures"]
     assert run["steps"] == run["curve"][-1]["step"] == 60
     assert run["curve"][-1]["ssim"] > run["curve"][0]["ssim"]
+
+
+@pytest.mark.slow
+def test_a_trial_of_the_whole_script(tmp_path, capsys):
+    figures = tried(tmp_path)
+    table = capsys.readouterr().out.splitlines()[-len(script.CHECKS) :]
+    assert [line.split()[:2] for line in table] == [
+        ["agreement", "ok"], ["full", "ok"], ["race", "ok"], ["freeze", "ok"], ["split", "ok"],
+        ["multi", "skipped"],
+    ]  # fmt: skip
     race = figures["race"]["figures"]
     assert set(race["runs"]) == {"ours", "third", "two_thirds", "all"}
     assert set(race["missed"]) == {"gsplat"}
@@ -47,7 +58,7 @@ def test_a_trial_of_the_whole_script(tmp_path, capsys):
 def test_a_machine_without_a_gpu_says_so_in_one_line(capsys):
     if cuda.missing() is None:
         pytest.skip("there is one")
-    assert script.main(base.Asked(Path("nowhere"), device="cuda")) == 2
+    assert script.check(base.Asked(Path("nowhere"), device="cuda")) == 2
     out, err = capsys.readouterr()
     assert out == ""
     (line,) = err.splitlines()
@@ -63,14 +74,14 @@ def test_a_check_that_fails_does_not_keep_others_from_running(tmp_path, monkeypa
 
     monkeypatch.setattr(script, "CHECKS", {"one": broken, "two": fine})
     write_capture(tmp_path / "capture", random_gaussians(40))
-    assert script.main(base.Asked(tmp_path / "capture", device="cpu", out=tmp_path / "out")) == 1
+    assert script.check(base.Asked(tmp_path / "capture", device="cpu", out=tmp_path / "out")) == 1
     printed = capsys.readouterr().out
     assert printed.splitlines()[-2:] == [
         "one        FAILED   RuntimeError: first line",
         "two        ok       well",
     ]
     assert "no categories: " in printed
-    assert script.main(base.Asked(tmp_path / "capture", device="cpu", only=("three",))) == 2
+    assert script.check(base.Asked(tmp_path / "capture", device="cpu", only=("three",))) == 2
 
 
 def test_a_lost_device_leaves_the_rest_to_a_new_process(tmp_path, monkeypatch):
@@ -87,7 +98,7 @@ def test_a_lost_device_leaves_the_rest_to_a_new_process(tmp_path, monkeypatch):
     assert found["two"] == base.Outcome("ok", "well")
     assert found["three"].state == "FAILED"
     (command,) = commands
-    assert command[1:6] == ["-m", "benchmarks", "gpu", "--scene", "scene"]
+    assert command[1:5] == ["-m", "benchmarks.gpu", "--scene", "scene"]
     assert command[command.index("--only") :] == ["--only", "two", "three"]
     assert command[command.index("--minutes") + 1] == "1.5"
     assert "--write" in command

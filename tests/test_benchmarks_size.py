@@ -10,8 +10,17 @@ import pytest
 from conftest import pinhole
 
 from benchmarks import far
-from benchmarks.size import AS_ONE, TRAINED, Measured
-from benchmarks.size_tables import OUTSIDE, SURVEY, ratio, summary, table, write_survey
+from benchmarks.size_tables import (
+    AS_ONE,
+    OUTSIDE,
+    SURVEY,
+    TRAINED,
+    Measured,
+    ratio,
+    summary,
+    table,
+    write_survey,
+)
 from sagesplat.core.geometry import project
 from sagesplat.studies.compare.report import MCMC, PLANNED, PRUNED, SAME_SHARE, SNAPSHOTS, Point
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks import wild as bench
 from sagesplat.core.errors import SceneError
 from sagesplat.demo import off_path
 from sagesplat.demo.cameras import demo_cameras
@@ -16,7 +15,6 @@ from sagesplat.demo.off_path import APART, UNSEEN
 from sagesplat.demo.wild import POSES, Wild, camera_gains, kept_views, lens_falloff, noisy_cameras
 from sagesplat.scene.colmap import load_colmap
 from sagesplat.scene.nerfstudio import load_transforms
-from sagesplat.segment.masks import Taxonomy
 
 SIZE: dict[str, Any] = {"views": 12, "width": 64, "height": 48}
 WILD = Wild(0.7, 0.15, 0.4, 2, True, 0.5, 0.005, keep=0.75, half_circle=True, off_path=4)
@@ -144,32 +142,3 @@ def test_refusals(tmp_path, monkeypatch):
     with pytest.raises(SceneError, match=r"0 of 2 viewpoints .* draw more photos"):
         make_capture(tmp_path / "few", views=3, width=32, height=24, wild=Wild(off_path=2))
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.slow
-def test_the_benchmark_measures_on_the_path_and_off_it(wild, tmp_path):
-    (tmp_path / "captures").mkdir()
-    (tmp_path / "captures" / "everything-0").symlink_to(wild)
-    lines: list[str] = []
-    found = bench.measure(tmp_path, ("everything, remedies",), 3, 0, lines.append)["everything, remedies"]
-    for where in ("test", "off_path"):
-        assert 5 < found[where]["psnr"] < 40
-        assert 0 < found[where]["ssim"] < 1
-        assert 0 < found[where]["mist"] < 1
-    given, refined = found["position_error"]
-    assert given > 0 < refined
-    assert found["off_path_by_category"].keys() <= set(
-        Taxonomy.read(wild / "masks/labels.json").names.values()
-    )
-    assert lines[0].startswith("everything, remedies ")
-
-
-def test_what_looks_like_the_truth_but_for_detail_is_no_mist():
-    photo = np.random.default_rng(0).random((48, 64, 3), np.float32) * 0.3
-    everywhere = np.ones((48, 64), bool)
-    detail, _, _ = bench._compared(np.full_like(photo, 0.15), photo, everywhere)
-    misty = photo.copy()
-    misty[12:36] += 0.4
-    mist, _, _ = bench._compared(misty, photo, everywhere)
-    assert detail.mist == 0
-    assert mist.mist == pytest.approx((24 + 2 * 0.67 * bench.BLUR) / 48, abs=0.03)  # blurred over its edges

@@ -6,7 +6,7 @@ import shlex
 import subprocess
 import tomllib
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 
@@ -14,6 +14,7 @@ import pytest
 import tyro
 
 import sagesplat
+from benchmarks.__main__ import names
 from sagesplat import cli
 from sagesplat.cli.parse import arguments
 from tools import doc_tables
@@ -43,13 +44,20 @@ def tracked() -> list[str]:
     return [f"/{line}" for line in done.stdout.splitlines()]
 
 
+def main_of(name: str) -> Callable[..., None]:
+    """What `python -m NAME` calls."""
+    module = importlib.import_module(name)
+    return (importlib.import_module(f"{name}.__main__") if hasattr(module, "__path__") else module).main
+
+
 @cache
 def flags() -> set[str]:
-    """Every flag of every command."""
+    """Every flag of every command, of `sagesplat`, of benchmarks, of the fuzzer."""
     found = {"--version", "--help", "--help-all"}
+    measured = [main_of(name) for name in (*map("benchmarks.{}".format, names()), "tests.fuzz")]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # tyro has no other way to its parsers yet
-        waiting = list(map(tyro.extras.get_parser, cli.commands().values()))
+        waiting = list(map(tyro.extras.get_parser, [*cli.commands().values(), *measured]))
     while waiting:
         for action in waiting.pop()._actions:
             found.update(action.option_strings)

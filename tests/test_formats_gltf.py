@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.readers.foreign_splats import glb, gltf
 from sagesplat.core.errors import DataError
 from sagesplat.core.transform import transformed
 from sagesplat.formats.splats import read_splat
 from sagesplat.formats.spz import decode_spz, encode_spz
 from tests.conftest import random_gaussians
+from tests.fuzz.readers.foreign_splats import glb, gltf
 from tests.test_formats_spz import rotations
 
 HALF_TURN = np.diag([-1.0, -1.0, 1.0])

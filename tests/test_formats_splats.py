@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.readers.foreign_splats import (
+from sagesplat.core.errors import DataError
+from sagesplat.core.gaussians import PARAMETERS, Gaussians, concat
+from sagesplat.formats.labels import sidecar, write_labels
+from sagesplat.formats.ply import write_ply
+from sagesplat.formats.splat import OPAQUE
+from sagesplat.formats.splats import num_lods, read_splat
+from sagesplat.formats.spz import write_spz
+from tests.fuzz.readers.foreign_splats import (
     archived,
     compressed_ply,
     dotsplat,
@@ -17,14 +24,7 @@ from benchmarks.readers.foreign_splats import (
     streamed,
     webp,
 )
-from benchmarks.readers.making import splats
-from sagesplat.core.errors import DataError
-from sagesplat.core.gaussians import PARAMETERS, Gaussians, concat
-from sagesplat.formats.labels import sidecar, write_labels
-from sagesplat.formats.ply import write_ply
-from sagesplat.formats.splat import OPAQUE
-from sagesplat.formats.splats import num_lods, read_splat
-from sagesplat.formats.spz import write_spz
+from tests.fuzz.readers.making import splats
 from tests.test_formats_ply import columns_of, foreign, make, same
 
 

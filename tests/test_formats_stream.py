@@ -14,7 +14,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from make_stream_vectors import DATA, Case, cases
 
-from benchmarks.mutate import BYTES
 from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import PARAMETERS, Gaussians
 from sagesplat.core.second_opacity import SecondOpacities, blended
@@ -23,6 +22,7 @@ from sagesplat.formats.stream import MAX_COUNT, decode_stream, encode_stream
 from sagesplat.formats.stream_header import SIZE, Precision
 from sagesplat.raster import rasterize
 from tests.conftest import damage, pinhole, random_gaussians
+from tests.fuzz.mutate import BYTES
 
 SIZES = [3, 3, 40, 200]
 FINE = Precision(1 / 250, 1, 0.25, 1 / 64, (8, 8), 5.0)

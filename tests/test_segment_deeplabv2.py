@@ -11,7 +11,6 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from benchmarks.deeplab import mean_iou, train_small
 from sagesplat.core.errors import BackendUnavailable, LabelError
 from sagesplat.segment.deeplabv2 import (
     COCO_STUFF_UNUSED,
@@ -395,6 +394,56 @@ def test_without_safetensors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 
 # training
+
+
+def train_small(
+    photos: Photos,
+    labels: LabelImages,
+    num_classes: int,
+    *,
+    steps: int,
+    blocks: Sequence[int],
+    width: int,
+    batch: int = 4,
+    rate: float = 3e-3,
+    seed: int = 0,
+    on_step: Callable[[int, float], None] | None = None,
+) -> DeepLabV2:
+    """A network from random weights; labels are classes 0 ... C - 1, negative ones do not count.
+
+    All photos are of one size. Each step sees a batch at one of the scales of inference, half of it mirrored;
+    unlike in the paper, batch norm learns too, since there are no weights to start from. `on_step(steps done,
+    loss)` is called after each.
+    """
+    torch.manual_seed(seed)
+    rng = np.random.default_rng(seed)
+    model = DeepLabV2(num_classes, blocks, width).train()
+    x = torch.from_numpy(np.stack(photos)[..., ::-1].astype(np.float32)) - torch.tensor(MEAN_BGR)
+    x, y = x.permute(0, 3, 1, 2), torch.from_numpy(np.stack(labels).astype(np.int64))
+    optimizer = torch.optim.AdamW(model.parameters(), rate, weight_decay=1e-3)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=steps)
+    for step in range(steps):
+        rows = torch.from_numpy(rng.choice(len(photos), min(batch, len(photos)), replace=False))
+        photo, label = x[rows], y[rows]
+        if rng.random() < 0.5:
+            photo, label = photo.flip(3), label.flip(2)
+        small = F.interpolate(photo, scale_factor=float(rng.choice(SCALES)), mode="bilinear")
+        logits = F.interpolate(model(small), tuple(label.shape[1:]), mode="bilinear")
+        loss = F.cross_entropy(logits, label.clamp(min=-1), ignore_index=-1)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+        if on_step is not None:
+            on_step(step + 1, float(loss.detach()))
+    return model.eval()
+
+
+def mean_iou(predicted: LabelImages, truth: LabelImages) -> float:
+    """Mean intersection over union of the truth's labels; its unlabelled pixels do not count."""
+    p, t = (np.concatenate([image.ravel() for image in images]) for images in (predicted, truth))
+    p, t = p[t >= 0], t[t >= 0]
+    return float(np.mean([((p == i) & (t == i)).sum() / ((p == i) | (t == i)).sum() for i in np.unique(t)]))
 
 
 def discs(seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -13,7 +13,6 @@ from conftest import orbit, random_gaussians
 from PIL import Image
 from test_cli import call
 
-from benchmarks.readers.foreign_splats import put_sog, sog, streamed
 from sagesplat.adapt.observe import TOTAL
 from sagesplat.adapt.viewpoints import Rule, Viewpoints, write_viewpoints
 from sagesplat.cli import commands
@@ -35,6 +34,7 @@ from sagesplat.studies.measure.levels import levels_of, stored_bytes, unique_nam
 from sagesplat.studies.measure.report import levels_table
 from sagesplat.studies.measure.run import measure
 from sagesplat.studies.measure.score import COVERED
+from tests.fuzz.readers.foreign_splats import put_sog, sog, streamed
 
 FULL = random_gaussians(150, degree=1, logit=2.0)
 NAMES = {3: "car", 184: "tree"}

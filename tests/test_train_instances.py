@@ -8,7 +8,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.labels import adjusted_rand_index
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.train.instances import label
@@ -17,6 +16,21 @@ from sagesplat.train.view_consensus import Sightings, join
 TAXONOMY = Taxonomy({62: "chair", 184: "tree-merged"})
 CHAIR = 1  # column of chairs: the first one is of what is unlabelled
 COLUMNS = 3
+
+
+def adjusted_rand_index(a: np.ndarray, b: np.ndarray) -> float:
+    """Agreement of two partitions: 1 where they are the same, about 0 by chance (Hubert and Arabie 1985)."""
+    _, a = np.unique(a, return_inverse=True)
+    _, b = np.unique(b, return_inverse=True)
+    rows, columns = int(a.max()) + 1, int(b.max()) + 1
+    table = np.bincount(a * columns + b, minlength=rows * columns).reshape(rows, columns).astype(float)
+
+    def pairs(counts: np.ndarray) -> float:
+        return float((counts * (counts - 1) / 2).sum())
+
+    both, of_a, of_b = pairs(table), pairs(table.sum(1)), pairs(table.sum(0))
+    chance, most = of_a * of_b / max(pairs(np.array([len(a)])), 1), (of_a + of_b) / 2
+    return 1.0 if most == chance else (both - chance) / (most - chance)
 
 
 def seen(objects: np.ndarray, views: int, damage: float, seed: int) -> Sightings:

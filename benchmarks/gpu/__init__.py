@@ -1,1 +1,1 @@
-"""`python -m benchmarks gpu`: all that a machine with a GPU owes, unattended."""
+"""`python -m benchmarks.gpu`: all that a machine with a GPU owes, unattended."""

@@ -14,7 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.gpu.base import ROOT, Bench, Outcome
+from benchmarks.common import ROOT
+from benchmarks.gpu.base import Bench, Outcome
 from sagesplat.core.config import TrainConfig
 from sagesplat.core.gaussians import PARAMETERS, Gaussians
 from sagesplat.raster import Backend, cuda, rasterize

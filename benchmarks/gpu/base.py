@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -17,8 +17,6 @@ from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.segment.masks import Masks
 from sagesplat.train.state import from_points
-
-ROOT = Path(__file__).parents[2]
 
 
 @dataclass(frozen=True)
@@ -38,7 +36,7 @@ class Asked:
 
     def command(self) -> list[str]:
         """The same as words for a new process."""
-        words = [sys.executable, "-m", "benchmarks", "gpu", "--scene", str(self.scene)]
+        words = [sys.executable, "-m", "benchmarks.gpu", "--scene", str(self.scene)]
         words += ["--downscale", str(self.downscale), "--steps", str(self.steps)]
         words += ["--minutes", str(self.minutes), "--device", self.device, *["--write"] * self.write]
         for name in ("masks", "lpips", "out"):
@@ -143,15 +141,6 @@ def wait(device: torch.device) -> None:
     """Until the device has done all."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
-
-
-def rounded(value: Any) -> Any:
-    """Floats of four digits, for files; keys as text."""
-    if isinstance(value, Mapping):
-        return {str(k): rounded(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [rounded(v) for v in value]
-    return float(f"{value:.4g}") if isinstance(value, float | np.floating) else value
 
 
 def one_line(error: BaseException) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks import gsplat_trainer
+from benchmarks.gpu import gsplat_trainer
 from benchmarks.gpu.base import Bench, Clock, Outcome, milliseconds, one_line, wait
 from benchmarks.gpu.split import grown, stages
 from sagesplat.adapt.observe import render_rgb

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.gpu.base import Bench, Outcome, between, mark, milliseconds, wait
-from benchmarks.measure import BACKWARD_OPERATIONS, FORWARD_OPERATIONS
+from benchmarks.kernels import BACKWARD_OPERATIONS, FORWARD_OPERATIONS
 from sagesplat.core.config import TrainConfig
 from sagesplat.core.gaussians import PARAMETERS, Gaussians
 from sagesplat.core.sh import num_bases

@@ -4,16 +4,119 @@ import itertools
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, NamedTuple
 
 import numpy as np
+from numba import njit
 
-from benchmarks.scaling.lru import HIT, MISS, SHARED, VALIDATED, Caches, new_caches, serve
-from benchmarks.scaling.visits import KINDS, Library
+from benchmarks.scaling.visits import Library
 from sagesplat.core.errors import DataError
 
 DAY = 86_400.0  # s
+HIT, SHARED, VALIDATED, MISS = range(4)
 _AT_ONCE = 20_000  # visits whose requests are in memory
+
+
+class Caches(NamedTuple):
+    """C caches over N files; each is a ring of what it holds, the latest used first, around node N."""
+
+    after: np.ndarray  # [C, N + 1] next node, towards what is older; -1: not held
+    before: np.ndarray  # [C, N + 1]
+    checked: np.ndarray  # [C, N] s at which a file was fetched or found unchanged
+    used: np.ndarray  # [C] bytes
+    capacity: np.ndarray  # [C] bytes
+
+
+def new_caches(pops: int, files: int, pop_bytes: float, shield_bytes: float) -> Caches:
+    """Empty caches of the points of presence, and the shield's as the last one."""
+    after = np.full((pops + 1, files + 1), -1, np.int32)
+    before = after.copy()
+    after[:, files] = before[:, files] = files
+    capacity = np.full(pops + 1, pop_bytes)
+    capacity[-1] = shield_bytes
+    return Caches(after, before, np.zeros((pops + 1, files)), np.zeros(pops + 1), capacity)
+
+
+@njit(cache=True)
+def _unlink(caches, c, file):  # type: ignore[no-untyped-def]
+    newer, older = caches.before[c, file], caches.after[c, file]
+    caches.after[c, newer] = older
+    caches.before[c, older] = newer
+    caches.after[c, file] = -1
+
+
+@njit(cache=True)
+def _to_front(caches, c, file):  # type: ignore[no-untyped-def]
+    ring = caches.after.shape[1] - 1
+    first = caches.after[c, ring]
+    caches.after[c, ring] = file
+    caches.before[c, file] = ring
+    caches.after[c, file] = first
+    caches.before[c, first] = file
+
+
+@njit(cache=True)
+def ask(caches: Caches, c, file, hashed, now, sizes, fill, ttl, coalesce):  # type: ignore[no-untyped-def]
+    """One request to cache `c`: HIT, SHARED, VALIDATED (held, asked for again) or MISS; keeps the file."""
+    if caches.after[c, file] >= 0:
+        _unlink(caches, c, file)
+        _to_front(caches, c, file)
+        age = now - caches.checked[c, file]
+        if 0 <= age < fill:
+            return SHARED if coalesce else MISS
+        if hashed or age <= ttl:
+            return HIT
+        caches.checked[c, file] = now
+        return VALIDATED
+    if sizes[file] > caches.capacity[c]:
+        return MISS
+    ring = caches.after.shape[1] - 1
+    caches.used[c] += sizes[file]
+    while caches.used[c] > caches.capacity[c]:
+        oldest = caches.before[c, ring]
+        _unlink(caches, c, oldest)
+        caches.used[c] -= sizes[oldest]
+    _to_front(caches, c, file)
+    caches.checked[c, file] = now
+    return MISS
+
+
+@njit(cache=True)
+def serve(  # type: ignore[no-untyped-def]
+    at, pop, files, hashed, body, sizes, caches, timing, coalesce, tables, origin, minutes
+):
+    """Requests in the order of time through a point of presence and the shield to the origin.
+
+    Args:
+        timing: s from which requests count, that a fetch takes, for which unhashed files are fresh.
+        tables: [2, 2, 4] pop or shield; requests or bytes delivered; by outcome. Added to.
+        origin: [2] requests and bytes. Added to.
+        minutes: [3, 1441] requests at points of presence, at the origin; bytes out; the last column is what
+            comes after a day. Added to.
+    """
+    begin, fill, ttl = timing
+    shield = len(caches.used) - 1
+    for i in range(len(at)):
+        file, now = files[i], at[i]
+        counts = now >= begin
+        minute = min(int((now - begin) / 60), 1440) if counts else 0
+        near = ask(caches, pop[i], file, hashed[i], now, sizes, fill, ttl, coalesce)
+        if counts:
+            tables[0, 0, near] += 1
+            tables[0, 1, near] += body[i]
+            minutes[0, minute] += 1
+            minutes[2, minute] += body[i]
+        if near < VALIDATED:
+            continue
+        fetched = sizes[file] if near == MISS else 0
+        far = ask(caches, shield, file, hashed[i], now, sizes, fill, ttl, coalesce)
+        if counts:
+            tables[1, 0, far] += 1
+            tables[1, 1, far] += fetched
+        if counts and far >= VALIDATED:
+            origin[0] += 1
+            origin[1] += sizes[file] if far == MISS else 0
+            minutes[1, minute] += 1
 
 
 @dataclass(frozen=True)
@@ -37,7 +140,6 @@ class Site:
     diurnal: float = 0.6  # the rate is 1 + diurnal cos(t - 20 h)
     growth: tuple[float, ...] = (1.0,)  # bytes of chunks and packs, one factor drawn for each scene
     header_bytes: int = 500  # of an answer
-    republish: Literal["", "all", "one"] = ""  # of every scene at noon: all files, or one category's
     warm_days: float = 1.0
     seed: int = 0
 
@@ -116,13 +218,12 @@ class Outcome:
 
 @dataclass(frozen=True, eq=False)
 class Objects:
-    """Files of all scenes: scene s has ids s F to s F + F - 1; those of a new training come after all."""
+    """Files of all scenes: scene s has ids s F to s F + F - 1."""
 
     bundle: np.ndarray  # [S] recorded bundle that a scene is a copy of
     size: np.ndarray  # [N] bytes
     factor: np.ndarray  # [S]
     popularity: np.ndarray  # [S] cumulative
-    changed: np.ndarray  # [B, F] by a new training
 
 
 def simulate(library: Library, site: Site) -> Outcome:
@@ -172,25 +273,10 @@ def lay_out(library: Library, site: Site) -> Objects:
     weights = np.arange(1, site.scenes + 1) ** -site.zipf
     return Objects(
         bundle=bundle,
-        size=np.concatenate([size, size]) if site.republish else size,
+        size=size,
         factor=factor,
         popularity=np.cumsum(weights / weights.sum()),
-        changed=_changed(library, site.republish),
     )
-
-
-def _changed(library: Library, what: str) -> np.ndarray:
-    """Files [B, F] that have another hash, or content, after a new training of all or of one category."""
-    if what == "all":
-        return library.kinds >= KINDS.index("manifest")
-    if not what:
-        return np.zeros_like(library.kinds, bool)
-    found = (library.kinds >= KINDS.index("manifest")) & (library.kinds <= KINDS.index("pack"))
-    for row, (labels, sizes) in enumerate(zip(library.labels, library.sizes, strict=True)):
-        bytes_of = np.bincount(labels[labels >= 0], sizes[labels >= 0])
-        median = np.argsort(bytes_of)[len(bytes_of) // 2]
-        found[row] |= labels == median
-    return found
 
 
 def _batches(
@@ -243,12 +329,10 @@ def _requests(
     factor = np.where(library.grows[b, file], objects.factor[scene[of]], 1.0)
     body = np.ceil(library.body[request] * factor).astype(np.int64)
     hashed = library.hashed[b, file]
-    renewed = objects.changed[b, file] & (at >= (site.warm_days + 0.5) * DAY)
 
     has = (known[of] < site.returning) & library.kept[b * library.visits + before[of], file]
     if site.shared_viewer:
         has |= (known[of] < site.returning + site.elsewhere) & library.page[b, file]
-    has &= ~renewed
     inside = has & hashed  # never leaves the browser
     unsent = has & ~hashed  # a 304
     counts = at >= site.warm_days * DAY
@@ -259,7 +343,7 @@ def _requests(
     tally[4] += int(body[counts & inside].sum())
     tally[5] += int(body[counts & unsent].sum())
 
-    thing = scene[of] * library.kinds.shape[1] + file + renewed * (len(objects.size) // 2)
+    thing = scene[of] * library.kinds.shape[1] + file
     if site.shared_viewer:
         thing = np.where(library.page[b, file], file, thing)  # that of the first scene
     out = ~inside
@@ -283,6 +367,3 @@ def _pick(library: Library, profile: np.ndarray, rng: np.random.Generator) -> np
     first = np.searchsorted(library.profile, np.arange(len(library.profiles)))
     each = np.bincount(library.profile)
     return first[profile] + (rng.random(len(profile)) * each[profile]).astype(np.int64)
-
-
-__all__ = ["DAY", "HIT", "MISS", "SHARED", "VALIDATED", "Caches", "Outcome", "Site", "lay_out", "simulate"]

@@ -1,11 +1,9 @@
 """Money: list prices of others with source and date, a month's bill, and which input moves it most."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from benchmarks.scaling.cdn import Site
 from benchmarks.scaling.theory import per_visit
-from benchmarks.scaling.training import Storage
 from benchmarks.scaling.visits import Library
 
 MONTH = 30  # days
@@ -66,6 +64,28 @@ def tiered(gb: float, tiers: tuple[tuple[float, float], ...]) -> float:
 
 
 @dataclass(frozen=True)
+class Storage:
+    """Bytes of one scene at rest."""
+
+    gaussians: float = 92e3
+    chunk_bytes: float = 20.7  # per Gaussian: 1,899,917 of 91,972 in garden's bundle
+    copies: int = 2  # the increments one by one, and all of them in the pack
+    master_bytes: float = 83.3  # per Gaussian: nested/ladder.npz, 7,659,856 for the same
+    documents: float = 315_000.0  # manifest and promises, unpacked
+    viewer: float = 3_220_000.0  # page, licences, schema; 0 where one page shows all scenes
+
+    @property
+    def bundle(self) -> float:
+        """Bytes of the folder that a web server has."""
+        return self.gaussians * self.chunk_bytes * self.copies + self.documents + self.viewer
+
+    @property
+    def master(self) -> float:
+        """Bytes of what bundles are made from."""
+        return self.gaussians * self.master_bytes
+
+
+@dataclass(frozen=True)
 class Service:
     """A site over a month: its traffic, its scenes at rest, and how they were trained."""
 
@@ -95,17 +115,10 @@ def per_1000_visits(library: Library, service: Service, prices: Prices) -> float
     return sum(bill(library, service, prices).values()) / (service.site.viewers * MONTH / 1000)
 
 
-def even_visits(library: Library, service: Service, prices: Prices) -> float:
-    """Visits of a scene and day at which its egress costs as much as its training."""
-    parts = bill(library, service, prices)
-    visits = service.site.viewers / service.site.scenes
-    return visits * parts["training"] / (parts["egress"] + parts["requests"])
-
-
 def sensitivity(
     library: Library, larger: Library, service: Service, prices: Prices = MIDDLE
-) -> dict[str, tuple[str, float, str, float]]:
-    """Dollars for a thousand visits when one input moves from its low to its high value: by input.
+) -> list[tuple[str, str, float, str, float]]:
+    """Dollars for a thousand visits when one input moves from low to high: what moves most comes first.
 
     Args:
         library: recorded visits.
@@ -132,7 +145,7 @@ def sensitivity(
     quick = replace(service, hours_per_1000=0.05)
     weekly = replace(service, hours_per_1000=4.0, trainings=4.3)
     known = on(shared_viewer=True, elsewhere=0.3)
-    return {
+    moved = {
         "price of egress": ("$0.003/GB", cheap, "$0.085/GB", dear),
         "Gaussians of a scene": ("92 k", cost(), "920 k", cost(million, visits=larger)),
         "visits of a scene": ("100,000 a day", few, "1 a day", many),
@@ -142,9 +155,4 @@ def sensitivity(
         "returning visitors": ("50 %", on(returning=0.5), "none", on(returning=0.0)),
         "what visitors ask for": (by_mix[0][1], by_mix[0][0], by_mix[-1][1], by_mix[-1][0]),
     }
-
-
-def as_rows(table: Mapping[str, tuple[str, float, str, float]]) -> list[tuple[str, str, float, str, float]]:
-    """Rows of a sensitivity table, what moves most first."""
-    rows = [(name, *row) for name, row in table.items()]
-    return sorted(rows, key=lambda row: -abs(row[4] - row[2]))
+    return sorted(((name, *row) for name, row in moved.items()), key=lambda row: -abs(row[4] - row[2]))

@@ -65,7 +65,7 @@ def file_rates(library: Library, site: Site) -> tuple[np.ndarray, np.ndarray]:
 
 
 def per_visit(library: Library, site: Site) -> tuple[float, float]:
-    """Requests and bytes to the viewer of a visit, headers included; `republish` is left out of account."""
+    """Requests and bytes to the viewer of a visit, headers included."""
     asked, sent = expected(library, site)
     requests = float(asked.sum(1).mean())
     bodies = np.where(library.grows, sent * np.mean(site.growth), sent)

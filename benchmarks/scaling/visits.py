@@ -1,6 +1,5 @@
 """Recorded visits of bundles (web/test/visitors.report.mjs) as flat arrays."""
 
-import subprocess
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,6 @@ import numpy as np
 from sagesplat.core.errors import DataError
 from sagesplat.io.files import read_json
 
-ROOT = Path(__file__).parents[2]
 KINDS = ("viewer", "manifest", "promises", "pack", "chunk")
 
 
@@ -28,7 +26,6 @@ class Library:
     sizes: np.ndarray  # [B, F] bytes over the network
     hashed: np.ndarray  # [B, F] name changes with the content: kept without asking again
     page: np.ndarray  # [B, F] hashed files of the viewer itself, the same in every bundle
-    labels: np.ndarray  # [B, F] category of a chunk, -1: none
     profile: np.ndarray  # [V] of each visit
     seconds: np.ndarray  # [V] that it lasts
     start: np.ndarray  # [B V + 1] first request of each visit
@@ -56,13 +53,11 @@ class Library:
         return table
 
 
-def read(paths: Sequence[Path], *, flight: bool = True) -> Library:
-    """Recorded visits, a file for each bundle; DataError for what is none or does not fit together.
+def read(paths: Sequence[Path]) -> Library:
+    """Recorded visits, a file of web/test/visitors.report.mjs for each bundle; DataError for what is none.
 
-    Args:
-        paths: files of web/test/visitors.report.mjs.
-        flight: count what is on its way when a browser stops a download: a round trip's worth at the link's
-            rate, which is the most that it can be.
+    Where a browser stops a download, what is on its way counts: a round trip's worth at the link's
+    rate, which is the most that it can be.
     """
     found = [_read_one(path) for path in paths]
     if not found:
@@ -72,7 +67,7 @@ def read(paths: Sequence[Path], *, flight: bool = True) -> Library:
         if shape != shapes[0]:
             raise DataError(f"{path}: its profiles are not those of {paths[0]}; record both in the same way")
     longest = max(len(one["files"]) for one in found)
-    tables = [_tables(one, longest, flight) for one in found]
+    tables = [_tables(one, longest) for one in found]
     joined = {name: np.stack([table[name] for table in tables]) for name in _PER_FILE}
     flat = {
         name: np.concatenate([table[name] for table in tables]) for name in ("at", "file", "body", "kept")
@@ -89,7 +84,7 @@ def read(paths: Sequence[Path], *, flight: bool = True) -> Library:
     )
 
 
-_PER_FILE = ("kinds", "sizes", "hashed", "page", "labels")
+_PER_FILE = ("kinds", "sizes", "hashed", "page")
 
 
 def _read_one(path: Path) -> dict[str, Any]:
@@ -112,7 +107,7 @@ def _read_one(path: Path) -> dict[str, Any]:
     return one
 
 
-def _tables(one: dict[str, Any], longest: int, flight: bool) -> dict[str, np.ndarray]:
+def _tables(one: dict[str, Any], longest: int) -> dict[str, np.ndarray]:
     """The arrays of one bundle; files padded with kind -1."""
     files = one["files"]
     pad = [0] * (longest - len(files))
@@ -124,9 +119,7 @@ def _tables(one: dict[str, Any], longest: int, flight: bool) -> dict[str, np.nda
     kept = np.zeros((len(visits), longest), bool)
     at, file, body = [], [], []
     for row, (profile, visit) in enumerate(visits):
-        on_the_way = flight * int(
-            profile["mbit"] * 125 * profile["latencyMs"]
-        )  # bytes sent before a server hears
+        on_the_way = int(profile["mbit"] * 125 * profile["latencyMs"])  # bytes sent before a server hears
         for ms, index, *part in visit["requests"]:
             came = part[0] if part else sizes[index]  # all of it is left out
             at.append(ms / 1000)
@@ -138,7 +131,6 @@ def _tables(one: dict[str, Any], longest: int, flight: bool) -> dict[str, np.nda
         "sizes": sizes,
         "hashed": hashed,
         "page": page,
-        "labels": np.array([f.get("label", -1) for f in files] + [-1 for _ in pad]),
         "seconds": np.array([visit["seconds"] for _, visit in visits]),
         "counts": np.array([len(visit["requests"]) for _, visit in visits]),
         "at": np.array(at),
@@ -146,21 +138,3 @@ def _tables(one: dict[str, Any], longest: int, flight: bool) -> dict[str, np.nda
         "body": np.array(body, np.int64),
         "kept": kept,
     }
-
-
-def record(
-    bundle: Path, out: Path, *, visits: int = 24, seed: int = 1, scale: int = 1, pack: bool = True
-) -> None:
-    """Record visits of a bundle through the viewer's own planner and streamer; DataError without Node.js."""
-    command = ["node", "test/visitors.report.mjs", str(bundle.resolve()), str(out.resolve())]
-    command += ["--visits", str(visits), "--seed", str(seed), "--scale", str(scale)]
-    command += [] if pack else ["--no-pack"]
-    try:
-        done = subprocess.run(command, cwd=ROOT / "web", capture_output=True, text=True)
-    except FileNotFoundError:
-        raise DataError("recording visits needs Node.js 20 or later on PATH; install it") from None
-    if done.returncode:
-        last = next((s for s in done.stderr.splitlines() if "Error" in s), "no word of why")
-        raise DataError(
-            f"{bundle}: recording visits failed ({last.strip()}); is it a bundle, and web/ installed?"
-        )

@@ -20,7 +20,7 @@ beside it. Where none suffices no level is accepted at that target.
 
 A category that 19 calibration views show (at 0.95) is "calibrated", the others are widened and
 "uncalibrated". As the inflation is estimated neither is exact, unlike split conformal prediction:
-`python -m benchmarks promises` tests both on splits drawn again.
+`python -m benchmarks.promises` tests both on splits drawn again.
 """
 
 from collections.abc import Mapping

@@ -1,0 +1,1 @@
+"""Damages files for every reader of the package: `python -m tests.fuzz` (docs/development.md)."""

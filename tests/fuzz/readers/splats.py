@@ -1,0 +1,170 @@
+"""Readers of splat files, levels, arrays and training checkpoints."""
+
+import json
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from sagesplat.segment.soft import read_soft, write_soft
+
+from sagesplat.adapt.ladder import read_ladder, read_prefixes
+from sagesplat.core.gaussians import Gaussians
+from sagesplat.core.second_opacity import SecondOpacities
+from sagesplat.formats.increments import read_increments, read_index, totals
+from sagesplat.formats.levels import check_level, read_level, write_level, write_set
+from sagesplat.formats.ply import read_ply, write_ply
+from sagesplat.formats.spz import encode_spz, read_spz
+from sagesplat.formats.stream import decode_stream, encode_stream
+from sagesplat.formats.stream_increments import read_streams
+from sagesplat.scene.scene import Camera, Lens, Points, Scene, View
+from sagesplat.scene.stored import read_scene, write_scene
+from sagesplat.segment.lift import LiftedLabels
+from sagesplat.train.checkpoint import latest_checkpoint, write_checkpoint
+from sagesplat.train.state import initial_state
+from sagesplat.train.view_parameters import ViewParameters
+from tests.fuzz.hostile import Reader
+from tests.fuzz.readers.making import PHOTOS, as_json, file, splats, written
+
+SETTINGS = json.dumps({"settings": {"steps": 2, "antialiased": True}})  # of the checkpoint
+CHUNK = {"label_id": 2, "level": 1, "count": 3, "nbytes": 99, "gpu_bytes": 48, "sha256": "0" * 64}
+
+
+def _ply(folder: Path, size: int) -> list[bytes]:
+    return [written(folder / "g.ply", lambda path: write_ply(path, splats(3 * size), {2: "sky"}))]
+
+
+def _spz(folder: Path, size: int) -> list[bytes]:
+    if size > 1:  # the best that gzip can do: nothing but zeros
+        return [encode_spz(_equal(3 * size))]
+    return [encode_spz(splats()), encode_spz(splats(bases=0), coarse=True)]
+
+
+def _streams(folder: Path, size: int) -> list[bytes]:
+    if size > 1:  # the best that the coder can do: nothing but the likeliest symbols
+        return [encode_stream(_equal(3 * size), [size, 3 * size]).content]
+    second = SecondOpacities(torch.linspace(-3, 3, 5), {2: (0.0, 0.5, 1.0)})
+    some = [encode_stream(splats(5, bases), [1, 3, 5]).content for bases in (0, 3, 15)]
+    return [*some, encode_stream(splats(5), [1, 3, 5], second=second).content]
+
+
+def _equal(count: int) -> Gaussians:
+    return splats(1).select(torch.zeros(count, dtype=torch.int64))
+
+
+def _index(folder: Path, size: int) -> list[bytes]:
+    content = encode_spz(splats())
+    (folder / "sky-01.spz").write_bytes(content)
+    chunk = CHUNK | {"uri": "sky-01.spz", "nbytes": len(content)}
+    chunks = [chunk | {"level": 1 + i % 3} for i in range(size)]
+    write_ply(folder / "sky-02.ply", splats())
+    replacing = chunk | {"uri": "sky-02.ply", "level": 2, "refine": "REPLACE"}
+    both = {"format": "spz+ply", "chunks": [chunk, replacing]}
+    streams = {"format": "stream", "chunks": _ranges(folder)}
+    return as_json(
+        {"format": "spz", "chunks": chunks}, {"format": "spz", "chunks": [chunk, chunk]}, both, streams
+    )
+
+
+def _ranges(folder: Path) -> list[dict[str, Any]]:
+    """The entries of a coded stream with two opacities, which lies in the folder."""
+    second = SecondOpacities(torch.linspace(-3, 3, 5), {2: (0.0, 0.5, 1.0)})
+    coded = encode_stream(splats(5), [1, 3, 5], second=second)
+    (folder / "sky-0.sgst").write_bytes(coded.content)
+    return [
+        CHUNK
+        | {"uri": "sky-0.sgst", "level": k, "count": k, "nbytes": high - low, "offset": low, "weight": w}
+        for k, (low, high), w in zip((1, 2), pairwise((0, *coded.ends)), coded.weights, strict=False)
+    ]
+
+
+def _read_index(path: Path) -> None:
+    chunks = read_index(path.parent)
+    totals(chunks, [2, 5], 3, "nbytes")
+    if len(chunks) < 10:  # what many chunks hold is not bounded by their index
+        read_increments(path.parent, chunks)
+        if {chunk.format for chunk in chunks} == {"stream"}:
+            read_streams(path.parent, chunks)
+
+
+def _checkpoints(folder: Path, size: int) -> list[bytes]:
+    state = initial_state(splats(3 * size), 0)
+    state.queue, state.frozen = [1, 0], {2: 1}
+    state.per_view = {"pose": ViewParameters.zeros(3, 6)}
+    return [written(folder / "c.npz", lambda path: write_checkpoint(path, state, SETTINGS))]
+
+
+def _read_checkpoint(path: Path) -> None:
+    latest_checkpoint(path, SETTINGS)
+
+
+def _levels(folder: Path, size: int) -> list[bytes]:
+    write_level(folder, 7, splats(3 * size), recovering=False, sh_degree=1)
+    return [written(folder / "000007.npz", lambda path: None)]
+
+
+def _read_level(path: Path) -> None:
+    check_level(path)
+    read_level(path)
+
+
+def _read_snapshots(path: Path) -> None:
+    ladder = read_ladder(path.parent)
+    ladder.load(ladder.levels[-1])
+
+
+def _nested(folder: Path, size: int) -> list[bytes]:
+    g = splats(3 * size)
+    sizes = {2: [1, 3 * size - 1], 5: [0, 1]}
+    plain = partial(write_set, g=g, step=7, sizes=sizes, place=np.ones(3 * size))
+    if size > 1:
+        return [written(folder / "n.npz", plain)]
+    return [
+        written(folder / "n.npz", write) for write in (plain, partial(plain, replaces={2: [2]}, exact=True))
+    ]
+
+
+def _read_nested(path: Path) -> None:
+    ladder = read_prefixes(path)
+    ladder.load(ladder.levels[-1])
+
+
+def _soft(folder: Path, size: int) -> list[bytes]:
+    share, ids = np.full((2, 8 * size, 8 * size), 0.5, np.float32), np.array([1, 2], np.int16)
+    return [written(folder / "s.npz", lambda path: write_soft(path, share, ids, share.shape[1:]))]
+
+
+def _lifted(folder: Path, size: int) -> list[bytes]:
+    count = np.ones(4 * size, np.int32)
+    (folder / "points").write_text(str(len(count)))
+    return [written(folder / "l.npz", LiftedLabels(count.astype(np.int16) - 1, count, count).write)]
+
+
+def _read_lifted(path: Path) -> None:
+    LiftedLabels.read(path, int(path.with_name("points").read_text()))
+
+
+def _stored(folder: Path, size: int) -> list[bytes]:
+    camera = Camera(np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32), 8, 6)
+    lens = Lens("OPENCV", (4.0, 4.0, 4.0, 3.0, 0.1, 0.0, 0.0, 0.0), 8, 6)
+    views = tuple(View(f"{i}{n}", camera, Path(f"/p/{i}{n}"), lens) for i in range(size) for n in PHOTOS)
+    rows, xyz = np.arange(3), np.zeros((3, 3), np.float32)
+    points = Points(xyz, xyz.astype(np.uint8), rows, rows.astype(np.int32), xyz[:, :2])
+    return [written(folder / "s.npz", lambda path: write_scene(path, Scene("s", folder, views, points)))]
+
+
+READERS = (
+    Reader("ply-splats", ".ply", _ply, file("g.ply", read_ply)),
+    Reader("spz", ".spz", _spz, file("g.spz", read_spz), 10_000),
+    Reader("stream", ".sgst", _streams, lambda folder, content: decode_stream(content), 10_000),
+    Reader("chunks", ".json", _index, file("index.json", _read_index)),
+    Reader("checkpoint", ".npz", _checkpoints, file("c.npz", _read_checkpoint)),
+    Reader("level", ".npz", _levels, file("000007.npz", _read_level)),
+    Reader("snapshots", ".npz", _levels, file("levels/000007.npz", _read_snapshots)),
+    Reader("nested", ".npz", _nested, file("n.npz", _read_nested)),
+    Reader("soft", ".npz", _soft, file("s.npz", read_soft), 100),
+    Reader("lifted", ".npz", _lifted, file("l.npz", _read_lifted), 3000),
+    Reader("stored", ".npz", _stored, file("s.npz", read_scene), 100),
+)
