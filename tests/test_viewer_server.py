@@ -720,8 +720,10 @@ def test_without_the_extra(bundle: Path, monkeypatch: pytest.MonkeyPatch):
 def test_other_folders(
     tmp_path: Path, contents: dict[str, bytes], message: str, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setitem(sys.modules, "sagesplat.stages.bundle", types.ModuleType("sagesplat.stages.bundle"))
-    sys.modules["sagesplat.stages.bundle"].bundle = sys.modules["sagesplat.stages.bundle"].live_bundle = None  # type: ignore[attr-defined]
+    for name in ("bundle", "live_bundle"):
+        unused = types.ModuleType(f"sagesplat.stages.{name}")
+        setattr(unused, name, None)
+        monkeypatch.setitem(sys.modules, unused.__name__, unused)
     with pytest.raises(SageError, match=message) as caught:
         show(write_bundle(tmp_path / "folder", contents) if contents else tmp_path, print, port=0)
     assert "\n" not in str(caught.value)
@@ -738,7 +740,7 @@ def test_a_bundle_cannot_be_followed(bundle: Path):
 
 
 class Bundling(types.ModuleType):
-    """In place of sagesplat.stages.bundle: writes what it is told to."""
+    """In place of sagesplat.stages.bundle and live_bundle: writes what it is told to."""
 
     def __init__(self) -> None:
         super().__init__("sagesplat.stages.bundle")
@@ -778,7 +780,8 @@ def bundling(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Bundling:
     fake, package = Bundling(), tmp_path / "package"
     fake.viewer = {"index.html": b"one <!-- poster -->"}
     write_bundle(package / "viewer" / "static", fake.viewer)
-    monkeypatch.setitem(sys.modules, "sagesplat.stages.bundle", fake)
+    for name in ("bundle", "live_bundle"):
+        monkeypatch.setitem(sys.modules, f"sagesplat.stages.{name}", fake)
     built = package / "viewer" / "static"
     monkeypatch.setattr(stages_view, "package_viewer", lambda: built)
     monkeypatch.setattr(site, "package_viewer", lambda: built)

@@ -36,7 +36,7 @@ export function blocksBundle(network: Network, options: BlocksOptions = {}): Man
   const models = promisesOf(labels, side, views, random);
   return {
     format: "sagesplat-bundle",
-    version: 2,
+    version: 1,
     generator: "test",
     name: "blocks",
     live: false,
@@ -48,6 +48,7 @@ export function blocksBundle(network: Network, options: BlocksOptions = {}): Man
     labels,
     promises: { fidelity: store(network, PROMISES, new TextEncoder().encode(JSON.stringify(models))) },
     target: { quality: "fidelity", value: 0.95 },
+    pack: null,
     cameras: [],
     start: { ...start, target: [5, 1, 5] },
     licenses: [],
@@ -110,10 +111,9 @@ function promisesOf(labels: readonly Label[], side: number, views: number, rando
   const column = (axis: number) =>
     differences(all.map((view) => (1e4 * (view[axis] ?? 0)) / (axis < 3 ? extent : 1)));
   return {
-    version: 2,
     quality: "fidelity",
     extent,
-    views: [0, 1, 2, 3, 4, 5].map(column),
+    views: [column(0), column(1), column(2), column(3), column(4), column(5)],
     labels: labels.map((label) => {
       const [x = 0, , z = 0] = label.boxes[0] ?? [];
       const away = all.map((view) => Math.hypot(view[0] - x, view[2] - z));

@@ -63,7 +63,7 @@ interface Pose {
   readonly quaternion: Quat;
 }
 
-/** A path from the bundle's start: to the next photos or to one nearby, with rests. Says the pose at a time. */
+/** A path from the bundle's start: to the next photos or to one nearby, with pauses. Says the pose at a time. */
 export function path(manifest: Manifest, seconds: number, seed: number): (second: number) => Pose {
   const random = seeded(seed);
   const { cameras, frame } = manifest;

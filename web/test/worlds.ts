@@ -62,7 +62,7 @@ export function bundle(network: Network, options: Options = {}): Manifest {
   const models = promises && labels ? promisesOf(made, random) : null;
   return {
     format: "sagesplat-bundle",
-    version: streams ? 4 : 2,
+    version: 1,
     generator: "test",
     name: "test",
     live,
@@ -76,7 +76,7 @@ export function bundle(network: Network, options: Options = {}): Manifest {
       ? { fidelity: store(network, PROMISES, new TextEncoder().encode(JSON.stringify(models))) }
       : {},
     target: { quality: "fidelity", value: 0.8 },
-    ...(pack && { pack: packOf(network, made) }),
+    pack: pack ? packOf(network, made) : null,
     cameras: [],
     start: { position: [0, 0, 0], quaternion: [0, 0, 0, 1], target: [0, 0, -1] },
     licenses: [],
@@ -185,13 +185,12 @@ export function modelOf(label: Label, rows: readonly number[], random: () => num
 function promisesOf(labels: readonly Label[], random: () => number): Promises {
   const views = Array.from({ length: 12 }, () => [10 * random() - 5, 0, 4 * random(), 0, 0, -1]);
   const rows = views.map((_, i) => i);
+  const column = (axis: number) =>
+    differences(views.map((view) => (1e4 * (view[axis] ?? 0)) / (axis < 3 ? 5 : 1)));
   return {
-    version: 2,
     quality: "fidelity",
     extent: 5,
-    views: [0, 1, 2, 3, 4, 5].map((axis) =>
-      differences(views.map((view) => (1e4 * (view[axis] ?? 0)) / (axis < 3 ? 5 : 1))),
-    ),
+    views: [column(0), column(1), column(2), column(3), column(4), column(5)],
     labels: labels.map((label) => ({
       ...modelOf(label, rows, random),
       shares: differences(rows.map(() => (10_000 * random()) / labels.length)),

@@ -12,7 +12,7 @@ import numpy as np
 from sagesplat.adapt.eq3 import Eq3, SsimModel
 from sagesplat.adapt.viewpoint import ViewModel
 
-CURVE_MOVES = 1e-4  # largest change of a curve by rounding, SSIM
+MAX_CURVE_CHANGE = 1e-4  # largest change of a curve by rounding, SSIM
 
 
 def of_files(model: ViewModel, files: Sequence[int], last: int) -> ViewModel:
@@ -51,8 +51,8 @@ def quality_entry(model: ViewModel) -> dict[str, Any]:
     }
 
 
-def curve_entry(curve: SsimModel, exact: bool = False) -> dict[str, Any]:
-    """Eq. 3 of a level, with the fewest digits that change it by at most CURVE_MOVES; all with `exact`.
+def curve_entry(curve: SsimModel) -> dict[str, Any]:
+    """Eq. 3 of a level, with the fewest digits that change it by at most MAX_CURVE_CHANGE.
 
     If both regimes are equal, only the far one is written, from distance 0 on.
     """
@@ -67,15 +67,13 @@ def curve_entry(curve: SsimModel, exact: bool = False) -> dict[str, Any]:
         "range": list(curve.d_range),
         "median": curve.median,
     }
-    if exact:
-        return entry
     below = 10.0 ** decimals_of(beta, 6)  # rounds down: some views are exactly at beta, where far begins
     short: dict[str, Any] = {**entry, "median": round(curve.median, 4)}
     away = np.array([*np.linspace(*curve.d_range, 200), curve.params.mu1, curve.params.mu2])  # with the cusps
     for digits in range(3, 16):
         params = [*significant(entry["params"][:8], digits), math.floor(beta * below) / below]
         short |= {"params": params, "range": significant(entry["range"], max(digits, 6))}
-        if np.abs(curve_of(short, curve.label_id)(away) - curve(away)).max() <= CURVE_MOVES:
+        if np.abs(curve_of(short, curve.label_id)(away) - curve(away)).max() <= MAX_CURVE_CHANGE:
             break
     return short
 

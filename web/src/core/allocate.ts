@@ -3,10 +3,7 @@
  * Same rules as src/sagesplat/adapt/allocate.py; tests/data/plans.json checks both.
  */
 
-import { mostWithin, UNITS } from "./knapsack";
-
-/** A matrix: a row per label, a column per level. */
-export type Table = readonly (readonly number[])[];
+import { mostWithin, type Table, UNITS } from "./knapsack";
 
 /** A level (from 0) per label. */
 export interface Allocation {

@@ -3,7 +3,8 @@
  * documented in src/sagesplat/adapt/knapsack.py; results are equal bit for bit.
  */
 
-import type { Table } from "./allocate";
+/** A matrix: a row per label, a column per level. */
+export type Table = readonly (readonly number[])[];
 
 /** Units of value in the total weight. */
 export const UNITS = 2 ** 40;

@@ -3,9 +3,10 @@
 import { type Category, Edits, type Operation, type Origin, type Ranks, runsOf } from "../core/edits";
 import { grow } from "../core/grow";
 import { type Packed, type Picked, pick } from "../core/pick";
-import type { Label } from "../types";
+import type { Streamer } from "../core/streamer";
+import type { Label, Manifest, Settings } from "../types";
 import { Mark } from "./spark";
-import type { Viewer } from "./viewer";
+import type { Stage } from "./stage";
 
 /** What is selected around a point: an instance, the whole category, or what is connected and of like colour. */
 export const SCOPES = ["instance", "category", "alike"] as const;
@@ -27,6 +28,17 @@ interface Seed extends Picked {
   readonly y: number;
 }
 
+/** What the editor needs of the viewer. */
+export interface EditableView {
+  readonly manifest: Manifest;
+  readonly stage: Stage;
+  readonly streamer: Streamer;
+  readonly settings: Settings;
+  set(partial: Partial<Settings>): void;
+  isHidden(label: number): boolean;
+  setHidden(labels: readonly number[], hidden: boolean): void;
+}
+
 export class Editor {
   readonly edits: Edits;
   selection: Selection | null = null;
@@ -40,7 +52,7 @@ export class Editor {
   private readonly hid = new Set<number>(); // the same of being shown or not
   private readonly labels: ReadonlyMap<number, Label>;
 
-  constructor(readonly viewer: Viewer) {
+  constructor(readonly viewer: EditableView) {
     const { labels, ladder = null } = viewer.manifest;
     this.labels = new Map(labels.map((label) => [label.id, label]));
     this.edits = new Edits(labels.map(originOf), ladder, () => {

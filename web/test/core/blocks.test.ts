@@ -88,5 +88,5 @@ test("parts say category and block, both or neither", () => {
   const { labels } = parseManifest(JSON.stringify(manifest));
   expect([labels[9]?.category, labels[9]?.block]).toEqual(["category-1", 2]);
   const odd = { ...manifest, labels: manifest.labels.map(({ block: _, ...label }) => label) };
-  expect(() => parseManifest(JSON.stringify(odd))).toThrow(/both category and block/);
+  expect(() => parseManifest(JSON.stringify(odd))).toThrow(/labels\[0\].block is missing/);
 });

@@ -48,7 +48,7 @@ test("a first level that is broken leaves its label away", async () => {
 
 test("a file that cannot be decoded caps its label", async () => {
   const { w, file } = made();
-  w.renderer.spoiled.add("1/3");
+  w.renderer.corrupt.add("1/3");
   w.streamer.start();
   await w.rest();
   expect(shown(w.streamer.state)).toEqual([4, 2, 4]);
@@ -154,7 +154,7 @@ test("promises that cannot be read are told of", async () => {
   const other = world({}, { manifest: { ...w.manifest, promises }, digest: null }, w);
   other.streamer.start();
   await other.pass(5000);
-  expect(other.streamer.state.message).toContain("promises-1.json: version is missing");
+  expect(other.streamer.state.message).toContain("promises-1.json: quality is missing");
 });
 
 test("without a digest files are checked by their size, and the user is told", async () => {

@@ -206,11 +206,11 @@ describe("a stream that fails", () => {
 
   test("where nothing can be checked, what cannot be decoded is fetched by itself", async () => {
     const { w, chunks, file } = made({}, { digest: null });
-    w.renderer.spoiled.add("1/3");
+    w.renderer.corrupt.add("1/3");
     w.set({ mode: "full" });
     w.streamer.start();
     await w.pass(700);
-    w.renderer.spoiled.clear();
+    w.renderer.corrupt.clear();
     await w.rest();
     expect(chunks()).toEqual([file(1, 3)]);
     expect(shown(w.streamer.state)).toEqual([4, 4, 4]);

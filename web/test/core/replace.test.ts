@@ -100,7 +100,7 @@ test("who changes his mind on the way down leaves nothing in memory", async () =
 
 test("a damaged level below one that replaces is as if there were no higher ones", async () => {
   const w = world({ ...OPTIONS, labels: 1 });
-  w.renderer.spoiled.add("0/4");
+  w.renderer.corrupt.add("0/4");
   w.set({ mode: "full" });
   w.streamer.start();
   await w.rest();

@@ -135,22 +135,6 @@ test("a bundle without labels, and labels without quality or boxes", async () =>
   expect(w.streamer.state.status).toBe("ok");
 });
 
-test("levels that add nothing need no file", async () => {
-  const made = world({ labels: 2, levels: 4 });
-  const empty = { uri: "", format: "spz" as const, bytes: 0, gpuBytes: 0, count: 0, sha256: "" };
-  const labels = made.manifest.labels.map((label) => ({
-    ...label,
-    levels: label.levels.map((level, k) => (k === 0 || k === 2 ? empty : level)),
-  }));
-  const w = world({}, { manifest: { ...made.manifest, labels } }, made);
-  w.set({ mode: "full" });
-  w.streamer.start();
-  await made.pass(5000);
-  expect(shown(w.streamer.state)).toEqual([4, 4]);
-  expect(w.renderer.levels(0)).toEqual([2, 4]);
-  expect(w.streamer.state.message).toBeNull();
-});
-
 describe("limits", () => {
   /** Full, then base, then full again. */
   const again = async (w: World) => {

@@ -135,6 +135,7 @@ test("a frustum that is no wider than the photos is that of the window", () => {
 });
 
 const curve: Curve = {
+  level: 1,
   params: [0.9, 0.1, 1, 1, 0.8, 0.05, 1, 1, 3],
   range: [0.5, 8],
   median: 0.7,
