@@ -92,8 +92,9 @@ def bundle(
     an impossible number; DataError for a damaged increment; SageError without a viewer.
     """
     edited = label_settings(job.run)
-    job = _without_capture(replace(job, run=replace(job.run, ladder="nested")))
+    job = replace(job, run=replace(job.run, ladder="nested"))
     _check_made(job)
+    job = _without_capture(job)
     names = set(job.names().values())
     names |= {category_and_block(job, name)[0] for name in names}
     always = [*edited.always, *(meant(composed(name), names) for name in always)]
