@@ -36,7 +36,7 @@ from sagesplat.train.state import initial_state
 from sagesplat.viewer.built import package_viewer
 from sagesplat.viewer.bundle import is_bundle
 from sagesplat.viewer.frames import camera_at
-from sagesplat.viewer.promises import allowed
+from sagesplat.viewer.promises import allowed_change
 from sagesplat.viewer.sent_model import read_model
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -128,7 +128,7 @@ def test_promises_survive_the_bundle(bundled: tuple[Job, BundleMade], quality: Q
             continue  # a level that adds nothing has no file
         at = own_views(model)
         told, kept = read_model(promises, entry["id"]).predict(*at), model.predict(*at)
-        assert (np.abs(told.mean - kept.mean) <= allowed(kept.mean)).all()
+        assert (np.abs(told.mean - kept.mean) <= allowed_change(kept.mean)).all()
         asked = kept.bound >= model.calibration.targets.min(initial=2)
         assert not (told.bound > kept.bound + 1e-9)[asked].any()
         np.testing.assert_array_equal(np.isnan(told.bound), np.isnan(kept.bound))

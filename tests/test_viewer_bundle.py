@@ -34,7 +34,7 @@ from sagesplat.viewer.bundle import SCHEMA, is_bundle, write_bundle, write_docum
 from sagesplat.viewer.frames import FLIP
 from sagesplat.viewer.manifest import CameraEntry, Category, Contents, documents
 from sagesplat.viewer.pack import NEARBY, Ladder, gains_of, order_of
-from sagesplat.viewer.promises import Seen, allowed, promises_document
+from sagesplat.viewer.promises import Seen, allowed_change, promises_document
 from sagesplat.viewer.quality import curve_entry, curve_of, of_files, quality_entry, significant
 from sagesplat.viewer.sent_model import SentModel, read_model
 
@@ -191,7 +191,7 @@ def own_views(made: ViewModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def assert_close_means(read: SentModel, made: ViewModel, *at: np.ndarray) -> None:
     known = made.predict(*at).mean
-    assert (np.abs(read.predict(*at).mean - known) <= allowed(known)).all()
+    assert (np.abs(read.predict(*at).mean - known) <= allowed_change(known)).all()
 
 
 def sent(made: ViewModel, seen: Seen | None = None) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 import { gzipSync } from "node:zlib";
 import { inAdvance } from "../src/core/advance";
-import { frustumOf, rotate } from "../src/core/distance";
+import { rotate } from "../src/core/distance";
 import type { Fetch } from "../src/core/download";
 import { loadManifest, parsePromises } from "../src/core/manifest";
 import { ladderOf } from "../src/core/planner";
@@ -11,7 +11,7 @@ import { Streamer } from "../src/core/streamer";
 import { ViewpointModels } from "../src/core/viewpoints";
 import type { Manifest, Settings, Viewpoint } from "../src/types";
 import { FakeRenderer, Network, putIncrements, VirtualClock } from "./simulate";
-import { BASE, NO_BUDGET } from "./worlds";
+import { BASE, frustumOf, NO_BUDGET } from "./worlds";
 
 /** The texts of a bundle; of its chunks only the sizes matter. */
 export interface Documents {

@@ -17,6 +17,8 @@ export interface World {
   pass(ms: number): Promise<void>;
   /** Lets time pass until the streamer is idle; fails after a minute. */
   rest(): Promise<void>;
+  /** Changes settings, starts the streamer if it is new, and rests. */
+  run(partial?: Partial<Settings>): Promise<void>;
 }
 
 export function world(options: Options = {}, more: Partial<StreamerOptions> = {}, on?: World): World {
@@ -59,6 +61,11 @@ export function world(options: Options = {}, more: Partial<StreamerOptions> = {}
         if (idle) return;
       }
       throw new Error(`never idle: ${JSON.stringify(streamer.state)}`);
+    },
+    run(partial = {}) {
+      made.set(partial);
+      streamer.start();
+      return made.rest();
     },
   };
   return made;

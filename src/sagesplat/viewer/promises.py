@@ -89,7 +89,7 @@ def _entry(
     offsets = model.heldout_variance * model.heldout_inputs @ model.weights
     offsets += np.array([curve.median if flat else 0.0 for curve in model.curves])
     order = np.argsort(places, kind="stable")
-    sent = order[_every(len(order))]
+    sent = order[_sent_views(len(order))]
     ordered = {name: getattr(model, name)[order] for name in ("inputs", "heldout_inputs", "weights")}
     shares = np.zeros(len(used)) if seen is None else seen.shares[used]
     corrections = (
@@ -118,17 +118,17 @@ def _rounded(entry: dict[str, Any], model: ViewModel, shared: Int[np.ndarray, "U
     own = model.inputs
     at = np.concatenate([own, (own + own[_neighbours(own)]) / 2])
     # a curve may jump exactly at the distance of a view: a little beyond it
-    told = np.exp(at[:, 6]) * (1 + 1e-9), at[:, :3] * model.extent, at[:, 3:6]
-    before = model.predict(*told)
-    coarser = allowed(before.mean.mean(0)) / MAX_ROUNDING_CHANGE
-    sent, moved = entry, math.inf
+    viewpoints = np.exp(at[:, 6]) * (1 + 1e-9), at[:, :3] * model.extent, at[:, 3:6]
+    before = model.predict(*viewpoints)
+    coarser = allowed_change(before.mean.mean(0)) / MAX_ROUNDING_CHANGE
+    sent, change = entry, math.inf
     for log_unit, unit in _UNITS if len(own) <= MOST_VIEWS else _UNITS[:1]:
         sent = _with_values(entry, model, shared, log_unit, significant(unit * coarser, 4))
-        after = model_of_entry(sent, shared, model.extent).predict(*told)
-        moved = _moved(before, after, model.calibration.discount)
-        if moved <= 1:
+        after = model_of_entry(sent, shared, model.extent).predict(*viewpoints)
+        change = _relative_change(before, after, model.calibration.discount)
+        if change <= 1:
             break
-    return {**sent, **_thresholds(model.calibration, moved)}
+    return {**sent, **_thresholds(model.calibration, change)}
 
 
 def _with_values(
@@ -140,7 +140,7 @@ def _with_values(
 ) -> dict[str, Any]:
     """The entry with log distances and values, by which it predicts what the model does."""
     own = model.inputs
-    logs = _differences(np.round(own[_every(len(own)), 6] / log_unit))
+    logs = _differences(np.round(own[_sent_views(len(own)), 6] / log_unit))
     sent = {**entry, "logDistances": {"unit": log_unit, "steps": logs}, "targets": [], "thresholds": []}
     inputs = inputs_of_entry(sent, shared)
     expected = matern32(own, own, model.lengths) @ model.weights
@@ -151,31 +151,31 @@ def _with_values(
     return sent
 
 
-def _moved(before: Prediction, after: Prediction, discount: float) -> float:
+def _relative_change(before: Prediction, after: Prediction, discount: float) -> float:
     """The largest change of what bounds come from, over what is allowed."""
     change = after.mean - before.mean + discount * (after.support - before.support)[:, None]
-    return float((np.abs(change) / allowed(before.mean)).max())
+    return float((np.abs(change) / allowed_change(before.mean)).max())
 
 
-def allowed(mean: np.ndarray) -> np.ndarray:
+def allowed_change(mean: np.ndarray) -> np.ndarray:
     """What rounding may change means by."""
     return np.maximum(MAX_ROUNDING_CHANGE, RELATIVE_ROUNDING * (1 - mean))
 
 
-def _thresholds(calibration: Calibration, moved: float) -> dict[str, list[int]]:
-    """Targets and thresholds in whole steps; thresholds go up by what means moved, so no bound is raised.
+def _thresholds(calibration: Calibration, change: float) -> dict[str, list[int]]:
+    """Targets and thresholds in whole steps; thresholds go up by as much as means change, so no bound is raised.
 
-    `moved`: the largest change of a mean, over what is allowed.
+    `change`: the largest change of a mean, over what is allowed.
     """
     targets, thresholds = calibration.targets, calibration.thresholds
     full = len(targets) > 0 and thresholds[-1] >= 1  # the full model keeps every target: that is not raised
-    just_below = 1 - 1.5 * STEP - moved * MAX_ROUNDING_CHANGE
+    just_below = 1 - 1.5 * STEP - change * MAX_ROUNDING_CHANGE
     if full:  # targets that only the full model keeps must not lend theirs to means below
         target = np.interp(just_below, thresholds, targets)
         low = thresholds < just_below
         targets, thresholds = [*targets[low], target, 1.0], np.array([*thresholds[low], just_below, 1.0])
     targets = np.floor(np.array(targets) / STEP + 1e-6).astype(int)
-    raised = thresholds + moved * allowed(thresholds)
+    raised = thresholds + change * allowed_change(thresholds)
     raised = np.ceil(raised / STEP - 1e-6).astype(int)
     rising = np.maximum.accumulate(raised - np.arange(len(raised))) + np.arange(len(raised))
     kept = (rising < STEPS_PER_UNIT) & (np.diff(targets, prepend=-2 * STEPS_PER_UNIT) > 0)
@@ -191,8 +191,8 @@ def _differences(whole: np.ndarray) -> list[Any]:
     return whole.astype(int).tolist()
 
 
-def _every(views: int) -> slice:
-    """Which of so many views are sent."""
+def _sent_views(views: int) -> slice:
+    """Which of a number of views are sent."""
     return slice(None, None, math.ceil(views / MOST_VIEWS))
 
 

@@ -40,13 +40,13 @@ def quality_entry(model: ViewModel) -> dict[str, Any]:
     null: no promise.
     """
     own = model.inputs
-    told = model.predict(np.exp(own[:, 6]), own[:, :3] * model.extent, own[:, 3:6])
-    low = np.quantile(told.bound, 1 - model.confidence, axis=0, method="lower")
+    predicted = model.predict(np.exp(own[:, 6]), own[:, :3] * model.extent, own[:, 3:6])
+    low = np.quantile(predicted.bound, 1 - model.confidence, axis=0, method="lower")
     return {
         "levels": list(model.levels),
         "status": model.status,
         "confidence": model.confidence,
-        "mean": told.mean.mean(0).round(3).tolist(),
+        "mean": predicted.mean.mean(0).round(3).tolist(),
         "bound": None if np.isnan(low).any() else (np.floor(low * 1000) / 1000).tolist(),
     }
 

@@ -15,10 +15,6 @@ export class LruCache {
     return this.kept.has(sha256);
   }
 
-  get bytes(): number {
-    return this.size;
-  }
-
   put(sha256: string, content: Uint8Array): void {
     this.drop(sha256);
     this.kept.set(sha256, content);

@@ -90,7 +90,7 @@ export interface Range {
 }
 
 /** Options of `receive`. */
-export interface Manner {
+export interface ReceiveOptions {
   readonly range?: Range; // all that is asked for
   readonly again?: boolean; // bypasses the browser's cache
   readonly silence?: number; // ms without data after which the download counts as failed
@@ -102,7 +102,7 @@ export async function receive(
   link: Link,
   file: File,
   signal: AbortController,
-  { again = false, silence = SILENCE, check, range }: Manner,
+  { again = false, silence = SILENCE, check, range }: ReceiveOptions,
   take: (part: Uint8Array) => boolean,
 ): Promise<void> {
   const { fetch, clock } = link; // the browser's fetch must not be called as a method

@@ -84,15 +84,6 @@ export class Downloads {
     void this.receive(this.pack);
   }
 
-  /** Bytes of cached files. */
-  get keptBytes(): number {
-    return this.cache.bytes;
-  }
-
-  isComing(file: File): boolean {
-    return this.loads.has(file);
-  }
-
   isHere(file: File): boolean {
     return this.arrived.has(file.sha256) || this.cache.has(file.sha256);
   }

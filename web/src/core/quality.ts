@@ -43,7 +43,7 @@ export function anywhere(label: Label, quality: Quality): Prediction {
 
 /** Exponent of the kernel weights in `corrected`, and the weight at which a correction counts by half. */
 const NEIGHBOUR_EXPONENT = 16;
-const ENOUGH = 1e-3;
+const HALF_WEIGHT = 1e-3;
 
 /** The views that the models of all labels share, and their scaled distances from the current viewpoint. */
 export class Views {
@@ -154,7 +154,7 @@ export class ViewModel {
       sum += weight * (this.corrections[i] as number);
       total += weight;
     }
-    return distance * Math.exp(sum / (total + ENOUGH));
+    return distance * Math.exp(sum / (total + HALF_WEIGHT));
   }
 
   /** The label's pixel share at a viewpoint, from the known views near it, 0..1. */

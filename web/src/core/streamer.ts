@@ -5,7 +5,7 @@ import { describe } from "./describe";
 import { type Lens, photoFrustum, rotate, widestLens } from "./distance";
 import { type Clock, clockOfBrowser, type Digest, digestOfBrowser, type Fetch, type File } from "./download";
 import { Downloads, TRIES_BEFORE_NOTICE } from "./downloads";
-import { same, sane } from "./inputs";
+import { normalised, same } from "./inputs";
 import { poll } from "./live";
 import { parsePromises } from "./manifest";
 import { inOrder } from "./order";
@@ -69,7 +69,7 @@ export class Streamer {
     const clock = options.clock ?? clockOfBrowser;
     this.clock = { after: (ms, run) => clock.after(ms, run), now: options.now ?? (() => clock.now()) };
     this.renderer = renderer;
-    this.settings = sane(settings);
+    this.settings = normalised(settings);
     this.content = manifest;
     this.lens = widestLens(manifest.cameras);
     this.entries = manifest.labels.map((label) => new Entry(label));
@@ -118,7 +118,7 @@ export class Streamer {
   }
 
   set(partial: Partial<Settings>): void {
-    this.settings = sane({ ...this.settings, ...partial });
+    this.settings = normalised({ ...this.settings, ...partial });
     this.hidden.shrink(this.settings.cacheBytes);
     this.replan();
   }

@@ -12,7 +12,7 @@ const TITLES: Readonly<Record<Scope, readonly [string, string]>> = {
   alike: ["Alike", "What is joined to it and of like colour"],
 };
 const WEIGHTS = [0, 0.25, 0.5, 1, 2, 4];
-const STILL = 5; // px that a pointer may move in a click
+const CLICK_TOLERANCE = 5; // px that a pointer may move in a click
 
 type Action = "rename" | "split" | "merge" | "hide" | "full" | "save" | "open";
 
@@ -131,7 +131,8 @@ export class EditorCard {
     canvas.addEventListener("pointerup", (event) => {
       const moved = from ? Math.hypot(event.clientX - from.clientX, event.clientY - from.clientY) : Infinity;
       const box = canvas.getBoundingClientRect();
-      if (this.isActive && moved <= STILL) this.pick(event.clientX - box.left, event.clientY - box.top);
+      if (this.isActive && moved <= CLICK_TOLERANCE)
+        this.pick(event.clientX - box.left, event.clientY - box.top);
     });
     window.addEventListener("keydown", (event) => this.key(event));
   }

@@ -1,6 +1,6 @@
 import { qualitiesOf } from "../core/manifest";
 import type { Quality, Settings } from "../types";
-import { USUAL, type Viewer } from "../view/viewer";
+import { DEFAULT_TARGETS, type Viewer } from "../view/viewer";
 import { h, iconButton, setText } from "./dom";
 import { formatBytes, formatCount, formatSsim, nameOf } from "./format";
 import { LabelTable } from "./labels";
@@ -176,7 +176,7 @@ const COMPARED: Readonly<Record<Quality, string>> = { fidelity: "the full scene"
 function qualityChoice(viewer: Viewer): Control[] {
   const known = qualitiesOf(viewer.manifest);
   if (known.length < 2) return [];
-  const targets = { ...USUAL }; // that were last asked for
+  const targets = { ...DEFAULT_TARGETS }; // that were last asked for
   const choose = () => {
     const { quality, target } = viewer.settings;
     targets[quality] = target;

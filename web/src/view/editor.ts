@@ -13,8 +13,8 @@ export const SCOPES = ["instance", "category", "alike"] as const;
 export type Scope = (typeof SCOPES)[number];
 
 const TOLERANCES = [0.1, 0.16, 0.22, 0.3, 0.4, 0.55]; // in colour, of what is alike
-const USUAL = 3;
-const SAME = 6; // px between clicks that are taken for one place
+const DEFAULT_TOLERANCE = 3;
+const SAME_PLACE = 6; // px between clicks that are taken for one place
 
 export interface Selection {
   readonly scope: Scope;
@@ -46,7 +46,7 @@ export class Editor {
   isWaiting = false; // for the rest of a label, of which a region is to be selected
   pickMs = Number.NaN; // of the last pick
   private seed: Seed | null = null;
-  private width = USUAL; // index of TOLERANCES
+  private width = DEFAULT_TOLERANCE; // index of TOLERANCES
   private readonly listeners = new Set<() => void>();
   private readonly weighed = new Set<number>(); // labels whose weight edits have set
   private readonly hid = new Set<number>(); // the same of being shown or not
@@ -88,7 +88,7 @@ export class Editor {
   pick(x: number, y: number): void {
     const begun = performance.now();
     const seed = this.seed;
-    if (seed && this.selection && Math.hypot(seed.x - x, seed.y - y) <= SAME) {
+    if (seed && this.selection && Math.hypot(seed.x - x, seed.y - y) <= SAME_PLACE) {
       this.cycle();
     } else {
       const found = this.meet(x, y);

@@ -3,18 +3,10 @@
 import { describe, expect, test } from "vitest";
 import distances from "../../../tests/data/distances.json?raw";
 import promised from "../../../tests/data/promises.json?raw";
-import {
-  frustumOf,
-  type Lens,
-  look,
-  photoFrustum,
-  rotate,
-  touches,
-  widestLens,
-} from "../../src/core/distance";
+import { type Lens, look, photoFrustum, rotate, touches, widestLens } from "../../src/core/distance";
 import { anywhere, curveAt, ViewModel, Views } from "../../src/core/quality";
 import type { Box, Camera, Curve, Label, Promises, Quat, Vec3, Viewpoint } from "../../src/types";
-import { differences } from "../worlds";
+import { differences, frustumOf } from "../worlds";
 
 interface PromiseCase {
   name: string;
