@@ -3,7 +3,6 @@
 import hashlib
 import json
 import math
-import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -26,7 +25,6 @@ from sagesplat.formats.increments import write_increments
 from sagesplat.formats.ply import read_ply
 from sagesplat.formats.spz import read_spz
 from sagesplat.formats.stream_increments import write_streams
-from sagesplat.io.lock import alone
 from sagesplat.scene.scene import Camera
 from sagesplat.viewer import boxes, frames, promises
 from sagesplat.viewer.built import has_viewer
@@ -654,58 +652,6 @@ def test_a_damaged_chunk_is_named_and_the_old_bundle_stays(tmp_path, contents, v
     assert "\n" not in str(caught.value)
     assert manifest_of(tmp_path / "out")["totals"]["count"] == 39
     assert not list(tmp_path.glob(".out*"))
-
-
-def test_a_bundle_that_cannot_be_swapped_in_leaves_the_earlier_one(
-    tmp_path, contents, viewer, monkeypatch
-) -> None:
-    out = tmp_path / "out"
-    write_bundle(out, contents, viewer)
-    before = files_of(out)
-    rename, failed = Path.rename, []
-
-    def fails(self: Path, target: Path) -> Path:
-        if target == out and not failed:
-            failed.append(self)
-            raise PermissionError(13, "Permission denied")
-        return rename(self, target)
-
-    few = replace(contents, categories=contents.categories[:1], chunks=contents.chunks[:2])
-    monkeypatch.setattr(Path, "rename", fails)
-    with pytest.raises(RunError, match="cannot be written"):
-        write_bundle(out, few, viewer)
-    assert failed
-    assert files_of(out) == before
-    out.rename(tmp_path / ".out.earlier")  # as a kill in the middle of the swap leaves it
-    (tmp_path / ".out.tmp-new").mkdir()
-    with pytest.raises(DataError):
-        write_bundle(out, replace(few, folder=tmp_path), viewer)
-    assert files_of(out) == before
-    assert not list(tmp_path.glob(".out*"))
-
-
-def test_a_full_disk_while_the_viewer_is_copied(tmp_path, contents, viewer, monkeypatch) -> None:
-    """Copying a folder fails with a list of files and no number; the line was "cannot be written (None)"."""
-
-    def full(*_: object, **__: object) -> None:
-        raise shutil.Error([("a", "b", "[Errno 28] No space left on device: 'a' -> 'b'")])
-
-    monkeypatch.setattr(shutil, "copytree", full)
-    with pytest.raises(RunError, match=r"out: cannot be written \(\[\('a', .*No space left on device"):
-        write_bundle(tmp_path / "out", contents, viewer)
-    monkeypatch.setattr(shutil, "disk_usage", lambda folder: shutil._ntuple_diskusage(9, 9, 0))  # type: ignore[attr-defined]
-    with pytest.raises(RunError, match="out: no space left, the disk is full; free 1 MB"):
-        write_bundle(tmp_path / "out", contents, viewer)
-    assert list(tmp_path.glob("*out*")) == []
-
-
-def test_a_second_bundler_is_told_of_the_first(tmp_path, contents, viewer) -> None:
-    with (
-        alone(tmp_path / "out"),
-        pytest.raises(RunError, match=r"out: process \d+ on .* writes there; wait for it or stop it$"),
-    ):
-        write_bundle(tmp_path / "out", contents, viewer)
-    write_bundle(tmp_path / "out", contents, viewer)
 
 
 def test_the_pack_brings_far_parts_out_of_sight_late() -> None:

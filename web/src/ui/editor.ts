@@ -1,6 +1,6 @@
 import type { Category, Operation } from "../core/edits";
 import { type Editor, SCOPES, type Scope } from "../view/editor";
-import { h, iconButton, setText } from "./dom";
+import { h, iconButton, isTyping, setText, textButton } from "./dom";
 import { formatCount } from "./format";
 import { messageOf } from "./notice";
 import { save, saved } from "./saving";
@@ -150,8 +150,7 @@ export class EditorCard {
 
   private key(event: KeyboardEvent): void {
     const { target, key } = event;
-    const typing = target instanceof HTMLElement && target.closest("input, select, textarea, dialog");
-    if (!this.isActive || (typing && key !== "Escape")) return;
+    if (!this.isActive || (isTyping(event) && key !== "Escape")) return;
     if (event.ctrlKey || event.metaKey) {
       const redo = key.toLowerCase() === "y" || (event.shiftKey && key.toLowerCase() === "z");
       if (!redo && key.toLowerCase() !== "z") return;
@@ -341,6 +340,5 @@ export class EditorCard {
   }
 }
 
-function button(text: string, title: string, click: () => void): HTMLButtonElement {
-  return h("button", { type: "button", class: "text", title, "aria-label": title, click }, text);
-}
+const button = (text: string, title: string, click: () => void): HTMLButtonElement =>
+  textButton(text, "text", click, { title, "aria-label": title });

@@ -1,7 +1,7 @@
 import { qualitiesOf } from "../core/manifest";
 import type { Quality, Settings } from "../types";
 import { DEFAULT_TARGETS, type Viewer } from "../view/viewer";
-import { h, iconButton, setText } from "./dom";
+import { h, iconButton, isTyping, setText } from "./dom";
 import { formatBytes, formatCount, formatSsim, nameOf } from "./format";
 import { LabelTable } from "./labels";
 
@@ -61,8 +61,7 @@ export class Panel {
     );
     if (matchMedia(NARROW).matches) this.element.classList.add("closed");
     window.addEventListener("keydown", (event) => {
-      const typing = event.target instanceof HTMLElement && event.target.closest("input, select, textarea");
-      if (event.key === "p" && !typing && !event.ctrlKey && !event.metaKey) this.toggle();
+      if (event.key === "p" && !isTyping(event) && !event.ctrlKey && !event.metaKey) this.toggle();
     });
     this.#announce();
   }

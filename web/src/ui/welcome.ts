@@ -1,4 +1,4 @@
-import { h } from "./dom";
+import { h, textButton } from "./dom";
 import { remember, remembered } from "./storage";
 
 const KEY = "sagesplat-welcome";
@@ -10,7 +10,7 @@ const WHAT = "Each part of the scene loads only as finely as it needs to; the sl
 export function welcome(canvas: HTMLElement): HTMLElement | null {
   if (remembered(KEY) !== null) return null;
   const how = matchMedia("(pointer: coarse)").matches ? TOUCH : MOUSE;
-  const close = h("button", { type: "button", class: "primary", click: () => done() }, "Got it");
+  const close = textButton("Got it", "primary", () => done());
   const element = h("div", { class: "welcome" }, h("p", {}, h("b", {}, how)), h("p", {}, WHAT), close);
   const done = () => {
     element.remove();
