@@ -21,7 +21,8 @@ from sagesplat.adapt.viewpoint import NO_CALIBRATION, Calibration, QualityKind, 
 from sagesplat.scene.scene import Camera
 from sagesplat.viewer import boxes
 from sagesplat.viewer.frames import FLIP
-from sagesplat.viewer.promises import Seen, promises_document, read_model
+from sagesplat.viewer.promises import Seen, promises_document
+from sagesplat.viewer.sent_model import read_model
 
 DATA = Path(__file__).parent / "data"
 Case = dict[str, Any]

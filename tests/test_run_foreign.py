@@ -31,12 +31,13 @@ from sagesplat.scene.blocks import Blocks, read_blocks, read_division, write_blo
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.stages import report, view
 from sagesplat.stages.api import open_run
-from sagesplat.stages.bundle import bundle, live_bundle
+from sagesplat.stages.bundle import bundle
 from sagesplat.stages.clean import clean_levels
 from sagesplat.stages.compose import compose_plan
 from sagesplat.stages.evaluate import evaluate_plans
 from sagesplat.stages.fit import fit_ladder
 from sagesplat.stages.label import read_edit_table
+from sagesplat.stages.live_bundle import live_bundle
 from sagesplat.stages.nest import nest_levels
 from sagesplat.stages.pipeline import run_all
 from sagesplat.stages.plan import make_plan

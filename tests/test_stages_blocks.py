@@ -49,9 +49,10 @@ from sagesplat.segment.block_categories import BlockCategories, category_of, spl
 from sagesplat.segment.masks import Masks, Taxonomy
 from sagesplat.stages.block_levels import nest_scene
 from sagesplat.stages.blocks import check
-from sagesplat.stages.bundle import _contents, live_bundle
+from sagesplat.stages.bundle_contents import bundle_contents
 from sagesplat.stages.instances import make_instances
 from sagesplat.stages.label_edits import apply_labels
+from sagesplat.stages.live_bundle import live_bundle
 from sagesplat.stages.pipeline import run_all
 from sagesplat.stages.results import increments_of
 from sagesplat.stages.shared import labels_named
@@ -429,7 +430,7 @@ def test_instances_of_blocks(finished: Path, tmp_path: Path) -> None:
     ]  # fmt: skip
     assert {job.parents_by_id.get(i) for i in plants} == {None, "potted plant@0", "potted plant@1"}
     # the viewer's tree: category, instance, block
-    tree = {(c.parent, c.category, c.block) for c in _contents(job, ladder.gaussians, False).categories}
+    tree = {(c.parent, c.category, c.block) for c in bundle_contents(job, ladder.gaussians, False).categories}
     assert {("potted plant", "potted plant 1", 0), (None, "dining table", 1)} <= tree
     # snapshots have no instances, and they can be folded back
     assert Job(RunDir(path, "snapshots"), print).names() == before

@@ -1,10 +1,11 @@
-import { defineConfig } from "vite";
+import { defineConfig } from "vitest/config";
 import { licenses } from "./licenses.ts";
+import { schema } from "./schema.ts";
 
 /** The page of a bundle, which the Python package brings. */
 export default defineConfig({
   base: "./",
-  plugins: [licenses()],
+  plugins: [schema(), licenses()],
   build: {
     outDir: "../src/sagesplat/viewer/static",
     emptyOutDir: true,
@@ -14,4 +15,5 @@ export default defineConfig({
     assetsInlineLimit: 0,
     chunkSizeWarningLimit: 4000,
   },
+  test: { testTimeout: 300_000 }, // a slow machine fails no test
 });

@@ -3,6 +3,7 @@ import { readFileSync } from "node:fs";
 import { join } from "node:path";
 import { defineConfig, type Plugin } from "vite";
 import { licenses } from "./licenses.ts";
+import { schema } from "./schema.ts";
 
 function ownLicense(): Plugin {
   const source = readFileSync(join(import.meta.dirname, "..", "LICENSE"), "utf8");
@@ -16,7 +17,7 @@ function ownLicense(): Plugin {
 
 /** The npm package: one module that brings all that it needs. */
 export default defineConfig({
-  plugins: [licenses(), ownLicense()],
+  plugins: [schema(), licenses(), ownLicense()],
   build: {
     outDir: "dist",
     target: "es2022",

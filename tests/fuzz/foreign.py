@@ -78,7 +78,7 @@ EXCEPTIONS: dict[str, str] = {
     "stages.view:_ladder_of": "a manifest that view.is_bundle has read",
     "viewer.bundle:_name_pack": OURS,
     "viewer.bundle:_put_up": OURS,
-    "viewer.bundle:has_viewer": OURS,
+    "viewer.built:has_viewer": OURS,
     "viewer.bundle:verified_files": _HASHED,
     "viewer.bundle:write_documents": OURS,
     "viewer.single_file:_is_ours": _HASHED,

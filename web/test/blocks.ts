@@ -1,9 +1,9 @@
 /** Scenes in blocks made up for tests: a square of blocks, each with all categories, far ones the largest. */
 
-import { frustumOf, rotate } from "../src/core/distance";
+import { rotate } from "../src/core/distance";
 import type { Box, Label, Level, Manifest, Promises, Viewpoint } from "../src/types";
-import { fnv, type Network, seeded } from "./simulate";
-import { differences, modelOf, PROMISES, qualityOf, totals } from "./worlds";
+import { type Network, seeded } from "./simulate";
+import { differences, frustumOf, manifestOf, modelOf, PROMISES, qualityOf, store } from "./worlds";
 
 const SIDE = 10; // of a block, world units
 
@@ -34,29 +34,14 @@ export function blocksBundle(network: Network, options: BlocksOptions = {}): Man
     return part(network, id, id % categories, block, [SIDE * column, SIDE * row], sizes, random);
   });
   const models = promisesOf(labels, side, views, random);
+  const promises = store(network, PROMISES, new TextEncoder().encode(JSON.stringify(models)));
+  const manifest = manifestOf(labels, promises);
   return {
-    format: "sagesplat-bundle",
-    version: 2,
-    generator: "test",
-    name: "blocks",
-    live: false,
-    frame: { axes: "rub", up: [0, 1, 0], floor: 0, extent: SIDE * side, metersPerUnit: 1, scale: "given" },
-    shDegree: 3,
-    antialiased: false,
-    background: [0, 0, 0],
-    totals: totals(labels),
-    labels,
-    promises: { fidelity: store(network, PROMISES, new TextEncoder().encode(JSON.stringify(models))) },
+    ...manifest,
+    frame: { ...manifest.frame, floor: 0, extent: SIDE * side },
     target: { quality: "fidelity", value: 0.95 },
-    cameras: [],
     start: { ...start, target: [5, 1, 5] },
-    licenses: [],
   };
-}
-
-function store(network: Network, uri: string, content: Uint8Array) {
-  network.files.set(uri, content);
-  return { uri, bytes: content.length, sha256: fnv(content) };
 }
 
 function part(
@@ -110,10 +95,9 @@ function promisesOf(labels: readonly Label[], side: number, views: number, rando
   const column = (axis: number) =>
     differences(all.map((view) => (1e4 * (view[axis] ?? 0)) / (axis < 3 ? extent : 1)));
   return {
-    version: 2,
     quality: "fidelity",
     extent,
-    views: [0, 1, 2, 3, 4, 5].map(column),
+    views: [column(0), column(1), column(2), column(3), column(4), column(5)],
     labels: labels.map((label) => {
       const [x = 0, , z = 0] = label.boxes[0] ?? [];
       const away = all.map((view) => Math.hypot(view[0] - x, view[2] - z));

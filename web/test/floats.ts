@@ -1,7 +1,8 @@
 /** Decodes coded streams to the numbers that docs/formats.md says, for comparison. */
 
 import { BASES, type Block, ROTATIONS } from "../src/core/columns";
-import type { Header, Sink } from "../src/core/stream";
+import type { Header } from "../src/core/header";
+import type { Sink } from "../src/core/stream";
 
 /** The Gaussians of a level, in right, up, back. */
 export interface Gaussians {
@@ -20,7 +21,7 @@ export interface Gaussians {
 export class Floats implements Sink<Gaussians> {
   private header: Header | null = null;
 
-  begin(header: Header, count: number, owed: number): Gaussians {
+  begin(header: Header, count: number, deferred: number): Gaussians {
     this.header = header;
     const floats = (each: number) => new Float32Array(each * count);
     return {
@@ -30,7 +31,7 @@ export class Floats implements Sink<Gaussians> {
       logScales: floats(3),
       opacities: floats(1),
       seconds: floats(1),
-      earlier: new Float32Array(owed),
+      earlier: new Float32Array(deferred),
       sh0: floats(3),
       shN: floats(3 * (BASES[header.degree] as number)),
     };

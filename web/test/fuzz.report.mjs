@@ -17,7 +17,7 @@ for (const name of folder ? readdirSync(folder) : []) {
   if (name.endsWith(".sgst")) streams.push(new Uint8Array(readFileSync(join(folder, name))));
 }
 const before = process.memoryUsage().rss;
-const found = module.fuzz(streams, Number(seed), Number(seconds));
+const found = module.fuzz(streams, Number(seed), { seconds: Number(seconds), longest: 1000 });
 const grown = Math.round((process.memoryUsage().rss - before) / 1e6);
 console.log(JSON.stringify({ streams: streams.length, seed: Number(seed), ...found, grownMB: grown }));
 process.exit(found.wrong.length ? 1 : 0);

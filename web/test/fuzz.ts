@@ -16,15 +16,20 @@ export interface Findings {
 
 const PER_BYTE = 128; // Gaussians in a byte, at most
 const WORDS = 56 + 2 + 1; // bytes of a Gaussian of degree 3, with two opacities, the second one sent later
-const LONG = 1000; // ms
 const [SHORT, LONGER] = [900, 20_000]; // bytes of a piece of a longer stream, usually and now and then
 
-/** Damages streams for some seconds, or so many times; the same ones for a seed. */
+/** When to stop, and what is a finding. */
+export interface Limits {
+  readonly seconds?: number; // to run
+  readonly most?: number; // streams to damage
+  readonly longest?: number; // ms that a stream may take
+}
+
+/** Damages streams, the same ones for a seed. */
 export function fuzz(
   streams: readonly Uint8Array[],
   seed: number,
-  seconds: number,
-  most = Infinity,
+  { seconds = Infinity, most = Infinity, longest = Infinity }: Limits,
 ): Findings {
   const random = seeded(seed);
   const below = (n: number) => Math.floor(random() * n);
@@ -36,7 +41,7 @@ export function fuzz(
     if (found.tried % 256 === 0 && performance.now() - begun > 1000 * seconds) break;
     const stream = streams[below(streams.length)] as Uint8Array;
     const piece = stream.subarray(0, 50 + below(below(50) ? SHORT : LONGER));
-    attempt(damaged(piece, below), below, found);
+    attempt(damaged(piece, below), below, longest, found);
   }
   Error.stackTraceLimit = stackTraceLimit;
   return found;
@@ -58,7 +63,7 @@ function damaged(stream: Uint8Array, below: (n: number) => number): Uint8Array {
   return bytes;
 }
 
-function attempt(bytes: Uint8Array, below: (n: number) => number, found: Findings): void {
+function attempt(bytes: Uint8Array, below: (n: number) => number, longest: number, found: Findings): void {
   const begun = performance.now();
   const parts: Part[] = [];
   const line = (what: string) => `${what}: ${Buffer.from(bytes).toString("base64")}`;
@@ -75,7 +80,7 @@ function attempt(bytes: Uint8Array, below: (n: number) => number, found: Finding
   found.tried += 1;
   const ms = performance.now() - begun;
   found.slowest = Math.max(found.slowest, ms);
-  if (ms > LONG) found.wrong.push(line(`${Math.round(ms)} ms`));
+  if (ms > longest) found.wrong.push(line(`${Math.round(ms)} ms`));
   const size = parts.reduce((sum, part) => sum + sizeOf(part), 0) / (PER_BYTE * WORDS * bytes.length || 1);
   found.largest = Math.max(found.largest, size);
   if (size > 1) found.wrong.push(line("more than its bytes may hold"));

@@ -2,16 +2,16 @@
 
 import { gzipSync } from "node:zlib";
 import { inAdvance } from "../src/core/advance";
-import { frustumOf, rotate } from "../src/core/distance";
+import { rotate } from "../src/core/distance";
 import type { Fetch } from "../src/core/download";
 import { loadManifest, parsePromises } from "../src/core/manifest";
-import { Outlook } from "../src/core/outlook";
 import { ladderOf } from "../src/core/planner";
 import { Entry } from "../src/core/residency";
 import { Streamer } from "../src/core/streamer";
+import { ViewpointModels } from "../src/core/viewpoints";
 import type { Manifest, Settings, Viewpoint } from "../src/types";
 import { FakeRenderer, Network, putIncrements, VirtualClock } from "./simulate";
-import { BASE, NO_BUDGET } from "./worlds";
+import { BASE, frustumOf, NO_BUDGET } from "./worlds";
 
 /** The texts of a bundle; of its chunks only the sizes matter. */
 export interface Documents {
@@ -64,12 +64,16 @@ function linkTo(documents: Documents, { mbit, connections }: Line) {
 
 /** Says the expected SSIM of some levels (0: nothing) at a viewpoint: 0 where nothing is drawn. */
 export function judge(manifest: Manifest, promises: string): (view: Viewpoint, levels: number[]) => number {
-  const outlook = new Outlook("fidelity", manifest.labels, parsePromises(promises, "promises", "fidelity"));
+  const models = new ViewpointModels(
+    "fidelity",
+    manifest.labels,
+    parsePromises(promises, "promises", "fidelity"),
+  );
   const entries = manifest.labels.map((label) => new Entry(label));
   return (view, levels) => {
     let [sum, total] = [0, 0];
     entries.forEach((entry, i) => {
-      outlook.see(entry, view);
+      models.see(entry, view);
       const known = entry.prediction.mean.some((value) => !Number.isNaN(value));
       if (!entry.sight.visible || !known) return;
       const values = entry.prediction.mean.slice(0, levels[i] ?? 0).filter((value) => !Number.isNaN(value));

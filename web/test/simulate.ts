@@ -132,14 +132,14 @@ export class Network {
     const range = /^bytes=(\d+)-(\d+)$/.exec(new Headers(init?.headers).get("Range") ?? "");
     if (range) this.askedRanges.push(`${path} ${range[1]}-${range[2]}`);
     if (!range || !this.ranges) {
-      return this.reply(200, this.body(path, this.spoiled(content, fault), fault, signal), tag);
+      return this.reply(200, this.body(path, this.corrupt(content, fault), fault, signal), tag);
     }
     const [start, end] = [Number(range[1]), Math.min(Number(range[2]), content.length - 1)];
     if (start >= content.length) {
       this.close();
       return this.reply(416, null, tag);
     }
-    const part = this.spoiled(content.subarray(start, end + 1), fault);
+    const part = this.corrupt(content.subarray(start, end + 1), fault);
     const said = fault === "wrong range" ? start + 1 : start;
     const body = this.body(path, part, fault, signal);
     return this.reply(206, body, tag, `bytes ${said}-${end}/${content.length}`);
@@ -150,7 +150,7 @@ export class Network {
     return Array.isArray(found) ? found.shift() : found;
   }
 
-  private spoiled(content: Uint8Array, fault: Fault | undefined): Uint8Array {
+  private corrupt(content: Uint8Array, fault: Fault | undefined): Uint8Array {
     if (fault === "truncated") return content.slice(0, content.length - 10);
     if (fault === "longer") return Uint8Array.from([...content, 0]);
     if (fault !== "corrupt") return content;
@@ -303,7 +303,7 @@ export class FakeRenderer implements Renderer {
   readonly alive = new Set<Handle>();
   decoded = 0;
   swaps: { show: readonly Handle[]; hide: readonly Handle[] }[] = [];
-  readonly spoiled = new Set<string>(); // "label/level" that cannot be decoded
+  readonly corrupt = new Set<string>(); // "label/level" that cannot be decoded
   /** Called after every swap. */
   watch: () => void = () => {};
 
@@ -323,7 +323,7 @@ export class FakeRenderer implements Renderer {
     const handle: Handle = { label, level, count: bytes.length };
     return new Promise((resolve, reject) => {
       this.clock.after(this.delay, () => {
-        if (this.spoiled.has(`${label}/${level}`)) return reject(new Error("not a splat file"));
+        if (this.corrupt.has(`${label}/${level}`)) return reject(new Error("not a splat file"));
         this.alive.add(handle);
         this.decoded += 1;
         resolve(handle);

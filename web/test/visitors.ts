@@ -1,12 +1,12 @@
 /** Visitors of a bundle: how long they stay, where they walk, and what their browsers ask a server for. */
 
-import { frustumOf, rotate } from "../src/core/distance";
+import { rotate } from "../src/core/distance";
 import type { Fetch } from "../src/core/download";
 import { loadManifest } from "../src/core/manifest";
 import { Streamer } from "../src/core/streamer";
 import type { Manifest, Quat, Settings, Vec3, Viewpoint } from "../src/types";
 import { FakeRenderer, Network, putIncrements, seeded, VirtualClock } from "./simulate";
-import { BASE, NO_BUDGET } from "./worlds";
+import { BASE, frustumOf, NO_BUDGET } from "./worlds";
 
 /** A file of a bundle, as a server has it. */
 export interface Served {
@@ -63,7 +63,7 @@ interface Pose {
   readonly quaternion: Quat;
 }
 
-/** A path from the bundle's start: to the next photos or to one nearby, with rests. Says the pose at a time. */
+/** A path from the bundle's start: to the next photos or to one nearby, with pauses. Says the pose at a time. */
 export function path(manifest: Manifest, seconds: number, seed: number): (second: number) => Pose {
   const random = seeded(seed);
   const { cameras, frame } = manifest;

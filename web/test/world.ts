@@ -17,6 +17,8 @@ export interface World {
   pass(ms: number): Promise<void>;
   /** Lets time pass until the streamer is idle; fails after a minute. */
   rest(): Promise<void>;
+  /** Changes settings, starts the streamer if it is new, and rests. */
+  run(partial?: Partial<Settings>): Promise<void>;
 }
 
 export function world(options: Options = {}, more: Partial<StreamerOptions> = {}, on?: World): World {
@@ -60,6 +62,11 @@ export function world(options: Options = {}, more: Partial<StreamerOptions> = {}
       }
       throw new Error(`never idle: ${JSON.stringify(streamer.state)}`);
     },
+    run(partial = {}) {
+      made.set(partial);
+      streamer.start();
+      return made.rest();
+    },
   };
   return made;
 }
@@ -76,7 +83,7 @@ function watcher(streamer: Streamer, renderer: FakeRenderer): () => void {
       const levels = renderer.levels(label.id);
       const start = label.levels.slice(0, shown).findLastIndex(({ refine }) => refine);
       const isDrawn = (i: number) => i >= start && i < shown;
-      const expected = label.levels.flatMap((file, i) => (isDrawn(i) && file.count ? [i + 1] : []));
+      const expected = label.levels.flatMap((_, i) => (isDrawn(i) ? [i + 1] : []));
       if (!live && levels.join() !== expected.join()) {
         throw new Error(`${label.name}: draws ${levels}, says ${expected}`);
       }

@@ -1,5 +1,6 @@
 /** Small bundles made up for tests. */
 
+import { rotate } from "../src/core/distance";
 import type {
   Label,
   LabelPromises,
@@ -8,7 +9,9 @@ import type {
   Manifest,
   Pack,
   Promises,
+  Quat,
   Settings,
+  Vec3,
   Viewpoint,
 } from "../src/types";
 import { fnv, type Network, seeded } from "./simulate";
@@ -32,6 +35,30 @@ export const at = (x: number, y = 0, z = 0): Viewpoint => ({
 });
 /** Sees what is right of x = 0. */
 export const rightOf = (view: Viewpoint): Viewpoint => ({ ...view, frustum: [[1, 0, 0, 0]] });
+
+/** Half spaces of a camera's frustum: left, right, bottom, top, front; the near plane is at the camera. */
+export function frustumOf(
+  position: Vec3,
+  quaternion: Quat,
+  fovY: number,
+  aspect: number,
+): Viewpoint["frustum"] {
+  const high = Math.tan(fovY / 2);
+  const wide = high * aspect;
+  const normals: Vec3[] = [
+    [1, 0, -wide],
+    [-1, 0, -wide],
+    [0, 1, -high],
+    [0, -1, -high],
+    [0, 0, -1],
+  ];
+  return normals.map((normal) => {
+    const [x, y, z] = rotate(quaternion, normal);
+    const length = Math.hypot(x, y, z);
+    const n = [x / length, y / length, z / length] as const;
+    return [...n, -(n[0] * position[0] + n[1] * position[1] + n[2] * position[2])] as const;
+  });
+}
 
 export interface Options {
   readonly labels?: number;
@@ -59,29 +86,38 @@ export function bundle(network: Network, options: Options = {}): Manifest {
     });
     return labelOf(id, streams ? streamOf(network, `chunks/l${id}-${seed}.sgst`, files) : files, random);
   });
-  const models = promises && labels ? promisesOf(made, random) : null;
+  const models =
+    promises && labels ? new TextEncoder().encode(JSON.stringify(promisesOf(made, random))) : null;
   return {
-    format: "sagesplat-bundle",
-    version: streams ? 4 : 2,
-    generator: "test",
-    name: "test",
+    ...manifestOf(made, models && store(network, PROMISES, models)),
     live,
-    frame: { axes: "rub", up: [0, 1, 0], floor: -1, extent: 5, metersPerUnit: 1, scale: "given" },
-    shDegree: 3,
-    antialiased: false,
-    background: [0, 0, 0],
-    totals: totals(made),
-    labels: made,
-    promises: models
-      ? { fidelity: store(network, PROMISES, new TextEncoder().encode(JSON.stringify(models))) }
-      : {},
-    target: { quality: "fidelity", value: 0.8 },
-    ...(pack && { pack: packOf(network, made) }),
-    cameras: [],
-    start: { position: [0, 0, 0], quaternion: [0, 0, 0, 1], target: [0, 0, -1] },
-    licenses: [],
+    pack: pack ? packOf(network, made) : null,
   };
 }
+
+/** A manifest of some labels, and maybe their models of fidelity. */
+export const manifestOf = (
+  labels: readonly Label[],
+  promises: Manifest["promises"]["fidelity"] | null,
+): Manifest => ({
+  format: "sagesplat-bundle",
+  version: 1,
+  generator: "test",
+  name: "test",
+  live: false,
+  frame: { axes: "rub", up: [0, 1, 0], floor: -1, extent: 5, metersPerUnit: 1, scale: "given" },
+  shDegree: 3,
+  antialiased: false,
+  background: [0, 0, 0],
+  totals: totals(labels),
+  labels,
+  promises: promises ? { fidelity: promises } : {},
+  target: { quality: "fidelity", value: 0.8 },
+  pack: null,
+  cameras: [],
+  start: { position: [0, 0, 0], quaternion: [0, 0, 0, 1], target: [0, 0, -1] },
+  licenses: [],
+});
 
 /** Puts files one after the other into one. */
 function streamOf(network: Network, uri: string, files: readonly Level[]): Level[] {
@@ -114,7 +150,7 @@ export function packOf(network: Network, labels: readonly Label[]): Pack {
   return { ...store(network, "scene-1.pack", content), order };
 }
 
-function store(network: Network, uri: string, content: Uint8Array) {
+export function store(network: Network, uri: string, content: Uint8Array) {
   network.files.set(uri, content);
   return { uri, bytes: content.length, sha256: fnv(content) };
 }
@@ -185,13 +221,12 @@ export function modelOf(label: Label, rows: readonly number[], random: () => num
 function promisesOf(labels: readonly Label[], random: () => number): Promises {
   const views = Array.from({ length: 12 }, () => [10 * random() - 5, 0, 4 * random(), 0, 0, -1]);
   const rows = views.map((_, i) => i);
+  const column = (axis: number) =>
+    differences(views.map((view) => (1e4 * (view[axis] ?? 0)) / (axis < 3 ? 5 : 1)));
   return {
-    version: 2,
     quality: "fidelity",
     extent: 5,
-    views: [0, 1, 2, 3, 4, 5].map((axis) =>
-      differences(views.map((view) => (1e4 * (view[axis] ?? 0)) / (axis < 3 ? 5 : 1))),
-    ),
+    views: [column(0), column(1), column(2), column(3), column(4), column(5)],
     labels: labels.map((label) => ({
       ...modelOf(label, rows, random),
       shares: differences(rows.map(() => (10_000 * random()) / labels.length)),

@@ -1,13 +1,11 @@
-"""Makes bundles for the web viewer, from a finished run or from the newest level of a running training."""
+"""Makes bundles for the web viewer from finished runs."""
 
 import io
-import json
-import shutil
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -19,19 +17,14 @@ from sagesplat.core.errors import RunError
 from sagesplat.core.events import Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.names import composed
-from sagesplat.formats.increments import INDEX, Increment, full_scene, read_increments, write_increments
+from sagesplat.formats.increments import INDEX, Increment, full_scene, read_increments
 from sagesplat.formats.label_edits import ladder_hash
-from sagesplat.formats.levels import read_level
-from sagesplat.io.files import write_json
-from sagesplat.io.lock import alone
-from sagesplat.io.npz import Npz
-from sagesplat.io.typed import known_json
 from sagesplat.raster import rasterize
 from sagesplat.run.job import Job
-from sagesplat.run.records import is_made_from, settings_of
+from sagesplat.run.records import is_made_from
 from sagesplat.scene import read_scene
-from sagesplat.segment.display_names import meant, title_of
-from sagesplat.segment.masks import UNLABELLED
+from sagesplat.segment.display_names import meant
+from sagesplat.stages.bundle_contents import bundle_contents
 from sagesplat.stages.edited import label_settings
 from sagesplat.stages.export import increment_files
 from sagesplat.stages.plan import main_target
@@ -44,31 +37,21 @@ from sagesplat.stages.results import (
     sampled_of,
     viewpoints_of,
 )
-from sagesplat.stages.shared import category_and_block, category_colors
-from sagesplat.viewer import boxes
+from sagesplat.stages.shared import category_and_block
 from sagesplat.viewer.built import check_viewer, package_viewer
 from sagesplat.viewer.bundle import (
-    MANIFEST,
     BundleSizes,
     check_target,
-    has_viewer,
     write_bundle,
-    write_documents,
 )
 from sagesplat.viewer.corrections import distance_error, with_corrections
-from sagesplat.viewer.frames import FLIP, camera_at
-from sagesplat.viewer.manifest import CameraEntry, Category, Contents, start_of
+from sagesplat.viewer.frames import camera_at
+from sagesplat.viewer.manifest import Category, Contents, start_of
 from sagesplat.viewer.pack import ASPECT, FOV_Y
 from sagesplat.viewer.promises import Seen
 from sagesplat.viewer.single_file import check_page, write_single_file
 
-_GROUND = {"dirt", "floor", "grass", "gravel", "ground", "pavement", "platform", "playingfield", "railroad"}
-_GROUND |= {"path", "road", "sand", "sidewalk", "snow", "soil", "street", "terrain"}
-_FEW = boxes.FEW  # SfM points; with fewer a category's boxes also take its Gaussians
-_OPAQUE = 0.1  # least opacity of such Gaussians
 _POSTER_HEIGHT = 360  # px
-_OTHERS = 10.0  # seconds to wait for another process that writes the same live bundle
-_LIVE = ".live.json"  # the level that a live bundle was made from, and its files
 
 
 @dataclass(frozen=True)
@@ -109,8 +92,9 @@ def bundle(
     an impossible number; DataError for a damaged increment; SageError without a viewer.
     """
     edited = label_settings(job.run)
-    job = _without_capture(replace(job, run=replace(job.run, ladder="nested")))
+    job = replace(job, run=replace(job.run, ladder="nested"))
     _check_made(job)
+    job = _without_capture(job)
     names = set(job.names().values())
     names |= {category_and_block(job, name)[0] for name in names}
     always = [*edited.always, *(meant(composed(name), names) for name in always)]
@@ -128,7 +112,7 @@ def bundle(
     full = full_scene(listed)
     g, drawn = read_increments(job.run.increments, full), viewpoints_of(job)
     contents = replace(
-        _contents(job, g, job.antialiased),
+        bundle_contents(job, g, job.antialiased),
         chunks=listed,
         meters_per_unit=meters_per_unit,
         drawn=[drawn.cameras[row] for row in drawn.rows("fit")],
@@ -171,8 +155,6 @@ def _in_streams(listed: Sequence[Increment]) -> bool:
 
 def _without_capture(job: Job) -> Job:
     """The job with the cameras and points that the run kept: its capture may be gone or changed since."""
-    if not job.run.geometry.exists():  # of an earlier version
-        return job
     source = replace(job)
     vars(source)["given_scene"] = read_scene(job.run.geometry)
     return replace(job, source=source)
@@ -189,64 +171,6 @@ def _poster(g: Gaussians, contents: Contents) -> bytes:
     file = io.BytesIO()
     Image.fromarray(pixels).save(file, "JPEG", quality=72, optimize=True)
     return file.getvalue()
-
-
-def live_bundle(job: Job, folder: Path, viewer: Path | None = None) -> bool:
-    """Write the newest level of a training, which may still run, to `folder`; False if it is there already.
-
-    The bundle has one level per category and no bounds. Files are written atomically. Those that a page may
-    still be loading are kept until two newer levels are written. RunError if there is no level yet, or where
-    another process writes there for seconds.
-    """
-    job = replace(job, run=replace(job.run, ladder="snapshots"))  # what training writes knows no instances
-    with alone(folder, _OTHERS):
-        return _live_bundle(job, folder, viewer or package_viewer())
-
-
-def _live_bundle(job: Job, folder: Path, viewer: Path) -> bool:
-    steps = sorted(p for p in job.run.levels.glob("*.npz") if not p.name.startswith("."))
-    if not steps:
-        raise RunError(f"{job.run.levels}: no level yet; wait, or run `sagesplat train`")
-    newest = {"level": steps[-1].name, "written": steps[-1].stat().st_mtime_ns}
-    previous = _read_live(folder / _LIVE)
-    if previous and previous.of == newest and (folder / MANIFEST).exists():
-        return False
-    if not previous:
-        check_target(folder)
-    if not has_viewer(folder, viewer):  # none yet, or that of an older version
-        check_viewer(viewer)
-        shutil.copytree(viewer, folder, dirs_exist_ok=True)
-    g = read_level(steps[-1])
-    g = g.select(torch.argsort(g.label_ids, stable=True))
-    antialiased = _antialiased(job)
-    work, target = folder / ".chunks", folder / "chunks"
-    sizes = {label: (n,) for label, n in g.counts().items()}
-    chunks = write_increments(work, g, sizes, job.names(), antialiased=antialiased)
-    target.mkdir(exist_ok=True)
-    for chunk in chunks:
-        (work / chunk.uri).replace(target / chunk.uri)
-    shutil.rmtree(work)
-    write_documents(folder, replace(_contents(job, g, antialiased), chunks=chunks, live=True))
-    uris = [chunk.uri for chunk in chunks]
-    kept = [uris, *(version for version in (previous.kept if previous else ()) if version != uris)][:3]
-    write_json(folder / _LIVE, {"of": newest, "kept": kept})
-    for path in target.iterdir():
-        if path.name not in {uri for version in kept for uri in version}:
-            path.unlink()
-    return True
-
-
-@dataclass(frozen=True)
-class _Live:
-    """What the last call of `live_bundle` wrote down."""
-
-    of: Any = None  # the newest snapshot then
-    kept: list[list[str]] = field(default_factory=list)  # files of the last versions
-
-
-def _read_live(path: Path) -> _Live | None:
-    """What the last call of `live_bundle` wrote down; None where there is nothing of use."""
-    return known_json(path, _Live)
 
 
 def _check_made(job: Job) -> None:
@@ -282,67 +206,6 @@ def _check_asked(
     for name, weight in weights.items():
         if not 0 <= weight <= 1e6:
             raise RunError(f"weight {weight} of {name} is impossible; give a number from 0 on, such as 2")
-
-
-def _contents(job: Job, g: Gaussians, antialiased: bool) -> Contents:
-    """The contents of a bundle without increments and bounds."""
-    scene, names = job.scene, job.names()
-    labels = sorted(g.counts())
-    job.check_named(job.run.levels, labels)
-    split_names = {i: category_and_block(job, names[i]) for i in labels}
-    colors = category_colors(job, {category for category, _ in split_names.values()})
-    ground = [i for i in labels if _GROUND & set(_title(job, split_names[i][0]).split())]
-    places = _places(job, g)
-    return Contents(
-        name=scene.name,
-        extent=scene.extent,
-        cameras=[
-            CameraEntry(view.name, scene.split(row), view.camera) for row, view in enumerate(scene.views)
-        ],
-        categories=[
-            Category(
-                i,
-                names[i],
-                _title(job, category),
-                colors[category],
-                boxes.split_boxes(places[i] * FLIP),
-                block=block,
-                parent=job.parents.get(category),
-            )
-            for i, (category, block) in split_names.items()
-        ],
-        chunks=[],
-        folder=job.run.increments,
-        sh_degree=g.sh_degree,
-        antialiased=antialiased,
-        points=scene.points.xyz,
-        ground=np.isin(job.point_labels, ground),
-    )
-
-
-def _title(job: Job, category: str) -> str:
-    return title_of(category) if category != job.whole_masks.taxonomy.name(UNLABELLED) else "everything else"
-
-
-def _places(job: Job, g: Gaussians) -> dict[int, np.ndarray]:
-    """By label id its SfM points [N, 3]; where they are few, also the means of its opaque Gaussians."""
-    points, rows = job.scene.points.xyz, _rows_by_label(job.point_labels)
-    means, mine = g.means.numpy(), _rows_by_label(g.label_ids.numpy())
-    opaque = g.logit_opacities.numpy() >= np.log(_OPAQUE / (1 - _OPAQUE))
-    places = {}
-    for label, own in mine.items():
-        known = points[rows.get(label, [])]
-        if len(known) < _FEW:
-            seen = own[opaque[own]]
-            known = np.concatenate([known, means[seen if len(seen) else own]])
-        places[label] = known
-    return places
-
-
-def _rows_by_label(label_ids: np.ndarray) -> dict[int, np.ndarray]:
-    order = np.argsort(label_ids, kind="stable")
-    labels, starts = np.unique(label_ids[order], return_index=True)
-    return dict(zip(labels.tolist(), np.split(order, starts[1:]), strict=True))
 
 
 def _with_quality(
@@ -399,16 +262,3 @@ def _shares(job: Job) -> dict[int, np.ndarray]:
     for label, view, pixels in zip(table.label_id, table.view, table.num_pixels, strict=True):
         shares[int(label)][view] = pixels / sizes[view]
     return shares
-
-
-def _antialiased(job: Job) -> bool:
-    """Whether the run trains with antialiasing; read from the checkpoint while training runs."""
-    try:
-        return bool(settings_of(job.run, "train")["antialiased"])
-    except RunError:
-        pass
-    try:
-        with Npz(job.run.checkpoint) as file:
-            return bool(json.loads(json.loads(str(file["meta"]))["settings"])["settings"]["antialiased"])
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return False  # no checkpoint yet, or one of another version

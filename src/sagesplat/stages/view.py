@@ -219,7 +219,7 @@ def _follow(job: "Job", site: "Site", stop: threading.Event) -> None:
 
 def _refresh(job: "Job", site: "Site") -> bool:
     """Show the newest level of a training, or the bundle of a run that is finished: True for that."""
-    from sagesplat.stages.bundle import live_bundle
+    from sagesplat.stages.live_bundle import live_bundle
 
     if is_finished(job.run):
         site.folder = run_bundle(replace(job))  # nothing remembered of a training that went on since

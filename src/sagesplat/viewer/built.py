@@ -21,6 +21,15 @@ def check_viewer(viewer: Path) -> None:
         raise SageError(f"{viewer}: viewer not built: run `make web` (installed packages have it)")
 
 
+def has_viewer(folder: Path, viewer: Path) -> bool:
+    """Whether a bundle has this viewer, by its page, which names all scripts by content hash."""
+    pages = [path / PAGE for path in (folder, viewer)]
+    if not all(page.is_file() for page in pages):
+        return False
+    mine, page = (with_pack(page.read_text(encoding="utf-8"), None) for page in pages)
+    return mine in (page, with_poster(page))
+
+
 def with_poster(page: str) -> str:
     """The page with a picture that is shown until its scripts are loaded."""
     return page.replace("<!-- poster -->", f'<img id="poster" src="{POSTER}" alt="" />')

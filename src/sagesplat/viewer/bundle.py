@@ -80,15 +80,6 @@ def _name_pack(page: Path, uri: str) -> None:
         write_text(page, with_pack(page.read_text(encoding="utf-8"), uri))
 
 
-def has_viewer(folder: Path, viewer: Path) -> bool:
-    """Whether a bundle has this viewer, by its page, which names all scripts by content hash."""
-    pages = [path / PAGE for path in (folder, viewer)]
-    if not all(page.is_file() for page in pages):
-        return False
-    mine, page = (with_pack(page.read_text(encoding="utf-8"), None) for page in pages)
-    return mine in (page, with_poster(page))
-
-
 def write_documents(folder: Path, contents: Contents) -> BundleSizes:
     """Write everything but the viewer and the increments, which must be there; the manifest last."""
     manifest, promises = documents(contents, (folder / THIRD_PARTY).exists())

@@ -1,7 +1,8 @@
 """The documents of a bundle as plain data: manifest.json and promises-*.json.
 
-manifest.json describes the bundle (its format: manifest.schema.json). A promises-*.json holds the viewpoint
-models of one quality, which are not needed for the first frame. All are deterministic: they contain no times.
+manifest.json describes the bundle. A promises-*.json holds the viewpoint models of one quality, which are not
+needed for the first frame. manifest.schema.json has the format of both, from which the viewer's types are
+generated. All are deterministic: they contain no times.
 """
 
 import hashlib
@@ -25,9 +26,7 @@ from sagesplat.viewer.pack import Ladder, order_of
 from sagesplat.viewer.promises import Seen, promises_document
 from sagesplat.viewer.quality import decimals_of, dumped, of_files, quality_entry, significant
 
-FORMAT, VERSION = "sagesplat-bundle", 2
-REPLACING = 3  # version of a bundle with levels that replace, or PLY files: older viewers refuse it
-STREAMS = 4  # version of a bundle with coded streams
+FORMAT, VERSION = "sagesplat-bundle", 1
 QUALITIES: tuple[QualityKind, ...] = get_args(QualityKind)
 TARGETS: dict[QualityKind, float] = {"fidelity": 0.95, "ssim": 0.7}  # where no plan says one
 THIRD_PARTY = "THIRD_PARTY_LICENSES.txt"  # of the built viewer
@@ -109,7 +108,7 @@ def documents(
     }
     manifest = {
         "format": FORMAT,
-        "version": max(map(_version, contents.chunks), default=VERSION),
+        "version": VERSION,
         "generator": f"sagesplat {__version__}",
         "name": contents.name,
         "live": contents.live,
@@ -136,13 +135,6 @@ def documents(
         "licenses": _licenses(third_party),
     }
     return manifest, promises
-
-
-def _version(chunk: Increment) -> int:
-    """The version of bundles from which on there are such increments."""
-    if chunk.format == "stream":
-        return STREAMS
-    return REPLACING if chunk.refine == "REPLACE" or chunk.format != "spz" else VERSION
 
 
 def _models(contents: Contents, quality: QualityKind) -> dict[int, ViewModel]:

@@ -12,7 +12,7 @@ import numpy as np
 from sagesplat.adapt.eq3 import Eq3, SsimModel
 from sagesplat.adapt.viewpoint import ViewModel
 
-CURVE_MOVES = 1e-4  # largest change of a curve by rounding, SSIM
+MAX_CURVE_CHANGE = 1e-4  # largest change of a curve by rounding, SSIM
 
 
 def of_files(model: ViewModel, files: Sequence[int], last: int) -> ViewModel:
@@ -40,19 +40,19 @@ def quality_entry(model: ViewModel) -> dict[str, Any]:
     null: no promise.
     """
     own = model.inputs
-    told = model.predict(np.exp(own[:, 6]), own[:, :3] * model.extent, own[:, 3:6])
-    low = np.quantile(told.bound, 1 - model.confidence, axis=0, method="lower")
+    predicted = model.predict(np.exp(own[:, 6]), own[:, :3] * model.extent, own[:, 3:6])
+    low = np.quantile(predicted.bound, 1 - model.confidence, axis=0, method="lower")
     return {
         "levels": list(model.levels),
         "status": model.status,
         "confidence": model.confidence,
-        "mean": told.mean.mean(0).round(3).tolist(),
+        "mean": predicted.mean.mean(0).round(3).tolist(),
         "bound": None if np.isnan(low).any() else (np.floor(low * 1000) / 1000).tolist(),
     }
 
 
-def curve_entry(curve: SsimModel, exact: bool = False) -> dict[str, Any]:
-    """Eq. 3 of a level, with the fewest digits that change it by at most CURVE_MOVES; all with `exact`.
+def curve_entry(curve: SsimModel) -> dict[str, Any]:
+    """Eq. 3 of a level, with the fewest digits that change it by at most MAX_CURVE_CHANGE.
 
     If both regimes are equal, only the far one is written, from distance 0 on.
     """
@@ -68,15 +68,13 @@ def curve_entry(curve: SsimModel, exact: bool = False) -> dict[str, Any]:
         "range": list(curve.d_range),
         "median": curve.median,
     }
-    if exact:
-        return entry
     below = 10.0 ** decimals_of(beta, 6)  # rounds down: some views are exactly at beta, where far begins
     short: dict[str, Any] = {**entry, "median": round(curve.median, 4)}
     away = np.array([*np.linspace(*curve.d_range, 200), curve.params.mu1, curve.params.mu2])  # with the cusps
     for digits in range(3, 16):
         params = [*significant(entry["params"][:8], digits), math.floor(beta * below) / below]
         short |= {"params": params, "range": significant(entry["range"], max(digits, 6))}
-        if np.abs(curve_of(short, curve.label_id)(away) - curve(away)).max() <= CURVE_MOVES:
+        if np.abs(curve_of(short, curve.label_id)(away) - curve(away)).max() <= MAX_CURVE_CHANGE:
             break
     return short
 

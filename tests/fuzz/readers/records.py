@@ -30,7 +30,7 @@ from sagesplat.scene.scene import Camera
 from sagesplat.segment import segmenters
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.segment.parents import read_parents, write_parents
-from sagesplat.stages import bundle, label, view
+from sagesplat.stages import label, live_bundle, view
 from sagesplat.stages.boundaries import _seconds
 from sagesplat.stages.clean import read_clean_figures
 from sagesplat.stages.edited import LabelSettings, label_settings, write_edited
@@ -342,7 +342,7 @@ def _begun(folder: Path, size: int) -> list[bytes]:
 
 
 def _read_begun(path: Path) -> None:
-    bundle._antialiased(Job(RunDir(path.parent), _ignore))
+    live_bundle.trains_antialiased(Job(RunDir(path.parent), _ignore))
 
 
 def _frozen(folder: Path, size: int) -> list[bytes]:
@@ -443,6 +443,6 @@ READERS = (
     Reader("edited", ".json", _edited, file("edited.json", _read_edited), 3000),
     Reader("segmenting", ".json", _networks, file(".network.json", _read_network), 3000),
     Reader("prompts", ".json", _scores, file(".prompts-0.json", read_scores), 3000),
-    Reader("live", ".json", _live, file("live.json", bundle._read_live), 3000),
+    Reader("live", ".json", _live, file("live.json", live_bundle.read_live), 3000),
     Reader("lock", ".json", _lock, file("lock", lock._holder), 3000),
 )

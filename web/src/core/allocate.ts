@@ -3,10 +3,7 @@
  * Same rules as src/sagesplat/adapt/allocate.py; tests/data/plans.json checks both.
  */
 
-import { mostWithin, UNITS } from "./knapsack";
-
-/** A matrix: a row per label, a column per level. */
-export type Table = readonly (readonly number[])[];
+import { solveKnapsack, type Table, UNITS } from "./knapsack";
 
 /** A level (from 0) per label. */
 export interface Allocation {
@@ -96,7 +93,7 @@ export function bestWithin(
   const { q, c } = known(quality, cost);
   const previous = options.previous ?? q.map(() => -1);
   const { slack = SLACK, states = STATES } = options;
-  const best = mostWithin(q, c, weight, Math.floor(budget), previous, slack, states);
+  const best = solveKnapsack(q, c, weight, Math.floor(budget), previous, slack, states);
   const { cost: total, value } = totals(best.levels, q, c, weight);
   const all = weight.reduce((sum, w) => sum + w, 0);
   return {

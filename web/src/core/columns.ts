@@ -1,7 +1,7 @@
 /** The columns of a coded stream, decoded to integers. docs/formats.md specifies them. */
 
+import type { Header } from "./header";
 import { type Reader, Table } from "./rans";
-import type { Header } from "./stream";
 
 export const LARGEST = 2048; // Gaussians of a block
 export const BASES = [0, 3, 8, 15] as const; // SH coefficients beyond the constant one, by degree

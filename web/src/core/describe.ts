@@ -1,8 +1,8 @@
 /** The state of a streamer as numbers and messages, for the UI and tests. */
 
 import type { LabelState, State } from "../types";
+import { type Failure, TRIES_BEFORE_NOTICE } from "./downloads";
 import type { Entry } from "./residency";
-import { type Failure, PATIENCE } from "./supply";
 
 /** The data that a state is described from. */
 export interface Overview {
@@ -61,7 +61,8 @@ function errorOf(entry: Entry, overview: Overview): string | null {
       const rest = level > 1 ? `stays at level ${level - 1}` : "cannot be shown";
       return `${failure.message}; ${title} ${rest}. Make the bundle again or check the server.`;
     }
-    if (failure && failure.tries >= PATIENCE) return `${failure.message}; ${title} waits, trying again.`;
+    if (failure && failure.tries >= TRIES_BEFORE_NOTICE)
+      return `${failure.message}; ${title} waits, trying again.`;
   }
   return null;
 }

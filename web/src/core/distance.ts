@@ -17,25 +17,6 @@ type Plane = Viewpoint["frustum"][number];
 const PERCENTILE = 0.05;
 const AT = [1 / 6, 1 / 2, 5 / 6]; // sample positions along each axis of a box
 
-/** Half spaces of a camera's frustum: left, right, bottom, top, front; the near plane is at the camera. */
-export function frustumOf(position: Vec3, quaternion: Quat, fovY: number, aspect: number): Plane[] {
-  const high = Math.tan(fovY / 2);
-  const wide = high * aspect;
-  const normals: Vec3[] = [
-    [1, 0, -wide],
-    [-1, 0, -wide],
-    [0, 1, -high],
-    [0, -1, -high],
-    [0, 0, -1],
-  ];
-  return normals.map((normal) => {
-    const [x, y, z] = rotate(quaternion, normal);
-    const length = Math.hypot(x, y, z);
-    const n = [x / length, y / length, z / length] as const;
-    return [...n, -(n[0] * position[0] + n[1] * position[1] + n[2] * position[2])] as const;
-  });
-}
-
 /** Half width and half height of a picture at distance 1. */
 export type Lens = readonly [number, number];
 

@@ -1,4 +1,4 @@
-/** Downloads single files of a bundle: verified content, bandwidth, and a cache. */
+/** Downloads single files of a bundle and verifies their content. */
 
 /** The subset of `fetch` that is used here. */
 export type Fetch = (url: string, init?: RequestInit) => Promise<Reply>;
@@ -90,7 +90,7 @@ export interface Range {
 }
 
 /** Options of `receive`. */
-export interface Manner {
+export interface ReceiveOptions {
   readonly range?: Range; // all that is asked for
   readonly again?: boolean; // bypasses the browser's cache
   readonly silence?: number; // ms without data after which the download counts as failed
@@ -102,7 +102,7 @@ export async function receive(
   link: Link,
   file: File,
   signal: AbortController,
-  { again = false, silence = SILENCE, check, range }: Manner,
+  { again = false, silence = SILENCE, check, range }: ReceiveOptions,
   take: (part: Uint8Array) => boolean,
 ): Promise<void> {
   const { fetch, clock } = link; // the browser's fetch must not be called as a method
@@ -201,80 +201,3 @@ export const clockOfBrowser: Clock = {
     return () => clearTimeout(timer);
   },
 };
-
-const SAMPLE = 100; // ms of downloading per sample
-const MEMORY = 2000; // ms: time constant of the bandwidth average
-const QUICK = 200; // ms, for samples above the average: a link seems slow while little is requested
-
-/** Bandwidth over all downloads, bytes per second, measured while there are any. */
-export class Bandwidth {
-  rate = Number.NaN;
-  private bytes = 0;
-  private busy = 0; // ms in this sample
-  private since = Number.NaN;
-
-  constructor(private readonly clock: Clock) {}
-
-  /** To be called when the first download starts, and when the last one has ended. */
-  running(any: boolean): void {
-    this.count(0);
-    this.since = any ? this.clock.now() : Number.NaN;
-  }
-
-  count(bytes: number): void {
-    const now = this.clock.now();
-    if (!Number.isNaN(this.since)) {
-      this.busy += now - this.since;
-      this.since = now;
-    }
-    this.bytes += bytes;
-    if (this.busy < SAMPLE) return;
-    const rate = (1000 * this.bytes) / this.busy;
-    const old = Number.isNaN(this.rate) ? 0 : Math.exp(-this.busy / (rate > this.rate ? QUICK : MEMORY));
-    this.rate = old ? old * this.rate + (1 - old) * rate : rate;
-    this.bytes = 0;
-    this.busy = 0;
-  }
-}
-
-/** An LRU cache of file contents by SHA-256, limited in bytes. */
-export class Shelf {
-  private readonly kept = new Map<string, Uint8Array>();
-  private size = 0;
-
-  constructor(private readonly limit: number) {}
-
-  get(sha256: string): Uint8Array | undefined {
-    const content = this.kept.get(sha256);
-    if (content) this.put(sha256, content);
-    return content;
-  }
-
-  has(sha256: string): boolean {
-    return this.kept.has(sha256);
-  }
-
-  get bytes(): number {
-    return this.size;
-  }
-
-  put(sha256: string, content: Uint8Array): void {
-    this.drop(sha256);
-    this.kept.set(sha256, content);
-    this.size += content.length;
-    for (const oldest of this.kept.keys()) {
-      if (this.size <= this.limit) break;
-      this.drop(oldest);
-    }
-  }
-
-  clear(): void {
-    this.kept.clear();
-    this.size = 0;
-  }
-
-  drop(sha256: string): void {
-    this.size -= this.kept.get(sha256)?.length ?? 0;
-    this.kept.delete(sha256);
-  }
-}

@@ -3,7 +3,7 @@
  * documented in src/sagesplat/adapt/fill.py; tests/data/plans.json (mode "fill") checks both.
  */
 
-import type { Table } from "./allocate";
+import type { Table } from "./knapsack";
 
 const SLACK = 0.004;
 

@@ -3,7 +3,7 @@
 import type { Settings, Viewpoint } from "../types";
 
 /** A budget without a number means no limit; a negative one means zero. */
-export function sane(settings: Settings): Settings {
+export function normalised(settings: Settings): Settings {
   const limit = (value: number) => (Number.isNaN(value) ? Infinity : Math.max(value, 0));
   const { bytes, gpuBytes, count } = settings.budget;
   return {

@@ -3,12 +3,13 @@
  * documented in src/sagesplat/adapt/knapsack.py; results are equal bit for bit.
  */
 
-import type { Table } from "./allocate";
+/** A matrix: a row per label, a column per level. */
+export type Table = readonly (readonly number[])[];
 
 /** Units of value in the total weight. */
 export const UNITS = 2 ** 40;
 
-export interface Most {
+export interface Solution {
   readonly levels: number[];
   readonly fits: boolean;
   readonly bound: number; // on the value, in units
@@ -30,7 +31,7 @@ interface Above {
  * @param previous - levels that count as `slack` better, -1: none
  * @param states - limit of partial compositions, 0: greedy only
  */
-export function mostWithin(
+export function solveKnapsack(
   q: Table,
   c: Table,
   weight: readonly number[],
@@ -38,7 +39,7 @@ export function mostWithin(
   previous: readonly number[],
   slack: number,
   states: number,
-): Most {
+): Solution {
   const above = aboveFloor(q, c, weight, budget, previous, slack);
   const { floor, extra, gain, room, base } = above;
   if (room < 0) return { levels: floor, fits: false, bound: base, optimal: true };

@@ -1,9 +1,9 @@
 /** Polls the manifest of a bundle whose training still runs. */
 
 import type { Manifest } from "../types";
-import { BundleError } from "./check";
 import type { Clock, Fetch } from "./download";
 import { parseManifest } from "./manifest";
+import { BundleError } from "./schema";
 
 const EVERY = 2000; // ms
 

@@ -11,8 +11,8 @@ export interface Load {
   isWhole: boolean; // all ranges of a file come, from its beginning
 }
 
-const TINY = 16_384; // remaining bytes below which a download is not aborted
-const MODEST = 2 ** 22; // the same of a file whose ranges cannot be asked for: the next time it would begin anew
+const NEARLY_COMPLETE = 16_384; // remaining bytes below which a download is not aborted
+const NEARLY_COMPLETE_WHOLE = 2 ** 22; // the same of a file whose ranges cannot be asked for: the next time it would begin anew
 
 const bytesOf = (files: readonly File[]): number => files.reduce((sum, { bytes }) => sum + bytes, 0);
 
@@ -77,7 +77,11 @@ export class Loads {
   keepOnly(wanted: ReadonlySet<string>): void {
     for (const load of this.all) {
       const size = bytesOf(load.files);
-      if (size - load.got <= (load.isWhole ? MODEST : TINY) || load.got > 0.8 * size) continue;
+      if (
+        size - load.got <= (load.isWhole ? NEARLY_COMPLETE_WHOLE : NEARLY_COMPLETE) ||
+        load.got > 0.8 * size
+      )
+        continue;
       if (!load.files.some((file) => wanted.has(file.sha256) && this.brings(load, file))) this.drop(load);
     }
   }

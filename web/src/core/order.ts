@@ -2,9 +2,9 @@
 
 import { known } from "./allocate";
 import type { File } from "./download";
+import type { Downloads } from "./downloads";
 import { type Candidate, potentialWeight, visibleWeight } from "./planner";
-import type { Entry } from "./residency";
-import type { Supply } from "./supply";
+import type { Entry, Step } from "./residency";
 
 /** Least weight: out of sight, or without gain. */
 const LEAST = 1e-6;
@@ -14,12 +14,6 @@ const NEARBY = 2 ** 18;
 
 /** Assumed probability that the viewer soon turns to a label out of sight. */
 const TURN = 0.25;
-
-/** An increment with its value: pixel-weighted SSIM gain per byte, along the concave hull. */
-export interface Step {
-  readonly level: number; // 1-based
-  readonly value: number;
-}
 
 /**
  * The increments of a path from `have` on with their values. Since they must come in order, an increment
@@ -80,7 +74,7 @@ interface Wanted {
  */
 export function inOrder(
   entries: readonly Entry[],
-  supply: Supply,
+  downloads: Downloads,
   promises: readonly File[],
   last = false,
 ): File[] {
@@ -92,7 +86,7 @@ export function inOrder(
     const files = entry.path;
     const first = files[0]?.level ?? 0;
     const isHere = ({ file, level }: { file: File; level: number }) =>
-      entry.has(level) || entry.decoding === level || supply.isHere(file);
+      entry.has(level) || entry.decoding === level || downloads.isHere(file);
     const have = files.findIndex((one) => !isHere(one));
     const lowest = entry.label.levels[0];
     if (!candidate || !lowest || !first) continue;
@@ -100,7 +94,7 @@ export function inOrder(
     let most = Infinity; // keeps the levels of a label in order
     if (!candidate.visible) {
       most = (TURN * potentialWeight(candidate) * (candidate.mean[0] || 1)) / Math.max(lowest.bytes, 1);
-      const missing = first === 1 && have === 0 && !supply.rests(lowest);
+      const missing = first === 1 && have === 0 && !downloads.isBackingOff(lowest);
       behind.push({ file: lowest, value: most, missing });
     }
     if (have < 0) continue;
@@ -114,14 +108,14 @@ export function inOrder(
     for (const { level, value } of entry.steps?.found ?? []) {
       const one = files[at];
       at += 1;
-      if (!one || supply.rests(one.file)) break; // later increments depend on it
+      if (!one || downloads.isBackingOff(one.file)) break; // later increments depend on it
       if (isHere(one)) continue;
       if (level > 1) rest.push({ file: one.file, value: Math.min(value, most), missing: true });
       else if (candidate.visible)
         base.push({ file: one.file, value: weight / one.file.bytes, missing: true });
     }
   }
-  const models = promises.filter((file) => !supply.rests(file));
+  const models = promises.filter((file) => !downloads.isBackingOff(file));
   const [nearby, far] = divided(behind);
   const [smallest, more] = [[...best(base), ...best(nearby)], best([...rest, ...far])];
   return last ? [...smallest, ...more, ...models] : [...smallest, ...models, ...more];

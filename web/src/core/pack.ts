@@ -9,9 +9,7 @@ const SILENCE = 3000;
 
 /** The increments in a manifest's pack, in their order. */
 export const filesOf = ({ pack, labels }: Manifest): File[] =>
-  (pack?.order ?? [])
-    .flatMap(([label, level]) => labels[label]?.levels[level - 1] ?? [])
-    .filter((file) => file.bytes);
+  (pack?.order ?? []).flatMap(([label, level]) => labels[label]?.levels[level - 1] ?? []);
 
 /** Concurrent requests of a browser without HTTP/2. */
 const CONNECTIONS = 6;

@@ -32,7 +32,7 @@ export interface Plan {
 
 const UNITS = ["bytes", "gpuBytes", "count"] as const;
 type Unit = (typeof UNITS)[number];
-const FINE = 2 ** 20; // steps of a budget when several units are combined
+const BUDGET_STEPS = 2 ** 20; // steps of a budget when several units are combined
 const LEAST_SHARE = 1e-4; // least pixel share, so that every visible label counts
 
 /** Costs of levels as sums over their increments, from the newest that replaces those below. */
@@ -144,7 +144,11 @@ function within(free: readonly Candidate[], budget: Budget): Chosen {
   // the largest share over all budgets, as the cost, respects each of them
   const largest = (c: Candidate, k: number) =>
     Math.max(...UNITS.map((unit) => (costOf(c, unit)[k] as number) / budget[unit] || 0));
-  const joint = best(free, (c) => c.label.levels.map((_, k) => Math.ceil(FINE * largest(c, k))), FINE);
+  const joint = best(
+    free,
+    (c) => c.label.levels.map((_, k) => Math.ceil(BUDGET_STEPS * largest(c, k))),
+    BUDGET_STEPS,
+  );
   return { levels: joint.levels, status: fits(free, joint.levels, budget) ? "ok" : "over budget" };
 }
 

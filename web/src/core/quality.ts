@@ -42,8 +42,8 @@ export function anywhere(label: Label, quality: Quality): Prediction {
 }
 
 /** Exponent of the kernel weights in `corrected`, and the weight at which a correction counts by half. */
-const LIKE = 16;
-const ENOUGH = 1e-3;
+const NEIGHBOUR_EXPONENT = 16;
+const HALF_WEIGHT = 1e-3;
 
 /** The views that the models of all labels share, and their scaled distances from the current viewpoint. */
 export class Views {
@@ -150,11 +150,11 @@ export class ViewModel {
     this.views.from(position, direction);
     let [sum, total] = [0, 0];
     for (let i = 0; i < this.own.length; i++) {
-      const weight = matern(this.square(this.own[i] as number)) ** LIKE;
+      const weight = matern(this.square(this.own[i] as number)) ** NEIGHBOUR_EXPONENT;
       sum += weight * (this.corrections[i] as number);
       total += weight;
     }
-    return distance * Math.exp(sum / (total + ENOUGH));
+    return distance * Math.exp(sum / (total + HALF_WEIGHT));
   }
 
   /** The label's pixel share at a viewpoint, from the known views near it, 0..1. */

@@ -57,14 +57,14 @@ export async function downloadRanges(
   link: Link,
   wanted: readonly File[],
   all: readonly File[],
-  { abort, again, answered, take, spoiled, progress }: Ranges,
+  { abort, again, answered, take, corrupt, progress }: Ranges,
 ): Promise<void> {
   const [first, last] = [wanted[0] as File, wanted.at(-1) as File];
   const start = first.offset ?? 0;
   const range = { start, end: (last.offset ?? 0) + last.bytes };
   const checks: Promise<void>[] = [];
   const cut = (file: File, content: Uint8Array) => {
-    checks.push(intact(link, file, content).then(() => take(file, content), spoiled.bind(null, file)));
+    checks.push(intact(link, file, content).then(() => take(file, content), corrupt.bind(null, file)));
   };
   let cutter = new Cutter(wanted, cut);
   let name = `bytes ${start} to ${range.end - 1} of ${first.uri}`;
@@ -94,7 +94,7 @@ export interface Ranges {
   /** Called for every range that is intact, in their order. */
   readonly take: (file: File, content: Uint8Array) => void;
   /** Called for every range that is not. */
-  readonly spoiled: (file: File, error: unknown) => void;
+  readonly corrupt: (file: File, error: unknown) => void;
   readonly progress: (bytes: number) => void;
 }
 

@@ -2,15 +2,20 @@
 
 import type { Handle, Label, Level, Renderer } from "../types";
 import type { Sight } from "./distance";
-import type { Step } from "./order";
 import { type Candidate, type Ladder, ladderOf } from "./planner";
 import type { Prediction } from "./quality";
+
+/** An increment with its value: pixel-weighted SSIM gain per byte, along the concave hull. */
+export interface Step {
+  readonly level: number; // 1-based
+  readonly value: number;
+}
 
 /** A label of the manifest. Drawn are the increments of level `shown`, or `former` until those are decoded. */
 export class Entry {
   readonly ladder: Ladder;
   readonly replaces: boolean; // whether any level replaces those below
-  readonly decoded: (Handle | null | undefined)[]; // by increment; null: an empty one
+  readonly decoded: (Handle | undefined)[]; // by increment
   /** Of a stream, the increments that were decoded, as they came: those that are disposed of are decoded again. */
   readonly contents: (Uint8Array | undefined)[] = [];
   wanted = 0;
@@ -26,7 +31,7 @@ export class Entry {
   constructor(public label: Label) {
     this.ladder = ladderOf(label);
     this.replaces = label.levels.some(({ refine }) => refine);
-    this.decoded = label.levels.map((file) => (file.count ? undefined : null));
+    this.decoded = label.levels.map(() => undefined);
   }
 
   /** Number of increments below a level that are not part of it, since it or a level below it replaces them. */
@@ -93,7 +98,7 @@ export class Entry {
   }
 
   handles(from: number, to: number): Handle[] {
-    return this.decoded.slice(from, to).filter((handle) => handle !== undefined && handle !== null);
+    return this.decoded.slice(from, to).filter((handle) => handle !== undefined);
   }
 
   /** GPU bytes of all decoded increments, including replaced ones that are still drawn. */

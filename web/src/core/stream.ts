@@ -1,76 +1,22 @@
 /** Coded streams: the nested levels of a category, decoded level by level. docs/formats.md specifies them. */
 
 import { Block, Columns, LARGEST } from "./columns";
+import { HEADER_BYTES, type Header, readHeader } from "./header";
 import { Reader } from "./rans";
 
-const HEADER = 44;
-const MAGIC = 0x53475354;
 const MAX_COUNT = 10_000_000;
 const PER_BYTE = 128; // Gaussians in a byte, at most
 const SMALLEST = 16; // Gaussians of a block: a power of two
-const GREATEST = 1e18;
-const VERSION = 2;
 const ALL_SECOND = 255; // weight of a level whose Gaussians have one opacity, which counts as both
 
 /** Makes of a stream's Gaussians what a caller wants of a level. */
 export interface Sink<Level> {
-  /** A level to be filled; with it come second opacities of the `owed` Gaussians before it. */
-  begin(header: Header, count: number, owed: number): Level;
+  /** A level to be filled; with it come second opacities of the `deferred` Gaussians before it. */
+  begin(header: Header, count: number, deferred: number): Level;
   /** Takes the first `count` rows of a block as the rows of the level from `start` on. */
   put(level: Level, block: Block, start: number, count: number): void;
-  /** Takes the second opacities of a block as those of the owed Gaussians from `start` on. */
+  /** Takes the second opacities of a block as those of the deferred Gaussians from `start` on. */
   putSeconds(level: Level, block: Block, start: number, count: number): void;
-}
-
-/** What a stream says of all its Gaussians. */
-export interface Header {
-  readonly antialiased: boolean;
-  readonly twoOpacities: boolean;
-  readonly degree: number;
-  readonly levels: number;
-  readonly opacityStep: number; // of 1/255
-  readonly shBits: readonly [number, number];
-  readonly spread: number;
-  readonly origin: readonly [number, number, number];
-  readonly step: number;
-  readonly scaleStep: number;
-  readonly colourStep: number;
-  readonly scaleOrigin: number;
-  readonly colourOrigin: number;
-  readonly rotationOrigin: number;
-}
-
-/** The header of a stream; throws for another format. */
-export function readHeader(bytes: Uint8Array): Header {
-  const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
-  if (bytes.length < HEADER || view.getUint32(0) !== MAGIC) throw new Error("not a sagesplat-stream");
-  if (view.getUint8(4) !== VERSION) throw new Error("a stream of another version");
-  if (view.getUint8(5) > 3 || view.getUint16(42, true)) throw new Error("a stream with unknown flags");
-  const float = (at: number) => view.getFloat32(at, true);
-  const header: Header = {
-    antialiased: (view.getUint8(5) & 1) > 0,
-    twoOpacities: (view.getUint8(5) & 2) > 0,
-    degree: view.getUint8(6),
-    levels: view.getUint8(7),
-    opacityStep: view.getUint8(8),
-    shBits: [view.getUint8(9), view.getUint8(10)],
-    spread: view.getUint8(11),
-    origin: [float(12), float(16), float(20)],
-    step: float(24),
-    scaleStep: float(28),
-    colourStep: float(32),
-    scaleOrigin: view.getInt16(36, true),
-    colourOrigin: view.getInt16(38, true),
-    rotationOrigin: view.getInt16(40, true),
-  };
-  const { step, scaleStep, colourStep, origin, levels, opacityStep, spread, shBits } = header;
-  const steps = [step, scaleStep, colourStep].every((s) => s >= 1 / GREATEST && s <= GREATEST);
-  const inReach = origin.every((at) => Math.abs(at) + step * 2 ** 17 <= GREATEST);
-  const bits = shBits.every((n) => n >= 1 && n <= 8);
-  if (!steps || !inReach || !bits || header.degree > 3 || !levels || !opacityStep || !spread) {
-    throw new Error("a stream with an impossible header");
-  }
-  return header;
 }
 
 /** Decodes a stream while its bytes arrive. */
@@ -79,7 +25,7 @@ export class StreamDecoder<Level> {
   private header: Header | null = null;
   private columns: Columns | null = null;
   private done = 0; // Gaussians
-  private owed = new Uint8Array(0); // first opacities of the newest Gaussians, those without second ones
+  private deferred = new Uint8Array(0); // first opacities of the newest Gaussians, those without second ones
   private levels = 0;
 
   constructor(private readonly sink: Sink<Level>) {}
@@ -98,10 +44,10 @@ export class StreamDecoder<Level> {
   push(bytes: Uint8Array): Level[] {
     this.waiting = this.waiting.length ? joined(this.waiting, bytes) : bytes;
     if (!this.header) {
-      if (this.waiting.length < HEADER) return [];
+      if (this.waiting.length < HEADER_BYTES) return [];
       this.header = readHeader(this.waiting);
       this.columns = new Columns(this.header);
-      this.waiting = this.waiting.subarray(HEADER);
+      this.waiting = this.waiting.subarray(HEADER_BYTES);
     }
     const found: Level[] = [];
     while (this.waiting.length) {
@@ -123,7 +69,7 @@ export class StreamDecoder<Level> {
     }
     if (Number.isNaN(size) || this.waiting.length < start + size) return null;
     const weight = header.twoOpacities ? (this.waiting[afterSize] as number) : ALL_SECOND;
-    const level = this.sink.begin(header, count, count && weight ? this.owed.length : 0);
+    const level = this.sink.begin(header, count, count && weight ? this.deferred.length : 0);
     if (count) this.decode(this.waiting.subarray(start, start + size), level, count, weight);
     this.waiting = this.waiting.subarray(start + size);
     this.levels++;
@@ -135,35 +81,35 @@ export class StreamDecoder<Level> {
     const block = blockOf(this.header as Header);
     const reader = new Reader(payload);
     if (weight) this.decodeOwed(reader, level);
-    const owed = new Uint8Array(weight ? 0 : this.owed.length + total);
-    owed.set(this.owed);
+    const deferred = new Uint8Array(weight ? 0 : this.deferred.length + total);
+    deferred.set(this.deferred);
     let before = 0;
     for (let at = 0; at < total; ) {
       const left = untilEnd(this.done);
       const count = Math.min(left, total - at);
       before = columns.decode(reader, block, count, before, weight > 0 && weight < ALL_SECOND);
       this.sink.put(level, block, at, count);
-      if (!weight) owed.set(block.opacities.subarray(0, count), this.owed.length + at);
+      if (!weight) deferred.set(block.opacities.subarray(0, count), this.deferred.length + at);
       if (count === left) columns.endBlock();
       at += count;
       this.done += count;
     }
-    this.owed = owed;
+    this.deferred = deferred;
     reader.finish();
   }
 
   private decodeOwed(reader: Reader, level: Level): void {
     const columns = this.columns as Columns;
     const block = blockOf(this.header as Header);
-    for (let at = 0; at < this.owed.length; ) {
-      const count = Math.min(untilEnd(at), this.owed.length - at);
-      block.opacities.set(this.owed.subarray(at, at + count));
+    for (let at = 0; at < this.deferred.length; ) {
+      const count = Math.min(untilEnd(at), this.deferred.length - at);
+      block.opacities.set(this.deferred.subarray(at, at + count));
       columns.decodeSeconds(reader, block, count);
       columns.endBlock();
       this.sink.putSeconds(level, block, at, count);
       at += count;
     }
-    this.owed = new Uint8Array(0);
+    this.deferred = new Uint8Array(0);
   }
 }
 

@@ -4,15 +4,15 @@ import type { Handle, Level, Manifest, Quality, Renderer, Settings, State, Viewp
 import { describe } from "./describe";
 import { type Lens, photoFrustum, rotate, widestLens } from "./distance";
 import { type Clock, clockOfBrowser, type Digest, digestOfBrowser, type Fetch, type File } from "./download";
-import { same, sane } from "./inputs";
+import { Downloads, TRIES_BEFORE_NOTICE } from "./downloads";
+import { normalised, same } from "./inputs";
 import { poll } from "./live";
 import { parsePromises } from "./manifest";
 import { inOrder } from "./order";
-import { Outlook } from "./outlook";
 import { filesOf } from "./pack";
 import { makePlan, type Plan } from "./planner";
 import { type Drawn, Entry, exchange, gpuBytesOf, Hidden, settle } from "./residency";
-import { PATIENCE, Supply } from "./supply";
+import { ViewpointModels } from "./viewpoints";
 
 export interface StreamerOptions {
   readonly manifest: Manifest;
@@ -28,18 +28,18 @@ export interface StreamerOptions {
 }
 
 const PLAN_EVERY = 125; // ms between plans, at least
-const REST = 4; // least pause after a plan, as a multiple of its duration, so that large scenes leave time to draw
-const QUICK = 4; // ms; plans that are faster need no pause
-const KEEP = 64 * 2 ** 20;
-const DECODES = 4; // concurrent
-const HOLDS_UP = 0.05; // size of the viewpoint models, relative to a pack, from which on they delay it
+const PAUSE = 4; // least pause after a plan, as a multiple of its duration, so that large scenes leave time to draw
+const QUICK_MS = 4; // ms; plans that are faster need no pause
+const FILE_CACHE_BYTES = 64 * 2 ** 20;
+const MAX_DECODES = 4; // concurrent
+const DELAYING_SHARE = 0.05; // size of the viewpoint models, relative to a pack, from which on they delay it
 const WITHOUT_MODELS = "levels are planned by what holds for all viewpoints.";
 const UNCHECKED = "Served without https: files are checked by their size only.";
 
 export class Streamer {
   private readonly renderer: Renderer;
   private readonly clock: Clock;
-  private readonly supply: Supply;
+  private readonly downloads: Downloads;
   private readonly digest: Digest;
   private readonly hidden: Hidden;
   private readonly listeners = new Set<() => void>();
@@ -50,7 +50,7 @@ export class Streamer {
   private lens: Lens | null; // of the photos
   private entries: Entry[];
   private leaving: Drawn[] = []; // drawn increments of labels that a new manifest removed
-  private outlooks = new Map<Quality, Outlook>(); // those that were asked for
+  private modelsByQuality = new Map<Quality, ViewpointModels>(); // those that were asked for
   private planned: Plan["status"] = "ok";
   private nextPlan = -Infinity; // ms of the clock: earliest time
   private nextWork = -Infinity;
@@ -69,22 +69,22 @@ export class Streamer {
     const clock = options.clock ?? clockOfBrowser;
     this.clock = { after: (ms, run) => clock.after(ms, run), now: options.now ?? (() => clock.now()) };
     this.renderer = renderer;
-    this.settings = sane(settings);
+    this.settings = normalised(settings);
     this.content = manifest;
     this.lens = widestLens(manifest.cameras);
     this.entries = manifest.labels.map((label) => new Entry(label));
     this.hidden = new Hidden(renderer);
     this.digest = options.digest === undefined ? digestOfBrowser : options.digest;
-    this.supply = new Supply({
+    this.downloads = new Downloads({
       base: options.base,
       fetch: options.fetch ?? ((url, init) => fetch(url, init)),
       clock: this.clock,
       digest: this.digest,
-      keepBytes: options.keepBytes ?? KEEP,
+      keepBytes: options.keepBytes ?? FILE_CACHE_BYTES,
       changed: () => this.arrived(),
-      ...(options.downloads && { atOnce: options.downloads }),
+      ...(options.downloads && { maxDownloads: options.downloads }),
     });
-    this.supply.know(manifest.labels.flatMap(({ levels }) => levels.filter(({ count }) => count)));
+    this.downloads.setRanges(manifest.labels.flatMap(({ levels }) => levels));
     const { position, quaternion } = manifest.start;
     this.viewpoint = { position, direction: rotate(quaternion, [0, 0, -1]), frustum: [] };
   }
@@ -95,7 +95,7 @@ export class Streamer {
   }
 
   get state(): State {
-    if (this.known?.bytesLoaded !== this.supply.received) this.known = null;
+    if (this.known?.bytesLoaded !== this.downloads.received) this.known = null;
     this.known ??= this.describe();
     return this.known;
   }
@@ -105,7 +105,7 @@ export class Streamer {
     if (this.phase !== "new") return;
     this.phase = "running";
     const { pack } = this.content;
-    if (pack) this.supply.open(pack, filesOf(this.content));
+    if (pack) this.downloads.openPack(pack, filesOf(this.content));
     this.plan();
     if (this.content.live) this.follow();
   }
@@ -118,7 +118,7 @@ export class Streamer {
   }
 
   set(partial: Partial<Settings>): void {
-    this.settings = sane({ ...this.settings, ...partial });
+    this.settings = normalised({ ...this.settings, ...partial });
     this.hidden.shrink(this.settings.cacheBytes);
     this.replan();
   }
@@ -139,7 +139,7 @@ export class Streamer {
 
   /** Retries failed downloads immediately, e.g. when the browser is online again. */
   retry(): void {
-    this.supply.forgive();
+    this.downloads.clearFailures();
     this.trouble = null;
     this.replan();
   }
@@ -147,7 +147,7 @@ export class Streamer {
   dispose(): void {
     if (this.phase === "disposed") return;
     this.phase = "disposed";
-    this.supply.close();
+    this.downloads.close();
     const former = [...this.leaving, ...this.entries.flatMap((e) => e.former ?? [])].flatMap(
       (d) => d.handles,
     );
@@ -173,9 +173,9 @@ export class Streamer {
     this.dirty = false;
     const begun = this.clock.now();
     const photo = photoFrustum(this.viewpoint, this.lens);
-    for (const entry of this.entries) this.outlook.see(entry, this.viewpoint, photo);
+    for (const entry of this.entries) this.models.see(entry, this.viewpoint, photo);
     const candidates = this.entries.map((entry) => {
-      return this.outlook.candidate(entry, this.settings, this.highest(entry));
+      return this.models.candidate(entry, this.settings, this.highest(entry));
     });
     const { wanted, status } = makePlan(candidates, this.settings);
     this.planned = status;
@@ -186,13 +186,13 @@ export class Streamer {
     this.wantedKeys = new Set(this.entries.flatMap((e) => e.path.map((f) => f.file.sha256)));
     if (this.promises) this.wantedKeys.add(this.promises.sha256);
     const took = this.clock.now() - begun;
-    this.nextPlan = begun + Math.max(PLAN_EVERY, (1 + REST) * took);
+    this.nextPlan = begun + Math.max(PLAN_EVERY, (1 + PAUSE) * took);
     this.work();
   }
 
   /** Highest available level of a label: below its first damaged increment. */
   private highest(entry: Entry): number {
-    const broken = entry.label.levels.findIndex((file) => this.supply.failure(file)?.lasting);
+    const broken = entry.label.levels.findIndex((file) => this.downloads.failure(file)?.lasting);
     return broken < 0 ? entry.label.levels.length : broken;
   }
 
@@ -212,13 +212,14 @@ export class Streamer {
     this.hidden.shrink(this.settings.cacheBytes);
     this.decodeMore();
     const promises = this.missingPromises();
-    const queue = inOrder(this.entries, this.supply, promises, this.promisesCanWait());
+    const queue = inOrder(this.entries, this.downloads, promises, this.promisesCanWait());
     this.pending = queue.length;
-    this.supply.keepOnly(this.wantedKeys);
-    const undecided = this.settings.mode !== "base" && promises.some((file) => !this.supply.rests(file));
-    this.supply.fill(queue, undecided);
+    this.downloads.keepOnly(this.wantedKeys);
+    const undecided =
+      this.settings.mode !== "base" && promises.some((file) => !this.downloads.isBackingOff(file));
+    this.downloads.fill(queue, undecided);
     const took = this.clock.now() - begun;
-    if (took > QUICK) this.nextWork = begun + (1 + REST) * took;
+    if (took > QUICK_MS) this.nextWork = begun + (1 + PAUSE) * took;
     this.changed();
     this.rest();
   }
@@ -236,12 +237,13 @@ export class Streamer {
     const { mode } = this.settings;
     const { promises, content } = this;
     const { pack } = content;
-    if (!this.supply.streams || this.planned !== "ok" || (mode !== "full" && mode !== "base")) return false;
-    return (promises?.bytes ?? 0) > HOLDS_UP * (pack?.bytes ?? 0);
+    if (!this.downloads.hasPack || this.planned !== "ok" || (mode !== "full" && mode !== "base"))
+      return false;
+    return (promises?.bytes ?? 0) > DELAYING_SHARE * (pack?.bytes ?? 0);
   }
 
   private missingPromises(): File[] {
-    return this.promises && !this.outlook.complete ? [this.promises] : [];
+    return this.promises && !this.models.complete ? [this.promises] : [];
   }
 
   /** The file with the viewpoint models of the quality that is asked for, if the bundle has one. */
@@ -249,10 +251,10 @@ export class Streamer {
     return this.content.promises[this.settings.quality];
   }
 
-  private get outlook(): Outlook {
+  private get models(): ViewpointModels {
     const { quality } = this.settings;
-    const known = this.outlooks.get(quality) ?? new Outlook(quality, this.content.labels);
-    this.outlooks.set(quality, known);
+    const known = this.modelsByQuality.get(quality) ?? new ViewpointModels(quality, this.content.labels);
+    this.modelsByQuality.set(quality, known);
     return known;
   }
 
@@ -265,7 +267,7 @@ export class Streamer {
 
   /** Decodes in the order of arrival, which is that of value. */
   private decodeMore(): void {
-    const came = this.supply.waiting;
+    const came = this.downloads.arrivals;
     const place = (entry: Entry) => came.get(entry.label.levels[entry.next - 1]?.sha256 ?? "") ?? -1;
     for (const entry of [...this.entries].sort((a, b) => place(a) - place(b))) this.decodeNext(entry);
   }
@@ -273,9 +275,9 @@ export class Streamer {
   private decodeNext(entry: Entry): void {
     const level = entry.next;
     const file = entry.label.levels[level - 1];
-    if (!file || entry.decoding || this.decodes >= DECODES) return;
-    if (this.supply.failure(file)?.lasting) return;
-    const content = entry.contents[level - 1] ?? this.supply.take(file);
+    if (!file || entry.decoding || this.decodes >= MAX_DECODES) return;
+    if (this.downloads.failure(file)?.lasting) return;
+    const content = entry.contents[level - 1] ?? this.downloads.take(file);
     if (content) void this.decode(entry, file, level, content);
   }
 
@@ -289,7 +291,7 @@ export class Streamer {
       handle = await this.renderer.decode(entry.label.id, level, content, file.format, below);
       if (file.format === "stream") entry.contents[level - 1] = content;
     } catch {
-      this.supply.spoil(file, `${file.uri} cannot be decoded`);
+      this.downloads.markCorrupt(file, `${file.uri} cannot be decoded`);
     }
     entry.decoding = 0;
     this.decodes -= 1;
@@ -315,14 +317,17 @@ export class Streamer {
   private takePromises(): void {
     const { quality } = this.settings;
     for (const file of this.missingPromises()) {
-      const content = this.supply.take(file);
+      const content = this.downloads.take(file);
       if (!content) return;
       try {
         const promises = parsePromises(new TextDecoder().decode(content), file.uri, quality);
-        this.outlooks.set(quality, new Outlook(quality, this.content.labels, promises));
+        this.modelsByQuality.set(quality, new ViewpointModels(quality, this.content.labels, promises));
         this.replan();
       } catch (error) {
-        this.supply.spoil(file, error instanceof Error ? error.message : `${file.uri} cannot be read`);
+        this.downloads.markCorrupt(
+          file,
+          error instanceof Error ? error.message : `${file.uri} cannot be read`,
+        );
       }
     }
   }
@@ -348,12 +353,12 @@ export class Streamer {
     const { entries, leaving } = exchange(this.entries, manifest.labels, this.hidden, this.renderer);
     this.entries = entries;
     this.leaving.push(...leaving);
-    this.outlooks.clear();
+    this.modelsByQuality.clear();
     this.content = manifest;
     this.lens = widestLens(manifest.cameras);
-    this.supply.know(manifest.labels.flatMap(({ levels }) => levels.filter(({ count }) => count)));
+    this.downloads.setRanges(manifest.labels.flatMap(({ levels }) => levels));
     this.trouble = null;
-    this.supply.forgive();
+    this.downloads.clearFailures();
     this.plan();
   }
 
@@ -362,7 +367,7 @@ export class Streamer {
     return (
       !this.dirty &&
       !this.postponed &&
-      !this.supply.running &&
+      !this.downloads.running &&
       !this.decodes &&
       !this.pending &&
       !this.retrying()
@@ -372,8 +377,8 @@ export class Streamer {
   /** Whether a failed download will soon be retried. */
   private retrying(): boolean {
     return [...this.wantedFiles(), ...this.missingPromises()].some((file) => {
-      const failure = this.supply.failure(file);
-      return failure !== undefined && !failure.lasting && failure.tries < PATIENCE;
+      const failure = this.downloads.failure(file);
+      return failure !== undefined && !failure.lasting && failure.tries < TRIES_BEFORE_NOTICE;
     });
   }
 
@@ -393,24 +398,24 @@ export class Streamer {
   }
 
   private describe(): State {
-    const promises = this.promises && this.supply.failure(this.promises);
+    const promises = this.promises && this.downloads.failure(this.promises);
     return describe(this.entries, {
       planned: this.planned,
-      bytesLoaded: this.supply.received,
-      bandwidth: this.supply.bandwidth.rate,
+      bytesLoaded: this.downloads.received,
+      bandwidth: this.downloads.bandwidth.rate,
       pending: this.pending,
       leavingBytes: this.leaving.reduce((sum, drawn) => sum + gpuBytesOf(drawn), 0),
       notes: [
         this.trouble,
-        this.supply.note,
+        this.downloads.note,
         promises &&
-          (promises.lasting || promises.tries >= PATIENCE) &&
+          (promises.lasting || promises.tries >= TRIES_BEFORE_NOTICE) &&
           `${promises.message}; ${WITHOUT_MODELS}`,
         !this.digest && UNCHECKED,
       ].map((note) => note || null),
       failure: (entry, level) => {
         const file = entry.label.levels[level - 1];
-        return file && this.supply.failure(file);
+        return file && this.downloads.failure(file);
       },
     });
   }

@@ -50,6 +50,18 @@ export function setIcon(button: HTMLElement, name: IconName): void {
   button.querySelector("svg")?.replaceWith(icon(name));
 }
 
+/** A button with a text, in one of the styles that style.css has. */
+export const textButton = (
+  text: string,
+  className: "primary" | "text",
+  click: () => void,
+  props: Props = {},
+): HTMLButtonElement => h("button", { type: "button", class: className, click, ...props }, text);
+
+/** Whether an event goes to something that takes keys itself. */
+export const isTyping = ({ target }: Event): boolean =>
+  target instanceof HTMLElement && target.closest("input, select, textarea, dialog") !== null;
+
 /** A button with an icon; its title is the tooltip and the accessible name. */
 export function iconButton(
   name: IconName,

@@ -1,6 +1,6 @@
 import type { Category, Operation } from "../core/edits";
 import { type Editor, SCOPES, type Scope } from "../view/editor";
-import { h, iconButton, setText } from "./dom";
+import { h, iconButton, isTyping, setText, textButton } from "./dom";
 import { formatCount } from "./format";
 import { messageOf } from "./notice";
 import { save, saved } from "./saving";
@@ -12,7 +12,7 @@ const TITLES: Readonly<Record<Scope, readonly [string, string]>> = {
   alike: ["Alike", "What is joined to it and of like colour"],
 };
 const WEIGHTS = [0, 0.25, 0.5, 1, 2, 4];
-const STILL = 5; // px that a pointer may move in a click
+const CLICK_TOLERANCE = 5; // px that a pointer may move in a click
 
 type Action = "rename" | "split" | "merge" | "hide" | "full" | "save" | "open";
 
@@ -131,7 +131,8 @@ export class EditorCard {
     canvas.addEventListener("pointerup", (event) => {
       const moved = from ? Math.hypot(event.clientX - from.clientX, event.clientY - from.clientY) : Infinity;
       const box = canvas.getBoundingClientRect();
-      if (this.isActive && moved <= STILL) this.pick(event.clientX - box.left, event.clientY - box.top);
+      if (this.isActive && moved <= CLICK_TOLERANCE)
+        this.pick(event.clientX - box.left, event.clientY - box.top);
     });
     window.addEventListener("keydown", (event) => this.key(event));
   }
@@ -149,8 +150,7 @@ export class EditorCard {
 
   private key(event: KeyboardEvent): void {
     const { target, key } = event;
-    const typing = target instanceof HTMLElement && target.closest("input, select, textarea, dialog");
-    if (!this.isActive || (typing && key !== "Escape")) return;
+    if (!this.isActive || (isTyping(event) && key !== "Escape")) return;
     if (event.ctrlKey || event.metaKey) {
       const redo = key.toLowerCase() === "y" || (event.shiftKey && key.toLowerCase() === "z");
       if (!redo && key.toLowerCase() !== "z") return;
@@ -340,6 +340,5 @@ export class EditorCard {
   }
 }
 
-function button(text: string, title: string, click: () => void): HTMLButtonElement {
-  return h("button", { type: "button", class: "text", title, "aria-label": title, click }, text);
-}
+const button = (text: string, title: string, click: () => void): HTMLButtonElement =>
+  textButton(text, "text", click, { title, "aria-label": title });

@@ -1,4 +1,4 @@
-import { h } from "./dom";
+import { h, textButton } from "./dom";
 
 const HELP: readonly (readonly [string, string])[] = [
   ["Drag", "orbit the scene, or look around in walk mode"],
@@ -20,7 +20,7 @@ const HELP: readonly (readonly [string, string])[] = [
 /** The help dialog; Escape closes it. */
 export function helpDialog(): HTMLDialogElement {
   const rows = HELP.flatMap(([key, text]) => [h("dt", {}, key), h("dd", {}, text)]);
-  const close = h("button", { type: "button", class: "primary", click: () => dialog.close() }, "Close");
+  const close = textButton("Close", "primary", () => dialog.close());
   const note = h(
     "p",
     { class: "hint" },

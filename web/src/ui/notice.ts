@@ -1,12 +1,8 @@
-import { h } from "./dom";
+import { h, textButton } from "./dom";
 
 /** Shows an error in place of the scene, with a button to reload. */
 export function fail(message: string): void {
-  const again = h(
-    "button",
-    { type: "button", class: "primary", click: () => location.reload() },
-    "Try again",
-  );
+  const again = textButton("Try again", "primary", () => location.reload());
   const box = document.getElementById("notice");
   document.getElementById("poster")?.remove();
   box?.replaceChildren(h("h1", {}, "The scene cannot be shown"), h("p", { role: "alert" }, message), again);

@@ -1,7 +1,7 @@
 import { qualitiesOf } from "../core/manifest";
 import type { Quality, Settings } from "../types";
-import { USUAL, type Viewer } from "../view/viewer";
-import { h, iconButton, setText } from "./dom";
+import { DEFAULT_TARGETS, type Viewer } from "../view/viewer";
+import { h, iconButton, isTyping, setText } from "./dom";
 import { formatBytes, formatCount, formatSsim, nameOf } from "./format";
 import { LabelTable } from "./labels";
 
@@ -61,8 +61,7 @@ export class Panel {
     );
     if (matchMedia(NARROW).matches) this.element.classList.add("closed");
     window.addEventListener("keydown", (event) => {
-      const typing = event.target instanceof HTMLElement && event.target.closest("input, select, textarea");
-      if (event.key === "p" && !typing && !event.ctrlKey && !event.metaKey) this.toggle();
+      if (event.key === "p" && !isTyping(event) && !event.ctrlKey && !event.metaKey) this.toggle();
     });
     this.#announce();
   }
@@ -176,7 +175,7 @@ const COMPARED: Readonly<Record<Quality, string>> = { fidelity: "the full scene"
 function qualityChoice(viewer: Viewer): Control[] {
   const known = qualitiesOf(viewer.manifest);
   if (known.length < 2) return [];
-  const targets = { ...USUAL }; // that were last asked for
+  const targets = { ...DEFAULT_TARGETS }; // that were last asked for
   const choose = () => {
     const { quality, target } = viewer.settings;
     targets[quality] = target;

@@ -1,16 +1,10 @@
+import { remember, remembered } from "./storage";
+
 const KEY = "sagesplat-theme";
 const THEMES = ["auto", "light", "dark"] as const;
 type Theme = (typeof THEMES)[number];
 
-function stored(): string | null {
-  try {
-    return localStorage.getItem(KEY);
-  } catch {
-    return null; // storage may be blocked; the theme is then not remembered
-  }
-}
-
-let theme: Theme = THEMES.find((name) => name === stored()) ?? "auto";
+let theme: Theme = THEMES.find((name) => name === remembered(KEY)) ?? "auto";
 show();
 
 function show(): void {
@@ -23,10 +17,6 @@ export function nextTheme(): Theme {
   const order: readonly Theme[] = dark ? ["auto", "light", "dark"] : ["auto", "dark", "light"];
   theme = order[(order.indexOf(theme) + 1) % order.length] ?? "auto";
   show();
-  try {
-    localStorage.setItem(KEY, theme);
-  } catch {
-    // as above
-  }
+  remember(KEY, theme);
   return theme;
 }

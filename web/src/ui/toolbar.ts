@@ -1,6 +1,6 @@
 import type { Viewer } from "../view/viewer";
 import { offered, type XrMode } from "../view/xr";
-import { h, iconButton, setIcon } from "./dom";
+import { h, iconButton, isTyping, setIcon, textButton } from "./dom";
 import type { EditorCard } from "./editor";
 import { blockColor } from "./groups";
 import { messageOf } from "./notice";
@@ -52,9 +52,7 @@ export function toolbar(viewer: Viewer, parts: Parts): { element: HTMLElement; u
     "]": () => photos.step(1),
   };
   window.addEventListener("keydown", (event) => {
-    const typing =
-      event.target instanceof HTMLElement && event.target.closest("input, select, textarea, dialog");
-    if (!typing && !event.ctrlKey && !event.altKey && !event.metaKey) keys[event.key]?.();
+    if (!isTyping(event) && !event.ctrlKey && !event.altKey && !event.metaKey) keys[event.key]?.();
   });
 
   return {
@@ -115,17 +113,13 @@ async function addHeadsets(
       change.catch((error: unknown) => say(`${names[mode]} did not start: ${messageOf(error)}`));
     };
     const title = `Enter ${names[mode]}`;
-    element.append(h("button", { type: "button", class: "text", title, click: enter }, names[mode]));
+    element.append(textButton(names[mode], "text", enter, { title }));
   }
   if (!modes.length) return;
-  const turning = h(
-    "button",
-    { type: "button", class: "text", title: "Turning in the headset: snap or smooth" },
-    "Snap",
-  );
-  turning.addEventListener("click", () => {
+  const turn = () => {
     headset.turning = headset.turning === "snap" ? "smooth" : "snap";
     turning.textContent = headset.turning === "snap" ? "Snap" : "Smooth";
-  });
+  };
+  const turning = textButton("Snap", "text", turn, { title: "Turning in the headset: snap or smooth" });
   element.append(turning);
 }

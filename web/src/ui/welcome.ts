@@ -1,4 +1,5 @@
-import { h } from "./dom";
+import { h, textButton } from "./dom";
+import { remember, remembered } from "./storage";
 
 const KEY = "sagesplat-welcome";
 const MOUSE = "Drag to turn, scroll to come closer, W A S D to walk.";
@@ -7,28 +8,16 @@ const WHAT = "Each part of the scene loads only as finely as it needs to; the sl
 
 /** Two lines for newcomers; gone at the first touch of the scene, and not shown again. */
 export function welcome(canvas: HTMLElement): HTMLElement | null {
-  if (seen()) return null;
+  if (remembered(KEY) !== null) return null;
   const how = matchMedia("(pointer: coarse)").matches ? TOUCH : MOUSE;
-  const close = h("button", { type: "button", class: "primary", click: () => done() }, "Got it");
+  const close = textButton("Got it", "primary", () => done());
   const element = h("div", { class: "welcome" }, h("p", {}, h("b", {}, how)), h("p", {}, WHAT), close);
   const done = () => {
     element.remove();
-    try {
-      localStorage.setItem(KEY, "seen");
-    } catch {
-      // storage may be blocked; it is then shown again
-    }
+    remember(KEY, "seen");
   };
   for (const event of ["pointerdown", "wheel", "keydown"] as const) {
     canvas.addEventListener(event, done, { once: true });
   }
   return element;
-}
-
-function seen(): boolean {
-  try {
-    return localStorage.getItem(KEY) !== null;
-  } catch {
-    return false;
-  }
 }

@@ -10,7 +10,7 @@ const TRAVEL = 700; // ms from one photo to the next
 const DEAD = 0.15; // dead zone of a gamepad's stick
 
 /** Keys by `KeyboardEvent.code`: translation (right, up, forward) or rotation (yaw, pitch). */
-const MOVES: Readonly<Record<string, readonly [number, number, number]>> = {
+const MOVE_KEYS: Readonly<Record<string, readonly [number, number, number]>> = {
   KeyW: [0, 0, 1],
   KeyS: [0, 0, -1],
   KeyA: [-1, 0, 0],
@@ -18,7 +18,7 @@ const MOVES: Readonly<Record<string, readonly [number, number, number]>> = {
   KeyE: [0, 1, 0],
   KeyQ: [0, -1, 0],
 };
-const TURNS: Readonly<Record<string, readonly [number, number]>> = {
+const TURN_KEYS: Readonly<Record<string, readonly [number, number]>> = {
   ArrowLeft: [1, 0],
   ArrowRight: [-1, 0],
   ArrowUp: [0, 1],
@@ -143,7 +143,7 @@ export class Controls {
     if (event.ctrlKey || event.altKey || event.metaKey) return;
     const target = event.target;
     const widget = target instanceof HTMLElement && target.closest("input, select, textarea, dialog");
-    if (widget || !(event.code in MOVES || event.code in TURNS)) return;
+    if (widget || !(event.code in MOVE_KEYS || event.code in TURN_KEYS)) return;
     event.preventDefault();
     this.#keys.add(event.code);
     if (event.shiftKey) this.#keys.add("ShiftLeft");
@@ -161,10 +161,10 @@ function heldKeys(keys: ReadonlySet<string>): Held {
   const move: [number, number, number] = [0, 0, 0];
   const turn: [number, number] = [0, 0];
   for (const key of keys) {
-    MOVES[key]?.forEach((value, i) => {
+    MOVE_KEYS[key]?.forEach((value, i) => {
       move[i as 0 | 1 | 2] += value;
     });
-    TURNS[key]?.forEach((value, i) => {
+    TURN_KEYS[key]?.forEach((value, i) => {
       turn[i as 0 | 1] += value;
     });
   }

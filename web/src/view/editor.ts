@@ -3,17 +3,18 @@
 import { type Category, Edits, type Operation, type Origin, type Ranks, runsOf } from "../core/edits";
 import { grow } from "../core/grow";
 import { type Packed, type Picked, pick } from "../core/pick";
-import type { Label } from "../types";
+import type { Streamer } from "../core/streamer";
+import type { Label, Manifest, Settings } from "../types";
 import { Mark } from "./spark";
-import type { Viewer } from "./viewer";
+import type { Stage } from "./stage";
 
 /** What is selected around a point: an instance, the whole category, or what is connected and of like colour. */
 export const SCOPES = ["instance", "category", "alike"] as const;
 export type Scope = (typeof SCOPES)[number];
 
 const TOLERANCES = [0.1, 0.16, 0.22, 0.3, 0.4, 0.55]; // in colour, of what is alike
-const USUAL = 3;
-const SAME = 6; // px between clicks that are taken for one place
+const DEFAULT_TOLERANCE = 3;
+const SAME_PLACE = 6; // px between clicks that are taken for one place
 
 export interface Selection {
   readonly scope: Scope;
@@ -27,6 +28,17 @@ interface Seed extends Picked {
   readonly y: number;
 }
 
+/** What the editor needs of the viewer. */
+export interface EditableView {
+  readonly manifest: Manifest;
+  readonly stage: Stage;
+  readonly streamer: Streamer;
+  readonly settings: Settings;
+  set(partial: Partial<Settings>): void;
+  isHidden(label: number): boolean;
+  setHidden(labels: readonly number[], hidden: boolean): void;
+}
+
 export class Editor {
   readonly edits: Edits;
   selection: Selection | null = null;
@@ -34,13 +46,13 @@ export class Editor {
   isWaiting = false; // for the rest of a label, of which a region is to be selected
   pickMs = Number.NaN; // of the last pick
   private seed: Seed | null = null;
-  private width = USUAL; // index of TOLERANCES
+  private width = DEFAULT_TOLERANCE; // index of TOLERANCES
   private readonly listeners = new Set<() => void>();
   private readonly weighed = new Set<number>(); // labels whose weight edits have set
   private readonly hid = new Set<number>(); // the same of being shown or not
   private readonly labels: ReadonlyMap<number, Label>;
 
-  constructor(readonly viewer: Viewer) {
+  constructor(readonly viewer: EditableView) {
     const { labels, ladder = null } = viewer.manifest;
     this.labels = new Map(labels.map((label) => [label.id, label]));
     this.edits = new Edits(labels.map(originOf), ladder, () => {
@@ -76,7 +88,7 @@ export class Editor {
   pick(x: number, y: number): void {
     const begun = performance.now();
     const seed = this.seed;
-    if (seed && this.selection && Math.hypot(seed.x - x, seed.y - y) <= SAME) {
+    if (seed && this.selection && Math.hypot(seed.x - x, seed.y - y) <= SAME_PLACE) {
       this.cycle();
     } else {
       const found = this.meet(x, y);

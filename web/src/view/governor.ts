@@ -11,11 +11,11 @@ const FEWEST = 20_000;
 const LATE = 1.2; // relative to the headset's frame time
 const ON_TIME = 1.08;
 const SETTLE = 600; // ms that a lower count needs to take effect
-const PATIENCE = 4_000;
+const RAISE_WAIT = 4_000;
 
 /** @param cap - initial limit, splats */
 export function governor(cap: number, now: number): Governor {
-  return { cap: Math.min(cap, XR_SPLATS), late: 1, changed: now, patience: PATIENCE };
+  return { cap: Math.min(cap, XR_SPLATS), late: 1, changed: now, patience: RAISE_WAIT };
 }
 
 /**

@@ -1,7 +1,8 @@
 /** Gaussians of coded streams in Spark's packed encoding. */
 
 import { type Block, type Harmonics, ROTATIONS } from "../core/columns";
-import type { Header, Sink } from "../core/stream";
+import type { Header } from "../core/header";
+import type { Sink } from "../core/stream";
 
 export const HARMONICS = ["sh1", "sh2", "sh3"] as const;
 export const WORDS = { sh1: 2, sh2: 4, sh3: 4 } as const; // uint32 words per splat
@@ -66,7 +67,7 @@ export class Packing implements Sink<Part> {
   private alpha = new Uint8Array(0); // in 1/255, by opacity
   private coefficients: readonly Lookup[] = [];
 
-  begin(header: Header, count: number, owed: number): Part {
+  begin(header: Header, count: number, deferred: number): Part {
     if (header !== this.header) this.prepare(header);
     const harmonics = HARMONICS.slice(0, header.degree).map(
       (key) => [key, new Uint32Array(count * WORDS[key])] as const,
@@ -74,7 +75,7 @@ export class Packing implements Sink<Part> {
     const opacities = header.twoOpacities ? new Uint8Array(2 * count) : null;
     const splats = new Uint32Array(4 * count);
     const part = { count, encoding: STREAM_ENCODING, splats, harmonics: new Map(harmonics), opacities };
-    return owed ? { ...part, earlier: new Uint8Array(owed) } : part;
+    return deferred ? { ...part, earlier: new Uint8Array(deferred) } : part;
   }
 
   put(part: Part, block: Block, start: number, count: number): void {

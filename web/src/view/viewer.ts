@@ -15,7 +15,7 @@ import { Headset } from "./xr";
 
 const CACHE = 128e6; // bytes of decoded increments that are not shown
 const UNLIMITED: Budget = { bytes: Infinity, gpuBytes: Infinity, count: Infinity };
-const SHARPEST = 2; // device pixels per CSS pixel: more costs fill rate without a visible gain
+const MAX_PIXEL_RATIO = 2; // device pixels per CSS pixel: more costs fill rate without a visible gain
 
 /** The viewer without its UI: a bundle, a camera, and settings. */
 export class Viewer {
@@ -76,7 +76,7 @@ export class Viewer {
   start(): void {
     const { canvas, renderer } = this.stage;
     const resize = () =>
-      this.stage.resize(canvas.clientWidth, canvas.clientHeight, Math.min(devicePixelRatio, SHARPEST));
+      this.stage.resize(canvas.clientWidth, canvas.clientHeight, Math.min(devicePixelRatio, MAX_PIXEL_RATIO));
     const watch = new ResizeObserver(resize);
     watch.observe(canvas);
     resize();
@@ -247,7 +247,7 @@ export class Viewer {
 }
 
 /** Targets to begin with, where the bundle says none of the quality. */
-export const USUAL: Readonly<Record<Quality, number>> = { fidelity: 0.95, ssim: 0.7 };
+export const DEFAULT_TARGETS: Readonly<Record<Quality, number>> = { fidelity: 0.95, ssim: 0.7 };
 
 function startSettings(manifest: Manifest, options: Options): Settings {
   const quality = options.quality ?? manifest.target.quality;
@@ -255,7 +255,7 @@ function startSettings(manifest: Manifest, options: Options): Settings {
   if (known.length && !known.includes(quality)) {
     throw new Error(`?quality=${quality}: this bundle has only ${known.join(" and ")}; correct the address.`);
   }
-  const usual = quality === manifest.target.quality ? manifest.target.value : USUAL[quality];
+  const usual = quality === manifest.target.quality ? manifest.target.value : DEFAULT_TARGETS[quality];
   const bytes = options.budget === null ? Infinity : options.budget * 1e6;
   return {
     mode: options.budget !== null && options.target === null ? "budget" : "target",

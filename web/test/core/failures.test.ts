@@ -20,8 +20,7 @@ test.each<[string, Fault, string, number]>([
 ])("%s caps its label, which says so; others live on", async (_, fault, words, tries) => {
   const { w, file, asked } = made();
   w.network.faults.set(file, fault);
-  w.streamer.start();
-  await w.rest();
+  await w.run();
   const { state } = w.streamer;
   expect(shown(state)).toEqual([4, 2, 4]);
   expect(state.labels[1]?.error).toContain(words);
@@ -39,8 +38,7 @@ test("a first level that is broken leaves its label away", async () => {
   const { w } = made();
   const file = w.manifest.labels[2]?.levels[0]?.uri ?? "";
   w.network.faults.set(file, "corrupt");
-  w.streamer.start();
-  await w.rest();
+  await w.run();
   expect(shown(w.streamer.state)).toEqual([4, 4, 0]);
   expect(w.streamer.state.status).toBe("ok");
   expect(w.streamer.state.message).toContain("label 2 cannot be shown");
@@ -48,9 +46,8 @@ test("a first level that is broken leaves its label away", async () => {
 
 test("a file that cannot be decoded caps its label", async () => {
   const { w, file } = made();
-  w.renderer.spoiled.add("1/3");
-  w.streamer.start();
-  await w.rest();
+  w.renderer.corrupt.add("1/3");
+  await w.run();
   expect(shown(w.streamer.state)).toEqual([4, 2, 4]);
   expect(w.streamer.state.message).toContain(`${file} cannot be decoded`);
 });
@@ -63,8 +60,7 @@ test.each<[string, Fault[]]>([
 ])("%s: tried again, without a word", async (_, faults) => {
   const { w, file, asked } = made();
   w.network.faults.set(file, [...faults]);
-  w.streamer.start();
-  await w.rest();
+  await w.run();
   expect(shown(w.streamer.state)).toEqual([4, 4, 4]);
   expect(w.streamer.state.message).toBeNull();
   expect(asked()).toBe(faults.length + 1);
@@ -138,9 +134,7 @@ test.each<[Fault, string]>([
 ])("without promises (%s) levels follow what holds everywhere", async (fault, words) => {
   const { w } = made();
   w.network.faults.set("promises-1.json", fault);
-  w.set({ mode: "target" });
-  w.streamer.start();
-  await w.rest();
+  await w.run({ mode: "target" });
   expect(w.streamer.state.message).toContain(words);
   expect(w.streamer.state.message).toContain("by what holds for all viewpoints");
   for (const label of w.streamer.state.labels) expect(label.promised).toBeGreaterThanOrEqual(0.8);
@@ -154,7 +148,7 @@ test("promises that cannot be read are told of", async () => {
   const other = world({}, { manifest: { ...w.manifest, promises }, digest: null }, w);
   other.streamer.start();
   await other.pass(5000);
-  expect(other.streamer.state.message).toContain("promises-1.json: version is missing");
+  expect(other.streamer.state.message).toContain("promises-1.json: quality is missing");
 });
 
 test("without a digest files are checked by their size, and the user is told", async () => {

@@ -37,14 +37,11 @@ test("everything comes from one stream, and is drawn while it comes", async () =
 test("a plan that wants less stops the stream, and what came is kept", async () => {
   const { w, chunks } = made({ levels: 8 });
   w.network.bandwidth = 250_000;
-  w.set({ mode: "base" });
-  w.streamer.start();
-  await w.rest();
+  await w.run({ mode: "base" });
   expect(w.network.aborted).toEqual([PACK]);
   expect(w.network.asked).toEqual([PACK, "promises-1.json"]);
   expect(w.streamer.state.bytesLoaded).toBeLessThan(w.manifest.totals.bytes / 4);
-  w.set({ mode: "full" });
-  await w.rest();
+  await w.run({ mode: "full" });
   expect(shown(w.streamer.state)).toEqual([8, 8, 8]);
   expect(new Set(chunks()).size).toBe(chunks().length);
   expect(w.network.asked.filter((path) => path === PACK)).toHaveLength(1);
@@ -89,9 +86,7 @@ test("what the stream would bring late is fetched beside it", async () => {
 test("a viewer with a small budget loads little more than that", async () => {
   const { w } = made({ labels: 4, levels: 8 });
   const bytes = w.manifest.totals.bytes / 4;
-  w.set({ mode: "budget", budget: { ...NO_BUDGET, bytes } });
-  w.streamer.start();
-  await w.rest();
+  await w.run({ mode: "budget", budget: { ...NO_BUDGET, bytes } });
   const models = w.manifest.promises.fidelity?.bytes ?? 0;
   expect(w.streamer.state.bytesShown).toBeLessThanOrEqual(bytes);
   expect(w.streamer.state.bytesLoaded).toBeLessThan(models + w.manifest.totals.bytes / 2);
@@ -110,9 +105,7 @@ test("dispose ends the stream", async () => {
 
 test("no room to keep anything: all is drawn all the same", async () => {
   const { w } = made({}, { keepBytes: 0 });
-  w.set({ mode: "full", cacheBytes: 0 });
-  w.streamer.start();
-  await w.rest();
+  await w.run({ mode: "full", cacheBytes: 0 });
   expect(shown(w.streamer.state)).toEqual([4, 4, 4]);
   expect(w.network.asked).toEqual([PACK, "promises-1.json"]);
 });
@@ -135,9 +128,7 @@ describe("a stream that fails", () => {
   ])("%s: the rest comes one by one", async (_, fault, note) => {
     const { w, chunks, twice } = made();
     w.network.faults.set(PACK, fault);
-    w.set({ mode: "full" });
-    w.streamer.start();
-    await w.rest();
+    await w.run({ mode: "full" });
     expect(shown(w.streamer.state)).toEqual([4, 4, 4]);
     if (note) expect(w.streamer.state.message).toMatch(note);
     else expect(w.streamer.state.message).toBeNull();
@@ -155,9 +146,7 @@ describe("a stream that fails", () => {
       return { ...reply, headers: { get: (name) => (name === "Content-Length" ? "99" : null) } };
     };
     const other = world({}, { manifest: w.manifest, fetch: shorter }, w);
-    other.set({ mode: "full" });
-    other.streamer.start();
-    await other.rest();
+    await other.run({ mode: "full" });
     expect(chunks()).toHaveLength(12);
     expect(other.streamer.state.message).toContain("only 99 of");
   });
@@ -165,9 +154,7 @@ describe("a stream that fails", () => {
   test("wrong bytes of one increment: fetched by itself", async () => {
     const { w, chunks, file } = made();
     w.network.faults.set(PACK, "corrupt");
-    w.set({ mode: "full" });
-    w.streamer.start();
-    await w.rest();
+    await w.run({ mode: "full" });
     expect(shown(w.streamer.state)).toEqual([4, 4, 4]);
     expect(chunks()).toHaveLength(1);
     expect([1, 2, 3, 4].flatMap((level) => [0, 1, 2].map((i) => file(i, level)))).toContain(chunks()[0]);
@@ -180,9 +167,7 @@ describe("a stream that fails", () => {
     w.network.faults.set(PACK, "corrupt");
     w.network.faults.set("*", "corrupt");
     w.network.faults.set("promises-1.json", []);
-    w.set({ mode: "full" });
-    w.streamer.start();
-    await w.rest();
+    await w.run({ mode: "full" });
     expect(chunks()).toHaveLength(1);
     const levels = shown(w.streamer.state);
     expect(levels.filter((level) => level < 4)).toHaveLength(1);
@@ -194,9 +179,7 @@ describe("a stream that fails", () => {
   test("another file in its place: given up after two increments", async () => {
     const { w, chunks, twice } = made();
     w.network.files.set(PACK, new Uint8Array(w.manifest.pack?.bytes ?? 0));
-    w.set({ mode: "full" });
-    w.streamer.start();
-    await w.rest();
+    await w.run({ mode: "full" });
     expect(shown(w.streamer.state)).toEqual([4, 4, 4]);
     expect(w.network.aborted).toEqual([PACK]);
     expect(chunks()).toHaveLength(12);
@@ -206,11 +189,11 @@ describe("a stream that fails", () => {
 
   test("where nothing can be checked, what cannot be decoded is fetched by itself", async () => {
     const { w, chunks, file } = made({}, { digest: null });
-    w.renderer.spoiled.add("1/3");
+    w.renderer.corrupt.add("1/3");
     w.set({ mode: "full" });
     w.streamer.start();
     await w.pass(700);
-    w.renderer.spoiled.clear();
+    w.renderer.corrupt.clear();
     await w.rest();
     expect(chunks()).toEqual([file(1, 3)]);
     expect(shown(w.streamer.state)).toEqual([4, 4, 4]);

@@ -2,8 +2,9 @@
 
 import { expect, test } from "vitest";
 import vectors from "../../../tests/data/plans.json?raw";
-import { bestWithin, cheapest, type Options, type Table } from "../../src/core/allocate";
+import { bestWithin, cheapest, type Options } from "../../src/core/allocate";
 import { fill } from "../../src/core/fill";
+import type { Table } from "../../src/core/knapsack";
 
 type Row = (number | null)[];
 interface Case {

@@ -15,9 +15,7 @@ const made = (options: Options = {}) => {
 
 test("every level comes once, in fewer requests than levels", async () => {
   const { w, total } = made({ levels: 12, bytes: 3000 });
-  w.set({ mode: "full" });
-  w.streamer.start();
-  await w.rest();
+  await w.run({ mode: "full" });
   expect(shown(w.streamer.state)).toEqual([12, 12, 12]);
   expect(w.streamer.state).toMatchObject({ bytesLoaded: total, message: null });
   expect(w.network.askedRanges.length).toBeLessThan(20);
@@ -29,21 +27,17 @@ test("levels of one request are drawn as they come", async () => {
   w.network.bandwidth = 10_000;
   const seen = new Set<number>();
   w.renderer.watch = () => seen.add(Math.max(0, ...w.renderer.levels(0)));
-  w.streamer.start();
-  await w.rest();
+  await w.run();
   expect(seen.size).toBeGreaterThan(9);
   expect(w.network.askedRanges.length).toBeLessThan(7);
 });
 
 test("what the plan does not want is not loaded", async () => {
   const { w } = made({ levels: 12 });
-  w.set({ mode: "base" });
-  w.streamer.start();
-  await w.rest();
+  await w.run({ mode: "base" });
   const lowest = w.manifest.labels.reduce((sum, { levels }) => sum + (levels[0]?.bytes ?? 0), 0);
   expect(w.streamer.state.bytesLoaded).toBe(lowest + (w.manifest.promises.fidelity?.bytes ?? 0));
-  w.set({ mode: "target", target: 0.7 });
-  await w.rest();
+  await w.run({ mode: "target", target: 0.7 });
   expect(shown(w.streamer.state)).toEqual(wanted(w.streamer.state));
   const starts = w.network.askedRanges.map((range) => range.replace(/-\d+$/, ""));
   expect(new Set(starts).size).toBe(starts.length);
@@ -53,9 +47,7 @@ describe("a server without ranges", () => {
   test("sends each file once", async () => {
     const { w, asked, total } = made({ levels: 8 });
     w.network.ranges = false;
-    w.set({ mode: "full" });
-    w.streamer.start();
-    await w.rest();
+    await w.run({ mode: "full" });
     expect(shown(w.streamer.state)).toEqual([8, 8, 8]);
     expect([0, 1, 2].map(asked)).toEqual([1, 1, 1]);
     expect(w.streamer.state).toMatchObject({ bytesLoaded: total, message: null });
@@ -64,11 +56,8 @@ describe("a server without ranges", () => {
   test("also where more is wanted later", async () => {
     const { w, asked } = made({ levels: 8 });
     w.network.ranges = false;
-    w.set({ mode: "base" });
-    w.streamer.start();
-    await w.rest();
-    w.set({ mode: "full" });
-    await w.rest();
+    await w.run({ mode: "base" });
+    await w.run({ mode: "full" });
     expect(shown(w.streamer.state)).toEqual([8, 8, 8]);
     expect([0, 1, 2].map(asked)).toEqual([1, 1, 1]);
   });
@@ -86,8 +75,7 @@ test.each<[string, Fault[]]>([
   const { w, file } = made();
   w.set({ mode: "full" });
   w.network.faults.set(file(1), [...faults]);
-  w.streamer.start();
-  await w.rest();
+  await w.run();
   expect(shown(w.streamer.state)).toEqual([4, 4, 4]);
   expect(w.streamer.state.message).toBeNull();
 });
@@ -102,8 +90,7 @@ test.each<[string, Fault, string]>([
   const { w, file } = made();
   w.set({ mode: "full" });
   w.network.faults.set(file(1), fault);
-  w.streamer.start();
-  await w.rest();
+  await w.run();
   const { state } = w.streamer;
   expect(shown(state)[1]).toBeLessThan(4);
   expect([shown(state)[0], shown(state)[2]]).toEqual([4, 4]);
@@ -114,16 +101,12 @@ test.each<[string, Fault, string]>([
 
 test("an evicted level comes back without being loaded again", async () => {
   const { w } = made({ levels: 6 });
-  w.set({ mode: "full", cacheBytes: 0 });
-  w.streamer.start();
-  await w.rest();
+  await w.run({ mode: "full", cacheBytes: 0 });
   const { bytesLoaded } = w.streamer.state;
   const { decoded } = w.renderer;
-  w.set({ mode: "base" });
-  await w.rest();
+  await w.run({ mode: "base" });
   expect(w.renderer.alive.size).toBe(3);
-  w.set({ mode: "full" });
-  await w.rest();
+  await w.run({ mode: "full" });
   expect(shown(w.streamer.state)).toEqual([6, 6, 6]);
   expect(w.streamer.state.bytesLoaded).toBe(bytesLoaded);
   expect(w.renderer.decoded).toBe(decoded + 15);
@@ -134,8 +117,7 @@ test("with a pack, ranges bring what it would bring too late", async () => {
   w.network.bandwidth = 100_000;
   w.streamer.start();
   await w.pass(400);
-  w.set({ mode: "budget", budget: { ...NO_BUDGET, bytes: w.manifest.totals.bytes / 3 } });
-  await w.rest();
+  await w.run({ mode: "budget", budget: { ...NO_BUDGET, bytes: w.manifest.totals.bytes / 3 } });
   const { state } = w.streamer;
   expect(shown(state)).toEqual(wanted(state));
   expect(state.message).toBeNull();
@@ -159,7 +141,7 @@ test("without promises the pack brings what is planned so far, and about a round
 test("the pack stops before a long way of what nobody wants", async () => {
   const { w } = made({ labels: 6, levels: 16, pack: true });
   w.network.bandwidth = 200_000;
-  w.set({
+  await w.run({
     mode: "target",
     target: 0.8,
     weights: new Map([
@@ -169,8 +151,6 @@ test("the pack stops before a long way of what nobody wants", async () => {
       [3, 0],
     ]),
   });
-  w.streamer.start();
-  await w.rest();
   const { state } = w.streamer;
   expect(shown(state)).toEqual(wanted(state));
   const takes = state.labels.reduce(

@@ -16,9 +16,7 @@ const levelsAsked = (w: World, label: number) =>
 
 async function started(mode: "base" | "full" | "target", options = {}, more = {}): Promise<World> {
   const w = world({ ...OPTIONS, ...options }, more);
-  w.set({ mode });
-  w.streamer.start();
-  await w.rest();
+  await w.run({ mode });
   return w;
 }
 
@@ -46,8 +44,7 @@ test("below it levels add up as ever", async () => {
   const w = await started("base");
   expect(shown(w.streamer.state)).toEqual([1, 1, 1]);
   const third = w.manifest.labels.map((label) => ladderOf(label).count[2] ?? 0);
-  w.set({ mode: "budget", budget: { ...NO_BUDGET, count: third.reduce((sum, n) => sum + n) } });
-  await w.rest();
+  await w.run({ mode: "budget", budget: { ...NO_BUDGET, count: third.reduce((sum, n) => sum + n) } });
   expect(Math.max(...wanted(w.streamer.state))).toBeLessThan(5);
   expect(w.streamer.state.count).toBeLessThanOrEqual(w.settings.budget.count);
 });
@@ -55,15 +52,13 @@ test("below it levels add up as ever", async () => {
 test("the old and the new change places in one swap, up and down", async () => {
   const w = await started("base", { labels: 1 });
   w.renderer.swaps = [];
-  w.set({ mode: "full" });
-  await w.rest();
+  await w.run({ mode: "full" });
   expect(w.renderer.swaps.map(({ show, hide }) => [show, hide].map((l) => l.map((h) => h.level)))).toEqual([
     [[4], [1]],
     [[5], []],
   ]);
   w.renderer.swaps = [];
-  w.set({ mode: "base" });
-  await w.rest();
+  await w.run({ mode: "base" });
   expect(w.renderer.swaps.map(({ show, hide }) => [show, hide].map((l) => l.map((h) => h.level)))).toEqual([
     [[1], [4, 5]],
   ]);
@@ -92,18 +87,15 @@ test("who changes his mind on the way down leaves nothing in memory", async () =
   w.set({ budget: { ...NO_BUDGET, count: third } });
   while (w.renderer.alive.size < 3) await w.pass(50);
   expect(shown(w.streamer.state)).toEqual([5]);
-  w.set({ budget: NO_BUDGET });
-  await w.rest();
+  await w.run({ budget: NO_BUDGET });
   expect(shown(w.streamer.state)).toEqual([5]);
   expect(w.renderer.alive.size).toBe(2);
 });
 
 test("a damaged level below one that replaces is as if there were no higher ones", async () => {
   const w = world({ ...OPTIONS, labels: 1 });
-  w.renderer.spoiled.add("0/4");
-  w.set({ mode: "full" });
-  w.streamer.start();
-  await w.rest();
+  w.renderer.corrupt.add("0/4");
+  await w.run({ mode: "full" });
   expect(shown(w.streamer.state)).toEqual([3]);
   expect(w.streamer.state.message).toContain("stays at level 3");
 });
@@ -111,8 +103,7 @@ test("a damaged level below one that replaces is as if there were no higher ones
 test("a pack brings them too, and the rest of it is not waited for", async () => {
   const w = await started("full", { pack: true });
   expect(shown(w.streamer.state)).toEqual([5, 5, 5]);
-  w.set({ mode: "base" });
-  await w.rest();
+  await w.run({ mode: "base" });
   expect(shown(w.streamer.state)).toEqual([1, 1, 1]);
 });
 

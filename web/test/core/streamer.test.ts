@@ -1,12 +1,11 @@
 /** What is loaded, drawn, kept and given up. */
 
 import { describe, expect, test } from "vitest";
-import { frustumOf } from "../../src/core/distance";
 import { digestOfBrowser } from "../../src/core/download";
 import type { Camera } from "../../src/types";
 import { type Network, settled } from "../simulate";
 import { shown, type World, wanted, world } from "../world";
-import { at, bundle, NO_BUDGET, rightOf, totals } from "../worlds";
+import { at, bundle, frustumOf, NO_BUDGET, rightOf, totals } from "../worlds";
 
 const chunks = (paths: readonly string[]) => paths.filter((path) => path.startsWith("chunks/"));
 const twice = (paths: readonly string[]) => paths.filter((path, i) => paths.indexOf(path) < i);
@@ -33,9 +32,7 @@ test("bytes, GPU bytes, counts and the speed of the link are those of what came"
   const w = world({ labels: 3, levels: 4 });
   w.network.bandwidth = 2e6;
   w.network.latency = 0;
-  w.set({ mode: "full" });
-  w.streamer.start();
-  await w.rest();
+  await w.run({ mode: "full" });
   const { state } = w.streamer;
   expect(state.count).toBe(w.manifest.totals.count);
   expect(state.bytesShown).toBe(w.manifest.totals.bytes);
@@ -46,39 +43,30 @@ test("bytes, GPU bytes, counts and the speed of the link are those of what came"
 
 test("every mode and its status", async () => {
   const w = world({ labels: 4, levels: 5 });
-  w.streamer.start();
-  await w.rest();
-  w.set({ mode: "base" });
-  await w.rest();
+  await w.run();
+  await w.run({ mode: "base" });
   expect(shown(w.streamer.state)).toEqual([1, 1, 1, 1]);
-  w.set({ mode: "full" });
-  await w.rest();
+  await w.run({ mode: "full" });
   expect(shown(w.streamer.state)).toEqual([5, 5, 5, 5]);
-  w.set({ mode: "target", target: 1 });
-  await w.rest();
+  await w.run({ mode: "target", target: 1 });
   expect(w.streamer.state.status).toBe("infeasible");
-  w.set({ mode: "full", budget: { ...NO_BUDGET, count: w.manifest.totals.count / 2 } });
-  await w.rest();
+  await w.run({ mode: "full", budget: { ...NO_BUDGET, count: w.manifest.totals.count / 2 } });
   expect(w.streamer.state.status).toBe("infeasible");
   expect(w.streamer.state.count).toBeLessThanOrEqual(w.manifest.totals.count / 2);
-  w.set({ mode: "budget" });
-  await w.rest();
+  await w.run({ mode: "budget" });
   expect(w.streamer.state.status).toBe("ok");
   for (const unit of ["bytes", "gpuBytes", "count"]) {
-    w.set({ budget: { ...NO_BUDGET, [unit]: 0 } });
-    await w.rest();
+    await w.run({ budget: { ...NO_BUDGET, [unit]: 0 } });
     expect(w.streamer.state.status).toBe("over budget");
     expect(shown(w.streamer.state)).toEqual([1, 1, 1, 1]);
   }
-  w.set({ budget: { bytes: Number.NaN, gpuBytes: Number.NaN, count: Number.NaN } });
-  await w.rest();
+  await w.run({ budget: { bytes: Number.NaN, gpuBytes: Number.NaN, count: Number.NaN } });
   expect(w.streamer.state.status).toBe("ok");
 });
 
 test("labels out of sight or of weight 0 want their lowest level, and come back at once from memory", async () => {
   const w = world({ labels: 4, levels: 5 });
-  w.streamer.start();
-  await w.rest();
+  await w.run();
   const before = shown(w.streamer.state);
   const asked = w.network.asked.length;
   w.streamer.update(rightOf(at(0)));
@@ -114,8 +102,7 @@ test("a label that is always shipped is whole in every mode, and paid first", as
 
 test("a bundle without labels, and labels without quality or boxes", async () => {
   const none = world({ labels: 0 });
-  none.streamer.start();
-  await none.rest();
+  await none.run();
   expect(none.streamer.state).toMatchObject({ status: "ok", labels: [], count: 0, message: null });
   const made = world({ labels: 3, levels: 4, promises: false });
   const labels = made.manifest.labels.map((label, i) => ({
@@ -135,33 +122,13 @@ test("a bundle without labels, and labels without quality or boxes", async () =>
   expect(w.streamer.state.status).toBe("ok");
 });
 
-test("levels that add nothing need no file", async () => {
-  const made = world({ labels: 2, levels: 4 });
-  const empty = { uri: "", format: "spz" as const, bytes: 0, gpuBytes: 0, count: 0, sha256: "" };
-  const labels = made.manifest.labels.map((label) => ({
-    ...label,
-    levels: label.levels.map((level, k) => (k === 0 || k === 2 ? empty : level)),
-  }));
-  const w = world({}, { manifest: { ...made.manifest, labels } }, made);
-  w.set({ mode: "full" });
-  w.streamer.start();
-  await made.pass(5000);
-  expect(shown(w.streamer.state)).toEqual([4, 4]);
-  expect(w.renderer.levels(0)).toEqual([2, 4]);
-  expect(w.streamer.state.message).toBeNull();
-});
-
 describe("limits", () => {
   /** Full, then base, then full again. */
   const again = async (w: World) => {
-    w.set({ mode: "full" });
-    w.streamer.start();
-    await w.rest();
-    w.set({ mode: "base" });
-    await w.rest();
+    await w.run({ mode: "full" });
+    await w.run({ mode: "base" });
     const kept = { alive: w.renderer.alive.size, gpuBytes: w.streamer.state.gpuBytes };
-    w.set({ mode: "full" });
-    await w.rest();
+    await w.run({ mode: "full" });
     expect(shown(w.streamer.state)).toEqual(w.manifest.labels.map((label) => label.levels.length));
     return kept;
   };
@@ -213,9 +180,7 @@ describe("aborts", () => {
   const big = { labels: 1, levels: 3, bytes: 400_000, promises: false };
   const started = async (wait: number) => {
     const w = world(big);
-    w.streamer.start();
-    w.set({ mode: "base" });
-    await w.rest();
+    await w.run({ mode: "base" });
     w.set({ mode: "full" });
     await w.pass(wait);
     w.set({ mode: "base" });
@@ -227,34 +192,28 @@ describe("aborts", () => {
     const w = await started(250);
     expect(w.network.aborted).toHaveLength(2);
     expect(w.streamer.state.pending).toBe(0);
-    w.set({ mode: "full" });
-    await w.rest();
+    await w.run({ mode: "full" });
     expect(shown(w.streamer.state)).toEqual([3]);
     expect(w.streamer.state.message).toBeNull();
   });
 
   test("what is nearly there may come, and is kept", async () => {
     const w = world(big, { downloads: 1 });
-    w.set({ mode: "base" });
-    w.streamer.start();
-    await w.rest();
+    await w.run({ mode: "base" });
     w.set({ mode: "full" });
     const second = w.manifest.labels[0]?.levels[1]?.bytes ?? 0;
     await w.pass(100 + 0.95 * (second / 1e6) * 1000);
-    w.set({ mode: "base" });
-    await w.rest();
+    await w.run({ mode: "base" });
     expect(w.network.aborted).toEqual([]);
     expect(shown(w.streamer.state)).toEqual([1]);
-    w.set({ mode: "full" });
-    await w.rest();
+    await w.run({ mode: "full" });
     expect(twice(w.network.asked)).toEqual([]);
   });
 });
 
 test("plans at most 8 times a second, and only when something changed", async () => {
   const w = world({ labels: 2, levels: 3 });
-  w.streamer.start();
-  await w.rest();
+  await w.run();
   let changes = 0;
   const stop = w.streamer.onChange(() => changes++);
   for (let frame = 0; frame < 60; frame++) {
@@ -271,8 +230,7 @@ test("plans at most 8 times a second, and only when something changed", async ()
   }
   expect(changes).toBe(0);
   stop();
-  w.set({ mode: "full" });
-  await w.rest();
+  await w.run({ mode: "full" });
   expect(changes).toBe(0);
 });
 
@@ -288,9 +246,7 @@ test("on a slow link few large files come at a time, on a fast one of small file
   expect(slow.network.most).toBeLessThanOrEqual(3);
   const fast = world({ labels: 6, levels: 4, bytes: 5000, promises: false });
   fast.network.bandwidth = 6e6;
-  fast.set({ mode: "full" });
-  fast.streamer.start();
-  await fast.rest();
+  await fast.run({ mode: "full" });
   expect(fast.network.most).toBeGreaterThan(8);
   expect(fast.network.most).toBeLessThanOrEqual(16);
 });
@@ -388,8 +344,7 @@ test("changing the state inside a callback does no harm", async () => {
     calls += 1;
     if (calls < 5) w.streamer.set({ target: 0.7 + calls / 50 });
   });
-  w.streamer.start();
-  await w.rest();
+  await w.run();
   await settled();
   expect(calls).toBeGreaterThan(5);
 });

@@ -3,18 +3,10 @@
 import { describe, expect, test } from "vitest";
 import distances from "../../../tests/data/distances.json?raw";
 import promised from "../../../tests/data/promises.json?raw";
-import {
-  frustumOf,
-  type Lens,
-  look,
-  photoFrustum,
-  rotate,
-  touches,
-  widestLens,
-} from "../../src/core/distance";
+import { type Lens, look, photoFrustum, rotate, touches, widestLens } from "../../src/core/distance";
 import { anywhere, curveAt, ViewModel, Views } from "../../src/core/quality";
 import type { Box, Camera, Curve, Label, Promises, Quat, Vec3, Viewpoint } from "../../src/types";
-import { differences } from "../worlds";
+import { differences, frustumOf } from "../worlds";
 
 interface PromiseCase {
   name: string;
@@ -135,6 +127,7 @@ test("a frustum that is no wider than the photos is that of the window", () => {
 });
 
 const curve: Curve = {
+  level: 1,
   params: [0.9, 0.1, 1, 1, 0.8, 0.05, 1, 1, 3],
   range: [0.5, 8],
   median: 0.7,

@@ -1,4 +1,4 @@
-import { describe, expect, it } from "vitest";
+import { expect, test } from "vitest";
 import type { Camera, Manifest } from "../../src/types";
 import { Network, VirtualClock } from "../simulate";
 import { PROFILES, path, resized, stays, visit } from "../visitors";
@@ -36,66 +36,35 @@ function world() {
 const [everything, target] = PROFILES;
 if (!everything || !target) throw new Error("no profiles");
 
-describe("visitors", () => {
-  it("stay a minute on average, half of them less than 31 s", () => {
-    const seconds = stays(1001, 3).sort((a, b) => a - b);
-    expect(seconds.reduce((a, b) => a + b, 0) / 1001).toBeCloseTo(60, -0.5);
-    expect(seconds[500]).toBeCloseTo(30.9, 0);
-    expect(stays(9, 1)).toEqual(stays(9, 1));
-    expect(stays(9, 1)).not.toEqual(stays(9, 2));
-  });
+test("visitors walk no faster than 1.2 m/s, from the start, and repeat", () => {
+  expect(stays(1001, 3).reduce((a, b) => a + b, 0) / 1001).toBeCloseTo(60, -0.5);
+  const { manifest } = world();
+  const [walk, again, other] = [path(manifest, 90, 5), path(manifest, 90, 5), path(manifest, 90, 6)];
+  expect(walk(0).position).toEqual(manifest.start.position);
+  let far = 0;
+  for (let second = 0; second < 90; second += 0.5) {
+    const [a, b] = [walk(second).position, walk(second + 0.5).position];
+    const step = Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2]);
+    expect(step).toBeLessThanOrEqual(0.6 + 1e-9);
+    far += step;
+    expect(again(second)).toEqual(walk(second));
+  }
+  expect(far).toBeGreaterThan(10);
+  expect(other(60)).not.toEqual(walk(60));
+});
 
-  it("walk no faster than 1.2 m/s, from the start, and repeat", () => {
-    const { manifest } = world();
-    const [walk, again, other] = [path(manifest, 90, 5), path(manifest, 90, 5), path(manifest, 90, 6)];
-    expect(walk(0).position).toEqual(manifest.start.position);
-    let far = 0;
-    for (let second = 0; second < 90; second += 0.5) {
-      const [a, b] = [walk(second).position, walk(second + 0.5).position];
-      const step = Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2]);
-      expect(step).toBeLessThanOrEqual(0.6 + 1e-9);
-      far += step;
-      expect(again(second)).toEqual(walk(second));
-    }
-    expect(far).toBeGreaterThan(10);
-    expect(other(60)).not.toEqual(walk(60));
-  });
-
-  it("ask for the page, then the manifest, then what the planner wants", async () => {
-    const { manifest, files } = world();
-    const log = await visit(manifest, files, everything, 20, 1);
-    const order = log.map(({ uri }) => uri);
-    expect(order[0]).toBe("index.html");
-    expect(order.indexOf("manifest.json")).toBeGreaterThan(order.indexOf("assets/index-AAAAAAAA.js"));
-    expect(order.indexOf(manifest.pack?.uri ?? "")).toBeGreaterThan(order.indexOf("manifest.json"));
-    const bytes = new Map(log.map((one) => [one.uri, one.bytes]));
-    expect(bytes.get(manifest.pack?.uri ?? "")).toBe(manifest.pack?.bytes);
-    expect(bytes.get("poster.jpg")).toBe(9000);
-    expect(await visit(manifest, files, everything, 20, 1)).toEqual(log);
-  });
-
-  it("who leaves early gets a part of it", async () => {
-    const { manifest, files } = world();
-    const log = await visit(manifest, files, everything, 0.25, 1);
-    expect(log.map(({ uri }) => uri)).not.toContain(manifest.pack?.uri);
-    const total = log.reduce((sum, { bytes }) => sum + bytes, 0);
-    expect(total).toBeGreaterThan(0);
-    expect(total).toBeLessThan(60_000);
-  });
-
-  it("without a pack files come one by one, each once", async () => {
-    const { manifest, files } = world();
-    const log = await visit(resized(manifest, 1, false), files, target, 30, 1);
-    const chunks = log.map(({ uri }) => uri).filter((uri) => uri.startsWith("chunks/"));
-    expect(chunks.length).toBeGreaterThan(4);
-    expect(new Set(chunks).size).toBe(chunks.length);
-  });
-
-  it("bundles of more Gaussians have more bytes and keep fitting together", () => {
-    const { manifest } = world();
-    const large = resized(manifest, 10, true);
-    const sum = large.labels.flatMap(({ levels }) => levels).reduce((total, { bytes }) => total + bytes, 0);
-    expect(large.totals.bytes).toBe(sum);
-    expect(large.pack?.bytes).toBe(sum);
-  });
+test("visitors ask for the page, then the manifest, then what the planner wants", async () => {
+  const { manifest, files } = world();
+  const log = await visit(manifest, files, everything, 20, 1);
+  const order = log.map(({ uri }) => uri);
+  expect(order[0]).toBe("index.html");
+  expect(order.indexOf("manifest.json")).toBeGreaterThan(order.indexOf("assets/index-AAAAAAAA.js"));
+  expect(order.indexOf(manifest.pack?.uri ?? "")).toBeGreaterThan(order.indexOf("manifest.json"));
+  const bytes = new Map(log.map((one) => [one.uri, one.bytes]));
+  expect(bytes.get(manifest.pack?.uri ?? "")).toBe(manifest.pack?.bytes);
+  expect(await visit(manifest, files, everything, 20, 1)).toEqual(log);
+  const single = await visit(resized(manifest, 1, false), files, target, 30, 1);
+  const chunks = single.map(({ uri }) => uri).filter((uri) => uri.startsWith("chunks/"));
+  expect(chunks.length).toBeGreaterThan(4);
+  expect(new Set(chunks).size).toBe(chunks.length);
 });

@@ -1,22 +1,12 @@
 /** Streams decoded by a worker, level by level, from where it was left. */
 
 import { expect, test } from "vitest";
-import streams from "../../../tests/data/streams.json?raw";
 import { type Answer, Decoders, type Job, Streams } from "../../src/view/decoding";
+import { bytesOf, type Golden, golden } from "../golden";
 import { settled } from "../simulate";
 
-interface Case {
-  name: string;
-  content: string;
-  ends: number[];
-  sizes: number[];
-}
-
-const all = JSON.parse(streams) as Case[];
-const bytesOf = ({ content }: Case) => Uint8Array.from(atob(content), (letter) => letter.charCodeAt(0));
-
 /** The ranges of levels with Gaussians, and how many each has; empty ones go with the next, or the last. */
-function ranges(one: Case): { increments: Uint8Array[]; counts: number[] } {
+function ranges(one: Golden): { increments: Uint8Array[]; counts: number[] } {
   const counts = one.sizes.map((size, i) => size - (one.sizes[i - 1] ?? 0));
   const filled = counts.flatMap((count, i) => (count ? i : []));
   const ends = filled.map((level, i) => (i === filled.length - 1 ? one.ends.at(-1) : one.ends[level]));
@@ -57,7 +47,7 @@ function made() {
   return { decoders, worker, workers };
 }
 
-const many = all.filter(({ sizes }) => sizes.length > 1);
+const many = golden.filter(({ sizes }) => sizes.length > 1);
 
 test.each(many)("$name: each level goes on where the one before ended", async (one) => {
   const { decoders, worker } = made();
@@ -71,7 +61,7 @@ test.each(many)("$name: each level goes on where the one before ended", async (o
 
 test("an earlier level is decoded again from what was kept", async () => {
   const { decoders, worker } = made();
-  const { increments, counts } = ranges(all.find(({ name }) => name.startsWith("degree 3")) as Case);
+  const { increments, counts } = ranges(golden.find(({ name }) => name.startsWith("degree 3")) as Golden);
   const first = [];
   for (let i = 1; i <= counts.length; i++) first.push(await decoders.decode(1, increments.slice(0, i)));
   for (const level of [2, 3, 1, 2]) {
@@ -92,7 +82,7 @@ test("streams do not mix", async () => {
 
 test("a damaged level is an error, and the next one begins anew", async () => {
   const { decoders, worker } = made();
-  const { increments } = ranges(many[1] as Case);
+  const { increments } = ranges(many[1] as Golden);
   await decoders.decode(1, increments.slice(0, 1));
   const wrong = (increments[1] as Uint8Array).slice();
   wrong[wrong.length - 1] = (wrong.at(-1) ?? 0) ^ 1;
@@ -106,7 +96,7 @@ test("without workers the page decodes itself", async () => {
   const decoders = new Decoders(() => {
     throw new Error("blob: is not allowed");
   });
-  const { increments, counts } = ranges(many[0] as Case);
+  const { increments, counts } = ranges(many[0] as Golden);
   for (const [i, count] of counts.entries()) {
     expect((await decoders.decode(1, increments.slice(0, i + 1))).count).toBe(count);
   }
@@ -114,7 +104,7 @@ test("without workers the page decodes itself", async () => {
 
 test("a worker that fails is replaced by the page, for what it had decoded too", async () => {
   const { decoders, worker, workers } = made();
-  const { increments, counts } = ranges(many[1] as Case);
+  const { increments, counts } = ranges(many[1] as Golden);
   await decoders.decode(1, increments.slice(0, 1));
   worker().dead = true;
   expect((await decoders.decode(1, increments.slice(0, 2))).count).toBe(counts[1]);
@@ -126,7 +116,7 @@ test("a worker that fails is replaced by the page, for what it had decoded too",
 test("nothing comes after the end", async () => {
   const { decoders, worker } = made();
   let answered = false;
-  const { increments } = ranges(many[0] as Case);
+  const { increments } = ranges(many[0] as Golden);
   void decoders.decode(1, increments.slice(0, 1)).then(() => {
     answered = true;
   });

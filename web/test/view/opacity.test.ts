@@ -1,20 +1,12 @@
 /** Splats with two opacities, by the level that is shown. */
 
 import { describe, expect, test } from "vitest";
-import streams from "../../../tests/data/streams.json?raw";
 import { StreamDecoder } from "../../src/core/stream";
 import { blendOpacities } from "../../src/view/opacity";
 import { ENCODING, Packing } from "../../src/view/packing";
+import { bytesOf, golden } from "../golden";
 
-interface Case {
-  name: string;
-  content: string;
-  weights?: number[];
-  levels?: number[][]; // opacities of all up to a level where it is the newest one
-}
-
-const cases = (JSON.parse(streams) as Case[]).filter(({ weights }) => weights);
-const bytesOf = ({ content }: Case) => Uint8Array.from(atob(content), (letter) => letter.charCodeAt(0));
+const cases = golden.filter(({ weights }) => weights);
 const alphas = (words: Uint32Array) => [...words].flatMap((word, i) => (i % 4 ? [] : word >>> 24));
 
 test("there are golden streams with two", () => expect(cases.length).toBeGreaterThan(1));

@@ -2,18 +2,12 @@
 
 import { utils } from "@sparkjsdev/spark";
 import { describe, expect, test } from "vitest";
-import streams from "../../../tests/data/streams.json?raw";
 import { BASES } from "../../src/core/columns";
 import { StreamDecoder } from "../../src/core/stream";
 import { STREAM_ENCODING as ENCODING, HARMONICS, Packing, WORDS } from "../../src/view/packing";
 import { Floats, type Gaussians } from "../floats";
+import { bytesOf, golden } from "../golden";
 
-interface Case {
-  name: string;
-  content: string;
-}
-
-const bytesOf = ({ content }: Case) => Uint8Array.from(atob(content), (letter) => letter.charCodeAt(0));
 const ENCODERS = { sh1: utils.encodeSh1Rgb, sh2: utils.encodeSh2Rgb, sh3: utils.encodeSh3Rgb };
 
 /** What Spark's encoder makes of Gaussians: four words each. */
@@ -51,7 +45,7 @@ function fieldsOf(words: Uint32Array): number[] {
   });
 }
 
-describe.each(JSON.parse(streams) as Case[])("$name", (one) => {
+describe.each(golden)("$name", (one) => {
   const [floats, parts] = [new StreamDecoder(new Floats()), new StreamDecoder(new Packing())].map((decoder) =>
     decoder.push(bytesOf(one)),
   ) as [ReturnType<StreamDecoder<Gaussians>["push"]>, ReturnType<Packing["begin"]>[]];

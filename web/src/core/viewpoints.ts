@@ -7,7 +7,7 @@ import { anywhere, type Prediction, ViewModel, Views } from "./quality";
 import type { Entry } from "./residency";
 
 /** Without viewpoint models, quality is the same everywhere and pixel share depends on the size of the boxes. */
-export class Outlook {
+export class ViewpointModels {
   readonly complete: boolean; // whether it has the viewpoint models
   private readonly models = new Map<number, ViewModel>();
   private readonly wherever = new Map<number, Prediction>(); // without a viewpoint model, or out of sight

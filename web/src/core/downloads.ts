@@ -1,15 +1,8 @@
 /** Schedules the downloads of the wanted files, best first; knows what has arrived or failed. */
 
-import {
-  Bandwidth,
-  DamagedError,
-  DownloadError,
-  download,
-  type File,
-  intact,
-  type Link,
-  Shelf,
-} from "./download";
+import { Bandwidth } from "./bandwidth";
+import { LruCache } from "./cache";
+import { DamagedError, DownloadError, download, type File, intact, type Link } from "./download";
 import { type Load, Loads } from "./loads";
 import { lateIn, Pack } from "./pack";
 import { consecutive, downloadRanges, rangesOf } from "./ranges";
@@ -23,22 +16,22 @@ export interface Failure {
 }
 
 /** Tries after which a failure is shown to the user; it is still retried, but rarely. */
-export const PATIENCE = 5;
+export const TRIES_BEFORE_NOTICE = 5;
 const FIRST_WAIT = 500; // ms, doubled with each try
 const LONGEST_WAIT = 15_000;
-const AT_ONCE = 16; // concurrent downloads; browsers allow only 6 without HTTP/2
-const AHEAD = 0.25; // seconds of bandwidth to keep in flight: more than a round trip
-const UNKNOWN = 32_768; // bytes in flight while the bandwidth is unknown
-const REQUESTS = 3; // requests that a round trip's bytes are divided between: browsers allow 6
-const SMALL = 8192; // bytes of ranges that one request brings at least, if they are wanted
+const MAX_DOWNLOADS = 16; // concurrent downloads; browsers allow only 6 without HTTP/2
+const SECONDS_IN_FLIGHT = 0.25; // seconds of bandwidth to keep in flight: more than a round trip
+const BYTES_AT_UNKNOWN_RATE = 32_768; // bytes in flight while the bandwidth is unknown
+const REQUESTS_PER_TRIP = 3; // requests that a round trip's bytes are divided between: browsers allow 6
+const LEAST_REQUEST_BYTES = 8192; // bytes of ranges that one request brings at least, if they are wanted
 
-export interface SupplyOptions extends Omit<Link, "received" | "answered"> {
+export interface DownloadsOptions extends Omit<Link, "received" | "answered"> {
   readonly keepBytes: number; // cache of downloaded files
   readonly changed: () => void; // called when a file arrived, failed or may be retried
-  readonly atOnce?: number;
+  readonly maxDownloads?: number;
 }
 
-export class Supply {
+export class Downloads {
   readonly bandwidth: Bandwidth;
   received = 0; // bytes in all
   /** Why the pack is unusable, if it does not match the manifest. */
@@ -51,15 +44,15 @@ export class Supply {
   private ranges: ReadonlyMap<string, readonly File[]> = new Map(); // of files, by uri
   private planned: ReadonlySet<string> = new Set(); // files of the plan, here or not
   private sendsRanges: boolean | null = null; // whether the server does; null: it was not asked
-  private readonly come = new Map<string, Uint8Array>(); // arrived files, until they are taken
+  private readonly arrived = new Map<string, Uint8Array>(); // arrived files, until they are taken
   private readonly failures = new Map<string, Failure>();
-  private readonly shelf: Shelf;
+  private readonly cache: LruCache;
   private readonly link: Link;
   private closed = false;
 
-  constructor(private readonly options: SupplyOptions) {
+  constructor(private readonly options: DownloadsOptions) {
     this.bandwidth = new Bandwidth(options.clock);
-    this.shelf = new Shelf(options.keepBytes);
+    this.cache = new LruCache(options.keepBytes);
     const received = (bytes: number) => {
       this.received += bytes;
       this.bandwidth.count(bytes);
@@ -75,44 +68,35 @@ export class Supply {
   }
 
   /** Names all ranges of files, in their order. */
-  know(files: readonly File[]): void {
+  setRanges(files: readonly File[]): void {
     this.ranges = rangesOf(files);
   }
 
   /** Whether a pack is loading. */
-  get streams(): boolean {
+  get hasPack(): boolean {
     return this.pack !== null;
   }
 
   /** Starts loading a pack; files that it brings in time are not downloaded separately. */
-  open(file: File, files: readonly File[]): void {
+  openPack(file: File, files: readonly File[]): void {
     this.begin();
     this.pack = new Pack(file, files);
     void this.receive(this.pack);
   }
 
-  /** Bytes of cached files. */
-  get keptBytes(): number {
-    return this.shelf.bytes;
-  }
-
-  isComing(file: File): boolean {
-    return this.loads.has(file);
-  }
-
   isHere(file: File): boolean {
-    return this.come.has(file.sha256) || this.shelf.has(file.sha256);
+    return this.arrived.has(file.sha256) || this.cache.has(file.sha256);
   }
 
   /** Arrived files that were not taken, with their rank in the order of arrival. */
-  get waiting(): Map<string, number> {
-    return new Map([...this.come.keys()].map((key, i) => [key, i]));
+  get arrivals(): Map<string, number> {
+    return new Map([...this.arrived.keys()].map((key, i) => [key, i]));
   }
 
   /** The content, if it has arrived; it stays in the cache while there is room. */
   take(file: File): Uint8Array | undefined {
-    const content = this.come.get(file.sha256) ?? this.shelf.get(file.sha256);
-    this.come.delete(file.sha256);
+    const content = this.arrived.get(file.sha256) ?? this.cache.get(file.sha256);
+    this.arrived.delete(file.sha256);
     return content;
   }
 
@@ -121,15 +105,15 @@ export class Supply {
   }
 
   /** Whether a file must not be retried yet. */
-  rests(file: File): boolean {
+  isBackingOff(file: File): boolean {
     const failure = this.failures.get(file.sha256);
     return failure !== undefined && (failure.lasting || failure.until > this.link.clock.now());
   }
 
   /** Reports a file that arrived intact but is unusable. */
-  spoil(file: File, message: string): void {
+  markCorrupt(file: File, message: string): void {
     if (this.unverified.delete(file.sha256)) {
-      this.shelf.drop(file.sha256);
+      this.cache.drop(file.sha256);
       this.fail(file, new DamagedError(message, false));
       return;
     }
@@ -142,11 +126,11 @@ export class Supply {
    * @param undecided - more files may be wanted soon, and values are still estimates
    */
   fill(wanted: readonly File[], undecided = false): void {
-    const single = this.pack ? this.besides(this.pack, wanted, undecided) : wanted;
+    const single = this.pack ? this.outsidePack(this.pack, wanted, undecided) : wanted;
     for (const file of single) {
       if (!this.hasRoom()) return;
-      if (this.loads.has(file) || this.rests(file) || this.mayComeWhole(file)) continue;
-      void this.run(this.together(file, single));
+      if (this.loads.has(file) || this.isBackingOff(file) || this.mayComeWhole(file)) continue;
+      void this.run(this.requestFor(file, single));
     }
   }
 
@@ -157,11 +141,17 @@ export class Supply {
   }
 
   /** What is asked for together with a file: of ranges those that touch, of a server without ranges all. */
-  private together(file: File, wanted: readonly File[]): readonly File[] {
+  private requestFor(file: File, wanted: readonly File[]): readonly File[] {
     const all = this.ranges.get(file.uri);
     if (!all || this.sendsRanges === false) return all ?? [file];
-    const missing = wanted.filter((one) => !this.loads.has(one) && !this.rests(one));
-    return consecutive(file, all, missing, this.room, Math.max(this.trip / REQUESTS, SMALL) || SMALL);
+    const missing = wanted.filter((one) => !this.loads.has(one) && !this.isBackingOff(one));
+    return consecutive(
+      file,
+      all,
+      missing,
+      this.room,
+      Math.max(this.trip / REQUESTS_PER_TRIP, LEAST_REQUEST_BYTES) || LEAST_REQUEST_BYTES,
+    );
   }
 
   /** Bytes per round trip of the link; NaN: unknown. */
@@ -170,7 +160,7 @@ export class Supply {
   }
 
   /** The wanted files that the pack does not bring, or brings late. */
-  private besides(pack: Pack, wanted: readonly File[], undecided: boolean): readonly File[] {
+  private outsidePack(pack: Pack, wanted: readonly File[], undecided: boolean): readonly File[] {
     if (this.ranges.size && !pack.isHere) {
       const isPlanned = ({ sha256 }: File) => this.planned.has(sha256);
       const missing = new Set(wanted.filter((file) => !this.loads.has(file)));
@@ -199,12 +189,12 @@ export class Supply {
   keepOnly(wanted: ReadonlySet<string>): void {
     this.planned = wanted;
     this.loads.keepOnly(wanted);
-    this.rest();
-    for (const key of this.come.keys()) if (!wanted.has(key)) this.come.delete(key);
+    this.pauseBandwidth();
+    for (const key of this.arrived.keys()) if (!wanted.has(key)) this.arrived.delete(key);
   }
 
   /** Forgets failures, so that all files may be retried immediately. */
-  forgive(): void {
+  clearFailures(): void {
     this.failures.clear();
   }
 
@@ -212,22 +202,26 @@ export class Supply {
     this.closed = true;
     this.pack?.stop();
     for (const load of this.loads.all) this.loads.drop(load);
-    this.rest();
-    this.come.clear();
-    this.shelf.clear();
+    this.pauseBandwidth();
+    this.arrived.clear();
+    this.cache.clear();
   }
 
   /** Number of concurrent downloads: many for small files, to fill the link; more would only weaken the order. */
   private hasRoom(): boolean {
     const { size } = this.loads.all;
-    if (this.closed || size >= (this.options.atOnce ?? AT_ONCE)) return false;
+    if (this.closed || size >= (this.options.maxDownloads ?? MAX_DOWNLOADS)) return false;
     return size < 2 || this.room > 0;
   }
 
   /** Bytes that may be asked for. */
   private get room(): number {
     const { rate } = this.bandwidth;
-    return (Number.isNaN(rate) ? UNKNOWN : Math.max(AHEAD * rate, UNKNOWN / 2)) - this.loads.left;
+    return (
+      (Number.isNaN(rate)
+        ? BYTES_AT_UNKNOWN_RATE
+        : Math.max(SECONDS_IN_FLIGHT * rate, BYTES_AT_UNKNOWN_RATE / 2)) - this.loads.left
+    );
   }
 
   private begin(): void {
@@ -235,7 +229,7 @@ export class Supply {
   }
 
   /** Stops the clock of the bandwidth where nothing is on its way. */
-  private rest(): void {
+  private pauseBandwidth(): void {
     if (!this.running) this.bandwidth.running(false);
   }
 
@@ -246,7 +240,7 @@ export class Supply {
       if (error instanceof DamagedError) this.note = `${error.message}; files are loaded one by one.`;
     }
     this.pack = null;
-    this.rest();
+    this.pauseBandwidth();
     if (!this.closed) this.options.changed();
   }
 
@@ -258,7 +252,7 @@ export class Supply {
       if (this.closed) return;
       if (!this.link.digest) this.unverified.add(file.sha256);
       this.loads.forget(file);
-      this.arrive(file, content);
+      this.store(file, content);
     } catch (error) {
       this.damaged += 1;
       if (this.damaged > 1) this.pack?.stop(); // the rest is likely damaged too
@@ -267,10 +261,10 @@ export class Supply {
     this.options.changed();
   }
 
-  private arrive(file: File, content: Uint8Array): void {
+  private store(file: File, content: Uint8Array): void {
     this.failures.delete(file.sha256);
-    this.come.set(file.sha256, content);
-    this.shelf.put(file.sha256, content);
+    this.arrived.set(file.sha256, content);
+    this.cache.put(file.sha256, content);
   }
 
   private async run(files: readonly File[]): Promise<void> {
@@ -287,7 +281,7 @@ export class Supply {
     }
     if (load.dropped) return;
     this.loads.end(load);
-    this.rest();
+    this.pauseBandwidth();
     this.options.changed();
   }
 
@@ -297,7 +291,7 @@ export class Supply {
     });
     if (load.dropped) return;
     this.unverified.delete(file.sha256);
-    this.arrive(file, content);
+    this.store(file, content);
   }
 
   private async runRanges(load: Load, files: readonly File[], again: boolean): Promise<void> {
@@ -320,10 +314,10 @@ export class Supply {
       take: (file, content) => {
         came(file, () => {
           this.unverified.delete(file.sha256);
-          this.arrive(file, content);
+          this.store(file, content);
         });
       },
-      spoiled: (file, error) => came(file, () => this.fail(file, error)),
+      corrupt: (file, error) => came(file, () => this.fail(file, error)),
       progress: (got) => {
         load.got = got;
       },

@@ -1,0 +1,208 @@
+/** The documents of a bundle. Generated from src/sagesplat/viewer/manifest.schema.json by `npm run build`. */
+
+export type Vec3 = [number, number, number];
+export type Whole = number;
+export type Sha256 = string;
+/** Smallest x y z, largest x y z. */
+export type Box = [number, number, number, number, number, number];
+export type Path = string;
+/** A range of a coded stream, which is one file for all levels of a label; or SPZ version 3; or a binary PLY in INRIA's layout, its y and z opposite to the bundle's. */
+export type Format = "stream" | "spz" | "ply";
+/** Whether a bound holds at its confidence, or calibration views were too few for that. */
+export type Status = "calibrated" | "uncalibrated";
+/** What quality is measured against: the full model from the same viewpoint (fidelity), or photos (ssim). Both are SSIM. */
+export type Quality = "fidelity" | "ssim";
+/** x y z w, camera to world; the camera looks along its -z, y is up. */
+export type Quaternion = [number, number, number, number];
+/** Whole steps of a unit. */
+export type Steps = number[];
+export type Unit = number;
+
+/** manifest.json of a sagesplat bundle: a labelled splat scene in nested levels of detail. Lengths in the capture's units, axes right, up, back. `$defs.promises` is the format of promises-*.json. */
+export interface Manifest {
+  format: "sagesplat-bundle";
+  version: 1;
+  generator: string;
+  name: string;
+  /** Training still runs: the manifest will change. */
+  live: boolean;
+  frame: {
+    /** COLMAP's world with y and z negated, as in SPZ. */
+    axes: "rub";
+    up: Vec3;
+    /** Height of the ground along up. */
+    floor: number;
+    /** 1.1 times the largest distance of a training camera from their mean. */
+    extent: number;
+    metersPerUnit: number;
+    scale: "given" | "guessed";
+  };
+  shDegree: number;
+  antialiased: boolean;
+  background: [number, number, number];
+  /** Of the full scene: every label at its last level. */
+  totals: {
+    count: Whole;
+    bytes: Whole;
+    gpuBytes: Whole;
+  };
+  ladder?: Sha256;
+  labels: Label[];
+  /** Viewpoint models by quality: against the full model (fidelity), against photos (ssim). */
+  promises: {
+    fidelity?: Reference;
+    ssim?: Reference;
+  };
+  /** What a viewer begins with. */
+  target: {
+    quality: Quality;
+    value: number;
+  };
+  pack: null | Pack;
+  cameras: Camera[];
+  start: {
+    position: Vec3;
+    quaternion: Quaternion;
+    target: Vec3;
+  };
+  licenses: {
+    what: string;
+    license: string;
+    /** Below the bundle. */
+    url?: string;
+  }[];
+}
+export interface Label {
+  /** -1: unlabelled. */
+  id: number;
+  /** Name in the taxonomy; CATEGORY@BLOCK in a scene in blocks. */
+  name: string;
+  /** In a scene in blocks: the name without the block; title and colour are the category's. */
+  category?: string;
+  /** In a scene in blocks: the block of the ground plane. */
+  block?: number;
+  /** Of an instance: the name of its category, such as chair for chair 1. */
+  parent?: string;
+  /** Display name. */
+  title: string;
+  color: string;
+  weight: number;
+  /** Always shipped in full, independent of the plan. */
+  always: boolean;
+  /** Not shown to begin with. */
+  hidden?: true;
+  /** Bounding boxes (smallest x y z, largest x y z) of parts with about equal numbers of points. */
+  boxes: Box[];
+  levels: Level[];
+  quality: {
+    fidelity?: LabelQuality;
+    ssim?: LabelQuality;
+  };
+}
+/** The increment that a level adds to the level below, or replaces it by. `sha256` is of its bytes: of the file, or of the range. */
+export interface Level {
+  uri: Path;
+  format: Format;
+  /** Of a range: its first byte in the file. The ranges of a label touch, and fill the file. */
+  offset?: number;
+  /** Weight of the second opacities of all Gaussians of the label where this is its newest level. Without it each has one opacity. */
+  weight?: number;
+  /** The level shows none of the increments below it. Without this it adds to them. */
+  refine?: "REPLACE";
+  bytes: number;
+  gpuBytes: number;
+  count: number;
+  sha256: Sha256;
+}
+/** Quality by level whatever the viewpoint, until the viewpoint models are there. */
+export interface LabelQuality {
+  /** Levels of the label that have a prediction, ascending. */
+  levels: number[];
+  status: Status;
+  confidence: number;
+  /** Expected quality, mean over the model's viewpoints. */
+  mean: number[];
+  /** Below the lower confidence bound of as many of these viewpoints as the confidence says; null: no promise. */
+  bound: null | number[];
+}
+/** A file of the bundle. */
+export interface Reference {
+  uri: Path;
+  bytes: number;
+  sha256: Sha256;
+}
+/** All increments concatenated in one file: one stream is faster than many files. */
+export interface Pack {
+  uri: Path;
+  /** Sum over the increments in it. */
+  bytes: number;
+  sha256: Sha256;
+  /** Index into labels, level (1-based). */
+  order: [Whole, Whole][];
+}
+export interface Camera {
+  name: string;
+  split: "train" | "test" | "calibration";
+  position: Vec3;
+  quaternion: Quaternion;
+  /** Radians. */
+  fovY: number;
+  width: number;
+  height: number;
+  /** fx fy cx cy, pixels. */
+  intrinsics: [number, number, number, number];
+}
+/** promises-*.json: the viewpoint models of all labels for one quality. Lists over views hold differences to the view before. */
+export interface Promises {
+  quality: Quality;
+  extent: number;
+  /** By axis (x y z over the extent, direction) and view, in 1/10000. */
+  views: [Steps, Steps, Steps, Steps, Steps, Steps];
+  labels: LabelPromises[];
+}
+/** The viewpoint model of a label. */
+export interface LabelPromises {
+  id: number;
+  /** 1-based levels with a prediction. */
+  levels: number[];
+  status: Status;
+  confidence: number;
+  /** Below it there is no bound. */
+  leastSupport: number;
+  /** Of the mean where the support is 0; none at a known viewpoint. */
+  discount: number;
+  targets: Steps;
+  thresholds: Steps;
+  /** For an unknown distance. */
+  medianLogDistance: number;
+  /** Length scales of position, direction, log distance. */
+  lengths: [number, number, number];
+  /** By level; empty: 0. */
+  curves: Curve[];
+  /** By level. */
+  offsets: number[];
+  /** Rows of the shared views: differences. */
+  views: Whole[];
+  /** By own view: differences. */
+  logDistances: {
+    unit: Unit;
+    steps: Steps;
+  };
+  /** By level and own view: differences along both. */
+  values: {
+    units: Unit[];
+    steps: Steps[];
+  };
+  shares: Steps;
+  corrections: Steps;
+}
+/** K1 exp(-g1 |d - mu1|^a1) for d < beta, K2 exp(-g2 |d - mu2|^a2) from beta on (Eq. 3). */
+export interface Curve {
+  level: number;
+  /** K1 g1 mu1 a1 K2 g2 mu2 a2 beta. */
+  params: [number, number, number, number, number, number, number, number, number];
+  /** Of the fitted distances. */
+  range: [number, number];
+  /** Used for an unknown distance. */
+  median: number;
+}

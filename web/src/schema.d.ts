@@ -1,0 +1,4 @@
+declare module "*.schema.json" {
+  const schema: import("./core/schema").Schema;
+  export default schema;
+}
