@@ -89,7 +89,7 @@ def open_run(folder: Path | str, ladder: LadderKind = "nested") -> "FinishedRun"
 
     Args:
         folder: The run folder.
-        ladder: Which levels to look at: "nested" (prefixes of one model), or those of the paper.
+        ladder: Which levels to look at: "nested" (prefixes of one model) or "snapshots" (the paper's).
 
     Returns:
         The run's scene, levels, plans and SSIM models.
