@@ -23,7 +23,8 @@ from sagesplat.scene.scene import Camera, Scene
 from sagesplat.segment.display_names import titles
 from sagesplat.stages import label_edits, pipeline
 from sagesplat.stages.bundle import BundleMade, bundle
-from sagesplat.stages.methods import Method, NestedLevels, method_of
+from sagesplat.stages.method import Method
+from sagesplat.stages.methods import NestedLevels, method_of
 from sagesplat.stages.plan import check_targets
 from sagesplat.stages.results import plans_of
 
