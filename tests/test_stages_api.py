@@ -15,7 +15,7 @@ from sagesplat import (
     read_ply,
     run_scene,
 )
-from sagesplat.adapt.plan import Plan, read_plans
+from sagesplat.adapt.plan import read_plans
 from sagesplat.core.errors import RunError
 from sagesplat.formats.splats import read_splat
 from sagesplat.stages.export import export_increments, export_scene
@@ -62,6 +62,8 @@ def test_a_plan_for_the_camera_of_a_view_is_the_plan_of_that_view(runs, ladder):
 def test_a_camera_is_planned_for_fidelity_by_default(runs):
     run = runs["nested"]
     camera = run.scene.views[0].camera
+    assert set(run.promises) <= set(run.names)
+    assert run.costs.count.shape[1] == 5
     plan = run.plan_camera(camera)
     assert (plan.quality, plan.target, plan.view) == ("fidelity", 0.95, None)
     assert {choice.status for choice in plan.choices} <= {"ok", "no promise", "no model"}
@@ -112,14 +114,7 @@ def test_a_composition_is_what_the_run_wrote(runs, ladder):
     assert torch.equal(g.means, written.means)
     assert torch.equal(run.compose(plan.levels).label_ids, written.label_ids)
     assert set(run.names) >= set(plan.levels)
-
-
-def test_a_run_is_opened_again(runs):
-    run = open_run(runs["nested"].job.run.path)
     assert [plan.target for plan in run.plans] == [0.3, 0.4, 0.5]
-    assert isinstance(run.plans[0], Plan)
-    assert set(run.promises) <= set(run.names)
-    assert run.costs.count.shape[1] == 5
 
 
 def test_what_is_no_run_folder_is_said(tmp_path: Path):

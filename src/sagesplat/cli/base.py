@@ -80,7 +80,7 @@ class Machine(Parallel):
 _CAPTURE = "capture: a COLMAP workspace, transforms.json, photos or a video"
 Scene = Positional[Annotated[Path, arg(metavar="SCENE", help=_CAPTURE)]]
 Run = Positional[Annotated[Path, arg(metavar="RUN", help="run folder")]]
-Ladder = Annotated[LadderKind, arg(help="Levels: nested (prefixes of one model) or those of the paper.")]
+Ladder = Annotated[LadderKind, arg(help="Levels: nested (prefixes of one model) or the training snapshots.")]
 Seed = Annotated[int, arg(help="Seed of the random numbers.")]
 Flat = arg(name="")
 

@@ -268,7 +268,7 @@ class PlanConfig:
     viewpoint (default: 0.95, where --target-ssim is not given; 1: the full model)."""
     target_ssim: float | None = None
     """SSIM against photos that the planned scene must reach; with --target-fidelity a plan beside that one
-    (default: none, of the levels of the paper 0.8)."""
+    (default: none, of snapshots 0.8)."""
     share: float = 0.95
     """Fraction of the viewpoints in which the level of a category must reach the target."""
     other_targets: tuple[float, ...] | None = None
@@ -401,6 +401,6 @@ class RunConfig:
     fuse: bool = False
     """Fuse the label images of all views through the trained Gaussians."""
     ladder: LadderKind = "nested"
-    """Levels: nested (prefixes of one model), or those that training recorded, as in the paper."""
+    """Levels: nested (prefixes of one model), or the snapshots of training, as in the paper."""
     seed: int = 0
     """Seed of the random numbers."""

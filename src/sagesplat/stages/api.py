@@ -23,7 +23,8 @@ from sagesplat.scene.scene import Camera, Scene
 from sagesplat.segment.display_names import titles
 from sagesplat.stages import label_edits, pipeline
 from sagesplat.stages.bundle import BundleMade, bundle
-from sagesplat.stages.methods import Method, NestedLevels, method_of
+from sagesplat.stages.method import Method
+from sagesplat.stages.methods import NestedLevels, method_of
 from sagesplat.stages.plan import check_targets
 from sagesplat.stages.results import plans_of
 
@@ -89,7 +90,7 @@ def open_run(folder: Path | str, ladder: LadderKind = "nested") -> "FinishedRun"
 
     Args:
         folder: The run folder.
-        ladder: Which levels to look at: "nested" (prefixes of one model), or those of the paper.
+        ladder: Which levels to look at: "nested" (prefixes of one model) or "snapshots" (the paper's).
 
     Returns:
         The run's scene, levels, plans and SSIM models.

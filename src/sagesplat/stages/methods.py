@@ -1,19 +1,15 @@
-"""How a scene is adapted: nested levels here, the paper's in `stages.snapshots`, behind one protocol.
+"""Ours, and which method a run has: stages and studies ask `method_of`, and never which of the two it is."""
 
-Stages and studies ask `method_of` what they need and never which of the two it is.
-"""
-
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import numpy as np
 
 from sagesplat.adapt.bound_plans import Costs, Quality, plan_for_view, plan_within, pooled, quality_at
 from sagesplat.adapt.coverage import Decisions, score
-from sagesplat.adapt.eq3 import SsimModel
 from sagesplat.adapt.fidelity import shown_enough
 from sagesplat.adapt.observe import LabelImages, Observations, RenderedLabels
 from sagesplat.adapt.plan import Plan
@@ -26,6 +22,7 @@ from sagesplat.run.job import Job
 from sagesplat.scene.scene import Camera, View
 from sagesplat.segment.masks import UNLABELLED
 from sagesplat.stages.fidelity import compositions_at, fit_drawn
+from sagesplat.stages.method import Curves, Method
 from sagesplat.stages.results import (
     fidelity_of,
     has_photos,
@@ -35,74 +32,10 @@ from sagesplat.stages.results import (
     viewpoints_of,
 )
 from sagesplat.stages.shared import distances_from, label_named, observed, rendered_labels
+from sagesplat.stages.snapshots import Snapshots
 from sagesplat.stages.viewpoints import fit_viewpoints
 
 _MENDINGS = 4  # times that a plan of a scene is measured in its composition and mended
-Curves = Mapping[tuple[int, int], SsimModel]  # Eq. 3 by (label id, level)
-
-
-class Method(Protocol):
-    """Levels of a run, what predicts their SSIM, and what they cost. The levels themselves: `Job.ladder`."""
-
-    default_target: ClassVar[dict[str, float]]  # of `PlanConfig`, where none is given
-    has_fidelity: ClassVar[bool]  # whether levels are compared with the full model too
-    has_instances: ClassVar[bool]  # whether instances can be categories of their own
-    streams: ClassVar[bool]  # whether a viewer can load the levels
-    level_files: Sequence[Path]  # what the levels are read from
-    sample_files: Sequence[Path] = ()  # what `sample` leaves
-    model_files: Sequence[Path]  # what `fit` leaves
-    files: Sequence[Path]  # what a plan, and all that is made from it, depends on
-    fit_settings: tuple[str, ...]  # fields of FitConfig that the models depend on
-
-    def __init__(self, job: Job) -> None: ...
-
-    def fit(self, table: Observations, config: FitConfig, curves: Curves) -> list[str]:
-        """Fit what there is beside Eq. 3; `table`: of views that show enough of a category."""
-        return []
-
-    def check(self, config: PlanConfig) -> None:
-        """RunError for a plan that cannot be made of these levels."""
-
-    def predicted(self, quality: QualityKind, label_id: int, level: int, row: int) -> float:
-        """Quality that plans count on in a view (row of Scene.views); NaN where nothing is promised."""
-        ...
-
-    def plan_view(self, row: int, target: float, quality: QualityKind = "ssim") -> Plan:
-        """The cheapest levels predicted to reach `target` in a view, seen or not."""
-        ...
-
-    def plan_camera(self, camera: Camera, target: float, quality: QualityKind) -> Plan:
-        """The same from any camera."""
-        ...
-
-    def plan_scene(self, target: float, share: float, quality: QualityKind = "ssim") -> Plan:
-        """The cheapest levels that reach `target` in a `share` of the viewpoints."""
-        ...
-
-    def plan_scenes(self, targets: Sequence[tuple[QualityKind, float]], share: float) -> list[Plan]:
-        """Plans of the scene for several targets, checked in their compositions where that is possible."""
-        return [self.plan_scene(target, share, quality) for quality, target in targets]
-
-    def plan_budget(self, config: PlanConfig) -> Plan:
-        """The levels of most expected quality within the budget."""
-        ...
-
-    def amount(self, plan: Plan) -> str:
-        """What a plan takes of all there is, for people."""
-        ...
-
-    @property
-    def bytes_to_send(self) -> dict[tuple[int, int], int] | None:
-        """Bytes of each (label id, level); None where the levels are not encoded."""
-        return None
-
-    def unseen_labels(self) -> LabelImages | None:
-        """The label images of test views; None: as the Gaussians paint them, as the paper has no others."""
-        return None
-
-    def coverage(self, targets: Sequence[float]) -> Decisions | None:
-        """How decisions by a lower confidence bound fare on test views; None without such a bound."""
-        return None
 
 
 class NestedLevels(Method):
@@ -300,8 +233,6 @@ class NestedLevels(Method):
 
 def method_for(ladder: LadderKind) -> type[Method]:
     """The method of a kind of levels."""
-    from sagesplat.stages.snapshots import Snapshots  # which needs the protocol
-
     return NestedLevels if ladder == "nested" else Snapshots
 
 

@@ -11,7 +11,7 @@ from sagesplat.core.config import PlanConfig
 from sagesplat.core.errors import RunError
 from sagesplat.run.job import Job
 from sagesplat.scene.scene import Camera
-from sagesplat.stages.methods import Curves, Method
+from sagesplat.stages.method import Curves, Method
 from sagesplat.stages.results import models_of
 from sagesplat.stages.shared import distances_from, observed
 
