@@ -89,6 +89,8 @@ def test_nothing_to_draw(packed, backend, monkeypatch):  # noqa: F811
             assert (render.radii == 0).all()
             assert (render.means2d == 0).all()
             assert all((grad == 0).all() for grad in grads.values())
+        oracle = rasterize(nothing, pinhole(20, 10), background=BACKGROUND, backend="reference")
+        assert (oracle.rgb == BACKGROUND).all()
 
 
 def test_what_is_not_drawn_leaves_no_garbage(standin):
@@ -298,6 +300,7 @@ def test_every_gap_is_one_line_with_its_cure(able, monkeypatch):
 
 
 def test_backends_and_devices_that_do_not_go_together():
+    assert resolve_backend("reference") == "reference"
     with pytest.raises(BackendUnavailable, match=r"^backend 'gpu' is not known; use cpu, cuda or"):
         resolve_backend("gpu")  # type: ignore[arg-type]
     with pytest.raises(BackendUnavailable, match=r"^device 'tpu' is not known; use --device cpu or cuda$"):
