@@ -23,10 +23,18 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))
 README = ROOT / "README.md"
-FOREIGN = {  # flags of other tools
-    *("--only-binary", "--constraint", "--dest", "--require-hashes", "--extra", "--upgrade"),  # pip, uv
-    *("--fix", "--address", "--generate", "--head", "--scale", "--decimate"),  # ruff, Ray, splat-transform
-    *("--densify-until", "--no-masks"),  # OpenSplat
+FOREIGN = {  # flags of other tools: pip and uv, ruff, Ray, splat-transform, OpenSplat; a placeholder
+    *(
+        "--only-binary",
+        "--constraint",
+        "--dest",
+        "--require-hashes",
+        "--extra",
+        "--upgrade",
+        "--force-reinstall",
+    ),
+    *("--fix", "--address", "--generate", "--head", "--scale", "--decimate"),
+    *("--densify-until", "--no-masks", "--flag", "--no-flag"),
 }
 FOREIGN_FILES = {  # a placeholder; gsplat's, instant-ngp's
     *("stages/NAME.py", "simple_trainer.py", "docs/nerf_dataset_tips.md")
@@ -66,20 +74,13 @@ def flags() -> set[str]:
     return found
 
 
-@cache
-def flags_of_module(name: str) -> set[str]:
-    """Those of `python -m NAME`: arguments of its functions and fields of its types."""
-    path = ROOT / name.replace(".", "/")
-    source = path / "__main__.py" if path.is_dir() else path.with_suffix(".py")
-    assert source.is_file(), f"no python -m {name}"
-    return {f"--{each.replace('_', '-')}" for each in re.findall(r"\b(\w+): ", source.read_text())}
-
-
 def words(path: Path) -> list[str]:
     """What stands between backticks, and the lines of code blocks."""
     text = re.sub(r"\\\n\s*", "", path.read_text())
-    fenced = "\n".join(re.findall(r"^```\w*\n([^`]*)^```$", text, re.MULTILINE))
-    blocks = [*re.findall(r"^ {4,}\S.*$", text, re.MULTILINE), *fenced.splitlines()]
+    fence = re.compile(r"^```[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+    blocks = "\n".join(fence.findall(text)).splitlines()
+    text = fence.sub("", text)
+    blocks += re.findall(r"^ {4,}\S.*$", text, re.MULTILINE)
     return [" ".join(word.split()) for word in re.findall(r"`([^`]+)`", text)] + blocks
 
 
@@ -119,14 +120,14 @@ def test_what_is_named_exists(path):
         for file in re.findall(r"(?<![\w.*])[\w./-]+\.(?:py|ts|mjs)\b", word):
             known = any(each.endswith(f"/{file.lstrip('./')}") for each in tracked())
             gone += [] if known or file in FOREIGN_FILES else [file]
-        names = re.findall(r"\bsagesplat((?:\.\w+)+)", word)
+        names = re.findall(r"(?<!/)\bsagesplat((?:\.\w+)+)", word)
         gone += [name for name in names if resolve(f"sagesplat{name}") is None]
-        module = re.search(r"python -m ((?:benchmarks|tests)\.[a-z]\w+)", word)
-        known_flags = flags() | FOREIGN | (flags_of_module(module[1]) if module else set())
+        for module in re.findall(r"python -m ((?:benchmarks|tests|tools)\.[a-z]\w+)", word):
+            file = f"/{module.replace('.', '/')}"
+            gone += [] if {f"{file}.py", f"{file}/__main__.py"} & set(tracked()) else [module]
         for flag in re.findall(r"(?<![\w-])--[a-z][\w.-]*\w", word):
             group = any(each.startswith(f"{flag}.") for each in flags())  # `--train`: all of its flags
-            earlier = re.match(r"python -m benchmarks ", word)  # of the commit that is named
-            gone += [] if group or flag in known_flags or earlier else [flag]
+            gone += [] if group or flag in flags() | FOREIGN else [flag]
         command = re.match(r"\s*(?:\.venv/bin/)?sagesplat ([a-z][\w-]*)", word)
         gone += [command[0]] if command and command[1] not in cli.commands() else []
     assert gone == []
