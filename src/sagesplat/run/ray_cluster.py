@@ -79,11 +79,12 @@ def _join(address: str, warn: "_Warnings") -> bool:
     if address == "local":
         return False
     named = address not in ("", "auto")
-    if named:
-        _check_answers(address)
     waits = threading.Timer(_GREETED, warn, [_WAITS])
     waits.daemon = True
-    waits.start()
+    if named:
+        _check_answers(address)
+    else:
+        waits.start()
     try:
         with signals.answered_at_once():  # Ray waits for minutes, and starts nothing here
             _init(address=address if named else "auto")
