@@ -27,6 +27,7 @@ from sagesplat.run.ray_task import ANSWER, checks_tokens
 
 _STORE = 256 * 2**20  # bytes of shared memory of a cluster of our own: results are small
 _TOKENS = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
+_LOOPBACK = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"  # 0: all of a cluster listens on 127.0.0.1 only
 _GREETED = 10.0  # seconds that a head may take to greet
 _SETTINGS = b"\0\0\0\4\0\0\0\0\0"  # HTTP/2's first frame, by client and server alike (RFC 9113, 3.4)
 _GREETING = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + _SETTINGS
@@ -78,11 +79,12 @@ def _join(address: str, warn: "_Warnings") -> bool:
     if address == "local":
         return False
     named = address not in ("", "auto")
-    if named:
-        _check_answers(address)
     waits = threading.Timer(_GREETED, warn, [_WAITS])
     waits.daemon = True
-    waits.start()
+    if named:
+        _check_answers(address)
+    else:
+        waits.start()
     try:
         with signals.answered_at_once():  # Ray waits for minutes, and starts nothing here
             _init(address=address if named else "auto")
@@ -122,16 +124,16 @@ def _own_cluster() -> Iterator[None]:
     """A cluster of this machine that only this process and those that it starts can use."""
     folder = Path(tempfile.mkdtemp(prefix="sagesplat-ray-"))  # for this user only; Ray opens its own to all
     token = folder / "token"
-    before = {name: os.environ.get(name) for name in _TOKENS}
+    before = {name: os.environ.get(name) for name in (*_TOKENS, _LOOPBACK)}
     try:
         token.touch(0o600)
         token.write_text(secrets.token_hex(32))
         os.environ.pop("RAY_AUTH_TOKEN", None)
-        os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(token)}
-        _reload_tokens()
+        os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(token), _LOOPBACK: "0"}
+        _reload_variables()
         _init(
             address="local", include_dashboard=False, object_store_memory=_STORE,
-            _node_ip_address="127.0.0.1", _temp_dir=str(folder / "ray"),
+            _temp_dir=str(folder / "ray"),
         )  # fmt: skip
         yield
     finally:
@@ -141,17 +143,19 @@ def _own_cluster() -> Iterator[None]:
             os.environ.pop(name, None)
             if value is not None:
                 os.environ[name] = value
-        _reload_tokens()
+        _reload_variables()
 
 
-def _reload_tokens() -> None:
-    """Let Ray read its variables again.
+def _reload_variables() -> None:
+    """Let Ray read its variables on tokens and the loopback again.
 
-    It has read them when it was imported, and nothing public lets it do so again: this is why the version of
-    Ray has an upper bound in pyproject.toml.
+    It has read them when it was imported, before anybody knew whether a cluster runs here, and nothing public
+    lets it do so again: this is why the version of Ray has an upper bound in pyproject.toml.
     """
+    from ray._private import ray_constants
     from ray._raylet import AuthenticationTokenLoader, Config  # pyright: ignore
 
+    ray_constants.ENABLE_RAY_CLUSTER = ray_constants.env_bool(_LOOPBACK, not ray_constants.IS_WINDOWS_OR_OSX)
     Config.initialize("")
     AuthenticationTokenLoader.instance().reset_cache()
 
