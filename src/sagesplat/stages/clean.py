@@ -9,12 +9,12 @@ from sagesplat.core.events import Progress
 from sagesplat.core.limits import Count, Number
 from sagesplat.formats.levels import read_level, select_level
 from sagesplat.io.files import write_json
-from sagesplat.io.typed import read_json_as
+from sagesplat.io.typed import check_limits, read_json_as
 from sagesplat.raster import device_of
 from sagesplat.run.job import Job
 from sagesplat.run.stage import run_stage
 from sagesplat.stages.shared import inlier_inputs
-from sagesplat.train.clean import Cleaned, Criterion, check, clean, find_floaters
+from sagesplat.train.clean import Cleaned, Criterion, clean, find_floaters
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class CleanFigures:
 def clean_levels(job: Job, config: CleanConfig) -> None:
     """Write the last level without its floaters (`RunDir.cleaned`); the level itself stays as recorded."""
     run = job.run
-    check(config)
+    check_limits(config, "clean.")
 
     def make() -> list[str]:
         for earlier in (run.cleaned, run.floaters_picture):
