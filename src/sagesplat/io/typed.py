@@ -17,7 +17,7 @@ from typing import Any, TypeVar, get_args, get_type_hints
 import msgspec
 
 from sagesplat.core.errors import DataError, RunError, SageError, short
-from sagesplat.core.limits import Number, NumberOrNaN
+from sagesplat.core.limits import LARGEST, Number, NumberOrNaN
 from sagesplat.io.files import loads_json, read_json
 
 Kind = TypeVar("Kind")
@@ -113,8 +113,8 @@ def _range(kind: Any) -> str:
     for part in get_args(kind):
         if isinstance(part, msgspec.Meta) and (low := part.ge if part.gt is None else part.gt) is not None:
             high = part.le if part.lt is None else part.lt
-            begin = f"a number {'from' if part.gt is None else 'above'} {low:,}"
-            if high is None or high >= 2**31 - 1:
+            begin = f"a number {'from' if part.gt is None else 'above'} {low:g}"
+            if high is None or high >= LARGEST:
                 return f"{begin} on"
             return f"{begin} {'to' if part.lt is None else 'to below'} {high:,}"
         if words := _range(part):

@@ -1,7 +1,6 @@
 """Makes bundles for the web viewer, from a finished run or from the newest level of a running training."""
 
 import io
-import json
 import shutil
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -15,6 +14,7 @@ from PIL import Image
 
 from sagesplat.adapt.observe import large_enough
 from sagesplat.adapt.viewpoint import QualityKind, ViewModel
+from sagesplat.core.config import TrainConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Warned
 from sagesplat.core.gaussians import Gaussians
@@ -25,7 +25,7 @@ from sagesplat.formats.levels import read_level
 from sagesplat.io.files import write_json
 from sagesplat.io.lock import alone
 from sagesplat.io.npz import Npz
-from sagesplat.io.typed import known_json
+from sagesplat.io.typed import known_json, parse_json_as
 from sagesplat.raster import rasterize
 from sagesplat.run.job import Job
 from sagesplat.run.records import is_made_from, settings_of
@@ -401,6 +401,18 @@ def _shares(job: Job) -> dict[int, np.ndarray]:
     return shares
 
 
+@dataclass(frozen=True)
+class _Meta:
+    """Of a checkpoint what it belongs to, as JSON of its own."""
+
+    settings: str
+
+
+@dataclass(frozen=True)
+class _Key:
+    settings: TrainConfig
+
+
 def _antialiased(job: Job) -> bool:
     """Whether the run trains with antialiasing; read from the checkpoint while training runs."""
     try:
@@ -409,6 +421,7 @@ def _antialiased(job: Job) -> bool:
         pass
     try:
         with Npz(job.run.checkpoint) as file:
-            return bool(json.loads(json.loads(str(file["meta"]))["settings"])["settings"]["antialiased"])
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+            meta = parse_json_as(str(file["meta"]), _Meta)
+            return parse_json_as(meta.settings, _Key).settings.antialiased
+    except (OSError, ValueError, KeyError):
         return False  # no checkpoint yet, or one of another version
