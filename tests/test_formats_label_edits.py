@@ -67,7 +67,7 @@ def test_edits_are_read_as_they_were_written() -> None:
         (broken(operations=[{"op": "rename", "category": "a", "to": "\x1b[31m"}]), "U\\+001B"),
         (broken(operations=[{"op": "rename", "category": "a", "to": 3}]), "to: expected str"),
         (broken(operations=[{"op": "weigh", "category": "a", "weight": -1}]), "weight: expected float >= 0"),
-        (broken(operations=[{"op": "weigh", "category": "a", "weight": True}]), "weight: expected float, got bool"),
+        (broken(operations=[{"op": "weigh", "category": "a", "weight": True}]), "expected float, got bool"),
         (broken(operations=[{"op": "hide", "category": "a", "hidden": 1}]), "hidden: expected bool"),
         (split([]), "empty selection"),
         (split([1]), "no runs"),

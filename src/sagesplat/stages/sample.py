@@ -51,7 +51,7 @@ def sample_levels(job: Job, config: SampleConfig, fit: FitConfig) -> None:
     run = job.run
     if run.ladder != "nested":
         return
-    check_limits(config)  # before an earlier result is given up
+    check_limits(config, "sample.")  # before an earlier result is given up
     rule = Rule(_SEED, config.neighbours, config.shift, config.turn)
 
     def make() -> list[str]:
