@@ -12,7 +12,7 @@ from hypothesis.extra.numpy import arrays
 from sagesplat.adapt import eq3 as module
 from sagesplat.adapt.eq3 import STATUSES, Eq3, SsimModel, fit_model, fit_models, read_models, write_models
 from sagesplat.adapt.observe import TOTAL, Observations
-from sagesplat.core.errors import DataError, RunError
+from sagesplat.core.errors import DataError
 
 
 def capture_distances(rng: np.random.Generator, n: int) -> np.ndarray:
@@ -218,5 +218,5 @@ def test_an_unusable_file_is_one_line(tmp_path, some_models, spoil):
 
 
 def test_a_missing_file_is_one_line(tmp_path):
-    with pytest.raises(RunError, match="no such file"):
+    with pytest.raises(DataError, match="no such file"):
         read_models(tmp_path / "models.json")

@@ -15,7 +15,6 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.second_opacity import SecondOpacities, blended
 from sagesplat.formats.increments import (
     Increment,
-    checked,
     full_scene,
     read_increments,
     read_index,
@@ -23,6 +22,7 @@ from sagesplat.formats.increments import (
     totals,
 )
 from sagesplat.formats.stream_increments import Streams, read_streams, write_streams
+from sagesplat.io.typed import convert_as
 
 SIZES = {0: (3, 3, 10, 20, 20), 2: (0, 4, 6, 6, 15), 5: (1, 2, 2, 2, 2)}
 NAMES = {0: "grass", 2: "car", 5: "sky"}
@@ -152,6 +152,6 @@ def test_damage_is_one_line(tmp_path, written):
 )  # fmt: skip
 def test_impossible_entries(wrong):
     good = Increment(0, 1, "a-x.sgst", 3, 40, 120, "0" * 64, offset=4, weight=0.5)
-    assert checked(good) == good
+    assert convert_as(asdict(good), Increment) == good
     with pytest.raises(ValueError, match=r"offset|weight"):
-        checked(Increment(**{**asdict(good), **wrong}))
+        convert_as({**asdict(good), **wrong}, Increment)

@@ -23,7 +23,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 
-from sagesplat.core.errors import BackendUnavailable, SceneError
+from sagesplat.core.errors import BackendUnavailable, SageError, SceneError
 from sagesplat.core.names import check_photo, collision_key
 from sagesplat.scene import load_scene, photos
 from sagesplat.scene._prepare import prepare_photos
@@ -550,15 +550,15 @@ def test_too_few_photos(
     ("config", "message"),
     [
         (PosesConfig(model="PINHOL"), "PINHOL: COLMAP cannot undistort it; take one of SIMPLE_PINHOLE"),
-        (PosesConfig(max_size=0), "max_size 0"),
-        (PosesConfig(min_registered=1.5), "min_registered 1.5"),
+        (PosesConfig(max_size=0), "--poses.max-size 0 is impossible"),
+        (PosesConfig(min_registered=1.5), "--poses.min-registered 1.5"),
     ],
 )
 def test_settings_that_cannot_be_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, config: PosesConfig, message: str
 ) -> None:
     monkeypatch.setattr(photos.importlib.util, "find_spec", lambda name: name)
-    with pytest.raises(SceneError, match=message):
+    with pytest.raises(SageError, match=message):
         reconstruct(tmp_path, tmp_path / "out", config)
 
 

@@ -104,8 +104,7 @@ def test_what_the_answers_depend_on(tmp_path: Path) -> None:
         (MasksConfig(segmenter="text"), '--segmenter text needs --prompts "stone fountain; ivy'),
         (MasksConfig(segmenter="text", prompts=" "), "needs --prompts"),
         (MasksConfig(prompts="a;;b"), "one is empty"),
-        (MasksConfig(prompts="ivy", prompt_threshold=1.0), "give a score from 0 to below 1"),
-        (MasksConfig(prompts="ivy", prompt_threshold=float("nan")), "give a score"),
+        (MasksConfig(prompts="ivy", prompt_threshold=1.0), "choose a number from 0 to below 1"),
         (MasksConfig(segmenter="text", prompts="ivy", model="a", prompt_model="b"), "leave one of them"),
     ],
 )

@@ -48,7 +48,6 @@ from sagesplat.scene.stored import read_scene, write_scene
 from sagesplat.segment.block_categories import BlockCategories, category_of, split_name
 from sagesplat.segment.masks import Masks, Taxonomy
 from sagesplat.stages.block_levels import nest_scene
-from sagesplat.stages.blocks import check
 from sagesplat.stages.bundle_contents import bundle_contents
 from sagesplat.stages.instances import make_instances
 from sagesplat.stages.label_edits import apply_labels
@@ -173,18 +172,6 @@ def test_a_part_keeps_its_points_and_some_of_the_background() -> None:
 def test_impossible_numbers_of_blocks(count: int) -> None:
     with pytest.raises(RunError, match=r"blocks of .* are impossible; choose fewer with --blocks\.count"):
         split(street(), count)
-
-
-@pytest.mark.parametrize(
-    ("config", "named"),
-    [
-        (BlocksConfig(count=0), "count 0"),
-        (BlocksConfig(boundary_steps=-1), "boundary-steps -1"),
-    ],
-)
-def test_impossible_settings(config: BlocksConfig, named: str) -> None:
-    with pytest.raises(RunError, match=rf"--blocks\.{named} is impossible; choose"):
-        check(config, TrainConfig())
 
 
 def test_partition_reads_back(tmp_path: Path) -> None:

@@ -123,9 +123,8 @@ def test_viewpoints_that_see_nothing_are_one_line(job: Job, tmp_path: Path):
 @pytest.mark.parametrize(
     ("config", "said"),
     [
-        (SampleConfig(views=-1), "impossible; give 0 or more"),
-        (SampleConfig(calibration_views=-3), "impossible; give 0 or more"),
-        (SampleConfig(shift=2.0), "cannot be used; choose"),
+        (SampleConfig(views=-1), "--sample.views -1 is impossible"),
+        (SampleConfig(shift=2.0), "--sample.shift 2.0 is impossible"),
         (SampleConfig(viewpoints=Path("nothing.json")), "nothing.json"),
     ],
 )

@@ -295,12 +295,12 @@ def test_the_command(compared, monkeypatch, capsys, tmp_path):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"shares": (0.1, 1.2)}, "--shares 1.2 is no share"),
-        ({"caps": (0.0,)}, "--caps 0 is no share"),
+        ({"shares": (0.1, 1.2)}, "--shares 0.1 1.2 is impossible"),
+        ({"caps": (0.0,)}, "--caps 0.0 is impossible"),
         ({"caps": (1e-6,)}, "--caps 1e-06 leaves too few"),
         ({"tune_steps": -2}, "--tune-steps -2 is impossible"),
         ({"budgets": 1}, "--budgets 1 is impossible"),
-        ({"targets": (1.5,)}, "target SSIM 1.5 is impossible"),
+        ({"targets": (1.5,)}, "--targets 1.5 is impossible"),
     ],
 )
 def test_impossible_settings_are_refused(finished, change, says):

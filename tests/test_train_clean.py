@@ -9,12 +9,11 @@ from conftest import orbit, random_gaussians, write_capture
 from torch import Tensor
 
 from sagesplat.core.config import CleanConfig
-from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import Gaussians, concat
 from sagesplat.raster import rasterize, set_threads
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene, View
-from sagesplat.train.clean import CRITERIA, Floaters, check, clean, find_floaters
+from sagesplat.train.clean import CRITERIA, Floaters, clean, find_floaters
 
 CONFIG = CleanConfig()
 N = 120
@@ -171,9 +170,3 @@ def test_without_photos_what_is_seen_of_the_splat_itself_stays(truth: Gaussians,
     for rows, goes in ((shown, False), (hidden, True)):
         cleaned = remove(g, Floaters({"hardly shown": rows}, weight), scene, real=False)
         assert cleaned.keep.all() != goes
-
-
-@pytest.mark.parametrize("loss", [-1, float("nan")])
-def test_impossible_losses_are_refused(loss: float) -> None:
-    with pytest.raises(RunError, match=r"--clean\.max-loss .* is impossible; choose 0 to 100"):
-        check(CleanConfig(max_loss=loss))

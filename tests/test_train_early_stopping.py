@@ -150,7 +150,7 @@ def test_a_killed_run_keeps_what_was_frozen(capture, tmp_path):
 @pytest.mark.parametrize("target", [0.0, -1.0, 1.5, float("nan")])
 def test_impossible_targets_are_one_line(capture, target):
     scene, photos, masks, labels = capture
-    with pytest.raises(RunError, match=r"--train.freeze-at .* is no SSIM"):
+    with pytest.raises(RunError, match=r"--train.freeze-at .* is impossible; choose a number above 0 to 1"):
         next(train(scene, photos, labels, replace(CONFIG, freeze_at=target), masks=masks))
     with pytest.raises(RunError, match="needs label images"):
         next(train(scene, photos, labels, replace(CONFIG, freeze_at=0.5)))

@@ -102,12 +102,6 @@ def test_when_a_label_is_overruled(label: int, shares: tuple[float, ...], expect
     assert refine(np.full((1, 1), label, np.int16), _drawn(*shares), IDS, FAIR).item() == expected
 
 
-def test_the_view_s_own_doubt_lets_the_others_win() -> None:
-    label_ids, drawn = np.full((1, 1), CAR, np.int16), _drawn(0.0, 0.2, 0.8)
-    for car, expected in ((0.9, CAR), (0.75, TREE)):
-        assert refine(label_ids, drawn, IDS, FAIR, _drawn(0, car, 1 - car)).item() == expected
-
-
 def test_thin_parts_are_overruled_later() -> None:
     label_ids = np.full((40, 40), TREE, np.int16)
     label_ids[:, 20:23] = CAR  # a pole

@@ -353,8 +353,8 @@ def test_a_chain_learns(tmp_path):
             kept = state.gaussians.of_labels([3]).means.sort(0).values
         losses.append(float(stepper(state, 0, rates.learning_rates(step), trainable)))
         if 14 <= step < 90 and step % 7 == 0:
-            mcmc.relocate(state, config, trainable)
-            mcmc.add(state, config, 90, trainable)
+            mcmc.relocate(state, trainable)
+            mcmc.add(state, 90, trainable)
             state.sort()
             trainable = trainable_rows(state.gaussians, state.frozen)
     assert np.mean(losses[-7:]) < 0.65 * np.mean(losses[:7])

@@ -3,13 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
 from conftest import orbit, random_gaussians
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import concat
 from sagesplat.formats.levels import starts_of
 from sagesplat.raster import rasterize
@@ -75,12 +73,6 @@ def test_sizes_grow_and_end_with_all(shares: list[float], count: int) -> None:
     assert usable == tuple(sorted(set(usable)))
     assert usable[-1] == 1.0
     assert [size_of(share, count) for share in usable][-1] == count
-
-
-@pytest.mark.parametrize("shares", [(), (0.0, 1.0), (0.5, 1.5), (float("nan"),)])
-def test_impossible_sizes(shares: tuple[float, ...]) -> None:
-    with pytest.raises(RunError, match="--shares"):
-        usable_shares(shares, 100)
 
 
 def test_sets_hold_levels_of_similar_size() -> None:

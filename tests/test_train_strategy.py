@@ -12,6 +12,7 @@ from sagesplat.core.config import TrainConfig
 from sagesplat.core.gaussians import PARAMETERS
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
+from sagesplat.train import schedule
 from sagesplat.train.events import LevelSaved, Trained
 from sagesplat.train.lr_schedule import LrSchedule
 from sagesplat.train.state import TrainState, initial_state

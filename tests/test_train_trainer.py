@@ -63,7 +63,8 @@ def undisturbed(scene, tmp_path_factory) -> tuple[list[Event], Path]:
     return list(run(scene, BUSY, folder=folder, settings="s")), folder
 
 
-def test_the_loss_falls(scene):
+def test_the_loss_falls(scene, monkeypatch):
+    monkeypatch.undo()  # a reset comes late
     events = list(run(scene, TrainConfig(max_steps=84, sh_degree=1)))
     losses = [e.loss for e in events if isinstance(e, Step)]
     assert np.mean(losses[-7:]) < 0.65 * np.mean(losses[:7])

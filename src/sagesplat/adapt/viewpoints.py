@@ -25,16 +25,14 @@ from msgspec import Meta
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation, Slerp
 
-from sagesplat.core.errors import RunError
 from sagesplat.core.limits import Count, Seed, Share
 from sagesplat.io.files import read_json, write_json
-from sagesplat.io.typed import convert_as, read_json_as, refused
+from sagesplat.io.typed import check_limits, convert_as, read_json_as, refused
 from sagesplat.scene.cameras import VIEWPOINTS, ViewpointsFile
 from sagesplat.scene.nerfstudio import Poses
 from sagesplat.scene.scene import Camera, Scene
 
 SETS = ("fit", "bias", "calibration")  # what they are for; none of them is used for another
-LARGEST_SHIFT = 1.0  # of the extent
 LARGEST_TURN = float(np.pi)
 _TRIES = 50
 _CLEAR = 0.5  # of the way to the closest point that its cameras have
@@ -48,14 +46,6 @@ class Rule:
     neighbours: Count = 4  # nearest cameras that one is drawn from; 0: no interpolation
     shift: Share = 0.03  # share of the scene's extent
     turn: Annotated[float, Meta(ge=0, le=LARGEST_TURN)] = 0.05  # radians
-
-    def check(self) -> None:
-        """RunError for a rule that cannot be followed."""
-        if self.neighbours < 0 or not 0 <= self.shift <= LARGEST_SHIFT or not 0 <= self.turn <= LARGEST_TURN:
-            raise RunError(
-                f"neighbours {self.neighbours}, shift {self.shift} and turn {self.turn} cannot be used; "
-                f"choose neighbours >= 0, a shift up to {LARGEST_SHIFT:g} and a turn up to {LARGEST_TURN:.4g}"
-            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +83,7 @@ def draw(
     Raises:
         RunError: For a rule that cannot be followed.
     """
-    rule.check()
+    check_limits(rule)
     sampler = _Sampler(scene, base, rule)
     cameras, sets = [], []
     for name, count in counts.items():

@@ -8,11 +8,13 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+from msgspec import Meta
 from tyro.conf import Positional, arg
 
 from sagesplat.core.config import LadderKind
 from sagesplat.core.errors import BackendUnavailable, RunError
 from sagesplat.core.extras import install
+from sagesplat.core.limits import Seed as SeedNumber
 
 if TYPE_CHECKING:
     from sagesplat.cli.console import Console
@@ -45,7 +47,7 @@ class Redo:
 class Device:
     """Device."""
 
-    threads: int = 0
+    threads: Annotated[int, Meta(ge=0, le=4096)] = 0
     """CPU threads (0: all cores)."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """auto: a CUDA GPU if one works (see `sagesplat doctor`), else the CPU."""
@@ -70,9 +72,9 @@ class Parallel(Compute):
 class Machine(Parallel):
     """Training processes and memory."""
 
-    processes: int = 1
+    processes: Annotated[int, Meta(ge=1, le=4096)] = 1
     """Training processes, one per GPU. Each step uses at least one photo per process."""
-    memory_limit: float = 0.0
+    memory_limit: Annotated[float, Meta(ge=0, le=2**20)] = 0.0
     """Memory limit of training, GiB; the maximum number of Gaussians is lowered to fit (0: 90 % of the
     memory of the machine or container)."""
 
@@ -81,7 +83,7 @@ _CAPTURE = "capture: a COLMAP workspace, transforms.json, photos or a video"
 Scene = Positional[Annotated[Path, arg(metavar="SCENE", help=_CAPTURE)]]
 Run = Positional[Annotated[Path, arg(metavar="RUN", help="run folder")]]
 Ladder = Annotated[LadderKind, arg(help="Levels: nested (prefixes of one model) or the training snapshots.")]
-Seed = Annotated[int, arg(help="Seed of the random numbers.")]
+Seed = Annotated[SeedNumber, arg(help="Seed of the random numbers.")]
 Flat = arg(name="")
 
 
@@ -94,8 +96,6 @@ def open_job(run: Path, options: Redo | Device, ladder: LadderKind = "nested") -
 
     check_links(run)
     machine = Machine(**vars(options))
-    if not machine.memory_limit >= 0:
-        raise RunError(f"--memory-limit {machine.memory_limit} is impossible; choose GiB, such as 8")
     limit = int(machine.memory_limit * 2**30)
     with computing(machine, run) as (backend, threads, executor), Console() as console, ExitStack() as locks:
         if backend == "cuda":
@@ -170,8 +170,6 @@ def prepare(machine: Machine) -> "tuple[Backend, int]":
     """The backend that this machine computes with, and its CPU threads."""
     from sagesplat.raster import cuda, resolve_backend, set_threads
 
-    if machine.processes < 1:
-        raise RunError(f"--processes {machine.processes} is impossible; choose 1 or more")
     device = machine.device
     if device == "auto" and cuda.missing() is None:
         device = "cuda"

@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from tyro.conf import Positional
 
@@ -37,6 +37,7 @@ class Flag:
     help: str
     default: Any
     setting: tuple[str, ...]  # the parameter of the command, and the field of its dataclass
+    kind: Any  # its annotation, with limits
 
 
 def flags_of(function: Callable[..., None]) -> Iterator[Flag]:
@@ -54,11 +55,12 @@ def flags_of(function: Callable[..., None]) -> Iterator[Flag]:
         default = None if parameter.default is parameter.empty else parameter.default
         if is_dataclass(hint):
             prefix = "" if told.get("name") == "" else f"{name}."
+            inner = get_type_hints(hint, include_extras=True)
             for field in fields(hint):
                 yield Flag(
                     f"--{prefix}{field.name.replace('_', '-')}", _first_line(_home(hint, field.name)),
-                    _values(get_type_hints(hint)[field.name]), field_help(hint).get(field.name, ""),
-                    getattr(default, field.name), (name, field.name),
+                    _values(inner[field.name]), field_help(hint).get(field.name, ""),
+                    getattr(default, field.name), (name, field.name), inner[field.name],
                 )  # fmt: skip
         else:
             positional = _POSITIONAL in marks
@@ -66,7 +68,7 @@ def flags_of(function: Callable[..., None]) -> Iterator[Flag]:
             help = " ".join(str(told.get("help") or described.get(name, "")).split())
             yield Flag(
                 shown if positional else f"--{shown}", "" if positional else "Options",
-                "" if positional else _values(hint), help, default, (name,),
+                "" if positional else _values(hint), help, default, (name,), hints[name],
             )  # fmt: skip
 
 
@@ -120,7 +122,7 @@ def _values(hint: Any) -> str:
     kind, of = get_origin(hint) or hint, get_args(hint)
     if kind is Annotated:
         return _values(of[0])
-    if kind is UnionType:  # X | None
+    if kind in (UnionType, Union):  # X | None
         return _values(of[0])
     if kind is Literal:
         return "{" + ",".join(map(str, of)) + "}"

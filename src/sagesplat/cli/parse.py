@@ -17,6 +17,7 @@ from sagesplat.cli.help import Flag, flags_of
 from sagesplat.cli.say import say
 from sagesplat.core.config import PlanConfig
 from sagesplat.core.errors import SageError
+from sagesplat.io.typed import impossible, refusal
 
 OLD_COMMANDS = {"online": "early-stopping", "parts": "block-categories"}
 OLD_FLAGS = {
@@ -47,7 +48,13 @@ def arguments(name: str, function: Callable[..., None], words: Sequence[str]) ->
     words = _joined(_renamed(words))
     values = _parse(name, function, words)
     known = _recorded(name, function, values, words)
-    return _parse(name, _with_defaults(function, known), words) if known else values
+    values = _parse(name, _with_defaults(function, known), words) if known else values
+    for flag in flags_of(function):
+        value = values[flag.setting[0]]
+        value = getattr(value, flag.setting[1]) if len(flag.setting) == 2 else value
+        if cure := refusal(value, flag.kind):
+            raise UsageError(impossible(flag.name, value, cure))
+    return values
 
 
 def current_command(name: str) -> str:

@@ -4,6 +4,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated
 
+from msgspec import Meta
 from tyro.conf import Positional, arg
 
 from sagesplat.cli.base import (
@@ -39,6 +40,7 @@ from sagesplat.core.config import (
 )
 from sagesplat.core.errors import RunError
 
+_Courtyards = Annotated[int, Meta(ge=1, le=100)]
 _SPLAT = "splat: PLY, compressed PLY, SPZ, SOG, streamed SOG (lod-meta.json), glTF or .splat"
 _INSTANCES = (
     'categories, such as "chair,car"; things: all that can be counted; *: all; "": fold instances back'
@@ -133,7 +135,7 @@ def adopt(
 @command
 def demo(
     run: Positional[Annotated[Path, arg(metavar="RUN")]] = Path("runs/demo"),
-    places: tuple[int, int] = (1, 1),
+    places: tuple[_Courtyards, _Courtyards] = (1, 1),
     wild: bool = False,
     machine: Annotated[Machine, Flat] = Machine(),
 ) -> None:

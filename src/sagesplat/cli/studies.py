@@ -20,6 +20,7 @@ from sagesplat.cli.base import (
 )
 from sagesplat.cli.say import say
 from sagesplat.core.config import CompareConfig, MeasureConfig
+from sagesplat.core.limits import SomeShare
 
 
 @command
@@ -36,7 +37,7 @@ def transfer(
     run_a: Positional[Annotated[Path, arg(metavar="RUN_A")]],
     run_b: Positional[Annotated[Path, arg(metavar="RUN_B")]],
     out: Path | None = None,
-    targets: tuple[float, ...] = (),
+    targets: tuple[SomeShare, ...] = (),
     lpips: Path | None = None,
     machine: Annotated[Parallel, Flat] = Parallel(),
 ) -> None:

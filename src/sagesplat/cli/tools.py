@@ -5,26 +5,28 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal
 
+from msgspec import Meta
 from tyro.conf import Positional, arg
 
 from sagesplat.cli.base import Compute, Device, Flat, Ladder, Run, command, open_job
 from sagesplat.cli.say import say
 from sagesplat.core.config import BundleConfig
 from sagesplat.core.errors import BackendUnavailable, RunError
+from sagesplat.core.limits import AtLeast1, SomeShare, StepNumber
 
 
 @command
 def export(
     run: Run,
     out: Positional[Annotated[Path, arg(metavar="OUT")]],
-    level: int | None = None,
+    level: StepNumber | None = None,
     labels: tuple[str, ...] = (),
     only: str = "",
     without: str = "",
-    target_fidelity: float | None = None,
-    target_ssim: float | None = None,
+    target_fidelity: SomeShare | None = None,
+    target_ssim: SomeShare | None = None,
     chunks: Literal["spz", "ply"] | None = None,
-    levels: tuple[int, ...] = (),
+    levels: tuple[StepNumber, ...] = (),
     rasterize_mode: Literal["classic", "antialiased"] | None = None,
     ladder: Ladder = "nested",
     machine: Annotated[Compute, Flat] = Compute(),
@@ -74,7 +76,7 @@ def export(
 def download(
     what: Positional[Annotated[str, arg(metavar="WHAT")]] = "",
     folder: Positional[Annotated[Path | None, arg(metavar="FOLDER")]] = None,
-    scale: int | None = None,
+    scale: AtLeast1 | None = None,
     show: Annotated[bool, arg(name="list")] = False,
 ) -> None:
     """Download a benchmark scene, or network weights that are not part of the package.
@@ -206,7 +208,7 @@ def labels(
 @command
 def view(
     path: Positional[Annotated[Path, arg(metavar="RUN|BUNDLE")]],
-    port: int | None = None,
+    port: Annotated[int, Meta(ge=0, le=2**16 - 1)] | None = None,
     host: str | None = None,
     lan: bool = False,
     ssl_certfile: Path | None = None,

@@ -1,8 +1,23 @@
-"""Settings of every stage. Standard library only, so that the command line answers at once."""
+"""Settings of every stage, with their limits. They import little: the command line answers at once."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from sagesplat.core.limits import NotNegative, Seed, Share, SomeShare
+
+MOST = 2**31 - 1  # steps, views, pixels
+Count = Annotated[int, Meta(ge=0, le=MOST)]
+AtLeast1 = Annotated[int, Meta(ge=1, le=MOST)]
+Downscale = Annotated[int, Meta(ge=0, le=1024)]
+BelowOne = Annotated[float, Meta(ge=0, lt=1)]
+Side = Annotated[int, Meta(ge=1, le=4096)]  # pixels
+Viewpoints = Annotated[int, Meta(ge=0, le=10_000)]
+Weight = Annotated[float, Meta(ge=0, le=1e6)]
+SomeViewpoints = Annotated[int, Meta(ge=1, le=10_000)]
+LevelShares = Annotated[tuple[SomeShare, ...], Meta(min_length=1)]
 
 LadderKind = Literal["nested", "snapshots"]  # prefixes of one model, or the levels that training recorded
 
@@ -11,12 +26,12 @@ LadderKind = Literal["nested", "snapshots"]  # prefixes of one model, or the lev
 class SceneConfig:
     """How the capture is read."""
 
-    downscale: int = 0
+    downscale: Downscale = 0
     """Downscaling factor of the photos that are trained on; 0: 1, but on a CPU 2, 4 or 8 where photos have
     more than 1.25 megapixels. images_N is read where the capture has it."""
-    test_every: int = 8
+    test_every: Count = 8
     """Every n-th view by name is a test view, used for evaluation only; 0: none."""
-    calibrate_every: int = 8
+    calibrate_every: Count = 8
     """Every n-th of the other views is held out of training, to calibrate the quality models; 0: none."""
     alpha: Literal["auto", "background", "ignore"] = "auto"
     """Transparent pixels of photos. background: an object that was cut out, composited over the background;
@@ -39,11 +54,11 @@ class PosesConfig:
     """Camera model of COLMAP."""
     refine_principal_point: bool = False
     """Estimate the principal point too, for photos that were cropped one by one."""
-    max_size: int = 3200
+    max_size: Annotated[int, Meta(ge=64, le=MOST)] = 3200
     """Longer side of the photos for feature extraction, and of the undistorted photos, pixels."""
-    max_frames: int = 300
+    max_frames: AtLeast1 = 300
     """Frames that are taken from a video."""
-    min_registered: float = 0.5
+    min_registered: Share = 0.5
     """Fraction of the photos that must get a pose."""
 
 
@@ -69,7 +84,7 @@ class MasksConfig:
     mask_model: str | None = None
     """Network that makes masks of the boxes of Grounding DINO and OWLv2: SAM 2 or SAM (default: SAM 2.1
     tiny)."""
-    prompt_threshold: float = 0.0
+    prompt_threshold: BelowOne = 0.0
     """Score from which on a prompt counts as found (0: 0.3 for Grounding DINO, 0.2 for OWLv2, 0.4 for
     CLIPSeg, 0.5 for SAM 3)."""
     classes: Path | None = None
@@ -86,7 +101,7 @@ class LabelsConfig:
     """Keep these categories, e.g. "grass-merged,tree-merged"; all others become unlabelled."""
     merge: str = ""
     """Merge categories, e.g. "vase=potted plant,potted plant=tree-merged"."""
-    min_share: float = 0.0
+    min_share: Share = 0.0
     """Categories that cover less than this fraction of all pixels become unlabelled."""
     ignore: str = ""
     """Categories that do not belong to the scene, e.g. "person,car": their pixels are not trained on, not
@@ -101,19 +116,19 @@ class LabelsConfig:
 class TrainConfig:
     """3DGS training (step numbers are for 30,000 steps and scale with --train.max-steps)."""
 
-    max_steps: int = 7000
+    max_steps: Annotated[int, Meta(ge=1, le=10**9)] = 7000
     """Training steps."""
     lr_schedule: Literal["fast", "published"] = "fast"
     """Learning rates. fast: larger at first, on downscaled photos where those have the same detail;
     published: as in 3DGS."""
-    level_every: int = 0
+    level_every: Annotated[int, Meta(ge=0, le=10**9)] = 0
     """Steps between two recorded levels, not scaled (0: a thirtieth of --train.max-steps)."""
-    sh_degree: int = 3
+    sh_degree: Annotated[int, Meta(ge=0, le=3)] = 3
     """Degree of the spherical harmonics."""
     antialiased: bool = True
     """Compensate opacities for the screen-space low-pass filter (Mip-Splatting): Gaussians smaller than a
     pixel then look the same at lower resolutions and from far away."""
-    batch: int = 1
+    batch: Annotated[int, Meta(ge=1, le=10**6)] = 1
     """Photos per step, at least one per process. Learning rates grow with its square root; the number of
     steps stays."""
     exposure: Literal["auto", "off", "affine"] = "auto"
@@ -125,15 +140,15 @@ class TrainConfig:
     strategy: Literal["default", "mcmc"] = "default"
     """Densification. default: clone, split, prune and reset as 3DGS; mcmc: relocation and noise as
     3DGS-MCMC."""
-    refine_every: int = 100
+    refine_every: AtLeast1 = 100
     """Steps between two densifications, not scaled: the gradient statistics need the views."""
-    refine_start: int = 500
+    refine_start: Count = 500
     """First step of densification, not scaled, at most a fifth of the training."""
-    refine_stop: int = 15_000
+    refine_stop: Count = 15_000
     """Last step of densification."""
-    grow_grad: float = 2e-4
+    grow_grad: NotNegative = 2e-4
     """Clone or split Gaussians whose mean screen-space gradient (in half image widths) is above this."""
-    max_gaussians: int = 0
+    max_gaussians: Count = 0
     """Maximum number of Gaussians; the limit grows linearly during densification (0: choose from the image
     size)."""
     poses: bool = False
@@ -144,7 +159,7 @@ class TrainConfig:
     the residual, from 30 % of the steps on and after ten visits of each view (at the latest from 60 %)."""
     mcmc_regularise: bool = True
     """With mcmc, pull opacities and scales towards 0 as published. It costs quality in short trainings."""
-    freeze_at: float | None = None
+    freeze_at: SomeShare | None = None
     """Stop each category when its mean SSIM in the training views reaches this (Fig. 1 of the paper)."""
 
 
@@ -154,7 +169,7 @@ class CleanConfig:
 
     floaters: Literal["remove", "keep"] = "remove"
     """remove: floaters are removed before the levels are made; keep: nothing is removed."""
-    max_loss: float = 0.02
+    max_loss: Annotated[float, Meta(ge=0, le=100)] = 0.02
     """Largest loss of PSNR on the training and on the calibration views, dB. Where it would be more, fewer
     are removed."""
 
@@ -163,10 +178,10 @@ class CleanConfig:
 class BlocksConfig:
     """Blocks of a large scene."""
 
-    count: int = 1
+    count: Annotated[int, Meta(ge=1, le=4096)] = 1
     """Ground-plane blocks that are trained independently and merged; 1: no blocks. The --train options hold
     for each block."""
-    boundary_steps: int = 300
+    boundary_steps: Count = 300
     """Boundary tuning: training steps on the Gaussians near the border of each block, after merging."""
 
 
@@ -174,20 +189,20 @@ class BlocksConfig:
 class NestConfig:
     """Nested levels: prefixes of one ordered model."""
 
-    steps: int = 2400
+    steps: Count = 2400
     """Training steps on random compositions of levels."""
-    levels: int = 16
+    levels: Annotated[int, Meta(ge=1, le=64)] = 16
     """Levels per category; their sizes grow geometrically."""
-    smallest: float = 0.01
+    smallest: SomeShare = 0.01
     """Size of the lowest level, as a fraction of the category's Gaussians."""
-    base_share: float = 0.2
+    base_share: BelowOne = 0.2
     """Size of the base model, as a fraction of all Gaussians; it is a small 3DGS-MCMC model that forms the
     lowest levels; 0: none."""
-    base_steps: int = 1600
+    base_steps: AtLeast1 = 1600
     """Training steps of the base model, which begins with the trained model, merged to that size."""
-    full_share: float = 0.1
+    full_share: Share = 0.1
     """Fraction of the first steps that sample the full model; rises linearly to 90 % of the last ones."""
-    rate_weight: float = 6e-4
+    rate_weight: NotNegative = 6e-4
     """Loss per bit that the SH coefficients of a Gaussian take in a coded stream, on average; 0: only how it
     looks counts."""
 
@@ -199,9 +214,9 @@ class AdoptConfig:
     fit: Literal["renders", "none"] = "renders"
     """Lower levels. renders: merged Gaussians, trained on the splat's own renders; none: merged Gaussians,
     without training."""
-    steps: int = 3000
+    steps: Count = 3000
     """Training steps on compositions of the lower levels."""
-    shares: tuple[float, ...] = (0.004, 0.008, 0.016, 0.031, 0.0625, 0.125, 0.25, 0.5, 0.7, 1.0)
+    shares: LevelShares = (0.004, 0.008, 0.016, 0.031, 0.0625, 0.125, 0.25, 0.5, 0.7, 1.0)
     """Sizes of the levels, as fractions of all Gaussians; categories that lose less keep fewer. Levels of
     fewer than 50 Gaussians are left out."""
     lossless: bool = False
@@ -209,22 +224,22 @@ class AdoptConfig:
     cameras: Path | None = None
     """Where to look from: a capture with or without photos, a cameras.json of 3DGS, a transforms.json or a
     viewpoints.json (default: viewpoints drawn from the splat itself)."""
-    views: int = 96
+    views: Annotated[int, Meta(ge=1, le=10_000)] = 96
     """Viewpoints to draw."""
     kind: Literal["auto", "object", "place"] = "auto"
     """How viewpoints are drawn. object: on orbits around it; place: where one can stand in it."""
     up: str = "auto"
     """Up direction of the viewpoints: x, -x, y, -y, z or -z (auto: from the geometry)."""
-    fov: float = 60.0
+    fov: Annotated[float, Meta(ge=1, le=150)] = 60.0
     """Field of view of the longer side of drawn viewpoints, degrees."""
-    size: tuple[int, int] = (512, 384)
+    size: tuple[Side, Side] = (512, 384)
     """Width and height of drawn viewpoints, pixels."""
-    lod: int = 0
+    lod: Annotated[int, Meta(ge=0, le=100)] = 0
     """Level of a streamed SOG to take as the reference; 0: the finest."""
     spz_axes: Literal["rub", "rdf"] = "rub"
     """Axes of an SPZ file that does not say them. rub: right, up, back, as the format has it; rdf: those of
     PLY, as PlayCanvas's tools write it."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the viewpoints and of the training."""
 
 
@@ -232,19 +247,19 @@ class AdoptConfig:
 class SampleConfig:
     """Viewpoints at which the levels are measured against the full model."""
 
-    views: int = 0
+    views: Viewpoints = 0
     """Viewpoints that the fidelity models are fitted to; 0: until their error stops shrinking, within about
     0.6 of the training's time."""
-    calibration_views: int = 0
+    calibration_views: Viewpoints = 0
     """Viewpoints that calibrate the bounds; 0: 200, or fewer after a short training."""
     viewpoints: Path | None = None
     """File with the cameras to draw from: a viewpoints.json, or a transforms.json (default: the cameras of
     the training and calibration photos)."""
-    neighbours: int = 4
+    neighbours: Count = 4
     """Each viewpoint lies between a camera and one of this many nearest ones; 0: at a camera."""
-    shift: float = 0.03
+    shift: Share = 0.03
     """Largest random shift along each axis, as a fraction of the scene extent."""
-    turn: float = 0.05
+    turn: Annotated[float, Meta(ge=0, le=3.1416)] = 0.05
     """Largest random rotation about each axis, radians."""
 
 
@@ -255,7 +270,7 @@ class FitConfig:
     distance: Literal["percentile", "minimum"] = "percentile"
     """Distance of a category in a view. percentile: 5th percentile over its visible points; minimum: as in
     the paper."""
-    confidence: float = 0.95
+    confidence: Annotated[float, Meta(gt=0, lt=1)] = 0.95
     """Target coverage of the lower confidence bounds, for views without a photo."""
 
 
@@ -263,22 +278,22 @@ class FitConfig:
 class PlanConfig:
     """Target quality or budget."""
 
-    target_fidelity: float | None = None
+    target_fidelity: SomeShare | None = None
     """Fidelity that the planned scene must reach: SSIM against the full model rendered from the same
     viewpoint (default: 0.95, where --target-ssim is not given; 1: the full model)."""
-    target_ssim: float | None = None
+    target_ssim: SomeShare | None = None
     """SSIM against photos that the planned scene must reach; with --target-fidelity a plan beside that one
     (default: none, of snapshots 0.8)."""
-    share: float = 0.95
+    share: SomeShare = 0.95
     """Fraction of the viewpoints in which the level of a category must reach the target."""
-    other_targets: tuple[float, ...] | None = None
+    other_targets: tuple[SomeShare, ...] | None = None
     """Further targets to plan and measure, of the quality that leads (default: fidelity 0.8, 0.9 and 0.98;
     SSIM 0.1 below and above)."""
-    budget: float = 0.0
+    budget: NotNegative = 0.0
     """Plan for the best quality within this budget instead of the target; 0: no budget."""
     budget_unit: Literal["bytes", "gpu-bytes", "count"] = "bytes"
     """Unit of the budget: bytes to transfer, bytes of GPU memory in the viewer, or Gaussians."""
-    weights: dict[str, float] = field(default_factory=dict)
+    weights: dict[str, Weight] = field(default_factory=dict)
     """Weights of categories within the budget, by name (1 unless named)."""
 
     @property
@@ -318,7 +333,7 @@ class PaperConfig:
     """Photo of Tables III and IV and of Fig. 4 (default: the middle one of the test views)."""
     lpips: Path | None = None
     """Folder with the LPIPS weights (default: where `sagesplat download lpips` puts them)."""
-    tune_steps: int = 500
+    tune_steps: Count = 500
     """Training steps of pruned 3DGS and of tuned compositions in Table IV."""
 
 
@@ -326,17 +341,17 @@ class PaperConfig:
 class CompareConfig:
     """Baselines beside the nested levels."""
 
-    targets: tuple[float, ...] = ()
+    targets: tuple[SomeShare, ...] = ()
     """SSIM targets for SAGE compositions (default: 0.6 0.7 0.8 and the targets of the run)."""
-    snapshots: int = 10
+    snapshots: AtLeast1 = 10
     """Maximum number of training snapshots to compare, evenly spaced in size."""
-    shares: tuple[float, ...] = (0.05, 0.1, 0.2, 0.35, 0.5, 0.7)
+    shares: tuple[SomeShare, ...] = (0.05, 0.1, 0.2, 0.35, 0.5, 0.7)
     """Sizes that the last snapshot is pruned to, as fractions of its Gaussians."""
-    tune_steps: int = 500
+    tune_steps: Annotated[int, Meta(ge=-1, le=MOST)] = 500
     """Training steps after pruning; -1: as many as the nested levels had."""
-    caps: tuple[float, ...] = (0.1, 0.2, 0.35, 0.5, 1.0)
+    caps: tuple[SomeShare, ...] = (0.1, 0.2, 0.35, 0.5, 1.0)
     """Sizes of 3DGS-MCMC models, trained from the start, as fractions of the last snapshot's Gaussians."""
-    budgets: int = 12
+    budgets: Annotated[int, Meta(ge=2, le=1000)] = 12
     """Number of byte budgets that the nested levels are planned for, in geometric steps."""
     lpips: Path | None = None
     """Folder with the LPIPS weights (default: where `sagesplat download lpips` puts them)."""
@@ -346,7 +361,7 @@ class CompareConfig:
 class MeasureConfig:
     """Viewpoints and metrics."""
 
-    views: int = 24
+    views: SomeViewpoints = 24
     """Number of viewpoints; of those of a file as many, evenly spread."""
     cameras: Path | None = None
     """Viewpoints of a file or a capture, instead of drawn ones: cameras.json of 3DGS, viewpoints.json,
@@ -355,11 +370,11 @@ class MeasureConfig:
     """Up direction for drawn viewpoints: x, -x, y, -y, z or -z (auto: the normal of a floor, or -y)."""
     kind: Literal["auto", "object", "place"] = "auto"
     """Draw viewpoints around an object, or inside of a place (auto: by the free space)."""
-    fov: float = 60.0
+    fov: Annotated[float, Meta(ge=1, le=150)] = 60.0
     """Field of view of drawn viewpoints along the longer side, degrees."""
-    size: int = 512
+    size: Annotated[int, Meta(ge=16, le=8192)] = 512
     """Longer side of the images, px; those of a file are made no larger."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of drawn viewpoints."""
     lpips: Path | None = None
     """Folder with the LPIPS weights (default: where `sagesplat download lpips` puts them)."""
@@ -369,12 +384,12 @@ class MeasureConfig:
 class BundleConfig:
     """Contents of the bundle."""
 
-    meters_per_unit: float | None = None
+    meters_per_unit: Annotated[float, Meta(ge=1e-6, le=1e6)] | None = None
     """Scale of the scene in metres per unit, for headsets (default: estimated from the height of the
     cameras)."""
     always: tuple[str, ...] = ()
     """Categories that are always shipped in full."""
-    weights: dict[str, float] = field(default_factory=dict)
+    weights: dict[str, Weight] = field(default_factory=dict)
     """Weights of categories in the viewer's plans, as NAME VALUE ... (default: 1 each)."""
     single_file: bool = False
     """Write one HTML page that opens from the disk, instead of a folder for a web server."""
@@ -402,5 +417,5 @@ class RunConfig:
     """Fuse the label images of all views through the trained Gaussians."""
     ladder: LadderKind = "nested"
     """Levels: nested (prefixes of one model), or the snapshots of training, as in the paper."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the random numbers."""

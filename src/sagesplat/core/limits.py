@@ -26,9 +26,9 @@ else:
         """A number, or NaN, which is null in JSON (`io.typed` reads it so)."""
 
 
-Whole = Annotated[int, Meta(ge=-(2**53), le=2**53)]
-Count = Annotated[int, Meta(ge=0, le=2**53)]  # of anything, bytes included
-AtLeast1 = Annotated[int, Meta(ge=1, le=2**53)]
+Whole = Annotated[int, Meta(ge=1 - 2**53, le=2**53 - 1)]
+Count = Annotated[int, Meta(ge=0, le=2**53 - 1)]  # of anything, bytes included
+AtLeast1 = Annotated[int, Meta(ge=1, le=2**53 - 1)]
 StepNumber = Annotated[int, Meta(ge=0, le=2**31 - 1)]
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 LabelId = Annotated[int, Meta(ge=-1, le=2**15 - 1)]  # -1: unlabelled

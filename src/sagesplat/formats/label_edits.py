@@ -8,17 +8,19 @@ list do not move them. docs/formats.md specifies the file.
 import hashlib
 import json
 import os
-import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
+from msgspec import Meta
 
 from sagesplat.core.errors import LabelError, RunError, short
+from sagesplat.core.limits import AtLeast1, Sha256
 from sagesplat.core.names import RULE, checked
-from sagesplat.io.files import loads_json, regular, unwritable, write_text
+from sagesplat.io.files import regular, unwritable, write_text
+from sagesplat.io.typed import convert_as, parse_json_as, refused
 
 if TYPE_CHECKING:  # loads torch, which `view` does without
     from sagesplat.formats.increments import Increment
@@ -28,6 +30,7 @@ FORMAT, VERSION = "sagesplat-label-edits", 1
 MAX_BYTES = 64 * 2**20
 MAX_WEIGHT = 1e6
 _CURE = "save it again in the viewer"
+_Rank = Annotated[int, Meta(ge=0, lt=2**31)]
 Runs = tuple[tuple[int, int], ...]  # first rank and number of consecutive ones, ascending
 
 
@@ -69,7 +72,7 @@ class Weigh:
     """The weight of a category in plans within a budget."""
 
     category: str
-    weight: float
+    weight: Annotated[float, Meta(ge=0, le=MAX_WEIGHT)]
 
 
 @dataclass(frozen=True)
@@ -91,6 +94,14 @@ class LabelEdits:
     operations: tuple[Operation, ...]
 
 
+@dataclass(frozen=True)
+class _Document:
+    format: Literal["sagesplat-label-edits"]
+    version: AtLeast1
+    ladder: Sha256
+    operations: list[dict[str, Any]]
+
+
 def parse_edits(content: bytes, name: str = FILE) -> LabelEdits:
     """The edits in a file's bytes.
 
@@ -98,30 +109,21 @@ def parse_edits(content: bytes, name: str = FILE) -> LabelEdits:
         LabelError: In one line, for a file that is damaged, of another format or of a later version, and for
             an operation that cannot be: an unknown one, a name that is none, an empty selection.
     """
-    try:
-        document = loads_json(content) if len(content) <= MAX_BYTES else None
-    except (ValueError, RecursionError):
-        document = None
-    if not isinstance(document, dict) or document.get("format") != FORMAT:
-        raise LabelError(f"{name}: not label edits (format {FORMAT}), or damaged; {_CURE}")
-    version = document.get("version")
-    if type(version) is not int or version < 1:
-        raise LabelError(f"{name}: of version {short(repr(version))}, which there is not; {_CURE}")
-    if version > VERSION:
-        raise LabelError(f"{name}: of version {version}, this sagesplat reads up to {VERSION}; update it")
-    ladder, listed = document.get("ladder"), document.get("operations")
-    if not isinstance(ladder, str) or not re.fullmatch("[0-9a-f]{64}", ladder):
-        raise LabelError(f"{name}: does not say which run it is of; {_CURE}")
-    if not isinstance(listed, list):
-        raise LabelError(f"{name}: has no list of operations; {_CURE}")
+    with refused(name, f"label edits (format {FORMAT}), or damaged", _CURE, LabelError):
+        if len(content) > MAX_BYTES:
+            raise ValueError(f"{len(content)} bytes")
+        document = parse_json_as(content, _Document)
+    if document.version > VERSION:
+        raise LabelError(
+            f"{name}: of version {document.version}, this sagesplat reads up to {VERSION}; update it"
+        )
     found = []
-    for number, entry in enumerate(listed, 1):
+    for number, entry in enumerate(document.operations, 1):
         try:
             found.append(_operation(entry))
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
-            why = f"no {error.args[0]}" if isinstance(error, KeyError) else str(error)
-            raise LabelError(f"{name}: operation {number}: {why}") from None
-    return LabelEdits(ladder, tuple(found))
+        except ValueError as error:
+            raise LabelError(f"{name}: operation {number}: {error}") from None
+    return LabelEdits(document.ladder, tuple(found))
 
 
 def read_edits(path: Path) -> LabelEdits:
@@ -166,67 +168,48 @@ def runs_of(ranks: Sequence[int] | np.ndarray) -> Runs:
     return tuple((int(part[0]), len(part)) for part in parts)
 
 
-def _operation(entry: Any) -> Operation:
-    if not isinstance(entry, dict):
-        raise ValueError(f"{entry!r:.60} is no operation")
+@dataclass(frozen=True)
+class _Split(Split):
+    """As it is in the file: of each run its first rank and its number, one after the other."""
+
+    gaussians: dict[str, list[_Rank]]  # type: ignore[assignment]
+
+
+_KINDS: dict[str, type[Operation]] = {
+    "rename": Rename, "merge": Merge, "split": _Split, "hide": Hide, "weigh": Weigh, "full": Full,
+}  # fmt: skip
+
+
+def _operation(entry: dict[str, Any]) -> Operation:
     kind = entry.get("op")
     if not isinstance(kind, str) or kind not in _KINDS:
         raise ValueError(f"{kind!r:.60} is not known; there are {', '.join(_KINDS)}")
-    return _KINDS[kind](entry)
+    made = convert_as(entry, _KINDS[kind])
+    names = {key: _name(key, getattr(made, key)) for key in ("category", "to", "into") if hasattr(made, key)}
+    if isinstance(made, _Split):
+        runs = {label: _runs(numbers) for label, numbers in made.gaussians.items() if numbers}
+        if not runs:
+            raise ValueError("an empty selection; select something to split off")
+        return Split(names["category"], names["to"], runs)
+    return replace(made, **names)
 
 
-def _name(entry: dict[str, Any], key: str) -> str:
+def _name(key: str, name: str) -> str:
     """A name in an operation: the rules are those of `core.names`, and of the viewer's `core/names.ts`."""
-    name = entry[key]
     try:
         return checked(name)
     except ValueError as error:
         raise ValueError(f"{key} {short(repr(name))}: {error}; {RULE}") from None
 
 
-def _flag(entry: dict[str, Any], key: str) -> bool:
-    if type(entry[key]) is not bool:
-        raise ValueError(f"{key} is {entry[key]!r:.60}, not true or false")
-    return entry[key]
-
-
-def _weight(entry: dict[str, Any]) -> float:
-    weight = entry["weight"]
-    if type(weight) not in (int, float) or not 0 <= weight <= MAX_WEIGHT:
-        raise ValueError(f"weight {weight!r:.60} is impossible; give a number from 0 on, such as 2")
-    return float(weight)
-
-
-def _gaussians(entry: dict[str, Any]) -> dict[str, Runs]:
-    given = entry["gaussians"]
-    if not isinstance(given, dict):
-        raise ValueError("gaussians are no lists of ranks by category")
-    found = {label: _runs(numbers) for label, numbers in given.items()}
-    if not any(found.values()):
-        raise ValueError("an empty selection; select something to split off")
-    return {label: runs for label, runs in found.items() if runs}
-
-
-def _runs(numbers: Any) -> Runs:
-    whole = isinstance(numbers, list) and all(type(n) is int and 0 <= n < 2**31 for n in numbers)
-    if not whole or len(numbers) % 2:
+def _runs(numbers: list[int]) -> Runs:
+    if len(numbers) % 2:
         raise ValueError("gaussians are no runs of ranks: first, number, first, number, ...")
     runs = tuple(zip(numbers[::2], numbers[1::2], strict=True))
-    ends = [first + count for first, count in runs]
-    starts = [first for first, _ in runs]
+    starts, ends = [first for first, _ in runs], [first + count for first, count in runs]
     if any(count < 1 for _, count in runs) or any(s < e for s, e in zip(starts[1:], ends, strict=False)):
         raise ValueError("runs of ranks that are empty, or do not rise")
     return runs
-
-
-_KINDS: dict[str, Callable[[dict[str, Any]], Operation]] = {
-    "rename": lambda e: Rename(_name(e, "category"), _name(e, "to")),
-    "merge": lambda e: Merge(_name(e, "category"), _name(e, "into")),
-    "split": lambda e: Split(_name(e, "category"), _name(e, "to"), _gaussians(e)),
-    "hide": lambda e: Hide(_name(e, "category"), _flag(e, "hidden")),
-    "weigh": lambda e: Weigh(_name(e, "category"), _weight(e)),
-    "full": lambda e: Full(_name(e, "category"), _flag(e, "always")),
-}
 
 
 def ladder_hash(increments: Sequence["Increment"], names: Mapping[int, str]) -> str:

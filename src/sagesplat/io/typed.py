@@ -10,13 +10,14 @@ import re
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import is_dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args, get_type_hints
 
 import msgspec
 
 from sagesplat.core.errors import DataError, RunError, SageError, short
-from sagesplat.core.limits import Number, NumberOrNaN
+from sagesplat.core.limits import LARGEST, Number, NumberOrNaN
 from sagesplat.io.files import loads_json, read_json
 
 Kind = TypeVar("Kind")
@@ -79,6 +80,46 @@ def convert_as(value: Any, kind: type[Kind], *, strict: bool = True) -> Kind:
 def to_plain(value: Any) -> Any:
     """What `json.dumps` can write: dicts and lists in place of dataclasses and arrays."""
     return msgspec.to_builtins(value, enc_hook=lambda other: other.tolist())
+
+
+def refusal(value: Any, kind: Any) -> str:
+    """What to choose in place of a setting that is not within the limits of its annotation; "": it is."""
+    try:
+        convert_as(value, kind)
+    except ValueError as error:
+        return f"choose {words}" if (words := _range(kind)) else str(error)
+    return ""
+
+
+def check_limits(settings: Any, prefix: str = "") -> None:
+    """RunError, naming the option, where a dataclass of settings holds one that is not within its limits."""
+    for name, kind in get_type_hints(type(settings), include_extras=True).items():
+        value, option = getattr(settings, name), f"{prefix}{name}".replace("_", "-")
+        if is_dataclass(value):
+            check_limits(value, f"{option}.")
+        elif cure := refusal(value, kind):
+            raise RunError(impossible(f"--{option}", value, cure))
+
+
+def impossible(option: str, value: Any, cure: str) -> str:
+    """The line for an option whose value is not within its limits."""
+    parts = [part for pair in value.items() for part in pair] if isinstance(value, dict) else value
+    text = " ".join(map(str, parts)) if isinstance(parts, tuple | list) else str(parts)
+    return f"{option} {short(text)} is impossible; {cure}"
+
+
+def _range(kind: Any) -> str:
+    """The limits in an annotation, in words; "" without any."""
+    for part in get_args(kind):
+        if isinstance(part, msgspec.Meta) and (low := part.ge if part.gt is None else part.gt) is not None:
+            high = part.le if part.lt is None else part.lt
+            begin = f"a number {'from' if part.gt is None else 'above'} {low:g}"
+            if high is None or high >= LARGEST:
+                return f"{begin} on"
+            return f"{begin} {'to' if part.lt is None else 'to below'} {high:,}"
+        if words := _range(part):
+            return words
+    return ""
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from sagesplat.core.errors import BackendUnavailable, SceneError
 from sagesplat.core.extras import install
 from sagesplat.core.limits import Count, Number
 from sagesplat.io.files import write_json
-from sagesplat.io.typed import convert_as, known_json
+from sagesplat.io.typed import check_limits, convert_as, known_json
 from sagesplat.scene._prepare import PreparedPhoto, prepare_photos
 from sagesplat.scene.detect import PHOTOS
 from sagesplat.scene.feature_masks import OfPhoto, write_feature_masks
@@ -143,11 +143,7 @@ def _check(source: Path, workspace: Path, config: PosesConfig) -> None:
         raise SceneError(f"{source}: no such file or folder; name a folder of photos or a video")
     if config.model not in _MODELS:
         raise SceneError(f"{config.model}: COLMAP cannot undistort it; take one of {', '.join(_MODELS)}")
-    if config.max_size < 64 or not 0 <= config.min_registered <= 1:
-        raise SceneError(
-            f"max_size {config.max_size} and min_registered {config.min_registered} cannot be used; "
-            "take max_size >= 64 and min_registered between 0 and 1"
-        )
+    check_limits(config, "poses.")
     inside, outside = source.resolve(), workspace.resolve()
     if inside == outside or any(inside.is_relative_to(outside / name) for name in _OWN):
         raise SceneError(f"{source}: lies where the poses would be written; name another for the poses")

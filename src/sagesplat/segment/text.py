@@ -13,6 +13,7 @@ from jaxtyping import UInt8
 
 from sagesplat.core.config import MasksConfig
 from sagesplat.core.errors import LabelError, RunError
+from sagesplat.io.typed import check_limits
 from sagesplat.segment.detections import Finder, painted_over, segmented, shared_areas
 from sagesplat.segment.detectors import DETECTORS, detector
 from sagesplat.segment.display_names import title_of
@@ -81,8 +82,7 @@ def settings(config: MasksConfig) -> dict[str, Any]:
     """What segmentation by text depends on; LabelError or RunError for settings that cannot be."""
     if not config.prompts.strip():
         raise RunError('--segmenter text needs --prompts "stone fountain; ivy; wooden bench"')
-    if not 0 <= config.prompt_threshold < 1:
-        raise RunError(f"--prompt-threshold {config.prompt_threshold:g}: give a score from 0 to below 1")
+    check_limits(config)
     if config.segmenter == "text" and config.model and config.prompt_model:
         raise RunError("--model and --prompt-model name the same network here; leave one of them")
     return {

@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 
 from sagesplat.adapt.free_viewpoints import check_size, free_cameras
 from sagesplat.adapt.observe import RenderedLabels
-from sagesplat.core.config import AdoptConfig, LabelsConfig, MasksConfig, NestConfig, SceneConfig, TrainConfig
+from sagesplat.core.config import AdoptConfig, LabelsConfig, MasksConfig, SceneConfig, TrainConfig
 from sagesplat.core.errors import DataError, RunError
 from sagesplat.core.events import Progress, Warned
 from sagesplat.core.gaussians import Gaussians
@@ -21,6 +21,7 @@ from sagesplat.core.names import repaired
 from sagesplat.core.sh import sh0_to_rgb
 from sagesplat.formats.levels import read_header, read_level, read_more, write_level, write_set
 from sagesplat.formats.splats import Splat, num_lods, read_splat
+from sagesplat.io.typed import check_limits
 from sagesplat.run.job import Job
 from sagesplat.run.records import file_hash, is_done
 from sagesplat.run.run_dir import RunDir
@@ -44,8 +45,6 @@ from sagesplat.segment.parents import read_parents, write_parents
 from sagesplat.stages.edited import check_not_edited
 from sagesplat.stages.label import edit_of, make_masks
 from sagesplat.stages.scene import check_folder, open_scene
-from sagesplat.train.lower_levels import check_shares
-from sagesplat.train.nested import check
 from sagesplat.train.votes import vote
 from sagesplat.viewer.frames import FLIP, upward
 
@@ -70,8 +69,7 @@ def open_splat(
     scene = replace(scene, downscale=scene.downscale or 1)  # nothing is trained on the photos
     check_folder(job.run)
     _check_run(job.run, config)
-    check_shares(config.shares)
-    check(NestConfig(steps=config.steps))
+    check_limits(config)
     own = job.run.capture / repaired(source.resolve().stem)
     photos = _make_capture(job, source, own, config, scene, labelled=not segmented)
     open_scene(job, config.cameras if photos and config.cameras else own, scene)

@@ -14,6 +14,7 @@ from sagesplat.core.events import Emit, Progress, named
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.second_opacity import SecondOpacities
 from sagesplat.formats.levels import read_sizes, write_set
+from sagesplat.io.typed import check_limits
 from sagesplat.run.executor import Task, results
 from sagesplat.run.job import Job, JobSpec
 from sagesplat.run.stage import run_stage
@@ -44,7 +45,7 @@ def nest_scene(job: Job, nest: NestConfig, config: BlocksConfig, seed: int) -> N
     if not job.has_blocks:
         return nest_levels(job, nest, seed)
     run, file = job.run, job.run.division
-    nested.check(nest)
+    check_limits(nest, "nest.")
     blocks = read_blocks(file)
     settings = {**asdict(nest), "seed": seed, "boundary_steps": config.boundary_steps}
 

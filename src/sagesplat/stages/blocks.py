@@ -19,6 +19,7 @@ from sagesplat.core.events import Emit, Progress, named
 from sagesplat.core.gaussians import concat
 from sagesplat.formats.levels import read_level, write_level
 from sagesplat.io.files import link, write_json
+from sagesplat.io.typed import check_limits
 from sagesplat.run.capture import Hashes, fingerprint, photo_hashes
 from sagesplat.run.executor import Task, results
 from sagesplat.run.job import Job, JobSpec
@@ -48,13 +49,7 @@ _SEEN = 0.01  # share of a photo's visible points from which on it sees a block
 
 def check(config: BlocksConfig, train: TrainConfig) -> None:
     """RunError for settings out of range, or that do not go together."""
-    wrong = (
-        ("count", config.count, config.count >= 1, "1 or more"),
-        ("boundary-steps", config.boundary_steps, config.boundary_steps >= 0, "0 or more"),
-    )
-    for name, value, fine, cure in wrong:
-        if not fine:
-            raise RunError(f"--blocks.{name} {value} is impossible; choose {cure}")
+    check_limits(config, "blocks.")
     if config.count > 1 and train.poses:  # a photo of several blocks would get several poses
         raise RunError("--train.poses does not go with --blocks.count; leave out one of them")
     if config.count > 1 and train.exposure == "affine":

@@ -9,13 +9,13 @@ from sagesplat.core.events import Progress
 from sagesplat.core.limits import Count, Number
 from sagesplat.formats.levels import read_level, select_level
 from sagesplat.io.files import write_json
-from sagesplat.io.typed import read_json_as
+from sagesplat.io.typed import check_limits, read_json_as
 from sagesplat.raster import device_of
 from sagesplat.run.job import Job
 from sagesplat.run.stage import run_stage
 from sagesplat.stages.scene import check_not_adopted
 from sagesplat.stages.shared import inlier_inputs
-from sagesplat.train.clean import Cleaned, Criterion, check, clean, find_floaters
+from sagesplat.train.clean import Cleaned, Criterion, clean, find_floaters
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ def clean_levels(job: Job, config: CleanConfig) -> None:
     check_not_adopted(run)
     if job.has_blocks:
         raise RunError(f"{run.blocks}: floaters are not removed from a scene in blocks; nest it as it is")
-    check(config)
+    check_limits(config, "clean.")
 
     def make() -> list[str]:
         for earlier in (run.cleaned, run.floaters_picture):

@@ -18,13 +18,14 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.ply import read_ply_splat, select_ply
 from sagesplat.formats.splat import Splat, undrawable
 from sagesplat.formats.splats import read_splat, scene_writer, write_splat
+from sagesplat.io.typed import check_limits
 from sagesplat.raster import Backend, device_of
 from sagesplat.scene import load_scene
 from sagesplat.scene.cameras import read_camera_file
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Points, Scene, View
 from sagesplat.stages.clean import CleanFigures, clean_lines, figures_of
-from sagesplat.train.clean import check, clean, find_floaters
+from sagesplat.train.clean import clean, find_floaters
 
 _VIEWS = 96  # viewpoints that are drawn where there are none
 _FOV, _SIZE = 60.0, (512, 384)  # degrees along the longer side, px
@@ -51,7 +52,7 @@ def clean_splat(
     Raises:
         SageError: For a file that cannot be read or written, or cameras that do not fit the splat.
     """
-    check(config)
+    check_limits(config, "clean.")
     _check_paths(source, out, picture, config)
     emit(StageStarted("clean"))
     begin = time.perf_counter()

@@ -1,6 +1,5 @@
 """Makes bundles for the web viewer from the newest level of a running training."""
 
-import json
 import shutil
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -8,13 +7,14 @@ from typing import Any
 
 import torch
 
+from sagesplat.core.config import TrainConfig
 from sagesplat.core.errors import RunError
 from sagesplat.formats.increments import write_increments
 from sagesplat.formats.levels import read_level
 from sagesplat.io.files import write_json
 from sagesplat.io.lock import alone
 from sagesplat.io.npz import Npz
-from sagesplat.io.typed import known_json
+from sagesplat.io.typed import known_json, parse_json_as
 from sagesplat.run.job import Job
 from sagesplat.run.records import settings_of
 from sagesplat.stages.bundle_contents import bundle_contents
@@ -83,6 +83,18 @@ def read_live(path: Path) -> Live | None:
     return known_json(path, Live)
 
 
+@dataclass(frozen=True)
+class _Meta:
+    """Of a checkpoint what it belongs to, as JSON of its own."""
+
+    settings: str
+
+
+@dataclass(frozen=True)
+class _Key:
+    settings: TrainConfig
+
+
 def trains_antialiased(job: Job) -> bool:
     """Whether the run trains with antialiasing; read from the checkpoint while training runs."""
     try:
@@ -91,6 +103,7 @@ def trains_antialiased(job: Job) -> bool:
         pass
     try:
         with Npz(job.run.checkpoint) as file:
-            return bool(json.loads(json.loads(str(file["meta"]))["settings"])["settings"]["antialiased"])
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+            meta = parse_json_as(str(file["meta"]), _Meta)
+            return parse_json_as(meta.settings, _Key).settings.antialiased
+    except (OSError, ValueError, KeyError):
         return False  # no checkpoint yet, or a damaged one

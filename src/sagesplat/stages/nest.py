@@ -11,6 +11,7 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.second_opacity import SecondOpacities
 from sagesplat.formats.levels import read_header, read_level, write_set
 from sagesplat.formats.stream_increments import read_streams, write_streams
+from sagesplat.io.typed import check_limits
 from sagesplat.run.job import Job
 from sagesplat.run.records import checkpoint_key
 from sagesplat.run.stage import run_stage
@@ -27,7 +28,7 @@ from sagesplat.train.nested import NestStep
 def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
     """Order the trained Gaussians and train their prefixes; write the ladder and its chunks."""
     run = job.run
-    nested.check(config)
+    check_limits(config, "nest.")
     settings = {**asdict(config), "seed": seed}
 
     def make() -> list[str]:

@@ -18,6 +18,7 @@ from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit, Progress, StageDone, StageStarted
 from sagesplat.demo.capture import cached_capture
 from sagesplat.demo.wild import EVERYTHING, NOTHING, Wild
+from sagesplat.io.typed import check_limits
 from sagesplat.run.job import Job
 from sagesplat.stages import blocks
 from sagesplat.stages.adopt import open_splat
@@ -37,8 +38,6 @@ from sagesplat.stages.preflight import check_segmenter, check_training
 from sagesplat.stages.report import make_report
 from sagesplat.stages.sample import sample_levels
 from sagesplat.stages.scene import check_not_adopted, open_scene
-from sagesplat.train import nested
-from sagesplat.train.clean import check as check_clean
 
 # the built-in capture, within minutes on two cores
 DEMO = RunConfig(
@@ -71,9 +70,8 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
         `sagesplat.run_scene` opens a job and calls this.
     """
     check_not_adopted(job.run)
-    check_targets(config.plan, config.ladder)  # before hours of training
-    nested.check(config.nest)
-    check_clean(config.clean)
+    check_limits(config)  # before hours of training
+    check_targets(config.plan, config.ladder)
     if config.labels.instances and not method_of(job).has_instances:
         raise RunError("--labels.instances: these levels have no instances; use --ladder nested")
     blocks.check(config.blocks, config.train)
@@ -113,6 +111,7 @@ def adopt(job: Job, source: Path, adopted: AdoptConfig, config: RunConfig) -> No
     Raises:
         SageError: For anything wrong with the file, the settings, the run folder or the machine.
     """
+    check_limits(config)
     check_targets(config.plan, "nested")
     open_splat(job, source, adopted, config.scene, config.masks, config.labels)
     method_of(job).check(config.plan)

@@ -2,10 +2,11 @@
 
 from dataclasses import asdict, replace
 
-from sagesplat.adapt.plan import Plan, check_target, quality_title, write_plans
+from sagesplat.adapt.plan import Plan, quality_title, write_plans
 from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.core.config import LadderKind, PlanConfig
 from sagesplat.core.errors import RunError
+from sagesplat.io.typed import check_limits
 from sagesplat.output.tables import plan_table
 from sagesplat.run.job import Job
 from sagesplat.run.records import settings_of
@@ -21,11 +22,10 @@ PAPER_TARGETS = (0.6, 0.7, 0.8)  # SSIM, where a run has no such target of its o
 
 def check_targets(config: PlanConfig, ladder: LadderKind) -> PlanConfig:
     """The settings with their targets filled in; RunError where these levels cannot be planned for them."""
+    check_limits(config)
     method = method_for(ladder)
     if config.target_fidelity is None and config.target_ssim is None:
         config = replace(config, **method.default_target)
-    for quality, target in config.all_targets:
-        check_target(target, quality)
     if config.target_fidelity is not None and not method.has_fidelity:
         raise RunError("--target-fidelity needs the nested ladder; give --target-ssim")
     return config

@@ -23,6 +23,7 @@ from sagesplat.adapt.viewpoints import (
 from sagesplat.core.config import FitConfig, SampleConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Progress
+from sagesplat.io.typed import check_limits
 from sagesplat.run.executor import split
 from sagesplat.run.job import Job
 from sagesplat.run.records import settings_of
@@ -50,7 +51,8 @@ def sample_levels(job: Job, config: SampleConfig, fit: FitConfig) -> None:
     run = job.run
     if run.ladder != "nested":
         return
-    rule = _checked(config)  # before an earlier result is given up
+    check_limits(config, "sample.")  # before an earlier result is given up
+    rule = Rule(_SEED, config.neighbours, config.shift, config.turn)
 
     def make() -> list[str]:
         own, given = capture_cameras(job.scene), config.viewpoints
@@ -75,17 +77,6 @@ def sample_levels(job: Job, config: SampleConfig, fit: FitConfig) -> None:
         inputs.append(config.viewpoints)
     settings = asdict(config) | {"distance": fit.distance}
     run_stage(job, "sample", settings, inputs, [run.viewpoints, run.sampled], make)
-
-
-def _checked(config: SampleConfig) -> Rule:
-    """The rule to draw by; RunError for settings that cannot be followed."""
-    if config.views < 0 or config.calibration_views < 0:
-        raise RunError(
-            f"{config.views} and {config.calibration_views} viewpoints are impossible; give 0 or more"
-        )
-    rule = Rule(_SEED, config.neighbours, config.shift, config.turn)
-    rule.check()
-    return rule
 
 
 def _counts(job: Job, config: SampleConfig) -> dict[str, int]:

@@ -24,7 +24,6 @@ from scipy.ndimage import minimum_filter
 from torch import Tensor
 
 from sagesplat.core.config import CleanConfig
-from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.geometry import project, weighted_quantile
 from sagesplat.metrics.image import psnr, squared_error_map
@@ -235,12 +234,6 @@ def _unmissed(
     gone = np.zeros(len(keep), bool)
     gone[order[:low]] = True
     return gone, now
-
-
-def check(config: CleanConfig) -> None:
-    """RunError for an impossible loss."""
-    if not 0 <= config.max_loss <= 100:
-        raise RunError(f"--clean.max-loss {config.max_loss:g} is impossible; choose 0 to 100")
 
 
 def _most_pixels(g: Gaussians, breadth: Float[Tensor, " N"], camera: Camera) -> Float32[np.ndarray, " N"]:

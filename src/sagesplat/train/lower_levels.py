@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import Gaussians, concat
 from sagesplat.train.merging import merge
 from sagesplat.train.nested import Nested, Spans
@@ -21,16 +20,8 @@ Counts = Mapping[int, int]  # label id -> Gaussians
 _SPAN = 2.5  # ratio of the sizes of the levels that share a trained set
 
 
-def check_shares(shares: Sequence[float]) -> None:
-    """RunError for sizes of levels that cannot be."""
-    if not shares or not all(0 < share <= 1 for share in shares):
-        named = " ".join(map(str, shares))
-        raise RunError(f"--shares {named}: impossible; give fractions such as 0.1 0.5 1")
-
-
 def usable_shares(shares: Sequence[float], count: int) -> tuple[float, ...]:
-    """Sizes of levels as fractions of `count` Gaussians, ascending, ending with 1; RunError for others."""
-    check_shares(shares)
+    """Sizes of levels as fractions of `count` Gaussians, ascending, ending with 1."""
     return (*sorted({share for share in shares if share < 1 and share * count >= FEWEST}), 1.0)
 
 

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from sagesplat.core import geometry
 from sagesplat.core.config import NestConfig, TrainConfig
-from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import Gaussians, concat
 from sagesplat.core.second_opacity import weight_at
 from sagesplat.formats.spz import SH_BITS
+from sagesplat.io.typed import check_limits
 from sagesplat.kernels.jit import njit
 from sagesplat.raster import Backend, device_of
 from sagesplat.scene.images import Photos
@@ -223,7 +223,7 @@ def nest(
     Raises:
         RunError: For impossible settings, a loss that is not finite, or memory that runs out.
     """
-    check(config)
+    check_limits(config, "nest.")
     device = device_of(backend)
     near = geometry.morton_order(nested.gaussians.means.numpy())  # neighbours in space are rendered together
     labels, of_base = nested.gaussians.label_ids.numpy()[near], nested.of_base[near]
@@ -399,19 +399,3 @@ def learning_rates(
         return {name: multiplier * rate for name, rate in third.items()}
 
     return rates
-
-
-def check(config: NestConfig) -> None:
-    """RunError for impossible settings."""
-    wrong = (
-        ("levels", config.levels, 1 <= config.levels <= 64, "1 to 64"),
-        ("steps", config.steps, config.steps >= 0, "0 or more"),
-        ("smallest", config.smallest, 0 < config.smallest <= 1, "a share such as 0.01"),
-        ("full-share", config.full_share, 0 <= config.full_share <= 1, "a share such as 0.1"),
-        ("rate-weight", config.rate_weight, config.rate_weight >= 0, "a number such as 0.0006, or 0"),
-        ("base-share", config.base_share, 0 <= config.base_share < 1, "a share such as 0.1, or 0"),
-        ("base-steps", config.base_steps, config.base_steps >= 1, "1 or more"),
-    )
-    for name, value, fine, cure in wrong:
-        if not fine:
-            raise RunError(f"--nest.{name} {value} is impossible; choose {cure}")

@@ -16,6 +16,7 @@ from sagesplat.core.errors import DataError, OutOfMemory, RunError
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.memory import ran_out
 from sagesplat.formats.levels import check_level, write_level
+from sagesplat.io.typed import check_limits
 from sagesplat.raster import Backend, device_of
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
@@ -347,15 +348,6 @@ def _check_levels(checkpoint: Path, step: int) -> None:
 
 
 def _check(config: TrainConfig, masks: Masks | None) -> None:
-    counts = (("max_steps", 1, 10**9), ("level_every", 0, 10**9), ("sh_degree", 0, 3), ("batch", 1, 10**6))
-    for name, low, high in counts:
-        value = getattr(config, name)
-        if not low <= value <= high:
-            raise RunError(
-                f"--train.{name.replace('_', '-')} {value} is impossible; choose {low} to {high:,}"
-            )
-    target = config.freeze_at
-    if target is not None and not 0 < target <= 1:
-        raise RunError(f"--train.freeze-at {target} is no SSIM to reach; choose a number such as 0.8")
-    if target is not None and masks is None:
+    check_limits(config, "train.")
+    if config.freeze_at is not None and masks is None:
         raise RunError("--train.freeze-at needs label images to measure categories on; bring masks")

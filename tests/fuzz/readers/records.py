@@ -67,7 +67,7 @@ settings.ladder = "snapshots"
 settings.train = { max_steps = 60, level_every = 20 }
 scenes.plot = "demo"
 variants.track = {}
-variants.projection.lift.votes = "projection"
+variants.published.train.lr_schedule = "published"
 """
 
 
@@ -215,7 +215,8 @@ def _sweep(folder: Path, size: int) -> list[bytes]:
 
 def _comparison(folder: Path, size: int) -> list[bytes]:
     fields: Any = [dict.fromkeys(kind.__dataclass_fields__, 1) for kind in (OfLabel, Point, Walk)]
-    point, walk = Point(**fields[1] | {"labels": {2: OfLabel(**fields[0])}}), Walk(**fields[2])
+    named = {"method": "SAGE", "name": "0.8", "labels": {2: OfLabel(**fields[0])}}
+    point, walk = Point(**fields[1] | named), Walk(**fields[2] | {"method": "SAGE", "keeps": True})
     return [written(folder / "c.json", lambda path: write_comparison(path, [point] * size, [walk]))]
 
 

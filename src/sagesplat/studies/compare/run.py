@@ -12,7 +12,7 @@ import numpy as np
 
 from sagesplat.adapt.allocate import along
 from sagesplat.adapt.observe import MIN_SHARE, TOTAL, as_unit, measure, measure_total, render_rgb
-from sagesplat.adapt.plan import Plan, check_target
+from sagesplat.adapt.plan import Plan
 from sagesplat.core.config import CompareConfig, PlanConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Progress, RunDone
@@ -21,6 +21,7 @@ from sagesplat.formats.increments import INDEX, read_increments, read_index, sho
 from sagesplat.formats.levels import read_level, write_set
 from sagesplat.formats.stream_increments import write_streams
 from sagesplat.io.files import write_text
+from sagesplat.io.typed import check_limits
 from sagesplat.metrics.color_correct import color_correct_affine
 from sagesplat.metrics.image import pasted
 from sagesplat.metrics.lpips import Lpips
@@ -145,20 +146,7 @@ def _check(job: Job, config: CompareConfig) -> None:
     for path in (run.prefixes, run.increments / INDEX, run.observations, run.promises, run.plan):
         if not path.exists():
             raise RunError(f"{path}: missing, but all is compared with it; finish `sagesplat run` (nested)")
-    for name, shares in (("shares", config.shares), ("caps", config.caps)):
-        for share in shares:
-            if not 0 < share <= 1:
-                raise RunError(f"{run.path}: --{name} {share:g} is no share of Gaussians; choose 0.1, say")
-    wrong = (
-        ("snapshots", config.snapshots, config.snapshots >= 1, "1 or more"),
-        ("budgets", config.budgets, config.budgets >= 2, "2 or more"),
-        ("tune-steps", config.tune_steps, config.tune_steps >= -1, "0 or more, or -1"),
-    )
-    for name, value, fine, cure in wrong:
-        if not fine:
-            raise RunError(f"{run.path}: --{name} {value} is impossible; choose {cure}")
-    for target in config.targets:
-        check_target(target)
+    check_limits(config)
     smallest = min(config.caps, default=1.0)
     if round(smallest * job.recorded.size(job.last_level.step)) < _FEWEST:
         raise RunError(f"{run.path}: --caps {smallest:g} leaves too few Gaussians to train; choose more")

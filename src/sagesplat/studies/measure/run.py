@@ -12,6 +12,7 @@ from sagesplat.core.config import MeasureConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit, Progress, StageStarted, Warned
 from sagesplat.formats.splats import Splat
+from sagesplat.io.typed import check_limits
 from sagesplat.metrics.image import ssim_map
 from sagesplat.output.contact_sheet import contact_sheet
 from sagesplat.raster import Backend
@@ -50,7 +51,7 @@ def measure(
         RunError: For one level alone, and where no viewpoint has anything in sight.
     """
     emit(StageStarted("measure"))
-    _check(config)
+    check_limits(config)
     reference, levels, names = _levels(paths)
     truth = reference.load()
     _tell_dropped(truth, reference.name, emit)
@@ -84,13 +85,6 @@ def measure(
     write_report(out, measured, how, _strip(truth, levels, cameras[row], views[row], renderer))
     _show(measured, emit)
     return measured
-
-
-def _check(config: MeasureConfig) -> None:
-    if config.views < 1:
-        raise RunError(f"--views {config.views} is impossible; choose 1 or more")
-    if not 16 <= config.size <= 8192:
-        raise RunError(f"--size {config.size} cannot be used; choose 16 to 8192 px")
 
 
 def _levels(paths: Sequence[Path]) -> tuple[Level, list[Level], list[str]]:
