@@ -353,7 +353,7 @@ def _from_json(entry: dict[str, Any]) -> Plan:
         Choice(
             label_id=int(choice["label_id"]),
             level=int(choice["level"]),
-            predicted=number(choice["predicted" if "predicted" in choice else "predicted_ssim"]),
+            predicted=number(choice["predicted"]),
             distance=number(choice["distance"]),
             count=int(choice["count"]),
             status=str(choice["status"]),
@@ -365,7 +365,7 @@ def _from_json(entry: dict[str, Any]) -> Plan:
     )
     if unknown := {choice.status for choice in choices} - set(STATUSES):
         raise ValueError(f"unknown status {unknown.pop()!r}")
-    quality = entry.get("quality", "ssim")  # the only one of older runs
+    quality = entry["quality"]
     if quality not in get_args(QualityKind):
         raise ValueError(f"unknown quality {quality!r}")
     return Plan(
@@ -375,7 +375,7 @@ def _from_json(entry: dict[str, Any]) -> Plan:
         share=maybe(float, entry["share"]),
         budget=maybe(float, entry.get("budget")),
         unit=maybe(str, entry.get("unit")),
-        fits=bool(entry.get("fits", True)),
+        fits=bool(entry["fits"]),
         quality=quality,
     )
 

@@ -1,6 +1,5 @@
 """Commands that compare methods, scenes, settings and viewpoints."""
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -164,7 +163,7 @@ def sweep(
     from sagesplat.studies.sweep.file import read_sweep
     from sagesplat.studies.sweep.run import run_sweep
 
-    cells = read_sweep(file, lambda text: say(f"sagesplat: {text}", file=sys.stderr))
+    cells = read_sweep(file)
     with computing(machine, out / "runs") as (backend, threads, executor), Console() as console:
         run_sweep(cells, out, console, backend, threads, machine.force, executor)
     say(out / "summary.md")

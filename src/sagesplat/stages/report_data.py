@@ -66,7 +66,7 @@ def report_data(
     run, scene, masks, ladder = job.run, job.scene, job.best_masks, job.ladder
     names = {**masks.taxonomy.names, UNLABELLED: masks.taxonomy.name(UNLABELLED)}
     promise, drawn = _promise(job)
-    beside = settings_of(run, "plan").get("target_ssim") if quality == "fidelity" else None
+    beside = settings_of(run, "plan")["target_ssim"] if quality == "fidelity" else None
     records = {path.stem: read_record(path) for path in stage_records(run)}
     return ReportData(
         title=scene.name,

@@ -3,7 +3,6 @@
 import re
 import tomllib
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
 from types import UnionType
@@ -25,10 +24,6 @@ _SET_BY = {
 _NEEDED = {
     bool: "true or false", int: "a whole number", float: "a finite number", str: "text in quotes",
     Path: "a path in quotes", tuple: "a list", dict: "a table",
-}  # fmt: skip
-_RENAMED = {  # settings by their names until the last release
-    "pace": "lr_schedule", "rest_share": "gradient_freeze_share", "seed_share": "base_share",
-    "seed_steps": "base_steps", "gain": "lr_multiplier", "seam_steps": "boundary_steps",
 }  # fmt: skip
 Config = TypeVar("Config")  # a frozen dataclass of settings
 
@@ -62,11 +57,8 @@ class _File:
     variants: dict[str, dict[str, Any]] = field(default_factory=dict)
 
 
-def read_sweep(path: Path, tell: Callable[[str], None] = lambda text: None) -> Sweep:
-    """The cells that a sweep file asks for, by scene, variant and seed. DataError where it is not one.
-
-    `tell` gets a line for each setting with an old name.
-    """
+def read_sweep(path: Path) -> Sweep:
+    """The cells that a sweep file asks for, by scene, variant and seed. DataError where it is not one."""
     try:
         text = path.read_text(encoding="utf-8")
         _need(len(text) <= MAX_LENGTH, f"{path}: {len(text)} characters, more than a sweep has; split it")
@@ -79,7 +71,6 @@ def read_sweep(path: Path, tell: Callable[[str], None] = lambda text: None) -> S
             f"{path}: not readable as TOML ({short(error)}); examples/sweep.toml shows one"
         ) from None
     folder = path.parent
-    _rename(document, f"{path}: ", tell)
     file = _set(_File(), document, f"{path}: ", folder)
     targets = sorted(round(target, 6) for target in file.targets)
     for key, values in (("scenes", list(file.scenes)), ("targets", targets), ("seeds", file.seeds)):
@@ -108,22 +99,6 @@ def read_sweep(path: Path, tell: Callable[[str], None] = lambda text: None) -> S
     for name, times in Counter(names).items():
         _need(times == 1, f"{path}: two runs would be called {name}; rename a scene or a variant")
     return tuple(cells)
-
-
-def _rename(table: dict[str, Any], where: str, tell: Callable[[str], None]) -> None:
-    """Give settings with old names their new ones, in the tables of stages within settings and variants."""
-    tables = [("settings.", table.get("settings"))]
-    variants = table.get("variants")
-    if isinstance(variants, dict):
-        tables += [(f"variants.{name}.", changes) for name, changes in variants.items()]
-    for prefix, of_run in tables:
-        for stage in ("train", "nest", "blocks"):
-            inner = of_run.get(stage) if isinstance(of_run, dict) else None
-            if not isinstance(inner, dict):
-                continue
-            for old in [key for key in inner if key in _RENAMED]:
-                tell(f"{where}{prefix}{stage}.{old} is called {_RENAMED[old]} now; the old name will go")
-                inner[_RENAMED[old]] = inner.pop(old)
 
 
 def _is_folder(path: Path) -> bool:
