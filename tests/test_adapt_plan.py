@@ -254,16 +254,6 @@ def test_all_of_a_plan_for_fidelity_reads_back(tmp_path):
     assert (plans[0].verdict, plans[0].calibrated) == ("no promise, uncalibrated", False)
 
 
-def test_plans_of_older_runs_are_of_ssim(tmp_path):
-    """They had no other quality, and called the promise predicted_ssim."""
-    path = tmp_path / "plan.json"
-    choice = {"label_id": 1, "level": 2, "predicted_ssim": 0.5, "distance": None, "count": 1, "status": "ok"}
-    plan = {"target": 0.5, "view": None, "share": 0.95, "choices": [choice]}
-    path.write_text(json.dumps({"scene": [plan], "views": []}))
-    ((found,), _) = read_plans(path)
-    assert (found.quality, found.choices[0].predicted, found.choices[0].calibrated) == ("ssim", 0.5, None)
-
-
 @pytest.mark.parametrize(
     "content",
     [
@@ -272,7 +262,7 @@ def test_plans_of_older_runs_are_of_ssim(tmp_path):
         '{"scene": [{"target": 0.5}], "views": []}',
         '{"scene": [], "views": [{"target": 0.5, "view": 1e999, "share": null, "choices": []}]}',
         '{"scene": [], "views": [{"target": 0.5, "view": 1, "share": null, "choices": [{"label_id": 1,'
-        ' "level": 1, "predicted_ssim": 0.5, "distance": null, "count": 1, "status": "fine"}]}]}',
+        ' "level": 1, "predicted": 0.5, "distance": null, "count": 1, "status": "fine"}]}]}',
         '{"views": [], "scene": [{"target": 1, "view": 1, "share": null, "choices": [], "quality": "psnr"}]}',
         '{"views": [], "scene": [{"target": 0.5, "view": 1, "share": null, "choices": [{"label_id": 1,'
         ' "level": 1, "predicted": 0.5, "distance": null, "count": 1, "status": "ok",'
