@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from sagesplat.segment.soft import read_soft, write_soft
 
 from benchmarks.hostile import Reader
 from benchmarks.readers.making import PHOTOS, as_json, file, splats, written
@@ -23,7 +24,6 @@ from sagesplat.formats.stream_increments import read_streams
 from sagesplat.scene.scene import Camera, Lens, Points, Scene, View
 from sagesplat.scene.stored import read_scene, write_scene
 from sagesplat.segment.lift import LiftedLabels
-from sagesplat.segment.soft import read_soft, write_soft
 from sagesplat.train.checkpoint import latest_checkpoint, write_checkpoint
 from sagesplat.train.state import initial_state
 from sagesplat.train.view_parameters import ViewParameters

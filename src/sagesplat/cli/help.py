@@ -45,7 +45,7 @@ def flags_of(function: Callable[..., None]) -> Iterator[Flag]:
     described = _described(inspect.getdoc(function) or "")
     for name, parameter in inspect.signature(function).parameters.items():
         hint, *marks = get_args(hints[name]) if get_origin(hints[name]) is Annotated else (hints[name],)
-        told = {
+        marked = {
             key: value
             for key in ("name", "metavar", "help")
             for mark in marks
@@ -53,7 +53,7 @@ def flags_of(function: Callable[..., None]) -> Iterator[Flag]:
         }
         default = None if parameter.default is parameter.empty else parameter.default
         if is_dataclass(hint):
-            prefix = "" if told.get("name") == "" else f"{name}."
+            prefix = "" if marked.get("name") == "" else f"{name}."
             for field in fields(hint):
                 yield Flag(
                     f"--{prefix}{field.name.replace('_', '-')}", _first_line(_home(hint, field.name)),
@@ -62,8 +62,8 @@ def flags_of(function: Callable[..., None]) -> Iterator[Flag]:
                 )  # fmt: skip
         else:
             positional = _POSITIONAL in marks
-            shown = told.get("metavar") or told.get("name") or name.replace("_", "-")
-            help = " ".join(str(told.get("help") or described.get(name, "")).split())
+            shown = marked.get("metavar") or marked.get("name") or name.replace("_", "-")
+            help = " ".join(str(marked.get("help") or described.get(name, "")).split())
             yield Flag(
                 shown if positional else f"--{shown}", "" if positional else "Options",
                 "" if positional else _values(hint), help, default, (name,),
