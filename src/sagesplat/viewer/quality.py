@@ -70,11 +70,12 @@ def curve_entry(curve: SsimModel) -> dict[str, Any]:
     }
     below = 10.0 ** decimals_of(beta, 6)  # rounds down: some views are exactly at beta, where far begins
     short: dict[str, Any] = {**entry, "median": round(curve.median, 4)}
-    away = np.array([*np.linspace(*curve.d_range, 200), curve.params.mu1, curve.params.mu2])  # with the cusps
+    cusps = curve.params.mu1, curve.params.mu2
+    distance = np.array([*np.linspace(*curve.d_range, 200), *cusps])
     for digits in range(3, 16):
         params = [*significant(entry["params"][:8], digits), math.floor(beta * below) / below]
         short |= {"params": params, "range": significant(entry["range"], max(digits, 6))}
-        if np.abs(curve_of(short, curve.label_id)(away) - curve(away)).max() <= MAX_CURVE_CHANGE:
+        if np.abs(curve_of(short, curve.label_id)(distance) - curve(distance)).max() <= MAX_CURVE_CHANGE:
             break
     return short
 
