@@ -26,7 +26,7 @@ from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene
 from sagesplat.train.events import Step, Trained
 from sagesplat.train.optim import adam_step
-from sagesplat.train.state import from_points, largest_scales
+from sagesplat.train.state import from_points
 from sagesplat.train.trainer import train
 
 # operations that the blending loops cost per pixel and Gaussian (docs/performance.md)
@@ -100,9 +100,8 @@ def on_capture(capture: Scene, steps: int, repeats: int) -> dict[str, Any]:
     if not steps:
         labels = np.full(len(g), -1, np.int16)
         config = TrainConfig(max_steps=30_000, level_every=30_000, lr_schedule="published")
-        for name, start in (("step_ms", g), ("step_initial_angle_ms", initial(capture, 0.015))):
-            events = train(capture, Photos(capture.views), labels, config, start=start)
-            result[name] = milliseconds(partial(next, (e for e in events if isinstance(e, Step))), 40)
+        events = train(capture, Photos(capture.views), labels, config, start=g)
+        result["step_ms"] = milliseconds(partial(next, (e for e in events if isinstance(e, Step))), 40)
     return result | blending(g, view, repeats) | {"peak_mib": peak_mib()}
 
 
@@ -135,10 +134,9 @@ def cloud(count: int, overlap: str, view: Camera, degree: int = 3, seed: int = 0
     )
 
 
-def initial(scene: Scene, angle: float = 0.0) -> Gaussians:
-    """What training begins with, by `TrainConfig.initial_angle`."""
-    largest = largest_scales(scene, angle) if angle else None
-    return from_points(scene.points, np.full(len(scene.points.xyz), -1, np.int16), 3, largest=largest)
+def initial(scene: Scene) -> Gaussians:
+    """What training begins with."""
+    return from_points(scene.points, np.full(len(scene.points.xyz), -1, np.int16), 3)
 
 
 def trained(scene: Scene, steps: int) -> Gaussians:

@@ -17,6 +17,7 @@ from sagesplat.adapt.photo_models import (
     measured_at,
 )
 from sagesplat.core.errors import RunError
+from sagesplat.io.typed import to_plain
 
 GRID = np.arange(0.5, 0.86, 0.05).round(2).tolist()
 SCENE = orbit(160)

@@ -1,7 +1,7 @@
 import pickle
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from sagesplat.core.errors import BackendUnavailable, LabelError
 from sagesplat.segment.deeplabv2 import (
@@ -17,6 +18,7 @@ from sagesplat.segment.deeplabv2 import (
     HEADS,
     MEAN_BGR,
     RATES,
+    SCALES,
     DeepLabV2,
     DeepLabV2Segmenter,
     HeadClasses,
@@ -397,8 +399,8 @@ def test_without_safetensors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 
 def train_small(
-    photos: Photos,
-    labels: LabelImages,
+    photos: Sequence[np.ndarray],
+    labels: Sequence[np.ndarray],
     num_classes: int,
     *,
     steps: int,
@@ -439,7 +441,7 @@ def train_small(
     return model.eval()
 
 
-def mean_iou(predicted: LabelImages, truth: LabelImages) -> float:
+def mean_iou(predicted: Sequence[np.ndarray], truth: Sequence[np.ndarray]) -> float:
     """Mean intersection over union of the truth's labels; its unlabelled pixels do not count."""
     p, t = (np.concatenate([image.ravel() for image in images]) for images in (predicted, truth))
     p, t = p[t >= 0], t[t >= 0]

@@ -3,6 +3,7 @@
 import csv
 import shutil
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -82,7 +83,7 @@ def trained(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("ladder", ["nested", pytest.param("snapshots", marks=pytest.mark.slow)])
 def test_every_stage_and_study_takes_them(
-    ladder: LadderKind, capture: Path, trained: Path, tmp_path: Path
+    ladder: Literal["nested", "snapshots"], capture: Path, trained: Path, tmp_path: Path
 ) -> None:
     run = Path(shutil.copytree(trained, tmp_path / "run"))
     job = Job(RunDir(run, ladder), lambda event: None)

@@ -8,7 +8,6 @@ import numpy as np
 
 from sagesplat.adapt.observe import (
     PERCENTILE,
-    LabelImages,
     Observations,
     RenderedLabels,
     distances_in_views,
@@ -57,11 +56,6 @@ def inlier_inputs(run: RunDir) -> list[Path]:
 def rendered_labels(job: Job) -> RenderedLabels:
     """The label images that the full model paints."""
     return RenderedLabels(job.ladder.load(job.ladder.levels[-1]), job.backend, job.antialiased)
-
-
-def label_images(job: Job, source: str) -> LabelImages:
-    """The label images that came with the photos ("given"), or those of the 3D labels ("rendered")."""
-    return job.best_masks if source == "given" else rendered_labels(job)
 
 
 def distances_from(job: Job, camera: Camera) -> dict[int, np.ndarray]:
