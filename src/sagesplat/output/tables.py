@@ -198,11 +198,11 @@ def counts_table(counts: Counts, labels: Sequence[int], names: Mapping[int, str]
 def ladder_table(
     rows: Observations, counts: Counts, recovering: frozenset[int], names: Mapping[int, str], columns: int = 4
 ) -> Table:
-    """Tables I and II in one, for a terminal: mean SSIM and thousands of Gaussians at some settled levels."""
+    """Tables I and II in one, for a terminal: mean SSIM and thousands of Gaussians at some levels, spread evenly."""
     levels = sorted({level for _, level in counts})
     not_recovering = [level for level in levels if level not in recovering] or levels
-    rows = np.linspace(0, len(not_recovering) - 1, columns).round().astype(int)
-    picked = sorted({not_recovering[i] for i in rows})
+    spread = np.linspace(0, len(not_recovering) - 1, columns).round().astype(int)
+    picked = sorted({not_recovering[i] for i in spread})
     body = []
     for label_id in [*by_size(counts), TOTAL]:
         cells = []
