@@ -1,7 +1,7 @@
 import pickle
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from sagesplat.core.errors import BackendUnavailable, LabelError
 from sagesplat.segment.deeplabv2 import (
@@ -17,6 +18,7 @@ from sagesplat.segment.deeplabv2 import (
     HEADS,
     MEAN_BGR,
     RATES,
+    SCALES,
     DeepLabV2,
     DeepLabV2Segmenter,
     HeadClasses,
@@ -407,6 +409,9 @@ def test_without_safetensors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 # training
 
+Photos = Sequence[np.ndarray]  # uint8 [H, W, 3]
+LabelImages = Sequence[np.ndarray]  # int16 [H, W]
+
 
 def train_small(
     photos: Photos,
@@ -423,9 +428,8 @@ def train_small(
 ) -> DeepLabV2:
     """A network from random weights; labels are classes 0 ... C - 1, negative ones do not count.
 
-    All photos are of one size. Each step sees a batch at one of the scales of inference, half of it mirrored;
-    unlike in the paper, batch norm learns too, since there are no weights to start from. `on_step(steps done,
-    loss)` is called after each.
+    Each step sees a batch at one of the scales of inference, half of it mirrored; unlike in the paper, batch norm
+    learns too, since there are no weights to start from.
     """
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
