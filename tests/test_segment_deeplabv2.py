@@ -428,8 +428,8 @@ def train_small(
 ) -> DeepLabV2:
     """A network from random weights; labels are classes 0 ... C - 1, negative ones do not count.
 
-    Each step sees a batch at one of the scales of inference, half of it mirrored; unlike in the paper, batch norm
-    learns too, since there are no weights to start from.
+    Each step sees a batch at one of the scales of inference, half of it mirrored; unlike in the paper, batch
+    norm learns too, since there are no weights to start from.
     """
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
