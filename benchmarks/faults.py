@@ -94,7 +94,7 @@ def measure(asked: Asked, wanted: Sequence[str], tell: Callable[[str], None]) ->
     Each is told in a line. RunError where there is no undisturbed run to compare with.
     """
     file = asked.out / "faults.json"
-    before = json.loads(file.read_text()) if file.exists() else {"cases": [], "digests": {}}
+    before: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {"cases": [], "digests": {}}
     cases = {row["case"]: Outcome(**row) for row in before["cases"]}
     digest = before["digests"]
 

@@ -62,7 +62,8 @@ def main(
         return
     used = set_threads(threads)
     capture = load_scene(scene, downscale=downscale)
-    result = {"scene": capture.name, "steps": steps, "threads": used} | on_capture(capture, steps, repeats)
+    result: dict[str, Any] = {"scene": capture.name, "steps": steps, "threads": used}
+    result |= on_capture(capture, steps, repeats)
     for name, value in result.items():
         print(f"{name:32} {value:,.4g}" if isinstance(value, float) else f"{name:32} {value}")
     finish(f"kernels_{capture.name}_{result['size'][0]}_{steps}", result, write)

@@ -64,7 +64,7 @@ def test_before_and_after_is_a_table_and_one_line_of_json(checkout, tmp_path, ca
 
 
 def test_what_is_no_checkout_is_one_line(tmp_path):
-    for words in ({}, {"against": "none"}):
+    for against in ("", "none"):
         with pytest.raises(SystemExit, match="name") as caught:
-            structure.main(tmp_path, **words)
+            structure.main(tmp_path, against=against)
         assert "\n" not in str(caught.value)

@@ -397,6 +397,9 @@ def test_without_safetensors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 # training
 
+Photos = Sequence[np.ndarray]  # uint8 [H, W, 3]
+LabelImages = Sequence[np.ndarray]  # int16 [H, W]
+
 
 def train_small(
     photos: Sequence[np.ndarray],
@@ -413,9 +416,8 @@ def train_small(
 ) -> DeepLabV2:
     """A network from random weights; labels are classes 0 ... C - 1, negative ones do not count.
 
-    All photos are of one size. Each step sees a batch at one of the scales of inference, half of it mirrored;
-    unlike in the paper, batch norm learns too, since there are no weights to start from. `on_step(steps done,
-    loss)` is called after each.
+    Each step sees a batch at one of the scales of inference, half of it mirrored; unlike in the paper, batch
+    norm learns too, since there are no weights to start from.
     """
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
