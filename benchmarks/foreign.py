@@ -51,7 +51,7 @@ EXCEPTIONS: dict[str, str] = {
     "kernels.jit:_file_hash": OURS,
     "output.report:template": OURS,
     "run.ray_cluster:_check_answers": "nine bytes, of which one is compared",
-    "run.remote:_piece": _HASHED,
+    "run.remote:run_part": _HASHED,
     "run.stage:run_stages": _WROTE,
     "stages.adopt:_label": "by read_header and read_level, which the readers run",
     "stages.adopt:_make_capture": _WROTE,

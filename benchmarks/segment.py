@@ -150,7 +150,7 @@ def fusion_sheet(job: Job, rows: Sequence[int], blend: float) -> Image.Image:
     views = [job.scene.views[row] for row in rows]
     columns = {
         name: [masks[view] for view in views]
-        for name, masks in (("before fusion", job.masks), ("after", job.best_masks))
+        for name, masks in (("before fusion", job.masks), ("after", job.level_masks))
     }
     return sheet([job.photos[row] for row in rows], columns, job.taxonomy, blend)
 

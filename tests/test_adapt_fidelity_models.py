@@ -13,9 +13,9 @@ from sagesplat.adapt.fidelity_models import (
     Trial,
     calibrated,
     fit_fidelity,
+    hold_all_categories,
     plan_nominal,
-    recentred,
-    settled,
+    remove_composition_bias,
 )
 from sagesplat.adapt.viewpoint import Calibration, read_promises, write_promises
 from sagesplat.core.errors import DataError
@@ -78,8 +78,8 @@ def made(seed: int, confidence: float = 0.95, spill: float = 0.0, views=(80, 60,
     fit, bias, calibration = (viewpoints(n, 10 * seed + i) for i, n in enumerate(views))
     models = fit_fidelity(sampled(fit, seed), fit, 2.0, confidence)
     for _ in range(2):
-        models = recentred(models, trial(models, bias, 100 * seed, spill), confidence)
-    models, held = settled(models, trial(models, bias, 100 * seed, spill), confidence)
+        models = remove_composition_bias(models, trial(models, bias, 100 * seed, spill), confidence)
+    models, held = hold_all_categories(models, trial(models, bias, 100 * seed, spill), confidence)
     return calibrated(models, trial(models, calibration, 100 * seed + 1, spill), confidence, held), held
 
 

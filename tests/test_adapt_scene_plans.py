@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sagesplat.adapt.bound_plans import Costs, pooled
-from sagesplat.adapt.scene_plans import mended, plan_for_scene, reached
+from sagesplat.adapt.scene_plans import plan_for_scene, raise_failing_levels, reached
 from sagesplat.core.errors import RunError
 
 quick = settings(max_examples=80, deadline=None)
@@ -86,21 +86,21 @@ def test_a_level_goes_up_where_its_composition_misses():
     plan = plan_for_scene(measured, pixels, of, 0.88, 0.95, "fidelity")
     assert plan.levels == {0: 2, 1: 1}
     composed = np.tile([0.85, 0.9], (39, 1))
-    up, settled = mended(plan, composed, of, *weights, last=False)
-    assert (up.levels, settled) == ({0: 3, 1: 1}, False)
+    up, holds = raise_failing_levels(plan, composed, of, *weights, last=False)
+    assert (up.levels, holds) == ({0: 3, 1: 1}, False)
     assert (up.count, up.transfer_bytes) == (40, 40)
-    left, settled = mended(plan, composed, of, *weights, last=True)
-    assert (left.levels, settled, left.verdict) == (plan.levels, True, "ok, uncalibrated")
+    left, holds = raise_failing_levels(plan, composed, of, *weights, last=True)
+    assert (left.levels, holds, left.verdict) == (plan.levels, True, "ok, uncalibrated")
     assert left.choices[0].reached is not None
     assert (left.choices[0].predicted, left.choices[0].reached.share) == (0.85, 0)
     one_in_39 = np.where(np.arange(39)[:, None] == 5, [0.85, 0.9], [0.89, 0.9])
-    fine, settled = mended(up, one_in_39, of, *weights, last=False)
-    assert (fine.levels, settled, fine.verdict) == (up.levels, True, "ok")
+    fine, holds = raise_failing_levels(up, one_in_39, of, *weights, last=False)
+    assert (fine.levels, holds, fine.verdict) == (up.levels, True, "ok")
     assert fine.choices[0].reached is not None
     assert (fine.choices[0].predicted, fine.choices[0].reached.num_views) == (0.89, 39)
     two_in_39 = np.where(np.isin(np.arange(39), [5, 9])[:, None], [0.85, 0.9], [0.89, 0.9])
-    assert mended(up, two_in_39, of, *weights, last=False)[1] is False  # 94.9 %
-    few = mended(plan, composed[:18], of, *weights, last=False)  # 18 views say too little
+    assert raise_failing_levels(up, two_in_39, of, *weights, last=False)[1] is False  # 94.9 %
+    few = raise_failing_levels(plan, composed[:18], of, *weights, last=False)  # 18 views say too little
     assert few == (plan, True)
 
 
@@ -109,8 +109,9 @@ def test_what_misses_at_its_highest_level_lifts_its_neighbours():
     plan = plan_for_scene(measured, np.zeros((40, 3)), costs(3, 2), 0.8, 0.95, "fidelity")
     assert plan.levels == {0: 2, 1: 1, 2: 2}
     composed = np.tile([0.7, 0.9, np.nan], (40, 1))
-    up, settled = mended(plan, composed, costs(3, 2), *pooled(measured, np.zeros((40, 3))), last=False)
-    assert (up.levels, settled) == ({0: 2, 1: 2, 2: 2}, False)
+    weights = pooled(measured, np.zeros((40, 3)))
+    up, holds = raise_failing_levels(plan, composed, costs(3, 2), *weights, last=False)
+    assert (up.levels, holds) == ({0: 2, 1: 2, 2: 2}, False)
 
 
 def test_few_views_take_the_full_model_or_prove_nothing():

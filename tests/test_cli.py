@@ -219,7 +219,7 @@ def test_every_argument_of_every_command_has_help() -> None:
         ("plan", ["--processes", "--memory-limit", "--executor", "--device", "--threads"]),
         ("bundle", ["--processes", "--memory-limit", "--executor", "--force"]),
         ("compose", ["--processes", "--memory-limit", "--executor"]),
-        ("lift", ["--processes", "--backend"]),
+        ("lift", ["--processes", "--device"]),
     ],
 )
 def test_a_command_has_the_flags_that_it_uses(command: str, absent: list[str]) -> None:
@@ -253,16 +253,16 @@ def test_words_that_cannot_be_parsed_are_one_line(
     assert error.count("\n") == 1
 
 
-def test_demo_takes_its_folder_with_and_without_the_flag(
+def test_demo_has_a_folder_of_its_own(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from sagesplat.stages import pipeline
 
     seen = []
     monkeypatch.setattr(pipeline, "run_demo", lambda job, places, wild: seen.append(job.run.path.name))
-    for words in ([], ["x"], ["--run", "y"], ["--run=z"]):
+    for words in ([], ["x"]):
         assert call(monkeypatch, capsys, "demo", *words)[0] == 0
-    assert seen == ["demo", "x", "y", "z"]
+    assert seen == ["demo", "x"]
 
 
 def test_an_example_without_its_network_ends_in_one_line(

@@ -10,10 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from test_cli import call
 
 from sagesplat.adapt.plan import read_plans
-from sagesplat.cli import parse
 from sagesplat.cli.console import Console
 from sagesplat.core.config import FitConfig, NestConfig, PlanConfig, TrainConfig
 from sagesplat.core.errors import RunError
@@ -24,7 +22,7 @@ from sagesplat.io.files import read_json
 from sagesplat.run.job import Job
 from sagesplat.run.recorded import recorded_settings
 from sagesplat.run.run_dir import RunDir
-from sagesplat.stages import export, pipeline, preflight, train
+from sagesplat.stages import pipeline, preflight, train
 from sagesplat.stages import plan as plan_stage
 from sagesplat.stages.nest import nest_levels
 from sagesplat.stages.train import train_levels
@@ -357,50 +355,3 @@ def test_a_training_that_does_not_fit_is_told_before_label_images(
             events.clear()
             preflight.check_training(roomy, TrainConfig())
             assert [type(e) for e in events] == told
-
-
-def test_old_names_of_commands_and_flags(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    seen = {}
-    monkeypatch.setattr(pipeline, "run_all", lambda job, scene, config: seen.update(config=config))
-    old = {
-        "--train.pace=published": ("train", "lr_schedule", "published"),
-        "--train.rest_share 0.5": ("train", "gradient_freeze_share", 0.5),
-        "--nest.seed-share 0.1": ("nest", "base_share", 0.1),
-        "--nest.seed-steps 7": ("nest", "base_steps", 7),
-        "--nest.gain 2": ("nest", "lr_multiplier", 2.0),
-        "--blocks.seam-steps 9": ("blocks", "boundary_steps", 9),
-    }
-    code, said = call(monkeypatch, capsys, "run", "a", "b", *" ".join(old).split())
-    assert code == 0
-    for part, name, value in old.values():
-        assert getattr(getattr(seen["config"], part), name) == value
-        assert f"--{part}.{name.replace('_', '-')} now" in said
-    assert said.count("\n") == len(old)
-    for name, now in parse.OLD_COMMANDS.items():
-        code, said = call(monkeypatch, capsys, name, "nowhere", *(["x"] if name == "online" else []))
-        assert code == 2
-        assert f"the command {name} is called {now} now" in said
-
-
-def test_no_old_name_is_one_of_today() -> None:
-    from sagesplat.cli import commands
-    from sagesplat.cli.help import flags_of
-
-    flags = {flag.name for flag in flags_of(commands()["run"])}
-    assert not flags & set(parse.OLD_FLAGS)
-    assert set(parse.OLD_FLAGS.values()) <= flags
-    assert not set(commands()) & set(parse.OLD_COMMANDS)
-    assert set(parse.OLD_COMMANDS.values()) <= set(commands())
-
-
-def test_names_of_categories_are_no_settings_of_label_images(
-    run: Path, command: Call, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seen = []
-    monkeypatch.setattr(
-        export, "export_scene", lambda job, out, **options: seen.append(options["labels"]) or 3
-    )
-    assert command("export", run, "a.ply")[0] == command("export", run, "a.ply", "--labels", "tree")[0] == 0
-    assert seen == [(), ("tree",)]

@@ -83,5 +83,5 @@ def test_a_run_with_awkward_names(
     assert len(set(uris)) == len(uris)
     assert all(re.fullmatch(r"chunks/[a-z0-9-]+-\d\d-[0-9a-f]{12}\.spz", uri) for uri in uris)
 
-    said = call(monkeypatch, capfd, "export", run, run / "a.ply", "--level", "2", "--labels", NAMES[7])
+    said = call(monkeypatch, capfd, "export", run, run / "a.ply", "--level", "2", "--only", NAMES[7])
     assert r"[/red] \xff/a.ply" in said

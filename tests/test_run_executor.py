@@ -287,7 +287,7 @@ settings.train = { max_steps = 20, level_every = 10, sh_degree = 1 }
 scenes.plot = "capture"
 variants.a = {}
 variants.b.fit.distance = "minimum"
-variants.c.lift.votes = "projection"
+variants.c.train.sh_degree = 0
 """
 
 

@@ -414,7 +414,7 @@ def test_instances_of_blocks(finished: Path, tmp_path: Path) -> None:
     categories = Masks(job.run.block_categories, Taxonomy.read(job.run.block_categories / "labels.json"))
     view = job.scene.views[0]
     for was, now in zip(
-        categories[view].ravel().tolist(), job.best_masks[view].ravel().tolist(), strict=True
+        categories[view].ravel().tolist(), job.level_masks[view].ravel().tolist(), strict=True
     ):
         name, block = split_name(names[now])
         assert (job.parents.get(name, name), block) == split_name(categories.taxonomy.name(was))

@@ -65,7 +65,7 @@ def test_instances_are_categories_of_their_own_and_can_be_folded_back(run: Path)
     assert set(job.initial_labels.tolist()) <= set(before)
     assert Job(RunDir(run, "snapshots"), print).names() == before
     view = job.scene.views[int(job.scene.test_ids[0])]
-    assert set(job.best_masks[view].ravel().tolist()) <= set(job.names())
+    assert set(job.level_masks[view].ravel().tolist()) <= set(job.names())
     instances(job, PLANTS, MasksConfig())
     assert stages(events, StageSkipped) == ["photo_instances", "instances"]
     with pytest.raises(RunError, match="add --force to fold them back"):

@@ -100,9 +100,9 @@ def test_label_images_of_a_network_are_fused(
     assert set(job.taxonomy.names.values()) == {"sky-other-merged", "ground"}
     lift_labels(job)
     train_levels(job, TrainConfig(max_steps=40, level_every=40), 0)
-    assert job.best_masks is job.masks
+    assert job.level_masks is job.masks
     fuse_masks(job)
-    assert job.best_masks.folder == job.run.fused
+    assert job.level_masks.folder == job.run.fused
     made = json.loads((job.run.fused / "fused.json").read_text())
     assert 0 < made["changed"] < 0.5
     assert all(0 <= share <= 1 for share in made["agreement"])

@@ -141,9 +141,9 @@ def test_merged_observations_are_those_that_rendering_measures(run: Path, viewer
     far = distances_in_views(job.scene, job.point_labels)
     how = {"valid": job.valid, "antialiased": job.antialiased, "backend": "cpu"}
     # with all categories at one level the Gaussians of the run are those of the merged category
-    exact = by_key(observe(job.scene, job.photos, job.best_masks, before.ladder, far, **how))
+    exact = by_key(observe(job.scene, job.photos, job.level_masks, before.ladder, far, **how))
     # its own stream has another grid, to which positions move by up to half a step (here 0.035)
-    coded = by_key(observe(job.scene, job.photos, job.best_masks, job.ladder, far, **how))
+    coded = by_key(observe(job.scene, job.photos, job.level_masks, job.ladder, far, **how))
     for name in ("label_id", "level", "view", "num_pixels", "distance"):
         np.testing.assert_array_equal(getattr(told, name), getattr(exact, name))
         np.testing.assert_array_equal(getattr(told, name), getattr(coded, name))
@@ -301,8 +301,8 @@ def test_instances_keep_their_category_through_edits(tmp_path: Path, viewer: Pat
     ids = {name: i for i, name in after.names().items()}
     view = before.scene.views[0]
     old = {name: i for i, name in before.names().items()}
-    mine = np.isin(before.best_masks[view], [old[name] for name in plants[:2]])
-    assert np.array_equal(after.best_masks[view] == ids[plants[0]], mine)
+    mine = np.isin(before.level_masks[view], [old[name] for name in plants[:2]])
+    assert np.array_equal(after.level_masks[view] == ids[plants[0]], mine)
     assert [("StageSkipped", stage) for stage in ("observe", "sample", "fit", "plan")] == later_commands(
         made.path
     )[:4]

@@ -34,9 +34,9 @@ settings.ladder = "snapshots"
 settings.train = { max_steps = 60, level_every = 20, refine_every = 5, sh_degree = 1 }
 scenes.plot = "capture"
 variants.track = {}
-variants.projection.lift.votes = "projection"
+variants.flat.train.sh_degree = 0
 """
-CELLS = ["plot-track-seed0", "plot-track-seed5", "plot-projection-seed0", "plot-projection-seed5"]
+CELLS = ["plot-track-seed0", "plot-track-seed5", "plot-flat-seed0", "plot-flat-seed5"]
 TABLES = ("cells.csv", "summary.csv", "summary.md")
 
 
@@ -96,7 +96,7 @@ def test_every_cell_and_target_is_a_row_that_agrees_with_its_run(finished: Path)
     rows = rows_of(finished / "out" / "cells.csv")
     assert [(r["variant"], r["seed"], r["target"]) for r in rows] == [
         (variant, seed, target)
-        for variant in ("track", "projection")
+        for variant in ("track", "flat")
         for seed in ("0", "5")
         for target in ("0.3", "0.4")
     ]
@@ -113,9 +113,9 @@ def test_every_cell_and_target_is_a_row_that_agrees_with_its_run(finished: Path)
     assert len({row["full PSNR"] for row in rows}) == 4  # every seed and variant was a training of its own
     summary = rows_of(finished / "out" / "summary.csv")
     assert [(r["variant"], r["target"], r["n"]) for r in summary] == [
-        (variant, target, "2") for variant in ("track", "projection") for target in ("0.3", "0.4")
+        (variant, target, "2") for variant in ("track", "flat") for target in ("0.3", "0.4")
     ]
-    pair = [float(r["SSIM"]) for r in rows if (r["variant"], r["target"]) == ("projection", "0.4")]
+    pair = [float(r["SSIM"]) for r in rows if (r["variant"], r["target"]) == ("flat", "0.4")]
     assert float(summary[3]["SSIM"]) == pytest.approx(sum(pair) / 2)
     assert float(summary[3]["SSIM sd"]) == pytest.approx(abs(pair[0] - pair[1]) / math.sqrt(2))
     lines = (finished / "out" / "summary.md").read_text().splitlines()
@@ -151,7 +151,7 @@ def test_cells_that_share_a_training_share_what_later_stages_read(finished, tmp_
         [settings]
         ladder = "snapshots"
         fuse = true
-        masks = { segmenter = "hf", model = "some/network", soft = true }
+        masks = { segmenter = "hf", model = "some/network" }
         train = { max_steps = 20, level_every = 20 }
         [scenes]
         plot = "capture"
@@ -162,8 +162,7 @@ def test_cells_that_share_a_training_share_what_later_stages_read(finished, tmp_
     events = sweep_in(tmp_path, text)
     assert [name for name in done(events) if name.endswith("/train")] == ["plot-first-seed0/train"]
     first, second = (RunDir(tmp_path / "out" / "runs" / f"plot-{name}-seed0") for name in ("first", "second"))
-    assert len(list(second.soft.iterdir())) == 12
-    assert settings_of(first, "fuse") == settings_of(second, "fuse") == {"soft": True}
+    assert settings_of(first, "fuse") == settings_of(second, "fuse") == {}
     for path in sorted(p for p in first.fused.rglob("*") if p.is_file()):
         assert (second.path / path.relative_to(first.path)).read_bytes() == path.read_bytes(), path.name
     # all that was there after training is there again
@@ -230,7 +229,7 @@ def test_a_cell_that_fails_is_recorded_and_the_others_go_on(copy: Path) -> None:
 
 
 def test_changed_settings_fail_unless_forced(copy: Path) -> None:
-    text = TEXT.replace("variants.projection.lift", "#").replace("5]", "]").replace("[0.4, 0.3]", "[0.35]")
+    text = TEXT.replace("variants.flat.train", "#").replace("5]", "]").replace("[0.4, 0.3]", "[0.35]")
     with pytest.raises(RunError, match="1 of 1 runs failed"):
         sweep_in(copy, text)
     assert "add --force" in rows_of(copy / "out" / "cells.csv")[0]["status"]
@@ -416,21 +415,3 @@ def test_spread_is_that_of_the_known_values(values: list[float]) -> None:
     assert sums["SSIM"] == pytest.approx(expected, nan_ok=True)
     expected = known.std(ddof=1) if len(known) > 1 else math.nan
     assert sums["SSIM sd"] == pytest.approx(expected, nan_ok=True)
-
-
-def test_settings_by_their_old_names_are_read_and_told(tmp_path: Path) -> None:
-    text = (
-        TEXT
-        + """
-variants.old.train = { pace = "published", rest_share = 0.5 }
-variants.old.nest = { seed_share = 0.1, seed_steps = 7, gain = 2.0 }
-variants.old.blocks = { seam_steps = 9 }
-"""
-    )
-    told: list[str] = []
-    config = read_sweep(write(tmp_path, text), told.append)[-1].config
-    assert (config.train.lr_schedule, config.train.gradient_freeze_share) == ("published", 0.5)
-    assert (config.nest.base_share, config.nest.base_steps, config.nest.lr_multiplier) == (0.1, 7, 2.0)
-    assert config.blocks.boundary_steps == 9
-    assert len(told) == 6
-    assert "variants.old.train.pace is called lr_schedule now" in told[0]

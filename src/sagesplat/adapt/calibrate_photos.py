@@ -165,10 +165,10 @@ def _scored(views: Mapping[int, LeftOut], confidence: float) -> dict[int, _Score
     for label, own in views.items():
         by = np.where(own.heldout, 1.0, inflation[label])[:, None]
         error = by * (own.ssim - own.mean)
-        away = 1 - own.support
-        discount = float(quantile * slope * np.abs(error).mean() / max(away.mean(), LEAST_ERROR))
+        unsupported = 1 - own.support
+        discount = float(quantile * slope * np.abs(error).mean() / max(unsupported.mean(), LEAST_ERROR))
         found[label] = _Scored(
-            score=own.mean - discount * away[:, None],
+            score=own.mean - discount * unsupported[:, None],
             measured=own.mean + error,
             change=own.change,
             bias=own.bias,
@@ -200,10 +200,10 @@ def _inflation(views: Mapping[int, LeftOut]) -> dict[int, float]:
 def _slope(views: Mapping[int, LeftOut]) -> float:
     """The share of an average error that grows with 1 - support, of all categories together; 0 to about 1."""
     some = [own for own in views.values() if len(own.rows) > 1 and own.error.mean() > LEAST_ERROR]
-    away = [(1 - own.support) / max((1 - own.support).mean(), LEAST_ERROR) for own in some]
+    unsupported = [(1 - own.support) / max((1 - own.support).mean(), LEAST_ERROR) for own in some]
     if not some:
         return 0.0
-    inputs = np.concatenate(away)
+    inputs = np.concatenate(unsupported)
     errors = np.concatenate([own.error / own.error.mean() for own in some])
     return float(nnls(np.column_stack([np.ones_like(inputs), inputs]), errors)[0][1])
 
@@ -256,9 +256,9 @@ def _risks(
     """The larger of two risks: each view weighs the same, or each decision; of views that accept any."""
     shares = (missed / np.maximum(accepted, 1)).sum(0)
     views, decisions = (accepted > 0).sum(0), accepted.sum(0)
-    usual = decisions / np.maximum(views, 1)  # of a view
+    typical = decisions / np.maximum(views, 1)  # of a view
     by_view = (shares + counted_in) / np.maximum(views + counted_in, 1)
-    by_decision = (missed.sum(0) + counted_in * usual) / np.maximum(decisions + counted_in * usual, 1e-9)
+    by_decision = (missed.sum(0) + counted_in * typical) / np.maximum(decisions + counted_in * typical, 1e-9)
     return np.maximum(by_view, by_decision)
 
 

@@ -167,13 +167,13 @@ def evaluate(
                 reference = kept[row]
             image = reference if g is last else render(g, neutral)
             least = MIN_SHARE * image.shape[0] * image.shape[1]
-            alike = fidelity_by_label(image, reference, labels[view], least)
+            fidelity = fidelity_by_label(image, reference, labels[view], least)
             colours = measure_colours(image, photo, valid[view])
             if view.camera.exposure is not None:
                 image = render(g, view.camera)
             measured = measure(image, photo, masks[view], inner[row], valid[view])
             measured[TOTAL] |= colours
-            return row, measured, alike
+            return row, measured, fidelity
 
         for found in each_view(in_view, views, device_of(backend)):
             yield found
@@ -183,25 +183,25 @@ def evaluate(
 
     full = {row: measured for row, measured, _ in measure_all(last)}
     for level in uniform:
-        for row, measured, alike in measure_all(ladder.load(level)):
+        for row, measured, fidelity in measure_all(ladder.load(level)):
             rows.append({
                 "quality": QUALITIES.index("fidelity"), "target": np.nan,
                 "view": row, "label_id": UNIFORM, "level": level,
-                "predicted": np.nan, "fidelity": alike[TOTAL],
+                "predicted": np.nan, "fidelity": fidelity[TOTAL],
                 "ssim": measured[TOTAL]["ssim"], "psnr": measured[TOTAL]["psnr"],
                 "num_pixels": measured[TOTAL]["num_pixels"],
                 "full_ssim": full[row][TOTAL]["ssim"], "full_psnr": full[row][TOTAL]["psnr"],
                 **_colours({}, {}),
             })  # fmt: skip
     for plan in plans:
-        for row, measured, alike in measure_all(compose(plan) if compose else ladder.compose(plan.levels)):
+        for row, measured, fidelity in measure_all(compose(plan) if compose else ladder.compose(plan.levels)):
             for label, values in measured.items():
                 level, known = plan.levels.get(label, -1), label in plan.levels
                 rows.append({
                     "quality": QUALITIES.index(plan.quality), "target": plan.target,
                     "view": row, "label_id": label, "level": level,
                     "predicted": predicted(plan.quality, label, level, row) if known else np.nan,
-                    "fidelity": alike.get(label, np.nan),
+                    "fidelity": fidelity.get(label, np.nan),
                     "ssim": values["ssim"], "psnr": values["psnr"], "num_pixels": values["num_pixels"],
                     "full_ssim": full[row][label]["ssim"], "full_psnr": full[row][label]["psnr"],
                     **_colours(values, full[row][label]),

@@ -5,9 +5,9 @@ Three sets of drawn viewpoints are used, each for one thing:
 1. "fit": a Gaussian process per category learns the expected fidelity of each level, all categories at the
    same level. Each viewpoint predicted without itself gives preliminary thresholds.
 2. "bias": compositions planned by the thresholds for a range of nominal targets are measured, and the
-   thresholds mended (`recentred`), so that they allow for neighbours at other levels. Where a category misses
-   a target at any level of its own, as its neighbours spill over it, all categories are held at the nominal
-   target that keeps it (`settled`).
+   thresholds corrected so that they allow for neighbours at other levels (`remove_composition_bias`). Where a
+   category misses a target at any level of its own, as its neighbours spill over it, all categories are held
+   at the nominal target that keeps it (`hold_all_categories`).
 3. "calibration": split conformal prediction says which nominal target to ask for, so that each target is kept
    at the confidence, category by category (`adapt.calibrate`). Neighbours' levels move with that, so it is
    done twice; the second time thresholds only rise.
@@ -41,8 +41,8 @@ TARGETS = np.unique(
 NOTHING_HELD = np.zeros(len(TARGETS), bool)
 EVERYTHING_HELD = ~NOTHING_HELD
 _ABOVE = 1e-9  # a threshold lies above its critical value
-_HAIR = 1e-6  # between equal thresholds
-_CHANCE = 3.0  # standard deviations of a share of views that are no more than chance
+_TIE_EPSILON = 1e-6  # between equal thresholds
+_NOISE_SIGMAS = 3.0  # standard deviations of a share of views that are no more than chance
 
 
 def fit_fidelity(
@@ -127,9 +127,9 @@ def _calibration(
     targets = np.append(TARGETS, 1.0)
     up = np.append(np.clip(thresholds + _ABOVE, -1, 1), 1.0)
     # Equal thresholds stay apart by a hair: below the first of them not even its target is reached.
-    hairs = _HAIR * np.arange(len(up))
-    up = np.maximum.accumulate(up - hairs) + hairs
-    up = np.minimum.accumulate((np.minimum(up, 1.0) - hairs)[::-1])[::-1] + hairs
+    ties = _TIE_EPSILON * np.arange(len(up))
+    up = np.maximum.accumulate(up - ties) + ties
+    up = np.minimum.accumulate((np.minimum(up, 1.0) - ties)[::-1])[::-1] + ties
     return Calibration(status, confidence, views, targets, up, least)
 
 
@@ -188,7 +188,9 @@ class Trial:
         return float(matern32(x, model.inputs, model.lengths).max(1).min())
 
 
-def recentred(models: Mapping[int, ViewModel], trial: Trial, confidence: float) -> dict[int, ViewModel]:
+def remove_composition_bias(
+    models: Mapping[int, ViewModel], trial: Trial, confidence: float
+) -> dict[int, ViewModel]:
     """The models with thresholds that allow for the neighbours' levels; `trial` was planned with the models.
 
     This is no calibration: it brings what is calibrated close to what is asked.
@@ -201,14 +203,14 @@ def recentred(models: Mapping[int, ViewModel], trial: Trial, confidence: float) 
     }
 
 
-def settled(
+def hold_all_categories(
     models: Mapping[int, ViewModel], trial: Trial, confidence: float
 ) -> tuple[dict[int, ViewModel], Bool[np.ndarray, " G"]]:
     """The same, and targets at which all categories are held for those that cannot help themselves.
 
-    `trial` was planned with models that are `recentred`. A category that still misses a target in more views
-    than chance explains does so at any level of its own: its neighbours' low levels spill over it. All ask
-    for the nominal target that keeps it.
+    `trial` was planned with models of `remove_composition_bias`. A category that still misses a target in
+    more views than chance explains does so at any level of its own: its neighbours' low levels spill over it.
+    All ask for the nominal target that keeps it.
     """
     floor, asked = np.full(len(TARGETS), -np.inf), {}
     for label, model in models.items():
@@ -217,7 +219,7 @@ def settled(
         asked[label] = _empirical(trial.critical(model), confidence)
         if views < fewest_views(confidence):
             continue
-        chance = views * (1 - confidence) + _CHANCE * np.sqrt(views * confidence * (1 - confidence))
+        chance = views * (1 - confidence) + _NOISE_SIGMAS * np.sqrt(views * confidence * (1 - confidence))
         spilled = np.interp(TARGETS, NOMINAL, (trial.missed(label) > chance).astype(float)) > 0
         floor = np.maximum(floor, np.where(spilled, asked[label], -np.inf))
     held = np.isfinite(floor)
@@ -241,7 +243,7 @@ def calibrated(
     """The models with thresholds that keep each target at a confidence.
 
     Args:
-        models: As `recentred` or `settled`.
+        models: From `remove_composition_bias` or `hold_all_categories`.
         trial: Planned with these models, at viewpoints used for nothing else.
         confidence: Share of decisions that are to hold, between 0 and 1.
         held: Targets whose thresholds must not fall, as other categories need them.

@@ -327,7 +327,7 @@ def observe(
         >>> from sagesplat.adapt.observe import distances_in_views, observe
         >>> run = open_run("runs/garden").job  # doctest: +SKIP
         >>> near = distances_in_views(run.scene, run.point_labels)  # doctest: +SKIP
-        >>> table = observe(run.scene, run.photos, run.best_masks, run.ladder, near)  # doctest: +SKIP
+        >>> table = observe(run.scene, run.photos, run.level_masks, run.ladder, near)  # doctest: +SKIP
     """
     rows: list[dict[str, float]] = []
     views = valid.rows(scene, range(len(scene.views)) if views is None else views)

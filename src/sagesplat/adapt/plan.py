@@ -239,8 +239,8 @@ def _eligible(models: Models, counts: Counts, recovering: Collection[int]) -> di
     for label_id in sorted({label_id for label_id, _ in counts}):
         levels = {level: count for (label, level), count in counts.items() if label == label_id}
         modelled = {level: count for level, count in levels.items() if (label_id, level) in models} or levels
-        settled = {level: count for level, count in modelled.items() if level not in recovering}
-        eligible[label_id] = settled or modelled
+        not_recovering = {level: count for level, count in modelled.items() if level not in recovering}
+        eligible[label_id] = not_recovering or modelled
     return eligible
 
 

@@ -7,7 +7,8 @@ probability `share` (split conformal prediction, Vovk et al. 2005). The cheapest
 target or more is taken.
 
 That is measured with all categories at the same level. In the composition the neighbours have other levels,
-so it is measured at further viewpoints; where fewer than the share keep the target, levels go up (`mended`).
+so it is measured at further viewpoints; where fewer than the share keep the target, levels go up
+(`raise_failing_levels`).
 """
 
 import math
@@ -79,7 +80,7 @@ def plan_for_scene(
     return Plan(float(target), None, choices, float(share), quality=kind)
 
 
-def mended(
+def raise_failing_levels(
     plan: Plan,
     measured: Float[np.ndarray, "V L"],
     costs: Costs,

@@ -72,14 +72,14 @@ def upright(
 
 def _found(floors: "_Floors", least: float) -> Upright:
     peak = floors.peak()
-    along = [floors.settled(normal) for normal in (*AXES.values(), peak, -peak)]
+    along = [floors.converged(normal) for normal in (*AXES.values(), peak, -peak)]
     along = [floor for floor in along if _is_floor(floor, least)]
     if not along:
         return Upright(AXES[CONVENTION], False, f"up is {CONVENTION} (the convention; no floor stands out)")
     best = max(along, key=lambda floor: floor.share)
-    usual = [floor for floor in along if floor.normal @ AXES[CONVENTION] > np.sqrt(0.5)]
-    usual = [floor for floor in usual if floor.share > _PREFERRED * best.share]
-    best = max(usual, key=lambda floor: floor.share, default=best)
+    typical = [floor for floor in along if floor.normal @ AXES[CONVENTION] > np.sqrt(0.5)]
+    typical = [floor for floor in typical if floor.share > _PREFERRED * best.share]
+    best = max(typical, key=lambda floor: floor.share, default=best)
     named = _named(best.normal)
     return Upright(best.normal, True, f"up is {named} (normal of a floor, {best.share:.0%} of the area)")
 
@@ -114,7 +114,7 @@ class _Floors:
         found = [area @ (np.abs(normals @ direction) > 0.95) for direction in directions]
         return directions[int(np.argmax(found))]
 
-    def settled(self, normal: np.ndarray) -> _Floor:
+    def converged(self, normal: np.ndarray) -> _Floor:
         """The floor along a direction, its own normal taken as the direction again."""
         floor = self.along(normal)
         for _ in range(3):

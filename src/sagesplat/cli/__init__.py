@@ -42,11 +42,10 @@ def _run(name: str, *words: str) -> None:
 
 def _command(name: str, *words: str) -> None:
     from sagesplat.cli.help import help_of
-    from sagesplat.cli.parse import arguments, current_command
+    from sagesplat.cli.parse import arguments
     from sagesplat.core.errors import SageError
     from sagesplat.core.memory import named_memory
 
-    name = current_command(name)
     known = commands()
     if name not in known:
         _fail(f"no command {name!r}; there are {', '.join(known)}")

@@ -46,7 +46,7 @@ def flags_of(function: Callable[..., None]) -> Iterator[Flag]:
     described = _described(inspect.getdoc(function) or "")
     for name, parameter in inspect.signature(function).parameters.items():
         hint, *marks = get_args(hints[name]) if get_origin(hints[name]) is Annotated else (hints[name],)
-        told = {
+        marked = {
             key: value
             for key in ("name", "metavar", "help")
             for mark in marks
@@ -54,7 +54,7 @@ def flags_of(function: Callable[..., None]) -> Iterator[Flag]:
         }
         default = None if parameter.default is parameter.empty else parameter.default
         if is_dataclass(hint):
-            prefix = "" if told.get("name") == "" else f"{name}."
+            prefix = "" if marked.get("name") == "" else f"{name}."
             inner = get_type_hints(hint, include_extras=True)
             for field in fields(hint):
                 yield Flag(
@@ -64,8 +64,8 @@ def flags_of(function: Callable[..., None]) -> Iterator[Flag]:
                 )  # fmt: skip
         else:
             positional = _POSITIONAL in marks
-            shown = told.get("metavar") or told.get("name") or name.replace("_", "-")
-            help = " ".join(str(told.get("help") or described.get(name, "")).split())
+            shown = marked.get("metavar") or marked.get("name") or name.replace("_", "-")
+            help = " ".join(str(marked.get("help") or described.get(name, "")).split())
             yield Flag(
                 shown if positional else f"--{shown}", "" if positional else "Options",
                 "" if positional else _values(hint), help, default, (name,), hints[name],

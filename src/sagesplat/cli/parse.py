@@ -1,4 +1,4 @@
-"""From words to a command's arguments: old names, the run's own settings, errors in one line."""
+"""From words to a command's arguments: the run's own settings, errors in one line."""
 
 import inspect
 import io
@@ -19,15 +19,6 @@ from sagesplat.core.config import PlanConfig
 from sagesplat.core.errors import SageError
 from sagesplat.io.typed import impossible, refusal
 
-OLD_COMMANDS = {"online": "early-stopping", "parts": "block-categories"}
-OLD_FLAGS = {
-    "--train.pace": "--train.lr-schedule",
-    "--train.rest-share": "--train.gradient-freeze-share",
-    "--nest.seed-share": "--nest.base-share",
-    "--nest.seed-steps": "--nest.base-steps",
-    "--nest.gain": "--nest.lr-multiplier",
-    "--blocks.seam-steps": "--blocks.boundary-steps",
-}
 _DIRECTIONS = {"-x", "-y", "-z"}
 _TARGETS = {"--target-fidelity", "--target-ssim"}  # of a plan: one given, the recorded ones are gone
 _AS_THEY_ARE = "--downscale", 1  # what most runs record; what they were given is 0, for the run to choose
@@ -43,9 +34,7 @@ def arguments(name: str, function: Callable[..., None], words: Sequence[str]) ->
 
     Raises UsageError.
     """
-    if name == "demo":  # whose folder is positional now
-        words = [word.removeprefix("--run=") for word in words if word != "--run"]
-    words = _joined(_renamed(words))
+    words = _joined(words)
     values = _parse(name, function, words)
     known = _recorded(name, function, values, words)
     values = _parse(name, _with_defaults(function, known), words) if known else values
@@ -55,25 +44,6 @@ def arguments(name: str, function: Callable[..., None], words: Sequence[str]) ->
         if cure := refusal(value, flag.kind):
             raise UsageError(impossible(flag.name, value, cure))
     return values
-
-
-def current_command(name: str) -> str:
-    """A command's name, also for one that had another until the last release."""
-    if name in OLD_COMMANDS:
-        _say(f"the command {name} is called {OLD_COMMANDS[name]} now; the old name will go")
-    return OLD_COMMANDS.get(name, name)
-
-
-def _renamed(words: Sequence[str]) -> list[str]:
-    """Words with flags as they are called now."""
-    renamed = []
-    for word in words:
-        flag, equals, value = word.partition("=")
-        new = OLD_FLAGS.get(flag.replace("_", "-"))
-        if new:
-            _say(f"{flag} is called {new} now; the old name will go")
-        renamed.append(f"{new}{equals}{value}" if new else word)
-    return renamed
 
 
 def _joined(words: Sequence[str]) -> list[str]:
@@ -178,8 +148,7 @@ def _recorded(
         known.pop("masks", None)
     if asked := given & _TARGETS:
         _forget_targets(known, "ssim" if asked == {"--target-ssim"} else "fidelity")
-    # `labels` are settings of one command, and names of categories in another
-    known = {key: value for key, value in known.items() if isinstance(value, type(values.get(key, ...)))}
+    known = {key: value for key, value in known.items() if key in values}
     changed = [
         _typed(flag, now)
         for flag in flags_of(function)

@@ -20,7 +20,6 @@ def export(
     run: Run,
     out: Positional[Annotated[Path, arg(metavar="OUT")]],
     level: StepNumber | None = None,
-    labels: tuple[str, ...] = (),
     only: str = "",
     without: str = "",
     target_fidelity: SomeShare | None = None,
@@ -40,8 +39,8 @@ def export(
         run: run folder
         out: file to write, or with --chunks a folder
         level: number of a level (of snapshots: its training step) to write instead of the planned scene
-        labels: names of the categories to write (default: all)
-        only: the same as one text, such as "chair 2,vase"; a category means all its instances
+        only: categories or instances to write, such as "chair 2,vase" (default: all); a category means all
+            its instances
         without: categories or instances to leave out, such as "person,chair 1"; says how large the holes are
         target_fidelity: write the scene planned for this fidelity (default: for the budget, else the main
             target)
@@ -58,15 +57,16 @@ def export(
         raise RunError(f"{out}: --only and --without are for one scene; leave them out with --chunks")
     if chunks and rasterize_mode:
         raise RunError(f"{out}: --rasterize-mode is for one scene; leave it out with --chunks")
+    if target_fidelity is not None and target_ssim is not None:
+        raise RunError(f"{out}: a scene has one target; leave out --target-ssim or --target-fidelity")
     with open_job(run, machine, ladder) as job:
         if chunks:
             count = export_increments(job, out, chunks)
         else:
             target = None if target_ssim is None else ("ssim", target_ssim)
             target = target if target_fidelity is None else ("fidelity", target_fidelity)
-            wanted = (*labels, *parse_names(only, "only"))
             count = export_scene(
-                job, out, level=level, labels=wanted, target=target, levels=levels,
+                job, out, level=level, labels=parse_names(only, "only"), target=target, levels=levels,
                 rasterize_mode=rasterize_mode, without=parse_names(without, "without"),
             )  # fmt: skip
     say(f"{out}: {count:,} {'chunks' if chunks else 'Gaussians'}")

@@ -137,8 +137,8 @@ def write_increments(
 def write_index(folder: Path, written: Sequence[Increment]) -> None:
     """Write the index; of an increment what is as by default is left out."""
     formats = sorted({one.format for one in written}, reverse=True)
-    usual = {field.name: field.default for field in fields(Increment)}
-    chunks = [{k: v for k, v in asdict(one).items() if v != usual[k]} for one in written]
+    defaults = {field.name: field.default for field in fields(Increment)}
+    chunks = [{k: v for k, v in asdict(one).items() if v != defaults[k]} for one in written]
     write_json(folder / INDEX, {"format": "+".join(formats), "chunks": chunks})
 
 

@@ -137,16 +137,16 @@ def encode_stream(
     one = np.repeat(weights, np.diff(ends, prepend=0)) == 255
     columns = replace(columns, opacities=np.where(one, columns.seconds, columns.opacities))
     tables, content, cuts, order = Tables(new_tables(header.layout)), header.pack(), [], []
-    owed: list[Columns] = []
+    deferred_opacities: list[Columns] = []
     for weight, (low, high) in zip(weights, pairwise((0, *ends.tolist())), strict=True):
         order.append(low + np.argsort(columns.positions[low:high], kind="stable"))
         some, payload = columns.rows(order[-1]), b""
         if high > low:
             writer = Writer(tables)
             if weight:
-                _code_owed(writer, header.layout, owed, given=True)
+                _code_deferred(writer, header.layout, deferred_opacities, given=True)
             _code_level(writer, header.layout, low, high - low, 0 < weight < 255, some)
-            owed = [] if weight else [*owed, some]
+            deferred_opacities = [] if weight else [*deferred_opacities, some]
             payload = writer.payload()
         content += _leb128(high - low) + _leb128(len(payload))
         content += bytes([weight] if second else []) + payload
@@ -198,7 +198,8 @@ def decode_stream(
         if levels is not None and not 1 <= levels <= header.levels:
             raise ValueError(f"level {levels} of {header.levels}")
         tables, at, parts, weights = Tables(new_tables(header.layout)), SIZE, [], []
-        ends, sizes, owed = [], [0], 0  # parts from this one on are still without second opacities
+        ends, sizes = [], [0]
+        deferred_opacities = 0  # parts from this one on are still without second opacities
         while len(sizes) <= (levels or header.levels):
             if levels is None and at == len(content):
                 break
@@ -211,10 +212,11 @@ def decode_stream(
             reader = _reader(tables, content[at : at + nbytes], count)
             if reader:
                 if weights[-1]:
-                    parts[owed:] = _code_owed(reader, header.layout, parts[owed:], given=False)
+                    without = parts[deferred_opacities:]
+                    parts[deferred_opacities:] = _code_deferred(reader, header.layout, without, given=False)
                 two = 0 < weights[-1] < 255
                 parts += _code_level(reader, header.layout, sizes[-1], count, two, None)
-                owed = len(parts) if weights[-1] else owed
+                deferred_opacities = len(parts) if weights[-1] else deferred_opacities
                 reader.finish()
             at += nbytes
             ends.append(at)
@@ -264,7 +266,7 @@ def _reader(tables: Tables, payload: bytes, count: int) -> Reader | None:
     return Reader(tables, payload) if count else None
 
 
-def _code_owed(coder: Coder, layout: Layout, parts: list[Columns], *, given: bool) -> list[Columns]:
+def _code_deferred(coder: Coder, layout: Layout, parts: list[Columns], *, given: bool) -> list[Columns]:
     """Code second opacities of Gaussians whose other columns were sent before; the parts with them."""
     if not parts:
         return []

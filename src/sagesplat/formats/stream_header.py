@@ -155,8 +155,8 @@ def header_of(
     colours = (g.sh0.double().numpy() * PER_COLOUR + 127.5) / precision.colour
     origin = int(np.median(scales[:, 2]))
     spread = int(np.clip(round(_CLASS / precision.log_scale), 1, 255))
-    usual = int(np.median(2 * scales[:, 2] - scales[:, 0])) - origin
-    rotation_origin = usual - round((_MIDDLE + precision.rotation) * spread)
+    predicted = int(np.median(2 * scales[:, 2] - scales[:, 0])) - origin
+    rotation_origin = predicted - round((_MIDDLE + precision.rotation) * spread)
     step = precision.position * middle
     if precision.grid:
         step, rotation_origin = precision.grid.step, precision.grid.rotation_origin - origin

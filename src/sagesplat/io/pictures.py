@@ -193,12 +193,12 @@ def _register_heif() -> None:
 @contextmanager
 def _opened(file: BufferedReader, kind: str) -> Iterator[ImageFile.ImageFile]:
     with _LOCK:  # Pillow's own limit is one for all: 89 megapixels warn, twice as many fail
-        usual = Image.MAX_IMAGE_PIXELS
+        default = Image.MAX_IMAGE_PIXELS
         Image.MAX_IMAGE_PIXELS = None
         try:
             image = Image.open(file, formats=[kind])
         finally:
-            Image.MAX_IMAGE_PIXELS = usual
+            Image.MAX_IMAGE_PIXELS = default
     with image:
         compression = image.info.get("compression", "raw")
         if kind == "TIFF" and compression not in _COMPRESSIONS:

@@ -87,10 +87,10 @@ def shortened(text: str) -> str:
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
 
 
-def _columns(usual: int, of_long: int, labels: Sequence[int], names: Mapping[int, str]) -> int:
+def _columns(typical: int, of_long: int, labels: Sequence[int], names: Mapping[int, str]) -> int:
     """Columns of a legend of these names: the usual number, or `of_long` where a name is long."""
     longest = max((len(caption(label, names)) for label in labels), default=0)
-    return usual if longest <= _LONG else of_long
+    return typical if longest <= _LONG else of_long
 
 
 def label_image(label_ids: Int[np.ndarray, "H W"], colours: Colours) -> UInt8[np.ndarray, "H W 3"]:

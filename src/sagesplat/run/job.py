@@ -188,7 +188,7 @@ class Job:
         return Masks(fused, self.masks.taxonomy) if (fused / "labels.json").exists() else self.masks
 
     @property
-    def best_masks(self) -> Masks:
+    def level_masks(self) -> Masks:
         """The same, of the parts that a scene in blocks has."""
         return Masks(self.run.block_labels, self.taxonomy) if self.has_block_categories else self.whole_masks
 

@@ -29,7 +29,7 @@ def work(
             yield number, function(job, part)
     else:
         spec, gpus = job.spec, job.gpus
-        tasks = [Task(name, _piece, (spec, function, part), gpus) for part in parts]
+        tasks = [Task(name, run_part, (spec, function, part), gpus) for part in parts]
         yield from job.executor.run(tasks, job.emit)
 
 
@@ -41,7 +41,7 @@ def work_all(
     return [results[number] for number in range(len(parts))]
 
 
-def _piece(spec: JobSpec, function: Callable[[Job, Any], Any], part: Any, emit: Emit) -> Any:
+def run_part(spec: JobSpec, function: Callable[[Job, Any], Any], part: Any, emit: Emit) -> Any:
     """A task: one part, in a process that may have computed others of the same scene."""
     kept = _kept(replace(spec, force=False), spec.run.scene.read_bytes())
     return function(spec.open(emit, kept), part)

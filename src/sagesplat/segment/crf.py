@@ -49,8 +49,8 @@ def refine(
     q = softmax(log_p, axis=0)
     for _ in range(config.iterations):
         near = spatial_scale * _blur(q * spatial_scale, shape, config)
-        alike = bilateral_scale * bilateral(q * bilateral_scale)
-        q = softmax(log_p + config.spatial_weight * near + config.bilateral_weight * alike, axis=0)
+        similar = bilateral_scale * bilateral(q * bilateral_scale)
+        q = softmax(log_p + config.spatial_weight * near + config.bilateral_weight * similar, axis=0)
     return q.reshape(shape)
 
 

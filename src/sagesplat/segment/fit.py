@@ -50,16 +50,16 @@ def _shown(size: Size, view: View, raw: RawPhoto, path: Path) -> str:
     sizes = {"raw": (width, height)} | ({"stored": (height, width)} if raw.sideways else {})
     sizes["undistorted"] = photo_size(view.image_path)
     exact = [form for form, other in sizes.items() if size == other]
-    alike = exact or [form for form, other in sizes.items() if _alike(size, other)]
+    matching = exact or [form for form, other in sizes.items() if _alike(size, other)]
     flat = "{} x {}".format(*sizes["undistorted"])
-    if not alike:
+    if not matching:
         raise _refused(path, size, f"its photo has {width} x {height}, and {flat} where it is undistorted")
-    if not exact and {"raw", "undistorted"} <= set(alike) and not is_pinhole(raw.lens):
+    if not exact and {"raw", "undistorted"} <= set(matching) and not is_pinhole(raw.lens):
         raise LabelError(
             f"{path}: {size[0]} x {size[1]} pixels fit its photo, {width} x {height}, and the undistorted "
             f"one, {flat}; scale it to the size of the one that it shows"
         )
-    return alike[0]
+    return matching[0]
 
 
 def _refused(path: Path, size: Size, photo: str) -> LabelError:

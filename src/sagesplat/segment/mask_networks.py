@@ -178,15 +178,15 @@ class _Squared:
     """A photo stretched to the square that a network takes; transformers does so with torchvision only."""
 
     def __init__(
-        self, folder: Path, side: int, usual: tuple[tuple[float, float, float], tuple[float, float, float]]
+        self, folder: Path, side: int, default: tuple[tuple[float, float, float], tuple[float, float, float]]
     ):
         try:
             stored = (known_json(folder / "processor_config.json", dict) or {}).get("image_processor")
             stored = stored or known_json(folder / "preprocessor_config.json", dict) or {}
             size = stored.get("size", {})
             self._size = int(size.get("width", side)), int(size.get("height", side))
-            self._mean = np.broadcast_to(np.float32(stored.get("image_mean", usual[0])), 3)
-            self._std = np.broadcast_to(np.float32(stored.get("image_std", usual[1])), 3)
+            self._mean = np.broadcast_to(np.float32(stored.get("image_mean", default[0])), 3)
+            self._std = np.broadcast_to(np.float32(stored.get("image_std", default[1])), 3)
         except (AttributeError, RunError) as error:
             raise ValueError(f"preprocessor_config.json: {error}") from None
 

@@ -171,8 +171,6 @@ def _in_streams(listed: Sequence[Increment]) -> bool:
 
 def _without_capture(job: Job) -> Job:
     """The job with the cameras and points that the run kept: its capture may be gone or changed since."""
-    if not job.run.geometry.exists():  # of an earlier version
-        return job
     source = replace(job)
     vars(source)["given_scene"] = read_scene(job.run.geometry)
     return replace(job, source=source)
@@ -213,7 +211,7 @@ def _live_bundle(job: Job, folder: Path, viewer: Path) -> bool:
         return False
     if not previous:
         check_target(folder)
-    if not has_viewer(folder, viewer):  # none yet, or that of an older version
+    if not has_viewer(folder, viewer):  # none yet, or not the one of this package
         check_viewer(viewer)
         shutil.copytree(viewer, folder, dirs_exist_ok=True)
     g = read_level(steps[-1])

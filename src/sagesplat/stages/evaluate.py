@@ -27,7 +27,7 @@ def evaluate_plans(job: Job) -> None:
         within = budget_plan_of(job)
         plans = [*plans_of(job), *([within] if within else [])]
         table = evaluate(
-            job.scene, job.photos, job.best_masks, job.ladder, plans, method.predicted,
+            job.scene, job.photos, job.level_masks, job.ladder, plans, method.predicted,
             uniform=_levels_beside(job, plans),
             compose=lambda plan: compose(job, plan), valid=job.valid,
             backend=job.backend, antialiased=job.antialiased,
@@ -60,9 +60,9 @@ def _lines(plan: Plan, rows: Evaluation, exposed: bool) -> list[str]:
     if not len(at):
         return []
     asked = "within the budget" if plan.budget is not None else f"{plan.asked} asked"
-    alike = f"fidelity {at.fidelity.mean():.3f}, " if plan.quality == "fidelity" else ""
+    fidelity = f"fidelity {at.fidelity.mean():.3f}, " if plan.quality == "fidelity" else ""
     return [
-        f"{asked}: test views {alike}{at.ssim.mean():.3f} / {at.psnr.mean():.2f} dB "
+        f"{asked}: test views {fidelity}{at.ssim.mean():.3f} / {at.psnr.mean():.2f} dB "
         f"(full model {at.full_ssim.mean():.3f} / {at.full_psnr.mean():.2f} dB)"
         f"{', with colours fitted to their photos' if exposed else ''}",
         *([_colours(at)] if exposed else []),

@@ -11,9 +11,9 @@ from sagesplat.adapt.fidelity_models import (
     Trial,
     calibrated,
     fit_fidelity,
+    hold_all_categories,
     plan_nominal,
-    recentred,
-    settled,
+    remove_composition_bias,
 )
 from sagesplat.adapt.viewpoint import ViewModel
 from sagesplat.core.config import FitConfig
@@ -39,8 +39,8 @@ def fit_drawn(job: Job, config: FitConfig) -> dict[int, ViewModel]:
     models = fit_fidelity(sampled, fit, job.scene.scale, confidence)
     models.pop(UNLABELLED, None)  # has no target and stays in full
     for _ in range(_ROUNDS):
-        models = recentred(models, trial(job, config, models, sampled.labels, bias), confidence)
-    models, held = settled(models, trial(job, config, models, sampled.labels, bias), confidence)
+        models = remove_composition_bias(models, trial(job, config, models, sampled.labels, bias), confidence)
+    models, held = hold_all_categories(models, trial(job, config, models, sampled.labels, bias), confidence)
     for lowered in (held, EVERYTHING_HELD):  # what calibration moved moves the neighbours: then only up
         models = calibrated(
             models, trial(job, config, models, sampled.labels, calibration), confidence, lowered

@@ -16,7 +16,7 @@ from sagesplat.adapt.eq3 import SsimModel
 from sagesplat.adapt.fidelity import shown_enough
 from sagesplat.adapt.observe import LabelImages, Observations
 from sagesplat.adapt.plan import Plan, plan_scene, plan_view
-from sagesplat.adapt.scene_plans import mended, plan_for_scene
+from sagesplat.adapt.scene_plans import plan_for_scene, raise_failing_levels
 from sagesplat.adapt.viewpoint import QualityKind, write_promises
 from sagesplat.core.config import FitConfig, PlanConfig
 from sagesplat.core.errors import RunError
@@ -37,7 +37,7 @@ from sagesplat.stages.results import (
 from sagesplat.stages.shared import distances, label_named, observed
 from sagesplat.stages.viewpoints import fit_viewpoints
 
-_MENDINGS = 4  # times that a plan of a scene is measured in its composition and mended
+_RAISES = 4  # times that a plan is measured in its composition, and its failing levels raised
 Curves = Mapping[tuple[int, int], SsimModel]  # Eq. 3 by (label id, level)
 
 
@@ -265,17 +265,17 @@ class NestedLevels(Method):
         return plan_for_scene(ssim, pixels, self.costs, target, share, quality, trained)
 
     def plan_scenes(self, targets: Sequence[tuple[QualityKind, float]], share: float) -> list[Plan]:
-        """See `Method`: those for fidelity are measured at drawn viewpoints, and mended."""
+        """See `Method`: those for fidelity are measured at drawn viewpoints, and raised."""
         plans = [self.plan_scene(target, share, quality) for quality, target in targets]
         drawn, mean_and_pixels = viewpoints_of(self.job), pooled(*self.sampled)
         cameras = [drawn.cameras[row] for row in drawn.rows("bias")]
         open_ones = [i for i, plan in enumerate(plans) if plan.quality == "fidelity"]
-        for left in reversed(range(_MENDINGS + 1)):
+        for left in reversed(range(_RAISES + 1)):
             if not open_ones or not cameras:
                 break
             measured = self._in_composition([plans[i] for i in open_ones], cameras)
             found = {
-                i: mended(plans[i], measured[:, j], self.costs, *mean_and_pixels, last=not left)
+                i: raise_failing_levels(plans[i], measured[:, j], self.costs, *mean_and_pixels, last=not left)
                 for j, i in enumerate(open_ones)
             }
             plans = [found[i][0] if i in found else plan for i, plan in enumerate(plans)]
@@ -315,7 +315,7 @@ class NestedLevels(Method):
 
     def unseen_labels(self) -> LabelImages | None:
         """See `Method`: a promise is measured on the photo's own."""
-        return self.job.best_masks
+        return self.job.level_masks
 
     def coverage(self, targets: Sequence[float]) -> Decisions | None:
         """See `Method`; every category at the same level, costs in transfer bytes."""

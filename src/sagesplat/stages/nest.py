@@ -36,7 +36,7 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
         check_nest(job, count, train_config(job).sh_degree)
         full = read_level(job.trained)
         base = read_level(run.base_model) if config.base_share else None
-        masks, sky = job.best_masks, job.sky
+        masks, sky = job.level_masks, job.sky
         shell = sky.shell if sky else None
         ordered = nested.order(
             full, job.scene, masks,

@@ -52,7 +52,7 @@ def _observe_views(
     """The observations of some views (rows, distances in all views, categories)."""
     rows, far, labels = part
     return observe(
-        job.scene, job.photos, job.best_masks, job.ladder, far,
+        job.scene, job.photos, job.level_masks, job.ladder, far,
         views=rows, valid=job.valid, labels=labels, backend=job.backend, antialiased=job.antialiased,
         progress=lambda done, total: job.emit(Progress("observe", done, total)),
     )  # fmt: skip

@@ -55,7 +55,7 @@ def make_plan(job: Job, config: PlanConfig) -> None:
 def show_plan(job: Job) -> None:
     """Show what the run composes, category by category, and the plan for SSIM beside one for fidelity."""
     plans, (quality, _) = [main_plan(job)], main_target(job.run)
-    ssim = settings_of(job.run, "plan").get("target_ssim")
+    ssim = settings_of(job.run, "plan")["target_ssim"]
     if quality == "fidelity" and ssim is not None:
         plans.append(scene_plan(job, "ssim", ssim))
     for plan in plans:
@@ -78,14 +78,14 @@ def show_plan(job: Job) -> None:
 def main_target(run: RunDir) -> tuple[QualityKind, float]:
     """The quality and the target that the run's plan was made for."""
     made = settings_of(run, "plan")
-    fidelity = made.get("target_fidelity")  # older runs have none
+    fidelity = made["target_fidelity"]
     return ("ssim", float(made["target_ssim"])) if fidelity is None else ("fidelity", float(fidelity))
 
 
 def ssim_targets(run: RunDir) -> list[float]:
     """Targets for studies of SSIM against photos: those of the run, else the paper's."""
     made = settings_of(run, "plan")
-    if made.get("target_fidelity") is None:
+    if made["target_fidelity"] is None:
         return list(made["targets"])
     return list(
         PAPER_TARGETS if made["target_ssim"] is None else PlanConfig(target_ssim=made["target_ssim"]).targets

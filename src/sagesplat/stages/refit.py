@@ -7,7 +7,7 @@ import numpy as np
 
 from sagesplat.adapt.eq3 import write_models
 from sagesplat.adapt.fidelity import SampledFidelity
-from sagesplat.adapt.fidelity_models import calibrated, fit_fidelity, recentred
+from sagesplat.adapt.fidelity_models import calibrated, fit_fidelity, remove_composition_bias
 from sagesplat.adapt.viewpoint import ViewModel, write_promises
 from sagesplat.core.config import FitConfig
 from sagesplat.run.job import Job
@@ -66,7 +66,7 @@ def _fit_drawn(
     fit = [drawn.cameras[row] for row in drawn.rows("fit")]
     mine = _columns(sampled, [label for label in sampled.labels if label in changed and label != UNLABELLED])
     models = fit_fidelity(mine, fit, job.scene.scale, confidence)
-    for name, step in (("bias", recentred), ("calibration", calibrated)):
+    for name, step in (("bias", remove_composition_bias), ("calibration", calibrated)):
         cameras = _some([drawn.cameras[row] for row in drawn.rows(name)], _MOST[name])
         measured = trial(
             job, config, {**known, **models}, sampled.labels, Compositions(job, cameras, changed)

@@ -63,10 +63,10 @@ def report_data(
 
     `url`: where the bundle was published.
     """
-    run, scene, masks, ladder = job.run, job.scene, job.best_masks, job.ladder
+    run, scene, masks, ladder = job.run, job.scene, job.level_masks, job.ladder
     names = {**masks.taxonomy.names, UNLABELLED: masks.taxonomy.name(UNLABELLED)}
     promise, drawn = _promise(job)
-    beside = settings_of(run, "plan").get("target_ssim") if quality == "fidelity" else None
+    beside = settings_of(run, "plan")["target_ssim"] if quality == "fidelity" else None
     records = {path.stem: read_record(path) for path in stage_records(run)}
     return ReportData(
         title=scene.name,
@@ -207,7 +207,7 @@ def _promise(job: Job) -> tuple[PromiseFacts | None, dict[int, np.ndarray]]:
 
 def picture_panels(job: Job, composed: Gaussians) -> list[Panel]:
     """A few test views, spread over the capture, in pictures."""
-    scene, photos, masks, ladder = job.scene, job.photos, job.best_masks, job.ladder
+    scene, photos, masks, ladder = job.scene, job.photos, job.level_masks, job.ladder
     tests = np.array(job.valid.rows(scene, scene.test_ids), int)
     if not len(tests):
         return []

@@ -34,7 +34,7 @@ from sagesplat.stages.methods import method_of
 
 VIEWS = (60, 120, 240)  # to fit to: the next number is tried while the last step made the error smaller by
 _SHRINKS = 0.1  # at least this share
-USUAL = {"fit": VIEWS[1], "bias": 60, "calibration": 180}  # as many as the training's time allows;
+DEFAULT_COUNTS = {"fit": VIEWS[1], "bias": 60, "calibration": 180}  # as many as the training's time allows;
 MOST = {"fit": VIEWS[-1], "bias": 60, "calibration": 300}  # after a long training up to these, by
 _EXTRA = 0.25  # this share of its time: they make bounds a little tighter, no more
 _RENDERS = 2.5  # a training step: a render takes about a quarter of it (demo: 0.6 of the training's time)
@@ -97,8 +97,8 @@ def _counts(job: Job, config: SampleConfig) -> dict[str, int]:
         "bias": 1.5 * compositions,
         "calibration": compositions,
     }
-    part = renders / sum(USUAL[name] * cost[name] for name in USUAL)
-    counts = {name: max(int(min(part, 1) * USUAL[name]), _FEWEST[name]) for name in USUAL}
+    part = renders / sum(DEFAULT_COUNTS[name] * cost[name] for name in DEFAULT_COUNTS)
+    counts = {name: max(int(min(part, 1) * DEFAULT_COUNTS[name]), _FEWEST[name]) for name in DEFAULT_COUNTS}
     left = renders - sum(counts[name] * cost[name] for name in counts)
     left *= _EXTRA if part > 1 else 1
     for name in counts:

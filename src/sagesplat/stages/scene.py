@@ -1,6 +1,5 @@
 """Makes scene.json from a capture, and a capture from photos or a video without poses."""
 
-import hashlib
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from sagesplat.run.capture import (
     read_capture,
 )
 from sagesplat.run.job import Job
-from sagesplat.run.records import file_hash, settings_of
+from sagesplat.run.records import file_hash
 from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
 from sagesplat.scene import load_scene
@@ -227,8 +226,13 @@ def _find_poses(job: Job, source: Path, capture: Path, config: PosesConfig, leav
 
     if job.run.path.resolve().is_relative_to(source.resolve()):
         raise RunError(f"{job.run.path}: lies among the photos; name a run folder outside of {source}")
-    digest, hashes = _hashes(job, source)
-    settings = {"source": str(source.resolve()), **asdict(config), "files": digest, **leaving_out.settings}
+    hashes = _hashes(job, source)
+    settings = {
+        "source": str(source.resolve()),
+        **asdict(config),
+        "files": hashes.digest,
+        **leaving_out.settings,
+    }
 
     def make() -> list[str]:
         result = reconstruct(
@@ -251,19 +255,10 @@ def _find_poses(job: Job, source: Path, capture: Path, config: PosesConfig, leav
         ]
 
     run_stage(job, "poses", settings, [], [capture / "poses.json"], make)
-    if hashes:
-        hashes.keep()
+    hashes.keep()
 
 
-def _hashes(job: Job, source: Path) -> tuple[str, Hashes | None]:
-    """What changes when the content of the photos, or of the video, does; and what is to be kept of it."""
+def _hashes(job: Job, source: Path) -> Hashes:
+    """What changes when the content of the photos, or of the video, does."""
     files = sorted(p for p in source.rglob("*") if p.is_file()) if source.is_dir() else [source]
-    state = [(str(p.relative_to(source)), p.stat().st_size, p.stat().st_mtime_ns) for p in files]
-    of_times = hashlib.sha256(repr(state).encode()).hexdigest()  # what older run folders recorded
-    try:
-        if settings_of(job.run, "poses").get("files") == of_times:
-            return of_times, None
-    except RunError:
-        pass
-    hashes = Hashes(job.run.source_hashes, {str(path.relative_to(source)): path for path in files})
-    return hashes.digest, hashes
+    return Hashes(job.run.source_hashes, {str(path.relative_to(source)): path for path in files})

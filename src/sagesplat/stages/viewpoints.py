@@ -89,7 +89,7 @@ def _measure_compositions(
     planned, wanted = part
     ladder = job.ladder
     assert isinstance(ladder, PrefixLadder)
-    masks, workspace = job.best_masks, Workspace()
+    masks, workspace = job.level_masks, Workspace()
 
     def in_view(of_view: _Planned) -> list[tuple[int, int, int, list[int], float]]:
         row, compositions = of_view

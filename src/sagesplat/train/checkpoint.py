@@ -200,8 +200,8 @@ def _state(found: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> TrainSta
         queue=meta["queue"],
         step=meta["step"],
         last_reset=meta["last_reset"],
-        frozen={int(label): int(step) for label, step in meta.get("frozen", ())},
-        withheld=int(meta.get("withheld", 0)),
+        frozen={int(label): int(step) for label, step in meta["frozen"]},
+        withheld=int(meta["withheld"]),
         order_share=arrays.get("order_share"),
         second_opacities=arrays.get(SECOND),
         per_view=_per_view(arrays),
@@ -209,7 +209,7 @@ def _state(found: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> TrainSta
 
 
 def _per_view(arrays: Mapping[str, torch.Tensor]) -> dict[str, ViewParameters]:
-    """The parameters of the views, by kind; none in the checkpoints of earlier versions."""
+    """The parameters of the views, by kind."""
     found: dict[str, ViewParameters] = {}
     for kind in sorted({name.split("/")[1] for name in arrays if name.startswith("view/")}):
         values, exp_avg, exp_avg_sq, counts = (arrays[f"view/{kind}/{name}"] for name in _OF_VIEWS)

@@ -241,8 +241,8 @@ def _most_pixels(g: Gaussians, breadth: Float[Tensor, " N"], camera: Camera) -> 
 
     `breadth`: product of the standard deviations of its broadest side, square world units.
     """
-    away = torch.linalg.vector_norm(g.means - g.means.new_tensor(camera.position), dim=1).clamp_min(1e-9)
-    pixels = 2 * math.pi * breadth * float(camera.K[0, 0] * camera.K[1, 1]) / away**2
+    distance = torch.linalg.vector_norm(g.means - g.means.new_tensor(camera.position), dim=1).clamp_min(1e-9)
+    pixels = 2 * math.pi * breadth * float(camera.K[0, 0] * camera.K[1, 1]) / distance**2
     return (g.logit_opacities.sigmoid() * pixels.clamp_max(camera.width * camera.height)).cpu().numpy()
 
 

@@ -57,8 +57,8 @@ class Shell:
     def place(self, means: Float32[Tensor, "N 3"]) -> Float32[Tensor, "N 3"]:
         """The means moved to the sphere, along their directions from the centre."""
         centre = means.new_tensor(self.centre)
-        away = means - centre
-        return centre + away * (self.radius / away.norm(dim=1, keepdim=True).clamp_min(1e-12))
+        offset = means - centre
+        return centre + offset * (self.radius / offset.norm(dim=1, keepdim=True).clamp_min(1e-12))
 
     def step(self, means: Tensor, before: Tensor, rows: Tensor) -> None:
         """Scale a training step of some rows (indices) to the shell's distance, along the shell; in place."""
@@ -219,8 +219,8 @@ def _with_margin(
     z, turn = 1 - (2 * np.arange(n) + 1) / n, np.pi * (1 + 5**0.5) * (np.arange(n) + 0.5)  # Fibonacci's
     across = np.sqrt(1 - z * z)
     grid = np.stack([across * np.cos(turn), across * np.sin(turn), z], 1)
-    distance, nearest = map(np.asarray, KDTree(seen).query(grid))
-    margin = (distance > 0.7 * spacing) & (distance < 2 * np.sin(np.radians(_MARGIN) / 2))
+    offset, nearest = map(np.asarray, KDTree(seen).query(grid))
+    margin = (offset > 0.7 * spacing) & (offset < 2 * np.sin(np.radians(_MARGIN) / 2))
     return np.concatenate([seen, grid[margin]]), np.concatenate([rgb, rgb[nearest[margin]]])
 
 

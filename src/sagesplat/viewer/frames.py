@@ -115,5 +115,5 @@ def camera_at(
 def _depths(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Depths of the points in the image, and of those in its central part."""
     pixels, depth = geometry.project(points, camera.w2c, camera.K)
-    away = np.abs(pixels / [camera.width, camera.height] - 0.5).max(1)
-    return depth[away <= 0.5], depth[away <= 0.2]
+    distance = np.abs(pixels / [camera.width, camera.height] - 0.5).max(1)
+    return depth[distance <= 0.5], depth[distance <= 0.2]

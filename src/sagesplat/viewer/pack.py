@@ -173,6 +173,6 @@ def _apparent_size(category: np.ndarray, position: np.ndarray, planes: np.ndarra
     near = category[boxes.touching(category, planes)]
     if not len(near):
         return 0.0
-    away = np.linalg.norm((near[:, :3] + near[:, 3:]) / 2 - position, axis=1)
+    distance = np.linalg.norm((near[:, :3] + near[:, 3:]) / 2 - position, axis=1)
     half = np.linalg.norm(near[:, 3:] - near[:, :3], axis=1) / 2
-    return float((np.minimum(1, half / np.maximum(away, 1e-9)) ** 2).sum() / len(category))
+    return float((np.minimum(1, half / np.maximum(distance, 1e-9)) ** 2).sum() / len(category))

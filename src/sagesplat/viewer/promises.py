@@ -31,13 +31,13 @@ from sagesplat.viewer.quality import curve_entry, curve_of, significant
 
 VERSION = 2
 # largest change of a mean by rounding, in any of the model's views and halfway to the next one: this much, or
-MOVES = 5e-4
-PART = 1e-2  # this part of what is missing to 1, if that is more
+MAX_ROUNDING_CHANGE = 5e-4
+RELATIVE_ROUNDING = 1e-2  # this part of what is missing to 1, if that is more
 NUGGET = 1e-3  # added to the kernel's diagonal: far below what a mean is uncertain by
 STEP = 1e-4  # of positions over the extent, directions, shares, targets and thresholds
 CORRECTION_STEP = 5e-3
 MOST_VIEWS = 1024  # of a model; of more every second, third, ... is sent: a browser solves for the weights
-LIKE = 16  # exponent of the kernel weights in `corrected`: only close views count
+NEIGHBOUR_EXPONENT = 16  # exponent of the kernel weights in `corrected`: only close views count
 _ENOUGH = 1e-3  # weight at which a correction counts by half
 _WHOLE = round(1 / STEP)
 # units of log distances and of values, the coarsest first
@@ -95,7 +95,7 @@ class SentModel:
         """
         here = np.column_stack([position / self.extent, direction, np.zeros(len(position))])
         known = np.column_stack([self.inputs[:, :6], np.zeros(len(self.inputs))])
-        weights = matern32(here, known, self.lengths) ** LIKE
+        weights = matern32(here, known, self.lengths) ** NEIGHBOUR_EXPONENT
         return distance * np.exp(weights @ self.corrections / (weights.sum(1) + _ENOUGH))
 
 
@@ -177,13 +177,13 @@ def _rounded(entry: dict[str, Any], model: ViewModel, shared: Int[np.ndarray, "U
     own = model.inputs
     at = np.concatenate([own, (own + own[_neighbours(own)]) / 2])
     # a curve may jump exactly at the distance of a view: a little beyond it
-    told = np.exp(at[:, 6]) * (1 + 1e-9), at[:, :3] * model.extent, at[:, 3:6]
-    before = model.predict(*told)
-    coarser = allowed(before.mean.mean(0)) / MOVES
+    predicted = np.exp(at[:, 6]) * (1 + 1e-9), at[:, :3] * model.extent, at[:, 3:6]
+    before = model.predict(*predicted)
+    coarser = allowed(before.mean.mean(0)) / MAX_ROUNDING_CHANGE
     sent, moved = entry, math.inf
     for log_unit, unit in _UNITS if len(own) <= MOST_VIEWS else _UNITS[:1]:
         sent = _with_values(entry, model, shared, log_unit, significant(unit * coarser, 4))
-        after = _model_of(sent, shared, model.extent).predict(*told)
+        after = _model_of(sent, shared, model.extent).predict(*predicted)
         moved = _moved(before, after, model.calibration.discount)
         if moved <= 1:
             break
@@ -218,7 +218,7 @@ def _moved(before: Prediction, after: Prediction, discount: float) -> float:
 
 def allowed(mean: np.ndarray) -> np.ndarray:
     """What rounding may change means by."""
-    return np.maximum(MOVES, PART * (1 - mean))
+    return np.maximum(MAX_ROUNDING_CHANGE, RELATIVE_ROUNDING * (1 - mean))
 
 
 def _thresholds(calibration: Calibration, moved: float) -> dict[str, list[int]]:
@@ -228,7 +228,7 @@ def _thresholds(calibration: Calibration, moved: float) -> dict[str, list[int]]:
     """
     targets, thresholds = calibration.targets, calibration.thresholds
     full = len(targets) > 0 and thresholds[-1] >= 1  # the full model keeps every target: that is not raised
-    just_below = 1 - 1.5 * STEP - moved * MOVES
+    just_below = 1 - 1.5 * STEP - moved * MAX_ROUNDING_CHANGE
     if full:  # targets that only the full model keeps must not lend theirs to means below
         target = np.interp(just_below, thresholds, targets)
         low = thresholds < just_below

@@ -40,13 +40,13 @@ def quality_entry(model: ViewModel) -> dict[str, Any]:
     null: no promise.
     """
     own = model.inputs
-    told = model.predict(np.exp(own[:, 6]), own[:, :3] * model.extent, own[:, 3:6])
-    low = np.quantile(told.bound, 1 - model.confidence, axis=0, method="lower")
+    predicted = model.predict(np.exp(own[:, 6]), own[:, :3] * model.extent, own[:, 3:6])
+    low = np.quantile(predicted.bound, 1 - model.confidence, axis=0, method="lower")
     return {
         "levels": list(model.levels),
         "status": model.status,
         "confidence": model.confidence,
-        "mean": told.mean.mean(0).round(3).tolist(),
+        "mean": predicted.mean.mean(0).round(3).tolist(),
         "bound": None if np.isnan(low).any() else (np.floor(low * 1000) / 1000).tolist(),
     }
 
@@ -72,11 +72,12 @@ def curve_entry(curve: SsimModel, exact: bool = False) -> dict[str, Any]:
         return entry
     below = 10.0 ** decimals_of(beta, 6)  # rounds down: some views are exactly at beta, where far begins
     short: dict[str, Any] = {**entry, "median": round(curve.median, 4)}
-    away = np.array([*np.linspace(*curve.d_range, 200), curve.params.mu1, curve.params.mu2])  # with the cusps
+    cusps = curve.params.mu1, curve.params.mu2
+    distance = np.array([*np.linspace(*curve.d_range, 200), *cusps])
     for digits in range(3, 16):
         params = [*significant(entry["params"][:8], digits), math.floor(beta * below) / below]
         short |= {"params": params, "range": significant(entry["range"], max(digits, 6))}
-        if np.abs(curve_of(short, curve.label_id)(away) - curve(away)).max() <= CURVE_MOVES:
+        if np.abs(curve_of(short, curve.label_id)(distance) - curve(distance)).max() <= CURVE_MOVES:
             break
     return short
 

@@ -327,7 +327,7 @@ def _of_plan(nested: NestedLevels, name: str, plan: Plan) -> Contender:
 
 def measure_sets(job: Job, contenders: Sequence[Contender], metrics: dict[str, Lpips]) -> list[Point]:
     """All contenders on all test views, some at a time."""
-    labels = job.best_masks
+    labels = job.level_masks
     tests, workspace, points = job.valid.rows(job.scene, job.scene.test_ids), Workspace(), []
     done, total = 0, len(contenders) * len(tests)
 

@@ -67,8 +67,8 @@ def prune_to(g: Gaussians, count: int, weights: np.ndarray) -> Gaussians:
 
 def nearest_snapshot(ladder: Ladder, count: int) -> int:
     """The level nearest in size to `count`, the latest of several; one soon after a reset only if all are."""
-    settled = [level for level in ladder.levels if level not in ladder.recovering] or ladder.levels
-    return min(settled, key=lambda level: (abs(ladder.size(level) - count), -level))
+    not_recovering = [level for level in ladder.levels if level not in ladder.recovering] or ladder.levels
+    return min(not_recovering, key=lambda level: (abs(ladder.size(level) - count), -level))
 
 
 def contenders(
