@@ -400,9 +400,9 @@ def test_what_blocks_are_made_of(tmp_path: Path, more: dict[str, Any]) -> None:
 def test_settings_of_a_wrong_type_are_no_record(run: Path) -> None:
     path = RunDir(run).provenance("train")
     record = read_json(path)
-    for name, value in [("max_steps", "6"), ("antialiased", 1), ("means_lr", None), ("seed", 10**30)]:
+    for name, value in [("max_steps", "6"), ("antialiased", 1), ("grow_grad", None), ("seed", 10**30)]:
         write_json(path, record | {"settings": record["settings"] | {name: value}})
-        with pytest.raises(RunError, match=rf"not the record of a stage; .*--force \({name} is"):
+        with pytest.raises(RunError, match=rf"not the record of a stage \({name}: expected .*--force"):
             records.read_record(path)
     del record["settings"]["antialiased"]
     write_json(path, record)

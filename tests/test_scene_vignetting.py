@@ -201,7 +201,7 @@ def test_training_tells_of_a_lens_that_nobody_corrected(capture):
      {"coefficients": [True, 2], "reach": 1}],
 )  # fmt: skip
 def test_a_damaged_record_is_refused(capture, tmp_path, made):
-    with pytest.raises(ValueError, match=r"expected|Expected|missing"):
+    with pytest.raises(ValueError, match=r"xpected|missing|out of range"):
         convert_as(made, Vignetting)
     assert convert_as(json.loads(json.dumps(asdict(LENS))), Vignetting) == LENS
     job = Job(RunDir(tmp_path / "run"), lambda _: None)

@@ -79,7 +79,7 @@ def test_the_json_may_bring_its_own_names(tmp_path):
         ),
         (
             '{"annotations": [{"file_name": "a.png", "segments_info": [{"id": -7, "category_id": 1}]}]}',
-            "beyond",
+            "expected int >= 0",
         ),
         (
             '{"annotations": [{"file_name": "a.png", "segments_info": [{"id": 8, "category_id": 1}]}]}',

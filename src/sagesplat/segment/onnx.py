@@ -28,7 +28,7 @@ from sagesplat.segment.segmenters import (
     group_classes,
     parse_device,
 )
-from sagesplat.segment.taxonomies import Source, to_coco
+from sagesplat.segment.taxonomies import SOURCES, to_coco
 
 _Value = Annotated[float, Meta(ge=-1e30, le=1e30)]
 _Scale = Annotated[float, Meta(gt=0, le=1e30)]
@@ -73,7 +73,7 @@ def read_classes(path: Path) -> Classes:
 class _File:
     classes: list[str]
     coco_panoptic: dict[str, int | None] = field(default_factory=dict)
-    vocabulary: Source | None = None
+    vocabulary: str | None = None
     mean: _Value | list[_Value] = 0.5
     std: _Scale | list[_Scale] = 0.5
 
@@ -82,6 +82,8 @@ def _categories(made: _File) -> dict[str, int | None]:
     """The category of each class: listed, or that of COCO nearest to it in a known vocabulary."""
     if made.vocabulary is None:
         return made.coco_panoptic
+    if made.vocabulary not in SOURCES:
+        raise ValueError(f'"vocabulary" is {made.vocabulary!r:.60}; take one of {", ".join(SOURCES)}')
     nearest = zip(made.classes, to_coco(made.classes, made.vocabulary), strict=True)
     return dict(nearest) | made.coco_panoptic
 
