@@ -43,7 +43,7 @@ class Opened:
         """All of them; a sound page has none."""
         return self.errors + self.violations + self.failed
 
-    def wait_for(self, expression: str, seconds: float = 20.0) -> Any:
+    def wait_for(self, expression: str, seconds: float = 240.0) -> Any:
         """The value of an expression as soon as it is true.
 
         Playwright's `wait_for_function` evaluates text on the page, which the viewer's policy forbids.
@@ -128,6 +128,7 @@ def open_page(
         viewport={"width": size[0], "height": size[1]}, device_scale_factor=1, color_scheme=scheme,
         has_touch=touch, ignore_https_errors=True,
     )  # fmt: skip
+    context.set_default_timeout(240_000)  # ms; a slow machine fails no test
     opened = Opened(context.new_page())
     _listen(opened)
     if script:
