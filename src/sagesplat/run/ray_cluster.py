@@ -29,6 +29,7 @@ _STORE = 256 * 2**20  # bytes of shared memory of a cluster of our own: results 
 _TOKENS = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 _LOOPBACK = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"  # 0: all of a cluster listens on 127.0.0.1 only
 _GREETED = 10.0  # seconds that a head may take to greet
+_ASKED = 60.0  # seconds that a process of the cluster may take to start and say whether tokens are checked
 _SETTINGS = b"\0\0\0\4\0\0\0\0\0"  # HTTP/2's first frame, by client and server alike (RFC 9113, 3.4)
 _GREETING = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + _SETTINGS
 _OPEN = (
@@ -164,7 +165,7 @@ def _tells_that_it_is_open() -> bool:
     """Whether a process of the cluster says that no token is asked for; False where none answers."""
     asked = ray.remote(num_cpus=0)(checks_tokens).remote()
     try:
-        return not ray.get(asked, timeout=ANSWER)
+        return not ray.get(asked, timeout=_ASKED)
     except (RayError, ModuleNotFoundError):  # busy, or without this package: the first task will say so
         ray.cancel(asked)
         return False
