@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from sagesplat.adapt.allocate import best_within, cheapest
 from sagesplat.adapt.fill import fill
-from sagesplat.adapt.plan import Choice, Plan, check_target
+from sagesplat.adapt.plan import Choice, Plan, Status, check_target
 from sagesplat.adapt.viewpoint import QualityKind, ViewModel
 from sagesplat.scene.scene import Camera
 
@@ -176,7 +176,7 @@ def make_choices(
     levels: Int[np.ndarray, " L"],
     predicted: Float[np.ndarray, "L K"],
     distance: Float[np.ndarray, " L"],
-    statuses: Sequence[str],
+    statuses: Sequence[Status],
     calibrated: Sequence[bool | None] | None = None,
 ) -> tuple[Choice, ...]:
     """A choice per category, from columns of `predicted`."""

@@ -7,6 +7,7 @@ category are those that its Gaussians paint in the full model. In the full model
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Int16, Int32
@@ -229,7 +230,8 @@ def distances_at(
 def write_sampled(path: Path, sampled: SampledFidelity) -> None:
     """fidelity.npz."""
     with atomic_path(path) as temporary:
-        np.savez(temporary, **{**vars(sampled), "labels": np.array(sampled.labels, np.int64)})
+        arrays: dict[str, Any] = {**vars(sampled), "labels": np.array(sampled.labels, np.int64)}
+        np.savez(temporary, **arrays)
 
 
 def read_sampled(path: Path) -> SampledFidelity:

@@ -27,7 +27,7 @@ from sagesplat.adapt.calibrate import (
 )
 from sagesplat.adapt.fidelity import SampledFidelity
 from sagesplat.adapt.process import fit_process, inputs_of, matern32
-from sagesplat.adapt.viewpoint import Calibration, ViewModel, constant_curve, monotone
+from sagesplat.adapt.viewpoint import Calibration, Status, ViewModel, constant_curve, monotone
 from sagesplat.scene.scene import Camera
 
 # Targets that compositions are planned for.
@@ -121,7 +121,7 @@ def _fit(
 
 
 def _calibration(
-    thresholds: Float[np.ndarray, " G"], status: str, confidence: float, views: int, least: float
+    thresholds: Float[np.ndarray, " G"], status: Status, confidence: float, views: int, least: float
 ) -> Calibration:
     """A calibration from the thresholds of TARGETS; the full model (mean 1) keeps all targets."""
     targets = np.append(TARGETS, 1.0)

@@ -17,7 +17,7 @@ too, whatever the count.
 import math
 from dataclasses import dataclass
 from itertools import islice
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -189,7 +189,7 @@ class _Check:
         camera = Camera(w2c.astype(np.float32), self.camera.K, self.camera.width, self.camera.height)
         position = torch.from_numpy(camera.position.copy()).to(self.g.means.device)
         near = ((self.g.means - position).norm(dim=1) < CLEAR).float()[:, None]
-        options = {"sh_degree": 0, "backend": self.backend, "workspace": self.workspace}
+        options: dict[str, Any] = {"sh_degree": 0, "backend": self.backend, "workspace": self.workspace}
         render = rasterize(self.g, camera, features=near, **options)
         assert render.features is not None
         seen = float(render.alpha.mean())

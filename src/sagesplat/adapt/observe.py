@@ -124,7 +124,7 @@ def render_rgb(
     tile_mask: Bool[np.ndarray, "h w"] | None = None,
 ) -> Float32[np.ndarray, "H W 3"]:
     """An image in [0, 1], as quality is measured on it; calls may share a `workspace`, images do not."""
-    how = {"backend": backend, "antialiased": antialiased, "workspace": workspace}
+    how: dict[str, Any] = {"backend": backend, "antialiased": antialiased, "workspace": workspace}
     with torch.no_grad():
         render = rasterize(g.to(device_of(backend)), camera, tile_mask=tile_mask, **how)
         return render.rgb.clamp(0, 1).float().cpu().numpy()
@@ -363,7 +363,7 @@ def _each_image(
 
     `views`: by row the tiles that are wanted at least; None: all.
     """
-    how = {"backend": backend, "antialiased": antialiased, "workspace": Workspace()}
+    how: dict[str, Any] = {"backend": backend, "antialiased": antialiased, "workspace": Workspace()}
     if isinstance(ladder, PrefixLadder):
 
         def in_view(row: int) -> list[dict[str, float]]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -83,7 +83,11 @@ class SeenLevels:
 
     def render(self, levels: Mapping[int, int]) -> Float32[np.ndarray, "H W 3"]:
         """See `Seen`."""
-        how = {"antialiased": self.antialiased, "backend": self.backend, "tile_mask": self.tile_mask}
+        how: dict[str, Any] = {
+            "antialiased": self.antialiased,
+            "backend": self.backend,
+            "tile_mask": self.tile_mask,
+        }
         with torch.no_grad():
             return rasterize(self.compose(levels), self.camera, **how).rgb.clamp(0, 1).float().cpu().numpy()
 

@@ -119,6 +119,6 @@ def write_transforms(folder: Path, names: list[str], cameras: list[Camera]) -> N
     for name, camera in zip(names, cameras, strict=True):
         c2w = np.linalg.inv(camera.w2c.astype(float)) * [1, -1, -1, 1]  # OpenGL's axes
         frames.append({"file_path": f"images/{name}", "transform_matrix": c2w.tolist()})
-    lens = {"w": cameras[0].width, "h": cameras[0].height}
+    lens: dict[str, float] = {"w": cameras[0].width, "h": cameras[0].height}
     lens |= {"fl_x": float(K[0, 0]), "fl_y": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2])}
     write_json(folder / "transforms.json", {"camera_model": "PINHOLE", **lens, "frames": frames})

@@ -33,7 +33,7 @@ def read_dotsplat(path: Path) -> Splat:
             raise DataError(
                 f"{path}: {rest} bytes after {rows} Gaussians; the file is truncated, copy it again"
             )
-        table = np.fromfile(path, _ROW)
+        table: np.ndarray = np.fromfile(path, _ROW)
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror}); give a .splat") from None
     with np.errstate(all="ignore"):  # scales of zero or less: such Gaussians are dropped

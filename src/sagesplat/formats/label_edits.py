@@ -139,7 +139,9 @@ def read_edits(path: Path) -> LabelEdits:
 
 def dump_edits(edits: LabelEdits) -> bytes:
     """The bytes of a file of edits."""
-    listed = [{"op": type(one).__name__.lower(), **vars(one)} for one in edits.operations]
+    listed: list[dict[str, Any]] = [
+        {"op": type(one).__name__.lower(), **vars(one)} for one in edits.operations
+    ]
     for entry in listed:
         if "gaussians" in entry:
             runs = entry["gaussians"].items()

@@ -68,7 +68,9 @@ def write_set(
     (see `starts_of`). `second`: the second opacities of the Gaussians, with weights of all these levels.
     `exact`: as float32, identical when read.
     """
-    arrays = {f"{label}/sizes": np.array(n, np.int64) for label, n in (sizes or {}).items()}
+    arrays: dict[str, np.ndarray] = {
+        f"{label}/sizes": np.array(n, np.int64) for label, n in (sizes or {}).items()
+    }
     for label, levels in (replaces or {}).items():
         if levels:
             arrays[f"{label}/replaces"] = np.array(sorted(levels), np.int64)

@@ -76,7 +76,7 @@ def write_ply(
         file.write("\n".join(header).encode())
         for start in range(0, len(gaussians), ROWS):
             rows = slice(start, start + ROWS)
-            block = np.empty(len(labels[rows]), dtype)
+            block: np.ndarray = np.empty(len(labels[rows]), dtype)
             block["values"] = np.concatenate([part[rows] for part in parts], axis=1)
             block["label"] = labels[rows]
             block.tofile(file)

@@ -135,8 +135,8 @@ def sog_files(g: Gaussians, *, name: str = "SOG", antialiased: bool = False) -> 
         codes, book = _coded(palette)
         files["shN_centroids.webp"] = _webp(_centroids(codes, bases))
         files["shN_labels.webp"] = webp(np.stack([rows & 255, rows >> 8, 0 * rows], 1))
-        meta["shN"] = {"count": len(palette), "bands": BASES.index(bases), "codebook": book}
-        meta["shN"]["files"] = ["shN_centroids.webp", "shN_labels.webp"]
+        names = ["shN_centroids.webp", "shN_labels.webp"]
+        meta["shN"] = {"count": len(palette), "bands": BASES.index(bases), "codebook": book, "files": names}
     return {META: json.dumps(meta).encode(), **files}
 
 

@@ -183,7 +183,8 @@ def where(typing_context, mask, a, b):  # type: ignore[no-untyped-def]
         return None
 
     def generate(context: Any, builder: Any, sig: Any, values: Any) -> Any:
-        chosen = (_in_all_lanes(context, builder, values[k], sig.args[k], vector) for k in (1, 2))
+        lanes: Any = vector
+        chosen = (_in_all_lanes(context, builder, values[k], sig.args[k], lanes) for k in (1, 2))
         return builder.select(values[0], *chosen)
 
     return vector(mask, a, b), generate

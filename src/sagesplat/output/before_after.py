@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -50,7 +51,7 @@ def before_after(
     parts, space = (g, g.select(stays), g.select(~stays)), Workspace()
 
     def render(part: Gaussians, camera: Camera) -> Float32[np.ndarray, "H W 3"]:
-        options = {"backend": backend, "antialiased": antialiased, "workspace": space}
+        options: dict[str, Any] = {"backend": backend, "antialiased": antialiased, "workspace": space}
         return render_rgb(part, camera, **options).copy()
 
     some = np.unique(np.linspace(0, len(cameras) - 1, min(_LOOKED, len(cameras))).round().astype(int))

@@ -33,7 +33,7 @@ class Table:
     title: str
     header: tuple[str, ...]
     formats: tuple[str, ...]
-    rows: list[tuple[str | int | float, ...]]
+    rows: Sequence[tuple[str | int | float, ...]]
     groups: tuple[tuple[str, int], ...] = ()  # (title, columns) over the header, from its second column on
     marks: Mapping[tuple[int, int], str] = field(default_factory=dict)  # (row, column): a note to the cell
     notes: tuple[str, ...] = ()  # under the table
@@ -198,7 +198,7 @@ def counts_table(counts: Counts, labels: Sequence[int], names: Mapping[int, str]
 def ladder_table(
     rows: Observations, counts: Counts, recovering: frozenset[int], names: Mapping[int, str], columns: int = 4
 ) -> Table:
-    """Tables I and II in one, for a terminal: mean SSIM and thousands of Gaussians at some levels, spread evenly."""
+    """Tables I and II in one, for a terminal: mean SSIM and thousands of Gaussians at evenly spread levels."""
     levels = sorted({level for _, level in counts})
     not_recovering = [level for level in levels if level not in recovering] or levels
     spread = np.linspace(0, len(not_recovering) - 1, columns).round().astype(int)

@@ -37,7 +37,8 @@ class Capture:
 
     def load(self) -> Scene:
         """The capture, whose vignetting is not estimated again. Raises SceneError."""
-        scene = load_scene(self.path, **{**self.settings, "vignetting": False})
+        settings: dict[str, Any] = {**self.settings, "vignetting": False}
+        scene = load_scene(self.path, **settings)
         return with_vignetting(scene, self.vignetting) if self.vignetting else scene
 
 

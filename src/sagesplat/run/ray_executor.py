@@ -37,7 +37,7 @@ class RayExecutor:
             folder.absolute() / f".cluster.tmp-{uuid.uuid4().hex[:12]}", Path.cwd()
         )
         near = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=True)
-        options = {"num_cpus": 0, "max_restarts": -1, "scheduling_strategy": near}
+        options: dict[str, Any] = {"num_cpus": 0, "max_restarts": -1, "scheduling_strategy": near}
         self._post: Any = ray.remote(**options)(EventBuffer).remote()
         self._taking: Any = None
 
@@ -107,7 +107,9 @@ class RayExecutor:
 
     def _submit(self, task: Task, run: str, number: int) -> Any:
         cpus = self._cpus(task.gpus)
-        asked = {"num_cpus": cpus, "num_gpus": task.gpus, "max_retries": 0, "scheduling_strategy": "SPREAD"}
+        asked: dict[str, Any] = {
+            "num_cpus": cpus, "num_gpus": task.gpus, "max_retries": 0, "scheduling_strategy": "SPREAD",
+        }  # fmt: skip
         if task.memory:
             asked["memory"] = task.memory
         return ray.remote(**asked)(run_task).remote(task, self._place, self._post, run, number, cpus)

@@ -185,7 +185,7 @@ def _binary_points(path: Path, data: _Bytes) -> ModelPoints:
     if not number:
         return _points(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)))
     windows = np.lib.stride_tricks.sliding_window_view(np.frombuffer(data.data, np.uint8), POINT.itemsize)
-    records = windows[starts].view(POINT)[:, 0]
+    records: np.ndarray = windows[starts].view(POINT)[:, 0]
     return _points(records["id"].astype(np.int64), records["xyz"], records["rgb"])
 
 

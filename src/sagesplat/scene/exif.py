@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from typing import Any
 
 from sagesplat.io.pictures import PictureError, open_picture
 
@@ -30,12 +31,12 @@ def exposure_of(path: Path) -> float | None:
     return value if abs(value) <= _MOST_EV else None
 
 
-def _number(value: object) -> float:
+def _number(value: Any) -> float:
     """A tag's number, the first where there are several; 0 for anything else."""
     if isinstance(value, tuple | list):
         value = value[0] if value else 0
     try:
-        number = float(value)  # type: ignore[arg-type]
+        number = float(value)
     except (TypeError, ValueError, ZeroDivisionError, OverflowError):
         return 0.0
     return number if math.isfinite(number) else 0.0

@@ -98,7 +98,7 @@ def reconstruct(
         _publish(workspace)
     renamed = {photo.name: photo.final for photo in photos if photo.name != photo.final}
     resolved = {"matching": request["matching"], "cameras": len(request["cameras"])}
-    report = {"complete": complete, "settings": asdict(config), "resolved": resolved}
+    report: dict[str, Any] = {"complete": complete, "settings": asdict(config), "resolved": resolved}
     report |= asdict(reconstruction) | {"workspace": str(workspace), "renamed": renamed}
     if complete:
         taken = {photo.prepared: (photo.final, photo.orientation) for photo in photos}

@@ -95,7 +95,7 @@ def _clean(job: Job, last: Path, config: CleanConfig) -> Cleaned:
 
 def figures_of(cleaned: Cleaned) -> CleanFigures:
     """The figures of a cleaning."""
-    removed = {name: int(rows.sum()) for name, rows in cleaned.removed.items()}
+    removed: dict[Criterion, int] = {name: int(rows.sum()) for name, rows in cleaned.removed.items()}
     return CleanFigures(len(cleaned.keep), cleaned.found, removed, cleaned.before, cleaned.after)
 
 

@@ -2,7 +2,7 @@
 
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import torch
@@ -37,8 +37,8 @@ class PhotoLoader:
 
     def __post_init__(self) -> None:
         cuda = self.device.type == "cuda"  # which GPU is in use is every thread's own affair
-        chosen = {"initializer": torch.cuda.set_device, "initargs": (self.device,)} if cuda else {}
-        self._worker = ThreadPoolExecutor(1, **chosen)
+        begin = partial(torch.cuda.set_device, self.device) if cuda else None
+        self._worker = ThreadPoolExecutor(1, initializer=begin)
         if self.limit < 0:
             free = torch.cuda.mem_get_info(self.device)[0] if self.device.type == "cuda" else 0
             self.limit = int(_MEMORY_SHARE * free)

@@ -103,7 +103,7 @@ def train(
     _check(config, masks)
     folder = None if folder is None else Path(folder)
     training: Training | None = None
-    with named_failures(lambda: _where(training and training.state, folder)):
+    with named_failures(lambda: _where(training.state if training else None, folder)):
         training = begin(
             scene, photos, label_ids, config,
             masks=masks, valid=valid, seed=seed, backend=backend, folder=folder, settings=settings,

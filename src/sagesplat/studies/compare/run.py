@@ -336,7 +336,11 @@ def measure_sets(job: Job, contenders: Sequence[Contender], metrics: dict[str, L
         return job.scene.views[row].camera.exposure is not None
 
     def image_of(g: Gaussians, row: int, neutral: bool = False) -> np.ndarray:
-        drawn = {"backend": job.backend, "antialiased": job.antialiased, "workspace": workspace}
+        drawn: dict[str, Any] = {
+            "backend": job.backend,
+            "antialiased": job.antialiased,
+            "workspace": workspace,
+        }
         camera = job.scene.views[row].camera
         return render_rgb(g, camera.neutral if neutral else camera, **drawn)
 

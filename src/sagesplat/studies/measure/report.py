@@ -93,7 +93,12 @@ def regions_table(measured: Measured) -> Table:
     for level, name in enumerate(measured.names):
         for label in (TOTAL, COVERED, *measured.labels()):
             if rows := measured.of(level, label):
-                cells = [name, measured.counts[level], measured.nbytes[level], measured.region(label)]
+                cells: list[Any] = [
+                    name,
+                    measured.counts[level],
+                    measured.nbytes[level],
+                    measured.region(label),
+                ]
                 cells += [len(rows), _mean(rows, "ssim"), _mean(rows, "psnr")]
                 cells += [
                     mean(np.array([row.lpips.get(net, np.nan) for row in rows])) for net in measured.nets

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -57,7 +58,7 @@ class Renderer:
     def covered(self, splat: Splat, camera: Camera) -> np.ndarray:
         """Pixels that the Gaussians cover, bool [H, W]."""
         g = splat.gaussians.to(device_of(self.backend))
-        options = {"backend": self.backend, "antialiased": splat.antialiased, "sh_degree": 0}
+        options: dict[str, Any] = {"backend": self.backend, "antialiased": splat.antialiased, "sh_degree": 0}
         return (rasterize(g, camera, **options).alpha > _OPAQUE).cpu().numpy()
 
 
