@@ -27,7 +27,7 @@ LOD_META = "lod-meta.json"
 _MOST_LEVELS = 100
 _CURE = "copy its folder again"
 _Number = Annotated[int, Meta(ge=0, lt=2**40)]
-_Name = Annotated[str, Meta(max_length=1000, pattern=r"^[^\x00-\x1f\x7f]+\Z")]
+_Name = Annotated[str, Meta(max_length=1000, pattern=r"^[^\x00-\x1f\x7f\ud800-\udfff]+\Z")]
 
 Slices = dict[int, list[tuple[int, int]]]  # by file: first row and number of rows of each leaf
 
