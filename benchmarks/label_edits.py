@@ -22,8 +22,8 @@ from sagesplat.formats.label_edits import (
     Rename,
     Split,
     Weigh,
+    dump_edits,
     ladder_hash,
-    write_edits,
 )
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
@@ -51,7 +51,7 @@ def measure(run: Path, views: int, split: bool, say: Any = print) -> dict[str, A
         edits, out = Path(work) / "labels.edit.json", Path(work) / "edited"
         ladder = ladder_hash(increments_of(before), before.names())
         operations = ten_edits(before, split)
-        write_edits(edits, LabelEdits(ladder, tuple(operations)))
+        edits.write_bytes(dump_edits(LabelEdits(ladder, tuple(operations))))
         wall, cpu = time.perf_counter(), time.process_time()
         made = apply_labels(before, edits, out)
         seconds, cpu_seconds = time.perf_counter() - wall, time.process_time() - cpu

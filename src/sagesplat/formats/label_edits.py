@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sagesplat.core.errors import LabelError, RunError, short
+from sagesplat.core.errors import LabelError, short
 from sagesplat.core.names import RULE, checked
-from sagesplat.io.files import loads_json, regular, unwritable, write_text
+from sagesplat.io.files import loads_json, regular
 
 if TYPE_CHECKING:  # loads torch, which `view` does without
     from sagesplat.formats.increments import Increment
@@ -146,24 +146,9 @@ def dump_edits(edits: LabelEdits) -> bytes:
     return (json.dumps(document, ensure_ascii=False, indent=1) + "\n").encode()
 
 
-def write_edits(path: Path, edits: LabelEdits) -> None:
-    """Write labels.edit.json; RunError where it cannot be written."""
-    try:
-        write_text(path, dump_edits(edits).decode())
-    except OSError as error:
-        raise RunError(unwritable(path, error)) from error
-
-
 def ranks_of(runs: Runs) -> np.ndarray:
     """The ranks in runs of them, int64, ascending."""
     return np.concatenate([np.arange(first, first + count) for first, count in runs])
-
-
-def runs_of(ranks: Sequence[int] | np.ndarray) -> Runs:
-    """Ascending ranks as runs of (first, number)."""
-    rising = np.asarray(ranks, np.int64)
-    parts = np.split(rising, np.flatnonzero(np.diff(rising) != 1) + 1) if len(rising) else []
-    return tuple((int(part[0]), len(part)) for part in parts)
 
 
 def _operation(entry: Any) -> Operation:

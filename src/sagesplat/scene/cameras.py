@@ -75,7 +75,9 @@ def _of_transforms(path: Path) -> list[NamedCamera]:
     cameras, complete = frame_cameras(path)
     if complete:
         return _of_capture(path)
-    return [NamedCamera(repaired(name), _within_limits(camera)) for name, camera in cameras]
+    for _, camera in cameras:
+        _check_size(camera.width, camera.height)
+    return [NamedCamera(repaired(name), camera) for name, camera in cameras]
 
 
 def _of_3dgs(entry: dict[str, Any], number: int) -> NamedCamera:
@@ -114,11 +116,6 @@ def _check_size(width: Any, height: Any) -> None:
     whole = all(isinstance(side, int) and 0 < side <= MAX_SIDE for side in (width, height))
     if not whole or width * height > MOST_PIXELS:
         raise ValueError(f"size {short(width)} x {short(height)} is out of range")
-
-
-def _within_limits(camera: Camera) -> Camera:
-    _check_size(camera.width, camera.height)
-    return camera
 
 
 def _camera(

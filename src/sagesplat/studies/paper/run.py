@@ -39,7 +39,7 @@ def paper_report(job: Job, config: PaperConfig) -> None:
 
 def cross_views(job: Job) -> None:
     """Plan each unseen view by itself and measure its composition."""
-    run, method, targets = job.run, method_of(job), _targets(job)
+    run, method, targets = job.run, method_of(job), ssim_targets(job.run)
     if not has_photos(run):
         raise RunError(
             f"{run.path}: crossview needs photos, and this splat came without; "
@@ -206,10 +206,6 @@ def _made_of(job: Job) -> list[Path]:
     return [run.labels, run.provenance("observe"), run.provenance("fit"), *compose_inputs(job)]
 
 
-def _targets(job: Job) -> list[float]:
-    return ssim_targets(job.run)
-
-
 def _view_plans(job: Job, view: int) -> list[Plan]:
     """Plans for one view at every target, as the paper's Table III makes them: from its four iterations."""
     levels = four_levels(job.ladder.levels)
@@ -217,7 +213,7 @@ def _view_plans(job: Job, view: int) -> list[Plan]:
     seen = distances(job, job.fit_config.distance)
     here = {label: float(d[view]) for label, d in seen.items()}
     models = models_of(job)
-    return [plan_view(models, counts, here, target, view) for target in _targets(job)]
+    return [plan_view(models, counts, here, target, view) for target in ssim_targets(job.run)]
 
 
 def _view(job: Job, config: PaperConfig) -> int:
