@@ -337,11 +337,11 @@ def breakages() -> dict[str, Callable[[Path, dict], Any]]:
         m[0, 3] = np.nan
         return m
 
-    def broken(folder: Path, _: dict) -> None:
-        (folder / "transforms.json").write_text('{"frames": [')
+    def put(name: str, content: bytes) -> Callable[[Path, dict], None]:
+        def change(folder: Path, _: dict) -> None:
+            (folder / name).write_bytes(content)
 
-    def deep(folder: Path, _: dict) -> None:
-        (folder / "transforms.json").write_text("[" * 200_000)
+        return change
 
     def gone(folder: Path, _: dict) -> None:
         (folder / "images/frame_00002.png").unlink()
@@ -350,16 +350,13 @@ def breakages() -> dict[str, Callable[[Path, dict], Any]]:
     def turned(folder: Path, _: dict) -> None:
         save_photo(folder / "images/frame_00002.png", (30, 40))
 
-    def damaged(folder: Path, _: dict) -> None:
-        (folder / "images/frame_00002.png").write_bytes(b"no photo")
-
     def no_focal(_: Path, content: dict) -> dict:
         return {key: value for key, value in content.items() if not key.startswith("fl_")}
 
     return {
         r"transforms.json: no such file": lambda f, c: (f / "transforms.json").unlink(),
-        r"not readable as JSON": broken,
-        r"transforms.json: (nested too deeply|not readable)": deep,
+        r"not readable as JSON": put("transforms.json", b'{"frames": ['),
+        r"transforms.json: (nested too deeply|not readable)": put("transforms.json", b"[" * 200_000),
         r"no frames; export": lambda f, c: {**c, "frames": []},
         r"transforms.json: no frames": lambda f, c: [1, 2],
         r"no frames; .* \{\"frames\": \[\.\.\.\]\}": lambda f, c: {**c, "frames": [1, 2, 3]},
@@ -398,7 +395,7 @@ def breakages() -> dict[str, Callable[[Path, dict], Any]]:
         r"OPENCV_FISHEYE has no p1 and p2": frame(camera_model="OPENCV_FISHEYE", p1=0.1),
         r"no pinhole view fits into a OPENCV camera": frame(k1=-30.0),
         r"frame_00002.png: 30 x 40 pixels, but its camera has another aspect ratio, 40 x 30": turned,
-        r"frame_00002.png: not readable as a photo": damaged,
+        r"frame_00002.png: not readable as a photo": put("images/frame_00002.png", b"no photo"),
         r"ply_file_path is '3'": lambda f, c: {**c, "ply_file_path": 3},
         r"ply_file_path '../a.ply' is outside": lambda f, c: {**c, "ply_file_path": "../a.ply"},
         r"a.ply: no such file; add it": lambda f, c: {**c, "ply_file_path": "a.ply"},

@@ -26,7 +26,7 @@ from sagesplat.core.config import (
 from sagesplat.demo.capture import make_capture
 from sagesplat.io.files import read_json, write_json
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import LadderKind, RunDir
+from sagesplat.run.run_dir import RunDir
 from sagesplat.stages.bundle import bundle
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.pipeline import run_all
@@ -81,9 +81,7 @@ def trained(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("ladder", ["nested", pytest.param("snapshots", marks=pytest.mark.slow)])
-def test_every_stage_and_study_takes_them(
-    ladder: LadderKind, capture: Path, trained: Path, tmp_path: Path
-) -> None:
+def test_every_stage_and_study_takes_them(ladder, capture, trained, tmp_path):
     run = Path(shutil.copytree(trained, tmp_path / "run"))
     job = Job(RunDir(run, ladder), lambda event: None)
     run_all(job, capture, CONFIG)
