@@ -219,9 +219,7 @@ def test_a_float_picture_larger_than_its_file(tmp_path: Path) -> None:
         Image.DecompressionBombWarning("large"),
     ],
 )
-def test_whatever_a_decoder_throws_is_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
-) -> None:
+def test_whatever_a_decoder_throws_is_one_line(tmp_path, monkeypatch, error):
     Image.fromarray(NOISE).save(tmp_path / "a.png")
 
     def fail(image: ImageFile.ImageFile) -> None:
@@ -393,9 +391,7 @@ KINDS = {
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("suffix", ["png", "tif"])
-def test_pixels_stay_bit_for_bit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, suffix: str
-) -> None:
+def test_pixels_stay_bit_for_bit(tmp_path, monkeypatch, kind, suffix):
     if (kind in ("CMYK", "I", "F") and suffix == "png") or (kind == "P" and suffix == "tif"):
         pytest.skip("not in this format")
     path = tmp_path / f"a.{suffix}"

@@ -76,6 +76,7 @@ def result(package: Path) -> tuple[float, bool]:
     return float(value), bool(int(hits))
 
 
+@pytest.mark.slow
 def test_a_change_in_any_file_that_a_kernel_uses_compiles_it_again(package: Path) -> None:
     assert result(package) == (18, False)
     assert result(package) == (18, True)
@@ -91,9 +92,7 @@ def test_a_change_in_any_file_that_a_kernel_uses_compiles_it_again(package: Path
     assert result(package) == (18, True)
 
 
-def test_without_a_folder_to_write_kernels_are_compiled_in_memory(
-    package: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_a_folder_to_write_kernels_are_compiled_in_memory(package, monkeypatch):
     from numba.core import caching
 
     from sagesplat.kernels.jit import njit

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -156,50 +157,36 @@ def breakages() -> dict:
         for photo in list((folder / "images").glob("**/*.png"))[:3]:
             Image.open(photo).transpose(Image.Transpose.ROTATE_90).save(photo)
 
-    def unknown(folder):
-        path = folder / "sparse/0/cameras.bin"
-        data = bytearray(path.read_bytes())
-        data[12] = 200
-        path.write_bytes(data)
+    def put(name: str, at: int, content: bytes) -> Callable[[Path], object]:
+        """Bytes written over a file of the model."""
 
-    def count(folder):
-        path = folder / "sparse/0/points3D.bin"
-        path.write_bytes(b"\xff" * 8 + path.read_bytes()[8:])
+        def change(folder: Path) -> None:
+            path = folder / "sparse/0" / name
+            data = bytearray(path.read_bytes())
+            data[at : at + len(content)] = content
+            path.write_bytes(data)
 
-    def no_points(folder):
-        (folder / "sparse/0/points3D.bin").write_bytes(bytes(8))
-
-    def nan(folder):
-        path = folder / "sparse/0/images.bin"
-        data = bytearray(path.read_bytes())
-        data[12:20] = np.array(np.nan).tobytes()
-        path.write_bytes(data)
-
-    def nan_point(folder):
-        path = folder / "sparse/0/points3D.bin"
-        data = bytearray(path.read_bytes())
-        data[16:24] = np.array(np.nan).tobytes()
-        path.write_bytes(data)
+        return change
 
     def truncate(folder):
         path = folder / "sparse/0/images.bin"
         path.write_bytes(path.read_bytes()[:-5])
 
-    def no_file(folder):
-        (folder / "sparse/0/points3D.bin").unlink()
-
+    nan = np.array(np.nan).tobytes()
     return {
         r"images: 2 of the model's 5 photos are missing, first 'part 1/02.png'": lambda f: shutil.rmtree(
             f / "images/part 1"
         ),
         r"30 x 40 pixels, but its camera has another aspect ratio, 40 x 30": shrink,
-        r"camera model number 200 is unknown": unknown,
-        r"points3D.bin: damaged or incomplete \(it ends within a record": count,
-        r"sparse/0: no 3D points": no_points,
-        r"images.bin: damaged .*photo 'part 0/05.png' has a pose that is not finite": nan,
-        r"points3D.bin: damaged .*not finite": nan_point,
+        r"camera model number 200 is unknown": put("cameras.bin", 12, b"\xc8"),
+        r"points3D.bin: damaged or incomplete \(it ends within a record": put("points3D.bin", 0, b"\xff" * 8),
+        r"sparse/0: no 3D points": lambda f: (f / "sparse/0/points3D.bin").write_bytes(bytes(8)),
+        r"images.bin: damaged .*photo 'part 0/05.png' has a pose that is not finite": put(
+            "images.bin", 12, nan
+        ),
+        r"points3D.bin: damaged .*not finite": put("points3D.bin", 16, nan),
         r"images.bin: damaged or incomplete \(it ends": truncate,
-        r"points3D.bin: no such file": no_file,
+        r"points3D.bin: no such file": lambda f: (f / "sparse/0/points3D.bin").unlink(),
         r"no COLMAP model \(looked for .*sparse/0": lambda f: shutil.rmtree(f / "sparse"),
         r"no such folder": lambda f: shutil.rmtree(f),
         r"01.png: not readable as a photo": lambda f: (f / "images/part 0/01.png").write_bytes(b"no image"),

@@ -337,11 +337,11 @@ def breakages() -> dict[str, Callable[[Path, dict], Any]]:
         m[0, 3] = np.nan
         return m
 
-    def broken(folder: Path, _: dict) -> None:
-        (folder / "transforms.json").write_text('{"frames": [')
+    def put(name: str, content: bytes) -> Callable[[Path, dict], None]:
+        def change(folder: Path, _: dict) -> None:
+            (folder / name).write_bytes(content)
 
-    def deep(folder: Path, _: dict) -> None:
-        (folder / "transforms.json").write_text("[" * 200_000)
+        return change
 
     def gone(folder: Path, _: dict) -> None:
         (folder / "images/frame_00002.png").unlink()
@@ -350,16 +350,13 @@ def breakages() -> dict[str, Callable[[Path, dict], Any]]:
     def turned(folder: Path, _: dict) -> None:
         save_photo(folder / "images/frame_00002.png", (30, 40))
 
-    def damaged(folder: Path, _: dict) -> None:
-        (folder / "images/frame_00002.png").write_bytes(b"no photo")
-
     def no_focal(_: Path, content: dict) -> dict:
         return {key: value for key, value in content.items() if not key.startswith("fl_")}
 
     return {
         r"transforms.json: no such file": lambda f, c: (f / "transforms.json").unlink(),
-        r"not readable as JSON": broken,
-        r"transforms.json: (nested too deeply|not readable)": deep,
+        r"not readable as JSON": put("transforms.json", b'{"frames": ['),
+        r"transforms.json: (nested too deeply|not readable)": put("transforms.json", b"[" * 200_000),
         r"not a transforms file \(frames: .*; export": lambda f, c: {**c, "frames": []},
         r"transforms.json: not a transforms file": lambda f, c: [1, 2],
         r"not a transforms file .*; .* \{\"frames\": \[\.\.\.\]\}": lambda f, c: {**c, "frames": [1, 2, 3]},

@@ -9,7 +9,6 @@ import sqlite3
 import subprocess
 import sys
 import types
-from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -164,9 +163,7 @@ def test_what_was_left_out_is_said(solved: tuple[Path, Path, list]) -> None:
     assert list(report["seconds"]) == ["prepare", "features", "matches", "mapping", "undistortion"]
 
 
-def test_label_images_of_the_photos_land_on_their_pixels(
-    solved: tuple[Path, Path, list], rendered: list[Image.Image], tmp_path: Path
-) -> None:
+def test_label_images_of_the_photos_land_on_their_pixels(solved, rendered, tmp_path):
     """As they were taken, one of them on its side: bright pixels of the photos are those labelled bright."""
     scene = load_scene(solved[1], test_every=0)
     (tmp_path / "labels.json").write_text('{"labels": {"0": "dark", "1": "bright"}}')
@@ -213,9 +210,7 @@ def test_progress_by_stage(solved: tuple[Path, Path, list]) -> None:
     assert stages["matches"][-1] == (28, 28)
 
 
-def test_a_finished_workspace_is_kept(
-    solved: tuple[Path, Path, list], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_finished_workspace_is_kept(solved, monkeypatch):
     source, out, _ = solved
     before = (out / "poses.json").read_text()
 
@@ -535,9 +530,7 @@ def all_corrupt(folder: Path) -> None:
         ),
     ],
 )
-def test_too_few_photos(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fill: Callable[[Path], None], message: str
-) -> None:
+def test_too_few_photos(tmp_path, monkeypatch, fill, message):
     monkeypatch.setattr(photos.importlib.util, "find_spec", lambda name: name)
     source = tmp_path / "photos"
     source.mkdir()
@@ -554,9 +547,7 @@ def test_too_few_photos(
         (PosesConfig(min_registered=1.5), "--poses.min-registered 1.5"),
     ],
 )
-def test_settings_that_cannot_be_used(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, config: PosesConfig, message: str
-) -> None:
+def test_settings_that_cannot_be_used(tmp_path, monkeypatch, config, message):
     monkeypatch.setattr(photos.importlib.util, "find_spec", lambda name: name)
     with pytest.raises(SageError, match=message):
         reconstruct(tmp_path, tmp_path / "out", config)
@@ -594,9 +585,7 @@ def test_without_pycolmap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
         ("", "COLMAP failed"),
     ],
 )
-def test_a_crash_of_the_child_is_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: str, message: str
-) -> None:
+def test_a_crash_of_the_child_is_one_line(tmp_path, monkeypatch, script, message):
     (tmp_path / "script.py").write_text(script)
     monkeypatch.setattr(photos, "_SCRIPT", tmp_path / "script.py")
     with pytest.raises(SceneError, match=message) as raised:

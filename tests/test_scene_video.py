@@ -108,9 +108,7 @@ def test_long_videos_keep_three_frames_to_choose_from(tmp_path: Path) -> None:
     ("matrix", "turns"),
     [((0, 1, -1, 0), -1), ((-1, 0, 0, -1), 2), ((0, -1, 1, 0), 1)],
 )
-def test_rotation_in_the_metadata_is_applied(
-    tmp_path: Path, matrix: tuple[int, int, int, int], turns: int
-) -> None:
+def test_rotation_in_the_metadata_is_applied(tmp_path, matrix, turns):
     """Players turn clockwise by a quarter for the matrix (0, 1, -1, 0), which phones write in portrait."""
     video = write_video(tmp_path / "a.mp4", pan(6))
     upright = extract_frames(video, tmp_path / "upright")

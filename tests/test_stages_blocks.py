@@ -29,7 +29,7 @@ from sagesplat.core.config import (
 from sagesplat.core.errors import LabelError, RunError, SceneError
 from sagesplat.core.events import Event, StageDone, StageSkipped
 from sagesplat.demo.capture import make_capture
-from sagesplat.formats.label_edits import Hide, LabelEdits, ladder_hash, write_edits
+from sagesplat.formats.label_edits import Hide, LabelEdits, dump_edits, ladder_hash
 from sagesplat.io.files import read_json, write_text
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
@@ -432,7 +432,7 @@ def test_instances_of_blocks(finished: Path, tmp_path: Path) -> None:
 def test_categories_of_blocks_can_be_hidden(finished: Path, tmp_path: Path) -> None:
     job = job_of(finished)
     edits = LabelEdits(ladder_hash(increments_of(job), job.names()), (Hide("dining table@0", True),))
-    write_edits(tmp_path / "labels.edit.json", edits)
+    (tmp_path / "labels.edit.json").write_bytes(dump_edits(edits))
     made = apply_labels(job, tmp_path / "labels.edit.json", tmp_path / "out", viewer=a_viewer(tmp_path))
     labels = {one["name"]: one for one in read_json(made.bundle.path / "manifest.json")["labels"]}
     assert labels["dining table@0"]["hidden"]

@@ -27,8 +27,8 @@ from sagesplat.formats.label_edits import (
     Rename,
     Split,
     Weigh,
+    dump_edits,
     ladder_hash,
-    write_edits,
 )
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
@@ -63,9 +63,8 @@ def viewer(tmp_path: Path) -> Path:
 
 def edited(run: Path, viewer: Path, *operations: Operation) -> LabelsApplied:
     job = job_of(run)
-    write_edits(
-        run / "labels.edit.json", LabelEdits(ladder_hash(increments_of(job), job.names()), operations)
-    )
+    edits = LabelEdits(ladder_hash(increments_of(job), job.names()), operations)
+    (run / "labels.edit.json").write_bytes(dump_edits(edits))
     return apply_labels(job, viewer=viewer)
 
 
@@ -215,7 +214,7 @@ def test_ranks_stay_those_of_the_run_after_a_merge(run: Path, viewer: Path) -> N
 def test_scripts_apply_edits(run: Path, tmp_path: Path) -> None:
     job = job_of(run)
     ladder = ladder_hash(increments_of(job), job.names())
-    write_edits(tmp_path / "mine.json", LabelEdits(ladder, (Rename(CAR, "auto"),)))
+    (tmp_path / "mine.json").write_bytes(dump_edits(LabelEdits(ladder, (Rename(CAR, "auto"),))))
     told: list[Event] = []
     made = sagesplat.apply_labels(
         str(run), tmp_path / "mine.json", tmp_path / "out", on_event=told.append, backend="cpu", threads=1
@@ -265,7 +264,7 @@ def test_a_name_that_only_label_images_have_is_taken(run: Path, viewer: Path) ->
 
 
 def test_edits_of_another_run(run: Path, viewer: Path) -> None:
-    write_edits(run / "labels.edit.json", LabelEdits("0" * 64, (Rename(CAR, "auto"),)))
+    (run / "labels.edit.json").write_bytes(dump_edits(LabelEdits("0" * 64, (Rename(CAR, "auto"),))))
     with pytest.raises(LabelError, match="edits of another run"):
         apply_labels(job_of(run), viewer=viewer)
 

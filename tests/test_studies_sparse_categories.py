@@ -3,7 +3,6 @@
 import csv
 import shutil
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pytest
@@ -82,9 +81,7 @@ def trained(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("ladder", ["nested", pytest.param("snapshots", marks=pytest.mark.slow)])
-def test_every_stage_and_study_takes_them(
-    ladder: Literal["nested", "snapshots"], capture: Path, trained: Path, tmp_path: Path
-) -> None:
+def test_every_stage_and_study_takes_them(ladder, capture, trained, tmp_path):
     run = Path(shutil.copytree(trained, tmp_path / "run"))
     job = Job(RunDir(run, ladder), lambda event: None)
     run_all(job, capture, CONFIG)

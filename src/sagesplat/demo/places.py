@@ -65,7 +65,8 @@ def build_places(seed: int, places: tuple[int, int]) -> World:
         rng = np.random.default_rng([seed, 3, i])
         foliage, own_solids, own_bodies = _courtyard(rng, place.house)
         leaves += [_moved_leaves(part, place) for part in foliage.parts]
-        solids += [(_moved_solid(row, place), material) for row, material in own_solids]
+        for row, material in own_solids:
+            solids.append(([*(place.centre + place.turn @ row[:2]), *row[2:]], material))
         bodies += [(_moved_body(planes, place), material) for planes, material in own_bodies]
         solid_place += [i] * len(own_solids)
         body_place += [i] * len(own_bodies)
@@ -179,10 +180,6 @@ def _moved_leaves(part: tuple[np.ndarray, ...], place: Place) -> tuple[np.ndarra
     frame[:, 0, :2] += place.centre
     reach[:, :2] = reach[:, :2] @ np.abs(place.turn).T
     return frame.reshape(-1, 12), reach, *rest
-
-
-def _moved_solid(row: list[float], place: Place) -> list[float]:
-    return [*(place.centre + place.turn @ row[:2]), *row[2:]]
 
 
 def _moved_body(planes: np.ndarray, place: Place) -> np.ndarray:

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from msgspec import Meta
 
-from sagesplat.core.errors import LabelError, RunError, short
+from sagesplat.core.errors import LabelError, short
 from sagesplat.core.limits import AtLeast1, Sha256
 from sagesplat.core.names import RULE, checked
-from sagesplat.io.files import regular, unwritable, write_text
+from sagesplat.io.files import regular
 from sagesplat.io.typed import convert_as, parse_json_as, refused
 
 if TYPE_CHECKING:  # loads torch, which `view` does without
@@ -150,24 +150,9 @@ def dump_edits(edits: LabelEdits) -> bytes:
     return (json.dumps(document, ensure_ascii=False, indent=1) + "\n").encode()
 
 
-def write_edits(path: Path, edits: LabelEdits) -> None:
-    """Write labels.edit.json; RunError where it cannot be written."""
-    try:
-        write_text(path, dump_edits(edits).decode())
-    except OSError as error:
-        raise RunError(unwritable(path, error)) from error
-
-
 def ranks_of(runs: Runs) -> np.ndarray:
     """The ranks in runs of them, int64, ascending."""
     return np.concatenate([np.arange(first, first + count) for first, count in runs])
-
-
-def runs_of(ranks: Sequence[int] | np.ndarray) -> Runs:
-    """Ascending ranks as runs of (first, number)."""
-    rising = np.asarray(ranks, np.int64)
-    parts = np.split(rising, np.flatnonzero(np.diff(rising) != 1) + 1) if len(rising) else []
-    return tuple((int(part[0]), len(part)) for part in parts)
 
 
 @dataclass(frozen=True)

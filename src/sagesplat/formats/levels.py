@@ -123,20 +123,19 @@ def starts_of(sizes: Sequence[int], replaces: Collection[int] = ()) -> tuple[int
 def _write(path: Path, header: LevelFile, g: Gaussians, more: dict[str, Any], exact: bool) -> None:
     meta = np.array([header.step, header.recovering, header.sh_degree], np.int64)
     arrays: dict[str, np.ndarray] = {"meta": meta, **more}
-    columns_of = _exact if exact else _encoded
     whole = {name: p.detach().cpu().numpy() for name, p in g.parameters().items()}
     whole["shN"] = whole["shN"][:, : num_bases(header.sh_degree) - 1]
     label_ids = g.label_ids.cpu().numpy()
     for label in header.counts:
         rows = np.flatnonzero(label_ids == label)
         values = {name: value[rows] for name, value in whole.items()}
-        arrays |= {f"{label}/{name}": column for name, column in columns_of(values).items()}
+        if exact:
+            columns = {name: value.astype(np.float32, copy=False) for name, value in values.items()}
+        else:
+            columns = _encoded(values)
+        arrays |= {f"{label}/{name}": column for name, column in columns.items()}
     with atomic_path(path, nbytes=sum(a.nbytes for a in arrays.values())) as temporary:
         np.savez(temporary, allow_pickle=False, **arrays)
-
-
-def _exact(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    return {name: value.astype(np.float32, copy=False) for name, value in values.items()}
 
 
 def _encoded(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -27,7 +27,7 @@ from sagesplat.formats.labels import NO_PARENTS, write_or_remove_labels
 from sagesplat.formats.ply import BASES
 from sagesplat.formats.quantisation import OTHERS
 from sagesplat.formats.sog import META
-from sagesplat.formats.splat import SplatWriter
+from sagesplat.formats.splat import SplatWriter, check_writable
 from sagesplat.io.files import atomic_folder, atomic_path
 
 GENERATOR = f"sagesplat {__version__}"
@@ -103,7 +103,11 @@ def sog_order(g: Gaussians) -> Int64[np.ndarray, " N"]:
 
 def sog_files(g: Gaussians, *, name: str = "SOG", antialiased: bool = False) -> dict[str, bytes]:
     """The files of a SOG scene by name, of Gaussians on the CPU in their order; errors as in `write_sog`."""
-    _check(name, g)
+    if not 0 < len(g) <= (_WIDEST - 4) ** 2:
+        raise DataError(
+            f"{name}: {len(g)} Gaussians; a SOG holds 1 to {(_WIDEST - 4) ** 2}, write other levels"
+        )
+    check_writable(g, name)
     count = len(g)
     width = 4 * math.ceil(math.sqrt(count) / 4)
 
@@ -138,18 +142,6 @@ def sog_files(g: Gaussians, *, name: str = "SOG", antialiased: bool = False) -> 
         names = ["shN_centroids.webp", "shN_labels.webp"]
         meta["shN"] = {"count": len(palette), "bands": BASES.index(bases), "codebook": book, "files": names}
     return {META: json.dumps(meta).encode(), **files}
-
-
-def _check(name: str, g: Gaussians) -> None:
-    if not 0 < len(g) <= (_WIDEST - 4) ** 2:
-        raise DataError(
-            f"{name}: {len(g)} Gaussians; a SOG holds 1 to {(_WIDEST - 4) ** 2}, write other levels"
-        )
-    for key, values in g.parameters().items():
-        if bad := int((~torch.isfinite(values)).sum()):
-            raise DataError(f"{name}: {bad} values of {key} are NaN or infinite; train the scene again")
-    if bad := int((~g.quats.any(1)).sum()):
-        raise DataError(f"{name}: {bad} Gaussians have a rotation of zeros; train the scene again")
 
 
 def _webp(pixels: np.ndarray) -> bytes:

@@ -96,6 +96,15 @@ def cleaned(splat: Splat, name: str) -> Splat:
     return replace(splat, gaussians=g, announced=announced, dropped=splat.dropped | dropped)
 
 
+def check_writable(g: Gaussians, name: str) -> None:
+    """DataError, which calls the file `name`, for NaN or infinities, or a rotation of zeros."""
+    for key, values in g.parameters().items():
+        if bad := int((~torch.isfinite(values)).sum()):
+            raise DataError(f"{name}: {bad} values of {key} are NaN or infinite; train the scene again")
+    if bad := int((~g.quats.any(1)).sum()):
+        raise DataError(f"{name}: {bad} Gaussians have a rotation of zeros; train the scene again")
+
+
 def undrawable(g: Gaussians) -> dict[str, Tensor]:
     """Bool [N] by reason: the Gaussians that `cleaned` leaves out. An infinite opacity logit can be drawn."""
     invisible = torch.isneginf(g.logit_opacities) | torch.isneginf(g.log_scales).any(1)

@@ -39,7 +39,7 @@ from sagesplat.formats.quantisation import (
     largest_restored,
     logits_of_bytes,
 )
-from sagesplat.formats.splat import Frame, Splat, SplatReader, SplatWriter
+from sagesplat.formats.splat import Frame, Splat, SplatReader, SplatWriter, check_writable
 from sagesplat.formats.spz_container import (
     ANTIALIASED,
     BASES,
@@ -155,7 +155,9 @@ def encode_spz(
         (True, 5)
     """
     g = g.detach().to("cpu")
-    _check(name, g)
+    if len(g) > MAX_COUNT:
+        raise DataError(f"{name}: {len(g)} Gaussians; SPZ readers take {MAX_COUNT}, write several files")
+    check_writable(g, name)
     degree = g.sh_degree if sh_degree is None else min(sh_degree, g.sh_degree)
     means, quats, harmonics = g.means.numpy(), g.quats.numpy(), g.shN[:, : BASES[degree]].numpy()
     means, quats, harmonics = flipped(means, quats, harmonics, frame)
@@ -264,16 +266,6 @@ def _gaussians(packed: Packed, label_id: int, frame: Frame) -> Gaussians:
         shN=torch.from_numpy(shN),
         label_ids=torch.full((count,), label_id, dtype=torch.int16),
     )
-
-
-def _check(name: str, g: Gaussians) -> None:
-    if len(g) > MAX_COUNT:
-        raise DataError(f"{name}: {len(g)} Gaussians; SPZ readers take {MAX_COUNT}, write several files")
-    for key, values in g.parameters().items():
-        if bad := int((~torch.isfinite(values)).sum()):
-            raise DataError(f"{name}: {bad} values of {key} are NaN or infinite; train the scene again")
-    if bad := int((~g.quats.any(1)).sum()):
-        raise DataError(f"{name}: {bad} Gaussians have a rotation of zeros; train the scene again")
 
 
 def _fractional_bits(

@@ -13,6 +13,8 @@ from sagesplat.scene.loading import MIN_VIEWS, camera_of, check_settings
 from sagesplat.scene.scene import Lens, Points, Scene, View
 from sagesplat.scene.undistort import distort, intrinsics, is_pinhole, pinhole
 
+MODEL_FILES = ("sparse/0/cameras.bin", "sparse/0/cameras.txt", "sparse/cameras.bin", "sparse/cameras.txt")
+
 
 def load_colmap(path: Path, *, downscale: int = 1, test_every: int = 8, images: str | None = None) -> Scene:
     """The scene of a COLMAP workspace: `images/` and `sparse/0` (or `sparse`) below `path`.
@@ -44,11 +46,11 @@ def load_colmap(path: Path, *, downscale: int = 1, test_every: int = 8, images: 
 def _find_model(path: Path) -> Path:
     if not path.is_dir():
         raise SceneError(f"{path}: no such folder; give the folder that holds images/ and sparse/")
-    for folder in (path / "sparse" / "0", path / "sparse"):
-        if any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
-            return folder
+    for name in MODEL_FILES:
+        if (path / name).is_file():
+            return (path / name).parent
     raise SceneError(
-        f"{path}: no COLMAP model (looked for cameras.bin and cameras.txt in sparse/0 and sparse); "
+        f"{path}: no COLMAP model (looked for {', '.join(MODEL_FILES)}); "
         "run COLMAP on the photos first, or give the folder that holds images/ and sparse/"
     )
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sagesplat.core.errors import SceneError
 from sagesplat.scene import stored
-from sagesplat.scene.colmap import load_colmap
+from sagesplat.scene.colmap import MODEL_FILES, load_colmap
 from sagesplat.scene.nerfstudio import load_blender, load_transforms
 from sagesplat.scene.scene import Scene
 
@@ -29,10 +29,7 @@ class CaptureFormat:
 
 
 CAPTURES = {
-    "colmap": CaptureFormat(
-        ("sparse/0/cameras.bin", "sparse/0/cameras.txt", "sparse/cameras.bin", "sparse/cameras.txt"),
-        load_colmap,
-    ),
+    "colmap": CaptureFormat(MODEL_FILES, load_colmap),
     "transforms": CaptureFormat(("transforms.json",), load_transforms, suffix=".json"),
     "blender": CaptureFormat(("transforms_train.json",), load_blender),
 }

@@ -4,12 +4,12 @@ sRGB's curve is v = 1.055 L^(1/2.4) - 0.055 but for the darkest colours. So ligh
 values, (v + 0.055) times gain^(1/2.4): what is fitted here is that factor, for each photo and channel.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int64
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import LinearOperator, cg
 
@@ -120,13 +120,11 @@ def _explained(
     count: int,
 ) -> float:
     """Share by which gains bring together the colours of points that they were not fitted to."""
-    before, after = 0.0, 0.0
-    for half in (0, 1):
-        a, b = points % 2 == half, points % 2 != half
-        gains = _fit(points[a], views[a], logs[a], count)
-        before += spread(points[b], logs[b])
-        after += spread(points[b], logs[b] - gains[views[b]])
-    return 1 - after / max(before, 1e-12)
+
+    def left(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return logs[b] - _fit(points[a], views[a], logs[a], count)[views[b]]
+
+    return cross_validated(points, logs, left)
 
 
 def _by_direction(gains: Float64[np.ndarray, " V"], forward: Float64[np.ndarray, "V 3"]) -> float:
@@ -181,6 +179,23 @@ def log_gains(
         scale = 2 * 1.4826 * float(np.median(np.abs(errors))) + 1e-4
         weight = 1 / (1 + (errors / scale) ** 2) ** 2
     return gain
+
+
+def cross_validated(
+    points: Int64[np.ndarray, " T"],
+    logs: Float64[np.ndarray, "T C"],
+    left: Callable[[Bool[np.ndarray, " T"], Bool[np.ndarray, " T"]], np.ndarray],
+) -> float:
+    """Share by which a fit to half of the points brings together the colours of the others.
+
+    `left`: what the fit to the first observations leaves of the logs of the second.
+    """
+    before, after = 0.0, 0.0
+    for half in (0, 1):
+        fitted, other = points % 2 == half, points % 2 != half
+        before += spread(points[other], logs[other])
+        after += spread(points[other], left(fitted, other))
+    return 1 - after / max(before, 1e-12)
 
 
 def spread(points: Int64[np.ndarray, " T"], logs: Float64[np.ndarray, "T C"]) -> float:

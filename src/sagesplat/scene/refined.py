@@ -28,7 +28,8 @@ class RefinedCameras:
 def given_cameras(scene: Scene) -> RefinedCameras:
     """The cameras of a scene as they are, nothing refined."""
     w2c = np.stack([view.camera.w2c for view in scene.views])
-    return RefinedCameras(w2c, _identities(len(w2c)), np.zeros(len(w2c), bool))
+    neutral = np.tile(np.eye(3, 4, dtype=np.float32), (len(w2c), 1, 1))
+    return RefinedCameras(w2c, neutral, np.zeros(len(w2c), bool))
 
 
 def with_cameras(scene: Scene, cameras: RefinedCameras) -> Scene:
@@ -85,7 +86,3 @@ def _check(cameras: RefinedCameras, views: int) -> None:
     rigid = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(initial=0) <= _MAX_SHEAR
     if not rigid or (np.linalg.det(rotation) < 0).any() or (cameras.w2c[:, 3] != [0, 0, 0, 1]).any():
         raise ValueError("a pose that is no rotation and translation")
-
-
-def _identities(views: int) -> Float32[np.ndarray, "V 3 4"]:
-    return np.tile(np.eye(3, 4, dtype=np.float32), (views, 1, 1))

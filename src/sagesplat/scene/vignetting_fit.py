@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from sagesplat.scene.gains import log_gains, spread
+from sagesplat.scene.gains import cross_validated, log_gains
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import STEEPEST, Scene, Vignetting
 from sagesplat.scene.track_colours import TrackColours, track_colours
@@ -92,10 +92,8 @@ def _explained(
 
     plain, full: log values less the photos' gains, found without and with the lens.
     """
-    before, after = 0.0, 0.0
-    for half in (0, 1):
-        fitted, other = points % 2 == half, points % 2 != half
-        found = _lens(points[fitted], full[fitted], basis[fitted])
-        before += spread(points[other], plain[other, None])
-        after += spread(points[other], (full[other] - basis[other] @ found)[:, None])
-    return 1 - after / max(before, 1e-12)
+
+    def left(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return (full[b] - basis[b] @ _lens(points[a], full[a], basis[a]))[:, None]
+
+    return cross_validated(points, plain[:, None], left)

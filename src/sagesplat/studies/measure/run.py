@@ -54,7 +54,9 @@ def measure(
     check_limits(config)
     reference, levels, names = _levels(paths)
     truth = reference.load()
-    _tell_dropped(truth, reference.name, emit)
+    if truth.dropped:
+        what = ", ".join(f"{count:,} {reason}" for reason, count in truth.dropped.items())
+        emit(Warned(f"{reference.name}: Gaussians left out: {what}"))
     check_size(truth.gaussians, reference.name)
     cameras, views, lines = _viewpoints(truth, config, backend)
     renderer, total = Renderer(backend), len(levels) * len(cameras)
@@ -98,12 +100,6 @@ def _levels(paths: Sequence[Path]) -> tuple[Level, list[Level], list[str]]:
         )
     owners = [path for path, some in zip(paths[1:], others, strict=True) for _ in some]
     return first[0], levels, unique_names(levels, owners or [paths[0]] * len(levels))
-
-
-def _tell_dropped(splat: Splat, name: str, emit: Emit) -> None:
-    if splat.dropped:
-        what = ", ".join(f"{count:,} {reason}" for reason, count in splat.dropped.items())
-        emit(Warned(f"{name}: Gaussians left out: {what}"))
 
 
 def _viewpoints(
