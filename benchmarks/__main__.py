@@ -40,7 +40,8 @@ from sagesplat.scene import load_scene
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene
 from sagesplat.segment import coco
-from sagesplat.segment.masks import Masks, Taxonomy, import_masks
+from sagesplat.segment.mask_files import import_masks
+from sagesplat.segment.masks import Masks, Taxonomy
 from sagesplat.train.events import Step
 from sagesplat.train.trainer import train
 

@@ -13,7 +13,8 @@ from sagesplat.scene import load_scene
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.segment.lift import lift
-from sagesplat.segment.masks import Masks, Taxonomy, import_masks
+from sagesplat.segment.mask_files import import_masks
+from sagesplat.segment.masks import Masks, Taxonomy
 from sagesplat.train.events import LabelFrozen, Step, Trained
 from sagesplat.train.trainer import train
 

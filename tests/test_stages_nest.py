@@ -16,7 +16,7 @@ from sagesplat.adapt.coverage import PREDICTORS
 from sagesplat.adapt.evaluate import read_evaluation
 from sagesplat.adapt.ladder import PrefixLadder, read_prefixes
 from sagesplat.adapt.observe import TOTAL, read_observations
-from sagesplat.adapt.plan import read_budget_plan, read_plans
+from sagesplat.adapt.plan_files import read_budget_plan, read_plans
 from sagesplat.core.config import FitConfig, NestConfig, PlanConfig, RunConfig, SceneConfig, TrainConfig
 from sagesplat.core.errors import DataError, RunError
 from sagesplat.core.events import Event, StageDone, StageSkipped

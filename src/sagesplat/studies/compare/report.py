@@ -16,7 +16,8 @@ from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import BYTES_PER_GAUSSIAN
 from sagesplat.io.files import read_json, write_json, write_text
 from sagesplat.output.figures import ACCENT, FAINT, INK, STYLE, caption, save_figure
-from sagesplat.output.tables import MB, Table
+from sagesplat.output.table import Table
+from sagesplat.output.tables import MB
 
 SNAPSHOTS, SAGE, PRUNED, MCMC = "3DGS, snapshots", "SAGE", "3DGS, pruned and tuned", "3DGS-MCMC"
 SAME_SHARE, PLANNED = "nested, same share", "nested, planned"
