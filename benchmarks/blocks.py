@@ -79,7 +79,7 @@ def label(spec: JobSpec, scene: Path, config: RunConfig, emit: Emit) -> None:
     job = spec.open(emit)
     open_scene(job, scene, config.scene)
     make_masks(job, config.masks, config.labels)
-    lift_labels(job, config.lift)
+    lift_labels(job)
 
 
 def as_one(spec: JobSpec, config: RunConfig, emit: Emit) -> None:

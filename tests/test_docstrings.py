@@ -12,7 +12,8 @@ import sagesplat
 
 # modules whose examples run here; those that need a capture or a run are marked +SKIP
 MODULES = (
-    "adapt.allocate", "adapt.fill", "adapt.observe", "adapt.photo_models", "adapt.eq1", "adapt.plan", "adapt.viewpoint",
+    "adapt.allocate", "adapt.eq1", "adapt.fill", "adapt.observe", "adapt.photo_models", "adapt.plan",
+    "adapt.viewpoint",
     "formats.levels", "formats.ply", "formats.splats", "formats.spz", "formats.stream",
     "metrics.color_correct", "metrics.image", "raster", "scene", "segment.masks", "segment.relabel",
     "segment.select", "stages.api", "stages.label_edits", "train.trainer",

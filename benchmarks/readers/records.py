@@ -68,7 +68,7 @@ settings.ladder = "snapshots"
 settings.train = { max_steps = 60, level_every = 20 }
 scenes.plot = "demo"
 variants.track = {}
-variants.projection.lift.votes = "projection"
+variants.flat.train.sh_degree = 0
 """
 
 
@@ -384,7 +384,7 @@ def _read_edited(path: Path) -> None:
     label_settings(RunDir(path.parent))
 
 
-NETWORK = {"segmenter": "onnx", "soft": True, "model": "0" * 64}
+NETWORK = {"segmenter": "onnx", "model": "0" * 64}
 
 
 def _networks(folder: Path, size: int) -> list[bytes]:

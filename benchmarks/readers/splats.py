@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from sagesplat.segment.soft import read_soft, write_soft
 
 from benchmarks.hostile import Reader
 from benchmarks.readers.making import PHOTOS, as_json, file, splats, written
@@ -131,11 +130,6 @@ def _read_nested(path: Path) -> None:
     ladder.load(ladder.levels[-1])
 
 
-def _soft(folder: Path, size: int) -> list[bytes]:
-    share, ids = np.full((2, 8 * size, 8 * size), 0.5, np.float32), np.array([1, 2], np.int16)
-    return [written(folder / "s.npz", lambda path: write_soft(path, share, ids, share.shape[1:]))]
-
-
 def _lifted(folder: Path, size: int) -> list[bytes]:
     count = np.ones(4 * size, np.int32)
     (folder / "points").write_text(str(len(count)))
@@ -164,7 +158,6 @@ READERS = (
     Reader("level", ".npz", _levels, file("000007.npz", _read_level)),
     Reader("snapshots", ".npz", _levels, file("levels/000007.npz", _read_snapshots)),
     Reader("nested", ".npz", _nested, file("n.npz", _read_nested)),
-    Reader("soft", ".npz", _soft, file("s.npz", read_soft), 100),
     Reader("lifted", ".npz", _lifted, file("l.npz", _read_lifted), 3000),
     Reader("stored", ".npz", _stored, file("s.npz", read_scene), 100),
 )
