@@ -19,6 +19,7 @@ from benchmarks.promises import CASES
 from sagesplat.core.config import (
     CleanConfig,
     CompareConfig,
+    FitConfig,
     LabelsConfig,
     MasksConfig,
     NestConfig,
