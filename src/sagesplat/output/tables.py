@@ -93,8 +93,8 @@ def ladder_table(
     """Tables I and II in one, for a terminal: mean SSIM and thousands of Gaussians at some settled levels."""
     levels = sorted({level for _, level in counts})
     not_recovering = [level for level in levels if level not in recovering] or levels
-    rows = np.linspace(0, len(not_recovering) - 1, columns).round().astype(int)
-    picked = sorted({not_recovering[i] for i in rows})
+    spaced = np.linspace(0, len(not_recovering) - 1, columns).round().astype(int)
+    picked = sorted({not_recovering[i] for i in spaced})
     body = []
     for label_id in [*by_size(counts), TOTAL]:
         cells = []
