@@ -34,7 +34,7 @@ from benchmarks.faults_run import (
 )
 from sagesplat.core.errors import RunError, SageError
 from sagesplat.demo.capture import cached_capture
-from sagesplat.output.tables import Table
+from sagesplat.output.table import Table
 
 NODE = {"num_cpus": 1, "object_store_memory": 80 * 2**20, "include_dashboard": False}
 CASES = ("a", "b", "c", "d", "e")

@@ -231,7 +231,7 @@ def _steps_as_long(job: Job, config: NestConfig) -> int:
     g, train = read_level(job.trained), train_config(job)
     views = job.scene.train_ids.tolist()
     begin = time.process_time()
-    importance(g, job.scene, views, config.criterion, valid=job.inliers, antialiased=job.antialiased)
+    importance(g, job.scene, views, "sensitivity", valid=job.inliers, antialiased=job.antialiased)
     sorting = len(nested.SORT_AT) * (time.process_time() - begin)
     unordered = nested.Nested(g, np.zeros(len(g), bool))
     few = replace(config, steps=_TIMED)
@@ -266,7 +266,7 @@ def _full_steps(job: Job, of: tuple[NestConfig, int]) -> Iterator[Gaussians]:
     settings = replace(train_config(job), batch=1)
     stepper = Stepper(
         PhotoLoader(job.scene, job.photos, device, job.inliers), settings, ActiveTiles(job.scene, None),
-        job.backend, sh_bits=config.sh_bits, shell=job.sky.shell if job.sky else None,
+        job.backend, sh_bits=SH_BITS, shell=job.sky.shell if job.sky else None,
     )  # fmt: skip
     rates, trainable = nested.learning_rates(settings, config, job.scene), trainable_rows(state.gaussians, {})
     tail = nested.TailAverage(config.steps)

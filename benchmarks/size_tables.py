@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from sagesplat.io.files import atomic_path
-from sagesplat.output.tables import MB, Table
+from sagesplat.output.table import Table
+from sagesplat.output.tables import MB
 from sagesplat.studies.compare.report import MCMC, PLANNED, PRUNED, SAME_SHARE, SNAPSHOTS, Point, least
 
 AS_ONE, TRAINED = "3DGS, as one", "3DGS"  # methods beside those of `sagesplat compare`

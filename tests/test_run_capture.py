@@ -17,7 +17,7 @@ from sagesplat.io.files import read_json, write_json
 from sagesplat.run import capture as run_capture
 from sagesplat.run.capture import Hashes, read_capture
 from sagesplat.run.job import Job
-from sagesplat.run.records import FORMAT, file_hash
+from sagesplat.run.records import file_hash
 from sagesplat.run.run_dir import RunDir
 from sagesplat.stages import scene as scene_stage
 from sagesplat.stages.scene import open_scene
@@ -128,19 +128,12 @@ def test_photos_without_poses_are_known_by_their_content(tmp_path: Path) -> None
     photos, job = tmp_path / "photos", Job(RunDir(tmp_path / "run"), lambda event: None)
     photos.mkdir()
     (photos / "a.jpg").write_bytes(b"one")
-    digest, hashes = scene_stage._hashes(job, photos)
-    assert hashes is not None
+    hashes = scene_stage._hashes(job, photos)
     hashes.keep()
     (photos / "a.jpg").touch()
-    assert scene_stage._hashes(job, photos)[0] == digest
+    assert scene_stage._hashes(job, photos).sha256 == hashes.sha256
     (photos / "a.jpg").write_bytes(b"two")
-    assert scene_stage._hashes(job, photos)[0] != digest
-    # an older run recorded sizes and times
-    state = (photos / "a.jpg").stat()
-    old = scene_stage.hashlib.sha256(repr([("a.jpg", state.st_size, state.st_mtime_ns)]).encode()).hexdigest()
-    record = {"format": FORMAT, "stage": "poses", "settings": {"files": old}, "inputs": {}}
-    write_json(job.run.provenance("poses"), record)
-    assert scene_stage._hashes(job, photos) == (old, None)
+    assert scene_stage._hashes(job, photos).sha256 != hashes.sha256
 
 
 def test_hashes_of_a_folder_that_cannot_be_written(tmp_path: Path) -> None:

@@ -395,7 +395,7 @@ def breakages() -> dict[str, Callable[[Path, dict], Any]]:
         r"OPENCV_FISHEYE has no p1 and p2": frame(camera_model="OPENCV_FISHEYE", p1=0.1),
         r"no pinhole view fits into a OPENCV camera": frame(k1=-30.0),
         r"frame_00002.png: 30 x 40 pixels, but its camera has another aspect ratio, 40 x 30": turned,
-        r"frame_00002.png: not readable as a photo": damaged,
+        r"frame_00002.png: not readable as a photo": put("images/frame_00002.png", b"no photo"),
         r"ply_file_path: expected str": lambda f, c: {**c, "ply_file_path": 3},
         r"ply_file_path '../a.ply' is outside": lambda f, c: {**c, "ply_file_path": "../a.ply"},
         r"a.ply: no such file; add it": lambda f, c: {**c, "ply_file_path": "a.ply"},

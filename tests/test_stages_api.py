@@ -15,7 +15,7 @@ from sagesplat import (
     read_ply,
     run_scene,
 )
-from sagesplat.adapt.plan import read_plans
+from sagesplat.adapt.plan_files import read_plans
 from sagesplat.core.errors import RunError
 from sagesplat.formats.splats import read_splat
 from sagesplat.stages.export import export_increments, export_scene

@@ -2,7 +2,8 @@
 
 from dataclasses import asdict, replace
 
-from sagesplat.adapt.plan import Plan, quality_title, write_plans
+from sagesplat.adapt.plan import Plan, quality_title
+from sagesplat.adapt.plan_files import write_plans
 from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.core.config import LadderKind, PlanConfig
 from sagesplat.core.errors import RunError

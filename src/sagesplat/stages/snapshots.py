@@ -5,7 +5,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from sagesplat.adapt.plan import Plan, plan_scene, plan_view
+from sagesplat.adapt.eq1 import plan_scene, plan_view
+from sagesplat.adapt.plan import Plan
 from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.core.config import PlanConfig
 from sagesplat.core.errors import RunError

@@ -22,7 +22,8 @@ from sagesplat.scene.points import read_points
 from sagesplat.scene.scene import Camera, View
 from sagesplat.segment.coco import read_panoptic
 from sagesplat.segment.instances import read_instances, write_instances
-from sagesplat.segment.masks import Taxonomy, import_masks, read_mask, write_mask
+from sagesplat.segment.mask_files import import_masks
+from sagesplat.segment.masks import Taxonomy, read_mask, write_mask
 from tests.fuzz.hostile import MIB, Reader
 from tests.fuzz.readers.making import PHOTOS, as_json, file, put, put_photos, written
 

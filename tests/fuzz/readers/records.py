@@ -31,7 +31,6 @@ from sagesplat.segment import segmenters
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.segment.parents import read_parents, write_parents
 from sagesplat.stages import label, live_bundle, view
-from sagesplat.stages.boundaries import _seconds
 from sagesplat.stages.clean import read_clean_figures
 from sagesplat.stages.edited import LabelSettings, label_settings, write_edited
 from sagesplat.stages.prompts import read_scores
@@ -177,8 +176,8 @@ def _plans(folder: Path, size: int) -> list[bytes]:
 
 
 def _read_plans(path: Path) -> None:
-    plan.read_plans(path)
-    plan.read_budget_plan(path)
+    plan_files.read_plans(path)
+    plan_files.read_budget_plan(path)
 
 
 def _table(kind: Any) -> Any:
@@ -275,7 +274,6 @@ def _read_provenance(path: Path) -> None:
     run = RunDir(path.parents[1])
     stage_seconds(run)
     recorded_settings(run)
-    _seconds(run, "train")
     _follows(Job(run, _ignore), Stage("train", TRAINED, [], []))
     is_done(run, "train", TRAINED, None, [run.scene], False)
     settings_of(run, "train")
@@ -383,7 +381,7 @@ def _read_edited(path: Path) -> None:
     label_settings(RunDir(path.parent))
 
 
-NETWORK = {"segmenter": "onnx", "soft": True, "model": "0" * 64}
+NETWORK = {"segmenter": "onnx", "model": "0" * 64}
 
 
 def _networks(folder: Path, size: int) -> list[bytes]:

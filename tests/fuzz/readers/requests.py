@@ -117,7 +117,6 @@ def _words(folder: Path, size: int) -> list[bytes]:
 def _parse(folder: Path, content: bytes) -> None:
     """Words of a command line, one on each line, as `main` reads them."""
     name, *words = content.decode("utf-8", "surrogateescape").replace("\0", "").split("\n")
-    name = parse.current_command(name)
     if name in COMMANDS and not {"-h", "--help", "--help-all"} & set(words):
         with suppress(OSError):  # `main` makes a line of what the system says
             parse.arguments(name, COMMANDS[name], words)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sagesplat.io.files import write_text
-from sagesplat.output.tables import Table
+from sagesplat.output.table import Table
 
 # columns of numbers, with their formats: SSIM and PSNR (dB) are of whole test views, "full" is the full model
 # (the last level: of recorded levels 3DGS itself), `error` the mean error of a category's prediction there; a

@@ -12,7 +12,8 @@ from sagesplat.adapt.observe import TOTAL
 from sagesplat.core.errors import RunError, SageError
 from sagesplat.core.events import Emit, Progress, StageDone, StageStarted, Warned, named
 from sagesplat.io.files import atomic_folder, link
-from sagesplat.output.tables import MB, Table, mean, promise_kept
+from sagesplat.output.table import Table
+from sagesplat.output.tables import MB, mean, promise_kept
 from sagesplat.raster import Backend
 from sagesplat.run.executor import LOCAL, Executor, Local, Task
 from sagesplat.run.job import Job, JobSpec
