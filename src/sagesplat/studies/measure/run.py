@@ -143,19 +143,8 @@ def _strip(truth: Splat, levels: Sequence[Level], camera: Camera, name: str, ren
 
 
 def _show(measured: Measured, emit: Emit) -> None:
-    columns = (
-        "level",
-        "Gaussians",
-        "share",
-        "MB",
-        "SSIM",
-        "PSNR",
-        *measured.nets,
-        "SSIM covered",
-        "worst SSIM",
-    )
-    table = levels_table(measured).only(*columns)
-    emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
-    if measured.labels():
-        table = categories_table(measured)
+    columns = ("level", "Gaussians", "share", "MB", "SSIM", "PSNR", *measured.nets, "SSIM covered")
+    tables = [levels_table(measured).only(*columns, "worst SSIM")]
+    tables += [categories_table(measured)] if measured.labels() else []
+    for table in tables:
         emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
