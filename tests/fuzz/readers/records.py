@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sagesplat.adapt import eq3, fidelity, plan, viewpoint, viewpoints
+from sagesplat.adapt import eq3, fidelity, plan_files, viewpoint, viewpoints
 from sagesplat.adapt.evaluate import Evaluation, read_evaluation
 from sagesplat.adapt.observe import Observations, read_observations
 from sagesplat.core.events import Event

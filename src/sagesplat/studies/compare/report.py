@@ -36,20 +36,15 @@ _HOW = (
     "between: interpolated between two neighbouring points of our curve, SSIM over log bytes; smallest: our "
     "smallest set is better already; dash: our curve does not reach that SSIM."
 )
-CONSOLE = {  # columns that a terminal has room for, by table
+# columns that a terminal has room for, by table
+CONSOLE = {
     "table_1_targets": (
-        "target",
-        "SSIM",
-        "SAGE raw MB",
-        "our raw MB",
-        "our MB",
-        "raw : raw",
-        "encoded : raw",
+        "target", "SSIM", "SAGE raw MB", "our raw MB", "our MB", "raw : raw", "encoded : raw"
     ),
     "table_2_baselines": ("method", "which", "as sent", "MB", "our MB", "MB : MB"),
     "table_3_mcmc": ("cap", "Gaussians", "PSNR", "ours", "our PSNR", "difference", "at equal count"),
     "table_4_walk": ("method", "keeps", "first MB", "later MB", "again MB", "replaced MB", "changes"),
-}
+}  # fmt: skip
 _PANELS = 12  # categories in a figure, the largest ones
 Size = Literal["raw", "encoded"]
 

@@ -165,12 +165,9 @@ def _of_chunks(
     levels = []
     for number in sorted({chunk.level for chunk in listed}, reverse=True):
         chunks = [chunk for label in labels for chunk in shown(listed, label, number)]
-        load = partial(_read_chunks, folder, chunks, names, antialiased)
+
+        def load(chunks: Sequence[Increment] = chunks) -> Splat:
+            return Splat(read_increments(folder, chunks), "increments", names, antialiased)
+
         levels.append(Level(f"{name} level {number}", name, sum(chunk.nbytes for chunk in chunks), load))
     return levels
-
-
-def _read_chunks(
-    folder: Path, chunks: Sequence[Increment], names: dict[int, str], antialiased: bool
-) -> Splat:
-    return Splat(read_increments(folder, chunks), "increments", names, antialiased)

@@ -65,8 +65,8 @@ def levels_table(measured: Measured) -> Table:
         whole, covered = measured.of(level, TOTAL), measured.of(level, COVERED)
         worst = min(whole, key=lambda row: row.ssim)
         cells = [name, measured.counts[level], measured.counts[level] / max(1, measured.reference_count)]
-        cells += [measured.nbytes[level] / MB, _mean(whole, "ssim"), _mean(whole, "psnr")]
-        cells += [_of_field(whole, net) for net in measured.nets]
+        cells += [measured.nbytes[level] / MB]
+        cells += [_of_field(whole, field) for field in ("ssim", "psnr", *measured.nets)]
         cells += [_mean(covered, "ssim"), _mean(covered, "psnr"), worst.ssim, measured.views[worst.view]]
         body.append(tuple(cells))
     header = ("level", "Gaussians", "share", "MB", "SSIM", "PSNR", *measured.nets)
@@ -94,28 +94,12 @@ def regions_table(measured: Measured) -> Table:
     for level, name in enumerate(measured.names):
         for label in (TOTAL, COVERED, *measured.labels()):
             if rows := measured.of(level, label):
-                cells: list[Any] = [
-                    name,
-                    measured.counts[level],
-                    measured.nbytes[level],
-                    measured.region(label),
-                ]
-                cells += [len(rows), _mean(rows, "ssim"), _mean(rows, "psnr")]
-                cells += [
-                    mean(np.array([row.lpips.get(net, np.nan) for row in rows])) for net in measured.nets
-                ]
+                cells: list[Any] = [name, measured.counts[level], measured.nbytes[level]]
+                cells += [measured.region(label), len(rows)]
+                cells += [_of_field(rows, field) for field in ("ssim", "psnr", *measured.nets)]
                 body.append((*cells, min(row.ssim for row in rows)))
-    header = (
-        "level",
-        "Gaussians",
-        "bytes",
-        "region",
-        "viewpoints",
-        "SSIM",
-        "PSNR",
-        *measured.nets,
-        "worst SSIM",
-    )
+    header = ("level", "Gaussians", "bytes", "region", "viewpoints", "SSIM", "PSNR", *measured.nets)
+    header += ("worst SSIM",)
     formats = ("", "d", "d", "", "d", *[".4f"] * (len(measured.nets) + 3))
     return Table("Levels by region", header, formats, body)
 

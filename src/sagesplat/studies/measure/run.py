@@ -137,19 +137,7 @@ def _strip(truth: Splat, levels: Sequence[Level], camera: Camera, name: str, ren
 
 
 def _show(measured: Measured, emit: Emit) -> None:
-    columns = (
-        "level",
-        "Gaussians",
-        "share",
-        "MB",
-        "SSIM",
-        "PSNR",
-        *measured.nets,
-        "SSIM covered",
-        "worst SSIM",
-    )
-    table = levels_table(measured).only(*columns)
-    emit(table.event)
+    columns = ("level", "Gaussians", "share", "MB", "SSIM", "PSNR", *measured.nets, "SSIM covered")
+    emit(levels_table(measured).only(*columns, "worst SSIM").event)
     if measured.labels():
-        table = categories_table(measured)
-        emit(table.event)
+        emit(categories_table(measured).event)

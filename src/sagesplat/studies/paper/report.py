@@ -280,18 +280,8 @@ def cross_view_table(
                 mean(np.abs(rows.predicted - rows.level_ssim)), mean(np.abs(rows.predicted - rows.ssim)),
                 regret, regret / max(1, size),
             ))  # fmt: skip
-    header = (
-        "target",
-        "category",
-        "views",
-        "promised",
-        "kept",
-        "met",
-        "predicted",
-        "at its level",
-        "composed",
-    )
-    header += ("3DGS", "error at level", "error composed", "regret", "of category")
+    header = ("target", "category", "views", "promised", "kept", "met", "predicted", "at its level")
+    header += ("composed", "3DGS", "error at level", "error composed", "regret", "of category")
     formats = ("", "", "d", "d", "d", "d", *[".3f"] * 6, ",.0f", ".1%")
     notes = (
         "Masks are the 3D labels rendered into each unseen view; each view has a plan of its own.",
