@@ -40,7 +40,8 @@ from sagesplat.scene import load_scene
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene
 from sagesplat.segment import coco
-from sagesplat.segment.masks import Masks, Taxonomy, import_masks
+from sagesplat.segment.mask_files import import_masks
+from sagesplat.segment.masks import Masks, Taxonomy
 from sagesplat.train.events import Step
 from sagesplat.train.trainer import train
 
@@ -205,7 +206,7 @@ def garden(
     if not steps:  # the trainer's own step, photo, statistics and all
         labels = np.full(len(g), -1, np.int16)
         config = TrainConfig(max_steps=30_000, level_every=30_000, lr_schedule="published")
-        for name, start in (("step_ms", g), ("step_initial_angle_ms", workloads.initial(capture, 0.015))):
+        for name, start in (("step_ms", g),):
             events = train(capture, Photos(capture.views), labels, config, start=start)
             step = partial(next, (event for event in events if isinstance(event, Step)))
             result[name] = measure.milliseconds(step, 40)
@@ -678,7 +679,7 @@ def blocks(
     def config(times: int) -> RunConfig:
         return RunConfig(
             train=TrainConfig(max_steps=times * steps),
-            blocks=BlocksConfig(count=count, boundary_steps=boundary_steps, margin=margin),
+            blocks=BlocksConfig(count=count, boundary_steps=boundary_steps),
             nest=NestConfig(steps=times * nest_steps, base_steps=times * nest_steps, levels=12),
         )
 
@@ -735,7 +736,6 @@ def freeze(
     downscale: int = 2,
     steps: int = 3000,
     targets: tuple[float, ...] = (0.8, 0.87),
-    gradient_freeze_share: float = 0.0,
     threads: int = 0,
     write: bool = False,
 ) -> None:
@@ -745,7 +745,7 @@ def freeze(
     with tempfile.TemporaryDirectory() as folder:
         capture = freezing.open_capture(scene, Path(folder), downscale)
         freezing.timed(capture, replace(config, max_steps=20, freeze_at=0.01))  # kernels are compiled now
-        result = freezing.compare(capture, config, list(targets), gradient_freeze_share)
+        result = freezing.compare(capture, config, list(targets))
     for name, run in result.items():
         if name != "pixel_shares":
             times = " ".join(f"{ms:.0f}" for ms in run["ms_per_step"])

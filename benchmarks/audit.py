@@ -2,10 +2,12 @@
 
 from typing import NamedTuple
 
+from sagesplat.adapt.eq1 import plan_view
 from sagesplat.adapt.eq3 import Eq3, SsimModel
-from sagesplat.adapt.plan import Plan, plan_view
+from sagesplat.adapt.plan import Plan
 from sagesplat.core.gaussians import BYTES_PER_GAUSSIAN
-from sagesplat.output.tables import MB, Table
+from sagesplat.output.table import Table
+from sagesplat.output.tables import MB
 
 STEPS = (5000, 10_000, 15_000, 30_000)
 TARGETS = (0.5, 0.6, 0.7)

@@ -11,7 +11,7 @@ from typing import Any
 from sagesplat.adapt.ladder import read_prefixes
 from sagesplat.core.config import BlocksConfig, RunConfig
 from sagesplat.core.events import Emit, StageDone, StageStarted, named
-from sagesplat.output.tables import Table
+from sagesplat.output.table import Table
 from sagesplat.raster import set_threads
 from sagesplat.run.executor import Local, Task
 from sagesplat.run.job import Job, JobSpec
@@ -79,7 +79,7 @@ def label(spec: JobSpec, scene: Path, config: RunConfig, emit: Emit) -> None:
     job = spec.open(emit)
     open_scene(job, scene, config.scene)
     make_masks(job, config.masks, config.labels)
-    lift_labels(job, config.lift)
+    lift_labels(job)
 
 
 def as_one(spec: JobSpec, config: RunConfig, emit: Emit) -> None:

@@ -26,7 +26,6 @@ TIMES = (1, 2, 4, 8)  # lower resolution
 FARTHER = (2, 4)
 TARGETS = (0.8, 0.9, 0.95)
 _SAMPLES = 4  # along each side of a pixel, of the reference
-_LEAST = 5e-4  # of the image that a category has to cover to count
 
 Image = Float32[np.ndarray, "H W 3"]
 Quality = dict[str, float]
@@ -120,7 +119,7 @@ def _least_bytes(job: Job, cameras: Sequence[Camera]) -> dict[float, float]:
         job.ladder, cameras, backend=job.backend, antialiased=job.antialiased
     )
     cost = np.broadcast_to(NestedLevels(job).costs.transfer_bytes, fidelity.shape)
-    shown = shown_enough(pixels, cameras, _LEAST)[..., None]
+    shown = shown_enough(pixels, cameras)[..., None]
     return {target: least_cost(~shown | (fidelity >= target), cost) for target in TARGETS}
 
 

@@ -21,7 +21,7 @@ from typing import Any
 
 from benchmarks.faults_run import AGAIN, TIMES, Asked, Command, differing, digests, ends, stages, used
 from sagesplat.core.errors import RunError
-from sagesplat.output.tables import Table
+from sagesplat.output.table import Table
 
 RESULTS = Path(__file__).parent / "results"
 NODE = {"num_cpus": 1, "object_store_memory": 80 * 2**20, "include_dashboard": False}

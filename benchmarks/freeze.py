@@ -13,7 +13,8 @@ from sagesplat.scene import load_scene
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.segment.lift import lift
-from sagesplat.segment.masks import Masks, Taxonomy, import_masks
+from sagesplat.segment.mask_files import import_masks
+from sagesplat.segment.masks import Masks, Taxonomy
 from sagesplat.train.events import LabelFrozen, Step, Trained
 from sagesplat.train.trainer import train
 
@@ -104,18 +105,12 @@ def pixel_shares(capture: Capture) -> dict[int, float]:
     return {label: count / sum(counts.values()) for label, count in counts.items()}
 
 
-def compare(
-    capture: Capture, config: TrainConfig, targets: list[float], gradient_freeze_share: float
-) -> dict:  # type: ignore[type-arg]
-    """The full run, one for each target, and one in which single Gaussians rest (0: none)."""
+def compare(capture: Capture, config: TrainConfig, targets: list[float]) -> dict:  # type: ignore[type-arg]
+    """The full run, and one for each target."""
     shares = pixel_shares(capture)
     full = timed(capture, config)
     result = {"pixel_shares": shares, "full": full}
     variants = [(f"freeze at {t}", replace(config, freeze_at=t)) for t in targets]
-    if gradient_freeze_share:
-        variants.append(
-            (f"rest {gradient_freeze_share}", replace(config, gradient_freeze_share=gradient_freeze_share))
-        )
     for name, variant in variants:
         run = timed(capture, variant)
         half = config.max_steps / 2

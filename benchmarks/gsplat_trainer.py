@@ -20,8 +20,9 @@ from torch.nn import functional as F
 
 from sagesplat.core.config import TrainConfig
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.metrics.image import photometric_loss
+from sagesplat.metrics.image import SSIM_WEIGHT, photometric_loss
 from sagesplat.scene.scene import Camera
+from sagesplat.train.densify import PRUNE_OPACITY
 from sagesplat.train.strategy import schedule_of
 
 NAMES = {  # gsplat's name: ours
@@ -89,8 +90,8 @@ def train(
     }
     slower = torch.optim.lr_scheduler.ExponentialLR(optimizers["means"], 0.01 ** (1 / config.max_steps))
     strategy = DefaultStrategy(
-        prune_opa=config.prune_opacity, grow_grad2d=config.grow_grad, grow_scale3d=config.grow_scale,
-        prune_scale3d=config.prune_scale, refine_start_iter=plan.refine_start,
+        prune_opa=PRUNE_OPACITY, grow_grad2d=config.grow_grad, grow_scale3d=0.01,
+        prune_scale3d=0.1, refine_start_iter=plan.refine_start,
         refine_stop_iter=plan.refine_stop, reset_every=plan.reset_every, refine_every=config.refine_every,
     )  # fmt: skip
     strategy.check_sanity(params, optimizers)
@@ -112,7 +113,7 @@ def train(
             sh_degree=min(step // plan.raise_sh_every, config.sh_degree),
         )  # fmt: skip
         strategy.step_pre_backward(params, optimizers, state, step, info)
-        loss(images[0], photo, config.ssim_weight).backward()
+        loss(images[0], photo, SSIM_WEIGHT).backward()
         for optimizer in optimizers.values():
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)

@@ -19,7 +19,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
 from sagesplat.adapt.observe import RenderedLabels
-from sagesplat.core.config import LabelsConfig, LiftConfig, MasksConfig, PosesConfig, SceneConfig, TrainConfig
+from sagesplat.core.config import LabelsConfig, MasksConfig, PosesConfig, SceneConfig, TrainConfig
 from sagesplat.core.gaussians import Gaussians, concat
 from sagesplat.demo.cameras import demo_cameras
 from sagesplat.demo.capture import cached_capture
@@ -72,7 +72,7 @@ def _trained(out: Path, steps: int) -> Job:
     config = TrainConfig(max_steps=steps, level_every=steps)
     open_scene(job, cached_capture(), SceneConfig(), PosesConfig(), MasksConfig(), LabelsConfig())
     make_masks(job, MasksConfig())
-    lift_labels(job, LiftConfig())
+    lift_labels(job)
     train_levels(job, config, 0)
     import_instances(job.scene, cached_capture() / "masks", job.run.photo_instances)
     return job

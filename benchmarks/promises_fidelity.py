@@ -46,7 +46,7 @@ def measure(
         )
 
     found, pixels = measured(np.concatenate([planned, equal, scenes], 1))
-    shown = shown_enough(pixels, cameras, job.fit_config.min_share)
+    shown = shown_enough(pixels, cameras)
     far = dict(zip(labels, distance.T.astype(np.float64), strict=True))
     quality = quality_at(costs, models, far, cameras, "fidelity")
     filled = np.array(

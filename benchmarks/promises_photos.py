@@ -28,7 +28,7 @@ MOST = 0.04  # bar: excess, SSIM
 
 def measure(job: Job, draws: int = DRAWS, targets: Sequence[float] = TARGETS) -> dict[str, Any]:
     """Coverage and excess by target, of a finished run whose held-out views are drawn again (`summary`)."""
-    table = observed(job, job.fit_config)
+    table = observed(job)
     table = table.select(table.label_id != UNLABELLED)
     parts = redrawn(table, job.scene, job.ladder.counts, targets, draws, job.fit_config.confidence)
     views = len(job.scene.calibration_ids), len(job.scene.test_ids)

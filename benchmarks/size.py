@@ -21,7 +21,6 @@ from sagesplat.core.config import (
     CompareConfig,
     FitConfig,
     LabelsConfig,
-    LiftConfig,
     MasksConfig,
     NestConfig,
     RunConfig,
@@ -32,6 +31,7 @@ from sagesplat.core.events import Event, StageDone, StageSkipped, Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.levels import read_header, read_level
 from sagesplat.formats.quantisation import rounded
+from sagesplat.formats.spz import SH_BITS
 from sagesplat.raster import device_of, resolve_backend
 from sagesplat.run.job import Job
 from sagesplat.run.records import seconds_of, settings_of
@@ -151,7 +151,7 @@ def _train(job: Job, folder: Path, scene: str, asked: Asked) -> None:
     capture = CASES[SCENES[scene]].capture(folder / "captures" / scene) if scene in SCENES else Path(scene)
     open_scene(job, capture, config.scene)
     make_masks(job, MasksConfig(), LabelsConfig())
-    lift_labels(job, LiftConfig())
+    lift_labels(job)
     pipeline.train(job, config.train, config.blocks, asked.seed)
 
 
@@ -180,13 +180,13 @@ def measure(folder: Path, scene: str, asked: Asked, say: Say) -> Measured:
     baselines = [*pruned_sets(job, config, place), *mcmc_sets(job, config, place), as_one]
     contenders = [*snapshot_points(job, config), *trained_sets(job, baselines).values(), _trained(job)]
     metrics = load_metrics(job, asked.lpips, NETS if asked.vgg else NETS[:1])
-    points = measure_sets(job, prefixes(NestedLevels(job)), metrics, FitConfig())
-    points += measure_sets(job, _planned(job, asked), metrics, FitConfig())
+    points = measure_sets(job, prefixes(NestedLevels(job)), metrics)
+    points += measure_sets(job, _planned(job, asked), metrics)
     for begin in range(0, len(contenders), _TOGETHER):
         some = [_as_decoded(job, one) for one in contenders[begin : begin + _TOGETHER]]
-        points += measure_sets(job, some, metrics, FitConfig())
+        points += measure_sets(job, some, metrics)
     raw = Contender(AS_ONE, "as in training", as_one.step, lambda: _as_trained(job, as_one.path), {})
-    unencoded = measure_sets(job, [raw], {}, FitConfig())[0]
+    unencoded = measure_sets(job, [raw], {})[0]
     return Measured(job.run.path.name, points, _figures(job, points, unencoded, as_one, asked))
 
 
@@ -211,14 +211,13 @@ def _as_decoded(job: Job, contender: Contender) -> Contender:
 
 def _as_trained(job: Job, path: Path) -> Gaussians:
     """A set that was trained with rounding, as training drew it."""
-    return rounded(read_level(path), tuple(settings_of(job.run, "nest")["sh_bits"]))
+    return rounded(read_level(path), SH_BITS)
 
 
 def _as_one(job: Job, place: Path, asked: Asked) -> Baseline:
     nest = settings_of(job.run, "nest")
     config = NestConfig(
-        steps=nest["steps"], lr_multiplier=nest["lr_multiplier"], sh_bits=tuple(nest["sh_bits"]),
-        two_opacities=nest["two_opacities"],
+        steps=nest["steps"],
     )  # fmt: skip
     there = sorted(place.glob("as-one-*.npz"))
     before = int(there[0].stem.rpartition("-")[2]) if there else 0
@@ -237,7 +236,7 @@ def _steps_as_long(job: Job, config: NestConfig) -> int:
     g, train = read_level(job.trained), train_config(job)
     views = job.scene.train_ids.tolist()
     begin = time.process_time()
-    importance(g, job.scene, views, config.criterion, valid=job.inliers, antialiased=job.antialiased)
+    importance(g, job.scene, views, "sensitivity", valid=job.inliers, antialiased=job.antialiased)
     sorting = len(nested.SORT_AT) * (time.process_time() - begin)
     unordered = nested.Nested(g, np.zeros(len(g), bool))
     few = replace(config, steps=_TIMED)
@@ -272,7 +271,7 @@ def _full_steps(job: Job, of: tuple[NestConfig, int]) -> Iterator[Gaussians]:
     settings = replace(train_config(job), batch=1)
     stepper = Stepper(
         PhotoLoader(job.scene, job.photos, device, job.inliers), settings, ActiveTiles(job.scene, None),
-        job.backend, sh_bits=config.sh_bits, shell=job.sky.shell if job.sky else None,
+        job.backend, sh_bits=SH_BITS, shell=job.sky.shell if job.sky else None,
     )  # fmt: skip
     rates, trainable = nested.learning_rates(settings, config, job.scene), trainable_rows(state.gaussians, {})
     tail = nested.TailAverage(config.steps)

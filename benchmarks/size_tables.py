@@ -8,7 +8,8 @@ from typing import Any
 
 from benchmarks.size import AS_ONE, TRAINED, Measured
 from sagesplat.io.files import atomic_path
-from sagesplat.output.tables import MB, Table
+from sagesplat.output.table import Table
+from sagesplat.output.tables import MB
 from sagesplat.studies.compare.report import MCMC, PLANNED, PRUNED, SAME_SHARE, SNAPSHOTS, Point, least
 
 BASELINES = (SNAPSHOTS, PRUNED, MCMC)

@@ -16,7 +16,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from sagesplat.adapt.observe import as_unit, render_rgb
-from sagesplat.core.config import CleanConfig, LabelsConfig, LiftConfig, MasksConfig, SceneConfig, TrainConfig
+from sagesplat.core.config import CleanConfig, LabelsConfig, MasksConfig, SceneConfig, TrainConfig
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.demo.capture import make_capture
 from sagesplat.demo.wild import EVERYTHING, EXPOSURE, FIGURES, NOTHING, POSES, VIGNETTING, Wild
@@ -106,7 +106,7 @@ def _measure(folder: Path, name: str, row: Row, steps: int, seed: int) -> dict[s
     config = replace(TrainConfig(), max_steps=steps, **row.train)
     open_scene(job, capture, SceneConfig(vignetting=row.vignetting))
     make_masks(job, MasksConfig(), LabelsConfig(ignore=row.ignore))
-    lift_labels(job, LiftConfig())
+    lift_labels(job)
     train_levels(job, config, seed)
     if row.clean:
         clean_levels(job, CleanConfig())

@@ -10,7 +10,7 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene
 from sagesplat.train.events import Trained
-from sagesplat.train.state import from_points, largest_scales
+from sagesplat.train.state import from_points
 from sagesplat.train.trainer import train
 
 GARDEN = Path(__file__).parents[2] / "shared" / "scenes" / "garden"
@@ -47,10 +47,9 @@ def cloud(count: int, overlap: str, view: Camera, degree: int = 3, seed: int = 0
     )
 
 
-def initial(scene: Scene, angle: float = 0.0) -> Gaussians:
-    """What training begins with, by `TrainConfig.initial_angle`."""
-    largest = largest_scales(scene, angle) if angle else None
-    return from_points(scene.points, np.full(len(scene.points.xyz), -1, np.int16), 3, largest=largest)
+def initial(scene: Scene) -> Gaussians:
+    """What training begins with."""
+    return from_points(scene.points, np.full(len(scene.points.xyz), -1, np.int16), 3)
 
 
 def trained(scene: Scene, steps: int) -> Gaussians:

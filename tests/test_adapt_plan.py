@@ -20,8 +20,10 @@ from benchmarks.audit import (
     paper_plan,
     sums_table,
 )
+from sagesplat.adapt.eq1 import plan_scene, plan_view
 from sagesplat.adapt.eq3 import Eq3, SsimModel
-from sagesplat.adapt.plan import Choice, Plan, Reached, plan_scene, plan_view, read_plans, write_plans
+from sagesplat.adapt.plan import Choice, Plan, Reached
+from sagesplat.adapt.plan_files import read_plans, write_plans
 from sagesplat.core.errors import DataError, RunError
 
 

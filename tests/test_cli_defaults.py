@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from sagesplat.adapt.plan import read_plans
+from sagesplat.adapt.plan_files import read_plans
 from sagesplat.cli.console import Console
 from sagesplat.core.config import FitConfig, NestConfig, PlanConfig, TrainConfig
 from sagesplat.core.errors import RunError

@@ -12,7 +12,8 @@ import sagesplat
 
 # modules whose examples run here; those that need a capture or a run are marked +SKIP
 MODULES = (
-    "adapt.allocate", "adapt.fill", "adapt.observe", "adapt.photo_models", "adapt.plan", "adapt.viewpoint",
+    "adapt.allocate", "adapt.eq1", "adapt.fill", "adapt.observe", "adapt.photo_models", "adapt.plan",
+    "adapt.viewpoint",
     "formats.levels", "formats.ply", "formats.splats", "formats.spz", "formats.stream",
     "metrics.color_correct", "metrics.image", "raster", "scene", "segment.masks", "segment.relabel",
     "segment.select", "stages.api", "stages.label_edits", "train.trainer",
@@ -21,12 +22,12 @@ CALLED_BY_MANY = (
     "adapt.allocate:best_within", "adapt.allocate:cheapest", "adapt.scene_plans:plan_for_scene",
     "adapt.bound_plans:plan_for_view", "adapt.bound_plans:plan_within", "adapt.bound_plans:quality_at",
     "adapt.eq3:fit_models", "adapt.evaluate:evaluate", "adapt.fill:fill", "adapt.observe:observe",
-    "adapt.plan:plan_scene", "adapt.plan:plan_view", "adapt.photo_models:fit_photo_models",
+    "adapt.eq1:plan_scene", "adapt.eq1:plan_view", "adapt.photo_models:fit_photo_models",
     "adapt.viewpoint:ViewModel.predict",
     "demo.capture:cached_capture", "demo.capture:make_capture", "formats.levels:read_level",
     "formats.ply:read_ply", "formats.ply:write_ply", "formats.spz:decode_spz", "formats.spz:encode_spz",
     "metrics.image:photometric_loss", "metrics.image:ssim_map", "raster:rasterize", "run.stage:run_stage",
-    "scene:load_scene", "segment.lift:lift", "segment.masks:import_masks",
+    "scene:load_scene", "segment.lift:lift", "segment.mask_files:import_masks",
     "segment.segmenters:segment_views", "stages.api:FinishedRun.bundle", "stages.api:FinishedRun.compose",
     "stages.api:FinishedRun.plan_camera", "stages.api:open_run", "stages.api:run_scene",
     "stages.pipeline:run_all", "train.fuse:fuse", "train.nested:nest", "train.trainer:train",

@@ -13,10 +13,11 @@ from browser import launch, open_page
 from page_checks import wrong_with, wrong_with_keyboard
 from PIL import Image
 
+from sagesplat.adapt.eq1 import plan_scene
 from sagesplat.adapt.eq3 import fit_models
 from sagesplat.adapt.evaluate import QUALITIES, UNIFORM, Evaluation, read_evaluation
 from sagesplat.adapt.observe import TOTAL, Observations, read_observations
-from sagesplat.adapt.plan import Plan, Reached, plan_scene
+from sagesplat.adapt.plan import Plan, Reached
 from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.io.columns import cell_text
 from sagesplat.output import figures

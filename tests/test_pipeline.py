@@ -9,7 +9,7 @@ import pytest
 
 from sagesplat.adapt.evaluate import read_evaluation
 from sagesplat.adapt.observe import TOTAL, read_observations
-from sagesplat.adapt.plan import read_plans
+from sagesplat.adapt.plan_files import read_plans
 from sagesplat.core.config import PlanConfig, RunConfig, SampleConfig, TrainConfig
 from sagesplat.core.errors import DataError, RunError
 from sagesplat.core.events import Event, RunDone, StageDone, StageSkipped, Training

@@ -29,7 +29,7 @@ from sagesplat.scene import load_scene, photos
 from sagesplat.scene._prepare import prepare_photos
 from sagesplat.scene.images import load_photo
 from sagesplat.scene.photos import PosesConfig, reconstruct
-from sagesplat.segment.masks import import_masks
+from sagesplat.segment.mask_files import import_masks
 
 WIDTH, HEIGHT, FOCAL = 240, 180, 210.0
 VIEWS = 6

@@ -9,7 +9,8 @@ from PIL import Image
 from sagesplat.core.errors import LabelError
 from sagesplat.scene.scene import Camera, Points, Scene, View
 from sagesplat.segment import coco
-from sagesplat.segment.masks import Masks, Taxonomy, import_masks
+from sagesplat.segment.mask_files import import_masks
+from sagesplat.segment.masks import Masks, Taxonomy
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "shared" / "models" / "coco_panoptic"
 

@@ -64,7 +64,6 @@ def test_majority_of_the_track(tmp_path):
     assert lifted.num_votes.tolist() == [3, 1, 0, 0, 0]
     assert lifted.num_agreeing.tolist() == [2, 1, 0, 0, 0]
     assert lifted.agreement == 0.75
-    assert lifted.agreement_by_label() == {CAR: 0.75}
 
 
 @pytest.mark.parametrize(("rest", "winner"), [(CAR, CAR), (TREE, TREE), (WALL, CAR)])

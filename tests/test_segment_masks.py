@@ -13,15 +13,8 @@ from sagesplat.core.errors import LabelError, SceneError
 from sagesplat.scene.scene import Camera, Lens, Points, Scene, View
 from sagesplat.scene.undistort import pinhole
 from sagesplat.segment.block_categories import BlockCategories
-from sagesplat.segment.masks import (
-    Masks,
-    Taxonomy,
-    import_masks,
-    mask_path,
-    prepare_folder,
-    read_mask,
-    write_mask,
-)
+from sagesplat.segment.mask_files import import_masks
+from sagesplat.segment.masks import Masks, Taxonomy, mask_path, prepare_folder, read_mask, write_mask
 
 LABELS = {"unlabelled": 255, "labels": {"3": "car", "184": "tree-merged"}}
 

@@ -19,7 +19,8 @@ from sagesplat import (
     read_ply,
     run_scene,
 )
-from sagesplat.adapt.plan import Plan, read_plans
+from sagesplat.adapt.plan import Plan
+from sagesplat.adapt.plan_files import read_plans
 from sagesplat.core.config import SampleConfig
 from sagesplat.core.errors import RunError
 from sagesplat.demo.capture import make_capture

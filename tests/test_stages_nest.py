@@ -16,7 +16,7 @@ from sagesplat.adapt.coverage import PREDICTORS
 from sagesplat.adapt.evaluate import read_evaluation
 from sagesplat.adapt.ladder import PrefixLadder, read_prefixes
 from sagesplat.adapt.observe import TOTAL, read_observations
-from sagesplat.adapt.plan import read_budget_plan, read_plans
+from sagesplat.adapt.plan_files import read_budget_plan, read_plans
 from sagesplat.core.config import FitConfig, NestConfig, PlanConfig, RunConfig, SceneConfig, TrainConfig
 from sagesplat.core.errors import DataError, RunError
 from sagesplat.core.events import Event, StageDone, StageSkipped
@@ -88,7 +88,7 @@ def seen() -> Scene:
     return Scene("two", Path("none"), views, points, test_every=0)
 
 
-@pytest.mark.parametrize("criterion", ["weight", "weight-volume", "peak", "sensitivity", "opacity"])
+@pytest.mark.parametrize("criterion", ["weight", "weight-volume", "sensitivity"])
 def test_importance_ranks_what_shows_above_what_does_not(seen, criterion) -> None:
     g = random_gaussians(40, logit=2.0)
     means = g.means.clone()
@@ -98,11 +98,8 @@ def test_importance_ranks_what_shows_above_what_does_not(seen, criterion) -> Non
     assert worth.shape == (40,)
     assert worth.dtype == np.float32
     assert (worth >= 0).all()
-    if criterion == "opacity":
-        np.testing.assert_allclose(worth, torch.sigmoid(g.logit_opacities))
-    else:
-        assert worth[0] == 0
-        assert (worth > 0).sum() > 20
+    assert worth[0] == 0
+    assert (worth > 0).sum() > 20
 
 
 def test_sensitivity_is_the_change_when_a_gaussian_fades(seen) -> None:
@@ -158,7 +155,7 @@ def test_they_are_sorted_again_by_what_they_have_become_worth(scene: Scene, monk
         start.gaussians,
         scene,
         scene.train_ids.tolist(),
-        config.criterion,
+        "sensitivity",
         antialiased=TrainConfig().antialiased,
     )
     rows = np.lexsort((-worth, ~start.of_base, start.gaussians.label_ids.numpy()))

@@ -28,7 +28,7 @@ from sagesplat.formats.levels import write_level
 from sagesplat.formats.ply import read_ply
 from sagesplat.io.files import read_json, write_json
 from sagesplat.output import tables
-from sagesplat.output.tables import Table
+from sagesplat.output.table import Table
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.scene.scene import View

@@ -11,7 +11,7 @@ from PIL import Image
 from sagesplat.adapt.coverage import PREDICTORS
 from sagesplat.adapt.evaluate import read_evaluation
 from sagesplat.adapt.observe import read_observations
-from sagesplat.adapt.plan import read_plans
+from sagesplat.adapt.plan_files import read_plans
 from sagesplat.adapt.viewpoint import read_promises
 from sagesplat.core.config import (
     CompareConfig,

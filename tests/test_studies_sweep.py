@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_stages_label import Halves
 
-from sagesplat.adapt.plan import read_plans
+from sagesplat.adapt.plan_files import read_plans
 from sagesplat.core.config import MasksConfig, PlanConfig, RunConfig, SceneConfig, TrainConfig
 from sagesplat.core.errors import DataError, RunError
 from sagesplat.core.events import Event, StageDone, TableMade, Training, Warned

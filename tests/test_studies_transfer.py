@@ -12,9 +12,9 @@ from conftest import LABELS, random_gaussians, write_capture
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sagesplat.adapt.eq1 import choose_snapshot, plan_view
 from sagesplat.adapt.eq3 import Eq3, SsimModel, write_models
 from sagesplat.adapt.observe import Observations
-from sagesplat.adapt.plan import choose_snapshot, plan_view
 from sagesplat.core.config import SceneConfig
 from sagesplat.core.errors import RunError
 from sagesplat.formats.levels import write_level

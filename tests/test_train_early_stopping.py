@@ -18,7 +18,8 @@ from sagesplat.raster import rasterize
 from sagesplat.scene import load_scene
 from sagesplat.scene.images import Photos
 from sagesplat.segment.lift import lift
-from sagesplat.segment.masks import Masks, Taxonomy, import_masks
+from sagesplat.segment.mask_files import import_masks
+from sagesplat.segment.masks import Masks, Taxonomy
 from sagesplat.train import schedule, stepper, trainer
 from sagesplat.train.early_stopping import (
     ActiveTiles,

@@ -148,7 +148,7 @@ def frozen_kept(bench: Bench, steps: int) -> dict[str, Any]:
     for step in range(1, steps + 1):
         stepper(state, min(3, step // every), rates(step), trainable)
         if step == 3 * every:
-            densify.reset_opacities(state, config, trainable)
+            densify.reset_opacities(state, trainable)
         if step % every == 0:
             strategy.refine(state, trainable)
             state.sort()

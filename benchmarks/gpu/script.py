@@ -27,7 +27,8 @@ from sagesplat.raster import Backend, cuda, resolve_backend, set_threads
 from sagesplat.scene import load_scene
 from sagesplat.scene.images import Photos
 from sagesplat.segment.lift import lift
-from sagesplat.segment.masks import Masks, Taxonomy, import_masks
+from sagesplat.segment.mask_files import import_masks
+from sagesplat.segment.masks import Masks, Taxonomy
 
 RESULTS = ROOT / "benchmarks" / "results"
 CHECKS: dict[str, Callable[[Bench], Outcome]] = {

@@ -24,7 +24,8 @@ from sagesplat.scene.points import read_points
 from sagesplat.scene.scene import Camera, View
 from sagesplat.segment.coco import read_panoptic
 from sagesplat.segment.instances import read_instances, write_instances
-from sagesplat.segment.masks import Taxonomy, import_masks, read_mask, write_mask
+from sagesplat.segment.mask_files import import_masks
+from sagesplat.segment.masks import Taxonomy, read_mask, write_mask
 
 NAMES = {"unlabelled": 255, "labels": {"184": "tree-merged", "7": "sky"}}
 CAMERA = Camera(np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32), 16, 12)

@@ -120,7 +120,7 @@ def _read_deeplab(path: Path) -> None:
     """What `load_deeplabv2` does, for a network of one convolution."""
     wanted = {"conv1.weight": torch.ones(int(path.with_name("size").read_text()), 3)}
     found: Any = deeplabv2._renamed(path, deeplabv2._read_weights(path))
-    deeplabv2._check(path, found, wanted, "voc")
+    deeplabv2._check(path, found, wanted)
     found["conv1.weight"].float()
 
 

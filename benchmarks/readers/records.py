@@ -384,7 +384,7 @@ def _read_edited(path: Path) -> None:
     label_settings(RunDir(path.parent))
 
 
-NETWORK = {"segmenter": "onnx", "soft": True, "model": "0" * 64}
+NETWORK = {"segmenter": "onnx", "model": "0" * 64}
 
 
 def _networks(folder: Path, size: int) -> list[bytes]:

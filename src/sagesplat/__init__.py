@@ -30,7 +30,8 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from sagesplat.adapt.plan import Plan, read_plans
+    from sagesplat.adapt.plan import Plan
+    from sagesplat.adapt.plan_files import read_plans
     from sagesplat.adapt.viewpoint import ViewModel, read_promises
     from sagesplat.core.config import NestConfig, PlanConfig, RunConfig, SceneConfig, TrainConfig
     from sagesplat.core.errors import SageError
@@ -64,7 +65,8 @@ __all__ = [
 
 # by module, below sagesplat
 _EXPORTS = {
-    "adapt.plan": "Plan read_plans",
+    "adapt.plan": "Plan",
+    "adapt.plan_files": "read_plans",
     "adapt.viewpoint": "ViewModel read_promises",
     "core.config": "NestConfig PlanConfig RunConfig SceneConfig TrainConfig",
     "core.errors": "SageError",

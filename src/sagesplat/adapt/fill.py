@@ -78,18 +78,6 @@ def fill(
     return _fill(np.array(levels, np.int64), value, cost, weight, float(lowest))
 
 
-def uniform_curve(
-    nbytes: Float[np.ndarray, " N"] | float,
-    quality: Float[np.ndarray, "L K"],
-    cost: Float[np.ndarray, "L K"] | Int[np.ndarray, "L K"],
-    weight: Float[np.ndarray, "L"],
-) -> Float[np.ndarray, " N"]:
-    """Mean quality that all labels at one level have at some bytes, linear between the levels."""
-    known = np.isfinite(quality).all(1) & (weight > 0)
-    total = max(weight[known].sum(), 1e-300)
-    return np.interp(nbytes, cost.sum(0), weight[known] @ quality[known] / total)
-
-
 @njit(cache=True, error_model="numpy")
 def _fill(levels, value, cost, weight, lowest):
     L, total, nbytes, worth = len(levels), weight.sum(), 0.0, 0.0

@@ -22,7 +22,8 @@ from sagesplat.output.by_category import Categories, merged, merged_counts, merg
 from sagesplat.output.figures import Colours, Panel
 from sagesplat.output.report_data import ReportData, main_plan, nearest, sizes_of, steps_of
 from sagesplat.output.report_figures import report_figures
-from sagesplat.output.tables import MB, Table, bytes_of, name_of
+from sagesplat.output.table import Table
+from sagesplat.output.tables import MB, bytes_of, name_of
 from sagesplat.segment.block_categories import category_of
 
 PICTURE_WIDTH = 1400  # pixels of a picture inside the page; the files beside it keep their size

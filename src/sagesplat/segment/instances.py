@@ -15,7 +15,8 @@ from sagesplat.scene.raw_photos import raw_photos
 from sagesplat.scene.scene import Scene, View
 from sagesplat.segment import coco
 from sagesplat.segment.fit import fit
-from sagesplat.segment.masks import VOID_16, mask_path, panoptic_segments
+from sagesplat.segment.mask_files import panoptic_segments
+from sagesplat.segment.masks import VOID_16, mask_path
 
 NO_INSTANCE = -1
 FOLDER = "instances"  # of a capture, beside its masks

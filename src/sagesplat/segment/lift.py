@@ -46,14 +46,6 @@ class LiftedLabels:
         """Share of all votes that agree with the label of their point; NaN without a vote."""
         return _share(self.num_agreeing, self.num_votes)
 
-    def agreement_by_label(self) -> dict[int, float]:
-        """The same share among the points of each label."""
-        return {
-            int(label_id): _share(self.num_agreeing[of_label], self.num_votes[of_label])
-            for label_id in np.unique(self.label_ids[self.label_ids != UNLABELLED])
-            for of_label in [self.label_ids == label_id]
-        }
-
     def write(self, path: Path) -> None:
         """Write labels.npz."""
         with atomic_path(path) as temporary:

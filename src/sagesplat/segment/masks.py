@@ -2,7 +2,7 @@
 
 import colorsys
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -16,16 +16,14 @@ from sagesplat.core.names import LENGTH, RULE, checked, collision_key
 from sagesplat.io.files import atomic_path, read_json, write_json
 from sagesplat.io.pictures import FREE_PIXELS, PictureError, open_picture
 from sagesplat.io.typed import convert_as, refused
-from sagesplat.scene.raw_photos import raw_photos
-from sagesplat.scene.scene import Scene, View
+from sagesplat.scene.scene import View
 from sagesplat.segment import coco
-from sagesplat.segment.fit import fit
 
 UNLABELLED = -1  # pixels, points and Gaussians without a category
 UNLABELLED_NAME = "unlabelled"
 UNLABELLED_COLOR = (128, 128, 128)
 MAX_LABEL_ID = np.iinfo(np.int16).max
-_UNKNOWN = -2  # never leaves this file
+UNKNOWN = -2  # never leaves this file
 _BLOCK = len("@4095")  # what a per-block category adds to the name of its category
 VOID_8, VOID_16 = 255, 65535  # what unlabelled pixels hold in 8- and 16-bit files, unless stated otherwise
 
@@ -70,7 +68,7 @@ class Taxonomy:
     @classmethod
     def read(cls, path: Path) -> "Taxonomy":
         """Read labels.json; LabelError where it is missing or its content cannot be used."""
-        return _read_labels(path, LENGTH + _BLOCK)[0]
+        return read_labels(path, LENGTH + _BLOCK)[0]
 
 
 class Masks:
@@ -89,7 +87,7 @@ class Masks:
         """A view's category ids at the size of its camera, -1 = unlabelled; shared, so not to be changed."""
         label_ids = self._cache.get(view.name)
         if label_ids is None:
-            label_ids = read_mask(mask_path(self.folder, view), self.taxonomy, _pixels(view))
+            label_ids = read_mask(mask_path(self.folder, view), self.taxonomy, num_pixels(view))
             if self._used + label_ids.nbytes <= self.cache_bytes:
                 self._cache[view.name] = label_ids
                 self._used += label_ids.nbytes
@@ -104,10 +102,11 @@ class Masks:
 
 def mask_path(folder: Path, view: View) -> Path:
     """Where a normalised folder keeps the label image of a view."""
-    return _png_path(folder, view.name)
+    return png_path(folder, view.name)
 
 
-def _png_path(folder: Path, photo: str) -> Path:
+def png_path(folder: Path, photo: str) -> Path:
+    """Where a folder keeps the label image of a photo; LabelError for a name outside of it."""
     name = PurePosixPath(photo)
     if name.is_absolute() or ".." in name.parts:
         raise LabelError(f"{photo}: a photo outside the image folder; move it there and rename it")
@@ -139,10 +138,10 @@ def read_mask(path: Path, taxonomy: Taxonomy, free: int = FREE_PIXELS) -> Int16[
     size. Memory: up to 20 bytes per pixel.
     """
     ids = {VOID_8: UNLABELLED, VOID_16: UNLABELLED} | {i: i for i in taxonomy.names}
-    return _translate(_read_png(path, free), ids, path, "make the masks again")
+    return translated(read_png(path, free), ids, path, "make the masks again")
 
 
-def _pixels(view: View) -> int:
+def num_pixels(view: View) -> int:
     """Number of pixels that any label image of a view may have: four times its photo's, at least."""
     return max(FREE_PIXELS, 4 * view.camera.width * view.camera.height)
 
@@ -159,174 +158,12 @@ def write_mask(path: Path, label_ids: Int16[np.ndarray, "H W"], taxonomy: Taxono
         Image.fromarray(pixels).save(temporary, format="PNG")
 
 
-def import_masks(scene: Scene, source: Path, target: Path) -> list[str]:
-    """Import label images: one per view at the size of its camera, with ids checked, and a labels.json.
-
-    Images are undistorted like the photos and resampled to the nearest pixel. Where structure from motion
-    undistorted the photos of the capture, that goes for label images of the photos as they were taken.
-
-    Args:
-        scene: The capture.
-        source: Folder of PNGs named like the photos (x.png or x.jpg.png for x.jpg). Either 8- or 16-bit ids
-            with a labels.json {"unlabelled": 255, "labels": {"184": "tree-merged"}}, where "unlabelled" may
-            be absent (then 255, in 16 bits 65535); or COCO panoptic PNGs with their JSON.
-        target: Folder to write.
-
-    Returns:
-        Names of the views without an image: they are unlabelled everywhere.
-
-    Raises:
-        LabelError: If the images cannot be used, or no view has one.
-    """
-    if source.resolve() == target.resolve():
-        raise LabelError(f"{source}: these are the masks of the run itself; name the folder they came from")
-    if not source.is_dir():
-        raise LabelError(f"{source}: no such folder; name the one with the label images")
-    taxonomy, find = _source(source)
-    found = {view.name: find(view.name) for view in scene.views}
-    missing = [name for name, file in found.items() if file is None]
-    if len(missing) == len(scene.views):
-        raise LabelError(
-            f"{source}: no label image for any view; name them like the photos "
-            f"({PurePosixPath(missing[0]).with_suffix('.png')}, ...)"
-        )
-    occurring, raw = set[int](), raw_photos(scene.path)
-    for view, path in zip(scene.views, prepare_folder(target, scene.views), strict=True):
-        label_ids = np.full((view.camera.height, view.camera.width), UNLABELLED, np.int16)
-        if (file := found[view.name]) is not None:
-            label_ids = fit(file.read(_pixels(view)), view, raw.get(view.name), file.path)
-        write_mask(path, label_ids, taxonomy)
-        occurring.update(np.unique(label_ids).tolist())
-    write_labels(target, taxonomy, occurring)
-    return missing
-
-
 def write_labels(folder: Path, taxonomy: Taxonomy, occurring: set[int]) -> None:
     """Write the labels.json of a finished folder of masks, with only the categories that occur in it."""
     names = {label_id: name for label_id, name in taxonomy.names.items() if label_id in occurring}
     if not names:
         raise LabelError(f"{folder}: every pixel is unlabelled; there is no category to work with")
     Taxonomy(names).write(folder / "labels.json")
-
-
-@dataclass(frozen=True, eq=False)
-class _File:
-    """A label image of the user's."""
-
-    path: Path
-    ids: dict[int, int]  # value in the file -> category id or UNLABELLED
-    segments: bool  # RGB-coded segment ids instead of category ids
-    cure: str  # what helps where the file holds other values
-
-    def read(self, free: int) -> Int16[np.ndarray, "h w"]:
-        """Category ids at the file's own size; `free` as in `read_mask`."""
-        return _translate(_read_png(self.path, free, self.segments), self.ids, self.path, self.cure)
-
-
-_Find = Callable[[str], _File | None]  # by the name of a photo
-
-
-def label_images_of(folder: Path) -> tuple[Taxonomy, Callable[[str], Int16[np.ndarray, "h w"] | None]]:
-    """The categories of a folder as `import_masks` takes it, and what reads an image by its photo's name.
-
-    None for a photo without one. LabelError as of `import_masks`.
-    """
-    if not folder.is_dir():
-        raise LabelError(f"{folder}: no such folder; name the one with the label images")
-    taxonomy, find = _source(folder)
-
-    def read(name: str) -> Int16[np.ndarray, "h w"] | None:
-        file = find(name)
-        return None if file is None else file.read(4 * FREE_PIXELS)
-
-    return taxonomy, read
-
-
-def _source(folder: Path) -> tuple[Taxonomy, _Find]:
-    return _id_source(folder) if (folder / "labels.json").exists() else _panoptic_source(folder)
-
-
-def _id_source(folder: Path) -> tuple[Taxonomy, _Find]:
-    """Images of ids with a labels.json."""
-    taxonomy, unlabelled = _read_labels(folder / "labels.json")
-    voids = (VOID_8, VOID_16) if unlabelled is None else (unlabelled,)
-    ids = dict.fromkeys(voids, UNLABELLED) | {i: i for i in taxonomy.names}
-    cure = 'name them in labels.json (or say there which value is "unlabelled")'
-
-    def find(name: str) -> _File | None:
-        paths = (folder / f"{name}.png", _png_path(folder, name))
-        path = next((p for p in paths if p.exists()), None)
-        return None if path is None else _File(path, ids, False, cure)
-
-    return taxonomy, find
-
-
-def _panoptic_source(folder: Path) -> tuple[Taxonomy, _Find]:
-    """COCO panoptic PNGs with the JSON of their segments."""
-    panoptic = coco.read_panoptic(folder)
-    if panoptic is None:
-        raise LabelError(
-            f"{folder}: no labels.json; write one like "
-            '{"unlabelled": 255, "labels": {"184": "tree-merged"}}'
-        )
-    taxonomy = taxonomy_of(panoptic.names, folder)
-
-    def find(name: str) -> _File | None:
-        key = str(PurePosixPath(name).with_suffix(""))
-        path = panoptic.pngs.get(key)
-        if path is None or not path.exists():
-            return None
-        ids = {0: UNLABELLED} | panoptic.segments[key]
-        return _File(path, ids, True, "they are no segments in the JSON; export image and JSON together")
-
-    return taxonomy, find
-
-
-def panoptic_segments(
-    folder: Path,
-) -> Callable[[str], tuple[Path, Integer[np.ndarray, "h w"]] | None] | None:
-    """What reads the segments of a photo (its file, and their numbers; 0 = none) from COCO panoptic PNGs.
-
-    None for a folder of other label images. LabelError as of `import_masks`.
-    """
-    if not folder.is_dir() or (folder / "labels.json").exists():
-        return None
-    panoptic = coco.read_panoptic(folder)
-    if panoptic is None:
-        return None
-
-    def read(name: str) -> tuple[Path, Integer[np.ndarray, "h w"]] | None:
-        path = panoptic.pngs.get(str(PurePosixPath(name).with_suffix("")))
-        if path is None or not path.exists():
-            return None
-        return path, _read_png(path, 4 * FREE_PIXELS, segments=True)
-
-    return read
-
-
-@dataclass(frozen=True)
-class _Labels:
-    """Of a labels.json; names are checked by `taxonomy_of`."""
-
-    labels: dict[int, Any]
-    unlabelled: int | None = None
-
-
-def _read_labels(path: Path, length: int = LENGTH) -> tuple[Taxonomy, int | None]:
-    """The taxonomy of a labels.json, and the value of unlabelled pixels if it is stated.
-
-    `length`: characters of a name, at most.
-    """
-    content = read_json(path, "it names the ids of the label images", LabelError)
-    form = 'of the form {"unlabelled": 255, "labels": {"184": "tree-merged"}}'
-    with refused(path, form, "rewrite it so", LabelError):
-        made = convert_as(content, _Labels, strict=False)
-    unlabelled, names = made.unlabelled, made.labels
-    if unlabelled is not None and not 0 <= unlabelled <= VOID_16:
-        raise LabelError(f'{path}: "unlabelled" is {short(unlabelled)}; give a pixel value, 0 ... {VOID_16}')
-    if unlabelled in names:
-        raise LabelError(f'{path}: {unlabelled} is "unlabelled" and has a name too; remove one of them')
-    return taxonomy_of(names, path, length), unlabelled
 
 
 def taxonomy_of(names: dict[int, Any], path: Path, length: int = LENGTH) -> Taxonomy:
@@ -357,7 +194,7 @@ def taxonomy_of(names: dict[int, Any], path: Path, length: int = LENGTH) -> Taxo
     return Taxonomy({label_id: name for name, label_id in sorted(found.items(), key=lambda of: of[1])})
 
 
-def _read_png(path: Path, free: int, segments: bool = False) -> Integer[np.ndarray, "h w"]:
+def read_png(path: Path, free: int, segments: bool = False) -> Integer[np.ndarray, "h w"]:
     """The ids in a PNG: grey values or palette indices, or R + 256 G + 65536 B with `segments`."""
     modes = ("RGB", "RGBA") if segments else ("1", "L", "P", "I;16", "I")
     try:
@@ -381,16 +218,41 @@ def _read_png(path: Path, free: int, segments: bool = False) -> Integer[np.ndarr
     return ids
 
 
-def _translate(
+@dataclass(frozen=True)
+class _Labels:
+    """Of a labels.json; names are checked by `taxonomy_of`."""
+
+    labels: dict[int, Any]
+    unlabelled: int | None = None
+
+
+def read_labels(path: Path, length: int = LENGTH) -> tuple[Taxonomy, int | None]:
+    """The taxonomy of a labels.json, and the value of unlabelled pixels if it is stated.
+
+    `length`: characters of a name, at most.
+    """
+    content = read_json(path, "it names the ids of the label images", LabelError)
+    form = 'of the form {"unlabelled": 255, "labels": {"184": "tree-merged"}}'
+    with refused(path, form, "rewrite it so", LabelError):
+        made = convert_as(content, _Labels, strict=False)
+    unlabelled, names = made.unlabelled, made.labels
+    if unlabelled is not None and not 0 <= unlabelled <= VOID_16:
+        raise LabelError(f'{path}: "unlabelled" is {short(unlabelled)}; give a pixel value, 0 ... {VOID_16}')
+    if unlabelled in names:
+        raise LabelError(f'{path}: {unlabelled} is "unlabelled" and has a name too; remove one of them')
+    return taxonomy_of(names, path, length), unlabelled
+
+
+def translated(
     raw: Integer[np.ndarray, "h w"], ids: dict[int, int], path: Path, cure: str
 ) -> Int16[np.ndarray, "h w"]:
     """Replace each value by what `ids` says; LabelError for values that it does not know."""
     small = raw.dtype.itemsize <= 2
     size = max(ids) + 2  # the last entry is for all larger values
-    table = np.full(max(size, np.iinfo(raw.dtype).max + 1) if small else size, _UNKNOWN, np.int16)
+    table = np.full(max(size, np.iinfo(raw.dtype).max + 1) if small else size, UNKNOWN, np.int16)
     table[list(ids)] = list(ids.values())
     label_ids = table[raw if small else np.minimum(raw, len(table) - 1)]
-    unknown = raw[label_ids == _UNKNOWN]
+    unknown = raw[label_ids == UNKNOWN]
     if len(unknown):
         unknown = np.unique(unknown[:10_000])  # of a large image some will do
         listed = ", ".join(map(str, unknown[:5])) + (", ..." if len(unknown) > 5 else "")

@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from sagesplat.adapt.bound_plans import Costs, plan_for_view, quality_at
+from sagesplat.adapt.eq1 import plan_view
 from sagesplat.adapt.observe import PERCENTILE, RenderedLabels, distances_in_views, widest_lens, within_lens
-from sagesplat.adapt.plan import Plan, plan_view
+from sagesplat.adapt.plan import Plan
 from sagesplat.adapt.viewpoint import ViewModel
 from sagesplat.core.config import PlanConfig, RunConfig
 from sagesplat.core.errors import RunError

@@ -10,7 +10,7 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.levels import read_sizes
 from sagesplat.io.files import write_text
 from sagesplat.metrics.image import pasted, squared_error_map, ssim_map
-from sagesplat.output.tables import Table
+from sagesplat.output.table import Table
 from sagesplat.raster import Workspace, device_of, rasterize
 from sagesplat.run.job import Job
 from sagesplat.run.records import seconds_of

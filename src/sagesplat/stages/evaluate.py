@@ -16,7 +16,7 @@ from sagesplat.stages.compose import compose, compose_inputs
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.plan import main_target, scene_plan
 from sagesplat.stages.results import budget_plan_of, plans_of
-from sagesplat.stages.shared import _show
+from sagesplat.stages.shared import show_table
 
 
 def evaluate_plans(job: Job) -> None:
@@ -36,7 +36,7 @@ def evaluate_plans(job: Job) -> None:
         table.write_csv(run.evaluation)
         if len(table):
             plan = scene_plan(job, *main_target(run))
-            _show(job, tables.outcome_table(plan, job.ladder.counts, table, titles(job.names())))
+            show_table(job, tables.outcome_table(plan, job.ladder.counts, table, titles(job.names())))
         exposed = any(job.scene.views[row].camera.exposure is not None for row in job.scene.test_ids)
         return [line for plan in plans for line in _lines(plan, table.of(plan), exposed)]
 

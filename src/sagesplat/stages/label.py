@@ -33,7 +33,8 @@ from sagesplat.segment.edit import (
     parse_merge,
 )
 from sagesplat.segment.lift import agreement_in, lift
-from sagesplat.segment.masks import MAX_LABEL_ID, UNLABELLED, Masks, Taxonomy, import_masks, write_labels
+from sagesplat.segment.mask_files import import_masks
+from sagesplat.segment.masks import MAX_LABEL_ID, UNLABELLED, Masks, Taxonomy, write_labels
 from sagesplat.segment.registry import SEGMENTERS, segmenter_for
 from sagesplat.segment.segmenters import segment_some
 from sagesplat.segment.valid import ValidPixels, write_valid

@@ -30,7 +30,7 @@ from sagesplat.stages.plan import make_plan
 from sagesplat.stages.refit import refit
 from sagesplat.stages.regroup import measure, move_labels, move_levels
 from sagesplat.stages.results import increments_of
-from sagesplat.stages.view import _is_finished
+from sagesplat.stages.view import is_finished
 
 # what a run begins with, as it is; label images, point labels and levels are written anew
 _KEPT = (
@@ -85,7 +85,7 @@ def apply_labels(
     path = edits or job.run.path / FILE
     out = (out or job.run.path.resolve().with_name(f"{job.run.path.resolve().name}-edited")).resolve()
     job = replace(job, run=replace(job.run, ladder="nested"), locks=None)
-    if not _is_finished(job.run):
+    if not is_finished(job.run):
         raise RunError(f"{job.run.path}: not finished; run `sagesplat run` again, then apply the edits")
     found = read_edits(path)
     made = _checked(job, found, path)

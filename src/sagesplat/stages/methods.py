@@ -12,10 +12,11 @@ import numpy as np
 
 from sagesplat.adapt.bound_plans import Costs, Quality, plan_for_view, plan_within, pooled, quality_at
 from sagesplat.adapt.coverage import Decisions, score
+from sagesplat.adapt.eq1 import plan_scene, plan_view
 from sagesplat.adapt.eq3 import SsimModel
 from sagesplat.adapt.fidelity import shown_enough
 from sagesplat.adapt.observe import LabelImages, Observations
-from sagesplat.adapt.plan import Plan, plan_scene, plan_view
+from sagesplat.adapt.plan import Plan
 from sagesplat.adapt.scene_plans import plan_for_scene, raise_failing_levels
 from sagesplat.adapt.viewpoint import QualityKind, write_promises
 from sagesplat.core.config import FitConfig, PlanConfig

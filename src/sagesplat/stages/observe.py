@@ -14,7 +14,7 @@ from sagesplat.run.remote import work_all
 from sagesplat.run.stage import run_stage
 from sagesplat.segment.display_names import titles
 from sagesplat.stages.methods import method_of
-from sagesplat.stages.shared import _show, distances, label_image_inputs
+from sagesplat.stages.shared import distances, label_image_inputs, show_table
 
 
 def observe_levels(job: Job, config: FitConfig) -> None:
@@ -25,7 +25,9 @@ def observe_levels(job: Job, config: FitConfig) -> None:
         table = observed_views(job, config)
         table.write_csv(run.observations)
         seen = table.select(np.isin(table.view, job.scene.train_ids))
-        _show(job, tables.ladder_table(seen, job.ladder.counts, job.ladder.recovering, titles(job.names())))
+        show_table(
+            job, tables.ladder_table(seen, job.ladder.counts, job.ladder.recovering, titles(job.names()))
+        )
         exposed = any(view.camera.exposure is not None for view in job.scene.views)
         how = ", rendered with the exposure of their photos" if exposed else ""
         return [

@@ -2,7 +2,8 @@
 
 from dataclasses import asdict
 
-from sagesplat.adapt.plan import Plan, quality_title, write_plans
+from sagesplat.adapt.plan import Plan, quality_title
+from sagesplat.adapt.plan_files import write_plans
 from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.core.config import PlanConfig
 from sagesplat.core.errors import RunError
@@ -15,7 +16,7 @@ from sagesplat.run.stage import run_stage
 from sagesplat.segment.display_names import titles
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.results import budget_plan_of, plans_of
-from sagesplat.stages.shared import _show, label_image_inputs
+from sagesplat.stages.shared import label_image_inputs, show_table
 
 PAPER_TARGETS = (0.6, 0.7, 0.8)  # SSIM, where a run has no such target of its own
 
@@ -72,7 +73,7 @@ def show_plan(job: Job) -> None:
             if plan.budget is None and job.run.ladder == "nested"
             else ()
         )
-        _show(job, table.only(*columns, *reached, "status"))
+        show_table(job, table.only(*columns, *reached, "status"))
 
 
 def main_target(run: RunDir) -> tuple[QualityKind, float]:

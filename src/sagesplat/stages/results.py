@@ -11,7 +11,8 @@ from sagesplat.adapt.eq3 import SsimModel, read_models
 from sagesplat.adapt.evaluate import UNIFORM, Evaluation, read_evaluation
 from sagesplat.adapt.fidelity import SampledFidelity, read_sampled
 from sagesplat.adapt.observe import TOTAL, Observations, read_observations
-from sagesplat.adapt.plan import Plan, read_budget_plan, read_plans
+from sagesplat.adapt.plan import Plan
+from sagesplat.adapt.plan_files import read_budget_plan, read_plans
 from sagesplat.adapt.viewpoint import QualityKind, ViewModel, read_promises
 from sagesplat.adapt.viewpoints import Viewpoints, read_viewpoints
 from sagesplat.core.errors import DataError

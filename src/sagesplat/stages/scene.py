@@ -29,7 +29,7 @@ from sagesplat.scene.feature_masks import OfPhoto
 from sagesplat.scene.scene import Scene, Vignetting
 from sagesplat.scene.stored import write_scene
 from sagesplat.segment.edit import ignored_ids, parse_ignore, parse_merge
-from sagesplat.segment.masks import label_images_of
+from sagesplat.segment.mask_files import label_images_of
 from sagesplat.stages.edited import check_not_edited
 
 _CPU_PIXELS = 1.25e6  # of a photo: a training step's time and the cap of Gaussians grow with them

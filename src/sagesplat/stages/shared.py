@@ -16,7 +16,7 @@ from sagesplat.core.config import TrainConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import TableMade
 from sagesplat.core.names import composed
-from sagesplat.output.tables import Table
+from sagesplat.output.table import Table
 from sagesplat.run.job import Job
 from sagesplat.run.records import settings_of
 from sagesplat.run.run_dir import RunDir
@@ -73,7 +73,8 @@ def observed(job: Job) -> Observations:
     return large_enough(observations_of(job), job.scene)
 
 
-def _show(job: Job, table: Table) -> None:
+def show_table(job: Job, table: Table) -> None:
+    """Emit a table for the console."""
     job.emit(TableMade(table.title, table.header, tuple(map(tuple, table.cells()))))
 
 

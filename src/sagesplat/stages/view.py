@@ -123,7 +123,7 @@ def run_bundle(job: "Job") -> Path:
     from sagesplat.stages.bundle import bundle
 
     folder = job.run.path / "bundle"
-    if not _is_finished(job.run):
+    if not is_finished(job.run):
         raise RunError(f"{job.run.path}: not finished; run `sagesplat run` again, or add --follow")
     if not _is_current(job.run, folder):
         bundle(job, folder)
@@ -144,7 +144,8 @@ def _open_run(path: Path, emit: Emit) -> "Job":
     return Job(run, emit)
 
 
-def _is_finished(run: RunDir) -> bool:
+def is_finished(run: RunDir) -> bool:
+    """Whether a run has all that a bundle is made of."""
     from sagesplat.stages.results import has_photos
 
     finished = all(path.exists() for path in (run.fidelity, run.increments / "index.json"))
@@ -210,7 +211,7 @@ def _refresh(job: "Job", site: "Site") -> bool:
     """Show the newest snapshot, or the bundle of a run that is finished: True for that."""
     from sagesplat.stages.bundle import live_bundle
 
-    if _is_finished(job.run):
+    if is_finished(job.run):
         site.folder = run_bundle(replace(job))  # nothing remembered of a training that went on since
         return True
     folder = job.run.path / "bundle-live"

@@ -17,7 +17,8 @@ from sagesplat.adapt.observe import (
 from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.metrics.image import psnr, squared_error_map
-from sagesplat.output.tables import Table, by_size, mean, name_of
+from sagesplat.output.table import Table
+from sagesplat.output.tables import by_size, mean, name_of
 from sagesplat.raster import Workspace
 from sagesplat.run.capture import read_capture
 from sagesplat.run.job import Job

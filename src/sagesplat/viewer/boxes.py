@@ -101,8 +101,8 @@ def distance(
 def _without_outliers(points: np.ndarray) -> np.ndarray:
     if len(points) < FEW:
         return points
-    distance = np.asarray(KDTree(points).query(points, k=NEIGHBOURS + 1)[0])[:, -1]
-    return points[distance <= FAR * np.median(distance)]
+    spacing = np.asarray(KDTree(points).query(points, k=NEIGHBOURS + 1)[0])[:, -1]
+    return points[spacing <= FAR * np.median(spacing)]
 
 
 def _halved(points: np.ndarray, most: int) -> list[np.ndarray]:

@@ -177,13 +177,13 @@ def _rounded(entry: dict[str, Any], model: ViewModel, shared: Int[np.ndarray, "U
     own = model.inputs
     at = np.concatenate([own, (own + own[_neighbours(own)]) / 2])
     # a curve may jump exactly at the distance of a view: a little beyond it
-    predicted = np.exp(at[:, 6]) * (1 + 1e-9), at[:, :3] * model.extent, at[:, 3:6]
-    before = model.predict(*predicted)
+    inputs = np.exp(at[:, 6]) * (1 + 1e-9), at[:, :3] * model.extent, at[:, 3:6]
+    before = model.predict(*inputs)
     coarser = allowed(before.mean.mean(0)) / MAX_ROUNDING_CHANGE
     sent, moved = entry, math.inf
     for log_unit, unit in _UNITS if len(own) <= MOST_VIEWS else _UNITS[:1]:
         sent = _with_values(entry, model, shared, log_unit, significant(unit * coarser, 4))
-        after = _model_of(sent, shared, model.extent).predict(*predicted)
+        after = _model_of(sent, shared, model.extent).predict(*inputs)
         moved = _moved(before, after, model.calibration.discount)
         if moved <= 1:
             break

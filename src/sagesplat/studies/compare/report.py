@@ -17,7 +17,8 @@ from sagesplat.core.limits import Count, NumberOrNaN
 from sagesplat.io.files import write_json, write_text
 from sagesplat.io.typed import read_json_as
 from sagesplat.output.figures import ACCENT, FAINT, INK, STYLE, caption, save_figure
-from sagesplat.output.tables import MB, Table
+from sagesplat.output.table import Table
+from sagesplat.output.tables import MB
 
 SNAPSHOTS, SAGE, PRUNED, MCMC = "3DGS, snapshots", "SAGE", "3DGS, pruned and tuned", "3DGS-MCMC"
 SAME_SHARE, PLANNED = "nested, same share", "nested, planned"

@@ -15,7 +15,8 @@ from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 from sagesplat.adapt.observe import TOTAL
 from sagesplat.io.files import write_json
 from sagesplat.output.figures import ACCENT, FAINT, STYLE, save_figure, shortened
-from sagesplat.output.tables import MB, Table, mean
+from sagesplat.output.table import Table
+from sagesplat.output.tables import MB, mean
 from sagesplat.studies.measure.score import COVERED, Row
 
 JSON, PICTURE = "measure.json", "measure"

@@ -19,17 +19,8 @@ from sagesplat.metrics.lpips import Lpips
 from sagesplat.output import figures
 from sagesplat.output.figures import STYLE, Colours
 from sagesplat.output.report import template
-from sagesplat.output.tables import (
-    MB,
-    Table,
-    by_size,
-    last_counts,
-    markdown_text,
-    mean,
-    name_of,
-    promise_kept,
-    view_mean,
-)
+from sagesplat.output.table import Table, markdown_text
+from sagesplat.output.tables import MB, by_size, last_counts, mean, name_of, promise_kept, view_mean
 from sagesplat.raster import Backend
 from sagesplat.scene.scene import Camera
 from sagesplat.studies.paper.cross_view import NONE, CrossView

@@ -6,14 +6,16 @@ from pathlib import Path
 import numpy as np
 
 from sagesplat.adapt.coverage import PREDICTORS, Decisions
+from sagesplat.adapt.eq1 import plan_view
 from sagesplat.adapt.observe import distances_in_views
-from sagesplat.adapt.plan import Plan, plan_view
+from sagesplat.adapt.plan import Plan
 from sagesplat.core.config import PaperConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Progress, RunDone, TableMade
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.columns import from_rows, write_columns
-from sagesplat.output.tables import Table, name_of, promise_kept
+from sagesplat.output.table import Table
+from sagesplat.output.tables import name_of, promise_kept
 from sagesplat.run.job import Job
 from sagesplat.run.stage import run_stage
 from sagesplat.segment.display_names import titles

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sagesplat.io.files import write_text
-from sagesplat.output.tables import Table
+from sagesplat.output.table import Table
 
 # columns of numbers, with their formats: SSIM and PSNR (dB) are of whole test views, "full" is the full model
 # (the last level: of snapshots 3DGS itself), `error` the mean error of a category's prediction there; a
@@ -54,7 +54,8 @@ def readable(summary: Table, measures: Sequence[str]) -> Table:
     return Table(summary.title, header, ("",) * len(header), body)
 
 
-def _write(out: Path, rows: list[Row]) -> None:
+def write_results(out: Path, rows: list[Row]) -> None:
+    """Write the runs, their summary and figures."""
     header = ("scene", "variant", "seed", "target", *MEASURES, "status")
     Table("Runs", header, ("", "", "d", "g", *MEASURES.values(), ""), rows).write_csv(out / "cells.csv")
     summary = summarise(rows)

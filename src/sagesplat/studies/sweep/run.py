@@ -12,7 +12,8 @@ from sagesplat.adapt.observe import TOTAL
 from sagesplat.core.errors import RunError, SageError
 from sagesplat.core.events import Emit, Progress, StageDone, StageStarted, TableMade, Warned, named
 from sagesplat.io.files import atomic_folder, link
-from sagesplat.output.tables import MB, Table, mean, promise_kept
+from sagesplat.output.table import Table
+from sagesplat.output.tables import MB, mean, promise_kept
 from sagesplat.raster import Backend
 from sagesplat.run.executor import LOCAL, Executor, Local, Task
 from sagesplat.run.job import Job, JobSpec
@@ -21,7 +22,7 @@ from sagesplat.run.run_dir import RunDir
 from sagesplat.stages.pipeline import demo_capture, run_all
 from sagesplat.stages.results import evaluation_of, plans_of
 from sagesplat.studies.sweep.file import Cell, Sweep
-from sagesplat.studies.sweep.report import MEASURES, SHOWN, Row, _write, readable, summarise
+from sagesplat.studies.sweep.report import MEASURES, SHOWN, Row, readable, summarise, write_results
 
 
 def run_sweep(
@@ -52,7 +53,7 @@ def run_sweep(
             failed[number] = name
         else:
             emit(StageDone(name, done.seconds, (f"run {number + 1} of {len(sweep)}",)))
-        _write(out, [row for at in sorted(rows) for row in rows[at]])
+        write_results(out, [row for at in sorted(rows) for row in rows[at]])
     shown = readable(summarise([row for at in sorted(rows) for row in rows[at]]), SHOWN)
     emit(TableMade(shown.title, shown.header, tuple(map(tuple, shown.cells()))))
     if failed:

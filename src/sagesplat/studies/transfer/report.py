@@ -12,7 +12,8 @@ from matplotlib.lines import Line2D
 
 from sagesplat.core.names import repaired
 from sagesplat.output.figures import FAINT, INK, STYLE, shortened
-from sagesplat.output.tables import Table, mean
+from sagesplat.output.table import Table
+from sagesplat.output.tables import mean
 from sagesplat.segment.display_names import titles
 from sagesplat.studies.transfer.score import (
     NORMALISATIONS,

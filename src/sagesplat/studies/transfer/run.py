@@ -6,12 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from sagesplat.adapt.plan import check_target, plan_view
+from sagesplat.adapt.eq1 import plan_view
+from sagesplat.adapt.plan import check_target
 from sagesplat.core.errors import RunError, SageError
 from sagesplat.core.events import Warned
 from sagesplat.metrics.lpips import load_lpips
 from sagesplat.output.figures import save_figure
-from sagesplat.output.tables import Table
+from sagesplat.output.table import Table
 from sagesplat.run.job import Job
 from sagesplat.run.records import settings_of
 from sagesplat.stages.results import models_of

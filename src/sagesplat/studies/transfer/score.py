@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from sagesplat.adapt.eq1 import choose_snapshot
 from sagesplat.adapt.eq3 import SsimModel
 from sagesplat.adapt.observe import Observations
-from sagesplat.adapt.plan import Counts, Models, choose_snapshot
+from sagesplat.adapt.plan import Counts, Models
 from sagesplat.core.errors import RunError
 from sagesplat.core.geometry import mean_neighbour_distance
 from sagesplat.segment.masks import UNLABELLED_NAME
