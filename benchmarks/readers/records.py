@@ -12,9 +12,10 @@ from benchmarks.hostile import MIB, Reader
 from benchmarks.readers.captures import points
 from benchmarks.readers.making import PHOTOS, as_json, file, put, put_photos, written
 from benchmarks.readers.splats import CHUNK
-from sagesplat.adapt import eq3, fidelity, plan, viewpoint, viewpoints
+from sagesplat.adapt import eq3, fidelity, viewpoint, viewpoints
 from sagesplat.adapt.evaluate import Evaluation, read_evaluation
 from sagesplat.adapt.observe import Observations, read_observations
+from sagesplat.adapt.plan_files import read_budget_plan, read_plans
 from sagesplat.core.events import Event
 from sagesplat.formats import label_edits
 from sagesplat.io import lock
@@ -178,8 +179,8 @@ def _plans(folder: Path, size: int) -> list[bytes]:
 
 
 def _read_plans(path: Path) -> None:
-    plan.read_plans(path)
-    plan.read_budget_plan(path)
+    read_plans(path)
+    read_budget_plan(path)
 
 
 def _table(kind: Any) -> Any:
