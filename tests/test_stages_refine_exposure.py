@@ -17,7 +17,7 @@ from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.scene.refined import read_refined
 from sagesplat.stages import blocks
-from sagesplat.stages.pipeline import run_all, train
+from sagesplat.stages.pipeline import run_all
 from sagesplat.stages.refine_exposure import ExposureFigures, exposure_lines, read_exposure_figures
 from sagesplat.stages.results import evaluation_of
 
@@ -86,7 +86,7 @@ def test_switched_off_nothing_is_left(run, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(run[0], folder)
     job = Job(RunDir(folder), lambda event: None, "cpu", force=True)
-    train(job, replace(CONFIG.train, exposure="off", max_steps=4, level_every=4), BlocksConfig(), 0)
+    train_scene(job, replace(CONFIG.train, exposure="off", max_steps=4, level_every=4), BlocksConfig(), 0)
     assert not job.run.cameras.exists()
     assert not job.run.refined.exists()
     assert job.scene is job.given_scene

@@ -35,7 +35,6 @@ from sagesplat.segment import segmenters
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.segment.parents import read_parents, write_parents
 from sagesplat.stages import bundle, label, view
-from sagesplat.stages.boundaries import _seconds
 from sagesplat.stages.clean import read_clean_figures
 from sagesplat.stages.edited import LabelSettings, label_settings, write_edited
 from sagesplat.stages.prompts import read_scores
@@ -276,7 +275,6 @@ def _read_provenance(path: Path) -> None:
     run = RunDir(path.parents[1])
     stage_seconds(run)
     recorded_settings(run)
-    _seconds(run, "train")
     _follows(Job(run, _ignore), Stage("train", TRAINED, [], []))
     is_done(run, "train", TRAINED, None, [run.scene], False)
     settings_of(run, "train")
