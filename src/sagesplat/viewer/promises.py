@@ -163,7 +163,7 @@ def allowed_change(mean: np.ndarray) -> np.ndarray:
 
 
 def _thresholds(calibration: Calibration, change: float) -> dict[str, list[int]]:
-    """Targets and thresholds in whole steps; thresholds go up by as much as means change: no bound is raised.
+    """Targets and thresholds in whole steps; thresholds go up as means change, so no bound rises.
 
     `change`: the largest change of a mean, over what is allowed.
     """
