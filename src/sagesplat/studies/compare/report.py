@@ -79,9 +79,7 @@ class Point:
     psnr: NumberOrNaN  # dB
     lpips_alex: NumberOrNaN  # NaN where it could not be measured
     lpips_vgg: NumberOrNaN
-    cc_ssim: NumberOrNaN = (
-        math.nan
-    )  # colour-corrected, as gsplat; NaN where no photo has an exposure
+    cc_ssim: NumberOrNaN = math.nan  # colour-corrected, as gsplat; NaN where no photo has an exposure
     cc_psnr: NumberOrNaN = math.nan
     cc_lpips_alex: NumberOrNaN = math.nan
     cc_lpips_vgg: NumberOrNaN = math.nan
