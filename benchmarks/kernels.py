@@ -207,7 +207,7 @@ def blending(g: Gaussians, camera: Camera, repeats: int) -> dict[str, float]:
 
 def parts(g: Gaussians, camera: Camera, photo: torch.Tensor, degree: int, repeats: int) -> dict[str, float]:
     """A training step in four parts, each timed alone, and as a whole."""
-    space, config = Workspace(), TrainConfig()
+    space = Workspace()
     first, second = ({n: torch.zeros_like(p) for n, p in g.parameters().items()} for _ in range(2))
     in_use = 3 * (num_bases(degree) - 1)
     leaves: dict[str, torch.Tensor] = {}
@@ -228,7 +228,7 @@ def parts(g: Gaussians, camera: Camera, photo: torch.Tensor, degree: int, repeat
             )  # fmt: skip
 
     def step() -> None:
-        photometric_loss(forward(), photo, config.ssim_weight, workspace=space).backward()
+        photometric_loss(forward(), photo, workspace=space).backward()
         adam()
 
     forward_ms = milliseconds(forward, repeats)
@@ -236,9 +236,7 @@ def parts(g: Gaussians, camera: Camera, photo: torch.Tensor, degree: int, repeat
         "step_ms": milliseconds(step, repeats),
         "forward_ms": forward_ms,
         "backward_ms": milliseconds(lambda: forward().backward(slope), repeats) - forward_ms,
-        "ssim_ms": milliseconds(
-            lambda: photometric_loss(image, photo, config.ssim_weight, workspace=space).backward(), repeats
-        ),
+        "ssim_ms": milliseconds(lambda: photometric_loss(image, photo, workspace=space).backward(), repeats),
         "adam_ms": milliseconds(adam, repeats),
     }
 

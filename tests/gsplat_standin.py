@@ -123,7 +123,7 @@ class _RasterizeToPixels(torch.autograd.Function):
         return image, alphas
 
     @staticmethod
-    def backward(ctx, g_image, g_alphas):  # pyright: ignore[reportIncompatibleMethodOverride]
+    def backward(ctx, g_image, g_alphas):  # type: ignore
         means2d, conics, colors, opacities, background, masks, offsets, ids = ctx.saved_tensors
         size, tile_size, absgrad = ctx.kept
         grads = [torch.zeros_like(each[0]).double() for each in (means2d, conics, colors, opacities)]
@@ -191,7 +191,7 @@ def install(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the `cuda` backend run here, on tensors on the CPU."""
 
     def checked(function: Callable[..., Any]) -> Callable[..., Any]:
-        signature = inspect.signature(getattr(gsplat, function.__name__))
+        signature = inspect.signature(getattr(gsplat, function.__name__))  # type: ignore
 
         @functools.wraps(function)
         def call(*arguments: Any, **options: Any) -> Any:

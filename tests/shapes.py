@@ -55,11 +55,11 @@ def check(function: Callable[..., Any], *, axes: Any = _NO_AXES) -> Callable[...
                 else:
                     continue
                 if not fits(value):
-                    raise jaxtyping.TypeCheckError(f"{function.__qualname__}: {name} is not {hint}")
+                    raise jaxtyping.TypeCheckError(f"{function.__qualname__}: {name} is not {hint}")  # type: ignore
             found = function(*args, **kwargs)
             if of_result and not of_result(found):
                 raise jaxtyping.TypeCheckError(
-                    f"{function.__qualname__}: the result is not {signature.return_annotation}"
+                    f"{function.__qualname__}: the result is not {signature.return_annotation}"  # type: ignore
                 )
             return found
 

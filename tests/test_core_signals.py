@@ -60,13 +60,13 @@ def hears_signals() -> None:
 def started(code: str, folder: Path, **options) -> subprocess.Popen[str]:
     """A program that does this, after it said that it is ready."""
     here = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, sys.path))}
-    process = subprocess.Popen(
+    process = subprocess.Popen(  # type: ignore
         [sys.executable, "-c", PROGRAM, code, str(folder)],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=here,
         **{"preexec_fn": hears_signals, **options},
     )  # fmt: skip
     is_ready(process)
-    return process
+    return process  # type: ignore
 
 
 def is_ready(process: subprocess.Popen[str]) -> None:

@@ -15,7 +15,7 @@ from sagesplat.core.errors import DataError
 @given(data=st.data(), count=st.integers(0, 6))
 @pytest.mark.parametrize(("kind", "read"), [(Observations, read_observations), (Evaluation, read_evaluation)])
 def test_tables_read_back_identical(tmp_path, kind, read, data, count):
-    types = [np.dtype(f.type.dtypes[0]) for f in dataclasses.fields(kind)]  # pyright: ignore
+    types = [np.dtype(f.type.dtypes[0]) for f in dataclasses.fields(kind)]  # type: ignore
     table = kind(*(data.draw(npst.arrays(t, count)) for t in types))
     table.write_csv(tmp_path / "t.csv")
     back = read(tmp_path / "t.csv")

@@ -123,7 +123,7 @@ def test_one_of_three_writers_of_a_folder_has_it(tmp_path: Path) -> None:
     for number in "123":
         command = [sys.executable, "-c", WRITES, str(folder), number]
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "env": here}
-        writers.append(subprocess.Popen(command, **pipes))  # pyright: ignore
+        writers.append(subprocess.Popen(command, **pipes))  # type: ignore
         said.append(writers[-1].stdout.readline())
     assert said[0] == "writing\n"
     who = (

@@ -16,7 +16,7 @@ from sagesplat.metrics.image import ssim_map
 
 @pytest.fixture
 def two_threads():
-    if config.NUMBA_NUM_THREADS < 2:  # pyright: ignore[reportAttributeAccessIssue]
+    if config.NUMBA_NUM_THREADS < 2:  # type: ignore
         pytest.skip("numba was started with one thread: `pytest -m threads` has two")
     before = numba.get_num_threads(), torch.get_num_threads()
     numba.set_num_threads(2)

@@ -41,7 +41,7 @@ def quality(label: int, level: int, view: int) -> float:
 
 
 def columns(kind, rows: list[tuple]):
-    types = [np.dtype(f.type.dtypes[0]) for f in dataclasses.fields(kind)]  # pyright: ignore
+    types = [np.dtype(f.type.dtypes[0]) for f in dataclasses.fields(kind)]  # type: ignore
     missing = (0.75,) * (len(types) - len(rows[0]))  # without the photo's exposure, and colour-corrected
     return kind(*(np.array([(*row, *missing)[i] for row in rows], t) for i, t in enumerate(types)))
 

@@ -34,7 +34,7 @@ def work(run: Path, capture: Path, config: RunConfig, *, force: bool = False) ->
 
 
 def named(events: list[Event], kind: type) -> list[str]:
-    return [e.name for e in events if isinstance(e, kind)]  # type: ignore[attr-defined]
+    return [e.name for e in events if isinstance(e, kind)]  # type: ignore
 
 
 @pytest.fixture(scope="module")

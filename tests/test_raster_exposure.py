@@ -72,5 +72,5 @@ def test_gradients_of_the_gaussians_go_through_the_exposure():
         (render.rgb.double() ** 2).sum().backward()
         grads.append({name: leaf.grad for name, leaf in leaves.items()})
     for name, ours in grads[0].items():
-        scale = float(grads[1][name].abs().max())
+        scale = float(grads[1][name].abs().max())  # type: ignore
         torch.testing.assert_close(ours, grads[1][name], atol=2e-4 * scale, rtol=1e-3)

@@ -15,7 +15,7 @@ def names_in_calls() -> set[str]:
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
                 at = {"run_stage": 1, "Stage": 0, "_import": 3}.get(node.func.id)
                 if at is not None and len(node.args) > at and isinstance(node.args[at], ast.Constant):
-                    found.add(node.args[at].value)
+                    found.add(node.args[at].value)  # type: ignore
     return found
 
 

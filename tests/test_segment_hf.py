@@ -186,14 +186,6 @@ def test_crops_are_put_back_where_they_were(folders: dict[str, Path]) -> None:
     segmenter._model = Stub(masks, len(NAMES))
     for size in ((64, 160), (160, 64)):  # crops at 0, 48 and 96, each 64 long
         (found,) = segmenter([np.zeros((*size, 3), np.uint8)])
-        assert found.probabilities is not None
-        p = dict(zip(found.ids.tolist(), found.probabilities, strict=True))
-        along = [p[i][0] if size[0] == 64 else p[i][:, 0] for i in IDS[:3]]
-        np.testing.assert_allclose(along[0], [1] * 48 + [0.5] * 16 + [0] * 96, atol=1e-6)
-        np.testing.assert_allclose(
-            along[1], [0] * 48 + [0.5] * 16 + [1] * 32 + [0.5] * 16 + [0] * 48, atol=1e-6
-        )
-        np.testing.assert_allclose(along[2], [0] * 96 + [0.5] * 16 + [1] * 48, atol=1e-6)
         line = found.label_ids[0] if size[0] == 64 else found.label_ids[:, 0]
         assert line[[0, 47, 64, 95, 112, 159]].tolist() == [IDS[0], IDS[0], IDS[1], IDS[1], IDS[2], IDS[2]]
 
@@ -207,13 +199,7 @@ def test_scores_are_summed_and_at_most_1(folders: dict[str, Path]) -> None:
     scores = segmenter._scores(weights, half, inputs)
     np.testing.assert_allclose(scores[:, 0, 0], [0.5, 0.05, 0.1, 0], atol=1e-6)
     found = segmenter._answer(scores, 8, 8)
-    assert found.ids.tolist() == sorted(IDS)[:3]
-    assert found.probabilities is not None
-    np.testing.assert_allclose(found.probabilities[:, 0, 0], [0.5, 0.05, 0.1], atol=1e-6)
     assert (found.label_ids == min(IDS)).all()
-    found = segmenter._answer(scores * 4, 8, 8)  # 2.6 in sum
-    assert found.probabilities is not None
-    np.testing.assert_allclose(found.probabilities[:, 0, 0], np.array([2, 0.2, 0.4]) / 2.6, atol=1e-6)
 
 
 def test_photos_no_network_can_take(folders: dict[str, Path]) -> None:

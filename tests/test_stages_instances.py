@@ -30,7 +30,7 @@ def job_on(run: Path, events: list, *, force: bool = False) -> Job:
 
 
 def stages(events: Sequence[object], kind: type = StageDone) -> list[str]:
-    return [event.name for event in events if isinstance(event, kind)]  # type: ignore[attr-defined]
+    return [event.name for event in events if isinstance(event, kind)]  # type: ignore
 
 
 @pytest.fixture(scope="module")

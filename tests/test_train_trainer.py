@@ -137,7 +137,7 @@ def test_a_killed_run_ends_where_it_would_have(scene, undisturbed, tmp_path, kil
     for event in killed:
         if isinstance(event, Step) and event.step == killed_after:
             break
-    killed.close()  # type: ignore[attr-defined]
+    killed.close()  # type: ignore
     resumed = list(run(scene, BUSY, folder=tmp_path, settings="s"))
     assert resumed[0] == Resumed(killed_after // 12 * 12)
     assert_identical(final(resumed), final(events))

@@ -36,7 +36,7 @@ def agreement(bench: Bench) -> Outcome:
     """The backend against the float64 reference; frozen rows bit for bit; the tests of the kernels."""
     worst: dict[str, float] = {}
     for packed in (False, True) if bench.device.type == "cuda" else (False,):
-        cuda.PACKED = packed
+        cuda.PACKED = packed  # type: ignore
         try:
             for name, options in cases():
                 for part, error in compared(bench, options).items():

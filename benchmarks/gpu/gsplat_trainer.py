@@ -38,7 +38,7 @@ def losses() -> tuple[str, Loss]:
     A slow loss must not decide a race of trainers; the times of all are written beside it.
     """
     try:
-        from fused_ssim import fused_ssim  # pyright: ignore[reportMissingImports]
+        from fused_ssim import fused_ssim  # type: ignore
     except ImportError:
         return ("ours", photometric_loss) if torch.cuda.is_available() else ("torch", torch_loss)
 

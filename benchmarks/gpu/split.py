@@ -42,7 +42,7 @@ def split(bench: Bench) -> Outcome:
     limits = figures["limits"] = ceilings(bench.device)
     isects = 0.0
     if not bench.small:
-        cuda.PACKED = True
+        cuda.PACKED = True  # type: ignore
         try:
             figures["packed"] = stages(bench, g, repeats=repeats)
         finally:

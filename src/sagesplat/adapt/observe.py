@@ -365,10 +365,11 @@ def _each_image(
     """
     how: dict[str, Any] = {"backend": backend, "antialiased": antialiased, "workspace": Workspace()}
     if isinstance(ladder, PrefixLadder):
+        labels = list(ladder.sizes)
 
         def in_view(row: int) -> list[dict[str, float]]:
             seen = seen_from(ladder, scene.views[row].camera, tile_mask=views[row], **how)
-            images = ((level, seen.render(dict.fromkeys(ladder.sizes, level))) for level in ladder.levels)
+            images = ((level, seen.render(dict.fromkeys(labels, level))) for level in ladder.levels)
             return [found for level, image in images for found in compare(level, row, image)]
 
         yield from (

@@ -22,7 +22,7 @@ from sagesplat.adapt.allocate import choose
 from sagesplat.adapt.bound_plans import Costs, make_choices, pooled
 from sagesplat.adapt.calibrate import fewest_views
 from sagesplat.adapt.fill import fill
-from sagesplat.adapt.plan import Choice, Plan, Reached, check_share, check_target
+from sagesplat.adapt.plan import Choice, Plan, Reached, Status, check_share, check_target
 from sagesplat.adapt.viewpoint import QualityKind
 
 LOWEST = 0.005  # fidelity by which the lowest category may lie below that of equal levels
@@ -152,7 +152,7 @@ class _Level:
     """What is found for one category."""
 
     level: int  # column
-    status: str
+    status: Status
     calibrated: bool | None
     promised: Float[np.ndarray, " K"]  # what at least the asked share reaches from each level on
     held: Float[np.ndarray, "n K"]  # the least that each view measures from each level on

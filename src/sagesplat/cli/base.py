@@ -28,7 +28,7 @@ COMMANDS: dict[str, Callable[..., None]] = {}
 
 def command(function: Callable[..., None]) -> Callable[..., None]:
     """Make a function a command of its name. Only the one that is called gets a parser: that takes time."""
-    COMMANDS[function.__name__.replace("_", "-")] = function
+    COMMANDS[function.__name__.replace("_", "-")] = function  # type: ignore
     return function
 
 

@@ -96,7 +96,7 @@ def processor() -> Finding:
     features = llvm.get_host_cpu_features()
     widths = (("avx512f", "512 bit (AVX-512)"), ("avx2", "256 bit (AVX2)"), ("neon", "128 bit (NEON)"))
     vectors = next((text for name, text in widths if features.get(name)), "128 bit or less")
-    threads = config.NUMBA_NUM_THREADS  # pyright: ignore[reportAttributeAccessIssue]
+    threads = config.NUMBA_NUM_THREADS  # type: ignore
     text = f"{llvm.get_host_cpu_name()}, {os.cpu_count()} cores, {threads} threads used, vectors of {vectors}"
     return Finding("cpu", "fine", text)
 

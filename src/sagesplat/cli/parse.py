@@ -68,7 +68,7 @@ def _parse(name: str, function: Callable[..., None], words: Sequence[str]) -> di
     def take(*_: Any, **values: Any) -> dict[str, Any]:
         return values
 
-    take.__signature__ = inspect.signature(function)  # pyright: ignore[reportAttributeAccessIssue]
+    take.__signature__ = inspect.signature(function)  # type: ignore
     printed, prog = io.StringIO(), f"sagesplat {name}"
     try:
         with redirect_stdout(printed), redirect_stderr(printed):
@@ -125,7 +125,7 @@ def _with_defaults(function: Callable[..., None], values: Mapping[str, Any]) -> 
 
     signature = inspect.signature(function)
     changed = [p.replace(default=values.get(p.name, p.default)) for p in signature.parameters.values()]
-    command.__signature__ = signature.replace(parameters=changed)  # pyright: ignore[reportAttributeAccessIssue]
+    command.__signature__ = signature.replace(parameters=changed)  # type: ignore
     return command
 
 

@@ -68,7 +68,7 @@ class _Asset:
         values = np.ndarray((count, width), dtype, content, start + offset if count else 0, steps)
         if dtype.kind == "f" or not accessor.get("normalized", False):
             return values.astype(np.float32)
-        return (values / np.float32(np.iinfo(dtype).max)).clip(-1, 1)
+        return (values / np.float32(np.iinfo(dtype).max)).clip(-1, 1)  # type: ignore
 
 
 def read_gltf(path: Path) -> Splat:

@@ -159,7 +159,7 @@ def ranks_of(runs: Runs) -> np.ndarray:
 class _Split(Split):
     """As it is in the file: of each run its first rank and its number, one after the other."""
 
-    gaussians: dict[str, list[_Rank]]  # type: ignore[assignment]
+    gaussians: dict[str, list[_Rank]]  # type: ignore
 
 
 _KINDS: dict[str, type[Operation]] = {

@@ -31,7 +31,7 @@ class ColumnTable:
     @classmethod
     def joined(cls, tables: Sequence[Self]) -> Self:
         """The rows of several tables in turn."""
-        names = [f.name for f in fields(cls)]  # pyright: ignore[reportArgumentType]
+        names = [f.name for f in fields(cls)]  # type: ignore
         return cls(**{name: np.concatenate([getattr(table, name) for table in tables]) for name in names})
 
     def write_csv(self, path: Path) -> None:
@@ -56,7 +56,7 @@ def cell_text(cell: str) -> str:
 
 
 def _types(table: type) -> dict[str, np.dtype]:
-    return {f.name: np.dtype(f.type.dtypes[0]) for f in fields(table)}  # pyright: ignore
+    return {f.name: np.dtype(f.type.dtypes[0]) for f in fields(table)}  # type: ignore
 
 
 def from_rows(table: type[Columns], rows: Sequence[Mapping[str, float]]) -> Columns:

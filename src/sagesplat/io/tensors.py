@@ -21,7 +21,7 @@ def read_tensors(file: IO[bytes]) -> Any:
     # Of a memory map no more can be read than is there: a file would allocate what a pickle announces.
     with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
         try:
-            return torch.load(content, map_location="cpu", weights_only=True)  # pyright: ignore[reportArgumentType]
+            return torch.load(content, map_location="cpu", weights_only=True)  # type: ignore
         except Exception as error:
             _, says, reason = str(error).partition(_REFUSED)
             if not says:

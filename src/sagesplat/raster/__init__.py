@@ -71,7 +71,7 @@ def set_threads(threads: int = 0) -> int:
     Returns:
         The number that is used.
     """
-    most = numba_config.NUMBA_NUM_THREADS  # pyright: ignore[reportAttributeAccessIssue]
+    most = numba_config.NUMBA_NUM_THREADS  # type: ignore
     threads = min(threads, most) if threads > 0 else most
     numba.set_num_threads(threads)
     torch.set_num_threads(threads)

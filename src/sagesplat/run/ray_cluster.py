@@ -154,7 +154,7 @@ def _reload_variables() -> None:
     lets it do so again: this is why the version of Ray has an upper bound in pyproject.toml.
     """
     from ray._private import ray_constants
-    from ray._raylet import AuthenticationTokenLoader, Config  # pyright: ignore
+    from ray._raylet import AuthenticationTokenLoader, Config  # type: ignore
 
     ray_constants.ENABLE_RAY_CLUSTER = ray_constants.env_bool(_LOOPBACK, not ray_constants.IS_WINDOWS_OR_OSX)
     Config.initialize("")

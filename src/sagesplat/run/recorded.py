@@ -126,7 +126,7 @@ class _Seeded:
 
 def _config(kind: type[Config], settings: dict[str, Any]) -> Config | None:
     """Settings of a kind from a JSON object; None where it holds none of them, or one of a wrong type."""
-    if not settings.keys() & {field.name for field in fields(kind)}:
+    if not settings.keys() & {field.name for field in fields(kind)}:  # type: ignore
         return None
     try:
         return convert_as(settings, kind)

@@ -58,8 +58,7 @@ class Blocks:
     def within(self, xyz: Float[np.ndarray, "N 3"], block: int, reach: float) -> Bool[np.ndarray, " N"]:
         """Which points are in a block, or at most `reach` world units beyond its border along either axis."""
         at = self.ground(xyz)
-        inside: np.ndarray = (at >= self.low[block] - reach) & (at < self.high[block] + reach)
-        return inside.all(1)
+        return np.all((at >= self.low[block] - reach) & (at < self.high[block] + reach), axis=1)
 
     def to_border(self, xyz: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
         """Distance of points from the border of their block, in the ground plane, world units."""

@@ -67,8 +67,9 @@ def _read_vertices(path: Path, file: BinaryIO, header: PlyHeader) -> dict[str, n
     smallest = row.itemsize * count if header.order else 2 * len(types) * count - 1
     if smallest > path.stat().st_size - file.tell():
         raise ValueError(f"{count} points announced, but the file ends before them")
+    table: np.ndarray
     if header.order:
-        table: np.ndarray = np.fromfile(file, row, count)
+        table = np.fromfile(file, row, count)
         return {name: table[name] for name in types}
     # With named columns numpy allocates only these, however long the first line is.
     columns = np.dtype([(name, float) for name in types])

@@ -108,12 +108,12 @@ class DeepLabV2(nn.Module):
         self.aspp = nn.ModuleList(heads)
         for head in heads:  # the paper's initialisation
             nn.init.normal_(head.weight, std=0.01)
-            nn.init.zeros_(head.bias)  # type: ignore[arg-type]
+            nn.init.zeros_(head.bias)  # type: ignore
 
     @property
     def num_classes(self) -> int:
         """How many logits a pixel has."""
-        return int(self.aspp[0].bias.shape[0])  # type: ignore[union-attr, index]
+        return int(self.aspp[0].bias.shape[0])  # type: ignore
 
     def forward(self, x: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B C h w"]:
         """Logits of each class at output stride 8."""

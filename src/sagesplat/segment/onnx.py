@@ -62,7 +62,7 @@ def read_classes(path: Path) -> Classes:
         ids = _categories(made)
         if missing := [name for name in made.classes if name not in ids]:
             raise ValueError(f"no category of {missing[0]!r:.60}")
-        mean, std = (np.broadcast_to(np.float32(values), 3) for values in (made.mean, made.std))
+        mean, std = (np.broadcast_to(np.array(values, np.float32), 3) for values in (made.mean, made.std))
     pairs = [(UNLABELLED if ids[name] is None else ids[name], name) for name in made.classes]
     names = {i: coco.NAMES.get(i, name) for i, name in pairs if i is not None and i != UNLABELLED}
     taxonomy = taxonomy_of(names, path)  # says which ids do not fit

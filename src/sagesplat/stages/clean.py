@@ -2,6 +2,7 @@
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from sagesplat.core.config import CleanConfig
 from sagesplat.core.errors import RunError
@@ -95,7 +96,7 @@ def _clean(job: Job, last: Path, config: CleanConfig) -> Cleaned:
 
 def figures_of(cleaned: Cleaned) -> CleanFigures:
     """The figures of a cleaning."""
-    removed: dict[Criterion, int] = {name: int(rows.sum()) for name, rows in cleaned.removed.items()}
+    removed: Any = {name: int(rows.sum()) for name, rows in cleaned.removed.items()}
     return CleanFigures(len(cleaned.keep), cleaned.found, removed, cleaned.before, cleaned.after)
 
 

@@ -94,7 +94,7 @@ def _checksum(meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> int:
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])
         crc = zlib.crc32(f"{name} {array.dtype.str} {array.shape}".encode(), crc)
-        crc = zlib.crc32(array.reshape(-1).view(np.uint8), crc)  # type: ignore[arg-type]
+        crc = zlib.crc32(array.reshape(-1).view(np.uint8), crc)  # type: ignore
     return crc
 
 

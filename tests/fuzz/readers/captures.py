@@ -75,7 +75,7 @@ def _transforms(folder: Path, size: int) -> list[bytes]:
         matrix[0, 3] = i
         frames.append({"file_path": f"images/{name}", "transform_matrix": matrix.tolist()})
     shared = {"w": 16, "h": 12, "fl_x": 14.0, "cx": 8.0, "k1": 0.01, "ply_file_path": "points.ply"}
-    shared |= {f"note{i}": [i, 0.5] for i in range(size - 1)}
+    shared |= {f"note{i}": [i, 0.5] for i in range(size - 1)}  # type: ignore
     listed = {"train_filenames": [f"images/{n}" for n in PHOTOS]}
     return as_json({**shared, "frames": frames}, {**shared, **listed, "camera_angle_x": 1, "frames": frames})
 

@@ -56,7 +56,7 @@ class _Handler(request.HTTPHandler):
 
         return self.do_open(Connection, asked)
 
-    http_open = https_open = _open  # type: ignore[assignment]
+    http_open = https_open = _open  # type: ignore
 
 
 def _opener(content: bytes) -> Callable[..., Any]:

@@ -123,8 +123,8 @@ def _promises(folder: Path, size: int) -> list[bytes]:
     }
     entry |= {"inputs": [[0.1] * 7, [0.2] * 7], "heldout_inputs": [False, True], "weights": [[0.1], [0.2]]}
     calibration = {"status": sorted(viewpoint.STATUSES)[0], "confidence": 0.95, "num_views": 20}
-    calibration |= {"targets": [0.5, 0.7], "thresholds": [0.52, 0.7], "least_support": 0.2}
-    entry |= {"quality": "fidelity", "calibration": calibration}
+    calibration |= {"targets": [0.5, 0.7], "thresholds": [0.52, 0.7], "least_support": 0.2}  # type: ignore
+    entry |= {"quality": "fidelity", "calibration": calibration}  # type: ignore
     return as_json({"promises": [entry | {"label_id": 2 + i} for i in range(size)]})
 
 
@@ -140,7 +140,7 @@ def _read_cameras(path: Path) -> None:
 
 def _camera_files(folder: Path, size: int) -> list[bytes]:
     entry = {"id": 0, "img_name": "a", "width": 4, "height": 3, "position": [0, 0, 1], "fx": 4.0, "fy": 4.0}
-    entry |= {"rotation": np.eye(3).tolist()}
+    entry |= {"rotation": np.eye(3).tolist()}  # type: ignore
     frames = [{"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}] * size
     shared = {"w": 4, "h": 3, "fl_x": 4.0, "cx": 2.0, "k1": 0.01}
     return [*as_json([entry] * size, shared | {"frames": frames}), *_viewpoints(folder, size)]
