@@ -97,7 +97,8 @@ def _clean(job: Job, last: Path, config: CleanConfig) -> Cleaned:
 def figures_of(cleaned: Cleaned) -> CleanFigures:
     """The figures of a cleaning."""
     removed: Any = {name: int(rows.sum()) for name, rows in cleaned.removed.items()}
-    return CleanFigures(len(cleaned.keep), cleaned.found, removed, cleaned.before, cleaned.after)
+    found: Any = cleaned.found
+    return CleanFigures(len(cleaned.keep), found, removed, cleaned.before, cleaned.after)
 
 
 def clean_lines(figures: CleanFigures) -> list[str]:
