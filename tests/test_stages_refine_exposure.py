@@ -17,6 +17,7 @@ from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.scene.refined import read_refined
 from sagesplat.stages import blocks
+from sagesplat.stages.blocks import train_scene
 from sagesplat.stages.pipeline import run_all
 from sagesplat.stages.refine_exposure import ExposureFigures, exposure_lines, read_exposure_figures
 from sagesplat.stages.results import evaluation_of
