@@ -52,7 +52,8 @@ def nest_scene(job: Job, nest: NestConfig, config: BlocksConfig, seed: int) -> N
     def make() -> list[str]:
         every = range(len(blocks))
         for number in every:
-            share_masks(job, job.block_spec(number).open(job.emit))
+            spec = job.block_spec(number)
+            share_masks(job, spec.open(job.emit))
         tasks = [
             Task(f"block {i}", nest_block, (job.block_spec(i), file, i, nest, seed), job.gpus) for i in every
         ]

@@ -170,9 +170,10 @@ def train_scene(job: Job, train: TrainConfig, config: BlocksConfig, seed: int) -
     def make() -> list[str]:
         tasks = []
         for number in range(len(blocks)):
-            block = job.block_spec(number).open(job.emit)
+            spec = job.block_spec(number)
+            block = spec.open(job.emit)
             share_masks(job, block)
-            what = (job.block_spec(number), number, train, seed)
+            what = (spec, number, train, seed)
             tasks.append(Task(f"block {number}", train_block, what, job.gpus, _needed(block, train)))
         results(job.executor, tasks, job.emit)
         run.provenance("train").unlink(missing_ok=True)  # from here on the earlier levels are gone
