@@ -134,7 +134,8 @@ def test_views_are_for_the_blocks_that_they_see() -> None:
     assert blind[np.arange(20), own].mean() > 0.8
 
 
-def test_a_part_keeps_its_points_and_some_of_the_background() -> None:
+def test_a_part_keeps_its_points_and_some_of_the_background(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sagesplat.scene.blocks._FAR_SHARE", 0.1)
     scene = street(places=2, views=10)
     wide = replace(scene.views[0], camera=scene.views[15].camera)  # one camera looks at the other place
     seen = np.zeros(50, np.int32)
@@ -149,7 +150,7 @@ def test_a_part_keeps_its_points_and_some_of_the_background() -> None:
     blocks = split(scene, 2)
     mine = int(blocks.of(scene.points.xyz[:1])[0])
     views = [0, 1, 2, 3, 9]
-    part, kept = training_scene(scene, blocks, mine, views, 0.1, seed=0)
+    part, kept = training_scene(scene, blocks, mine, views, seed=0)
     near = blocks.within(scene.points.xyz, mine, blocks.margin)
     assert near[kept].sum() == near.sum()
     assert 0 < (~near[kept]).sum() <= 0.1 * near.sum()
@@ -161,10 +162,10 @@ def test_a_part_keeps_its_points_and_some_of_the_background() -> None:
     ):
         was = (scene.points.track_points == kept[point]) & (scene.points.track_views == views[view])
         assert (scene.points.track_uv[was] == uv).all(1).any()
-    same, _ = training_scene(scene, blocks, mine, views, 0.1, seed=0)
+    same, _ = training_scene(scene, blocks, mine, views, seed=0)
     np.testing.assert_array_equal(same.points.xyz, part.points.xyz)
     with pytest.raises(RunError, match="has 0 views and"):
-        training_scene(scene, blocks, mine, [], 0.1, seed=0)
+        training_scene(scene, blocks, mine, [], seed=0)
 
 
 @pytest.mark.parametrize("count", [0, 1, 500])
