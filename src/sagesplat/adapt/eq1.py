@@ -42,7 +42,7 @@ def plan_view(
 
     Example:
         >>> from sagesplat.adapt.eq3 import Eq3, SsimModel
-        >>> from sagesplat.adapt.plan import plan_view
+        >>> from sagesplat.adapt.eq1 import plan_view
         >>> def model(level, k):  # SSIM k at distance 0, falling by exp(-0.1 d)
         ...     curve = Eq3(k, 0.1, 0.0, 1.0, k, 0.1, 0.0, 1.0, 0.0)
         ...     return SsimModel(3, level, curve, (0.0, 10.0), k, 0.0, 9, "one regime")
