@@ -157,11 +157,11 @@ def test_given_flags_win_and_another_source_of_label_images_drops_the_recorded_o
     monkeypatch.setattr(
         pipeline, "run_all", lambda job, scene, config: seen.update(config=config, run=job.run)
     )
-    (run / "segmented" / "options.json").write_text('{"segmenter": "hf", "model": "a/b", "batch": 3}')
+    (run / "segmented" / "options.json").write_text('{"segmenter": "hf", "model": "a/b", "crf": true}')
     assert command("run", capture, run, "--train.max-steps=70", "--seed", "4")[0] == 0
     config = seen["config"]
     assert (config.train.max_steps, config.train.level_every, config.seed) == (70, 30, 4)
-    assert (config.masks.model, config.masks.batch, seen["run"].ladder) == ("a/b", 3, "snapshots")
+    assert (config.masks.model, config.masks.crf, seen["run"].ladder) == ("a/b", True, "snapshots")
     assert command("run", capture, run, "--masks", capture / "masks")[0] == 0
     assert (seen["config"].masks.segmenter, seen["config"].masks.model) == ("auto", None)
 

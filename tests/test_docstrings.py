@@ -12,7 +12,7 @@ import sagesplat
 
 # modules whose examples run here; those that need a capture or a run are marked +SKIP
 MODULES = (
-    "adapt.allocate", "adapt.eq1", "adapt.fill", "adapt.observe", "adapt.photo_models", "adapt.plan",
+    "adapt.allocate", "adapt.eq1", "adapt.fill", "adapt.observe", "adapt.photo_models",
     "adapt.viewpoint",
     "formats.levels", "formats.ply", "formats.splats", "formats.spz", "formats.stream",
     "metrics.color_correct", "metrics.image", "raster", "scene", "segment.masks", "segment.relabel",

@@ -367,7 +367,7 @@ def test_a_loop_that_never_ends_is_stopped(tmp_path, files, capfd):
     yes = field(5, field(2, 9) + field(8, "yes") + field(9, b"\x01"))
     nodes = field(1, loop + attribute("body", 6, body, 5))
     model = model_of(tmp_path / "m.onnx", nodes, outputs=[LOGITS], tensors=yes)
-    with pytest.raises(LabelError, match=r"m\.onnx: no answer within 0\.3 s; raise --time-limit"):
+    with pytest.raises(LabelError, match=r"m\.onnx: no answer within 0\.3 s; take another network"):
         OnnxSegmenter(model, files[1], time_limit=0.3)([red_and_blue()])
     assert capfd.readouterr() == ("", "")
     assert OnnxSegmenter(*files, time_limit=600)([red_and_blue()])  # one that ends

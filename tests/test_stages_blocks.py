@@ -135,7 +135,8 @@ def test_views_are_for_the_blocks_that_they_see() -> None:
     assert blind[np.arange(20), own].mean() > 0.8
 
 
-def test_a_part_keeps_its_points_and_some_of_the_background() -> None:
+def test_a_part_keeps_its_points_and_some_of_the_background(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sagesplat.scene.blocks._FAR_SHARE", 0.1)
     scene = street(places=2, views=10)
     wide = replace(scene.views[0], camera=scene.views[15].camera)  # one camera looks at the other place
     seen = np.zeros(50, np.int32)

@@ -165,7 +165,9 @@ def test_what_is_not_drawn_stays_as_it_is(scene: Scene, monkeypatch) -> None:
     """With the smallest prefix drawn only (a share that rounds to one Gaussian), no other row moves."""
     monkeypatch.setattr(nested, "SORT_AT", ())
     start = ordered()
-    config = replace(QUICK, steps=3, drawn_from=1e-9, full_share=0.0, full_share_end=0.0)
+    monkeypatch.setattr(nested, "_DRAWN_FROM", 1e-9)
+    monkeypatch.setattr(nested, "_FULL_SHARE_END", 0.0)
+    config = replace(QUICK, steps=3, full_share=0.0)
     result = trained(scene, start, config, seed=1)
     moved = (result.gaussians.means != start.gaussians.means).any(1).numpy()
     first = np.isin(np.arange(60), [0, 20, 40])
@@ -180,6 +182,7 @@ def test_the_full_model_trains_second_opacities_and_low_levels_the_first(scene, 
     monkeypatch.setattr(nested, "weight_at", lambda shares: np.float32(shares == 1))
     given = torch.linspace(-1, 1, 60)
     start = replace(ordered(), second_opacities=given)
+    monkeypatch.setattr(nested, "_FULL_SHARE_END", float(full))
     config = replace(QUICK, steps=2, full_share=float(full))
     result = trained(scene, start, config)
     first = result.gaussians.logit_opacities != start.gaussians.logit_opacities
