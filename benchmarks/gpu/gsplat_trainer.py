@@ -23,6 +23,7 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.metrics.image import SSIM_WEIGHT, photometric_loss
 from sagesplat.scene.scene import Camera
 from sagesplat.train.densify import PRUNE_OPACITY
+from sagesplat.train.lr_schedule import PUBLISHED_RATES
 from sagesplat.train.strategy import schedule_of
 
 NAMES = {  # gsplat's name: ours
@@ -82,7 +83,7 @@ def train(
     params: dict[str, Any] = {
         name: torch.nn.Parameter(getattr(initial, ours).detach().clone()) for name, ours in NAMES.items()
     }
-    rates = {name: getattr(config, f"{ours}_lr") for name, ours in NAMES.items()}
+    rates = {name: PUBLISHED_RATES[ours] for name, ours in NAMES.items()}
     rates["means"] *= extent
     optimizers: dict[str, torch.optim.Optimizer] = {
         name: torch.optim.Adam([{"params": p, "lr": rates[name], "name": name}], eps=1e-15, fused=True)
