@@ -22,7 +22,7 @@ FILES = {
     "benchmarks/speed.py": "1\n2\n3\n",
     "web/src/core/a.ts": "1\n",
     "web/test/a.test.ts": "1\n2\n",
-    "docs/a.md": "x" * 2400,
+    "docs/index.md": "x" * 2400,
 }
 
 
