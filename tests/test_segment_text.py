@@ -1,6 +1,5 @@
 """Segmentation by text: settings, loading, and what becomes of a fake network's answers."""
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +8,7 @@ import torch
 from text_networks import photo, save
 
 from sagesplat.core.config import MasksConfig
-from sagesplat.core.errors import BackendUnavailable, LabelError, OutOfMemory, RunError, SageError
+from sagesplat.core.errors import LabelError, OutOfMemory
 from sagesplat.segment.detections import Found
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.segment.prompts import prompts_of
@@ -98,23 +97,6 @@ def test_what_the_answers_depend_on(tmp_path: Path) -> None:
     assert settings(over)["model"] == "google/owl"
 
 
-@pytest.mark.parametrize(
-    ("config", "complaint"),
-    [
-        (MasksConfig(segmenter="text"), '--segmenter text needs --prompts "stone fountain; ivy'),
-        (MasksConfig(segmenter="text", prompts=" "), "needs --prompts"),
-        (MasksConfig(prompts="a;;b"), "one is empty"),
-        (MasksConfig(prompts="ivy", prompt_threshold=1.0), "choose a number from 0 to below 1"),
-        (MasksConfig(segmenter="text", prompts="ivy", model="a", prompt_model="b"), "leave one of them"),
-    ],
-)
-def test_settings_that_cannot_be(config: MasksConfig, complaint: str) -> None:
-    with pytest.raises(SageError, match=complaint) as caught:
-        SEGMENTERS["text"].settings(config)
-    assert isinstance(caught.value, RunError | LabelError)
-    assert "\n" not in str(caught.value)
-
-
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     kinds = ("dino", "owlv2", "sam", "sam2", "clipseg", "sam3")
@@ -159,42 +141,17 @@ def test_the_usual_threshold_is_the_family_s(folders: dict[str, str]) -> None:
 
 
 def test_networks_of_the_wrong_kind(folders: dict[str, str], tmp_path: Path) -> None:
-    (tmp_path / "empty").mkdir()
-    broken = save(tmp_path / "broken", "dino")
-    (broken / "preprocessor_config.json").unlink()
     silent = save(tmp_path / "silent", "owlv2")
     for name in ("vocab.json", "merges.txt", "tokenizer_config.json"):
         (silent / name).unlink()
-    odd = save(tmp_path / "odd", "sam2")
-    (odd / "preprocessor_config.json").write_text('{"size": {"height": "tall"}}')
     cases: list[tuple[str, str | None, str]] = [
         (folders["sam2"], None, "a network of kind sam2; take one of clipseg, grounding-dino, "),
         (folders["dino"], folders["owlv2"], "a network of kind owlv2; take one of sam, sam2, sam2_video"),
         (folders["clipseg"], folders["sam"], "kind clipseg makes masks itself; leave out --mask-model"),
-        (str(tmp_path / "none"), None, "no such folder"),
-        (str(tmp_path / "empty"), None, "no network of transformers .*; name one for segmentation by text"),
-        (str(broken), folders["sam2"], "cannot be loaded .*preprocessor_config.json"),
         (str(silent), folders["sam2"], "cannot be loaded .*tokenizer"),
-        (folders["dino"], str(odd), "cannot be loaded"),
     ]
     for model, masks, complaint in cases:
         config = MasksConfig(segmenter="text", prompts="ivy", model=model, mask_model=masks)
         with pytest.raises(LabelError, match=complaint) as caught:
             load_text(config, "cpu", 1, [].append, {})
         assert "\n" not in str(caught.value)
-
-
-def test_without_transformers(folders: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "transformers", None)
-    with pytest.raises(BackendUnavailable, match=r"pip install 'sagesplat\[hf\]'"):
-        load_text(config_of(folders, "dino", "sam2"), "cpu", 1, [].append, {})
-
-
-def test_the_default_networks_are_asked_for_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from huggingface_hub import constants
-
-    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
-    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
-    config = MasksConfig(segmenter="text", prompts="ivy")
-    with pytest.raises(BackendUnavailable, match="hf download IDEA-Research/grounding-dino-tiny, then"):
-        load_text(config, "cpu", 1, [].append, {})

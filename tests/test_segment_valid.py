@@ -140,10 +140,6 @@ def test_transparent_borders_are_of_cut_out_objects(tmp_path, scene):
     assert ignores_alpha(replace(scene, alpha="ignore"))
 
 
-def test_opaque_photos_have_no_alpha_to_ignore(scene):
-    assert not ignores_alpha(scene)
-
-
 def test_black_is_zero_in_every_channel(tmp_path):
     pixels = np.zeros((2, 3, 3), np.uint8)
     pixels[0, 1] = (0, 0, 9)
