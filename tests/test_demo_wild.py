@@ -10,7 +10,7 @@ from sagesplat.demo.cameras import demo_cameras
 from sagesplat.demo.capture import make_capture
 from sagesplat.demo.figures import PERSON
 from sagesplat.demo.off_path import APART, UNSEEN
-from sagesplat.demo.wild import POSES, Wild, camera_gains, noisy_cameras
+from sagesplat.demo.wild import Wild, noisy_cameras
 from sagesplat.scene.colmap import load_colmap
 from sagesplat.scene.nerfstudio import load_transforms
 
@@ -64,18 +64,9 @@ def test_each_disturbance_alone_leaves_the_truth(clean, tmp_path):
     assert fall[:, [0, 0, -1, -1], [0, -1, 0, -1]].mean() < 0.9
 
 
-def test_gains_have_no_mean_and_drift():
-    gains = np.log2(camera_gains(Wild(exposure=0.7, white_balance=0.2), 60, 3))
-    assert np.abs(gains.mean(0)).max() < 0.05
-    assert 0.55 < np.abs(gains[:, 1]).max() <= 0.7
-    drift = gains[:, 0] - gains[:, 1]
-    assert np.abs(drift).max() == pytest.approx(0.2)
-    assert np.abs(np.diff(drift)).mean() < 0.3 * drift.std() * np.pi
-
-
 def test_pose_noise_has_the_size_that_was_asked():
     cameras = demo_cameras(400, 64, 48, 0)
-    noisy = noisy_cameras(POSES, cameras, 0)
+    noisy = noisy_cameras(Wild(pose_degrees=0.5, pose_shift=0.005), cameras, 0)
     turns = [n.w2c[:3, :3].astype(float) @ c.w2c[:3, :3].T for n, c in zip(noisy, cameras, strict=True)]
     angle = np.degrees([np.arcsin(np.linalg.norm(t - t.T) / np.sqrt(8)) for t in turns])
     assert np.sqrt(np.mean(angle**2)) == pytest.approx(0.5, rel=0.1)

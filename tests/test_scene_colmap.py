@@ -113,14 +113,6 @@ def test_downscale_keeps_the_exact_ratio(tmp_path, shipped):
     assert project(scene).max() < 1e-4
 
 
-def test_images_names_another_folder(tmp_path):
-    capture(tmp_path, [PINHOLE])
-    (tmp_path / "images").rename(tmp_path / "photos")
-    assert load_colmap(tmp_path, images="photos").views[0].image_path.parts[-3] == "photos"
-    with pytest.raises(SceneError, match="images: no such folder"):
-        load_colmap(tmp_path)
-
-
 def test_observations_outside_the_view_are_left_out(tmp_path):
     small = ModelCamera(1, "PINHOLE", 8, 8, (35.0, 35.0, 4.0, 4.0))
     capture(tmp_path, [small])

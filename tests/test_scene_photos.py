@@ -454,14 +454,6 @@ def test_portrait_and_landscape_of_a_phone_are_cameras_of_their_own(tmp_path: Pa
     assert sorted(len(group) for group in groups) == [2, 2, 4]
 
 
-def test_many_photos_and_videos_are_matched_in_sequence(tmp_path: Path) -> None:
-    Image.new("RGB", (30, 20)).save(tmp_path / "a.png")
-    found, _ = prepare_photos(tmp_path, tmp_path / "t", tmp_path / "t", lambda done, total: None)
-    assert photos._request(tmp_path, found * 100, PosesConfig())["matching"] == "exhaustive"
-    assert photos._request(tmp_path, found * 101, PosesConfig())["matching"] == "sequential"
-    assert photos._request(tmp_path / "a.png", found, PosesConfig())["matching"] == "sequential"
-
-
 def test_too_few_photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(photos.importlib.util, "find_spec", lambda name: name)
     source = tmp_path / "photos"

@@ -87,13 +87,6 @@ def test_light_falls_from_the_axis_to_the_reach_and_stays_there():
     assert share[5, 10] == pytest.approx(np.exp(-0.4 * t - 0.1 * t * t), rel=1e-5)
 
 
-def test_light_does_not_depend_on_the_size_of_the_photo():
-    large = camera(96, 96, 80)
-    np.testing.assert_allclose(
-        light(LENS, large).reshape(48, 2, 48, 2).mean((1, 3)), light(LENS, large.resized(48, 48)), atol=3e-3
-    )
-
-
 @given(st.integers(0, 2**32 - 1), st.floats(-0.9, 0), st.floats(-0.2, 0.1))
 def test_correction_undoes_the_lens(seed, a, b):
     lens, at = Vignetting((a, b), 0.5), camera(16, 12, 14)

@@ -103,11 +103,3 @@ def test_borders_move_to_the_edges_of_the_photo() -> None:
     labels = refine(p, photo).argmax(0)
     assert (p.argmax(0)[:, 30:36] == 0).all()
     assert (labels == (u > 30)).all()
-
-
-def test_impossible_labels_are_finite() -> None:
-    p = np.zeros((3, 8, 8), np.float32)
-    p[0, :, :4], p[1, :, 4:] = 1, 1
-    q = refine(p, photo_of("edges", 8, 8))
-    assert np.isfinite(q).all()
-    assert (q[2] < 1e-3).all()

@@ -201,7 +201,7 @@ def test_each_form_of_file_loads(form: str, tmp_path: Path) -> None:
             r"conv1\.weight has values that are not finite",
         ),
         ({"module.conv1.weight": torch.zeros(1)}, r"module\.conv1\.weight is there twice"),
-        (weights(182), "182 outputs, but head 'voc' has 21; take head 'coco-stuff'"),
+        (weights(7), r"7 outputs, but 182 \(coco-stuff\) or 21 \(voc\) are known"),
     ],
 )
 def test_what_cannot_be_loaded_is_one_line(changes: dict[str, Any], says: str, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from sagesplat.core.errors import LabelError, RunError
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.splats import read_splat, write_splat
 from sagesplat.io.files import write_json
-from sagesplat.segment.instances import parse_instances, read_instances, wanted_ids, write_instances
+from sagesplat.segment.instances import read_instances, wanted_ids, write_instances
 from sagesplat.segment.parents import read_parents, write_parents
 from sagesplat.segment.select import select, select_mask
 
@@ -54,8 +54,6 @@ def test_instance_files_of_another_size_or_kind_are_refused(tmp_path: Path) -> N
 
 
 def test_categories_are_named_one_by_one_or_all_at_once() -> None:
-    assert parse_instances(" chair, car ,chair") == ("chair", "car")
-    assert parse_instances("") == ()
     assert wanted_ids({62: "chair", 184: "tree-merged", 201: "ivy"}, ("things",)) == [62, 201]
     assert wanted_ids({62: "chair", 184: "tree-merged"}, ("*",)) == [62, 184]
     with pytest.raises(LabelError, match="no category 'sofa'; there are chair"):
@@ -64,18 +62,13 @@ def test_categories_are_named_one_by_one_or_all_at_once() -> None:
 
 def test_parents_are_kept_and_checked(tmp_path: Path) -> None:
     path = tmp_path / "parents.json"
-    assert read_parents(path) == {}
     write_parents(path, {"chair 1": "chair"})
     assert read_parents(path) == {"chair 1": "chair"}
     write_json(path, {"format": "sagesplat-parents", "version": 1, "parents": {"a": "b", "b": "c"}})
     with pytest.raises(RunError, match="an instance itself"):
         read_parents(path)
-    for wrong in ([], {}, {"format": "sagesplat-parents", "version": 1, "parents": {"a": 1}}):
-        write_json(path, wrong)
-        with pytest.raises(RunError, match=r"parents\.json"):
-            read_parents(path)
     write_parents(path, {})
-    assert not path.exists()
+    assert read_parents(path) == {}
 
 
 @pytest.mark.parametrize("name", ["a.ply", "a.spz", "a.sog"])

@@ -298,14 +298,6 @@ def test_names_and_colors():
     assert Taxonomy({9: "statue"}).color(9) == taxonomy.color(201)
 
 
-def test_an_accent_in_two_ways_is_one_name(tmp_path):
-    save(tmp_path / "a.png", IDS, {"labels": {"3": "caf\u00e9", "184": "cafe\u0301"}})
-    with pytest.raises(LabelError, match="name of its own"):
-        imported(scene_of("a.jpg"), tmp_path)
-    save(tmp_path / "a.png", IDS, {"labels": {"3": "cafe\u0301", "184": "Tree"}})
-    assert imported(scene_of("a.jpg"), tmp_path)[0].taxonomy.names == {3: "caf\u00e9", 184: "Tree"}
-
-
 def test_photos_that_some_disks_take_for_one(tmp_path):
     prepare_folder(tmp_path, scene_of("a.jpg", "sub/a.jpg", "b.jpg").views)
     for one, other in (("a.jpg", "A.png"), ("caf\u00e9.jpg", "cafe\u0301.jpg"), ("a.jpg", "a.png")):

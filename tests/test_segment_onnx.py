@@ -203,25 +203,6 @@ LOGITS = ("logits", (1, 3, 16, 32), FLOAT)
 
 
 @pytest.mark.parametrize(
-    ("shape", "kind"),
-    [
-        ((), FLOAT),
-        ((1, 3, 0, 32), FLOAT),
-        ((1, 3, 10**9, 10**9), FLOAT),
-        ((1, 3, 16, 32), INT64),
-        ((1, 4, 16, 32), FLOAT),
-    ],
-)
-def test_inputs_that_are_no_photo(tmp_path, files, shape, kind):
-    nodes = node("Identity", ["photo"], "logits")
-    model = model_of(tmp_path / "m.onnx", nodes, [("photo", shape, kind)], [("logits", shape, kind)])
-    with pytest.raises(LabelError, match=r"m\.onnx: .*export it") as caught:
-        OnnxSegmenter(model, files[1])
-    assert "\n" not in str(caught.value)
-    assert len(str(caught.value)) < 1000
-
-
-@pytest.mark.parametrize(
     ("nodes", "output"),
     [
         (b"", None),

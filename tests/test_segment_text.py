@@ -8,13 +8,13 @@ import torch
 from text_networks import photo, save
 
 from sagesplat.core.config import MasksConfig
-from sagesplat.core.errors import LabelError, OutOfMemory
+from sagesplat.core.errors import LabelError
 from sagesplat.segment.detections import Found
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.segment.prompts import prompts_of
 from sagesplat.segment.registry import SEGMENTERS
 from sagesplat.segment.segmenters import Segmented, Segmenter
-from sagesplat.segment.text import TextOver, TextSegmenter, load_text, settings
+from sagesplat.segment.text import TextOver, TextSegmenter, load_text
 
 WORDS = "stone fountain; ivy; wooden bench; tree"
 
@@ -72,31 +72,6 @@ def test_prompts_over_another_segmenter() -> None:
     assert both.best == {"fountain": pytest.approx(0.65), "tree-merged": pytest.approx(0.65)}
 
 
-def test_no_memory_is_one_line() -> None:
-    def full(_: np.ndarray) -> Found:
-        raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 8 bytes")
-
-    finder = Finds(best=[])
-    segmenter = TextSegmenter(finder, prompts_of(["ivy"], {}))
-    segmenter._finder = full  # type: ignore[assignment]
-    with pytest.raises(OutOfMemory, match="segmentation by text: no memory on cpu"):
-        segmenter([photo(4, 8)])
-
-
-def test_what_the_answers_depend_on(tmp_path: Path) -> None:
-    config = MasksConfig(segmenter="text", prompts="ivy; the tree")
-    assert settings(config) == {
-        "model": "IDEA-Research/grounding-dino-tiny", "mask_model": "facebook/sam2.1-hiera-tiny",
-        "prompts": ["ivy", "the tree"], "prompt_threshold": 0.0,
-    }  # fmt: skip
-    given = MasksConfig(segmenter="text", prompts="ivy", model=str(tmp_path), mask_model="a/b")
-    assert settings(given) | {"prompts": 0} == {
-        "model": tmp_path, "mask_model": "a/b", "prompts": 0, "prompt_threshold": 0.0,
-    }  # fmt: skip
-    over = MasksConfig(segmenter="hf", prompts="ivy", model="eomt", prompt_model="google/owl")
-    assert settings(over)["model"] == "google/owl"
-
-
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     kinds = ("dino", "owlv2", "sam", "sam2", "clipseg", "sam3")
@@ -132,12 +107,6 @@ def test_networks_of_all_families_segment(folders: dict[str, str], model: str, m
             np.testing.assert_array_equal(answer.instances >= 0, answer.label_ids >= 0)
     assert isinstance(segmenter, TextSegmenter)
     assert min(segmenter.best.values()) > 0.01
-
-
-def test_the_usual_threshold_is_the_family_s(folders: dict[str, str]) -> None:
-    for model, masks, usual in (("dino", "sam2", 0.3), ("owlv2", "sam", 0.2), ("sam3", None, 0.5)):
-        config = config_of(folders, model, masks, threshold=0)
-        assert load_text(config, "cpu", 1, [].append, {}).threshold == usual
 
 
 def test_networks_of_the_wrong_kind(folders: dict[str, str], tmp_path: Path) -> None:
