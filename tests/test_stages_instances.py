@@ -15,8 +15,8 @@ from sagesplat.demo.capture import make_capture
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.segment.instances import read_instances, write_instances
-from sagesplat.segment.masks import mask_path
 from sagesplat.segment.lift import LiftedLabels
+from sagesplat.segment.masks import mask_path
 from sagesplat.stages.instances import make_instances
 from sagesplat.stages.label import lift_labels, make_masks
 from sagesplat.stages.scene import open_scene
